@@ -1,0 +1,28 @@
+"""The one family of errors this room raises for anything a person or a file can cause."""
+
+from __future__ import annotations
+
+
+class CalibrationError(Exception):
+    """Something a person can act on. `str()` says what, where and what to do next.
+
+    `exit_code`: 1 failed, 2 usage or configuration, 4 a quality gate failed.
+    """
+
+    exit_code = 1
+
+
+class TooFewViewsError(CalibrationError):
+    """Fewer usable views than the method needs."""
+
+
+class DegenerateMotionError(CalibrationError):
+    """The rotations do not determine X; the message names the missing direction."""
+
+
+class BadViewsError(CalibrationError):
+    """Input that cannot be solved: NaN, mixed picture sizes, singular intrinsics …"""
+
+
+class GateFailedError(CalibrationError):
+    exit_code = 4

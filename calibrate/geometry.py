@@ -1,0 +1,194 @@
+"""Rigid transforms with frame names, and the SO(3)/SE(3) maps that everything else is written in.
+
+`base_from_flange` maps points of `flange` into `base`; chains touch:
+``base_from_flange @ flange_from_camera @ camera_from_board``. Inside solvers plain arrays of shape
+(..., 4, 4) are used under the same names; `Transform` stands wherever frames could be mixed up.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.spatial.transform import Rotation
+
+Array = NDArray[np.float64]
+
+
+class FrameMismatchError(ValueError):
+    """Two transforms were chained whose frames do not touch."""
+
+
+@dataclass(frozen=True, eq=False)
+class Transform:
+    """A rigid transform `parent_from_child`: maps points of `child` (metres) into `parent`."""
+
+    parent: str
+    child: str
+    matrix: Array
+    """(4, 4), rotation orthonormal to 1e-6; raises ValueError otherwise."""
+
+    def __post_init__(self) -> None:
+        matrix = np.array(self.matrix, dtype=float)
+        if matrix.shape != (4, 4) or not is_rigid(matrix):
+            raise ValueError(f"{self.parent}_from_{self.child} is not a rigid transform:\n{matrix}")
+        matrix.flags.writeable = False
+        object.__setattr__(self, "matrix", matrix)
+
+    @property
+    def rotation(self) -> Array:
+        """(3, 3)"""
+        return self.matrix[:3, :3]
+
+    @property
+    def translation_m(self) -> Array:
+        """(3,)"""
+        return self.matrix[:3, 3]
+
+    @property
+    def quaternion_xyzw(self) -> Array:
+        """(4,), w >= 0"""
+        return quaternion_from_matrix(self.rotation)
+
+    def inverse(self) -> Transform:
+        return Transform(self.child, self.parent, inverse(self.matrix))
+
+    def __matmul__(self, other: Transform) -> Transform:
+        if self.child != other.parent:
+            raise FrameMismatchError(
+                f"{self.parent}_from_{self.child} @ {other.parent}_from_{other.child}: "
+                f"'{self.child}' does not touch '{other.parent}'"
+            )
+        return Transform(self.parent, other.child, self.matrix @ other.matrix)
+
+    def apply(self, points: Array) -> Array:
+        """Points (..., 3) of `child` in metres → the same points in `parent`."""
+        return transform_points(self.matrix, points)
+
+    @classmethod
+    def from_quaternion(
+        cls, parent: str, child: str, translation_m: ArrayLike, quaternion_xyzw: ArrayLike
+    ) -> Transform:
+        return cls(parent, child, pose_from_quaternion(translation_m, quaternion_xyzw))
+
+
+def pose(rotation: ArrayLike, translation_m: ArrayLike) -> Array:
+    """(..., 3, 3) and (..., 3) → (..., 4, 4)."""
+    R, t = np.asarray(rotation, dtype=float), np.asarray(translation_m, dtype=float)
+    matrix = np.zeros((*np.broadcast_shapes(R.shape[:-2], t.shape[:-1]), 4, 4))
+    matrix[..., :3, :3], matrix[..., :3, 3], matrix[..., 3, 3] = R, t, 1.0
+    return matrix
+
+
+def inverse(matrix: Array) -> Array:
+    """Inverse of rigid transforms (..., 4, 4)."""
+    R_t = np.swapaxes(matrix[..., :3, :3], -1, -2)
+    return pose(R_t, -np.einsum("...ij,...j->...i", R_t, matrix[..., :3, 3]))
+
+
+def transform_points(matrix: Array, points: Array) -> Array:
+    """Rigid transform (..., 4, 4) applied to points (..., n, 3) or (3,), metres."""
+    points = np.asarray(points, dtype=float)
+    if points.ndim == 1:
+        return np.asarray(matrix[..., :3, :3] @ points + matrix[..., :3, 3])
+    return np.asarray(points @ np.swapaxes(matrix[..., :3, :3], -1, -2) + matrix[..., None, :3, 3])
+
+
+def is_rigid(matrix: Array, tolerance: float = 1e-6) -> bool:
+    R = matrix[:3, :3]
+    return bool(
+        np.isfinite(matrix).all()
+        and np.abs(R @ R.T - np.eye(3)).max() < tolerance
+        and np.linalg.det(R) > 0
+        and np.abs(matrix[3] - [0, 0, 0, 1]).max() < tolerance
+    )
+
+
+def skew(v: Array) -> Array:
+    """[v]× of vectors (..., 3): skew(v) @ w = v × w."""
+    v = np.asarray(v, dtype=float)
+    S = np.zeros((*v.shape[:-1], 3, 3))
+    S[..., 0, 1], S[..., 0, 2] = -v[..., 2], v[..., 1]
+    S[..., 1, 0], S[..., 1, 2] = v[..., 2], -v[..., 0]
+    S[..., 2, 0], S[..., 2, 1] = -v[..., 1], v[..., 0]
+    return S
+
+
+def rotation_exp(vector: ArrayLike) -> Array:
+    """Rotation vectors (..., 3) in radians → matrices (..., 3, 3) (Rodrigues)."""
+    v = np.asarray(vector, dtype=float)
+    return np.asarray(Rotation.from_rotvec(v.reshape(-1, 3)).as_matrix().reshape(*v.shape[:-1], 3, 3))
+
+
+def rotation_log(R: ArrayLike) -> Array:
+    """Rotation matrices (..., 3, 3) → rotation vectors (..., 3) in radians, angle in [0, π].
+
+    At exactly π the axis sign is ambiguous; either one is returned.
+    """
+    M = np.asarray(R, dtype=float)
+    return np.asarray(Rotation.from_matrix(M.reshape(-1, 3, 3)).as_rotvec().reshape(*M.shape[:-2], 3))
+
+
+def rotation_angle(R: ArrayLike) -> Any:
+    """Angle of rotation matrices (..., 3, 3), radians, accurate near 0 and near π."""
+    return np.linalg.norm(rotation_log(R), axis=-1)
+
+
+def project_to_rotation(M: Array) -> Array:
+    """Nearest rotation (Frobenius) to matrices (..., 3, 3), by SVD with det = +1."""
+    U, _, Vt = np.linalg.svd(M)
+    D = np.zeros_like(M)
+    D[..., 0, 0] = D[..., 1, 1] = 1.0
+    D[..., 2, 2] = np.sign(np.linalg.det(U @ Vt))
+    return np.asarray(U @ D @ Vt)
+
+
+def quaternion_from_matrix(R: ArrayLike) -> Array:
+    """(..., 3, 3) → (..., 4) x, y, z, w with w >= 0."""
+    M = np.asarray(R, dtype=float)
+    q = Rotation.from_matrix(M.reshape(-1, 3, 3)).as_quat(canonical=True)
+    return np.asarray(q.reshape(*M.shape[:-2], 4))
+
+
+def matrix_from_quaternion(quaternion_xyzw: ArrayLike) -> Array:
+    """(..., 4) x, y, z, w (any positive norm) → (..., 3, 3)."""
+    q = np.asarray(quaternion_xyzw, dtype=float)
+    return np.asarray(Rotation.from_quat(q.reshape(-1, 4)).as_matrix().reshape(*q.shape[:-1], 3, 3))
+
+
+def pose_from_quaternion(translation_m: ArrayLike, quaternion_xyzw: ArrayLike) -> Array:
+    return pose(matrix_from_quaternion(quaternion_xyzw), translation_m)
+
+
+def pose_from_rotvec(translation_m: ArrayLike, rotvec_rad: ArrayLike) -> Array:
+    """UR convention: x, y, z [m] and a rotation vector [rad]."""
+    return pose(rotation_exp(rotvec_rad), translation_m)
+
+
+def perturb(matrix: Array, delta: ArrayLike) -> Array:
+    """The project's one error convention: delta = (..., 6) [δt (m), δφ (rad)], both in the parent frame.
+
+    R = Exp(δφ) R̂, t = t̂ + δt. The 6×6 covariances everywhere are of this delta, in this order.
+    """
+    d = np.asarray(delta, dtype=float)
+    return pose(rotation_exp(d[..., 3:]) @ matrix[..., :3, :3], matrix[..., :3, 3] + d[..., :3])
+
+
+def difference(matrix: Array, reference: Array) -> Array:
+    """The delta (..., 6) with perturb(reference, delta) = matrix."""
+    d_phi = rotation_log(matrix[..., :3, :3] @ np.swapaxes(reference[..., :3, :3], -1, -2))
+    return np.concatenate([matrix[..., :3, 3] - reference[..., :3, 3], d_phi], axis=-1)
+
+
+def interpolate(first: Array, second: Array, fraction: float) -> Array:
+    """Point on the path first → second (4, 4): linear translation, constant-axis rotation."""
+    R1 = first[:3, :3]
+    R = R1 @ rotation_exp(fraction * rotation_log(R1.T @ second[:3, :3]))
+    return pose(R, (1 - fraction) * first[:3, 3] + fraction * second[:3, 3])
+
+
+def random_rotation(rng: np.random.Generator) -> Array:
+    """Uniform on SO(3), (3, 3)."""
+    return matrix_from_quaternion(rng.normal(size=4))

@@ -1,0 +1,197 @@
+"""Kinematics of Universal Robots arms: forward, all analytic inverses, Jacobian, singularity measure.
+
+Standard Denavit-Hartenberg: frame i from i-1 is Rz(q_i) Tz(d_i) Tx(a_i) Rx(alpha_i). Frame 6 is the
+flange; `base` is the controller's base frame. Lengths in metres, angles in radians. Parameters: Universal
+Robots, "DH parameters for calculations of kinematics and dynamics".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calibrate.geometry import Array, inverse
+
+_ALPHA = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
+JOINT_NAMES = ("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3")
+
+
+@dataclass(frozen=True)
+class DhDeltas:
+    """Factory or estimated corrections to the nominal table: each (6,), metres or radians."""
+
+    a_m: tuple[float, ...] = (0.0,) * 6
+    d_m: tuple[float, ...] = (0.0,) * 6
+    alpha_rad: tuple[float, ...] = (0.0,) * 6
+    theta_rad: tuple[float, ...] = (0.0,) * 6
+
+
+@dataclass(frozen=True)
+class RobotModel:
+    name: str
+    a_m: tuple[float, ...]
+    d_m: tuple[float, ...]
+    generation: str
+    """'CB3' or 'e-Series'"""
+    alpha_rad: tuple[float, ...] = _ALPHA
+    theta_offset_rad: tuple[float, ...] = (0.0,) * 6
+    joint_limit_rad: float = 2 * np.pi
+    """Joints turn within ± this."""
+    link_radius_m: tuple[float, ...] = field(default=(0.09, 0.075, 0.06, 0.05, 0.05, 0.045))
+    """Rough capsule radii of the links, for clearance; generous."""
+
+    def calibrated(self, deltas: DhDeltas) -> RobotModel:
+        """This model with deltas added; the analytic inverse stays that of the nominal table."""
+
+        def add(nominal: tuple[float, ...], delta: tuple[float, ...]) -> tuple[float, ...]:
+            return tuple(n + d for n, d in zip(nominal, delta, strict=True))
+
+        return replace(
+            self,
+            a_m=add(self.a_m, deltas.a_m),
+            d_m=add(self.d_m, deltas.d_m),
+            alpha_rad=add(self.alpha_rad, deltas.alpha_rad),
+            theta_offset_rad=add(self.theta_offset_rad, deltas.theta_rad),
+        )
+
+
+def _model(name: str, a2: float, a3: float, d1: float, d4: float, d5: float, d6: float) -> RobotModel:
+    generation = "e-Series" if name.endswith("e") else "CB3"
+    return RobotModel(name, (0.0, a2, a3, 0.0, 0.0, 0.0), (d1, 0.0, 0.0, d4, d5, d6), generation)
+
+
+MODELS: dict[str, RobotModel] = {
+    m.name: m
+    for m in (
+        _model("UR3", -0.24365, -0.21325, 0.1519, 0.11235, 0.08535, 0.0819),
+        _model("UR5", -0.425, -0.39225, 0.089159, 0.10915, 0.09465, 0.0823),
+        _model("UR10", -0.612, -0.5723, 0.1273, 0.163941, 0.1157, 0.0922),
+        _model("UR3e", -0.24355, -0.2132, 0.15185, 0.13105, 0.08535, 0.0921),
+        _model("UR5e", -0.425, -0.3922, 0.1625, 0.1333, 0.0997, 0.0996),
+        _model("UR10e", -0.6127, -0.57155, 0.1807, 0.17415, 0.11985, 0.11655),
+        _model("UR16e", -0.4784, -0.36, 0.1807, 0.17415, 0.11985, 0.11655),
+    )
+}
+
+
+def link_frames(model: RobotModel, joints_rad: ArrayLike) -> Array:
+    """Joints (..., 6) → base_from_link for links 0…6, (..., 7, 4, 4); link 0 is the base, 6 the flange."""
+    q = np.asarray(joints_rad, dtype=float)
+    frames = np.zeros((*q.shape[:-1], 7, 4, 4))
+    frames[..., 0, :, :] = np.eye(4)
+    for i in range(6):
+        theta = q[..., i] + model.theta_offset_rad[i]
+        ct, st = np.cos(theta), np.sin(theta)
+        ca, sa = np.cos(model.alpha_rad[i]), np.sin(model.alpha_rad[i])
+        step = np.zeros((*q.shape[:-1], 4, 4))
+        step[..., 0, 0], step[..., 0, 1], step[..., 0, 2] = ct, -st * ca, st * sa
+        step[..., 1, 0], step[..., 1, 1], step[..., 1, 2] = st, ct * ca, -ct * sa
+        step[..., 2, 1], step[..., 2, 2] = sa, ca
+        step[..., 0, 3], step[..., 1, 3], step[..., 2, 3] = model.a_m[i] * ct, model.a_m[i] * st, model.d_m[i]
+        step[..., 3, 3] = 1.0
+        frames[..., i + 1, :, :] = frames[..., i, :, :] @ step
+    return frames
+
+
+def forward(model: RobotModel, joints_rad: ArrayLike) -> Array:
+    """Joints (..., 6) → base_from_flange (..., 4, 4)."""
+    return np.asarray(link_frames(model, joints_rad)[..., 6, :, :])
+
+
+def jacobian(model: RobotModel, joints_rad: ArrayLike) -> Array:
+    """Geometric Jacobian (..., 6, 6) in base: flange velocity (m/s), then angular velocity (rad/s)."""
+    frames = link_frames(model, joints_rad)
+    z = frames[..., :6, :3, 2]
+    lever = frames[..., 6, None, :3, 3] - frames[..., :6, :3, 3]
+    return np.concatenate([np.swapaxes(np.cross(z, lever), -1, -2), np.swapaxes(z, -1, -2)], axis=-2)
+
+
+def singularity_measure(model: RobotModel, joints_rad: ArrayLike) -> Array:
+    """Smallest singular value of the Jacobian, lengths divided by the arm's reach; 0 = singular. (...,)"""
+    J = jacobian(model, joints_rad).copy()
+    J[..., :3, :] /= abs(model.a_m[1]) + abs(model.a_m[2])
+    return np.asarray(np.linalg.svd(J, compute_uv=False)[..., -1])
+
+
+def inverse_all(model: RobotModel, base_from_flange: Array) -> Array:
+    """All analytic solutions of the nominal table, (n, 6) with n ≤ 8, each joint in (-π, π].
+
+    Source: K. Hawkins, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms" (2013).
+    At a wrist singularity (sin q5 = 0) wrist 3 is set to 0. Unreachable poses give (0, 6).
+    """
+    a2, a3 = model.a_m[1], model.a_m[2]
+    d1, _, _, d4, d5, d6 = model.d_m
+    T = np.asarray(base_from_flange, dtype=float)
+    solutions = []
+    wrist = T[:3, 3] - d6 * T[:3, 2]
+    radius = np.hypot(wrist[0], wrist[1])
+    if radius < abs(d4):
+        return np.zeros((0, 6))
+    for s1 in (1.0, -1.0):
+        q1 = np.arctan2(wrist[1], wrist[0]) + s1 * np.arccos(d4 / radius) + np.pi / 2
+        c5 = (T[0, 3] * np.sin(q1) - T[1, 3] * np.cos(q1) - d4) / d6
+        if abs(c5) > 1 + 1e-9:
+            continue
+        for s5 in (1.0, -1.0):
+            q5 = s5 * np.arccos(np.clip(c5, -1, 1))
+            q6 = 0.0
+            if abs(np.sin(q5)) > 1e-9:
+                sign = np.sign(np.sin(q5))
+                q6 = np.arctan2(
+                    sign * (-T[0, 1] * np.sin(q1) + T[1, 1] * np.cos(q1)),
+                    sign * (T[0, 0] * np.sin(q1) - T[1, 0] * np.cos(q1)),
+                )
+            solutions += _arm_plane(T, a2, a3, d1, d4, d5, d6, q1, q5, q6)
+    if not solutions:
+        return np.zeros((0, 6))
+    return np.asarray((np.array(solutions) + np.pi) % (2 * np.pi) - np.pi)
+
+
+def _arm_plane(
+    T: Array,
+    a2: float,
+    a3: float,
+    d1: float,
+    d4: float,
+    d5: float,
+    d6: float,
+    q1: float,
+    q5: float,
+    q6: float,
+) -> list[list[float]]:
+    """Shoulder, elbow and wrist 1: a planar two-link arm, elbow up and down."""
+
+    def step(q: float, d: float, alpha: float) -> Array:
+        ct, st, ca, sa = np.cos(q), np.sin(q), np.cos(alpha), np.sin(alpha)
+        return np.array(
+            [[ct, -st * ca, st * sa, 0], [st, ct * ca, -ct * sa, 0], [0, sa, ca, d], [0, 0, 0, 1.0]]
+        )
+
+    T14 = inverse(step(q1, d1, np.pi / 2)) @ T @ inverse(step(q5, d5, -np.pi / 2) @ step(q6, d6, 0.0))
+    x, y = T14[0, 3], T14[1, 3]
+    c3 = (x * x + y * y - a2 * a2 - a3 * a3) / (2 * a2 * a3)
+    if abs(c3) > 1 + 1e-9:
+        return []
+    found = []
+    for s3 in (1.0, -1.0):
+        q3 = s3 * np.arccos(np.clip(c3, -1, 1))
+        q2 = np.arctan2(y, x) - np.arctan2(a3 * np.sin(q3), a2 + a3 * np.cos(q3))
+        q4 = np.arctan2(T14[1, 0], T14[0, 0]) - q2 - q3
+        found.append([q1, q2, q3, q4, q5, q6])
+    return found
+
+
+def inverse_nearest(model: RobotModel, base_from_flange: Array, near_rad: ArrayLike) -> Array | None:
+    """The solution (6,) nearest to `near_rad`, turns of 2π chosen within the joint limits; None if none."""
+    near = np.asarray(near_rad, dtype=float)
+    candidates = inverse_all(model, base_from_flange)
+    if len(candidates) == 0:
+        return None
+    turned = candidates + 2 * np.pi * np.round((near - candidates) / (2 * np.pi))
+    limit = model.joint_limit_rad
+    turned = np.where(
+        turned > limit, turned - 2 * np.pi, np.where(turned < -limit, turned + 2 * np.pi, turned)
+    )
+    return np.asarray(turned[np.argmin(np.abs(turned - near).max(axis=1))])

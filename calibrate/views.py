@@ -1,0 +1,63 @@
+"""The solver's input: views, each a robot pose with the board's points seen in one picture."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibrate.geometry import Array
+from recordings.messages import CameraModel, Mount
+
+
+@dataclass(frozen=True, eq=False)
+class ImageView:
+    """One stop of the arm with its detected board."""
+
+    index: int
+    """Pose number in the session, as people see it."""
+    name: str
+    base_from_flange: Array
+    """(4, 4)"""
+    board_points: Array
+    """(k, 3) detected corners in `board`, metres (z = 0)."""
+    pixels: Array
+    """(k, 2) the same corners in the picture."""
+    joints_rad: Array | None = None
+    """(6,) or None where no joints were recorded."""
+    camera_from_board: Array | None = None
+    """(4, 4) PnP, once intrinsics are known."""
+
+
+@dataclass(frozen=True, eq=False)
+class ViewSet:
+    """All views of a session, in capture order, of one camera and one board."""
+
+    mount: Mount
+    views: tuple[ImageView, ...]
+    camera: CameraModel
+    """matrix is None until intrinsics are known."""
+    robot_model: str = "unknown"
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    def __iter__(self) -> Iterator[ImageView]:
+        return iter(self.views)
+
+    def select(self, positions: list[int]) -> ViewSet:
+        """The views at these places in the tuple (not pose numbers)."""
+        return replace(self, views=tuple(self.views[i] for i in positions))
+
+    @property
+    def base_from_flange(self) -> Array:
+        """(n, 4, 4)"""
+        return np.array([v.base_from_flange for v in self.views]).reshape(-1, 4, 4)
+
+    @property
+    def camera_from_board(self) -> Array:
+        """(n, 4, 4); ValueError while a view has no PnP pose yet."""
+        if any(v.camera_from_board is None for v in self.views):
+            raise ValueError("camera_from_board is not known yet: run PnP first")
+        return np.array([v.camera_from_board for v in self.views]).reshape(-1, 4, 4)

@@ -1,0 +1,24 @@
+"""The one family of errors this room raises for anything a person or a file can cause."""
+
+from __future__ import annotations
+
+
+class RecordingError(Exception):
+    """Something is wrong with a recording, a folder or a disk. `str()` says what, where and what to do next.
+
+    `exit_code`: 1 failed, 2 usage or configuration (the command line's contract).
+    """
+
+    exit_code = 1
+
+
+class UnsealedRecordingError(RecordingError):
+    """The file was never finished or is cut; `recordings recover` can help."""
+
+
+class CorruptRecordingError(RecordingError):
+    """The file breaks a rule of the format; the message names the byte offset."""
+
+
+class ImportFolderError(RecordingError):
+    """A folder to import is wrong; the message names file, row and remedy."""

@@ -1,0 +1,80 @@
+"""What the session needs of a device. Real, simulated and played-back devices are equals behind these."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Protocol
+
+import msgspec
+
+from recordings.messages import CameraIdentity, Picture, RobotIdentity, RobotState
+
+
+class Robot(Protocol):
+    """An arm. Connecting is read-only; only `start_control` (by a go) replaces the robot's program."""
+
+    @property
+    def identity(self) -> RobotIdentity: ...
+
+    async def connect(self) -> RobotIdentity:
+        """Reads identity and starts the state stream. Raises RobotError."""
+
+    def subscribe(self, callback: Callable[[RobotState], None]) -> None:
+        """Every sample, in order, at the full rate, from the reader's thread: the callback must be quick."""
+
+    def latest(self) -> RobotState:
+        """Newest state; StaleStateError when older than 100 ms or its controller time stands still."""
+
+    def at(self, host_monotonic_ns: int) -> RobotState:
+        """State interpolated at a host time within the last 10 s; StaleStateError outside."""
+
+    async def start_control(self) -> None:
+        """Spawns the control child. Only in answer to a go. RobotError with remedy when refused."""
+
+    async def move(self, joints_rad: Sequence[float], speed_rad_s: float, acceleration_rad_s2: float) -> None:
+        """Moves the joints and returns when arrived. RobotError, SafetyStopError, StaleStateError."""
+
+    def heartbeat(self) -> None:
+        """Called by the session loop at least every 50 ms while control lives; without it the arm stops."""
+
+    async def stop(self, reason: str) -> None:
+        """Decelerates now, by both paths; idempotent, in any state, never raises."""
+
+    async def end_control(self) -> None:
+        """Stops the script and ends the child."""
+
+    async def close(self) -> None: ...
+
+
+class Camera(Protocol):
+    @property
+    def identity(self) -> CameraIdentity: ...
+
+    async def open(self) -> CameraIdentity:
+        """Raises CameraError with the remedy."""
+
+    async def capture(self, timeout_s: float = 5.0) -> Picture:
+        """One trigger, one frame. Raises CameraError; never returns an older frame."""
+
+    async def preview(self) -> Picture | None:
+        """A recent picture for the screen; None when there is none. Never recorded."""
+
+    async def close(self) -> None: ...
+
+
+class TriggerPulse(msgspec.Struct, frozen=True):
+    count: int
+    device_us: int
+    host_monotonic_ns: int
+
+
+class Trigger(Protocol):
+    async def open(self) -> str:
+        """Identity text. Raises TriggerError."""
+
+    async def fire(self) -> TriggerPulse: ...
+
+    async def light(self, level: float) -> None:
+        """0 = off, 1 = full."""
+
+    async def close(self) -> None: ...

@@ -1,0 +1,63 @@
+"""Messages on the control socket: JSON lines of at most 64 kB, allow-listed verbs, typed arguments.
+
+client → daemon   {"id": 1, "verb": "go", "args": {…}}
+daemon → client   {"id": 1, "ok": true, "result": {…}}      or   {"id": 1, "ok": false, "error": "…"}
+                  {"status": {…}}      full, right after `watch`
+                  {"changes": {…}}     changed top-level sections of the status
+`stop` needs no lease and is handled before anything that is queued.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import msgspec
+
+LINE_LIMIT_BYTES = 64 * 1024
+CLIENT_LIMIT = 16
+
+Verb = Literal[
+    "hello",  # {who} → {version, pid}
+    "watch",  # → status, then changes
+    "lease",  # {action: take|release}
+    "stop",  # now; from anyone
+    "acknowledge",  # leave `stopped` or `fault` after a person looked
+    "plan",  # → the loaded plan
+    "load_plan",  # {plan: {…}} inline plan; checked, refused with all problems
+    "make_plan",  # {poses, seed} → made in a worker, then loaded
+    "prepare",  # {purpose, index?} → GoSummary; checks the whole path from where the arm is
+    "go",  # {token} the person's confirmation of exactly that summary
+    "pause",  # after this pose
+    "finish",  # seal what is there
+    "retake",  # {index}
+    "skip",  # {index}
+    "reorder",  # {order: [indices]}
+    "add",  # {pose}
+    "drop",  # {index}
+    "free_drive",  # {on: bool}
+    "record",  # capture here and now (free-drive)
+    "preview",  # {width, height} → {jpeg_base64, width, height, corners, sequence}
+    "doctor",  # → [{name, state, text, remedy}]
+    "sessions",  # → [{name, folder, views, sealed, …}]
+    "open_replay",  # {path}
+]
+
+
+class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    id: int
+    verb: Verb
+    args: dict[str, Any] = {}
+
+
+class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
+    id: int
+    ok: bool
+    result: Any = None
+    error: str = ""
+
+
+class Notice(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Unasked-for line to a watcher; exactly one field is set."""
+
+    status: dict[str, Any] | None = None
+    changes: dict[str, Any] | None = None

@@ -1,0 +1,54 @@
+"""The one owner of the truth: everything a simulated cell really is. Files of it are JSON.
+
+Controller, camera and trigger are separate processes that each read the same truth; the result is
+compared with it at the end, and nothing in between may look at it.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+
+from recordings.messages import BoardSpec, CameraModel, Matrix4, Mount, Vector6
+
+
+class CellTruth(msgspec.Struct, frozen=True, omit_defaults=True):
+    scene: str
+    seed: int
+    mount: Mount
+    robot_model: str
+    board: BoardSpec
+    camera: CameraModel
+    """True lens."""
+    camera_mount: Matrix4
+    """flange_from_camera (eye-in-hand) or base_from_camera (eye-to-hand): the answer."""
+    board_place: Matrix4
+    """base_from_board (eye-in-hand) or flange_from_board (eye-to-hand)."""
+    start_joints_rad: Vector6
+    robot_sigma_m: float = 0.00005
+    """Repeatability: the flange misses by this much per axis, drawn anew at every stop."""
+    robot_sigma_rad: float = 8.7e-5
+    dh_delta_a_m: Vector6 = (0.0,) * 6
+    """The true arm differs from the nominal table by these (systematic error)."""
+    dh_delta_d_m: Vector6 = (0.0,) * 6
+    dh_delta_alpha_rad: Vector6 = (0.0,) * 6
+    dh_delta_theta_rad: Vector6 = (0.0,) * 6
+    pixel_noise: float = 2.0
+    """Grey levels, 1σ, at gain 0 dB."""
+    blur_px: float = 0.7
+    """Sigma of the lens's blur."""
+    illumination: float = 1.0
+    exposure_us: float = 10_000.0
+    gain_db: float = 0.0
+    camera_clock_offset_ns: int = 0
+    camera_clock_drift_ppm: float = 0.0
+    controller_clock_drift_ppm: float = 0.0
+
+
+def write_truth(truth: CellTruth, path: Path) -> None:
+    path.write_bytes(msgspec.json.encode(truth))
+
+
+def read_truth(path: Path) -> CellTruth:
+    return msgspec.json.decode(path.read_bytes(), type=CellTruth)

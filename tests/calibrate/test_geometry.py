@@ -1,0 +1,88 @@
+"""What anyone may rely on about frames and rotations."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm, logm
+
+from calibrate import geometry as g
+
+vectors = st.lists(st.floats(-3.0, 3.0), min_size=3, max_size=3).map(np.array)
+deltas = st.lists(st.floats(-1.0, 1.0), min_size=6, max_size=6).map(np.array)
+
+
+def test_chains_touch_or_raise() -> None:
+    base_from_flange = g.Transform("base", "flange", g.pose_from_rotvec([0.1, 0.2, 0.3], [0.1, 0, 0.4]))
+    flange_from_camera = g.Transform("flange", "camera", g.pose_from_rotvec([0, 0, 0.05], [0, 1, 0]))
+    chained = base_from_flange @ flange_from_camera
+    assert (chained.parent, chained.child) == ("base", "camera")
+    point = np.array([0.3, -0.2, 1.0])
+    np.testing.assert_allclose(
+        chained.apply(point), base_from_flange.apply(flange_from_camera.apply(point)), atol=1e-15
+    )
+    with pytest.raises(g.FrameMismatchError, match="'base' does not touch 'flange'|does not touch"):
+        flange_from_camera @ base_from_flange
+
+
+def test_a_mirror_image_is_no_transform() -> None:
+    with pytest.raises(ValueError, match="not a rigid"):
+        g.Transform("base", "flange", np.diag([1.0, 1.0, -1.0, 1.0]))
+
+
+@given(vectors)
+@settings(max_examples=50, deadline=None)
+def test_exponential_is_the_matrix_exponential(v: np.ndarray) -> None:
+    np.testing.assert_allclose(g.rotation_exp(v), expm(g.skew(v)), atol=1e-12)
+
+
+@given(vectors)
+@settings(max_examples=50, deadline=None)
+def test_logarithm_inverts_it_and_agrees_with_logm(v: np.ndarray) -> None:
+    R = g.rotation_exp(v)
+    log = g.rotation_log(R)
+    assert np.linalg.norm(log) <= np.pi + 1e-9
+    np.testing.assert_allclose(g.rotation_exp(log), R, atol=1e-9)
+    if 1e-3 < np.linalg.norm(log) < 3.0:
+        np.testing.assert_allclose(g.skew(log), np.real(logm(R)), atol=1e-7)
+
+
+@given(vectors, deltas)
+@settings(max_examples=50, deadline=None)
+def test_difference_undoes_perturb(v: np.ndarray, delta: np.ndarray) -> None:
+    reference = g.pose_from_rotvec(v[::-1], v)
+    np.testing.assert_allclose(g.difference(g.perturb(reference, delta), reference), delta, atol=1e-9)
+
+
+@given(vectors, vectors)
+@settings(max_examples=50, deadline=None)
+def test_inverse_and_quaternion_round_trip(t: np.ndarray, v: np.ndarray) -> None:
+    T = g.pose_from_rotvec(t, v)
+    np.testing.assert_allclose(g.inverse(T) @ T, np.eye(4), atol=1e-12)
+    q = g.quaternion_from_matrix(T[:3, :3])
+    assert q[3] >= 0
+    np.testing.assert_allclose(g.pose_from_quaternion(t, q), T, atol=1e-12)
+
+
+def test_quaternion_order_is_x_y_z_w() -> None:
+    R = g.matrix_from_quaternion([0, 0, np.sin(np.pi / 4), np.cos(np.pi / 4)])
+    np.testing.assert_allclose(R @ [1, 0, 0], [0, 1, 0], atol=1e-12)
+
+
+def test_projection_gives_the_nearest_rotation() -> None:
+    rng = np.random.default_rng(1)
+    R = g.random_rotation(rng)
+    noisy = R + 0.05 * rng.normal(size=(3, 3))
+    best = g.project_to_rotation(noisy)
+    assert np.linalg.det(best) > 0
+    rivals = [g.rotation_exp(0.02 * rng.normal(size=3)) @ best for _ in range(200)]
+    assert all(np.linalg.norm(noisy - best) <= np.linalg.norm(noisy - r) for r in rivals)
+
+
+def test_interpolation_ends_where_it_should() -> None:
+    a, b = g.pose_from_rotvec([0, 0, 0], [0, 0, 0.2]), g.pose_from_rotvec([1, 0, 0], [0, 0, 1.0])
+    np.testing.assert_allclose(g.interpolate(a, b, 0.0), a, atol=1e-12)
+    np.testing.assert_allclose(g.interpolate(a, b, 1.0), b, atol=1e-12)
+    np.testing.assert_allclose(g.rotation_log(g.interpolate(a, b, 0.5)[:3, :3]), [0, 0, 0.6], atol=1e-12)

@@ -23,7 +23,7 @@ def test_chains_touch_or_raise() -> None:
     np.testing.assert_allclose(
         chained.apply(point), base_from_flange.apply(flange_from_camera.apply(point)), atol=1e-15
     )
-    with pytest.raises(g.FrameMismatchError, match="'base' does not touch 'flange'|does not touch"):
+    with pytest.raises(g.FrameMismatchError, match="'camera' does not touch 'base'"):
         flange_from_camera @ base_from_flange
 
 

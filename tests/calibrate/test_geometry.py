@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from scipy.linalg import expm, logm
+from scipy.linalg import expm
 
 from calibrate import geometry as g
 
@@ -40,13 +40,11 @@ def test_exponential_is_the_matrix_exponential(v: np.ndarray) -> None:
 
 @given(vectors)
 @settings(max_examples=50, deadline=None)
-def test_logarithm_inverts_it_and_agrees_with_logm(v: np.ndarray) -> None:
+def test_logarithm_is_its_inverse_with_the_least_angle(v: np.ndarray) -> None:
     R = g.rotation_exp(v)
     log = g.rotation_log(R)
     assert np.linalg.norm(log) <= np.pi + 1e-9
     np.testing.assert_allclose(g.rotation_exp(log), R, atol=1e-9)
-    if 1e-3 < np.linalg.norm(log) < 3.0:
-        np.testing.assert_allclose(g.skew(log), np.real(logm(R)), atol=1e-7)
 
 
 @given(vectors, deltas)

@@ -1,0 +1,154 @@
+"""The operator's screen: a client that shows the daemon's status and sends the operator's wishes.
+
+It holds no truth: closing it, killing it or losing ssh changes nothing but the lease, whose loss
+makes the daemon decelerate the arm and pause.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from typing import Any, ClassVar
+
+import msgspec
+from textual import work
+from textual.app import App
+from textual.binding import Binding, BindingType
+from textual.message import Message
+from textual.reactive import reactive
+
+from station.errors import RefusedError, StationError
+from station.status import GoSummary, StationState, StationStatus
+from station.tui.confirm import Confirm, ConfirmGo
+from station.tui.link import Connect, Link
+from station.tui.live import LiveScreen
+from station.tui.widgets.preview import Preview
+
+PREVIEW_PERIOD_S = 0.25
+RECONNECT_S = 1.0
+
+
+class StatusChanged(Message):
+    def __init__(self, status: StationStatus | None) -> None:
+        super().__init__()
+        self.status = status
+
+
+class StationApp(App[None]):
+    """One app, several screens; the same keys everywhere."""
+
+    TITLE = "Calibration station"
+    CSS_PATH = "station.tcss"
+    MODES: ClassVar[dict[str, Any]] = {"live": LiveScreen}
+    DEFAULT_MODE = "live"
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("f12", "stop", "STOP", priority=True, id="stop", tooltip="Stop the arm now; from any screen"),
+        Binding("f5", "run", "Run", id="run", tooltip="Check the plan, show what would move, and ask"),
+        Binding("f6", "pause", "Pause", id="pause", tooltip="Stop after this pose; nothing is lost"),
+        Binding("f7", "finish", "Finish", id="finish", tooltip="Seal the recording with what is there"),
+        Binding("f8", "acknowledge", "Ack", id="acknowledge", tooltip="I looked: leave STOPPED or FAULT"),
+        Binding("ctrl+q", "leave", "Quit", id="quit", tooltip="Close this screen; the daemon goes on"),
+    ]
+    status: reactive[StationStatus | None] = reactive(None)
+
+    def __init__(self, connect: Connect, who: str = "") -> None:
+        super().__init__()
+        self._connect = connect
+        self._who = who
+        self._link: Link | None = None
+
+    def on_mount(self) -> None:
+        self.follow()
+        self.fetch_previews()
+
+    # --- the daemon → the screen ---
+
+    @work(exclusive=True, group="follow", exit_on_error=False)
+    async def follow(self) -> None:
+        """Stays connected for as long as the screen lives."""
+        while True:
+            try:
+                self._link = await self._connect()
+                async for status in self._link.statuses():
+                    self.post_message(StatusChanged(status))
+            except (OSError, StationError):
+                pass
+            self._link = None
+            self.post_message(StatusChanged(None))
+            await asyncio.sleep(RECONNECT_S)
+
+    @work(exclusive=True, group="preview", exit_on_error=False)
+    async def fetch_previews(self) -> None:
+        while True:
+            await asyncio.sleep(PREVIEW_PERIOD_S)
+            screen = self.screen
+            if self._link is None or not isinstance(screen, LiveScreen):
+                continue
+            try:
+                answer = await self._link.request("preview", width=480, height=384)
+            except (OSError, StationError):
+                continue
+            if answer:
+                screen.query_one(Preview).show(answer)
+
+    def on_status_changed(self, message: StatusChanged) -> None:
+        self.status = message.status
+        for screen in self.screen_stack:
+            if isinstance(screen, LiveScreen):
+                screen.show(message.status)
+
+    # --- the operator → the daemon ---
+
+    async def ask(self, verb: str, **args: Any) -> Any:
+        """The daemon's answer, or None after a notice that says why not."""
+        if self._link is None:
+            self.notify("No connection to the daemon: nothing was sent.", severity="error")
+            return None
+        try:
+            return await self._link.request(verb, **args)
+        except RefusedError as refused:
+            self.notify(str(refused), severity="warning", timeout=10)
+        except (OSError, StationError) as gone:
+            self.notify(str(gone) or "The daemon is gone.", severity="error", timeout=10)
+        return None
+
+    @work(group="stop", exit_on_error=False)
+    async def action_stop(self) -> None:
+        await self.ask("stop")
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_run(self) -> None:
+        """Prepare, ask the person, go: the only way from a key to a motion."""
+        if await self.ask("lease", action="take") is None:
+            return
+        resuming = self.status is not None and self.status.state is StationState.PAUSED
+        answer = await self.ask("prepare", purpose="resume" if resuming else "run")
+        if answer is None:
+            return
+        go = msgspec.convert(answer, GoSummary)
+        if await self.push_screen_wait(ConfirmGo(go)):
+            await self.ask("go", token=go.token)
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_pause(self) -> None:
+        await self.ask("pause")
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_finish(self) -> None:
+        captured = self.status.session.captured if self.status else 0
+        question = f"{captured} poses are captured. The recording is closed and can be solved."
+        if await self.push_screen_wait(Confirm("Finish this session?", question, yes="Finish")):
+            await self.ask("finish")
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_acknowledge(self) -> None:
+        await self.ask("acknowledge")
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_leave(self) -> None:
+        running = self.status is not None and self.status.state not in (
+            StationState.IDLE,
+            StationState.DISCONNECTED,
+        )
+        text = "A session is running. Without this screen the arm decelerates and the session pauses."
+        if not running or await self.push_screen_wait(Confirm("Close the screen?", text, yes="Close")):
+            self.exit()

@@ -1,0 +1,67 @@
+"""The one question before anything moves: what, how far, how fast. And the plain yes/no box."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import Horizontal, Vertical
+from textual.screen import ModalScreen
+from textual.widgets import Button, Label, Static
+
+from station.status import GoSummary
+from station.tui.words import degrees, duration
+
+
+class Confirm(ModalScreen[bool]):
+    """A question with consequences. Enter presses the focused button, which is the harmless one."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("escape", "answer(False)", "No", tooltip="Close without doing anything")
+    ]
+
+    def __init__(self, title: str, body: str, yes: str, no: str = "Cancel") -> None:
+        super().__init__()
+        self._title, self._body, self._yes, self._no = title, body, yes, no
+
+    def compose(self) -> ComposeResult:
+        with Vertical(id="confirm"):
+            yield Label(self._title, id="confirm-title")
+            yield Static(self._body, id="confirm-body", markup=False)
+            with Horizontal(id="confirm-buttons"):
+                yield Button(self._no, id="no")
+                yield Button(self._yes, id="yes", variant="warning")
+
+    def on_mount(self) -> None:
+        self.query_one("#no", Button).focus()
+
+    def on_button_pressed(self, event: Button.Pressed) -> None:
+        self.dismiss(event.button.id == "yes")
+
+    def action_answer(self, yes: bool) -> None:
+        self.dismiss(yes)
+
+
+def go_text(go: GoSummary) -> str:
+    """The summary a person confirms, one fact a line."""
+    lines = [
+        f"What       {go.purpose}, {go.poses} pose{'s' if go.poses != 1 else ''}",
+        f"First      {go.first_move}",
+        f"How far    {go.path_m:.2f} m of flange path, largest joint turn {degrees(go.largest_step_rad, 0)}",
+        f"How fast   up to {go.top_speed_m_s:.2f} m/s at any point of arm, tool and camera",
+        f"How long   about {duration(go.duration_s)} min",
+        f"Plan       {go.plan_sha256[:12]}",
+        *(f"WARNING    {warning}" for warning in go.warnings),
+        "",
+        "The emergency stop on the pendant is the safety device. F12 stops too.",
+        "Is everybody out of the arm's reach?",
+    ]
+    return "\n".join(lines)
+
+
+class ConfirmGo(Confirm):
+    """Go, for exactly this summary and once."""
+
+    def __init__(self, go: GoSummary) -> None:
+        super().__init__("The arm will move", go_text(go), yes="Go: move the arm", no="Do not move")

@@ -1,0 +1,35 @@
+"""The event list: newest first, level as a word and not only as a colour."""
+
+from __future__ import annotations
+
+from rich.text import Text
+from textual.reactive import reactive
+from textual.widgets import Static
+
+from station.status import Event, StationStatus
+from station.tui.words import clock
+
+_STYLES = {"debug": "dim", "info": "", "warning": "bold", "error": "bold reverse"}
+_WORDS = {"debug": "", "info": "", "warning": "WARN ", "error": "ERROR "}
+
+
+def event_text(event: Event) -> Text:
+    return Text.assemble(
+        (clock(event.wall_ns), "dim"), " ", (_WORDS[event.level] + event.text, _STYLES[event.level])
+    )
+
+
+class Events(Static):
+    """As many of the newest events as fit."""
+
+    status: reactive[StationStatus | None] = reactive(None)
+
+    def __init__(self, *, id: str = "events") -> None:
+        super().__init__(id=id, classes="panel")
+        self.border_title = "Events"
+
+    def watch_status(self, status: StationStatus | None) -> None:
+        events = () if status is None else status.events
+        newest = [event_text(e) for e in reversed(events[-max(4, self.size.height) :])]
+        text = Text("\n", no_wrap=True, overflow="ellipsis").join(newest)
+        self.update(text)

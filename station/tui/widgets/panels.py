@@ -1,0 +1,123 @@
+"""Small text panels of the live screen: each turns one part of the status into a few aligned lines."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+
+from rich.text import Text
+from textual.reactive import reactive
+from textual.widgets import Static
+
+from station.status import StationState, StationStatus
+from station.tui.words import POSE_MARKS, degrees, mm, size
+
+Lines = Callable[[StationStatus], list[str]]
+
+
+class Panel(Static):
+    """A titled box that redraws only when its own lines change."""
+
+    status: reactive[StationStatus | None] = reactive(None)
+
+    def __init__(self, title: str, lines: Lines, *, id: str) -> None:
+        super().__init__(id=id, classes="panel")
+        self.border_title = title
+        self._lines = lines
+        self._shown = ""
+
+    def watch_status(self, status: StationStatus | None) -> None:
+        text = "" if status is None else "\n".join(self._lines(status))
+        if text != self._shown:
+            self._shown = text
+            self.update(Text(text, no_wrap=True, overflow="ellipsis"))
+
+
+def _line(name: str, text: str, good: bool | None) -> str:
+    return f"{name:<8}{text:<15.15}{ {True: 'ok', False: 'BAD', None: '-'}[good]:>3}"
+
+
+def device_lines(status: StationStatus) -> list[str]:
+    robot, camera, recorder, bounds = status.robot, status.camera, status.recorder, status.clock
+    lines = [
+        _line("robot", f"{robot.rate_hz:.0f} Hz {robot.age_ms:.0f} ms", robot.connected),
+        _line("camera", f"{camera.fps:.0f} fps drop {camera.dropped}", camera.connected),
+    ]
+    if status.trigger.present:
+        pulses, frames = status.trigger.pulses, status.trigger.frames
+        lines.append(_line("trigger", f"{pulses} = {frames}", pulses == frames))
+    recording = f"sync {recorder.sync_ms:.0f} ms" if recorder.recording else "not recording"
+    lines.append(_line("record", recording, None if not recorder.recording else not recorder.error))
+    if bounds.camera_bound_ms is not None:
+        lines.append(_line("clock", f"± {bounds.camera_bound_ms:.2f} ms", True))
+    return lines
+
+
+def detection_lines(status: StationStatus) -> list[str]:
+    seen = status.detection
+    if not seen.found:
+        return [seen.reason or "no board in view", f"saturated {100 * seen.saturated:.1f} %"]
+    tilt = "-" if seen.tilt_rad is None else degrees(seen.tilt_rad, 0)
+    far = "-" if seen.distance_m is None else mm(seen.distance_m, 0)
+    return [
+        f"board {seen.corners}/{seen.expected}  sharp {seen.sharpness:.0f}  sat {100 * seen.saturated:.1f} %",
+        f"fills {100 * seen.coverage:.0f} %  tilt {tilt}  at {far}",
+    ]
+
+
+def robot_lines(status: StationStatus) -> list[str]:
+    robot = status.robot
+    if robot.joints_rad is None or robot.base_from_flange is None:
+        return ["no robot state"]
+    x, y, z = (row[3] * 1000 for row in robot.base_from_flange[:3])
+    joints = " ".join(f"{math.degrees(q):6.1f}" for q in robot.joints_rad)
+    return [f"flange {x:8.1f} {y:8.1f} {z:8.1f} mm", f"joints {joints}"]
+
+
+def progress_lines(status: StationStatus) -> list[str]:
+    session = status.session
+    if session.current is None or session.current >= len(session.poses):
+        done = sum(p.state == "done" for p in session.poses)
+        return [f"{done} of {len(session.poses)} poses captured" if session.poses else "no plan loaded"]
+    pose = session.poses[session.current]
+    steps = ("moving", "settling", "capturing", "writing")
+    at = steps.index(pose.state) if pose.state in steps else (4 if pose.state == "done" else -1)
+    words = ("move", "settle", "capture", "write")
+    marks = [f"{w} {'█████' if i < at else '██▒░░' if i == at else '░░░░░'}" for i, w in enumerate(words)]
+    return [f"{pose.name}: {pose.why}"[:60], " ".join(marks)]
+
+
+def pose_map_lines(status: StationStatus) -> list[str]:
+    marks = "".join(POSE_MARKS[p.state] for p in status.session.poses)
+    rows = [" ".join(marks[i : i + 13]) for i in range(0, len(marks), 13)]
+    return [*rows, "+ done  - skipped  x failed"] if marks else ["no plan loaded"]
+
+
+def estimate_lines(status: StationStatus) -> list[str]:
+    estimate = status.estimate
+    if estimate.sigma_translation_mm is None or estimate.translation_mm is None:
+        return [f"{estimate.views} views: too few yet"]
+    x, y, z = estimate.translation_mm
+    rotation = "" if estimate.sigma_rotation_deg is None else f"  {estimate.sigma_rotation_deg:.3f}°"
+    return [
+        f"{x:7.1f} {y:7.1f} {z:7.1f} mm",
+        f"± {estimate.sigma_translation_mm:.2f} mm{rotation}",
+        "enough" if estimate.enough else estimate.advice or "not final",
+    ]
+
+
+def footer_hint(status: StationStatus) -> str:
+    """What the operator would do next, in a few words."""
+    if status.state is StationState.IDLE and status.session.poses:
+        return "F5 shows what would move and asks"
+    if status.state in (StationState.STOPPED, StationState.FAULT):
+        return "look at the arm, then F8 to acknowledge"
+    if status.state is StationState.PAUSED:
+        return "F5 to go on, F7 to finish with what is there"
+    return ""
+
+
+def recorder_line(status: StationStatus) -> str:
+    recorder = status.recorder
+    drops = f"  {recorder.drops} DROPPED" if recorder.drops else ""
+    return f"{size(recorder.bytes)} written{drops}"

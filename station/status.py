@@ -40,6 +40,8 @@ class PoseStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     corners: int | None = None
     predicted_sigma_mm: float | None = None
     coverage: float | None = None
+    base_from_flange: Matrix4 | None = None
+    """Where the flange is expected to be."""
 
 
 class RobotStatus(msgspec.Struct, frozen=True, omit_defaults=True):

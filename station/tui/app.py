@@ -21,6 +21,9 @@ from station.status import GoSummary, StationState, StationStatus
 from station.tui.confirm import Confirm, ConfirmGo
 from station.tui.link import Connect, Link
 from station.tui.live import LiveScreen
+from station.tui.log import LogScreen
+from station.tui.plan import PlanScreen
+from station.tui.screen import StationScreen
 from station.tui.widgets.preview import Preview
 
 PREVIEW_PERIOD_S = 0.25
@@ -38,7 +41,7 @@ class StationApp(App[None]):
 
     TITLE = "Calibration station"
     CSS_PATH = "station.tcss"
-    MODES: ClassVar[dict[str, Any]] = {"live": LiveScreen}
+    MODES: ClassVar[dict[str, Any]] = {"live": LiveScreen, "plan": PlanScreen, "log": LogScreen}
     DEFAULT_MODE = "live"
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("f12", "stop", "STOP", priority=True, id="stop", tooltip="Stop the arm now; from any screen"),
@@ -46,6 +49,9 @@ class StationApp(App[None]):
         Binding("f6", "pause", "Pause", id="pause", tooltip="Stop after this pose; nothing is lost"),
         Binding("f7", "finish", "Finish", id="finish", tooltip="Seal the recording with what is there"),
         Binding("f8", "acknowledge", "Ack", id="acknowledge", tooltip="I looked: leave STOPPED or FAULT"),
+        Binding("1", "switch_mode('live')", "Live", id="live", tooltip="The running capture"),
+        Binding("2", "switch_mode('plan')", "Plan", id="plan", tooltip="All poses, their state and reasons"),
+        Binding("5", "switch_mode('log')", "Log", id="log", tooltip="Everything that was said"),
         Binding("ctrl+q", "leave", "Quit", id="quit", tooltip="Close this screen; the daemon goes on"),
     ]
     status: reactive[StationStatus | None] = reactive(None)
@@ -93,7 +99,7 @@ class StationApp(App[None]):
     def on_status_changed(self, message: StatusChanged) -> None:
         self.status = message.status
         for screen in self.screen_stack:
-            if isinstance(screen, LiveScreen):
+            if isinstance(screen, StationScreen) and screen.is_mounted:
                 screen.show(message.status)
 
     # --- the operator → the daemon ---
@@ -110,6 +116,12 @@ class StationApp(App[None]):
         except (OSError, StationError) as gone:
             self.notify(str(gone) or "The daemon is gone.", severity="error", timeout=10)
         return None
+
+    @work(group="command", exit_on_error=False)
+    async def send(self, verb: str, **args: Any) -> None:
+        """A wish of one of the screens; control of the arm is taken with it."""
+        if await self.ask("lease", action="take") is not None:
+            await self.ask(verb, **args)
 
     @work(group="stop", exit_on_error=False)
     async def action_stop(self) -> None:

@@ -1,0 +1,115 @@
+"""Plan: every pose with its state and reason; add, drop, skip, retake before and while the arm works."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, ClassVar, cast
+
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import Horizontal
+from textual.widgets import DataTable
+
+from station.status import PoseStatus, StationStatus
+from station.tui.screen import StationScreen
+from station.tui.widgets.sketch import PlanSketch
+from station.tui.words import POSE_MARKS
+
+if TYPE_CHECKING:
+    from station.tui.app import StationApp
+
+COLUMNS = ("#", "pose", "state", "try", "corners", "gain", "why it is there / what happened")
+
+
+def row_of(pose: PoseStatus) -> tuple[str, ...]:
+    """One line of the table, plain words and marks."""
+    gain = "" if pose.predicted_sigma_mm is None else f"{pose.predicted_sigma_mm:.2f} mm"
+    return (
+        str(pose.index + 1),
+        pose.name,
+        f"{POSE_MARKS[pose.state]} {pose.state}",
+        str(pose.attempt or ""),
+        "" if pose.corners is None else str(pose.corners),
+        gain,
+        pose.reason or pose.why,
+    )
+
+
+class PlanScreen(StationScreen):
+    """The table is the plan as the daemon holds it; every change is asked of the daemon."""
+
+    HELP = "Poses in capture order. Nothing here moves the arm: F5 shows what would move and asks."
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("r", "pose('retake')", "Retake", tooltip="Take this pose again at the next run"),
+        Binding("s", "pose('skip')", "Skip", tooltip="Leave this pose out"),
+        Binding("d", "pose('drop')", "Drop", tooltip="Remove this pose from the plan"),
+        Binding("a", "add", "Add here", tooltip="Add the arm's present posture as a pose"),
+        Binding("n", "make", "New plan", tooltip="Plan 25 poses from the configured guesses (seconds)"),
+        Binding("ctrl+up", "shift(-1)", "Up", tooltip="Visit this pose earlier"),
+        Binding("ctrl+down", "shift(1)", "Down", tooltip="Visit this pose later"),
+    ]
+
+    def body(self) -> ComposeResult:
+        with Horizontal(id="plan"):
+            yield DataTable(id="plan-table", cursor_type="row", zebra_stripes=True)
+            yield PlanSketch(id="plan-sketch")
+
+    def on_mount(self) -> None:
+        self.table.add_columns(*COLUMNS)
+        self.table.focus()
+
+    @property
+    def table(self) -> DataTable[str]:
+        return cast("DataTable[str]", self.query_one("#plan-table", DataTable))
+
+    @property
+    def station(self) -> StationApp:
+        return cast("StationApp", self.app)
+
+    def show(self, status: StationStatus | None) -> None:
+        super().show(status)
+        poses = () if status is None else status.session.poses
+        rows = [row_of(pose) for pose in poses]
+        if len(rows) != self.table.row_count:
+            self.table.clear()
+            for row in rows:
+                self.table.add_row(*row)
+        for line, row in enumerate(rows):
+            for column, text in enumerate(row):
+                if self.table.get_cell_at((line, column)) != text:  # type: ignore[arg-type]
+                    self.table.update_cell_at((line, column), text)  # type: ignore[arg-type]
+        self.query_one(PlanSketch).show(status, self.table.cursor_row)
+
+    def on_data_table_row_highlighted(self, event: DataTable.RowHighlighted) -> None:
+        self.query_one(PlanSketch).show(self.station.status, event.cursor_row)
+
+    def _selected(self) -> int | None:
+        status = self.station.status
+        if status is None or not status.session.poses:
+            self.notify("No plan is loaded: n makes one, or `station plan` in a shell.", severity="warning")
+            return None
+        return status.session.poses[self.table.cursor_row].index
+
+    def action_pose(self, verb: str) -> None:
+        index = self._selected()
+        if index is not None:
+            self.station.send(verb, index=index)
+
+    def action_shift(self, by: int) -> None:
+        status, line = self.station.status, self.table.cursor_row
+        if status is None or not 0 <= line + by < len(status.session.poses):
+            return
+        order = [pose.index for pose in status.session.poses]
+        order[line], order[line + by] = order[line + by], order[line]
+        self.station.send("reorder", order=order)
+        self.table.move_cursor(row=line + by)
+
+    def action_add(self) -> None:
+        robot = self.station.status.robot if self.station.status else None
+        if robot is None or robot.joints_rad is None:
+            self.notify("The arm's posture is not known: no robot state.", severity="warning")
+            return
+        self.station.send("add", joints_rad=list(robot.joints_rad))
+
+    def action_make(self) -> None:
+        self.notify("Planning: some seconds …")
+        self.station.send("make_plan", poses=25, seed=1)

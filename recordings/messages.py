@@ -168,6 +168,8 @@ class View(msgspec.Struct, frozen=True, omit_defaults=True):
     stillness: Stillness | None = None
     source_file: str = ""
     note: str = ""
+    part: int = 1
+    """The part of the session that holds the picture; filled in by the reader."""
 
 
 class CaptureEvent(msgspec.Struct, frozen=True, omit_defaults=True):

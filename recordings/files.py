@@ -1,0 +1,100 @@
+"""How files come to be: safe names, exclusive creation, one writer at a time, nothing half-written."""
+
+from __future__ import annotations
+
+import fcntl
+import os
+import re
+import shutil
+from pathlib import Path
+
+from recordings.errors import RecordingError
+
+PART_SUFFIX = ".part"
+"""Of a recording that is being written; gone once it is finished and on the disk."""
+_SESSION_NAME = re.compile(r"[a-z0-9-]{1,40}")
+_ATTACHMENT_NAME = re.compile(r"[a-z0-9]([a-z0-9_-]|\.(?!\.)){0,39}")
+
+
+def is_session_name(name: str) -> bool:
+    """1…40 of a-z, 0-9 and '-': a folder name on every system, never a path."""
+    return _SESSION_NAME.fullmatch(name) is not None
+
+
+def is_attachment_name(name: str) -> bool:
+    """Like `plan.yaml`: at most 40 of a-z, 0-9, '-', '_' and single dots."""
+    return _ATTACHMENT_NAME.fullmatch(name) is not None
+
+
+def session_name_from(text: str) -> str:
+    """The nearest safe session name to what a person wrote."""
+    return re.sub(r"[^a-z0-9]+", "-", text.lower()).strip("-")[:40] or "session"
+
+
+def create_exclusively(path: Path) -> int:
+    """A new file opened for writing and locked: never an existing file, never through a symlink.
+
+    Returns the descriptor. Raises RecordingError with the remedy.
+    """
+    flags = os.O_RDWR | os.O_CREAT | os.O_EXCL | os.O_NOFOLLOW | os.O_CLOEXEC
+    try:
+        descriptor = os.open(path, flags, 0o640)
+    except FileExistsError as error:
+        raise RecordingError(f"{path} exists already; choose another name or move it away") from error
+    except FileNotFoundError as error:
+        raise RecordingError(f"the folder {path.parent} does not exist; create it first") from error
+    except OSError as error:
+        raise RecordingError(f"cannot create {path}: {error.strerror}") from error
+    lock(descriptor, path)
+    return descriptor
+
+
+def lock(descriptor: int, path: Path) -> None:
+    """Marks the open file or folder as ours until it is closed. RecordingError when someone else has it."""
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError as error:
+        raise RecordingError(f"{path} is in use by another process; wait until it has finished") from error
+
+
+def sync_folder(folder: Path) -> None:
+    """Makes a creation or rename inside the folder survive a power loss."""
+    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+    try:
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def rename_new(source: Path, target: Path) -> None:
+    """Renames within one folder, durably, and never over something that is there. Raises RecordingError."""
+    if os.path.lexists(target):
+        raise RecordingError(f"{target} appeared meanwhile; the new recording is kept as {source}")
+    source.rename(target)
+    sync_folder(target.parent)
+
+
+def write_atomically(path: Path, content: bytes) -> None:
+    """Replaces a small file in one step. OSError as it comes."""
+    temporary = path.with_name(path.name + ".tmp")
+    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o640)
+    with os.fdopen(descriptor, "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.rename(path)
+    sync_folder(path.parent)
+
+
+def require_free_space(folder: Path, reserve_bytes: int) -> int:
+    """Free bytes on the folder's disk. Raises RecordingError when they are fewer than the reserve.
+
+    Asked before each pose, so that a pose is never begun that cannot be stored.
+    """
+    free = shutil.disk_usage(folder).free
+    if free < reserve_bytes:
+        raise RecordingError(
+            f"only {free / 1e9:.1f} GB are free at {folder}, below the reserve of {reserve_bytes / 1e9:.1f} GB: "
+            f"free {(reserve_bytes - free) / 1e9:.1f} GB and go on"
+        )
+    return free

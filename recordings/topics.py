@@ -1,0 +1,53 @@
+"""What lies on which topic of a recording."""
+
+from __future__ import annotations
+
+from enum import Enum
+from typing import Any
+
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from mcap_protobuf.schema import build_file_descriptor_set
+
+from recordings.messages import CaptureEvent, RobotState, View
+from recordings.schema import PictureFacts, message_class
+
+
+class Topic(Enum):
+    ROBOT_STATE = "/robot/state"
+    PICTURE_FACTS = "/camera/frame"
+    RAW_IMAGE = "/camera/image"
+    COMPRESSED_IMAGE = "/camera/image/compressed"
+    CAMERA_CALIBRATION = "/camera/calibration"
+    VIEW = "/session/view"
+    EVENT = "/session/event"
+    TRANSFORM = "/tf"
+    LOG = "/log"
+
+
+_MESSAGES: dict[Topic, Any] = {
+    Topic.ROBOT_STATE: message_class(RobotState),
+    Topic.PICTURE_FACTS: message_class(PictureFacts),
+    Topic.RAW_IMAGE: RawImage,
+    Topic.COMPRESSED_IMAGE: CompressedImage,
+    Topic.CAMERA_CALIBRATION: CameraCalibration,
+    Topic.VIEW: message_class(View),
+    Topic.EVENT: message_class(CaptureEvent),
+    Topic.TRANSFORM: FrameTransform,
+    Topic.LOG: Log,
+}
+
+
+def schema_name(topic: Topic) -> str:
+    """Full protobuf name of the topic's message."""
+    return str(_MESSAGES[topic].DESCRIPTOR.full_name)
+
+
+def schema_bytes(topic: Topic) -> bytes:
+    """The FileDescriptorSet that goes into the file."""
+    descriptors: FileDescriptorSet = build_file_descriptor_set(_MESSAGES[topic])
+    return bytes(descriptors.SerializeToString())

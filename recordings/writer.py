@@ -1,0 +1,246 @@
+"""Writes one recording file, synchronously: `.mcap.part` until it is finished, checked in and renamed.
+
+Layout: one MCAP, chunks of 1 MiB without compression, checksums of every chunk, of the data section and of
+the summary. Raw values and all clocks go in; geometry is applied by the reader's users.
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+import msgspec
+from mcap.writer import CompressionType, Writer
+
+from recordings import viewing
+from recordings.errors import RecordingError
+from recordings.files import (
+    PART_SUFFIX,
+    create_exclusively,
+    is_attachment_name,
+    is_session_name,
+    rename_new,
+    sync_folder,
+)
+from recordings.messages import CameraModel, CaptureEvent, Picture, RobotState, SessionInfo, Stamps, View
+from recordings.pictures import PictureError, encode_png, read_header
+from recordings.schema import FORMAT, PictureFacts, encode
+from recordings.topics import Topic, schema_bytes, schema_name
+
+CHUNK_BYTES = 1024 * 1024
+ATTACHMENT_LIMIT_BYTES = 16 * 1024 * 1024
+_LIBRARY = "calibration-station"
+_SECOND_NS = 1_000_000_000
+
+
+class DirectFile:
+    """Writes straight to the descriptor: whole chunks come as one call, and an error shows at once."""
+
+    def __init__(self, descriptor: int) -> None:
+        self.descriptor = descriptor
+        self.closed = False
+        self._position = 0
+
+    def write(self, data: bytes) -> int:
+        rest = memoryview(data)
+        while rest:
+            done = os.write(self.descriptor, rest)
+            self._position += done
+            rest = rest[done:]
+        return len(data)
+
+    def tell(self) -> int:
+        return self._position
+
+    def flush(self) -> None:
+        """Nothing is held back."""
+
+    def close(self) -> None:
+        if not self.closed:
+            self.closed = True
+            os.close(self.descriptor)
+
+
+class RecordingWriter:
+    """One file, one thread. The first error of the disk is final: the file is closed as it is.
+
+    Raises RecordingError from every method; after a write error `recordings recover` takes the `.part` file.
+    """
+
+    def __init__(self, path: Path, info: SessionInfo, *, lossless_png: bool = False) -> None:
+        """Creates `path` + '.part'. `lossless_png` compresses pictures (half the size, 20 ms each)."""
+        if path.suffix != ".mcap":
+            raise RecordingError(f"{path}: a recording's name ends in .mcap")
+        if not is_session_name(info.name):
+            raise RecordingError(f"'{info.name}' is no session name: use 1 to 40 of a-z, 0-9 and '-'")
+        if os.path.lexists(path):
+            raise RecordingError(f"{path} exists already; choose another name or move it away")
+        self.path = path
+        self.part_path = path.with_name(path.name + PART_SUFFIX)
+        self.info = info
+        self.error: RecordingError | None = None
+        self._lossless_png = lossless_png
+        self._start_ns = info.created_wall_ns or time.time_ns()
+        self._channels: dict[Topic, int] = {}
+        self._sequences: dict[Topic, int] = {}
+        self._pictures: set[int] = set()
+        self._attachments: set[str] = set()
+        self._file = DirectFile(create_exclusively(self.part_path))
+        self._writer = Writer(
+            self._file,  # type: ignore[arg-type]  # write, tell and flush are all it uses
+            chunk_size=CHUNK_BYTES,
+            compression=CompressionType.NONE,
+            enable_crcs=True,
+            enable_data_crcs=True,
+        )
+        with self._disk():
+            self._writer.start(profile="", library=_LIBRARY)
+            content = {"format": FORMAT, "session": msgspec.json.encode(info).decode()}
+            self._writer.add_metadata("session", content)
+            sync_folder(path.parent)
+        if info.camera.matrix is not None:
+            self.camera_model(info.camera)
+
+    def robot_state(self, state: RobotState) -> None:
+        self._add(Topic.ROBOT_STATE, encode(state), self._time_ns(state.stamps))
+
+    def picture(self, picture: Picture, encoded: bytes | None = None) -> None:
+        """`encoded`: the same picture's PNG or JPEG bytes, stored instead of the array (imported files)."""
+        if picture.sequence in self._pictures or picture.sequence < 0:
+            raise RecordingError(f"picture {picture.sequence} was recorded before; sequences count up from 0")
+        height, width = picture.image.shape[:2]
+        facts = PictureFacts(
+            stamps=picture.stamps,
+            frame_id=picture.frame_id,
+            sequence=picture.sequence,
+            width=width,
+            height=height,
+            exposure_us=picture.exposure_us,
+            gain_db=picture.gain_db,
+            pixel_format=picture.pixel_format,
+            trigger_count=picture.trigger_count,
+        )
+        time_ns = self._time_ns(picture.stamps, picture.sequence)
+        try:
+            topic, image = self._image(picture, encoded, time_ns)
+        except PictureError as error:
+            raise RecordingError(f"picture {picture.sequence}: {error}") from error
+        self._add(Topic.PICTURE_FACTS, encode(facts), time_ns, picture.sequence)
+        self._add(topic, image.SerializeToString(), time_ns, picture.sequence)
+        self._pictures.add(picture.sequence)
+        self.flush()
+
+    def _image(self, picture: Picture, encoded: bytes | None, time_ns: int) -> tuple[Topic, Any]:
+        if encoded is None and self._lossless_png:
+            encoded = encode_png(picture.image)
+        if encoded is None:
+            return Topic.RAW_IMAGE, viewing.raw_image(picture.image, picture.pixel_format, time_ns)
+        return Topic.COMPRESSED_IMAGE, viewing.compressed_image(encoded, read_header(encoded).format, time_ns)
+
+    def view(self, view: View) -> None:
+        """The picture must have been recorded before: a view never points at nothing."""
+        if view.picture_sequence not in self._pictures:
+            raise RecordingError(
+                f"view {view.index} names picture {view.picture_sequence}, which is not in the recording; "
+                "take the pose again"
+            )
+        time_ns = self._time_ns(view.stamps, view.picture_sequence)
+        self._add(Topic.VIEW, encode(view), time_ns)
+        self._add(Topic.TRANSFORM, viewing.flange_transform(view, time_ns).SerializeToString(), time_ns)
+
+    def event(self, event: CaptureEvent) -> None:
+        time_ns = self._time_ns(event.stamps)
+        self._add(Topic.EVENT, encode(event), time_ns)
+        self._add(Topic.LOG, viewing.log_line(event, time_ns).SerializeToString(), time_ns)
+
+    def camera_model(self, model: CameraModel) -> None:
+        """Intrinsics for viewers; what calibrate uses is `SessionInfo.camera`."""
+        message = viewing.camera_calibration(model, self._start_ns)
+        self._add(Topic.CAMERA_CALIBRATION, message.SerializeToString(), self._start_ns)
+
+    def attach(self, name: str, media_type: str, content: bytes) -> None:
+        """A small file that rides along, like `plan.yaml`."""
+        if not is_attachment_name(name) or name in self._attachments:
+            raise RecordingError(f"'{name}' is no new attachment name: a-z, 0-9, '-', single dots, once")
+        if len(content) > ATTACHMENT_LIMIT_BYTES:
+            raise RecordingError(f"attachment {name} is larger than {ATTACHMENT_LIMIT_BYTES >> 20} MiB")
+        with self._disk():
+            self._writer.add_attachment(self._start_ns, self._start_ns, name, media_type, content)
+        self._attachments.add(name)
+
+    def flush(self) -> None:
+        """Ends the open chunk and hands everything to the operating system: survives a killed process."""
+        with self._disk():
+            self._writer.flush()  # type: ignore[no-untyped-call]
+
+    def sync(self) -> None:
+        """Everything so far is on the disk when this returns: survives a power loss."""
+        self.flush()
+        with self._disk():
+            os.fdatasync(self._file.descriptor)
+
+    def finish(self) -> Path:
+        """Seals the file, renames it, and returns its final path."""
+        with self._disk():
+            self._writer.finish()  # type: ignore[no-untyped-call]
+            os.fsync(self._file.descriptor)
+            rename_new(self.part_path, self.path)
+        self.close()
+        return self.path
+
+    def close(self) -> None:
+        """Closes without sealing; the `.part` file stays for `recordings recover`. Idempotent."""
+        self._file.close()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    @property
+    def bytes_written(self) -> int:
+        """Handed to the operating system so far."""
+        return self._file.tell()
+
+    def _time_ns(self, stamps: Stamps, place: int = 0) -> int:
+        """Wall time where there is one; imported pictures have none and follow each other by a second."""
+        return stamps.host_wall_ns or self._start_ns + place * _SECOND_NS
+
+    def _add(self, topic: Topic, content: bytes, time_ns: int, sequence: int | None = None) -> None:
+        if sequence is None:
+            sequence = self._sequences.get(topic, 0)
+            self._sequences[topic] = sequence + 1
+        with self._disk():
+            self._writer.add_message(self._channel(topic), time_ns, content, time_ns, sequence & 0xFFFFFFFF)
+
+    def _channel(self, topic: Topic) -> int:
+        if topic not in self._channels:
+            schema_id = self._writer.register_schema(schema_name(topic), "protobuf", schema_bytes(topic))
+            self._channels[topic] = self._writer.register_channel(topic.value, "protobuf", schema_id)
+        return self._channels[topic]
+
+    @contextmanager
+    def _disk(self) -> Iterator[None]:
+        """Around everything that writes: refuses after an error, and makes the first error the last."""
+        if self.error is not None:
+            raise self.error
+        if self._file.closed:
+            raise RecordingError(f"{self.path} is closed")
+        try:
+            yield
+        except OSError as error:
+            # A writer that failed once cannot be trusted again: what it holds in memory is thrown away.
+            self.error = RecordingError(
+                f"writing {self.part_path} failed ({error.strerror}); everything synced before is safe. "
+                f"Free space or replace the disk, then: recordings recover {self.part_path}"
+            )
+            self._file.close()
+            raise self.error from error

@@ -1,0 +1,201 @@
+"""RTDE, the real-time data exchange of Universal Robots controllers: framing, types, recipes (version 2).
+
+One packet = uint16 size of the whole packet, uint8 type, payload; everything big-endian. Shared by the
+state reader (client) and the simulated controller (server). Source: Universal Robots, "Real-Time Data
+Exchange (RTDE) Guide". Pure standard library; knows no socket.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, field
+from enum import IntEnum, IntFlag
+
+from station.errors import RobotError
+
+PORT = 30004
+PROTOCOL_VERSION = 2
+HEADER = struct.Struct(">HB")
+
+Value = bool | int | float | tuple[float, ...] | tuple[int, ...]
+
+
+class RtdeError(RobotError):
+    """The bytes on the connection are not RTDE, or a variable was refused."""
+
+
+class PacketType(IntEnum):
+    PROTOCOL_VERSION = ord("V")
+    CONTROLLER_VERSION = ord("v")
+    TEXT_MESSAGE = ord("M")
+    DATA = ord("U")
+    OUTPUT_SETUP = ord("O")
+    INPUT_SETUP = ord("I")
+    START = ord("S")
+    PAUSE = ord("P")
+
+
+class RobotMode(IntEnum):
+    NO_CONTROLLER = -1
+    DISCONNECTED = 0
+    CONFIRM_SAFETY = 1
+    BOOTING = 2
+    POWER_OFF = 3
+    POWER_ON = 4
+    IDLE = 5
+    BACKDRIVE = 6
+    RUNNING = 7
+
+
+class SafetyMode(IntEnum):
+    NORMAL = 1
+    REDUCED = 2
+    PROTECTIVE_STOP = 3
+    RECOVERY = 4
+    SAFEGUARD_STOP = 5
+    SYSTEM_EMERGENCY_STOP = 6
+    ROBOT_EMERGENCY_STOP = 7
+    VIOLATION = 8
+    FAULT = 9
+
+
+class SafetyStatus(IntFlag):
+    """The bits of `safety_status_bits`."""
+
+    NORMAL = 1 << 0
+    REDUCED = 1 << 1
+    PROTECTIVE_STOPPED = 1 << 2
+    RECOVERY = 1 << 3
+    SAFEGUARD_STOPPED = 1 << 4
+    SYSTEM_EMERGENCY_STOPPED = 1 << 5
+    ROBOT_EMERGENCY_STOPPED = 1 << 6
+    EMERGENCY_STOPPED = 1 << 7
+    VIOLATION = 1 << 8
+    FAULT = 1 << 9
+    STOPPED_DUE_TO_SAFETY = 1 << 10
+
+
+class RuntimeState(IntEnum):
+    """Of the program; it runs only when PLAYING."""
+
+    STOPPING = 0
+    STOPPED = 1
+    PLAYING = 2
+    PAUSING = 3
+    PAUSED = 4
+    RESUMING = 5
+
+
+class RobotStatus(IntFlag):
+    """The bits of `robot_status_bits`."""
+
+    POWER_ON = 1 << 0
+    PROGRAM_RUNNING = 1 << 1
+    TEACH_BUTTON = 1 << 2
+    POWER_BUTTON = 1 << 3
+
+
+@dataclass(frozen=True)
+class DataType:
+    code: str
+    """Of `struct`, for one element."""
+    count: int = 1
+
+
+DATA_TYPES: dict[str, DataType] = {
+    "BOOL": DataType("?"),
+    "UINT8": DataType("B"),
+    "UINT32": DataType("I"),
+    "UINT64": DataType("Q"),
+    "INT32": DataType("i"),
+    "DOUBLE": DataType("d"),
+    "VECTOR3D": DataType("d", 3),
+    "VECTOR6D": DataType("d", 6),
+    "VECTOR6INT32": DataType("i", 6),
+    "VECTOR6UINT32": DataType("I", 6),
+}
+NOT_FOUND = "NOT_FOUND"
+IN_USE = "IN_USE"
+
+
+def packet(kind: PacketType, payload: bytes = b"") -> bytes:
+    return HEADER.pack(HEADER.size + len(payload), kind) + payload
+
+
+class PacketReader:
+    """Cuts a byte stream into packets. Holds at most one unfinished packet (64 kB)."""
+
+    def __init__(self) -> None:
+        self._rest = b""
+
+    def feed(self, data: bytes) -> list[tuple[int, bytes]]:
+        """All packets (type, payload) that are complete now. Raises RtdeError on an impossible size."""
+        data = self._rest + data if self._rest else data
+        packets = []
+        start, end = 0, len(data)
+        while end - start >= HEADER.size:
+            size, kind = HEADER.unpack_from(data, start)
+            if size < HEADER.size:
+                raise RtdeError(f"an RTDE packet claims a size of {size} bytes; the other side is not RTDE")
+            if end - start < size:
+                break
+            packets.append((kind, data[start + HEADER.size : start + size]))
+            start += size
+        self._rest = data[start:]
+        return packets
+
+
+@dataclass(frozen=True)
+class Recipe:
+    """An agreed list of variables, and how their values lie in a data packet."""
+
+    id: int
+    names: tuple[str, ...]
+    types: tuple[str, ...]
+    packer: struct.Struct = field(init=False, repr=False, compare=False)
+    """Of a whole data packet: size, type, recipe id, then every element in order."""
+
+    def __post_init__(self) -> None:
+        refused = [n for n, t in zip(self.names, self.types, strict=True) if t not in DATA_TYPES]
+        if refused:
+            raise RtdeError(f"the controller refused {', '.join(refused)}")
+        codes = "".join(DATA_TYPES[t].code * DATA_TYPES[t].count for t in self.types)
+        object.__setattr__(self, "packer", struct.Struct(">HBB" + codes))
+
+    def pack(self, elements: Sequence[bool | int | float]) -> bytes:
+        """Flat elements (vectors spread out) → a whole data packet."""
+        return self.packer.pack(self.packer.size, PacketType.DATA, self.id, *elements)
+
+    def unpack_elements(self, payload: bytes) -> tuple[float, ...]:
+        """A data packet's payload (recipe id first) → flat elements. Raises RtdeError on a wrong length."""
+        if len(payload) != self.packer.size - HEADER.size:
+            raise RtdeError(
+                f"a data packet of recipe {self.id} has {len(payload)} bytes, "
+                f"expected {self.packer.size - HEADER.size}"
+            )
+        return self.packer.unpack(HEADER.pack(self.packer.size, PacketType.DATA) + payload)[3:]
+
+    def unpack(self, payload: bytes) -> dict[str, Value]:
+        """As `unpack_elements`, by name; vectors as tuples."""
+        elements = self.unpack_elements(payload)
+        values: dict[str, Value] = {}
+        start = 0
+        for name, type_name in zip(self.names, self.types, strict=True):
+            count = DATA_TYPES[type_name].count
+            values[name] = elements[start] if count == 1 else elements[start : start + count]
+            start += count
+        return values
+
+
+def join_names(names: Iterable[str]) -> bytes:
+    return ",".join(names).encode("ascii")
+
+
+def split_names(payload: bytes) -> tuple[str, ...]:
+    """Comma-separated names; a trailing comma is allowed. Raises RtdeError when they are not ASCII."""
+    try:
+        text = payload.decode("ascii")
+    except UnicodeDecodeError:
+        raise RtdeError("a list of variable names is not ASCII") from None
+    return tuple(name for name in text.split(",") if name)

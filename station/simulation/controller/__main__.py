@@ -1,0 +1,151 @@
+"""`python -m station.simulation.controller`: one simulated arm on one loopback address."""
+
+from __future__ import annotations
+
+import argparse
+import asyncio
+import json
+import os
+import signal
+import sys
+from pathlib import Path
+
+from station.simulation.controller.admin import AdminServer
+from station.simulation.controller.kinematics import TABLES
+from station.simulation.controller.machine import Machine
+from station.simulation.controller.robot import Settings
+
+PARENT_POLL_S = 0.5
+
+_EPILOG = """\
+ports
+  30004  RTDE                     30001-30003  URScript uploads
+  29999  dashboard                29990        admin: faults, hands, truth (JSON lines)
+
+examples
+  python -m station.simulation.controller --model UR10e --host 127.0.0.2
+  echo '{"cmd": "help"}'  | nc -N 127.0.0.2 29990      every admin command
+  echo '{"cmd": "pstop"}' | nc -N 127.0.0.2 29990      a protective stop, now
+  echo '{"cmd": "truth"}' | nc -N 127.0.0.2 29990      where the arm truly is
+  python -c 'import rtde_control; rtde_control.RTDEControlInterface("127.0.0.2").moveJ([0,-1,1,-1,-1,0])'
+
+The port numbers are fixed (clients have them built in): give every arm its own 127.x.y.z address.
+When all ports listen, one JSON line {"ready": true, "host": …} appears on standard output.
+What is verified and what a real controller may do differently: docs/simulated-controller.md."""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    options = _parser().parse_args(arguments)
+    try:
+        settings = _settings(options)
+    except (OSError, ValueError) as error:
+        print(f"cannot use the truth file {options.truth}: {error}", file=sys.stderr)
+        return 2
+    try:
+        asyncio.run(_serve(options.host, settings, options))
+    except OSError as error:
+        print(
+            f"cannot listen on {options.host}: {error.strerror or error}. Another controller runs on this "
+            "address, or it is not one of this machine; choose another 127.x.y.z with --host.",
+            file=sys.stderr,
+        )
+        return 1
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m station.simulation.controller",
+        description="A simulated Universal Robots controller for unmodified RTDE, URScript and dashboard "
+        "clients such as ur_rtde. It moves in time and can be told to fail.",
+        epilog=_EPILOG,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--model", default="UR10", choices=sorted(TABLES), help="default: UR10 (CB3, 125 Hz)")
+    parser.add_argument("--host", default="127.0.0.1", help="loopback address to listen on")
+    parser.add_argument(
+        "--truth", type=Path, help="JSON of a simulated cell: start joints, repeatability, DH errors, drift"
+    )
+    parser.add_argument("--joints", type=float, nargs=6, metavar="RAD", help="start joints")
+    parser.add_argument("--serial", help="answer to `get serial number`")
+    parser.add_argument("--local", action="store_true", help="start in local control (e-Series)")
+    parser.add_argument(
+        "--time-scale", type=float, default=1.0, metavar="F", help="the arm moves F times faster; for tests"
+    )
+    parser.add_argument(
+        "--die-with-parent", action="store_true", help="end when standard input closes or the parent is gone"
+    )
+    return parser
+
+
+def _settings(options: argparse.Namespace) -> Settings:
+    if not options.time_scale > 0:
+        raise ValueError(f"--time-scale must be > 0, not {options.time_scale}")
+    given: dict[str, object] = {"model": options.model, "time_scale": options.time_scale}
+    given["remote"] = not options.local
+    options.drift_ppm = 0.0
+    if options.truth is not None:
+        from station.simulation.cell import read_truth  # loads numpy: only when it is asked for
+
+        truth = read_truth(options.truth)
+        options.drift_ppm = truth.controller_clock_drift_ppm
+        given |= {
+            "start_joints_rad": truth.start_joints_rad,
+            "sigma_m": truth.robot_sigma_m,
+            "sigma_rad": truth.robot_sigma_rad,
+            "seed": truth.seed,
+            "dh_delta": (
+                truth.dh_delta_a_m,
+                truth.dh_delta_d_m,
+                truth.dh_delta_alpha_rad,
+                truth.dh_delta_theta_rad,
+            ),
+        }
+    if options.joints is not None:
+        given["start_joints_rad"] = tuple(options.joints)
+    if options.serial is not None:
+        given["serial"] = options.serial
+    return Settings(**given)  # type: ignore[arg-type]
+
+
+async def _serve(host: str, settings: Settings, options: argparse.Namespace) -> None:
+    loop = asyncio.get_running_loop()
+    ended = asyncio.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        loop.add_signal_handler(number, ended.set)
+    machine = Machine(host, settings, options.drift_ppm)
+    try:
+        machine.open()
+        admin = await AdminServer(machine).open()
+    except OSError:
+        for service in machine.services:
+            service.close()
+        raise
+    ready = {"ready": True, "host": host, "model": settings.model, "pid": os.getpid()}
+    print(json.dumps(ready), flush=True)
+    watch = loop.create_task(_parent_gone(ended)) if options.die_with_parent else None
+    await ended.wait()
+    if watch is not None:
+        watch.cancel()
+    admin.close()
+    machine.close()
+
+
+async def _parent_gone(ended: asyncio.Event) -> None:
+    """The parent holds the other end of standard input; the kernel closes it when the parent dies."""
+    parent = os.getppid()
+    loop = asyncio.get_running_loop()
+
+    def read() -> None:
+        if not os.read(0, 4096):
+            ended.set()
+            loop.remove_reader(0)
+
+    loop.add_reader(0, read)
+    while os.getppid() == parent:
+        await asyncio.sleep(PARENT_POLL_S)
+    ended.set()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,157 @@
+"""Admin commands that break something."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+from station.simulation.controller.arm import Vibration
+from station.simulation.controller.kinematics import DhTable, Six
+from station.simulation.controller.machine import Machine
+from station.simulation.controller.network import Cut
+from station.simulation.controller.rtde_server import ADMIN
+
+ZERO: Six = (0.0,) * 6
+
+
+def pstop(machine: Machine) -> None:
+    """Protective stop now."""
+    machine.robot.protective_stop("admin")
+
+
+def estop(machine: Machine, on: bool = True) -> None:
+    """Emergency stop button pressed (on) or pulled out again; afterwards the arm has no power: `run`."""
+    machine.robot.emergency_stop(on)
+
+
+def safeguard(machine: Machine, on: bool = True) -> None:
+    """Safeguard stop: the program pauses; released, it stays paused until `play`."""
+    machine.robot.safeguard(on)
+
+
+def power_off(machine: Machine) -> None:
+    """The arm loses power."""
+    machine.robot.power_off()
+
+
+def drop(machine: Machine, how: Cut = "fin", ports: list[str] | None = None) -> dict[str, Any]:
+    """Cuts every connection of these ports (rtde, script, dashboard; all if none named) by fin or rst."""
+    if how not in ("fin", "rst"):
+        raise ValueError(f"how is fin or rst, not {how}")
+    return {"cut": machine.cut(how, ports)}
+
+
+def stall(machine: Machine, on: bool = True) -> None:
+    """RTDE links stay open but no data comes; everything else works."""
+    machine.rtde.stalled = on
+
+
+def freeze(machine: Machine, on: bool = True) -> None:
+    """RTDE sends the same packet for ever: the timestamp stands still on a live link."""
+    machine.rtde.frozen = on
+
+
+def mute(machine: Machine, on: bool = True, ports: list[str] | None = None) -> None:
+    """Ports accept connections, but what arrives is lost and nothing is answered."""
+    for service in machine.chosen(ports):
+        service.silent = on
+
+
+def stall_dash(machine: Machine, on: bool = True) -> None:
+    """The dashboard accepts connections and never says a word."""
+    machine.dashboard.silent = on
+
+
+def black_hole(machine: Machine, on: bool = True, ports: list[str] | None = None) -> None:
+    """As a cable pulled out: links carry nothing, connecting hangs."""
+    for service in machine.chosen(ports):
+        service.black_hole(on)
+
+
+def restart(machine: Machine, down_s: float = 1.0, running: bool = False) -> None:
+    """The controller reboots: links reset, ports closed for down_s, time 0, powered off unless running."""
+    machine.background(machine.reboot(float(down_s), running))
+
+
+def late(machine: Machine, ms: float) -> None:
+    """No cycle runs for this long; then all that were due run at once (a hiccup of the simulation)."""
+    machine.clock.hold_until_ns = time.monotonic_ns() + int(ms * 1e6)
+
+
+def delay(machine: Machine, ms: float) -> None:
+    """Every data packet leaves this much later from now on (0 = none): a slow network."""
+    machine.rtde.delay_s = ms / 1000
+
+
+def lose(machine: Machine, packets: int) -> None:
+    """The next cycles' data packets are never sent."""
+    machine.lose_packets = int(packets)
+
+
+def in_use(machine: Machine, inputs: list[str], on: bool = True) -> None:
+    """Another RTDE client owns these input variables (e.g. "input_int_register_0")."""
+    for name in inputs:
+        if name not in machine.robot.inputs.types:
+            raise ValueError(f"there is no input variable {name}")
+        if not on:
+            machine.rtde.claims.pop(name, None)
+        elif not machine.rtde.claim(name, ADMIN):
+            raise ValueError(f"{name} is owned by a client already")
+
+
+def vibrate(
+    machine: Machine,
+    amplitude_rad: float,
+    frequency_hz: float = 12.0,
+    decay_s: float | None = None,
+    joint: int = 1,
+) -> None:
+    """A joint shakes about its rest: for ever, or fading after each motion. amplitude_rad 0 ends it."""
+    vibration = Vibration(amplitude_rad, frequency_hz, decay_s, joint)
+    machine.robot.arm.vibration = vibration if amplitude_rad > 0 else None
+
+
+def offset(machine: Machine, joints_rad: list[float] | None = None) -> None:
+    """From the next motion on the arm rests this much short of its command (none: as commanded)."""
+    machine.robot.arm.offset = _six(joints_rad)
+
+
+def dh(
+    machine: Machine,
+    a_m: list[float] | None = None,
+    d_m: list[float] | None = None,
+    alpha_rad: list[float] | None = None,
+    theta_rad: list[float] | None = None,
+) -> None:
+    """The true arm differs from the nominal table by these; what the controller reports does not."""
+    nominal: DhTable = machine.robot.table
+    machine.robot.true_table = nominal.plus(_six(a_m), _six(d_m), _six(alpha_rad), _six(theta_rad))
+
+
+def _six(values: list[float] | None) -> Six:
+    if values is not None and len(values) != 6:
+        raise ValueError(f"expected 6 numbers, not {values}")
+    return tuple(map(float, values)) if values is not None else ZERO
+
+
+FAULTS: dict[str, Callable[..., Any]] = {
+    "pstop": pstop,
+    "estop": estop,
+    "safeguard": safeguard,
+    "power_off": power_off,
+    "drop": drop,
+    "stall": stall,
+    "freeze": freeze,
+    "mute": mute,
+    "stall_dash": stall_dash,
+    "black_hole": black_hole,
+    "restart": restart,
+    "late": late,
+    "delay": delay,
+    "lose": lose,
+    "in_use": in_use,
+    "vibrate": vibrate,
+    "offset": offset,
+    "dh": dh,
+}

@@ -1,0 +1,199 @@
+"""The arm itself: follows one motion at a time, lags a little, and can be made to misbehave."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from math import exp, pi, sin
+
+from station.simulation.controller.kinematics import DhTable, Rigid, Six, compose, forward
+from station.simulation.controller.paths import Braking, Path, Profile, Trapezoid, UnreachableError
+
+LAG_S = 0.015
+"""Time constant with which the true joints follow the commanded ones."""
+SCALE_PER_S = 5.0
+"""How fast the speed scaling follows the slider or a pause."""
+PROGRAM_END_RAD_S2 = 4.0
+"""Deceleration when the program ends under a motion."""
+ZERO: Six = (0.0,) * 6
+
+MakePath = Callable[[Six], Path]
+"""Joints where the motion begins → its path."""
+
+
+class Motion:
+    """One way from here to there. `done` once the arm's command rests at its end."""
+
+    def __init__(self, make_path: MakePath, speed: float, acceleration: float) -> None:
+        self.make_path = make_path
+        self.speed = speed
+        self.acceleration = acceleration
+        self.path: Path | None = None
+        self.profile: Profile | None = None
+        self.elapsed_s = 0.0
+        self.braking = False
+        self.done = False
+
+
+@dataclass
+class Vibration:
+    """Of one joint, about its rest; `decay_s` None = for ever."""
+
+    amplitude_rad: float
+    frequency_hz: float
+    decay_s: float | None
+    joint: int
+    time_s: float = 0.0
+
+    def now(self) -> float:
+        fade = 1.0 if self.decay_s is None else exp(-self.time_s / self.decay_s)
+        return self.amplitude_rad * fade * sin(2 * pi * self.frequency_hz * self.time_s)
+
+
+class Arm:
+    """Joints that move in time. Speeds in rad/s of simulated time; `scale` is slider × pause."""
+
+    def __init__(self, table: DhTable, joints_rad: Six, draw_miss: Callable[[], Six]) -> None:
+        self.table = table
+        self.flange_from_tcp: Rigid = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+        self.command = joints_rad
+        self.command_speed = ZERO
+        self.actual = joints_rad
+        self._lagged = joints_rad
+        self.actual_speed = ZERO
+        self.scale = 1.0
+        self.motion: Motion | None = None
+        self._next: Motion | None = None
+        self._draw_miss = draw_miss
+        self.miss = draw_miss()
+        """(6,) [δt (m), δφ (rad)] by which the true flange misses its pose now."""
+        self._misses = (self.miss, self.miss)
+        self.offset: Six = ZERO
+        """Joints where the arm rests short of its command; takes effect with the next motion."""
+        self._offset_now: Six = ZERO
+        self.vibration: Vibration | None = None
+
+    @property
+    def moving(self) -> bool:
+        return self.motion is not None
+
+    def start(self, make_path: MakePath, speed: float, acceleration: float) -> Motion:
+        """Goes there; from a running motion it comes to rest first. Raises UnreachableError."""
+        motion = Motion(make_path, speed, acceleration)
+        if self.motion is None:
+            self._begin(motion)
+        else:
+            make_path(self.command)  # an impossible goal is refused now, not after the braking
+            self.brake(PROGRAM_END_RAD_S2)
+            self._next = motion
+        return motion
+
+    def _begin(self, motion: Motion) -> None:
+        motion.path = motion.make_path(self.command)
+        motion.profile = Trapezoid(motion.path.length, motion.speed, motion.acceleration)
+        self.motion = motion
+        self._offset_now = self.offset
+        self._misses = (self.miss, self._draw_miss())
+
+    def brake(self, deceleration_rad_s2: float) -> None:
+        """Comes to rest on its path, the leading joint at this deceleration."""
+        self._brake_in(max(map(abs, self.command_speed)) / deceleration_rad_s2)
+
+    def brake_tool(self, deceleration_m_s2: float) -> None:
+        """Comes to rest on its path, the tool's point at this deceleration (a pure turn: the joints)."""
+        speed_m_s = self.tool_speed_m_s()
+        if speed_m_s < 1e-4:
+            self.brake(deceleration_m_s2)
+        else:
+            self._brake_in(speed_m_s / deceleration_m_s2)
+
+    def tool_speed_m_s(self) -> float:
+        step_s = 1e-4
+        later = tuple(q + step_s * v for q, v in zip(self.command, self.command_speed, strict=True))
+        here = compose(forward(self.table, self.command), self.flange_from_tcp)
+        there = compose(forward(self.table, later), self.flange_from_tcp)
+        return float(sum((there[i] - here[i]) ** 2 for i in (3, 7, 11)) ** 0.5 / step_s)
+
+    def _brake_in(self, duration_s: float) -> None:
+        self._drop_next()
+        motion = self.motion
+        if motion is None or motion.profile is None:
+            return
+        s, speed = motion.profile.at(motion.elapsed_s)
+        speed *= self.scale
+        if motion.braking and motion.profile.duration_s - motion.elapsed_s <= duration_s:
+            return
+        self._misses = (self.miss, self._misses[1])
+        motion.profile = Braking(s, speed, duration_s)
+        motion.braking = True
+        motion.elapsed_s = 0.0
+
+    def _drop_next(self) -> None:
+        if self._next is not None:
+            self._next.done = True
+            self._next = None
+
+    def freeze(self) -> None:
+        """At rest at once, where it is: the brakes, or the safety system."""
+        self._drop_next()
+        if self.motion is not None:
+            self.motion.done = True
+            self.motion = None
+        self.command = self._lagged = self.actual
+        self.command_speed = self.actual_speed = self._offset_now = ZERO
+
+    def step(self, dt_s: float, wanted_scale: float) -> None:
+        """One cycle. Raises UnreachableError when the path leaves the arm's reach (the arm then rests)."""
+        change = SCALE_PER_S * dt_s
+        self.scale += max(-change, min(change, wanted_scale - self.scale))
+        if self.motion is not None:
+            self._follow(self.motion, dt_s)
+        elif self.command_speed is not ZERO:
+            self.command_speed = ZERO
+        self._lag(dt_s)
+
+    def _follow(self, motion: Motion, dt_s: float) -> None:
+        assert motion.path is not None and motion.profile is not None
+        motion.elapsed_s += dt_s * (1.0 if motion.braking else self.scale)
+        profile = motion.profile
+        s, _ = profile.at(motion.elapsed_s)
+        try:
+            joints = motion.path.at(s)
+        except UnreachableError:
+            self.freeze()
+            raise
+        self.command_speed = tuple((b - a) / dt_s for a, b in zip(self.command, joints, strict=True))
+        self.command = joints
+        share = min(1.0, motion.elapsed_s / profile.duration_s) if profile.duration_s > 0 else 1.0
+        before, after = self._misses
+        self.miss = tuple(a + share * (b - a) for a, b in zip(before, after, strict=True))
+        if motion.elapsed_s >= profile.duration_s:
+            self._end(motion)
+
+    def _end(self, motion: Motion) -> None:
+        motion.done = True
+        following = self._next
+        self.motion = self._next = None
+        if self.vibration is not None:
+            self.vibration.time_s = 0.0
+        if following is not None:
+            self._begin(following)
+
+    def _lag(self, dt_s: float) -> None:
+        goal = tuple(c - o for c, o in zip(self.command, self._offset_now, strict=True))
+        before = self.actual
+        if goal != self._lagged:
+            share = 1 - exp(-dt_s / LAG_S)
+            near = max(abs(g - a) for g, a in zip(goal, self._lagged, strict=True)) < 1e-9
+            self._lagged = (
+                goal if near else tuple(a + share * (g - a) for a, g in zip(self._lagged, goal, strict=True))
+            )
+        self.actual = self._lagged
+        if self.vibration is not None:
+            self.vibration.time_s += dt_s
+            joint, shake = self.vibration.joint, self.vibration.now()
+            self.actual = (*self.actual[:joint], self.actual[joint] + shake, *self.actual[joint + 1 :])
+        if self.actual is before:
+            self.actual_speed = ZERO
+        else:
+            self.actual_speed = tuple((b - a) / dt_s for a, b in zip(before, self.actual, strict=True))

@@ -1,0 +1,203 @@
+"""The simulated arm's own kinematics in plain scalars: fast enough for 500 Hz, and independent.
+
+`calibrate.kinematics` is deliberately not used: the station compares the controller's flange pose with
+its own, and shared code would let a shared sign error cancel. A rigid transform here is a 12-tuple,
+the rows of its upper 3×4 block. Standard Denavit-Hartenberg parameters as published by Universal Robots,
+"DH parameters for calculations of kinematics and dynamics". Metres and radians.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import acos, atan2, cos, hypot, pi, sin, sqrt
+
+Rigid = tuple[float, ...]
+"""(12,) r00 r01 r02 tx r10 r11 r12 ty r20 r21 r22 tz"""
+Six = tuple[float, ...]
+
+IDENTITY: Rigid = (1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+JOINT_LIMIT_RAD = 2 * pi
+
+
+@dataclass(frozen=True)
+class DhTable:
+    a_m: Six
+    d_m: Six
+    alpha_rad: Six = (pi / 2, 0.0, 0.0, pi / 2, -pi / 2, 0.0)
+    theta_rad: Six = (0.0,) * 6
+
+    def plus(self, a_m: Six, d_m: Six, alpha_rad: Six, theta_rad: Six) -> DhTable:
+        def add(x: Six, y: Six) -> Six:
+            return tuple(i + j for i, j in zip(x, y, strict=True))
+
+        return DhTable(
+            add(self.a_m, a_m),
+            add(self.d_m, d_m),
+            add(self.alpha_rad, alpha_rad),
+            add(self.theta_rad, theta_rad),
+        )
+
+
+def _table(a2: float, a3: float, d1: float, d4: float, d5: float, d6: float) -> DhTable:
+    return DhTable((0.0, a2, a3, 0.0, 0.0, 0.0), (d1, 0.0, 0.0, d4, d5, d6))
+
+
+TABLES = {
+    "UR3": _table(-0.24365, -0.21325, 0.1519, 0.11235, 0.08535, 0.0819),
+    "UR5": _table(-0.425, -0.39225, 0.089159, 0.10915, 0.09465, 0.0823),
+    "UR10": _table(-0.612, -0.5723, 0.1273, 0.163941, 0.1157, 0.0922),
+    "UR3e": _table(-0.24355, -0.2132, 0.15185, 0.13105, 0.08535, 0.0921),
+    "UR5e": _table(-0.425, -0.3922, 0.1625, 0.1333, 0.0997, 0.0996),
+    "UR10e": _table(-0.6127, -0.57155, 0.1807, 0.17415, 0.11985, 0.11655),
+}
+
+
+def compose(A: Rigid, B: Rigid) -> Rigid:
+    a0, a1, a2, a3, a4, a5, a6, a7, a8, a9, a10, a11 = A
+    b0, b1, b2, b3, b4, b5, b6, b7, b8, b9, b10, b11 = B
+    return (
+        a0 * b0 + a1 * b4 + a2 * b8,
+        a0 * b1 + a1 * b5 + a2 * b9,
+        a0 * b2 + a1 * b6 + a2 * b10,
+        a0 * b3 + a1 * b7 + a2 * b11 + a3,
+        a4 * b0 + a5 * b4 + a6 * b8,
+        a4 * b1 + a5 * b5 + a6 * b9,
+        a4 * b2 + a5 * b6 + a6 * b10,
+        a4 * b3 + a5 * b7 + a6 * b11 + a7,
+        a8 * b0 + a9 * b4 + a10 * b8,
+        a8 * b1 + a9 * b5 + a10 * b9,
+        a8 * b2 + a9 * b6 + a10 * b10,
+        a8 * b3 + a9 * b7 + a10 * b11 + a11,
+    )
+
+
+def invert(A: Rigid) -> Rigid:
+    a0, a1, a2, x, a4, a5, a6, y, a8, a9, a10, z = A
+    return (
+        a0, a4, a8, -(a0 * x + a4 * y + a8 * z),
+        a1, a5, a9, -(a1 * x + a5 * y + a9 * z),
+        a2, a6, a10, -(a2 * x + a6 * y + a10 * z),
+    )  # fmt: skip
+
+
+def from_rotvec(rx: float, ry: float, rz: float, x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Rigid:
+    """Rotation vector [rad] and translation [m] (Rodrigues' formula)."""
+    angle = sqrt(rx * rx + ry * ry + rz * rz)
+    if angle < 1e-12:
+        return (1.0, -rz, ry, x, rz, 1.0, -rx, y, -ry, rx, 1.0, z)
+    u, v, w = rx / angle, ry / angle, rz / angle
+    c, s = cos(angle), sin(angle)
+    k = 1 - c
+    return (
+        c + u * u * k, u * v * k - w * s, u * w * k + v * s, x,
+        v * u * k + w * s, c + v * v * k, v * w * k - u * s, y,
+        w * u * k - v * s, w * v * k + u * s, c + w * w * k, z,
+    )  # fmt: skip
+
+
+def to_rotvec(A: Rigid) -> tuple[float, float, float]:
+    """Rotation vector [rad], angle in [0, π], by way of the quaternion (accurate near 0 and near π)."""
+    m00, m01, m02, _, m10, m11, m12, _, m20, m21, m22, _ = A
+    trace = m00 + m11 + m22
+    if trace > 0:
+        s = 2 * sqrt(trace + 1)
+        w, x, y, z = s / 4, (m21 - m12) / s, (m02 - m20) / s, (m10 - m01) / s
+    elif m00 > m11 and m00 > m22:
+        s = 2 * sqrt(1 + m00 - m11 - m22)
+        w, x, y, z = (m21 - m12) / s, s / 4, (m01 + m10) / s, (m02 + m20) / s
+    elif m11 > m22:
+        s = 2 * sqrt(1 + m11 - m00 - m22)
+        w, x, y, z = (m02 - m20) / s, (m01 + m10) / s, s / 4, (m12 + m21) / s
+    else:
+        s = 2 * sqrt(1 + m22 - m00 - m11)
+        w, x, y, z = (m10 - m01) / s, (m02 + m20) / s, (m12 + m21) / s, s / 4
+    if w < 0:
+        w, x, y, z = -w, -x, -y, -z
+    norm = sqrt(x * x + y * y + z * z)
+    scale = 2.0 if norm < 1e-12 else 2 * atan2(norm, w) / norm
+    return x * scale, y * scale, z * scale
+
+
+def from_pose(pose: Six) -> Rigid:
+    """UR pose: x y z [m], rotation vector [rad]."""
+    x, y, z, rx, ry, rz = pose
+    return from_rotvec(rx, ry, rz, x, y, z)
+
+
+def to_pose(A: Rigid) -> Six:
+    return (A[3], A[7], A[11], *to_rotvec(A))
+
+
+def forward(table: DhTable, joints_rad: Six) -> Rigid:
+    """base_from_flange."""
+    T = IDENTITY
+    for q, theta, a, d, alpha in zip(
+        joints_rad, table.theta_rad, table.a_m, table.d_m, table.alpha_rad, strict=True
+    ):
+        ct, st, ca, sa = cos(q + theta), sin(q + theta), cos(alpha), sin(alpha)
+        T = compose(T, (ct, -st * ca, st * sa, a * ct, st, ct * ca, -ct * sa, a * st, 0.0, sa, ca, d))
+    return T
+
+
+def inverse_all(table: DhTable, base_from_flange: Rigid) -> list[Six]:
+    """Every solution of the nominal geometry, at most 8. At a wrist singularity wrist 3 is set to 0.
+
+    Derived from the geometry: the wrist's centre lies d4 beside the plane of the arm (2 × q1); the angle
+    between wrist 2's axis and the flange's axis (2 × q5); then a planar two-link arm (2 × q3).
+    """
+    T = base_from_flange
+    a2, a3 = table.a_m[1], table.a_m[2]
+    d1, _, _, d4, d5, d6 = table.d_m
+    wx, wy, wz = T[3] - d6 * T[2], T[7] - d6 * T[6], T[11] - d6 * T[10]
+    radius = hypot(wx, wy)
+    if radius < d4:
+        return []
+    solutions: list[Six] = []
+    beside = acos(d4 / radius)
+    for side in (beside, -beside):
+        q1 = atan2(wy, wx) + pi / 2 + side
+        s1, c1 = sin(q1), cos(q1)
+        # Row of the frame "sideways of the arm" in the flange: what wrists 2 and 3 turn.
+        hx, hy, hz = T[0] * s1 - T[4] * c1, T[1] * s1 - T[5] * c1, T[2] * s1 - T[6] * c1
+        for flip in (1.0, -1.0):
+            s5 = flip * hypot(hx, hy)
+            q5 = atan2(s5, hz)
+            q6 = atan2(-hy / s5, hx / s5) if abs(s5) > 1e-9 else 0.0
+            s6, c6 = sin(q6), cos(q6)
+            # Frame 5 y axis in base; d5 runs against it.
+            ux, uy, uz = T[0] * s6 + T[1] * c6, T[4] * s6 + T[5] * c6, T[8] * s6 + T[9] * c6
+            # Origin of frame 3 in the plane of the arm: step back over d5, along the plane's axes.
+            px, pz = (wx + d5 * ux) * c1 + (wy + d5 * uy) * s1, wz + d5 * uz - d1
+            c3 = (px * px + pz * pz - a2 * a2 - a3 * a3) / (2 * a2 * a3)
+            if abs(c3) > 1 + 1e-9:
+                continue
+            bend = acos(max(-1.0, min(1.0, c3)))
+            q234 = atan2(-(ux * c1 + uy * s1), uz)
+            for q3 in (bend, -bend):
+                q2 = atan2(pz, px) - atan2(a3 * sin(q3), a2 + a3 * cos(q3))
+                solutions.append(tuple(_wrap(q) for q in (q1, q2, q3, q234 - q2 - q3, q5, q6)))
+    return solutions
+
+
+def _wrap(angle: float) -> float:
+    return (angle + pi) % (2 * pi) - pi
+
+
+def inverse_nearest(table: DhTable, base_from_flange: Rigid, near_rad: Six) -> Six | None:
+    """The solution nearest to `near_rad` (largest joint difference), turns chosen within ±2π; or None."""
+    best, best_distance = None, float("inf")
+    for solution in inverse_all(table, base_from_flange):
+        turned = tuple(_nearest_turn(q, near) for q, near in zip(solution, near_rad, strict=True))
+        distance = max(abs(q - near) for q, near in zip(turned, near_rad, strict=True))
+        if distance < best_distance:
+            best, best_distance = turned, distance
+    return best
+
+
+def _nearest_turn(angle: float, near: float) -> float:
+    turned = angle + 2 * pi * round((near - angle) / (2 * pi))
+    if turned > JOINT_LIMIT_RAD:
+        return turned - 2 * pi
+    if turned < -JOINT_LIMIT_RAD:
+        return turned + 2 * pi
+    return turned

@@ -1,0 +1,296 @@
+"""The controller behind the sockets: arm, power, safety, program, registers; one `tick` per cycle.
+
+Knows no socket, so that every rule here can be tested without one.
+"""
+
+from __future__ import annotations
+
+import random
+from dataclasses import dataclass
+from math import inf
+
+from station.devices.rtde import RobotMode, RuntimeState, SafetyMode
+from station.simulation.controller.arm import PROGRAM_END_RAD_S2, Arm, MakePath, Motion
+from station.simulation.controller.history import History
+from station.simulation.controller.journal import Journal
+from station.simulation.controller.kinematics import (
+    TABLES,
+    DhTable,
+    Rigid,
+    Six,
+    compose,
+    forward,
+    from_rotvec,
+)
+from station.simulation.controller.paths import UnreachableError
+from station.simulation.controller.programs import CustomScript, ForeignProgram, Program, ScriptError
+from station.simulation.controller.publisher import Publisher
+from station.simulation.controller.script import ControlScript
+from station.simulation.controller.uploads import Upload
+from station.simulation.controller.variables import INPUT_TYPES, OUTPUT_TYPES, VariableStore
+
+PROGRAM_START_S = 0.05
+UNLOCK_AFTER_S = 5.0
+CB3_VERSION = (3, 15, 8, 106339)
+E_SERIES_VERSION = (5, 11, 1, 108318)
+
+
+@dataclass(frozen=True)
+class Settings:
+    model: str = "UR10"
+    start_joints_rad: Six = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
+    serial: str = "20263000001"
+    time_scale: float = 1.0
+    """The arm moves this many times faster than it says; clocks stay real. For tests."""
+    sigma_m: float = 0.0
+    sigma_rad: float = 0.0
+    seed: int = 0
+    dh_delta: tuple[Six, Six, Six, Six] = ((0.0,) * 6,) * 4
+    """a_m, d_m, alpha_rad, theta_rad of the true arm against the nominal table."""
+    remote: bool = True
+    paused_by_protective_stop: bool = True
+    """runtime_state after a protective stop: paused (4), else stopped (1)."""
+
+    @property
+    def is_e_series(self) -> bool:
+        return self.model.endswith("e")
+
+    @property
+    def version(self) -> tuple[int, int, int, int]:
+        return E_SERIES_VERSION if self.is_e_series else CB3_VERSION
+
+    @property
+    def rate_hz(self) -> int:
+        return 500 if self.is_e_series else 125
+
+
+class SimulatedRobot:
+    def __init__(self, settings: Settings, journal: Journal) -> None:
+        self.settings = settings
+        self.journal = journal
+        self.dt_s = 1.0 / settings.rate_hz
+        self.table = TABLES[settings.model]
+        self.true_table: DhTable = self.table.plus(*settings.dh_delta)
+        self._random = random.Random(settings.seed)
+        self.arm = Arm(self.table, settings.start_joints_rad, self._draw_miss)
+        self.history = History(self.dt_s)
+        self.inputs = VariableStore(INPUT_TYPES)
+        self.outputs = VariableStore(OUTPUT_TYPES)
+        self.tcp: Six = (0.0,) * 6
+        self.payload_kg = 0.0
+        self.payload_cog: Six = (0.0,) * 3
+        self.robot_mode = RobotMode.RUNNING
+        self.safety_mode = SafetyMode.NORMAL
+        self.runtime_state = RuntimeState.STOPPED
+        self.remote = settings.remote
+        self.slider = 1.0
+        self.program: Program | None = None
+        self._starting: tuple[int, Program] | None = None
+        self.ticks = 0
+        self.time_s = 0.0
+        self._safety_since_s = -inf
+        self.watchdog_s = 0.0
+        """Longest silence of the command register that is allowed; 0 = none."""
+        self._silence_s = 0.0
+        self._hands: Motion | None = None
+        self._publisher = Publisher(self)
+
+    def _draw_miss(self) -> Six:
+        m, rad = self.settings.sigma_m, self.settings.sigma_rad
+        return tuple(self._random.gauss(0.0, sigma) for sigma in (m, m, m, rad, rad, rad))
+
+    # -- one cycle ----------------------------------------------------------------------------------
+
+    def tick(self, monotonic_ns: int, late: bool = False) -> None:
+        """One cycle; `monotonic_ns` is when it is due. `late`: many cycles run at once because this
+        process was held up; such time does not count as the client's silence."""
+        self.ticks += 1
+        self.time_s = self.ticks * self.dt_s
+        if self._starting is not None:
+            self._count_down()
+        if self.program is not None and self.runtime_state == RuntimeState.PLAYING:
+            self._step_program(late)
+        held = self.robot_mode != RobotMode.RUNNING or not self.safe
+        by_hand = self._hands is not None and not self._hands.done
+        held |= self.runtime_state == RuntimeState.PAUSED and not by_hand
+        scale = 0.0 if held else 1.0 if by_hand else self.slider
+        try:
+            self.arm.step(self.dt_s * self.settings.time_scale, scale)
+        except UnreachableError as error:
+            self.protective_stop(str(error))
+        self.history.add(monotonic_ns, self.arm.actual, self.arm.miss)
+        self._publisher.publish()
+
+    def _count_down(self) -> None:
+        assert self._starting is not None
+        left, program = self._starting
+        if left > 0:
+            self._starting = (left - 1, program)
+            return
+        self._starting = None
+        self.program = program
+        self.runtime_state = RuntimeState.PLAYING
+        program.begin()
+
+    def _step_program(self, late: bool) -> None:
+        assert self.program is not None
+        if self.watchdog_s > 0 and not late:
+            self._silence_s += self.dt_s
+            if self._silence_s > self.watchdog_s:
+                self.stop_program("watchdog: the command register was silent")
+                return
+        try:
+            running = self.program.step()
+        except (ScriptError, UnreachableError) as error:
+            self.stop_program(f"runtime error: {error}")
+            return
+        if not running:
+            self.stop_program("the program ended")
+
+    def command_register_written(self, index: int) -> None:
+        """A data packet carried this input_int_register."""
+        if isinstance(self.program, ControlScript) and index == self.program.offset_int:
+            self._silence_s = 0.0
+
+    # -- the program --------------------------------------------------------------------------------
+
+    @property
+    def safe(self) -> bool:
+        return self.safety_mode in (SafetyMode.NORMAL, SafetyMode.REDUCED)
+
+    @property
+    def accepts_programs(self) -> bool:
+        local = self.settings.is_e_series and not self.remote
+        return self.safe and self.robot_mode == RobotMode.RUNNING and not local
+
+    @property
+    def free_for_hands(self) -> bool:
+        """The pendant's arrows or free-drive may move the arm."""
+        playing = self.runtime_state == RuntimeState.PLAYING
+        return self.safe and self.robot_mode == RobotMode.RUNNING and not playing
+
+    def lead(self, make_path: MakePath, speed_rad_s: float, acceleration_rad_s2: float) -> bool:
+        """A person moves the arm; a paused program's motion is lost. False while it is not free."""
+        if not self.free_for_hands:
+            return False
+        if self.arm.moving:
+            self.arm.freeze()
+        self._hands = self.arm.start(make_path, speed_rad_s, acceleration_rad_s2)
+        return True
+
+    def upload(self, upload: Upload) -> None:
+        """A program arrived on a script port: it replaces whatever runs, or is silently ignored."""
+        accepted = self.accepts_programs
+        self.journal.note(
+            "upload", upload.name or upload.text[:200], characters=len(upload.text), accepted=accepted
+        )
+        if not accepted or upload.secondary:
+            return
+        if upload.is_control_script:
+            self.start_program(ControlScript(self, upload))
+        elif "write_output_integer_register" in upload.text:
+            self.start_program(CustomScript(self, upload))
+        else:
+            self.start_program(ForeignProgram(upload.name or "line", 1 if not upload.name else None))
+
+    def start_program(self, program: Program) -> None:
+        self.stop_program(f"replaced by {program.name}")
+        self._starting = (round(PROGRAM_START_S / self.settings.time_scale / self.dt_s), program)
+
+    def stop_program(self, reason: str) -> None:
+        """Ends the program (if any); a motion decelerates. Registers keep their values."""
+        if self.program is not None or self._starting is not None:
+            name = self.program.name if self.program is not None else "program"
+            self.journal.note("controller", "program stopped", name=name, reason=reason)
+        self.program = self._starting = None
+        self.runtime_state = RuntimeState.STOPPED
+        self.watchdog_s = self._silence_s = 0.0
+        self.arm.brake(PROGRAM_END_RAD_S2)
+
+    def pause_program(self) -> bool:
+        if self.runtime_state != RuntimeState.PLAYING:
+            return False
+        self.runtime_state = RuntimeState.PAUSED
+        return True
+
+    def play_program(self) -> bool:
+        """Resumes a paused program (there is nothing else to play here)."""
+        ready = self.program is not None and self.safe and self.robot_mode == RobotMode.RUNNING
+        if not ready or self.runtime_state != RuntimeState.PAUSED:
+            return False
+        self.runtime_state = RuntimeState.PLAYING
+        self._silence_s = 0.0
+        return True
+
+    # -- safety and power ---------------------------------------------------------------------------
+
+    def protective_stop(self, reason: str) -> None:
+        """The arm rests at once; only `unlock` brings it back, and only after 5 s."""
+        self.journal.note("controller", "protective stop", reason=reason)
+        self._safety(SafetyMode.PROTECTIVE_STOP)
+        self.arm.freeze()
+        if self.program is None or not self.settings.paused_by_protective_stop:
+            self.stop_program("protective stop")
+        else:
+            self.runtime_state = RuntimeState.PAUSED
+
+    def unlock(self) -> bool:
+        """Of a protective stop. False within 5 s of its start."""
+        if self.safety_mode != SafetyMode.PROTECTIVE_STOP:
+            return True
+        if self.time_s - self._safety_since_s < UNLOCK_AFTER_S:
+            return False
+        self._safety(SafetyMode.NORMAL)
+        return True
+
+    def safeguard(self, on: bool) -> None:
+        if on:
+            self._safety(SafetyMode.SAFEGUARD_STOP)
+            self.pause_program()
+        elif self.safety_mode == SafetyMode.SAFEGUARD_STOP:
+            self._safety(SafetyMode.NORMAL)
+
+    def emergency_stop(self, on: bool) -> None:
+        if on:
+            self._safety(SafetyMode.ROBOT_EMERGENCY_STOP)
+            self.power_off(RobotMode.IDLE if self.settings.is_e_series else RobotMode.POWER_OFF)
+        elif self.safety_mode == SafetyMode.ROBOT_EMERGENCY_STOP:
+            self._safety(SafetyMode.NORMAL)
+            self.robot_mode = RobotMode.POWER_OFF
+
+    def power_off(self, mode: RobotMode = RobotMode.POWER_OFF) -> None:
+        self.stop_program("power off")
+        self.arm.freeze()
+        self.robot_mode = mode
+
+    def power_on(self) -> None:
+        if self.safe and self.robot_mode == RobotMode.POWER_OFF:
+            self.robot_mode = RobotMode.IDLE
+
+    def release_brakes(self) -> None:
+        if self.safe and self.robot_mode == RobotMode.IDLE:
+            self.robot_mode = RobotMode.RUNNING
+
+    def reset(self, running: bool) -> None:
+        """After a reboot: time 0, empty registers; installation and the arm's place survive."""
+        self.inputs, self.outputs = VariableStore(INPUT_TYPES), VariableStore(OUTPUT_TYPES)
+        self.history = History(self.dt_s)
+        self.ticks, self.time_s, self.slider = 0, 0.0, 1.0
+        self._safety(SafetyMode.NORMAL)
+        self.robot_mode = RobotMode.RUNNING if running else RobotMode.POWER_OFF
+        self._publisher = Publisher(self)
+
+    def _safety(self, mode: SafetyMode) -> None:
+        if mode != self.safety_mode:
+            self._safety_since_s = self.time_s
+        self.safety_mode = mode
+
+    # -- the truth ----------------------------------------------------------------------------------
+
+    def true_flange(self, joints: Six, miss: Six) -> Rigid:
+        """base_from_flange with the arm's real lengths and its repeatability error."""
+        T = forward(self.true_table, joints)
+        turned = compose(from_rotvec(*miss[3:]), T)
+        return (
+            *turned[:3], T[3] + miss[0], *turned[4:7], T[7] + miss[1], *turned[8:11], T[11] + miss[2],
+        )  # fmt: skip

@@ -1,0 +1,185 @@
+"""Port 30004: handshake, data to clients every cycle, registers from clients."""
+
+from __future__ import annotations
+
+import asyncio
+import struct
+from operator import itemgetter
+from typing import Any
+
+from station.devices.rtde import (
+    IN_USE,
+    NOT_FOUND,
+    PORT,
+    PROTOCOL_VERSION,
+    PacketReader,
+    PacketType,
+    Recipe,
+    RtdeError,
+    join_names,
+    packet,
+    split_names,
+)
+from station.simulation.controller.network import Connection, Service
+from station.simulation.controller.robot import SimulatedRobot
+from station.simulation.controller.variables import E_SERIES_ONLY
+
+ADMIN = "admin"
+
+
+class RtdeServer:
+    def __init__(self, host: str, robot: SimulatedRobot) -> None:
+        self.robot = robot
+        self.service = Service("rtde", host, PORT, lambda: RtdeConnection(self))
+        self.claims: dict[str, object] = {}
+        """Input name → the connection (or the admin) that owns it."""
+        self.stalled = False
+        """Links live, no data is sent."""
+        self.frozen = False
+        """The same packet again and again."""
+        self.delay_s = 0.0
+        """Data packets leave this much later, in order."""
+        self.sent = 0
+        self.skipped = 0
+
+    def send_states(self) -> None:
+        """Called once per cycle."""
+        for connection in self.service.connections:
+            assert isinstance(connection, RtdeConnection)
+            connection.send_state()
+
+    def lose(self) -> None:
+        """Called instead of `send_states` for a cycle whose packet is lost."""
+        self.skipped += 1
+
+    def claim(self, name: str, owner: object) -> bool:
+        return self.claims.setdefault(name, owner) is owner
+
+    def release(self, owner: object) -> None:
+        self.claims = {name: o for name, o in self.claims.items() if o is not owner}
+
+
+class RtdeConnection(Connection):
+    def __init__(self, server: RtdeServer) -> None:
+        self._server = server
+        self._robot = server.robot
+        self._packets = PacketReader()
+        self._inputs: list[Recipe] = []
+        self._output: Recipe | None = None
+        self._elements: Any = None
+        self._every = 1
+        self._playing = False
+        self._last = b""
+        self._handlers = {
+            PacketType.PROTOCOL_VERSION: self._protocol_version,
+            PacketType.CONTROLLER_VERSION: self._controller_version,
+            PacketType.OUTPUT_SETUP: self._output_setup,
+            PacketType.INPUT_SETUP: self._input_setup,
+            PacketType.START: self._start,
+            PacketType.PAUSE: self._pause,
+        }
+
+    def received(self, data: bytes) -> None:
+        try:
+            for kind, payload in self._packets.feed(data):
+                if kind == PacketType.DATA:
+                    self._data(payload)
+                elif kind in self._handlers:
+                    kind = PacketType(kind)
+                    self.transport.write(packet(kind, self._handlers[kind](payload)))
+                else:
+                    raise RtdeError(f"packet type {kind}")
+        except (RtdeError, struct.error) as error:
+            self._robot.journal.note("rtde", "bad packet", error=str(error))
+            self.transport.close()
+
+    def closed(self) -> None:
+        self._server.release(self)
+
+    # -- handshake: exactly one reply per request -------------------------------------------------------
+
+    def _protocol_version(self, payload: bytes) -> bytes:
+        (version,) = struct.unpack(">H", payload)
+        return bytes([version == PROTOCOL_VERSION])
+
+    def _controller_version(self, payload: bytes) -> bytes:
+        return struct.pack(">4I", *self._robot.settings.version)
+
+    def _output_setup(self, payload: bytes) -> bytes:
+        (frequency_hz,) = struct.unpack_from(">d", payload)
+        names = split_names(payload[8:])
+        types = [self._output_type(name) for name in names]
+        if NOT_FOUND in types:
+            return b"\x00" + join_names(types)
+        base_hz = self._robot.settings.rate_hz
+        self._every = max(1, round(base_hz / frequency_hz)) if frequency_hz > 0 else 1
+        self._output = Recipe(1, names, tuple(types))
+        self._elements = itemgetter(*self._robot.outputs.indices(names), 0)
+        return b"\x01" + join_names(types)
+
+    def _output_type(self, name: str) -> str:
+        if name in E_SERIES_ONLY and not self._robot.settings.is_e_series:
+            return NOT_FOUND
+        return self._robot.outputs.types.get(name, NOT_FOUND)
+
+    def _input_setup(self, payload: bytes) -> bytes:
+        names = split_names(payload)
+        types = [self._input_type(name) for name in names]
+        if NOT_FOUND in types or IN_USE in types:
+            return b"\x00" + join_names(types)
+        self._inputs.append(Recipe(len(self._inputs) + 1, names, tuple(types)))
+        return bytes([len(self._inputs)]) + join_names(types)
+
+    def _input_type(self, name: str) -> str:
+        if name not in self._robot.inputs.types:
+            return NOT_FOUND
+        return self._robot.inputs.types[name] if self._server.claim(name, self) else IN_USE
+
+    def _start(self, payload: bytes) -> bytes:
+        self._playing = self._output is not None
+        return bytes([self._playing])
+
+    def _pause(self, payload: bytes) -> bytes:
+        self._playing = False
+        return b"\x01"
+
+    # -- data -------------------------------------------------------------------------------------------
+
+    def _data(self, payload: bytes) -> None:
+        number = payload[0] if payload else 0
+        if not 1 <= number <= len(self._inputs):
+            raise RtdeError(f"data for input recipe {number}, which was never set up")
+        recipe = self._inputs[number - 1]
+        robot = self._robot
+        robot.inputs.write(recipe.names, recipe.unpack_elements(payload))
+        for name in recipe.names:
+            if name.startswith("input_int_register_"):
+                robot.command_register_written(int(name.rpartition("_")[2]))
+        if "speed_slider_mask" in recipe.names and robot.inputs.get("speed_slider_mask"):
+            robot.slider = max(0.0, min(1.0, robot.inputs.get("speed_slider_fraction")))
+            robot.journal.note("rtde", "speed slider", fraction=robot.slider)
+        for name in recipe.names:
+            if name.endswith("_output") and "digital" in name:
+                robot.journal.note("rtde", name, value=robot.inputs.get(name))
+
+    def send_state(self) -> None:
+        server = self._server
+        if not self._playing or server.stalled or self.service.silent or self._robot.ticks % self._every:
+            return
+        if not (server.frozen and self._last):
+            assert self._output is not None
+            self._last = self._output.pack(self._elements(self._robot.outputs.elements)[:-1])
+        if server.delay_s > 0:
+            asyncio.get_running_loop().call_later(server.delay_s, self._write, self._last)
+        else:
+            self._write(self._last)
+
+    def _write(self, data: bytes) -> None:
+        """Skips the packet when the client does not read, like the real one; never queues."""
+        if self.transport.is_closing():
+            return
+        if self.transport.get_write_buffer_size():
+            self._server.skipped += 1
+            return
+        self.transport.write(data)
+        self._server.sent += 1

@@ -1,0 +1,126 @@
+"""What a set of views can tell: Fisher information of X, board place and intrinsics from geometry alone.
+
+The model is that of the maximum-likelihood estimate: pixel noise on every corner, and on every robot
+pose an independent error (translation and rotation, per axis) that is a nuisance of its own view.
+Parameter order: δX (6), δY (6), then intrinsics fx fy cx cy and distortion when they are free. Deltas are
+those of `geometry.perturb`. X = flange_from_camera, Y = base_from_board (eye-in-hand), or
+X = base_from_camera, Y = flange_from_board (eye-to-hand).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calibrate.geometry import Array, skew
+from recordings.messages import CameraModel, Mount
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations per axis."""
+
+    pixel_px: float = 0.15
+    robot_m: float = 0.0001
+    robot_rad: float = 0.00017
+
+
+def camera_matrix(camera: CameraModel) -> tuple[Array, Array]:
+    """(3, 3) matrix and (d,) distortion. ValueError while the matrix is unknown."""
+    if camera.matrix is None:
+        raise ValueError("the camera's matrix is not known")
+    distortion = camera.distortion or (0.0,) * 5
+    return np.array(camera.matrix, dtype=float), np.array(distortion, dtype=float)
+
+
+def project(camera: CameraModel, points: Array) -> tuple[Array, Array, Array]:
+    """Points (n, 3) in `camera` → pixels (n, 2), d pixel/d point (n, 2, 3), d pixel/d intrinsics (n, 2, 4+d).
+
+    Intrinsics in the order fx fy cx cy, distortion. Points must lie in front of the camera.
+    """
+    K, D = camera_matrix(camera)
+    zero = np.zeros(3)
+    flat = np.ascontiguousarray(points, dtype=float).reshape(-1, 1, 3)
+    if camera.distortion_model == "equidistant":
+        pixels, jac = cv2.fisheye.projectPoints(flat, zero, zero, K, D[:4])
+        jac = jac.reshape(-1, 2, jac.shape[-1])
+        return _floats(pixels.reshape(-1, 2)), _floats(jac[..., 11:14]), _floats(jac[..., :8])
+    pixels, jac = cv2.projectPoints(flat, zero, zero, K, D)
+    jac = np.asarray(jac).reshape(-1, 2, jac.shape[-1])
+    return _floats(pixels).reshape(-1, 2), _floats(jac[..., 3:6]), _floats(jac[..., 6:])
+
+
+def _floats(values: ArrayLike) -> Array:
+    return np.asarray(values, dtype=float)
+
+
+def camera_points(mount: Mount, base_from_flange: Array, X: Array, Y: Array, board_points: Array) -> Array:
+    """Board points (k, 3) as the camera of each view sees them, (n, k, 3) in `camera`."""
+    return _chain(mount, base_from_flange, X, Y, board_points)[0]
+
+
+def _chain(mount: Mount, E: Array, X: Array, Y: Array, points: Array) -> tuple[Array, Array, Array, Array]:
+    """Points in camera, and their derivatives by δX, δY, δE: (n, k, 3), three times (n, k, 3, 6)."""
+    Rx, tx, Ry, ty = X[:3, :3], X[:3, 3], Y[:3, :3], Y[:3, 3]
+    Re, te = E[:, None, :3, :3], E[:, None, :3, 3]
+    turned = points @ Ry.T
+    if mount == "eye-in-hand":
+        q = np.broadcast_to(turned + ty, (len(E), *points.shape))
+        out = np.swapaxes(Re, -1, -2)  # base → flange
+        near = np.einsum("nkij,nkj->nki", np.broadcast_to(out, (*q.shape, 3)), q - te)
+        dE = np.concatenate([-np.broadcast_to(out, (*q.shape, 3)), out @ skew(q - te)], axis=-1)
+        dY = np.concatenate([np.broadcast_to(out, (*q.shape, 3)), -out @ skew(turned)], axis=-1)
+    else:
+        f = turned + ty
+        lever = np.einsum("nkij,kj->nki", np.broadcast_to(Re, (len(E), len(points), 3, 3)), f)
+        near = lever + te
+        eye = np.broadcast_to(np.eye(3), (*near.shape, 3))
+        dE = np.concatenate([eye, -skew(lever)], axis=-1)
+        dY = np.concatenate([np.broadcast_to(Re, (*near.shape, 3)), -Re @ skew(turned)], axis=-1)
+    eye = np.broadcast_to(np.eye(3), (*near.shape, 3))
+    dX = np.concatenate([-eye, skew(near - tx)], axis=-1)
+    return (near - tx) @ Rx, Rx.T @ dX, Rx.T @ dY, Rx.T @ dE
+
+
+def view_information(
+    mount: Mount,
+    camera: CameraModel,
+    base_from_flange: Array,
+    X: Array,
+    Y: Array,
+    board_points: Array,
+    noise: Noise,
+    free_intrinsics: bool,
+) -> Array:
+    """Information of each view, (n, p, p): p = 12, or 16 + distortion when the intrinsics are free.
+
+    The view's own robot error is marginalised (Woodbury), so views simply add.
+    """
+    n, k = len(base_from_flange), len(board_points)
+    points, dX, dY, dE = _chain(mount, base_from_flange, X, Y, board_points)
+    _, by_point, by_lens = project(camera, points.reshape(-1, 3))
+    by_point = by_point.reshape(n, k, 2, 3)
+    blocks = [by_point @ dX, by_point @ dY]
+    if free_intrinsics:
+        blocks.append(by_lens.reshape(n, k, 2, -1))
+    J = np.concatenate(blocks, axis=-1).reshape(n, 2 * k, -1) / noise.pixel_px
+    G = (by_point @ dE).reshape(n, 2 * k, 6) / noise.pixel_px
+    G = G * np.repeat([noise.robot_m, noise.robot_rad], 3)
+    J_t, G_t = np.swapaxes(J, -1, -2), np.swapaxes(G, -1, -2)
+    cross = G_t @ J
+    return np.asarray(J_t @ J - np.swapaxes(cross, -1, -2) @ np.linalg.solve(np.eye(6) + G_t @ G, cross))
+
+
+def covariance_of(information: Array, lens_prior: Array | None = None) -> Array:
+    """Information (..., p, p) → covariance (..., p, p), scaled inside so that metres and pixels do not clash.
+
+    `lens_prior` (p,) is added to the diagonal. Directions without information get a huge variance.
+    """
+    M = information + (np.diag(lens_prior) if lens_prior is not None else 0.0)
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(M, axis1=-2, axis2=-1), 1e-12))
+    scaled = M * scale[..., :, None] * scale[..., None, :]
+    scaled = scaled + 1e-12 * np.eye(M.shape[-1])
+    return np.asarray(np.linalg.inv(scaled) * scale[..., :, None] * scale[..., None, :])

@@ -1,0 +1,259 @@
+"""Limits before motion: whole paths are checked and their speeds capped before anything moves.
+
+A joint move is straight in joint space with all joints in step, as the controller's moveJ runs it; speed
+and acceleration are those of the leading joint. The caps below are code: no configuration raises them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calibrate.geometry import Array, difference
+from calibrate.kinematics import JOINT_NAMES, forward
+from station.collision import CellGeometry, margins, moving_points
+from station.plan.model import Plan, PlannedPose
+
+SPEED_CAP_M_S = 0.25
+JOINT_SPEED_CAP_RAD_S = 1.05
+JOINT_ACCELERATION_CAP_RAD_S2 = 1.4
+_SPEED_RESERVE = 0.97
+"""Between samples a point may be a little faster than at them."""
+SPACING_M = 0.01
+"""No modelled point moves further between two checked samples; margins are reduced by half of it."""
+_FLANGE_TOLERANCE_M, _FLANGE_TOLERANCE_RAD = 0.002, 0.005
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One broken limit. `str()` is the sentence for people."""
+
+    pose: str
+    limit: str
+    text: str
+    joint: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.pose}: {self.text}"
+
+
+@dataclass(frozen=True)
+class MoveCheck:
+    """One joint move, checked along its whole path."""
+
+    name: str
+    problems: tuple[Problem, ...]
+    joint_speed_rad_s: float
+    """Of the leading joint: with it no modelled point exceeds the speed limit."""
+    joint_acceleration_rad_s2: float
+    duration_s: float
+    path_m: float
+    """Length of the flange's path."""
+    step_rad: float
+    """Turn of the leading joint."""
+    top_speed_m_s: float
+    """Of the fastest modelled point, with the trapezoid's true peak."""
+    margin_m: float
+    """Smallest distance to any limit along the way."""
+
+
+@dataclass(frozen=True)
+class PlanCheck:
+    moves: tuple[MoveCheck, ...]
+    problems: tuple[Problem, ...]
+    """All of them: of the moves, and of the plan as such."""
+
+    @property
+    def duration_s(self) -> float:
+        return sum(move.duration_s for move in self.moves)
+
+    @property
+    def path_m(self) -> float:
+        return sum(move.path_m for move in self.moves)
+
+    @property
+    def largest_step_rad(self) -> float:
+        return max((move.step_rad for move in self.moves), default=0.0)
+
+    @property
+    def top_speed_m_s(self) -> float:
+        return max((move.top_speed_m_s for move in self.moves), default=0.0)
+
+
+def trapezoid(step_rad: ArrayLike, speed_rad_s: ArrayLike, acceleration_rad_s2: float) -> tuple[Array, Array]:
+    """Duration (s) and peak speed (rad/s) of a move of the leading joint by `step_rad`, from rest to rest."""
+    step, speed = np.abs(step_rad), np.asarray(speed_rad_s, dtype=float)
+    peak = np.minimum(speed, np.sqrt(step * acceleration_rad_s2))
+    cruise = np.maximum(step - peak**2 / acceleration_rad_s2, 0.0)
+    return 2 * peak / acceleration_rad_s2 + cruise / np.maximum(peak, 1e-9), peak
+
+
+def joint_bounds(geometry: CellGeometry) -> tuple[Array, Array]:
+    """Lowest and highest joint angles (6,), rad: the arm's own and the configuration's."""
+    own, limits = geometry.model.joint_limit_rad, geometry.limits
+    low = np.maximum(-own, limits.joints_min_rad or (-own,) * 6)
+    high = np.minimum(own, limits.joints_max_rad or (own,) * 6)
+    return low, high
+
+
+def point_speed_m_s(geometry: CellGeometry, joints_rad: ArrayLike, joint_speeds_rad_s: ArrayLike) -> float:
+    """Speed of the fastest modelled point of arm, tool or camera, now."""
+    q, dq = np.asarray(joints_rad, dtype=float), np.asarray(joint_speeds_rad_s, dtype=float)
+    step = 1e-4
+    ends = moving_points(geometry, np.array([q - step * dq, q + step * dq]))
+    return float(np.linalg.norm(ends[1] - ends[0], axis=-1).max() / (2 * step))
+
+
+def sample_path(geometry: CellGeometry, from_rad: Array, to_rad: Array, spacing_m: float) -> Array:
+    """Joints (m, 6) along the move, so dense that no modelled point moves more than `spacing_m` between."""
+    coarse = from_rad + np.linspace(0, 1, 9)[:, None] * (to_rad - from_rad)
+    steps = np.linalg.norm(np.diff(moving_points(geometry, coarse), axis=0), axis=-1)
+    # An arc is longer than its chord: 10 % covers the 1/8 of the largest turn that a step spans.
+    count = int(np.ceil(1.1 * 8 * steps.max() / spacing_m)) + 1
+    return np.asarray(from_rad + np.linspace(0, 1, max(count, 3))[:, None] * (to_rad - from_rad))
+
+
+def check_path(
+    geometry: CellGeometry,
+    from_joints_rad: ArrayLike,
+    to_joints_rad: ArrayLike,
+    name: str = "move",
+    spacing_m: float = SPACING_M,
+) -> MoveCheck:
+    """Everything that can be wrong with one move, and the speed it may be driven at."""
+    start, target = (np.asarray(q, dtype=float) for q in (from_joints_rad, to_joints_rad))
+    if start.shape != (6,) or target.shape != (6,) or not np.isfinite([start, target]).all():
+        broken = Problem(name, "joints", "six finite joint angles in radians are needed")
+        return MoveCheck(name, (broken,), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -np.inf)
+    problems = _joint_problems(geometry, start, target, name)
+    samples = sample_path(geometry, start, target, spacing_m)
+    gaps, labels = margins(geometry, samples)
+    problems += _margin_problems(gaps - spacing_m / 2, labels, name)
+    speed, acceleration, duration, peak = allowed_speed(geometry, samples)
+    flange = forward(geometry.model, samples)[:, :3, 3]
+    return MoveCheck(
+        name=name,
+        problems=tuple(problems),
+        joint_speed_rad_s=speed,
+        joint_acceleration_rad_s2=acceleration,
+        duration_s=duration,
+        path_m=float(np.linalg.norm(np.diff(flange, axis=0), axis=1).sum()),
+        step_rad=float(np.abs(target - start).max()),
+        top_speed_m_s=peak,
+        margin_m=float(gaps.min()),
+    )
+
+
+def allowed_speed(geometry: CellGeometry, samples: Array) -> tuple[float, float, float, float]:
+    """Samples (m, 6) evenly along one move → leading joint's speed and acceleration, duration, top speed."""
+    limits = geometry.limits
+    step_rad = float(np.abs(samples[-1] - samples[0]).max())
+    acceleration = min(limits.joint_acceleration_rad_s2, JOINT_ACCELERATION_CAP_RAD_S2)
+    speed = min(limits.joint_speed_rad_s, JOINT_SPEED_CAP_RAD_S)
+    if step_rad < 1e-9:
+        return speed, acceleration, 0.0, 0.0
+    points = moving_points(geometry, samples)
+    travel = np.linalg.norm(np.diff(points, axis=0), axis=-1).max()
+    metres_per_rad = travel * (len(samples) - 1) / step_rad
+    speed = min(speed, _SPEED_RESERVE * min(limits.speed_m_s, SPEED_CAP_M_S) / max(metres_per_rad, 1e-9))
+    duration, peak = trapezoid(step_rad, speed, acceleration)
+    return float(speed), acceleration, float(duration), float(peak * metres_per_rad)
+
+
+def _joint_problems(geometry: CellGeometry, start: Array, target: Array, name: str) -> list[Problem]:
+    low, high = joint_bounds(geometry)
+    problems = []
+    for i, joint in enumerate(JOINT_NAMES):
+        if not low[i] - 1e-9 <= target[i] <= high[i] + 1e-9:
+            problems.append(
+                Problem(
+                    name,
+                    "joint range",
+                    f"{joint} would stand at {np.rad2deg(target[i]):.1f}°, allowed is "
+                    f"{np.rad2deg(low[i]):.0f}° to {np.rad2deg(high[i]):.0f}°",
+                    joint,
+                )
+            )
+        turn = abs(target[i] - start[i])
+        if turn > geometry.limits.joint_step_rad + 1e-9:
+            problems.append(
+                Problem(
+                    name,
+                    "joint step",
+                    f"{joint} would turn {np.rad2deg(turn):.0f}° in one move, allowed is "
+                    f"{np.rad2deg(geometry.limits.joint_step_rad):.0f}° (limits.joint_step_rad); "
+                    "put a pose in between or choose the same arm branch",
+                    joint,
+                )
+            )
+    return problems
+
+
+def _margin_problems(gaps: Array, labels: Sequence[str], name: str) -> list[Problem]:
+    problems = []
+    for column in (int(c) for c in np.flatnonzero(gaps.min(axis=0) < 0)):
+        at = int(np.argmin(gaps[:, column]))
+        where = "at the target" if at == len(gaps) - 1 else f"after {at / (len(gaps) - 1):.0%} of the way"
+        problems.append(
+            Problem(
+                name,
+                "clearance",
+                f"{labels[column]}, {-1000 * gaps[at, column]:.0f} mm too close {where}",
+                labels[column].split(" against ")[0],
+            )
+        )
+    return problems
+
+
+def check_plan(plan: Plan, start_joints_rad: ArrayLike | None, geometry: CellGeometry) -> PlanCheck:
+    """The whole plan from where the arm is now (None: from its first pose), move by move."""
+    problems = list(_plan_problems(plan, geometry))
+    geometry = _with_plan_speeds(geometry, plan)
+    before = start_joints_rad
+    moves = []
+    for number, pose in enumerate(plan.poses, start=1):
+        name = f"pose {number} ({pose.name})"
+        problems += _flange_problems(geometry, pose, name)
+        origin = pose.joints_rad if before is None else before
+        moves.append(check_path(geometry, origin, pose.joints_rad, name))
+        before = pose.joints_rad
+    return PlanCheck(tuple(moves), (*problems, *(p for move in moves for p in move.problems)))
+
+
+def _with_plan_speeds(geometry: CellGeometry, plan: Plan) -> CellGeometry:
+    """The plan may ask for slower joints than the configuration, never for faster ones."""
+    limits = geometry.limits
+    slower = msgspec.structs.replace(
+        limits,
+        joint_speed_rad_s=min(limits.joint_speed_rad_s, plan.joint_speed_rad_s),
+        joint_acceleration_rad_s2=min(limits.joint_acceleration_rad_s2, plan.joint_acceleration_rad_s2),
+    )
+    return replace(geometry, limits=slower)
+
+
+def _plan_problems(plan: Plan, geometry: CellGeometry) -> list[Problem]:
+    problems = []
+    if not plan.poses:
+        problems.append(Problem("plan", "poses", "it has no poses"))
+    if plan.robot != geometry.model.name:
+        text = f"it was made for a {plan.robot}, the cell has a {geometry.model.name}; make a new plan"
+        problems.append(Problem("plan", "robot", text))
+    return problems
+
+
+def _flange_problems(geometry: CellGeometry, pose: PlannedPose, name: str) -> list[Problem]:
+    if pose.base_from_flange is None or len(pose.joints_rad) != 6:
+        return []
+    delta = difference(forward(geometry.model, pose.joints_rad), np.array(pose.base_from_flange))
+    off_m, off_rad = float(np.linalg.norm(delta[:3])), float(np.linalg.norm(delta[3:]))
+    if off_m <= _FLANGE_TOLERANCE_M and off_rad <= _FLANGE_TOLERANCE_RAD:
+        return []
+    text = (
+        f"joints and expected flange pose differ by {1000 * off_m:.1f} mm and {np.rad2deg(off_rad):.2f}°; "
+        "was one of them edited, or is the plan for another arm model?"
+    )
+    return [Problem(name, "flange pose", text)]

@@ -1,0 +1,105 @@
+"""The order of the stops: short in time, every move free of collision."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from calibrate.geometry import Array
+from station.collision import CellGeometry, margins, moving_points
+from station.limits import (
+    JOINT_ACCELERATION_CAP_RAD_S2,
+    JOINT_SPEED_CAP_RAD_S,
+    SPACING_M,
+    SPEED_CAP_M_S,
+    trapezoid,
+)
+
+_SAMPLES = 13
+BLOCKED = np.inf
+
+
+def move_times(geometry: CellGeometry, joints_from: Array, joints_to: Array) -> Array:
+    """Durations (n,) in seconds of joint moves (n, 6) → (n, 6); BLOCKED where the path breaks a limit.
+
+    Coarse but on the safe side: margins shrink by half of what modelled points travel between samples.
+    """
+    n = len(joints_from)
+    if n == 0:
+        return np.zeros(0)
+    fractions = np.linspace(0, 1, _SAMPLES)
+    paths = joints_from[:, None] + fractions[:, None] * (joints_to - joints_from)[:, None]
+    flat = paths.reshape(-1, 6)
+    points = moving_points(geometry, flat).reshape(n, _SAMPLES, -1, 3)
+    travel = np.linalg.norm(np.diff(points, axis=1), axis=-1).max(axis=(1, 2))
+    worst = margins(geometry, flat)[0].min(axis=1).reshape(n, _SAMPLES).min(axis=1)
+    limits = geometry.limits
+    step = np.abs(joints_to - joints_from).max(axis=1)
+    rate = travel * (_SAMPLES - 1) / np.maximum(step, 1e-9)
+    speed = np.minimum(limits.joint_speed_rad_s, JOINT_SPEED_CAP_RAD_S)
+    speed = np.minimum(speed, 0.97 * min(limits.speed_m_s, SPEED_CAP_M_S) / np.maximum(rate, 1e-9))
+    duration, _ = trapezoid(step, speed, min(limits.joint_acceleration_rad_s2, JOINT_ACCELERATION_CAP_RAD_S2))
+    bad = (worst < np.maximum(1.1 * travel, SPACING_M) / 2) | (step > limits.joint_step_rad)
+    return np.where(bad, BLOCKED, duration)
+
+
+def time_matrix(geometry: CellGeometry, joints_rad: Array) -> Array:
+    """(n, n) move durations between all poses, symmetric, BLOCKED where a path breaks a limit."""
+    n = len(joints_rad)
+    i, j = np.triu_indices(n, 1)
+    times = np.zeros((n, n))
+    times[i, j] = times[j, i] = move_times(geometry, joints_rad[i], joints_rad[j])
+    return times
+
+
+def short_order(times: Array, first_leg: Array, seed: int) -> list[int]:
+    """A short open path through all n poses; `first_leg` (n,) is the time from the start to each.
+
+    Nearest neighbour from every pose, then 2-opt and or-opt until nothing improves. BLOCKED moves are
+    avoided where that is possible; `path_time` tells.
+    """
+    n = len(times)
+    cost = np.where(np.isfinite(times), times, 1e4)
+    lead = np.where(np.isfinite(first_leg), first_leg, 1e4)
+    rng = np.random.default_rng(seed)
+    starts = list(np.argsort(lead, kind="stable")[: min(n, 8)])
+    starts += [s for s in rng.permutation(n)[:4] if s not in starts]
+    tours = [_improve(_nearest(cost, int(s)), cost, lead) for s in starts]
+    return min(tours, key=lambda tour: path_time(tour, cost, lead))
+
+
+def path_time(order: list[int], times: Array, first_leg: Array) -> float:
+    return float(first_leg[order[0]] + sum(times[a, b] for a, b in pairwise(order)))
+
+
+def _nearest(cost: Array, start: int) -> list[int]:
+    left, tour = set(range(len(cost))) - {start}, [start]
+    while left:
+        tour.append(min(left, key=lambda j: (cost[tour[-1], j], j)))
+        left.remove(tour[-1])
+    return tour
+
+
+def _improve(tour: list[int], cost: Array, lead: Array) -> list[int]:
+    best = path_time(tour, cost, lead)
+    improved = True
+    while improved:
+        improved = False
+        for candidate in _neighbours(tour):
+            length = path_time(candidate, cost, lead)
+            if length < best - 1e-9:
+                tour, best, improved = candidate, length, True
+                break
+    return tour
+
+
+def _neighbours(tour: list[int]) -> list[list[int]]:
+    n = len(tour)
+    reversals = [tour[:i] + tour[i : j + 1][::-1] + tour[j + 1 :] for i in range(n) for j in range(i + 1, n)]
+    moved = []
+    for size in (1, 2, 3):
+        for i in range(n - size + 1):
+            piece, rest = tour[i : i + size], tour[:i] + tour[i + size :]
+            moved += [rest[:k] + piece + rest[k:] for k in range(len(rest) + 1) if k != i]
+    return reversals + moved

@@ -1,0 +1,204 @@
+"""From a rough idea of the cell to a plan: candidates, one arm branch, the best 25, a short safe order."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
+from itertools import pairwise
+
+import numpy as np
+
+from calibrate.geometry import Array
+from calibrate.information import Noise
+from calibrate.kinematics import forward
+from station.config import StationConfig
+from station.errors import LimitError
+from station.limits import check_plan
+from station.plan.candidates import Pool, ViewRange, find_candidates
+from station.plan.choose import Criterion, choose, informations, objective_for, sigma_of
+from station.plan.describe import planned_pose
+from station.plan.explain import explain_shortage
+from station.plan.model import Plan
+from station.plan.order import BLOCKED, move_times, short_order, time_matrix
+from station.plan.scene import Scene, scene_of
+
+Progress = Callable[[str, float], None]
+POOL_SIZE = 320
+_DRAWS = 24
+
+
+@dataclass(frozen=True)
+class PlanOptions:
+    count: int = 25
+    seed: int = 0
+    criterion: Criterion = "A"
+    noise: Noise = field(default_factory=Noise)
+    free_intrinsics: bool = True
+    """The lens is calibrated from the same pictures."""
+    view: ViewRange = field(default_factory=ViewRange)
+    pool: int = POOL_SIZE
+
+
+def make_plan(
+    config: StationConfig,
+    *,
+    start_joints_rad: Sequence[float] | None = None,
+    seed: int = 0,
+    count: int = 25,
+    progress: Progress = lambda text, done: None,
+) -> Plan:
+    """A plan of `count` poses for the configured cell. Deterministic by seed; takes seconds.
+
+    ConfigError when the configuration lacks what planning needs; LimitError when there is no such plan,
+    saying which limit binds and what to change.
+    """
+    options = PlanOptions(count=count, seed=seed, free_intrinsics=True)
+    return plan_scene(scene_of(config), options, start_joints_rad, progress)
+
+
+def plan_scene(
+    scene: Scene,
+    options: PlanOptions,
+    start_joints_rad: Sequence[float] | None = None,
+    progress: Progress = lambda text, done: None,
+) -> Plan:
+    """The same, for a scene that is already known."""
+    rng = np.random.default_rng(options.seed)
+    start = None if start_joints_rad is None else np.asarray(start_joints_rad, dtype=float)
+    progress("looking for poses", 0.0)
+    pool, notes = _pool(scene, options, start, rng)
+    progress("choosing", 0.3)
+    joints, flange = _choose_and_order(scene, options, pool, start, rng, progress)
+    progress("checking", 0.95)
+    plan = _describe(scene, options, joints, flange, notes)
+    check = check_plan(plan, start, scene.geometry)
+    if check.problems:
+        raise LimitError("The plan does not pass its own check:\n" + "\n".join(map(str, check.problems)))
+    progress("done", 1.0)
+    return plan
+
+
+def _relaxed(view: ViewRange) -> list[tuple[ViewRange, str]]:
+    """The wanted range, then ever less particular ones, each with what is to be said about it."""
+    doubtful = replace(view, visible_share=0.7, off_centre=0.2, border_px=6.0)
+    rolled = replace(doubtful, roll_rad=np.pi, tilt_rad=(view.tilt_rad[0], view.tilt_rad[1] + 0.1))
+    wide = replace(
+        rolled,
+        visible_share=0.3,
+        off_centre=0.1,
+        distance_m=(0.8 * view.distance_m[0], 1.3 * view.distance_m[1]),
+    )
+    return [
+        (view, ""),
+        (doubtful, "the guess is so rough that some pictures may cut the board"),
+        (rolled, "poses of any roll had to be used"),
+        (wide, "distances beyond the wanted range had to be used and some pictures may cut the board"),
+    ]
+
+
+def _pool(
+    scene: Scene, options: PlanOptions, start: Array | None, rng: np.random.Generator
+) -> tuple[Pool, list[str]]:
+    """Candidates of the best branch. LimitError with the reason when the widest range has too few."""
+    draws = scene.drawn(_DRAWS, rng)
+    best: Pool | None = None
+    for view, note in _relaxed(options.view):
+        found = find_candidates(scene, view, 3 * options.pool, rng, start, draws)
+        branch = _best_branch(scene, found, start, options.pool)
+        if len(branch) >= 2 * options.count:
+            return branch, [note] if note else []
+        if best is None or len(branch) >= len(best):
+            best = branch
+            best_note = note
+    assert best is not None
+    if len(best) < options.count:
+        raise LimitError(explain_shortage(scene, options.count, best))
+    return best, [best_note]
+
+
+def _best_branch(scene: Scene, found: Pool, start: Array | None, wanted: int) -> Pool:
+    """The arm branch with the most candidates; among those with plenty, the one nearest to the start.
+
+    Only candidates reachable from the start, directly, count when there is a start.
+    """
+    branches = []
+    for number in np.unique(found.branch):
+        members = found.take(np.flatnonzero(found.branch == number))
+        members = members.take(np.arange(min(len(members), wanted)))
+        nearness = 0.0 if start is None else float(np.abs(members.joints_rad - start).max(axis=1).min())
+        if start is not None:
+            step = move_times(
+                scene.geometry, np.repeat(start[None], len(members), axis=0), members.joints_rad
+            )
+            if not np.isfinite(step).any():
+                continue
+        branches.append((-min(len(members), wanted // 2), nearness, int(number), members))
+    if not branches:
+        return found.take(np.zeros(0, dtype=int))
+    return min(branches, key=lambda entry: entry[:3])[3]
+
+
+def _choose_and_order(
+    scene: Scene,
+    options: PlanOptions,
+    pool: Pool,
+    start: Array | None,
+    rng: np.random.Generator,
+    progress: Progress,
+) -> tuple[Array, Array]:
+    """Joints (count, 6) and flange poses (count, 4, 4), in order. Poses without a free way are replaced."""
+    objective = objective_for(scene, options.criterion, options.free_intrinsics)
+    information = informations(scene, pool.base_from_flange, options.noise, options.free_intrinsics)
+    allowed = np.arange(len(pool))
+    while len(allowed) >= options.count:
+        picked = choose(
+            information[allowed],
+            options.count,
+            objective,
+            rng,
+            progress=lambda d: progress("choosing", 0.3 + 0.5 * d),
+        )
+        places = allowed[picked]
+        joints = pool.joints_rad[places]
+        times = time_matrix(scene.geometry, joints)
+        lead = (
+            np.zeros(len(joints))
+            if start is None
+            else move_times(scene.geometry, np.repeat(start[None], len(joints), axis=0), joints)
+        )
+        progress("ordering", 0.85)
+        order = short_order(times, lead, options.seed)
+        blocked = _blocked(order, times, lead)
+        if not blocked:
+            return joints[order], pool.base_from_flange[places][order]
+        allowed = np.setdiff1d(allowed, places[blocked])
+    raise LimitError(explain_shortage(scene, options.count, pool.take(allowed)))
+
+
+def _blocked(order: list[int], times: Array, lead: Array) -> list[int]:
+    """Members that cannot be reached in this order; the worst connected one of each blocked move."""
+    if lead[order[0]] == BLOCKED:
+        return [order[0]]
+    free = np.isfinite(times).sum(axis=1)
+    return [min((a, b), key=lambda m: free[m]) for a, b in pairwise(order) if times[a, b] == BLOCKED]
+
+
+def _describe(scene: Scene, options: PlanOptions, joints: Array, flange: Array, notes: list[str]) -> Plan:
+    objective = objective_for(scene, options.criterion, options.free_intrinsics)
+    information = informations(scene, flange, options.noise, options.free_intrinsics).cumsum(axis=0)
+    flange = forward(scene.geometry.model, joints)
+    poses = tuple(
+        planned_pose(
+            scene, number, joints[number], flange[number], sigma_of(information[number], objective)[0]
+        )
+        for number in range(len(joints))
+    )
+    return Plan(
+        robot=scene.geometry.model.name,
+        mount=scene.mount,
+        poses=poses,
+        joint_speed_rad_s=scene.geometry.limits.joint_speed_rad_s,
+        joint_acceleration_rad_s2=scene.geometry.limits.joint_acceleration_rad_s2,
+        seed=options.seed,
+        note="; ".join(notes),
+    )

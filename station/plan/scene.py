@@ -1,0 +1,150 @@
+"""What the planner believes of a cell: camera mount, board place and solids, from the configuration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibrate.board import board_points
+from calibrate.geometry import Array, inverse, pose, pose_from_quaternion, rotation_exp, transform_points
+from calibrate.information import camera_points
+from calibrate.kinematics import MODELS, DhDeltas
+from recordings.messages import BoardSpec, CameraModel, Mount
+from station.collision import CellGeometry, plate
+from station.config import Capsule, PoseGuess, StationConfig
+from station.errors import ConfigError
+
+_CAMERA_BODY_M, _CAMERA_RADIUS_M = 0.05, 0.035
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A guess of the cell, good to the sigmas it carries."""
+
+    mount: Mount
+    camera: CameraModel
+    board: BoardSpec
+    X: Array
+    """flange_from_camera (eye-in-hand) or base_from_camera (eye-to-hand), (4, 4)"""
+    Y: Array
+    """base_from_board (eye-in-hand) or flange_from_board (eye-to-hand), (4, 4)"""
+    geometry: CellGeometry
+    x_sigma: tuple[float, float] = (0.0, 0.0)
+    """Per axis: metres, radians."""
+    y_sigma: tuple[float, float] = (0.0, 0.0)
+    working_distance_m: float = 0.5
+
+    def camera_from_board(self, base_from_flange: Array) -> Array:
+        """(..., 4, 4) → (..., 4, 4)"""
+        if self.mount == "eye-in-hand":
+            return np.asarray(inverse(base_from_flange @ self.X) @ self.Y)
+        return np.asarray(inverse(self.X) @ base_from_flange @ self.Y)
+
+    def base_from_flange(self, camera_from_board: Array) -> Array:
+        """The flange pose that shows the board so."""
+        if self.mount == "eye-in-hand":
+            return np.asarray(self.Y @ inverse(self.X @ camera_from_board))
+        return np.asarray(self.X @ camera_from_board @ inverse(self.Y))
+
+    def seen(self, base_from_flange: Array, points: Array) -> Array:
+        """Board points (k, 3) in `camera`, (n, k, 3)."""
+        return camera_points(self.mount, base_from_flange, self.X, self.Y, points)
+
+    def drawn(self, draws: int, rng: np.random.Generator) -> list[tuple[Array, Array]]:
+        """Other (X, Y) that the guess allows, by its sigmas."""
+
+        def disturbed(matrix: Array, sigma: tuple[float, float]) -> Array:
+            # A guess is wrong about where the thing is and how it is turned, each about itself.
+            turned = matrix[:3, :3] @ rotation_exp(rng.normal(0, sigma[1], 3))
+            return pose(turned, matrix[:3, 3] + rng.normal(0, sigma[0], 3))
+
+        return [(disturbed(self.X, self.x_sigma), disturbed(self.Y, self.y_sigma)) for _ in range(draws)]
+
+
+def board_extent(board: BoardSpec) -> tuple[Array, Array]:
+    """Corners (2,) of the printed area in the board's plane, one square beyond the outermost points."""
+    points = board_points(board)[:, :2]
+    return points.min(axis=0) - board.square_m, points.max(axis=0) + board.square_m
+
+
+def scene_of(config: StationConfig) -> Scene:
+    """The scene that the configuration describes. ConfigError names what is missing."""
+    if config.robot.model not in MODELS:
+        raise ConfigError(f"robot.model '{config.robot.model}' is unknown; known are {', '.join(MODELS)}")
+    camera, mount_guess, place_guess = config.camera.model, config.camera_guess, config.board_guess
+    if camera is None or camera.matrix is None:
+        raise ConfigError(
+            "planning needs a rough lens: give camera.model with width, height and matrix "
+            "(focal length in pixels = lens mm / pixel size mm; the centre = half the picture)"
+        )
+    if mount_guess is None or place_guess is None:
+        missing = "camera_guess" if mount_guess is None else "board_guess"
+        raise ConfigError(
+            f"planning needs {missing} in the configuration; or let `station plan bootstrap` find it"
+        )
+    X, Y = (pose_from_quaternion(g.translation_m, g.rotation_xyzw) for g in (mount_guess, place_guess))
+    return Scene(
+        config.mount,
+        camera,
+        config.board,
+        X,
+        Y,
+        geometry_of(config, X, Y, 2 * place_guess.sigma_m),
+        _sigmas(mount_guess),
+        _sigmas(place_guess),
+        config.working_distance_m,
+    )
+
+
+def _sigmas(guess: PoseGuess) -> tuple[float, float]:
+    return guess.sigma_m, guess.sigma_rad
+
+
+def cell_geometry(config: StationConfig) -> CellGeometry:
+    """Geometry for checks before motion; uses the guesses where there are any."""
+    X, Y = (
+        None if g is None else pose_from_quaternion(g.translation_m, g.rotation_xyzw)
+        for g in (config.camera_guess, config.board_guess)
+    )
+    doubt_m = 2 * config.board_guess.sigma_m if config.board_guess else 0.0
+    return geometry_of(config, X, Y, doubt_m)
+
+
+def geometry_of(config: StationConfig, X: Array | None, Y: Array | None, doubt_m: float) -> CellGeometry:
+    """Solids and obstacles of a cell; board clearance grows by `doubt_m`, what its place is not known to."""
+    model = MODELS[config.robot.model]
+    if (deltas := config.robot.kinematics) is not None:
+        model = model.calibrated(DhDeltas(deltas.a_m, deltas.d_m, deltas.alpha_rad, deltas.theta_rad))
+    low, high = board_extent(config.board)
+    limits = config.limits
+    solids = limits.solids
+    obstacles: tuple[Capsule, ...] = ()
+    watched: tuple[tuple[float, float, float], ...] = ()
+    clearance = limits.clearance_m
+    if config.mount == "eye-in-hand":
+        if X is not None:
+            watched = (_point(X[:3, 3]),)
+            solids = solids or (camera_body("camera", X),)
+        if Y is not None:
+            obstacles = plate("board", Y, low, high)
+            clearance = limits.board_clearance_m + doubt_m
+    else:
+        if Y is not None:
+            solids += plate("board", Y, low, high)
+            corners = np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
+            watched = tuple(_point(p) for p in transform_points(Y, corners))
+        if X is not None:
+            obstacles = (camera_body("camera", X),)
+            clearance = limits.clearance_m + doubt_m
+    return CellGeometry(model, limits, solids, obstacles, clearance, watched)
+
+
+def camera_body(name: str, parent_from_camera: Array) -> Capsule:
+    """A camera as it stands behind its optical centre."""
+    ends = transform_points(parent_from_camera, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -_CAMERA_BODY_M]]))
+    return Capsule(name, _point(ends[0]), _point(ends[1]), _CAMERA_RADIUS_M)
+
+
+def _point(p: Array) -> tuple[float, float, float]:
+    return float(p[0]), float(p[1]), float(p[2])

@@ -94,7 +94,7 @@ def require_free_space(folder: Path, reserve_bytes: int) -> int:
     free = shutil.disk_usage(folder).free
     if free < reserve_bytes:
         raise RecordingError(
-            f"only {free / 1e9:.1f} GB are free at {folder}, below the reserve of {reserve_bytes / 1e9:.1f} GB: "
+            f"only {free / 1e9:.1f} GB are free at {folder}, the reserve is {reserve_bytes / 1e9:.1f} GB: "
             f"free {(reserve_bytes - free) / 1e9:.1f} GB and go on"
         )
     return free

@@ -12,7 +12,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-PICTURE_LIMIT_BYTES = 48 * 1024 * 1024
+PICTURE_LIMIT_BYTES = 36 * 1024 * 1024
 """Decoded size above which no picture is read or written: bounds the reader's memory."""
 SIDE_LIMIT_PX = 16384
 
@@ -132,7 +132,7 @@ def decode_picture(data: bytes, width: int, height: int) -> NDArray[Any]:
         raise PictureError("cannot be decoded")
     decoded: NDArray[Any] = np.asarray(image)
     if decoded.ndim == 3 and decoded.dtype == np.uint16:
-        return np.right_shift(decoded, 8).astype(np.uint8)
+        return np.asarray(np.right_shift(decoded, 8), np.uint8)
     return decoded
 
 

@@ -203,7 +203,7 @@ def parse_statistics(content: memoryview) -> Statistics:
     cursor.done()
     if len(pairs) % 10:
         raise BadRecordError("the message counts do not end where they say")
-    counts = {channel: count for channel, count in struct.iter_unpack("<HQ", pairs)}
+    counts = dict(struct.iter_unpack("<HQ", pairs))
     return Statistics(messages, schemas, channels, attachments, metadata, chunks, start, end, counts)
 
 

@@ -114,6 +114,12 @@ class RecordingWriter:
         if picture.sequence in self._pictures or picture.sequence < 0:
             raise RecordingError(f"picture {picture.sequence} was recorded before; sequences count up from 0")
         height, width = picture.image.shape[:2]
+        camera = self.info.camera
+        if (width, height) != (camera.width, camera.height):
+            raise RecordingError(
+                f"picture {picture.sequence} is {width}×{height}, the session's camera is "
+                f"{camera.width}×{camera.height}: all pictures of a session have one size"
+            )
         facts = PictureFacts(
             stamps=picture.stamps,
             frame_id=picture.frame_id,

@@ -1,0 +1,227 @@
+"""One sealed file of a recording: proven when opened, then read message by message."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, TypeVar
+
+import msgspec
+import numpy as np
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from google.protobuf.message import DecodeError
+
+from recordings.contents import MessageIndex
+from recordings.errors import CorruptRecordingError
+from recordings.files import is_attachment_name, is_session_name
+from recordings.messages import CaptureEvent, Picture, RobotState, SessionInfo, View
+from recordings.pictures import PictureError, decode_picture, raw_array
+from recordings.scan import open_file, scan_file
+from recordings.schema import FORMAT, PictureFacts, SchemaError, decode, schema_difference
+from recordings.topics import Topic, schema_bytes, schema_name
+
+VIEWS_LIMIT = 10_000
+_RIGID_TOLERANCE = 1e-6
+S = TypeVar("S", bound=msgspec.Struct)
+
+
+class RecordingPart:
+    """A file that passed the strict scan. Raises CorruptRecordingError where a message is wrong in itself."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises UnsealedRecordingError, CorruptRecordingError or RecordingError."""
+        self.path = path
+        self._descriptor = open_file(path)
+        try:
+            self.size_bytes = os.fstat(self._descriptor).st_size
+            self._contents, self.sha256 = scan_file(self._descriptor, path)
+            self._topics = self._check_channels()
+            self.info = self._session_info()
+            self.attachments = self._checked_attachments()
+            self._facts = self._index_pictures(Topic.PICTURE_FACTS)
+            self._raw = self._index_pictures(Topic.RAW_IMAGE)
+            self._compressed = self._index_pictures(Topic.COMPRESSED_IMAGE)
+            self._check_picture_pairs()
+            self.views = self._checked_views()
+        except BaseException:
+            os.close(self._descriptor)
+            raise
+
+    def __del__(self) -> None:
+        if hasattr(self, "_topics"):
+            os.close(self._descriptor)
+
+    def messages(self, topic: Topic) -> MessageIndex:
+        """Where a topic's messages lie, with their times; empty when there are none."""
+        return self._topics.get(topic, MessageIndex())
+
+    def robot_states(self) -> Iterator[RobotState]:
+        return self._decoded(Topic.ROBOT_STATE, RobotState)
+
+    def events(self) -> Iterator[CaptureEvent]:
+        return self._decoded(Topic.EVENT, CaptureEvent)
+
+    def picture_facts(self) -> Iterator[PictureFacts]:
+        return self._decoded(Topic.PICTURE_FACTS, PictureFacts)
+
+    def picture_sequences(self) -> list[int]:
+        """Of all pictures, in file order."""
+        return list(self._facts)
+
+    def picture(self, sequence: int) -> Picture:
+        """Decoded; its array is read-only. KeyError when there is no such picture."""
+        facts = self._message(Topic.PICTURE_FACTS, self._facts[sequence], PictureFacts)
+        compressed = sequence in self._compressed
+        topic = Topic.COMPRESSED_IMAGE if compressed else Topic.RAW_IMAGE
+        place = (self._compressed if compressed else self._raw)[sequence]
+        message = self._image_message(topic, place)
+        size = (self.info.camera.width, self.info.camera.height)
+        try:
+            if (facts.width, facts.height) != size:
+                raise PictureError(f"is {facts.width}×{facts.height}, the camera {size[0]}×{size[1]}")
+            if compressed:
+                image = decode_picture(message.data, *size)
+            elif (message.width, message.height) != size:
+                raise PictureError(f"is {message.width}×{message.height}, expected {size[0]}×{size[1]}")
+            else:
+                image = raw_array(message.data, message.encoding, *size)
+        except PictureError as error:
+            raise self.corrupt(topic, place, f"picture {sequence} {error}") from error
+        image.flags.writeable = False
+        return Picture(
+            image=image,
+            stamps=facts.stamps,
+            frame_id=facts.frame_id,
+            sequence=facts.sequence,
+            exposure_us=facts.exposure_us,
+            gain_db=facts.gain_db,
+            pixel_format=facts.pixel_format,
+            trigger_count=facts.trigger_count,
+        )
+
+    def stored_picture(self, sequence: int) -> tuple[str, bytes] | None:
+        """(format, file bytes) of a picture that is kept compressed; None when it is kept raw."""
+        if sequence not in self._compressed:
+            return None
+        message = self._image_message(Topic.COMPRESSED_IMAGE, self._compressed[sequence])
+        return str(message.format), bytes(message.data)
+
+    def corrupt(self, topic: Topic, place: int, reason: str) -> CorruptRecordingError:
+        offset = self._topics[topic].offsets[place]
+        return CorruptRecordingError(
+            f"{self.path} is damaged at byte {offset} ({topic.value}): {reason}. Use the original file"
+        )
+
+    def _image_message(self, topic: Topic, place: int) -> Any:
+        kind: Any = CompressedImage if topic is Topic.COMPRESSED_IMAGE else RawImage
+        try:
+            return kind.FromString(self._content(topic, place))
+        except DecodeError as error:
+            raise self.corrupt(topic, place, "the image message cannot be parsed") from error
+
+    def _content(self, topic: Topic, place: int) -> bytes:
+        index = self._topics[topic]
+        data = os.pread(self._descriptor, index.lengths[place], index.offsets[place])
+        if len(data) != index.lengths[place]:
+            raise self.corrupt(topic, place, "the file became shorter after it was opened")
+        return data
+
+    def _message(self, topic: Topic, place: int, struct: type[S]) -> S:
+        try:
+            return decode(struct, self._content(topic, place))
+        except SchemaError as error:
+            raise self.corrupt(topic, place, str(error)) from error
+
+    def _decoded(self, topic: Topic, struct: type[S]) -> Iterator[S]:
+        for place in range(len(self.messages(topic))):
+            yield self._message(topic, place, struct)
+
+    def _file_error(self, reason: str) -> CorruptRecordingError:
+        return CorruptRecordingError(f"{self.path} cannot be used: {reason}")
+
+    def _check_channels(self) -> dict[Topic, MessageIndex]:
+        """Known topics with exactly the meaning this version knows."""
+        names = {topic.value: topic for topic in Topic}
+        found: dict[Topic, MessageIndex] = {}
+        for number, channel in self._contents.channels.items():
+            topic = names.get(channel.topic)
+            if topic is None or topic in found:
+                raise self._file_error(f"topic '{channel.topic[:60]}' is unknown or declared twice")
+            schema = self._contents.schemas[channel.schema_id]
+            if (channel.encoding, schema.encoding, schema.name) != (
+                "protobuf",
+                "protobuf",
+                schema_name(topic),
+            ):
+                raise self._file_error(
+                    f"topic {topic.value} holds {schema.name[:60]}, not {schema_name(topic)}"
+                )
+            try:
+                difference = schema_difference(schema_bytes(topic), schema.data)
+            except SchemaError as error:
+                difference = str(error)
+            if difference:
+                raise self._file_error(f"topic {topic.value}: {difference}; use the version that wrote it")
+            found[topic] = self._contents.messages[number]
+        return found
+
+    def _session_info(self) -> SessionInfo:
+        record = self._contents.metadata.get("session", {})
+        if record.get("format") != FORMAT:
+            raise self._file_error(
+                f"its format is '{record.get('format', 'unknown')[:40]}', this version reads '{FORMAT}'"
+            )
+        try:
+            info = msgspec.json.decode(record.get("session", ""), type=SessionInfo)
+        except (msgspec.DecodeError, RecursionError) as error:
+            raise self._file_error(f"its description does not fit this version: {error}") from error
+        if not is_session_name(info.name) or info.part < 1:
+            raise self._file_error(f"its session name '{info.name[:60]}' or part {info.part} is not allowed")
+        return info
+
+    def _checked_attachments(self) -> dict[str, bytes]:
+        for name in self._contents.attachments:
+            if not is_attachment_name(name):
+                raise self._file_error(f"an attachment is named '{name[:60]}'")
+        return dict(self._contents.attachments)
+
+    def _index_pictures(self, topic: Topic) -> dict[int, int]:
+        """Sequence → place on the topic."""
+        places: dict[int, int] = {}
+        for place, sequence in enumerate(self.messages(topic).sequences):
+            if places.setdefault(sequence, place) != place:
+                raise self.corrupt(topic, place, f"picture {sequence} stands twice in the file")
+        return places
+
+    def _check_picture_pairs(self) -> None:
+        if self._raw.keys() & self._compressed.keys():
+            raise self._file_error("a picture is stored both raw and compressed")
+        if self._facts.keys() != self._raw.keys() | self._compressed.keys():
+            raise self._file_error("some pictures lack their description, or the other way round")
+
+    def _checked_views(self) -> list[View]:
+        """All attempts in file order, each with this file's part number."""
+        if len(self.messages(Topic.VIEW)) > VIEWS_LIMIT:
+            raise self._file_error(f"more than {VIEWS_LIMIT} views")
+        views = []
+        for place, view in enumerate(self._decoded(Topic.VIEW, View)):
+            if view.picture_sequence not in self._facts:
+                raise self.corrupt(Topic.VIEW, place, f"view {view.index} names a picture that is not there")
+            if not _is_rigid(view):
+                raise self.corrupt(
+                    Topic.VIEW, place, f"the flange pose of view {view.index} is no rigid transform"
+                )
+            views.append(msgspec.structs.replace(view, part=self.info.part))
+        return views
+
+
+def _is_rigid(view: View) -> bool:
+    T = np.array([n for row in view.base_from_flange for n in row])
+    if T.size != 16 or not np.isfinite(T).all():
+        return False
+    T = T.reshape(4, 4)
+    R = T[:3, :3]
+    orthonormal = np.abs(R @ R.T - np.eye(3)).max() < _RIGID_TOLERANCE and np.linalg.det(R) > 0
+    return bool(orthonormal and np.abs(T[3] - [0, 0, 0, 1]).max() < _RIGID_TOLERANCE)

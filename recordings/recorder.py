@@ -1,0 +1,227 @@
+"""The recorder of a running session: one thread owns the file, all others hand messages over and go on.
+
+Pictures and robot states are dropped, and counted, when the disk cannot keep up; views, events and
+attachments never are. Data reach the operating system after every picture and at least every 0.1 s, the disk at every
+`sync` and at least every 0.5 s.
+"""
+
+from __future__ import annotations
+
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass
+from pathlib import Path
+
+from recordings.errors import RecordingError
+from recordings.messages import CameraModel, CaptureEvent, Picture, RobotState, SessionInfo, View
+from recordings.writer import RecordingWriter
+
+QUEUE_LIMIT_BYTES = 128 * 1024 * 1024
+QUEUE_LIMIT_MESSAGES = 20_000
+FLUSH_PERIOD_S = 0.1
+SYNC_PERIOD_S = 0.5
+_STATE_BYTES = 400
+_SMALL_BYTES = 1000
+
+
+@dataclass(frozen=True)
+class _Item:
+    write: Callable[[], object]
+    size_bytes: int
+    done: Future[None] | None = None
+    """Resolved after a sync that follows the write."""
+
+
+class Recorder:
+    """Thread-safe. The first write error is final: later calls raise it, futures fail with it.
+
+    `dropped`: pictures and states lost to a full queue. `last_sync_s`: how long the newest fdatasync took.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        info: SessionInfo,
+        *,
+        lossless_png: bool = False,
+        queue_limit_bytes: int = QUEUE_LIMIT_BYTES,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        """Creates the file and starts the thread. Raises RecordingError."""
+        self._writer = RecordingWriter(path, info, lossless_png=lossless_png)
+        self.part_path = self._writer.part_path
+        self.dropped = 0
+        self.last_sync_s = 0.0
+        self.error: RecordingError | None = None
+        self._queue_limit_bytes = queue_limit_bytes
+        self._clock = clock
+        self._queue: deque[_Item] = deque()
+        self._queued_bytes = 0
+        self._dropped_pictures: set[int] = set()
+        self._wake = threading.Condition()
+        self._finished: Future[Path] | None = None
+        self._closing = False
+        self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
+        self._thread.start()
+
+    @property
+    def bytes_written(self) -> int:
+        """Handed to the operating system so far."""
+        return self._writer.bytes_written
+
+    @property
+    def queued_bytes(self) -> int:
+        """Waiting for the disk; the session pauses when it grows."""
+        return self._queued_bytes
+
+    def robot_state(self, state: RobotState) -> bool:
+        """False when it was dropped."""
+        return self._offer(lambda: self._writer.robot_state(state), _STATE_BYTES)
+
+    def picture(self, picture: Picture) -> bool:
+        """False when it was dropped: take it again. The array must not be changed afterwards."""
+        kept = self._offer(lambda: self._writer.picture(picture), picture.image.nbytes)
+        if not kept:
+            self._dropped_pictures.add(picture.sequence)
+        return kept
+
+    def view(self, view: View) -> None:
+        """Raises RecordingError when its picture was dropped or an earlier write failed."""
+        if view.picture_sequence in self._dropped_pictures:
+            raise RecordingError(
+                f"the picture of pose {view.index} was dropped, the disk is too slow: take the pose again"
+            )
+        self._put(_Item(lambda: self._writer.view(view), _SMALL_BYTES))
+
+    def event(self, event: CaptureEvent) -> None:
+        self._put(_Item(lambda: self._writer.event(event), _SMALL_BYTES))
+
+    def camera_model(self, model: CameraModel) -> None:
+        self._put(_Item(lambda: self._writer.camera_model(model), _SMALL_BYTES))
+
+    def attach(self, name: str, media_type: str, content: bytes) -> None:
+        self._put(_Item(lambda: self._writer.attach(name, media_type, content), len(content)))
+
+    def sync(self) -> Future[None]:
+        """Resolves when everything handed over before is on the disk; fails with RecordingError."""
+        done: Future[None] = Future()
+        try:
+            self._put(_Item(lambda: None, 0, done))
+        except RecordingError as error:
+            done.set_exception(error)
+        return done
+
+    def finish(self) -> Future[Path]:
+        """Seals the file after all that was handed over before; the future is its path. Idempotent."""
+        with self._wake:
+            if self._finished is None:
+                self._finished = Future()
+                if self.error is not None:
+                    self._finished.set_exception(self.error)
+                self._wake.notify()
+            return self._finished
+
+    def close(self) -> None:
+        """Stops the thread without sealing, after what is queued; the `.part` file stays. Idempotent."""
+        with self._wake:
+            self._closing = True
+            self._wake.notify()
+        self._thread.join()
+
+    def _offer(self, write: Callable[[], object], size_bytes: int) -> bool:
+        with self._wake:
+            full = (
+                self._queued_bytes + size_bytes > self._queue_limit_bytes
+                or len(self._queue) >= QUEUE_LIMIT_MESSAGES
+            )
+            if full or self.error is not None or self._ended:
+                self.dropped += 1
+                return False
+            self._append(_Item(write, size_bytes))
+            if size_bytes > _STATE_BYTES:  # states wait for the next flush: no 500 wake-ups a second
+                self._wake.notify()
+            return True
+
+    def _put(self, item: _Item) -> None:
+        with self._wake:
+            if self.error is not None:
+                raise self.error
+            if self._ended:
+                raise RecordingError(f"the recording {self._writer.path} is finished")
+            self._append(item)
+            self._wake.notify()
+
+    def _append(self, item: _Item) -> None:
+        self._queue.append(item)
+        self._queued_bytes += item.size_bytes
+
+    @property
+    def _ended(self) -> bool:
+        return self._finished is not None or self._closing
+
+    def _run(self) -> None:
+        try:
+            self._work()
+        except RecordingError as error:
+            self._fail(error)
+        except Exception as error:
+            self._fail(RecordingError(f"the recorder failed on {self.part_path}: {error!r}"))
+        finally:
+            self._writer.close()
+
+    def _work(self) -> None:
+        flushed_s = synced_s = self._clock()
+        while (item := self._next()) is not None or not self._ended:
+            if item is not None:
+                self._write(item)
+            now_s = self._clock()
+            if now_s - synced_s >= SYNC_PERIOD_S:
+                self._sync()
+                flushed_s = synced_s = self._clock()
+            elif now_s - flushed_s >= FLUSH_PERIOD_S:
+                self._writer.flush()
+                flushed_s = now_s
+        if self._finished is not None:
+            self._finished.set_result(self._writer.finish())
+
+    def _next(self) -> _Item | None:
+        """The oldest item; None when there is none for a flush period, or when there will be no more."""
+        with self._wake:
+            if not self._queue and not self._ended:
+                self._wake.wait(FLUSH_PERIOD_S)
+            if not self._queue:
+                return None
+            item = self._queue.popleft()
+            self._queued_bytes -= item.size_bytes
+            return item
+
+    def _write(self, item: _Item) -> None:
+        try:
+            item.write()
+            if item.done is not None:
+                self._sync()
+        except BaseException as error:
+            if item.done is not None:
+                item.done.set_exception(error)
+            raise
+        if item.done is not None:
+            item.done.set_result(None)
+
+    def _sync(self) -> None:
+        start_s = self._clock()
+        self._writer.sync()
+        self.last_sync_s = self._clock() - start_s
+
+    def _fail(self, error: RecordingError) -> None:
+        with self._wake:
+            self.error = error
+            waiting = [item.done for item in self._queue if item.done is not None]
+            self._queue.clear()
+            self._queued_bytes = 0
+            if self._finished is not None and not self._finished.done():
+                self._finished.set_exception(error)
+        for future in waiting:
+            future.set_exception(error)

@@ -1,0 +1,139 @@
+"""What a board looks like: its points, how many there are, and in which turns it looks the same.
+
+Board frame: origin in the first point, x along a row, y down the columns, z into the board.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from calibrate.errors import CalibrationError
+from calibrate.geometry import Array, pose, rotation_exp
+from recordings.messages import BoardKind, BoardSpec
+
+APRIL_DICTIONARY = "DICT_APRILTAG_36h11"
+_LARGEST_SIDE = 200
+
+
+class BoardError(CalibrationError):
+    """The description of a board cannot be right."""
+
+    exit_code = 2
+
+
+def dictionary_id(name: str) -> int:
+    """OpenCV's number of a marker dictionary such as DICT_6X6_250; BoardError when there is none."""
+    value = getattr(cv2.aruco, name, None)
+    if not name.startswith("DICT_") or not isinstance(value, int):
+        raise BoardError(f"board: dictionary {name!r} is not one of OpenCV's; write for example DICT_6X6_250.")
+    return value
+
+
+def check_board(spec: BoardSpec) -> None:
+    """Raises BoardError where the numbers cannot belong to a real board."""
+    smallest = 1 if spec.kind is BoardKind.APRIL_GRID else 2
+    if not all(smallest <= side <= _LARGEST_SIDE for side in (spec.columns, spec.rows)):
+        raise BoardError(
+            f"board: {spec.columns} × {spec.rows} is impossible; columns and rows must be {smallest} … "
+            f"{_LARGEST_SIDE}. A chessboard counts inner corners, a charuco board counts squares."
+        )
+    if not 1e-4 <= spec.square_m <= 10.0:
+        raise BoardError(f"board: square_m = {spec.square_m} is not a size in metres (25 mm is 0.025).")
+    if spec.kind is BoardKind.CHARUCO:
+        dictionary_id(spec.dictionary or "")
+        if spec.marker_m is None or not 0 < spec.marker_m < spec.square_m:
+            raise BoardError("board: a charuco board needs marker_m, smaller than square_m.")
+    elif spec.kind is BoardKind.APRIL_GRID:
+        dictionary_id(spec.dictionary or APRIL_DICTIONARY)
+        if spec.marker_m is None or not 0 < spec.marker_m < spec.square_m:
+            raise BoardError("board: an april-grid needs marker_m, the gap between tags, smaller than square_m.")
+    elif spec.columns * spec.rows < 4:
+        raise BoardError("board: fewer than 4 points do not fix a pose.")
+
+
+def grid_shape(spec: BoardSpec) -> tuple[int, int]:
+    """Columns and rows of points (not for april-grid, whose points come four to a tag)."""
+    if spec.kind is BoardKind.CHARUCO:
+        return spec.columns - 1, spec.rows - 1
+    return spec.columns, spec.rows
+
+
+@lru_cache(maxsize=32)
+def board_points(spec: BoardSpec) -> Array:
+    """All points of the board in `board`, (n, 3) metres, z = 0; the row number is the point's identity.
+
+    Asymmetric circles: `square_m` is the distance of neighbouring rows, half that of circles in a row
+    (OpenCV's convention). april-grid: corners of tag 0, 1 … row by row from the bottom left as Kalibr counts,
+    each tag's four from its bottom left, counter-clockwise as printed.
+    """
+    if spec.kind is BoardKind.APRIL_GRID:
+        points = _april_points(spec)
+    else:
+        columns, rows = grid_shape(spec)
+        j, i = np.meshgrid(np.arange(columns, dtype=float), np.arange(rows, dtype=float))
+        if spec.kind is BoardKind.ASYMMETRIC_CIRCLES:
+            j = 2 * j + i % 2
+        points = np.stack([j.ravel(), i.ravel(), np.zeros(i.size)], axis=1) * spec.square_m
+    points.flags.writeable = False
+    return points
+
+
+def _april_points(spec: BoardSpec) -> Array:
+    pitch = spec.square_m + (spec.marker_m or 0.0)
+    row, column = np.divmod(np.arange(spec.columns * spec.rows), spec.columns)
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * spec.square_m
+    plane = np.stack([column, row], axis=1)[:, None, :] * pitch + corners
+    plane[..., 1] *= -1  # Kalibr counts upwards, y points down
+    return np.concatenate([plane.reshape(-1, 2), np.zeros((4 * len(row), 1))], axis=1)
+
+
+def looks_same_turns(spec: BoardSpec) -> tuple[int, ...]:
+    """Turns about the normal, in quarters, after which the board looks exactly as before; always with 0.
+
+    A chessboard's colours decide when columns + rows is odd. Square markers always decide; the three dots of
+    a radon board are not read.
+    """
+    columns, rows = spec.columns, spec.rows
+    if spec.kind in (BoardKind.CHARUCO, BoardKind.APRIL_GRID):
+        return (0,)
+    if spec.kind is BoardKind.CHESSBOARD:
+        if (columns + rows) % 2:
+            return (0,)
+        return (0, 1, 2, 3) if columns == rows and columns % 2 == 0 else (0, 2)
+    if spec.kind is BoardKind.CIRCLES:
+        return (0, 1, 2, 3) if columns == rows else (0, 2)
+    return (0,) if rows % 2 else (0, 2)
+
+
+def board_from_turned(spec: BoardSpec, quarters: int) -> Array:
+    """(4, 4): the board frame turned by `quarters` of 90° about the centre of its points."""
+    points = board_points(spec)
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    R = np.round(rotation_exp([0.0, 0.0, quarters * np.pi / 2]))
+    return pose(R, centre - R @ centre)
+
+
+def ambiguity_text(spec: BoardSpec) -> str:
+    """One sentence for people when the board can be mistaken for itself turned; empty otherwise."""
+    turns = looks_same_turns(spec)
+    if len(turns) == 1:
+        return ""
+    angle = "by 90°" if len(turns) == 4 else "by 180°"
+    return (
+        f"The {describe_board(spec)} looks the same when turned {angle}; its orientation is decided by the "
+        "agreement of all views with the robot's motion. A board whose columns + rows is odd avoids this."
+    )
+
+
+def describe_board(spec: BoardSpec) -> str:
+    """'chessboard 7×6, 25 mm'"""
+    text = f"{spec.kind.value} {spec.columns}×{spec.rows}, {spec.square_m * 1000:g} mm"
+    if spec.kind is BoardKind.CHARUCO:
+        layout = ", legacy layout" if spec.legacy else ""
+        text += f", markers {(spec.marker_m or 0) * 1000:g} mm {spec.dictionary}{layout}"
+    elif spec.kind is BoardKind.APRIL_GRID:
+        text += f", gap {(spec.marker_m or 0) * 1000:g} mm"
+    return text

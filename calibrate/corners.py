@@ -1,0 +1,101 @@
+"""Grids of corners in a picture: spacing, regularity, handedness, and sub-pixel refinement."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.geometry import Array
+
+Grey = NDArray[np.uint8]
+
+_WINDOW_SHARE = 0.35
+"""Half window of the refinement over the local spacing: as much edge as possible, no other corner."""
+_IRREGULAR_SHARE = 0.3
+_REFINEMENT_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-3)
+
+
+def to_grey(image: NDArray[Any]) -> Grey:
+    """(h, w) or (h, w, 3 BGR), uint8 or uint16 → (h, w) uint8; 10 and 12 bits are recognised by the maximum."""
+    if image.dtype == np.uint16:
+        bits = next(b for b in (8, 10, 12, 16) if int(image.max(initial=0)) < 1 << b)
+        image = (image >> (bits - 8)).astype(np.uint8)
+    if image.dtype != np.uint8:
+        raise ValueError(f"a picture of {image.dtype} is not supported; 8 or 16 bits are")
+    if image.ndim == 3:
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
+    return np.ascontiguousarray(image)
+
+
+def local_spacing(grid: Array) -> Array:
+    """(rows, columns, 2) pixels → (rows, columns): distance to the nearest neighbour in row or column."""
+    across = np.linalg.norm(np.diff(grid, axis=1), axis=-1)
+    down = np.linalg.norm(np.diff(grid, axis=0), axis=-1)
+    spacing = np.full(grid.shape[:2], np.inf)
+    for shifted, steps in ((spacing[:, :-1], across), (spacing[:, 1:], across)):
+        np.minimum(shifted, steps, out=shifted)
+    for shifted, steps in ((spacing[:-1], down), (spacing[1:], down)):
+        np.minimum(shifted, steps, out=shifted)
+    return spacing
+
+
+def is_regular(grid: Array) -> bool:
+    """Does the grid vary smoothly, as any lens shows a flat board? Finds single wrong corners.
+
+    Third differences along rows and columns vanish for smooth grids; in short rows second ones are used.
+    """
+    for axis in (0, 1):
+        count = grid.shape[axis]
+        steps = np.linalg.norm(np.diff(grid, axis=axis), axis=-1)
+        if count < 3:
+            continue
+        order, allowed = (3, _IRREGULAR_SHARE) if count > 3 else (2, 2 * _IRREGULAR_SHARE)
+        bend = np.linalg.norm(np.diff(grid, n=order, axis=axis), axis=-1)
+        size = np.minimum.reduce([np.take(steps, range(k, k + bend.shape[axis]), axis) for k in range(order)])
+        if (bend > allowed * size + 1.0).any():
+            return False
+    return True
+
+
+def right_handed(grid: Array) -> Array:
+    """The grid with its columns reversed where needed, so that x × y points away from the viewer."""
+    across = grid[:, -1] - grid[:, 0]
+    down = grid[-1] - grid[0]
+    x, y = across.mean(axis=0), down.mean(axis=0)
+    return grid if x[0] * y[1] - x[1] * y[0] > 0 else grid[:, ::-1]
+
+
+def refine(grey: Grey, corners: Array, spacing_px: Array, largest_half_window: int = 24) -> Array:
+    """Saddle points to sub-pixel accuracy; each corner with a window that fits its own spacing.
+
+    corners: (n, 2); spacing_px: (n,). A corner that runs away by more than 0.4 spacings keeps its place.
+    """
+    half = np.clip(np.floor(spacing_px * _WINDOW_SHARE), 2, largest_half_window).astype(int)
+    refined = corners.copy()
+    for size in np.unique(half):
+        chosen = half == size
+        points = np.ascontiguousarray(corners[chosen].reshape(-1, 1, 2), dtype=np.float32)
+        cv2.cornerSubPix(grey, points, (int(size), int(size)), (-1, -1), _REFINEMENT_STEPS)
+        refined[chosen] = points.reshape(-1, 2)
+    ran = np.linalg.norm(refined - corners, axis=1) > 0.4 * spacing_px
+    refined[ran] = corners[ran]
+    return refined
+
+
+def square_contrast(grey: Grey, grid: Array) -> float:
+    """Brightness of the squares at odd places minus that at even ones, over the spread; > 0: first is dark.
+
+    grid: (rows, columns, 2). Value in about -1 … 1; near 0 the colours decide nothing.
+    """
+    centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
+    samples = cv2.remap(
+        cv2.blur(grey, (3, 3)), centres.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    ).astype(float)
+    odd = np.indices(samples.shape).sum(axis=0) % 2 == 1
+    if odd.all() or not odd.any():
+        return 0.0 if samples.size == 0 else float(np.sign(grey.mean() - samples.mean()))
+    spread = samples.std() + 1e-9
+    return float((samples[odd].mean() - samples[~odd].mean()) / (2 * spread))

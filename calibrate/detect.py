@@ -1,0 +1,120 @@
+"""One picture in, the board's points out; says why when there are none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.board import board_points, check_board, describe_board
+from calibrate.chessboard import find_chessboard, seen_size
+from calibrate.circles import find_circles
+from calibrate.corners import Grey, to_grey
+from calibrate.geometry import Array
+from calibrate.markers import find_april_grid, find_charuco
+from recordings.messages import BoardKind, BoardSpec
+
+FEWEST_POINTS = 6
+"""Fewer corners of a partial board do not give a trustworthy pose."""
+_SATURATED_GREY = 252
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """What one picture shows of the board."""
+
+    found: bool
+    reason: str
+    """Empty when found; otherwise a sentence for people."""
+    indices: NDArray[np.intp]
+    """(k,) rows of `board_points`"""
+    pixels: Array
+    """(k, 2)"""
+    expected: int
+    """Points of the whole board."""
+    width: int
+    height: int
+    sharpness: float
+    """Mean squared Laplacian over the variance of the grey values, on the board (whole picture if none)."""
+    saturated: float
+    """Share of pixels at the upper end of the scale there, 0 … 1."""
+    coverage: float
+    """Share of the picture inside the outline of the points, 0 … 1."""
+
+    @property
+    def corners(self) -> int:
+        return len(self.indices)
+
+
+def detect(image: NDArray[Any], spec: BoardSpec, thorough: bool = True) -> Detection:
+    """Finds the board to sub-pixel accuracy.
+
+    image: (h, w) uint8 or uint16, or (h, w, 3) BGR. `thorough=False` leaves out the slow attempts and the
+    search for the reason (previews). Raises BoardError for an impossible board; a picture without a board is
+    an answer, not an error.
+    """
+    check_board(spec)
+    grey = to_grey(image)
+    expected = len(board_points(spec))
+    indices, pixels = _find(grey, spec, thorough)
+    height, width = grey.shape
+    fewest = min(FEWEST_POINTS, expected)
+    found = len(indices) >= fewest
+    reason = "" if found else _reason(grey, spec, len(indices), fewest, thorough)
+    if not found:
+        indices, pixels = indices[:0], pixels[:0]
+    sharpness, saturated = _picture_quality(grey, pixels)
+    area = cv2.contourArea(cv2.convexHull(pixels.astype(np.float32))) if found else 0.0
+    return Detection(
+        found, reason, indices, pixels, expected, width, height, sharpness, saturated, area / (width * height)
+    )
+
+
+def _find(grey: Grey, spec: BoardSpec, thorough: bool) -> tuple[NDArray[np.intp], Array]:
+    if spec.kind is BoardKind.CHARUCO:
+        return find_charuco(grey, spec)
+    if spec.kind is BoardKind.APRIL_GRID:
+        return find_april_grid(grey, spec)
+    if spec.kind is BoardKind.CHESSBOARD:
+        pixels = find_chessboard(grey, spec, thorough)
+    else:
+        pixels = find_circles(grey, spec)
+    if pixels is None:
+        return np.zeros(0, dtype=np.intp), np.zeros((0, 2))
+    return np.arange(len(pixels)), pixels
+
+
+def _reason(grey: Grey, spec: BoardSpec, count: int, fewest: int, thorough: bool) -> str:
+    if count:
+        return f"only {count} corners of the board are seen, {fewest} are needed"
+    level = float(grey.mean())
+    if float(grey.std()) < 3.0:
+        return f"the picture is empty (grey {level:.0f}, no contrast)"
+    if float((grey >= _SATURATED_GREY).mean()) > 0.5:
+        return "the picture is over-exposed: more than half of it is saturated"
+    if level < 12.0:
+        return f"the picture is too dark (mean grey {level:.0f})"
+    if thorough and spec.kind is BoardKind.CHESSBOARD:
+        seen = seen_size(grey)
+        expected = (spec.columns, spec.rows)
+        if seen is not None and sorted(seen) != sorted(expected):
+            return (
+                f"board {spec.columns}×{spec.rows} expected, {seen[0]}×{seen[1]} seen "
+                "(inner corners; partly hidden, or another board)"
+            )
+    return f"no {describe_board(spec)} found"
+
+
+def _picture_quality(grey: Grey, pixels: Array) -> tuple[float, float]:
+    if len(pixels):
+        x0, y0 = np.maximum(np.floor(pixels.min(axis=0)).astype(int), 0)
+        x1, y1 = np.ceil(pixels.max(axis=0)).astype(int) + 1
+        region = grey[y0:y1, x0:x1]
+    else:
+        region = grey
+    laplacian = cv2.Laplacian(region, cv2.CV_32F)
+    variance = float(region.std()) ** 2 + 1e-6
+    return float(np.square(laplacian).mean()) / variance, float((region >= _SATURATED_GREY).mean())

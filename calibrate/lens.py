@@ -1,0 +1,55 @@
+"""Projection and its inverse for the three lens models, all by OpenCV."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+
+from calibrate.errors import BadViewsError
+from calibrate.geometry import Array, rotation_log
+from recordings.messages import CameraModel
+
+_UNDISTORT_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-10)
+
+
+def camera_matrix(camera: CameraModel) -> Array:
+    """(3, 3); BadViewsError where it is missing or not a camera matrix."""
+    if camera.matrix is None:
+        raise BadViewsError("the camera's intrinsics are not known yet: calibrate them first")
+    K = np.array(camera.matrix, dtype=float)
+    if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
+        raise BadViewsError(
+            f"the camera matrix {camera.matrix} is not one: 3 × 3, finite, positive focal lengths are needed"
+        )
+    return K
+
+
+def distortion(camera: CameraModel) -> Array:
+    """(4,) for equidistant, otherwise (5,) or (8,), zeros appended; OpenCV's order."""
+    values = np.array(camera.distortion, dtype=float)
+    size = 4 if camera.distortion_model == "equidistant" else (8 if len(values) > 5 else 5)
+    if len(values) > size or not np.isfinite(values).all():
+        raise BadViewsError(f"distortion {camera.distortion} does not fit {camera.distortion_model}")
+    return np.concatenate([values, np.zeros(size - len(values))])
+
+
+def project(camera: CameraModel, camera_from_board: Array, points: Array) -> Array:
+    """Points (n, 3) of `board` → pixels (n, 2)."""
+    K, D = camera_matrix(camera), distortion(camera)
+    rvec, tvec = rotation_log(camera_from_board[:3, :3]), camera_from_board[:3, 3]
+    points = np.ascontiguousarray(points, dtype=float).reshape(-1, 1, 3)
+    if camera.distortion_model == "equidistant":
+        pixels, _ = cv2.fisheye.projectPoints(points, rvec, tvec, K, D)
+    else:
+        pixels, _ = cv2.projectPoints(points, rvec, tvec, K, D)
+    return np.asarray(pixels, dtype=float).reshape(-1, 2)
+
+
+def undistort(camera: CameraModel, pixels: Array) -> Array:
+    """Pixels (n, 2) → the pixels (n, 2) that a lens without distortion and the same matrix would show."""
+    K, D = camera_matrix(camera), distortion(camera)
+    points = np.ascontiguousarray(pixels, dtype=float).reshape(-1, 1, 2)
+    if camera.distortion_model == "equidistant":
+        return np.asarray(cv2.fisheye.undistortPoints(points, K, D, P=K)).reshape(-1, 2)
+    plain = cv2.undistortPointsIter(points, K, D, np.eye(3), K, _UNDISTORT_STEPS)
+    return np.asarray(plain).reshape(-1, 2)

@@ -1,0 +1,131 @@
+"""Boards that carry square markers: ChArUco and AprilGrid. Partial views are welcome."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.board import APRIL_DICTIONARY, board_points, dictionary_id
+from calibrate.corners import Grey, local_spacing, refine
+from calibrate.geometry import Array
+from recordings.messages import BoardSpec
+
+Indices = NDArray[np.intp]
+_NOTHING = (np.zeros(0, dtype=np.intp), np.zeros((0, 2)))
+
+
+@lru_cache(maxsize=8)
+def charuco_board(spec: BoardSpec) -> Any:
+    """OpenCV's description of the board; also what draws it."""
+    dictionary = cv2.aruco.getPredefinedDictionary(dictionary_id(spec.dictionary or ""))
+    board = cv2.aruco.CharucoBoard((spec.columns, spec.rows), spec.square_m, spec.marker_m, dictionary)
+    board.setLegacyPattern(spec.legacy)
+    return board
+
+
+def find_charuco(grey: Grey, spec: BoardSpec) -> tuple[Indices, Array]:
+    """Point indices (k,) and pixels (k, 2) of the chessboard corners that were found."""
+    board = charuco_board(spec)
+    markers, marker_ids, _ = _marker_detector(spec.dictionary or "", 1).detectMarkers(grey)
+    if marker_ids is None or len(marker_ids) < 2:
+        return _NOTHING
+    # OpenCV's sub-pixel step needs both markers of a corner; ours runs on every corner that the plane predicts.
+    plane_of = dict(zip(board.getIds().ravel().tolist(), board.getObjPoints(), strict=True))
+    seen = [(plane_of[i], m) for i, m in zip(marker_ids.ravel().tolist(), markers, strict=True) if i in plane_of]
+    if len(seen) < 2:
+        return _NOTHING
+    plane = np.concatenate([corners[:, :2] for corners, _ in seen]).astype(float)
+    pixels = np.concatenate([marker.reshape(4, 2) for _, marker in seen]).astype(float)
+    points = board_points(spec)[:, :2] + spec.square_m  # OpenCV counts from the outer edge
+    return _snap_to_corners(grey, spec, plane, pixels, points)
+
+
+def _snap_to_corners(
+    grey: Grey, spec: BoardSpec, plane: Array, pixels: Array, points: Array
+) -> tuple[Indices, Array]:
+    """Predicts the chessboard corners from marker corners near them, refines, keeps what is a true saddle."""
+    nearest = np.linalg.norm(plane[None] - points[:, None], axis=-1)
+    H, _ = cv2.findHomography(plane.astype(np.float64), pixels.astype(np.float64), cv2.RANSAC, 6.0)
+    if H is None:
+        return _NOTHING
+    predicted = _apply(H, points)
+    shown = _apply(H, plane)
+    # The lens bends the plane: shift each prediction by what its nearest markers missed.
+    weight = np.exp(-0.5 * (nearest / spec.square_m) ** 2)
+    known = weight.sum(axis=1) > 0.3
+    miss = (weight @ (pixels - shown)) / np.maximum(weight.sum(axis=1, keepdims=True), 1e-9)
+    predicted += miss
+    spacing = local_spacing(predicted.reshape(spec.rows - 1, spec.columns - 1, 2)).ravel()
+    height, width = grey.shape
+    margin = np.maximum(spacing * 0.4, 4.0)
+    inside = (
+        (predicted[:, 0] > margin)
+        & (predicted[:, 0] < width - 1 - margin)
+        & (predicted[:, 1] > margin)
+        & (predicted[:, 1] < height - 1 - margin)
+    )
+    chosen = np.flatnonzero(known & inside & (spacing > 5.0))
+    if len(chosen) == 0:
+        return _NOTHING
+    corners = refine(grey, predicted[chosen], 0.8 * spacing[chosen])
+    good = is_saddle(grey, corners, spacing[chosen])
+    return chosen[good], corners[good]
+
+
+def is_saddle(grey: Grey, corners: Array, spacing_px: Array) -> NDArray[np.bool_]:
+    """A chessboard corner: on a small circle round it bright and dark alternate twice, opposite sides alike."""
+    angles = np.arange(16) * (2 * np.pi / 16)
+    radius = np.clip(0.25 * spacing_px, 2.0, 12.0)[:, None]
+    x = (corners[:, :1] + radius * np.cos(angles)).astype(np.float32)
+    y = (corners[:, 1:] + radius * np.sin(angles)).astype(np.float32)
+    ring = cv2.remap(cv2.blur(grey, (3, 3)), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float)
+    ring -= ring.mean(axis=1, keepdims=True)
+    spectrum = np.abs(np.fft.rfft(ring, axis=1)) ** 2
+    share = spectrum[:, 2] / np.maximum(spectrum[:, 1:].sum(axis=1), 1e-9)
+    return np.asarray((share > 0.6) & (ring.std(axis=1) > 4.0))
+
+
+def _apply(H: Array, points: Array) -> Array:
+    moved = np.concatenate([points, np.ones((len(points), 1))], axis=1) @ H.T
+    return np.asarray(moved[:, :2] / moved[:, 2:])
+
+
+@lru_cache(maxsize=8)
+def _marker_detector(dictionary: str, border_bits: int) -> Any:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.markerBorderBits = border_bits
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    return cv2.aruco.ArucoDetector(
+        cv2.aruco.getPredefinedDictionary(dictionary_id(dictionary)), parameters
+    )
+
+
+def find_april_grid(grey: Grey, spec: BoardSpec) -> tuple[Indices, Array]:
+    """Four corners of every tag that is seen. Printed borders of one and of two bits (Kalibr) are tried."""
+    best = _NOTHING
+    for border_bits in (2, 1):
+        found = _tags(grey, spec, border_bits)
+        if len(found[0]) > len(best[0]):
+            best = found
+    return best
+
+
+def _tags(grey: Grey, spec: BoardSpec, border_bits: int) -> tuple[Indices, Array]:
+    detector = _marker_detector(spec.dictionary or APRIL_DICTIONARY, border_bits)
+    markers, ids, _ = detector.detectMarkers(grey)
+    if ids is None:
+        return _NOTHING
+    tags = [(int(i), m) for i, m in zip(ids.ravel(), markers, strict=True) if i < spec.columns * spec.rows]
+    if not tags:
+        return _NOTHING
+    # OpenCV goes clockwise from the top left, Kalibr counter-clockwise from the bottom left.
+    corners = np.concatenate([m.reshape(4, 2)[[3, 2, 1, 0]] for _, m in tags]).astype(float)
+    sides = np.repeat([np.linalg.norm(np.diff(m.reshape(4, 2), axis=0), axis=1).min() for _, m in tags], 4)
+    gap_share = (spec.marker_m or spec.square_m) / spec.square_m
+    refined = refine(grey, corners, sides * min(1.0, gap_share))
+    indices = np.concatenate([np.arange(4 * i, 4 * i + 4) for i, _ in tags])
+    return indices.astype(np.intp), refined

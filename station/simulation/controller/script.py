@@ -36,7 +36,8 @@ END_PROGRAM = 255
 
 COMMANDS = {
     1: "moveJ", 2: "moveJ_IK", 3: "moveL", 4: "moveL_FK", 6: "forceMode", 7: "forceModeStop",
-    8: "zeroFtSensor", 9: "speedJ", 10: "speedL", 11: "servoJ", 12: "servoC", 15: "speedStop", 16: "servoStop",
+    8: "zeroFtSensor", 9: "speedJ", 10: "speedL", 11: "servoJ", 12: "servoC", 15: "speedStop",
+    16: "servoStop",
     17: "setPayload",
     18: "teachMode", 19: "endTeachMode", 20: "forceModeSetDamping", 21: "forceModeSetGainScaling",
     24: "servoL", 25: "toolContact", 26: "getStepTime", 27: "getActualJointPositionsHistory",

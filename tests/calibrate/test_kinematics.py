@@ -1,0 +1,199 @@
+"""Kinematics of UR arms: against published poses and an independent formulation, and as properties."""
+
+from __future__ import annotations
+
+from math import pi
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.linalg import expm
+
+from calibrate.geometry import Array, rotation_angle, rotation_log, skew
+from calibrate.kinematics import (
+    MODELS,
+    DhDeltas,
+    RobotModel,
+    forward,
+    inverse_all,
+    inverse_nearest,
+    jacobian,
+    link_frames,
+    singularity_measure,
+)
+
+UR10 = MODELS["UR10"]
+NAMES = sorted(MODELS)
+HALF_TURN = np.diag([-1.0, -1.0, 1.0, 1.0])
+"""Textbooks and ROS turn the base by 180° about z against the controller's base frame."""
+
+joints = st.lists(st.floats(-3.1, 3.1), min_size=6, max_size=6).map(np.array)
+
+
+def product_of_exponentials(model: RobotModel, q: Array) -> Array:
+    """Lynch & Park, "Modern Robotics", example 4.5: the arm stretched out along x at zero, in the textbook's
+    base. Knows nothing of Denavit-Hartenberg."""
+    L1, L2 = -model.a_m[1], -model.a_m[2]
+    H1, H2 = model.d_m[0], model.d_m[4]
+    W1, W2 = model.d_m[3], model.d_m[5]
+    home = np.array([[-1, 0, 0, L1 + L2], [0, 0, 1, W1 + W2], [0, 1, 0, H1 - H2], [0, 0, 0, 1.0]])
+    axes = np.array([[0, 0, 1], [0, 1, 0], [0, 1, 0], [0, 1, 0], [0, 0, -1], [0, 1, 0]], dtype=float)
+    points = np.array(
+        [[0, 0, 0], [0, 0, H1], [L1, 0, H1], [L1 + L2, 0, H1], [L1 + L2, W1, 0], [L1 + L2, 0, H1 - H2]]
+    )
+    T = np.eye(4)
+    for axis, point, angle in zip(axes, points, q, strict=True):
+        twist = np.zeros((4, 4))
+        twist[:3, :3], twist[:3, 3] = skew(axis), -np.cross(axis, point)
+        T = T @ expm(twist * angle)
+    return T @ home
+
+
+@pytest.mark.parametrize(
+    ("name", "q", "translation_m"),
+    [
+        # The zero and the upright pose of UR5 and UR10, as their ROS descriptions publish them.
+        ("UR5", [0, 0, 0, 0, 0, 0], [0.81725, 0.19145, -0.005491]),
+        ("UR5", [0, -pi / 2, 0, -pi / 2, 0, 0], [0.0, 0.19145, 1.001059]),
+        ("UR10", [0, 0, 0, 0, 0, 0], [1.1843, 0.256141, 0.0116]),
+        ("UR10", [0, -pi / 2, 0, -pi / 2, 0, 0], [0.0, 0.256141, 1.4273]),
+    ],
+)
+def test_published_poses(name: str, q: list[float], translation_m: list[float]) -> None:
+    assert (HALF_TURN @ forward(MODELS[name], q))[:3, 3] == pytest.approx(translation_m, abs=1e-9)
+
+
+def test_the_textbook_example_of_a_ur5() -> None:
+    """Modern Robotics, after example 4.5: θ2 = −π/2, θ5 = π/2; printed with three decimals."""
+    T = HALF_TURN @ forward(MODELS["UR5"], [0, -pi / 2, 0, 0, pi / 2, 0])
+    printed = [[0, -1, 0, 0.095], [1, 0, 0, 0.109], [0, 0, 1, 0.988], [0, 0, 0, 1]]
+    # The book rounds link lengths to millimetres: 0.988 = 0.425 + 0.392 + 0.089 + 0.082.
+    assert pytest.approx(np.array(printed), abs=1.5e-3) == T
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_forward_agrees_with_the_product_of_exponentials(name: str) -> None:
+    for q in np.random.default_rng(1).uniform(-pi, pi, (20, 6)):
+        expected = product_of_exponentials(MODELS[name], q)
+        assert np.allclose(HALF_TURN @ forward(MODELS[name], q), expected, atol=1e-12)
+
+
+def test_forward_takes_any_leading_shape() -> None:
+    q = np.random.default_rng(2).uniform(-pi, pi, (2, 3, 6))
+    batch = forward(UR10, q)
+    assert batch.shape == (2, 3, 4, 4)
+    assert np.allclose(batch[1, 2], forward(UR10, q[1, 2]))
+    assert link_frames(UR10, q).shape == (2, 3, 7, 4, 4)
+
+
+@settings(max_examples=60, deadline=None)
+@given(q=joints, name=st.sampled_from(NAMES))
+def test_every_inverse_solution_reaches_the_pose_and_the_joints_are_among_them(q: Array, name: str) -> None:
+    model = MODELS[name]
+    T = forward(model, q)
+    solutions = inverse_all(model, T)
+    assert len(solutions) >= 1
+    reached = forward(model, solutions)
+    assert np.abs(reached - T).max() < 1e-6
+    if singularity_measure(model, q) > 1e-3:
+        apart = np.abs((solutions - q + pi) % (2 * pi) - pi).max(axis=1)
+        assert apart.min() < 1e-5
+        assert np.all(np.abs(solutions) <= pi)
+
+
+def test_a_pose_well_inside_the_reach_has_eight_different_inverses() -> None:
+    solutions = inverse_all(UR10, forward(UR10, [0.3, -1.2, 1.6, -1.0, -1.3, 0.4]))
+    assert solutions.shape == (8, 6)
+    apart = np.abs((solutions[:, None] - solutions[None] + pi) % (2 * pi) - pi).max(axis=2)
+    assert apart[~np.eye(8, dtype=bool)].min() > 0.05
+
+
+@pytest.mark.parametrize("offset_m", [[2.0, 0, 0], [0, 0, -1.6]])
+def test_a_pose_out_of_reach_has_no_inverse(offset_m: list[float]) -> None:
+    T = forward(UR10, [0.3, -1.2, 1.6, -1.0, -1.3, 0.4])
+    T[:3, 3] += offset_m
+    assert inverse_all(UR10, T).shape == (0, 6)
+    assert inverse_nearest(UR10, T, np.zeros(6)) is None
+
+
+def test_a_wrist_on_the_shoulder_axis_has_no_inverse() -> None:
+    T = np.eye(4)
+    T[:3, 3] = [0.05, 0.0, 0.6]
+    T[:3, :3] = np.diag([1.0, -1.0, -1.0])
+    assert inverse_all(UR10, T).shape == (0, 6)
+
+
+def test_at_a_wrist_singularity_the_pose_is_still_reached() -> None:
+    T = forward(UR10, [0.3, -1.2, 1.6, -1.0, 0.0, 0.4])
+    solutions = inverse_all(UR10, T)
+    assert len(solutions) >= 2
+    assert np.abs(forward(UR10, solutions) - T).max() < 1e-5
+
+
+@settings(max_examples=60, deadline=None)
+@given(q=st.lists(st.floats(-6.2, 6.2), min_size=6, max_size=6).map(np.array))
+def test_nearest_inverse_keeps_the_branch_and_the_turn(q: Array) -> None:
+    if singularity_measure(UR10, q) < 0.02:
+        return
+    near = np.clip(q + 0.001, -2 * pi, 2 * pi)
+    found = inverse_nearest(UR10, forward(UR10, q), near)
+    assert found is not None
+    assert np.abs(found - q).max() < 1e-6
+    assert np.abs(found).max() <= 2 * pi
+
+
+@settings(max_examples=30, deadline=None)
+@given(q=joints, name=st.sampled_from(NAMES))
+def test_jacobian_is_the_derivative_of_forward(q: Array, name: str) -> None:
+    model, step = MODELS[name], 1e-6
+    numeric = np.zeros((6, 6))
+    for i in range(6):
+        d = np.zeros(6)
+        d[i] = step
+        plus, minus = forward(model, q + d), forward(model, q - d)
+        numeric[:3, i] = (plus[:3, 3] - minus[:3, 3]) / (2 * step)
+        numeric[3:, i] = rotation_log(plus[:3, :3] @ minus[:3, :3].T) / (2 * step)
+    assert np.allclose(jacobian(model, q), numeric, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "q",
+    [
+        [0.3, -1.2, 1.6, -1.0, 0.0, 0.4],  # wrist: joints 4 and 6 parallel
+        [0.3, -1.2, 0.0, -1.0, -1.3, 0.4],  # elbow stretched
+        [0.3, *np.array([-1.2, 1.6, -1.0]), pi, 0.4],  # wrist again, folded back
+    ],
+)
+def test_singular_poses_measure_zero(q: list[float]) -> None:
+    assert singularity_measure(UR10, q) < 1e-9
+    assert singularity_measure(UR10, [0.3, -1.2, 1.6, -1.0, -1.3, 0.4]) > 0.05
+
+
+def test_a_wrist_over_the_shoulder_measures_zero() -> None:
+    """q2 and q3 chosen so that the wrist's centre lies on the base axis (but for d4)."""
+    a2, a3 = UR10.a_m[1], UR10.a_m[2]
+    q3 = 1.9
+    elbow = np.array([a2 + a3 * np.cos(q3), a3 * np.sin(q3)])
+    d5_x = UR10.d_m[4]  # q2 + q3 + q4 = π/2: frame 5 reaches sideways by d5
+    q2 = np.arccos(-d5_x / np.linalg.norm(elbow)) - np.arctan2(elbow[1], elbow[0])
+    q = [0.0, q2, q3, pi / 2 - q2 - q3, -1.2, 0.0]
+    wrist = link_frames(UR10, q)[5, :3, 3]
+    assert wrist[0] == pytest.approx(0.0, abs=1e-9)
+    assert singularity_measure(UR10, q) < 1e-9
+
+
+def test_deltas_move_the_flange_by_what_they_say() -> None:
+    longer = UR10.calibrated(DhDeltas(d_m=(0.01, 0, 0, 0, 0, 0)))
+    q = [0.3, -1.2, 1.6, -1.0, -1.3, 0.4]
+    shift = forward(longer, q)[:3, 3] - forward(UR10, q)[:3, 3]
+    assert shift == pytest.approx([0, 0, 0.01], abs=1e-12)
+    turned = UR10.calibrated(DhDeltas(theta_rad=(0, 0, 0, 0, 0, 0.02)))
+    angle = rotation_angle(forward(turned, q)[:3, :3] @ forward(UR10, q)[:3, :3].T)
+    assert angle == pytest.approx(0.02)
+
+
+def test_generations_and_limits() -> None:
+    assert UR10.generation == "CB3"
+    assert MODELS["UR10e"].generation == "e-Series"
+    assert UR10.joint_limit_rad == pytest.approx(2 * pi)

@@ -18,12 +18,15 @@ from textual.reactive import reactive
 
 from station.errors import RefusedError, StationError
 from station.status import GoSummary, StationState, StationStatus
+from station.tui.checklist import ChecklistScreen
 from station.tui.confirm import Confirm, ConfirmGo
+from station.tui.jobs import JobScreen
 from station.tui.link import Connect, Link
 from station.tui.live import LiveScreen
 from station.tui.log import LogScreen
 from station.tui.plan import PlanScreen
 from station.tui.screen import StationScreen
+from station.tui.sessions import SessionsScreen
 from station.tui.widgets.preview import Preview
 
 PREVIEW_PERIOD_S = 0.25
@@ -41,7 +44,13 @@ class StationApp(App[None]):
 
     TITLE = "Calibration station"
     CSS_PATH = "station.tcss"
-    MODES: ClassVar[dict[str, Any]] = {"live": LiveScreen, "plan": PlanScreen, "log": LogScreen}
+    MODES: ClassVar[dict[str, Any]] = {
+        "live": LiveScreen,
+        "plan": PlanScreen,
+        "sessions": SessionsScreen,
+        "log": LogScreen,
+        "checklist": ChecklistScreen,
+    }
     DEFAULT_MODE = "live"
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("f12", "stop", "STOP", priority=True, id="stop", tooltip="Stop the arm now; from any screen"),
@@ -51,7 +60,9 @@ class StationApp(App[None]):
         Binding("f8", "acknowledge", "Ack", id="acknowledge", tooltip="I looked: leave STOPPED or FAULT"),
         Binding("1", "switch_mode('live')", "Live", id="live", tooltip="The running capture"),
         Binding("2", "switch_mode('plan')", "Plan", id="plan", tooltip="All poses, their state and reasons"),
+        Binding("4", "switch_mode('sessions')", "Sessions", id="sessions", tooltip="Past recordings"),
         Binding("5", "switch_mode('log')", "Log", id="log", tooltip="Everything that was said"),
+        Binding("6", "switch_mode('checklist')", "Check", id="checklist", tooltip="Is everything there?"),
         Binding("ctrl+q", "leave", "Quit", id="quit", tooltip="Close this screen; the daemon goes on"),
     ]
     status: reactive[StationStatus | None] = reactive(None)
@@ -154,6 +165,22 @@ class StationApp(App[None]):
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_acknowledge(self) -> None:
         await self.ask("acknowledge")
+
+    # --- work in processes of its own ---
+
+    @work(exclusive=True, group="job", exit_on_error=False)
+    async def solve(self, recording: str) -> None:
+        if (
+            await self.push_screen_wait(
+                JobScreen(f"Solving {recording}", "calibrate.cli", "solve", recording)
+            )
+            >= 0
+        ):
+            await self.switch_mode("sessions")
+
+    @work(exclusive=True, group="job", exit_on_error=False)
+    async def recover(self, folder: str) -> None:
+        await self.push_screen_wait(JobScreen(f"Recovering {folder}", "recordings.cli", "recover", folder))
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_leave(self) -> None:

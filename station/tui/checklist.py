@@ -1,0 +1,55 @@
+"""Checklist: what a capture needs, what is there, and the remedy for what is not. First thing at first start."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar, cast
+
+from rich.table import Table
+from rich.text import Text
+from textual import work
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import VerticalScroll
+from textual.widgets import Static
+
+from station.tui.screen import StationScreen
+
+if TYPE_CHECKING:
+    from station.tui.app import StationApp
+
+WORDS = {"ok": "ok", "warning": "WARN", "failed": "MISSING", "skipped": "-"}
+
+
+def checklist_table(checks: list[dict[str, Any]]) -> Table:
+    """One row a check; the remedy stands below what is missing."""
+    table = Table(box=None, expand=True, padding=(0, 1))
+    for title, width in (("", 8), ("what", 18), ("found", None)):
+        table.add_column(title, width=width)
+    for check in checks:
+        state = str(check.get("state", ""))
+        text = Text(str(check.get("text", "")))
+        if check.get("remedy") and state != "ok":
+            text.append(f"\n→ {check['remedy']}", style="bold")
+        table.add_row(WORDS.get(state, state), str(check.get("name", "")), text)
+    return table
+
+
+class ChecklistScreen(StationScreen):
+    HELP = "The same list as `station doctor`. It only looks: nothing moves and nothing is changed."
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("r", "refresh_checks", "Check again", tooltip="Look at every item again")
+    ]
+
+    def body(self) -> ComposeResult:
+        with VerticalScroll(id="checklist-scroll"):
+            yield Static("checking …", id="checklist")
+
+    def on_screen_resume(self) -> None:
+        super().on_screen_resume()
+        self.action_refresh_checks()
+
+    @work(exclusive=True, exit_on_error=False)
+    async def action_refresh_checks(self) -> None:
+        answer = await cast("StationApp", self.app).ask("doctor")
+        if answer is not None:
+            self.query_one("#checklist", Static).update(checklist_table(answer))

@@ -1,0 +1,74 @@
+"""Long work started from the screen: a process of its own, its progress shown, cancelled at will."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from typing import ClassVar
+
+from textual import work
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import Vertical
+from textual.screen import ModalScreen
+from textual.widgets import Button, Label, RichLog
+
+TERMINATE_S = 5.0
+
+
+class JobScreen(ModalScreen[int]):
+    """Runs `python -m MODULE ARGS…` and returns its exit code; Escape or Cancel ends it (-1)."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("escape", "cancel", "Cancel", tooltip="End this work; nothing half-written stays")
+    ]
+
+    def __init__(self, title: str, module: str, *args: str) -> None:
+        super().__init__()
+        self._title, self._command = title, (sys.executable, "-m", module, *args)
+        self._process: asyncio.subprocess.Process | None = None
+        self._exit_code: int | None = None
+        self._cancelled = False
+
+    def compose(self) -> ComposeResult:
+        with Vertical(id="job"):
+            yield Label(self._title, id="job-title")
+            yield RichLog(id="job-lines", wrap=True, max_lines=500)
+            yield Button("Cancel", id="job-cancel")
+
+    def on_mount(self) -> None:
+        self.run_job()
+
+    @work(exclusive=True, exit_on_error=False)
+    async def run_job(self) -> None:
+        self._process = await asyncio.create_subprocess_exec(
+            *self._command,
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.STDOUT,
+        )
+        assert self._process.stdout is not None
+        lines = self.query_one("#job-lines", RichLog)
+        async for line in self._process.stdout:
+            lines.write(line.decode(errors="replace").rstrip())
+        self._exit_code = await self._process.wait()
+        if self._cancelled:
+            self.dismiss(-1)
+        elif self._exit_code in (0, 4):
+            self.dismiss(self._exit_code)
+        else:  # The person reads why before it goes away.
+            self.query_one("#job-cancel", Button).label = "Close"
+
+    async def action_cancel(self) -> None:
+        if self._process is None or self._exit_code is not None:
+            self.dismiss(-1 if self._exit_code is None else self._exit_code)
+            return
+        self._cancelled = True
+        self._process.terminate()
+        try:
+            await asyncio.wait_for(self._process.wait(), TERMINATE_S)
+        except TimeoutError:
+            self._process.kill()
+
+    async def on_button_pressed(self) -> None:
+        await self.action_cancel()

@@ -1,0 +1,94 @@
+"""Sessions: what was recorded; solve, recover, or watch any of them again."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, ClassVar, cast
+
+from textual import work
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.widgets import DataTable
+
+from station.tui.screen import StationScreen
+from station.tui.words import size
+
+if TYPE_CHECKING:
+    from station.tui.app import StationApp
+
+COLUMNS = ("session", "source", "views", "size", "state", "calibration")
+
+
+class SessionsScreen(StationScreen):
+    HELP = "Past recordings. Solving runs in its own process; the daemon and a running capture go on."
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("f9", "solve", "Solve", tooltip="Solve this recording again, outside the daemon"),
+        Binding("v", "result", "Result", tooltip="Show this session's calibration"),
+        Binding("w", "watch", "Watch", tooltip="Play this recording in the live screen"),
+        Binding("c", "recover", "Recover", tooltip="Rebuild an unfinished recording"),
+    ]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._sessions: list[dict[str, Any]] = []
+
+    def body(self) -> ComposeResult:
+        yield DataTable(id="sessions-table", cursor_type="row", zebra_stripes=True)
+
+    def on_mount(self) -> None:
+        self.table.add_columns(*COLUMNS)
+        self.table.focus()
+
+    def on_screen_resume(self) -> None:
+        super().on_screen_resume()
+        self.fetch()
+
+    @property
+    def table(self) -> DataTable[str]:
+        return cast("DataTable[str]", self.query_one("#sessions-table", DataTable))
+
+    @property
+    def station(self) -> StationApp:
+        return cast("StationApp", self.app)
+
+    @work(exclusive=True, group="fetch", exit_on_error=False)
+    async def fetch(self) -> None:
+        answer = await self.station.ask("sessions")
+        self._sessions = list(answer or [])
+        self.table.clear()
+        for session in self._sessions:
+            self.table.add_row(
+                str(session.get("name", "")),
+                str(session.get("source", "")),
+                str(session.get("views", "")),
+                size(float(session.get("bytes", 0))),
+                "sealed" if session.get("sealed") else "UNSEALED",
+                "yes" if session.get("calibration") else "-",
+            )
+
+    def _selected(self) -> dict[str, Any] | None:
+        if not self._sessions:
+            self.notify("No session is recorded yet: F5 on the live screen starts one.")
+            return None
+        return self._sessions[self.table.cursor_row]
+
+    def action_solve(self) -> None:
+        if (session := self._selected()) is not None:
+            if not session.get("sealed"):
+                self.notify("This recording was never finished: press c to recover it first.")
+                return
+            self.station.solve(str(session["recording"]))
+
+    def action_result(self) -> None:
+        if (session := self._selected()) is not None:
+            if not session.get("calibration"):
+                self.notify("Not solved yet: F9 solves it.")
+                return
+            self.station.show_result(str(session["calibration"]))
+
+    def action_watch(self) -> None:
+        if (session := self._selected()) is not None:
+            self.station.send("open_replay", path=str(session["folder"]))
+
+    def action_recover(self) -> None:
+        if (session := self._selected()) is not None:
+            self.station.recover(str(session["folder"]))

@@ -1,8 +1,8 @@
 """The recorder of a running session: one thread owns the file, all others hand messages over and go on.
 
 Pictures and robot states are dropped, and counted, when the disk cannot keep up; views, events and
-attachments never are. Data reach the operating system after every picture and at least every 0.1 s, the disk at every
-`sync` and at least every 0.5 s.
+attachments never are. Data reach the operating system after every picture and at least every 0.1 s, the
+disk at every `sync` and at least every 0.5 s.
 """
 
 from __future__ import annotations

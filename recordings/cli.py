@@ -1,0 +1,81 @@
+"""`recordings info | import | export | recover`: exit 0 good, 1 failed, 2 usage, 3 done with loss."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.progress import Progress
+
+from recordings.errors import RecordingError
+from recordings.importer import import_folder
+from recordings.info import recording_info
+from recordings.info_text import print_info
+from recordings.reader import open_recording
+
+main = typer.Typer(
+    name="recordings",
+    help="Look into, make, convert and rescue recordings.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+)
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
+
+
+@contextmanager
+def _errors_for_people() -> Iterator[None]:
+    try:
+        yield
+    except RecordingError as error:
+        print(f"error: {error}", file=sys.stderr)
+        raise typer.Exit(error.exit_code) from error
+
+
+@main.command()
+def info(recording: Path, json_: Json = False) -> None:
+    """What a recording holds: contents, rates, gaps, clock quality, size."""
+    with _errors_for_people():
+        facts = recording_info(open_recording(recording))
+    if json_:
+        print(json.dumps(facts))
+    else:
+        print_info(facts)
+
+
+@main.command("import")
+def import_(
+    folder: Path,
+    output: Annotated[Path, typer.Option("-o", "--output", help="The recording to write (.mcap).")],
+    json_: Json = False,
+) -> None:
+    """Your own pictures and poses (dataset.yaml, poses.csv, pictures) to a recording."""
+    with _errors_for_people(), _progress("importing", not json_) as progress:
+        done = import_folder(folder, output, progress)
+    if json_:
+        print(json.dumps({"recording": str(done.path), "views": done.pictures, "bytes": done.size_bytes}))
+    else:
+        print(f"{done.path}: {done.pictures} views, {done.size_bytes / 1e6:.1f} MB")
+        print(f"next: calibrate solve {done.path}")
+
+
+@contextmanager
+def _progress(text: str, shown: bool) -> Iterator[Callable[[int, int], None]]:
+    """A bar on stderr, where it is a terminal."""
+    console = Console(stderr=True)
+    if not shown or not console.is_terminal:
+        yield lambda done, total: None
+        return
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task(text)
+        yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+if __name__ == "__main__":
+    main()

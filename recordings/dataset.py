@@ -1,0 +1,131 @@
+"""`dataset.yaml`: how other people describe their board and camera to `recordings import`."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import yaml
+
+from recordings.errors import ImportFolderError
+from recordings.messages import BoardKind, BoardSpec, CameraModel, Mount, RobotIdentity
+from recordings.pictures import SIDE_LIMIT_PX
+
+DATASET_FILE = "dataset.yaml"
+POSES_FILE = "poses.csv"
+_YAML_LIMIT_BYTES = 256 * 1024
+_NEST_LIMIT = 20
+
+
+class Dataset(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What stands in dataset.yaml."""
+
+    mount: Mount
+    board: BoardSpec
+    camera: CameraModel
+    robot: str | RobotIdentity = ""
+    note: str = ""
+
+
+class _StrictLoader(yaml.SafeLoader):  # type: ignore[misc]  # yaml has no types
+    """Plain data only: no aliases, no tags of its own, no key twice, no deep nesting."""
+
+    depth = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        if self.check_event(yaml.AliasEvent):
+            event = self.peek_event()
+            raise yaml.composer.ComposerError(None, None, "aliases (*) are not allowed", event.start_mark)
+        self.depth += 1
+        if self.depth > _NEST_LIMIT:
+            mark = self.peek_event().start_mark
+            raise yaml.composer.ComposerError(None, None, "it is nested too deeply", mark)
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
+
+    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
+        seen = set()
+        for key_node, _ in node.value:
+            if key_node.value in seen:
+                text = f"'{key_node.value}' stands here twice"
+                raise yaml.constructor.ConstructorError(None, None, text, key_node.start_mark)
+            seen.add(key_node.value)
+        content: dict[Any, Any] = super().construct_mapping(node, deep)
+        return content
+
+
+def read_dataset(folder: Path) -> tuple[Dataset, bytes]:
+    """(description, the file's bytes). Raises ImportFolderError with file, place and remedy."""
+    path = folder / DATASET_FILE
+    content = read_small_file(path, _YAML_LIMIT_BYTES)
+    try:
+        plain = yaml.load(content, _StrictLoader)
+    except (yaml.YAMLError, UnicodeDecodeError, ValueError) as error:
+        raise ImportFolderError(f"{path} is not plain YAML: {_yaml_text(error)}") from error
+    try:
+        dataset = msgspec.convert(plain, Dataset)
+    except msgspec.ValidationError as error:
+        hint = " (numbers are written like 0.025, not 25e-3)" if "float" in str(error) else ""
+        raise ImportFolderError(f"{path}: {str(error).replace('`$.', '`')}{hint}. See {_HELP}") from error
+    problem = _board_problem(dataset.board) or _camera_problem(dataset.camera)
+    if problem:
+        raise ImportFolderError(f"{path}: {problem}. See {_HELP}")
+    return dataset, content
+
+
+_HELP = "docs/recording-format.md, 'Bring your own pictures'"
+
+
+def _yaml_text(error: Exception) -> str:
+    mark = getattr(error, "problem_mark", None)
+    text = getattr(error, "problem", None) or str(error)
+    return f"line {mark.line + 1}: {text}" if mark else text
+
+
+def _board_problem(board: BoardSpec) -> str:
+    if not (2 <= board.columns <= 100 and 2 <= board.rows <= 100):
+        return f"board: {board.columns}×{board.rows} columns×rows; each is 2 to 100"
+    if not 1e-4 <= board.square_m <= 10:
+        return f"board: square_m = {board.square_m} is not a length in metres (25 mm = 0.025)"
+    if board.kind is BoardKind.CHARUCO and not (board.marker_m and board.dictionary):
+        return "board: a charuco board needs marker_m and dictionary"
+    if board.marker_m is not None and board.marker_m <= 0:
+        return f"board: marker_m = {board.marker_m} is not a length in metres"
+    if board.kind is BoardKind.CHARUCO and board.marker_m and board.marker_m >= board.square_m:
+        return f"board: marker_m = {board.marker_m} must be smaller than square_m = {board.square_m}"
+    return ""
+
+
+def _camera_problem(camera: CameraModel) -> str:
+    if not (0 < camera.width <= SIDE_LIMIT_PX and 0 < camera.height <= SIDE_LIMIT_PX):
+        return f"camera: {camera.width}×{camera.height} is no picture size"
+    if not all(math.isfinite(d) for d in camera.distortion):
+        return "camera: distortion holds a number that is not finite"
+    if camera.matrix is None:
+        return "" if not camera.distortion else "camera: distortion without matrix; give both or neither"
+    K = np.array(camera.matrix)
+    if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
+        return "camera: matrix must be 3×3 with positive focal lengths"
+    if K[2].tolist() != [0, 0, 1]:
+        return "camera: the last row of matrix must be [0, 0, 1]"
+    return ""
+
+
+def read_small_file(path: Path, limit_bytes: int) -> bytes:
+    """The whole file. ImportFolderError when it is missing, unreadable or too large to be right."""
+    if not path.is_file():
+        raise ImportFolderError(
+            f"{path} is missing; a folder to import has {DATASET_FILE}, {POSES_FILE} and pictures"
+        )
+    try:
+        with path.open("rb") as file:
+            content = file.read(limit_bytes + 1)
+    except OSError as error:
+        raise ImportFolderError(f"cannot read {path}: {error.strerror}") from error
+    if len(content) > limit_bytes:
+        raise ImportFolderError(f"{path} is larger than {limit_bytes // 1024} kB; is it the right file?")
+    return content

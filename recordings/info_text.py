@@ -1,0 +1,62 @@
+"""`recordings info` as a person reads it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from typing import Any
+
+from rich.console import Console
+from rich.table import Table
+
+
+def print_info(facts: dict[str, Any]) -> None:
+    """Prints what `recording_info` found as two small tables."""
+    console = Console()
+    table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
+    for name, value in _info_rows(facts):
+        table.add_row(name, value)
+    console.print(table)
+    topics = Table("topic", "messages", "rate", "size", box=None, padding=(0, 2, 0, 0), header_style="dim")
+    for topic in facts["topics"]:
+        rate = f"{(topic['messages'] - 1) / topic['span_s']:.1f} Hz" if topic["span_s"] > 0 else "-"
+        topics.add_row(topic["topic"], str(topic["messages"]), rate, f"{topic['bytes'] / 1e6:.2f} MB")
+    console.print(topics)
+
+
+def _info_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    created = datetime.fromtimestamp(facts["created_wall_ns"] / 1e9, UTC)
+    camera, robot, views = facts["camera"], facts["robot"], facts["views"]
+    yield "recording", f"{facts['path']}  {facts['size_bytes'] / 1e6:.1f} MB  sealed, all checksums good"
+    yield "session", f"{facts['name']}  {facts['source']}  {facts['mount']}  {created:%Y-%m-%d %H:%M} UTC"
+    if facts["parts"] > 1:
+        yield "parts", str(facts["parts"])
+    yield "board", facts["board"]
+    known = "intrinsics known" if camera["intrinsics"] else "intrinsics to be found"
+    yield (
+        "camera",
+        f"{camera['identity']} {camera['serial']} {camera['width']}×{camera['height']}, {known}".strip(),
+    )
+    yield "robot", f"{robot['model']} {robot['serial']}".strip()
+    retakes = views["attempts"] - views["poses"]
+    yield "views", f"{views['poses']} poses" + (f", {retakes} retaken" if retakes else "")
+    if states := facts["robot_states"]:
+        rate = f"{states['rate_hz']:.1f} Hz" if states["rate_hz"] else "controller time stands still"
+        gaps = (
+            f"{states['gaps']} gaps, largest {states['largest_gap_s'] * 1e3:.0f} ms"
+            if states["gaps"]
+            else "no gap"
+        )
+        yield "robot states", f"{states['count']} at {rate}, {gaps}"
+    for name, clock in facts["clocks"].items():
+        if clock:
+            yield f"{name} clock", _clock_text(clock)
+    if facts["attachments"]:
+        yield "attached", ", ".join(f"{name} ({size} B)" for name, size in facts["attachments"].items())
+    if facts["note"]:
+        yield "note", facts["note"]
+
+
+def _clock_text(clock: dict[str, float]) -> str:
+    within = f"95 % within {clock['spread_p95_ms']:.2f} ms, all within {clock['spread_max_ms']:.2f} ms"
+    return f"drift {clock['drift_ppm']:+.1f} ppm against the host, {within}"

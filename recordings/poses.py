@@ -1,0 +1,106 @@
+"""`poses.csv`: one robot pose per picture, as other tools can write it."""
+
+from __future__ import annotations
+
+import csv
+import io
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+from recordings.dataset import POSES_FILE, read_small_file
+from recordings.errors import ImportFolderError
+from recordings.messages import Matrix4
+
+HEADER = ["image", "x", "y", "z", "qx", "qy", "qz", "qw"]
+_CSV_LIMIT_BYTES = 4 * 1024 * 1024
+_REACH_LIMIT_M = 20.0
+"""No arm reaches this far: such numbers are millimetres."""
+_UNIT_TOLERANCE = 0.01
+
+
+@dataclass(frozen=True)
+class PoseRow:
+    line: int
+    image: str
+    """Relative to the folder, as written."""
+    base_from_flange: Matrix4
+
+
+def read_poses(folder: Path) -> tuple[list[PoseRow], bytes]:
+    """(rows, the file's bytes). Raises ImportFolderError with file, row and remedy."""
+    path = folder / POSES_FILE
+    content = read_small_file(path, _CSV_LIMIT_BYTES)
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ImportFolderError(f"{path} is not UTF-8 text; save it as plain CSV") from error
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    try:
+        lines = [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]
+    except csv.Error as error:
+        raise ImportFolderError(f"{path} line {reader.line_num}: {error}") from error
+    if not lines or [cell.strip() for cell in lines[0][1]] != HEADER:
+        found = ",".join(lines[0][1])[:100] if lines else "nothing"
+        raise ImportFolderError(
+            f"{path} line 1: the header is '{found}', it must be '{','.join(HEADER)}' "
+            "(base_from_flange: metres and a unit quaternion, w last)"
+        )
+    rows = [_pose_row(path, line, [cell.strip() for cell in cells]) for line, cells in lines[1:]]
+    if not rows:
+        raise ImportFolderError(f"{path} has a header but no poses; add one line per picture")
+    _check_unique(path, rows)
+    return rows, content
+
+
+def _pose_row(path: Path, line: int, cells: list[str]) -> PoseRow:
+    def wrong(reason: str) -> ImportFolderError:
+        return ImportFolderError(f"{path} line {line}: {reason}")
+
+    if len(cells) != len(HEADER):
+        raise wrong(f"{len(cells)} values where {len(HEADER)} are needed ({','.join(HEADER)})")
+    numbers = []
+    for name, cell in zip(HEADER[1:], cells[1:], strict=True):
+        try:
+            numbers.append(float(cell))
+        except ValueError as error:
+            raise wrong(f"{name} = '{cell[:40]}' is not a number") from error
+        if not math.isfinite(numbers[-1]):
+            raise wrong(f"{name} = {cell} is not finite; correct the pose or delete the line")
+    if not cells[0]:
+        raise wrong("the image's name is missing")
+    position, quaternion = numbers[:3], numbers[3:]
+    if max(map(abs, position)) > _REACH_LIMIT_M:
+        raise wrong(
+            f"the flange is {max(map(abs, position)):g} m away: x, y, z must be metres, not millimetres"
+        )
+    length = math.hypot(*quaternion)
+    if abs(length - 1) > _UNIT_TOLERANCE:
+        raise wrong(
+            f"the quaternion's length is {length:.4g}, it must be 1 "
+            "(qx,qy,qz,qw, not a rotation vector or Euler angles)"
+        )
+    return PoseRow(line, cells[0], matrix_from_quaternion(position, [q / length for q in quaternion]))
+
+
+def _check_unique(path: Path, rows: list[PoseRow]) -> None:
+    first: dict[str, int] = {}
+    for row in rows:
+        if row.image in first:
+            raise ImportFolderError(
+                f"{path} line {row.line}: {row.image} stands already in line {first[row.image]}; "
+                "each picture has one pose"
+            )
+        first[row.image] = row.line
+
+
+def matrix_from_quaternion(position_m: list[float], quaternion_xyzw: list[float]) -> Matrix4:
+    """Unit quaternion and position → 4×4."""
+    x, y, z, w = quaternion_xyzw
+    px, py, pz = position_m
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), px),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), py),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), pz),
+        (0.0, 0.0, 0.0, 1.0),
+    )

@@ -132,7 +132,7 @@ def check_path(
     problems = _joint_problems(geometry, start, target, name)
     samples = sample_path(geometry, start, target, spacing_m)
     gaps, labels = margins(geometry, samples)
-    problems += _margin_problems(gaps - spacing_m / 2, labels, name)
+    problems += _margin_problems(leaving(gaps - spacing_m / 2), labels, name)
     speed, acceleration, duration, peak = allowed_speed(geometry, samples)
     flange = forward(geometry.model, samples)[:, :3, 3]
     return MoveCheck(
@@ -191,6 +191,17 @@ def _joint_problems(geometry: CellGeometry, start: Array, target: Array, name: s
                 )
             )
     return problems
+
+
+def leaving(gaps: Array) -> Array:
+    """Margins (..., samples, c) along paths, where an arm that already stands too close may move away.
+
+    A margin that starts negative counts as zero for as long as it only grows.
+    """
+    growing = np.diff(gaps, axis=-2, prepend=gaps[..., :1, :]) > -1e-4
+    excused = np.cumprod(growing & (gaps < 0), axis=-2).astype(bool)
+    excused[..., -1, :] = False
+    return np.where(excused, 0.0, gaps)
 
 
 def _margin_problems(gaps: Array, labels: Sequence[str], name: str) -> list[Problem]:

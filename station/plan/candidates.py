@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.board import board_points
-from calibrate.geometry import Array, pose, rotation_exp
+from calibrate.geometry import Array, pose, rotation_exp, transform_points
 from calibrate.information import camera_matrix, project
 from calibrate.kinematics import inverse_all, singularity_measure
 from recordings.messages import CameraModel
-from station.collision import margins
+from station.collision import ARM_BODIES, body_segments, margins, segment_distance
 from station.limits import joint_bounds
 from station.plan.scene import Scene
 
@@ -36,6 +36,8 @@ class ViewRange:
     visible_share: float = 0.95
     """Share of the guess's uncertainty for which the whole board must still be in the picture."""
     smallest_singular: float = 0.03
+    free_sight: bool = True
+    """No part of the arm between camera and board."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,12 +162,30 @@ def find_candidates(
         return Pool(np.zeros((0, 6)), empty, empty, np.zeros(0, dtype=int), np.zeros(0), lost)
     keep = singularity_measure(scene.geometry.model, joints) >= view.smallest_singular
     lost["near a singular posture"] += int((~keep).sum())
+    if view.free_sight:
+        hidden = ~sees_past_the_arm(scene, joints, flange[rows])
+        lost["the arm stands between camera and board"] += int((keep & hidden).sum())
+        keep &= ~hidden
     gaps, labels = margins(scene.geometry, joints)
     worst = gaps.min(axis=1)
     for name in (labels[c] for c in gaps[keep & (worst < _PATH_RESERVE_M)].argmin(axis=1)):
         lost[name] += 1
     keep &= worst >= _PATH_RESERVE_M
     return Pool(joints[keep], flange[rows][keep], views[rows][keep], branches[keep], worst[keep], lost)
+
+
+def sees_past_the_arm(scene: Scene, joints_rad: Array, base_from_flange: Array) -> NDArray[np.bool_]:
+    """(n,) whether no part of the arm stands in the lines of sight to the board's outline."""
+    starts, ends, radii = body_segments(scene.geometry, joints_rad)
+    links = slice(2, len(ARM_BODIES))
+    if scene.mount == "eye-in-hand":
+        eye = transform_points(base_from_flange, scene.X[None, :3, 3])
+        board = np.broadcast_to(transform_points(scene.Y, _outline(scene)), (len(eye), 8, 3))
+    else:
+        eye = np.broadcast_to(scene.X[:3, 3], (len(joints_rad), 1, 3))
+        board = transform_points(base_from_flange @ scene.Y, _outline(scene))
+    gap = segment_distance(eye[:, :, None], board[:, :, None], starts[:, None, links], ends[:, None, links])
+    return np.asarray((gap > radii[links]).all(axis=(1, 2)))
 
 
 def _all_branches(

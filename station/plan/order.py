@@ -13,6 +13,7 @@ from station.limits import (
     JOINT_SPEED_CAP_RAD_S,
     SPACING_M,
     SPEED_CAP_M_S,
+    leaving,
     trapezoid,
 )
 
@@ -33,14 +34,16 @@ def move_times(geometry: CellGeometry, joints_from: Array, joints_to: Array) -> 
     flat = paths.reshape(-1, 6)
     points = moving_points(geometry, flat).reshape(n, _SAMPLES, -1, 3)
     travel = np.linalg.norm(np.diff(points, axis=1), axis=-1).max(axis=(1, 2))
-    worst = margins(geometry, flat)[0].min(axis=1).reshape(n, _SAMPLES).min(axis=1)
+    slack = np.maximum(1.1 * travel, SPACING_M) / 2
+    gaps = margins(geometry, flat)[0].reshape(n, _SAMPLES, -1) - slack[:, None, None]
+    worst = leaving(gaps).min(axis=(1, 2))
     limits = geometry.limits
     step = np.abs(joints_to - joints_from).max(axis=1)
     rate = travel * (_SAMPLES - 1) / np.maximum(step, 1e-9)
     speed = np.minimum(limits.joint_speed_rad_s, JOINT_SPEED_CAP_RAD_S)
     speed = np.minimum(speed, 0.97 * min(limits.speed_m_s, SPEED_CAP_M_S) / np.maximum(rate, 1e-9))
     duration, _ = trapezoid(step, speed, min(limits.joint_acceleration_rad_s2, JOINT_ACCELERATION_CAP_RAD_S2))
-    bad = (worst < np.maximum(1.1 * travel, SPACING_M) / 2) | (step > limits.joint_step_rad)
+    bad = (worst < 0) | (step > limits.joint_step_rad)
     return np.where(bad, BLOCKED, duration)
 
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import pairwise
 
+import msgspec
 import numpy as np
 
 from calibrate.geometry import Array
@@ -15,7 +16,7 @@ from station.config import StationConfig
 from station.errors import LimitError
 from station.limits import check_plan
 from station.plan.candidates import Pool, ViewRange, find_candidates
-from station.plan.choose import Criterion, choose, informations, objective_for, sigma_of
+from station.plan.choose import Criterion, Objective, choose, informations, objective_for, sigma_of
 from station.plan.describe import planned_pose
 from station.plan.explain import explain_shortage
 from station.plan.model import Plan
@@ -67,15 +68,9 @@ def plan_scene(
     start = None if start_joints_rad is None else np.asarray(start_joints_rad, dtype=float)
     progress("looking for poses", 0.0)
     pool, notes = _pool(scene, options, start, rng)
-    progress("choosing", 0.3)
-    joints, flange = _choose_and_order(scene, options, pool, start, rng, progress)
-    progress("checking", 0.95)
-    plan = _describe(scene, options, joints, flange, notes)
-    check = check_plan(plan, start, scene.geometry)
-    if check.problems:
-        raise LimitError("The plan does not pass its own check:\n" + "\n".join(map(str, check.problems)))
+    plan = _choose_and_order(scene, options, pool, start, rng, progress)
     progress("done", 1.0)
-    return plan
+    return msgspec.structs.replace(plan, note="; ".join(notes))
 
 
 def _relaxed(view: ViewRange) -> list[tuple[ViewRange, str]]:
@@ -84,6 +79,7 @@ def _relaxed(view: ViewRange) -> list[tuple[ViewRange, str]]:
     rolled = replace(doubtful, roll_rad=np.pi, tilt_rad=(view.tilt_rad[0], view.tilt_rad[1] + 0.1))
     wide = replace(
         rolled,
+        free_sight=False,
         visible_share=0.3,
         off_centre=0.1,
         distance_m=(0.8 * view.distance_m[0], 1.3 * view.distance_m[1]),
@@ -92,7 +88,10 @@ def _relaxed(view: ViewRange) -> list[tuple[ViewRange, str]]:
         (view, ""),
         (doubtful, "the guess is so rough that some pictures may cut the board"),
         (rolled, "poses of any roll had to be used"),
-        (wide, "distances beyond the wanted range had to be used and some pictures may cut the board"),
+        (
+            wide,
+            "distances beyond the wanted range had to be used; pictures may cut or hide parts of the board",
+        ),
     ]
 
 
@@ -145,60 +144,68 @@ def _choose_and_order(
     start: Array | None,
     rng: np.random.Generator,
     progress: Progress,
-) -> tuple[Array, Array]:
-    """Joints (count, 6) and flange poses (count, 4, 4), in order. Poses without a free way are replaced."""
+) -> Plan:
+    """The checked plan. Poses that no free way leads to leave the pool, and the choice is made again."""
     objective = objective_for(scene, options.criterion, options.free_intrinsics)
     information = informations(scene, pool.base_from_flange, options.noise, options.free_intrinsics)
-    allowed = np.arange(len(pool))
-    while len(allowed) >= options.count:
+    left = np.arange(len(pool))
+    while len(left) >= options.count:
         picked = choose(
-            information[allowed],
+            information[left],
             options.count,
             objective,
             rng,
-            progress=lambda d: progress("choosing", 0.3 + 0.5 * d),
-        )
-        places = allowed[picked]
-        joints = pool.joints_rad[places]
-        times = time_matrix(scene.geometry, joints)
-        lead = (
-            np.zeros(len(joints))
-            if start is None
-            else move_times(scene.geometry, np.repeat(start[None], len(joints), axis=0), joints)
+            progress=lambda done: progress("choosing", 0.3 + 0.5 * done),
         )
         progress("ordering", 0.85)
-        order = short_order(times, lead, options.seed)
-        blocked = _blocked(order, times, lead)
+        places = left[picked]
+        order, blocked = _ordered(scene, pool.joints_rad[places], start, options.seed)
         if not blocked:
-            return joints[order], pool.base_from_flange[places][order]
-        allowed = np.setdiff1d(allowed, places[blocked])
-    raise LimitError(explain_shortage(scene, options.count, pool.take(allowed)))
+            places = places[order]
+            plan = _describe(scene, options, pool.joints_rad[places], information[places], objective)
+            progress("checking", 0.95)
+            blocked = _failing(plan, start, scene)
+            if not blocked:
+                return plan
+        left = np.setdiff1d(left, places[blocked])
+    raise LimitError(explain_shortage(scene, options.count, pool.take(left)))
 
 
-def _blocked(order: list[int], times: Array, lead: Array) -> list[int]:
-    """Members that cannot be reached in this order; the worst connected one of each blocked move."""
+def _ordered(scene: Scene, joints: Array, start: Array | None, seed: int) -> tuple[list[int], list[int]]:
+    """A short order of joints (n, 6), and those members that it cannot reach freely."""
+    times = time_matrix(scene.geometry, joints)
+    lead = np.zeros(len(joints))
+    if start is not None:
+        lead = move_times(scene.geometry, np.repeat(start[None], len(joints), axis=0), joints)
+    order = short_order(times, lead, seed)
     if lead[order[0]] == BLOCKED:
-        return [order[0]]
+        return order, [order[0]]
     free = np.isfinite(times).sum(axis=1)
-    return [min((a, b), key=lambda m: free[m]) for a, b in pairwise(order) if times[a, b] == BLOCKED]
+    return order, [min(legs, key=lambda m: free[m]) for legs in pairwise(order) if times[legs] == BLOCKED]
 
 
-def _describe(scene: Scene, options: PlanOptions, joints: Array, flange: Array, notes: list[str]) -> Plan:
-    objective = objective_for(scene, options.criterion, options.free_intrinsics)
-    information = informations(scene, flange, options.noise, options.free_intrinsics).cumsum(axis=0)
+def _failing(plan: Plan, start: Array | None, scene: Scene) -> list[int]:
+    """Places of poses whose move does not pass the dense check. LimitError when the plan as such is wrong."""
+    check = check_plan(plan, start, scene.geometry)
+    failing = [place for place, move in enumerate(check.moves) if move.problems]
+    if check.problems and not failing:
+        raise LimitError("\n".join(map(str, check.problems)))
+    return failing
+
+
+def _describe(scene: Scene, options: PlanOptions, joints: Array, gained: Array, objective: Objective) -> Plan:
     flange = forward(scene.geometry.model, joints)
+    known = gained.cumsum(axis=0)
     poses = tuple(
-        planned_pose(
-            scene, number, joints[number], flange[number], sigma_of(information[number], objective)[0]
-        )
+        planned_pose(scene, number, joints[number], flange[number], sigma_of(known[number], objective)[0])
         for number in range(len(joints))
     )
+    limits = scene.geometry.limits
     return Plan(
         robot=scene.geometry.model.name,
         mount=scene.mount,
         poses=poses,
-        joint_speed_rad_s=scene.geometry.limits.joint_speed_rad_s,
-        joint_acceleration_rad_s2=scene.geometry.limits.joint_acceleration_rad_s2,
+        joint_speed_rad_s=limits.joint_speed_rad_s,
+        joint_acceleration_rad_s2=limits.joint_acceleration_rad_s2,
         seed=options.seed,
-        note="; ".join(notes),
     )

@@ -1,0 +1,195 @@
+"""Plans as files: strict `plan.yaml`, lists of joints or poses from elsewhere, and taught poses."""
+
+from __future__ import annotations
+
+import csv
+import math
+import re
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import yaml
+
+from calibrate.geometry import Array, pose_from_quaternion
+from calibrate.kinematics import MODELS, forward, inverse_nearest
+from recordings.files import write_atomically
+from recordings.messages import Mount
+from station.errors import ConfigError
+from station.plan.model import Plan, PlannedPose
+
+_SIZE_LIMIT_BYTES = 4_000_000
+_POSE_LIMIT = 2000
+_JOINTS_DEG = [f"j{i}_deg" for i in range(1, 7)]
+_JOINTS_RAD = [f"j{i}_rad" for i in range(1, 7)]
+_POSE = ["x", "y", "z", "qx", "qy", "qz", "qw"]
+
+
+def save_plan(plan: Plan, path: Path) -> None:
+    """Writes `plan.yaml` in one step. ConfigError with the remedy when the disk refuses."""
+    text = yaml.safe_dump(msgspec.to_builtins(plan), sort_keys=False, default_flow_style=None, width=110)
+    try:
+        write_atomically(path, text.encode())
+    except OSError as error:
+        raise ConfigError(
+            f"cannot write the plan to {path}: {error.strerror}; choose another folder"
+        ) from error
+
+
+def load_plan(path: Path) -> Plan:
+    """Reads and checks `plan.yaml`. ConfigError lists every problem that can be seen, with its line."""
+    text = _read(path)
+    return parse_plan(text, str(path))
+
+
+def parse_plan(text: str, name: str = "plan") -> Plan:
+    """The same for text that is already here (an attachment of a recording, an editor)."""
+    try:
+        # The pure-Python node tree knows the lines that msgspec's message does not.
+        tree = yaml.compose(text, Loader=yaml.SafeLoader)
+        plan = msgspec.convert(yaml.safe_load(text), Plan, strict=True)
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None)
+        where = f", line {mark.line + 1}" if mark else ""
+        raise ConfigError(
+            f"{name}{where}: not readable as YAML ({getattr(error, 'problem', error)})"
+        ) from error
+    except msgspec.ValidationError as error:
+        raise ConfigError(f"{name}{_line_of(tree, str(error))}: {error}") from error
+    problems = _value_problems(plan)
+    if problems:
+        raise ConfigError("\n".join(f"{name}: {problem}" for problem in problems))
+    return plan
+
+
+def _read(path: Path) -> str:
+    try:
+        if path.stat().st_size > _SIZE_LIMIT_BYTES:
+            raise ConfigError(f"{path} is larger than {_SIZE_LIMIT_BYTES // 1_000_000} MB: not a plan")
+        return path.read_text(encoding="utf-8")
+    except OSError as error:
+        raise ConfigError(f"cannot read {path}: {error.strerror}; is the name right?") from error
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path} is not a text file; a plan is YAML, a list is CSV") from error
+
+
+def _line_of(tree: yaml.Node | None, message: str) -> str:
+    """', line N' of the node that msgspec's `$.poses[3].name` speaks of."""
+    found = re.search(r"`\$([^`]*)`", message)
+    node = tree
+    for key, index in re.findall(r"\.(\w+)|\[(\d+)\]", found.group(1) if found else ""):
+        below: yaml.Node | None = None
+        if isinstance(node, yaml.MappingNode) and key:
+            below = next((value for name, value in node.value if name.value == key), None)
+        elif isinstance(node, yaml.SequenceNode) and index and int(index) < len(node.value):
+            below = node.value[int(index)]
+        if below is None:
+            break
+        node = below
+    return f", line {node.start_mark.line + 1}" if node is not None else ""
+
+
+def _value_problems(plan: Plan) -> list[str]:
+    """What types cannot say."""
+    problems = []
+    if plan.robot not in MODELS:
+        problems.append(f"robot '{plan.robot}' is unknown; known are {', '.join(MODELS)}")
+    if not 1 <= len(plan.poses) <= _POSE_LIMIT:
+        problems.append(f"{len(plan.poses)} poses; 1 to {_POSE_LIMIT} are possible")
+    for limit in ("joint_speed_rad_s", "joint_acceleration_rad_s2"):
+        value = getattr(plan, limit)
+        if not (math.isfinite(value) and value > 0):
+            problems.append(f"{limit} is {value}; it must be a positive number")
+    names = [pose.name for pose in plan.poses]
+    for number, pose in enumerate(plan.poses):
+        where = f"poses[{number}] ({pose.name})"
+        if names.index(pose.name) != number:
+            problems.append(f"{where}: the name is used twice")
+        if not np.isfinite(pose.joints_rad).all():
+            problems.append(f"{where}: joints_rad has a value that is not a number")
+        elif np.abs(pose.joints_rad).max() > 2 * np.pi + 1e-9:
+            problems.append(f"{where}: a joint is beyond ±360°; joints are in radians, not degrees")
+        matrix = pose.base_from_flange
+        if matrix is not None and np.shape(np.array(matrix, dtype=object)) != (4, 4):
+            problems.append(f"{where}: base_from_flange must have 4 rows of 4 numbers")
+    return problems
+
+
+def taught_plan(robot: str, mount: Mount, joints_rad: Sequence[Sequence[float]], why: str = "taught") -> Plan:
+    """A plan from joints that a person taught (pendant, free-drive) in this order."""
+    if robot not in MODELS:
+        raise ConfigError(f"robot '{robot}' is unknown; known are {', '.join(MODELS)}")
+    poses = tuple(
+        _plain_pose(robot, f"p{n + 1:02d}", np.array(q, dtype=float), why) for n, q in enumerate(joints_rad)
+    )
+    return Plan(robot=robot, mount=mount, poses=poses)
+
+
+def _plain_pose(robot: str, name: str, joints: Array, why: str) -> PlannedPose:
+    j = [float(angle) for angle in joints]
+    flange = forward(MODELS[robot], joints)
+    rows = tuple(tuple(float(x) for x in row) for row in flange)
+    return PlannedPose(name, (j[0], j[1], j[2], j[3], j[4], j[5]), rows, why=why)
+
+
+def import_list(path: Path, robot: str, mount: Mount, near_joints_rad: Sequence[float] | None = None) -> Plan:
+    """A CSV list as a plan: header `[name,]j1_deg…j6_deg`, `[name,]j1_rad…` or `[name,]x,y,z,qx,qy,qz,qw`.
+
+    Poses are base_from_flange in metres; each takes the arm branch nearest to the one before (the first:
+    nearest to `near_joints_rad`, which is needed then). ConfigError names file, row and remedy.
+    """
+    rows = list(csv.reader(_read(path).splitlines()))
+    if not rows:
+        raise ConfigError(
+            f"{path} is empty; the first row must name the columns, e.g. {','.join(_JOINTS_DEG)}"
+        )
+    header = [column.strip() for column in rows[0]]
+    named, columns = header[:1] == ["name"], header[1:] if header[:1] == ["name"] else header
+    if columns not in (_JOINTS_DEG, _JOINTS_RAD, _POSE):
+        raise ConfigError(
+            f"{path}, row 1: the columns are {','.join(header)!r}; wanted is {','.join(_JOINTS_DEG)} or "
+            f"{','.join(_JOINTS_RAD)} or {','.join(_POSE)}, with `name` before them if you like"
+        )
+    if columns == _POSE and near_joints_rad is None:
+        raise ConfigError(
+            f"{path} lists flange poses: give --start with the arm's joints to choose its branch"
+        )
+    poses: list[PlannedPose] = []
+    near = np.asarray(near_joints_rad if near_joints_rad is not None else np.zeros(6), dtype=float)
+    for number, row in enumerate(rows[1:], start=2):
+        if not any(cell.strip() for cell in row):
+            continue
+        name = row[0].strip() if named else f"p{len(poses) + 1:02d}"
+        values = _numbers(row[1:] if named else row, len(columns), f"{path}, row {number}")
+        near = _row_joints(values, columns, robot, near, f"{path}, row {number}")
+        poses.append(_plain_pose(robot, name, near, f"from {path.name}"))
+    plan = Plan(robot=robot, mount=mount, poses=tuple(poses), note=f"imported from {path.name}")
+    if problems := _value_problems(plan):
+        raise ConfigError("\n".join(f"{path}: {problem}" for problem in problems))
+    return plan
+
+
+def _numbers(cells: list[str], wanted: int, where: str) -> list[float]:
+    if len(cells) != wanted:
+        raise ConfigError(f"{where}: {len(cells)} numbers, wanted are {wanted}")
+    try:
+        values = [float(cell) for cell in cells]
+    except ValueError as error:
+        raise ConfigError(f"{where}: {error}; write numbers with a point, 0.25") from error
+    if not np.isfinite(values).all():
+        raise ConfigError(f"{where}: a value is not a finite number")
+    return values
+
+
+def _row_joints(values: list[float], columns: list[str], robot: str, near: Array, where: str) -> Array:
+    if columns == _JOINTS_DEG:
+        return np.deg2rad(values)
+    if columns == _JOINTS_RAD:
+        return np.array(values)
+    if np.linalg.norm(values[3:]) < 1e-6:
+        raise ConfigError(f"{where}: the quaternion is zero; no rotation is 0,0,0,1")
+    joints = inverse_nearest(MODELS[robot], pose_from_quaternion(values[:3], values[3:]), near)
+    if joints is None:
+        raise ConfigError(f"{where}: the {robot} cannot reach this flange pose; are lengths in metres?")
+    return joints

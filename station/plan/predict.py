@@ -1,0 +1,124 @@
+"""How good X will be: from a plan alone, after each captured pose, and which pose would help most next."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calibrate.geometry import Array
+from calibrate.information import Noise
+from calibrate.kinematics import forward
+from station.limits import check_path
+from station.plan.candidates import ViewRange, find_candidates
+from station.plan.choose import informations, objective_for, sigma_of
+from station.plan.describe import planned_pose
+from station.plan.model import Plan, PlannedPose
+from station.plan.scene import Scene
+
+_FURTHER_POSES = 60
+_TRIES = 12
+_DRAWS = 16
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """Expected 1σ of X: translation as the root of the summed variances, rotation likewise."""
+
+    sigma_m: float
+    sigma_rad: float
+
+
+@dataclass(frozen=True)
+class Advice:
+    now: Forecast
+    enough: bool
+    text: str
+    next_pose: PlannedPose | None = None
+    """The pose that would help most, reachable from where the arm is; None when enough or when none helps."""
+    poses_missing: int | None = None
+    """So many more like it reach the goal; None = not with poses of this kind."""
+
+
+@dataclass(frozen=True)
+class AdviceOptions:
+    noise: Noise = field(default_factory=Noise)
+    free_intrinsics: bool = True
+    view: ViewRange = field(default_factory=ViewRange)
+    pool: int = 150
+    seed: int = 0
+
+
+def forecast(scene: Scene, plan: Plan, noise: Noise, free_intrinsics: bool = True) -> list[Forecast]:
+    """Expected sigma after each pose of the plan, first to last."""
+    flange = forward(scene.geometry.model, np.array([pose.joints_rad for pose in plan.poses]).reshape(-1, 6))
+    return forecast_views(scene, flange, noise, free_intrinsics)
+
+
+def forecast_views(
+    scene: Scene, base_from_flange: Array, noise: Noise, free_intrinsics: bool = True
+) -> list[Forecast]:
+    """Expected sigma after each of the views taken from these flange poses (n, 4, 4)."""
+    objective = objective_for(scene, "A", free_intrinsics)
+    known = informations(scene, base_from_flange, noise, free_intrinsics).cumsum(axis=0)
+    return [Forecast(*sigma_of(information, objective)) for information in known]
+
+
+def advise(
+    scene: Scene,
+    captured: ArrayLike,
+    goal_m: float,
+    joints_now_rad: Sequence[float],
+    options: AdviceOptions | None = None,
+) -> Advice:
+    """Are the captured flange poses (n, 4, 4) enough? If not: the next best pose, and how many more."""
+    options = options or AdviceOptions()
+    flange = np.asarray(captured, dtype=float).reshape(-1, 4, 4)
+    objective = objective_for(scene, "A", options.free_intrinsics)
+    known = informations(scene, flange, options.noise, options.free_intrinsics).sum(axis=0)
+    now = Forecast(*sigma_of(known, objective))
+    state = f"expected error {1000 * now.sigma_m:.2f} mm after {len(flange)} views"
+    if now.sigma_m <= goal_m:
+        return Advice(now, True, f"enough: {state}, the goal is {1000 * goal_m:.2f} mm")
+    rng = np.random.default_rng(options.seed)
+    start = np.asarray(joints_now_rad, dtype=float)
+    draws = scene.drawn(_DRAWS, rng)
+    pool = find_candidates(scene, options.view, options.pool, rng, start, draws)
+    if len(pool) == 0:
+        return Advice(now, False, f"{state}; no further pose is reachable with the board in view")
+    gains = informations(scene, pool.base_from_flange, options.noise, options.free_intrinsics)
+    scores = objective(known + gains)
+    ranked = np.argsort(scores, kind="stable")[:_TRIES]
+    free = (
+        int(place)
+        for place in ranked
+        if not check_path(scene.geometry, start, pool.joints_rad[place]).problems
+    )
+    best = next(free, None)
+    if best is None:
+        return Advice(
+            now, False, f"{state}; no free way from here to a pose that helps: jog the arm and ask again"
+        )
+    missing = _missing(known, gains, goal_m=goal_m, scene=scene, free_intrinsics=options.free_intrinsics)
+    after = sigma_of(known + gains[best], objective)[0]
+    pose = planned_pose(
+        scene, len(flange), pool.joints_rad[best], forward(scene.geometry.model, pool.joints_rad[best]), after
+    )
+    more = (
+        f"about {missing} more" if missing else f"more than {_FURTHER_POSES} more, or a better camera or arm"
+    )
+    text = f"{state}; the goal of {1000 * goal_m:.2f} mm needs {more}. Next best: {pose.why}"
+    return Advice(now, False, text, pose, missing)
+
+
+def _missing(known: Array, gains: Array, goal_m: float, scene: Scene, free_intrinsics: bool) -> int | None:
+    """How many greedily chosen further poses reach the goal."""
+    objective = objective_for(scene, "A", free_intrinsics)
+    total = known
+    for count in range(1, _FURTHER_POSES + 1):
+        total = total + gains[int(np.argmin(objective(total + gains)))]
+        if sigma_of(total, objective)[0] <= goal_m:
+            return count
+    return None

@@ -4,6 +4,7 @@ Lengths in metres, angles in radians; every sigma and covariance is of `geometry
 [δt, δφ] in the parent frame of X.
 """
 
+# ruff: noqa: N815  (e_t and e_R are written as the paper writes them)
 from __future__ import annotations
 
 from dataclasses import dataclass, field
@@ -74,7 +75,7 @@ class Certificate:
     objective: float
     lower_bound: float
     floor: float
-    """Absolute floor of the denominator, 1e-9 times the trace of the form."""
+    """Absolute floor of the denominator, 1e-8 times the trace of the form."""
     tolerance: float
     unique: bool
     """False where another rotation reaches the same value (all axes parallel)."""

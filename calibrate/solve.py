@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
-from calibrate.errors import CalibrationError
+from calibrate.admit import require_solvable
+from calibrate.profile_paper import solve_paper_profile
+from calibrate.profile_robust import solve_robust_profile
 from calibrate.solution import Solution, SolveOptions
 from calibrate.views import ViewSet
 
@@ -12,7 +14,11 @@ __all__ = ["Solution", "SolveOptions", "solve_views"]
 def solve_views(views: ViewSet, options: SolveOptions | None = None) -> Solution:
     """Hand-eye calibration of views that have `camera_from_board` (run PnP first).
 
-    Raises TooFewViewsError, DegenerateMotionError or BadViewsError; never returns a number that it knows
-    to be wrong.
+    Same views, options and machine give the same bits. Raises TooFewViewsError, DegenerateMotionError or
+    BadViewsError; what is merely doubtful comes back in `warnings`.
     """
-    raise CalibrationError("the solver is not built yet")
+    options = options or SolveOptions()
+    require_solvable(views)
+    if options.profile == "paper":
+        return solve_paper_profile(views, options)
+    return solve_robust_profile(views, options)

@@ -1,0 +1,73 @@
+"""Which views may enter the solver at all: named errors for everything that cannot be solved."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calibrate.errors import BadViewsError, TooFewViewsError
+from calibrate.geometry import is_rigid
+from calibrate.views import ImageView, ViewSet
+
+MIN_VIEWS = 4
+MAX_VIEWS = 20_000
+"""Beyond this the last stage would need more than a minute and a gigabyte."""
+
+
+def require_solvable(views: ViewSet) -> None:
+    """Raise TooFewViewsError or BadViewsError, naming view and remedy."""
+    if len(views) < MIN_VIEWS:
+        raise TooFewViewsError(
+            f"{len(views)} usable views, at least {MIN_VIEWS} are needed (15 to 25 are good). Record "
+            "more poses, or check why the board was not found in the others."
+        )
+    if len(views) > MAX_VIEWS:
+        raise BadViewsError(
+            f"{len(views)} views; at most {MAX_VIEWS} are solved at once. Split the recording."
+        )
+    _require_camera(views)
+    for view in views:
+        _require_view(view)
+    first = views.views[0].base_from_flange
+    if all(np.abs(view.base_from_flange - first).max() < 1e-9 for view in views):
+        raise BadViewsError("All robot poses are identical. Check how the poses were recorded.")
+
+
+def _require_camera(views: ViewSet) -> None:
+    if views.camera.matrix is None:
+        if any(len(view.pixels) for view in views):
+            raise BadViewsError("No camera matrix: calibrate the intrinsics first.")
+        return
+    K = np.array(views.camera.matrix)
+    if (
+        K.shape != (3, 3)
+        or not np.isfinite(K).all()
+        or abs(np.linalg.det(K)) < 1e-9
+        or K[0, 0] <= 0
+        or K[1, 1] <= 0
+    ):
+        raise BadViewsError(
+            f"The camera matrix is singular or not a camera matrix: {K.tolist()}. Give fx, fy > 0 in pixels."
+        )
+    if not np.isfinite(views.camera.distortion).all():
+        raise BadViewsError("The lens distortion contains NaN or infinity.")
+
+
+def _require_view(view: ImageView) -> None:
+    where = f"View {view.index} ({view.name})"
+    if not is_rigid(np.asarray(view.base_from_flange)):
+        raise BadViewsError(
+            f"{where}: the robot pose is not a rigid transform (NaN, or a rotation that is not orthonormal). "
+            "Correct or remove this view."
+        )
+    if view.camera_from_board is None:
+        raise BadViewsError(f"{where}: no board pose yet. Run PnP before the solver.")
+    if not is_rigid(np.asarray(view.camera_from_board)):
+        raise BadViewsError(
+            f"{where}: the board pose is mirrored or not a rigid transform. Check the order of the corners."
+        )
+    if view.camera_from_board[2, 3] <= 0:
+        raise BadViewsError(f"{where}: the board pose lies behind the camera. Check corners and intrinsics.")
+    if len(view.pixels) != len(view.board_points):
+        raise BadViewsError(f"{where}: {len(view.pixels)} pixels for {len(view.board_points)} board points.")
+    if not (np.isfinite(view.pixels).all() and np.isfinite(view.board_points).all()):
+        raise BadViewsError(f"{where}: NaN among its corners. Remove this view.")

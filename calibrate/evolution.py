@@ -1,0 +1,121 @@
+"""Differential evolution (Storn and Price 1997) as the paper runs it, over a whole generation at a time.
+
+Synchronous generations: every mutant is made from the old population (eqs. 18-20). All random numbers are
+drawn before the first generation, so a run is a function of its seed alone, whatever is evaluated.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.geometry import Array
+
+Evaluate = Callable[[Array], Array]
+"""Candidates (m, d) → values (m,)."""
+
+
+@dataclass(frozen=True)
+class EvolutionSettings:
+    population: int = 30
+    """M"""
+    factor: float = 0.5
+    """F"""
+    crossover: float = 0.9
+    """CR, per component; no component is forced to cross."""
+    generations: int = 100
+
+
+@dataclass(frozen=True, eq=False)
+class Evolved:
+    best: Array
+    """(d,)"""
+    value: float
+    population: Array
+    """(M, d) of the last generation."""
+    values: Array
+    """(M,)"""
+
+
+def evolve(
+    evaluate: Evaluate,
+    lower: Array,
+    upper: Array,
+    rng: np.random.Generator,
+    settings: EvolutionSettings | None = None,
+) -> Evolved:
+    """Minimise within the box; mutants outside are rounded to it, ties are accepted (eq. 20)."""
+    s = settings or EvolutionSettings()
+    d = len(lower)
+    x = lower + (upper - lower) * rng.random((s.population, d))
+    partners = _partners(rng, s.generations, s.population)
+    crosses = rng.random((s.generations, s.population, d)) <= s.crossover
+    values = evaluate(x)
+    for (p1, p2, p3), cross in zip(partners, crosses, strict=True):
+        mutant = x[p2]
+        mutant -= x[p3]
+        mutant *= s.factor
+        mutant += x[p1]
+        np.maximum(mutant, lower, out=mutant)
+        np.minimum(mutant, upper, out=mutant)
+        trial = np.where(cross, mutant, x)
+        trial_values = evaluate(trial)
+        better = trial_values <= values
+        np.copyto(x, trial, where=better[:, None])
+        np.copyto(values, trial_values, where=better)
+    best = int(np.argmin(values))
+    return Evolved(x[best].copy(), float(values[best]), x, values)
+
+
+def _partners(rng: np.random.Generator, generations: int, population: int) -> NDArray[np.intp]:
+    """p1 ≠ p2 ≠ p3 ≠ i, uniform, (generations, 3, population): draws that step over what is taken."""
+    shape = (generations, population)
+    taken = [np.broadcast_to(np.arange(population), shape)]
+    chosen = []
+    for k in range(1, 4):
+        pick = rng.integers(0, population - k, size=shape)
+        for held in taken:
+            pick = pick + (pick >= held)
+        chosen.append(pick)
+        taken = list(np.sort([*taken, pick], axis=0))
+    return np.stack(chosen, axis=1)
+
+
+def rotations_from_vectors(gamma: Array) -> Array:
+    """Rodrigues for many rotation vectors (m, 3) → (m, 3, 3); light, for inner loops."""
+    theta2 = np.einsum("mi,mi->m", gamma, gamma)
+    theta = np.sqrt(theta2)
+    small = theta < 1e-8
+    safe = np.where(small, 1.0, theta)
+    a = np.where(small, 1.0, np.sin(theta) / safe)
+    b = np.where(small, 0.5, (1.0 - np.cos(theta)) / (safe * safe))
+    R = b[:, None, None] * (gamma[:, :, None] * gamma[:, None, :])
+    diagonal = 1.0 - b * theta2
+    ax, ay, az = a * gamma[:, 0], a * gamma[:, 1], a * gamma[:, 2]
+    R[:, 0, 0] += diagonal
+    R[:, 1, 1] += diagonal
+    R[:, 2, 2] += diagonal
+    R[:, 0, 1] -= az
+    R[:, 1, 0] += az
+    R[:, 0, 2] += ay
+    R[:, 2, 0] -= ay
+    R[:, 1, 2] -= ax
+    R[:, 2, 1] += ax
+    return R
+
+
+def rotations_from_quaternions(q: Array) -> Array:
+    """Any non-zero quaternions (m, 4) x, y, z, w, normalised here → (m, 3, 3)."""
+    q = q / np.sqrt(np.maximum(np.einsum("mi,mi->m", q, q), 1e-300))[:, None]
+    x, y, z, w = q.T
+    R = np.empty((len(q), 3, 3))
+    R[:, 0, 0] = 1 - 2 * (y * y + z * z)
+    R[:, 1, 1] = 1 - 2 * (x * x + z * z)
+    R[:, 2, 2] = 1 - 2 * (x * x + y * y)
+    R[:, 0, 1], R[:, 1, 0] = 2 * (x * y - z * w), 2 * (x * y + z * w)
+    R[:, 0, 2], R[:, 2, 0] = 2 * (x * z + y * w), 2 * (x * z - y * w)
+    R[:, 1, 2], R[:, 2, 1] = 2 * (y * z - x * w), 2 * (y * z + x * w)
+    return R

@@ -1,0 +1,156 @@
+"""Controllers as processes, the real wheel in a child that is killed at its deadline, robots without sockets."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import textwrap
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import pytest
+
+from station.simulation.admin import AdminClient
+from station.simulation.controller.journal import Journal
+from station.simulation.controller.robot import Settings, SimulatedRobot
+from station.simulation.controller.uploads import Upload
+from station.simulation.launch import SimulatedController, start_controller
+
+_BEFORE = """
+import json, math, os, sys, threading, time
+import rtde_control, rtde_receive, rtde_io, dashboard_client
+from station.simulation.admin import AdminClient
+host = sys.argv[1]
+admin = AdminClient(host)
+result = {}
+HOME = [0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0]
+NEAR = [0.2, -1.5, 1.5, -1.5, -1.5, 0.1]
+FAR = [1.2, -1.5, 1.5, -1.5, -1.5, 0.1]
+def until(what, timeout_s=3.0):
+    end = time.monotonic() + timeout_s
+    while not what():
+        if time.monotonic() > end:
+            raise TimeoutError("condition not met")
+        time.sleep(0.005)
+def finished(control):
+    return control.getAsyncOperationProgress() < 0
+"""
+_AFTER = """
+print("RESULT", json.dumps(result), flush=True)
+os._exit(0)  # never the wheel's destructors
+"""
+CONTROL_SCRIPT = Upload(
+    "rtde_control", "def rtde_control():\n reg_offset_float = 0\n reg_offset_int = 0\nend\n"
+)
+
+
+@pytest.fixture
+def controller() -> Iterator[Callable[..., SimulatedController]]:
+    """Starts controllers: `controller("UR10", time_scale=…)`; all end with the test."""
+    running: list[SimulatedController] = []
+
+    def start(model: str = "UR10", **options: Any) -> SimulatedController:
+        running.append(start_controller(model, **options))
+        return running[-1]
+
+    yield start
+    for child in running:
+        child.stop()
+
+
+@pytest.fixture
+def admin() -> Iterator[Callable[[SimulatedController], AdminClient]]:
+    clients: list[AdminClient] = []
+
+    def connect(running: SimulatedController) -> AdminClient:
+        clients.append(running.admin())
+        return clients[-1]
+
+    yield connect
+    for client in clients:
+        client.close()
+
+
+def run_wheel(running: SimulatedController, code: str, timeout_s: float = 25.0) -> dict[str, Any]:
+    """Runs code against the unmodified ur_rtde wheel in a process of its own; its `result` comes back."""
+    source = _BEFORE + textwrap.dedent(code) + _AFTER
+    child = subprocess.run(
+        [sys.executable, "-c", source, running.host], capture_output=True, text=True, timeout=timeout_s
+    )
+    for line in child.stdout.splitlines():
+        if line.startswith("RESULT "):
+            result: dict[str, Any] = json.loads(line.removeprefix("RESULT "))
+            return result
+    raise AssertionError(f"the child gave no result (exit {child.returncode}):\n{child.stderr[-3000:]}")
+
+
+@pytest.fixture
+def wheel() -> Callable[..., dict[str, Any]]:
+    """`wheel(controller, code)`: what `code` put into `result`, run against the unmodified ur_rtde wheel."""
+    return run_wheel
+
+
+class Bench:
+    """A robot without sockets: time goes on only by `run`, registers are written by hand."""
+
+    def __init__(self, **settings: Any) -> None:
+        self.robot = SimulatedRobot(Settings(**settings), Journal())
+        self._ns = 1_000_000_000
+
+    def run(self, seconds: float) -> None:
+        for _ in range(round(seconds / self.robot.dt_s)):
+            self._ns += round(self.robot.dt_s * 1e9)
+            self.robot.tick(self._ns)
+
+    def run_until(self, done: Callable[[], bool], limit_s: float = 30.0) -> float:
+        """Simulated seconds that passed."""
+        start = self.robot.ticks
+        while not done():
+            if (self.robot.ticks - start) * self.robot.dt_s > limit_s:
+                raise AssertionError(f"not within {limit_s} s")
+            self.run(self.robot.dt_s)
+        return (self.robot.ticks - start) * self.robot.dt_s
+
+    def start_script(self, upload: Upload = CONTROL_SCRIPT) -> None:
+        self.robot.upload(upload)
+        self.run(0.1)
+
+    def write(self, command: int, doubles: list[float] | None = None, asynchronous: int = 0) -> None:
+        """A command packet, as a client sends it."""
+        for i, value in enumerate(doubles or []):
+            self.robot.inputs.set(f"input_double_register_{i}", value)
+        self.robot.inputs.set("input_int_register_1", asynchronous)
+        self.robot.inputs.set("input_int_register_0", command)
+        self.robot.command_register_written(0)
+
+    def command(self, command: int, doubles: list[float] | None = None, asynchronous: int = 0) -> float:
+        """The client's handshake: waits for ready, sends, waits for done, clears. Seconds until done."""
+        self.run_until(lambda: self.state == 1)
+        self.write(command, doubles, asynchronous)
+        took = self.run_until(lambda: self.state == 2, limit_s=60.0)
+        self.write(0)
+        return took
+
+    @property
+    def state(self) -> int:
+        return int(self.robot.outputs.get("output_int_register_0"))
+
+    @property
+    def answer(self) -> int:
+        return int(self.robot.outputs.get("output_int_register_1"))
+
+    @property
+    def word(self) -> int:
+        return int(self.robot.outputs.get("output_int_register_2"))
+
+    def results(self, count: int = 6) -> list[float]:
+        return [self.robot.outputs.get(f"output_double_register_{i}") for i in range(count)]
+
+    def output(self, name: str) -> float:
+        return self.robot.outputs.get(name)
+
+
+@pytest.fixture
+def bench() -> Callable[..., Bench]:
+    return Bench

@@ -8,6 +8,7 @@ from typing import Protocol
 import msgspec
 
 from recordings.messages import CameraIdentity, Picture, RobotIdentity, RobotState
+from station.clocks import ClockFit
 
 
 class Robot(Protocol):
@@ -55,6 +56,10 @@ class Camera(Protocol):
 
     async def capture(self, timeout_s: float = 5.0) -> Picture:
         """One trigger, one frame. Raises CameraError; never returns an older frame."""
+
+    @property
+    def clock(self) -> ClockFit | None:
+        """The camera's clock against the host's; None while it is not known. `frames.mid_exposure` uses it."""
 
     async def preview(self) -> Picture | None:
         """A recent picture for the screen; None when there is none. Never recorded."""

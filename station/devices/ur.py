@@ -1,0 +1,264 @@
+"""A Universal Robots arm behind `station.devices.base.Robot`: one control process per go, two ways to stop.
+
+Everything here runs in one event loop and returns to it within milliseconds; the state stream has its own
+thread, ur_rtde its own process. Safety rules and what each fault does: docs/safety.md, docs/faults.md.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import math
+import time
+from collections.abc import Coroutine, Sequence
+from pathlib import Path
+from typing import Any
+
+from station.config import RobotConfig
+from station.devices.rtde import RuntimeState
+from station.devices.ur_child import ControlChild
+from station.devices.ur_condition import foreign_program, not_powered, program_not_running, safety_stop
+from station.devices.ur_dashboard import STOP, Dashboard
+from station.devices.ur_link import UrLink
+from station.devices.ur_moves import MoveWatch
+from station.errors import RobotError
+
+log = logging.getLogger(__name__)
+
+POLL_S = 0.005
+STOP_WAIT_S = 0.05
+JOINT_SPEED_LIMIT_RAD_S = 1.05
+JOINT_ACCELERATION_LIMIT_RAD_S2 = 1.5
+LOCAL_CONTROL = "the robot is in local control: switch the pendant to Remote (top right), then give a new go"
+
+
+class UrRobot(UrLink):
+    """`log_dir`: where the control process's words go."""
+
+    def __init__(self, config: RobotConfig, log_dir: Path, lock_dir: Path | None = None) -> None:
+        super().__init__(config, lock_dir)
+        self.notice = ""
+        """What a person should know while a move is under way, though it is no fault; empty = nothing."""
+        self._log_path = log_dir / "control.log"
+        self._child: ControlChild | None = None
+        self._controls = False
+        self._moving = False
+        self._stop_reason = ""
+        self._background: set[asyncio.Task[Any]] = set()
+
+    @property
+    def control(self) -> bool:
+        """The control program runs and obeys us."""
+        return self._controls
+
+    # -- control ----------------------------------------------------------------------------------------
+
+    async def start_control(self) -> None:
+        """Spawns the control process, which loads its program. Only in answer to a go. Raises RobotError."""
+        if self._child is not None:
+            raise RobotError("control is already started")
+        self.check()
+        await self._may_start()
+        self._stop_reason = ""
+        self._log_path.parent.mkdir(parents=True, exist_ok=True)
+        child = self._child = ControlChild.spawn(self.config.host, self._log_path)
+        try:
+            tcp = await child.ready()
+            if self._stop_reason:
+                raise RobotError(f"stopped while control was starting: {self._stop_reason}")
+            if tcp is not None and self._tool is not None:
+                self._tool.agree((tcp[0], tcp[1], tcp[2], tcp[3], tcp[4], tcp[5]))
+        except BaseException:
+            await self.end_control()
+            raise
+        self._controls = True
+
+    async def _may_start(self) -> None:
+        """Raises RobotError, with the remedy, while starting control would disturb somebody or must fail."""
+        # A connection that was opened in local mode stays refused: e-Series want a new one.
+        fresh = await Dashboard.open(self.config.host)
+        if self.dashboard is not None:
+            await self.dashboard.close()
+        self.dashboard = fresh
+        self.remote = await fresh.remote()
+        state = self.latest()
+        if self.remote is False:
+            raise RobotError(LOCAL_CONTROL)
+        self.program = await fresh.ask("programState")
+        trouble = safety_stop(state) or not_powered(state) or foreign_program(state, self.program)
+        if trouble is not None:
+            raise trouble
+
+    def heartbeat(self) -> None:
+        """Called by the session loop at least every 50 ms while control lives; without it the arm stops."""
+        if self._child is not None:
+            self._child.beat()
+
+    async def end_control(self) -> None:
+        """Stops the script and ends the child."""
+        child, self._child, self._controls = self._child, None, False
+        if child is None:
+            return
+        await child.end()
+        await self._stop_leftover_program()
+
+    # -- moving -----------------------------------------------------------------------------------------
+
+    async def move(self, joints_rad: Sequence[float], speed_rad_s: float, acceleration_rad_s2: float) -> None:
+        """Moves the joints and returns when arrived. Whatever else ends it stops the arm and control.
+
+        Raises RobotError, SafetyStopError, StaleStateError. Paths are checked by the planner; here only the
+        caps on speed, acceleration and joint range are kept.
+        """
+        _check_numbers(joints_rad, speed_rad_s, acceleration_rad_s2, self.model.joint_limit_rad)
+        child = self._child
+        if child is None or not self._controls:
+            raise RobotError(f"control is not started{self._why_stopped()}: a person's go starts it")
+        if self._moving:
+            raise RobotError("a move is already under way")
+        self._moving = True
+        try:
+            self.check()
+            sample = self.newest()
+            watch = MoveWatch(joints_rad, sample.operation, time.monotonic())
+            await child.move(joints_rad, speed_rad_s, acceleration_rad_s2)
+            await self._follow(watch, child)
+        except BaseException as error:
+            error = self._explain(error)
+            await asyncio.shield(self.stop(str(error) or type(error).__name__))
+            raise error
+        finally:
+            self._moving = False
+            self.notice = ""
+
+    async def _follow(self, watch: MoveWatch, child: ControlChild) -> None:
+        while True:
+            if self._stop_reason:
+                raise RobotError(f"stopped: {self._stop_reason}")
+            sample = self.newest()
+            if watch.step(sample.state, sample.operation, self.age_s(), time.monotonic()):
+                return
+            child.check()
+            self.notice = watch.notice
+            await asyncio.sleep(POLL_S)
+
+    def _explain(self, error: BaseException) -> BaseException:
+        """The cause behind a symptom: STOP before all, then safety, then what the program's state says."""
+        if not isinstance(error, RobotError):
+            return error
+        if self._stop_reason:
+            return RobotError(f"stopped: {self._stop_reason}")
+        sample = self.reader.newest if self.reader is not None else None
+        if sample is None:
+            return error
+        return safety_stop(sample.state) or error
+
+    # -- stopping ---------------------------------------------------------------------------------------
+
+    async def stop(self, reason: str) -> None:
+        """Decelerates now, by both paths; idempotent, in any state, never raises. Control ends with it.
+
+        Without control of ours the dashboard's stop is sent all the same: it ends a foreign program too.
+        """
+        self._stop_reason = self._stop_reason or reason
+        child, self._child, self._controls = self._child, None, False
+        waits: list[asyncio.Future[Any]] = []
+        try:
+            if child is not None:
+                child.stop()
+                waits.append(child.stop_acknowledged)
+            if self.dashboard is not None and self.dashboard.alive:
+                waits.append(self.dashboard.send(STOP))
+            self._later(self._finish_stop(child, fallback=len(waits) < 2 or child is None))
+            if waits:
+                await asyncio.wait(waits, timeout=STOP_WAIT_S)
+        except Exception:
+            log.exception("a path of the stop failed")
+
+    async def _finish_stop(self, child: ControlChild | None, fallback: bool) -> None:
+        """Behind the stop: the dashboard again by a new connection if need be, then the end of the child."""
+        if fallback or self.dashboard is None or not self.dashboard.alive:
+            await self._dashboard_stop_anew()
+        if child is not None:
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(STOP_WAIT_S):
+                    await asyncio.shield(child.stop_acknowledged)
+            child.kill()
+            await child.reap()
+            await self._stop_leftover_program()
+
+    async def _stop_leftover_program(self) -> None:
+        """A child that was killed may have left its program playing (it moves nothing; its watchdog ends
+        it), or one that had just been sent starts only now."""
+        await asyncio.sleep(0.2)
+        sample = self.reader.newest if self.reader is not None else None
+        if sample is not None and sample.state.runtime_state == RuntimeState.PLAYING and self._child is None:
+            await self._dashboard_stop_anew()
+
+    async def _dashboard_stop_anew(self) -> None:
+        try:
+            dashboard = await Dashboard.open(self.config.host, timeout_s=1.0)
+        except RobotError as error:
+            log.warning("dashboard stop: %s", error)
+            return
+        with contextlib.suppress(RobotError):
+            await dashboard.ask(STOP)
+        await dashboard.close()
+
+    def on_link_lost(self, why: str) -> None:
+        """ur_rtde would now reconnect by itself and load its program again: its process ends first."""
+        if self._child is not None and not self._moving:
+            self._later(self.stop(f"connection to the robot lost ({why})"))
+        if self._child is not None:
+            self._child.kill()
+
+    async def supervise_more(self) -> None:
+        """Between moves: a program, a process or a switch that failed ends control, and says why."""
+        await super().supervise_more()
+        child = self._child
+        if child is None or not self._controls:
+            return
+        try:
+            child.check()
+            state = self.latest()
+            trouble = safety_stop(state) or not_powered(state) or program_not_running(state)
+            if self.remote is False:
+                trouble = RobotError(LOCAL_CONTROL)
+            if trouble is not None:
+                raise trouble
+        except RobotError as error:
+            await self.stop(str(error))
+            raise
+
+    async def close(self) -> None:
+        """Stops what moves, ends control and every connection."""
+        if self._moving:
+            await self.stop("the station is closing the robot")
+        await self.end_control()
+        if self._background:
+            await asyncio.wait(self._background, timeout=2.0)
+        await super().close()
+
+    def _why_stopped(self) -> str:
+        return f" ({self._stop_reason})" if self._stop_reason else ""
+
+    def _later(self, work: Coroutine[Any, Any, Any]) -> None:
+        task = asyncio.get_running_loop().create_task(work)
+        self._background.add(task)
+        task.add_done_callback(self._background.discard)
+
+
+def _check_numbers(
+    joints_rad: Sequence[float], speed_rad_s: float, acceleration_rad_s2: float, limit_rad: float
+) -> None:
+    """Raises RobotError: ur_rtde sends NaN and wrong lengths to the controller as they are."""
+    if len(joints_rad) != 6 or not all(math.isfinite(q) and abs(q) <= limit_rad for q in joints_rad):
+        raise RobotError(f"not six joint angles within ± {limit_rad:.2f} rad: {list(joints_rad)}")
+    if not 0 < speed_rad_s <= JOINT_SPEED_LIMIT_RAD_S:
+        raise RobotError(f"joint speed {speed_rad_s} rad/s is not within 0…{JOINT_SPEED_LIMIT_RAD_S}")
+    if not 0 < acceleration_rad_s2 <= JOINT_ACCELERATION_LIMIT_RAD_S2:
+        raise RobotError(
+            f"joint acceleration {acceleration_rad_s2} rad/s² is not within "
+            f"0…{JOINT_ACCELERATION_LIMIT_RAD_S2}"
+        )

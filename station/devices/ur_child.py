@@ -1,0 +1,227 @@
+"""The parent's side of the control process: one per go, deadlines on everything, killed on doubt."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from station.errors import RobotError
+
+CONNECT_S = 8.0
+ACKNOWLEDGE_S = 1.0
+END_S = 1.0
+LOG_LIMIT_BYTES = 1_000_000
+STOP_DECELERATION = 2.0
+"""The script reads it as m/s² of the tool for an asynchronous stop (see docs/safety.md)."""
+
+
+class ControlChild:
+    """Belongs to the event loop it was started in. Not reusable: after `end` or `kill` start a new one."""
+
+    def __init__(self, process: subprocess.Popen[bytes], channel: socket.socket, log_path: Path) -> None:
+        self._process = process
+        self._channel = channel
+        self._log_path = log_path
+        self._loop = asyncio.get_running_loop()
+        self._ready: asyncio.Future[dict[str, Any]] = self._loop.create_future()
+        self._moves: dict[int, asyncio.Future[dict[str, Any]]] = {}
+        self._number = 0
+        self._beat_ns = 0
+        self._answered_ns = 0
+        self.stop_acknowledged: asyncio.Future[None] = self._loop.create_future()
+        self.kicks_refused = False
+        """The child says that the control script does not take kicks any more."""
+        self.gone = asyncio.Event()
+        """The process ended or was killed."""
+        self._loop.add_reader(channel, self._receive)
+
+    @classmethod
+    def spawn(cls, host: str, log_path: Path) -> ControlChild:
+        """Starts the process (milliseconds). From the loop's thread: the child dies with that thread."""
+        with contextlib.suppress(FileNotFoundError):
+            if log_path.stat().st_size > LOG_LIMIT_BYTES:
+                log_path.replace(log_path.with_suffix(".log.1"))
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        ours.setblocking(False)
+        command = [sys.executable, "-m", "station.devices.ur_control", host, str(theirs.fileno())]
+        with theirs, log_path.open("ab") as log:
+            process = subprocess.Popen(
+                [*command, str(os.getpid())],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=log,
+                pass_fds=(theirs.fileno(),),
+                start_new_session=True,
+            )
+        return cls(process, ours, log_path)
+
+    @property
+    def pid(self) -> int:
+        return self._process.pid
+
+    async def ready(self, timeout_s: float = CONNECT_S) -> tuple[float, ...] | None:
+        """Waits for the control script to run; the TCP offset if readable. Kills it and raises RobotError."""
+        try:
+            async with asyncio.timeout(timeout_s):
+                answer = await asyncio.shield(self._ready)
+        except TimeoutError:
+            self.kill()
+            await self.reap()
+            raise RobotError(
+                f"the control process was not ready within {timeout_s:g} s and was killed; "
+                f"see {self._log_path}"
+            ) from None
+        if "refused" in answer:
+            self.kill()
+            await self.reap()
+            raise RobotError(_refusal(str(answer["refused"])) + self.epitaph())
+        return tuple(answer["tcp"]) if answer.get("tcp") else None
+
+    # -- requests ---------------------------------------------------------------------------------------
+
+    def beat(self) -> None:
+        """Passes the session loop's heartbeat on. Never blocks: a child that does not read gets none."""
+        now_ns = time.monotonic_ns()
+        if self._send({"do": "beat", "ns": now_ns}) and self._beat_ns <= self._answered_ns:
+            self._beat_ns = now_ns
+
+    async def move(self, joints_rad: Sequence[float], speed_rad_s: float, acceleration_rad_s2: float) -> None:
+        """Asks for an asynchronous move and waits until the script has taken it. Raises RobotError."""
+        self._number += 1
+        answer: asyncio.Future[dict[str, Any]] = self._loop.create_future()
+        self._moves[self._number] = answer
+        request = {
+            "do": "move",
+            "id": self._number,
+            "joints": list(joints_rad),
+            "speed": speed_rad_s,
+            "acceleration": acceleration_rad_s2,
+        }
+        try:
+            if not self._send(request):
+                raise RobotError(f"the control process takes no requests{self.epitaph()}")
+            async with asyncio.timeout(ACKNOWLEDGE_S):
+                reply = await answer
+        except TimeoutError:
+            raise RobotError(
+                f"the control process did not acknowledge the move within {ACKNOWLEDGE_S:g} s; "
+                f"see {self._log_path}"
+            ) from None
+        finally:
+            self._moves.pop(self._number, None)
+        if not reply["ok"]:
+            raise RobotError(f"the move was not started: {reply['error']}")
+
+    def stop(self) -> None:
+        """Puts the stop on the wire to the child, now. Never raises."""
+        self._send({"do": "stop", "deceleration": STOP_DECELERATION})
+
+    def check(self) -> None:
+        """Raises RobotError when the process died, hangs, or its script takes no kicks."""
+        if self.gone.is_set():
+            raise RobotError(f"the control process died{self.epitaph()}; see {self._log_path}")
+        if self._beat_ns > self._answered_ns and time.monotonic_ns() - self._beat_ns > ACKNOWLEDGE_S * 1e9:
+            raise RobotError(f"the control process hangs; see {self._log_path}")
+        if self.kicks_refused:
+            raise RobotError(
+                "the watchdog of the control program could not be kicked: the session was busy for too long, "
+                "or the program stopped"
+            )
+
+    def _send(self, request: dict[str, Any]) -> bool:
+        try:
+            self._channel.send(json.dumps(request).encode())
+        except OSError:  # full, or closed
+            return False
+        return True
+
+    # -- the end ----------------------------------------------------------------------------------------
+
+    async def end(self, timeout_s: float = END_S) -> None:
+        """Ends script and process in good order, by force when that takes too long. Reaps it."""
+        self._send({"do": "end"})
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(timeout_s):
+                await self.gone.wait()
+        self.kill()
+        await self.reap()
+
+    def kill(self) -> None:
+        """SIGKILL; immediate, from any state."""
+        with contextlib.suppress(OSError):
+            self._process.kill()
+        self._close()
+
+    async def reap(self) -> None:
+        while self._process.poll() is None:
+            await asyncio.sleep(0.005)
+
+    def epitaph(self) -> str:
+        """How it died, in words; empty while it lives or after a normal end."""
+        code = self._process.poll()
+        if code is None or code == 0:
+            return ""
+        if code < 0:
+            return f" (signal {-code}, {signal.Signals(-code).name})"
+        return f" (exit code {code})"
+
+    # -- answers ----------------------------------------------------------------------------------------
+
+    def _receive(self) -> None:
+        try:
+            message = self._channel.recv(65536)
+        except BlockingIOError:
+            return
+        except OSError:
+            message = b""
+        if not message:
+            self._close()
+            return
+        answer = json.loads(message)
+        if "beat" in answer:
+            self._answered_ns = max(self._answered_ns, int(answer["beat"]))
+            self.kicks_refused = not answer["kicked"]
+        elif "id" in answer:
+            waiter = self._moves.get(answer["id"])
+            if waiter is not None and not waiter.done():
+                waiter.set_result(answer)
+        elif "stopped" in answer:
+            if not self.stop_acknowledged.done():
+                self.stop_acknowledged.set_result(None)
+        elif not self._ready.done():
+            self._ready.set_result(answer)
+
+    def _close(self) -> None:
+        if self._channel.fileno() >= 0:
+            self._loop.remove_reader(self._channel)
+            self._channel.close()
+        self.gone.set()
+        died = {"ok": False, "error": "the control process died", "refused": "the control process died"}
+        for waiter in (*self._moves.values(), self._ready):
+            if not waiter.done():
+                waiter.set_result(died)
+
+
+def _refusal(text: str) -> str:
+    """ur_rtde's words → what a person can do."""
+    lowered = text.lower()
+    if "in use" in lowered:
+        return (
+            "another program controls the robot (its RTDE registers are in use): close that program, or the "
+            "field bus on the pendant, then try again"
+        )
+    if "remote control" in lowered:
+        return "the robot is in local control: switch the pendant to Remote (top right), then try again"
+    if "start control script" in lowered:
+        return "the control program did not start: power on, release the brakes, clear the pendant's messages"
+    return f"control could not start: {text}"

@@ -1,0 +1,119 @@
+"""What a robot state means for a person: why the arm cannot or must not move, and what to do about it."""
+
+from __future__ import annotations
+
+from recordings.messages import RobotState
+from station.devices.rtde import RobotMode, RuntimeState, SafetyMode, SafetyStatus
+from station.errors import RobotError, SafetyStopError
+
+_EMERGENCY = (
+    SafetyStatus.EMERGENCY_STOPPED
+    | SafetyStatus.ROBOT_EMERGENCY_STOPPED
+    | SafetyStatus.SYSTEM_EMERGENCY_STOPPED
+)
+_SAFETY_SENTENCES: tuple[tuple[SafetyStatus, frozenset[SafetyMode], str], ...] = (
+    (
+        _EMERGENCY,
+        frozenset({SafetyMode.ROBOT_EMERGENCY_STOP, SafetyMode.SYSTEM_EMERGENCY_STOP}),
+        "emergency stop: make the cell safe, release the button, then power on and release the brakes",
+    ),
+    (
+        SafetyStatus.FAULT | SafetyStatus.VIOLATION,
+        frozenset({SafetyMode.FAULT, SafetyMode.VIOLATION}),
+        "safety fault or violation: read the pendant's log; only the pendant can clear it",
+    ),
+    (
+        SafetyStatus.PROTECTIVE_STOPPED,
+        frozenset({SafetyMode.PROTECTIVE_STOP}),
+        "protective stop: find what the arm ran into, then enable it again on the pendant",
+    ),
+    (
+        SafetyStatus.SAFEGUARD_STOPPED,
+        frozenset({SafetyMode.SAFEGUARD_STOP}),
+        "safeguard stop: close the guard (or clear the scanner) and reset it there",
+    ),
+    (
+        SafetyStatus.RECOVERY,
+        frozenset({SafetyMode.RECOVERY}),
+        "recovery mode: move the arm back inside its safety limits on the pendant",
+    ),
+    (
+        SafetyStatus.STOPPED_DUE_TO_SAFETY,
+        frozenset(),
+        "stopped for a safety reason: read the pendant",
+    ),
+)
+_MODE_SENTENCES = {
+    RobotMode.NO_CONTROLLER: "the controller is not running; restart the robot",
+    RobotMode.DISCONNECTED: "the arm is not connected to its controller; restart the robot",
+    RobotMode.CONFIRM_SAFETY: "the pendant asks for the safety configuration to be confirmed",
+    RobotMode.BOOTING: "the robot is still starting; wait",
+    RobotMode.POWER_OFF: "the arm has no power: power on and release the brakes on the pendant",
+    RobotMode.POWER_ON: "the arm is powered but not started: release the brakes on the pendant",
+    RobotMode.IDLE: "the brakes are on: release them on the pendant",
+    RobotMode.BACKDRIVE: "the arm is in backdrive: end it on the pendant",
+}
+_PROGRAM_WORDS = {
+    RuntimeState.STOPPING: "stopping",
+    RuntimeState.STOPPED: "stopped",
+    RuntimeState.PLAYING: "playing",
+    RuntimeState.PAUSING: "pausing",
+    RuntimeState.PAUSED: "paused",
+    RuntimeState.RESUMING: "resuming",
+}
+_SAFETY_WORDS = {mode: mode.name.replace("_", " ") for mode in SafetyMode}
+
+
+def safety_stop(state: RobotState) -> SafetyStopError | None:
+    """The reason why safety holds the arm, or None. Bits and mode both count: either may come first."""
+    for bits, modes, sentence in _SAFETY_SENTENCES:
+        if state.safety_status_bits & bits or state.safety_mode in modes:
+            return SafetyStopError(f"{sentence}. Then acknowledge here and give a new go.")
+    return None
+
+
+def not_powered(state: RobotState) -> RobotError | None:
+    if state.robot_mode == RobotMode.RUNNING:
+        return None
+    return RobotError(
+        _MODE_SENTENCES.get(
+            RobotMode(state.robot_mode) if state.robot_mode in _MODES else RobotMode.NO_CONTROLLER,
+            f"the robot is in mode {state.robot_mode}",
+        )
+    )
+
+
+def program_not_running(state: RobotState) -> RobotError | None:
+    """Of our own control script, which must play as long as control lives."""
+    if state.runtime_state == RuntimeState.PLAYING:
+        return None
+    word = program_word(state)
+    return RobotError(
+        f"the control program is {word}: stopped or paused on the pendant, by remote control being switched "
+        "off, or by its watchdog. Look at the cell, acknowledge here and give a new go."
+    )
+
+
+def foreign_program(state: RobotState, name: str) -> RobotError | None:
+    """Why control cannot start: somebody else's program would be replaced by it."""
+    if state.runtime_state == RuntimeState.STOPPED:
+        return None
+    return RobotError(
+        f"the program {name or 'on the robot'} is {program_word(state)}; starting control would replace it. "
+        "Stop it on the pendant, then try again."
+    )
+
+
+def program_word(state: RobotState) -> str:
+    return _PROGRAM_WORDS.get(state.runtime_state, f"in state {state.runtime_state}")  # type: ignore[call-overload, no-any-return]
+
+
+def safety_word(state: RobotState) -> str:
+    return _SAFETY_WORDS.get(state.safety_mode, f"SAFETY MODE {state.safety_mode}")  # type: ignore[call-overload, no-any-return]
+
+
+def mode_word(state: RobotState) -> str:
+    return RobotMode(state.robot_mode).name.replace("_", " ") if state.robot_mode in _MODES else "UNKNOWN"
+
+
+_MODES = frozenset(int(mode) for mode in RobotMode)

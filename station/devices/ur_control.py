@@ -1,0 +1,127 @@
+"""The disposable process that holds ur_rtde's control interface: `python -m station.devices.ur_control`.
+
+Everything that can hang, crash or abort inside that library happens here and costs only this process. It is
+started by `ur_child`, answers requests on one inherited socket (one JSON object per message) and dies with
+its parent. It never reconnects, never uploads its script a second time and never moves by itself.
+
+Requests: {"do": "beat", "ns": N}   N = host monotonic time of the session loop; kicks the watchdog if fresh
+          {"do": "move", "id": I, "joints": [6], "speed": rad/s, "acceleration": rad/s²}
+          {"do": "stop", "deceleration": …}
+          {"do": "end"}
+Answers:  {"ready": true, "tcp": [6] | null} · {"refused": text} · {"beat": N, "kicked": bool}
+          {"id": I, "ok": bool, "error": text} · {"stopped": true}
+"""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import math
+import os
+import signal
+import socket
+import sys
+import time
+from typing import Any, NoReturn
+
+BEAT_FRESH_NS = 100_000_000
+WATCHDOG_HZ = 5.0
+"""The controller stops the script after 1/5 s without a kick."""
+MESSAGE_LIMIT = 4096
+_PR_SET_PDEATHSIG = 1
+
+
+def die_with_parent(parent_pid: int) -> None:
+    """Has the kernel kill this process when the thread that started it ends."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent_pid:  # it died before the line above
+        os._exit(1)
+
+
+class ControlServer:
+    def __init__(self, control: Any, channel: socket.socket) -> None:
+        self._control = control
+        self._channel = channel
+        self._beat_ns = 0
+        self._watched = False
+        self._script_lost = False
+
+    def serve(self) -> None:
+        """Until the parent says `end` or closes the socket."""
+        while message := self._channel.recv(MESSAGE_LIMIT):
+            request = json.loads(message)
+            verb = request["do"]
+            if verb == "beat":
+                self._beat(int(request["ns"]))
+            elif verb == "move":
+                error = self._move(request)
+                self.answer({"id": request["id"], "ok": not error, "error": error})
+            elif verb == "stop":
+                self._control.stopJ(float(request["deceleration"]), True)
+                self.answer({"stopped": True})
+            elif verb == "end":
+                self._control.stopScript()
+                return
+
+    def answer(self, reply: dict[str, Any]) -> None:
+        self._channel.send(json.dumps(reply).encode())
+
+    def _fresh(self) -> bool:
+        return time.monotonic_ns() - self._beat_ns <= BEAT_FRESH_NS
+
+    def _beat(self, beat_ns: int) -> None:
+        self._beat_ns = beat_ns
+        kicked = self._fresh() and not self._script_lost
+        if kicked:
+            kicked = self._watch() and self._control.kickWatchdog()
+            self._script_lost = not kicked
+        self.answer({"beat": beat_ns, "kicked": kicked})
+
+    def _watch(self) -> bool:
+        """Arms the watchdog once; from then on the script lives only as long as it is kicked."""
+        if not self._watched:
+            self._watched = bool(self._control.setWatchdog(WATCHDOG_HZ))
+        return self._watched
+
+    def _move(self, request: dict[str, Any]) -> str:
+        joints = [float(q) for q in request["joints"]]
+        if len(joints) != 6 or not all(map(math.isfinite, joints)):
+            return f"six finite joint angles are needed, not {joints}"
+        if not self._fresh():
+            return "the session's heartbeat is missing"
+        if self._script_lost or not self._watch():
+            return "the control program is not running or its watchdog could not be armed"
+        try:
+            ok = self._control.moveJ(joints, float(request["speed"]), float(request["acceleration"]), True)
+        except (ValueError, RuntimeError) as error:
+            return str(error)
+        return "" if ok else "the controller did not take the move"
+
+
+def main(host: str, descriptor: int, parent_pid: int) -> NoReturn:
+    """`descriptor`: the inherited socket. Leaves by os._exit: the library's destructors can hang or abort."""
+    die_with_parent(parent_pid)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    channel = socket.socket(fileno=descriptor)
+    from rtde_control import RTDEControlInterface
+
+    try:
+        control = RTDEControlInterface(host)
+    except RuntimeError as error:
+        channel.send(json.dumps({"refused": str(error)}).encode())
+        os._exit(1)
+    server = ControlServer(control, channel)
+    try:
+        tcp: list[float] | None = control.getTCPOffset()
+    except RuntimeError:
+        tcp = None
+    try:
+        server.answer({"ready": True, "tcp": tcp})
+        server.serve()
+    except OSError as error:
+        print(f"the parent is gone: {error}", file=sys.stderr, flush=True)
+    os._exit(0)
+
+
+if __name__ == "__main__":
+    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))

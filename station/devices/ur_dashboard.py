@@ -1,0 +1,120 @@
+"""Client of the dashboard server (port 29999): questions, and the one order this station may give: `stop`.
+
+Source: Universal Robots, "Dashboard Server e-Series / CB-Series, port 29999". One line per command, one line
+per reply, in order. Nothing here can unlock, power or reset a robot: what is not in ALLOWED is never sent.
+"""
+
+from __future__ import annotations
+
+import asyncio
+from collections import deque
+
+from station.errors import RobotError
+
+PORT = 29999
+STOP = "stop"
+ALLOWED = frozenset(
+    {
+        STOP, "PolyscopeVersion", "get serial number", "get robot model", "is in remote control",
+        "robotmode", "safetystatus", "programState", "running", "get loaded program",
+    }
+)  # fmt: skip
+LINE_LIMIT = 4096
+
+
+class DashboardError(RobotError):
+    """The dashboard is silent, gone or does not speak its protocol."""
+
+
+class Dashboard:
+    """One connection, for one event loop. A reply that is too late breaks it: its order would be lost."""
+
+    def __init__(self, host: str, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._host = host
+        self._reader = reader
+        self._writer = writer
+        self._waiting: deque[asyncio.Future[str]] = deque()
+        self._task = asyncio.create_task(self._read())
+
+    @classmethod
+    async def open(cls, host: str, timeout_s: float = 2.0) -> Dashboard:
+        """Connects and waits for the greeting. Raises DashboardError."""
+        where = f"dashboard of {host} (port {PORT})"
+        writer = None
+        try:
+            async with asyncio.timeout(timeout_s):
+                reader, writer = await asyncio.open_connection(host, PORT, limit=LINE_LIMIT)
+                greeting = await reader.readline()
+        except TimeoutError:
+            if writer is not None:
+                writer.transport.abort()
+            raise DashboardError(f"{where}: no answer within {timeout_s:g} s; is this the robot?") from None
+        except (OSError, ValueError) as error:
+            if writer is not None:
+                writer.transport.abort()
+            raise DashboardError(
+                f"{where}: {error.__class__.__name__}: {error}; check cable, address and that it is on"
+            ) from None
+        if b"Dashboard Server" not in greeting:
+            writer.transport.abort()
+            raise DashboardError(f"{where}: unexpected greeting {greeting[:80]!r}; is this a robot?")
+        return cls(host, reader, writer)
+
+    @property
+    def alive(self) -> bool:
+        return not self._task.done()
+
+    def send(self, command: str) -> asyncio.Future[str]:
+        """Puts the line on the wire before it returns; the future gives the reply."""
+        if command not in ALLOWED:
+            raise ValueError(f"the dashboard command {command!r} is never sent by this station")
+        reply: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        if not self.alive or self._writer.is_closing():
+            reply.set_exception(DashboardError(f"the dashboard connection to {self._host} is gone"))
+            return reply
+        self._waiting.append(reply)
+        self._writer.write(command.encode("ascii") + b"\n")
+        return reply
+
+    async def ask(self, command: str, timeout_s: float = 1.0) -> str:
+        """The reply line. Raises DashboardError when it does not come in time."""
+        try:
+            async with asyncio.timeout(timeout_s):
+                return await self.send(command)
+        except TimeoutError:
+            self._break("silent")
+            raise DashboardError(
+                f"dashboard of {self._host}: no reply to {command!r} within {timeout_s:g} s"
+            ) from None
+
+    async def remote(self) -> bool | None:
+        """Remote control is on; None where there is no such switch (CB3)."""
+        reply = (await self.ask("is in remote control")).strip().lower()
+        return {"true": True, "false": False}.get(reply)
+
+    async def _read(self) -> None:
+        why = "closed by the robot"
+        try:
+            while line := await self._reader.readline():
+                if not self._waiting:
+                    continue
+                waiter = self._waiting.popleft()
+                if not waiter.done():
+                    waiter.set_result(line.decode("utf-8", errors="replace").strip())
+        except (OSError, ValueError) as error:
+            why = str(error)
+        finally:
+            self._break(why)
+
+    def _break(self, why: str) -> None:
+        self._writer.transport.abort()
+        while self._waiting:
+            waiter = self._waiting.popleft()
+            if not waiter.done():
+                waiter.set_exception(DashboardError(f"dashboard of {self._host}: {why}"))
+                waiter.exception()  # the caller may be gone; that is no warning
+
+    async def close(self) -> None:
+        self._break("closed")
+        self._task.cancel()
+        await asyncio.gather(self._task, return_exceptions=True)

@@ -1,0 +1,259 @@
+"""The read-only half of an arm: identity, state stream, dashboard questions. Changes nothing on the robot.
+
+Enough for free-drive capture. A lost connection is opened again by itself: reading cannot hurt.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from calibrate.kinematics import MODELS, DhDeltas
+from recordings.messages import RobotIdentity, RobotState
+from station.clocks import ClockFit
+from station.config import RobotConfig
+from station.devices.ur_condition import safety_stop
+from station.devices.ur_dashboard import Dashboard, DashboardError
+from station.devices.ur_history import state_at
+from station.devices.ur_lock import RobotLock
+from station.devices.ur_probe import SCRIPT_PORT, ProbeResult, check_port, identify, lock_name
+from station.devices.ur_state import Sample, StateReader
+from station.devices.ur_tool import TcpCheck
+from station.errors import RobotError, StaleStateError, StationError
+
+log = logging.getLogger(__name__)
+
+STALE_S = 0.1
+FIRST_STATE_S = 4.0
+SUPERVISE_S = 0.2
+RECONNECT_S = (0.2, 0.5, 1.0, 2.0)
+
+
+class UrLink:
+    def __init__(self, config: RobotConfig, lock_dir: Path | None = None) -> None:
+        """Raises RobotError for an unknown model."""
+        if config.model not in MODELS:
+            raise RobotError(f"unknown robot.model {config.model!r}; known: {', '.join(sorted(MODELS))}")
+        self.config = config
+        self.model = MODELS[config.model]
+        if (k := config.kinematics) is not None:
+            self.model = self.model.calibrated(DhDeltas(k.a_m, k.d_m, k.alpha_rad, k.theta_rad))
+        self.remote: bool | None = None
+        """Remote control is on; None where there is no such switch (CB3)."""
+        self.program = ""
+        """The dashboard's words about the program, as of connect or the last question."""
+        self.reader: StateReader | None = None
+        """The state stream's counters; another object after a lost connection."""
+        self.dashboard: Dashboard | None = None
+        self.lost = 0
+        """Connections that ended by themselves."""
+        self._lock_dir = lock_dir
+        self._lock: RobotLock | None = None
+        self._identity = RobotIdentity(model=config.model)
+        self._subscribers: list[Callable[[RobotState], None]] = []
+        self._tool: TcpCheck | None = None
+        self._trouble: RobotError | None = None
+        self._supervisor: asyncio.Task[None] | None = None
+
+    # -- connecting -------------------------------------------------------------------------------------
+
+    @property
+    def identity(self) -> RobotIdentity:
+        return self._identity
+
+    async def connect(self) -> RobotIdentity:
+        """Reads identity and starts the state stream; changes nothing on the robot. Raises RobotError."""
+        if self._supervisor is not None:
+            return self._identity
+        if not self.config.host:
+            raise RobotError("robot.host is empty: give the robot's address in the configuration")
+        try:
+            await self._open()
+        except BaseException:
+            await self._close_link()
+            self._unlock()
+            raise
+        self._supervisor = asyncio.create_task(self._supervise(), name="robot supervisor")
+        return self._identity
+
+    async def _open(self) -> None:
+        host = self.config.host
+        self.dashboard = await Dashboard.open(host)
+        found = await identify(self.dashboard)
+        self._check_identity(found)
+        if self._lock is None:
+            self._lock = RobotLock(lock_name(host, found.serial), self._lock_dir)
+        await check_port(host, SCRIPT_PORT)
+        loop = asyncio.get_running_loop()
+        reader = StateReader(host, self._deliver, lambda why: _call(loop, self._reader_ended, reader, why))
+        self.reader = reader
+        reader.start()
+        try:
+            async with asyncio.timeout(FIRST_STATE_S):
+                first = await asyncio.wrap_future(reader.started)
+        except TimeoutError:
+            raise RobotError(f"{host}: RTDE answers, but no state came within {FIRST_STATE_S:g} s") from None
+        self._adopt(found, first, reader)
+
+    def _check_identity(self, found: ProbeResult) -> None:
+        wanted, host = self.config, self.config.host
+        if found.model and found.model != wanted.model:
+            raise RobotError(
+                f"the robot at {host} is a {found.model}, the configuration says {wanted.model}: correct "
+                "robot.model or robot.host"
+            )
+        if wanted.serial and found.serial and found.serial != wanted.serial:
+            raise RobotError(
+                f"the robot at {host} has serial {found.serial}, the configuration says {wanted.serial}: "
+                "correct robot.serial or robot.host"
+            )
+        if self._lock is not None and found.serial != self._identity.serial:
+            raise RobotError(f"another robot (serial {found.serial}) answers at {host} now; end this session")
+        self.remote, self.program = found.remote, found.program
+
+    def _adopt(self, found: ProbeResult, first: Sample, reader: StateReader) -> None:
+        if self._tool is None:
+            self._tool = TcpCheck(self.model, first.state, self.config.kinematics is not None)
+        else:
+            self._tool.check(first.state)
+        self._identity = RobotIdentity(
+            model=self.config.model,
+            serial=found.serial,
+            controller_version=".".join(map(str, reader.version)),
+            tcp_offset=self._tool.offset,
+            payload_kg=first.payload_kg,
+        )
+
+    async def close(self) -> None:
+        """Ends every connection and gives the robot free for others."""
+        if self._supervisor is not None:
+            self._supervisor.cancel()
+            await asyncio.gather(self._supervisor, return_exceptions=True)
+            self._supervisor = None
+        await self._close_link()
+        self._unlock()
+        self._tool = None
+
+    def _unlock(self) -> None:
+        if self._lock is not None:
+            self._lock.release()
+            self._lock = None
+
+    async def _close_link(self) -> None:
+        reader, self.reader = self.reader, None
+        if reader is not None:
+            await asyncio.to_thread(reader.close)
+        dashboard, self.dashboard = self.dashboard, None
+        if dashboard is not None:
+            await dashboard.close()
+
+    # -- the state --------------------------------------------------------------------------------------
+
+    def subscribe(self, callback: Callable[[RobotState], None]) -> None:
+        """Every sample, in order, at the full rate, from the reader's thread: the callback must be quick."""
+        self._subscribers.append(callback)
+
+    def _deliver(self, state: RobotState) -> None:
+        for callback in self._subscribers:
+            try:
+                callback(state)
+            except Exception:
+                log.exception("a subscriber of the robot's state failed and is dropped")
+                self._subscribers = [s for s in self._subscribers if s is not callback]
+
+    def newest(self) -> Sample:
+        """Whatever came last, however old. Raises StaleStateError when nothing ever came."""
+        sample = self.reader.newest if self.reader is not None else None
+        if sample is None:
+            raise StaleStateError(f"no connection to the robot at {self.config.host}")
+        return sample
+
+    def age_s(self) -> float:
+        """Of the newest sample; a controller time that stands still makes none."""
+        sample = self.reader.newest if self.reader is not None else None
+        if sample is None:
+            return float("inf")
+        return (time.monotonic_ns() - sample.state.stamps.host_monotonic_ns) / 1e9
+
+    def latest(self) -> RobotState:
+        """Newest state; StaleStateError when older than 100 ms or its controller time stands still."""
+        sample, age_s = self.newest(), self.age_s()
+        if age_s > STALE_S:
+            raise StaleStateError(self._stale_words(age_s))
+        return sample.state
+
+    def _stale_words(self, age_s: float) -> str:
+        reader = self.reader
+        assert reader is not None
+        if reader.ended is not None:
+            return f"connection to the robot lost ({reader.ended}): check cable and controller"
+        if reader.frozen:
+            return f"the controller's clock stands still since {age_s * 1000:.0f} ms: restart the controller"
+        return f"no news from the robot for {age_s * 1000:.0f} ms: check cable and network"
+
+    def at(self, host_monotonic_ns: int) -> RobotState:
+        """State interpolated at a host time within the last 10 s; StaleStateError outside."""
+        if self.reader is None:
+            raise StaleStateError("not connected to the robot")
+        return state_at(self.reader.history.copy(), self.clock(), host_monotonic_ns)
+
+    def clock(self) -> ClockFit | None:
+        """The controller's clock against the host's; None before there is enough to tell."""
+        return self.reader.clock.fit() if self.reader is not None else None
+
+    def check(self) -> None:
+        """Raises what speaks against capturing here and now: safety stop, stale state, TCP changed …"""
+        state = self.latest()
+        stop = safety_stop(state)
+        if stop is not None:
+            raise stop
+        assert self._tool is not None
+        self._tool.check(state)
+        if self._trouble is not None:
+            raise self._trouble
+
+    # -- supervision ------------------------------------------------------------------------------------
+
+    def _reader_ended(self, reader: StateReader, why: str) -> None:
+        if reader is self.reader and self._supervisor is not None:
+            self.lost += 1
+            log.warning("robot state of %s: %s", self.config.host, why)
+            self.on_link_lost(why)
+
+    def on_link_lost(self, why: str) -> None:
+        """For the half that moves the arm."""
+
+    async def _supervise(self) -> None:
+        failures = 0
+        while True:
+            await asyncio.sleep(SUPERVISE_S if not failures else RECONNECT_S[min(failures, 4) - 1])
+            reader = self.reader
+            try:
+                if reader is None or reader.ended is not None:
+                    await self._close_link()
+                    await self._open()
+                await self.supervise_more()
+                failures, self._trouble = 0, None
+            except StationError as error:
+                failures += 1
+                self._trouble = error if isinstance(error, RobotError) else RobotError(str(error))
+            except Exception:
+                failures += 1
+                log.exception("the robot's supervision failed; it goes on")
+
+    async def supervise_more(self) -> None:
+        """Asks the dashboard what the state stream does not say. Raises StationError."""
+        if self.dashboard is None or not self.dashboard.alive:
+            self.dashboard = await Dashboard.open(self.config.host)
+        if self.remote is not None:
+            with contextlib.suppress(DashboardError):
+                self.remote = await self.dashboard.remote()
+
+
+def _call(loop: asyncio.AbstractEventLoop, function: Callable[..., None], *arguments: object) -> None:
+    with contextlib.suppress(RuntimeError):  # the loop is closed: nobody is left to tell
+        loop.call_soon_threadsafe(function, *arguments)

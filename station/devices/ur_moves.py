@@ -1,0 +1,99 @@
+"""Watches one asynchronous move from the state stream: arrived, under way, or why not. Pure; knows no clock.
+
+ur_rtde's script reports asynchronous operations in output_int_register_2: bits 24–30 count operations,
+bit 15 = running. The word is written by another thread of the script, so a move that was just accepted may
+still look "not running": only a new count means that it has begun. After a protective stop, a program stop
+or a lost link the word freezes, so the state decides first.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+from recordings.messages import RobotState
+from station.devices.ur_condition import not_powered, program_not_running, safety_stop
+from station.errors import RobotError, StaleStateError
+
+STALE_S = 0.25
+ARRIVED_RAD = 0.01
+PROGRESS_RAD = 5e-4
+NO_PROGRESS_S = 3.0
+SLIDER_ZERO_S = 10.0
+"""An arm that waits longer for its slider gives up: nobody should be surprised by it."""
+SLIDER_STILL = 0.005
+
+
+def operation_count(word: int) -> int:
+    return word >> 24 & 0x7F
+
+
+def is_running(word: int) -> bool:
+    return bool(word & 1 << 15)
+
+
+@dataclass
+class MoveWatch:
+    target_rad: Sequence[float]
+    operation_before: int
+    """The word before the move was asked for."""
+    begun_s: float
+    notice: str = ""
+    """What a person should know now, though it is no fault; empty = nothing."""
+    _last_progress_s: float = field(init=False)
+    _distance_rad: float = field(init=False, default=float("inf"))
+    _ended_s: float | None = field(init=False, default=None)
+
+    def __post_init__(self) -> None:
+        self._last_progress_s = self.begun_s
+
+    def step(self, state: RobotState, word: int, age_s: float, now_s: float) -> bool:
+        """True when arrived. `age_s`: of the newest state. Raises what ended the move otherwise."""
+        if age_s > STALE_S:
+            raise StaleStateError(
+                f"no news from the robot for {age_s * 1000:.0f} ms during a move: check cable and network"
+            )
+        trouble = safety_stop(state) or not_powered(state) or program_not_running(state)
+        if trouble is not None:
+            raise trouble
+        distances = [abs(q - t) for q, t in zip(state.joints_rad, self.target_rad, strict=True)]
+        distance_rad = max(distances)
+        if abs(distance_rad - self._distance_rad) > PROGRESS_RAD:
+            self._distance_rad = distance_rad
+            self._last_progress_s = now_s
+        if operation_count(word) != operation_count(self.operation_before) and not is_running(word):
+            return self._ended(distance_rad, distances.index(distance_rad), now_s)
+        self._waiting(state, now_s)
+        return False
+
+    def _ended(self, distance_rad: float, joint: int, now_s: float) -> bool:
+        if distance_rad <= ARRIVED_RAD:
+            return True
+        if self._ended_s is None:
+            self._ended_s = now_s
+        if now_s - self._ended_s > STALE_S:
+            raise RobotError(
+                f"the move ended {distance_rad:.3f} rad short on joint {joint + 1}: "
+                "something else commanded or stopped the arm"
+            )
+        return False
+
+    def _waiting(self, state: RobotState, now_s: float) -> None:
+        idle_s = now_s - self._last_progress_s
+        fraction = state.target_speed_fraction
+        self.notice = ""
+        if fraction < SLIDER_STILL:
+            self.notice = "the speed slider on the pendant is at 0: the arm waits for it"
+            if idle_s > SLIDER_ZERO_S:
+                raise RobotError(
+                    f"the speed slider on the pendant stood at 0 for {SLIDER_ZERO_S:g} s: raise it, "
+                    "then give a new go"
+                )
+            return
+        if fraction < 0.995:
+            self.notice = f"speed slider at {fraction * 100:.0f} %"
+        if idle_s > NO_PROGRESS_S:
+            raise RobotError(
+                f"the arm has not moved for {NO_PROGRESS_S:g} s although a move is under way; "
+                "look at the pendant"
+            )

@@ -1,0 +1,106 @@
+"""Looks at a robot from outside, with time-outs, changing nothing: is it there, and what is it."""
+
+from __future__ import annotations
+
+import asyncio
+import ipaddress
+import re
+from dataclasses import dataclass, field, replace
+
+from station.devices.ur_dashboard import Dashboard, DashboardError
+from station.errors import RobotError
+
+SCRIPT_PORT = 30002
+RTDE_PORT = 30004
+CONNECT_S = 2.0
+
+
+@dataclass(frozen=True)
+class ProbeResult:
+    """What the dashboard says. Empty or None where this controller has no answer."""
+
+    model: str = ""
+    serial: str = ""
+    version: tuple[int, ...] = ()
+    remote: bool | None = None
+    program: str = ""
+    problems: tuple[str, ...] = field(default=())
+    """What is wrong, each with its remedy; empty = reachable and complete."""
+
+    @property
+    def is_e_series(self) -> bool:
+        return bool(self.version) and self.version[0] >= 5
+
+    @property
+    def version_text(self) -> str:
+        return ".".join(map(str, self.version))
+
+
+async def probe(host: str) -> ProbeResult:
+    """Asks all ports at once; takes at most a few seconds and never raises."""
+    result, *answers = await asyncio.gather(
+        _ask_dashboard(host), _port_problem(host, SCRIPT_PORT), _port_problem(host, RTDE_PORT)
+    )
+    return replace(result, problems=(*result.problems, *(p for p in answers if p)))
+
+
+async def identify(dashboard: Dashboard) -> ProbeResult:
+    """Model, serial, version and mode by an open dashboard connection. Raises DashboardError."""
+    version = _version(await dashboard.ask("PolyscopeVersion"))
+    model = (await dashboard.ask("get robot model")).strip()
+    serial = (await dashboard.ask("get serial number")).strip()
+    e_series = bool(version) and version[0] >= 5
+    if re.fullmatch(r"UR\d+", model) and e_series and model in ("UR3", "UR5", "UR10", "UR16"):
+        model += "e"  # the e-Series dashboard leaves the letter out
+    return ProbeResult(
+        model=model if re.fullmatch(r"UR\d+e?", model) else "",
+        serial=serial if serial.isdigit() else "",  # CB3 before 3.12 does not know the question
+        version=version,
+        remote=await dashboard.remote(),
+        program=(await dashboard.ask("programState")).strip(),
+    )
+
+
+def lock_name(host: str, serial: str) -> str:
+    """What the single-owner lock is called. Simulated controllers share a serial but not an address."""
+    try:
+        loopback = ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        loopback = host == "localhost"
+    return host if loopback or not serial else serial
+
+
+async def _ask_dashboard(host: str) -> ProbeResult:
+    dashboard = None
+    try:
+        dashboard = await Dashboard.open(host, CONNECT_S)
+        return await identify(dashboard)
+    except DashboardError as error:
+        return ProbeResult(problems=(str(error),))
+    finally:
+        if dashboard is not None:
+            await dashboard.close()
+
+
+async def check_port(host: str, port: int) -> None:
+    """Raises RobotError unless something accepts a connection there within 2 s."""
+    problem = await _port_problem(host, port)
+    if problem:
+        raise RobotError(problem)
+
+
+async def _port_problem(host: str, port: int) -> str:
+    try:
+        async with asyncio.timeout(CONNECT_S):
+            _, writer = await asyncio.open_connection(host, port)
+    except TimeoutError:
+        return f"{host}:{port} did not answer within {CONNECT_S:g} s: check cable, address and firewall"
+    except OSError as error:
+        return f"{host}:{port}: {error.strerror or error}; is the robot on, is this service enabled?"
+    writer.transport.abort()
+    return ""
+
+
+def _version(text: str) -> tuple[int, ...]:
+    found = re.search(r"(\d+)\.(\d+)\.(\d+)(?:\.(\d+))?", text)
+    return tuple(int(part) for part in found.groups() if part) if found else ()

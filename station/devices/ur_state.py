@@ -1,0 +1,235 @@
+"""Reads the controller's state at its full rate, in its own thread, keeping every sample. Read-only.
+
+A reader lives as long as its connection: when that ends it says why and is not used again.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import select
+import socket
+import struct
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from typing import NamedTuple
+
+from recordings.messages import RobotState, Stamps
+from station.clocks import ClockEstimator
+from station.devices.rtde import (
+    PORT,
+    PROTOCOL_VERSION,
+    PacketReader,
+    PacketType,
+    Recipe,
+    RtdeError,
+    join_names,
+    packet,
+    split_names,
+)
+
+log = logging.getLogger(__name__)
+
+HISTORY_S = 10.0
+SILENCE_S = 2.0
+"""Without data for this long the connection is given up."""
+HANDSHAKE_S = 2.0
+SO_TIMESTAMPNS = 35
+"""Linux, 64 bit: receive time by the kernel, wall clock; `socket` does not name it."""
+_TIMESPEC = struct.Struct("@qq")
+_ANCILLARY_BYTES = socket.CMSG_SPACE(_TIMESPEC.size)
+
+NAMES = (
+    "timestamp", "actual_q", "actual_qd", "target_q", "actual_TCP_pose", "robot_mode", "safety_mode",
+    "safety_status_bits", "runtime_state", "robot_status_bits", "speed_scaling", "target_speed_fraction",
+    "output_int_register_2",
+)  # fmt: skip
+PAYLOAD_SINCE = {3: (3, 11), 5: (5, 5)}
+"""First versions that report the payload."""
+
+
+class Sample(NamedTuple):
+    state: RobotState
+    operation: int
+    """ur_rtde's word about asynchronous moves, see `ur_moves`."""
+    payload_kg: float
+
+
+class StateReader(threading.Thread):
+    """`on_state` is called for every sample from this thread and must be quick; `on_end` once, at the end."""
+
+    def __init__(
+        self, host: str, on_state: Callable[[RobotState], None], on_end: Callable[[str], None]
+    ) -> None:
+        super().__init__(name=f"state of {host}", daemon=True)
+        self.host = host
+        self.version: tuple[int, int, int, int] = (0, 0, 0, 0)
+        self.rate_hz = 0.0
+        self.started: Future[Sample] = Future()
+        """The first sample, or the RobotError that prevented it."""
+        self.newest: Sample | None = None
+        self.history: deque[RobotState] = deque(maxlen=1)
+        self.clock = ClockEstimator()
+        self.samples = 0
+        self.lost = 0
+        """Samples that the controller made and that never came."""
+        self.frozen = 0
+        """Packets whose controller time did not advance."""
+        self.ended: str | None = None
+        """Why the connection is over; None while it lives."""
+        self._on_state = on_state
+        self._on_end = on_end
+        self._packets = PacketReader()
+        self._pending: deque[tuple[int, bytes]] = deque()
+        self._stop_read, self._stop_write = socket.socketpair()
+
+    # -- the life of a connection ---------------------------------------------------------------------
+
+    def run(self) -> None:
+        why = "closed here"
+        try:
+            with socket.create_connection((self.host, PORT), timeout=HANDSHAKE_S) as link:
+                recipe = self._handshake(link)
+                self._follow(link, recipe)
+        except TimeoutError:
+            why = f"no answer from {self.host}:{PORT} within {HANDSHAKE_S:g} s"
+        except (OSError, RtdeError) as error:
+            why = str(error)
+        finally:
+            with contextlib.suppress(OSError):
+                self._stop_read.close()
+            self.ended = why
+            if not self.started.done():
+                self.started.set_exception(RtdeError(f"robot state of {self.host}: {why}"))
+            self._on_end(why)
+
+    def close(self) -> None:
+        """Ends the thread; returns when it has ended (milliseconds, or the connect timeout)."""
+        self.request_end()
+        self.join(HANDSHAKE_S + 1.0)
+
+    def request_end(self) -> None:
+        with contextlib.suppress(OSError):
+            self._stop_write.close()
+
+    # -- handshake --------------------------------------------------------------------------------------
+
+    def _handshake(self, link: socket.socket) -> Recipe:
+        link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        accepted = self._ask(link, PacketType.PROTOCOL_VERSION, struct.pack(">H", PROTOCOL_VERSION))
+        if accepted != b"\x01":
+            raise RtdeError(f"the controller does not speak RTDE version {PROTOCOL_VERSION}")
+        begun = time.perf_counter()
+        version = self._ask(link, PacketType.CONTROLLER_VERSION)
+        self.clock.latency_s = (time.perf_counter() - begun) / 2
+        if len(version) != 16:
+            raise RtdeError(f"the controller's version has {len(version)} bytes, expected 16")
+        self.version = struct.unpack(">4I", version)
+        self.rate_hz = 500.0 if self.version[0] > 3 else 125.0
+        self.history = deque(maxlen=int(HISTORY_S * self.rate_hz) + 1)
+        names: tuple[str, ...] = NAMES
+        if self.version[:2] >= PAYLOAD_SINCE.get(self.version[0], (0, 0)):
+            names += ("payload",)
+        wanted = struct.pack(">d", self.rate_hz) + join_names(names)
+        answer = self._ask(link, PacketType.OUTPUT_SETUP, wanted)
+        types = split_names(answer[1:])
+        if len(types) != len(names):
+            raise RtdeError(f"asked for {len(names)} variables, the controller answered {len(types)} types")
+        refused = [n for n, t in zip(names, types, strict=True) if t == "NOT_FOUND"]
+        if refused:
+            raise RtdeError(f"the controller has no {', '.join(refused)}; update its software")
+        recipe = Recipe(answer[0], names, types)
+        if self._ask(link, PacketType.START) != b"\x01":
+            raise RtdeError("the controller refused to send its state")
+        return recipe
+
+    def _ask(self, link: socket.socket, kind: PacketType, payload: bytes = b"") -> bytes:
+        """Sends a request; what else arrives before its reply (messages) is skipped."""
+        link.settimeout(HANDSHAKE_S)
+        link.sendall(packet(kind, payload))
+        give_up = time.monotonic() + HANDSHAKE_S
+        while time.monotonic() < give_up:
+            while self._pending:
+                got, answer = self._pending.popleft()
+                if got == kind:
+                    return answer
+            data = link.recv(65536)
+            if not data:
+                raise RtdeError(f"{self.host}:{PORT} closed the connection during the handshake")
+            self._pending.extend(self._packets.feed(data))
+        raise TimeoutError
+
+    # -- the stream -------------------------------------------------------------------------------------
+
+    def _follow(self, link: socket.socket, recipe: Recipe) -> None:
+        link.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
+        link.setblocking(False)
+        for kind, payload in self._pending:
+            self._take(kind, payload, recipe, time.monotonic_ns(), time.time_ns())
+        poller = select.poll()
+        poller.register(link, select.POLLIN)
+        poller.register(self._stop_read, select.POLLIN)
+        while True:
+            ready = poller.poll(SILENCE_S * 1000)
+            if not ready:
+                raise RtdeError(f"no data from the robot for {SILENCE_S:g} s")
+            if any(fd == self._stop_read.fileno() for fd, _ in ready):
+                return
+            try:
+                data, ancillary, _, _ = link.recvmsg(65536, _ANCILLARY_BYTES)
+            except BlockingIOError:
+                continue
+            if not data:
+                raise RtdeError("the robot closed the connection")
+            monotonic_ns, wall_ns = _arrival(ancillary)
+            for kind, payload in self._packets.feed(data):
+                self._take(kind, payload, recipe, monotonic_ns, wall_ns)
+
+    def _take(self, kind: int, payload: bytes, recipe: Recipe, monotonic_ns: int, wall_ns: int) -> None:
+        if kind != PacketType.DATA:
+            return
+        v = recipe.unpack_elements(payload)
+        controller_s = v[0]
+        before = self.newest
+        if before is not None:
+            gap = (controller_s - before.state.stamps.controller_s) * self.rate_hz
+            if gap == 0:
+                self.frozen += 1
+                return
+            self.lost += max(0, round(gap) - 1)
+        state = RobotState(
+            stamps=Stamps(host_monotonic_ns=monotonic_ns, host_wall_ns=wall_ns, controller_s=controller_s),
+            joints_rad=v[1:7],  # type: ignore[arg-type]  # struct gave exactly six
+            joint_speeds_rad_s=v[7:13],  # type: ignore[arg-type]
+            target_joints_rad=v[13:19],  # type: ignore[arg-type]
+            tcp_pose=v[19:25],  # type: ignore[arg-type]
+            robot_mode=int(v[25]),
+            safety_mode=int(v[26]),
+            safety_status_bits=int(v[27]),
+            runtime_state=int(v[28]),
+            robot_status_bits=int(v[29]),
+            speed_scaling=v[30],
+            target_speed_fraction=v[31],
+        )
+        self.samples += 1
+        self.clock.add(controller_s, monotonic_ns)
+        self.history.append(state)
+        self.newest = Sample(state, int(v[32]), v[33] if len(v) > 33 else 0.0)
+        if not self.started.done():
+            self.started.set_result(self.newest)
+        self._on_state(state)
+
+
+def _arrival(ancillary: list[tuple[int, int, bytes]]) -> tuple[int, int]:
+    """Host monotonic and wall time of the newest bytes, as the kernel saw them come."""
+    monotonic_ns, wall_ns = time.monotonic_ns(), time.time_ns()
+    for level, kind, value in ancillary:
+        if level == socket.SOL_SOCKET and kind == SO_TIMESTAMPNS:
+            seconds, ns = _TIMESPEC.unpack(value)
+            age_ns = wall_ns - (seconds * 1_000_000_000 + ns)
+            if 0 <= age_ns < 10_000_000_000:  # else the wall clock was set in between
+                return monotonic_ns - age_ns, wall_ns - age_ns
+    return monotonic_ns, wall_ns

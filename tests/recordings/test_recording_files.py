@@ -1,0 +1,106 @@
+"""Files come to be exclusively, by one writer, under safe names, and whole or not at all."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from recordings.errors import RecordingError, UnsealedRecordingError
+from recordings.files import is_attachment_name, is_session_name, require_free_space, session_name_from
+from recordings.reader import open_recording
+from recordings.writer import RecordingWriter
+from tests.recordings.small_recording import make_info, make_picture, write_small
+
+EVIL = ["../../etc/x", "/etc/passwd", "a\0b", "x" * 300, "", "..", ".", "a/b", "Ä", "a..b", "A", "a\n"]
+
+
+def test_the_name_is_there_only_after_finish(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, make_info()) as writer:
+        writer.picture(make_picture(0))
+        assert not path.exists()
+        assert writer.part_path.stat().st_size == writer.bytes_written > 0
+        writer.finish()
+    assert path.exists()
+    assert not writer.part_path.exists()
+
+
+def test_an_unfinished_file_names_recover(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        writer.picture(make_picture(0))
+    for place in (writer.part_path, tmp_path):
+        with pytest.raises(UnsealedRecordingError, match="recordings recover"):
+            open_recording(place)
+
+
+def test_nothing_is_overwritten(small: Path) -> None:
+    before = small.read_bytes()
+    with pytest.raises(RecordingError, match="exists already"):
+        RecordingWriter(small, make_info())
+    assert small.read_bytes() == before
+
+
+def test_a_file_that_appears_meanwhile_is_kept(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    with RecordingWriter(path, make_info()) as writer:
+        path.write_text("somebody else's")
+        with pytest.raises(RecordingError, match="appeared meanwhile"):
+            writer.finish()
+    assert path.read_text() == "somebody else's"
+    assert writer.part_path.exists()
+
+
+@pytest.mark.parametrize("suffix", ["", ".part"])
+def test_a_planted_symlink_is_not_followed(tmp_path: Path, suffix: str) -> None:
+    target = tmp_path / "precious.txt"
+    target.write_text("precious")
+    (tmp_path / f"a.mcap{suffix}").symlink_to(target)
+    with pytest.raises(RecordingError, match="exists already"):
+        RecordingWriter(tmp_path / "a.mcap", make_info())
+    assert target.read_text() == "precious"
+
+
+def test_a_dangling_symlink_creates_nothing(tmp_path: Path) -> None:
+    (tmp_path / "a.mcap.part").symlink_to(tmp_path / "new.txt")
+    with pytest.raises(RecordingError):
+        RecordingWriter(tmp_path / "a.mcap", make_info())
+    assert not (tmp_path / "new.txt").exists()
+
+
+@pytest.mark.parametrize("name", EVIL)
+def test_evil_names_are_refused(tmp_path: Path, name: str) -> None:
+    with pytest.raises(RecordingError, match="name"):
+        RecordingWriter(tmp_path / "a.mcap", make_info(name=name))
+    assert list(tmp_path.iterdir()) == []
+    with (
+        RecordingWriter(tmp_path / "b.mcap", make_info()) as writer,
+        pytest.raises(RecordingError, match="name"),
+    ):
+        writer.attach(name, "text/plain", b"")
+
+
+@given(st.text(max_size=60))
+def test_any_text_gives_a_safe_session_name(text: str) -> None:
+    assert is_session_name(session_name_from(text))
+
+
+@given(st.text(max_size=50))
+def test_no_attachment_name_leaves_its_folder(text: str) -> None:
+    if is_attachment_name(text):
+        assert os.path.normpath(f"/root/{text}") == f"/root/{text}"
+
+
+def test_a_missing_folder_says_so(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="does not exist"):
+        write_small(tmp_path / "no" / "a.mcap")
+
+
+def test_free_space_below_the_reserve_is_refused_with_the_amount(tmp_path: Path) -> None:
+    free = require_free_space(tmp_path, 1)
+    assert free > 1
+    with pytest.raises(RecordingError, match=r"free 4\.0 GB and go on"):
+        require_free_space(tmp_path, free + 4_000_000_000)

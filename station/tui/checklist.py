@@ -1,4 +1,4 @@
-"""Checklist: what a capture needs, what is there, and the remedy for what is not. First thing at first start."""
+"""Checklist: what a capture needs, what is there, and the remedy for what is not."""
 
 from __future__ import annotations
 

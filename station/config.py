@@ -55,6 +55,8 @@ class CameraConfig(Section, frozen=True):
     """None = negotiated"""
     model: CameraModel | None = None
     """Known intrinsics; None = found from the session's pictures."""
+    model_is_rough: bool = False
+    """`model` is only good enough to plan with; the lens is found from the session's pictures."""
 
 
 class TriggerConfig(Section, frozen=True):

@@ -59,7 +59,7 @@ class Camera(Protocol):
 
     @property
     def clock(self) -> ClockFit | None:
-        """The camera's clock against the host's; None while it is not known. `frames.mid_exposure` uses it."""
+        """The camera's clock against the host's; None while not known. For `frames.mid_exposure`."""
 
     async def preview(self) -> Picture | None:
         """A recent picture for the screen; None when there is none. Never recorded."""

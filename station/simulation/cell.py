@@ -7,10 +7,15 @@ compared with it at the end, and nothing in between may look at it.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 
 from recordings.messages import BoardSpec, CameraModel, Matrix4, Mount, Vector6
+from station.errors import ConfigError
+
+SceneName = Literal["paper", "blog"]
+NoiseLevel = Literal["low", "mid", "high"]
 
 
 class CellTruth(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -51,4 +56,22 @@ def write_truth(truth: CellTruth, path: Path) -> None:
 
 
 def read_truth(path: Path) -> CellTruth:
-    return msgspec.json.decode(path.read_bytes(), type=CellTruth)
+    """Raises ConfigError where it is missing or no truth."""
+    try:
+        return msgspec.json.decode(path.read_bytes(), type=CellTruth)
+    except (OSError, msgspec.DecodeError) as error:
+        raise ConfigError(
+            f"{path}: no truth of a simulated cell ({error}); make one with make_cell"
+        ) from error
+
+
+def make_cell(
+    scene: SceneName = "paper", seed: int = 0, noise: NoiseLevel = "low", mount: Mount = "eye-in-hand"
+) -> CellTruth:
+    """The truth of a cell; the same arguments give the same cell. ConfigError for an unknown name.
+
+    Seed 0 is the scene as published; see `scenes`.
+    """
+    from station.simulation.scenes import build_cell  # the controller reads truths and plans nothing
+
+    return build_cell(scene, seed, noise, mount)

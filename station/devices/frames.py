@@ -1,0 +1,124 @@
+"""Which trigger a frame belongs to, and when it was exposed: by counters and clocks, never by order alone."""
+
+from __future__ import annotations
+
+from station.clocks import ClockEstimator, ClockFit
+from station.errors import CameraError
+
+LAST_FRAME_ID = 65_535
+"""GigE Vision block ids run from 1 to this and start over at 1; 0 means "no frame"."""
+UNKNOWN_READOUT_S = 0.05
+_ROUND_TRIP_SPREAD = 1.5
+"""Readings of the device clock that took longer than this times the quickest one say too little."""
+
+
+def next_frame_id(frame_id: int) -> int:
+    return frame_id % LAST_FRAME_ID + 1
+
+
+def frames_between(earlier_id: int, later_id: int) -> int:
+    """How many frames `later_id` comes after `earlier_id`: 1 for the next one, 0 for the same."""
+    return (later_id - earlier_id) % LAST_FRAME_ID
+
+
+class FrameCounter:
+    """Accepts a frame only as the answer to the one outstanding trigger.
+
+    One trigger, then one frame with the next frame id. After any disagreement the count starts afresh with
+    the next frame, so that one lost frame costs one pose and no more.
+    """
+
+    def __init__(self) -> None:
+        self.frames = 0
+        """Accepted; the newest one's sequence number is one less."""
+        self.missing = 0
+        self.unexpected = 0
+        self._last_id: int | None = None
+        self._last_pulse: int | None = None
+
+    def restart(self) -> None:
+        """The camera was opened or acquisition started anew: the next frame id may be any."""
+        self._last_id = self._last_pulse = None
+
+    def accept(self, frame_id: int, pulse_count: int | None = None) -> int:
+        """The frame's sequence number. `pulse_count`: of the trigger box, for its trigger.
+
+        Raises CameraError for a frame that is not the next one or a pulse count that did not grow by one.
+        """
+        last_id, last_pulse = self._last_id, self._last_pulse
+        self._last_id, self._last_pulse = frame_id, pulse_count
+        if not 1 <= frame_id <= LAST_FRAME_ID:
+            raise CameraError(f"the camera numbered a frame {frame_id}; frame ids are 1 … {LAST_FRAME_ID}")
+        frames = 1 if last_id is None else frames_between(last_id, frame_id)
+        pulses = 1 if last_pulse is None or pulse_count is None else pulse_count - last_pulse
+        if frames == 0:
+            self.unexpected += 1
+            raise CameraError(f"the camera sent frame {frame_id} twice; take this pose again")
+        if frames > 1 and frames > pulses:
+            self.missing += frames - 1
+            raise CameraError(
+                f"frames {next_frame_id(last_id or 0)} … were lost before frame {frame_id}: which picture "
+                "belongs to this pose is not certain; take it again"
+            )
+        if pulses != 1:
+            self.unexpected += 1
+            raise CameraError(
+                f"the trigger box counted {pulses} pulses for one picture (noise on the trigger line?); "
+                "take this pose again"
+            )
+        self.frames += 1
+        return self.frames - 1
+
+    def lost(self) -> None:
+        """A trigger had no frame."""
+        self.missing += 1
+        self.restart()
+
+    def surplus(self, frames: int) -> CameraError:
+        """The error for frames that came without a trigger."""
+        self.unexpected += frames
+        self.restart()
+        return CameraError(
+            f"{frames} frame(s) came without a trigger (noise on the trigger line, or a double exposure); "
+            "take this pose again"
+        )
+
+
+class DeviceClock:
+    """A camera's clock, read over the wire: half of the round trip is all that is not known of a reading."""
+
+    def __init__(self) -> None:
+        self._estimator = ClockEstimator()
+        self._quickest_ns: int | None = None
+
+    def reading(self, device_ns: int, asked_monotonic_ns: int, answered_monotonic_ns: int) -> None:
+        """The device showed `device_ns` at some moment between asking and the answer."""
+        round_trip_ns = max(answered_monotonic_ns - asked_monotonic_ns, 1)
+        if self._quickest_ns is None or round_trip_ns < self._quickest_ns:
+            self._quickest_ns = round_trip_ns
+        if round_trip_ns > _ROUND_TRIP_SPREAD * self._quickest_ns:
+            return
+        self._estimator.latency_s = _ROUND_TRIP_SPREAD * self._quickest_ns / 2e9
+        self._estimator.add(device_ns / 1e9, asked_monotonic_ns + round_trip_ns // 2)
+
+    def restart(self) -> None:
+        self._estimator.reset()
+        self._quickest_ns = None
+
+    @property
+    def fit(self) -> ClockFit | None:
+        return self._estimator.fit()
+
+
+def mid_exposure(
+    start_device_ns: int, arrival_monotonic_ns: int, exposure_us: float, clock: ClockFit | None
+) -> tuple[int, float]:
+    """Host monotonic time (ns) of the middle of an exposure and its 95 % bound (s).
+
+    By the camera's clock where one is known; else from the first packet's arrival, where all that is known
+    is that the exposure ended before it, and readout takes less than `UNKNOWN_READOUT_S`.
+    """
+    half_ns = round(exposure_us * 500)
+    if clock is not None:
+        return clock.to_host_ns(start_device_ns / 1e9) + half_ns, clock.bound_s
+    return arrival_monotonic_ns - half_ns - round(UNKNOWN_READOUT_S * 5e8), UNKNOWN_READOUT_S / 2

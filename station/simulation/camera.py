@@ -1,0 +1,214 @@
+"""A camera of a simulated cell: renders, in a process of its own, what the arm's true pose shows."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import sys
+import time
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from recordings.messages import CameraIdentity, Picture, Stamps
+from station.clocks import ClockFit
+from station.config import CameraConfig
+from station.devices.frames import DeviceClock, FrameCounter
+from station.errors import CameraError
+from station.simulation.cell import CellTruth
+
+START_TIMEOUT_S = 20.0
+_CLOCK_READINGS = 8
+_PIPE_LIMIT = 4 * 2**20
+
+
+class RenderedCamera:
+    """`station.devices.base.Camera` of a simulated cell. `controller_host`: whose arm it looks at."""
+
+    def __init__(self, truth: CellTruth, controller_host: str, config: CameraConfig | None = None) -> None:
+        self._truth = truth
+        self._host = controller_host
+        self._exposure_us = truth.exposure_us if config is None else config.exposure_us
+        self._gain_db = truth.gain_db if config is None else config.gain_db
+        self._process: asyncio.subprocess.Process | None = None
+        self._reader: asyncio.Task[None] | None = None
+        self._frames: asyncio.Queue[Picture | CameraError] = asyncio.Queue()
+        self._answers: asyncio.Queue[Picture | dict[str, Any] | CameraError] = asyncio.Queue()
+        self._asking = asyncio.Lock()
+        self._device_clock = DeviceClock()
+        self.counter = FrameCounter()
+
+    @property
+    def identity(self) -> CameraIdentity:
+        return CameraIdentity(
+            vendor="Daheng Imaging (simulated)",
+            model="MER-131-75GM",
+            serial=f"SIM{self._truth.seed:05d}",
+            driver="rendered",
+        )
+
+    @property
+    def clock(self) -> ClockFit | None:
+        return self._device_clock.fit
+
+    async def open(self) -> CameraIdentity:
+        """Starts the process and reads its clock a few times."""
+        self._process = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-m", "station.simulation.camera_process"),
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+            limit=_PIPE_LIMIT,
+        )
+        self.counter.restart()
+        self._device_clock.restart()
+        self._reader = asyncio.create_task(self._read(self._process))
+        setup = {
+            "truth": msgspec.to_builtins(self._truth),
+            "controller_host": self._host,
+            "exposure_us": self._exposure_us,
+            "gain_db": self._gain_db,
+        }
+        try:
+            await self._ask(setup, START_TIMEOUT_S)
+            for _ in range(_CLOCK_READINGS):
+                await self._read_clock()
+        except BaseException:
+            await self.close()
+            raise
+        return self.identity
+
+    async def capture(self, timeout_s: float = 5.0) -> Picture:
+        """One trigger, one frame; a frame that was there before the trigger is an error, not the answer."""
+        async with self._asking:
+            await self._read_clock_locked()
+            if not self._frames.empty():
+                raise self.counter.surplus(self._drain())
+            self._write({"cmd": "trigger"})
+            try:
+                frame = await asyncio.wait_for(self._frames.get(), timeout_s)
+            except TimeoutError:
+                self.counter.lost()
+                raise CameraError(
+                    f"the camera sent no picture within {timeout_s:g} s of its trigger; take this pose again"
+                ) from None
+            if isinstance(frame, CameraError):
+                raise frame
+            sequence = self.counter.accept(frame.frame_id)
+            self._check_settings(frame)
+            return msgspec.structs.replace(frame, sequence=sequence)
+
+    async def preview(self) -> Picture | None:
+        """At half the size, rendered anew."""
+        try:
+            picture = await self._ask({"cmd": "preview"}, 2.0)
+        except CameraError:
+            return None
+        return picture if isinstance(picture, Picture) else None
+
+    async def inject(self, fault: str, value: Any = None) -> None:
+        """Arms a fault of `camera_faults`; 'unplugged' ends the process."""
+        if fault == "unplugged":
+            self._write({"cmd": "fault", "name": fault})
+            return
+        await self._ask({"cmd": "fault", "name": fault, "value": value}, 2.0)
+
+    async def close(self) -> None:
+        process, self._process = self._process, None
+        if process is not None:
+            assert process.stdin is not None
+            process.stdin.close()
+            try:
+                await asyncio.wait_for(process.wait(), 2.0)
+            except TimeoutError:
+                process.kill()
+                await process.wait()
+        if self._reader is not None:
+            self._reader.cancel()
+            with contextlib.suppress(asyncio.CancelledError):
+                await self._reader
+            self._reader = None
+
+    def _check_settings(self, frame: Picture) -> None:
+        if (frame.exposure_us, frame.gain_db) != (self._exposure_us, self._gain_db):
+            raise CameraError(
+                f"the camera exposed {frame.exposure_us:g} µs at {frame.gain_db:g} dB, set were "
+                f"{self._exposure_us:g} µs at {self._gain_db:g} dB; something else changes its settings"
+            )
+
+    def _drain(self) -> int:
+        count = 0
+        while not self._frames.empty():
+            self._frames.get_nowait()
+            count += 1
+        return count
+
+    async def _read_clock(self) -> None:
+        async with self._asking:
+            await self._read_clock_locked()
+
+    async def _read_clock_locked(self) -> None:
+        asked_ns = time.monotonic_ns()
+        answer = await self._ask_locked({"cmd": "clock"}, 2.0)
+        if isinstance(answer, dict):
+            self._device_clock.reading(answer["device_ns"], asked_ns, time.monotonic_ns())
+
+    async def _ask(self, request: dict[str, Any], timeout_s: float) -> Picture | dict[str, Any]:
+        async with self._asking:
+            return await self._ask_locked(request, timeout_s)
+
+    async def _ask_locked(self, request: dict[str, Any], timeout_s: float) -> Picture | dict[str, Any]:
+        while not self._answers.empty():
+            self._answers.get_nowait()  # an answer that came after its deadline
+        self._write(request)
+        try:
+            answer = await asyncio.wait_for(self._answers.get(), timeout_s)
+        except TimeoutError:
+            raise CameraError(f"the rendered camera does not answer within {timeout_s:g} s") from None
+        if isinstance(answer, CameraError):
+            raise answer
+        return answer
+
+    def _write(self, request: dict[str, Any]) -> None:
+        if self._process is None or self._process.stdin is None or self._process.returncode is not None:
+            raise CameraError("the rendered camera is not open or has ended; open it again")
+        self._process.stdin.write(json.dumps(request).encode() + b"\n")
+
+    async def _read(self, process: asyncio.subprocess.Process) -> None:
+        """Sorts what the process sends until it ends; then everyone who waits is told."""
+        assert process.stdout is not None
+        try:
+            while line := await process.stdout.readline():
+                header = json.loads(line)
+                match header["kind"]:
+                    case "frame":
+                        self._frames.put_nowait(await _picture(process.stdout, header))
+                    case "preview":
+                        self._answers.put_nowait(await _picture(process.stdout, header))
+                    case "error":
+                        error = CameraError(f"the rendered camera cannot see the arm: {header['text']}")
+                        (self._frames if header["cmd"] == "trigger" else self._answers).put_nowait(error)
+                    case _:
+                        self._answers.put_nowait(header)
+        except (asyncio.IncompleteReadError, ConnectionError):
+            pass  # it ended within a frame
+        gone = CameraError("the camera is gone (its process ended); open it again")
+        self._frames.put_nowait(gone)
+        self._answers.put_nowait(gone)
+
+
+async def _picture(stream: asyncio.StreamReader, header: dict[str, Any]) -> Picture:
+    data = await stream.readexactly(header["bytes"])
+    return Picture(
+        image=np.frombuffer(data, np.uint8).reshape(header["height"], header["width"]),
+        stamps=Stamps(
+            host_monotonic_ns=header["arrival_monotonic_ns"],
+            host_wall_ns=time.time_ns() - (time.monotonic_ns() - header["arrival_monotonic_ns"]),
+            device_ns=header["device_ns"],
+        ),
+        frame_id=header["frame_id"],
+        sequence=0,
+        exposure_us=header["exposure_us"],
+        gain_db=header["gain_db"],
+    )

@@ -1,0 +1,178 @@
+"""The rendered camera's own process: takes triggers on standard input, gives frames on standard output.
+
+It behaves like a device: its own clock, frame ids that wrap, exposure that takes time, and faults on
+demand. Frames are JSON lines with `bytes`, followed by that many bytes of pixels. It ends with its input.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+import time
+from typing import Any, BinaryIO
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.geometry import Array, inverse
+from recordings.messages import BoardSpec, CameraModel
+from station.errors import RobotError
+from station.simulation.admin import AdminClient
+from station.simulation.camera_faults import CameraFaults
+from station.simulation.cell import CellTruth
+from station.simulation.renderer import Light, render, scaled
+
+TRIGGER_LATENCY_NS = 150_000
+READOUT_NS = 13_300_000
+"""One frame at 75 fps"""
+FIRST_FRAME_ID = 65_520
+"""So that every session sees the ids start over."""
+PREVIEW_SCALE = 0.5
+
+
+Message = tuple[dict[str, Any], NDArray[np.uint8] | None]
+
+
+class CameraProcess:
+    def __init__(self, truth: CellTruth, controller_host: str, exposure_us: float, gain_db: float) -> None:
+        self.truth = truth
+        self.exposure_us = exposure_us
+        self.gain_db = gain_db
+        self.faults = CameraFaults()
+        self._host = controller_host
+        self._admin: AdminClient | None = None
+        self._frame_id = FIRST_FRAME_ID
+        self._rng = np.random.default_rng([truth.seed, 77])
+        self._mount: Array = np.array(truth.camera_mount)
+        self._place: Array = np.array(truth.board_place)
+
+    def device_ns(self, host_monotonic_ns: int) -> int:
+        """The camera's own clock."""
+        drift_ns = host_monotonic_ns * self.truth.camera_clock_drift_ppm * 1e-6
+        return (
+            host_monotonic_ns
+            + round(drift_ns)
+            + self.truth.camera_clock_offset_ns
+            + self.faults.clock_step_ns
+        )
+
+    def answer(self, request: dict[str, Any]) -> list[Message]:
+        """Messages to send back, each with its pixels or None. Raises RobotError without a controller."""
+        match request["cmd"]:
+            case "trigger":
+                return self._trigger()
+            case "preview":
+                camera = scaled(self.truth.camera, PREVIEW_SCALE)
+                return [self._frame("preview", time.monotonic_ns(), camera, frame_id=0)]
+            case "clock":
+                return [({"kind": "clock", "device_ns": self.device_ns(time.monotonic_ns())}, None)]
+            case "fault":
+                self.faults.inject(request["name"], request.get("value"))
+                return [({"kind": "fault"}, None)]
+        raise ValueError(f"unknown command {request['cmd']!r}")
+
+    def _trigger(self) -> list[Message]:
+        if self.faults.take("missed-trigger"):
+            return []
+        frames: list[Message] = []
+        for _ in range(2 if self.faults.take("double-frame") else 1):
+            start_ns = time.monotonic_ns() + TRIGGER_LATENCY_NS
+            frames.append(self._frame("frame", start_ns, self.truth.camera, self._frame_id))
+            self._frame_id = self._frame_id % 65_535 + 1
+        return [] if self.faults.take("lost-frame") else frames
+
+    def _frame(
+        self, kind: str, start_ns: int, camera: CameraModel, frame_id: int
+    ) -> tuple[dict[str, Any], NDArray[np.uint8]]:
+        exposure_us = self.faults.exposure_us or self.exposure_us
+        exposure_ns = round(exposure_us * 1000)
+        base_from_flange = self._flange_at(start_ns + exposure_ns // 2)
+        light = Light(
+            exposure_us=exposure_us,
+            gain_db=self.gain_db,
+            illumination=self.truth.illumination * self.faults.illumination,
+            pixel_noise=self.truth.pixel_noise,
+            blur_px=self.truth.blur_px * camera.width / self.truth.camera.width,
+        )
+        board = self.faults.board or self.truth.board
+        picture = render(camera, board, self.camera_from_board(base_from_flange), light, self._rng)
+        self.faults.cover(picture)
+        arrival_ns = start_ns + exposure_ns + READOUT_NS
+        _sleep_until(arrival_ns)
+        header = {
+            "kind": kind,
+            "frame_id": frame_id,
+            "device_ns": self.device_ns(start_ns),
+            "arrival_monotonic_ns": arrival_ns,
+            "exposure_us": exposure_us,
+            "gain_db": self.gain_db,
+        }
+        return header, picture
+
+    def camera_from_board(self, base_from_flange: Array) -> Array:
+        if self.truth.mount == "eye-in-hand":
+            return inverse(base_from_flange @ self._mount) @ self._place
+        return inverse(self._mount) @ base_from_flange @ self._place
+
+    def _flange_at(self, host_monotonic_ns: int) -> Array:
+        """Where the flange truly is then: the controller's admin port waits for times to come."""
+        try:
+            if self._admin is None:
+                self._admin = AdminClient(self._host)
+            answer = self._admin.ask("truth", at_monotonic_ns=host_monotonic_ns)
+        except RobotError:
+            self._admin = None
+            raise
+        return np.array(answer["base_from_flange"])
+
+
+def _sleep_until(host_monotonic_ns: int) -> None:
+    time.sleep(max(0.0, (host_monotonic_ns - time.monotonic_ns()) / 1e9))
+
+
+def serve(lines: BinaryIO, out: BinaryIO) -> None:
+    """The first line describes the camera, each further one is a request; returns at the end of input."""
+    setup = json.loads(lines.readline())
+    truth = msgspec.convert(setup["truth"], CellTruth)
+    camera = CameraProcess(truth, setup["controller_host"], setup["exposure_us"], setup["gain_db"])
+    _warm_up(camera)
+    _send(out, {"kind": "ready"}, None)
+    for line in lines:
+        request = json.loads(line)
+        if request["cmd"] == "fault" and request["name"] == "unplugged":
+            return
+        try:
+            for header, pixels in camera.answer(request):
+                _send(out, header, pixels)
+        except RobotError as error:
+            _send(out, {"kind": "error", "cmd": request["cmd"], "text": str(error)}, None)
+
+
+def _warm_up(camera: CameraProcess) -> None:
+    """Both lens tables are made before the first trigger: they take a second."""
+    nowhere = np.diag([1.0, 1.0, 1.0, 1.0])
+    nowhere[2, 3] = -1.0
+    board: BoardSpec = camera.truth.board
+    for model in (camera.truth.camera, scaled(camera.truth.camera, PREVIEW_SCALE)):
+        render(model, board, nowhere)
+
+
+def _send(out: BinaryIO, header: dict[str, Any], pixels: NDArray[np.uint8] | None) -> None:
+    if pixels is None:
+        out.write(json.dumps(header).encode() + b"\n")
+    else:
+        height, width = pixels.shape
+        line = header | {"width": width, "height": height, "bytes": pixels.nbytes}
+        out.write(json.dumps(line).encode() + b"\n")
+        out.write(pixels.data)
+    out.flush()
+
+
+if __name__ == "__main__":
+    cv2.setNumThreads(1)
+    try:
+        serve(sys.stdin.buffer, sys.stdout.buffer)
+    except (BrokenPipeError, KeyboardInterrupt):
+        sys.exit(0)  # the daemon is gone

@@ -1,0 +1,190 @@
+"""Where camera, board and arm of a simulated cell stand, so that the arm can show the board in many ways.
+
+A place counts when enough of the planner's own candidate poses are reachable and free from there.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from calibrate.board import board_points
+from calibrate.geometry import Array, inverse, pose, quaternion_from_matrix, rotation_exp, transform_points
+from calibrate.kinematics import MODELS, forward, inverse_all, singularity_measure
+from recordings.messages import BoardSpec, CameraModel, Mount
+from station.collision import body_segments, margins, segment_distance
+from station.config import CameraConfig, LimitsConfig, Plane, PoseGuess, RobotConfig, StationConfig
+from station.errors import ConfigError
+from station.plan.candidates import find_candidates, view_range
+from station.plan.scene import Scene, scene_of
+
+ROBOT = "UR10"
+TABLE = Plane("table", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+"""The arm stands on it."""
+_ATTEMPTS = 400
+_TRIED_VIEWS = 60
+_NEEDED_SHARE = 0.4
+"""Of the tried views, reachable on the start's own arm branch."""
+_START_MARGIN_M = 0.015
+_START_SINGULARITY = 0.08
+
+
+class Placement(NamedTuple):
+    camera_mount: Array
+    board_place: Array
+    start_joints_rad: Array
+
+
+def board_centre(board: BoardSpec) -> Array:
+    points = board_points(board)
+    return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
+
+
+def seen_from(board: BoardSpec, distance_m: float, rotation: Array | None = None) -> Array:
+    """camera_from_board with the board's middle on the optical axis."""
+    R = np.eye(3) if rotation is None else rotation
+    return pose(R, np.array([0.0, 0.0, distance_m]) - R @ board_centre(board))
+
+
+def cell_description(
+    mount: Mount,
+    camera: CameraModel,
+    board: BoardSpec,
+    camera_guess: PoseGuess,
+    board_guess: PoseGuess,
+    host: str = "",
+) -> StationConfig:
+    """The configuration of a simulated cell: UR10 on a table, rendered camera."""
+    return StationConfig(
+        name="simulated",
+        mount=mount,
+        robot=RobotConfig(model=ROBOT, host=host),
+        camera=CameraConfig(driver="rendered", model=camera, model_is_rough=True),
+        board=board,
+        camera_guess=camera_guess,
+        board_guess=board_guess,
+        limits=LimitsConfig(planes=(TABLE,)),
+    )
+
+
+def guess_of(matrix: Array, sigma_m: float, sigma_rad: float) -> PoseGuess:
+    t, q = matrix[:3, 3], quaternion_from_matrix(matrix[:3, :3])
+    return PoseGuess(
+        (float(t[0]), float(t[1]), float(t[2])),
+        (float(q[0]), float(q[1]), float(q[2]), float(q[3])),
+        sigma_m,
+        sigma_rad,
+    )
+
+
+def place_moving_camera(
+    board: BoardSpec, camera: CameraModel, camera_turn: Array, rng: np.random.Generator
+) -> Placement:
+    """Eye-in-hand: a mount turned by `camera_turn` (3, 3), looking down at a board on table or stand."""
+    for _ in range(_ATTEMPTS):
+        around, beside_m, ahead_m = (
+            rng.uniform(-np.pi, np.pi),
+            rng.uniform(0.06, 0.11),
+            rng.uniform(0.03, 0.10),
+        )
+        X = pose(camera_turn, [beside_m * np.cos(around), beside_m * np.sin(around), ahead_m])
+        base_from_camera = _camera_looking_down(rng)
+        tilt = rotation_exp([*rng.uniform(-0.2, 0.2, 2), rng.uniform(-np.pi, np.pi)])
+        Y = base_from_camera @ seen_from(board, rng.uniform(0.47, 0.53), tilt)
+        if _lowest_corner_m(board, Y) < 0.005:
+            continue
+        scene = _exact_scene("eye-in-hand", camera, board, X, Y)
+        start = _comfortable_start(scene, base_from_camera @ inverse(X), rng)
+        if start is not None and _sees(scene, start) and _roomy(scene, start, rng):
+            return Placement(X, Y, start)
+    raise ConfigError(f"no place found for a camera turned by\n{camera_turn}\ntake another seed")
+
+
+def place_fixed_camera(board: BoardSpec, camera: CameraModel, rng: np.random.Generator) -> Placement:
+    """Eye-to-hand: a camera beside the cell, the board on the flange facing away from the arm."""
+    outwards = rotation_exp([np.pi, 0.0, 0.0])
+    for _ in range(_ATTEMPTS):
+        turn = outwards @ rotation_exp([*rng.uniform(-0.1, 0.1, 2), rng.uniform(-np.pi, np.pi)])
+        Y = pose(
+            turn,
+            np.array([*rng.uniform(-0.01, 0.01, 2), rng.uniform(0.03, 0.06)]) - turn @ board_centre(board),
+        )
+        flange = pose(_random_turn(rng), _shell_point(rng))
+        look = rotation_exp([*rng.uniform(-0.2, 0.2, 2), rng.uniform(-np.pi, np.pi)])
+        X = flange @ Y @ inverse(seen_from(board, rng.uniform(0.48, 0.55), look))
+        if X[2, 3] < 0.1 or np.hypot(X[0, 3], X[1, 3]) < 0.4:
+            continue
+        scene = _exact_scene("eye-to-hand", camera, board, X, Y)
+        start = _comfortable_start(scene, flange, rng)
+        if start is not None and _sees(scene, start) and _roomy(scene, start, rng):
+            return Placement(X, Y, start)
+    raise ConfigError("no place found for a camera beside the cell; take another seed")
+
+
+def _camera_looking_down(rng: np.random.Generator) -> Array:
+    """base_from_camera over the table, its axis at most 50° from straight down, any roll."""
+    lean, around = np.deg2rad(rng.uniform(0, 50)), rng.uniform(-np.pi, np.pi)
+    axis = np.array([np.cos(around), np.sin(around), 0.0]) * (np.pi - lean)
+    turn = rotation_exp(axis) @ rotation_exp([0.0, 0.0, rng.uniform(-np.pi, np.pi)])
+    return pose(turn, _shell_point(rng))
+
+
+def _shell_point(rng: np.random.Generator) -> Array:
+    """A point within the arm's comfortable reach, in `base`."""
+    radius, around = rng.uniform(0.45, 0.85), rng.uniform(-np.pi, np.pi)
+    return np.array([radius * np.cos(around), radius * np.sin(around), rng.uniform(0.45, 0.9)])
+
+
+def _random_turn(rng: np.random.Generator) -> Array:
+    return rotation_exp(rng.normal(size=3) * 2.0)
+
+
+def _exact_scene(mount: Mount, camera: CameraModel, board: BoardSpec, X: Array, Y: Array) -> Scene:
+    # 20 mm of doubt about the board, as in the configuration that is handed out, keep clearances equal.
+    guesses = guess_of(X, 0.02, 0.0), guess_of(Y, 0.02, 0.0)
+    return scene_of(cell_description(mount, camera, board, *guesses))
+
+
+def _comfortable_start(scene: Scene, base_from_flange: Array, rng: np.random.Generator) -> Array | None:
+    solutions = inverse_all(MODELS[ROBOT], base_from_flange)
+    if len(solutions) == 0:
+        return None
+    gaps, _ = margins(scene.geometry, solutions)
+    free = gaps.min(axis=1) > _START_MARGIN_M
+    free &= singularity_measure(MODELS[ROBOT], solutions) > _START_SINGULARITY
+    free &= forward(MODELS[ROBOT], solutions)[:, 2, 3] > 0.15
+    good = np.flatnonzero(free)
+    return None if len(good) == 0 else np.asarray(solutions[rng.choice(good)])
+
+
+def _sees(scene: Scene, joints_rad: Array) -> bool:
+    """Whether no part of the arm is between the camera and the board's corners."""
+    flange = forward(MODELS[ROBOT], joints_rad)
+    in_hand = scene.mount == "eye-in-hand"
+    base_from_board = scene.Y if in_hand else flange @ scene.Y
+    eye = (flange @ scene.X if in_hand else scene.X)[:3, 3]
+    corners = transform_points(base_from_board, board_points(scene.board))
+    starts, ends, radii = body_segments(scene.geometry, joints_rad[None])
+    arm = slice(0, 7)
+    gap = segment_distance(eye[None, None], corners[:, None], starts[:, arm], ends[:, arm])
+    limit = radii[arm] + 0.005 if in_hand else np.minimum(radii[arm], 0.03)
+    return bool((gap > limit).all())
+
+
+def _roomy(scene: Scene, start: Array, rng: np.random.Generator) -> bool:
+    """Whether enough varied views are reachable without changing the arm branch."""
+    found = find_candidates(scene, view_range(scene), _TRIED_VIEWS, rng, start, [])
+    if len(found) == 0:
+        return False
+    near = np.abs(found.joints_rad - start).max(axis=1) < 2.6
+    in_branch = np.bincount(found.branch[near]) if near.any() else np.zeros(1)
+    return bool(in_branch.max() >= _NEEDED_SHARE * _TRIED_VIEWS)
+
+
+def _lowest_corner_m(board: BoardSpec, base_from_board: Array) -> float:
+    points = board_points(board)
+    reach = 2 * board.square_m
+    low, high = points.min(axis=0) - reach, points.max(axis=0) + reach
+    corners = np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
+    return float(transform_points(base_from_board, corners)[:, 2].min())

@@ -1,0 +1,210 @@
+"""Pictures of a board as a camera with a known lens would take them.
+
+Every pixel is followed back through the lens to the board: no textures are warped, so corners lie where
+`cv2.projectPoints` puts them. Pixels that hold an edge are the mean of sub-pixel samples.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.geometry import Array, is_rigid
+from recordings.messages import BoardSpec, CameraModel
+from station.simulation.board_print import BoardPrint, Floats, board_print
+
+TABLE_ALBEDO = 0.30
+FULL_SCALE_US = 10_000.0
+"""At this exposure, gain 0 dB and illumination 1, albedo 1 in the picture's centre gives WHITE_LEVEL."""
+WHITE_LEVEL = 235.0
+BLACK_LEVEL = 3.0
+VIGNETTING = 0.18
+"""Light lost in the picture's far corners."""
+_SAMPLES = 4
+"""Sub-pixel samples per pixel and direction, where there is an edge."""
+
+
+@dataclass(frozen=True)
+class Light:
+    """All that decides the grey levels."""
+
+    exposure_us: float = FULL_SCALE_US
+    gain_db: float = 0.0
+    illumination: float = 1.0
+    pixel_noise: float = 2.0
+    """Grey levels, 1 sigma, at 0 dB"""
+    blur_px: float = 0.7
+    """Sigma of the lens's blur"""
+
+
+@dataclass(frozen=True, eq=False)
+class _Lens:
+    """The ray (x, y, 1) of each pixel centre, its change per pixel, and the vignetting."""
+
+    x: Floats
+    y: Floats
+    vignetting: Floats
+
+
+def render(
+    camera: CameraModel,
+    board: BoardSpec,
+    camera_from_board: Array,
+    light: Light | None = None,
+    rng: np.random.Generator | None = None,
+) -> NDArray[np.uint8]:
+    """(height, width) mono8 picture; `camera_from_board` (4, 4) at mid-exposure.
+
+    Without `rng` the picture is free of noise. ValueError for a transform that is not rigid or a camera
+    without a matrix.
+    """
+    if not is_rigid(camera_from_board):
+        raise ValueError(f"camera_from_board is not a rigid transform:\n{camera_from_board}")
+    light = light or Light()
+    lens = _lens(camera)
+    gain = 10 ** (light.gain_db / 20)
+    scale = WHITE_LEVEL * light.illumination * gain * light.exposure_us / FULL_SCALE_US
+    picture = np.full(lens.x.shape, TABLE_ALBEDO, dtype=np.float32)
+    window = _window(camera, board, camera_from_board, margin_px=4 + int(4 * light.blur_px))
+    if window is not None:
+        picture[window] = _reflectance(lens, window, camera_from_board, board_print(board))
+        if light.blur_px > 0:
+            blurred = cv2.GaussianBlur(
+                picture[window], (0, 0), light.blur_px, borderType=cv2.BORDER_REPLICATE
+            )
+            picture[window] = blurred
+    picture *= lens.vignetting
+    picture *= np.float32(scale)
+    picture += np.float32(BLACK_LEVEL + 0.5)
+    if rng is not None and light.pixel_noise > 0:
+        noise = rng.standard_normal(picture.shape, dtype=np.float32)
+        noise *= np.float32(light.pixel_noise * gain)
+        picture += noise
+    np.clip(picture, 0.0, 255.0, out=picture)
+    return picture.astype(np.uint8)
+
+
+def scaled(camera: CameraModel, factor: float) -> CameraModel:
+    """The same lens with `factor` times the pixels; pixel (0, 0) stays the centre of the first pixel."""
+    if camera.matrix is None:
+        raise ValueError("the camera has no matrix")
+    (fx, skew, cx), (_, fy, cy), _ = camera.matrix
+    matrix = (
+        (fx * factor, skew * factor, (cx + 0.5) * factor - 0.5),
+        (0.0, fy * factor, (cy + 0.5) * factor - 0.5),
+        (0.0, 0.0, 1.0),
+    )
+    return CameraModel(
+        width=round(camera.width * factor),
+        height=round(camera.height * factor),
+        matrix=matrix,
+        distortion=camera.distortion,
+        distortion_model=camera.distortion_model,
+    )
+
+
+@lru_cache(maxsize=4)
+def _lens(camera: CameraModel) -> _Lens:
+    if camera.matrix is None:
+        raise ValueError("the camera has no matrix")
+    if camera.distortion_model == "equidistant":
+        raise ValueError("fisheye lenses are not simulated")
+    u, v = np.meshgrid(np.arange(camera.width, dtype=float), np.arange(camera.height, dtype=float))
+    pixels = np.stack([u, v], axis=-1).reshape(-1, 1, 2)
+    matrix = np.array(camera.matrix)
+    stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 40, 1e-7)
+    rays = cv2.undistortPointsIter(pixels, matrix, np.array(camera.distortion), np.eye(3), np.eye(3), stop)
+    x, y = np.moveaxis(rays.reshape(camera.height, camera.width, 2), -1, 0)
+    corner = np.hypot(camera.width / 2, camera.height / 2)
+    radius = np.hypot(u - camera.width / 2, v - camera.height / 2) / corner
+    vignetting = 1.0 - VIGNETTING * radius**2
+    return _Lens(x.astype(np.float32), y.astype(np.float32), vignetting.astype(np.float32))
+
+
+def _window(
+    camera: CameraModel, board: BoardSpec, camera_from_board: Array, margin_px: int
+) -> tuple[slice, slice] | None:
+    """Rows and columns that may show the sheet; None where it is out of the picture."""
+    x0, y0, x1, y1 = board_print(board).sheet_m
+    along = np.linspace(0.0, 1.0, 9)
+    x, y = x0 + along * (x1 - x0), y0 + along * (y1 - y0)
+    ones = np.ones_like(along)
+    outline = np.concatenate(
+        [
+            np.stack([x, y0 * ones], 1),
+            np.stack([x, y1 * ones], 1),
+            np.stack([x0 * ones, y], 1),
+            np.stack([x1 * ones, y], 1),
+        ]
+    )
+    points = np.column_stack([outline, np.zeros(len(outline))])
+    in_camera = points @ camera_from_board[:3, :3].T + camera_from_board[:3, 3]
+    whole = (slice(0, camera.height), slice(0, camera.width))
+    if (in_camera[:, 2] <= 0.01).all():
+        return None
+    if (in_camera[:, 2] <= 0.01).any():
+        return whole
+    rotation, _ = cv2.Rodrigues(camera_from_board[:3, :3])
+    pixels, _ = cv2.projectPoints(
+        points, rotation, camera_from_board[:3, 3], np.array(camera.matrix), np.array(camera.distortion)
+    )
+    # A point far outside the picture may be folded back by the distortion polynomial: look everywhere then.
+    if np.abs(in_camera[:, :2] / in_camera[:, 2:]).max() > 1.0:
+        return whole
+    low = np.floor(pixels.reshape(-1, 2).min(axis=0)).astype(int) - margin_px
+    high = np.ceil(pixels.reshape(-1, 2).max(axis=0)).astype(int) + margin_px + 1
+    left, top = np.clip(low, 0, (camera.width, camera.height))
+    right, bottom = np.clip(high, 0, (camera.width, camera.height))
+    if right <= left or bottom <= top:
+        return None
+    return slice(int(top), int(bottom)), slice(int(left), int(right))
+
+
+def _reflectance(
+    lens: _Lens, window: tuple[slice, slice], camera_from_board: Array, printed: BoardPrint
+) -> Floats:
+    """Mean reflectance over each pixel of the window."""
+    plane_from_ray = np.asarray(np.linalg.inv(camera_from_board[:3, [0, 1, 3]]), dtype=float)
+    front = camera_from_board[:3, 2] @ camera_from_board[:3, 3] > 0  # z of the board points away from the eye
+    x, y = lens.x[window], lens.y[window]
+    if not front:
+        return np.full(x.shape, TABLE_ALBEDO, dtype=np.float32)
+    value = _sample(plane_from_ray, x, y, printed)
+    kernel = np.ones((3, 3), dtype=np.uint8)
+    edge = cv2.dilate(value, kernel) != cv2.erode(value, kernel)
+    rows, columns = np.nonzero(edge)
+    if len(rows) == 0:
+        return value
+    offsets = (np.arange(_SAMPLES) + 0.5) / _SAMPLES - 0.5
+    dv, du = (o.reshape(-1, 1).astype(np.float32) for o in np.meshgrid(offsets, offsets, indexing="ij"))
+    (xu, xv), (yu, yv) = _slopes(x, rows, columns), _slopes(y, rows, columns)
+    x_fine = x[rows, columns] + du * xu + dv * xv
+    y_fine = y[rows, columns] + du * yu + dv * yv
+    value[rows, columns] = _sample(plane_from_ray, x_fine, y_fine, printed).mean(axis=0)
+    return value
+
+
+def _slopes(field: Floats, rows: NDArray[np.intp], columns: NDArray[np.intp]) -> tuple[Floats, Floats]:
+    """Change per pixel to the right and per pixel down."""
+    height, width = field.shape
+    left, right = np.maximum(columns - 1, 0), np.minimum(columns + 1, width - 1)
+    up, down = np.maximum(rows - 1, 0), np.minimum(rows + 1, height - 1)
+    to_right = (field[rows, right] - field[rows, left]) / np.maximum(right - left, 1).astype(np.float32)
+    to_down = (field[down, columns] - field[up, columns]) / np.maximum(down - up, 1).astype(np.float32)
+    return to_right, to_down
+
+
+def _sample(plane_from_ray: Array, x: Floats, y: Floats, printed: BoardPrint) -> Floats:
+    """Reflectance where the rays (x, y, 1) meet the board's plane; the table where they miss."""
+    h = plane_from_ray.astype(np.float32)
+    inverse_depth = h[2, 0] * x + h[2, 1] * y + h[2, 2]
+    ahead = inverse_depth > 1e-3
+    safe = np.where(ahead, inverse_depth, np.float32(1.0))
+    board_x = (h[0, 0] * x + h[0, 1] * y + h[0, 2]) / safe
+    board_y = (h[1, 0] * x + h[1, 1] * y + h[1, 2]) / safe
+    value = printed.albedo(board_x, board_y, TABLE_ALBEDO)
+    return np.where(ahead, value, np.float32(TABLE_ALBEDO))

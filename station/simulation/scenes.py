@@ -1,0 +1,202 @@
+"""Cells to simulate: the paper's and the blog's, and by seed any number of others.
+
+Seed 0 is the scene as published. Other seeds draw the camera's mount anywhere on SO(3), the board's
+place, the lens and the noise; the board stays where 25 varied poses can look at it.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calibrate.geometry import Array, pose, project_to_rotation, random_rotation, rotation_exp
+from calibrate.kinematics import MODELS, forward
+from recordings.messages import BoardSpec, CameraModel, Matrix4, Mount, Vector6
+from station.config import BLOG_BOARD, PAPER_BOARD, PoseGuess, StationConfig
+from station.errors import ConfigError
+from station.simulation.cell import CellTruth, NoiseLevel, SceneName
+from station.simulation.placement import (
+    Placement,
+    board_centre,
+    cell_description,
+    guess_of,
+    place_fixed_camera,
+    place_moving_camera,
+)
+
+PAPER_X = (
+    (1.0000, -0.0032, -0.0026, -0.0013),
+    (0.0032, 1.0000, -0.0068, -0.0603),
+    (0.0026, 0.0068, 1.0000, 0.0870),
+)
+"""Eq. 23 of the paper, flange_from_camera; rounded there, so its rotation is made orthonormal here."""
+_START_DEG = (0.0, -94.0, -90.0, -86.0, 90.0, 0.0)
+"""The flange points straight down, half a metre over the table."""
+_GUESS_M, _GUESS_RAD = 0.005, 0.03
+"""Error of the guesses, 1 sigma per axis"""
+
+
+class _Scene(NamedTuple):
+    board: BoardSpec
+    camera: CameraModel
+    mount: Array
+    """Published flange_from_camera"""
+
+
+class _Noise(NamedTuple):
+    robot_sigma_m: float
+    robot_sigma_rad: float
+    dh_sigma_m: float
+    dh_sigma_rad: float
+    pixel_noise: float
+    blur_px: float
+
+
+_NOISE = {
+    "low": _Noise(5.0e-5, 8.7e-5, 0.0, 0.0, 2.0, 0.7),
+    "mid": _Noise(1.0e-4, 1.7e-4, 1.0e-4, 1.0e-4, 4.0, 0.9),
+    "high": _Noise(2.0e-4, 3.5e-4, 3.0e-4, 3.0e-4, 7.0, 1.2),
+}
+
+
+def build_cell(scene: SceneName, seed: int, noise: NoiseLevel, mount: Mount) -> CellTruth:
+    """The truth of a cell; the same arguments give the same cell. ConfigError for an unknown name."""
+    scenes = {"paper": _paper_scene, "blog": _blog_scene}
+    if scene not in scenes or noise not in _NOISE or mount not in ("eye-in-hand", "eye-to-hand"):
+        raise ConfigError(
+            f"no simulated cell '{scene}' with noise '{noise}' and mount '{mount}'; there are the scenes "
+            f"{', '.join(scenes)}, the noise levels {', '.join(_NOISE)}, eye-in-hand and eye-to-hand"
+        )
+    rng = np.random.default_rng([2026, seed])
+    published = scenes[scene]()
+    camera = published.camera if seed == 0 else _other_lens(published.camera, rng)
+    placed = _place(published, camera, seed, mount, rng)
+    truth = CellTruth(
+        scene=scene,
+        seed=seed,
+        mount=mount,
+        robot_model="UR10",
+        board=published.board,
+        camera=camera,
+        camera_mount=_matrix4(placed.camera_mount),
+        board_place=_matrix4(placed.board_place),
+        start_joints_rad=_vector6(placed.start_joints_rad),
+    )
+    return _with_noise(truth, _NOISE[noise], rng)
+
+
+def _paper_scene() -> _Scene:
+    focal_px = 8.0 / 0.0048
+    camera = CameraModel(
+        width=1280,
+        height=1024,
+        matrix=((focal_px + 3.1, 0.0, 646.2), (0.0, focal_px + 2.7, 505.8), (0.0, 0.0, 1.0)),
+        distortion=(-0.092, 0.118, 0.0004, -0.0003, 0.0),
+    )
+    rows = np.array(PAPER_X)
+    return _Scene(PAPER_BOARD, camera, pose(project_to_rotation(rows[:, :3]), rows[:, 3]))
+
+
+def _blog_scene() -> _Scene:
+    """X is the blog's `Hand-Eye` frame, RPY(0, −15, 0)° at (0.1, 0, 0) m on the flange.
+
+    RobWork's camera looks along −z of `Hand-Eye-Sim`, which is `Hand-Eye` rolled by 180°. The blog's own
+    answer is `Hand-Eye` itself, so that its z is the optical axis; `camera` is taken as that frame.
+    """
+    focal_px = 360.0 / np.tan(np.deg2rad(31.0482) / 2)
+    camera = CameraModel(
+        width=960,
+        height=720,
+        matrix=((float(focal_px), 0.0, 480.0), (0.0, float(focal_px), 360.0), (0.0, 0.0, 1.0)),
+    )
+    return _Scene(BLOG_BOARD, camera, pose(rotation_exp([0.0, np.deg2rad(-15.0), 0.0]), [0.1, 0.0, 0.0]))
+
+
+def _place(
+    published: _Scene, camera: CameraModel, seed: int, mount: Mount, rng: np.random.Generator
+) -> Placement:
+    if mount == "eye-to-hand":
+        return place_fixed_camera(published.board, camera, rng)
+    if seed != 0:
+        return place_moving_camera(published.board, camera, random_rotation(rng), rng)
+    start = np.deg2rad(_START_DEG)
+    base_from_camera = forward(MODELS["UR10"], start) @ published.mount
+    axis = base_from_camera[:3, 2]
+    middle = base_from_camera[:3, 3] - axis * base_from_camera[2, 3] / axis[2]
+    level = np.array([[0.0, 1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, -1.0]])
+    return Placement(published.mount, pose(level, middle - level @ board_centre(published.board)), start)
+
+
+def _other_lens(camera: CameraModel, rng: np.random.Generator) -> CameraModel:
+    """Another copy of the lens: focal length, centre and distortion a little different."""
+    assert camera.matrix is not None
+    focal = camera.matrix[0][0] * rng.uniform(0.97, 1.03)
+    cx, cy = camera.matrix[0][2] + rng.normal(0, 6), camera.matrix[1][2] + rng.normal(0, 6)
+    k1 = rng.uniform(-0.12, 0.04)
+    tangential = rng.normal(0, 3e-4, 2)
+    return msgspec.structs.replace(
+        camera,
+        matrix=((focal, 0.0, cx), (0.0, focal * (1 + rng.normal(0, 3e-4)), cy), (0.0, 0.0, 1.0)),
+        distortion=(k1, -k1 * rng.uniform(0.5, 1.3), float(tangential[0]), float(tangential[1]), 0.0),
+    )
+
+
+def _with_noise(truth: CellTruth, level: _Noise, rng: np.random.Generator) -> CellTruth:
+    spread = 1.0 if truth.seed == 0 else float(rng.uniform(0.8, 1.2))
+
+    def deltas(sigma: float) -> Vector6:
+        return _vector6(rng.normal(0, sigma, 6) if sigma else np.zeros(6))
+
+    return msgspec.structs.replace(
+        truth,
+        robot_sigma_m=level.robot_sigma_m * spread,
+        robot_sigma_rad=level.robot_sigma_rad * spread,
+        dh_delta_a_m=deltas(level.dh_sigma_m),
+        dh_delta_d_m=deltas(level.dh_sigma_m),
+        dh_delta_alpha_rad=deltas(level.dh_sigma_rad),
+        dh_delta_theta_rad=deltas(level.dh_sigma_rad),
+        pixel_noise=level.pixel_noise * spread,
+        blur_px=level.blur_px * spread,
+        camera_clock_offset_ns=int(rng.integers(-(10**12), 10**12)),
+        camera_clock_drift_ppm=float(rng.uniform(-30, 30)),
+        controller_clock_drift_ppm=float(rng.uniform(-15, 15)),
+    )
+
+
+def _matrix4(matrix: Array) -> Matrix4:
+    return tuple(tuple(float(x) for x in row) for row in matrix)
+
+
+def _vector6(values: ArrayLike) -> Vector6:
+    a, b, c, d, e, f = (float(x) for x in np.asarray(values))
+    return a, b, c, d, e, f
+
+
+def cell_config(truth: CellTruth, host: str = "") -> StationConfig:
+    """What an operator with a tape measure would write down: guesses of mount, board and lens, all a bit off.
+
+    `host`: the simulated controller. The same truth gives the same configuration.
+    """
+    rng = np.random.default_rng([1987, truth.seed])
+
+    def roughly(matrix: Matrix4) -> PoseGuess:
+        M = np.array(matrix)
+        turned = M[:3, :3] @ rotation_exp(
+            np.clip(rng.normal(0, _GUESS_RAD, 3), -2 * _GUESS_RAD, 2 * _GUESS_RAD)
+        )
+        moved = M[:3, 3] + np.clip(rng.normal(0, _GUESS_M, 3), -2 * _GUESS_M, 2 * _GUESS_M)
+        return guess_of(pose(turned, moved), _GUESS_M, _GUESS_RAD)
+
+    assert truth.camera.matrix is not None
+    focal_px = round(truth.camera.matrix[0][0], -1)
+    centre = ((truth.camera.width - 1) / 2, (truth.camera.height - 1) / 2)
+    rough_lens = CameraModel(
+        width=truth.camera.width,
+        height=truth.camera.height,
+        matrix=((focal_px, 0.0, centre[0]), (0.0, focal_px, centre[1]), (0.0, 0.0, 1.0)),
+    )
+    mount_guess, board_guess = roughly(truth.camera_mount), roughly(truth.board_place)
+    return cell_description(truth.mount, rough_lens, truth.board, mount_guess, board_guess, host)

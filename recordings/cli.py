@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import sys
 from collections.abc import Callable, Iterator
@@ -16,8 +17,9 @@ from rich.progress import Progress
 from recordings.errors import RecordingError
 from recordings.importer import import_folder
 from recordings.info import recording_info
-from recordings.info_text import print_info
+from recordings.info_text import print_info, print_recovery
 from recordings.reader import open_recording
+from recordings.recover import recover as recover_recording
 
 main = typer.Typer(
     name="recordings",
@@ -63,6 +65,23 @@ def import_(
     else:
         print(f"{done.path}: {done.pictures} views, {done.size_bytes / 1e6:.1f} MB")
         print(f"next: calibrate solve {done.path}")
+
+
+@main.command()
+def recover(
+    recording: Path,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Default: repaired in place.")] = None,
+    json_: Json = False,
+) -> None:
+    """Rebuild an unfinished, cut or damaged recording (or a session's folder); ends with 3 when it had to."""
+    with _errors_for_people():
+        results = recover_recording(recording, output)
+    if json_:
+        print(json.dumps([dataclasses.asdict(result) for result in results], default=str))
+    else:
+        for result in results:
+            print_recovery(result)
+    raise typer.Exit(3 if any(result.rebuilt for result in results) else 0)
 
 
 @contextmanager

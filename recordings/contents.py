@@ -52,6 +52,8 @@ class Contents:
     messages: dict[int, MessageIndex] = field(default_factory=dict)
     """By channel."""
     attachments: dict[str, bytes] = field(default_factory=dict)
+    media_types: dict[str, str] = field(default_factory=dict)
+    """Of the attachments."""
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     chunks: int = 0
     message_count: int = 0
@@ -106,6 +108,7 @@ class Contents:
         if record.name in self.attachments:
             raise BadRecordError(f"attachment '{record.name[:40]}' stands twice in the file")
         self.attachments[record.name] = record.data
+        self.media_types[record.name] = record.media_type
 
     def add_metadata(self, content: memoryview) -> None:
         self._metadata_bytes += len(content)

@@ -9,6 +9,10 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
+from recordings.recover import Recovery
+
+_LOSSES_SHOWN = 20
+
 
 def print_info(facts: dict[str, Any]) -> None:
     """Prints what `recording_info` found as two small tables."""
@@ -60,3 +64,19 @@ def _info_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
 def _clock_text(clock: dict[str, float]) -> str:
     within = f"95 % within {clock['spread_p95_ms']:.2f} ms, all within {clock['spread_max_ms']:.2f} ms"
     return f"drift {clock['drift_ppm']:+.1f} ppm against the host, {within}"
+
+
+def print_recovery(result: Recovery) -> None:
+    """What `recordings recover` did with one file."""
+    if not result.rebuilt:
+        print(f"{result.path}: whole, nothing was lost ({result.poses} poses)")
+        return
+    print(
+        f"{result.path}: saved {result.poses} poses, {result.pictures} pictures and "
+        f"{result.robot_states} robot states; {result.lost_bytes} bytes were lost"
+    )
+    for loss in result.losses[:_LOSSES_SHOWN]:
+        print(f"  lost: {loss}")
+    if len(result.losses) > _LOSSES_SHOWN:
+        print(f"  and {len(result.losses) - _LOSSES_SHOWN} more")
+    print(f"the damaged file is kept as {result.kept_original}")

@@ -19,7 +19,7 @@ from recordings.files import is_attachment_name, is_session_name
 from recordings.messages import CaptureEvent, Picture, RobotState, SessionInfo, View
 from recordings.pictures import PictureError, decode_picture, raw_array
 from recordings.scan import open_file, scan_file
-from recordings.schema import FORMAT, PictureFacts, SchemaError, decode, schema_difference
+from recordings.schema import FORMAT, SESSION_RECORDS, PictureFacts, SchemaError, decode, schema_difference
 from recordings.topics import Topic, schema_bytes, schema_name
 
 VIEWS_LIMIT = 10_000
@@ -168,7 +168,7 @@ class RecordingPart:
         return found
 
     def _session_info(self) -> SessionInfo:
-        record = self._contents.metadata.get("session", {})
+        record = self._contents.metadata.get(SESSION_RECORDS[0], {})
         if record.get("format") != FORMAT:
             raise self._file_error(
                 f"its format is '{record.get('format', 'unknown')[:40]}', this version reads '{FORMAT}'"

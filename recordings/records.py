@@ -7,6 +7,7 @@ returns short data, skips padding or passes over a record it does not know.
 from __future__ import annotations
 
 import struct
+import zlib
 from collections.abc import Iterator
 from enum import IntEnum
 from typing import NamedTuple
@@ -219,3 +220,18 @@ def split_records(content: memoryview) -> Iterator[tuple[int, int, memoryview]]:
             raise BadRecordError(f"a record says it has {length} bytes, {end - start} are left")
         yield position, opcode, content[start : start + length]
         position = start + length
+
+
+def with_crc(content: dict[str, str]) -> dict[str, str]:
+    """Metadata records have no checksum of their own in MCAP: ours carry one as an entry."""
+    return content | {"crc32": _map_crc(content)}
+
+
+def require_crc(content: dict[str, str]) -> None:
+    """BadRecordError unless the entries are those that `with_crc` sealed."""
+    if content.get("crc32") != _map_crc({k: v for k, v in content.items() if k != "crc32"}):
+        raise BadRecordError("the checksum of a metadata record does not fit")
+
+
+def _map_crc(content: dict[str, str]) -> str:
+    return f"{zlib.crc32(repr(sorted(content.items())).encode()):08x}"

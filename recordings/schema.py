@@ -19,6 +19,8 @@ from msgspec import inspect
 from recordings.messages import CaptureEvent, RobotState, Stamps, Stillness, View
 
 FORMAT = "station-recording/1"
+SESSION_RECORDS = ("session", "session-copy")
+"""Metadata records with the SessionInfo: twice, because nothing can be saved from a file without it."""
 PACKAGE = "station"
 _FILE = "station/recording.proto"
 _MATRIX_COLUMNS = 4

@@ -29,12 +29,13 @@ from recordings.files import (
 )
 from recordings.messages import CameraModel, CaptureEvent, Picture, RobotState, SessionInfo, Stamps, View
 from recordings.pictures import PictureError, encode_png, read_header
-from recordings.schema import FORMAT, PictureFacts, encode
+from recordings.records import with_crc
+from recordings.schema import FORMAT, SESSION_RECORDS, PictureFacts, encode
 from recordings.topics import Topic, schema_bytes, schema_name
 
 CHUNK_BYTES = 1024 * 1024
 ATTACHMENT_LIMIT_BYTES = 16 * 1024 * 1024
-_LIBRARY = "calibration-station"
+LIBRARY = "calibration-station"
 _SECOND_NS = 1_000_000_000
 
 
@@ -99,9 +100,10 @@ class RecordingWriter:
             enable_data_crcs=True,
         )
         with self._disk():
-            self._writer.start(profile="", library=_LIBRARY)
-            content = {"format": FORMAT, "session": msgspec.json.encode(info).decode()}
-            self._writer.add_metadata("session", content)
+            self._writer.start(profile="", library=LIBRARY)
+            content = with_crc({"format": FORMAT, "session": msgspec.json.encode(info).decode()})
+            for name in SESSION_RECORDS:
+                self._writer.add_metadata(name, content)
             sync_folder(path.parent)
         if info.camera.matrix is not None:
             self.camera_model(info.camera)

@@ -8,7 +8,7 @@ PYTHON ?= $(or $(SYSTEM_PYTHON),python3)
 VENV_FLAGS := $(if $(SYSTEM_PYTHON),--system-site-packages,)
 READY := $(VENV)/.ready
 
-.PHONY: help venv demo test check bench soak clean
+.PHONY: help venv demo demo-gige test check bench soak install install-files uninstall clean
 help:  ## list the commands
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
@@ -25,6 +25,9 @@ venv: $(READY)  ## create .venv with everything in it
 demo: $(READY)  ## the whole job with no hardware: simulated UR10 and camera to a calibration and its report
 	@$(BIN)/station demo
 
+demo-gige: $(READY)  ## the same, with the camera over real GigE Vision inside a network namespace
+	@$(BIN)/station demo --gige
+
 test: $(READY)  ## all tests
 	$(BIN)/python -m pytest -n 2 --dist loadfile
 
@@ -39,6 +42,41 @@ bench: $(READY)  ## the benchmarks; tables go to benchmarks/README.md
 
 soak: $(READY)  ## the long runs that CI shortens
 	$(BIN)/python -m pytest -m soak --timeout 3600
+
+# Staged installs: make install DESTDIR=/some/root. The venv is made there, its scripts point at PREFIX.
+DESTDIR ?=
+PREFIX ?= /usr/local
+SYSCONFDIR ?= /etc
+APP := $(PREFIX)/lib/calibration-station
+DOC := $(PREFIX)/share/doc/calibration-station
+UNITS := station.service station-tui@.service calibrate@.service
+
+install: install-files  ## install programs, units and users' definitions below PREFIX (/usr/local) and /etc
+	$(PYTHON) -m venv $(VENV_FLAGS) $(DESTDIR)$(APP)
+	$(DESTDIR)$(APP)/bin/python -m pip --disable-pip-version-check install --quiet -c constraints.txt .
+	sed -i '1s|^#!$(DESTDIR)$(APP)|#!$(APP)|' $(addprefix $(DESTDIR)$(APP)/bin/,station calibrate recordings)
+	install -d $(DESTDIR)$(PREFIX)/bin
+	for name in station calibrate recordings; do ln -sf $(APP)/bin/$$name $(DESTDIR)$(PREFIX)/bin/$$name; done
+	@echo "Next: systemd/README.md (users, configuration, start)."
+
+install-files:  # the part of install that needs no network
+	for unit in $(UNITS); do \
+		install -d $(DESTDIR)$(SYSCONFDIR)/systemd/system && \
+		sed 's|@PREFIX@|$(PREFIX)|g; s|@SYSCONFDIR@|$(SYSCONFDIR)|g' systemd/$$unit \
+			> $(DESTDIR)$(SYSCONFDIR)/systemd/system/$$unit; done
+	install -D -m 644 systemd/station.sysusers $(DESTDIR)$(SYSCONFDIR)/sysusers.d/station.conf
+	install -D -m 644 systemd/station.tmpfiles $(DESTDIR)$(SYSCONFDIR)/tmpfiles.d/station.conf
+	install -D -m 644 systemd/60-station.rules $(DESTDIR)$(SYSCONFDIR)/udev/rules.d/60-station.rules
+	test -e $(DESTDIR)$(SYSCONFDIR)/station/station.env || \
+		install -D -m 644 systemd/station.env $(DESTDIR)$(SYSCONFDIR)/station/station.env
+	install -d $(DESTDIR)$(DOC) && install -m 644 docs/*.md $(DESTDIR)$(DOC)
+
+uninstall:  ## remove what install put there; configuration, recordings and calibrations stay
+	rm -rf $(DESTDIR)$(APP) $(DESTDIR)$(DOC)
+	rm -f $(addprefix $(DESTDIR)$(PREFIX)/bin/,station calibrate recordings)
+	rm -f $(addprefix $(DESTDIR)$(SYSCONFDIR)/systemd/system/,$(UNITS))
+	rm -f $(DESTDIR)$(SYSCONFDIR)/sysusers.d/station.conf $(DESTDIR)$(SYSCONFDIR)/tmpfiles.d/station.conf
+	rm -f $(DESTDIR)$(SYSCONFDIR)/udev/rules.d/60-station.rules
 
 clean:  ## remove the venv and caches
 	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache

@@ -1,0 +1,79 @@
+"""The units are valid, closed, and land where `make install` says, in a scratch root."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+UNITS = {"station.service": 2.0, "calibrate@.service": 1.0, "station-tui@.service": 2.0}
+needs_systemd = pytest.mark.skipif(not shutil.which("systemd-analyze"), reason="no systemd-analyze here")
+
+
+def make(target: str, root: Path) -> None:
+    subprocess.run(
+        ["make", "-C", str(ROOT), target, f"DESTDIR={root}"], check=True, capture_output=True, text=True
+    )
+
+
+@pytest.fixture
+def scratch(tmp_path: Path) -> Path:
+    """A root with the files installed and stand-ins for the programs."""
+    make("install-files", tmp_path)
+    for name in ("station", "calibrate"):
+        program = tmp_path / "usr/local/bin" / name
+        program.parent.mkdir(parents=True, exist_ok=True)
+        program.write_text("#!/bin/sh\n")
+        program.chmod(0o755)
+    return tmp_path
+
+
+@needs_systemd
+@pytest.mark.parametrize("unit", UNITS)
+def test_exposure_stays_below_the_limit(scratch: Path, unit: str) -> None:
+    path = scratch / "etc/systemd/system" / unit
+    done = subprocess.run(
+        ["systemd-analyze", "security", "--offline=true", str(path)], capture_output=True, text=True
+    )
+    found = re.search(r"Overall exposure level for \S+: ([\d.]+)", done.stdout)
+    assert found, done.stdout + done.stderr
+    assert float(found[1]) <= UNITS[unit]
+
+
+@needs_systemd
+@pytest.mark.parametrize("unit", UNITS)
+def test_unit_is_valid(scratch: Path, unit: str, tmp_path: Path) -> None:
+    text = (scratch / "etc/systemd/system" / unit).read_text()
+    assert "@PREFIX@" not in text
+    # verify looks for the program on this machine: the stand-in takes its place.
+    standing_in = text.replace("/usr/local/bin", str(scratch / "usr/local/bin"))
+    path = tmp_path / "verify" / unit
+    path.parent.mkdir()
+    path.write_text(standing_in)
+    done = subprocess.run(["systemd-analyze", "verify", str(path)], capture_output=True, text=True)
+    complaints = [line for line in done.stderr.splitlines() if Path(unit).stem.rstrip("@") in line]
+    assert done.returncode == 0, done.stderr
+    assert not complaints
+
+
+@needs_systemd
+def test_users_are_creatable(scratch: Path) -> None:
+    done = subprocess.run(
+        ["systemd-sysusers", f"--root={scratch}", "--dry-run", str(scratch / "etc/sysusers.d/station.conf")],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def test_uninstall_removes_all_but_what_is_the_owners(scratch: Path) -> None:
+    own = scratch / "etc/station/station.env"
+    own.write_text("STATION_CONFIG=/etc/station/mine.yaml\n")
+    make("install-files", scratch)
+    assert "mine.yaml" in own.read_text()
+    make("uninstall", scratch)
+    assert [p for p in scratch.rglob("*") if p.is_file()] == [own]

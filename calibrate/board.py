@@ -28,7 +28,9 @@ def dictionary_id(name: str) -> int:
     """OpenCV's number of a marker dictionary such as DICT_6X6_250; BoardError when there is none."""
     value = getattr(cv2.aruco, name, None)
     if not name.startswith("DICT_") or not isinstance(value, int):
-        raise BoardError(f"board: dictionary {name!r} is not one of OpenCV's; write for example DICT_6X6_250.")
+        raise BoardError(
+            f"board: dictionary {name!r} is not one of OpenCV's; write for example DICT_6X6_250."
+        )
     return value
 
 
@@ -49,7 +51,9 @@ def check_board(spec: BoardSpec) -> None:
     elif spec.kind is BoardKind.APRIL_GRID:
         dictionary_id(spec.dictionary or APRIL_DICTIONARY)
         if spec.marker_m is None or not 0 < spec.marker_m < spec.square_m:
-            raise BoardError("board: an april-grid needs marker_m, the gap between tags, smaller than square_m.")
+            raise BoardError(
+                "board: an april-grid needs marker_m, the gap between tags, smaller than square_m."
+            )
     elif spec.columns * spec.rows < 4:
         raise BoardError("board: fewer than 4 points do not fix a pose.")
 

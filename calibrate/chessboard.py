@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from typing import Any
 
 import cv2
 import numpy as np
@@ -43,7 +44,7 @@ def _attempts(grey: Grey, size: tuple[int, int], thorough: bool) -> Iterator[Arr
         return
     if max(grey.shape) > _LARGE_SIDE_PX:
         yield _scaled(grey, 0.5, lambda small: _classic(small, size))
-    equalised = cv2.createCLAHE(clipLimit=4.0, tileGridSize=(8, 8)).apply(grey)
+    equalised: Any = cv2.createCLAHE(clipLimit=4.0, tileGridSize=(8, 8)).apply(grey)
     yield _classic(equalised, size)
     yield _sector(equalised, size, cv2.CALIB_CB_EXHAUSTIVE)
     if max(grey.shape) <= 2 * _LARGE_SIDE_PX:
@@ -56,7 +57,7 @@ def _classic(grey: Grey, size: tuple[int, int]) -> Array | None:
 
 
 def _sector(grey: Grey, size: tuple[int, int], flags: int) -> Array | None:
-    """A. Duda, U. Frese: "Accurate detection and localization of checkerboard corners" (2018), OpenCV's SB."""
+    """A. Duda, U. Frese: "Accurate detection and localization of checkerboard corners" (2018): SB."""
     found, corners = cv2.findChessboardCornersSB(grey, size, flags=flags | cv2.CALIB_CB_NORMALIZE_IMAGE)
     return np.asarray(corners, dtype=float) if found else None
 

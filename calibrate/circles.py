@@ -16,7 +16,7 @@ from recordings.messages import BoardKind, BoardSpec
 
 
 def find_circles(grey: Grey, spec: BoardSpec) -> Array | None:
-    """All centres in board order, (rows·columns, 2) pixels, or None. Dark circles on light ground, or inverted."""
+    """All centres in board order, (rows·columns, 2) pixels, or None; dark on light or light on dark."""
     kind = (
         cv2.CALIB_CB_ASYMMETRIC_GRID
         if spec.kind is BoardKind.ASYMMETRIC_CIRCLES

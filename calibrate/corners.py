@@ -19,7 +19,7 @@ _REFINEMENT_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-
 
 
 def to_grey(image: NDArray[Any]) -> Grey:
-    """(h, w) or (h, w, 3 BGR), uint8 or uint16 → (h, w) uint8; 10 and 12 bits are recognised by the maximum."""
+    """(h, w) or (h, w, 3 BGR), uint8 or uint16 → (h, w) uint8; the maximum tells 10, 12 and 16 bits apart."""
     if image.dtype == np.uint16:
         bits = next(b for b in (8, 10, 12, 16) if int(image.max(initial=0)) < 1 << b)
         image = (image >> (bits - 8)).astype(np.uint8)
@@ -85,15 +85,23 @@ def refine(grey: Grey, corners: Array, spacing_px: Array, largest_half_window: i
     return refined
 
 
+def sample(grey: Grey, pixels: Array) -> Array:
+    """Grey values at pixels (r, c, 2), lightly smoothed, (r, c)."""
+    places: Any = pixels.astype(np.float32)
+    smooth = cv2.blur(grey, (3, 3))
+    values = cv2.remap(
+        smooth, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    return np.asarray(values, dtype=np.float64)
+
+
 def square_contrast(grey: Grey, grid: Array) -> float:
     """Brightness of the squares at odd places minus that at even ones, over the spread; > 0: first is dark.
 
     grid: (rows, columns, 2). Value in about -1 … 1; near 0 the colours decide nothing.
     """
     centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
-    samples = cv2.remap(
-        cv2.blur(grey, (3, 3)), centres.astype(np.float32), None, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
-    ).astype(float)
+    samples = sample(grey, centres)
     odd = np.indices(samples.shape).sum(axis=0) % 2 == 1
     if odd.all() or not odd.any():
         return 0.0 if samples.size == 0 else float(np.sign(grey.mean() - samples.mean()))

@@ -6,7 +6,7 @@ Z. Zhang, "A flexible new technique for camera calibration" (2000), by OpenCV.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -56,8 +56,8 @@ def calibrate_intrinsics(views: ViewSet, model: LensModel = "plumb_bob") -> Intr
     """
     if len(views) < FEWEST_VIEWS:
         raise TooFewViewsError(
-            f"The lens cannot be found from {len(views)} view(s): at least {FEWEST_VIEWS} with different tilts are "
-            "needed. Give the camera's matrix and distortion, or take more pictures."
+            f"The lens cannot be found from {len(views)} view(s): at least {FEWEST_VIEWS} with different "
+            "tilts are needed. Give the camera's matrix and distortion, or take more pictures."
         )
     dropped: dict[int, str] = {}
     used = views
@@ -76,9 +76,9 @@ def calibrate_intrinsics(views: ViewSet, model: LensModel = "plumb_bob") -> Intr
     size = (views.camera.width, views.camera.height)
     if not (0.2 * max(size) < fit.K[0, 0] < 100 * max(size)) or fit.rms_px > 0.01 * max(size):
         raise BadViewsError(
-            f"No lens explains the corners (focal length {fit.K[0, 0]:.0f} px, rms {fit.rms_px:.1f} px). Check the "
-            "board's columns and rows, or give the camera's matrix. Pictures that all face the board squarely "
-            "do not determine a lens: tilt the camera by 20° to 40°."
+            f"No lens explains the corners (focal length {fit.K[0, 0]:.0f} px, rms {fit.rms_px:.1f} px). "
+            "Check the board's columns and rows, or give the camera's matrix. Pictures that all face the "
+            "board squarely do not determine a lens: tilt the camera by 20° to 40°."
         )
     return Intrinsics(
         CameraModel(
@@ -114,15 +114,23 @@ def _fit(views: ViewSet, flags: int) -> _Fit:
     pixels = [v.pixels.astype(np.float32) for v in views]
     size = (views.camera.width, views.camera.height)
     try:
+        unknown: Any = None
         rms, K, D, _, _, sigma, _, per_view = cv2.calibrateCameraExtended(
-            object_points, pixels, size, None, None, flags=flags | cv2.CALIB_USE_LU, criteria=_STEPS
+            object_points, pixels, size, unknown, unknown, flags=flags | cv2.CALIB_USE_LU, criteria=_STEPS
         )
     except cv2.error as problem:
         raise BadViewsError(
-            f"The lens cannot be found from these corners ({problem.err}). Check the board's columns and rows."
+            f"The lens cannot be found from these corners ({problem.err}). Check the board's size."
         ) from None
     count = 8 if flags & cv2.CALIB_RATIONAL_MODEL else 5
-    return _Fit(flags, float(rms), K, D.ravel()[:count], sigma.ravel()[: 4 + count], per_view.ravel())
+    return _Fit(
+        flags, float(rms), _floats(K), _floats(D)[:count], _floats(sigma)[: 4 + count], _floats(per_view)
+    )
+
+
+def _floats(values: Any) -> Array:
+    found = np.asarray(values, dtype=np.float64)
+    return found if found.shape == (3, 3) else found.ravel()
 
 
 def _undetermined(fit: _Fit, camera: CameraModel) -> tuple[int, str] | None:
@@ -139,14 +147,17 @@ def _undetermined(fit: _Fit, camera: CameraModel) -> tuple[int, str] | None:
     ):
         return (
             cv2.CALIB_FIX_PRINCIPAL_POINT,
-            f"principal point held at the picture's centre: the views know it only to {max(s[2], s[3]):.0f} px",
+            f"principal point held at the centre: the views know it only to {max(s[2], s[3]):.0f} px",
         )
     if rational:
         return None
     if not fit.flags & cv2.CALIB_FIX_K3 and small(k3, s[8]):
         return cv2.CALIB_FIX_K3, f"k3 held at 0: found {k3:.3g} ± {s[8]:.2g}"
     if not fit.flags & cv2.CALIB_ZERO_TANGENT_DIST and small(p1, s[6]) and small(p2, s[7]):
-        return cv2.CALIB_ZERO_TANGENT_DIST, f"p1, p2 held at 0: found {p1:.2g} ± {s[6]:.1g}, {p2:.2g} ± {s[7]:.1g}"
+        return (
+            cv2.CALIB_ZERO_TANGENT_DIST,
+            f"p1, p2 held at 0: found {p1:.2g} ± {s[6]:.1g}, {p2:.2g} ± {s[7]:.1g}",
+        )
     if fit.flags & cv2.CALIB_FIX_K3 and not fit.flags & cv2.CALIB_FIX_K2 and small(k2, s[5]):
         return cv2.CALIB_FIX_K2, f"k2 held at 0: found {k2:.3g} ± {s[5]:.2g}"
     if fit.flags & cv2.CALIB_FIX_K2 and not fit.flags & cv2.CALIB_FIX_K1 and small(k1, s[4]):
@@ -171,4 +182,4 @@ def _fit_fisheye(views: ViewSet) -> _Fit:
     for points, seen, rvec, tvec in zip(object_points, pixels, rvecs, tvecs, strict=True):
         shown, _ = cv2.fisheye.projectPoints(points, rvec, tvec, K, D)
         per_view.append(np.sqrt(np.square(shown.reshape(-1, 2) - seen.reshape(-1, 2)).sum(axis=1).mean()))
-    return _Fit(0, float(rms), K, D.ravel(), np.zeros(8), np.array(per_view))
+    return _Fit(0, float(rms), _floats(K), _floats(D), np.zeros(8), np.array(per_view))

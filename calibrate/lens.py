@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 
@@ -50,6 +52,7 @@ def undistort(camera: CameraModel, pixels: Array) -> Array:
     K, D = camera_matrix(camera), distortion(camera)
     points = np.ascontiguousarray(pixels, dtype=float).reshape(-1, 1, 2)
     if camera.distortion_model == "equidistant":
-        return np.asarray(cv2.fisheye.undistortPoints(points, K, D, P=K)).reshape(-1, 2)
-    plain = cv2.undistortPointsIter(points, K, D, np.eye(3), K, _UNDISTORT_STEPS)
-    return np.asarray(plain).reshape(-1, 2)
+        plain: Any = cv2.fisheye.undistortPoints(points, K, D, P=K)
+    else:
+        plain = cv2.undistortPointsIter(points, K, D, np.eye(3), K, _UNDISTORT_STEPS)
+    return np.asarray(plain, dtype=np.float64).reshape(-1, 2)

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.board import APRIL_DICTIONARY, board_points, dictionary_id
-from calibrate.corners import Grey, local_spacing, refine
+from calibrate.corners import Grey, local_spacing, refine, sample
 from calibrate.geometry import Array
 from recordings.messages import BoardSpec
 
@@ -22,7 +22,7 @@ _NOTHING = (np.zeros(0, dtype=np.intp), np.zeros((0, 2)))
 def charuco_board(spec: BoardSpec) -> Any:
     """OpenCV's description of the board; also what draws it."""
     dictionary = cv2.aruco.getPredefinedDictionary(dictionary_id(spec.dictionary or ""))
-    board = cv2.aruco.CharucoBoard((spec.columns, spec.rows), spec.square_m, spec.marker_m, dictionary)
+    board = cv2.aruco.CharucoBoard((spec.columns, spec.rows), spec.square_m, spec.marker_m or 0.0, dictionary)
     board.setLegacyPattern(spec.legacy)
     return board
 
@@ -33,9 +33,11 @@ def find_charuco(grey: Grey, spec: BoardSpec) -> tuple[Indices, Array]:
     markers, marker_ids, _ = _marker_detector(spec.dictionary or "", 1).detectMarkers(grey)
     if marker_ids is None or len(marker_ids) < 2:
         return _NOTHING
-    # OpenCV's sub-pixel step needs both markers of a corner; ours runs on every corner that the plane predicts.
+    # OpenCV's sub-pixel step needs both markers of a corner; ours takes every corner the plane predicts.
     plane_of = dict(zip(board.getIds().ravel().tolist(), board.getObjPoints(), strict=True))
-    seen = [(plane_of[i], m) for i, m in zip(marker_ids.ravel().tolist(), markers, strict=True) if i in plane_of]
+    seen = [
+        (plane_of[i], m) for i, m in zip(marker_ids.ravel().tolist(), markers, strict=True) if i in plane_of
+    ]
     if len(seen) < 2:
         return _NOTHING
     plane = np.concatenate([corners[:, :2] for corners, _ in seen]).astype(float)
@@ -48,14 +50,15 @@ def _snap_to_corners(
     grey: Grey, spec: BoardSpec, plane: Array, pixels: Array, points: Array
 ) -> tuple[Indices, Array]:
     """Predicts the chessboard corners from marker corners near them, refines, keeps what is a true saddle."""
-    nearest = np.linalg.norm(plane[None] - points[:, None], axis=-1)
-    H, _ = cv2.findHomography(plane.astype(np.float64), pixels.astype(np.float64), cv2.RANSAC, 6.0)
+    from_corner = np.linalg.norm(plane[None] - points[:, None], axis=-1)
+    found: Any = cv2.findHomography(plane, pixels, cv2.RANSAC, 6.0)
+    H = found[0]
     if H is None:
         return _NOTHING
     predicted = _apply(H, points)
     shown = _apply(H, plane)
     # The lens bends the plane: shift each prediction by what its nearest markers missed.
-    weight = np.exp(-0.5 * (nearest / spec.square_m) ** 2)
+    weight = np.exp(-0.5 * (from_corner / spec.square_m) ** 2)
     known = weight.sum(axis=1) > 0.3
     miss = (weight @ (pixels - shown)) / np.maximum(weight.sum(axis=1, keepdims=True), 1e-9)
     predicted += miss
@@ -77,12 +80,11 @@ def _snap_to_corners(
 
 
 def is_saddle(grey: Grey, corners: Array, spacing_px: Array) -> NDArray[np.bool_]:
-    """A chessboard corner: on a small circle round it bright and dark alternate twice, opposite sides alike."""
+    """A chessboard corner: round it bright and dark alternate twice, opposite sides alike."""
     angles = np.arange(16) * (2 * np.pi / 16)
     radius = np.clip(0.25 * spacing_px, 2.0, 12.0)[:, None]
-    x = (corners[:, :1] + radius * np.cos(angles)).astype(np.float32)
-    y = (corners[:, 1:] + radius * np.sin(angles)).astype(np.float32)
-    ring = cv2.remap(cv2.blur(grey, (3, 3)), x, y, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE).astype(float)
+    circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
+    ring = sample(grey, corners[:, None] + radius[..., None] * circle)
     ring -= ring.mean(axis=1, keepdims=True)
     spectrum = np.abs(np.fft.rfft(ring, axis=1)) ** 2
     share = spectrum[:, 2] / np.maximum(spectrum[:, 1:].sum(axis=1), 1e-9)
@@ -99,9 +101,7 @@ def _marker_detector(dictionary: str, border_bits: int) -> Any:
     parameters = cv2.aruco.DetectorParameters()
     parameters.markerBorderBits = border_bits
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
-    return cv2.aruco.ArucoDetector(
-        cv2.aruco.getPredefinedDictionary(dictionary_id(dictionary)), parameters
-    )
+    return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(dictionary_id(dictionary)), parameters)
 
 
 def find_april_grid(grey: Grey, spec: BoardSpec) -> tuple[Indices, Array]:

@@ -98,6 +98,8 @@ def _screw_cost(A: Array, B: Array) -> Array:
     # The axis of a small turn is not known, nor is the sign of that of a half turn.
     trust = np.minimum(1.0, np.minimum(angle_a, angle_b) / 0.2)
     pitch_miss = np.abs(along_a - along_b)
-    pitch_miss = np.where(angle_a > np.pi - 0.1, np.minimum(pitch_miss, np.abs(along_a + along_b)), pitch_miss)
+    pitch_miss = np.where(
+        angle_a > np.pi - 0.1, np.minimum(pitch_miss, np.abs(along_a + along_b)), pitch_miss
+    )
     square = ((angle_a - angle_b) / ANGLE_SCALE_RAD) ** 2 + (trust * pitch_miss / PITCH_SCALE_M) ** 2
     return np.asarray(square / (1.0 + square))

@@ -46,14 +46,12 @@ def solve_pnp(views: ViewSet, board: BoardSpec | None = None) -> ViewSet:
         points = view.board_points
         if board is not None and options[k].turn:
             points = transform_points(inverse(board_from_turned(board, options[k].turn)), points)
-        solved.append(
-            replace(view, camera_from_board=options[k].camera_from_board, board_points=points)
-        )
+        solved.append(replace(view, camera_from_board=options[k].camera_from_board, board_points=points))
     return replace(views, views=tuple(solved))
 
 
 def candidate_poses(view: ImageView, camera: CameraModel, board: BoardSpec | None) -> list[Candidate]:
-    """Poses that explain the picture about equally well, best first, each in every turn that looks the same."""
+    """Poses that explain the picture equally well, best first, each in every turn that looks the same."""
     tilts = _planar_poses(view, camera)
     turns = looks_same_turns(board) if board is not None else (0,)
     found = []
@@ -71,7 +69,9 @@ def _planar_poses(view: ImageView, camera: CameraModel) -> list[Array]:
     try:
         count, rvecs, tvecs, _ = cv2.solvePnPGeneric(points, pixels, K, None, flags=cv2.SOLVEPNP_IPPE)
     except cv2.error as problem:
-        raise BadViewsError(f"view {view.name}: the corners do not fix a board pose ({problem.err})") from None
+        raise BadViewsError(
+            f"view {view.name}: the corners do not fix a board pose ({problem.err})"
+        ) from None
     scored = []
     for rvec, tvec in zip(rvecs[:count], tvecs[:count], strict=True):
         rvec, tvec = cv2.solvePnPRefineLM(points, pixels, K, None, rvec, tvec)

@@ -1,0 +1,268 @@
+"""`calibrate`: recording to calibration, and what is done with it. See docs/calibration-file.md."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.table import Table
+
+from calibrate.calibration import CalibrationFileError, read_calibration, write_calibration
+from calibrate.cli_files import read_board, read_camera
+from calibrate.errors import CalibrationError
+from calibrate.gates import GateLimits, read_limits
+from calibrate.load import Progress as LoadProgress
+from calibrate.pipeline import JobOptions, SolvedRecording, solve_recording
+from calibrate.summary import summary
+from recordings.errors import RecordingError
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, help="From a recording to a calibration.")
+out = Console(highlight=False)
+err = Console(stderr=True, highlight=False)
+
+Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session folder", show_default=False)]
+AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout and nothing else")]
+GATE_FAILED = 4
+
+
+class ProfileName(StrEnum):
+    robust = "robust"
+    paper = "paper"
+
+
+class LensName(StrEnum):
+    plumb_bob = "plumb_bob"
+    rational = "rational_polynomial"
+    fisheye = "equidistant"
+
+
+Profile = Annotated[
+    ProfileName, typer.Option(help="robust: the station's; paper: the published method, exactly")
+]
+Seed = Annotated[int, typer.Option(help="Of every random draw")]
+BoardFile = Annotated[
+    Path | None, typer.Option("--board", help="YAML of another board than the recorded one")
+]
+SquareMm = Annotated[float | None, typer.Option("--square-mm", help="Another square size")]
+CameraFile = Annotated[
+    Path | None, typer.Option("--camera", help="Known lens: camera_info YAML or a calibration file")
+]
+Find = Annotated[bool, typer.Option("--find-intrinsics", help="Find the lens even where it is recorded")]
+LensKind = Annotated[LensName, typer.Option("--lens", help="Model of a lens that has to be found")]
+GatesFile = Annotated[Path | None, typer.Option("--gates", help="YAML of other limits")]
+Threads = Annotated[int | None, typer.Option(help="For finding boards; the result does not depend on it")]
+Distance = Annotated[float | None, typer.Option("--working-distance-mm", help="Where the error is stated")]
+
+
+def job_options(
+    profile: ProfileName,
+    seed: int,
+    board: Path | None,
+    square_mm: float | None,
+    camera: Path | None,
+    find_intrinsics: bool,
+    lens: LensName,
+    gates: Path | None,
+    threads: int | None,
+    working_distance_mm: float | None,
+) -> JobOptions:
+    return JobOptions(
+        profile=profile.value,
+        seed=seed,
+        board=None if board is None else read_board(board),
+        square_m=None if square_mm is None else square_mm / 1000,
+        camera=None if camera is None else read_camera(camera),
+        lens_model=lens.value,
+        find_intrinsics=find_intrinsics,
+        limits=GateLimits() if gates is None else read_limits(gates),
+        working_distance_m=None if working_distance_mm is None else working_distance_mm / 1000,
+        threads=threads,
+    )
+
+
+@app.command()
+def solve(
+    recording: Rec,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Default: NAME.calibration.yaml in this folder")
+    ] = None,
+    profile: Profile = ProfileName.robust,
+    as_json: AsJson = False,
+    seed: Seed = 0,
+    board: BoardFile = None,
+    square_mm: SquareMm = None,
+    camera: CameraFile = None,
+    find_intrinsics: Find = False,
+    lens: LensKind = LensName.plumb_bob,
+    gates: GatesFile = None,
+    threads: Threads = None,
+    working_distance_mm: Distance = None,
+    report: Annotated[Path | None, typer.Option(help="Also write the report (HTML)")] = None,
+) -> None:
+    """Solve a recording and write the calibration file. Exit 4: written, but a gate failed."""
+    options = job_options(
+        profile, seed, board, square_mm, camera, find_intrinsics, lens, gates, threads, working_distance_mm
+    )
+    target = output or Path(f"{recording.name.removesuffix('.mcap')}.calibration.yaml")
+    check_target(target)
+    with detection_progress() as progress:
+        job = solve_recording(recording, options, progress)
+    write_calibration(job.calibration, target)
+    if report is not None:
+        from calibrate.report import write_report  # matplotlib is slow to load
+
+        write_report(job, report)
+    if as_json:
+        print_json(solve_json(job))
+    else:
+        out.print(summary(job.calibration))
+        out.print(f"written: {target}" + ("" if report is None else f"  report: {report}"))
+        if job.passed:
+            out.print(f"next: calibrate install {target}")
+    if not job.passed:
+        raise typer.Exit(GATE_FAILED)
+
+
+def solve_json(job: SolvedRecording) -> dict[str, Any]:
+    """The contract of `calibrate solve --json`."""
+    plain = msgspec.to_builtins(job.calibration)
+    views, quality, lens = plain["views"], plain["quality"], plain["intrinsics"]
+    holdout = quality.get("holdout")
+    proof = quality["certificate"]
+    return {
+        "mount": plain["mount"],
+        "result": plain["result"],
+        "sigma": plain["sigma"],
+        "covariance": plain["covariance"],
+        "views": {
+            "used": views["used"],
+            "rejected": [{"index": r["index"], "reason": r["reason"]} for r in views.get("rejected", [])],
+        },
+        "intrinsics": {key: lens[key] for key in ("width", "height", "matrix", "distortion", "rms_px")},
+        "holdout": None if holdout is None else {"e_t_m": holdout["e_t_m"], "e_R": holdout["e_R"]},
+        "certificate": {
+            key: proof[key] for key in ("certified", "relative_gap", "objective", "distance_sigma")
+        },
+        "gates": quality["gates"],
+        "solve_ms": sum(job.stage_ms.values()),
+    }
+
+
+@app.command()
+def compare(
+    recording: Rec,
+    as_json: AsJson = False,
+    seed: Seed = 0,
+    board: BoardFile = None,
+    square_mm: SquareMm = None,
+    camera: CameraFile = None,
+    find_intrinsics: Find = False,
+    lens: LensKind = LensName.plumb_bob,
+    threads: Threads = None,
+) -> None:
+    """Every method side by side on the same views."""
+    from calibrate.peers import compare as compare_methods
+
+    options = job_options(
+        ProfileName.robust, seed, board, square_mm, camera, find_intrinsics, lens, None, threads, None
+    )
+    with detection_progress() as progress:
+        job = solve_recording(recording, options, progress)
+    results = compare_methods(job.views, job.solution)
+    if as_json:
+        print_json(
+            {
+                "mount": job.solution.mount,
+                "views": {"used": list(job.solution.used)},
+                "methods": [peer_plain(peer) for peer in results],
+            }
+        )
+        return
+    table = Table("method", "e_t mm", "e_R", "spread mm", "spread °", "px", "σ from ours", "ms", "", box=None)
+    for peer in results:
+        table.add_row(
+            peer.name,
+            _number(peer.e_t_m, 1e3, 3),
+            _number(peer.e_R, 1, 5),
+            _number(peer.board_spread_m, 1e3, 3),
+            _number(peer.board_spread_rad, float(np.degrees(1)), 4),
+            _number(peer.reprojection_px, 1, 3),
+            _number(peer.distance_sigma, 1, 1),
+            _number(peer.time_ms, 1, 1),
+            peer.note,
+        )
+    out.print(table)
+
+
+def peer_plain(peer: Any) -> dict[str, Any]:
+    plain = {
+        key: value.tolist() if isinstance(value, np.ndarray) else value
+        for key, value in vars(peer).items()
+        if not key.startswith("samples_")
+    }
+    return {key: float(value) if isinstance(value, np.floating) else value for key, value in plain.items()}
+
+
+def _number(value: float | None, factor: float, digits: int) -> str:
+    return "-" if value is None else f"{value * factor:.{digits}f}"
+
+
+def check_target(target: Path) -> None:
+    """A calibration file may be replaced; anything else that stands there is left alone."""
+    if not target.parent.is_dir():
+        raise OutputError(f"{target}: the folder {target.parent} does not exist.")
+    if target.exists():
+        try:
+            read_calibration(target)
+        except CalibrationFileError:
+            raise OutputError(
+                f"{target} exists and is no whole calibration file; give another name with -o."
+            ) from None
+
+
+class OutputError(CalibrationError):
+    """Where the result should go is wrong."""
+
+    exit_code = 2
+
+
+@contextmanager
+def detection_progress() -> Iterator[LoadProgress | None]:
+    """A bar on stderr, only on a terminal."""
+    if not err.is_terminal:
+        yield None
+        return
+    columns = (
+        TextColumn("finding the board"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.description}"),
+    )
+    with Progress(*columns, console=err, transient=True) as bar:
+        task = bar.add_task("", total=None)
+        yield lambda done, total, name: bar.update(task, completed=done, total=total, description=name)
+
+
+def print_json(value: object) -> None:
+    sys.stdout.write(msgspec.json.encode(value).decode() + "\n")
+
+
+def main() -> None:
+    try:
+        app()
+    except (CalibrationError, RecordingError) as problem:
+        print(f"calibrate: {problem}", file=sys.stderr)
+        sys.exit(problem.exit_code)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,166 @@
+"""A recording becomes views: pictures decoded, boards found, in bounded memory and in a fixed order."""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterator
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field
+
+import cv2
+import numpy as np
+
+from calibrate.board import board_points
+from calibrate.detect import Detection, detect
+from calibrate.errors import BadViewsError, TooFewViewsError
+from calibrate.geometry import is_rigid
+from calibrate.solution import RejectedView
+from calibrate.views import ImageView, ViewSet
+from recordings.messages import BoardSpec, CameraModel, View
+from recordings.reader import Recording
+
+FEWEST_VIEWS = 4
+Progress = Callable[[int, int, str], None]
+"""done, of, name of the picture"""
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedViews:
+    """What the pictures of a recording show."""
+
+    views: ViewSet
+    """With pixels, without board poses; the camera's matrix is None unless it was known."""
+    board: BoardSpec
+    pictures: int
+    without_board: tuple[RejectedView, ...]
+    detections: dict[int, Detection] = field(default_factory=dict)
+    """Pose number → what was seen, also where nothing was."""
+
+
+def load_views(
+    recording: Recording,
+    board: BoardSpec | None = None,
+    camera: CameraModel | None = None,
+    progress: Progress | None = None,
+    threads: int | None = None,
+) -> LoadedViews:
+    """Finds the board in every picture of the recording.
+
+    `board` and `camera` replace the recorded ones (another size, known intrinsics). OpenCV works single-
+    threaded inside each of `threads` workers, so that the result does not depend on their number. Raises
+    BadViewsError for pictures or poses that cannot be, TooFewViewsError when fewer than 4 show the board.
+    """
+    info = recording.info
+    spec = board or info.board
+    model = camera or info.camera
+    views: list[ImageView] = []
+    missing: list[RejectedView] = []
+    seen: dict[int, Detection] = {}
+    for view, detection in _detect_all(recording, spec, model, progress, threads):
+        seen[view.index] = detection
+        if detection.found:
+            views.append(_image_view(view, detection, spec))
+        else:
+            missing.append(RejectedView(view.index, view.name, detection.reason, "corners"))
+    if len(views) < FEWEST_VIEWS:
+        raise TooFewViewsError(_too_few_text(recording, len(views), len(seen), missing))
+    model = CameraModel(
+        model.width or next(iter(seen.values())).width,
+        model.height or next(iter(seen.values())).height,
+        model.matrix,
+        model.distortion,
+        model.distortion_model,
+    )
+    found = ViewSet(info.mount, tuple(views), model, info.robot.model)
+    return LoadedViews(found, spec, len(seen), tuple(missing), seen)
+
+
+def _detect_all(
+    recording: Recording,
+    spec: BoardSpec,
+    camera: CameraModel,
+    progress: Progress | None,
+    threads: int | None,
+) -> Iterator[tuple[View, Detection]]:
+    """In the order of the views, with at most a few pictures in memory."""
+    workers = threads or _available_cores()
+    total = len(recording.views())
+    waiting: deque[tuple[View, Future[Detection]]] = deque()
+    done = 0
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    pool = ThreadPoolExecutor(workers, thread_name_prefix="detect")
+    try:
+        for view in recording.views():
+            waiting.append((view, pool.submit(_decode_and_detect, recording, view, spec, camera)))
+            while len(waiting) > 2 * workers:
+                yield _finished(waiting)
+                done += 1
+                if progress:
+                    progress(done, total, view.name)
+        while waiting:
+            name = waiting[0][0].name
+            yield _finished(waiting)
+            done += 1
+            if progress:
+                progress(done, total, name)
+    finally:
+        pool.shutdown(cancel_futures=True)
+        cv2.setNumThreads(before)
+
+
+def _finished(waiting: deque[tuple[View, Future[Detection]]]) -> tuple[View, Detection]:
+    view, future = waiting.popleft()
+    try:
+        return view, future.result()
+    except ValueError as problem:
+        raise BadViewsError(f"view {view.index} ({view.name}): {problem}") from None
+
+
+def _decode_and_detect(recording: Recording, view: View, spec: BoardSpec, camera: CameraModel) -> Detection:
+    picture = recording.picture(view)
+    _check_size(view, picture.image.shape[1], picture.image.shape[0], camera)
+    return detect(picture.image, spec)
+
+
+def _available_cores() -> int:
+    return max(1, len(os.sched_getaffinity(0)))
+
+
+def _check_size(view: View, width: int, height: int, camera: CameraModel) -> None:
+    if camera.width and (width, height) != (camera.width, camera.height):
+        raise BadViewsError(
+            f"view {view.index} ({view.name}): the picture is {width}×{height}, the camera is "
+            f"{camera.width}×{camera.height}. All pictures of a recording must come from one camera with one "
+            "setting; check the region of interest, or the width and height in dataset.yaml."
+        )
+
+
+def _image_view(view: View, detection: Detection, spec: BoardSpec) -> ImageView:
+    base_from_flange = np.array(view.base_from_flange, dtype=float)
+    if base_from_flange.shape != (4, 4) or not is_rigid(base_from_flange, 1e-5):
+        raise BadViewsError(
+            f"view {view.index} ({view.name}): base_from_flange is not a rigid transform. Record it again, "
+            "or leave the view out of the folder and import again."
+        )
+    return ImageView(
+        index=view.index,
+        name=view.name,
+        base_from_flange=base_from_flange,
+        board_points=board_points(spec)[detection.indices],
+        pixels=detection.pixels,
+        joints_rad=None if view.joints_rad is None else np.array(view.joints_rad),
+    )
+
+
+def _too_few_text(recording: Recording, found: int, total: int, missing: list[RejectedView]) -> str:
+    text = (
+        f"{recording.path}: the board is seen in {found} of {total} pictures; at least {FEWEST_VIEWS} views "
+        "are needed."
+    )
+    if missing:
+        text += f" First reason, view {missing[0].index} ({missing[0].name}): {missing[0].reason}."
+    if total >= FEWEST_VIEWS:
+        text += " Check the board's kind, columns and rows; solve again with --board to try another."
+    return text

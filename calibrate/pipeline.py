@@ -1,0 +1,177 @@
+"""The whole offline job: a recording in, a solved and judged calibration out. No files are written here."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+
+from calibrate.board import ambiguity_text, check_board
+from calibrate.calibration import Calibration
+from calibrate.document import make_calibration
+from calibrate.errors import BadViewsError
+from calibrate.gates import Evidence, Gate, GateLimits, judge
+from calibrate.intrinsics import Intrinsics, LensModel, calibrate_intrinsics
+from calibrate.load import LoadedViews, Progress, load_views
+from calibrate.pnp import solve_pnp, view_rms_px
+from calibrate.scale import ScaleCheck, check_scale
+from calibrate.solution import Profile, Solution, SolveOptions
+from calibrate.solve import solve_views
+from calibrate.views import ViewSet
+from recordings.messages import BoardSpec, CameraModel
+from recordings.reader import Recording, open_recording
+
+_WORST_VIEW_PX = 20.0
+
+
+@dataclass(frozen=True)
+class JobOptions:
+    """What a person may choose for one run; recorded in the calibration's provenance."""
+
+    profile: Profile = "robust"
+    seed: int = 0
+    board: BoardSpec | None = None
+    """Instead of the recorded one."""
+    square_m: float | None = None
+    """Another size of square; a charuco board's markers and an april-grid's gaps grow with it."""
+    camera: CameraModel | None = None
+    """Known intrinsics, instead of the recorded ones or of finding them."""
+    lens_model: LensModel = "plumb_bob"
+    find_intrinsics: bool = False
+    """Find them from these pictures even where some are recorded."""
+    limits: GateLimits = field(default_factory=GateLimits)
+    working_distance_m: float | None = None
+    threads: int | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedRecording:
+    recording: Recording
+    loaded: LoadedViews
+    views: ViewSet
+    """With intrinsics and board poses, as the solver got them."""
+    intrinsics: Intrinsics | None
+    """None when they were given."""
+    solution: Solution
+    scale: ScaleCheck | None
+    coverage: float
+    gates: tuple[Gate, ...]
+    calibration: Calibration
+    stage_ms: dict[str, float]
+
+    @property
+    def passed(self) -> bool:
+        return all(gate.passed for gate in self.gates)
+
+
+def solve_recording(
+    path: Path, options: JobOptions | None = None, progress: Progress | None = None
+) -> SolvedRecording:
+    """Raises RecordingError (unsealed, damaged) or CalibrationError; each says what to do next."""
+    options = options or JobOptions()
+    clock = _Stages()
+    with clock.stage("open"):
+        recording = open_recording(path)
+    with clock.stage("detect"):
+        camera = options.camera
+        if options.find_intrinsics:
+            recorded = recording.info.camera
+            camera = CameraModel(recorded.width, recorded.height)
+        board = _board(options, recording.info.board)
+        loaded = load_views(recording, board, camera, progress, options.threads)
+    views, intrinsics = loaded.views, None
+    with clock.stage("intrinsics"):
+        if views.camera.matrix is None:
+            intrinsics = calibrate_intrinsics(views, options.lens_model)
+            views = replace(views, camera=intrinsics.camera)
+    with clock.stage("board poses"):
+        views = solve_pnp(views, loaded.board)
+        _check_lens_fits(views)
+    with clock.stage("solve"):
+        solution = solve_views(
+            views,
+            SolveOptions(
+                profile=options.profile,
+                seed=options.seed,
+                intrinsics_from_same_pictures=intrinsics is not None,
+                working_distance_m=options.working_distance_m,
+            ),
+        )
+    with clock.stage("judge"):
+        used = views.select([k for k, view in enumerate(views) if view.index in set(solution.used)])
+        scale = None
+        if not solution.on_box:  # a wrong X says nothing about the board
+            scale = check_scale(
+                used, solution.matrix[:3, :3], loaded.board, options.limits.board_scale or 0.01
+            )
+        coverage = picture_coverage(used)
+        evidence = Evidence(
+            scale, coverage if intrinsics is not None else None, _clock_bound_s(recording, solution)
+        )
+        gates = judge(solution, evidence, options.limits)
+        calibration = make_calibration(recording, loaded, views, intrinsics, solution, scale, gates, options)
+    return SolvedRecording(
+        recording, loaded, views, intrinsics, solution, scale, coverage, gates, calibration, clock.ms
+    )
+
+
+def _board(options: JobOptions, recorded: BoardSpec) -> BoardSpec:
+    board = options.board or recorded
+    if options.square_m is not None:
+        ratio = options.square_m / board.square_m
+        marker_m = None if board.marker_m is None else board.marker_m * ratio
+        board = msgspec.structs.replace(board, square_m=options.square_m, marker_m=marker_m)
+    check_board(board)
+    return board
+
+
+def picture_coverage(views: ViewSet) -> float:
+    """Share of the picture inside the outlines of the boards seen, all views together."""
+    scale = 64 / max(views.camera.width, views.camera.height)
+    seen = np.zeros((round(views.camera.height * scale), round(views.camera.width * scale)), np.uint8)
+    for view in views:
+        outline = cv2.convexHull((view.pixels * scale).astype(np.float32)).round().astype(np.int32)
+        cv2.fillConvexPoly(seen, outline, 1)
+    return float(seen.mean())
+
+
+def _check_lens_fits(views: ViewSet) -> None:
+    median = float(np.median([view_rms_px(v, views.camera, v.camera_from_board) for v in views]))  # type: ignore[arg-type]
+    if not median <= _WORST_VIEW_PX:
+        raise BadViewsError(
+            f"The board does not fit the pictures: corners miss by {median:.0f} px in the median view. The "
+            "intrinsics belong to another camera or resolution, or the board's columns and rows are wrong. "
+            "Solve with --find-intrinsics, or correct the board."
+        )
+
+
+def _clock_bound_s(recording: Recording, solution: Solution) -> float | None:
+    used = set(solution.used)
+    bounds = [v.time_bound_s for v in recording.views() if v.index in used and v.time_bound_s is not None]
+    return max(bounds) if bounds else None
+
+
+def notes(job: SolvedRecording) -> list[str]:
+    """Sentences that a person should read beside the result."""
+    found = [ambiguity_text(job.loaded.board)] if ambiguity_text(job.loaded.board) else []
+    if job.intrinsics is not None:
+        found += list(job.intrinsics.held)
+        found += [f"view {i}: left out of the lens: {why}" for i, why in job.intrinsics.dropped.items()]
+    return found + list(job.solution.warnings)
+
+
+class _Stages:
+    def __init__(self) -> None:
+        self.ms: dict[str, float] = {}
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.ms[name] = (time.perf_counter() - start) * 1000

@@ -7,6 +7,7 @@ makes the daemon decelerate the arm and pause.
 from __future__ import annotations
 
 import asyncio
+from pathlib import Path
 from typing import Any, ClassVar
 
 import msgspec
@@ -25,6 +26,7 @@ from station.tui.link import Connect, Link
 from station.tui.live import LiveScreen
 from station.tui.log import LogScreen
 from station.tui.plan import PlanScreen
+from station.tui.result import ResultScreen
 from station.tui.screen import StationScreen
 from station.tui.sessions import SessionsScreen
 from station.tui.widgets.preview import Preview
@@ -47,6 +49,7 @@ class StationApp(App[None]):
     MODES: ClassVar[dict[str, Any]] = {
         "live": LiveScreen,
         "plan": PlanScreen,
+        "result": ResultScreen,
         "sessions": SessionsScreen,
         "log": LogScreen,
         "checklist": ChecklistScreen,
@@ -60,6 +63,7 @@ class StationApp(App[None]):
         Binding("f8", "acknowledge", "Ack", id="acknowledge", tooltip="I looked: leave STOPPED or FAULT"),
         Binding("1", "switch_mode('live')", "Live", id="live", tooltip="The running capture"),
         Binding("2", "switch_mode('plan')", "Plan", id="plan", tooltip="All poses, their state and reasons"),
+        Binding("3", "switch_mode('result')", "Result", id="result", tooltip="May it be trusted?"),
         Binding("4", "switch_mode('sessions')", "Sessions", id="sessions", tooltip="Past recordings"),
         Binding("5", "switch_mode('log')", "Log", id="log", tooltip="Everything that was said"),
         Binding("6", "switch_mode('checklist')", "Check", id="checklist", tooltip="Is everything there?"),
@@ -72,6 +76,8 @@ class StationApp(App[None]):
         self._connect = connect
         self._who = who
         self._link: Link | None = None
+        self.result_path: str | None = None
+        """The calibration file the result screen shows."""
 
     def on_mount(self) -> None:
         self.follow()
@@ -170,17 +176,34 @@ class StationApp(App[None]):
 
     @work(exclusive=True, group="job", exit_on_error=False)
     async def solve(self, recording: str) -> None:
-        if (
-            await self.push_screen_wait(
-                JobScreen(f"Solving {recording}", "calibrate.cli", "solve", recording)
-            )
-            >= 0
-        ):
-            await self.switch_mode("sessions")
+        output = str(Path(recording).with_suffix(".calibration.yaml"))
+        job = JobScreen(f"Solving {recording}", "calibrate.cli", "solve", recording, "-o", output)
+        if await self.push_screen_wait(job) >= 0:
+            await self.show_result(output)
+
+    async def show_result(self, calibration: str) -> None:
+        self.result_path = calibration
+        await self.switch_mode("result")
 
     @work(exclusive=True, group="job", exit_on_error=False)
     async def recover(self, folder: str) -> None:
         await self.push_screen_wait(JobScreen(f"Recovering {folder}", "recordings.cli", "recover", folder))
+
+    @work(exclusive=True, group="job", exit_on_error=False)
+    async def install(self, calibration: str) -> None:
+        body = (
+            f"{calibration}\nbecomes what every consumer of this cell reads. `calibrate rollback` undoes it."
+        )
+        if await self.push_screen_wait(Confirm("Install this calibration?", body, yes="Install")):
+            await self.push_screen_wait(JobScreen("Installing", "calibrate.cli", "install", calibration))
+
+    @work(exclusive=True, group="job", exit_on_error=False)
+    async def discard(self, calibration: str) -> None:
+        body = f"{calibration}\nis deleted. The recording stays and can be solved again."
+        if await self.push_screen_wait(Confirm("Discard this result?", body, yes="Discard")):
+            Path(calibration).unlink(missing_ok=True)
+            self.result_path = None
+            await self.switch_mode("sessions")
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_leave(self) -> None:

@@ -78,12 +78,12 @@ class SessionsScreen(StationScreen):
                 return
             self.station.solve(str(session["recording"]))
 
-    def action_result(self) -> None:
+    async def action_result(self) -> None:
         if (session := self._selected()) is not None:
             if not session.get("calibration"):
                 self.notify("Not solved yet: F9 solves it.")
                 return
-            self.station.show_result(str(session["calibration"]))
+            await self.station.show_result(str(session["calibration"]))
 
     def action_watch(self) -> None:
         if (session := self._selected()) is not None:

@@ -1,0 +1,123 @@
+"""Result: may this calibration be trusted? Gates first, then X with its sigmas, then the views."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, ClassVar, cast
+
+import numpy as np
+from rich.text import Text
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import Horizontal, VerticalScroll
+from textual.widgets import Static
+
+from calibrate.calibration import Calibration, read_calibration
+from calibrate.errors import CalibrationError
+from station.tui.screen import StationScreen
+
+if TYPE_CHECKING:
+    from station.tui.app import StationApp
+
+BAR_CELLS = 24
+
+
+def verdict_text(calibration: Calibration) -> Text:
+    """The checklist: what passed, what failed and what to do about it."""
+    failed = calibration.quality.failed
+    stamp = "" if calibration.source == "real" else f"{calibration.source.upper()}: never for a real cell\n"
+    head = "READY TO INSTALL\n" if not failed else f"{len(failed)} GATE(S) FAILED: will not install\n"
+    text = Text(stamp, style="bold").append(head, style="bold reverse" if failed else "bold")
+    for gate in calibration.quality.gates:
+        text.append(f"\n[{'ok' if gate.passed else 'FAIL'}] ", style="" if gate.passed else "bold reverse")
+        text.append(f"{gate.name}: {gate.text}")
+    return text
+
+
+def answer_text(calibration: Calibration) -> Text:
+    """X for people: millimetres and degrees, with one sigma each."""
+    result, quality = calibration.result, calibration.quality
+    x, y, z = (1000 * v for v in result.translation_m)
+    sx, sy, sz = 1000 * np.sqrt(np.diag(np.array(calibration.covariance))[:3])
+    lines = [
+        f"{result.parent_frame}_from_{result.child_frame}",
+        f"x {x:9.2f} ± {sx:.2f} mm",
+        f"y {y:9.2f} ± {sy:.2f} mm",
+        f"z {z:9.2f} ± {sz:.2f} mm",
+        "quaternion " + " ".join(f"{q:.5f}" for q in result.rotation_xyzw),
+        f"rotation ± {calibration.sigma.rotation_deg:.3f}°",
+    ]
+    if quality.predicted_error_mm is not None and quality.working_distance_m is not None:
+        lines.append(f"a point at {quality.working_distance_m:.2f} m: ± {quality.predicted_error_mm:.2f} mm")
+    if quality.holdout is not None:
+        e_t, e_R = quality.holdout.e_t_m, quality.holdout.e_R
+        lines.append(f"hold-out e_t {1000 * e_t:.2f} mm, e_R {e_R:.4f}")
+    return Text("\n".join([*lines, *quality.warnings]))
+
+
+def residual_text(calibration: Calibration) -> Text:
+    """Reprojection per view as bars, rejected views with their reasons below."""
+    rms = {v.index: v.rms_px for v in calibration.quality.views if v.rms_px is not None}
+    longest = max(rms.values(), default=1.0)
+    lines = [
+        f"{index + 1:>3} {'█' * max(1, round(BAR_CELLS * value / longest)):<{BAR_CELLS}} {value:.2f} px"
+        for index, value in sorted(rms.items())
+    ]
+    rejected = [f"{r.index + 1:>3} REJECTED {r.name}: {r.reason}" for r in calibration.views.rejected]
+    return Text("\n".join(["reprojection per view", *lines, *rejected]))
+
+
+class ResultScreen(StationScreen):
+    HELP = "The newest result, or the one picked on the sessions screen. Installing can be undone."
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("i", "install", "Install", tooltip="Make this the cell's calibration; rollback undoes it"),
+        Binding("x", "discard", "Discard", tooltip="Delete this result; the recording stays"),
+    ]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._calibration: Calibration | None = None
+
+    def body(self) -> ComposeResult:
+        with Horizontal(id="result"):
+            with VerticalScroll(id="result-left"):
+                yield Static("No result yet: capture a session, then F9 solves it.", id="verdict")
+            with VerticalScroll(id="result-right"):
+                yield Static(id="answer")
+                yield Static(id="residuals")
+
+    @property
+    def station(self) -> StationApp:
+        return cast("StationApp", self.app)
+
+    def on_screen_resume(self) -> None:
+        super().on_screen_resume()
+        self.load()
+
+    def load(self) -> None:
+        path = self.station.result_path
+        if path is None:
+            return
+        try:
+            self._calibration = read_calibration(Path(path))
+        except CalibrationError as problem:
+            self._calibration = None
+            self.query_one("#verdict", Static).update(Text(str(problem)))
+            return
+        self.query_one("#verdict", Static).update(verdict_text(self._calibration))
+        self.query_one("#answer", Static).update(answer_text(self._calibration))
+        self.query_one("#residuals", Static).update(residual_text(self._calibration))
+
+    def _path(self) -> str | None:
+        if self._calibration is None:
+            self.notify("There is no result to use: F9 on the sessions screen makes one.")
+            return None
+        return self.station.result_path
+
+    def action_install(self) -> None:
+        if (path := self._path()) is not None:
+            self.station.install(path)
+
+    def action_discard(self) -> None:
+        if (path := self._path()) is not None:
+            self.station.discard(path)

@@ -10,6 +10,7 @@ import signal
 import sys
 from pathlib import Path
 
+from station.errors import StationError
 from station.simulation.controller.admin import AdminServer
 from station.simulation.controller.kinematics import TABLES
 from station.simulation.controller.machine import Machine
@@ -38,8 +39,8 @@ def main(arguments: list[str] | None = None) -> int:
     options = _parser().parse_args(arguments)
     try:
         settings = _settings(options)
-    except (OSError, ValueError) as error:
-        print(f"cannot use the truth file {options.truth}: {error}", file=sys.stderr)
+    except (OSError, ValueError, StationError) as error:
+        print(f"cannot start: {error}", file=sys.stderr)
         return 2
     try:
         asyncio.run(_serve(options.host, settings, options))

@@ -33,6 +33,11 @@ class Machine:
         for service in self.services:
             service.open()
         self.clock.start()
+        self._begin()
+
+    def _begin(self) -> None:
+        """The arm's place at controller time 0."""
+        self.robot.history.add(self.clock.start_ns, self.robot.arm.actual, self.robot.arm.miss)
 
     def _tick(self, due_ns: int, late: bool) -> None:
         self.robot.tick(due_ns, late)
@@ -72,6 +77,7 @@ class Machine:
         await asyncio.sleep(down_s)
         robot.reset(running)
         self.clock.restart()
+        self._begin()
         for service in self.services:
             service.open()
         self.off = False

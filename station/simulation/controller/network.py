@@ -10,6 +10,8 @@ from typing import Literal
 
 BACKLOG = 16
 BLACK_HOLE_FILL = 8
+SEND_BUFFER_BYTES = 32 * 1024
+"""Small: a client that does not read soon gets nothing, rather than seconds of old data."""
 
 Cut = Literal["fin", "rst"]
 
@@ -85,6 +87,7 @@ class Service:
             return
         client.setblocking(False)
         client.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        client.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER_BYTES)
         task: asyncio.Task[object] = loop.create_task(loop.connect_accepted_socket(self._protocol, client))
         self._accepting.add(task)
         task.add_done_callback(self._accepting.discard)

@@ -56,6 +56,13 @@ class Operation:
         assert isinstance(step, MoveStep)
         self._motion = self._arm.start(step.make_path, step.speed, step.acceleration)
 
+    def kill(self) -> None:
+        """Another move or a stop takes over."""
+        if self._word is not None:
+            if not self._started:
+                self._word.start()
+            self._word.finish()
+
     def step(self) -> bool:
         """One cycle; True when everything is done. Raises UnreachableError."""
         if not self._started:

@@ -37,14 +37,13 @@ class Publisher:
 
     def publish(self) -> None:
         robot, out, arm = self._robot, self._robot.outputs, self._robot.arm
-        scale = 1.0 / robot.settings.time_scale
         out.set("timestamp", robot.time_s)
         out.set("target_q", *arm.command)
         out.set("actual_q", *arm.actual)
-        out.set("target_qd", *(v * scale for v in arm.command_speed))
-        out.set("actual_qd", *(v * scale for v in arm.actual_speed))
-        self._tool("target_TCP", arm.command, scale)
-        self._tool("actual_TCP", arm.actual, scale)
+        out.set("target_qd", *arm.command_speed)
+        out.set("actual_qd", *arm.actual_speed)
+        self._tool("target_TCP", arm.command)
+        self._tool("actual_TCP", arm.actual)
         out.set("target_speed_fraction", robot.slider)
         out.set("speed_scaling", min(1.0, arm.scale / robot.slider) if robot.slider > 0 else 1.0)
         out.set("payload", robot.payload_kg)
@@ -66,7 +65,7 @@ class Publisher:
         )
         out.set("joint_mode", *(_JOINT_MODE.get(robot.robot_mode, 239),) * 6)
 
-    def _tool(self, name: str, joints: Six, speed_scale: float) -> None:
+    def _tool(self, name: str, joints: Six) -> None:
         """Pose and speed of the tool; computed only when joints or TCP changed."""
         robot = self._robot
         before = self._seen.get(name)
@@ -79,7 +78,9 @@ class Publisher:
         robot.outputs.set(f"{name}_pose", *to_pose(T))
         self._seen[name] = (joints, robot.tcp, T)
         if before is not None and before[1] is robot.tcp:
-            robot.outputs.set(f"{name}_speed", *_speed(before[2], T, speed_scale / robot.dt_s))
+            robot.outputs.set(
+                f"{name}_speed", *_speed(before[2], T, 1 / (robot.dt_s * robot.settings.time_scale))
+            )
 
 
 def _speed(last: Rigid, now: Rigid, per_s: float) -> Six:

@@ -220,8 +220,8 @@ class ControlScript:
 
     def _kill_operation(self) -> None:
         if self._operation is not None:
+            self._operation.kill()
             self._operation = None
-            self._word.finish()
 
     def _stop(self) -> None:
         """The script ignores which of the two was asked for: a synchronous stop is a stopj until the first

@@ -1,16 +1,20 @@
-"""Controllers as processes, the real wheel in a child that is killed at its deadline, robots without sockets."""
+"""Controllers as processes, the real wheel in a child of its own, a raw client, robots without sockets."""
 
 from __future__ import annotations
 
 import json
+import socket
+import struct
 import subprocess
 import sys
 import textwrap
+from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import pytest
 
+from station.devices.rtde import PORT, PacketReader, PacketType, Recipe, join_names, packet, split_names
 from station.simulation.admin import AdminClient
 from station.simulation.controller.journal import Journal
 from station.simulation.controller.robot import Settings, SimulatedRobot
@@ -33,6 +37,10 @@ def until(what, timeout_s=3.0):
         if time.monotonic() > end:
             raise TimeoutError("condition not met")
         time.sleep(0.005)
+def near(q, goal):
+    return max(abs(a - b) for a, b in zip(q, goal)) < 1e-6
+def fastest(speeds):
+    return max(map(abs, speeds))
 def finished(control):
     return control.getAsyncOperationProgress() < 0
 """
@@ -89,6 +97,69 @@ def run_wheel(running: SimulatedController, code: str, timeout_s: float = 25.0) 
 def wheel() -> Callable[..., dict[str, Any]]:
     """`wheel(controller, code)`: what `code` put into `result`, run against the unmodified ur_rtde wheel."""
     return run_wheel
+
+
+class RtdeClient:
+    """A raw client of port 30004, blocking, with a timeout."""
+
+    def __init__(self, host: str, timeout_s: float = 3.0) -> None:
+        self._socket = socket.create_connection((host, PORT), timeout_s)
+        self._reader = PacketReader()
+        self._waiting: deque[tuple[int, bytes]] = deque()
+        self.output: Recipe | None = None
+
+    def receive(self) -> tuple[int, bytes]:
+        """The next packet. TimeoutError when none comes, ConnectionError when the link ends."""
+        while not self._waiting:
+            data = self._socket.recv(65536)
+            if not data:
+                raise ConnectionError("closed by the controller")
+            self._waiting += self._reader.feed(data)
+        return self._waiting.popleft()
+
+    def send(self, data: bytes) -> None:
+        self._socket.sendall(data)
+
+    def request(self, kind: PacketType, payload: bytes = b"") -> bytes:
+        self.send(packet(kind, payload))
+        answer, reply = self.receive()
+        assert answer == kind
+        return reply
+
+    def start(self, *names: str, frequency_hz: float = 500.0) -> None:
+        """Version, output setup, start."""
+        assert self.request(PacketType.PROTOCOL_VERSION, b"\x00\x02") == b"\x01"
+        reply = self.request(
+            PacketType.OUTPUT_SETUP, struct.pack(">d", frequency_hz) + join_names(names) + b","
+        )
+        self.output = Recipe(reply[0], names, split_names(reply[1:]))
+        assert self.request(PacketType.START) == b"\x01"
+
+    def inputs(self, *names: str) -> Recipe:
+        reply = self.request(PacketType.INPUT_SETUP, join_names(names) + b",")
+        return Recipe(reply[0], names, split_names(reply[1:]))
+
+    def sample(self) -> dict[str, Any]:
+        kind, payload = self.receive()
+        assert kind == PacketType.DATA and self.output is not None
+        return self.output.unpack(payload)
+
+    def close(self) -> None:
+        self._socket.close()
+
+
+@pytest.fixture
+def rtde() -> Iterator[Callable[..., RtdeClient]]:
+    """Opens raw RTDE connections."""
+    clients: list[RtdeClient] = []
+
+    def connect(running: SimulatedController, timeout_s: float = 3.0) -> RtdeClient:
+        clients.append(RtdeClient(running.host, timeout_s))
+        return clients[-1]
+
+    yield connect
+    for client in clients:
+        client.close()
 
 
 class Bench:

@@ -25,7 +25,7 @@ def test_the_wheel_reads_moves_and_asks(controller: Start, wheel: Wheel, model: 
         result["modes"] = [receive.getRobotMode(), receive.getSafetyMode(), receive.getRuntimeState()]
         result["steady"] = control.isSteady()
         result["moveJ"] = control.moveJ(NEAR, 1.0, 2.0)
-        until(lambda: max(abs(a - b) for a, b in zip(receive.getActualQ(), NEAR)) < 1e-6)
+        until(lambda: near(receive.getActualQ(), NEAR))
         result["setTcp"] = control.setTcp([0, 0, 0.1, 0, 0, 0])
         result["offset"] = control.getTCPOffset()
         time.sleep(0.02)
@@ -75,10 +75,10 @@ def test_asynchronous_moves_paths_and_stops(controller: Start, wheel: Wheel) -> 
         result["call"] = time.monotonic() - began
         until(lambda: control.getAsyncOperationProgress() >= 0)
         time.sleep(0.3)
-        result["moving"] = max(map(abs, receive.getActualQd()))
+        result["moving"] = fastest(receive.getActualQd())
         control.stopJ(5.0, False)
         time.sleep(0.15)
-        result["stopped"] = max(map(abs, receive.getActualQd()))
+        result["stopped"] = fastest(receive.getActualQd())
         result["short"] = FAR[0] - receive.getActualQ()[0]
         result["finished"] = finished(control)
         path = [[*NEAR, 2.0, 4.0, 0.0], [*HOME, 2.0, 4.0, 0.0], [*NEAR, 2.0, 4.0, 0.0]]
@@ -92,7 +92,7 @@ def test_asynchronous_moves_paths_and_stops(controller: Start, wheel: Wheel) -> 
         control.moveJ(FAR, 1.0, 2.0, True)
         time.sleep(0.2)
         result["replaced"] = control.moveJ(NEAR, 2.0, 4.0, True)
-        until(lambda: finished(control) and max(abs(a - b) for a, b in zip(receive.getActualQ(), NEAR)) < 1e-6)
+        until(lambda: finished(control) and near(receive.getActualQ(), NEAR))
         control.stopScript()
         result["running"] = control.isProgramRunning()
         """,
@@ -121,7 +121,7 @@ def test_protective_stop_needs_five_seconds_an_unlock_and_a_new_script(
         time.sleep(0.05)
         result["state"] = [receive.getSafetyMode(), receive.getRobotMode(), receive.isProtectiveStopped(),
                            receive.isEmergencyStopped(), receive.getRuntimeState()]
-        result["speed"] = max(map(abs, receive.getActualQd()))
+        result["speed"] = fastest(receive.getActualQd())
         result["move"] = control.moveJ(NEAR, 0.5, 1.0)
         result["word"] = control.getAsyncOperationProgress()
         try:
@@ -159,7 +159,7 @@ def test_emergency_stop_and_recovery(controller: Start, wheel: Wheel, model: str
         time.sleep(0.05)
         result["state"] = [receive.getSafetyMode(), receive.getRobotMode(), receive.isEmergencyStopped(),
                            control.isProgramRunning()]
-        result["speed"] = max(map(abs, receive.getActualQd()))
+        result["speed"] = fastest(receive.getActualQd())
         result["move"] = control.moveJ(NEAR, 0.5, 1.0)
         admin.ask("estop", on=False)
         time.sleep(0.05)
@@ -185,12 +185,12 @@ def test_a_safeguard_stop_pauses_until_play(controller: Start, wheel: Wheel) -> 
         time.sleep(0.2)
         admin.ask("safeguard")
         time.sleep(0.4)
-        result["held"] = [receive.getSafetyMode(), receive.getRuntimeState(), max(map(abs, receive.getActualQd()))]
+        result["held"] = [receive.getSafetyMode(), receive.getRuntimeState(), fastest(receive.getActualQd())]
         admin.ask("safeguard", on=False)
         time.sleep(0.1)
         result["cleared"] = [receive.getSafetyMode(), receive.getRuntimeState(), admin.ask("state")["moving"]]
         result["play"] = admin.ask("play")["playing"]
-        until(lambda: max(abs(a - b) for a, b in zip(receive.getActualQ(), NEAR)) < 1e-6)
+        until(lambda: near(receive.getActualQ(), NEAR))
         """,
     )
     assert result["held"][:2] == [5, 4] and result["held"][2] < 1e-4
@@ -207,7 +207,7 @@ def test_power_off_and_program_stop_from_the_pendant(controller: Start, wheel: W
         time.sleep(0.3)
         admin.ask("stop_program")
         time.sleep(0.3)
-        result["stopped"] = [receive.getRuntimeState(), max(map(abs, receive.getActualQd()))]
+        result["stopped"] = [receive.getRuntimeState(), fastest(receive.getActualQd())]
         began = time.monotonic()
         result["move"] = control.moveJ(NEAR, 0.5, 1.0)
         result["at once"] = time.monotonic() - began
@@ -235,12 +235,12 @@ def test_the_watchdog_stops_a_silent_client(controller: Start, wheel: Wheel) -> 
         for _ in range(20):
             control.kickWatchdog()
             time.sleep(0.03)
-        result["kicked"] = [control.isProgramRunning(), max(map(abs, receive.getActualQd()))]
+        result["kicked"] = [control.isProgramRunning(), fastest(receive.getActualQd())]
         silent = time.monotonic()
         until(lambda: not control.isProgramRunning())
         result["noticed"] = time.monotonic() - silent
         time.sleep(0.3)
-        result["speed"] = max(map(abs, receive.getActualQd()))
+        result["speed"] = fastest(receive.getActualQd())
         """,
     )
     assert result["set"] and result["kicked"][0] and result["kicked"][1] > 0.2
@@ -259,12 +259,12 @@ def test_speed_slider_by_the_wheel_and_on_the_pendant(controller: Start, wheel: 
         result["fraction"] = receive.getTargetSpeedFraction()
         control.moveJ(FAR, 1.0, 10.0, True)
         time.sleep(0.5)
-        result["slow"] = max(map(abs, receive.getTargetQd()))
+        result["slow"] = fastest(receive.getTargetQd())
         admin.ask("slider", fraction=0.0)
         time.sleep(0.3)
-        result["zero"] = [max(map(abs, receive.getTargetQd())), control.getAsyncOperationProgress()]
+        result["zero"] = [fastest(receive.getTargetQd()), control.getAsyncOperationProgress()]
         admin.ask("slider", fraction=1.0)
-        until(lambda: max(abs(a - b) for a, b in zip(receive.getActualQ(), FAR)) < 1e-6)
+        until(lambda: near(receive.getActualQ(), FAR))
         """,
     )
     assert result["fraction"] == pytest.approx(0.25) and result["slow"] == pytest.approx(0.25, abs=0.01)
@@ -342,8 +342,8 @@ def test_registers_owned_by_a_field_bus(controller: Start, wheel: Wheel) -> None
             rtde_control.RTDEControlInterface(host)
         except RuntimeError as error:
             result["refused"] = str(error)
-        flags = rtde_control.RTDEControlInterface
-        control = rtde_control.RTDEControlInterface(host, 125.0, flags.FLAG_UPLOAD_SCRIPT | flags.FLAG_UPPER_RANGE_REGISTERS)
+        Control = rtde_control.RTDEControlInterface
+        control = Control(host, 125.0, Control.FLAG_UPLOAD_SCRIPT | Control.FLAG_UPPER_RANGE_REGISTERS)
         result["upper"] = [control.isSteady(), control.moveJ(NEAR, 2.0, 4.0)]
         """,
     )

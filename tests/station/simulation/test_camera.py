@@ -1,0 +1,128 @@
+"""The rendered camera against a real simulated controller: pictures of where the arm truly is."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibrate.detect import detect
+from calibrate.geometry import inverse
+from station.devices.frames import mid_exposure
+from station.errors import CameraError
+from station.simulation.admin import AdminClient
+from station.simulation.camera import RenderedCamera
+from station.simulation.cell import CellTruth, make_cell, write_truth
+from station.simulation.launch import SimulatedController
+
+pytestmark = pytest.mark.process
+
+
+@pytest.fixture
+def cell() -> CellTruth:
+    return make_cell(seed=3)
+
+
+@pytest.fixture
+def arm(
+    controller: Callable[..., SimulatedController], cell: CellTruth, tmp_path: Path
+) -> SimulatedController:
+    write_truth(cell, tmp_path / "truth.json")
+    return controller(truth=tmp_path / "truth.json")
+
+
+@pytest.fixture
+async def camera(arm: SimulatedController, cell: CellTruth) -> AsyncIterator[RenderedCamera]:
+    rendered = RenderedCamera(cell, arm.host)
+    await rendered.open()
+    yield rendered
+    await rendered.close()
+
+
+async def test_pictures_show_the_board_from_the_true_pose_at_mid_exposure(
+    camera: RenderedCamera, arm: SimulatedController, cell: CellTruth
+) -> None:
+    picture = await camera.capture()
+    assert picture.image.shape == (1024, 1280) and picture.image.dtype == np.uint8
+    middle_ns, bound_s = mid_exposure(picture, camera.clock)
+    assert 0 < bound_s < 0.005
+    with AdminClient(arm.host) as admin:
+        flange = np.array(admin.ask("truth", at_monotonic_ns=middle_ns)["base_from_flange"])
+    view = inverse(flange @ np.array(cell.camera_mount)) @ np.array(cell.board_place)
+    seen = detect(picture.image, cell.board)
+    assert seen.found, seen.reason
+    ray = view[:3, 3]
+    assert cell.camera.matrix is not None
+    first = seen.pixels[np.flatnonzero(seen.indices == 0)[0]]
+    expected = [cell.camera.matrix[i][i] * ray[i] / ray[2] + cell.camera.matrix[i][2] for i in range(2)]
+    assert np.linalg.norm(first - expected) < 3.0, "distortion moves it by a pixel or two at most"
+
+
+async def test_frames_are_numbered_over_the_wrap_and_stamped_by_the_cameras_own_clock(
+    camera: RenderedCamera, cell: CellTruth
+) -> None:
+    before_ns = time.monotonic_ns()
+    pictures = [await camera.capture() for _ in range(20)]
+    assert [p.sequence for p in pictures] == list(range(20))
+    ids = [p.frame_id for p in pictures]
+    assert 65_535 in ids and ids[ids.index(65_535) + 1] == 1 and 0 not in ids
+    device = np.array([p.stamps.device_ns for p in pictures])
+    host = np.array([p.stamps.host_monotonic_ns for p in pictures])
+    assert (np.diff(device) > 0).all() and host[0] > before_ns
+    assert abs((host - device).mean() + cell.camera_clock_offset_ns) < 1e9, "another epoch than the host's"
+    assert camera.clock is not None
+    estimated = np.array([camera.clock.to_host_ns(d / 1e9) for d in device])
+    true_start = host - 13_300_000 - 10_000_000  # readout and exposure of this camera
+    assert np.abs(estimated - true_start).max() / 1e9 < camera.clock.bound_s
+
+
+async def test_preview_is_smaller_and_never_counts_as_a_frame(camera: RenderedCamera) -> None:
+    preview = await camera.preview()
+    assert preview is not None and preview.image.shape == (512, 640)
+    assert (await camera.capture()).sequence == 0
+
+
+async def test_the_event_loop_is_free_while_a_picture_is_made(camera: RenderedCamera) -> None:
+    longest_s, running = 0.0, True
+
+    async def beat() -> None:
+        nonlocal longest_s
+        while running:
+            start_s = time.monotonic()
+            await asyncio.sleep(0.001)
+            longest_s = max(longest_s, time.monotonic() - start_s)
+
+    beating = asyncio.create_task(beat())
+    for _ in range(3):
+        await camera.capture()
+    running = False
+    await beating
+    assert longest_s < 0.05, "heartbeats of the arm are due every 50 ms"
+
+
+async def test_without_a_controller_the_camera_says_so(cell: CellTruth) -> None:
+    rendered = RenderedCamera(cell, "127.254.253.252")
+    await rendered.open()
+    try:
+        with pytest.raises(CameraError, match="simulated controller"):
+            await rendered.capture()
+        assert await rendered.preview() is None
+    finally:
+        await rendered.close()
+
+
+async def test_a_closed_camera_is_refused_and_can_be_opened_again(camera: RenderedCamera) -> None:
+    await camera.close()
+    with pytest.raises(CameraError, match="not open"):
+        await camera.capture()
+    await camera.open()
+    assert (await camera.capture()).image.mean() > 10
+
+
+async def test_an_unknown_fault_is_refused(camera: RenderedCamera) -> None:
+    with pytest.raises(CameraError, match="missed-trigger"):
+        await camera.inject("gremlins")

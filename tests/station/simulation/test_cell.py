@@ -1,0 +1,121 @@
+"""Simulated cells: the published scenes as published, other seeds truly other, and all of them usable."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from calibrate.board import board_points
+from calibrate.geometry import inverse, is_rigid, rotation_angle, transform_points
+from calibrate.kinematics import MODELS, forward
+from station.config import BLOG_BOARD, PAPER_BOARD
+from station.errors import ConfigError
+from station.plan.planner import make_plan
+from station.simulation.cell import CellTruth, make_cell, read_truth, write_truth
+from station.simulation.placement import board_centre
+from station.simulation.scenes import cell_config
+
+
+def camera_from_board(cell: CellTruth, joints_rad: object) -> np.ndarray:
+    flange = forward(MODELS[cell.robot_model], joints_rad)  # type: ignore[arg-type]
+    X, Y = np.array(cell.camera_mount), np.array(cell.board_place)
+    return inverse(flange @ X) @ Y if cell.mount == "eye-in-hand" else inverse(X) @ flange @ Y
+
+
+def test_the_papers_scene_is_the_default() -> None:
+    cell = make_cell()
+    assert cell.robot_model == "UR10" and cell.board == PAPER_BOARD
+    assert (cell.camera.width, cell.camera.height) == (1280, 1024)
+    assert cell.camera.matrix is not None and abs(cell.camera.matrix[0][0] - 8.0 / 0.0048) < 10
+    published = np.array([[1, -0.0032, -0.0026], [0.0032, 1, -0.0068], [0.0026, 0.0068, 1]])
+    X = np.array(cell.camera_mount)
+    assert np.abs(X[:3, :3] - published).max() < 2e-4
+    assert np.allclose(X[:3, 3], [-0.0013, -0.0603, 0.0870])
+    place = np.array(cell.board_place)
+    assert place[2, 3] == pytest.approx(0.0, abs=1e-9) and place[2, 2] == pytest.approx(-1.0)
+
+
+def test_the_blogs_scene_has_its_lens_board_and_answer() -> None:
+    cell = make_cell("blog")
+    assert cell.board == BLOG_BOARD and (cell.camera.width, cell.camera.height) == (960, 720)
+    assert cell.camera.matrix is not None
+    assert 2 * np.degrees(np.arctan(360 / cell.camera.matrix[1][1])) == pytest.approx(31.0482)
+    printed = np.array([[0.965926, 0, -0.258819, 0.1], [0, 1, 0, 0], [0.258819, 0, 0.965926, 0]])
+    assert np.abs(np.array(cell.camera_mount)[:3] - printed).max() < 1e-6
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("seed", [0, 1, 2, 3, 4, 5])
+def test_the_camera_sees_the_board_from_the_start(mount: str, seed: int) -> None:
+    cell = make_cell(seed=seed, mount=mount)  # type: ignore[arg-type]
+    view = camera_from_board(cell, cell.start_joints_rad)
+    centre = transform_points(view, board_centre(cell.board))
+    assert 0.4 < centre[2] < 0.65 and np.hypot(*centre[:2]) < 0.05
+    assert view[2, 2] > 0.85, "its front, not too slanted"
+    assert is_rigid(np.array(cell.camera_mount)) and is_rigid(np.array(cell.board_place))
+    if mount == "eye-in-hand":
+        corners = transform_points(np.array(cell.board_place), board_points(cell.board))
+        assert corners[:, 2].min() >= -1e-9, "on or over the table"
+
+
+@pytest.mark.parametrize(
+    ("scene", "seed", "mount"),
+    [("paper", 0, "eye-in-hand"), ("paper", 7, "eye-in-hand"), ("blog", 3, "eye-to-hand")],
+)
+def test_a_plan_of_25_poses_exists_from_what_an_operator_would_guess(
+    scene: str, seed: int, mount: str
+) -> None:
+    cell = make_cell(scene, seed, mount=mount)  # type: ignore[arg-type]
+    plan = make_plan(cell_config(cell), start_joints_rad=cell.start_joints_rad)
+    assert len(plan.poses) == 25
+    for planned in plan.poses:
+        centre = transform_points(camera_from_board(cell, planned.joints_rad), board_centre(cell.board))
+        assert centre[2] > 0.25
+
+
+def test_mounts_of_other_seeds_are_spread_over_all_rotations() -> None:
+    turns = np.array([np.array(make_cell(seed=s).camera_mount)[:3, :3] for s in range(1, 31)])
+    angles = rotation_angle(turns)
+    # Uniform on SO(3): half of the angles lie above 2.2 rad or so; a box of ±π/2 would show none.
+    assert (angles > np.pi / 2).sum() > 15 and angles.max() > 2.8
+    assert turns[:, 2, 2].min() < -0.5, "some look back along the arm"
+
+
+def test_the_same_arguments_give_the_same_cell_and_seeds_differ(tmp_path: Path) -> None:
+    assert make_cell(seed=4) == make_cell(seed=4)
+    assert make_cell(seed=4).camera != make_cell(seed=5).camera
+    write_truth(make_cell(seed=4), tmp_path / "truth.json")
+    assert read_truth(tmp_path / "truth.json") == make_cell(seed=4)
+
+
+def test_noise_levels_grow() -> None:
+    low, mid, high = (make_cell(noise=n) for n in ("low", "mid", "high"))  # type: ignore[arg-type]
+    assert low.robot_sigma_m < mid.robot_sigma_m < high.robot_sigma_m
+    assert low.pixel_noise < mid.pixel_noise < high.pixel_noise
+    assert not any(low.dh_delta_a_m) and any(mid.dh_delta_a_m)
+
+
+def test_the_guess_is_off_but_within_its_own_sigmas() -> None:
+    for seed in range(1, 6):
+        cell = make_cell(seed=seed)
+        guess = cell_config(cell).camera_guess
+        assert guess is not None
+        t = np.array(guess.translation_m)
+        off = np.linalg.norm(t - np.array(cell.camera_mount)[:3, 3])
+        assert 0 < off < 2 * np.sqrt(3) * guess.sigma_m
+    assert cell_config(cell).camera.model_is_rough
+
+
+def test_unknown_names_are_refused() -> None:
+    with pytest.raises(ConfigError, match="paper, blog"):
+        make_cell("moon")  # type: ignore[arg-type]
+
+
+def test_a_missing_or_broken_truth_is_named(tmp_path: Path) -> None:
+    broken = tmp_path / "truth.json"
+    broken.write_text("{}")
+    for path in (broken, tmp_path / "none.json"):
+        with pytest.raises(ConfigError, match=r"truth\.json|none\.json"):
+            read_truth(path)

@@ -1,0 +1,91 @@
+"""The simulated arm's own kinematics: against published figures, and against the station's."""
+
+from __future__ import annotations
+
+from math import pi
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from calibrate import kinematics as station
+from calibrate.geometry import pose_from_rotvec, rotation_log
+from station.simulation.controller.kinematics import (
+    TABLES,
+    Rigid,
+    compose,
+    forward,
+    from_pose,
+    inverse_all,
+    inverse_nearest,
+    invert,
+    to_pose,
+)
+
+joints = st.tuples(*[st.floats(-3.1, 3.1)] * 6)
+numbers = st.floats(-1.5, 1.5)
+
+
+def matrix(T: Rigid) -> np.ndarray:
+    return np.vstack([np.array(T).reshape(3, 4), [0, 0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("model", "q", "translation_m"),
+    [
+        ("UR5", (0.0,) * 6, (-0.81725, -0.19145, -0.005491)),
+        ("UR5", (0.0, -pi / 2, 0.0, -pi / 2, 0.0, 0.0), (0.0, -0.19145, 1.001059)),
+        ("UR10", (0.0,) * 6, (-1.1843, -0.256141, 0.0116)),
+        ("UR10", (0.0, -pi / 2, 0.0, -pi / 2, 0.0, 0.0), (0.0, -0.256141, 1.4273)),
+    ],
+)
+def test_published_poses(model: str, q: tuple[float, ...], translation_m: tuple[float, ...]) -> None:
+    T = forward(TABLES[model], q)
+    assert (T[3], T[7], T[11]) == pytest.approx(translation_m, abs=1e-9)
+
+
+@pytest.mark.parametrize("model", sorted(TABLES))
+def test_both_kinematics_agree(model: str) -> None:
+    for q in np.random.default_rng(3).uniform(-pi, pi, (20, 6)):
+        expected = station.forward(station.MODELS[model], q)
+        assert np.allclose(matrix(forward(TABLES[model], tuple(q))), expected, atol=1e-12)
+
+
+@settings(max_examples=50, deadline=None)
+@given(q=joints, model=st.sampled_from(sorted(TABLES)))
+def test_inverses_reach_the_pose_and_agree_in_number(q: tuple[float, ...], model: str) -> None:
+    T = forward(TABLES[model], q)
+    solutions = inverse_all(TABLES[model], T)
+    for solution in solutions:
+        assert np.allclose(forward(TABLES[model], solution), T, atol=1e-6)
+    if station.singularity_measure(station.MODELS[model], q) > 1e-2:
+        assert len(solutions) == len(station.inverse_all(station.MODELS[model], matrix(T)))
+        nearest = inverse_nearest(TABLES[model], T, q)
+        assert nearest == pytest.approx(q, abs=1e-6)
+
+
+def test_out_of_reach() -> None:
+    assert inverse_nearest(TABLES["UR10"], from_pose((2.0, 0.0, 0.5, 0.0, 0.0, 0.0)), (0.0,) * 6) is None
+
+
+def test_the_nearest_inverse_keeps_the_turn() -> None:
+    q = (5.0, -4.4, 1.5, -4.5, -1.5, 6.0)
+    assert inverse_nearest(TABLES["UR10"], forward(TABLES["UR10"], q), q) == pytest.approx(q, abs=1e-9)
+
+
+@settings(max_examples=60, deadline=None)
+@given(pose=st.tuples(*[numbers] * 6))
+def test_poses_and_rotation_vectors_agree_with_geometry(pose: tuple[float, ...]) -> None:
+    T = from_pose(pose)
+    assert np.allclose(matrix(T), pose_from_rotvec(pose[:3], pose[3:]), atol=1e-12)
+    assert to_pose(T) == pytest.approx(pose, abs=1e-9)
+    assert compose(T, invert(T)) == pytest.approx((1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0), abs=1e-12)
+
+
+@pytest.mark.parametrize("axis", np.vstack([np.eye(3), np.ones((1, 3)) / 3**0.5]))
+@pytest.mark.parametrize("angle", [0.0, 1e-9, 1e-4, pi - 1e-4, pi - 1e-9])
+def test_rotation_vectors_near_zero_and_half_a_turn(axis: np.ndarray, angle: float) -> None:
+    pose = (0.0, 0.0, 0.0, *(float(x) for x in angle * axis))
+    T = from_pose(pose)
+    assert to_pose(T)[3:] == pytest.approx(tuple(rotation_log(matrix(T)[:3, :3])), abs=1e-7)

@@ -1,0 +1,260 @@
+"""How the simulated arm moves: profiles, straight lines, stops, slider, and its deliberate faults."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+from math import pi
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from station.simulation.controller.arm import Arm, Vibration
+from station.simulation.controller.kinematics import TABLES, Six, compose, forward, from_pose
+from station.simulation.controller.paths import JointPath, LinePath, PolylinePath, Trapezoid, UnreachableError
+
+UR10 = TABLES["UR10"]
+HOME = (0.0, -1.5, 1.5, -1.5, -1.5, 0.0)
+DT = 0.008
+TOOL = from_pose((0.0, 0.0, 0.1, 0.0, 0.0, 0.0))
+
+positive = st.floats(0.01, 10.0)
+
+
+def make_arm() -> Arm:
+    return Arm(UR10, HOME, lambda: (0.0,) * 6)
+
+
+def run(arm: Arm, seconds: float, scale: float = 1.0) -> None:
+    for _ in range(round(seconds / DT)):
+        arm.step(DT, scale)
+
+
+def go(arm: Arm, goal: Six, speed: float = 1.0, acceleration: float = 2.0) -> None:
+    arm.start(lambda start: JointPath(start, goal), speed, acceleration)
+
+
+@given(length=positive, speed=positive, acceleration=positive, share=st.floats(0, 1))
+def test_a_trapezoid_keeps_its_limits_and_arrives(
+    length: float, speed: float, acceleration: float, share: float
+) -> None:
+    profile = Trapezoid(length, speed, acceleration)
+    total = profile.duration_s
+    s, v = profile.at(share * total)
+    assert -1e-9 <= s <= length * (1 + 1e-9) and -1e-9 <= v <= speed * (1 + 1e-9)
+    assert profile.at(total) == (length, 0.0)
+    step = total * 1e-4
+    later, v_later = profile.at(share * total + step)
+    assert later >= s - 1e-9
+    assert abs(v_later - v) <= acceleration * step * (1 + 1e-6) + 1e-9
+
+
+def test_a_long_trapezoid_takes_the_textbook_time() -> None:
+    assert Trapezoid(2.0, 0.5, 1.0).duration_s == pytest.approx(2.0 / 0.5 + 0.5 / 1.0)
+    assert Trapezoid(0.16, 10.0, 1.0).duration_s == pytest.approx(2 * 0.4)
+    assert Trapezoid(0.0, 1.0, 1.0).duration_s == 0.0
+
+
+def test_joints_move_together_and_end_exactly() -> None:
+    arm = make_arm()
+    goal = (1.0, -1.0, 1.5, -1.5, -1.5, 0.2)
+    go(arm, goal)
+    run(arm, 0.6)
+    done = [(q - h) / (g - h) for q, h, g in zip(arm.command, HOME, goal, strict=True) if g != h]
+    assert 0.1 < done[0] < 0.9
+    assert done == pytest.approx([done[0]] * len(done))
+    run(arm, 2.0)
+    assert arm.command == goal and arm.actual == pytest.approx(goal, abs=1e-9)
+    assert not arm.moving and arm.actual_speed == (0.0,) * 6
+
+
+def test_the_true_joints_lag_behind_the_command() -> None:
+    arm = make_arm()
+    go(arm, (1.0, *HOME[1:]))
+    run(arm, 0.8)
+    lag = arm.command[0] - arm.actual[0]
+    assert lag == pytest.approx(0.015 * 1.0, rel=0.35)
+
+
+def test_a_straight_line_is_straight_and_turns_about_one_axis() -> None:
+    arm = make_arm()
+    first = compose(forward(UR10, HOME), TOOL)
+    goal = (
+        first[0],
+        *first[1:3],
+        first[3] + 0.1,
+        *first[4:7],
+        first[7] - 0.05,
+        *first[8:11],
+        first[11] + 0.08,
+    )
+    arm.start(lambda start: LinePath(UR10, TOOL, start, goal), 0.1, 0.5)
+    while arm.moving:
+        arm.step(DT, 1.0)
+        T = compose(forward(UR10, arm.command), TOOL)
+        u = (T[3] - first[3]) / 0.1
+        assert (T[7] - first[7], T[11] - first[11]) == pytest.approx((-0.05 * u, 0.08 * u), abs=1e-9)
+        assert T[:3] == pytest.approx(first[:3], abs=1e-9)
+
+
+def test_a_turn_on_the_spot_is_timed_by_its_angle() -> None:
+    start = compose(forward(UR10, HOME), TOOL)
+    goal = compose(start, from_pose((0.0, 0.0, 0.0, 0.0, 0.0, 0.5)))
+    assert LinePath(UR10, TOOL, HOME, goal).length == pytest.approx(0.5)
+
+
+def test_impossible_goals_are_refused_before_anything_moves() -> None:
+    arm = make_arm()
+    with pytest.raises(UnreachableError):
+        go(arm, (7.0, *HOME[1:]))
+    with pytest.raises(UnreachableError):
+        arm.start(lambda q: LinePath(UR10, TOOL, q, from_pose((3.0, 0, 0, 0, 0, 0))), 0.1, 0.5)
+    assert not arm.moving
+
+
+def test_a_line_that_leaves_the_reach_freezes_the_arm() -> None:
+    """Both ends are in reach; between them the line crosses the cylinder no wrist centre can enter."""
+    arm = Arm(UR10, (0.0, -1.0, 1.9, -2.4, -1.5, 0.0), lambda: (0.0,) * 6)
+    first = forward(UR10, arm.command)
+    goal = compose(from_pose((0.0, 0.0, 0.0, 0.0, 0.0, pi)), first)
+    goal = (*first[:3], goal[3], *first[4:7], goal[7], *first[8:])
+    identity = from_pose((0.0,) * 6)
+    arm.start(lambda q: LinePath(UR10, identity, q, goal), 0.5, 2.0)
+    with pytest.raises(UnreachableError):
+        run(arm, 10.0)
+    assert not arm.moving and arm.command == arm.actual
+
+
+@pytest.mark.parametrize("deceleration", [0.5, 2.0, 8.0])
+def test_stopping_takes_speed_over_deceleration(deceleration: float) -> None:
+    arm = make_arm()
+    go(arm, (3.0, *HOME[1:]))
+    run(arm, 1.0)
+    arm.brake(deceleration)
+    seconds = 0.0
+    while arm.moving:
+        arm.step(DT, 1.0)
+        seconds += DT
+    assert seconds == pytest.approx(1.0 / deceleration, abs=2 * DT)
+    assert arm.command[0] < 2.9
+
+
+def test_a_tool_stop_is_in_metres() -> None:
+    arm = make_arm()
+    go(arm, (3.0, *HOME[1:]))
+    run(arm, 1.0)
+    speed_m_s = arm.tool_speed_m_s()
+    T = forward(UR10, arm.command)
+    assert speed_m_s == pytest.approx((T[3] ** 2 + T[7] ** 2) ** 0.5, rel=1e-3)  # 1 rad/s about the base
+    arm.brake_tool(2.0)
+    seconds = 0.0
+    while arm.moving:
+        arm.step(DT, 1.0)
+        seconds += DT
+    assert seconds == pytest.approx(speed_m_s / 2.0, abs=2 * DT)
+
+
+def test_a_second_stop_never_lengthens_the_first() -> None:
+    arm = make_arm()
+    go(arm, (3.0, *HOME[1:]))
+    run(arm, 1.0)
+    arm.brake(10.0)
+    arm.brake(0.1)
+    run(arm, 0.2)
+    assert not arm.moving
+
+
+def test_a_new_goal_replaces_the_old_one_from_rest() -> None:
+    arm = make_arm()
+    go(arm, (3.0, *HOME[1:]))
+    run(arm, 0.5)
+    other = (-0.5, *HOME[1:])
+    go(arm, other)
+    speeds = []
+    while arm.moving:
+        arm.step(DT, 1.0)
+        speeds.append(arm.command_speed[0])
+    assert arm.command == other
+    assert min(abs(v) for v in speeds[5:-5]) < 0.05  # it came to rest between the two
+    jumps = [abs(b - a) for a, b in pairwise(speeds)]
+    assert max(jumps) < 0.05
+
+
+def test_the_slider_slows_and_holds() -> None:
+    arm = make_arm()
+    go(arm, (3.0, *HOME[1:]), 1.0, 10.0)
+    run(arm, 0.6)
+    run(arm, 0.5, scale=0.25)
+    assert arm.command_speed[0] == pytest.approx(0.25, rel=1e-6)
+    run(arm, 0.5, scale=0.0)
+    assert arm.command_speed[0] == 0.0 and arm.moving
+    run(arm, 6.0)
+    assert arm.command[0] == 3.0
+
+
+def test_freeze_is_at_once() -> None:
+    arm = make_arm()
+    go(arm, (3.0, *HOME[1:]))
+    run(arm, 0.6)
+    arm.freeze()
+    where = arm.actual
+    run(arm, 0.5)
+    assert arm.actual == where and arm.actual_speed == (0.0,) * 6
+
+
+def test_a_polyline_passes_its_corners() -> None:
+    corners = [HOME, (0.5, *HOME[1:]), (0.5, -1.0, *HOME[2:])]
+    path = PolylinePath(list(corners))
+    assert path.length == pytest.approx(1.0)
+    assert path.at(0.5) == pytest.approx(corners[1]) and path.at(2.0) == corners[2]
+    assert path.at(0.25)[0] == pytest.approx(0.25)
+
+
+def test_vibration_fades_after_each_motion_or_never() -> None:
+    arm = make_arm()
+    arm.vibration = Vibration(1e-3, 12.0, 0.1, joint=1)
+    go(arm, (0.3, *HOME[1:]))
+    run(arm, 1.5)
+    early = max(abs(arm.actual_speed[1]) for _ in range(12) if arm.step(DT, 1.0) is None)
+    run(arm, 1.5)
+    late = max(abs(arm.actual_speed[1]) for _ in range(12) if arm.step(DT, 1.0) is None)
+    assert early > 100 * late
+    arm.vibration = Vibration(1e-3, 12.0, None, joint=1)
+    run(arm, 3.0)
+    peaks = []
+    for _ in range(20):
+        arm.step(DT, 1.0)
+        peaks.append(abs(arm.actual[1] - HOME[1]))
+    assert max(peaks) == pytest.approx(1e-3, rel=0.2)
+    assert arm.command[1] == HOME[1]
+
+
+def test_an_offset_leaves_the_arm_short_of_its_next_goal() -> None:
+    arm = make_arm()
+    arm.offset = (0.01, 0.0, 0.0, 0.0, 0.0, 0.0)
+    run(arm, 0.5)
+    assert arm.actual == HOME
+    go(arm, (0.5, *HOME[1:]))
+    run(arm, 2.0)
+    assert arm.command[0] == 0.5 and arm.actual[0] == pytest.approx(0.49, abs=1e-8)
+
+
+def test_every_stop_misses_differently_and_never_jumps() -> None:
+    draws = iter(float(i) for i in range(1, 100))
+
+    def draw() -> Six:
+        return (next(draws), *(0.0,) * 5)
+
+    arm = Arm(UR10, HOME, draw)
+    assert arm.miss[0] == 1.0
+    go(arm, (0.5, *HOME[1:]))
+    seen = [arm.miss[0]]
+    while arm.moving:
+        arm.step(DT, 1.0)
+        seen.append(arm.miss[0])
+    assert seen[-1] == 2.0 and max(b - a for a, b in pairwise(seen)) < 0.05
+    go(arm, (2.5, *HOME[1:]))
+    run(arm, 0.5)
+    arm.brake(2.0)
+    run(arm, 1.0)
+    assert arm.miss[0] == 3.0  # a stop on the way is a stop: fully drawn anew

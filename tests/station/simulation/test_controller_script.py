@@ -1,0 +1,398 @@
+"""The command loop in registers, and the state machine around it, cycle by cycle."""
+
+from __future__ import annotations
+
+from math import nan
+
+import pytest
+
+from station.devices.rtde import RobotMode, RuntimeState, SafetyMode
+from station.simulation.controller.kinematics import forward, from_pose, to_pose
+from station.simulation.controller.operation import AsyncWord, Operation
+from station.simulation.controller.uploads import Upload
+
+HOME = [0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0]
+GOAL = [0.4, -1.5, 1.5, -1.5, -1.5, 0.1]
+
+
+def running(word: int) -> bool:
+    return bool(word >> 15 & 1)
+
+
+def operation(word: int) -> int:
+    return word >> 24 & 0x7F
+
+
+def changes(word: int) -> int:
+    return word >> 16 & 0x7F
+
+
+@pytest.fixture
+def script(bench):
+    """A UR10 whose control script runs."""
+    made = bench()
+    made.start_script()
+    return made
+
+
+def test_the_script_starts_after_its_delay_and_is_ready(bench) -> None:
+    made = bench()
+    made.robot.upload(Upload("rtde_control", "def rtde_control():\n reg_offset_int = 0\nend\n"))
+    made.run(0.03)
+    assert made.robot.runtime_state == RuntimeState.STOPPED
+    made.run(0.05)
+    assert made.robot.runtime_state == RuntimeState.PLAYING and made.state == 1
+    assert not running(made.word)
+
+
+def test_a_blocking_move_answers_when_it_has_arrived(script) -> None:
+    took = script.command(1, [*GOAL, 0.5, 1.0])
+    assert took == pytest.approx(0.4 / 0.5 + 0.5 / 1.0, abs=0.03)
+    assert list(script.robot.arm.command) == GOAL
+
+
+def test_a_command_that_stays_in_the_register_runs_once(script) -> None:
+    script.write(47)
+    script.run(0.2)
+    assert script.state == 2
+    assert script.robot.journal.counts["script: isSteady"] == 1
+    script.write(0)
+    script.run(0.02)
+    assert script.state == 1
+
+
+def test_an_asynchronous_move_starts_one_cycle_after_it_was_accepted(script) -> None:
+    before = operation(script.word)
+    script.write(1, [*GOAL, 0.5, 1.0], asynchronous=1)
+    script.run(0.008)
+    assert script.state == 2 and not running(script.word)
+    script.run(0.008)
+    assert running(script.word) and operation(script.word) == before + 1
+    script.write(0)
+    script.run_until(lambda: not running(script.word))
+    assert operation(script.word) == before + 1 and script.word & 0xFFFF == 0
+    assert list(script.robot.arm.command) == GOAL
+
+
+def test_operation_ids_wrap_at_seven_bits_and_stay_positive(script) -> None:
+    for _ in range(130):
+        script.command(1, [*HOME, 1.0, 1.0], asynchronous=1)
+        script.run(0.016)
+        script.run_until(lambda: not running(script.word))
+    assert 0 <= operation(script.word) < 128 and script.word >= 0
+    assert operation(script.word) == 130 % 128
+
+
+def test_an_operation_killed_before_its_first_cycle_still_counts(bench) -> None:
+    words = []
+    operation_without_time = Operation(bench().robot.arm, [], AsyncWord(words.append))
+    operation_without_time.kill()
+    assert [(operation(word), running(word)) for word in words] == [(1, True), (1, False)]
+
+
+def test_a_new_move_replaces_a_running_one(script) -> None:
+    script.command(1, [3.0, *GOAL[1:], 0.5, 1.0], asynchronous=1)
+    script.run(0.5)
+    first = operation(script.word)
+    script.command(1, [*GOAL, 0.5, 1.0], asynchronous=1)
+    script.run(0.016)
+    assert operation(script.word) == first + 1
+    script.run_until(lambda: not running(script.word))
+    assert list(script.robot.arm.command) == GOAL
+
+
+def test_progress_of_a_path_counts_its_marks(bench) -> None:
+    made = bench()
+    body = "".join(
+        f"  signal_async_progress({i})\n  movej([{q},-1.5,1.5,-1.5,-1.5,0],a=2.0,v=1.0,r=0.0)\n"
+        for i, q in enumerate((0.2, 0.4, 0.1))
+    )
+    made.start_script(
+        Upload(
+            "rtde_control",
+            f"def rtde_control():\n reg_offset_int = 0\n def exec_move_path():\n{body} end\nend\n",
+        )
+    )
+    made.command(45, asynchronous=1)
+    made.run(0.016)
+    seen = []
+    while running(made.word):
+        seen.append(made.word & 0x7FFF)
+        made.run(0.008)
+    assert sorted(set(seen)) == [0, 1, 2] and seen == sorted(seen)
+    assert made.robot.arm.command[0] == 0.1
+
+
+def test_stop_uses_joints_until_the_first_asynchronous_stop(script) -> None:
+    """The script's own bug: it ignores which stop was asked for."""
+
+    def stop_time(command: int, asynchronous: int = 0) -> float:
+        script.command(1, [script.robot.arm.command[0] + 2.0, *GOAL[1:], 1.0, 10.0], asynchronous=1)
+        script.run(0.6)
+        if not asynchronous:
+            return script.command(command, [2.0])
+        script.command(command, [2.0], asynchronous=1)
+        return script.run_until(lambda: not running(script.word))
+
+    by_joints = stop_time(33)
+    assert by_joints == pytest.approx(1.0 / 2.0, abs=0.03)  # stopL asked, stopj done
+    stop_time(34, asynchronous=1)
+    by_tool = stop_time(34)
+    speed_m_s = sum(x * x for x in to_pose(forward(script.robot.table, script.robot.arm.command))[:2]) ** 0.5
+    assert by_tool == pytest.approx(speed_m_s / 2.0, abs=0.05)
+    assert by_tool != pytest.approx(by_joints, abs=0.03)
+
+
+def test_an_asynchronous_stop_is_an_operation_of_its_own(script) -> None:
+    script.command(1, [3.0, *GOAL[1:], 0.5, 1.0], asynchronous=1)
+    script.run(0.5)
+    before = operation(script.word)
+    script.command(34, [1.0], asynchronous=1)
+    script.run(0.016)
+    assert operation(script.word) == before + 1 and running(script.word)
+    script.run_until(lambda: not running(script.word))
+    assert not script.robot.arm.moving
+
+
+def test_stop_without_motion_answers_at_once(script) -> None:
+    assert script.command(34, [2.0]) < 0.03
+
+
+@pytest.mark.parametrize(
+    ("command", "arguments"),
+    [
+        (1, [nan, *GOAL[1:], 0.5, 1.0]),
+        (1, [*GOAL, 0.0, 1.0]),
+        (1, [*GOAL, 0.5, -1.0]),
+        (1, [7.0, *GOAL[1:], 0.5, 1.0]),
+        (3, [3.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.1, 0.5]),
+        (46, [3.0, 0.0, 0.0, 0.0, 0.0, 0.0]),
+        (29, [nan, 0.0, 0.0, 0.0, 0.0, 0.0]),
+        (34, [0.0]),
+    ],
+)
+def test_impossible_arguments_end_the_program_and_nothing_moves(script, command, arguments) -> None:
+    script.write(command, arguments)
+    script.run(0.1)
+    assert script.robot.runtime_state == RuntimeState.STOPPED
+    assert list(script.robot.arm.command) == HOME
+    reason = script.robot.journal.entries()[-1]
+    assert reason["verb"] == "program stopped" and "runtime error" in reason["reason"]
+
+
+def test_questions_of_kinematics_use_the_active_tool(script) -> None:
+    tcp = [0.01, 0.02, 0.1, 0.0, 0.3, 0.0]
+    script.command(29, tcp)
+    script.command(40)
+    assert script.results() == tcp
+    script.command(43)
+    pose = script.results()
+    assert pose == pytest.approx(list(script.robot.outputs.vector("actual_TCP_pose")), abs=1e-12)
+    script.command(46, pose)
+    assert script.results() == pytest.approx(HOME, abs=1e-9)
+    script.command(60, pose)
+    assert script.answer == 1
+    script.command(60, [3.0, 0, 0, 0, 0, 0])
+    assert script.answer == 0
+    script.write(58)
+    script.run(0.016)
+    assert script.results() == pytest.approx(to_pose(forward(script.robot.table, tuple(HOME))), abs=1e-12)
+    script.write(0)
+    script.run(0.016)
+    script.command(39, [*pose, 0, 0, 0, 0, 0, 0.2])
+    turned = to_pose(from_pose(tuple(script.results())))
+    assert turned[:3] == pytest.approx(pose[:3])
+
+
+def test_forward_kinematics_uses_stale_registers_as_tool(script) -> None:
+    """A hazard of the real script that drivers must know: a move's speed becomes a tool offset."""
+    script.command(1, [*GOAL, 1.0, 1.4])
+    script.write(44, GOAL)
+    script.run(0.016)
+    right = to_pose(forward(script.robot.table, tuple(GOAL)))
+    assert abs(script.results()[0] - right[0]) > 0.5
+
+
+def test_not_steady_while_moving(script) -> None:
+    script.command(1, [*GOAL, 0.5, 1.0], asynchronous=1)
+    script.run(0.3)
+    script.command(47)
+    assert script.answer == 0
+    script.run(2.0)
+    script.command(47)
+    assert script.answer == 1
+
+
+def test_speed_and_payload_are_published(script) -> None:
+    script.command(17, [1.5, 0.0, 0.01, 0.05])
+    script.run(0.016)
+    assert script.output("payload") == 1.5 and script.robot.outputs.vector("payload_cog") == (0.0, 0.01, 0.05)
+    script.command(1, [2.0, *HOME[1:], 0.5, 5.0], asynchronous=1)
+    script.run(1.0)
+    radius = sum(x * x for x in script.robot.outputs.vector("actual_TCP_pose")[:2]) ** 0.5
+    speed = script.robot.outputs.vector("actual_TCP_speed")
+    assert (speed[0] ** 2 + speed[1] ** 2) ** 0.5 == pytest.approx(0.5 * radius, rel=1e-2)
+    assert speed[2:] == pytest.approx((0.0, 0.0, 0.0, 0.5), abs=1e-3)
+    assert script.robot.outputs.vector("target_qd")[0] == pytest.approx(0.5)
+
+
+def test_the_watchdog_counts_silence_of_the_command_register(script) -> None:
+    script.command(35, [10.0])
+    script.command(1, [3.0, *HOME[1:], 0.3, 1.0], asynchronous=1)
+    for _ in range(20):
+        script.run(0.05)
+        script.robot.command_register_written(0)
+    assert script.robot.runtime_state == RuntimeState.PLAYING
+    script.robot.command_register_written(1)  # another register does not count
+    silent = script.run_until(lambda: script.robot.runtime_state == RuntimeState.STOPPED)
+    assert silent == pytest.approx(0.1, abs=0.017)
+    script.run(0.3)
+    assert not script.robot.arm.moving and script.robot.arm.command[0] < 1.0
+    assert running(script.word), "the word freezes as it was"
+
+
+def test_late_cycles_are_not_the_clients_silence(script) -> None:
+    script.command(35, [10.0])
+    for i in range(100):
+        script.robot.tick(10**12 + i, late=True)
+    assert script.robot.runtime_state == RuntimeState.PLAYING
+
+
+def test_stop_script_ends_the_program(script) -> None:
+    script.write(255)
+    script.run(0.02)
+    assert script.robot.runtime_state == RuntimeState.STOPPED
+
+
+def test_unknown_commands_are_acknowledged_and_logged(script) -> None:
+    script.command(65, [1.0])
+    script.command(199)
+    assert script.robot.journal.counts["script: command 199"] == 1
+
+
+def test_upper_registers(bench) -> None:
+    made = bench()
+    made.start_script(
+        Upload(
+            "rtde_control",
+            "def rtde_control():\n global reg_offset_float = # float register offset\n24\n"
+            " global reg_offset_int = # int register offset\n24\nend\n",
+        )
+    )
+    assert made.output("output_int_register_24") == 1 and made.state == 0
+    made.robot.inputs.set("input_int_register_24", 47)
+    made.run(0.016)
+    assert made.output("output_int_register_24") == 2 and made.output("output_int_register_25") == 1
+
+
+def test_protective_stop_rests_at_once_and_holds_the_word(script) -> None:
+    script.command(1, [3.0, *HOME[1:], 0.5, 1.0], asynchronous=1)
+    script.run(1.0)
+    script.robot.protective_stop("test")
+    where = script.robot.arm.actual
+    script.run(1.0)
+    assert script.robot.arm.actual == where and running(script.word)
+    assert script.output("safety_status_bits") == 1 << 2 | 1 << 10
+    assert script.output("safety_mode") == 3 and script.output("robot_mode") == 7
+    assert script.output("runtime_state") == RuntimeState.PAUSED
+    assert script.robot.unlock() is False
+    assert not script.robot.play_program()
+    script.run(4.5)
+    assert script.robot.unlock() is True and script.robot.safety_mode == SafetyMode.NORMAL
+    script.run(0.5)
+    assert script.robot.arm.actual == where
+
+
+def test_protective_stop_may_stop_the_program_instead(bench) -> None:
+    made = bench(paused_by_protective_stop=False)
+    made.start_script()
+    made.robot.protective_stop("test")
+    made.run(0.02)
+    assert made.output("runtime_state") == RuntimeState.STOPPED
+
+
+@pytest.mark.parametrize(("model", "mode"), [("UR10", RobotMode.POWER_OFF), ("UR10e", RobotMode.IDLE)])
+def test_emergency_stop_bits_and_way_back(bench, model, mode) -> None:
+    made = bench(model=model)
+    made.start_script()
+    made.robot.emergency_stop(True)
+    made.run(0.02)
+    assert made.output("safety_status_bits") == 1 << 6 | 1 << 7 | 1 << 10
+    assert made.robot.robot_mode == mode
+    made.robot.power_on()
+    made.robot.release_brakes()
+    assert made.robot.robot_mode == mode, "nothing powers on while the button is pressed"
+    made.robot.emergency_stop(False)
+    made.robot.release_brakes()
+    assert made.robot.robot_mode == RobotMode.POWER_OFF
+    made.robot.power_on()
+    made.robot.release_brakes()
+    made.run(0.02)
+    assert made.robot.robot_mode == RobotMode.RUNNING and made.output("robot_status_bits") == 1
+
+
+def test_programs_are_ignored_when_they_must_be(bench) -> None:
+    for spoil in (
+        lambda robot: robot.power_off(),
+        lambda robot: robot.protective_stop("test"),
+        lambda robot: setattr(robot, "remote", False),
+    ):
+        made = bench(model="UR10e")
+        spoil(made.robot)
+        made.start_script()
+        assert made.robot.program is None
+        assert made.robot.journal.entries()[-1]["accepted"] is False
+
+
+def test_cb3_has_no_local_mode(bench) -> None:
+    made = bench(model="UR10", remote=False)
+    made.start_script()
+    assert made.robot.runtime_state == RuntimeState.PLAYING
+
+
+def test_pause_holds_the_motion_and_play_goes_on(script) -> None:
+    script.command(1, [*GOAL, 0.2, 1.0], asynchronous=1)
+    script.run(0.5)
+    assert script.robot.pause_program()
+    script.run(0.5)
+    where = script.robot.arm.command
+    script.run(0.5)
+    assert script.robot.arm.command == where and script.robot.arm.moving
+    assert script.output("speed_scaling") == pytest.approx(0.0)
+    assert script.robot.play_program()
+    script.run_until(lambda: not script.robot.arm.moving)
+    assert list(script.robot.arm.command) == GOAL
+
+
+def test_hands_move_the_arm_only_when_it_is_free(script) -> None:
+    from station.simulation.controller.paths import PolylinePath
+
+    def lead() -> bool:
+        return script.robot.lead(lambda q: PolylinePath([q, tuple(GOAL)]), 0.5, 2.0)
+
+    assert lead() is False
+    script.command(1, [3.0, *HOME[1:], 0.2, 1.0], asynchronous=1)
+    script.run(0.5)
+    script.robot.pause_program()
+    script.robot.slider = 0.0
+    script.run(0.5)
+    assert lead() is True
+    script.run(3.0)
+    assert list(script.robot.arm.command) == GOAL
+    script.robot.slider = 1.0
+    script.robot.play_program()
+    script.run(1.0)
+    assert list(script.robot.arm.command) == GOAL, "the motion that was under way is lost"
+
+
+def test_time_scale_speeds_up_motion_and_nothing_else(bench) -> None:
+    """Faster motion, same clock, and speeds as commanded."""
+    fast = bench(time_scale=4.0)
+    fast.start_script()
+    fast.write(1, [2.0, *HOME[1:], 0.5, 2.0], 1)
+    fast.run(0.5)
+    assert fast.robot.outputs.vector("target_qd")[0] == pytest.approx(0.5, rel=0.01)
+    fast.write(0)
+    took = 0.5 + fast.run_until(lambda: not fast.robot.arm.moving)
+    assert took == pytest.approx((2.0 / 0.5 + 0.5 / 2.0) / 4, abs=0.03)
+    assert fast.robot.time_s == pytest.approx(fast.robot.ticks / 125)

@@ -1,0 +1,67 @@
+"""The truth of the simulated arm: by host time, with its real lengths and its repeatability."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calibrate.geometry import perturb
+from calibrate.kinematics import MODELS, DhDeltas
+from calibrate.kinematics import forward as station_forward
+from station.simulation.controller.history import SPAN_S, History
+
+Q = (0.3, -1.2, 1.6, -1.0, -1.3, 0.4)
+
+
+def test_history_interpolates_and_knows_its_bounds() -> None:
+    history = History(0.008)
+    with pytest.raises(LookupError):
+        history.at(0)
+    for i in range(10):
+        history.add(1000 + i * 8, (float(i),) * 6, (0.0,) * 6)
+    assert history.at(1004)[0][0] == pytest.approx(0.5)
+    assert history.at(1000)[0][0] == 0.0 and history.at(1072)[0][0] == 9.0
+    for outside in (999, 1073):
+        with pytest.raises(LookupError, match="outside the history"):
+            history.at(outside)
+
+
+def test_history_keeps_its_span_and_no_more() -> None:
+    history = History(0.008)
+    for i in range(10_000):
+        history.add(i * 8_000_000, (float(i),) * 6, (0.0,) * 6)
+    newest = history.newest_ns
+    oldest = newest - int((SPAN_S - 0.01) * 1e9)
+    assert history.at(oldest)[0][0] == pytest.approx(oldest / 8_000_000)
+    with pytest.raises(LookupError):
+        history.at(newest - int((SPAN_S + 0.01) * 1e9))
+
+
+def test_the_true_flange_has_the_true_lengths_and_the_miss(bench) -> None:
+    deltas = DhDeltas(
+        a_m=(0, 1e-3, 0, 0, 0, 0), d_m=(0, 0, 0, 2e-3, 0, 0), alpha_rad=(1e-3, 0, 0, 0, 0, 0),
+        theta_rad=(0, 0, 2e-3, 0, 0, 0),
+    )  # fmt: skip
+    made = bench(dh_delta=(deltas.a_m, deltas.d_m, deltas.alpha_rad, deltas.theta_rad))
+    miss = (1e-4, -2e-4, 3e-4, 1e-3, 2e-3, -1e-3)
+    expected = perturb(station_forward(MODELS["UR10"].calibrated(deltas), Q), np.array(miss))
+    found = np.array(made.robot.true_flange(Q, miss)).reshape(3, 4)
+    assert np.allclose(found, expected[:3], atol=1e-12)
+
+
+def test_reported_poses_know_nothing_of_the_truth(bench) -> None:
+    made = bench(sigma_m=1e-3, sigma_rad=1e-2, dh_delta=((0.0, 0.01, 0, 0, 0, 0),) + ((0.0,) * 6,) * 3)
+    made.run(0.1)
+    reported = made.robot.outputs.vector("actual_TCP_pose")[:3]
+    nominal = station_forward(MODELS["UR10"], made.robot.arm.actual)[:3, 3]
+    assert reported == pytest.approx(nominal, abs=1e-12)
+    assert made.robot.true_flange(made.robot.arm.actual, made.robot.arm.miss)[3] != pytest.approx(
+        nominal[0], abs=1e-4
+    )
+
+
+def test_the_misses_have_the_sigma_they_were_asked_for_and_repeat_with_the_seed(bench) -> None:
+    draws = np.array([bench(sigma_m=1e-3, sigma_rad=2e-3, seed=s).robot.arm.miss for s in range(400)])
+    assert draws[:, :3].std() == pytest.approx(1e-3, rel=0.15)
+    assert draws[:, 3:].std() == pytest.approx(2e-3, rel=0.15)
+    assert bench(sigma_m=1e-3, seed=5).robot.arm.miss == bench(sigma_m=1e-3, seed=5).robot.arm.miss

@@ -1,0 +1,66 @@
+"""Programs as text: they arrive in pieces, end in column 0, and say what they are."""
+
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from station.simulation.controller.uploads import LIMIT, PathStep, UploadReader
+
+SCRIPT = """def rtde_control():
+  global reg_offset_float = # float register offset
+0
+  global reg_offset_int = # int register offset
+24
+  def exec_move_path():
+    signal_async_progress(0)
+    movej([0.1,-1,1,-1,-1,0],a=1.4,v=1.05,r=0)
+    signal_async_progress(1)
+    movel(p[0.3,-0.2,0.4,0,3.14,0],a=0.5,v=0.1,r=0.01)
+  end
+  if True:
+    end_of_nothing = 1
+  end
+end
+"""
+
+
+@given(cuts=st.lists(st.integers(1, 90), max_size=30))
+def test_programs_are_found_in_any_segmentation(cuts: list[int]) -> None:
+    stream = (SCRIPT + "stopj(2.0)\nsec note():\n  textmsg(1)\nend\n# a comment\n\n").encode()
+    reader, seen = UploadReader(), []
+    for cut in [*cuts, len(stream)]:
+        seen += reader.feed(stream[:cut])
+        stream = stream[cut:]
+    assert [u.name for u in seen] == ["rtde_control", "", "note"]
+    assert seen[0].text == SCRIPT and seen[1].text == "stopj(2.0)"
+    assert [u.secondary for u in seen] == [False, False, True]
+
+
+def test_offsets_stand_on_the_line_after_their_comment() -> None:
+    (upload,) = UploadReader().feed(SCRIPT.encode())
+    assert upload.is_control_script
+    assert (upload.offset("float"), upload.offset("int")) == (0, 24)
+
+
+def test_the_moves_of_a_path() -> None:
+    (upload,) = UploadReader().feed(SCRIPT.encode())
+    assert upload.path() == (
+        PathStep(progress=0),
+        PathStep(None, "movej", False, (0.1, -1, 1, -1, -1, 0), 1.4, 1.05),
+        PathStep(progress=1),
+        PathStep(None, "movel", True, (0.3, -0.2, 0.4, 0, 3.14, 0), 0.5, 0.1),
+    )
+
+
+def test_a_program_without_end_is_bounded() -> None:
+    reader = UploadReader()
+    reader.feed(b"def endless():\n")
+    with pytest.raises(ValueError, match="without an end"):
+        for _ in range(5):
+            reader.feed(b" x = 1\n" * (LIMIT // 20))
+
+
+def test_bytes_that_are_no_text_do_no_harm() -> None:
+    assert [u.name for u in UploadReader().feed(b"\xff\xfe\n")] == [""]

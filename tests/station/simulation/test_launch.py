@@ -1,0 +1,114 @@
+"""Starting and ending the controller's process."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from station.errors import RobotError
+from station.simulation.launch import start_controller
+
+pytestmark = pytest.mark.process
+
+
+def gone(pid: int, timeout_s: float = 5.0) -> bool:
+    """The process has ended (a zombie that nobody reaps here counts as ended)."""
+    deadline = time.monotonic() + timeout_s
+    while time.monotonic() < deadline:
+        try:
+            if Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z":
+                return True
+        except FileNotFoundError:
+            return True
+        time.sleep(0.02)
+    return False
+
+
+def test_it_is_ready_when_the_call_returns_and_gone_after_the_block() -> None:
+    with start_controller("UR5e") as running:
+        with running.admin() as admin:
+            assert admin.ask("state")["model"] == "UR5e"
+        assert running.running and running.host.startswith("127.")
+    assert not running.running and running.process.returncode == 0
+    running.stop()
+
+
+def test_several_at_once_on_their_own_addresses() -> None:
+    with start_controller("UR10") as first, start_controller("UR3e") as second:
+        assert first.host != second.host
+        with first.admin() as a, second.admin() as b:
+            assert (a.ask("state")["model"], b.ask("state")["model"]) == ("UR10", "UR3e")
+
+
+def test_an_address_in_use_is_an_error_that_says_so() -> None:
+    with start_controller("UR10") as first, pytest.raises(RobotError, match="choose another 127"):
+        start_controller("UR10", host=first.host)
+
+
+def test_a_bad_truth_file_is_an_error_that_names_it(tmp_path: Path) -> None:
+    path = tmp_path / "truth.json"
+    path.write_text("{}")
+    with pytest.raises(RobotError, match=r"did not start: cannot start: .*truth\.json.*scene"):
+        start_controller("UR10", truth=path)
+    with pytest.raises(RobotError, match="No such file"):
+        start_controller("UR10", truth=tmp_path / "absent.json")
+
+
+def test_a_child_that_is_not_ready_in_time_is_killed(tmp_path: Path) -> None:
+    with pytest.raises(RobotError, match=r"no ready line within 0\.001 s"):
+        start_controller("UR10", host="127.0.0.1", timeout_s=0.001)
+
+
+@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+def test_it_dies_with_its_parent(number: int) -> None:
+    code = (
+        "import time; from station.simulation.launch import start_controller; c = start_controller('UR10');"
+        "print(c.process.pid, flush=True); time.sleep(60)"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
+    assert parent.stdout is not None
+    child = int(parent.stdout.readline())
+    os.kill(parent.pid, number)
+    parent.wait()
+    parent.stdout.close()
+    assert gone(child)
+
+
+def test_a_stopped_child_is_ended_by_force() -> None:
+    running = start_controller("UR10")
+    os.kill(running.process.pid, signal.SIGSTOP)
+    running.stop()
+    assert running.process.returncode == -signal.SIGKILL
+
+
+def test_its_standard_error_goes_where_it_is_told(tmp_path: Path) -> None:
+    log = tmp_path / "controller.log"
+    with start_controller("UR10", log=log) as first, pytest.raises(RobotError, match=str(log)):
+        start_controller("UR10", host=first.host, log=log)
+    assert "cannot listen" in log.read_text()
+
+
+def test_help_teaches() -> None:
+    text = subprocess.run(
+        [sys.executable, "-m", "station.simulation.controller", "--help"],
+        capture_output=True,
+        text=True,
+        check=True,
+    ).stdout
+    for word in ("30004", "29990", "truth", '{"cmd": "pstop"}', "docs/simulated-controller.md"):
+        assert word in text
+
+
+def test_it_starts_without_the_numeric_libraries() -> None:
+    code = (
+        "import sys, station.simulation.controller.__main__;"
+        "print([m for m in ('numpy', 'scipy', 'cv2', 'textual', 'rtde_control') if m in sys.modules])"
+    )
+    out = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert out.strip() == "[]"

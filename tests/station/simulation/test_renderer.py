@@ -1,0 +1,175 @@
+"""Rendered pictures show the board exactly where OpenCV's projection puts it, and behave like a camera's."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from calibrate.board import board_points, looks_same_turns
+from calibrate.detect import detect
+from calibrate.geometry import Array, pose, rotation_exp
+from recordings.messages import BoardKind, BoardSpec, CameraModel
+from station.config import PAPER_BOARD
+from station.simulation.board_print import board_print
+from station.simulation.placement import seen_from
+from station.simulation.renderer import BLACK_LEVEL, Light, render, scaled
+
+CAMERA = CameraModel(
+    width=1280,
+    height=1024,
+    matrix=((1669.8, 0.0, 646.2), (0.0, 1669.4, 505.8), (0.0, 0.0, 1.0)),
+    distortion=(-0.11, 0.12, 0.0006, -0.0005, 0.01),
+)
+SMALL = scaled(CAMERA, 0.25)
+NO_NOISE = Light(pixel_noise=0.0)
+BOARDS = {
+    "chessboard": PAPER_BOARD,
+    "charuco": BoardSpec(BoardKind.CHARUCO, 7, 5, 0.03, marker_m=0.022, dictionary="DICT_5X5_100"),
+    "charuco legacy": BoardSpec(
+        BoardKind.CHARUCO, 6, 6, 0.03, marker_m=0.022, dictionary="DICT_4X4_50", legacy=True
+    ),
+    "circles": BoardSpec(BoardKind.CIRCLES, 8, 6, 0.025),
+    "asymmetric circles": BoardSpec(BoardKind.ASYMMETRIC_CIRCLES, 4, 11, 0.018),
+    "april grid": BoardSpec(BoardKind.APRIL_GRID, 5, 4, 0.035, marker_m=0.0105),
+}
+
+
+def projected(board: BoardSpec, camera_from_board: Array, camera: CameraModel = CAMERA) -> Array:
+    """The oracle."""
+    rotation, _ = cv2.Rodrigues(camera_from_board[:3, :3])
+    pixels, _ = cv2.projectPoints(
+        board_points(board),
+        rotation,
+        camera_from_board[:3, 3],
+        np.array(camera.matrix),
+        np.array(camera.distortion),
+    )
+    return np.asarray(pixels.reshape(-1, 2))
+
+
+def varied_views(board: BoardSpec, count: int, seed: int) -> list[Array]:
+    rng = np.random.default_rng(seed)
+    views = []
+    for _ in range(count):
+        turn = rotation_exp(np.array([*rng.uniform(-0.5, 0.5, 2), 0.0])) @ rotation_exp(
+            [0, 0, rng.uniform(-3, 3)]
+        )
+        view = seen_from(board, rng.uniform(0.45, 0.6), turn)
+        view[:2, 3] += rng.uniform(-0.04, 0.04, 2)
+        views.append(view)
+    return views
+
+
+def test_corners_lie_where_opencv_projects_them_without_bias() -> None:
+    errors = []
+    rng = np.random.default_rng(5)
+    for view in varied_views(PAPER_BOARD, 12, seed=1):
+        picture = render(CAMERA, PAPER_BOARD, view, Light(pixel_noise=0.3), rng)
+        truth = projected(PAPER_BOARD, view)
+        stop = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 100, 1e-6)
+        start = truth.astype(np.float32).reshape(-1, 1, 2) + np.float32(0.4)
+        found = cv2.cornerSubPix(picture, start, (6, 6), (-1, -1), stop).reshape(-1, 2)
+        errors.append(found - truth)
+    error = np.concatenate(errors)
+    assert np.abs(error.mean(axis=0)).max() < 0.004
+    assert np.sqrt((error**2).mean()) < 0.03
+
+
+def test_a_point_on_a_hand_drawn_ray_is_where_the_pinhole_says() -> None:
+    """No projection code at all: a bare pinhole, a board straight ahead, sides at integer pixels + ½."""
+    camera = CameraModel(400, 400, ((400.0, 0.0, 199.5), (0.0, 400.0, 199.5), (0.0, 0.0, 1.0)))
+    board = BoardSpec(BoardKind.CHESSBOARD, 3, 3, 0.05)
+    # At 0.5 m a square is 40 px; the first inner corner is to the left and above: 199.5 − 40 = 159.5.
+    view = pose(np.eye(3), [-0.05, -0.05, 0.5])
+    picture = render(camera, board, view, Light(pixel_noise=0.0, blur_px=0.0))
+    assert picture[159, 159] < 30 and picture[160, 160] < 30  # black: first square and its diagonal neighbour
+    assert picture[159, 160] > 150 and picture[160, 159] > 150
+    assert picture[121, 159] < 30 < 150 < picture[119, 159]  # the first square begins at 119.5
+
+
+@pytest.mark.parametrize("name", BOARDS)
+def test_every_board_is_detected_where_it_is(name: str) -> None:
+    board = BOARDS[name]
+    for view in varied_views(board, 2, seed=3):
+        picture = render(CAMERA, board, view, Light(pixel_noise=1.0), np.random.default_rng(2))
+        seen = detect(picture, board)
+        assert seen.found, seen.reason
+        truth = projected(board, view)
+        # A grid that looks the same upside down may be read from its other end.
+        orders = [truth, truth[::-1]] if 2 in looks_same_turns(board) else [truth]
+        error = min((seen.pixels - points[seen.indices] for points in orders), key=np.linalg.norm)
+        # Centres of circles are seen a little off by perspective; everything else is exact.
+        assert np.sqrt((error**2).mean()) < (0.25 if "circles" in name else 0.12)
+
+
+def test_black_squares_begin_with_the_first_one() -> None:
+    ink = board_print(PAPER_BOARD)
+    s = PAPER_BOARD.square_m
+    x = np.array([-0.5 * s, 0.5 * s, 0.5 * s, 6.5 * s, 7.6 * s], dtype=np.float32)
+    y = np.array([-0.5 * s, -0.5 * s, 0.5 * s, -0.5 * s, 0.0], dtype=np.float32)
+    assert np.allclose(ink.albedo(x, y, 0.3), [0.05, 0.85, 0.05, 0.85, 0.3])
+
+
+def test_light_gain_and_exposure_scale_the_picture() -> None:
+    view = seen_from(PAPER_BOARD, 0.6)
+    base = render(SMALL, PAPER_BOARD, view, Light(exposure_us=4000, pixel_noise=0.0)).astype(float)
+    for other, factor in (
+        (Light(exposure_us=8000, pixel_noise=0.0), 2.0),
+        (Light(exposure_us=4000, gain_db=6.0, pixel_noise=0.0), 10 ** (6 / 20)),
+        (Light(exposure_us=4000, illumination=0.5, pixel_noise=0.0), 0.5),
+    ):
+        picture = render(SMALL, PAPER_BOARD, view, other).astype(float)
+        assert np.abs((picture - BLACK_LEVEL) - factor * (base - BLACK_LEVEL)).max() <= 1.0 + factor
+    bright = render(SMALL, PAPER_BOARD, view, Light(exposure_us=40_000, pixel_noise=0.0))
+    assert (bright == 255).mean() > 0.1
+
+
+def test_noise_has_the_stated_sigma_and_grows_with_gain() -> None:
+    view = seen_from(PAPER_BOARD, 0.6)
+    for gain_db in (0.0, 6.0):
+        light = Light(exposure_us=4000, gain_db=gain_db, pixel_noise=3.0)
+        first, second = (render(SMALL, PAPER_BOARD, view, light, np.random.default_rng(s)) for s in (1, 2))
+        table = np.s_[:40, :]
+        sigma = (first[table].astype(float) - second[table]).std() / np.sqrt(2)
+        assert sigma == pytest.approx(3.0 * 10 ** (gain_db / 20), rel=0.05)
+    same = render(SMALL, PAPER_BOARD, view, light, np.random.default_rng(2))
+    assert np.array_equal(second, same)
+
+
+def test_blur_widens_an_edge_as_a_gaussian_does() -> None:
+    camera = CameraModel(400, 400, ((400.0, 0.0, 199.5), (0.0, 400.0, 199.5), (0.0, 0.0, 1.0)))
+    board = BoardSpec(BoardKind.CHESSBOARD, 3, 3, 0.05)
+    view = pose(np.eye(3), [-0.05, -0.05, 0.5])
+    row = render(camera, board, view, Light(pixel_noise=0.0, blur_px=1.5))[140].astype(float)
+    slope = np.diff(row[150:170])
+    centre = (slope * np.arange(19)).sum() / slope.sum()
+    spread = np.sqrt((slope * (np.arange(19) - centre) ** 2).sum() / slope.sum())
+    assert centre + 150.5 == pytest.approx(159.5, abs=0.05)
+    assert spread == pytest.approx(1.5, rel=0.08)
+
+
+@pytest.mark.parametrize(
+    "view",
+    [
+        seen_from(PAPER_BOARD, -0.5),
+        seen_from(PAPER_BOARD, 0.5, rotation_exp([np.pi, 0, 0])),
+        pose(np.eye(3), [5.0, 0.0, 0.5]),
+    ],
+    ids=["behind the camera", "from its back", "beside the picture"],
+)
+def test_no_board_where_none_can_be_seen(view: Array) -> None:
+    picture = render(SMALL, PAPER_BOARD, view, NO_NOISE)
+    assert picture.max() < 100 and picture.min() > 40
+
+
+def test_a_board_that_crosses_the_cameras_plane_is_drawn_where_it_is_ahead() -> None:
+    view = pose(rotation_exp([np.pi / 2 - 0.1, 0, 0]), [-0.07, 0.03, 0.02])
+    assert render(SMALL, PAPER_BOARD, view, NO_NOISE).shape == (256, 320)
+
+
+def test_impossible_input_is_refused() -> None:
+    with pytest.raises(ValueError, match="rigid"):
+        render(SMALL, PAPER_BOARD, np.full((4, 4), np.nan))
+    with pytest.raises(ValueError, match="matrix"):
+        render(CameraModel(64, 64), PAPER_BOARD, seen_from(PAPER_BOARD, 0.5))

@@ -208,6 +208,15 @@ def parse_statistics(content: memoryview) -> Statistics:
     return Statistics(messages, schemas, channels, attachments, metadata, chunks, start, end, counts)
 
 
+def check_message_index(content: memoryview) -> None:
+    """Nothing follows these, but a damaged chunk must not pass for one."""
+    cursor = Cursor(content)
+    cursor.uint(2)
+    if len(cursor.bytes(cursor.uint(4))) % 16:
+        raise BadRecordError("a message index does not end where it says")
+    cursor.done()
+
+
 def split_records(content: memoryview) -> Iterator[tuple[int, int, memoryview]]:
     """The records inside a chunk or a summary: (offset of the record, opcode, its content)."""
     position, end = 0, len(content)

@@ -20,7 +20,9 @@ from recordings.records import (
     RECORD_HEAD,
     BadRecordError,
     Opcode,
+    check_message_index,
     parse_chunk_head,
+    parse_header,
     parse_metadata,
     require_crc,
     split_records,
@@ -30,7 +32,7 @@ from recordings.scan import CHUNK_LIMIT_BYTES, SUMMARY_LIMIT_BYTES
 _LIKE_A_RECORD = re.compile(rb"[\x06\x09\x0c].{4}\x00{4}", re.DOTALL)
 """Opcode of a chunk, attachment or metadata record, and a length below 4 GiB."""
 _BLOCK_BYTES = 1024 * 1024
-_KEPT = (Opcode.CHUNK, Opcode.ATTACHMENT, Opcode.METADATA)
+_DATA_END_LENGTH = 4
 
 
 @dataclass
@@ -82,8 +84,6 @@ class _Walk:
         if len(head) < RECORD_HEAD.size:
             raise BadRecordError("the file ends inside a record")
         opcode, length = RECORD_HEAD.unpack(head)
-        if not 1 <= opcode <= max(Opcode):
-            raise BadRecordError("the record's kind is unknown")
         if length > self._size - position - RECORD_HEAD.size:
             raise BadRecordError("the file ends inside a record, or its length is damaged")
         if length > CHUNK_LIMIT_BYTES:
@@ -100,10 +100,14 @@ class _Walk:
         elif opcode == Opcode.METADATA:
             require_crc(parse_metadata(content).content)
             self._found.contents.add_metadata(content)
-        elif opcode in (Opcode.DATA_END, Opcode.FOOTER):
+        elif opcode == Opcode.DATA_END and len(content) == _DATA_END_LENGTH:
             return position, True
-        elif opcode == Opcode.MESSAGE:
-            raise BadRecordError("a message outside a chunk has no checksum")
+        elif opcode == Opcode.MESSAGE_INDEX:
+            check_message_index(content)
+        elif opcode == Opcode.HEADER:
+            parse_header(content)
+        else:
+            raise BadRecordError(f"a record of kind 0x{opcode:02x} does not belong here")
         return position + RECORD_HEAD.size + len(content), False
 
     def _chunk(self, start: int, content: memoryview) -> None:

@@ -24,6 +24,7 @@ from recordings.records import (
     BadRecordError,
     Opcode,
     Statistics,
+    check_message_index,
     parse_chunk_head,
     parse_header,
     parse_statistics,
@@ -157,7 +158,9 @@ class _Scan:
             self._contents.add_attachment(content)
         elif opcode == Opcode.METADATA:
             self._contents.add_metadata(content)
-        elif opcode != Opcode.MESSAGE_INDEX:
+        elif opcode == Opcode.MESSAGE_INDEX:
+            check_message_index(content)
+        else:
             raise BadRecordError(f"a record of kind 0x{opcode:02x} does not belong here")
         return start + int(length)
 

@@ -160,6 +160,7 @@ class RecordingWriter:
         time_ns = self._time_ns(view.stamps, view.picture_sequence)
         self._add(Topic.VIEW, encode(view), time_ns)
         self._add(Topic.TRANSFORM, viewing.flange_transform(view, time_ns).SerializeToString(), time_ns)
+        self.flush()
 
     def event(self, event: CaptureEvent) -> None:
         time_ns = self._time_ns(event.stamps)

@@ -1,0 +1,115 @@
+"""Recovery: in place or to a new name, never over anything, only when nobody writes, and verified."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from recordings.errors import RecordingError
+from recordings.reader import open_recording
+from recordings.recover import recover
+from recordings.topics import Topic
+from recordings.writer import RecordingWriter
+from tests.recordings.small_recording import make_info, make_picture, make_view, write_small
+
+
+def write_unfinished(path: Path, poses: int = 2, part: int = 1) -> Path:
+    with RecordingWriter(path, make_info(part=part)) as writer:
+        writer.attach("plan.yaml", "application/yaml", b"poses: 2\n")
+        for index in range(poses):
+            writer.picture(make_picture(index))
+            writer.view(make_view(index))
+        writer.flush()
+    return writer.part_path
+
+
+def test_an_unfinished_file_takes_its_name_and_the_damaged_one_is_kept(tmp_path: Path) -> None:
+    part = write_unfinished(tmp_path / "a.mcap")
+    before = part.read_bytes()
+    (result,) = recover(part)
+    assert result.rebuilt
+    assert (result.poses, result.pictures, result.lost_bytes) == (2, 2, 0)
+    recording = open_recording(tmp_path / "a.mcap")
+    assert recording.info == make_info()
+    assert recording.attachments() == {"plan.yaml": b"poses: 2\n"}
+    assert result.kept_original is not None
+    assert result.kept_original.read_bytes() == before
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "a.mcap.part.damaged"]
+
+
+def test_with_an_output_the_original_is_untouched(tmp_path: Path) -> None:
+    part = write_unfinished(tmp_path / "a.mcap")
+    (result,) = recover(part, tmp_path / "b.mcap")
+    assert result.kept_original == part
+    assert len(open_recording(tmp_path / "b.mcap").views()) == 2
+
+
+def test_a_whole_file_that_only_missed_its_rename_is_renamed(small: Path) -> None:
+    part = small.rename(small.with_name("small.mcap.part"))
+    (result,) = recover(part)
+    assert not result.rebuilt
+    assert result.path == small
+    assert len(open_recording(small).views()) == 3
+
+
+def test_a_whole_file_is_left_alone(small: Path) -> None:
+    before = small.read_bytes()
+    (result,) = recover(small)
+    assert not result.rebuilt
+    assert small.read_bytes() == before
+
+
+def test_a_file_that_is_being_written_is_refused(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        writer.picture(make_picture(0))
+        with pytest.raises(RecordingError, match="in use by another process"):
+            recover(writer.part_path)
+
+
+def test_nothing_is_overwritten(tmp_path: Path) -> None:
+    part = write_unfinished(tmp_path / "a.mcap")
+    taken = write_small(tmp_path / "b.mcap")
+    before = taken.read_bytes()
+    with pytest.raises(RecordingError, match="exists already"):
+        recover(part, taken)
+    assert taken.read_bytes() == before
+
+
+def test_a_picture_without_its_view_and_a_view_without_its_picture(tmp_path: Path) -> None:
+    """The chunk of pose 1's picture is cut out: its view must go too, the others stay."""
+    path = write_small(tmp_path / "a.mcap", poses=3)
+    part = open_recording(path).parts[0]
+    offset = part.messages(Topic.RAW_IMAGE).offsets[1]
+    data = bytearray(path.read_bytes())
+    data[offset + 50] ^= 1
+    path.write_bytes(data)
+    (result,) = recover(path)
+    assert [view.index for view in open_recording(path).views()] == [0, 2]
+    assert any("pose 1" in loss and "lost its picture" in loss for loss in result.losses)
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"hello" * 100, bytes(5000), b"\x06" * 5000])
+def test_a_file_with_nothing_in_it_says_so_and_leaves_nothing(tmp_path: Path, content: bytes) -> None:
+    part = tmp_path / "a.mcap.part"
+    part.write_bytes(content)
+    with pytest.raises(RecordingError, match="nothing can be saved"):
+        recover(part)
+    assert list(tmp_path.iterdir()) == [part]
+
+
+def test_a_folder_is_recovered_file_by_file(tmp_path: Path) -> None:
+    write_small(tmp_path / "part-1.mcap")
+    write_unfinished(tmp_path / "part-2.mcap", part=2)
+    results = recover(tmp_path)
+    assert [result.rebuilt for result in results] == [False, True]
+    assert [(v.index, v.part) for v in open_recording(tmp_path).views()] == [(0, 2), (1, 2), (2, 1)]
+
+
+def test_a_leftover_of_an_earlier_attempt_is_not_trodden_on(tmp_path: Path) -> None:
+    part = write_unfinished(tmp_path / "a.mcap")
+    (tmp_path / "a.mcap.recovering").write_text("left over")
+    with pytest.raises(RecordingError, match="exists already"):
+        recover(part)
+    assert part.exists()
+    assert (tmp_path / "a.mcap.recovering").read_text() == "left over"

@@ -57,11 +57,6 @@ def _floats(values: ArrayLike) -> Array:
     return np.asarray(values, dtype=float)
 
 
-def camera_points(mount: Mount, base_from_flange: Array, X: Array, Y: Array, board_points: Array) -> Array:
-    """Board points (k, 3) as the camera of each view sees them, (n, k, 3) in `camera`."""
-    return _chain(mount, base_from_flange, X, Y, board_points)[0]
-
-
 def _chain(mount: Mount, E: Array, X: Array, Y: Array, points: Array) -> tuple[Array, Array, Array, Array]:
     """Points in camera, and their derivatives by δX, δY, δE: (n, k, 3), three times (n, k, 3, 6)."""
     Rx, tx, Ry, ty = X[:3, :3], X[:3, 3], Y[:3, :3], Y[:3, 3]

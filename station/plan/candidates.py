@@ -33,8 +33,10 @@ class ViewRange:
     off_centre: float = 0.35
     """Share of half the picture that the board's centre may be away from the picture's centre."""
     border_px: float = 12.0
-    visible_share: float = 0.95
-    """Share of the guess's uncertainty for which the whole board must still be in the picture."""
+    doubt: float = 1.6
+    """The guess is taken to be wrong by so many times its sigmas."""
+    visible_share: float = 1.0
+    """Share of such wrong guesses for which the whole board must still be in the picture."""
     smallest_singular: float = 0.03
     free_sight: bool = True
     """No part of the arm between camera and board."""
@@ -69,6 +71,26 @@ class Pool:
             branch=self.branch[places],
             margin_m=self.margin_m[places],
         )
+
+
+_NEAR_FILL, _FAR_FILL = 0.64, 0.40
+"""Share of the picture's width or height that the board's outline fills, at the nearest and farthest."""
+_FOCUS = (0.6, 1.6)
+"""Pictures are sharp within these multiples of the working distance."""
+
+
+def view_range(scene: Scene) -> ViewRange:
+    """Distances at which the board fills the picture well, as far as they lie near the working distance."""
+    K, _ = camera_matrix(scene.camera)
+    outline = _outline(scene)
+    size_m = (outline.max(axis=0) - outline.min(axis=0))[:2]
+    picture = np.array([scene.camera.width, scene.camera.height])
+    full_m = float((np.diag(K)[:2] * size_m / picture).max())
+    focus = np.array(_FOCUS) * scene.working_distance_m
+    near, far = (float(d) for d in np.clip([full_m / _NEAR_FILL, full_m / _FAR_FILL], *focus))
+    if far < 1.2 * near:
+        near, far = full_m / _NEAR_FILL, full_m / _FAR_FILL
+    return ViewRange(distance_m=(near, far))
 
 
 def camera_views(scene: Scene, view: ViewRange, count: int, rng: np.random.Generator) -> Array:
@@ -122,12 +144,16 @@ def share_visible(
 ) -> Array:
     """(n,) share of the drawn guesses that show the whole board; 0 where the guess itself does not."""
     outline = _outline(scene)
-    seen = visible(scene.camera, scene.seen(base_from_flange, outline), view.border_px)
-    share = np.zeros(len(base_from_flange))
+    share = visible(scene.camera, scene.seen(base_from_flange, outline), view.border_px).astype(float)
+    if not draws:
+        return share
+    seen = np.flatnonzero(share)
+    hits = np.zeros(len(seen))
     for X, Y in draws:
         drawn = replace(scene, X=X, Y=Y)
-        share += visible(scene.camera, drawn.seen(base_from_flange, outline), view.border_px)
-    return np.where(seen, share / max(len(draws), 1) if draws else 1.0, 0.0)
+        hits += visible(scene.camera, drawn.seen(base_from_flange[seen], outline), view.border_px)
+    share[seen] = hits / len(draws)
+    return share
 
 
 def _outline(scene: Scene) -> Array:
@@ -148,14 +174,18 @@ def find_candidates(
     rng: np.random.Generator,
     near_joints_rad: Array | None,
     draws: list[tuple[Array, Array]],
+    tries: int | None = None,
 ) -> Pool:
-    """Up to `count` camera poses (all their arm branches) that pass view, reach, joints and clearance."""
+    """All arm branches of camera poses that pass view, reach, joints and clearance.
+
+    `tries` (None: `count`) camera poses are looked at; the first `count` of those that show the board go on.
+    """
     lost: Counter[str] = Counter()
-    views = camera_views(scene, view, count, rng)
+    views = camera_views(scene, view, tries or count, rng)
     flange = scene.base_from_flange(views)
     good = share_visible(scene, flange, view, draws) >= view.visible_share
     lost["board not wholly in the picture"] = int((~good).sum())
-    views, flange = views[good], flange[good]
+    views, flange = views[good][:count], flange[good][:count]
     rows, joints, branches = _all_branches(scene, flange, view, near_joints_rad, lost)
     if len(rows) == 0:
         empty = np.zeros((0, 4, 4))

@@ -9,23 +9,27 @@ from itertools import pairwise
 import msgspec
 import numpy as np
 
+from calibrate.board import board_points
 from calibrate.geometry import Array
 from calibrate.information import Noise
 from calibrate.kinematics import forward
 from station.config import StationConfig
 from station.errors import LimitError
 from station.limits import check_plan
-from station.plan.candidates import Pool, ViewRange, find_candidates
+from station.plan.candidates import Pool, ViewRange, find_candidates, view_range, visible
 from station.plan.choose import Criterion, Objective, choose, informations, objective_for, sigma_of
-from station.plan.describe import planned_pose
+from station.plan.describe import expected_view, planned_pose
 from station.plan.explain import explain_shortage
+from station.plan.groups import best_group
 from station.plan.model import Plan
 from station.plan.order import BLOCKED, move_times, short_order, time_matrix
 from station.plan.scene import Scene, scene_of
 
 Progress = Callable[[str, float], None]
 POOL_SIZE = 320
-_DRAWS = 24
+_DRAWS = 48
+_TRIES = 12
+"""Camera poses looked at per wanted member of the pool; most fall to the guess's uncertainty."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +40,8 @@ class PlanOptions:
     noise: Noise = field(default_factory=Noise)
     free_intrinsics: bool = True
     """The lens is calibrated from the same pictures."""
-    view: ViewRange = field(default_factory=ViewRange)
+    view: ViewRange | None = None
+    """None = by the lens and the board's size."""
     pool: int = POOL_SIZE
 
 
@@ -73,68 +78,51 @@ def plan_scene(
     return msgspec.structs.replace(plan, note="; ".join(notes))
 
 
-def _relaxed(view: ViewRange) -> list[tuple[ViewRange, str]]:
+def _relaxed(view: ViewRange, start_roll_rad: float | None) -> list[tuple[ViewRange, str]]:
     """The wanted range, then ever less particular ones, each with what is to be said about it."""
-    doubtful = replace(view, visible_share=0.7, off_centre=0.2, border_px=6.0)
-    rolled = replace(doubtful, roll_rad=np.pi, tilt_rad=(view.tilt_rad[0], view.tilt_rad[1] + 0.1))
+    rolls = [0.0, np.pi / 2, -np.pi / 2, np.pi] if start_roll_rad is None else [start_roll_rad, 0.0]
+    views = [(replace(view, roll_centre_rad=roll), "") for roll in rolls]
+    doubtful = replace(views[0][0], doubt=1.0, visible_share=0.9, off_centre=0.2)
+    rolled = replace(doubtful, roll_rad=np.pi, visible_share=0.7, border_px=6.0)
+    near, far = view.distance_m
     wide = replace(
-        rolled,
-        free_sight=False,
-        visible_share=0.3,
-        off_centre=0.1,
-        distance_m=(0.8 * view.distance_m[0], 1.3 * view.distance_m[1]),
+        rolled, free_sight=False, visible_share=0.3, off_centre=0.1, distance_m=(0.85 * near, 1.3 * far)
     )
     return [
-        (view, ""),
-        (doubtful, "the guess is so rough that some pictures may cut the board"),
-        (rolled, "poses of any roll had to be used"),
-        (
-            wide,
-            "distances beyond the wanted range had to be used; pictures may cut or hide parts of the board",
-        ),
+        *views,
+        (doubtful, "the guess is rough: some pictures may cut the board"),
+        (rolled, "poses of any roll had to be used, and some pictures may cut the board"),
+        (wide, "unusual distances had to be used; pictures may cut or hide parts of the board"),
     ]
+
+
+def _start_roll(scene: Scene, start: Array | None) -> float | None:
+    """Roll of the board as seen from the start, rad; None where the start does not look at it."""
+    if start is None:
+        return None
+    flange = forward(scene.geometry.model, start)
+    if not visible(scene.camera, scene.seen(flange[None], board_points(scene.board)), 0.0)[0]:
+        return None
+    return expected_view(scene, flange).roll_rad
 
 
 def _pool(
     scene: Scene, options: PlanOptions, start: Array | None, rng: np.random.Generator
 ) -> tuple[Pool, list[str]]:
     """Candidates of the best branch. LimitError with the reason when the widest range has too few."""
-    draws = scene.drawn(_DRAWS, rng)
-    best: Pool | None = None
-    for view, note in _relaxed(options.view):
-        found = find_candidates(scene, view, 3 * options.pool, rng, start, draws)
-        branch = _best_branch(scene, found, start, options.pool)
-        if len(branch) >= 2 * options.count:
-            return branch, [note] if note else []
-        if best is None or len(branch) >= len(best):
-            best = branch
-            best_note = note
+    best: tuple[Pool, str] | None = None
+    for view, note in _relaxed(options.view or view_range(scene), _start_roll(scene, start)):
+        draws = scene.drawn(_DRAWS, view.doubt, rng)
+        found = find_candidates(scene, view, 2 * options.pool, rng, start, draws, _TRIES * options.pool)
+        group = best_group(scene, found, start, options.pool, 3 * options.count)
+        if best is None or len(group) > len(best[0]):
+            best = group, note
+        if len(group) >= 3 * options.count:
+            break
     assert best is not None
-    if len(best) < options.count:
-        raise LimitError(explain_shortage(scene, options.count, best))
-    return best, [best_note]
-
-
-def _best_branch(scene: Scene, found: Pool, start: Array | None, wanted: int) -> Pool:
-    """The arm branch with the most candidates; among those with plenty, the one nearest to the start.
-
-    Only candidates reachable from the start, directly, count when there is a start.
-    """
-    branches = []
-    for number in np.unique(found.branch):
-        members = found.take(np.flatnonzero(found.branch == number))
-        members = members.take(np.arange(min(len(members), wanted)))
-        nearness = 0.0 if start is None else float(np.abs(members.joints_rad - start).max(axis=1).min())
-        if start is not None:
-            step = move_times(
-                scene.geometry, np.repeat(start[None], len(members), axis=0), members.joints_rad
-            )
-            if not np.isfinite(step).any():
-                continue
-        branches.append((-min(len(members), wanted // 2), nearness, int(number), members))
-    if not branches:
-        return found.take(np.zeros(0, dtype=int))
-    return min(branches, key=lambda entry: entry[:3])[3]
+    if len(best[0]) < options.count:
+        raise LimitError(explain_shortage(scene, options.count, best[0]))
+    return best[0], [best[1]] if best[1] else []
 
 
 def _choose_and_order(
@@ -149,16 +137,21 @@ def _choose_and_order(
     objective = objective_for(scene, options.criterion, options.free_intrinsics)
     information = informations(scene, pool.base_from_flange, options.noise, options.free_intrinsics)
     left = np.arange(len(pool))
+    picked: list[int] = []
     while len(left) >= options.count:
-        picked = choose(
+        # The first choice is polished; when poses without a free way leave, only their places are filled.
+        kept = tuple(int(k) for k in np.flatnonzero(np.isin(left, picked)))
+        chosen = choose(
             information[left],
             options.count,
             objective,
             rng,
+            keep=kept,
+            sweeps=0 if kept else 6,
             progress=lambda done: progress("choosing", 0.3 + 0.5 * done),
         )
         progress("ordering", 0.85)
-        places = left[picked]
+        places = left[chosen]
         order, blocked = _ordered(scene, pool.joints_rad[places], start, options.seed)
         if not blocked:
             places = places[order]
@@ -167,7 +160,8 @@ def _choose_and_order(
             blocked = _failing(plan, start, scene)
             if not blocked:
                 return plan
-        left = np.setdiff1d(left, places[blocked])
+        gone = places[blocked]
+        left, picked = np.setdiff1d(left, gone), [p for p in places if p not in gone]
     raise LimitError(explain_shortage(scene, options.count, pool.take(left)))
 
 

@@ -12,7 +12,7 @@ from calibrate.geometry import Array
 from calibrate.information import Noise
 from calibrate.kinematics import forward
 from station.limits import check_path
-from station.plan.candidates import ViewRange, find_candidates
+from station.plan.candidates import ViewRange, find_candidates, view_range
 from station.plan.choose import informations, objective_for, sigma_of
 from station.plan.describe import planned_pose
 from station.plan.model import Plan, PlannedPose
@@ -46,7 +46,8 @@ class Advice:
 class AdviceOptions:
     noise: Noise = field(default_factory=Noise)
     free_intrinsics: bool = True
-    view: ViewRange = field(default_factory=ViewRange)
+    view: ViewRange | None = None
+    """None = by the lens and the board's size."""
     pool: int = 150
     seed: int = 0
 
@@ -84,8 +85,9 @@ def advise(
         return Advice(now, True, f"enough: {state}, the goal is {1000 * goal_m:.2f} mm")
     rng = np.random.default_rng(options.seed)
     start = np.asarray(joints_now_rad, dtype=float)
-    draws = scene.drawn(_DRAWS, rng)
-    pool = find_candidates(scene, options.view, options.pool, rng, start, draws)
+    view = options.view or view_range(scene)
+    draws = scene.drawn(_DRAWS, view.doubt, rng)
+    pool = find_candidates(scene, view, options.pool, rng, start, draws)
     if len(pool) == 0:
         return Advice(now, False, f"{state}; no further pose is reachable with the board in view")
     gains = informations(scene, pool.base_from_flange, options.noise, options.free_intrinsics)

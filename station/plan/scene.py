@@ -8,7 +8,6 @@ import numpy as np
 
 from calibrate.board import board_points
 from calibrate.geometry import Array, inverse, pose, pose_from_quaternion, rotation_exp, transform_points
-from calibrate.information import camera_points
 from calibrate.kinematics import MODELS, DhDeltas
 from recordings.messages import BoardSpec, CameraModel, Mount
 from station.collision import CellGeometry, plate
@@ -49,15 +48,15 @@ class Scene:
 
     def seen(self, base_from_flange: Array, points: Array) -> Array:
         """Board points (k, 3) in `camera`, (n, k, 3)."""
-        return camera_points(self.mount, base_from_flange, self.X, self.Y, points)
+        return transform_points(self.camera_from_board(base_from_flange), points)
 
-    def drawn(self, draws: int, rng: np.random.Generator) -> list[tuple[Array, Array]]:
-        """Other (X, Y) that the guess allows, by its sigmas."""
+    def drawn(self, draws: int, doubt: float, rng: np.random.Generator) -> list[tuple[Array, Array]]:
+        """Other (X, Y) that the guess allows, `doubt` times its sigmas away."""
 
         def disturbed(matrix: Array, sigma: tuple[float, float]) -> Array:
             # A guess is wrong about where the thing is and how it is turned, each about itself.
-            turned = matrix[:3, :3] @ rotation_exp(rng.normal(0, sigma[1], 3))
-            return pose(turned, matrix[:3, 3] + rng.normal(0, sigma[0], 3))
+            turned = matrix[:3, :3] @ rotation_exp(doubt * rng.normal(0, sigma[1], 3))
+            return pose(turned, matrix[:3, 3] + doubt * rng.normal(0, sigma[0], 3))
 
         return [(disturbed(self.X, self.x_sigma), disturbed(self.Y, self.y_sigma)) for _ in range(draws)]
 

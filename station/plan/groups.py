@@ -1,0 +1,61 @@
+"""Candidates that belong together: one arm branch, and a free direct move from a common hub to each."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calibrate.geometry import Array
+from station.plan.candidates import Pool
+from station.plan.order import move_times
+from station.plan.scene import Scene
+
+_HUBS = 6
+_REACH_RAD = 2.6
+"""Members turn no joint further than this from the hub: no flips of the wrist, no wound-up cables."""
+
+
+def best_group(scene: Scene, found: Pool, start: Array | None, wanted: int, plenty: int) -> Pool:
+    """A group of at most `wanted`: of the branch nearest to the start that has `plenty`, or else the largest.
+
+    With a start, only groups count that it has a free direct move into. Empty when there is none.
+    """
+    branches = [found.take(np.flatnonzero(found.branch == n)) for n in np.unique(found.branch)]
+    if start is None:
+        branches.sort(key=lambda branch: -len(branch))
+    else:
+        branches.sort(key=lambda branch: float(np.abs(branch.joints_rad - start).max(axis=1).min()))
+    best = found.take(np.zeros(0, dtype=int))
+    for branch in branches:
+        group = _best_of_branch(scene, branch.take(np.arange(min(wanted, len(branch)))), start)
+        if len(group) > len(best):
+            best = group
+        if len(best) >= plenty:
+            break
+    return best
+
+
+def _best_of_branch(scene: Scene, branch: Pool, start: Array | None) -> Pool:
+    groups = [branch.take(np.zeros(0, dtype=int))]
+    for hub in _hubs(branch.joints_rad, start):
+        free = np.isfinite(_moves(scene, hub, branch.joints_rad))
+        group = branch.take(np.flatnonzero(free))
+        if start is None or np.isfinite(_moves(scene, start, group.joints_rad, reach_rad=np.inf)).any():
+            groups.append(group)
+    return max(groups, key=len)
+
+
+def _hubs(joints: Array, start: Array | None) -> Array:
+    """The start, and members far from one another (farthest-point sampling), most central first."""
+    spread = np.abs(joints[:, None] - joints[None]).max(axis=2)
+    hubs = [int(np.argmin(spread.mean(axis=1)))]
+    while len(hubs) < min(_HUBS, len(joints)):
+        hubs.append(int(np.argmax(spread[:, hubs].min(axis=1))))
+    return joints[hubs] if start is None else np.vstack([start, joints[hubs]])
+
+
+def _moves(scene: Scene, hub: Array, members: Array, reach_rad: float = _REACH_RAD) -> Array:
+    """Durations (n,) of direct moves hub → members; infinite beyond the reach or where not free."""
+    near = np.abs(members - hub).max(axis=1) <= reach_rad
+    times = np.full(len(members), np.inf)
+    times[near] = move_times(scene.geometry, np.repeat(hub[None], int(near.sum()), axis=0), members[near])
+    return times

@@ -32,6 +32,13 @@ def verdict(calibration: Calibration) -> tuple[bool, str]:
     return False, f"NOT GOOD ENOUGH: {names} ({len(failed)} of {len(calibration.quality.gates)} gates failed)"
 
 
+def pose_text(calibration: Calibration) -> str:
+    """Position in mm, then roll, pitch, yaw about fixed axes in degrees."""
+    x, y, z = (v * 1000 for v in calibration.result.translation_m)
+    roll, pitch, yaw = Rotation.from_quat(calibration.result.rotation_xyzw).as_euler("xyz", degrees=True)
+    return f"{x:.3f}  {y:.3f}  {z:.3f} mm,  roll {roll:.4f}°  pitch {pitch:.4f}°  yaw {yaw:.4f}°"
+
+
 def summary(calibration: Calibration) -> RenderableType:
     """For a rich console, 80 columns and more."""
     good, sentence = verdict(calibration)
@@ -48,10 +55,9 @@ def summary(calibration: Calibration) -> RenderableType:
 def _result_table(calibration: Calibration) -> Table:
     result, quality = calibration.result, calibration.quality
     table = Table.grid(padding=(0, 2))
-    x, y, z = (v * 1000 for v in result.translation_m)
-    roll, pitch, yaw = Rotation.from_quat(result.rotation_xyzw).as_euler("xyz", degrees=True)
-    table.add_row(f"{result.parent_frame}_from_{result.child_frame}", f"{x:.3f}  {y:.3f}  {z:.3f} mm")
-    table.add_row("rotation", f"roll {roll:.4f}°  pitch {pitch:.4f}°  yaw {yaw:.4f}°  (fixed axes)")
+    position, rotation = pose_text(calibration).split(",", 1)
+    table.add_row(f"{result.parent_frame}_from_{result.child_frame}", position)
+    table.add_row("rotation", f"{rotation.strip()}  (fixed axes)")
     table.add_row("1σ", f"{calibration.sigma.translation_mm:.3f} mm  {calibration.sigma.rotation_deg:.4f}°")
     if quality.predicted_error_mm is not None:
         table.add_row(

@@ -1,0 +1,281 @@
+"""The page, in the order a person asks: is it good, what is it, why should I believe it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from calibrate.board import describe_board
+from calibrate.calibration import write_atomically
+from calibrate.geometry import Array
+from calibrate.lens import project
+from calibrate.pipeline import SolvedRecording
+from calibrate.report import html, plots
+from calibrate.report.pictures import drawn_view
+from calibrate.solution import PeerResult
+from calibrate.summary import pose_text, source_stamp, verdict
+
+_PICTURES_LIMIT = 60
+
+
+def write_report(
+    job: SolvedRecording,
+    path: Path,
+    peers: Sequence[PeerResult] = (),
+    history: Sequence[Sequence[str]] = (),
+) -> None:
+    """Writes the page atomically. `history`: rows (generation, when, what, change) of what was installed."""
+    content = report_page(job, peers, history).encode()
+    write_atomically(path, lambda file: file.write(content))
+
+
+def report_page(
+    job: SolvedRecording, peers: Sequence[PeerResult] = (), history: Sequence[Sequence[str]] = ()
+) -> str:
+    name = job.recording.info.name
+    return html.page(
+        f"Calibration of {name}",
+        [
+            *_verdict(job),
+            *_result(job),
+            *_gates(job),
+            *_error(job),
+            *_residuals(job),
+            *_holdout(job, peers),
+            *_methods(peers),
+            *_lens(job),
+            *_views(job),
+            *_history(history),
+            *_provenance(job),
+        ],
+    )
+
+
+def _verdict(job: SolvedRecording) -> Iterator[str]:
+    calibration = job.calibration
+    good, sentence = verdict(calibration)
+    quality = calibration.quality
+    yield f"<h1>Calibration of {html.escape(job.recording.info.name)}</h1>"
+    if stamp := source_stamp(calibration):
+        yield f'<div class="stamp">{html.escape(stamp)}. It will not be installed on a real cell.</div>'
+    expected = ""
+    if quality.predicted_error_mm is not None and quality.working_distance_m is not None:
+        expected = (
+            f"A point {quality.working_distance_m * 1000:.0f} mm in front of the camera is expected to be right "
+            f"to {quality.predicted_error_mm:.2f} mm (1σ)."
+        )
+    yield (
+        f'<div class="verdict {"good" if good else "bad"}"><strong>{html.escape(sentence)}</strong>'
+        f"{html.escape(expected)}</div>"
+    )
+    for warning in quality.warnings:
+        yield html.paragraph(warning, "warning")
+
+
+def _result(job: SolvedRecording) -> Iterator[str]:
+    calibration = job.calibration
+    result, sigma = calibration.result, np.sqrt(np.diag(np.array(calibration.covariance)))
+    name = f"{result.parent_frame}_from_{result.child_frame}"
+    yield html.heading(f"Where the camera is: {name}")
+    yield f'<p class="big">{html.escape(pose_text(calibration))}</p>'
+    rows = [
+        (
+            axis,
+            f"{result.translation_m[k] * 1000:.3f}",
+            f"{sigma[k] * 1000:.3f}",
+            f"{np.degrees(sigma[k + 3]):.4f}",
+        )
+        for k, axis in enumerate("xyz")
+    ]
+    yield html.table(
+        ("", "position, mm", "1σ, mm", f"1σ about it ({result.parent_frame}), °"), rows, (1, 2, 3)
+    )
+    quaternion = ", ".join(f"{v:.9f}" for v in result.rotation_xyzw)
+    yield html.paragraph(f"Quaternion x, y, z, w: {quaternion}", "note")
+    matrix = "\n".join("  ".join(f"{v:+.9f}" for v in row) for row in result.matrix)
+    yield f"<pre><code>{html.escape(matrix)}</code></pre>"
+    yield html.paragraph(
+        f"Together: {calibration.sigma.translation_mm:.3f} mm and {calibration.sigma.rotation_deg:.4f}° (1σ, "
+        "root mean squared length). The full 6 × 6 covariance is in the calibration file.",
+        "note",
+    )
+
+
+def _gates(job: SolvedRecording) -> Iterator[str]:
+    yield html.heading("Gates")
+    yield html.table(
+        ("", "gate", "found"), [("✓" if gate.passed else "✗", gate.name, gate.text) for gate in job.gates]
+    )
+
+
+def _error(job: SolvedRecording) -> Iterator[str]:
+    quality = job.calibration.quality
+    yield html.heading("Where the error comes from")
+    if quality.error_shares:
+        shares = {name: share for name, share in quality.error_shares.items() if share > 0.001}
+        yield html.figure(plots.error_shares(shares), "Shares of the variance of X by source.")
+    noise = quality.noise
+    if noise:
+        yield html.paragraph(
+            f"Corners scatter by {noise['corner_px']:.3f} px, the robot by {noise['robot_mm']:.3f} mm and "
+            f"{noise['robot_deg']:.4f}° (estimated from the residuals)."
+        )
+    yield html.paragraph(f"Least known: {quality.weakest}." if quality.weakest else "")
+    yield html.paragraph(quality.robot_systematics)
+
+
+def _modelled_pixels(job: SolvedRecording) -> dict[int, tuple[Array, Array]]:
+    """Pose number → (found, modelled) pixels by the board's own pose in that picture."""
+    found = {}
+    camera = job.solution.camera
+    for view in job.views:
+        if view.camera_from_board is not None:
+            found[view.index] = (view.pixels, project(camera, view.camera_from_board, view.board_points))
+    return found
+
+
+def _residuals(job: SolvedRecording) -> Iterator[str]:
+    solution = job.solution
+    yield html.heading("Residuals")
+    if solution.residual_px:
+        robot_mm = {index: metres * 1000 for index, (metres, _) in solution.residual_robot.items()}
+        limit = next((gate.limit for gate in job.gates if gate.name == "view residual"), None)
+        yield html.figure(
+            plots.residuals_by_view(solution.residual_px, robot_mm, limit),
+            "Per pose: how far the corners miss the model, and how far the flange is from where it was recorded.",
+        )
+    pairs = [both for index, both in _modelled_pixels(job).items() if index in set(solution.used)]
+    if pairs:
+        pixels = np.concatenate([found for found, _ in pairs])
+        misses = np.concatenate([found - modelled for found, modelled in pairs])
+        yield html.figure(
+            plots.residual_scatter(misses, pixels, job.solution.camera),
+            "Found corners against the lens and each picture's own board pose. Left: circles at 1, 2, 3 σ. "
+            "Right: over the picture; a pattern of arrows means that the lens model does not fit.",
+        )
+
+
+def _holdout(job: SolvedRecording, peers: Sequence[PeerResult]) -> Iterator[str]:
+    score = job.solution.holdout
+    if score is None:
+        return
+    yield html.heading("Views that took no part")
+    methods = [("this calibration", np.asarray(score.samples_e_t_m), np.asarray(score.samples_e_R))]
+    methods += [
+        (peer.name, peer.samples_e_t_m, peer.samples_e_R)
+        for peer in peers
+        if peer.samples_e_t_m is not None and peer.samples_e_R is not None
+    ]
+    yield html.figure(
+        plots.holdout_samples(methods),
+        f"Mean e_t {score.e_t_m * 1000:.4f} mm, e_R {score.e_R:.6f} over {len(score.pairs)} samples. These "
+        "numbers are dominated by the noise of the held-out views themselves: good methods cannot be ranked by them.",
+    )
+    yield html.paragraph(score.note, "note")
+
+
+def _methods(peers: Sequence[PeerResult]) -> Iterator[str]:
+    if not peers:
+        return
+    yield html.heading("Every method on the same views")
+    rows = [
+        (
+            peer.name,
+            html.number(peer.e_t_m, 4, 1e3),
+            html.number(peer.e_R, 6),
+            html.number(peer.board_spread_m, 3, 1e3),
+            html.number(peer.board_spread_rad, 4, float(np.degrees(1))),
+            html.number(peer.distance_sigma, 1),
+            peer.note,
+        )
+        for peer in peers
+    ]
+    head = ("method", "e_t, mm", "e_R", "board spread, mm", "board spread, °", "σ from ours", "")
+    yield html.table(head, rows, (1, 2, 3, 4, 5))
+
+
+def _lens(job: SolvedRecording) -> Iterator[str]:
+    lens = job.calibration.intrinsics
+    yield html.heading("Lens")
+    origin = "found from these pictures" if job.intrinsics is not None else "given, not fitted"
+    rms = "" if lens.rms_px is None else f", rms {lens.rms_px:.3f} px"
+    yield html.paragraph(f"{lens.distortion_model}, {lens.width}×{lens.height}, {origin}{rms}.")
+    values = {
+        "fx": lens.matrix[0][0],
+        "fy": lens.matrix[1][1],
+        "cx": lens.matrix[0][2],
+        "cy": lens.matrix[1][2],
+    } | dict(zip(_distortion_names(lens.distortion_model), lens.distortion, strict=False))
+    rows = [
+        (name, f"{value:.6g}", f"{lens.sigma[name]:.2g}" if name in lens.sigma else "–")
+        for name, value in values.items()
+    ]
+    yield html.table(("", "value", "1σ"), rows, (1, 2))
+    for text in lens.held:
+        yield html.paragraph(text, "note")
+    yield html.figure(
+        plots.coverage_map(job.views),
+        f"Left: where corners were seen ({job.coverage:.0%} of the picture). Right: what the lens model corrects.",
+    )
+
+
+def _distortion_names(model: str) -> tuple[str, ...]:
+    return (
+        ("k1", "k2", "k3", "k4")
+        if model == "equidistant"
+        else ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
+    )
+
+
+def _views(job: SolvedRecording) -> Iterator[str]:
+    rejected = {view.index: view.reason for view in job.calibration.views.rejected}
+    yield html.heading(f"Views: {len(job.solution.used)} used, {len(rejected)} left out")
+    if rejected:
+        names = {view.index: view.name for view in job.recording.views()}
+        yield html.table(
+            ("pose", "name", "why it was left out"),
+            [(str(index), names.get(index, ""), reason) for index, reason in rejected.items()],
+        )
+    modelled = _modelled_pixels(job)
+    cells = []
+    for view in job.recording.views()[:_PICTURES_LIMIT]:
+        detection = job.loaded.detections.get(view.index)
+        found = detection.pixels if detection is not None else np.zeros((0, 2))
+        jpeg = drawn_view(
+            job.recording.picture(view).image, found, modelled.get(view.index, (found, None))[1]
+        )
+        px = job.solution.residual_px.get(view.index)
+        caption = f"{view.index}: {view.name}" + (f", {px:.2f} px" if px is not None else "")
+        if view.index in rejected:
+            caption += f": {rejected[view.index]}"
+        mark = "out" if view.index in rejected else "in"
+        cells.append(f'<div class="{mark}">{html.figure(html.picture(jpeg, caption), caption)}</div>')
+    yield '<div class="views">' + "\n".join(cells) + "</div>"
+    if len(job.recording.views()) > _PICTURES_LIMIT:
+        yield html.paragraph(f"The first {_PICTURES_LIMIT} are shown.", "note")
+
+
+def _history(history: Sequence[Sequence[str]]) -> Iterator[str]:
+    if history:
+        yield html.heading("Installed before")
+        yield html.table(("generation", "installed", "result", "change"), history)
+
+
+def _provenance(job: SolvedRecording) -> Iterator[str]:
+    calibration = job.calibration
+    origin, robot, camera = calibration.provenance, calibration.robot, calibration.camera
+    yield html.heading("Where it comes from")
+    rows = [
+        ("recording", f"{origin.recording}, SHA-256 {origin.recording_sha256}"),
+        ("source", calibration.source),
+        ("mount", calibration.mount),
+        ("board", describe_board(calibration.board)),
+        ("robot", f"{robot.model} {robot.serial} {robot.controller_version}".strip()),
+        ("camera", f"{camera.vendor} {camera.model} {camera.serial} ({camera.driver})".strip()),
+        ("profile, seed", f"{origin.profile}, {origin.seed}"),
+        ("software", ", ".join(f"{name} {version}" for name, version in origin.software.items())),
+        ("solved", calibration.created),
+    ]
+    yield html.table(("", ""), rows)

@@ -1,0 +1,151 @@
+"""Figures as SVG text, deterministic: the same input gives the same bytes."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import cv2
+import matplotlib
+import numpy as np
+from matplotlib.figure import Figure
+
+from calibrate.geometry import Array
+from calibrate.lens import camera_matrix, undistort
+from calibrate.views import ViewSet
+from recordings.messages import CameraModel
+
+_BLUE, _RED, _GREY, _ORANGE = "#0969da", "#b42318", "#8c959f", "#bc4c00"
+_STYLE: Any = {
+    "svg.hashsalt": "report",
+    "svg.fonttype": "none",
+    "font.family": "sans-serif",
+    "font.size": 9,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#eaeef2",
+    "axes.axisbelow": True,
+}
+
+
+def _figure(width: float, height: float, columns: int = 1) -> tuple[Figure, Any]:
+    figure = Figure(figsize=(width, height), layout="constrained")
+    axes = figure.subplots(1, columns)
+    return figure, axes
+
+
+def _svg(figure: Figure) -> str:
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    text = buffer.getvalue()
+    return text[text.index("<svg") :]
+
+
+def residuals_by_view(
+    residual_px: Mapping[int, float], robot_mm: Mapping[int, float], limit_px: float | None
+) -> str:
+    """Bars: rms of the corners, and the robot's miss, per pose."""
+    with matplotlib.rc_context(_STYLE):
+        figure, axes = _figure(10, 2.6, 2)
+        for axis, values, unit in (
+            (axes[0], residual_px, "corners, px rms"),
+            (axes[1], robot_mm, "robot, mm"),
+        ):
+            axis.bar([str(k) for k in values], list(values.values()), color=_BLUE)
+            axis.set_xlabel("pose")
+            axis.set_ylabel(unit)
+            axis.tick_params(axis="x", labelsize=7)
+        if limit_px is not None and residual_px and max(residual_px.values()) > 0.3 * limit_px:
+            axes[0].axhline(limit_px, color=_RED, linewidth=1)
+        return _svg(figure)
+
+
+def residual_scatter(misses: Array, pixels: Array, camera: CameraModel) -> str:
+    """Where the corners miss: all misses (n, 2) px round zero, and over the picture as arrows."""
+    with matplotlib.rc_context(_STYLE):
+        figure, axes = _figure(10, 3.6, 2)
+        reach = float(np.abs(misses).max(initial=1e-3)) * 1.05
+        axes[0].scatter(misses[:, 0], misses[:, 1], s=3, color=_BLUE, alpha=0.5, linewidths=0)
+        axes[0].set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel="x miss, px", ylabel="y miss, px")
+        axes[0].set_aspect("equal")
+        sigma = float(np.sqrt(np.square(misses).mean()))
+        angle = np.linspace(0, 2 * np.pi, 100)
+        for k in (1, 2, 3):
+            axes[0].plot(k * sigma * np.cos(angle), k * sigma * np.sin(angle), color=_GREY, linewidth=0.7)
+        keep = np.linspace(0, len(pixels) - 1, min(len(pixels), 1500)).astype(int)
+        axes[1].quiver(
+            pixels[keep, 0],
+            pixels[keep, 1],
+            misses[keep, 0],
+            misses[keep, 1],
+            angles="xy",
+            color=_BLUE,
+            width=0.0015,
+        )
+        axes[1].set(xlim=(0, camera.width), ylim=(camera.height, 0), xlabel="x, px", ylabel="y, px")
+        axes[1].set_aspect("equal")
+        return _svg(figure)
+
+
+def holdout_samples(methods: Sequence[tuple[str, Array, Array]]) -> str:
+    """Error per held-out sample, translation (mm) and rotation; ours first. The paper's figures 4 and 5."""
+    with matplotlib.rc_context(_STYLE):
+        figure, axes = _figure(10, 3.0, 2)
+        for place, (name, e_t_m, e_R) in enumerate(methods):
+            look: dict[str, Any] = {"linewidth": 0.8, "marker": ".", "alpha": 0.7}
+            if place == 0:
+                look = {"linewidth": 2, "marker": "o", "color": _RED, "zorder": 5}
+            samples = np.arange(1, len(e_t_m) + 1)
+            axes[0].plot(samples, e_t_m * 1000, label=name, **look)
+            axes[1].plot(samples, e_R, **look)
+        axes[0].set(xlabel="held-out sample", ylabel="translation error, mm", ylim=(0, None))
+        axes[1].set(xlabel="held-out sample", ylabel="rotation error (spectral norm)", ylim=(0, None))
+        figure.legend(loc="outside lower center", ncols=5, fontsize=7, frameon=False)
+        return _svg(figure)
+
+
+def error_shares(shares: Mapping[str, float]) -> str:
+    """One bar: where the error of X comes from."""
+    colours = (_BLUE, _ORANGE, "#1a7f37", "#8250df", _GREY)
+    with matplotlib.rc_context(_STYLE | {"axes.grid": False}):
+        figure, axis = _figure(10, 0.95)
+        left = 0.0
+        for (name, share), colour in zip(shares.items(), colours, strict=False):
+            axis.barh([0], [share], left=[left], color=colour, label=f"{name.replace('_', ' ')} {share:.0%}")
+            left += share
+        axis.set_axis_off()
+        figure.legend(loc="outside lower center", ncols=5, fontsize=8, frameon=False)
+        return _svg(figure)
+
+
+def coverage_map(views: ViewSet) -> str:
+    """How often each part of the picture saw the board, with all corners; and what the lens does."""
+    camera = views.camera
+    seen = np.zeros((camera.height // 8 + 1, camera.width // 8 + 1), np.float32)
+    for view in views:
+        mask = np.zeros(seen.shape, np.uint8)
+        cv2.fillConvexPoly(mask, cv2.convexHull((view.pixels / 8).astype(np.float32)).astype(np.int32), 1)
+        seen += mask
+    with matplotlib.rc_context(_STYLE | {"axes.grid": False}):
+        figure, axes = _figure(10, 3.4, 2)
+        extent = (0, camera.width, camera.height, 0)
+        shown = axes[0].imshow(seen, extent=extent, cmap="Blues", interpolation="nearest")
+        figure.colorbar(shown, ax=axes[0], label="views")
+        for view in views:
+            axes[0].plot(view.pixels[:, 0], view.pixels[:, 1], ".", markersize=1, color=_ORANGE)
+        axes[0].set(xlim=(0, camera.width), ylim=(camera.height, 0), xlabel="x, px", ylabel="y, px")
+        _distortion_curve(axes[1], camera)
+        return _svg(figure)
+
+
+def _distortion_curve(axis: Any, camera: CameraModel) -> None:
+    corners = np.array([[0, 0], [camera.width, 0], [0, camera.height], [camera.width, camera.height]], float)
+    centre = camera_matrix(camera)[:2, 2]
+    far = corners[np.linalg.norm(corners - centre, axis=1).argmax()]
+    ray = centre + np.linspace(0.01, 1, 60)[:, None] * (far - centre)
+    shift = np.linalg.norm(undistort(camera, ray) - centre, axis=1) - np.linalg.norm(ray - centre, axis=1)
+    axis.plot(np.linalg.norm(ray - centre, axis=1), shift, color=_BLUE)
+    axis.axhline(0, color=_GREY, linewidth=0.7)
+    axis.set(xlabel="distance from the principal point, px", ylabel="distortion removed, px")

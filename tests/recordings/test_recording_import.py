@@ -1,0 +1,224 @@
+"""`recordings import`: a good folder becomes a recording, a bad one an error with file, row and remedy."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from typer.testing import CliRunner
+
+from recordings.cli import main
+from recordings.errors import ImportFolderError, RecordingError
+from recordings.importer import import_folder
+from recordings.poses import matrix_from_quaternion
+from recordings.reader import open_recording
+from tests.recordings.small_recording import BOARD, HEIGHT, WIDTH, make_image
+
+Change = Callable[[Path], object]
+
+
+def edit(name: str, old: str, new: str) -> Change:
+    def change(folder: Path) -> None:
+        path = folder / name
+        text = path.read_text()
+        assert old in text, f"the test itself is wrong: no '{old}'"
+        path.write_text(text.replace(old, new, 1))
+
+    return change
+
+
+def test_a_good_folder_becomes_a_recording(folder: Path, tmp_path: Path) -> None:
+    done = import_folder(folder, tmp_path / "out.mcap")
+    recording = open_recording(done.path)
+    info = recording.info
+    assert (info.name, info.mount, info.source, info.board) == ("pictures", "eye-in-hand", "imported", BOARD)
+    assert (info.robot.model, info.note) == ("UR10", "made for a test")
+    assert [v.source_file for v in recording.views()] == [f"images/{i}.png" for i in range(3)]
+    turned = recording.views()[1].base_from_flange
+    np.testing.assert_allclose(
+        turned, [[0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]], atol=1e-12
+    )
+    for view, picture in recording.pictures():
+        np.testing.assert_array_equal(picture.image, make_image(view.index))
+    stored = recording.parts[0].stored_picture(0)
+    assert stored == ("png", (folder / "images/0.png").read_bytes())
+    assert set(recording.attachments()) == {"dataset.yaml", "poses.csv"}
+    assert done.pictures == 3
+
+
+def test_other_formats_and_colour_are_stored_without_loss(folder: Path, tmp_path: Path) -> None:
+    colour = np.random.default_rng(0).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
+    deep = np.random.default_rng(1).integers(0, 65536, (HEIGHT, WIDTH)).astype(np.uint16)
+    cv2.imwrite(str(folder / "images/0.bmp"), colour)
+    cv2.imwrite(str(folder / "images/1.pgm"), make_image(1))
+    cv2.imwrite(str(folder / "images/2.png"), deep)
+    text = (folder / "poses.csv").read_text()
+    (folder / "poses.csv").write_text(text.replace("0.png", "0.bmp").replace("1.png", "1.pgm"))
+    recording = open_recording(import_folder(folder, tmp_path / "out.mcap").path)
+    for (_, picture), expected in zip(recording.pictures(), [colour, make_image(1), deep], strict=True):
+        np.testing.assert_array_equal(picture.image, expected)
+        assert picture.image.dtype == expected.dtype
+
+
+def test_a_byte_order_mark_spaces_and_crlf_are_fine(folder: Path, tmp_path: Path) -> None:
+    text = (folder / "poses.csv").read_text().replace(",", ", ").replace("\n", "\r\n") + "\r\n"
+    (folder / "poses.csv").write_bytes(b"\xef\xbb\xbf" + text.encode())
+    assert import_folder(folder, tmp_path / "out.mcap").pictures == 3
+
+
+def cut_picture(folder: Path) -> None:
+    path = folder / "images/1.png"
+    path.write_bytes(path.read_bytes()[:-40])
+
+
+def cut_jpeg(folder: Path) -> None:
+    data = cv2.imencode(".jpg", make_image(1))[1].tobytes()
+    (folder / "images/1.png").write_bytes(data[:-20])
+
+
+def flip_picture(folder: Path) -> None:
+    data = bytearray((folder / "images/1.png").read_bytes())
+    data[len(data) // 2] ^= 1
+    (folder / "images/1.png").write_bytes(data)
+
+
+def another_size(folder: Path) -> None:
+    cv2.imwrite(str(folder / "images/2.png"), make_image(2, 40, 30))
+
+
+def huge_header(folder: Path) -> None:
+    data = bytearray((folder / "images/1.png").read_bytes())
+    data[16:24] = (30000).to_bytes(4, "big") * 2
+    (folder / "images/1.png").write_bytes(data)
+
+
+BAD: dict[str, tuple[Change, str]] = {
+    "no dataset": (lambda f: (f / "dataset.yaml").unlink(), r"dataset.yaml is missing"),
+    "no poses": (lambda f: (f / "poses.csv").unlink(), r"poses.csv is missing"),
+    "wrong header": (
+        edit("poses.csv", "qx,qy,qz,qw", "qw,qx,qy,qz"),
+        r"line 1: the header is .*must be 'image,x,y",
+    ),
+    "no header": (edit("poses.csv", "image,x,y,z,qx,qy,qz,qw\n", ""), r"line 1: the header is"),
+    "only a header": (lambda f: (f / "poses.csv").write_text("image,x,y,z,qx,qy,qz,qw\n"), r"no poses"),
+    "empty": (lambda f: (f / "poses.csv").write_text(""), r"the header is 'nothing'"),
+    "column missing": (edit("poses.csv", "0.1,0.2,0.3,0,", "0.1,0.2,0.3,"), r"line 3: 7 values where 8"),
+    "not a number": (edit("poses.csv", "0.1,0.2", "0.1,abc"), r"line 3: y = 'abc' is not a number"),
+    "decimal comma": (edit("poses.csv", "0.1,0.2", '"0,1",0.2'), r"line 3: x = '0,1' is not a number"),
+    "nan": (edit("poses.csv", "0.1,0.2", "nan,0.2"), r"line 3: x = nan is not finite"),
+    "infinite": (edit("poses.csv", "0.1,0.2", "inf,0.2"), r"line 3: x = inf is not finite"),
+    "zero quaternion": (
+        edit("poses.csv", "0.7071067811865476,0.7071067811865476", "0,0"),
+        r"line 2: .*length is 0,",
+    ),
+    "rotation vector": (
+        edit("poses.csv", "0.7071067811865476,0.7071067811865476", "1.57,0"),
+        r"not a rotation vector",
+    ),
+    "millimetres": (edit("poses.csv", "0.1,0.2", "612.3,0.2"), r"line 3: .*612.3 m away.*not millimetres"),
+    "twice": (
+        edit("poses.csv", "images/2.png", "images/0.png"),
+        r"line 4: images/0.png stands already in line 2",
+    ),
+    "no image name": (edit("poses.csv", "images/1.png", ""), r"line 3: the image's name is missing"),
+    "binary poses": (lambda f: (f / "poses.csv").write_bytes(b"\xff\xfe\x00"), r"not UTF-8"),
+    "picture missing": (
+        lambda f: (f / "images/1.png").unlink(),
+        r"line 3: picture images/1.png cannot be read",
+    ),
+    "picture unreadable": (lambda f: (f / "images/1.png").write_text("no"), r"line 3: .*neither PNG"),
+    "picture empty": (lambda f: (f / "images/1.png").write_bytes(b""), r"line 3: .*neither PNG"),
+    "picture cut": (cut_picture, r"line 3: .*the PNG is cut"),
+    "jpeg cut": (cut_jpeg, r"line 3: .*the JPEG is cut"),
+    "picture damaged": (flip_picture, r"line 3: .*the PNG is damaged"),
+    "header of 30000×30000": (huge_header, r"line 3: .*impossible size 30000×30000"),
+    "mixed sizes": (another_size, r"line 4: picture images/2.png is 40×30, dataset.yaml says 32×24"),
+    "outside": (edit("poses.csv", "images/1.png", "../../secret.png"), r"line 3: .*outside the folder"),
+    "unknown mount": (edit("dataset.yaml", "eye-in-hand", "on-hand"), r"Invalid enum value 'on-hand'.*mount"),
+    "unknown key": (edit("dataset.yaml", "note:", "nota:"), r"unknown field `nota`"),
+    "board kind": (
+        edit("dataset.yaml", "kind: chessboard", "kind: chess"),
+        r"Invalid enum value 'chess'.*board.kind",
+    ),
+    "board size": (edit("dataset.yaml", "columns: 7", "columns: 0"), r"0×6 columns×rows"),
+    "square in mm": (edit("dataset.yaml", "0.025", "25"), r"square_m = 25.0 is not a length in metres"),
+    "exponent without dot": (edit("dataset.yaml", "0.025", "25e-3"), r"Expected `float`.*not 25e-3"),
+    "key twice": (
+        edit("dataset.yaml", "note:", "mount: eye-in-hand\nnote:"),
+        r"line 5: 'mount' stands here twice",
+    ),
+    "alias": (edit("dataset.yaml", "made", "&a made\nx: *a #"), r"aliases"),
+    "tag": (edit("dataset.yaml", "made", "!!python/object:os.system made"), r"not plain YAML"),
+    "brackets": (lambda f: (f / "dataset.yaml").write_text("[" * 100_000), r"nested too deeply"),
+    "not yaml": (edit("dataset.yaml", "mount:", "mount: : :"), r"not plain YAML: line 1"),
+    "a list": (lambda f: (f / "dataset.yaml").write_text("- 1\n"), r"Expected `object`"),
+    "huge": (lambda f: (f / "dataset.yaml").write_text("#" * 300_000), r"larger than 256 kB"),
+    "singular camera": (
+        edit("dataset.yaml", "height: 24", "height: 24, matrix: [[0,0,0],[0,0,0],[0,0,1]]"),
+        r"positive focal lengths",
+    ),
+    "distortion alone": (
+        edit("dataset.yaml", "height: 24", "height: 24, distortion: [0.1]"),
+        r"without matrix",
+    ),
+    "charuco without markers": (
+        edit("dataset.yaml", "chessboard", "charuco"),
+        r"needs marker_m and dictionary",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_a_bad_folder_says_what_where_and_what_to_do(folder: Path, tmp_path: Path, name: str) -> None:
+    change, message = BAD[name]
+    change(folder)
+    with pytest.raises(ImportFolderError, match=message):
+        import_folder(folder, tmp_path / "out.mcap")
+    assert [p.name for p in tmp_path.iterdir()] == ["pictures"], "something half-written was left behind"
+
+
+def test_the_command_line_ends_with_one_paragraph_and_no_traceback(folder: Path, tmp_path: Path) -> None:
+    result = CliRunner().invoke(main, ["import", str(folder / "nowhere"), "-o", str(tmp_path / "out.mcap")])
+    assert result.exit_code == 1
+    assert result.stderr.startswith("error: ")
+    assert "is not a folder" in result.stderr
+    assert "Traceback" not in result.output
+
+
+def test_the_command_line_prints_one_json_object(folder: Path, tmp_path: Path) -> None:
+    output = tmp_path / "out.mcap"
+    result = CliRunner().invoke(main, ["import", str(folder), "-o", str(output), "--json"])
+    assert result.exit_code == 0
+    assert json.loads(result.stdout) == {"recording": str(output), "views": 3, "bytes": output.stat().st_size}
+
+
+def test_an_existing_output_is_not_touched(folder: Path, tmp_path: Path) -> None:
+    output = tmp_path / "out.mcap"
+    output.write_text("precious")
+    with pytest.raises(RecordingError, match="exists already"):
+        import_folder(folder, output)
+    assert output.read_text() == "precious"
+
+
+def test_quaternions_turn_as_scipy_says() -> None:
+    from scipy.spatial.transform import Rotation
+
+    for q in Rotation.random(20, random_state=1).as_quat():
+        matrix = np.array(matrix_from_quaternion([1.0, 2.0, 3.0], q.tolist()))
+        np.testing.assert_allclose(matrix[:3, :3], Rotation.from_quat(q).as_matrix(), atol=1e-12)
+        assert matrix[:3, 3].tolist() == [1, 2, 3]
+
+
+def test_every_real_dataset_imports(datasets: Path, tmp_path: Path) -> None:
+    folders = sorted(path.parent for path in datasets.glob("*/dataset.yaml"))
+    assert folders
+    for source in folders:
+        done = import_folder(source, tmp_path / f"{source.name}.mcap")
+        recording = open_recording(done.path)
+        camera = recording.info.camera
+        assert len(recording.views()) == done.pictures == len((source / "poses.csv").read_text().split()) - 1
+        assert recording.picture(recording.views()[0]).image.shape[:2] == (camera.height, camera.width)

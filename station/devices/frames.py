@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+from collections import deque
+
+from recordings.messages import Picture
 from station.clocks import ClockEstimator, ClockFit
 from station.errors import CameraError
 
 LAST_FRAME_ID = 65_535
 """GigE Vision block ids run from 1 to this and start over at 1; 0 means "no frame"."""
 UNKNOWN_READOUT_S = 0.05
-_ROUND_TRIP_SPREAD = 1.5
-"""Readings of the device clock that took longer than this times the quickest one say too little."""
+GOOD_ROUND_TRIP_NS = 500_000
+"""A slower reading of the device clock counts only if it is at most twice as slow as the quickest one."""
+READINGS_KEPT = 200
 
 
 def next_frame_id(frame_id: int) -> int:
@@ -89,36 +93,37 @@ class DeviceClock:
 
     def __init__(self) -> None:
         self._estimator = ClockEstimator()
-        self._quickest_ns: int | None = None
+        self._round_trips_ns: deque[int] = deque(maxlen=READINGS_KEPT)
 
     def reading(self, device_ns: int, asked_monotonic_ns: int, answered_monotonic_ns: int) -> None:
         """The device showed `device_ns` at some moment between asking and the answer."""
         round_trip_ns = max(answered_monotonic_ns - asked_monotonic_ns, 1)
-        if self._quickest_ns is None or round_trip_ns < self._quickest_ns:
-            self._quickest_ns = round_trip_ns
-        if round_trip_ns > _ROUND_TRIP_SPREAD * self._quickest_ns:
+        quickest_ns = min(self._round_trips_ns, default=round_trip_ns)
+        if round_trip_ns > max(2 * quickest_ns, GOOD_ROUND_TRIP_NS):
             return
-        self._estimator.latency_s = _ROUND_TRIP_SPREAD * self._quickest_ns / 2e9
+        self._round_trips_ns.append(round_trip_ns)
+        self._estimator.latency_s = max(self._round_trips_ns) / 2e9
         self._estimator.add(device_ns / 1e9, asked_monotonic_ns + round_trip_ns // 2)
 
     def restart(self) -> None:
         self._estimator.reset()
-        self._quickest_ns = None
+        self._round_trips_ns.clear()
 
     @property
     def fit(self) -> ClockFit | None:
         return self._estimator.fit()
 
 
-def mid_exposure(
-    start_device_ns: int, arrival_monotonic_ns: int, exposure_us: float, clock: ClockFit | None
-) -> tuple[int, float]:
-    """Host monotonic time (ns) of the middle of an exposure and its 95 % bound (s).
+def mid_exposure(picture: Picture, clock: ClockFit | None) -> tuple[int, float]:
+    """Host monotonic time (ns) of the middle of a picture's exposure, and its 95 % bound (s).
 
-    By the camera's clock where one is known; else from the first packet's arrival, where all that is known
-    is that the exposure ended before it, and readout takes less than `UNKNOWN_READOUT_S`.
+    By the camera's clock where one is known; else from the first packet's arrival, of which all that is
+    known is that it comes after the exposure, by `UNKNOWN_READOUT_S` at most.
     """
-    half_ns = round(exposure_us * 500)
-    if clock is not None:
-        return clock.to_host_ns(start_device_ns / 1e9) + half_ns, clock.bound_s
-    return arrival_monotonic_ns - half_ns - round(UNKNOWN_READOUT_S * 5e8), UNKNOWN_READOUT_S / 2
+    half_ns = round(picture.exposure_us * 500)
+    if clock is not None and picture.stamps.device_ns:
+        device_s = picture.stamps.device_ns / 1e9
+        beyond_s = clock.drift_uncertainty * max(0.0, device_s - clock.reference_s)
+        return clock.to_host_ns(device_s) + half_ns, clock.bound_s + beyond_s
+    readout_ns = round(UNKNOWN_READOUT_S * 1e9)
+    return picture.stamps.host_monotonic_ns - readout_ns // 2 - half_ns, readout_ns / 2e9

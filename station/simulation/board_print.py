@@ -121,11 +121,10 @@ def board_print(board: BoardSpec) -> BoardPrint:
         )
     if board.kind is BoardKind.CHARUCO:
         first_white = board.legacy and rows % 2 == 0
-        squares = _Squares(columns, rows, s, origin_m=0.0, first_white=first_white)
+        squares = _Squares(columns, rows, s, origin_m=-s, first_white=first_white)
         markers = _charuco_markers(board)
-        return BoardPrint(
-            (-0.5 * s, -0.5 * s, (columns + 0.5) * s, (rows + 0.5) * s), _Markers(squares, markers)
-        )
+        sheet = (-1.5 * s, -1.5 * s, (columns - 0.5) * s, (rows - 0.5) * s)
+        return BoardPrint(sheet, _Markers(squares, markers))
     return _april_grid(board)
 
 
@@ -150,12 +149,15 @@ def _marker(
 
 
 def _charuco_markers(board: BoardSpec) -> tuple[_Marker, ...]:
+    """OpenCV counts from the outer corner of the first square, the board's frame from the first inner one."""
     dictionary = _dictionary(board, "DICT_4X4_250")
     marker_m = board.marker_m or 0.75 * board.square_m
     layout = cv2.aruco.CharucoBoard((board.columns, board.rows), board.square_m, marker_m, dictionary)
     layout.setLegacyPattern(board.legacy)
     return tuple(
-        _marker(dictionary, int(number), 1, np.asarray(corners, dtype=np.float32))
+        _marker(
+            dictionary, int(number), 1, np.asarray(corners, dtype=np.float32) - np.float32(board.square_m)
+        )
         for number, corners in zip(np.asarray(layout.getIds()).ravel(), layout.getObjPoints(), strict=True)
     )
 

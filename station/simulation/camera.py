@@ -61,6 +61,7 @@ class RenderedCamera:
             stdout=asyncio.subprocess.PIPE,
             limit=_PIPE_LIMIT,
         )
+        self._frames, self._answers = asyncio.Queue(), asyncio.Queue()
         self.counter.restart()
         self._device_clock.restart()
         self._reader = asyncio.create_task(self._read(self._process))
@@ -72,8 +73,9 @@ class RenderedCamera:
         }
         try:
             await self._ask(setup, START_TIMEOUT_S)
-            for _ in range(_CLOCK_READINGS):
-                await self._read_clock()
+            async with self._asking:
+                for _ in range(_CLOCK_READINGS):
+                    await self._read_clock()
         except BaseException:
             await self.close()
             raise
@@ -82,7 +84,7 @@ class RenderedCamera:
     async def capture(self, timeout_s: float = 5.0) -> Picture:
         """One trigger, one frame; a frame that was there before the trigger is an error, not the answer."""
         async with self._asking:
-            await self._read_clock_locked()
+            await self._read_clock()
             if not self._frames.empty():
                 raise self.counter.surplus(self._drain())
             self._write({"cmd": "trigger"})
@@ -145,10 +147,6 @@ class RenderedCamera:
         return count
 
     async def _read_clock(self) -> None:
-        async with self._asking:
-            await self._read_clock_locked()
-
-    async def _read_clock_locked(self) -> None:
         asked_ns = time.monotonic_ns()
         answer = await self._ask_locked({"cmd": "clock"}, 2.0)
         if isinstance(answer, dict):
@@ -187,7 +185,7 @@ class RenderedCamera:
                     case "preview":
                         self._answers.put_nowait(await _picture(process.stdout, header))
                     case "error":
-                        error = CameraError(f"the rendered camera cannot see the arm: {header['text']}")
+                        error = CameraError(f"the rendered camera: {header['text']}")
                         (self._frames if header["cmd"] == "trigger" else self._answers).put_nowait(error)
                     case _:
                         self._answers.put_nowait(header)

@@ -146,7 +146,7 @@ def serve(lines: BinaryIO, out: BinaryIO) -> None:
         try:
             for header, pixels in camera.answer(request):
                 _send(out, header, pixels)
-        except RobotError as error:
+        except (RobotError, ValueError) as error:
             _send(out, {"kind": "error", "cmd": request["cmd"], "text": str(error)}, None)
 
 

@@ -35,7 +35,7 @@ PAPER_X = (
 """Eq. 23 of the paper, flange_from_camera; rounded there, so its rotation is made orthonormal here."""
 _START_DEG = (0.0, -94.0, -90.0, -86.0, 90.0, 0.0)
 """The flange points straight down, half a metre over the table."""
-_GUESS_M, _GUESS_RAD = 0.005, 0.03
+_GUESS_M, _GUESS_RAD = 0.004, 0.02
 """Error of the guesses, 1 sigma per axis"""
 
 

@@ -1,0 +1,167 @@
+"""YAML that means what it says: files written by people, read into strict types, all problems at once.
+
+YAML 1.1 as PyYAML reads it surprises: `no` is false, `010` is 8, `12:30:45` is a number, `1e-3` is text,
+the last of two equal keys wins, and ten lines of aliases can expand to gigabytes. Here only true and false
+are booleans, numbers are decimal, and aliases, tags and duplicate keys are errors.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from types import NoneType, UnionType
+from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+
+import msgspec
+import yaml
+
+LIMIT_BYTES = 256 * 1024
+_NEST_LIMIT = 20
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Problem:
+    line: int
+    """From 1; 0 = the whole file."""
+    where: str
+    """'limits.speed_m_s'"""
+    text: str
+
+    def __str__(self) -> str:
+        place = f"line {self.line}: " if self.line else ""
+        return f"{place}{self.where + ': ' if self.where else ''}{self.text}"
+
+
+class StrictYamlError(ValueError):
+    """Everything that is wrong with one file."""
+
+    def __init__(self, problems: list[Problem]) -> None:
+        super().__init__("\n".join(map(str, problems)))
+        self.problems = problems
+
+
+class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # yaml has no types
+    """Plain data of the YAML 1.2 core schema."""
+
+    yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
+    depth = 0
+
+    def compose_node(self, parent: Any, index: Any) -> Any:
+        mark = self.peek_event().start_mark
+        if self.check_event(yaml.AliasEvent) or getattr(self.peek_event(), "anchor", None):
+            raise yaml.MarkedYAMLError(problem="anchors (&) and aliases (*) are refused", problem_mark=mark)
+        if getattr(self.peek_event(), "tag", None):
+            raise yaml.MarkedYAMLError(problem="tags (!) are refused", problem_mark=mark)
+        self.depth += 1
+        if self.depth > _NEST_LIMIT:
+            raise yaml.MarkedYAMLError(problem="nested too deeply", problem_mark=mark)
+        node = super().compose_node(parent, index)
+        self.depth -= 1
+        return node
+
+
+for _tag, _pattern, _first in (
+    ("null", r"~|null|", "~n"),
+    ("bool", r"true|false", "tf"),
+    ("int", r"[-+]?(0|[1-9][0-9]*)", "-+0123456789"),
+    ("float", r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.inf|\.nan", "-+.0123456789"),
+):
+    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), list(_first))
+_Loader.add_implicit_resolver("tag:yaml.org,2002:null", re.compile("^$"), [""])
+_Loader.add_constructor("tag:yaml.org,2002:float", lambda _, node: _float(node.value))
+
+
+def _float(text: str) -> float:
+    return float(text.replace(".inf", "inf").replace(".nan", "nan"))
+
+
+def load(content: bytes, kind: type[T]) -> T:
+    """The file's content as `kind`, a msgspec struct. Raises StrictYamlError with all problems and lines."""
+    if len(content) > LIMIT_BYTES:
+        raise StrictYamlError([Problem(0, "", f"larger than {LIMIT_BYTES // 1024} kB")])
+    try:
+        loader = _Loader(content)
+        node = loader.get_single_node()
+        problems = list(_problems(node, kind, "")) if node else [Problem(0, "", "the file is empty")]
+        if problems:
+            raise StrictYamlError(problems)
+        plain = loader.construct_document(node)
+    except yaml.MarkedYAMLError as error:
+        line = error.problem_mark.line + 1 if error.problem_mark else 0
+        raise StrictYamlError([Problem(line, "", str(error.problem))]) from None
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError, OverflowError) as error:
+        if isinstance(error, StrictYamlError):
+            raise
+        raise StrictYamlError([Problem(0, "", f"not YAML: {error}")]) from None
+    try:
+        return msgspec.convert(plain, kind)
+    except msgspec.ValidationError as error:
+        raise StrictYamlError([Problem(0, "", str(error))]) from None
+
+
+def _problems(node: yaml.Node, kind: Any, where: str) -> Iterator[Problem]:
+    """Walks the tree beside the type, so that one report names every wrong key and value."""
+    line = node.start_mark.line + 1
+    options = [k for k in _options(kind) if k is not NoneType]
+    if node.tag.endswith(":null") and len(options) < len(_options(kind)):
+        return
+    structs = [k for k in options if isinstance(k, type) and issubclass(k, msgspec.Struct)]
+    if structs and isinstance(node, yaml.MappingNode):
+        yield from _struct_problems(node, structs[0], where)
+    elif (
+        isinstance(node, yaml.SequenceNode) and len(options) == 1 and get_origin(options[0]) in (tuple, list)
+    ):
+        item = get_args(options[0])
+        if len(item) == 1 or item[-1] is Ellipsis:
+            for i, child in enumerate(node.value):
+                yield from _problems(child, item[0], f"{where}[{i}]")
+        elif len(node.value) != len(item):
+            yield Problem(line, where, f"{len(item)} values are needed, {len(node.value)} are here")
+        else:
+            for i, (child, child_kind) in enumerate(zip(node.value, item, strict=True)):
+                yield from _problems(child, child_kind, f"{where}[{i}]")
+    else:
+        yield from _leaf_problems(node, kind, where)
+
+
+def _struct_problems(node: yaml.MappingNode, kind: type[msgspec.Struct], where: str) -> Iterator[Problem]:
+    hints = get_type_hints(kind)
+    fields = {f.encode_name: f for f in msgspec.structs.fields(kind)}
+    seen: set[str] = set()
+    for key, value in node.value:
+        name, line = str(key.value), key.start_mark.line + 1
+        inside = f"{where}.{name}" if where else name
+        if name in seen:
+            yield Problem(line, inside, "stands here twice")
+        elif name not in fields:
+            near = difflib.get_close_matches(name, fields, n=1)
+            hint = f"did you mean '{near[0]}'?" if near else f"known here: {', '.join(fields)}"
+            yield Problem(line, inside, f"unknown key; {hint}")
+        else:
+            yield from _problems(value, hints[fields[name].name], inside)
+        seen.add(name)
+    for name, field in fields.items():
+        if field.required and name not in seen:
+            yield Problem(node.start_mark.line + 1, f"{where}.{name}" if where else name, "is missing")
+
+
+def _leaf_problems(node: yaml.Node, kind: Any, where: str) -> Iterator[Problem]:
+    line = node.start_mark.line + 1
+    loader = _Loader("")
+    value = loader.construct_object(node, deep=True)
+    try:
+        msgspec.convert(value, kind)
+    except msgspec.ValidationError as error:
+        found = f" (found {node.value[:40]!r})" if isinstance(node, yaml.ScalarNode) else ""
+        yield Problem(line, where, f"{error}{found}")
+        return
+    if isinstance(value, float) and not math.isfinite(value):
+        yield Problem(line, where, "is not a finite number")
+
+
+def _options(kind: Any) -> tuple[Any, ...]:
+    return get_args(kind) if get_origin(kind) in (Union, UnionType) else (kind,)

@@ -1,0 +1,80 @@
+"""Files written by people: what YAML would read differently than meant is refused, all of it at once."""
+
+from __future__ import annotations
+
+import math
+
+import msgspec
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from recordings.strict_yaml import StrictYamlError, load
+
+
+class Inner(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    speed_m_s: float
+    name: str = ""
+
+
+class Outer(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    inner: Inner
+    point_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    many: tuple[Inner, ...] = ()
+    on: bool = False
+    count: int = 0
+    maybe: Inner | None = None
+
+
+def problems(text: str) -> list[str]:
+    with pytest.raises(StrictYamlError) as caught:
+        load(text.encode(), Outer)
+    return [str(p) for p in caught.value.problems]
+
+
+def test_numbers_and_words_mean_what_they_look_like() -> None:
+    outer = load(b"inner: {speed_m_s: 1e-3, name: no}\ncount: 10\npoint_m: [1, 2.5, -.5]\nmaybe: null", Outer)
+    assert outer.inner == Inner(0.001, "no")
+    assert outer.point_m == (1.0, 2.5, -0.5)
+
+
+def test_all_problems_come_in_one_report_with_their_lines() -> None:
+    found = problems(
+        "inner:\n  speed_ms: 3\n  name: [1]\npoint_m: [1, 2]\nmany: [{speed_m_s: fast}]\non: yes\n"
+    )
+    assert found[0].startswith("line 2: inner.speed_ms: unknown key; did you mean 'speed_m_s'?")
+    assert any(p.startswith("line 2: inner.speed_m_s: is missing") for p in found)
+    assert any(p.startswith("line 3: inner.name:") for p in found)
+    assert any(p.startswith("line 4: point_m: 3 values are needed, 2 are here") for p in found)
+    assert any(p.startswith("line 5: many[0].speed_m_s:") and "'fast'" in p for p in found)
+    assert any(p.startswith("line 6: on:") and "'yes'" in p for p in found)
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        ("inner: {speed_m_s: 1, speed_m_s: 2}", "twice"),
+        ("inner: &a {speed_m_s: 1}\nmaybe: *a", "anchors"),
+        ("inner: !!python/object:os.system {}", "tags"),
+        ("inner: {speed_m_s: .nan}", "finite"),
+        ("inner: {speed_m_s: .inf}", "finite"),
+        ("inner: {speed_m_s: 12:30:45}", "12:30:45"),
+        ("inner: {speed_m_s: 1}\ncount: 010", "010"),
+        ("[" * 100_000, "nested"),
+        ("", "empty"),
+        ("inner: {speed_m_s: 1", "line 1"),
+        ("- 1", "object"),
+        ("x" * 300_000, "larger than 256 kB"),
+    ],
+)
+def test_traps_are_refused(text: str, said: str) -> None:
+    assert said in "\n".join(problems(text))
+
+
+@given(st.binary(max_size=200))
+@settings(max_examples=150, deadline=None)
+def test_any_bytes_give_a_value_or_a_report(content: bytes) -> None:
+    try:
+        assert math.isfinite(load(content, Outer).inner.speed_m_s)
+    except StrictYamlError as error:
+        assert error.problems

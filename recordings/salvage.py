@@ -10,6 +10,7 @@ import os
 import re
 import zlib
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 
 from recordings.contents import Contents
@@ -169,9 +170,10 @@ class _Walk:
         summary = self._read(start, end - start)
         if zlib.crc32(tail[: FOOTER_BYTES - 4], zlib.crc32(summary)) != crc or offsets_start > end:
             return
-        for _, opcode, content in split_records(memoryview(summary)):
-            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._take_in(0, opcode, content)
+        with suppress(BadRecordError):
+            for _, opcode, content in split_records(memoryview(summary)):
+                if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                    self._take_in(0, opcode, content)
 
 
 def _proven_records(content: memoryview) -> tuple[memoryview, int]:

@@ -1,0 +1,79 @@
+"""A small MCAP of shapes in space over time: what Foxglove, Lichtblick and rerun show in a 3D panel."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from foxglove_schemas_protobuf.LinePrimitive_pb2 import LinePrimitive
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from google.protobuf.message import Message
+from mcap_protobuf.writer import Writer
+from numpy.typing import NDArray
+
+from recordings.errors import RecordingError
+from recordings.files import sync_folder
+
+TOPIC = "/plan/scene"
+Colour = tuple[float, float, float, float]
+"""Red, green, blue, opacity, each 0…1."""
+
+
+@dataclass(frozen=True, eq=False)
+class Line:
+    """A polyline (n, 3) in the entity's frame, metres."""
+
+    points: NDArray[np.float64]
+    colour: Colour
+    width_m: float = 0.003
+
+
+@dataclass(frozen=True)
+class Entity:
+    """Things that appear together; one of the same name later replaces it."""
+
+    name: str
+    frame: str
+    lines: tuple[Line, ...] = ()
+    text: str = ""
+    text_at_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+
+def write_scene(path: Path, steps: Sequence[tuple[float, Sequence[Entity]]]) -> None:
+    """Writes (seconds, entities) steps in time order, whole or not at all. RecordingError with the remedy."""
+    part = path.with_name(path.name + ".part")
+    try:
+        with part.open("wb") as stream:
+            writer = Writer(stream)
+            for seconds, entities in steps:
+                time_ns = int(seconds * 1e9)
+                writer.write_message(TOPIC, _update(entities, time_ns), time_ns, time_ns)
+            writer.finish()
+            stream.flush()
+            os.fsync(stream.fileno())
+        part.replace(path)
+        sync_folder(path.parent)
+    except OSError as error:
+        part.unlink(missing_ok=True)
+        raise RecordingError(f"cannot write {path}: {error.strerror}; choose another folder") from error
+
+
+def _update(entities: Sequence[Entity], time_ns: int) -> Message:
+    update = SceneUpdate()
+    for entity in entities:
+        made = update.entities.add(id=entity.name, frame_id=entity.frame)
+        made.timestamp.seconds, made.timestamp.nanos = divmod(time_ns, 1_000_000_000)
+        for line in entity.lines:
+            shape = made.lines.add(type=LinePrimitive.LINE_STRIP, thickness=line.width_m)
+            shape.pose.orientation.w = 1.0
+            shape.color.r, shape.color.g, shape.color.b, shape.color.a = line.colour
+            for x, y, z in line.points:
+                shape.points.add(x=x, y=y, z=z)
+        if entity.text:
+            label = made.texts.add(text=entity.text, font_size=0.02, billboard=True)
+            label.pose.position.x, label.pose.position.y, label.pose.position.z = entity.text_at_m
+            label.pose.orientation.w = label.color.a = 1.0
+    return update

@@ -70,6 +70,7 @@ class RtdeConnection(Connection):
         self._every = 1
         self._playing = False
         self._last = b""
+        self._busy_until_s = 0.0
         self._handlers = {
             PacketType.PROTOCOL_VERSION: self._protocol_version,
             PacketType.CONTROLLER_VERSION: self._controller_version,
@@ -169,10 +170,13 @@ class RtdeConnection(Connection):
         if not (server.frozen and self._last):
             assert self._output is not None
             self._last = self._output.pack(self._elements(self._robot.outputs.elements)[:-1])
-        if server.delay_s > 0:
-            asyncio.get_running_loop().call_later(server.delay_s, self._write, self._last)
-        else:
+        loop = asyncio.get_running_loop()
+        due_s = loop.time() + server.delay_s
+        if due_s > self._busy_until_s and server.delay_s == 0:
             self._write(self._last)
+        else:  # never overtakes what was sent before it
+            self._busy_until_s = max(due_s, self._busy_until_s + 1e-6)
+            loop.call_at(self._busy_until_s, self._write, self._last)
 
     def _write(self, data: bytes) -> None:
         """Skips the packet when the client does not read, like the real one; never queues."""

@@ -111,7 +111,10 @@ class ControlScript:
 
     def _note(self, command: int) -> None:
         name = COMMANDS.get(command, f"command {command}")
-        self._robot.journal.note("script", name, id=command, arguments=list(self._doubles(0, 8)))
+        has_effect = command in self._commands or command == END_PROGRAM
+        self._robot.journal.note(
+            "script", name, id=command, arguments=list(self._doubles(0, 8)), has_effect=has_effect
+        )
 
     def _process(self, command: int) -> None:
         """Unknown ids and those without an effect here are acknowledged like the real script does."""

@@ -51,7 +51,7 @@ def write_scene(path: Path, steps: Sequence[tuple[float, Sequence[Entity]]]) -> 
             for seconds, entities in steps:
                 time_ns = int(seconds * 1e9)
                 writer.write_message(TOPIC, _update(entities, time_ns), time_ns, time_ns)
-            writer.finish()
+            writer.finish()  # type: ignore[no-untyped-call]
             stream.flush()
             os.fsync(stream.fileno())
         part.replace(path)

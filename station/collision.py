@@ -173,6 +173,8 @@ def _plane_margins(
     for plane in geometry.limits.planes:
         normal = np.array(plane.normal) / np.linalg.norm(plane.normal)
         height = np.minimum((starts - plane.point_m) @ normal, (ends - plane.point_m) @ normal)
+        # The upper arm's near end is the shoulder, which stands where it was bolted down.
+        height[:, 2] = (ends[:, 2] - plane.point_m) @ normal
         columns.append(height[:, movers] - radii[movers] - geometry.limits.clearance_m)
         labels += [f"{body} against {plane.name}" for body in geometry.body_names[movers]]
     return np.concatenate(columns, axis=1) if columns else np.zeros((len(starts), 0)), labels

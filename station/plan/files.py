@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import csv
 import math
-import re
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -14,21 +13,35 @@ import yaml
 
 from calibrate.geometry import Array, pose_from_quaternion
 from calibrate.kinematics import MODELS, forward, inverse_nearest
+from recordings import strict_yaml
 from recordings.files import write_atomically
 from recordings.messages import Mount
 from station.errors import ConfigError
 from station.plan.model import Plan, PlannedPose
 
-_SIZE_LIMIT_BYTES = 4_000_000
-_POSE_LIMIT = 2000
+_POSE_LIMIT = 200
 _JOINTS_DEG = [f"j{i}_deg" for i in range(1, 7)]
 _JOINTS_RAD = [f"j{i}_rad" for i in range(1, 7)]
 _POSE = ["x", "y", "z", "qx", "qy", "qz", "qw"]
 
 
+class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # yaml has no types
+    """Without anchors: equal rows are written out, as the strict reader wants them."""
+
+    def ignore_aliases(self, data: object) -> bool:
+        return True
+
+
 def save_plan(plan: Plan, path: Path) -> None:
     """Writes `plan.yaml` in one step. ConfigError with the remedy when the disk refuses."""
-    text = yaml.safe_dump(msgspec.to_builtins(plan), sort_keys=False, default_flow_style=None, width=110)
+    text = yaml.dump(
+        msgspec.to_builtins(plan),
+        Dumper=_Dumper,
+        sort_keys=False,
+        default_flow_style=None,
+        width=110,
+        allow_unicode=True,
+    )
     try:
         write_atomically(path, text.encode())
     except OSError as error:
@@ -39,55 +52,32 @@ def save_plan(plan: Plan, path: Path) -> None:
 
 def load_plan(path: Path) -> Plan:
     """Reads and checks `plan.yaml`. ConfigError lists every problem that can be seen, with its line."""
-    text = _read(path)
-    return parse_plan(text, str(path))
+    return parse_plan(_read(path), str(path))
 
 
-def parse_plan(text: str, name: str = "plan") -> Plan:
-    """The same for text that is already here (an attachment of a recording, an editor)."""
+def parse_plan(content: bytes, name: str = "plan") -> Plan:
+    """The same for what is already here (an attachment of a recording, an editor)."""
     try:
-        # The pure-Python node tree knows the lines that msgspec's message does not.
-        tree = yaml.compose(text, Loader=yaml.SafeLoader)
-        plan = msgspec.convert(yaml.safe_load(text), Plan, strict=True)
-    except yaml.YAMLError as error:
-        mark = getattr(error, "problem_mark", None)
-        where = f", line {mark.line + 1}" if mark else ""
-        raise ConfigError(
-            f"{name}{where}: not readable as YAML ({getattr(error, 'problem', error)})"
-        ) from error
-    except msgspec.ValidationError as error:
-        raise ConfigError(f"{name}{_line_of(tree, str(error))}: {error}") from error
-    problems = _value_problems(plan)
-    if problems:
-        raise ConfigError("\n".join(f"{name}: {problem}" for problem in problems))
+        plan = strict_yaml.load(content, Plan)
+    except strict_yaml.StrictYamlError as error:
+        raise _report(name, [str(problem) for problem in error.problems]) from None
+    if problems := _value_problems(plan):
+        raise _report(name, problems)
     return plan
 
 
-def _read(path: Path) -> str:
+def _report(name: str, problems: list[str]) -> ConfigError:
+    count = f"{len(problems)} problem{'s' if len(problems) > 1 else ''}"
+    return ConfigError("\n".join([f"{name}: {count}", *(f"  {problem}" for problem in problems)]))
+
+
+def _read(path: Path) -> bytes:
     try:
-        if path.stat().st_size > _SIZE_LIMIT_BYTES:
-            raise ConfigError(f"{path} is larger than {_SIZE_LIMIT_BYTES // 1_000_000} MB: not a plan")
-        return path.read_text(encoding="utf-8")
+        if path.stat().st_size > strict_yaml.LIMIT_BYTES:
+            raise ConfigError(f"{path} is larger than {strict_yaml.LIMIT_BYTES // 1024} kB: not a plan")
+        return path.read_bytes()
     except OSError as error:
-        raise ConfigError(f"cannot read {path}: {error.strerror}; is the name right?") from error
-    except UnicodeDecodeError as error:
-        raise ConfigError(f"{path} is not a text file; a plan is YAML, a list is CSV") from error
-
-
-def _line_of(tree: yaml.Node | None, message: str) -> str:
-    """', line N' of the node that msgspec's `$.poses[3].name` speaks of."""
-    found = re.search(r"`\$([^`]*)`", message)
-    node = tree
-    for key, index in re.findall(r"\.(\w+)|\[(\d+)\]", found.group(1) if found else ""):
-        below: yaml.Node | None = None
-        if isinstance(node, yaml.MappingNode) and key:
-            below = next((value for name, value in node.value if name.value == key), None)
-        elif isinstance(node, yaml.SequenceNode) and index and int(index) < len(node.value):
-            below = node.value[int(index)]
-        if below is None:
-            break
-        node = below
-    return f", line {node.start_mark.line + 1}" if node is not None else ""
+        raise ConfigError(f"cannot read {path}: {error.strerror}; is the name right?") from None
 
 
 def _value_problems(plan: Plan) -> list[str]:
@@ -139,7 +129,10 @@ def import_list(path: Path, robot: str, mount: Mount, near_joints_rad: Sequence[
     Poses are base_from_flange in metres; each takes the arm branch nearest to the one before (the first:
     nearest to `near_joints_rad`, which is needed then). ConfigError names file, row and remedy.
     """
-    rows = list(csv.reader(_read(path).splitlines()))
+    try:
+        rows = list(csv.reader(_read(path).decode().splitlines()))
+    except UnicodeDecodeError:
+        raise ConfigError(f"{path} is not a text file; a list is CSV") from None
     if not rows:
         raise ConfigError(
             f"{path} is empty; the first row must name the columns, e.g. {','.join(_JOINTS_DEG)}"
@@ -166,7 +159,7 @@ def import_list(path: Path, robot: str, mount: Mount, near_joints_rad: Sequence[
         poses.append(_plain_pose(robot, name, near, f"from {path.name}"))
     plan = Plan(robot=robot, mount=mount, poses=tuple(poses), note=f"imported from {path.name}")
     if problems := _value_problems(plan):
-        raise ConfigError("\n".join(f"{path}: {problem}" for problem in problems))
+        raise _report(str(path), problems)
     return plan
 
 

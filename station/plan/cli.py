@@ -1,0 +1,173 @@
+"""`station plan`: makes, imports, checks and shows pose plans. The arm is never touched."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.table import Table
+
+from recordings.errors import RecordingError
+from station.config import StationConfig
+from station.config_file import load_config
+from station.errors import ConfigError, LimitError, StationError
+from station.limits import PlanCheck, check_plan
+from station.plan.files import import_list, load_plan, save_plan
+from station.plan.foxglove import save_scene
+from station.plan.model import Plan, plan_sha256
+from station.plan.planner import make_plan
+from station.plan.preview import save_picture
+from station.plan.scene import cell_geometry, scene_of
+from station.plan.sketch import sketch
+
+_errors = Console(stderr=True)
+_NOTHING_KNOWN_M = 0.05
+"""A larger expected error says no more than that there are too few poses yet."""
+
+
+def plan_command(
+    config: Annotated[
+        Path | None, typer.Option(help="The cell's configuration; none: a simulated cell.")
+    ] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Where plan.yaml goes.")] = None,
+    check: Annotated[Path | None, typer.Option(help="Check this plan instead of making one.")] = None,
+    from_list: Annotated[Path | None, typer.Option(help="CSV of joints or flange poses instead.")] = None,
+    start: Annotated[
+        str | None, typer.Option(help="Joints where the arm stands, degrees: 0,-90,90,…")
+    ] = None,
+    poses: Annotated[int, typer.Option(min=3, max=200, help="How many.")] = 25,
+    seed: Annotated[int, typer.Option(help="The same seed gives the same plan.")] = 0,
+    scene: Annotated[str, typer.Option(help="Simulated cell: paper or blog.")] = "paper",
+    picture: Annotated[Path | None, typer.Option(help="Save a picture of the plan (png, svg, pdf).")] = None,
+    foxglove: Annotated[Path | None, typer.Option(help="Save a scene for Foxglove (mcap).")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, nothing else.")] = False,
+) -> None:
+    """Make a pose plan, or check one. Nothing moves."""
+    try:
+        cell, standing = _cell(config, scene, start)
+        plan = _plan(cell, standing, check, from_list, poses, seed, quiet=as_json)
+        outcome = check_plan(plan, standing, cell_geometry(cell))
+        if output is not None and check is None:
+            save_plan(plan, output)
+        shown = None if cell.camera_guess is None or cell.board_guess is None else scene_of(cell)
+        if shown is not None and picture is not None:
+            save_picture(shown, plan, picture)
+        if shown is not None and foxglove is not None:
+            save_scene(shown, plan, foxglove)
+    except (StationError, RecordingError) as error:
+        _errors.print(f"[bold red]error:[/] {error}", soft_wrap=True, highlight=False)
+        raise typer.Exit(error.exit_code) from None
+    if as_json:
+        typer.echo(json.dumps(_summary(plan, outcome)))
+    else:
+        _show(
+            plan, outcome, sketch(shown, plan) if shown is not None else "", output if check is None else None
+        )
+    if outcome.problems:
+        raise typer.Exit(LimitError.exit_code)
+
+
+def _cell(config: Path | None, scene: str, start: str | None) -> tuple[StationConfig, list[float] | None]:
+    """The cell to plan for, and where its arm stands."""
+    standing = _joints(start) if start is not None else None
+    if config is not None:
+        return load_config(config)[0], standing
+    # Simulation is loaded only where it is wanted.
+    from station.simulation.scenes import build_cell, cell_config
+
+    truth = build_cell(scene, 0, "low", "eye-in-hand")  # type: ignore[arg-type]
+    return cell_config(truth), standing or list(truth.start_joints_rad)
+
+
+def _joints(text: str) -> list[float]:
+    try:
+        degrees = [float(part) for part in text.replace(";", ",").split(",")]
+    except ValueError:
+        degrees = []
+    if len(degrees) != 6 or not np.isfinite(degrees).all():
+        raise ConfigError(
+            f"--start {text!r}: six joint angles in degrees are needed, e.g. 0,-90,90,-90,-90,0"
+        )
+    return [float(np.deg2rad(angle)) for angle in degrees]
+
+
+def _plan(
+    cell: StationConfig,
+    standing: list[float] | None,
+    check: Path | None,
+    from_list: Path | None,
+    poses: int,
+    seed: int,
+    quiet: bool,
+) -> Plan:
+    if check is not None and from_list is not None:
+        raise ConfigError("--check and --from-list exclude each other; give one of them")
+    if check is not None:
+        return load_plan(check)
+    if from_list is not None:
+        return import_list(from_list, cell.robot.model, cell.mount, standing)
+    with Progress(
+        TextColumn("{task.description}"), BarColumn(), console=_errors, transient=True, disable=quiet
+    ) as bar:
+        task = bar.add_task("planning", total=1.0)
+
+        def report(text: str, done: float) -> None:
+            bar.update(task, description=text, completed=done)
+
+        return make_plan(cell, start_joints_rad=standing, seed=seed, count=poses, progress=report)
+
+
+def _summary(plan: Plan, outcome: PlanCheck) -> dict[str, Any]:
+    last = plan.poses[-1].predicted_sigma_m if plan.poses else None
+    return {
+        "plan_sha256": plan_sha256(plan),
+        "poses": len(plan.poses),
+        "robot": plan.robot,
+        "mount": plan.mount,
+        "duration_s": round(outcome.duration_s, 3),
+        "path_m": round(outcome.path_m, 4),
+        "largest_step_rad": round(outcome.largest_step_rad, 4),
+        "top_speed_m_s": round(outcome.top_speed_m_s, 4),
+        "expected_sigma_mm": None if last is None else round(1000 * last, 4),
+        "note": plan.note,
+        "problems": [msgspec.to_builtins(vars(problem)) for problem in outcome.problems],
+    }
+
+
+def _show(plan: Plan, outcome: PlanCheck, picture: str, output: Path | None) -> None:
+    console = Console(highlight=False, soft_wrap=True)
+    table = Table(box=None, pad_edge=False)
+    for heading in ("pose", "move s", "turn °", "margin mm", "σ mm"):
+        table.add_column(heading, justify="left" if heading == "pose" else "right", no_wrap=True)
+    table.add_column("why")
+    for pose, move in zip(plan.poses, outcome.moves, strict=True):
+        known = pose.predicted_sigma_m is not None and pose.predicted_sigma_m < _NOTHING_KNOWN_M
+        sigma = f"{1000 * (pose.predicted_sigma_m or 0):.2f}" if known else "–"
+        table.add_row(
+            pose.name,
+            f"{move.duration_s:.1f}",
+            f"{np.rad2deg(move.step_rad):.0f}",
+            f"{1000 * move.margin_m:.0f}",
+            sigma,
+            pose.why,
+        )
+    console.print(table)
+    if picture:
+        console.print(picture, markup=False)
+    console.print(
+        f"{len(plan.poses)} poses, {outcome.duration_s:.0f} s of motion over {outcome.path_m:.1f} m, "
+        f"at most {outcome.top_speed_m_s:.2f} m/s and {np.rad2deg(outcome.largest_step_rad):.0f}° in one move"
+    )
+    if plan.note:
+        console.print(f"note: {plan.note}")
+    for problem in outcome.problems:
+        console.print(f"[red]✗[/] {problem}")
+    if output is not None:
+        console.print(f"written to {output}")
+    console.print("check: " + ("FAILED, nothing may move" if outcome.problems else "passed"))

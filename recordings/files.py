@@ -12,6 +12,8 @@ from recordings.errors import RecordingError
 
 PART_SUFFIX = ".part"
 """Of a recording that is being written; gone once it is finished and on the disk."""
+EMPTY_SUFFIX = ".empty"
+"""Of a session's part that was begun but holds nothing; recovery sets it aside."""
 _SESSION_NAME = re.compile(r"[a-z0-9-]{1,40}")
 _ATTACHMENT_NAME = re.compile(r"[a-z0-9]([a-z0-9_-]|\.(?!\.)){0,39}")
 

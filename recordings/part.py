@@ -33,6 +33,7 @@ class RecordingPart:
     def __init__(self, path: Path) -> None:
         """Raises UnsealedRecordingError, CorruptRecordingError or RecordingError."""
         self.path = path
+        self._descriptor = -1
         self._descriptor = open_file(path)
         try:
             self.size_bytes = os.fstat(self._descriptor).st_size
@@ -46,12 +47,16 @@ class RecordingPart:
             self._check_picture_pairs()
             self.views = self._checked_views()
         except BaseException:
-            os.close(self._descriptor)
+            self._close()
             raise
 
     def __del__(self) -> None:
-        if hasattr(self, "_topics"):
+        self._close()
+
+    def _close(self) -> None:
+        if self._descriptor >= 0:
             os.close(self._descriptor)
+            self._descriptor = -1
 
     def messages(self, topic: Topic) -> MessageIndex:
         """Where a topic's messages lie, with their times; empty when there are none."""

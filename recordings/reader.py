@@ -8,7 +8,7 @@ from itertools import chain
 from pathlib import Path
 
 from recordings.errors import CorruptRecordingError, RecordingError, UnsealedRecordingError
-from recordings.files import PART_SUFFIX
+from recordings.files import EMPTY_SUFFIX, PART_SUFFIX
 from recordings.messages import CaptureEvent, Picture, RobotState, SessionInfo, View
 from recordings.part import RecordingPart
 
@@ -102,15 +102,28 @@ def _open_parts(folder: Path) -> list[RecordingPart]:
             f"{folder} holds {len(files)} recordings: name one of them, or one session's folder"
         )
     parts = sorted((RecordingPart(folder / name) for name in files), key=lambda part: part.info.part)
+    _check_one_session(folder, parts, sum(name.endswith(EMPTY_SUFFIX) for name in names))
+    return parts
+
+
+def _check_one_session(folder: Path, parts: list[RecordingPart], set_aside: int) -> None:
+    """The parts are of one session and none is missing, but for as many as recovery found empty."""
     first = parts[0].info
-    for number, part in enumerate(parts, start=1):
+    for before, part in zip([None, *parts], parts, strict=False):
         info = part.info
-        if (info.name, info.mount, info.board) != (first.name, first.mount, first.board):
+        if (info.name, info.mount, info.board, info.source) != (
+            first.name,
+            first.mount,
+            first.board,
+            first.source,
+        ):
             raise RecordingError(
                 f"{part.path} and {parts[0].path} are of different sessions: name one of them, not the folder"
             )
-        if info.camera != first.camera or info.source != first.source:
+        if info.camera != first.camera or info.camera_identity.serial != first.camera_identity.serial:
             raise RecordingError(f"{part.path} was recorded with another camera than {parts[0].path}")
-        if info.part != number:
-            raise CorruptRecordingError(f"part {number} of session '{first.name}' is missing in {folder}")
-    return parts
+        set_aside -= info.part - 1 - (before.info.part if before else 0)
+        if set_aside < 0:
+            raise CorruptRecordingError(f"a part before {part.path} of session '{first.name}' is missing")
+        if before and before.info.part == info.part:
+            raise CorruptRecordingError(f"{before.path} and {part.path} are both part {info.part}")

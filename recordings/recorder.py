@@ -62,6 +62,8 @@ class Recorder:
         self._queued_bytes = 0
         self._dropped_pictures: set[int] = set()
         self._wake = threading.Condition()
+        self._awaited: Future[None] | None = None
+        """Of the item that is being written."""
         self._finished: Future[Path] | None = None
         self._closing = False
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
@@ -90,7 +92,7 @@ class Recorder:
 
     def view(self, view: View) -> None:
         """Raises RecordingError when its picture was dropped or an earlier write failed."""
-        if view.picture_sequence in self._dropped_pictures:
+        if self.error is None and view.picture_sequence in self._dropped_pictures:
             raise RecordingError(
                 f"the picture of pose {view.index} was dropped, the disk is too slow: take the pose again"
             )
@@ -108,6 +110,7 @@ class Recorder:
     def sync(self) -> Future[None]:
         """Resolves when everything handed over before is on the disk; fails with RecordingError."""
         done: Future[None] = Future()
+        done.set_running_or_notify_cancel()  # nobody who stops waiting can cancel the writing
         try:
             self._put(_Item(lambda: None, 0, done))
         except RecordingError as error:
@@ -119,6 +122,7 @@ class Recorder:
         with self._wake:
             if self._finished is None:
                 self._finished = Future()
+                self._finished.set_running_or_notify_cancel()
                 if self.error is not None:
                     self._finished.set_exception(self.error)
                 self._wake.notify()
@@ -199,16 +203,12 @@ class Recorder:
             return item
 
     def _write(self, item: _Item) -> None:
-        try:
-            item.write()
-            if item.done is not None:
-                self._sync()
-        except BaseException as error:
-            if item.done is not None:
-                item.done.set_exception(error)
-            raise
+        self._awaited = item.done
+        item.write()
         if item.done is not None:
+            self._sync()
             item.done.set_result(None)
+        self._awaited = None
 
     def _sync(self) -> None:
         start_s = self._clock()
@@ -218,10 +218,11 @@ class Recorder:
     def _fail(self, error: RecordingError) -> None:
         with self._wake:
             self.error = error
-            waiting = [item.done for item in self._queue if item.done is not None]
+            futures = [self._awaited, *(item.done for item in self._queue)]
             self._queue.clear()
             self._queued_bytes = 0
             if self._finished is not None and not self._finished.done():
                 self._finished.set_exception(error)
-        for future in waiting:
-            future.set_exception(error)
+        for future in futures:
+            if future is not None:
+                future.set_exception(error)

@@ -11,7 +11,7 @@ from mcap.writer import CompressionType, Writer
 
 from recordings.contents import Contents
 from recordings.errors import CorruptRecordingError, RecordingError, UnsealedRecordingError
-from recordings.files import PART_SUFFIX, create_exclusively, lock, rename_new, sync_folder
+from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, create_exclusively, lock, rename_new, sync_folder
 from recordings.messages import View
 from recordings.part import RecordingPart
 from recordings.records import MESSAGE_HEAD, RECORD_HEAD, Opcode, split_records, with_crc
@@ -22,7 +22,12 @@ from recordings.topics import Topic
 from recordings.writer import CHUNK_BYTES, LIBRARY, DirectFile
 
 DAMAGED_SUFFIX = ".damaged"
+
 _DATA_OFFSET = RECORD_HEAD.size + MESSAGE_HEAD.size
+
+
+class NothingToSaveError(RecordingError):
+    """Not even the description of the session is whole."""
 
 
 @dataclass(frozen=True)
@@ -55,8 +60,18 @@ def recover(source: Path, output: Path | None = None) -> list[Recovery]:
         files = sorted(p for p in source.iterdir() if p.name.endswith((".mcap", ".mcap" + PART_SUFFIX)))
         if not files:
             raise RecordingError(f"{source} holds no recording (*.mcap, *.mcap.part)")
-        return [_recover_file(path, None) for path in files]
+        return [_recover_part(path) for path in files]
     return [_recover_file(source, output)]
+
+
+def _recover_part(source: Path) -> Recovery:
+    """Of a session: a part that was begun but holds nothing is set aside, the session goes on without it."""
+    try:
+        return _recover_file(source, None)
+    except NothingToSaveError as error:
+        aside = source.with_name(source.name + EMPTY_SUFFIX)
+        rename_new(source, aside)
+        return Recovery(source, aside, 0, 0, 0, aside.stat().st_size, (str(error),))
 
 
 def _recover_file(source: Path, output: Path | None) -> Recovery:
@@ -105,7 +120,7 @@ def _rebuild(descriptor: int, source: Path, final: Path, in_place: bool) -> Reco
         (found.contents.metadata[n] for n in SESSION_RECORDS if n in found.contents.metadata), None
     )
     if session is None:
-        raise RecordingError(
+        raise NothingToSaveError(
             f"nothing can be saved from {source}: the description of the session itself is lost "
             f"({os.fstat(descriptor).st_size} bytes)"
         )

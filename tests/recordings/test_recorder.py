@@ -1,0 +1,269 @@
+"""The recorder: acknowledged means on the disk, drops are counted, the first error is the last."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import threading
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from recordings import recorder as recorder_module
+from recordings.errors import RecordingError
+from recordings.messages import CaptureEvent, Stamps
+from recordings.reader import open_recording
+from recordings.recorder import Recorder
+from recordings.writer import RecordingWriter
+from tests.recordings.small_recording import make_info, make_picture, make_state, make_view
+
+TIMEOUT_S = 20.0
+
+
+class Gate:
+    """Holds the writer thread up in its first write until opened: a disk that does not answer."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.opened = threading.Event()
+        self.reached = threading.Event()
+        original = RecordingWriter.event
+
+        def slow_event(writer: RecordingWriter, event: CaptureEvent) -> None:
+            self.reached.set()
+            assert self.opened.wait(TIMEOUT_S)
+            original(writer, event)
+
+        monkeypatch.setattr(RecordingWriter, "event", slow_event)
+
+
+def event(kind: str = "note") -> CaptureEvent:
+    return CaptureEvent(Stamps(), kind)
+
+
+def test_a_session_from_several_threads_comes_back_complete(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "a.mcap", make_info())
+
+    def send_states() -> None:
+        for count in range(2000):
+            assert recorder.robot_state(make_state(count))
+
+    robot = threading.Thread(target=send_states)
+    robot.start()
+    for index in range(10):
+        assert recorder.picture(make_picture(index))
+        recorder.view(make_view(index))
+        recorder.sync().result(TIMEOUT_S)
+    robot.join()
+    recorder.attach("plan.yaml", "application/yaml", b"x")
+    recording = open_recording(recorder.finish().result(TIMEOUT_S))
+    assert list(recording.robot_states()) == [make_state(i) for i in range(2000)]
+    assert [view.index for view in recording.views()] == list(range(10))
+    assert recorder.dropped == 0
+
+
+def test_sync_resolves_only_after_fdatasync_of_what_came_before(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    order: list[str] = []
+    real_sync, real_view = os.fdatasync, RecordingWriter.view
+
+    def fdatasync(descriptor: int) -> None:
+        order.append(f"sync {os.fstat(descriptor).st_size}")
+        real_sync(descriptor)
+
+    def view(writer: RecordingWriter, written: object) -> None:
+        real_view(writer, written)  # type: ignore[arg-type]
+        order.append(f"view {writer.bytes_written}")
+
+    monkeypatch.setattr(os, "fdatasync", fdatasync)
+    monkeypatch.setattr(RecordingWriter, "view", view)
+    recorder = Recorder(tmp_path / "a.mcap", make_info(), clock=lambda: 0.0)
+    recorder.picture(make_picture(0))
+    recorder.view(make_view(0))
+    recorder.sync().result(TIMEOUT_S)
+    size = recorder.part_path.stat().st_size
+    assert order == [f"view {size}", f"sync {size}"]
+    recorder.close()
+
+
+def test_data_reach_the_system_and_the_disk_without_being_asked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = 0.0
+    synced = threading.Event()
+    real_sync = os.fdatasync
+
+    def fdatasync(descriptor: int) -> None:
+        real_sync(descriptor)
+        synced.set()
+
+    monkeypatch.setattr(os, "fdatasync", fdatasync)
+    recorder = Recorder(tmp_path / "a.mcap", make_info(), clock=lambda: now_s)
+    recorder.robot_state(make_state(0))
+    now_s = recorder_module.FLUSH_PERIOD_S * 1.01
+    wait_until(lambda: b"station.RobotState" in recorder.part_path.read_bytes())
+    assert not synced.is_set()
+    now_s = recorder_module.SYNC_PERIOD_S * 1.01
+    assert synced.wait(TIMEOUT_S)
+    recorder.close()
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    pause = threading.Event()
+    for _ in range(int(TIMEOUT_S / 0.01)):
+        if condition():
+            return
+        pause.wait(0.01)
+    raise AssertionError("it never came true")
+
+
+def test_a_slow_disk_costs_counted_pictures_and_never_a_view(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gate = Gate(monkeypatch)
+    size = make_picture(0).image.nbytes
+    recorder = Recorder(tmp_path / "a.mcap", make_info(), queue_limit_bytes=3 * size + 500)
+    recorder.event(event())
+    assert gate.reached.wait(TIMEOUT_S)
+    kept = [recorder.picture(make_picture(sequence)) for sequence in range(5)]
+    assert kept == [True, True, True, False, False]
+    assert recorder.queued_bytes >= 3 * size
+    assert recorder.dropped == 2
+    recorder.view(make_view(0))
+    with pytest.raises(RecordingError, match=r"dropped.*take the pose again"):
+        recorder.view(make_view(4))
+    gate.opened.set()
+    recording = open_recording(recorder.finish().result(TIMEOUT_S))
+    assert recording.parts[0].picture_sequences() == [0, 1, 2]
+    assert [view.index for view in recording.views()] == [0]
+
+
+def test_the_callers_never_wait_for_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    gate = Gate(monkeypatch)
+    recorder = Recorder(tmp_path / "a.mcap", make_info())
+    recorder.event(event())
+    assert gate.reached.wait(TIMEOUT_S)
+    for count in range(recorder_module.QUEUE_LIMIT_MESSAGES + 7):  # returns although nothing is written
+        recorder.robot_state(make_state(count))
+    recorder.event(event())
+    done = recorder.sync()
+    assert not done.done()
+    assert recorder.dropped == 7
+    gate.opened.set()
+    done.result(TIMEOUT_S)
+    recorder.close()
+
+
+def break_disk_after(monkeypatch: pytest.MonkeyPatch, good_writes: int) -> None:
+    real_write = os.write
+    count = 0
+
+    def write(descriptor: int, data: bytes) -> int:
+        nonlocal count
+        count += 1
+        if count > good_writes:
+            raise OSError(28, "No space left on device")
+        return real_write(descriptor, data)
+
+    monkeypatch.setattr("recordings.writer.os.write", write)
+
+
+def test_the_first_write_error_is_final_and_said_to_everyone(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = Recorder(tmp_path / "a.mcap", make_info())
+    recorder.picture(make_picture(0))
+    recorder.view(make_view(0))
+    recorder.sync().result(TIMEOUT_S)
+    safe = recorder.part_path.read_bytes()
+    break_disk_after(monkeypatch, 0)
+    recorder.picture(make_picture(1))
+    with pytest.raises(RecordingError, match=r"No space left on device.*recordings recover"):
+        recorder.sync().result(TIMEOUT_S)
+    assert recorder.error is not None
+    monkeypatch.undo()  # space is free again, and still nothing more is written
+    assert not recorder.picture(make_picture(2))
+    for call in (lambda: recorder.view(make_view(2)), lambda: recorder.event(event())):
+        with pytest.raises(RecordingError, match="No space left"):
+            call()
+    with pytest.raises(RecordingError, match="No space left"):
+        recorder.sync().result(TIMEOUT_S)
+    with pytest.raises(RecordingError, match="No space left"):
+        recorder.finish().result(TIMEOUT_S)
+    assert recorder.part_path.read_bytes() == safe
+    assert not (tmp_path / "a.mcap").exists()
+
+
+def test_waiting_syncs_fail_with_the_error_and_nobody_hangs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gate = Gate(monkeypatch)
+    recorder = Recorder(tmp_path / "a.mcap", make_info())
+    recorder.event(event())
+    assert gate.reached.wait(TIMEOUT_S)
+    recorder.picture(make_picture(0))
+    waiting = [recorder.sync() for _ in range(3)]
+    finishing = recorder.finish()
+    break_disk_after(monkeypatch, 0)
+    gate.opened.set()
+    for future in (*waiting, finishing):
+        with pytest.raises(RecordingError, match="No space left"):
+            future.result(TIMEOUT_S)
+
+
+@pytest.mark.parametrize("call", ["fdatasync", "fsync"])
+def test_an_error_of_the_sync_itself_is_as_final(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
+) -> None:
+    recorder = Recorder(tmp_path / "a.mcap", make_info(), clock=lambda: 0.0)
+    recorder.picture(make_picture(0))
+
+    def fail(descriptor: int) -> None:
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(os, call, fail)
+    if call == "fdatasync":
+        with pytest.raises(RecordingError, match="Input/output error"):
+            recorder.sync().result(TIMEOUT_S)
+    with pytest.raises(RecordingError, match="Input/output error"):
+        recorder.finish().result(TIMEOUT_S)
+    assert not (tmp_path / "a.mcap").exists()
+
+
+async def test_a_task_that_stops_waiting_does_not_harm_the_recording(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    gate = Gate(monkeypatch)
+    recorder = Recorder(tmp_path / "a.mcap", make_info())
+    recorder.event(event())
+    waiting = asyncio.wrap_future(recorder.sync())
+    waiting.cancel()
+    gate.opened.set()
+    recorder.picture(make_picture(0))
+    assert open_recording(await asyncio.wrap_future(recorder.finish())).parts[0].picture_sequences() == [0]
+
+
+def test_closing_leaves_the_part_file_for_recovery(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "a.mcap", make_info())
+    recorder.picture(make_picture(0))
+    recorder.close()
+    recorder.close()
+    assert recorder.part_path.exists()
+    with pytest.raises(RecordingError, match="finished"):
+        recorder.event(event())
+
+
+def test_lossless_png_is_smaller_and_the_same(tmp_path: Path) -> None:
+    smooth = make_picture(0)
+    smooth.image[:] = 7
+    sizes = []
+    for lossless in (False, True):
+        recorder = Recorder(tmp_path / f"{lossless}.mcap", make_info(), lossless_png=lossless)
+        recorder.picture(smooth)
+        recorder.view(make_view(0))
+        path = recorder.finish().result(TIMEOUT_S)
+        ((_, picture),) = open_recording(path).pictures()
+        assert (picture.image == 7).all()
+        sizes.append(path.stat().st_size)
+    assert sizes[1] < sizes[0]

@@ -54,17 +54,12 @@ class Objective:
         reduced = self.gram[np.ix_(_REST, _REST)] - cross @ self._b_inverse() @ cross.T
         return np.asarray((reduced + reduced.T) / 2)
 
-    def covariance(self, X: Array) -> Array:
-        """(6, 6) of `geometry.perturb`'s delta at the optimum X, as if all pairs were independent.
-
-        Gauss-Newton with the residuals' own variance f/(6n - 6). Pairs share views, so this is rough; it
-        serves where there is nothing better (the paper's profile).
-        """
+    def curvature(self, X: Array) -> Array:
+        """(6, 6) half the Gauss-Newton Hessian at X, for `geometry.perturb`'s delta."""
         J = np.zeros((13, 6))
         J[9:12, :3] = _I3
         J[:9, 3:] = (skew(_I3) @ X[:3, :3]).reshape(3, 9).T
-        variance = max(self.value(X), 0.0) / max(6 * self.pairs - 6, 1)
-        return np.asarray(variance * np.linalg.pinv(J.T @ self.gram @ J, hermitian=True))
+        return np.asarray(J.T @ self.gram @ J)
 
     def _b_inverse(self) -> Array:
         return np.asarray(np.linalg.pinv(self.gram[9:12, 9:12], rcond=1e-10, hermitian=True))

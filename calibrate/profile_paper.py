@@ -20,6 +20,7 @@ from calibrate.certificate import certify
 from calibrate.frames import board_frames, camera_frames
 from calibrate.geometry import Transform
 from calibrate.objective import build_objective
+from calibrate.pair_covariance import pair_covariance
 from calibrate.pairs import consecutive_pairs, mount_poses
 from calibrate.paper import solve_paper
 from calibrate.solution import Certificate, Solution, SolveOptions
@@ -40,7 +41,7 @@ def solve_paper_profile(views: ViewSet, options: SolveOptions) -> Solution:
     result = solve_paper(fit, options.seed)
     solved = time.perf_counter()
     X, indices = result.X, [view.index for view in views]
-    covariance = result.objective.covariance(X)
+    covariance = pair_covariance(result.objective, fit, X)
     distance = options.working_distance_m or median_distance_m(C)
     parent, _ = camera_frames(views.mount)
     certificate = certify(build_objective(fit, "log", centre=X), _PROBLEM.format(len(fit))).certificate

@@ -1,26 +1,31 @@
-"""`--profile robust`: certain first estimate over all pairs, then what makes it precise and honest."""
+"""`--profile robust`: certain first estimate, then what makes it precise and honest."""
 
 from __future__ import annotations
 
-import time
+from dataclasses import replace
 
-from scipy import stats
+import numpy as np
 
 from calibrate.assess import (
-    board_places,
     board_spread,
-    mean_pose,
+    distance_in_sigmas,
     median_distance_m,
     observe,
     point_error_m,
-    require_motion,
     score_holdout,
 )
+from calibrate.board_poses import refine_board_poses
+from calibrate.consensus import pose_arrays
+from calibrate.estimate import Estimate
+from calibrate.fit import Fit, fit_views
 from calibrate.frames import board_frames, camera_frames
 from calibrate.geometry import Transform
-from calibrate.pairs import all_pairs, mount_poses
-from calibrate.robust import solve_global
-from calibrate.solution import HoldoutScore, Solution, SolveOptions
+from calibrate.likelihood.model import observe_views
+from calibrate.likelihood.residuals import corner_residuals, robot_residuals
+from calibrate.pair_covariance import pair_covariance
+from calibrate.pairs import all_pairs
+from calibrate.solution import ErrorBudget, HoldoutScore, NoiseScales, Solution, SolveOptions
+from calibrate.stopwatch import Stopwatch
 from calibrate.views import ViewSet
 
 HELD_OUT = 6
@@ -28,47 +33,95 @@ HELD_OUT = 6
 
 
 def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
-    start = time.perf_counter()
-    H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
-    pairs = all_pairs(H, C)
-    require_motion(pairs)
-    result = solve_global(
-        pairs, options.seed, f"chordal objective over {len(pairs)} pairs of {len(views)} views"
-    )
-    X = result.X
-    covariance = result.objective.covariance(X)
-    distance = options.working_distance_m or median_distance_m(C)
-    spread_m, spread_rad = board_spread(H, C, X)
-    holdout = _holdout(views, options) if options.holdout else None
-    end = time.perf_counter()
+    """All views to fit; a second fit without the last 6 for the hold-out score."""
+    watch = Stopwatch()
+    free = options.intrinsics_from_same_pictures and views.camera.distortion_model == "plumb_bob"
+    fit = fit_views(views, options.seed, free, options.reject_outliers, watch)
+    result, state = fit.estimate, fit.estimate.state
+    parent, child = camera_frames(views.mount)
+    H, _ = pose_arrays(fit.views)
+    C = fit.boards.C
+    distance = options.working_distance_m or median_distance_m(C[fit.places])
+    spread_m, spread_rad = board_spread(H[fit.places], C[fit.places], state.X)
+    pairs, start = fit.pairs, fit.certified
+    apart = distance_in_sigmas(start.X, state.X, pair_covariance(start.objective, pairs, start.X))
+    holdout = _holdout(fit, options, free) if options.holdout else None
+    watch.lap("hold-out")
+    indices = [view.index for view in fit.views]
     return Solution(
         mount=views.mount,
         profile="robust",
-        parent_from_child=Transform(*camera_frames(views.mount), X),
-        covariance=covariance,
-        confidence_threshold=float(6 * stats.f.ppf(0.95, 6, max(3 * len(views) - 6, 1))),
-        board_place=Transform(*board_frames(views.mount), mean_pose(board_places(H, C, X))),
-        camera=views.camera,
-        rms_px=None,
-        used=tuple(view.index for view in views),
-        rejected=(),
-        certificate=result.certificate,
-        observability=observe(pairs, covariance, distance, camera_frames(views.mount)[0]),
+        parent_from_child=Transform(parent, child, state.X),
+        covariance=result.covariance,
+        confidence_threshold=result.threshold,
+        board_place=Transform(*board_frames(views.mount), state.Y),
+        camera=state.camera,
+        rms_px=_rms_px(fit),
+        used=tuple(indices[i] for i in fit.places),
+        rejected=fit.rejected,
+        certificate=replace(start.certificate, distance_sigma=apart),
+        observability=observe(pairs, result.covariance, distance, parent),
         holdout=holdout,
-        predicted_error_m=point_error_m(X, covariance, distance),
+        turned=tuple(indices[i] for i in sorted(fit.consensus.turned)),
+        noise=NoiseScales(*(float(s) for s in result.sigma[:3])),
+        budget=ErrorBudget(**result.shares),
+        predicted_error_m=point_error_m(state.X, result.covariance, distance),
         working_distance_m=distance,
         board_spread_m=spread_m,
         board_spread_rad=spread_rad,
-        solve_ms=1e3 * (end - start),
+        residual_px={indices[i]: float(fit.boards.rms_px[i]) for i in fit.places},
+        residual_robot=_robot_misses(fit, indices),
+        warnings=_warnings(fit, options, result),
+        stage_ms=watch.stage_ms,
+        solve_ms=watch.total_ms,
         seed=options.seed,
     )
 
 
-def _holdout(views: ViewSet, options: SolveOptions) -> HoldoutScore | None:
-    fitted = len(views) - HELD_OUT
-    if fitted < 4:
+def _holdout(fit: Fit, options: SolveOptions, intrinsics_free: bool) -> HoldoutScore | None:
+    """Fit on all but the last 6 kept views, lens included; score all pairs inside those 6."""
+    kept = fit.views.select(fit.places.tolist())
+    fitted = len(kept) - HELD_OUT
+    if fitted < 5:
         return None
-    H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
-    X = solve_global(all_pairs(H[:fitted], C[:fitted]), options.seed).X
-    scored = all_pairs(H[fitted:], C[fitted:])
-    return score_holdout(X, scored, [view.index for view in views.views[fitted:]], fitted)
+    first = kept.select(list(range(fitted)))
+    last = kept.select(list(range(fitted, len(kept))))
+    partial = fit_views(first, options.seed, intrinsics_free, False, Stopwatch()).estimate.state
+    H, C = pose_arrays(last)
+    boards = refine_board_poses(observe_views(last), replace(partial, C=C))
+    pairs = all_pairs(H, boards.C)
+    note = f"fit on {fitted} views, all {len(pairs)} pairs inside the other {HELD_OUT} scored"
+    return score_holdout(partial.X, pairs, [view.index for view in last], fitted, note)
+
+
+def _rms_px(fit: Fit) -> float | None:
+    """Over all corners of the fitted views, bad ones included with their weight."""
+    if not fit.observed.has_pixels:
+        return None
+    square = (corner_residuals(fit.observed, fit.estimate.state) ** 2).sum(axis=-1)
+    weights = fit.estimate.weights
+    return float(np.sqrt((weights * square).sum() / weights.sum()))
+
+
+def _robot_misses(fit: Fit, indices: list[int]) -> dict[int, tuple[float, float]]:
+    e = robot_residuals(fit.observed, fit.estimate.state)
+    return {
+        indices[i]: (float(np.linalg.norm(row[:3])), float(np.linalg.norm(row[3:])))
+        for i, row in zip(fit.places.tolist(), e, strict=True)
+    }
+
+
+def _warnings(fit: Fit, options: SolveOptions, result: Estimate) -> tuple[str, ...]:
+    warnings = []
+    if options.intrinsics_from_same_pictures and not result.intrinsics_free:
+        warnings.append(
+            "The intrinsics came from the same pictures but could not be refined with X (only the plumb_bob "
+            "model can): their uncertainty is not in the stated sigma."
+        )
+    if not result.converged:
+        warnings.append(f"The final estimate had not settled after {result.steps} steps.")
+    if not fit.certified.certificate.certified:
+        warnings.append("The global optimum of the pair objective could not be certified.")
+    if not fit.observed.has_pixels:
+        warnings.append("No corners were recorded: board poses are taken as exact, all error is the robot's.")
+    return tuple(warnings)

@@ -1,0 +1,1 @@
+"""The maximum-likelihood model: corners, robot poses and what joins them."""

@@ -1,0 +1,175 @@
+"""Which views contradict X, and why: every rejected view is named with its reason.
+
+A view is judged by the distance between its recorded flange pose and the one that X, the board's place and
+its own corners imply, in sigmas of both together (corners and robot).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import stats
+
+from calibrate.board_poses import BoardPoses
+from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
+from calibrate.likelihood.model import Observations, State
+from calibrate.likelihood.residuals import modelled_flange, robot_derivatives, robot_residuals
+from calibrate.pairs import Places, mount_poses
+from calibrate.solution import RejectedView
+from calibrate.views import ImageView, ViewSet
+
+_FALSE_ALARM = 2e-4
+"""Probability that a good view is rejected."""
+_BLURRED = 5.0
+"""A view whose typical corner error is this many times the others' is not trusted."""
+_BLURRED_PX = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Judgement:
+    """All views against one X."""
+
+    distance2: Array
+    """(n,) squared sigmas, 6 degrees of freedom."""
+    miss: Array
+    """(n, 6) modelled against recorded flange."""
+    modelled: Array
+    """(n, 4, 4)"""
+    limit: float
+    blurred: NDArray[np.bool_]
+    """(n,)"""
+
+    @property
+    def good(self) -> Places:
+        return np.flatnonzero((self.distance2 <= self.limit) & ~self.blurred)
+
+
+def judge_views(
+    observed: Observations, state: State, boards: BoardPoses, sigma: Array, fitted: int
+) -> Judgement:
+    """`state` and `boards` speak of all views; X, Y and sigma come from `fitted` of them."""
+    state = replace(state, C=boards.C)
+    miss = robot_residuals(observed, state)
+    _, _, by_C = robot_derivatives(observed, state)
+    covariance = sigma[0] ** 2 * by_C @ boards.covariance @ np.swapaxes(by_C, 1, 2)
+    covariance += np.diag(np.repeat(sigma[1:3] ** 2, 3))
+    distance2 = np.einsum("ni,ni->n", miss, np.linalg.solve(covariance, miss[..., None])[..., 0])
+    limit = float(6 * stats.f.ppf(1 - _FALSE_ALARM, 6, max(3 * fitted - 6, 3)))
+    typical = float(np.median(boards.typical_px))
+    blurred = boards.typical_px > max(_BLURRED * typical, _BLURRED_PX)
+    return Judgement(distance2, miss, modelled_flange(observed, state), limit, blurred)
+
+
+def board_turns(view: ImageView) -> list[Array]:
+    """Rigid maps of the board onto itself: half a turn, and quarter turns where it is square."""
+    if not len(view.board_points):
+        return []
+    low, high = view.board_points.min(axis=0), view.board_points.max(axis=0)
+    centre = (low + high) / 2
+    square = abs((high - low)[0] - (high - low)[1]) < 1e-9
+    turns = []
+    for quarter in (2, 1, 3) if square else (2,):
+        R = rotation_exp([0.0, 0.0, quarter * np.pi / 2])
+        turns.append(pose(R, centre - R @ centre))
+    return turns
+
+
+def turn_view(view: ImageView, turn: Array) -> ImageView:
+    """The same picture with its corners read in turned order."""
+    assert view.camera_from_board is not None
+    return replace(
+        view,
+        board_points=transform_points(turn, view.board_points),
+        camera_from_board=view.camera_from_board @ inverse(turn),
+    )
+
+
+def explain(views: ViewSet, state: State, verdict: Judgement, places: Places) -> tuple[RejectedView, ...]:
+    """Name and reason for each rejected place."""
+    moved = _moved_boards(views, state, verdict, places)
+    return tuple(_explain_one(views, state, verdict, int(i), moved) for i in places)
+
+
+def _explain_one(
+    views: ViewSet, state: State, verdict: Judgement, i: int, moved: dict[int, str]
+) -> RejectedView:
+    view = views.views[i]
+    miss_mm, miss_deg = _size(verdict.miss[i])
+    gap = f"robot and picture disagree by {miss_mm:.2f} mm and {miss_deg:.3f}°"
+    if verdict.blurred[i]:
+        reason = "its corners fit no board pose: blurred, hidden or misread"
+        return RejectedView(view.index, view.name, reason, "corners")
+    other = _owner_of_pose(views, verdict, i)
+    if other is not None:
+        reason = f"wrong pose: it carries the robot pose of view {views.views[other].index} ({gap})"
+        return RejectedView(view.index, view.name, reason, "wrong-pose")
+    if i in moved:
+        return RejectedView(view.index, view.name, f"{moved[i]} ({gap})", "moved-board")
+    scale = _fitting_scale(views, state, i, verdict)
+    if scale is not None:
+        reason = f"wrong square size: with squares {scale:.3f} times as large it would agree ({gap})"
+        return RejectedView(view.index, view.name, reason, "wrong-square-size")
+    return RejectedView(view.index, view.name, f"{gap}: wrong pose, or the board was moved", "inconsistent")
+
+
+def _size(miss: Array) -> tuple[float, float]:
+    return float(np.linalg.norm(miss[:3])) * 1e3, float(np.degrees(np.linalg.norm(miss[3:])))
+
+
+def _tolerance(verdict: Judgement) -> Array:
+    """(2,) m and rad within which two poses pass for the same: 5 typical misses of the good views."""
+    good = verdict.good
+    misses = verdict.miss[good] if len(good) else verdict.miss
+    lengths = [np.linalg.norm(misses[:, :3], axis=1), np.linalg.norm(misses[:, 3:], axis=1)]
+    return np.array([max(5 * float(np.median(v)), 1e-6) for v in lengths])
+
+
+def _owner_of_pose(views: ViewSet, verdict: Judgement, i: int) -> int | None:
+    """Whose modelled flange pose is the one recorded for view i?"""
+    recorded = np.asarray(views.views[i].base_from_flange)
+    delta = difference(verdict.modelled, recorded)
+    tolerance = _tolerance(verdict)
+    near = (np.linalg.norm(delta[:, :3], axis=1) < tolerance[0]) & (
+        np.linalg.norm(delta[:, 3:], axis=1) < tolerance[1]
+    )
+    near[i] = False
+    found = np.flatnonzero(near)
+    return int(found[0]) if len(found) else None
+
+
+def _board_places(views: ViewSet, state: State) -> Array:
+    return np.asarray(mount_poses(views.base_from_flange, views.mount) @ state.X @ state.C)
+
+
+def _moved_boards(views: ViewSet, state: State, verdict: Judgement, places: Places) -> dict[int, str]:
+    """Rejected views that agree with each other on another place of the board."""
+    where = _board_places(views, state)
+    tolerance = 2 * _tolerance(verdict)
+    found: dict[int, str] = {}
+    for i in places:
+        delta = difference(where[places], where[i])
+        near = (np.linalg.norm(delta[:, :3], axis=1) < tolerance[0]) & (
+            np.linalg.norm(delta[:, 3:], axis=1) < tolerance[1]
+        )
+        if near.sum() >= 2:
+            shift_mm, turn_deg = _size(difference(where[i], state.Y))
+            numbers = ", ".join(str(views.views[int(j)].index) for j in places[near])
+            found[int(i)] = (
+                f"moved board: views {numbers} agree on a place {shift_mm:.1f} mm and {turn_deg:.2f}° away"
+            )
+    return found
+
+
+def _fitting_scale(views: ViewSet, state: State, i: int, verdict: Judgement) -> float | None:
+    """Factor on the board's size that brings the view to the board's place; None if none does."""
+    H = mount_poses(views.base_from_flange[i : i + 1], views.mount)[0]
+    camera_in_place = H @ state.X
+    ray = camera_in_place[:3, :3] @ state.C[i, :3, 3]
+    target = state.Y[:3, 3] - camera_in_place[:3, 3]
+    scale = float(ray @ target / (ray @ ray))
+    tolerance = 2 * _tolerance(verdict)
+    left = np.linalg.norm(scale * ray - target)
+    turn = np.linalg.norm(verdict.miss[i, 3:])
+    return scale if left < tolerance[0] and turn < tolerance[1] and abs(scale - 1) > 0.005 else None

@@ -1,0 +1,117 @@
+"""Pinhole projection with lens distortion and its exact derivatives, for many points at once.
+
+OpenCV's models and coefficient order: plumb_bob k1 k2 p1 p2 k3, rational_polynomial + k4 k5 k6,
+equidistant (fisheye) k1 … k4. Pixel (0, 0) is the centre of the top left pixel.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from calibrate.geometry import Array
+from recordings.messages import CameraModel
+
+INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
+"""What the last stage can refine, in this order."""
+
+
+@dataclass(frozen=True, eq=False)
+class Projected:
+    pixels: Array
+    """(..., 2)"""
+    by_point: Array
+    """(..., 2, 3) ∂pixel/∂point, 1/m"""
+    by_intrinsics: Array | None
+    """(..., 2, 9) in the order of INTRINSICS; None unless asked for (plumb_bob only)."""
+
+
+def project(camera: CameraModel, points: Array, with_intrinsics: bool = False) -> Projected:
+    """Points (..., 3) in `camera`, metres. Points at or behind the camera give non-finite pixels."""
+    K = camera_matrix(camera)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        w = 1.0 / points[..., 2]
+    x, y = points[..., 0] * w, points[..., 1] * w
+    if camera.distortion_model == "equidistant":
+        xd, yd, D = _equidistant(x, y, camera.distortion)
+    else:
+        xd, yd, D = _brown(x, y, camera.distortion)
+    skewed = K[0, 1]
+    pixels = np.stack([K[0, 0] * xd + skewed * yd + K[0, 2], K[1, 1] * yd + K[1, 2]], axis=-1)
+    J = np.empty((*points.shape[:-1], 2, 3))
+    by_x = K[:2, :2] @ D
+    J[..., :2] = by_x * w[..., None, None]
+    J[..., 2] = -(by_x[..., 0] * (x * w)[..., None] + by_x[..., 1] * (y * w)[..., None])
+    return Projected(pixels, J, _by_intrinsics(K, x, y, xd, yd) if with_intrinsics else None)
+
+
+def camera_matrix(camera: CameraModel) -> Array:
+    """K (3, 3); ValueError where intrinsics are not known yet."""
+    if camera.matrix is None:
+        raise ValueError("the camera has no matrix yet")
+    return np.array(camera.matrix, dtype=float)
+
+
+def intrinsics_vector(camera: CameraModel) -> Array:
+    """(9,) in the order of INTRINSICS."""
+    K = camera_matrix(camera)
+    distortion = np.zeros(5)
+    distortion[: len(camera.distortion)] = camera.distortion[:5]
+    return np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], distortion])
+
+
+def with_intrinsics_vector(camera: CameraModel, vector: Array) -> CameraModel:
+    """The same plumb_bob camera with other numbers, skew kept."""
+    fx, fy, cx, cy, *distortion = (float(v) for v in vector)
+    skewed = float(camera_matrix(camera)[0, 1])
+    matrix = ((fx, skewed, cx), (0.0, fy, cy), (0.0, 0.0, 1.0))
+    return msgspec.structs.replace(camera, matrix=matrix, distortion=tuple(distortion))
+
+
+def _brown(x: Array, y: Array, coefficients: tuple[float, ...]) -> tuple[Array, Array, Array]:
+    """Radial (rational) and tangential distortion: xd, yd, ∂(xd, yd)/∂(x, y) (..., 2, 2)."""
+    k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, *(0.0,) * 8)[:8]
+    r2 = x * x + y * y
+    top = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    bottom = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+    radial = top / bottom
+    slope = (k1 + r2 * (2 * k2 + 3 * k3 * r2) - radial * (k4 + r2 * (2 * k5 + 3 * k6 * r2))) / bottom
+    xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
+    yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
+    D = np.empty((*x.shape, 2, 2))
+    D[..., 0, 0] = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+    D[..., 0, 1] = D[..., 1, 0] = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+    D[..., 1, 1] = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+    return xd, yd, D
+
+
+def _equidistant(x: Array, y: Array, coefficients: tuple[float, ...]) -> tuple[Array, Array, Array]:
+    """Kannala-Brandt: θd = θ (1 + k1 θ² + … + k4 θ⁸), scaled along the ray's direction."""
+    k1, k2, k3, k4 = (*coefficients, *(0.0,) * 4)[:4]
+    r = np.sqrt(x * x + y * y)
+    safe = np.maximum(r, 1e-9)
+    theta = np.arctan(safe)
+    t2 = theta * theta
+    bent = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
+    slope = (1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))) / (1 + safe * safe)
+    scale = bent / safe
+    along = (slope - scale) / (safe * safe)
+    D = np.empty((*x.shape, 2, 2))
+    D[..., 0, 0] = scale + along * x * x
+    D[..., 0, 1] = D[..., 1, 0] = along * x * y
+    D[..., 1, 1] = scale + along * y * y
+    return x * scale, y * scale, D
+
+
+def _by_intrinsics(K: Array, x: Array, y: Array, xd: Array, yd: Array) -> Array:
+    r2 = x * x + y * y
+    zero, one = np.zeros_like(x), np.ones_like(x)
+    u = [xd, zero, one, zero]
+    v = [zero, yd, zero, one]
+    by_k_x = [x * r2, x * r2 * r2, 2 * x * y, r2 + 2 * x * x, x * r2 * r2 * r2]
+    by_k_y = [y * r2, y * r2 * r2, r2 + 2 * y * y, 2 * x * y, y * r2 * r2 * r2]
+    u += [K[0, 0] * a + K[0, 1] * b for a, b in zip(by_k_x, by_k_y, strict=True)]
+    v += [K[1, 1] * b for b in by_k_y]
+    return np.stack([np.stack(u, axis=-1), np.stack(v, axis=-1)], axis=-2)

@@ -3,11 +3,25 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
+from station.simulation.admin import AdminClient
+from station.simulation.launch import SimulatedController, start_controller
+
 DATASETS = Path(os.environ.get("STATION_DATASETS", Path(__file__).parents[2] / "shared" / "datasets"))
+
+MAY_BE_SENT = {
+    "dashboard: stop", "dashboard: PolyscopeVersion", "dashboard: get serial number",
+    "dashboard: get robot model", "dashboard: is in remote control", "dashboard: robotmode",
+    "dashboard: safetystatus", "dashboard: programState", "dashboard: running",
+    "dashboard: get loaded program", "upload: rtde_control", "script: moveJ", "script: stopJ",
+    "script: setWatchdog", "script: getTCPOffset", "script: stopScript",
+}  # fmt: skip
+"""Everything a station ever says to a controller; a change here is a change of the safety rules."""
 
 
 @pytest.fixture
@@ -16,3 +30,36 @@ def datasets() -> Path:
     if not DATASETS.is_dir():
         pytest.skip(f"no real recordings at {DATASETS} (set STATION_DATASETS)")
     return DATASETS
+
+
+@pytest.fixture
+def only_allowed_was_sent() -> Callable[[str], None]:
+    """`only_allowed_was_sent(host)`: what the simulated controller there was ever asked is on the list."""
+    return check_allow_list
+
+
+def check_allow_list(host: str) -> None:
+    with AdminClient(host) as admin:
+        counts: dict[str, int] = admin.ask("log")["counts"]
+    foreign = {c for c in counts if not c.startswith("controller: ")} - MAY_BE_SENT
+    assert not foreign, f"sent to the robot, but not on the list: {sorted(foreign)}"
+
+
+@pytest.fixture
+def controller() -> Iterator[Callable[..., SimulatedController]]:
+    """Starts simulated controllers: `controller("UR10e", time_scale=…)`. All end with the test, and what
+    each was asked is held against the list of what a station may say."""
+    running: list[SimulatedController] = []
+
+    def start(model: str = "UR10", **options: Any) -> SimulatedController:
+        running.append(start_controller(model, **options))
+        return running[-1]
+
+    yield start
+    try:
+        for child in running:
+            if child.running:
+                check_allow_list(child.host)
+    finally:
+        for child in running:
+            child.stop()

@@ -17,6 +17,18 @@ class Robot(Protocol):
     @property
     def identity(self) -> RobotIdentity: ...
 
+    @property
+    def control(self) -> bool:
+        """The control program runs and obeys us."""
+
+    @property
+    def notice(self) -> str:
+        """What a person should know while a move is under way, though it is no fault; empty = nothing."""
+
+    @property
+    def remote(self) -> bool | None:
+        """Remote control is on; None where there is no such switch or it is not known."""
+
     async def connect(self) -> RobotIdentity:
         """Reads identity and starts the state stream. Raises RobotError."""
 
@@ -28,6 +40,12 @@ class Robot(Protocol):
 
     def at(self, host_monotonic_ns: int) -> RobotState:
         """State interpolated at a host time within the last 10 s; StaleStateError outside."""
+
+    def clock(self) -> ClockFit | None:
+        """The controller's clock against the host's; None while not known."""
+
+    def check(self) -> None:
+        """Raises RobotError for what speaks against capturing now: safety stop, stale state, TCP changed."""
 
     async def start_control(self) -> None:
         """Spawns the control child. Only in answer to a go. RobotError with remedy when refused."""

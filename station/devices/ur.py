@@ -20,14 +20,20 @@ from station.devices.rtde import RuntimeState
 from station.devices.ur_child import ControlChild
 from station.devices.ur_condition import foreign_program, not_powered, program_not_running, safety_stop
 from station.devices.ur_dashboard import STOP, Dashboard
+from station.devices.ur_heart import Heart
 from station.devices.ur_link import UrLink
-from station.devices.ur_moves import MoveWatch
-from station.errors import RobotError
+from station.devices.ur_moves import STALE_S, MoveWatch
+from station.errors import RobotError, SafetyStopError, StaleStateError
 
 log = logging.getLogger(__name__)
 
 POLL_S = 0.005
 STOP_WAIT_S = 0.05
+WATCHDOG_S = 0.15
+"""A pause of the heartbeat that can have tripped the watchdog (1/5 s, and ticks)."""
+PROGRAM_START_NS = 200_000_000
+LEFTOVER_WAIT_NS = 2_000_000_000
+CLOSE_WAIT_S = 0.5
 JOINT_SPEED_LIMIT_RAD_S = 1.05
 JOINT_ACCELERATION_LIMIT_RAD_S2 = 1.5
 LOCAL_CONTROL = "the robot is in local control: switch the pendant to Remote (top right), then give a new go"
@@ -45,12 +51,17 @@ class UrRobot(UrLink):
         self._controls = False
         self._moving = False
         self._stop_reason = ""
+        self._heart = Heart()
         self._background: set[asyncio.Task[Any]] = set()
 
     @property
     def control(self) -> bool:
         """The control program runs and obeys us."""
         return self._controls
+
+    @property
+    def control_pid(self) -> int | None:
+        return self._child.pid if self._child is not None else None
 
     # -- control ----------------------------------------------------------------------------------------
 
@@ -66,11 +77,13 @@ class UrRobot(UrLink):
         try:
             tcp = await child.ready()
             if self._stop_reason:
-                raise RobotError(f"stopped while control was starting: {self._stop_reason}")
+                raise RobotError("stopped")
             if tcp is not None and self._tool is not None:
                 self._tool.agree((tcp[0], tcp[1], tcp[2], tcp[3], tcp[4], tcp[5]))
-        except BaseException:
+        except BaseException as error:
             await self.end_control()
+            if self._stop_reason and isinstance(error, RobotError):
+                raise RobotError(f"stopped while control was starting: {self._stop_reason}") from None
             raise
         self._controls = True
 
@@ -92,6 +105,7 @@ class UrRobot(UrLink):
 
     def heartbeat(self) -> None:
         """Called by the session loop at least every 50 ms while control lives; without it the arm stops."""
+        self._heart.beat()
         if self._child is not None:
             self._child.beat()
 
@@ -125,9 +139,9 @@ class UrRobot(UrLink):
             await child.move(joints_rad, speed_rad_s, acceleration_rad_s2)
             await self._follow(watch, child)
         except BaseException as error:
-            error = self._explain(error)
-            await asyncio.shield(self.stop(str(error) or type(error).__name__))
-            raise error
+            cause = self._explain(error, child)
+            await asyncio.shield(self.stop(str(cause) or type(cause).__name__))
+            raise await self._ask_remote(cause) from None
         finally:
             self._moving = False
             self.notice = ""
@@ -143,16 +157,42 @@ class UrRobot(UrLink):
             self.notice = watch.notice
             await asyncio.sleep(POLL_S)
 
-    def _explain(self, error: BaseException) -> BaseException:
-        """The cause behind a symptom: STOP before all, then safety, then what the program's state says."""
-        if not isinstance(error, RobotError):
+    def _explain(self, error: BaseException, child: ControlChild) -> BaseException:
+        """The cause behind a symptom: STOP first, then safety, the link, our own heartbeat, the child."""
+        reader = self.reader
+        if not isinstance(error, RobotError) or reader is None or reader.newest is None:
             return error
         if self._stop_reason:
             return RobotError(f"stopped: {self._stop_reason}")
-        sample = self.reader.newest if self.reader is not None else None
-        if sample is None:
+        state = reader.newest.state
+        stop = safety_stop(state) or not_powered(state)
+        if stop is not None:
+            return stop
+        if reader.ended is not None:
+            return StaleStateError(self._stale_words(self.age_s()))
+        if state.runtime_state == RuntimeState.PLAYING:
             return error
-        return safety_stop(sample.state) or error
+        pause_s = self._heart.worst_s()
+        if pause_s > WATCHDOG_S:
+            return RobotError(
+                f"the session was busy for {pause_s * 1000:.0f} ms and the watchdog stopped the arm. "
+                "Look for what loads this computer, then give a new go."
+            )
+        try:
+            child.check(patience_s=WATCHDOG_S)
+        except RobotError as trouble:
+            return trouble
+        return error
+
+    async def _ask_remote(self, error: BaseException) -> BaseException:
+        """A program that just stopped may have been stopped by the switch to local control."""
+        if isinstance(error, RobotError) and self.remote and self.dashboard is not None:
+            with contextlib.suppress(RobotError, TimeoutError):
+                async with asyncio.timeout(0.3):
+                    self.remote = await self.dashboard.remote()
+            if self.remote is False and not isinstance(error, SafetyStopError):
+                return RobotError(LOCAL_CONTROL)
+        return error
 
     # -- stopping ---------------------------------------------------------------------------------------
 
@@ -178,23 +218,26 @@ class UrRobot(UrLink):
 
     async def _finish_stop(self, child: ControlChild | None, fallback: bool) -> None:
         """Behind the stop: the dashboard again by a new connection if need be, then the end of the child."""
+        ending = [_end_after_stop(child)] if child is not None else []
         if fallback or self.dashboard is None or not self.dashboard.alive:
-            await self._dashboard_stop_anew()
+            ending.append(self._dashboard_stop_anew())
+        await asyncio.gather(*ending)
         if child is not None:
-            with contextlib.suppress(TimeoutError):
-                async with asyncio.timeout(STOP_WAIT_S):
-                    await asyncio.shield(child.stop_acknowledged)
-            child.kill()
-            await child.reap()
             await self._stop_leftover_program()
 
     async def _stop_leftover_program(self) -> None:
-        """A child that was killed may have left its program playing (it moves nothing; its watchdog ends
-        it), or one that had just been sent starts only now."""
-        await asyncio.sleep(0.2)
-        sample = self.reader.newest if self.reader is not None else None
-        if sample is not None and sample.state.runtime_state == RuntimeState.PLAYING and self._child is None:
-            await self._dashboard_stop_anew()
+        """A killed child may have left its program playing, or one that it had just sent starts only now:
+        it moves nothing, but it would look like somebody else's. Waits for news that is newer than this."""
+        asked_ns = time.monotonic_ns()
+        give_up_ns = asked_ns + LEFTOVER_WAIT_NS
+        while time.monotonic_ns() < give_up_ns and self._child is None:
+            await asyncio.sleep(0.05)
+            sample = self.reader.newest if self.reader is not None else None
+            if sample is None or sample.state.stamps.host_monotonic_ns < asked_ns + PROGRAM_START_NS:
+                continue
+            if sample.state.runtime_state == RuntimeState.PLAYING:
+                await self._dashboard_stop_anew()
+            return
 
     async def _dashboard_stop_anew(self) -> None:
         try:
@@ -217,12 +260,14 @@ class UrRobot(UrLink):
         """Between moves: a program, a process or a switch that failed ends control, and says why."""
         await super().supervise_more()
         child = self._child
-        if child is None or not self._controls:
+        if child is None or not self._controls or self._moving:
             return
         try:
             child.check()
-            state = self.latest()
+            state = self.newest().state
             trouble = safety_stop(state) or not_powered(state) or program_not_running(state)
+            if self.age_s() > STALE_S:
+                trouble = StaleStateError(self._stale_words(self.age_s()))
             if self.remote is False:
                 trouble = RobotError(LOCAL_CONTROL)
             if trouble is not None:
@@ -237,7 +282,9 @@ class UrRobot(UrLink):
             await self.stop("the station is closing the robot")
         await self.end_control()
         if self._background:
-            await asyncio.wait(self._background, timeout=2.0)
+            _, late = await asyncio.wait(self._background, timeout=CLOSE_WAIT_S)
+            for task in late:
+                task.cancel()
         await super().close()
 
     def _why_stopped(self) -> str:
@@ -247,6 +294,15 @@ class UrRobot(UrLink):
         task = asyncio.get_running_loop().create_task(work)
         self._background.add(task)
         task.add_done_callback(self._background.discard)
+
+
+async def _end_after_stop(child: ControlChild) -> None:
+    """Leaves a moment to pass the stop on, then ends the process."""
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(STOP_WAIT_S):
+            await asyncio.shield(child.stop_acknowledged)
+    child.kill()
+    await child.reap()
 
 
 def _check_numbers(

@@ -126,12 +126,12 @@ class ControlChild:
         """Puts the stop on the wire to the child, now. Never raises."""
         self._send({"do": "stop", "deceleration": STOP_DECELERATION})
 
-    def check(self) -> None:
+    def check(self, patience_s: float = ACKNOWLEDGE_S) -> None:
         """Raises RobotError when the process died, hangs, or its script takes no kicks."""
         if self.gone.is_set():
             raise RobotError(f"the control process died{self.epitaph()}; see {self._log_path}")
-        if self._beat_ns > self._answered_ns and time.monotonic_ns() - self._beat_ns > ACKNOWLEDGE_S * 1e9:
-            raise RobotError(f"the control process hangs; see {self._log_path}")
+        if self._beat_ns > self._answered_ns and time.monotonic_ns() - self._beat_ns > patience_s * 1e9:
+            raise RobotError(f"the control process hangs, its watchdog stops the arm; see {self._log_path}")
         if self.kicks_refused:
             raise RobotError(
                 "the watchdog of the control program could not be kicked: the session was busy for too long, "
@@ -210,6 +210,8 @@ class ControlChild:
         for waiter in (*self._moves.values(), self._ready):
             if not waiter.done():
                 waiter.set_result(died)
+        if not self.stop_acknowledged.done():
+            self.stop_acknowledged.set_result(None)
 
 
 def _refusal(text: str) -> str:

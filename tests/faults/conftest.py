@@ -1,0 +1,164 @@
+"""An arm in motion, faults thrown at it, and a stopwatch: when did it stop, when did the station notice."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from station.config import RobotConfig
+from station.devices.ur import UrRobot
+from station.errors import RobotError
+from station.simulation.admin import AdminClient
+from station.simulation.launch import SimulatedController
+
+AT_REST_RAD_S = 1e-3
+FAR_RAD = 1.5
+
+
+@dataclass
+class Outcome:
+    """What a fault in mid-move did. Times since the fault."""
+
+    error: RobotError
+    noticed_s: float
+    stopped_s: float
+
+
+@dataclass
+class Cell:
+    """A controller and a driver in front of it, with the heartbeat of a session loop."""
+
+    controller: SimulatedController
+    admin: AdminClient
+    robot: UrRobot
+    beating: bool = True
+    _tasks: list[asyncio.Task[Any]] = field(default_factory=list)
+
+    def start_heart(self) -> None:
+        self._tasks.append(asyncio.create_task(self._heart()))
+
+    async def _heart(self) -> None:
+        while True:
+            if self.beating:
+                self.robot.heartbeat()
+            await asyncio.sleep(0.03)
+
+    async def end(self) -> None:
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+
+    def speed_rad_s(self) -> float:
+        """Of the fastest joint, by the controller's own account; works when every link to it is cut."""
+        return max(map(abs, self.admin.ask("state")["joint_speeds_rad_s"]))
+
+    def joints_rad(self) -> list[float]:
+        joints: list[float] = self.admin.ask("state")["joints_rad"]
+        return joints
+
+    def asked(self, what: str) -> int:
+        return int(self.admin.ask("log")["counts"].get(what, 0))
+
+    def far_move(self) -> asyncio.Task[None]:
+        """A move of several seconds, under way."""
+        goal = self.joints_rad()
+        goal[0] += FAR_RAD
+        return asyncio.create_task(self.robot.move(goal, 0.5, 1.0))
+
+    async def cruising(self) -> asyncio.Task[None]:
+        """The task of a move that has reached its full speed."""
+        move = self.far_move()
+        await self.until(lambda: self.speed_rad_s() > 0.4)
+        return move
+
+    async def until(self, condition: Callable[[], bool], timeout_s: float = 5.0) -> float:
+        """Seconds until it holds."""
+        begun = time.monotonic()
+        while not condition():
+            if time.monotonic() - begun > timeout_s:
+                raise AssertionError(f"not within {timeout_s} s")
+            await asyncio.sleep(0.004)
+        return time.monotonic() - begun
+
+    async def at_rest(self, timeout_s: float = 5.0) -> float:
+        return await self.until(lambda: self.speed_rad_s() < AT_REST_RAD_S, timeout_s)
+
+    async def strike(self, fault: Callable[[], object], timeout_s: float = 6.0) -> Outcome:
+        """The fault in mid-move. Fails unless the move ends with a RobotError and the arm rests."""
+        move = await self.cruising()
+        begun = time.monotonic()
+        noticed: list[float] = []
+        move.add_done_callback(lambda _: noticed.append(time.monotonic() - begun))
+        fault()
+        await self.at_rest(timeout_s)
+        stopped = time.monotonic() - begun
+        with suppress(RobotError):
+            async with asyncio.timeout(timeout_s):
+                await move
+        error = move.exception()
+        assert isinstance(error, RobotError), error
+        return Outcome(error, noticed[0], stopped)
+
+    async def stays_at_rest(self, seconds: float = 0.4) -> None:
+        """Nothing moves by itself, and no control comes back by itself."""
+        before = self.joints_rad()
+        uploads = self.asked("upload: rtde_control")
+        await asyncio.sleep(seconds)
+        after = self.joints_rad()
+        assert max(abs(a - b) for a, b in zip(before, after, strict=True)) < 1e-3
+        assert self.asked("upload: rtde_control") == uploads
+        assert not self.robot.control
+
+
+MakeCell = Callable[..., Awaitable[Cell]]
+
+
+@pytest.fixture
+async def cell(controller: Callable[..., SimulatedController], tmp_path: Path) -> AsyncIterator[MakeCell]:
+    """`await cell("UR10e", control=True)`: connected, with control started as if by a person's go."""
+    cells: list[Cell] = []
+
+    async def make(model: str = "UR10", control: bool = True, **options: Any) -> Cell:
+        running = await asyncio.to_thread(controller, model, **options)
+        robot = UrRobot(RobotConfig(model=model, host=running.host), tmp_path / "log", tmp_path / "lock")
+        made = Cell(running, running.admin(), robot)
+        cells.append(made)
+        made.start_heart()
+        await robot.connect()
+        if control:
+            await robot.start_control()
+        return made
+
+    yield make
+    for made in cells:
+        await made.robot.close()
+        await made.end()
+        made.admin.close()
+
+
+@pytest.fixture
+def fault_times(request: pytest.FixtureRequest) -> Callable[[Outcome], None]:
+    """Keeps measured times for the matrix in docs/faults.md: JSON lines in $FAULT_TIMES, if set."""
+
+    def keep(outcome: Outcome) -> None:
+        place = os.environ.get("FAULT_TIMES")
+        if place:
+            row = {
+                "test": request.node.name,
+                "noticed_ms": round(outcome.noticed_s * 1000),
+                "stopped_ms": round(outcome.stopped_s * 1000),
+                "error": str(outcome.error),
+            }
+            with Path(place).open("a") as lines:
+                lines.write(json.dumps(row) + "\n")
+
+    return keep

@@ -1,0 +1,82 @@
+"""Nothing outside the simulation can unlock, power or reset a robot: it is not even written down."""
+
+from __future__ import annotations
+
+import ast
+import re
+from pathlib import Path
+
+import pytest
+
+from station.devices.ur_dashboard import ALLOWED, Dashboard
+
+ROOT = Path(__file__).parents[2]
+DASHBOARD_COMMANDS = {
+    "unlock protective stop", "close safety popup", "restart safety", "power on", "power off",
+    "brake release", "unlock_protective_stop", "power_on", "power_off", "brake_release",
+}  # fmt: skip
+LIBRARY_CALLS = {
+    "unlockProtectiveStop", "closeSafetyPopup", "restartSafety", "powerOn", "powerOff", "brakeRelease",
+    "teachMode", "freedriveMode", "triggerProtectiveStop", "reuploadScript", "reconnect", "setTcp",
+    "setPayload", "setSpeedSlider", "sendCustomScript", "sendCustomScriptFunction", "jogStart", "speedJ",
+    "speedL", "servoJ", "DashboardClient", "RTDEIOInterface",
+}  # fmt: skip
+PLAIN = re.compile(
+    r"""["'](unlock protective stop|restart safety|power on|power off|brake release)(\\n)?["']"""
+)
+
+
+def sources(pattern: str) -> list[Path]:
+    """What is shipped or started by people; not the simulation, which must know what it must refuse."""
+    folders = ["recordings", "calibrate", "station", "systemd", "benchmarks", "docs"]
+    found = [p for folder in folders for p in (ROOT / folder).rglob(pattern) if p.is_file()]
+    return [p for p in found if ROOT / "station" / "simulation" not in p.parents]
+
+
+def offences(source: str) -> list[str]:
+    found = []
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Attribute) and node.attr in LIBRARY_CALLS:
+            found.append(f"line {node.lineno}: .{node.attr}")
+        elif isinstance(node, ast.Name | ast.alias):
+            name = node.id if isinstance(node, ast.Name) else node.name
+            if name.rpartition(".")[2] in LIBRARY_CALLS:
+                found.append(f"{name}")
+        elif isinstance(node, ast.Constant) and isinstance(node.value, str | bytes):
+            text = node.value.decode("latin-1") if isinstance(node.value, bytes) else node.value
+            if text.strip().lower() in DASHBOARD_COMMANDS or text in LIBRARY_CALLS:
+                found.append(f"line {node.lineno}: {text!r}")
+    return found
+
+
+def test_no_source_names_a_forbidden_command() -> None:
+    checked = sources("*.py")
+    assert len(checked) > 50
+    assert {str(p): o for p in checked if (o := offences(p.read_text()))} == {}
+
+
+def test_no_other_file_quotes_one() -> None:
+    others = [
+        p for kind in ("*.md", "*.yaml", "*.service", "*.sh", "*.tcss", "*.html") for p in sources(kind)
+    ]
+    assert [p for p in others if PLAIN.search(p.read_text())] == []
+
+
+@pytest.mark.parametrize(
+    "offence",
+    [
+        "d.powerOn()",
+        "send(b'brake release\\n')",
+        "ask('unlock protective stop')",
+        "from x import DashboardClient",
+    ],
+)
+def test_the_search_finds_what_it_looks_for(offence: str) -> None:
+    assert offences(offence)
+
+
+@pytest.mark.parametrize("command", [*sorted(DASHBOARD_COMMANDS), "play", "load x", "shutdown"])
+def test_the_dashboard_client_refuses(command: str) -> None:
+    assert command not in ALLOWED
+    with pytest.raises(ValueError, match="never sent"):
+        Dashboard.send(object.__new__(Dashboard), command)

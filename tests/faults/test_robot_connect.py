@@ -1,0 +1,231 @@
+"""Faults at connect, at a go and between moves: nothing hangs, every refusal has a remedy."""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+import sys
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from station.config import RobotConfig
+from station.devices.ur import UrRobot
+from station.errors import RobotError, SafetyStopError, StaleStateError
+from station.simulation.launch import SimulatedController
+
+pytestmark = pytest.mark.process
+
+Make = Callable[..., Awaitable[Any]]
+Start = Callable[..., SimulatedController]
+
+
+def robot_at(host: str, folder: Path, **config: Any) -> UrRobot:
+    return UrRobot(RobotConfig(host=host, **config), folder / "log", folder / "lock")
+
+
+async def test_nobody_is_there(tmp_path: Path) -> None:
+    with pytest.raises(RobotError, match="check cable, address and that it is on"):
+        await robot_at("127.255.3.9", tmp_path).connect()
+
+
+@pytest.mark.parametrize(
+    ("fault", "words", "limit_s"),
+    [
+        ({"cmd": "stall_dash"}, "dashboard .* no answer within 2 s", 3.0),
+        ({"cmd": "mute", "ports": ["rtde"]}, "no answer .* within 2 s", 5.0),
+        ({"cmd": "stall"}, "state", 5.0),
+        ({"cmd": "black_hole"}, "no answer within 2 s", 3.0),
+        ({"cmd": "black_hole", "ports": ["script"]}, "did not answer within 2 s", 4.0),
+        ({"cmd": "black_hole", "ports": ["rtde"]}, "no answer .* within 2 s", 5.0),
+    ],
+)
+async def test_a_silent_controller_does_not_hang_the_station(
+    controller: Start, tmp_path: Path, fault: dict[str, Any], words: str, limit_s: float
+) -> None:
+    running = await asyncio.to_thread(controller)
+    with running.admin() as admin:
+        admin.ask(**fault)
+        robot = robot_at(running.host, tmp_path)
+        begun = time.monotonic()
+        with pytest.raises(RobotError, match=words):
+            await robot.connect()
+        assert time.monotonic() - begun < limit_s
+        admin.ask(**fault, on=False)
+        await robot.connect()  # nothing is left over from the failure
+        await robot.close()
+
+
+@pytest.mark.parametrize(
+    ("config", "words"),
+    [
+        ({"model": "UR5"}, "is a UR10"),
+        ({"serial": "1"}, "correct robot.serial"),
+        ({"model": "UR10e"}, "is a UR10"),
+    ],
+)
+async def test_another_arm_than_configured(
+    controller: Start, tmp_path: Path, config: dict[str, Any], words: str
+) -> None:
+    running = await asyncio.to_thread(controller)
+    with pytest.raises(RobotError, match=words):
+        await robot_at(running.host, tmp_path, **config).connect()
+
+
+async def test_one_owner(controller: Start, tmp_path: Path) -> None:
+    running = await asyncio.to_thread(controller)
+    first, second = robot_at(running.host, tmp_path), robot_at(running.host, tmp_path)
+    await first.connect()
+    with pytest.raises(RobotError, match=r"owned by another station .*pid \d+, .* since"):
+        await second.connect()
+    await first.close()
+    await second.connect()
+    await second.close()
+
+
+async def test_connecting_is_read_only(cell: Make) -> None:
+    c = await cell(control=False)
+    c.admin.ask("foreign", name="palletising.urp")
+    await c.until(lambda: c.admin.ask("state")["runtime_state"] == "PLAYING")
+    await asyncio.sleep(0.5)
+    assert c.admin.ask("state")["program"] == "palletising.urp"
+    assert c.asked("upload: rtde_control") == 0
+    assert c.admin.ask("state")["claims"] == []
+
+
+@pytest.mark.parametrize(
+    ("model", "fault", "words"),
+    [
+        ("UR10", {"cmd": "foreign"}, "palletising.urp is playing.*Stop it on the pendant"),
+        ("UR10", {"cmd": "power_off"}, "power on and release the brakes on the pendant"),
+        ("UR10e", {"cmd": "remote", "on": False}, "switch the pendant to Remote"),
+        ("UR10", {"cmd": "pstop"}, "protective stop"),
+        ("UR10", {"cmd": "in_use", "inputs": ["input_int_register_0"]}, "another program controls the robot"),
+    ],
+)
+async def test_a_go_is_refused(cell: Make, model: str, fault: dict[str, Any], words: str) -> None:
+    c = await cell(model, control=False)
+    c.admin.ask(**fault)
+    await asyncio.sleep(0.2)
+    with pytest.raises(RobotError, match=f"(?s){words}"):
+        await c.robot.start_control()
+    assert c.asked("upload: rtde_control") == 0
+    assert not c.robot.control
+
+
+async def test_a_robot_switched_to_remote_after_connecting_can_be_driven(cell: Make) -> None:
+    c = await cell("UR10e", control=False, options=("--local",))
+    assert c.robot.remote is False
+    c.admin.ask("remote", on=True)
+    await c.robot.start_control()
+    assert c.robot.control
+
+
+async def test_remote_control_lost_between_moves_ends_control(cell: Make) -> None:
+    c = await cell("UR10e")
+    c.admin.ask("remote", on=False)
+    assert await c.until(lambda: not c.robot.control) < 1.0
+    await asyncio.sleep(0.3)
+    with pytest.raises(RobotError, match="switch the pendant to Remote"):
+        await c.robot.start_control()
+
+
+@pytest.mark.parametrize("fault", [{"cmd": "freeze"}, {"cmd": "stall"}])
+async def test_old_news_is_not_taken_for_new(cell: Make, fault: dict[str, Any]) -> None:
+    c = await cell(control=False)
+    c.admin.ask(**fault)
+    await asyncio.sleep(0.15)
+    with pytest.raises(StaleStateError):
+        c.robot.latest()
+    c.admin.ask(**fault, on=False)
+    await c.until(lambda: c.robot.age_s() < 0.05)
+    c.robot.latest()
+
+
+async def test_the_link_comes_back_by_itself_but_control_does_not(cell: Make) -> None:
+    c = await cell()
+    c.admin.ask("drop")
+    await c.until(lambda: not c.robot.control)
+    await c.until(lambda: c.robot.age_s() < 0.05)
+    await c.stays_at_rest()
+    await c.robot.start_control()
+    goal = c.joints_rad()
+    goal[5] += 0.05
+    await c.robot.move(goal, 0.5, 1.0)
+
+
+async def test_tcp_changed_on_the_pendant(cell: Make) -> None:
+    c = await cell(control=True)
+    c.robot.check()
+    c.admin.ask("tcp", pose=[0.0, 0.0, 0.12, 0.0, 0.0, 0.0])
+    await asyncio.sleep(0.2)
+    with pytest.raises(RobotError, match=r"TCP offset on the pendant was changed.*by 120.0 mm"):
+        c.robot.check()
+    goal = c.joints_rad()
+    goal[0] += 0.2
+    with pytest.raises(RobotError, match="TCP offset"):
+        await c.robot.move(goal, 0.5, 1.0)
+    await c.stays_at_rest()
+
+
+async def test_a_tool_on_the_pendant_is_reported_and_not_mixed_in(controller: Start, tmp_path: Path) -> None:
+    running = await asyncio.to_thread(controller)
+    with running.admin() as admin:
+        admin.ask("tcp", pose=[0.01, -0.02, 0.15, 0.0, 0.0, 0.5])
+        await asyncio.sleep(0.1)
+        robot = robot_at(running.host, tmp_path)
+        identity = await robot.connect()
+        assert identity.tcp_offset == pytest.approx((0.01, -0.02, 0.15, 0.0, 0.0, 0.5), abs=1e-6)
+        await robot.start_control()  # reads the offset from the controller and compares
+        await robot.close()
+
+
+@pytest.mark.parametrize(
+    "goal",
+    [
+        [0.0, -1.5, 1.5, -1.5, float("nan"), 0.0],
+        [0.0, -1.5, 1.5, -1.5, -1.5],
+        [0.0, -1.5, 1.5, -1.5, -1.5, 6.5],
+    ],
+    ids=["nan", "five joints", "beyond the joint limit"],
+)
+async def test_an_impossible_goal_is_never_sent(cell: Make, goal: list[float]) -> None:
+    c = await cell()
+    with pytest.raises(RobotError, match="not six joint angles"):
+        await c.robot.move(goal, 0.5, 1.0)
+    assert c.asked("script: moveJ") == 0
+    assert c.robot.control  # a refused number is no fault
+
+
+async def test_safety_stop_between_moves_ends_control(cell: Make) -> None:
+    c = await cell()
+    c.admin.ask("estop")
+    await c.until(lambda: not c.robot.control)
+    with pytest.raises(SafetyStopError, match="emergency stop"):
+        c.robot.check()
+
+
+async def test_a_daemon_that_died_leaves_no_lock(controller: Start, tmp_path: Path) -> None:
+    running = await asyncio.to_thread(controller)
+    program = (
+        "import sys; from pathlib import Path; from station.devices.ur_lock import RobotLock\n"
+        "RobotLock(sys.argv[1], Path(sys.argv[2])); print('held', flush=True); sys.stdin.read()"
+    )
+    holder = subprocess.Popen(
+        [sys.executable, "-c", program, running.host, str(tmp_path / "lock")],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+    )
+    assert holder.stdout is not None and holder.stdin is not None
+    with holder:
+        assert holder.stdout.readline() == b"held\n"
+        robot = robot_at(running.host, tmp_path)
+        with pytest.raises(RobotError, match=f"pid {holder.pid}"):
+            await robot.connect()
+        holder.kill()
+        holder.wait()
+        await robot.connect()
+        await robot.close()

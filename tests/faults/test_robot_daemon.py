@@ -1,0 +1,74 @@
+"""The process that drives the arm dies or freezes in mid-move: the arm stops, nothing of it stays behind."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from station.errors import RobotError
+
+pytestmark = pytest.mark.process
+
+DRIVER = """
+import asyncio, sys
+from pathlib import Path
+from station.config import RobotConfig
+from station.devices.ur import UrRobot
+
+async def main(host, folder):
+    robot = UrRobot(RobotConfig(host=host), folder / "log", folder / "lock")
+    await robot.connect()
+    async def heart():
+        while True:
+            robot.heartbeat()
+            await asyncio.sleep(0.03)
+    beating = asyncio.create_task(heart())
+    await robot.start_control()
+    goal = list(robot.latest().joints_rad)
+    goal[0] += 1.5
+    print(robot.control_pid, flush=True)
+    await robot.move(goal, 0.5, 1.0)
+
+asyncio.run(main(sys.argv[1], Path(sys.argv[2])))
+"""
+
+
+@pytest.mark.parametrize("kill", [signal.SIGKILL, signal.SIGSTOP], ids=["SIGKILL", "SIGSTOP"])
+async def test_driving_process(
+    cell: Callable[..., Awaitable[Any]], fault_times: Callable[[Any], None], tmp_path: Path, kill: int
+) -> None:
+    c = await cell(control=False)
+    await c.robot.close()
+    driver = subprocess.Popen(
+        [sys.executable, "-c", DRIVER, c.controller.host, str(tmp_path)], stdout=subprocess.PIPE, text=True
+    )
+    with driver:
+        assert driver.stdout is not None
+        child_pid = int(await asyncio.to_thread(driver.stdout.readline))
+        await c.until(lambda: c.speed_rad_s() > 0.4)
+        os.kill(driver.pid, kill)
+        stopped_s = await c.at_rest()
+        assert stopped_s < 0.7  # 1/5 s of silence, then the controller decelerates
+        fault_times(
+            type("O", (), {"noticed_s": 0.0, "stopped_s": stopped_s, "error": RobotError("none left")})
+        )
+        await c.stays_at_rest()
+        driver.kill()
+        driver.wait()
+    await c.until(lambda: not Path(f"/proc/{child_pid}").exists() or _is_zombie(child_pid))
+    assert c.admin.ask("state")["program"] is None
+
+
+def _is_zombie(pid: int) -> bool:
+    try:
+        return " Z " in Path(f"/proc/{pid}/stat").read_text()
+    except FileNotFoundError:
+        return True

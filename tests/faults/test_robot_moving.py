@@ -1,0 +1,130 @@
+"""Faults in mid-move: the arm stops, the operator reads why and what to do, nothing goes on by itself."""
+
+from __future__ import annotations
+
+import os
+import signal
+from collections.abc import Awaitable, Callable
+from typing import Any
+
+import pytest
+
+from station.errors import RobotError, SafetyStopError, StaleStateError
+
+pytestmark = pytest.mark.process
+
+Make = Callable[..., Awaitable[Any]]
+Keep = Callable[[Any], None]
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [("pstop", "protective stop"), ("safeguard", "safeguard stop"), ("estop", "emergency stop")],
+)
+@pytest.mark.parametrize("model", ["UR10", "UR10e"])
+async def test_safety_stop(cell: Make, fault_times: Keep, model: str, fault: str, words: str) -> None:
+    c = await cell(model)
+    outcome = await c.strike(lambda: c.admin.ask(fault))
+    fault_times(outcome)
+    assert isinstance(outcome.error, SafetyStopError)
+    assert words in str(outcome.error) and "new go" in str(outcome.error)
+    assert outcome.noticed_s < 0.25 and outcome.stopped_s < 0.5
+    await c.stays_at_rest()
+    with pytest.raises(SafetyStopError):
+        await c.robot.start_control()
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ({"cmd": "stop_program"}, "control program is stopped"),
+        ({"cmd": "pause"}, "control program is paused"),
+        ({"cmd": "power_off"}, "no power"),
+        ({"cmd": "remote", "on": False}, "switch the pendant to Remote"),
+    ],
+    ids=["program stopped", "program paused", "power off", "remote control lost"],
+)
+async def test_something_on_the_pendant(
+    cell: Make, fault_times: Keep, fault: dict[str, Any], words: str
+) -> None:
+    c = await cell("UR10e")
+    outcome = await c.strike(lambda: c.admin.ask(**fault))
+    fault_times(outcome)
+    assert words in str(outcome.error)
+    assert outcome.noticed_s < 0.25 and outcome.stopped_s < 0.6
+    await c.stays_at_rest()
+
+
+async def test_a_program_paused_on_the_pendant_does_not_go_on_when_play_is_pressed(cell: Make) -> None:
+    c = await cell()
+    await c.strike(lambda: c.admin.ask("pause"))
+    await c.until(lambda: c.admin.ask("state")["runtime_state"] == "STOPPED")
+    c.admin.ask("play")
+    await c.stays_at_rest()
+
+
+@pytest.mark.parametrize("how", ["fin", "rst"])
+@pytest.mark.parametrize("ports", [None, ["rtde"]], ids=["every link", "rtde links"])
+async def test_link_cut(cell: Make, fault_times: Keep, how: str, ports: list[str] | None) -> None:
+    c = await cell()
+    outcome = await c.strike(lambda: c.admin.ask("drop", how=how, ports=ports))
+    fault_times(outcome)
+    assert "connection to the robot lost" in str(outcome.error)
+    assert outcome.noticed_s < 0.5 and outcome.stopped_s < 1.0
+    await c.until(lambda: c.admin.ask("state")["program"] is None)  # ur_rtde loads its program anew by itself
+    await c.stays_at_rest(1.0)
+
+
+@pytest.mark.parametrize(
+    "fault",
+    [{"cmd": "stall"}, {"cmd": "freeze"}, {"cmd": "black_hole"}],
+    ids=["silent link", "frozen data", "cable pulled"],
+)
+async def test_no_news(cell: Make, fault_times: Keep, fault: dict[str, Any]) -> None:
+    c = await cell()
+    outcome = await c.strike(lambda: c.admin.ask(**fault))
+    fault_times(outcome)
+    assert isinstance(outcome.error, StaleStateError)
+    assert "no news" in str(outcome.error)
+    assert 0.2 < outcome.noticed_s < 0.6 and outcome.stopped_s < 1.2
+    c.admin.ask(**fault, on=False)
+    await c.stays_at_rest()
+
+
+async def test_controller_restart(cell: Make, fault_times: Keep) -> None:
+    c = await cell()
+    outcome = await c.strike(lambda: c.admin.ask("restart", down_s=0.5, running=True))
+    fault_times(outcome)
+    await c.until(lambda: c.robot.age_s() < 0.1, timeout_s=6.0)
+    await c.stays_at_rest()
+
+
+@pytest.mark.parametrize(
+    ("kill", "words"),
+    [(signal.SIGSEGV, "control process died"), (signal.SIGSTOP, "control process hangs")],
+    ids=["child segfault", "child hung"],
+)
+async def test_control_process(cell: Make, fault_times: Keep, kill: signal.Signals, words: str) -> None:
+    c = await cell()
+    pid = c.robot.control_pid
+    outcome = await c.strike(lambda: os.kill(pid, kill))
+    fault_times(outcome)
+    assert words in str(outcome.error)
+    assert outcome.stopped_s < 1.2
+    await c.stays_at_rest()
+    with pytest.raises(ProcessLookupError):
+        os.kill(pid, 0)
+
+
+async def test_a_session_loop_that_stalls_stops_the_arm(cell: Make, fault_times: Keep) -> None:
+    c = await cell()
+
+    def stall() -> None:
+        c.beating = False
+
+    outcome = await c.strike(stall)
+    fault_times(outcome)
+    assert "the session was busy for" in str(outcome.error)
+    assert outcome.stopped_s < 1.0
+    assert isinstance(outcome.error, RobotError)
+    await c.stays_at_rest()

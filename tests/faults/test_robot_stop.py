@@ -1,0 +1,110 @@
+"""STOP: two paths, from any state, quickly, and for good."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from station.config import RobotConfig
+from station.devices.ur import UrRobot
+from station.errors import RobotError
+
+pytestmark = pytest.mark.process
+
+Make = Callable[..., Awaitable[Any]]
+Keep = Callable[[Any], None]
+
+
+@pytest.mark.parametrize("model", ["UR10", "UR10e"])
+async def test_stop_in_mid_move(cell: Make, model: str) -> None:
+    c = await cell(model)
+    move = await c.cruising()
+    begun = time.monotonic()
+    await c.robot.stop("operator")
+    assert time.monotonic() - begun < 0.1
+    with pytest.raises(RobotError, match="stopped: operator"):
+        await move
+    assert await c.at_rest() < 0.5
+    await c.stays_at_rest()
+    with pytest.raises(RobotError, match=r"control is not started .operator.: a person's go starts it"):
+        await c.robot.move(c.joints_rad(), 0.5, 1.0)
+
+
+async def test_both_paths_are_used(cell: Make) -> None:
+    c = await cell()
+    move = await c.cruising()
+    await c.robot.stop("operator")
+    with pytest.raises(RobotError):
+        await move
+    await c.until(lambda: c.asked("dashboard: stop") > 0)
+    # The script may have been ended by the dashboard's stop before it read the child's.
+    assert c.asked("script: stopJ") + c.asked("controller: program stopped") > 0
+
+
+async def test_with_a_hung_child_the_dashboard_stops_the_arm(cell: Make) -> None:
+    c = await cell()
+    move = await c.cruising()
+    os.kill(c.robot.control_pid, signal.SIGSTOP)
+    begun = time.monotonic()
+    await c.robot.stop("operator")
+    assert time.monotonic() - begun < 0.1
+    assert await c.at_rest() < 0.4
+    assert c.asked("script: stopJ") == 0
+    with pytest.raises(RobotError):
+        await move
+
+
+async def test_with_a_silent_dashboard_the_child_stops_the_arm(cell: Make) -> None:
+    c = await cell()
+    c.admin.ask("stall_dash")
+    move = await c.cruising()
+    begun = time.monotonic()
+    await c.robot.stop("operator")
+    assert time.monotonic() - begun < 0.1
+    assert await c.at_rest() < 0.5
+    assert c.asked("script: stopJ") == 1
+    with pytest.raises(RobotError):
+        await move
+
+
+async def test_stop_is_welcome_in_any_state(cell: Make, tmp_path: Path) -> None:
+    stranger = UrRobot(RobotConfig(host="127.255.3.9"), tmp_path / "log")
+    await stranger.stop("never connected")
+    await stranger.close()
+    c = await cell(control=False)
+    await c.robot.stop("no control")
+    await c.robot.start_control()
+    await asyncio.gather(*(c.robot.stop(f"number {i}") for i in range(5)))
+    await c.robot.stop("again")
+    await c.stays_at_rest()
+    await c.robot.close()
+    await c.robot.stop("closed")
+
+
+async def test_stop_while_control_starts(cell: Make) -> None:
+    c = await cell(control=False)
+    start = asyncio.create_task(c.robot.start_control())
+    await c.until(lambda: c.robot.control_pid is not None)
+    await c.robot.stop("changed my mind")
+    with pytest.raises(RobotError, match="changed my mind"):
+        await start
+    await asyncio.sleep(0.4)
+    await c.until(lambda: c.admin.ask("state")["program"] is None)
+    assert not c.robot.control and c.robot.control_pid is None
+
+
+async def test_a_cancelled_move_stops_the_arm(cell: Make) -> None:
+    c = await cell()
+    move = await c.cruising()
+    move.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await move
+    assert await c.at_rest() < 0.5
+    await c.stays_at_rest()

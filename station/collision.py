@@ -99,20 +99,24 @@ def moving_points(geometry: CellGeometry, joints_rad: Array) -> Array:
     return np.concatenate(points, axis=1)
 
 
+_TINY = 1e-24
+"""Square of a length that is a point."""
+
+
 def segment_distance(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
     """Shortest distance between segments a0–a1 and b0–b1, broadcast over (..., 3).
 
     Source: C. Ericson, "Real-Time Collision Detection" (2005), section 5.1.9.
     """
     d1, d2, r = a1 - a0, b1 - b0, a0 - b0
-    a = np.maximum(np.einsum("...i,...i->...", d1, d1), 1e-12)
-    e = np.maximum(np.einsum("...i,...i->...", d2, d2), 1e-12)
+    a = np.maximum(np.einsum("...i,...i->...", d1, d1), _TINY)
+    e = np.maximum(np.einsum("...i,...i->...", d2, d2), _TINY)
     b = np.einsum("...i,...i->...", d1, d2)
     c = np.einsum("...i,...i->...", d1, r)
     f = np.einsum("...i,...i->...", d2, r)
     parallel = a * e - b * b
     s = np.where(
-        parallel > 1e-9 * a * e, np.clip((b * f - c * e) / np.maximum(parallel, 1e-18), 0.0, 1.0), 0.0
+        parallel > 1e-9 * a * e, np.clip((b * f - c * e) / np.maximum(parallel, _TINY**2), 0.0, 1.0), 0.0
     )
     t = (b * s + f) / e
     s = np.where(t < 0, np.clip(-c / a, 0, 1), np.where(t > 1, np.clip((b - c) / a, 0, 1), s))

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
@@ -12,25 +10,21 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 import typer
-from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from rich.table import Table
 
-from calibrate.calibration import CalibrationFileError, read_calibration, write_calibration
+from calibrate import cli_install
+from calibrate.calibration import write_calibration
 from calibrate.cli_files import read_board, read_camera
+from calibrate.cli_output import AsJson, check_target, detection_progress, out, print_json
 from calibrate.errors import CalibrationError
 from calibrate.gates import GateLimits, read_limits
-from calibrate.load import Progress as LoadProgress
 from calibrate.pipeline import JobOptions, SolvedRecording, solve_recording
 from calibrate.summary import summary
 from recordings.errors import RecordingError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="From a recording to a calibration.")
-out = Console(highlight=False)
-err = Console(stderr=True, highlight=False)
-
+cli_install.register(app)
 Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session folder", show_default=False)]
-AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout and nothing else")]
 GATE_FAILED = 4
 
 
@@ -214,46 +208,6 @@ def peer_plain(peer: Any) -> dict[str, Any]:
 
 def _number(value: float | None, factor: float, digits: int) -> str:
     return "-" if value is None else f"{value * factor:.{digits}f}"
-
-
-def check_target(target: Path) -> None:
-    """A calibration file may be replaced; anything else that stands there is left alone."""
-    if not target.parent.is_dir():
-        raise OutputError(f"{target}: the folder {target.parent} does not exist.")
-    if target.exists():
-        try:
-            read_calibration(target)
-        except CalibrationFileError:
-            raise OutputError(
-                f"{target} exists and is no whole calibration file; give another name with -o."
-            ) from None
-
-
-class OutputError(CalibrationError):
-    """Where the result should go is wrong."""
-
-    exit_code = 2
-
-
-@contextmanager
-def detection_progress() -> Iterator[LoadProgress | None]:
-    """A bar on stderr, only on a terminal."""
-    if not err.is_terminal:
-        yield None
-        return
-    columns = (
-        TextColumn("finding the board"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.description}"),
-    )
-    with Progress(*columns, console=err, transient=True) as bar:
-        task = bar.add_task("", total=None)
-        yield lambda done, total, name: bar.update(task, completed=done, total=total, description=name)
-
-
-def print_json(value: object) -> None:
-    sys.stdout.write(msgspec.json.encode(value).decode() + "\n")
 
 
 def main() -> None:

@@ -46,6 +46,15 @@ def read_camera(path: Path) -> CameraModel:
     return camera
 
 
+def read_cell_serials(path: Path) -> tuple[str, str]:
+    """(robot's, camera's) serial number of a station's configuration; empty where it names none."""
+    plain = _read(path)
+    robot, camera = plain.get("robot"), plain.get("camera")
+    if not isinstance(robot, dict) or not isinstance(camera, dict):
+        raise InputFileError(f"{path}: no station configuration, robot and camera are missing.")
+    return str(robot.get("serial") or ""), str(camera.get("serial") or "")
+
+
 def _camera_info(path: Path, plain: dict[str, Any]) -> CameraModel:
     try:
         return CameraModel(

@@ -59,11 +59,11 @@ def _verdict(job: SolvedRecording) -> Iterator[str]:
     quality = calibration.quality
     yield f"<h1>Calibration of {html.escape(job.recording.info.name)}</h1>"
     if stamp := source_stamp(calibration):
-        yield f'<div class="stamp">{html.escape(stamp)}. It will not be installed on a real cell.</div>'
+        yield f'<div class="stamp">{html.escape(stamp)}. It is not installed on a real cell.</div>'
     expected = ""
     if quality.predicted_error_mm is not None and quality.working_distance_m is not None:
         expected = (
-            f"A point {quality.working_distance_m * 1000:.0f} mm in front of the camera is expected to be right "
+            f"A point {quality.working_distance_m * 1000:.0f} mm in front of the camera should be right "
             f"to {quality.predicted_error_mm:.2f} mm (1σ)."
         )
     yield (
@@ -144,7 +144,7 @@ def _residuals(job: SolvedRecording) -> Iterator[str]:
         limit = next((gate.limit for gate in job.gates if gate.name == "view residual"), None)
         yield html.figure(
             plots.residuals_by_view(solution.residual_px, robot_mm, limit),
-            "Per pose: how far the corners miss the model, and how far the flange is from where it was recorded.",
+            "Per pose: how far the corners miss the model, and the modelled flange the recorded one.",
         )
     pairs = [both for index, both in _modelled_pixels(job).items() if index in set(solution.used)]
     if pairs:
@@ -171,7 +171,7 @@ def _holdout(job: SolvedRecording, peers: Sequence[PeerResult]) -> Iterator[str]
     yield html.figure(
         plots.holdout_samples(methods),
         f"Mean e_t {score.e_t_m * 1000:.4f} mm, e_R {score.e_R:.6f} over {len(score.pairs)} samples. These "
-        "numbers are dominated by the noise of the held-out views themselves: good methods cannot be ranked by them.",
+        "numbers are dominated by the noise of the held-out views: good methods cannot be ranked by them.",
     )
     yield html.paragraph(score.note, "note")
 
@@ -217,7 +217,7 @@ def _lens(job: SolvedRecording) -> Iterator[str]:
         yield html.paragraph(text, "note")
     yield html.figure(
         plots.coverage_map(job.views),
-        f"Left: where corners were seen ({job.coverage:.0%} of the picture). Right: what the lens model corrects.",
+        f"Left: where corners were seen ({job.coverage:.0%} of the picture). Right: what the lens bends.",
     )
 
 

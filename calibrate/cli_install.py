@@ -1,0 +1,203 @@
+"""`calibrate show | diff | export | install | list | rollback`: what is done with a calibration file."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+import typer
+from rich.table import Table
+
+from calibrate.calibration import Calibration, read_calibration, write_atomically
+from calibrate.cli_files import read_cell_serials
+from calibrate.cli_output import AsJson, OutputError, err, out, print_json
+from calibrate.formats import FORMATS, export
+from calibrate.formats.frames import FrameNames
+from calibrate.generations import Generation, generations, read_log, state_root
+from calibrate.install import install, load_installed, rollback
+from calibrate.summary import pose_difference, pose_text, summary, verdict
+
+Root = Annotated[
+    Path | None,
+    typer.Option("--root", help="State folder (default: $STATE_DIRECTORY or the XDG state folder)"),
+]
+_FORMATS_HELP = "; ".join(f"{name}: {kind.says}" for name, kind in FORMATS.items())
+FormatName = StrEnum("FormatName", {name.replace("-", "_"): name for name in FORMATS})  # type: ignore[misc]
+Named = Annotated[Path | None, typer.Argument(help="A calibration file; default: the installed one")]
+
+
+class CellKind(StrEnum):
+    real = "real"
+    imported = "imported"
+    simulated = "simulated"
+
+
+def register(app: typer.Typer) -> None:
+    app.command("show")(show)
+    app.command("diff")(diff)
+    app.command("export")(export_file)
+    app.command("install")(install_file)
+    app.command("list")(list_installed)
+    app.command("rollback")(roll_back)
+
+
+def named_or_installed(file: Path | None, root: Path | None) -> Calibration:
+    return load_installed(root, allow_simulated=True) if file is None else read_calibration(file)
+
+
+def show(file: Named = None, root: Root = None, as_json: AsJson = False) -> None:
+    """Show a calibration: the verdict, the result, the gates."""
+    calibration = named_or_installed(file, root)
+    if as_json:
+        print_json(msgspec.to_builtins(calibration))
+    else:
+        out.print(summary(calibration))
+
+
+def diff(
+    first: Annotated[Path, typer.Argument(help="A calibration file")],
+    second: Named = None,
+    root: Root = None,
+    as_json: AsJson = False,
+) -> None:
+    """How far two calibrations are apart, and whether that is more than their uncertainty."""
+    a, b = read_calibration(first), named_or_installed(second, root)
+    if a.mount != b.mount:
+        raise OutputError(f"{first} is {a.mount}, the other is {b.mount}: there is nothing to compare.")
+    millimetres, degrees, sigmas = pose_difference(a, b)
+    lens_px = float(np.abs(np.array(a.intrinsics.matrix) - np.array(b.intrinsics.matrix)).max())
+    if as_json:
+        print_json(
+            {
+                "translation_mm": millimetres,
+                "rotation_deg": degrees,
+                "sigmas": sigmas,
+                "lens_matrix_px": lens_px,
+            }
+        )
+        return
+    table = Table("", str(first), str(second or "installed"), box=None)
+    rows: list[tuple[str, Any]] = [
+        ("result", pose_text),
+        ("1σ", lambda c: f"{c.sigma.translation_mm:.3f} mm  {c.sigma.rotation_deg:.4f}°"),
+        ("verdict", lambda c: verdict(c)[1]),
+        ("source", lambda c: c.source),
+        ("solved", lambda c: c.created),
+        ("robot", lambda c: f"{c.robot.model} {c.robot.serial}"),
+        ("camera", lambda c: f"{c.camera.model} {c.camera.serial}"),
+        ("recording", lambda c: c.provenance.recording),
+    ]
+    for name, say in rows:
+        table.add_row(name, say(a), say(b))
+    out.print(table)
+    # Six numbers: 3.55 sigmas are exceeded by chance in 5 % of honest pairs (chi-square, 6 degrees).
+    judged = "more than" if sigmas > 3.55 else "within"
+    out.print(
+        f"apart: {millimetres:.3f} mm, {degrees:.4f}°, {sigmas:.1f} sigmas ({judged} their uncertainty); "
+        f"camera matrix differs by up to {lens_px:.2f} px"
+    )
+
+
+def export_file(
+    to: Annotated[FormatName, typer.Option("--to", help=_FORMATS_HELP)],
+    file: Named = None,
+    output: Annotated[Path | None, typer.Option("-o", "--output", help="Default: stdout")] = None,
+    base: Annotated[str, typer.Option(help="What the robot's base is called there")] = FrameNames.base,
+    flange: Annotated[str, typer.Option(help="… its flange")] = FrameNames.flange,
+    camera: Annotated[str, typer.Option(help="… the camera's optical frame")] = FrameNames.camera,
+    body: Annotated[str, typer.Option(help="… the camera's body frame")] = FrameNames.body,
+    root: Root = None,
+) -> None:
+    """Write a calibration in another program's format."""
+    calibration = named_or_installed(file, root)
+    text = export(calibration, str(to.value), FrameNames(base, flange, camera, body))
+    if output is None:
+        typer.echo(text, nl=False)
+        return
+    if not output.parent.is_dir():
+        raise OutputError(f"{output}: the folder {output.parent} does not exist.")
+    write_atomically(output, lambda target: target.write(text.encode()))
+
+
+def install_file(
+    file: Annotated[Path, typer.Argument(help="A calibration file")],
+    root: Root = None,
+    cell: Annotated[CellKind, typer.Option(help="What kind of cell this root belongs to")] = CellKind.real,
+    cell_config: Annotated[
+        Path | None, typer.Option(help="The station's configuration: its robot and camera are checked")
+    ] = None,
+    override: Annotated[
+        str, typer.Option(help="Install although refused; this reason goes into the file")
+    ] = "",
+    as_json: AsJson = False,
+) -> None:
+    """Make a calibration the installed one. Exit 4: a gate failed; nothing was changed."""
+    robot_serial, camera_serial = ("", "") if cell_config is None else read_cell_serials(cell_config)
+    made = install(
+        file,
+        root,
+        cell=cell.value,
+        override=override,
+        robot_serial=robot_serial,
+        camera_serial=camera_serial,
+    )
+    _switched(made, root, as_json)
+
+
+def roll_back(
+    to: Annotated[int | None, typer.Argument(help="Generation; default: the one before")] = None,
+    root: Root = None,
+    reason: Annotated[str, typer.Option(help="Goes into the log")] = "",
+    as_json: AsJson = False,
+) -> None:
+    """Go back to an older installed calibration."""
+    _switched(rollback(root, to, reason), root, as_json)
+
+
+def _switched(generation: Generation, root: Path | None, as_json: bool) -> None:
+    stable = state_root(root) / "calibrations" / "current"
+    if as_json:
+        print_json({"generation": generation.number, "path": str(generation.path), "current": str(stable)})
+        return
+    log = read_log(root)
+    out.print(f"generation {generation.number} is installed: {stable}")
+    if log and log[-1].change:
+        out.print(f"change: {log[-1].change}")
+
+
+def list_installed(root: Root = None, as_json: AsJson = False) -> None:
+    """Every calibration that was installed here."""
+    known = generations(root)
+    if as_json:
+        print_json([_plain(generation) for generation in known])
+        return
+    if not known:
+        err.print(f"nothing is installed in {state_root(root)}")
+        return
+    table = Table("", "generation", "solved", "result", "verdict", box=None)
+    for generation in known:
+        calibration = generation.calibration
+        table.add_row(
+            "→" if generation.current else "",
+            str(generation.number),
+            "" if calibration is None else calibration.created,
+            generation.problem if calibration is None else pose_text(calibration),
+            "" if calibration is None else verdict(calibration)[1],
+        )
+    out.print(table)
+
+
+def _plain(generation: Generation) -> dict[str, Any]:
+    calibration = generation.calibration
+    return {
+        "generation": generation.number,
+        "current": generation.current,
+        "path": str(generation.path),
+        "problem": generation.problem,
+        "created": None if calibration is None else calibration.created,
+        "source": None if calibration is None else calibration.source,
+        "sigma": None if calibration is None else msgspec.to_builtins(calibration.sigma),
+    }

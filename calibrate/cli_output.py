@@ -1,0 +1,63 @@
+"""How the command line speaks: results on stdout, everything else on stderr."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+from calibrate.calibration import CalibrationFileError, read_calibration
+from calibrate.errors import CalibrationError
+from calibrate.load import Progress as LoadProgress
+
+out = Console(highlight=False)
+err = Console(stderr=True, highlight=False)
+
+AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout and nothing else")]
+
+
+class OutputError(CalibrationError):
+    """Where the result should go is wrong, or what was asked for does not exist."""
+
+    exit_code = 2
+
+
+def check_target(target: Path) -> None:
+    """A calibration file may be replaced; anything else that stands there is left alone."""
+    if not target.parent.is_dir():
+        raise OutputError(f"{target}: the folder {target.parent} does not exist.")
+    if target.exists():
+        try:
+            read_calibration(target)
+        except CalibrationFileError:
+            raise OutputError(
+                f"{target} exists and is no whole calibration file; give another name with -o."
+            ) from None
+
+
+@contextmanager
+def detection_progress() -> Iterator[LoadProgress | None]:
+    """A bar on stderr, only on a terminal."""
+    if not err.is_terminal:
+        yield None
+        return
+    columns = (
+        TextColumn("finding the board"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.description}"),
+    )
+    with Progress(*columns, console=err, transient=True) as bar:
+        task = bar.add_task("", total=None)
+        yield lambda done, total, name: bar.update(task, completed=done, total=total, description=name)
+
+
+def print_json(value: object) -> None:
+    sys.stdout.write(msgspec.json.encode(value).decode() + "\n")

@@ -1,0 +1,40 @@
+"""ROS 2 static_transform_publisher: the command line and a launch file."""
+
+from __future__ import annotations
+
+from calibrate.calibration import Calibration
+from calibrate.formats.frames import FrameNames, comment, number
+
+
+def arguments(calibration: Calibration, frames: FrameNames) -> list[str]:
+    """--x … --child-frame-id C; the quaternion, not angles, so that nothing can be misread."""
+    values = (*calibration.result.translation_m, *calibration.result.rotation_xyzw)
+    names = ("--x", "--y", "--z", "--qx", "--qy", "--qz", "--qw")
+    found = [part for name, value in zip(names, values, strict=True) for part in (name, number(value))]
+    return [*found, "--frame-id", frames.parent(calibration), "--child-frame-id", frames.camera]
+
+
+def command(calibration: Calibration, frames: FrameNames) -> str:
+    line = " ".join(["ros2 run tf2_ros static_transform_publisher", *arguments(calibration, frames)])
+    return f"# {comment(calibration)}\n{line}\n"
+
+
+def launch_file(calibration: Calibration, frames: FrameNames) -> str:
+    listed = ",\n".join(f"                {part!r}" for part in arguments(calibration, frames))
+    return f'''# {comment(calibration)}
+from launch import LaunchDescription
+from launch_ros.actions import Node
+
+
+def generate_launch_description():
+    return LaunchDescription([
+        Node(
+            package="tf2_ros",
+            executable="static_transform_publisher",
+            name="{frames.camera}_publisher",
+            arguments=[
+{listed},
+            ],
+        ),
+    ])
+'''

@@ -1,0 +1,181 @@
+"""Where installed calibrations lie, and the one atomic switch between them.
+
+    ROOT/calibrations/gen/0007-1a2b3c4d.yaml     every calibration ever installed, never changed
+    ROOT/calibrations/current -> gen/0007-…      what consumers read
+    ROOT/calibrations/log.jsonl                  who switched to what, when and why
+
+Whoever loses power or is killed at any moment finds the old calibration or the new one.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import getpass
+import os
+import re
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+
+from calibrate.calibration import Calibration, CalibrationFileError, fsync_folder, read_calibration
+from calibrate.errors import CalibrationError
+
+_NAME = re.compile(r"(\d{4,})-[0-9a-f]{8}\.yaml")
+
+
+class InstallError(CalibrationError):
+    """Nothing was installed; what was installed before still is."""
+
+
+@dataclass(frozen=True)
+class Generation:
+    number: int
+    path: Path
+    current: bool
+    calibration: Calibration | None
+    """None when the file is damaged; `problem` says how."""
+    problem: str = ""
+
+
+class LogEntry(msgspec.Struct, frozen=True, omit_defaults=True):
+    wall: str
+    action: Literal["install", "rollback"]
+    generation: int
+    who: str
+    change: str = ""
+    """Against what was installed before."""
+    reason: str = ""
+
+
+def state_root(root: Path | None = None) -> Path:
+    """Where the station keeps its state: `root`, $STATE_DIRECTORY (systemd), or the XDG state folder."""
+    if root is not None:
+        return root
+    if state := os.environ.get("STATE_DIRECTORY", "").split(":")[0]:
+        return Path(state)
+    base = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
+    return Path(base) / "calibration-station"
+
+
+def generations(root: Path | None = None) -> list[Generation]:
+    """Everything ever installed, oldest first; damaged files are listed with their problem."""
+    folder = calibrations_folder(root)
+    current = current_name(folder)
+    found = []
+    for path in sorted((folder / "gen").glob("*.yaml")):
+        match = _NAME.fullmatch(path.name)
+        if match is None:
+            continue
+        calibration, problem = None, ""
+        try:
+            calibration = read_calibration(path)
+        except CalibrationFileError as damage:
+            problem = str(damage)
+        found.append(Generation(int(match[1]), path, path.name == current, calibration, problem))
+    return sorted(found, key=lambda generation: generation.number)
+
+
+def read_log(root: Path | None = None) -> list[LogEntry]:
+    """Oldest first; lines that a crash cut are left out."""
+    path = calibrations_folder(root) / "log.jsonl"
+    entries = []
+    for line in path.read_bytes().splitlines() if path.exists() else []:
+        try:
+            entries.append(msgspec.json.decode(line, type=LogEntry))
+        except msgspec.DecodeError:
+            continue
+    return entries
+
+
+def content_name(content: bytes) -> str:
+    """First 8 hex digits of the content's own hash, as written in the file."""
+    found = re.search(rb"^sha256: '?([0-9a-f]{8})", content, re.MULTILINE)
+    if found is None:
+        raise CalibrationFileError("a calibration file without its hash cannot be installed")
+    return found[1].decode()
+
+
+def calibrations_folder(root: Path | None) -> Path:
+    return state_root(root) / "calibrations"
+
+
+def current_name(folder: Path) -> str:
+    try:
+        return (folder / "current").readlink().name
+    except OSError:
+        return ""
+
+
+def next_number(folder: Path) -> int:
+    numbers = [int(m[1]) for p in (folder / "gen").iterdir() if (m := _NAME.fullmatch(p.name))]
+    return max(numbers, default=0) + 1
+
+
+def write_new(path: Path, content: bytes) -> None:
+    """A generation appears under its name only when it is whole and on the disk."""
+    temporary = path.with_suffix(".tmp")
+    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o640)
+    with os.fdopen(descriptor, "wb") as file:
+        file.write(content)
+        file.flush()
+        os.fsync(file.fileno())
+    temporary.rename(path)
+    fsync_folder(path.parent)
+
+
+def switch(folder: Path, name: str, content: bytes) -> None:
+    """`current` → gen/name by one rename, then read back through it."""
+    temporary = folder / "current.new"
+    temporary.unlink(missing_ok=True)
+    temporary.symlink_to(Path("gen") / name)
+    temporary.replace(folder / "current")
+    fsync_folder(folder)
+    if (folder / "current").read_bytes() != content:
+        raise InstallError(f"{folder / 'current'} does not read back what was installed; check the disk.")
+
+
+def append_log(folder: Path, entry: LogEntry) -> None:
+    with (folder / "log.jsonl").open("ab") as file:
+        file.write(msgspec.json.encode(entry) + b"\n")
+        file.flush()
+        os.fsync(file.fileno())
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """One installer at a time; the folders exist inside."""
+    try:
+        (folder / "gen").mkdir(parents=True, exist_ok=True)
+        descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o640)
+    except OSError as problem:
+        raise InstallError(
+            f"{folder} cannot be used: {problem.strerror}. Name another with --root."
+        ) from None
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_EX)
+        yield
+    except OSError as problem:
+        raise InstallError(f"{folder}: {problem.strerror or problem}. Nothing was switched.") from None
+    finally:
+        os.close(descriptor)
+
+
+def no_generation(folder: Path, number: int, known: list[Generation]) -> Generation:
+    have = ", ".join(str(g.number) for g in known) or "none"
+    raise InstallError(f"{folder}: there is no generation {number}; there are: {have}.")
+
+
+def now_text() -> str:
+    return datetime.now(UTC).isoformat(timespec="seconds")
+
+
+def who() -> str:
+    try:
+        return getpass.getuser()
+    except (OSError, KeyError):
+        return f"uid {os.getuid()}"

@@ -1,0 +1,202 @@
+"""Installing a calibration, who refuses it and why, loading it in other programs, and the way back.
+
+How it lies on the disk is `generations`' business.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Literal
+
+import msgspec
+import numpy as np
+
+from calibrate.calibration import (
+    Calibration,
+    Override,
+    decode_calibration,
+    encode_calibration,
+    read_calibration,
+)
+from calibrate.errors import GateFailedError
+from calibrate.generations import (
+    Generation,
+    InstallError,
+    LogEntry,
+    append_log,
+    calibrations_folder,
+    content_name,
+    generations,
+    locked,
+    next_number,
+    no_generation,
+    now_text,
+    switch,
+    who,
+    write_new,
+)
+from calibrate.geometry import Transform, difference
+from recordings.messages import Source
+
+Cell = Literal["real", "imported", "simulated"]
+_CELL_OF: dict[Source, Cell] = {
+    "real": "real",
+    "imported": "imported",
+    "simulated": "simulated",
+    "playback": "simulated",
+}
+
+
+class InstallGateError(GateFailedError, InstallError):
+    """A gate failed and nobody took responsibility."""
+
+
+def load_installed(root: Path | None = None, allow_simulated: bool = False) -> Calibration:
+    """The installed calibration, verified: the call for programs that use the camera.
+
+    `calibration.transform` is `flange_from_camera` (eye-in-hand) or `base_from_camera` (eye-to-hand), with
+    both frame names in it; `calibration.intrinsics.model` is the lens. Raises InstallError when nothing is
+    installed or when it is simulated and that was not asked for, CalibrationFileError when it is damaged.
+    """
+    current = calibrations_folder(root) / "current"
+    if not current.exists():
+        raise InstallError(f"{current}: nothing is installed. Run: calibrate install FILE")
+    calibration = read_calibration(current)
+    if _CELL_OF[calibration.source] == "simulated" and not allow_simulated:
+        raise InstallError(
+            f"{current}: the installed calibration is {calibration.source}, not of a real cell."
+        )
+    return calibration
+
+
+def install(
+    path: Path,
+    root: Path | None = None,
+    *,
+    cell: Cell = "real",
+    override: str = "",
+    robot_serial: str = "",
+    camera_serial: str = "",
+) -> Generation:
+    """Makes the calibration file `path` the current one.
+
+    `cell`: what kind of cell this root belongs to; a real one takes nothing simulated, played back or
+    imported, and no override changes that. `override`: a person's reason to install although a gate failed
+    or robot or camera differ; it goes into the file. `robot_serial`, `camera_serial`: of the cell's own
+    configuration, when known. Raises InstallError (also as exit code 4 for a gate) or CalibrationFileError.
+    """
+    calibration = read_calibration(path)
+    folder = calibrations_folder(root)
+    with locked(folder):
+        before = _installed_before(root)
+        objections = _objections(calibration, before, robot_serial, camera_serial)
+        _refuse_foreign_source(calibration, before, cell, path)
+        failed = [f"gate {gate.name}: {gate.text}" for gate in calibration.quality.failed]
+        if (failed or objections) and not override.strip():
+            kind = InstallGateError if failed and not objections else InstallError
+            raise kind(
+                f"{path} is not installed. " + " ".join([*objections, *failed]) + " If a person takes "
+                'responsibility: calibrate install --override "REASON".'
+            )
+        if failed or objections:
+            taken = Override(override.strip(), who(), [*objections, *failed])
+            calibration = msgspec.structs.replace(calibration, override=taken)
+        content = encode_calibration(calibration)
+        number = next_number(folder)
+        name = f"{number:04d}-{content_name(content)}.yaml"
+        write_new(folder / "gen" / name, content)
+        decode_calibration((folder / "gen" / name).read_bytes(), str(folder / "gen" / name))
+        switch(folder, name, content)
+        change = change_text(before, calibration)
+        append_log(folder, LogEntry(now_text(), "install", number, who(), change, override.strip()))
+    return Generation(number, folder / "gen" / name, True, calibration)
+
+
+def rollback(root: Path | None = None, to: int | None = None, reason: str = "") -> Generation:
+    """Switches back: to the generation before the current one, or to `to`. The same switch as `install`."""
+    folder = calibrations_folder(root)
+    with locked(folder):
+        known = generations(root)
+        current = next((g for g in known if g.current), None)
+        if to is None:
+            older = [g for g in known if current is not None and g.number < current.number and not g.problem]
+            if not older:
+                raise InstallError(f"{folder}: there is no older calibration to go back to.")
+            target = older[-1]
+        else:
+            target = next((g for g in known if g.number == to), None) or no_generation(folder, to, known)
+        if target.calibration is None:
+            raise InstallError(f"generation {target.number} is damaged and cannot be used: {target.problem}")
+        switch(folder, target.path.name, target.path.read_bytes())
+        before = None if current is None else current.calibration
+        change = change_text(before, target.calibration)
+        append_log(folder, LogEntry(now_text(), "rollback", target.number, who(), change, reason))
+    return Generation(target.number, target.path, True, target.calibration)
+
+
+def change_text(before: Calibration | None, after: Calibration) -> str:
+    """'0.12 mm, 0.004° from generation before', or empty when there was none of the same frames."""
+    if before is None or before.mount != after.mount:
+        return ""
+    delta = difference(after.transform.matrix, before.transform.matrix)
+    degrees = float(np.degrees(np.linalg.norm(delta[3:])))
+    return f"{np.linalg.norm(delta[:3]) * 1000:.3f} mm, {degrees:.4f}° from the one before"
+
+
+def installed_transform(root: Path | None = None, allow_simulated: bool = False) -> Transform:
+    """`flange_from_camera` or `base_from_camera` of the installed calibration, verified."""
+    return load_installed(root, allow_simulated).transform
+
+
+def _installed_before(root: Path | None) -> Calibration | None:
+    """The current one; where that is damaged, the newest that is whole, so that the checks still hold."""
+    known = [g for g in generations(root) if g.calibration is not None]
+    current = [g for g in known if g.current]
+    return (current or known)[-1].calibration if known else None
+
+
+def _refuse_foreign_source(
+    calibration: Calibration, before: Calibration | None, cell: Cell, path: Path
+) -> None:
+    kind = _CELL_OF[calibration.source]
+    if kind != cell:
+        hint = {
+            "real": "A real cell takes only what was captured on it.",
+            "imported": "This root is for imported recordings.",
+            "simulated": "This root belongs to a simulated cell.",
+        }[cell]
+        raise InstallError(
+            f"{path} is {calibration.source} and is not installed on a {cell} cell. {hint} "
+            f"Files from elsewhere go to a place of their own: calibrate install --cell {kind} --root FOLDER {path}"
+        )
+    if before is not None and _CELL_OF[before.source] != kind:
+        raise InstallError(
+            f"{path} ({calibration.source}) does not follow a {before.source} calibration in the same place. "
+            "Use another --root."
+        )
+
+
+def _objections(
+    calibration: Calibration, before: Calibration | None, robot_serial: str, camera_serial: str
+) -> list[str]:
+    """Reasons against, other than gates: another robot or camera than the cell's."""
+    robot, camera = calibration.robot, calibration.camera
+    found = []
+    if robot_serial and robot.serial != robot_serial:
+        found.append(f"It is of robot {robot.serial or 'unknown'}, the cell has {robot_serial}.")
+    if camera_serial and camera.serial != camera_serial:
+        found.append(f"It is of camera {camera.serial or 'unknown'}, the cell has {camera_serial}.")
+    if before is not None:
+        if (before.robot.model, before.robot.serial) != (robot.model, robot.serial):
+            found.append(
+                f"It is of robot {robot.model} {robot.serial}, the installed one of {before.robot.model} "
+                f"{before.robot.serial}."
+            )
+        if (before.camera.model, before.camera.serial) != (camera.model, camera.serial):
+            found.append(
+                f"It is of camera {camera.model} {camera.serial}, the installed one of {before.camera.model} "
+                f"{before.camera.serial}."
+            )
+        if before.mount != calibration.mount:
+            found.append(f"It is {calibration.mount}, the installed one {before.mount}.")
+    return found

@@ -18,6 +18,7 @@ from textual.message import Message
 from textual.reactive import reactive
 
 from station.errors import RefusedError, StationError
+from station.protocol import Verb
 from station.status import GoSummary, StationState, StationStatus
 from station.tui.checklist import ChecklistScreen
 from station.tui.confirm import Confirm, ConfirmGo
@@ -121,7 +122,7 @@ class StationApp(App[None]):
 
     # --- the operator → the daemon ---
 
-    async def ask(self, verb: str, **args: Any) -> Any:
+    async def ask(self, verb: Verb, **args: Any) -> Any:
         """The daemon's answer, or None after a notice that says why not."""
         if self._link is None:
             self.notify("No connection to the daemon: nothing was sent.", severity="error")
@@ -135,7 +136,7 @@ class StationApp(App[None]):
         return None
 
     @work(group="command", exit_on_error=False)
-    async def send(self, verb: str, **args: Any) -> None:
+    async def send(self, verb: Verb, **args: Any) -> None:
         """A wish of one of the screens; control of the arm is taken with it."""
         if await self.ask("lease", action="take") is not None:
             await self.ask(verb, **args)

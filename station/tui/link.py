@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import AsyncIterator, Awaitable, Callable
 from typing import Any, Protocol
 
+from station.protocol import Verb
 from station.status import StationStatus
 
 
 class Link(Protocol):
     """What the screen needs of a connection; `station.client.Client` is one, tests bring another."""
 
-    async def request(self, verb: str, **args: Any) -> Any:
+    async def request(self, verb: Verb, **args: Any) -> Any:
         """The daemon's result. RefusedError with the daemon's reason; StationError when it is gone."""
 
     def statuses(self) -> AsyncIterator[StationStatus]:

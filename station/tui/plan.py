@@ -9,6 +9,7 @@ from textual.binding import Binding, BindingType
 from textual.containers import Horizontal
 from textual.widgets import DataTable
 
+from station.protocol import Verb
 from station.status import PoseStatus, StationStatus
 from station.tui.screen import StationScreen
 from station.tui.widgets.sketch import PlanSketch
@@ -89,7 +90,7 @@ class PlanScreen(StationScreen):
             return None
         return status.session.poses[self.table.cursor_row].index
 
-    def action_pose(self, verb: str) -> None:
+    def action_pose(self, verb: Verb) -> None:
         index = self._selected()
         if index is not None:
             self.station.send(verb, index=index)

@@ -1,0 +1,170 @@
+"""The way every screen and command talks to the daemon: one Unix socket, JSON lines."""
+
+from __future__ import annotations
+
+import asyncio
+import getpass
+import os
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from station.errors import RefusedError, StationError
+from station.protocol import LINE_LIMIT_BYTES, Reply, Request, Verb
+from station.status import StationStatus
+
+CONNECT_S = 5.0
+ANSWER_S = 30.0
+_ANSWER_LIMIT_BYTES = 8 * 1024 * 1024
+"""The daemon is trusted more than its clients are: a preview is larger than any request."""
+
+
+class DaemonGoneError(StationError):
+    """No daemon answers on the socket, or it went away."""
+
+
+def who_am_i() -> str:
+    """'anna on tty1': what others read as the holder of the lease."""
+    try:
+        terminal = " on " + os.ttyname(0).removeprefix("/dev/")
+    except OSError:
+        terminal = ""
+    try:
+        return getpass.getuser() + terminal
+    except (OSError, KeyError):
+        return f"uid {os.getuid()}{terminal}"
+
+
+class _Incoming(msgspec.Struct):
+    """Any line from the daemon."""
+
+    id: int | None = None
+    ok: bool = False
+    result: Any = None
+    error: str = ""
+    status: dict[str, Any] | None = None
+    changes: dict[str, Any] | None = None
+
+
+class Client:
+    """A connection. Losing it loses the lease: the daemon then decelerates the arm and pauses."""
+
+    def __init__(self, path: Path, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._path, self._reader, self._writer = path, reader, writer
+        self._next_id = 1
+        self._waiting: dict[int, asyncio.Future[Reply]] = {}
+        self._plain_status: dict[str, Any] | None = None
+        self._fresh = asyncio.Event()
+        self._gone = False
+        self._task = asyncio.create_task(self._read(), name="client-read")
+
+    @classmethod
+    async def connect(cls, path: Path, who: str = "", timeout_s: float = CONNECT_S) -> Client:
+        """Raises DaemonGoneError with the remedy when nobody serves there."""
+        try:
+            async with asyncio.timeout(timeout_s):
+                reader, writer = await asyncio.open_unix_connection(str(path), limit=_ANSWER_LIMIT_BYTES)
+        except (FileNotFoundError, ConnectionRefusedError):
+            raise DaemonGoneError(
+                f"No station daemon serves {path}. Start one: `station serve --config FILE`, or "
+                "`station serve --simulate` for a cell without hardware."
+            ) from None
+        except PermissionError:
+            raise DaemonGoneError(
+                f"{path}: not allowed. Operators are members of the group station-operator "
+                "(log in again after being added)."
+            ) from None
+        except (OSError, TimeoutError) as error:
+            raise DaemonGoneError(f"{path}: the daemon does not answer ({error or 'timeout'}).") from None
+        client = cls(path, reader, writer)
+        await client.request("hello", who=who or who_am_i())
+        return client
+
+    async def request(self, verb: Verb, *, timeout_s: float = ANSWER_S, **args: Any) -> Any:
+        """The daemon's result as plain data. RefusedError with its reason; DaemonGoneError."""
+        if self._gone:
+            raise self._gone_error()
+        request = Request(self._next_id, verb, args)
+        line = msgspec.json.encode(request) + b"\n"
+        if len(line) > LINE_LIMIT_BYTES:
+            raise RefusedError(f"{verb}: {len(line)} bytes are more than the daemon takes at once.")
+        self._next_id += 1
+        answer: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+        self._waiting[request.id] = answer
+        try:
+            self._writer.write(line)
+            await self._writer.drain()
+            async with asyncio.timeout(timeout_s):
+                reply = await answer
+        except TimeoutError:
+            raise StationError(f"{verb}: no answer from the daemon within {timeout_s:.0f} s.") from None
+        except OSError:
+            raise self._gone_error() from None
+        finally:
+            self._waiting.pop(request.id, None)
+        if not reply.ok:
+            raise RefusedError(reply.error)
+        return reply.result
+
+    async def statuses(self) -> AsyncIterator[StationStatus]:
+        """The status now and after every change (slow readers see the newest only)."""
+        await self.request("watch")
+        while True:
+            await self._fresh.wait()
+            self._fresh.clear()
+            if self._plain_status is not None:
+                yield msgspec.convert(self._plain_status, StationStatus)
+            if self._gone:
+                return
+
+    async def close(self) -> None:
+        self._task.cancel()
+        self._writer.close()
+        await asyncio.gather(self._task, return_exceptions=True)
+
+    async def __aenter__(self) -> Client:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def _read(self) -> None:
+        decoder = msgspec.json.Decoder(_Incoming)
+        try:
+            while line := await self._reader.readline():
+                self._take(decoder.decode(line))
+        except (OSError, ValueError, msgspec.DecodeError):
+            pass  # A daemon that speaks nonsense is as good as gone.
+        finally:
+            self._gone = True
+            for answer in self._waiting.values():
+                if not answer.done():
+                    answer.set_exception(self._gone_error())
+            self._fresh.set()
+
+    def _take(self, message: _Incoming) -> None:
+        if message.id is not None:
+            answer = self._waiting.get(message.id)
+            if answer is not None and not answer.done():
+                answer.set_result(Reply(message.id, message.ok, message.result, message.error))
+            return
+        if message.status is not None:
+            self._plain_status = message.status
+        elif message.changes is not None and self._plain_status is not None:
+            self._plain_status = self._plain_status | message.changes
+        self._fresh.set()
+
+    def _gone_error(self) -> DaemonGoneError:
+        return DaemonGoneError(f"The station daemon at {self._path} is gone; nothing was sent to the arm.")
+
+
+def ask(path: Path, verb: Verb, **args: Any) -> Any:
+    """One question from a plain program, no event loop needed. Raises as `Client.request` does."""
+
+    async def once() -> Any:
+        async with await Client.connect(path) as client:
+            return await client.request(verb, **args)
+
+    return asyncio.run(once())

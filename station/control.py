@@ -190,7 +190,8 @@ class _Connection:
             return
         self._writer.write(line)
         if self._writer.transport.get_write_buffer_size() > UNSENT_LIMIT_BYTES:
-            self.drop("it does not read what it is sent")
+            log.warning("client %d (pid %d) does not read: dropped", self.peer.client_id, self.peer.pid)
+            self._writer.transport.abort()
 
     def drop(self, why: str) -> None:
         log.warning("client %d (pid %d) is dropped: %s", self.peer.client_id, self.peer.pid, why)

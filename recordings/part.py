@@ -12,6 +12,7 @@ import numpy as np
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
+from numpy.typing import NDArray
 
 from recordings.contents import MessageIndex
 from recordings.errors import CorruptRecordingError
@@ -81,17 +82,11 @@ class RecordingPart:
         compressed = sequence in self._compressed
         topic = Topic.COMPRESSED_IMAGE if compressed else Topic.RAW_IMAGE
         place = (self._compressed if compressed else self._raw)[sequence]
-        message = self._image_message(topic, place)
         size = (self.info.camera.width, self.info.camera.height)
         try:
             if (facts.width, facts.height) != size:
                 raise PictureError(f"is {facts.width}×{facts.height}, the camera {size[0]}×{size[1]}")
-            if compressed:
-                image = decode_picture(message.data, *size)
-            elif (message.width, message.height) != size:
-                raise PictureError(f"is {message.width}×{message.height}, expected {size[0]}×{size[1]}")
-            else:
-                image = raw_array(message.data, message.encoding, *size)
+            image = self._decoded_image(topic, place, *size)
         except PictureError as error:
             raise self.corrupt(topic, place, f"picture {sequence} {error}") from error
         image.flags.writeable = False
@@ -105,6 +100,16 @@ class RecordingPart:
             pixel_format=facts.pixel_format,
             trigger_count=facts.trigger_count,
         )
+
+    def _decoded_image(self, topic: Topic, place: int, width: int, height: int) -> NDArray[Any]:
+        message = self._image_message(topic, place)
+        data = message.data
+        if topic is Topic.COMPRESSED_IMAGE:
+            del message  # it holds a second copy of the bytes
+            return decode_picture(data, width, height)
+        if (message.width, message.height) != (width, height):
+            raise PictureError(f"is {message.width}×{message.height}, expected {width}×{height}")
+        return raw_array(data, message.encoding, width, height)
 
     def stored_picture(self, sequence: int) -> tuple[str, bytes] | None:
         """(format, file bytes) of a picture that is kept compressed; None when it is kept raw."""

@@ -15,7 +15,7 @@ from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, create_exclusively, lock
 from recordings.messages import View
 from recordings.part import RecordingPart
 from recordings.records import MESSAGE_HEAD, RECORD_HEAD, Opcode, split_records, with_crc
-from recordings.salvage import Salvage, salvage
+from recordings.salvage import CompressedError, Salvage, salvage
 from recordings.scan import open_file
 from recordings.schema import SESSION_RECORDS, SchemaError, decode
 from recordings.topics import Topic
@@ -115,7 +115,10 @@ def _report(
 
 
 def _rebuild(descriptor: int, source: Path, final: Path, in_place: bool) -> Recovery:
-    found = salvage(descriptor)
+    try:
+        found = salvage(descriptor)
+    except CompressedError as error:
+        raise RecordingError(f"{source} was compressed by another tool; undo it: mcap decompress") from error
     session = next(
         (found.contents.metadata[n] for n in SESSION_RECORDS if n in found.contents.metadata), None
     )

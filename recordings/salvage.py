@@ -28,7 +28,7 @@ from recordings.records import (
     require_crc,
     split_records,
 )
-from recordings.scan import CHUNK_LIMIT_BYTES, SUMMARY_LIMIT_BYTES
+from recordings.scan import CHUNK_LIMIT_BYTES, COMPRESSIONS, SUMMARY_LIMIT_BYTES
 
 _LIKE_A_RECORD = re.compile(rb"[\x06\x09\x0c].{4}\x00{4}", re.DOTALL)
 """Opcode of a chunk, attachment or metadata record, and a length below 4 GiB."""
@@ -51,8 +51,12 @@ class Salvage:
         return sum(end - start for start, end, _ in self.lost)
 
 
+class CompressedError(Exception):
+    """Somebody packed the file: it needs unpacking, not recovery."""
+
+
 def salvage(descriptor: int) -> Salvage:
-    """Reads the whole open file once; memory is bounded as in the strict reader."""
+    """Reads the whole open file once; memory is bounded as in the strict reader. Raises CompressedError."""
     return _Walk(descriptor).run()
 
 
@@ -179,8 +183,8 @@ class _Walk:
 def _proven_records(content: memoryview) -> tuple[memoryview, int]:
     """(the records inside a chunk, their offset in it) when the checksum fits. BadRecordError otherwise."""
     head = parse_chunk_head(content)
-    if head.compression:
-        raise BadRecordError("the chunk is compressed; unpack the file with `mcap decompress` first")
+    if head.compression in COMPRESSIONS:
+        raise CompressedError
     records = content[head.data_offset :]
     if head.uncompressed_size != len(records) or zlib.crc32(records) != head.crc:
         raise BadRecordError("the chunk's checksum does not fit its content")

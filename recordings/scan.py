@@ -32,6 +32,8 @@ from recordings.records import (
 )
 
 CHUNK_LIMIT_BYTES = PICTURE_LIMIT_BYTES + 4 * 1024 * 1024
+COMPRESSIONS = ("zstd", "lz4")
+"""What other tools may have packed a recording with. Nothing here unpacks: no file can grow in memory."""
 SUMMARY_LIMIT_BYTES = 32 * 1024 * 1024
 _BLOCK_BYTES = 1024 * 1024
 _UNCHECKED = {
@@ -168,7 +170,7 @@ class _Scan:
         head = parse_chunk_head(content)
         if head.compression:
             raise BadRecordError(
-                f"the chunk is compressed ('{head.compression[:20]}'), this station writes none that are"
+                f"the chunk is compressed ('{head.compression[:20]}'), this station writes none"
             )
         records = content[head.data_offset :]
         if head.uncompressed_size != len(records):

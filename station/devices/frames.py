@@ -11,7 +11,7 @@ from station.errors import CameraError
 LAST_FRAME_ID = 65_535
 """GigE Vision block ids run from 1 to this and start over at 1; 0 means "no frame"."""
 UNKNOWN_READOUT_S = 0.05
-GOOD_ROUND_TRIP_NS = 500_000
+GOOD_ROUND_TRIP_NS = 2_000_000
 """A slower reading of the device clock counts only if it is at most twice as slow as the quickest one."""
 READINGS_KEPT = 200
 
@@ -44,9 +44,10 @@ class FrameCounter:
         """The camera was opened or acquisition started anew: the next frame id may be any."""
         self._last_id = self._last_pulse = None
 
-    def accept(self, frame_id: int, pulse_count: int | None = None) -> int:
+    def accept(self, frame_id: int, pulse_count: int | None = None, *, sequenced: bool = True) -> int:
         """The frame's sequence number. `pulse_count`: of the trigger box, for its trigger.
 
+        `sequenced=False`: a preview, which takes no sequence number.
         Raises CameraError for a frame that is not the next one or a pulse count that did not grow by one.
         """
         last_id, last_pulse = self._last_id, self._last_pulse
@@ -70,6 +71,14 @@ class FrameCounter:
                 f"the trigger box counted {pulses} pulses for one picture (noise on the trigger line?); "
                 "take this pose again"
             )
+        self.frames += sequenced
+        return self.frames - 1
+
+    def follow(self, frame_id: int) -> int:
+        """Free-running: the sequence number; gaps are only counted."""
+        if self._last_id is not None:
+            self.missing += max(0, frames_between(self._last_id, frame_id) - 1)
+        self._last_id = frame_id
         self.frames += 1
         return self.frames - 1
 

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.geometry import Array, inverse
-from recordings.messages import BoardSpec, CameraModel
+from recordings.messages import CameraModel
 from station.errors import RobotError
 from station.simulation.admin import AdminClient
 from station.simulation.camera_faults import CameraFaults
@@ -47,6 +47,13 @@ class CameraProcess:
         self._rng = np.random.default_rng([truth.seed, 77])
         self._mount: Array = np.array(truth.camera_mount)
         self._place: Array = np.array(truth.board_place)
+
+    def warm_up(self) -> None:
+        """Both lens tables are made before the first trigger: they take half a second."""
+        behind = np.eye(4)
+        behind[2, 3] = -1.0
+        for model in (self.truth.camera, scaled(self.truth.camera, PREVIEW_SCALE)):
+            render(model, self.truth.board, behind)
 
     def device_ns(self, host_monotonic_ns: int) -> int:
         """The camera's own clock."""
@@ -87,19 +94,8 @@ class CameraProcess:
         self, kind: str, start_ns: int, camera: CameraModel, frame_id: int
     ) -> tuple[dict[str, Any], NDArray[np.uint8]]:
         exposure_us = self.faults.exposure_us or self.exposure_us
-        exposure_ns = round(exposure_us * 1000)
-        base_from_flange = self._flange_at(start_ns + exposure_ns // 2)
-        light = Light(
-            exposure_us=exposure_us,
-            gain_db=self.gain_db,
-            illumination=self.truth.illumination * self.faults.illumination,
-            pixel_noise=self.truth.pixel_noise,
-            blur_px=self.truth.blur_px * camera.width / self.truth.camera.width,
-        )
-        board = self.faults.board or self.truth.board
-        picture = render(camera, board, self.camera_from_board(base_from_flange), light, self._rng)
-        self.faults.cover(picture)
-        arrival_ns = start_ns + exposure_ns + READOUT_NS
+        picture = self.picture(start_ns, camera)
+        arrival_ns = start_ns + round(exposure_us * 1000) + READOUT_NS
         _sleep_until(arrival_ns)
         header = {
             "kind": kind,
@@ -110,6 +106,22 @@ class CameraProcess:
             "gain_db": self.gain_db,
         }
         return header, picture
+
+    def picture(self, start_ns: int, camera: CameraModel) -> NDArray[np.uint8]:
+        """Exposed from the host time `start_ns` on; returns after the exposure."""
+        exposure_us = self.faults.exposure_us or self.exposure_us
+        base_from_flange = self._flange_at(start_ns + round(exposure_us * 500))
+        light = Light(
+            exposure_us=exposure_us,
+            gain_db=self.gain_db,
+            illumination=self.truth.illumination * self.faults.illumination,
+            pixel_noise=self.truth.pixel_noise,
+            blur_px=self.truth.blur_px * camera.width / self.truth.camera.width,
+        )
+        board = self.faults.board or self.truth.board
+        picture = render(camera, board, self.camera_from_board(base_from_flange), light, self._rng)
+        self.faults.cover(picture)
+        return picture
 
     def camera_from_board(self, base_from_flange: Array) -> Array:
         if self.truth.mount == "eye-in-hand":
@@ -137,7 +149,7 @@ def serve(lines: BinaryIO, out: BinaryIO) -> None:
     setup = json.loads(lines.readline())
     truth = msgspec.convert(setup["truth"], CellTruth)
     camera = CameraProcess(truth, setup["controller_host"], setup["exposure_us"], setup["gain_db"])
-    _warm_up(camera)
+    camera.warm_up()
     _send(out, {"kind": "ready"}, None)
     for line in lines:
         request = json.loads(line)
@@ -148,15 +160,6 @@ def serve(lines: BinaryIO, out: BinaryIO) -> None:
                 _send(out, header, pixels)
         except (RobotError, ValueError) as error:
             _send(out, {"kind": "error", "cmd": request["cmd"], "text": str(error)}, None)
-
-
-def _warm_up(camera: CameraProcess) -> None:
-    """Both lens tables are made before the first trigger: they take a second."""
-    nowhere = np.diag([1.0, 1.0, 1.0, 1.0])
-    nowhere[2, 3] = -1.0
-    board: BoardSpec = camera.truth.board
-    for model in (camera.truth.camera, scaled(camera.truth.camera, PREVIEW_SCALE)):
-        render(model, board, nowhere)
 
 
 def _send(out: BinaryIO, header: dict[str, Any], pixels: NDArray[np.uint8] | None) -> None:

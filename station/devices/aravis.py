@@ -1,0 +1,164 @@
+"""GenICam cameras: one worker thread per camera, because with a lost camera a single call takes seconds."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any, TypeVar
+
+import msgspec
+
+from recordings.messages import CameraIdentity, Picture
+from station.clocks import ClockFit
+from station.config import CameraConfig
+from station.devices.aravis_device import GenicamDevice
+from station.devices.base import Trigger
+from station.devices.frames import DeviceClock, FrameCounter
+from station.errors import CameraError
+
+T = TypeVar("T")
+_CLOCK_READINGS = 8
+_STREAM_POP_S = 0.1
+
+
+class AravisCamera:
+    """`station.devices.base.Camera`. With `trigger: hardware` the box given here fires it."""
+
+    def __init__(self, config: CameraConfig, trigger: Trigger | None = None) -> None:
+        if config.trigger == "hardware" and trigger is None:
+            raise CameraError("camera.trigger is 'hardware' but no trigger box is configured")
+        self._config = config
+        self._trigger = trigger
+        self._device: GenicamDevice | None = None
+        self._worker: ThreadPoolExecutor | None = None
+        self._busy = asyncio.Lock()
+        self._clock = DeviceClock()
+        self._newest: Picture | None = None
+        self._identity = CameraIdentity(driver="aravis")
+        self.counter = FrameCounter()
+
+    @property
+    def identity(self) -> CameraIdentity:
+        return self._identity
+
+    @property
+    def clock(self) -> ClockFit | None:
+        return self._clock.fit
+
+    async def open(self) -> CameraIdentity:
+        async with self._busy:
+            await self._run(self._open)
+        return self._identity
+
+    async def settings(self) -> dict[str, Any]:
+        """As the camera reports them now."""
+        async with self._busy:
+            return await self._run(lambda: self._live().settings())
+
+    async def capture(self, timeout_s: float = 5.0) -> Picture:
+        async with self._busy:
+            exposure_us, gain_db = await self._run(self._prepare)
+            pulse = None
+            if self._config.trigger == "hardware":
+                assert self._trigger is not None
+                pulse = (await self._trigger.fire()).count
+            picture = await self._run(partial(self._take, timeout_s))
+            sequence = self.counter.accept(picture.frame_id, pulse)
+            self._newest = msgspec.structs.replace(
+                picture, sequence=sequence, exposure_us=exposure_us, gain_db=gain_db, trigger_count=pulse
+            )
+            return self._newest
+
+    async def preview(self) -> Picture | None:
+        """A fresh picture where the camera is idle and can be triggered by software, else the newest one."""
+        if self._busy.locked() or self._config.trigger == "hardware":
+            return self._newest
+        async with self._busy:
+            try:
+                await self._run(self._prepare)
+                picture = await self._run(partial(self._take, 1.0))
+                self.counter.accept(picture.frame_id, sequenced=False)
+            except CameraError:
+                return None
+        return picture
+
+    async def stream(self, callback: Callable[[Picture], None], stop: threading.Event) -> None:
+        """Free-running: every frame, in order, from the worker's thread, until `stop` is set."""
+        async with self._busy:
+            await self._run(partial(self._stream_frames, callback, stop))
+
+    async def close(self) -> None:
+        if self._worker is not None:
+            worker, self._worker = self._worker, None
+            device, self._device = self._device, None
+            if device is not None:
+                await asyncio.get_running_loop().run_in_executor(worker, device.close)
+            worker.shutdown(wait=False)
+
+    async def _run(self, job: Callable[[], T]) -> T:
+        if self._worker is None:
+            self._worker = ThreadPoolExecutor(1, "aravis")
+        return await asyncio.get_running_loop().run_in_executor(self._worker, job)
+
+    def _open(self) -> None:
+        device = GenicamDevice(self._config)
+        self._identity = device.open(self._identity.serial)
+        self._device = device
+        self.counter.restart()
+        self._clock.restart()
+        for _ in range(_CLOCK_READINGS):
+            device.latch(self._clock)
+
+    def _live(self) -> GenicamDevice:
+        """The device; opened again, by its serial, after it was lost."""
+        if self._device is None:
+            raise CameraError("the camera is not open")
+        if self._device.lost.is_set():
+            self._device.close()
+            self._open()
+        return self._device
+
+    def _prepare(self) -> tuple[float, float]:
+        device = self._live()
+        if self._config.trigger != "free-running" and (extra := device.drain()):
+            raise self.counter.surplus(extra)
+        device.latch(self._clock)
+        return device.check_settings()
+
+    def _take(self, timeout_s: float) -> Picture:
+        device = self._live()
+        if self._config.trigger == "free-running":
+            device.drain()  # they began before they were asked for
+            self.counter.restart()
+        elif self._config.trigger == "software":
+            device.trigger()
+        try:
+            picture = device.frame(timeout_s)
+        except CameraError:
+            self.counter.lost()
+            raise
+        if picture is None:
+            self.counter.lost()
+            raise CameraError(
+                f"the camera sent no picture within {timeout_s:g} s of its trigger; take this pose again "
+                "(with hardware trigger: check the line)"
+            )
+        return picture
+
+    def _stream_frames(self, callback: Callable[[Picture], None], stop: threading.Event) -> None:
+        device = self._live()
+        self.counter.restart()
+        device.drain()
+        while not stop.is_set():
+            try:
+                picture = device.frame(_STREAM_POP_S)
+            except CameraError:
+                if device.lost.is_set():
+                    raise
+                continue  # incomplete: the next frame's id shows the gap, and the counter counts it
+            if picture is not None:
+                sequence = self.counter.follow(picture.frame_id)
+                callback(msgspec.structs.replace(picture, sequence=sequence))

@@ -1,0 +1,254 @@
+"""One GenICam camera through Aravis, blocking. The only module with `gi`, loaded when a camera is opened."""
+
+from __future__ import annotations
+
+import threading
+import time
+from contextlib import contextmanager
+from typing import TYPE_CHECKING, Any
+
+from recordings.messages import CameraIdentity, Picture, Stamps
+from station.config import CameraConfig
+from station.devices.frames import DeviceClock
+from station.devices.pixels import bits_per_pixel, decode
+from station.errors import CameraError
+
+if TYPE_CHECKING:
+    from collections.abc import Iterator
+
+BUFFERS = 12
+_LATCH_WAIT_S = 0.02
+_POP_S = 0.1
+"""So often a waiting capture looks whether the camera was lost."""
+_EXPOSURE_TOLERANCE = 0.02
+_GAIN_TOLERANCE_DB = 0.2
+_INSTALL = (
+    "GenICam cameras need Debian's python3-gi and gir1.2-aravis-0.8 (apt install both, then make the venv "
+    "again with --system-site-packages)"
+)
+
+
+def _aravis() -> tuple[Any, Any]:
+    try:
+        import gi
+
+        gi.require_version("Aravis", "0.8")
+        from gi.repository import Aravis, GLib
+    except (ImportError, ValueError) as error:
+        raise CameraError(f"{_INSTALL}: {error}") from error
+    return Aravis, GLib
+
+
+class GenicamDevice:
+    """One opened camera; blocking, for one thread. All methods raise CameraError."""
+
+    def __init__(self, config: CameraConfig) -> None:
+        self._config = config
+        self._aravis, self._glib = _aravis()
+        self._camera: Any = None
+        self._stream: Any = None
+        self._latched_ns = 0
+        self.lost = threading.Event()
+        self.identity = CameraIdentity(driver="aravis")
+
+    def open(self, serial: str = "") -> CameraIdentity:
+        """Finds, sets up and starts the camera. `serial`: only this very one."""
+        bits_per_pixel(self._config.pixel_format)
+        with self._explained("opening the camera"):
+            self._camera = self._aravis.Camera.new(_find(self._aravis, serial or self._config.device))
+            self._camera.get_device().connect("control-lost", lambda _: self.lost.set())
+            self.identity = CameraIdentity(
+                vendor=self._camera.get_vendor_name() or "",
+                model=self._camera.get_model_name() or "unknown",
+                serial=self._camera.get_device_serial_number() or "",
+                driver="aravis",
+            )
+        with self._explained("setting up the camera"):
+            self._set_up()
+        with self._explained("starting the camera"):
+            self._stream = self._camera.create_stream(None, None)
+            payload = self._camera.get_payload()
+            for _ in range(BUFFERS):
+                self._stream.push_buffer(self._aravis.Buffer.new_allocate(payload))
+            self._camera.start_acquisition()
+        self.check_settings()
+        return self.identity
+
+    def close(self) -> None:
+        """Takes seconds when the camera is gone; never raises."""
+        if self._camera is not None and not self.lost.is_set():
+            try:
+                self._camera.stop_acquisition()
+            except self._glib.Error:
+                self.lost.set()
+        self._stream = self._camera = None
+
+    def _set_up(self) -> None:
+        camera, config = self._camera, self._config
+        camera.set_range_check_policy(self._aravis.RangeCheckPolicy.ENABLE)
+        camera.stop_acquisition()
+        camera.clear_triggers()
+        for automatic in ("ExposureAuto", "GainAuto"):
+            if camera.is_feature_available(automatic):
+                camera.set_string(automatic, "Off")
+        camera.set_pixel_format_from_string(config.pixel_format)
+        if config.region is not None:
+            camera.set_region(*config.region)
+        camera.set_exposure_time(config.exposure_us)
+        if camera.is_gain_available():
+            camera.set_gain(config.gain_db)
+        if camera.is_gv_device():
+            if config.packet_size is None:
+                camera.gv_auto_packet_size()
+            else:
+                camera.gv_set_packet_size(config.packet_size)
+        camera.set_acquisition_mode(self._aravis.AcquisitionMode.CONTINUOUS)
+        if config.trigger != "free-running":
+            camera.set_trigger("Software" if config.trigger == "software" else "Line0")
+
+    def settings(self) -> dict[str, Any]:
+        """Read back from the camera now, for the recording."""
+        camera = self._camera
+        with self._explained("reading the camera's settings"):
+            region = camera.get_region()
+            return {
+                "pixel_format": camera.get_pixel_format_as_string(),
+                "region": [region.x, region.y, region.width, region.height],
+                "exposure_us": camera.get_exposure_time(),
+                "gain_db": camera.get_gain() if camera.is_gain_available() else 0.0,
+                "packet_size": camera.gv_get_packet_size() if camera.is_gv_device() else None,
+            }
+
+    def check_settings(self) -> tuple[float, float]:
+        """Exposure (µs) and gain (dB) as they are; CameraError when they are not what was asked for."""
+        with self._explained("reading the camera's settings"):
+            exposure_us = float(self._camera.get_exposure_time())
+            gain_db = float(self._camera.get_gain()) if self._camera.is_gain_available() else 0.0
+            region = self._camera.get_region()
+        wanted = self._config
+        actual = (region.x, region.y, region.width, region.height)
+        if (
+            abs(exposure_us - wanted.exposure_us) > _EXPOSURE_TOLERANCE * wanted.exposure_us
+            or abs(gain_db - wanted.gain_db) > _GAIN_TOLERANCE_DB
+            or (wanted.region is not None and actual != wanted.region)
+        ):
+            raise CameraError(
+                f"the camera stands at {exposure_us:g} µs, {gain_db:g} dB, region {actual}; set were "
+                f"{wanted.exposure_us:g} µs, {wanted.gain_db:g} dB, region {wanted.region or 'whole'}: the "
+                "camera cannot do that, or another program changes its settings"
+            )
+        return exposure_us, gain_db
+
+    def latch(self, clock: DeviceClock) -> None:
+        """One reading of the camera's clock, where it has one that can be latched."""
+        for command, value in (
+            ("GevTimestampControlLatch", "GevTimestampValue"),
+            ("TimestampLatch", "TimestampLatchValue"),
+        ):
+            if not self._camera.is_feature_available(command):
+                continue
+            with self._explained("reading the camera's clock"):
+                asked_ns = time.monotonic_ns()
+                self._camera.execute_command(command)
+                device_ns = self._to_ns(self._camera.get_integer(value))
+                while device_ns == self._latched_ns and time.monotonic_ns() < asked_ns + _LATCH_WAIT_S * 1e9:
+                    device_ns = self._to_ns(self._camera.get_integer(value))
+                answered_ns = time.monotonic_ns()
+            if device_ns != self._latched_ns:
+                self._latched_ns = device_ns
+                clock.reading(device_ns, asked_ns, answered_ns)
+            return
+
+    def _to_ns(self, ticks: int) -> int:
+        feature = "GevTimestampTickFrequency"
+        rate_hz = self._camera.get_integer(feature) if self._camera.is_feature_available(feature) else 0
+        return ticks if rate_hz in (0, 1_000_000_000) else round(ticks * 1e9 / rate_hz)
+
+    def drain(self) -> int:
+        """Throws away what arrived without being asked for; how many frames that was."""
+        count = 0
+        while (buffer := self._stream.try_pop_buffer()) is not None:
+            self._stream.push_buffer(buffer)
+            count += 1
+        return count
+
+    def trigger(self) -> None:
+        with self._explained("triggering the camera"):
+            self._camera.software_trigger()
+
+    def frame(self, timeout_s: float) -> Picture | None:
+        """The next frame, complete; None when none comes in time."""
+        end_s = time.monotonic() + timeout_s
+        buffer = None
+        while buffer is None:
+            if self.lost.is_set():
+                raise CameraError(f"{self._name} is gone (cable, power?); it is opened again when it is back")
+            left_s = end_s - time.monotonic()
+            if left_s <= 0:
+                return None
+            buffer = self._stream.timeout_pop_buffer(round(min(left_s, _POP_S) * 1e6))
+        try:
+            return self._picture(buffer)
+        finally:
+            self._stream.push_buffer(buffer)
+
+    def _picture(self, buffer: Any) -> Picture:
+        if buffer.get_status() != self._aravis.BufferStatus.SUCCESS:
+            raise CameraError(
+                f"frame {buffer.get_frame_id()} came incomplete ({buffer.get_status().value_nick}): packets "
+                "were lost; check cable, network card and packet size, and take this pose again"
+            )
+        width, height = buffer.get_image_width(), buffer.get_image_height()
+        wall_ns = buffer.get_system_timestamp()
+        image = decode(buffer.get_data(), width, height, self._config.pixel_format)
+        return Picture(
+            image=image,
+            stamps=Stamps(
+                host_monotonic_ns=time.monotonic_ns() - (time.time_ns() - wall_ns),
+                host_wall_ns=wall_ns,
+                device_ns=buffer.get_timestamp(),
+            ),
+            frame_id=buffer.get_frame_id(),
+            sequence=0,
+            exposure_us=self._config.exposure_us,
+            gain_db=self._config.gain_db,
+            pixel_format="BGR8" if image.ndim == 3 else self._config.pixel_format,
+        )
+
+    @property
+    def _name(self) -> str:
+        return f"camera {self.identity.model} {self.identity.serial}".rstrip()
+
+    @contextmanager
+    def _explained(self, doing: str) -> Iterator[None]:
+        if self.lost.is_set():
+            raise CameraError(f"{self._name} is gone (cable, power?); it is opened again when it is back")
+        try:
+            yield
+        except self._glib.Error as error:
+            if error.matches(self._aravis.device_error_quark(), self._aravis.DeviceError.TIMEOUT):
+                self.lost.set()
+            raise CameraError(f"{doing} failed: {error.message}") from error
+
+
+def _find(aravis: Any, wanted: str) -> str:
+    """Aravis's id of the camera with this serial, address or name; of the only one when none is wanted."""
+    if wanted.count(".") == 3 and wanted.replace(".", "").isdigit():
+        return wanted
+    aravis.update_device_list()
+    found = []
+    for i in range(aravis.get_n_devices()):
+        names = (
+            aravis.get_device_serial_nbr(i),
+            aravis.get_device_address(i),
+            aravis.get_device_id(i),
+            aravis.get_device_model(i),
+        )
+        if wanted in names:
+            return str(names[2])
+        found.append(f"{names[3]} {names[0]} at {names[1]}")
+    if len(found) == 1 and not wanted:
+        return str(aravis.get_device_id(0))
+    listed = "; ".join(found) or "none"
+    which = f"no camera '{wanted}'" if wanted else "which camera? set camera.device"
+    raise CameraError(f"{which}: found {listed}. Check power, cable and network, or give its IP address")

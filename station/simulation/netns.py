@@ -1,0 +1,72 @@
+"""A network with nothing but loopback, for the GigE simulator: discovery broadcasts reach nobody.
+
+``python -m station.simulation.netns COMMAND …`` runs a command inside such a namespace.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import fcntl
+import os
+import shutil
+import socket
+import struct
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from station.errors import StationError
+
+_CLONE_NEWNET = 0x40000000
+_SIOCGIFFLAGS, _SIOCSIFFLAGS, _IFF_UP = 0x8913, 0x8914, 0x1
+
+
+def is_isolated() -> bool:
+    """Whether this process sees no network interface but `lo`, and that is up."""
+    return [name for _, name in socket.if_nameindex()] == ["lo"] and bool(_lo_flags() & _IFF_UP)
+
+
+def isolated_command(command: list[str]) -> list[str]:
+    """The same command inside a namespace of its own. StationError where `unshare` is missing."""
+    unshare = shutil.which("unshare")
+    if unshare is None:
+        raise StationError("the GigE simulator needs 'unshare' (apt install util-linux)")
+    # Without root a user namespace gives the right to make a network namespace.
+    rights = [] if os.geteuid() == 0 else ["--map-root-user"]
+    return [unshare, *rights, "--net", sys.executable, "-m", "station.simulation.netns", *command]
+
+
+@contextmanager
+def isolated_thread() -> Iterator[None]:
+    """The calling thread, and the threads and children it starts, in a namespace with only `lo`.
+
+    Needs root; StationError otherwise.
+    """
+    libc = ctypes.CDLL(None, use_errno=True)
+    with Path("/proc/thread-self/ns/net").open("rb") as before:
+        if libc.unshare(_CLONE_NEWNET) != 0:
+            reason = os.strerror(ctypes.get_errno())
+            raise StationError(f"no network namespace of its own for the GigE simulator: {reason}")
+        try:
+            bring_lo_up()
+            yield
+        finally:
+            libc.setns(before.fileno(), _CLONE_NEWNET)
+
+
+def bring_lo_up() -> None:
+    request = struct.pack("16sh14x", b"lo", _lo_flags() | _IFF_UP)
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as control:
+        fcntl.ioctl(control, _SIOCSIFFLAGS, request)
+
+
+def _lo_flags() -> int:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as control:
+        answer = fcntl.ioctl(control, _SIOCGIFFLAGS, struct.pack("16sh14x", b"lo", 0))
+    return int(struct.unpack("16sh14x", answer)[1])
+
+
+if __name__ == "__main__":
+    bring_lo_up()
+    os.execvp(sys.argv[1], sys.argv[1:])

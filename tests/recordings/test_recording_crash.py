@@ -1,0 +1,131 @@
+"""A killed process, a full disk: what was acknowledged is there afterwards."""
+
+from __future__ import annotations
+
+import os
+import random
+import resource
+import signal
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recordings.reader import open_recording
+from recordings.recover import recover
+from tests.recordings.small_recording import make_image
+
+ROOT = Path(__file__).parents[2]
+
+WRITER = textwrap.dedent(
+    """
+    import sys, itertools
+    from pathlib import Path
+    from recordings.errors import RecordingError
+    from recordings.recorder import Recorder
+    from tests.recordings.small_recording import make_info, make_picture, make_state, make_view
+
+    recorder = Recorder(Path(sys.argv[1]), make_info())
+    print("ready", flush=True)
+    try:
+        for index in itertools.count():
+            for count in range(20):
+                recorder.robot_state(make_state(20 * index + count))
+            if not recorder.picture(make_picture(index)):
+                raise recorder.error
+            recorder.view(make_view(index))
+            recorder.sync().result()
+            print(index, flush=True)
+    except RecordingError as error:
+        print("error", error, flush=True)
+    """
+)
+
+
+def start(path: Path, file_size_limit: int | None = None) -> subprocess.Popen[str]:
+    def limit() -> None:
+        if file_size_limit is not None:
+            signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
+            resource.setrlimit(resource.RLIMIT_FSIZE, (file_size_limit, file_size_limit))
+
+    return subprocess.Popen(
+        [sys.executable, "-c", WRITER, str(path)],
+        stdout=subprocess.PIPE,
+        text=True,
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        preexec_fn=limit,
+    )
+
+
+def check_what_is_left(part: Path, acknowledged: list[int]) -> None:
+    """Every acknowledged pose is there, unchanged, and at most one that was on its way beside them."""
+    recover(part)
+    recording = open_recording(part.with_suffix(""))
+    views = recording.views()
+    assert [view.index for view in views] == list(range(len(views)))
+    assert len(acknowledged) <= len(views) <= len(acknowledged) + 1
+    assert len(recording.parts[0].picture_sequences()) <= len(acknowledged) + 1
+    for view, picture in recording.pictures():
+        np.testing.assert_array_equal(picture.image, make_image(view.index))
+    assert len(list(recording.robot_states())) >= 20 * len(views)
+
+
+def kill_at_a_random_moment(folder: Path, seed: int) -> int:
+    """Kills between two lines of the writer's report, after a wait too short to be a whole pose."""
+    path = folder / "a.mcap"
+    chance = random.Random(seed)
+    process = start(path)
+    assert process.stdout is not None
+    lines = [process.stdout.readline() for _ in range(chance.randint(1, 60))]
+    pause_s = chance.uniform(0, 0.004)
+    try:
+        process.wait(pause_s)
+    except subprocess.TimeoutExpired:
+        process.kill()
+    lines += process.stdout.read().splitlines(keepends=True)
+    process.wait()
+    acknowledged = [int(line) for line in lines if line.endswith("\n") and line.strip().isdigit()]
+    check_what_is_left(path.with_name("a.mcap.part"), acknowledged)
+    return len(acknowledged)
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("seed", range(6))
+def test_kill_9_loses_no_acknowledged_pose(tmp_path: Path, seed: int) -> None:
+    kill_at_a_random_moment(tmp_path, seed)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("seed", range(100, 200))
+def test_kill_9_at_a_hundred_moments(tmp_path: Path, seed: int) -> None:
+    kill_at_a_random_moment(tmp_path, seed)
+
+
+def fill_the_disk(folder: Path, limit_bytes: int) -> None:
+    path = folder / "a.mcap"
+    process = start(path, limit_bytes)
+    output = process.communicate(timeout=60)[0].splitlines()
+    assert output[0] == "ready"
+    assert output[-1].startswith("error writing ")
+    assert "File too large" in output[-1]
+    assert "recordings recover" in output[-1]
+    assert not path.exists()
+    part = path.with_name("a.mcap.part")
+    assert part.stat().st_size <= limit_bytes
+    check_what_is_left(part, [int(line) for line in output[1:-1]])
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("limit_bytes", [20_000, 45_678, 99_999])
+def test_a_full_disk_loses_nothing_acknowledged(tmp_path: Path, limit_bytes: int) -> None:
+    fill_the_disk(tmp_path, limit_bytes)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("seed", range(100))
+def test_a_disk_full_at_a_hundred_points(tmp_path: Path, seed: int) -> None:
+    fill_the_disk(tmp_path, random.Random(seed).randint(12_000, 400_000))

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections import deque
 
-from recordings.messages import Picture
 from station.clocks import ClockEstimator, ClockFit
 from station.errors import CameraError
 
@@ -123,16 +122,19 @@ class DeviceClock:
         return self._estimator.fit()
 
 
-def mid_exposure(picture: Picture, clock: ClockFit | None) -> tuple[int, float]:
-    """Host monotonic time (ns) of the middle of a picture's exposure, and its 95 % bound (s).
+def mid_exposure(
+    start_device_ns: int, arrival_monotonic_ns: int, exposure_us: float, clock: ClockFit | None
+) -> tuple[int, float]:
+    """Host monotonic time (ns) of the middle of an exposure, and its 95 % bound (s).
 
-    By the camera's clock where one is known; else from the first packet's arrival, of which all that is
-    known is that it comes after the exposure, by `UNKNOWN_READOUT_S` at most.
+    `start_device_ns`: the camera's clock at the start of exposure, 0 = it has none. By the camera's clock
+    where it is known; else from the first packet's arrival, of which all that is known is that it comes
+    after the exposure, by `UNKNOWN_READOUT_S` at most.
     """
-    half_ns = round(picture.exposure_us * 500)
-    if clock is not None and picture.stamps.device_ns:
-        device_s = picture.stamps.device_ns / 1e9
+    half_ns = round(exposure_us * 500)
+    if clock is not None and start_device_ns:
+        device_s = start_device_ns / 1e9
         beyond_s = clock.drift_uncertainty * max(0.0, device_s - clock.reference_s)
         return clock.to_host_ns(device_s) + half_ns, clock.bound_s + beyond_s
     readout_ns = round(UNKNOWN_READOUT_S * 1e9)
-    return picture.stamps.host_monotonic_ns - readout_ns // 2 - half_ns, readout_ns / 2e9
+    return arrival_monotonic_ns - readout_ns // 2 - half_ns, readout_ns / 2e9

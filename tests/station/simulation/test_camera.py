@@ -12,7 +12,8 @@ import pytest
 
 from calibrate.detect import detect
 from calibrate.geometry import inverse
-from station.devices.frames import mid_exposure
+from recordings.messages import Picture
+from station.devices import frames
 from station.errors import CameraError
 from station.simulation.admin import AdminClient
 from station.simulation.camera import RenderedCamera
@@ -20,6 +21,11 @@ from station.simulation.cell import CellTruth, make_cell, write_truth
 from station.simulation.launch import SimulatedController
 
 pytestmark = pytest.mark.process
+
+
+def mid_exposure(picture: Picture, camera: RenderedCamera) -> tuple[int, float]:
+    stamps = picture.stamps
+    return frames.mid_exposure(stamps.device_ns, stamps.host_monotonic_ns, picture.exposure_us, camera.clock)
 
 
 @pytest.fixture
@@ -48,7 +54,7 @@ async def test_pictures_show_the_board_from_the_true_pose_at_mid_exposure(
 ) -> None:
     picture = await camera.capture()
     assert picture.image.shape == (1024, 1280) and picture.image.dtype == np.uint8
-    middle_ns, bound_s = mid_exposure(picture, camera.clock)
+    middle_ns, bound_s = mid_exposure(picture, camera)
     assert 0 < bound_s < 0.005
     with AdminClient(arm.host) as admin:
         flange = np.array(admin.ask("truth", at_monotonic_ns=middle_ns)["base_from_flange"])
@@ -75,7 +81,7 @@ async def test_frames_are_numbered_over_the_wrap_and_stamped_by_the_cameras_own_
     assert (np.diff(device) > 0).all() and host[0] > before_ns
     assert abs((host - device).mean() + cell.camera_clock_offset_ns) < 1e9, "another epoch than the host's"
     assert camera.clock is not None
-    middle_ns, bound_s = mid_exposure(pictures[-1], camera.clock)
+    middle_ns, bound_s = mid_exposure(pictures[-1], camera)
     true_middle_ns = host[-1] - 13_300_000 - 5_000_000  # readout and half the exposure of this camera
     assert abs(middle_ns - true_middle_ns) / 1e9 < bound_s < 0.002
 

@@ -36,6 +36,7 @@ What is verified and what a real controller may do differently: docs/simulated-c
 
 
 def main(arguments: list[str] | None = None) -> int:
+    parent = os.getppid()  # now: it surely lives while it waits for the ready line
     options = _parser().parse_args(arguments)
     try:
         settings = _settings(options)
@@ -43,7 +44,7 @@ def main(arguments: list[str] | None = None) -> int:
         print(f"cannot start: {error}", file=sys.stderr)
         return 2
     try:
-        asyncio.run(_serve(options.host, settings, options))
+        asyncio.run(_serve(options.host, settings, options, parent))
     except OSError as error:
         print(
             f"cannot listen on {options.host}: {error.strerror or error}. Another controller runs on this "
@@ -109,7 +110,7 @@ def _settings(options: argparse.Namespace) -> Settings:
     return Settings(**given)  # type: ignore[arg-type]
 
 
-async def _serve(host: str, settings: Settings, options: argparse.Namespace) -> None:
+async def _serve(host: str, settings: Settings, options: argparse.Namespace, parent: int) -> None:
     loop = asyncio.get_running_loop()
     ended = asyncio.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -124,7 +125,7 @@ async def _serve(host: str, settings: Settings, options: argparse.Namespace) -> 
         raise
     ready = {"ready": True, "host": host, "model": settings.model, "pid": os.getpid()}
     print(json.dumps(ready), flush=True)
-    watch = loop.create_task(_parent_gone(ended)) if options.die_with_parent else None
+    watch = loop.create_task(_parent_gone(ended, parent)) if options.die_with_parent else None
     await ended.wait()
     if watch is not None:
         watch.cancel()
@@ -132,9 +133,9 @@ async def _serve(host: str, settings: Settings, options: argparse.Namespace) -> 
     machine.close()
 
 
-async def _parent_gone(ended: asyncio.Event) -> None:
-    """The parent holds the other end of standard input; the kernel closes it when the parent dies."""
-    parent = os.getppid()
+async def _parent_gone(ended: asyncio.Event, parent: int) -> None:
+    """Standard input ends when the parent dies, unless a child it forked still holds the pipe: then the
+    parent's number tells."""
     loop = asyncio.get_running_loop()
 
     def read() -> None:

@@ -10,7 +10,7 @@ LIMIT = 4_000_000
 """Characters of one unfinished program."""
 
 _BEGIN = re.compile(r"^(?:def|sec)\s+(\w+)\s*\([^\n]*\)\s*:[ \t]*$", re.MULTILINE)
-_END = re.compile(r"^end[ \t]*\r?$\n?", re.MULTILINE)
+_END = re.compile(r"^end[ \t]*\r?\n", re.MULTILINE)
 _OFFSET = r"reg_offset_{}\s*=\s*(?:#[^\n]*\n)?\s*(\d+)"
 _STEP = re.compile(
     r"signal_async_progress\((\d+)\)|(movej|movel|movep)\((p?)\[([^\]]*)\],\s*a=([^,]+),\s*v=([^,]+),\s*r=([^)]+)\)"

@@ -74,6 +74,16 @@ def test_the_nearest_inverse_keeps_the_turn() -> None:
     assert inverse_nearest(TABLES["UR10"], forward(TABLES["UR10"], q), q) == pytest.approx(q, abs=1e-9)
 
 
+@pytest.mark.parametrize(("q1", "near"), [(0.3, 6.2), (-0.3, -6.2)])
+def test_the_nearest_inverse_stays_within_a_turn_either_way(q1: float, near: float) -> None:
+    """q1 ± 2π would be nearest, but no joint turns that far."""
+    q = (-1.2, 1.6, -1.0, -1.3, 0.4)
+    T = forward(TABLES["UR10"], (q1, *q))
+    found = inverse_nearest(TABLES["UR10"], T, (near, *q))
+    assert found is not None and max(map(abs, found)) <= 2 * pi
+    assert forward(TABLES["UR10"], found) == pytest.approx(T, abs=1e-9)
+
+
 @settings(max_examples=60, deadline=None)
 @given(pose=st.tuples(*[numbers] * 6))
 def test_poses_and_rotation_vectors_agree_with_geometry(pose: tuple[float, ...]) -> None:

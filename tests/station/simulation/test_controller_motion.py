@@ -192,6 +192,18 @@ def test_the_slider_slows_and_holds() -> None:
     assert arm.command[0] == 3.0
 
 
+def test_a_stop_at_a_low_slider_starts_from_the_low_speed() -> None:
+    arm = make_arm()
+    go(arm, (3.0, *HOME[1:]), 1.0, 10.0)
+    run(arm, 1.0, scale=0.25)
+    before = arm.command[0]
+    arm.brake(2.0)
+    arm.step(DT, 0.25)
+    assert arm.command_speed[0] < 0.25
+    run(arm, 0.5, scale=0.25)
+    assert arm.command[0] - before == pytest.approx(0.25**2 / (2 * 2.0), rel=0.02)
+
+
 def test_freeze_is_at_once() -> None:
     arm = make_arm()
     go(arm, (3.0, *HOME[1:]))
@@ -256,5 +268,9 @@ def test_every_stop_misses_differently_and_never_jumps() -> None:
     go(arm, (2.5, *HOME[1:]))
     run(arm, 0.5)
     arm.brake(2.0)
-    run(arm, 1.0)
+    seen = [arm.miss[0]]
+    while arm.moving:
+        arm.step(DT, 1.0)
+        seen.append(arm.miss[0])
+    assert all(0 <= b - a < 0.05 for a, b in pairwise(seen))
     assert arm.miss[0] == 3.0  # a stop on the way is a stop: fully drawn anew

@@ -62,7 +62,7 @@ def test_a_command_that_stays_in_the_register_runs_once(script) -> None:
 
 
 def test_an_asynchronous_move_starts_one_cycle_after_it_was_accepted(script) -> None:
-    before = operation(script.word)
+    before, writes = operation(script.word), changes(script.word)
     script.write(1, [*GOAL, 0.5, 1.0], asynchronous=1)
     script.run(0.008)
     assert script.state == 2 and not running(script.word)
@@ -71,6 +71,7 @@ def test_an_asynchronous_move_starts_one_cycle_after_it_was_accepted(script) -> 
     script.write(0)
     script.run_until(lambda: not running(script.word))
     assert operation(script.word) == before + 1 and script.word & 0xFFFF == 0
+    assert changes(script.word) == writes + 2
     assert list(script.robot.arm.command) == GOAL
 
 

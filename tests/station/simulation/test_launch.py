@@ -80,6 +80,27 @@ def test_it_dies_with_its_parent(number: int) -> None:
     assert gone(child)
 
 
+def test_it_dies_with_its_parent_though_a_sibling_holds_the_pipe() -> None:
+    code = (
+        "import os, time\n"
+        "from station.simulation.launch import start_controller\n"
+        "c = start_controller('UR10')\n"
+        "sibling = os.fork()\n"
+        "if sibling: print(c.process.pid, sibling, flush=True)\n"
+        "time.sleep(30)"
+    )
+    parent = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE)
+    assert parent.stdout is not None
+    child, sibling = map(int, parent.stdout.readline().split())
+    try:
+        parent.kill()
+        parent.wait()
+        assert gone(child)
+    finally:
+        os.kill(sibling, signal.SIGKILL)
+        parent.stdout.close()
+
+
 def test_a_stopped_child_is_ended_by_force() -> None:
     running = start_controller("UR10")
     os.kill(running.process.pid, signal.SIGSTOP)

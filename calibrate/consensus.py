@@ -73,9 +73,9 @@ def pose_arrays(views: ViewSet) -> tuple[Array, Array]:
 
 def disagreement(what: str) -> BadViewsError:
     return BadViewsError(
-        f"{what} The robot poses do not belong to these pictures, or are in another convention (rotation vector "
-        "or Euler angles, mm or m, flange_from_base instead of base_from_flange), or the mount is wrong. Check "
-        "the first rows."
+        f"{what} The robot poses do not belong to these pictures, or are in another convention (rotation "
+        "vector or Euler angles, mm or m, flange_from_base instead of base_from_flange), or the mount is "
+        "wrong. Check the first rows."
     )
 
 

@@ -31,8 +31,8 @@ class Estimate:
     state: State
     sigma: Array
     """(4,) corner px, robot m, robot rad, kinematic scale."""
-    covariance: Array
-    """(6, 6) of X."""
+    joint_covariance: Array
+    """(12 + p, 12 + p) of X, Y and the kinematic errors."""
     shares: dict[str, float]
     """Share of X's variance (translation weighed by its size, see `_shares`) by source, sums to 1."""
     weights: Array
@@ -41,6 +41,11 @@ class Estimate:
     steps: int
     converged: bool
     intrinsics_free: bool
+
+    @property
+    def covariance(self) -> Array:
+        """(6, 6) of X."""
+        return self.joint_covariance[:6, :6]
 
     @property
     def threshold(self) -> float:
@@ -92,7 +97,7 @@ def estimate(
     return Estimate(
         state=state,
         sigma=sigma,
-        covariance=_symmetric(solved.covariance[:6, :6]),
+        joint_covariance=_without_intrinsics(solved.covariance, intrinsics_free),
         shares=_shares(normal, solved, sigma, intrinsics_free),
         weights=weights,
         normal=normal,
@@ -171,5 +176,7 @@ def _without(normal: Normal, columns: slice) -> Normal:
     )
 
 
-def _symmetric(M: Array) -> Array:
-    return np.asarray((M + M.T) / 2)
+def _without_intrinsics(covariance: Array, intrinsics_free: bool) -> Array:
+    keep = np.delete(np.arange(len(covariance)), slice(12, 21 if intrinsics_free else 12))
+    part = covariance[np.ix_(keep, keep)]
+    return np.asarray((part + part.T) / 2)

@@ -9,12 +9,14 @@ import numpy as np
 from calibrate.board_poses import BoardPoses, refine_board_poses
 from calibrate.consensus import Consensus, disagreement, find_consensus, pose_arrays
 from calibrate.estimate import Estimate, estimate, first_state
-from calibrate.likelihood.model import Observations, State, observe_views
+from calibrate.likelihood.kinematics import UNIT, kinematic_derivatives
+from calibrate.likelihood.model import Observations, observe_views
 from calibrate.outliers import Judgement, explain, judge_views
 from calibrate.pairs import Pairs, Places, all_pairs
 from calibrate.robust import GlobalResult, solve_global
-from calibrate.solution import RejectedView
+from calibrate.solution import KinematicPrior, RejectedView, RobotSystematics
 from calibrate.stopwatch import Stopwatch
+from calibrate.systematics import FEWEST_VIEWS, fit_kinematics
 from calibrate.views import ViewSet
 
 _ROUNDS = 5
@@ -29,68 +31,116 @@ class Fit:
     consensus: Consensus
     views: ViewSet
     """All views, turned boards set right."""
+    settled: Settled
+    rejected: tuple[RejectedView, ...]
+    pairs: Pairs
+    """All pairs of the kept views, board poses by the final lens."""
+    certified: GlobalResult
+    """Global optimum over those pairs."""
+    systematics: RobotSystematics | None
+
+
+@dataclass(frozen=True, eq=False)
+class Settled:
+    """An estimate and the views that it accepts."""
+
     places: Places
     """Those that the estimate rests on."""
     observed: Observations
     """Of those."""
     estimate: Estimate
     verdict: Judgement
+    """On all views."""
     boards: BoardPoses
     """Of all views, by their own corners and the final lens."""
-    rejected: tuple[RejectedView, ...]
-    pairs: Pairs
-    """All pairs of the kept views, board poses by the final lens."""
-    certified: GlobalResult
-    """Global optimum over those pairs."""
 
 
-def fit_views(views: ViewSet, seed: int, intrinsics_free: bool, reject: bool, watch: Stopwatch) -> Fit:
-    """At most 5 rounds of estimate and verdict: bounded time."""
+def fit_views(
+    views: ViewSet,
+    seed: int,
+    intrinsics_free: bool,
+    reject: bool,
+    watch: Stopwatch,
+    kinematic_prior: KinematicPrior = "off",
+) -> Fit:
+    """Raises BadViewsError or DegenerateMotionError as its stages do."""
     consensus = find_consensus(views, seed, reject)
     watch.lap("certified optimum")
-    views, places, X = consensus.views, consensus.places, consensus.start.X
+    views, places = consensus.views, consensus.places
     everything = observe_views(views)
-    camera = views.camera
-    seen: list[tuple[int, ...]] = []
-    for _ in range(_ROUNDS):
-        seen.append(tuple(places.tolist()))
-        observed = observe_views(views.select(places.tolist()))
-        H, C = pose_arrays(views)
-        result = estimate(observed, first_state(observed, X, C[places], H[places], camera), intrinsics_free)
-        boards, verdict = _judge(everything, views, result)
-        X, camera = result.state.X, result.state.camera
-        good = verdict.good if reject else places
-        if np.array_equal(good, places) or tuple(good.tolist()) in seen:
-            break
-        if len(good) < _FEWEST:
-            raise disagreement(f"Only {len(good)} of {len(views)} views agree; {_FEWEST} are needed.")
-        places = good
+    H, C = pose_arrays(views)
+    start = first_state(_part(everything, places), consensus.start.X, C[places], H[places], views.camera)
+    plain = estimate(_part(everything, places), start, intrinsics_free)
+    settled = _settle(everything, views, places, plain, reject)
+    _require_plausible_noise(settled.estimate)
     watch.lap("maximum likelihood")
-    _require_plausible_noise(result)
+    finding, settled = _with_kinematics(everything, views, settled, kinematic_prior, reject)
+    watch.lap("robot systematics")
+    places = settled.places
     bad = np.setdiff1d(np.arange(len(views)), places)
-    state = _full_state(result.state, boards)
-    rejected = explain(views, state, verdict, bad)
-    watch.lap("verdicts")
-    pairs = all_pairs(H[places], boards.C[places])
+    full = replace(settled.estimate.state, C=settled.boards.C)
+    rejected = explain(views, full, settled.verdict, bad)
+    pairs = all_pairs(H[places], settled.boards.C[places])
     problem = f"chordal objective over all {len(pairs)} pairs of the {len(places)} used views"
     certified = solve_global(pairs, seed, problem)
     watch.lap("certified optimum")
-    return Fit(consensus, views, places, observed, result, verdict, boards, rejected, pairs, certified)
+    return Fit(consensus, views, settled, rejected, pairs, certified, finding)
+
+
+def _settle(
+    everything: Observations, views: ViewSet, places: Places, result: Estimate, reject: bool
+) -> Settled:
+    """Estimate and verdict in turns until the accepted views stay the same; at most 5 rounds."""
+    seen: list[tuple[int, ...]] = []
+    C = views.camera_from_board
+    while True:
+        state = result.state
+        boards = refine_board_poses(everything, replace(state, C=C))
+        verdict = judge_views(everything, result, boards, places)
+        seen.append(tuple(places.tolist()))
+        good = verdict.good if reject else places
+        if len(seen) >= _ROUNDS or tuple(good.tolist()) in seen:
+            return Settled(places, _part(everything, places), result, verdict, boards)
+        if len(good) < _FEWEST:
+            raise disagreement(f"Only {len(good)} of {len(views)} views agree; {_FEWEST} are needed.")
+        places = good
+        start = replace(state, C=boards.C[places])
+        result = estimate(_part(everything, places), start, result.intrinsics_free, result.sigma)
+
+
+def _part(everything: Observations, places: Places) -> Observations:
+    return replace(
+        everything,
+        flange=everything.flange[places],
+        points=everything.points[places],
+        pixels=everything.pixels[places],
+        present=everything.present[places],
+        kinematics=None if everything.kinematics is None else everything.kinematics[places],
+    )
+
+
+def _with_kinematics(
+    everything: Observations, views: ViewSet, plain: Settled, prior: KinematicPrior, reject: bool
+) -> tuple[RobotSystematics | None, Settled]:
+    """The finding, and the estimate that counts: with the kinematic model where it is due.
+
+    With the model, views are judged again: some looked wrong only because the arm is.
+    """
+    derivatives = kinematic_derivatives(views) if len(plain.places) >= FEWEST_VIEWS else None
+    if derivatives is None:
+        return None, plain
+    fitted = fit_kinematics(plain.observed, plain.estimate, derivatives[plain.places])
+    if prior == "off" or not (fitted.finding.detected or prior == "on"):
+        return fitted.finding, plain
+    with_table = replace(everything, kinematics=derivatives)
+    settled = _settle(with_table, views, plain.places, fitted.estimate, reject)
+    table_errors = tuple((UNIT * settled.estimate.state.theta).tolist())
+    return replace(fitted.finding, prior_applied=True, table_errors=table_errors), settled
 
 
 def _require_plausible_noise(result: Estimate) -> None:
     robot_m, robot_rad = float(result.sigma[1]), float(result.sigma[2])
     if robot_m > MAX_ROBOT_M or robot_rad > MAX_ROBOT_RAD:
         raise disagreement(
-            f"Robot poses and pictures disagree by {robot_m * 1e3:.0f} mm and {np.degrees(robot_rad):.1f}° per axis."
+            f"Robot and pictures disagree by {robot_m * 1e3:.0f} mm, {np.degrees(robot_rad):.1f}° per axis."
         )
-
-
-def _judge(everything: Observations, views: ViewSet, result: Estimate) -> tuple[BoardPoses, Judgement]:
-    state = replace(result.state, C=views.camera_from_board)
-    boards = refine_board_poses(everything, state)
-    return boards, judge_views(everything, state, boards, result.sigma, len(result.state.C))
-
-
-def _full_state(state: State, boards: BoardPoses) -> State:
-    return replace(state, C=boards.C)

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy import stats
 
 from calibrate.board_poses import BoardPoses
+from calibrate.estimate import Estimate
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
 from calibrate.likelihood.model import Observations, State
 from calibrate.likelihood.residuals import modelled_flange, robot_derivatives, robot_residuals
@@ -46,17 +47,22 @@ class Judgement:
         return np.flatnonzero((self.distance2 <= self.limit) & ~self.blurred)
 
 
-def judge_views(
-    observed: Observations, state: State, boards: BoardPoses, sigma: Array, fitted: int
-) -> Judgement:
-    """`state` and `boards` speak of all views; X, Y and sigma come from `fitted` of them."""
-    state = replace(state, C=boards.C)
+def judge_views(observed: Observations, result: Estimate, boards: BoardPoses, fitted: Places) -> Judgement:
+    """`observed` and `boards` speak of all views, `result` rests on the `fitted` ones.
+
+    For the others the uncertainty of X, Y and the kinematic errors counts too.
+    """
+    state = replace(result.state, C=boards.C)
     miss = robot_residuals(observed, state)
-    _, _, by_C = robot_derivatives(observed, state)
-    covariance = sigma[0] ** 2 * by_C @ boards.covariance @ np.swapaxes(by_C, 1, 2)
-    covariance += np.diag(np.repeat(sigma[1:3] ** 2, 3))
+    by_X, by_Y, by_C = robot_derivatives(observed, state)
+    covariance = result.sigma[0] ** 2 * by_C @ boards.covariance @ np.swapaxes(by_C, 1, 2)
+    covariance += np.diag(np.repeat(result.sigma[1:3] ** 2, 3))
+    parts = [by_X, by_Y] if observed.kinematics is None else [by_X, by_Y, -observed.kinematics]
+    others = np.setdiff1d(np.arange(len(miss)), fitted)
+    J = np.concatenate(parts, axis=2)[others]
+    covariance[others] += J @ result.joint_covariance @ np.swapaxes(J, 1, 2)
     distance2 = np.einsum("ni,ni->n", miss, np.linalg.solve(covariance, miss[..., None])[..., 0])
-    limit = float(6 * stats.f.ppf(1 - _FALSE_ALARM, 6, max(3 * fitted - 6, 3)))
+    limit = float(6 * stats.f.ppf(1 - _FALSE_ALARM, 6, max(3 * len(fitted) - 6, 3)))
     typical = float(np.median(boards.typical_px))
     blurred = boards.typical_px > max(_BLURRED * typical, _BLURRED_PX)
     return Judgement(distance2, miss, modelled_flange(observed, state), limit, blurred)

@@ -17,7 +17,7 @@ from calibrate.assess import (
 from calibrate.board_poses import refine_board_poses
 from calibrate.consensus import pose_arrays
 from calibrate.estimate import Estimate
-from calibrate.fit import Fit, fit_views
+from calibrate.fit import Fit, Settled, fit_views
 from calibrate.frames import board_frames, camera_frames
 from calibrate.geometry import Transform
 from calibrate.likelihood.model import observe_views
@@ -36,13 +36,14 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
     """All views to fit; a second fit without the last 6 for the hold-out score."""
     watch = Stopwatch()
     free = options.intrinsics_from_same_pictures and views.camera.distortion_model == "plumb_bob"
-    fit = fit_views(views, options.seed, free, options.reject_outliers, watch)
-    result, state = fit.estimate, fit.estimate.state
+    fit = fit_views(views, options.seed, free, options.reject_outliers, watch, options.kinematic_prior)
+    settled = fit.settled
+    result, state, places = settled.estimate, settled.estimate.state, settled.places
     parent, child = camera_frames(views.mount)
     H, _ = pose_arrays(fit.views)
-    C = fit.boards.C
-    distance = options.working_distance_m or median_distance_m(C[fit.places])
-    spread_m, spread_rad = board_spread(H[fit.places], C[fit.places], state.X)
+    C = settled.boards.C
+    distance = options.working_distance_m or median_distance_m(C[places])
+    spread_m, spread_rad = board_spread(H[places], C[places], state.X)
     pairs, start = fit.pairs, fit.certified
     apart = distance_in_sigmas(start.X, state.X, pair_covariance(start.objective, pairs, start.X))
     holdout = _holdout(fit, options, free) if options.holdout else None
@@ -56,21 +57,22 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
         confidence_threshold=result.threshold,
         board_place=Transform(*board_frames(views.mount), state.Y),
         camera=state.camera,
-        rms_px=_rms_px(fit),
-        used=tuple(indices[i] for i in fit.places),
+        rms_px=_rms_px(settled),
+        used=tuple(indices[i] for i in places),
         rejected=fit.rejected,
         certificate=replace(start.certificate, distance_sigma=apart),
         observability=observe(pairs, result.covariance, distance, parent),
         holdout=holdout,
         turned=tuple(indices[i] for i in sorted(fit.consensus.turned)),
         noise=NoiseScales(*(float(s) for s in result.sigma[:3])),
+        systematics=fit.systematics,
         budget=ErrorBudget(**result.shares),
         predicted_error_m=point_error_m(state.X, result.covariance, distance),
         working_distance_m=distance,
         board_spread_m=spread_m,
         board_spread_rad=spread_rad,
-        residual_px={indices[i]: float(fit.boards.rms_px[i]) for i in fit.places},
-        residual_robot=_robot_misses(fit, indices),
+        residual_px={indices[i]: float(settled.boards.rms_px[i]) for i in places},
+        residual_robot=_robot_misses(settled, indices),
         warnings=_warnings(fit, options, result),
         stage_ms=watch.stage_ms,
         solve_ms=watch.total_ms,
@@ -80,13 +82,13 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
 
 def _holdout(fit: Fit, options: SolveOptions, intrinsics_free: bool) -> HoldoutScore | None:
     """Fit on all but the last 6 kept views, lens included; score all pairs inside those 6."""
-    kept = fit.views.select(fit.places.tolist())
+    kept = fit.views.select(fit.settled.places.tolist())
     fitted = len(kept) - HELD_OUT
     if fitted < 5:
         return None
     first = kept.select(list(range(fitted)))
     last = kept.select(list(range(fitted, len(kept))))
-    partial = fit_views(first, options.seed, intrinsics_free, False, Stopwatch()).estimate.state
+    partial = fit_views(first, options.seed, intrinsics_free, False, Stopwatch()).settled.estimate.state
     H, C = pose_arrays(last)
     boards = refine_board_poses(observe_views(last), replace(partial, C=C))
     pairs = all_pairs(H, boards.C)
@@ -94,20 +96,20 @@ def _holdout(fit: Fit, options: SolveOptions, intrinsics_free: bool) -> HoldoutS
     return score_holdout(partial.X, pairs, [view.index for view in last], fitted, note)
 
 
-def _rms_px(fit: Fit) -> float | None:
+def _rms_px(settled: Settled) -> float | None:
     """Over all corners of the fitted views, bad ones included with their weight."""
-    if not fit.observed.has_pixels:
+    if not settled.observed.has_pixels:
         return None
-    square = (corner_residuals(fit.observed, fit.estimate.state) ** 2).sum(axis=-1)
-    weights = fit.estimate.weights
+    square = (corner_residuals(settled.observed, settled.estimate.state) ** 2).sum(axis=-1)
+    weights = settled.estimate.weights
     return float(np.sqrt((weights * square).sum() / weights.sum()))
 
 
-def _robot_misses(fit: Fit, indices: list[int]) -> dict[int, tuple[float, float]]:
-    e = robot_residuals(fit.observed, fit.estimate.state)
+def _robot_misses(settled: Settled, indices: list[int]) -> dict[int, tuple[float, float]]:
+    e = robot_residuals(settled.observed, settled.estimate.state)
     return {
         indices[i]: (float(np.linalg.norm(row[:3])), float(np.linalg.norm(row[3:])))
-        for i, row in zip(fit.places.tolist(), e, strict=True)
+        for i, row in zip(settled.places.tolist(), e, strict=True)
     }
 
 
@@ -122,6 +124,8 @@ def _warnings(fit: Fit, options: SolveOptions, result: Estimate) -> tuple[str, .
         warnings.append(f"The final estimate had not settled after {result.steps} steps.")
     if not fit.certified.certificate.certified:
         warnings.append("The global optimum of the pair objective could not be certified.")
-    if not fit.observed.has_pixels:
+    if not fit.settled.observed.has_pixels:
         warnings.append("No corners were recorded: board poses are taken as exact, all error is the robot's.")
+    if fit.systematics is not None and fit.systematics.detected:
+        warnings.append(fit.systematics.text)
     return tuple(warnings)

@@ -16,6 +16,7 @@ from calibrate.geometry import Array, Transform
 from recordings.messages import CameraModel, Mount
 
 Profile = Literal["robust", "paper"]
+KinematicPrior = Literal["auto", "on", "off"]
 
 
 @dataclass(frozen=True)
@@ -26,7 +27,7 @@ class SolveOptions:
     """The camera model was fitted to these very pictures: the last stage refines it together with X
     (robust profile; plumb_bob only), and its uncertainty is part of X's covariance."""
     reject_outliers: bool = True
-    kinematic_prior: Literal["auto", "on", "off"] = "auto"
+    kinematic_prior: KinematicPrior = "auto"
     """Model errors of the arm's Denavit-Hartenberg table. auto: when the residuals show them and joints
     were recorded."""
     working_distance_m: float | None = None
@@ -138,6 +139,12 @@ class RobotSystematics:
     worst_joint_rms_m: float = 0.0
     """Flange displacement that errors at this joint explain, rms over the views."""
     prior_applied: bool = False
+    """X and its covariance come from the model with kinematic errors."""
+    scale_mm: float = 0.0
+    """Fitted size of the table's errors, mm or mrad."""
+    table_errors: tuple[float, ...] = ()
+    """Where applied: estimated a (6), d (6) in metres, alpha (6), theta (6) in radians, true minus nominal.
+    Only their sum at the flange is known well, not each one."""
     text: str = ""
 
 

@@ -69,9 +69,16 @@ def first_sigma(observed: Observations, state: State) -> Array:
 
 
 def estimate(
-    observed: Observations, start: State, intrinsics_free: bool = False, sigma: Array | None = None
+    observed: Observations,
+    start: State,
+    intrinsics_free: bool = False,
+    sigma: Array | None = None,
+    fit_scales: bool = True,
 ) -> Estimate:
-    """Maximum likelihood from `start`. BadViewsError where the views do not determine the parameters."""
+    """Maximum likelihood from `start`; `fit_scales` False keeps `sigma` as given.
+
+    Raises BadViewsError where the views do not determine the parameters.
+    """
     intrinsics_free = intrinsics_free and observed.has_pixels
     state = start
     sigma = first_sigma(observed, state) if sigma is None else sigma
@@ -81,7 +88,9 @@ def estimate(
             steps += 1
             weights = corner_weights(observed, state, sigma[0])
             normal = linearise(observed, state, weights, intrinsics_free)
-            previous, sigma = sigma, reml_scales(normal, sigma, observed.has_pixels)
+            previous = sigma
+            if fit_scales:
+                sigma = reml_scales(normal, sigma, observed.has_pixels)
             solved = normal.solve(sigma**-2)
             state = _step(observed, state, solved, sigma, intrinsics_free)
             steady = np.abs(np.log(sigma / previous)).max() < 1e-3

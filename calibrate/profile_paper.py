@@ -65,6 +65,7 @@ def solve_paper_profile(views: ViewSet, options: SolveOptions) -> Solution:
         holdout=score_holdout(X, pairs.select(slice(len(fit), None)), indices, fitted, note)
         if held
         else None,
+        kept=views.views,
         predicted_error_m=point_error_m(X, covariance, distance),
         working_distance_m=distance,
         board_spread_m=spread_m,

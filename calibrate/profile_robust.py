@@ -63,6 +63,7 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
         certificate=replace(start.certificate, distance_sigma=apart),
         observability=observe(pairs, result.covariance, distance, parent),
         holdout=holdout,
+        kept=tuple(fit.views.views[i] for i in places),
         turned=tuple(indices[i] for i in sorted(fit.consensus.turned)),
         noise=NoiseScales(*(float(s) for s in result.sigma[:3])),
         systematics=fit.systematics,

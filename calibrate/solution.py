@@ -13,6 +13,7 @@ from typing import Literal
 import numpy as np
 
 from calibrate.geometry import Array, Transform
+from calibrate.views import ImageView
 from recordings.messages import CameraModel, Mount
 
 Profile = Literal["robust", "paper"]
@@ -172,6 +173,8 @@ class Solution:
     certificate: Certificate
     observability: Observability
     holdout: HoldoutScore | None = None
+    kept: tuple[ImageView, ...] = ()
+    """The used views as the solver read them, boards turned where that was needed."""
     turned: tuple[int, ...] = ()
     """Views whose corner order was turned by 180° to agree with the others, and kept."""
     noise: NoiseScales | None = None

@@ -1,0 +1,143 @@
+"""`calibrate compare`: every method of the literature and ours, side by side on the same views."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from functools import partial
+
+import cv2
+import numpy as np
+
+from calibrate.admit import require_solvable
+from calibrate.assess import board_spread, distance_in_sigmas, motion_errors
+from calibrate.consensus import pose_arrays
+from calibrate.errors import CalibrationError
+from calibrate.estimate import estimate, first_state
+from calibrate.geometry import Array, is_rigid
+from calibrate.likelihood.model import observe_views
+from calibrate.pairs import Pairs, all_pairs, consecutive_pairs
+from calibrate.paper import solve_paper
+from calibrate.peer_methods import (
+    HAND_EYE,
+    ROBOT_WORLD,
+    heller_global,
+    opencv_hand_eye,
+    opencv_robot_world,
+    orthonormalised,
+    strobl_hirzinger,
+    zhao_minimax,
+    zhi_linear,
+)
+from calibrate.profile_robust import HELD_OUT, solve_robust_profile
+from calibrate.reprojection import reprojection_px
+from calibrate.solution import PeerResult, Solution, SolveOptions
+from calibrate.views import ViewSet
+
+Method = Callable[[ViewSet], Array]
+_MAX_PAIRS = 2000
+_REPROJECTION_SIGMA = np.array([1.0, 1e-6, 1e-6, 1.0])
+"""Robot poses as good as exact."""
+
+
+def compare_all(views: ViewSet, options: SolveOptions | None = None) -> list[PeerResult]:
+    """One row per method, ours last. All get the views that ours keeps (turned boards set right), with the
+    board poses of the given intrinsics; e_t and e_R are scored on the last 6 of them, fitted without.
+    """
+    require_solvable(views)
+    options = replace(options or SolveOptions(), profile="robust")
+    start = time.perf_counter()
+    ours = solve_robust_profile(views, options)
+    ours_ms = 1e3 * (time.perf_counter() - start)
+    kept = replace(views, views=ours.kept)
+    rows = [_row(name, method, kept, ours) for name, method in _methods(options).items()]
+    final = _scored("ours", ours.matrix, None, kept, ours)
+    if ours.holdout is not None:
+        final = replace(
+            final,
+            e_t_m=ours.holdout.e_t_m,
+            e_R=ours.holdout.e_R,
+            samples_e_t_m=ours.holdout.samples_e_t_m,
+            samples_e_R=ours.holdout.samples_e_R,
+        )
+    return [*rows, replace(final, time_ms=ours_ms, note="hold-out, outliers and proof included in the time")]
+
+
+def _methods(options: SolveOptions) -> dict[str, Method]:
+    methods: dict[str, Method] = {}
+    for name, number in HAND_EYE.items():
+        methods[name] = partial(_by_poses, partial(opencv_hand_eye, method=number))
+    for name, number in ROBOT_WORLD.items():
+        methods[name] = partial(_by_poses, partial(opencv_robot_world, method=number))
+    methods["Zhao CO"] = partial(_by_pairs, zhao_minimax)
+    methods["Zhao CO + SVD"] = partial(_by_pairs, lambda pairs: orthonormalised(zhao_minimax(pairs)))
+    methods["Zhi-Schwertfeger"] = partial(_by_pairs, zhi_linear)
+    methods["Strobl-Hirzinger"] = _strobl
+    methods["Heller, certified"] = partial(_by_pairs, heller_global)
+    methods["reprojection only"] = _reprojection_only
+    methods["DE, paper"] = partial(_paper, seed=options.seed)
+    return methods
+
+
+def _by_poses(solve: Callable[[Array, Array], Array], views: ViewSet) -> Array:
+    return solve(*pose_arrays(views))
+
+
+def _by_pairs(solve: Callable[[Pairs], Array], views: ViewSet) -> Array:
+    return solve(all_pairs(*pose_arrays(views), limit=_MAX_PAIRS))
+
+
+def _strobl(views: ViewSet) -> Array:
+    start = _by_poses(partial(opencv_hand_eye, method=HAND_EYE["Park-Martin"]), views)
+    return _by_pairs(partial(strobl_hirzinger, start=start), views)
+
+
+def _paper(views: ViewSet, seed: int) -> Array:
+    return solve_paper(consecutive_pairs(*pose_arrays(views)), seed).X
+
+
+def _reprojection_only(views: ViewSet) -> Array:
+    """Pixels alone, robot poses taken as exact, intrinsics held; from Park and Martin's X."""
+    observed = observe_views(views)
+    if not observed.has_pixels:
+        raise CalibrationError("no corners in this recording")
+    H, C = pose_arrays(views)
+    X = opencv_hand_eye(H, C, HAND_EYE["Park-Martin"])
+    start = first_state(observed, X, C, H, views.camera)
+    return estimate(observed, start, sigma=_REPROJECTION_SIGMA, fit_scales=False).state.X
+
+
+def _row(name: str, method: Method, views: ViewSet, ours: Solution) -> PeerResult:
+    start = time.perf_counter()
+    try:
+        X = method(views)
+        elapsed_ms = 1e3 * (time.perf_counter() - start)
+        fitted = len(views) - HELD_OUT
+        partial_X = method(views.select(list(range(fitted)))) if fitted >= 5 else None
+    except (CalibrationError, cv2.error, np.linalg.LinAlgError, ValueError) as error:
+        return PeerResult(name, None, note=f"failed: {str(error).splitlines()[0]}")
+    if not np.isfinite(X).all():
+        return PeerResult(name, None, note="failed: not a number")
+    return replace(_scored(name, X, partial_X, views, ours), time_ms=elapsed_ms)
+
+
+def _scored(name: str, X: Array, partial_X: Array | None, views: ViewSet, ours: Solution) -> PeerResult:
+    rigid = is_rigid(X)
+    H, C = pose_arrays(views)
+    spread = board_spread(H, C, X) if rigid else (None, None)
+    result = PeerResult(
+        name=name,
+        matrix=X,
+        board_spread_m=spread[0],
+        board_spread_rad=spread[1],
+        reprojection_px=reprojection_px(views, X) if rigid else None,
+        distance_sigma=distance_in_sigmas(X, ours.matrix, ours.covariance) if rigid else None,
+        rigid=rigid,
+        note="" if rigid else "raw matrix, not a rigid transform",
+    )
+    if partial_X is None or not np.isfinite(partial_X).all():
+        return result
+    last = slice(len(views) - HELD_OUT, None)
+    e_t, e_R = motion_errors(partial_X, all_pairs(H[last], C[last]))
+    return replace(result, e_t_m=float(e_t.mean()), e_R=float(e_R.mean()), samples_e_t_m=e_t, samples_e_R=e_R)

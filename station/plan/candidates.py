@@ -12,7 +12,7 @@ from calibrate.board import board_points
 from calibrate.geometry import Array, pose, rotation_exp, transform_points
 from calibrate.information import camera_matrix, project
 from calibrate.kinematics import inverse_all, singularity_measure
-from recordings.messages import CameraModel
+from recordings.messages import BoardSpec, CameraModel
 from station.collision import ARM_BODIES, body_segments, margins, segment_distance
 from station.limits import joint_bounds
 from station.plan.scene import Scene
@@ -82,8 +82,8 @@ _FOCUS = (0.6, 1.6)
 def view_range(scene: Scene) -> ViewRange:
     """Distances at which the board fills the picture well, as far as they lie near the working distance."""
     K, _ = camera_matrix(scene.camera)
-    outline = _outline(scene)
-    size_m = (outline.max(axis=0) - outline.min(axis=0))[:2]
+    rim = outline(scene.board)
+    size_m = (rim.max(axis=0) - rim.min(axis=0))[:2]
     picture = np.array([scene.camera.width, scene.camera.height])
     full_m = float((np.diag(K)[:2] * size_m / picture).max())
     focus = np.array(_FOCUS) * scene.working_distance_m
@@ -143,24 +143,24 @@ def share_visible(
     scene: Scene, base_from_flange: Array, view: ViewRange, draws: list[tuple[Array, Array]]
 ) -> Array:
     """(n,) share of the drawn guesses that show the whole board; 0 where the guess itself does not."""
-    outline = _outline(scene)
-    share = visible(scene.camera, scene.seen(base_from_flange, outline), view.border_px).astype(float)
+    rim = outline(scene.board)
+    share = visible(scene.camera, scene.seen(base_from_flange, rim), view.border_px).astype(float)
     if not draws:
         return share
     seen = np.flatnonzero(share)
     hits = np.zeros(len(seen))
     for X, Y in draws:
         drawn = replace(scene, X=X, Y=Y)
-        hits += visible(scene.camera, drawn.seen(base_from_flange[seen], outline), view.border_px)
+        hits += visible(scene.camera, drawn.seen(base_from_flange[seen], rim), view.border_px)
     share[seen] = hits / len(draws)
     return share
 
 
-def _outline(scene: Scene) -> Array:
+def outline(board: BoardSpec) -> Array:
     """Points (8, 3) around the detectable ones, half a square wider: detectors need the rim."""
-    points = board_points(scene.board)
-    low = points.min(axis=0) - scene.board.square_m / 2
-    high = points.max(axis=0) + scene.board.square_m / 2
+    points = board_points(board)
+    low = points.min(axis=0) - board.square_m / 2
+    high = points.max(axis=0) + board.square_m / 2
     middle = (low + high) / 2
     xs, ys = (low[0], middle[0], high[0]), (low[1], middle[1], high[1])
     grid = [(x, y, 0.0) for x in xs for y in ys if (x, y) != (middle[0], middle[1])]
@@ -210,10 +210,10 @@ def sees_past_the_arm(scene: Scene, joints_rad: Array, base_from_flange: Array) 
     links = slice(2, len(ARM_BODIES))
     if scene.mount == "eye-in-hand":
         eye = transform_points(base_from_flange, scene.X[None, :3, 3])
-        board = np.broadcast_to(transform_points(scene.Y, _outline(scene)), (len(eye), 8, 3))
+        board = np.broadcast_to(transform_points(scene.Y, outline(scene.board)), (len(eye), 8, 3))
     else:
         eye = np.broadcast_to(scene.X[:3, 3], (len(joints_rad), 1, 3))
-        board = transform_points(base_from_flange @ scene.Y, _outline(scene))
+        board = transform_points(base_from_flange @ scene.Y, outline(scene.board))
     gap = segment_distance(eye[:, :, None], board[:, :, None], starts[:, None, links], ends[:, None, links])
     return np.asarray((gap > radii[links]).all(axis=(1, 2)))
 

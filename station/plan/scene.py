@@ -8,7 +8,7 @@ import numpy as np
 
 from calibrate.board import board_points
 from calibrate.geometry import Array, inverse, pose, pose_from_quaternion, rotation_exp, transform_points
-from calibrate.kinematics import MODELS, DhDeltas
+from calibrate.kinematics import MODELS, DhDeltas, RobotModel
 from recordings.messages import BoardSpec, CameraModel, Mount
 from station.collision import CellGeometry, plate
 from station.config import Capsule, PoseGuess, StationConfig
@@ -110,11 +110,16 @@ def cell_geometry(config: StationConfig) -> CellGeometry:
     return geometry_of(config, X, Y, doubt_m)
 
 
-def geometry_of(config: StationConfig, X: Array | None, Y: Array | None, doubt_m: float) -> CellGeometry:
-    """Solids and obstacles of a cell; board clearance grows by `doubt_m`, what its place is not known to."""
+def arm_model(config: StationConfig) -> RobotModel:
+    """The configured arm, with its factory calibration where it is given."""
     model = MODELS[config.robot.model]
     if (deltas := config.robot.kinematics) is not None:
         model = model.calibrated(DhDeltas(deltas.a_m, deltas.d_m, deltas.alpha_rad, deltas.theta_rad))
+    return model
+
+
+def geometry_of(config: StationConfig, X: Array | None, Y: Array | None, doubt_m: float) -> CellGeometry:
+    """Solids and obstacles of a cell; board clearance grows by `doubt_m`, what its place is not known to."""
     low, high = board_extent(config.board)
     limits = config.limits
     solids = limits.solids
@@ -136,7 +141,7 @@ def geometry_of(config: StationConfig, X: Array | None, Y: Array | None, doubt_m
         if X is not None:
             obstacles = (camera_body("camera", X),)
             clearance = limits.clearance_m + doubt_m
-    return CellGeometry(model, limits, solids, obstacles, clearance, watched)
+    return CellGeometry(arm_model(config), limits, solids, obstacles, clearance, watched)
 
 
 def camera_body(name: str, parent_from_camera: Array) -> Capsule:

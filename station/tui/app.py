@@ -17,6 +17,7 @@ from textual.binding import Binding, BindingType
 from textual.message import Message
 from textual.reactive import reactive
 
+from station.client import Client
 from station.errors import RefusedError, StationError
 from station.protocol import Verb
 from station.status import GoSummary, StationState, StationStatus
@@ -72,10 +73,9 @@ class StationApp(App[None]):
     ]
     status: reactive[StationStatus | None] = reactive(None)
 
-    def __init__(self, connect: Connect, who: str = "") -> None:
+    def __init__(self, connect: Connect) -> None:
         super().__init__()
         self._connect = connect
-        self._who = who
         self._link: Link | None = None
         self.result_path: str | None = None
         """The calibration file the result screen shows."""
@@ -215,3 +215,12 @@ class StationApp(App[None]):
         text = "A session is running. Without this screen the arm decelerates and the session pauses."
         if not running or await self.push_screen_wait(Confirm("Close the screen?", text, yes="Close")):
             self.exit()
+
+
+def run(socket: Path, who: str = "") -> None:
+    """Opens the screen on the daemon that serves `socket` and returns when it is closed."""
+
+    async def connect() -> Link:
+        return await Client.connect(socket, who)
+
+    StationApp(connect).run()

@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from recordings.errors import RecordingError
+from recordings.export import Target, export_recording
 from recordings.importer import import_folder
 from recordings.info import recording_info
 from recordings.info_text import print_info, print_recovery
@@ -65,6 +66,19 @@ def import_(
     else:
         print(f"{done.path}: {done.pictures} views, {done.size_bytes / 1e6:.1f} MB")
         print(f"next: calibrate solve {done.path}")
+
+
+@main.command()
+def export(
+    recording: Path,
+    output: Annotated[Path, typer.Option("-o", "--output", help="The folder to write; it must not exist.")],
+    to: Annotated[Target, typer.Option("--to", help="folder: for `import`; csv: tables; ros2: a bag.")],
+    json_: Json = False,
+) -> None:
+    """A recording as a folder of pictures and poses, as CSV tables, or as a ROS 2 bag."""
+    with _errors_for_people():
+        written = export_recording(open_recording(recording), output, to)
+    print(json.dumps({"output": str(written)}) if json_ else f"{written} written")
 
 
 @main.command()

@@ -52,6 +52,10 @@ class Recording:
         except KeyError as error:
             raise RecordingError(f"{self.path} has no picture for view {view.index}") from error
 
+    def stored_picture(self, view: View) -> tuple[str, bytes] | None:
+        """(format, file bytes) of a picture that is kept compressed; None when it is kept raw."""
+        return self._by_number[view.part].stored_picture(view.picture_sequence)
+
     def pictures(self) -> Iterator[tuple[View, Picture]]:
         """One at a time, in the order of `views`."""
         for view in self.views():

@@ -79,6 +79,11 @@ class Recorder:
         """Waiting for the disk; the session pauses when it grows."""
         return self._queued_bytes
 
+    @property
+    def alive(self) -> bool:
+        """The writer's thread works; false after finish, close or an error."""
+        return self._thread.is_alive()
+
     def robot_state(self, state: RobotState) -> bool:
         """False when it was dropped."""
         return self._offer(lambda: self._writer.robot_state(state), _STATE_BYTES)

@@ -12,7 +12,7 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from numpy.typing import NDArray
 
-from recordings.messages import CameraModel, CaptureEvent, View
+from recordings.messages import CameraModel, CaptureEvent, Matrix4, View
 from recordings.pictures import raw_encoding
 
 CAMERA_FRAME = "camera"
@@ -66,10 +66,10 @@ def camera_calibration(model: CameraModel, time_ns: int) -> Any:
 
 def flange_transform(view: View, time_ns: int) -> Any:
     """base_from_flange of a view, so that a 3D panel shows where the pictures were taken."""
-    R = np.array(view.base_from_flange)
-    x, y, z, w = quaternion_xyzw(R[:3, :3])
+    T = view.base_from_flange
+    x, y, z, w = quaternion_xyzw(T)
     message = FrameTransform(parent_frame_id="base", child_frame_id="flange")
-    message.translation.x, message.translation.y, message.translation.z = R[:3, 3].tolist()
+    message.translation.x, message.translation.y, message.translation.z = T[0][3], T[1][3], T[2][3]
     message.rotation.x, message.rotation.y, message.rotation.z, message.rotation.w = x, y, z, w
     _stamp(message, time_ns)
     return message
@@ -84,8 +84,9 @@ def log_line(event: CaptureEvent, time_ns: int) -> Any:
     return message
 
 
-def quaternion_xyzw(R: NDArray[np.float64]) -> tuple[float, float, float, float]:
-    """(3, 3) rotation → quaternion with w ≥ 0: the eigenvector of Bar-Itzhack's K (2000), any angle."""
+def quaternion_xyzw(transform: Matrix4) -> tuple[float, float, float, float]:
+    """Of a rigid transform, w ≥ 0: the eigenvector of Bar-Itzhack's K (2000), good at any angle."""
+    R = np.array(transform)
     K = np.array(
         [
             [R[0, 0] - R[1, 1] - R[2, 2], R[1, 0] + R[0, 1], R[2, 0] + R[0, 2], R[2, 1] - R[1, 2]],

@@ -1,0 +1,202 @@
+"""Exports come back through other readers' own rules: import, csv, rosbags, rerun."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+from typer.testing import CliRunner
+
+from recordings.cdr import definition_text, encode_cdr
+from recordings.cli import main
+from recordings.errors import RecordingError
+from recordings.export import Target, export_recording
+from recordings.importer import import_folder
+from recordings.reader import open_recording
+from recordings.viewing import quaternion_xyzw
+from recordings.writer import RecordingWriter
+from tests.recordings.small_recording import (
+    HEIGHT,
+    START_NS,
+    TURNED,
+    WIDTH,
+    make_image,
+    make_info,
+    make_picture,
+    make_state,
+    make_view,
+    write_small,
+)
+
+
+def test_a_folder_export_imports_as_the_same_views(small: Path, tmp_path: Path) -> None:
+    original = open_recording(small)
+    folder = export_recording(original, tmp_path / "out", Target.FOLDER)
+    again = open_recording(import_folder(folder, tmp_path / "again.mcap").path)
+    assert (again.info.board, again.info.mount, again.info.camera) == (
+        original.info.board,
+        original.info.mount,
+        original.info.camera,
+    )
+    for (a, picture_a), (b, picture_b) in zip(original.pictures(), again.pictures(), strict=True):
+        np.testing.assert_allclose(a.base_from_flange, b.base_from_flange, atol=1e-12)
+        np.testing.assert_array_equal(picture_a.image, picture_b.image)
+
+
+def test_an_imported_file_is_exported_byte_for_byte(folder: Path, tmp_path: Path) -> None:
+    recording = open_recording(import_folder(folder, tmp_path / "a.mcap").path)
+    out = export_recording(recording, tmp_path / "out", Target.FOLDER)
+    for index in range(3):
+        assert (out / f"images/{index:03d}.png").read_bytes() == (folder / f"images/{index}.png").read_bytes()
+
+
+def test_tables_hold_every_value_in_full_precision(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        for count in range(4):
+            writer.robot_state(make_state(count))
+        for sequence, attempt in enumerate([1, 2]):
+            writer.picture(make_picture(sequence))
+            writer.view(make_view(0, sequence, attempt))
+        recording = open_recording(writer.finish())
+    out = export_recording(recording, tmp_path / "out", Target.CSV)
+    tables = {path.stem: list(csv.DictReader(path.open())) for path in out.iterdir()}
+    assert {name: len(rows) for name, rows in tables.items()} == {
+        "robot_states": 4,
+        "pictures": 2,
+        "views": 2,
+        "events": 0,
+    }
+    state = tables["robot_states"][3]
+    assert float(state["shoulder_rad"]) == make_state(3).joints_rad[1]
+    assert int(state["host_monotonic_ns"]) == make_state(3).stamps.host_monotonic_ns
+    assert [row["used"] for row in tables["views"]] == ["0", "1"]
+    assert float(tables["views"][0]["z"]) == TURNED[2][3]
+
+
+def test_nothing_is_overwritten_and_nothing_left_behind(small: Path, tmp_path: Path) -> None:
+    taken = tmp_path / "taken"
+    taken.mkdir()
+    with pytest.raises(RecordingError, match="exists already"):
+        export_recording(open_recording(small), taken, Target.CSV)
+    with pytest.raises(RecordingError, match="cannot write"):
+        export_recording(open_recording(small), tmp_path / "no" / "out", Target.CSV)
+    assert list(taken.iterdir()) == []
+    assert not (tmp_path / "no").exists()
+
+
+def test_an_export_that_fails_halfway_leaves_nothing(small: Path, tmp_path: Path) -> None:
+    recording = open_recording(small)
+    (tmp_path / "out.part").mkdir()
+    with pytest.raises(RecordingError, match="cannot write"):
+        export_recording(recording, tmp_path / "out", Target.FOLDER)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("target", ["folder", "csv", "ros2"])
+def test_the_command_line_writes_each_target(small: Path, tmp_path: Path, target: str) -> None:
+    result = CliRunner().invoke(main, ["export", str(small), "--to", target, "-o", str(tmp_path / "out")])
+    assert result.exit_code == 0, result.output
+    assert (tmp_path / "out").is_dir()
+
+
+def test_quaternions_of_any_rotation_turn_back() -> None:
+    rotations = [
+        *Rotation.random(50, random_state=2),
+        Rotation.from_rotvec([np.pi, 0, 0]),
+        Rotation.identity(),
+    ]
+    for rotation in rotations:
+        T = np.eye(4)
+        T[:3, :3] = rotation.as_matrix()
+        q = quaternion_xyzw(tuple(map(tuple, T.tolist())))
+        assert q[3] >= 0
+        np.testing.assert_allclose(Rotation.from_quat(q).as_matrix(), T[:3, :3], atol=1e-12)
+
+
+def test_cdr_aligns_numbers_and_ends_strings_as_the_standard_says() -> None:
+    """By hand: head, sec, nanosec, length 2, 'a\\0', pad 2, length 1, one double at a multiple of 8."""
+    message = {
+        "header": {"stamp": {"sec": 1, "nanosec": 2}, "frame_id": "a"},
+        "name": [],
+        "position": [0.5],
+        "velocity": [],
+        "effort": [],
+    }
+    expected = struct.pack("<iII2s2xI", 1, 2, 2, b"a\0", 0) + struct.pack("<I", 1) + bytes(0)
+    assert len(expected) == 24
+    expected += struct.pack("<dII", 0.5, 0, 0)
+    assert encode_cdr("sensor_msgs/JointState", message) == b"\0\1\0\0" + expected
+
+
+def test_the_definition_text_names_every_nested_type() -> None:
+    text = definition_text("tf2_msgs/TFMessage")
+    assert text.startswith("geometry_msgs/TransformStamped[] transforms\n====")
+    for part in ("std_msgs/Header", "builtin_interfaces/Time", "geometry_msgs/Quaternion"):
+        assert text.count(f"MSG: {part}\n") == 1
+
+
+def test_the_bag_has_the_profile_and_counts_that_ros_wants(small: Path, tmp_path: Path) -> None:
+    out = export_recording(open_recording(small), tmp_path / "bag", Target.ROS2)
+    described = yaml.safe_load((out / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    counts = {t["topic_metadata"]["name"]: t["message_count"] for t in described["topics_with_message_count"]}
+    assert counts == {"/camera/camera_info": 1, "/joint_states": 9, "/camera/image_raw": 3, "/tf": 3}
+    assert described["message_count"] == 16
+    assert (out / described["relative_file_paths"][0]).read_bytes()[17:25] == b"\x04\0\0\0ros2"
+
+
+@pytest.mark.parametrize("lossless_png", [False, True])
+def test_rosbags_reads_the_bag_back(tmp_path: Path, lossless_png: bool) -> None:
+    """Runs where the `rosbags` package is installed (it is no dependency)."""
+    highlevel = pytest.importorskip("rosbags.highlevel", reason="the rosbags package is not installed")
+    with RecordingWriter(tmp_path / "a.mcap", make_info(), lossless_png=lossless_png) as writer:
+        for index in range(3):
+            writer.robot_state(make_state(index))
+            writer.picture(make_picture(index))
+            writer.view(make_view(index))
+        path = writer.finish()
+    bag = export_recording(open_recording(path), tmp_path / "bag", Target.ROS2)
+    found: dict[str, list[object]] = {}
+    with highlevel.AnyReader([bag]) as reader:
+        for connection, time_ns, raw in reader.messages():
+            assert time_ns >= START_NS
+            found.setdefault(connection.topic, []).append(reader.deserialize(raw, connection.msgtype))
+    joints = found["/joint_states"][2]
+    np.testing.assert_array_equal(joints.position, make_state(2).joints_rad)  # type: ignore[attr-defined]
+    transform = found["/tf"][0].transforms[0]  # type: ignore[attr-defined]
+    assert (transform.header.frame_id, transform.child_frame_id) == ("base", "flange")
+    assert transform.transform.translation.z == TURNED[2][3]
+    camera = found["/camera/camera_info"][0]
+    assert (camera.width, camera.distortion_model, camera.k[0]) == (WIDTH, "plumb_bob", 900.0)  # type: ignore[attr-defined]
+    if lossless_png:
+        assert [m.format for m in found["/camera/image_raw/compressed"]] == ["png"] * 3  # type: ignore[attr-defined]
+        return
+    image = found["/camera/image_raw"][1]
+    assert (image.encoding, image.height, image.step) == ("mono8", HEIGHT, WIDTH)  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(image.data.reshape(HEIGHT, WIDTH), make_image(1))  # type: ignore[attr-defined]
+
+
+def test_rerun_opens_the_recording_without_a_plugin(tmp_path: Path) -> None:
+    """Runs where the `rerun-sdk` package is installed (it is no dependency)."""
+    pytest.importorskip("rerun", reason="the rerun-sdk package is not installed")
+    rerun = shutil.which("rerun", path=str(Path(sys.executable).parent))
+    assert rerun is not None
+    path = write_small(tmp_path / "a.mcap")
+
+    def run(*arguments: str) -> str:
+        done = subprocess.run([rerun, *arguments], capture_output=True, text=True, check=True, timeout=60)
+        return done.stdout + done.stderr
+
+    run("mcap", "check", str(path))
+    run("mcap", "convert", str(path), "-o", str(tmp_path / "a.rrd"))
+    shown = run("rrd", "print", str(tmp_path / "a.rrd"))
+    for column in ("Image:buffer", "Pinhole:image_from_camera", "Transform3D:translation", "TextLog:text"):
+        assert column in shown, f"rerun shows no {column}"
+    assert "station.RobotState" in shown

@@ -109,7 +109,8 @@ class PlanScreen(StationScreen):
         if robot is None or robot.joints_rad is None:
             self.notify("The arm's posture is not known: no robot state.", severity="warning")
             return
-        self.station.send("add", joints_rad=list(robot.joints_rad))
+        pose = {"name": "here", "joints_rad": list(robot.joints_rad), "why": "added on the screen"}
+        self.station.send("add", pose=pose)
 
     def action_make(self) -> None:
         self.notify("Planning: some seconds …")

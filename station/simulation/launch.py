@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-import json
+import os
 import random
 import selectors
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from types import TracebackType
@@ -15,7 +16,10 @@ from station.errors import RobotError
 from station.simulation.admin import AdminClient
 
 ATTEMPTS = 5
+ADDRESS_TAKEN = 1
+"""Exit code of a controller that cannot listen on its address."""
 STOP_TIMEOUT_S = 3.0
+END_TIMEOUT_S = 0.5
 
 
 class SimulatedController:
@@ -33,16 +37,16 @@ class SimulatedController:
         """A new connection to the admin port. Raises RobotError."""
         return AdminClient(self.host)
 
-    def stop(self) -> None:
+    def stop(self, timeout_s: float = STOP_TIMEOUT_S) -> None:
         """Ends the child, by force if it does not listen. Idempotent."""
         if self.running:
             self.process.terminate()
             try:
-                self.process.wait(STOP_TIMEOUT_S)
+                self.process.wait(timeout_s)
             except subprocess.TimeoutExpired:
                 self.process.kill()
                 self.process.wait()
-        for pipe in (self.process.stdin, self.process.stdout):
+        for pipe in (self.process.stdin, self.process.stdout, self.process.stderr):
             if pipe is not None:
                 pipe.close()
 
@@ -77,42 +81,43 @@ def start_controller(
     command += ["--time-scale", str(time_scale), *options]
     if truth is not None:
         command += ["--truth", str(truth)]
-    reason = ""
-    for _ in range(ATTEMPTS if host is None else 1):
+    attempts = 1 if host is not None else ATTEMPTS
+    while True:
+        attempts -= 1
         address = host or _random_loopback()
-        child, reason = _start([*command, "--host", address], timeout_s, log)
-        if child is not None:
+        child, problem = _start([*command, "--host", address], timeout_s, log)
+        if not problem:
             return SimulatedController(address, child)
-    raise RobotError(f"the simulated {model} did not start: {reason}")
+        if child.returncode != ADDRESS_TAKEN or attempts == 0:
+            raise RobotError(f"the simulated {model} did not start: {problem}")
 
 
 def _random_loopback() -> str:
     return f"127.{random.randint(1, 254)}.{random.randint(0, 255)}.{random.randint(1, 254)}"
 
 
-def _start(
-    command: list[str], timeout_s: float, log: Path | None
-) -> tuple[subprocess.Popen[bytes] | None, str]:
-    """The child once it is ready, or None and why not."""
-    stderr = log.open("ab") if log is not None else subprocess.PIPE
-    try:
+def _start(command: list[str], timeout_s: float, log: Path | None) -> tuple[subprocess.Popen[bytes], str]:
+    """The child, and why it is not ready and has been ended ("" = it is)."""
+    with log.open("a+b") if log is not None else tempfile.TemporaryFile() as stderr:
+        said_before = stderr.seek(0, os.SEEK_END)
         child = subprocess.Popen(
             command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=stderr, start_new_session=True
         )
-    finally:
-        if log is not None:
-            stderr.close()  # type: ignore[union-attr]
-    line = _read_line(child, timeout_s)
+        if b'"ready": true' in _read_line(child, timeout_s):
+            return child, ""
+        _end(child)
+        stderr.seek(said_before)
+        words = stderr.read().decode(errors="replace").strip()
+    return child, words or f"no ready line within {timeout_s:g} s"
+
+
+def _end(child: subprocess.Popen[bytes]) -> None:
+    """Waits for a child that is ending by itself, or kills it; closes its pipes."""
     try:
-        ready = bool(json.loads(line)["ready"])
-    except (ValueError, KeyError):
-        ready = False
-    if ready:
-        return child, ""
-    child.kill()
-    _, words = child.communicate()
-    late = f"no ready line within {timeout_s:g} s"
-    return None, (words or b"").decode(errors="replace").strip() or (f"see {log}" if log else late)
+        child.wait(END_TIMEOUT_S)
+    except subprocess.TimeoutExpired:
+        child.kill()
+    child.communicate()
 
 
 def _read_line(child: subprocess.Popen[bytes], timeout_s: float) -> bytes:

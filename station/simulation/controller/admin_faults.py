@@ -6,13 +6,12 @@ import time
 from collections.abc import Callable
 from typing import Any
 
+from station.simulation.controller.arguments import number, numbers
 from station.simulation.controller.arm import Vibration
-from station.simulation.controller.kinematics import DhTable, Six
+from station.simulation.controller.kinematics import DhTable
 from station.simulation.controller.machine import Machine
 from station.simulation.controller.network import Cut
 from station.simulation.controller.rtde_server import ADMIN
-
-ZERO: Six = (0.0,) * 6
 
 
 def pstop(machine: Machine) -> None:
@@ -71,22 +70,22 @@ def black_hole(machine: Machine, on: bool = True, ports: list[str] | None = None
 
 def restart(machine: Machine, down_s: float = 1.0, running: bool = False) -> None:
     """The controller reboots: links reset, ports closed for down_s, time 0, powered off unless running."""
-    machine.background(machine.reboot(float(down_s), running))
+    machine.background(machine.reboot(number("down_s", down_s, 0.0, 60.0), running))
 
 
 def late(machine: Machine, ms: float) -> None:
     """No cycle runs for this long; then all that were due run at once (a hiccup of the simulation)."""
-    machine.clock.hold_until_ns = time.monotonic_ns() + int(ms * 1e6)
+    machine.clock.hold_until_ns = time.monotonic_ns() + int(number("ms", ms, 0.0, 60_000.0) * 1e6)
 
 
 def delay(machine: Machine, ms: float) -> None:
     """Every data packet leaves this much later from now on (0 = none): a slow network."""
-    machine.rtde.delay_s = ms / 1000
+    machine.rtde.delay_s = number("ms", ms, 0.0, 10_000.0) / 1000
 
 
 def lose(machine: Machine, packets: int) -> None:
     """The next cycles' data packets are never sent."""
-    machine.lose_packets = int(packets)
+    machine.lose_packets = int(number("packets", packets, 0))
 
 
 def in_use(machine: Machine, inputs: list[str], on: bool = True) -> None:
@@ -108,13 +107,18 @@ def vibrate(
     joint: int = 1,
 ) -> None:
     """A joint shakes about its rest: for ever, or fading after each motion. amplitude_rad 0 ends it."""
-    vibration = Vibration(amplitude_rad, frequency_hz, decay_s, joint)
-    machine.robot.arm.vibration = vibration if amplitude_rad > 0 else None
+    vibration = Vibration(
+        number("amplitude_rad", amplitude_rad, 0.0, 0.1),
+        number("frequency_hz", frequency_hz, 0.0),
+        None if decay_s is None else number("decay_s", decay_s, 1e-3),
+        int(number("joint", joint, 0, 5)),
+    )
+    machine.robot.arm.vibration = vibration if vibration.amplitude_rad > 0 else None
 
 
 def offset(machine: Machine, joints_rad: list[float] | None = None) -> None:
     """From the next motion on the arm rests this much short of its command (none: as commanded)."""
-    machine.robot.arm.offset = _six(joints_rad)
+    machine.robot.arm.offset = numbers("joints_rad", joints_rad, 6)
 
 
 def dh(
@@ -126,13 +130,12 @@ def dh(
 ) -> None:
     """The true arm differs from the nominal table by these; what the controller reports does not."""
     nominal: DhTable = machine.robot.table
-    machine.robot.true_table = nominal.plus(_six(a_m), _six(d_m), _six(alpha_rad), _six(theta_rad))
-
-
-def _six(values: list[float] | None) -> Six:
-    if values is not None and len(values) != 6:
-        raise ValueError(f"expected 6 numbers, not {values}")
-    return tuple(map(float, values)) if values is not None else ZERO
+    machine.robot.true_table = nominal.plus(
+        numbers("a_m", a_m, 6),
+        numbers("d_m", d_m, 6),
+        numbers("alpha_rad", alpha_rad, 6),
+        numbers("theta_rad", theta_rad, 6),
+    )
 
 
 FAULTS: dict[str, Callable[..., Any]] = {

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
+from station.simulation.controller.arguments import number, numbers
 from station.simulation.controller.kinematics import Six
 from station.simulation.controller.machine import Machine
 from station.simulation.controller.paths import Path, PolylinePath
@@ -46,9 +47,7 @@ def foreign(machine: Machine, name: str = "palletising.urp") -> None:
 
 def slider(machine: Machine, fraction: float) -> None:
     """Speed slider on the pendant, 0…1."""
-    if not 0 <= fraction <= 1:
-        raise ValueError(f"fraction is 0…1, not {fraction}")
-    machine.robot.slider = float(fraction)
+    machine.robot.slider = number("fraction", fraction, 0.0, 1.0)
 
 
 def remote(machine: Machine, on: bool = True) -> None:
@@ -61,13 +60,13 @@ def remote(machine: Machine, on: bool = True) -> None:
 
 def tcp(machine: Machine, pose: list[float]) -> None:
     """TCP of the installation: x y z [m], rotation vector [rad], in the flange."""
-    machine.robot.tcp = _numbers(pose, 6)
+    machine.robot.tcp = numbers("pose", pose, 6)
 
 
 def payload(machine: Machine, kg: float, cog_m: list[float] | None = None) -> None:
     """Payload of the installation."""
-    machine.robot.payload_kg = float(kg)
-    machine.robot.payload_cog = _numbers(cog_m, 3) if cog_m is not None else (0.0,) * 3
+    machine.robot.payload_kg = number("kg", kg, 0.0)
+    machine.robot.payload_cog = numbers("cog_m", cog_m, 3)
 
 
 def jog(machine: Machine, joints_rad: list[float], speed_rad_s: float = 0.5) -> dict[str, Any]:
@@ -78,21 +77,16 @@ def jog(machine: Machine, joints_rad: list[float], speed_rad_s: float = 0.5) -> 
 def hand_move(machine: Machine, path: list[list[float]], speed_rad_s: float = 0.5) -> dict[str, Any]:
     """A person leads the arm through these joints (free-drive), the fastest joint at speed_rad_s."""
     robot = machine.robot
-    corners = [_numbers(corner, 6) for corner in path]
+    corners = [numbers("path", corner, 6) for corner in path]
+    speed_rad_s = number("speed_rad_s", speed_rad_s, 1e-3, 100.0)
 
     def make_path(start: Six) -> Path:
         return PolylinePath([start, *corners])
 
     length_rad = PolylinePath([robot.arm.command, *corners]).length
-    if not robot.lead(make_path, float(speed_rad_s), HAND_RAD_S2):
+    if not robot.lead(make_path, speed_rad_s, HAND_RAD_S2):
         raise ValueError("the arm is not free: a program plays, a safety stop holds it, or it has no power")
     return {"length_rad": length_rad}
-
-
-def _numbers(values: list[float], count: int) -> Six:
-    if len(values) != count:
-        raise ValueError(f"expected {count} numbers, not {values}")
-    return tuple(map(float, values))
 
 
 HANDS: dict[str, Callable[..., Any]] = {

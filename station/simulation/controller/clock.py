@@ -72,14 +72,19 @@ class Clock:
             os.read(self._fd, 8)
         except BlockingIOError:
             return
-        now_ns = time.monotonic_ns()
-        if now_ns >= self.hold_until_ns:
-            behind = int((now_ns - self.start_ns) / self._cycle_ns) - self.count
-            late = behind > LATE_CYCLES
-            for _ in range(min(behind, CHUNK)):
-                self.count += 1
-                due_ns = self.due_ns(self.count)
-                self.worst_lateness_ns = max(self.worst_lateness_ns, now_ns - due_ns)
-                self.late_cycles += late
-                self._tick(due_ns, late)
-        self._arm()
+        try:
+            self._catch_up(time.monotonic_ns())
+        finally:
+            self._arm()
+
+    def _catch_up(self, now_ns: int) -> None:
+        if now_ns < self.hold_until_ns:
+            return
+        behind = int((now_ns - self.start_ns) / self._cycle_ns) - self.count
+        late = behind > LATE_CYCLES
+        for _ in range(min(behind, CHUNK)):
+            self.count += 1
+            due_ns = self.due_ns(self.count)
+            self.worst_lateness_ns = max(self.worst_lateness_ns, now_ns - due_ns)
+            self.late_cycles += late
+            self._tick(due_ns, late)

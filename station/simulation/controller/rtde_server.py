@@ -110,10 +110,10 @@ class RtdeConnection(Connection):
         (frequency_hz,) = struct.unpack_from(">d", payload)
         names = split_names(payload[8:])
         types = [self._output_type(name) for name in names]
-        if NOT_FOUND in types:
+        if not names or NOT_FOUND in types:
             return b"\x00" + join_names(types)
         base_hz = self._robot.settings.rate_hz
-        self._every = max(1, round(base_hz / frequency_hz)) if frequency_hz > 0 else 1
+        self._every = round(base_hz / min(frequency_hz, base_hz)) if frequency_hz >= 1 else base_hz
         self._output = Recipe(1, names, tuple(types))
         self._elements = itemgetter(*self._robot.outputs.indices(names), 0)
         return b"\x01" + join_names(types)

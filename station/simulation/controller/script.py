@@ -259,7 +259,7 @@ class ControlScript:
 
     def _set_watchdog(self) -> None:
         (minimum_hz,) = self._doubles(0, 1)
-        if not minimum_hz > 0:
+        if not (minimum_hz > 0 and isfinite(minimum_hz)):
             raise ScriptError(f"watchdog frequency {minimum_hz} is not > 0")
         self._robot.watchdog_s = 1.0 / minimum_hz
 

@@ -6,6 +6,7 @@ import socket
 import struct
 import time
 from itertools import pairwise
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -102,6 +103,60 @@ def test_nothing_is_sent_before_start_and_after_pause(controller, rtde) -> None:
     with pytest.raises(TimeoutError):
         while True:
             client.receive()
+
+
+def test_no_bytes_on_any_port_stop_the_controller(controller, rtde, admin) -> None:
+    running = controller("UR10e")
+    ask, good = admin(running), rtde(running)
+    good.start("timestamp")
+    rng = np.random.default_rng(7)
+    handshake = packet(PacketType.OUTPUT_SETUP, struct.pack(">d", 1e-300) + b"timestamp") + packet(
+        PacketType.START
+    )
+    empty = packet(PacketType.OUTPUT_SETUP, struct.pack(">d", float("nan"))) + packet(PacketType.START)
+    texts = [b"def \n", b"\xff\xfe\n" * 50, b"end\n" * 50, b"def a():\nend\ndef b(:\nend\n", b"\n" * 5000]
+    for port in (30004, 30001, 30002, 29999, 29990):
+        for junk in (handshake, empty, *texts, *(rng.bytes(int(n)) for n in rng.integers(1, 3000, 12))):
+            with socket.create_connection((running.host, port), 3) as link:
+                link.sendall(junk)
+    before = ask.ask("stats")["cycles"]
+    stamps = [good.sample()["timestamp"] for _ in range(400)]
+    assert [b - a for a, b in pairwise(stamps)] == pytest.approx([0.002] * 399, abs=1e-9)
+    assert ask.ask("stats")["cycles"] > before
+    assert ask.ask("state")["target_joints_rad"] == pytest.approx(HOME)
+
+
+def test_hundreds_of_links_leave_nothing_behind(controller, rtde, admin) -> None:
+    running = controller("UR10e")
+    ask = admin(running)
+    folder = Path(f"/proc/{running.process.pid}")
+
+    def memory_kib() -> int:
+        return int((folder / "status").read_text().partition("VmRSS:")[2].split()[0])
+
+    def cycle() -> None:
+        client = rtde(running)
+        client.inputs("input_int_register_0")
+        client.start("timestamp", "actual_q")
+        client.sample()
+        client.close()
+        with socket.create_connection((running.host, 29999), 3) as link:
+            link.recv(100)
+
+    def files_when_quiet() -> int:
+        deadline = time.monotonic() + 3
+        while ask.ask("state")["connections"]["rtde"] and time.monotonic() < deadline:
+            time.sleep(0.01)
+        time.sleep(0.05)
+        return len(list((folder / "fd").iterdir()))
+
+    for _ in range(40):
+        cycle()
+    files, memory = files_when_quiet(), memory_kib()
+    for _ in range(300):
+        cycle()
+    assert files_when_quiet() == files
+    assert memory_kib() - memory < 3000
 
 
 @pytest.mark.parametrize("junk", [b"\x00\x01\x00", b"\x00\x04U\x07", b"\x00\x03?", b"\x00\x04Vx"])
@@ -371,6 +426,10 @@ def test_the_admin_port_explains_itself_and_survives_nonsense(controller, admin)
     for nonsense, words in (
         ({"cmd": "explode"}, "lists the names"),
         ({"cmd": "slider", "fraction": 3}, "0…1"),
+        ({"cmd": "delay", "ms": float("nan")}, "ms must be a number in 0…10000"),
+        ({"cmd": "jog", "joints_rad": HOME, "speed_rad_s": 0}, "speed_rad_s"),
+        ({"cmd": "vibrate", "amplitude_rad": 0.001, "decay_s": 0}, "decay_s"),
+        ({"cmd": "tcp", "pose": "here"}, "expected 6 numbers"),
         ({"cmd": "jog"}, "missing 1 required"),
         ({"cmd": "tcp", "pose": [1, 2]}, "expected 6 numbers"),
         ({"cmd": "drop", "ports": ["moon"]}, "not ['moon']"),

@@ -20,6 +20,7 @@ from station.devices.ur_condition import safety_stop
 from station.devices.ur_dashboard import Dashboard, DashboardError
 from station.devices.ur_history import state_at
 from station.devices.ur_lock import RobotLock
+from station.devices.ur_primary import Installation, PrimaryReader
 from station.devices.ur_probe import SCRIPT_PORT, ProbeResult, check_port, identify, lock_name
 from station.devices.ur_state import Sample, StateReader
 from station.devices.ur_tool import TcpCheck
@@ -55,6 +56,7 @@ class UrLink:
         self._lock: RobotLock | None = None
         self._identity = RobotIdentity(model=config.model)
         self._subscribers: list[Callable[[RobotState], None]] = []
+        self._primary: PrimaryReader | None = None
         self._tool: TcpCheck | None = None
         self._trouble: RobotError | None = None
         self._supervisor: asyncio.Task[None] | None = None
@@ -97,7 +99,13 @@ class UrLink:
                 first = await asyncio.wrap_future(reader.started)
         except TimeoutError:
             raise RobotError(f"{host}: RTDE answers, but no state came within {FIRST_STATE_S:g} s") from None
-        self._adopt(found, first, reader)
+        self._primary = PrimaryReader(host)
+        installation = await self._primary.first()
+        if installation.tcp_offset is None:
+            log.warning(
+                "%s:30001 does not state the TCP offset; it is derived from the nominal kinematics", host
+            )
+        self._adopt(found, first, reader, installation)
 
     def _check_identity(self, found: ProbeResult) -> None:
         wanted, host = self.config, self.config.host
@@ -115,11 +123,14 @@ class UrLink:
             raise RobotError(f"another robot (serial {found.serial}) answers at {host} now; end this session")
         self.remote, self.program = found.remote, found.program
 
-    def _adopt(self, found: ProbeResult, first: Sample, reader: StateReader) -> None:
+    def _adopt(
+        self, found: ProbeResult, first: Sample, reader: StateReader, installation: Installation
+    ) -> None:
         if self._tool is None:
-            self._tool = TcpCheck(self.model, first.state, self.config.kinematics is not None)
+            calibrated = self.config.kinematics is not None
+            self._tool = TcpCheck(self.model, calibrated, first.state, installation)
         else:
-            self._tool.check(first.state)
+            self._tool.check(first.state, installation)
         self._identity = RobotIdentity(
             model=self.config.model,
             serial=found.serial,
@@ -147,6 +158,9 @@ class UrLink:
         reader, self.reader = self.reader, None
         if reader is not None:
             await asyncio.to_thread(reader.close)
+        primary, self._primary = self._primary, None
+        if primary is not None:
+            await primary.close()
         dashboard, self.dashboard = self.dashboard, None
         if dashboard is not None:
             await dashboard.close()
@@ -211,8 +225,8 @@ class UrLink:
         stop = safety_stop(state)
         if stop is not None:
             raise stop
-        assert self._tool is not None
-        self._tool.check(state)
+        if self._tool is not None and self._primary is not None:
+            self._tool.check(state, self._primary.installation)
         if self._trouble is not None:
             raise self._trouble
 
@@ -249,6 +263,8 @@ class UrLink:
         """Asks the dashboard what the state stream does not say. Raises StationError."""
         if self.dashboard is None or not self.dashboard.alive:
             self.dashboard = await Dashboard.open(self.config.host)
+        if self._primary is not None and self._primary.dead:
+            self._primary = PrimaryReader(self.config.host)
         if self.remote is not None:
             with contextlib.suppress(DashboardError):
                 self.remote = await self.dashboard.remote()

@@ -1,75 +1,123 @@
 """Guards against a mixed-up TCP: what lies between our flange pose and the controller's tool pose.
 
-flange_from_tcp = forward(joints)⁻¹ · base_from_tcp, from one and the same sample. It must be the offset set
-on the pendant, and it must not change. The controller knows the factory calibration of its arm, our nominal
-table does not: they differ by some millimetres, so without `robot.kinematics` in the configuration the check
-is coarse.
+flange_from_tcp = forward(joints)⁻¹ · base_from_tcp, from one and the same sample. It must be the offset that
+the controller states, and it must not change. The controller knows the factory calibration of its arm and our
+nominal table does not: they differ by some millimetres, so the check is fine only when the controller states
+its kinematics too, or when the configuration does.
 """
 
 from __future__ import annotations
 
+import logging
 import math
 
 import numpy as np
 
 from calibrate.geometry import Array, difference, inverse, pose_from_rotvec, rotation_log
-from calibrate.kinematics import RobotModel, forward
+from calibrate.kinematics import DhDeltas, RobotModel, forward
 from recordings.messages import RobotState, Vector6
+from station.devices.ur_primary import DhParameters, Installation
 from station.errors import RobotError
+
+log = logging.getLogger(__name__)
 
 NOMINAL_TOLERANCE = (0.006, math.radians(1.0))
 CALIBRATED_TOLERANCE = (0.0005, math.radians(0.1))
+STATED_TOLERANCE = (1e-6, 1e-6)
 LONGEST_M = 1.0
+_MODEL_REMEDY = "check robot.model and robot.kinematics in the configuration"
+_CHANGED = "the TCP offset on the pendant was changed during the session"
+_CHANGED_REMEDY = "set it back, or end this session and begin a new one"
 
 
 class TcpCheck:
-    """`calibrated`: the model carries this very arm's kinematics."""
+    """`model`: with the configuration's kinematics, if it has any (`calibrated`)."""
 
-    def __init__(self, model: RobotModel, first: RobotState, calibrated: bool) -> None:
-        """Raises RobotError when the difference cannot be a tool: wrong model or wrong kinematics."""
+    def __init__(
+        self, model: RobotModel, calibrated: bool, first: RobotState, installation: Installation
+    ) -> None:
+        """Raises RobotError when pose, kinematics and stated offset do not fit together."""
         self._model = model
-        self._tolerance_m, self._tolerance_rad = CALIBRATED_TOLERANCE if calibrated else NOMINAL_TOLERANCE
-        self._flange_from_tcp = self._derive(first)
-        length_m = float(np.linalg.norm(self._flange_from_tcp[:3, 3]))
+        self._tolerance = CALIBRATED_TOLERANCE if calibrated else NOMINAL_TOLERANCE
+        self._stated = installation.tcp_offset
+        if not calibrated and installation.dh is not None and self._stated is not None:
+            self._try_controllers_model(_stated_model(model, installation.dh), first)
+        self._first = self._derive(first)
+        length_m = float(np.linalg.norm(self._first[:3, 3]))
         if length_m > LONGEST_M:
             raise RobotError(
                 f"the controller's tool pose lies {length_m:.2f} m from the flange pose of a {model.name}: "
                 "wrong robot.model, or a wrong TCP on the pendant (Installation → TCP)"
             )
+        if self._stated is not None:
+            self.agree(self._stated)
+
+    def _try_controllers_model(self, model: RobotModel, first: RobotState) -> None:
+        """Uses the controller's own kinematics if they explain its own tool pose, as they should."""
+        assert self._stated is not None
+        own = _flange_from_tcp(model, first)
+        if _exceeds(difference(own, _pose(self._stated)), CALIBRATED_TOLERANCE):
+            log.warning("the kinematics stated by the controller do not explain its tool pose; using ours")
+            return
+        self._model, self._tolerance = model, CALIBRATED_TOLERANCE
 
     @property
     def offset(self) -> Vector6:
-        """flange_from_tcp: x y z [m], rotation vector [rad]."""
-        T = self._flange_from_tcp
+        """flange_from_tcp: x y z [m], rotation vector [rad]; the controller's words where it has any."""
+        if self._stated is not None:
+            return self._stated
+        T = self._first
         x, y, z, rx, ry, rz = np.concatenate([T[:3, 3], rotation_log(T[:3, :3])]).tolist()
         return (x, y, z, rx, ry, rz)
 
     def agree(self, stated: Vector6) -> None:
         """Raises RobotError unless the offset that the controller states explains its tool pose."""
-        self._compare(
-            pose_from_rotvec(stated[:3], stated[3:]),
-            self._flange_from_tcp,
-            "the flange pose of our kinematics and the controller's tool pose do not fit its TCP offset",
-            "check robot.model and robot.kinematics in the configuration",
-        )
+        what = "our flange pose and the controller's tool pose do not fit its TCP offset"
+        _compare(self._first, _pose(stated), self._tolerance, what, _MODEL_REMEDY)
 
-    def check(self, state: RobotState) -> None:
+    def check(self, state: RobotState, installation: Installation) -> None:
         """Raises RobotError when the TCP on the pendant is another one than at connect."""
-        self._compare(
-            self._flange_from_tcp,
-            self._derive(state),
-            "the TCP offset on the pendant was changed during the session",
-            "set it back, or end this session and begin a new one",
-        )
+        if self._stated is not None and installation.tcp_offset is not None:
+            now = _pose(installation.tcp_offset)
+            _compare(now, _pose(self._stated), STATED_TOLERANCE, _CHANGED, _CHANGED_REMEDY)
+        _compare(self._derive(state), self._first, self._tolerance, _CHANGED, _CHANGED_REMEDY)
 
     def _derive(self, state: RobotState) -> Array:
-        base_from_tcp = pose_from_rotvec(state.tcp_pose[:3], state.tcp_pose[3:])
-        return inverse(forward(self._model, state.joints_rad)) @ base_from_tcp
+        return _flange_from_tcp(self._model, state)
 
-    def _compare(self, reference: Array, found: Array, what: str, remedy: str) -> None:
-        delta = difference(found, reference)
-        shift_m, turn_rad = float(np.linalg.norm(delta[:3])), float(np.linalg.norm(delta[3:]))
-        if shift_m > self._tolerance_m or turn_rad > self._tolerance_rad:
-            raise RobotError(
-                f"TCP mix-up: {what} (by {shift_m * 1000:.1f} mm, {math.degrees(turn_rad):.2f}°): {remedy}"
-            )
+
+def _flange_from_tcp(model: RobotModel, state: RobotState) -> Array:
+    return inverse(forward(model, state.joints_rad)) @ _pose(state.tcp_pose)
+
+
+def _pose(vector: Vector6) -> Array:
+    return pose_from_rotvec(vector[:3], vector[3:])
+
+
+def _stated_model(nominal: RobotModel, dh: DhParameters) -> RobotModel:
+    """The nominal model with the deltas that make it the controller's."""
+
+    def minus(stated: Vector6, table: tuple[float, ...]) -> tuple[float, ...]:
+        return tuple(s - t for s, t in zip(stated, table, strict=True))
+
+    return nominal.calibrated(
+        DhDeltas(
+            a_m=minus(dh.a_m, nominal.a_m),
+            d_m=minus(dh.d_m, nominal.d_m),
+            alpha_rad=minus(dh.alpha_rad, nominal.alpha_rad),
+            theta_rad=minus(dh.theta_rad, nominal.theta_offset_rad),
+        )
+    )
+
+
+def _exceeds(delta: Array, tolerance: tuple[float, float]) -> bool:
+    return bool(np.linalg.norm(delta[:3]) > tolerance[0] or np.linalg.norm(delta[3:]) > tolerance[1])
+
+
+def _compare(found: Array, reference: Array, tolerance: tuple[float, float], what: str, remedy: str) -> None:
+    delta = difference(found, reference)
+    if _exceeds(delta, tolerance):
+        shift_mm, turn_rad = float(np.linalg.norm(delta[:3])) * 1000, float(np.linalg.norm(delta[3:]))
+        raise RobotError(
+            f"TCP mix-up: {what} (by {shift_mm:.1f} mm, {math.degrees(turn_rad):.2f}°): {remedy}"
+        )

@@ -160,9 +160,9 @@ async def test_the_link_comes_back_by_itself_but_control_does_not(cell: Make) ->
 async def test_tcp_changed_on_the_pendant(cell: Make) -> None:
     c = await cell(control=True)
     c.robot.check()
-    c.admin.ask("tcp", pose=[0.0, 0.0, 0.12, 0.0, 0.0, 0.0])
+    c.admin.ask("tcp", pose=[0.0, 0.0, 0.002, 0.0, 0.0, 0.0])
     await asyncio.sleep(0.2)
-    with pytest.raises(RobotError, match=r"TCP offset on the pendant was changed.*by 120.0 mm"):
+    with pytest.raises(RobotError, match=r"TCP offset on the pendant was changed.*by 2.0 mm"):
         c.robot.check()
     goal = c.joints_rad()
     goal[0] += 0.2

@@ -9,6 +9,7 @@ from station.simulation.controller.clock import Clock
 from station.simulation.controller.dashboard import dashboard_service
 from station.simulation.controller.journal import Journal
 from station.simulation.controller.network import Cut, Service
+from station.simulation.controller.primary_port import primary_service
 from station.simulation.controller.robot import Settings, SimulatedRobot
 from station.simulation.controller.rtde_server import RtdeServer
 from station.simulation.controller.script_port import script_services
@@ -22,7 +23,8 @@ class Machine:
         self.clock = Clock(self.robot.dt_s / (1 + drift_ppm * 1e-6), self._tick)
         self.rtde = RtdeServer(host, self.robot)
         self.dashboard = dashboard_service(host, self.robot)
-        self.services = [self.rtde.service, *script_services(host, self.robot), self.dashboard]
+        scripts = (primary_service(host, self.robot), *script_services(host, self.robot))
+        self.services = [self.rtde.service, *scripts, self.dashboard]
         self.lose_packets = 0
         self.off = False
         """Rebooting: nothing listens."""

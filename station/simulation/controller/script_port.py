@@ -1,4 +1,4 @@
-"""Ports 30001–30003: programs come in as text; nothing is sent back."""
+"""Ports 30002 and 30003: programs come in as text; nothing is sent back."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from station.simulation.controller.network import Connection, Service
 from station.simulation.controller.robot import SimulatedRobot
 from station.simulation.controller.uploads import UploadReader
 
-PORTS = (30001, 30002, 30003)
+PORTS = (30002, 30003)
 
 
 class ScriptConnection(Connection):

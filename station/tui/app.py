@@ -176,9 +176,10 @@ class StationApp(App[None]):
     # --- work in processes of its own ---
 
     @work(exclusive=True, group="job", exit_on_error=False)
-    async def solve(self, recording: str) -> None:
-        output = str(Path(recording).with_suffix(".calibration.yaml"))
-        job = JobScreen(f"Solving {recording}", "calibrate.cli", "solve", recording, "-o", output)
+    async def solve(self, recording: str, folder: str) -> None:
+        output, report = (str(Path(folder) / name) for name in ("calibration.yaml", "report.html"))
+        to = ("-o", output, "--report", report)
+        job = JobScreen(f"Solving {recording}", "calibrate.cli", "solve", recording, *to)
         if await self.push_screen_wait(job) >= 0:
             await self.show_result(output)
 
@@ -221,6 +222,6 @@ def run(socket: Path, who: str = "") -> None:
     """Opens the screen on the daemon that serves `socket` and returns when it is closed."""
 
     async def connect() -> Link:
-        return await Client.connect(socket, who)
+        return await Client.connect(socket, who, interactive=True)
 
     StationApp(connect).run()

@@ -76,7 +76,7 @@ class SessionsScreen(StationScreen):
             if not session.get("sealed"):
                 self.notify("This recording was never finished: press c to recover it first.")
                 return
-            self.station.solve(str(session["recording"]))
+            self.station.solve(str(session["recording"]), str(session["folder"]))
 
     async def action_result(self) -> None:
         if (session := self._selected()) is not None:

@@ -20,6 +20,7 @@ from calibrate.estimate import Estimate
 from calibrate.fit import Fit, Settled, fit_views
 from calibrate.frames import board_frames, camera_frames
 from calibrate.geometry import Transform
+from calibrate.lens_check import check_lens
 from calibrate.likelihood.model import observe_views
 from calibrate.likelihood.residuals import corner_residuals, robot_residuals
 from calibrate.pair_covariance import pair_covariance
@@ -46,6 +47,8 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
     spread_m, spread_rad = board_spread(H[places], C[places], state.X)
     pairs, start = fit.pairs, fit.certified
     apart = distance_in_sigmas(start.X, state.X, pair_covariance(start.objective, pairs, start.X))
+    lens_finding = "" if free else check_lens(settled.observed, result)
+    watch.lap("lens check")
     holdout = _holdout(fit, options, free) if options.holdout else None
     watch.lap("hold-out")
     indices = [view.index for view in fit.views]
@@ -74,7 +77,7 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
         board_spread_rad=spread_rad,
         residual_px={indices[i]: float(settled.boards.rms_px[i]) for i in places},
         residual_robot=_robot_misses(settled, indices),
-        warnings=_warnings(fit, options, result),
+        warnings=_warnings(fit, options, result, lens_finding),
         stage_ms=watch.stage_ms,
         solve_ms=watch.total_ms,
         seed=options.seed,
@@ -114,8 +117,8 @@ def _robot_misses(settled: Settled, indices: list[int]) -> dict[int, tuple[float
     }
 
 
-def _warnings(fit: Fit, options: SolveOptions, result: Estimate) -> tuple[str, ...]:
-    warnings = []
+def _warnings(fit: Fit, options: SolveOptions, result: Estimate, lens_finding: str) -> tuple[str, ...]:
+    warnings = [lens_finding] if lens_finding else []
     if options.intrinsics_from_same_pictures and not result.intrinsics_free:
         warnings.append(
             "The intrinsics came from the same pictures but could not be refined with X (only the plumb_bob "

@@ -33,10 +33,10 @@ from station.collision import CellGeometry, margins
 from station.config import PoseGuess, StationConfig
 from station.errors import ConfigError, LimitError
 from station.limits import SPACING_M, check_path
-from station.plan.candidates import outline, visible
 from station.plan.describe import planned_pose
 from station.plan.model import PlannedPose
 from station.plan.scene import Scene, arm_model, geometry_of
+from station.plan.visibility import outline, visible
 
 MOVES_MIN, MOVES_MAX = 3, 5
 GOOD_M, GOOD_RAD = 0.006, 0.02

@@ -9,14 +9,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.board import board_points
-from calibrate.geometry import Array, pose, rotation_exp, transform_points
-from calibrate.information import camera_matrix, project
+from calibrate.geometry import Array, pose, rotation_exp
+from calibrate.information import camera_matrix
 from calibrate.kinematics import inverse_all, singularity_measure
-from recordings.messages import BoardSpec, CameraModel
-from station.collision import ARM_BODIES, body_segments, margins, segment_distance
+from station.collision import margins
 from station.limits import joint_bounds
 from station.plan.scene import Scene
+from station.plan.visibility import outline, sees_past_the_arm, share_visible
 
+NOT_IN_PICTURE = "the board is not wholly in the picture"
+OUT_OF_REACH = "the arm's reach"
 _PATH_RESERVE_M = 0.01
 """Poses stand this far from every limit, so that moves between neighbours have room."""
 
@@ -57,7 +59,9 @@ class Pool:
     margin_m: Array
     """(n,)"""
     lost: Counter[str] = field(default_factory=Counter)
-    """Why the others fell out: limit → count."""
+    """How many others a limit forbids (a pose may break several)."""
+    alone: Counter[str] = field(default_factory=Counter)
+    """How many others would be possible without this one limit."""
 
     def __len__(self) -> int:
         return len(self.joints_rad)
@@ -115,58 +119,6 @@ def camera_views(scene: Scene, view: ViewRange, count: int, rng: np.random.Gener
     return pose(R, distance[:, None] * ray - R @ centre)
 
 
-def visible(camera: CameraModel, points: Array, border_px: float) -> Array:
-    """Points (n, k, 3) in `camera` → (n,) whether all lie inside the picture, true lens included."""
-    n, k = points.shape[:2]
-    in_front = points[..., 2] > 0.02
-    safe = np.where(in_front[..., None], points, [0.0, 0.0, 1.0])
-    pixels = project(camera, safe.reshape(-1, 3))[0].reshape(n, k, 2)
-    size = np.array([camera.width, camera.height]) - 1
-    inside = ((pixels >= border_px) & (pixels <= size - border_px)).all(axis=-1)
-    # Far off the axis a distortion polynomial folds points back into the picture.
-    radius = np.linalg.norm(safe[..., :2] / safe[..., 2:], axis=-1)
-    return np.asarray((inside & in_front & (radius < lens_radius(camera))).all(axis=1))
-
-
-def lens_radius(camera: CameraModel) -> float:
-    """Largest normalised radius up to which the lens model grows, at most 1.3 times the picture's corner."""
-    K, _ = camera_matrix(camera)
-    corner = np.hypot(camera.width, camera.height) / (2 * min(K[0, 0], K[1, 1]))
-    radii = np.linspace(0, 1.3 * corner, 200)
-    line = np.stack([radii, np.zeros(200), np.ones(200)], axis=1)
-    x = project(camera, line)[0][:, 0]
-    falling = np.flatnonzero(np.diff(x) <= 0)
-    return float(radii[falling[0]] if len(falling) else radii[-1])
-
-
-def share_visible(
-    scene: Scene, base_from_flange: Array, view: ViewRange, draws: list[tuple[Array, Array]]
-) -> Array:
-    """(n,) share of the drawn guesses that show the whole board; 0 where the guess itself does not."""
-    rim = outline(scene.board)
-    share = visible(scene.camera, scene.seen(base_from_flange, rim), view.border_px).astype(float)
-    if not draws:
-        return share
-    seen = np.flatnonzero(share)
-    hits = np.zeros(len(seen))
-    for X, Y in draws:
-        drawn = replace(scene, X=X, Y=Y)
-        hits += visible(scene.camera, drawn.seen(base_from_flange[seen], rim), view.border_px)
-    share[seen] = hits / len(draws)
-    return share
-
-
-def outline(board: BoardSpec) -> Array:
-    """Points (8, 3) around the detectable ones, half a square wider: detectors need the rim."""
-    points = board_points(board)
-    low = points.min(axis=0) - board.square_m / 2
-    high = points.max(axis=0) + board.square_m / 2
-    middle = (low + high) / 2
-    xs, ys = (low[0], middle[0], high[0]), (low[1], middle[1], high[1])
-    grid = [(x, y, 0.0) for x in xs for y in ys if (x, y) != (middle[0], middle[1])]
-    return np.array(grid)
-
-
 def find_candidates(
     scene: Scene,
     view: ViewRange,
@@ -180,66 +132,64 @@ def find_candidates(
 
     `tries` (None: `count`) camera poses are looked at; the first `count` of those that show the board go on.
     """
-    lost: Counter[str] = Counter()
     views = camera_views(scene, view, tries or count, rng)
     flange = scene.base_from_flange(views)
-    good = share_visible(scene, flange, view, draws) >= view.visible_share
-    lost["board not wholly in the picture"] = int((~good).sum())
-    views, flange = views[good][:count], flange[good][:count]
-    rows, joints, branches = _all_branches(scene, flange, view, near_joints_rad, lost)
-    if len(rows) == 0:
-        empty = np.zeros((0, 4, 4))
-        return Pool(np.zeros((0, 6)), empty, empty, np.zeros(0, dtype=int), np.zeros(0), lost)
-    keep = singularity_measure(scene.geometry.model, joints) >= view.smallest_singular
-    lost["near a singular posture"] += int((~keep).sum())
-    if view.free_sight:
-        hidden = ~sees_past_the_arm(scene, joints, flange[rows])
-        lost["the arm stands between camera and board"] += int((keep & hidden).sum())
-        keep &= ~hidden
-    gaps, labels = margins(scene.geometry, joints)
-    worst = gaps.min(axis=1)
-    for name in (labels[c] for c in gaps[keep & (worst < _PATH_RESERVE_M)].argmin(axis=1)):
-        lost[name] += 1
-    keep &= worst >= _PATH_RESERVE_M
-    return Pool(joints[keep], flange[rows][keep], views[rows][keep], branches[keep], worst[keep], lost)
+    seen = share_visible(scene, flange, view.border_px, draws) >= view.visible_share
+    lost = Counter({NOT_IN_PICTURE: int((~seen).sum())})
+    views, flange = views[seen][:count], flange[seen][:count]
+    rows, joints = _all_branches(scene, flange, near_joints_rad)
+    lost[OUT_OF_REACH] = len(views) - len(np.unique(rows))
+    checks, worst = _checks(scene, view, joints, flange[rows])
+    keep = np.logical_and.reduce(list(checks.values()))
+    failing = np.sum([~good for good in checks.values()], axis=0)
+    alone = Counter({name: int((~good & (failing == 1)).sum()) for name, good in checks.items()})
+    lost += Counter({name: int((~good).sum()) for name, good in checks.items()})
+    kept = Pool(joints, flange[rows], views[rows], branch_of(scene, joints), worst, lost, alone)
+    return kept.take(np.flatnonzero(keep))
 
 
-def sees_past_the_arm(scene: Scene, joints_rad: Array, base_from_flange: Array) -> NDArray[np.bool_]:
-    """(n,) whether no part of the arm stands in the lines of sight to the board's outline."""
-    starts, ends, radii = body_segments(scene.geometry, joints_rad)
-    links = slice(2, len(ARM_BODIES))
-    if scene.mount == "eye-in-hand":
-        eye = transform_points(base_from_flange, scene.X[None, :3, 3])
-        board = np.broadcast_to(transform_points(scene.Y, outline(scene.board)), (len(eye), 8, 3))
-    else:
-        eye = np.broadcast_to(scene.X[:3, 3], (len(joints_rad), 1, 3))
-        board = transform_points(base_from_flange @ scene.Y, outline(scene.board))
-    gap = segment_distance(eye[:, :, None], board[:, :, None], starts[:, None, links], ends[:, None, links])
-    return np.asarray((gap > radii[links]).all(axis=(1, 2)))
-
-
-def _all_branches(
-    scene: Scene, flange: Array, view: ViewRange, near: Array | None, lost: Counter[str]
-) -> tuple[Array, Array, Array]:
-    """Inverse kinematics of all poses: row in `flange`, joints within their range, branch number."""
+def _checks(
+    scene: Scene, view: ViewRange, joints: Array, base_from_flange: Array
+) -> tuple[dict[str, NDArray[np.bool_]], Array]:
+    """What joints (n, 6) must pass, by name, each (n,); and the smallest margin (n,)."""
     low, high = joint_bounds(scene.geometry)
-    rows, joints = [], []
-    for row, target in enumerate(flange):
-        solutions = inverse_all(scene.geometry.model, target)
-        if len(solutions) == 0:
-            lost["out of the arm's reach"] += 1
-        rows += [row] * len(solutions)
-        joints += list(solutions)
-    if not rows:
-        return np.zeros(0, dtype=int), np.zeros((0, 6)), np.zeros(0, dtype=int)
-    q = np.array(joints)
+    checks: dict[str, NDArray[np.bool_]] = {
+        "the joint range": np.asarray(((joints >= low) & (joints <= high)).all(axis=1)),
+        "singular postures": np.asarray(
+            singularity_measure(scene.geometry.model, joints) >= view.smallest_singular
+        ),
+    }
+    if view.free_sight:
+        checks["the arm itself, between camera and board"] = sees_past_the_arm(
+            scene, joints, base_from_flange
+        )
+    gaps, labels = margins(scene.geometry, joints)
+    for label, gap in zip(labels, gaps.T, strict=True):
+        name = _limit_of(label, scene)
+        good = np.asarray(gap >= _PATH_RESERVE_M)
+        checks[name] = checks[name] & good if name in checks else good
+    return checks, gaps.min(axis=1)
+
+
+def _limit_of(label: str, scene: Scene) -> str:
+    """'forearm against table' → 'table'; bodies of the arm against each other are one limit."""
+    _, against, other = label.partition(" against ")
+    if not against:
+        return label.replace("flange or camera outside ", "")
+    return "the arm touching itself or its tool" if other in scene.geometry.body_names else other
+
+
+def _all_branches(scene: Scene, flange: Array, near: Array | None) -> tuple[NDArray[np.intp], Array]:
+    """Inverse kinematics of all poses: row in `flange` (m,), and joints (m, 6)."""
+    low, high = joint_bounds(scene.geometry)
+    solutions = [inverse_all(scene.geometry.model, target) for target in flange]
+    rows = np.repeat(np.arange(len(flange)), [len(found) for found in solutions])
+    q = np.concatenate([np.zeros((0, 6)), *solutions])
     branches = branch_of(scene, q)
     for branch in np.unique(branches):
         here = branches == branch
         q[here] = _gather(q[here], near, low, high)
-    inside = ((q >= low) & (q <= high)).all(axis=1)
-    lost["joint range"] += int((~inside).sum())
-    return np.array(rows)[inside], q[inside], branches[inside]
+    return rows, q
 
 
 def _gather(q: Array, near: Array | None, low: Array, high: Array) -> Array:

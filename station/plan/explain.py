@@ -2,14 +2,84 @@
 
 from __future__ import annotations
 
-from station.plan.candidates import Pool
+import numpy as np
+
+from calibrate.board import board_points
+from calibrate.geometry import Array, transform_points
+from station.collision import margins
+from station.plan.candidates import NOT_IN_PICTURE, OUT_OF_REACH, Pool
 from station.plan.scene import Scene
 
+_REMEDIES = {
+    NOT_IN_PICTURE: "measure camera_guess and board_guess better, use a smaller board or a wider lens",
+    "the joint range": "widen limits.joints_min_rad and joints_max_rad, or turn the board",
+    "singular postures": "move the board sideways, so that the arm need not stretch or fold",
+    "the arm itself, between camera and board": "turn the board to face the camera, or mount the camera so "
+    "that it looks away from the arm (is camera_guess right?)",
+    "the arm touching itself or its tool": "check limits.solids, or move the board further from the base",
+    "the board": "lower limits.board_clearance_m, measure board_guess better (its sigma counts), or turn it",
+    "the camera": "work further from the camera, or measure camera_guess better (its sigma counts)",
+}
 
-def explain_shortage(scene: Scene, wanted: int, best: Pool) -> str:
-    """One paragraph for a person."""
-    lines = [f"Only {len(best)} of the wanted {wanted} poses are possible."]
-    for reason, count in best.lost.most_common(3):
-        if count:
-            lines.append(f"{count} candidates fell to: {reason}.")
-    return " ".join(lines)
+
+def explain_shortage(scene: Scene, wanted: int, group: Pool, found: Pool, start: Array | None) -> str:
+    """One paragraph for a person: `group` is what is usable, `found` all that passes pose by pose."""
+    if start is not None and len(found) >= wanted and len(group) < wanted:
+        return _start_is_cut_off(scene, wanted, len(group), len(found), start)
+    sentences = [
+        f"Only {len(group)} of the wanted {wanted} poses are possible."
+        if len(group)
+        else "No pose is possible."
+    ]
+    if found.lost[OUT_OF_REACH] > 2 * len(found) and found.lost[OUT_OF_REACH] >= sum(found.alone.values()):
+        sentences.append(_reach(scene, found.lost[OUT_OF_REACH]))
+        return " ".join(sentences)
+    if not found.alone.total() and found.lost[NOT_IN_PICTURE] > max(found.lost.values(), default=0) / 2:
+        sentences.append(f"Mostly {NOT_IN_PICTURE} for what the guess allows: {_REMEDIES[NOT_IN_PICTURE]}.")
+    ranked = found.alone if found.alone.total() else found.lost
+    for limit, count in ranked.most_common(2):
+        if count and limit not in (NOT_IN_PICTURE, OUT_OF_REACH):
+            gain = f"without it {count} more would be" if found.alone.total() else f"it forbids {count}"
+            sentences.append(f"What binds is {limit}: {gain}; {_remedy(limit)}.")
+    return " ".join(sentences)
+
+
+def _remedy(limit: str) -> str:
+    if "workspace" in limit:
+        bound = "workspace_min_m" if "minimum" in limit else "workspace_max_m"
+        return f"widen limits.{bound}, or move the board into the box"
+    return _REMEDIES.get(
+        limit, f"move the board away from the {limit}, or correct its place in limits.planes"
+    )
+
+
+def _reach(scene: Scene, count: int) -> str:
+    model = scene.geometry.model
+    arm_m = abs(model.a_m[1]) + abs(model.a_m[2]) + model.d_m[4]
+    if scene.mount == "eye-in-hand":
+        centre, thing, guess = (
+            transform_points(scene.Y, board_points(scene.board).mean(axis=0)),
+            "board",
+            "board_guess",
+        )
+    else:
+        centre, thing, guess = scene.X[:3, 3], "camera", "camera_guess"
+    away_m = float(np.linalg.norm(centre - [0.0, 0.0, model.d_m[0]]))
+    return (
+        f"What binds is the arm's reach: {count} views of the board lie beyond it. The {thing} stands "
+        f"{away_m:.2f} m from the {model.name}'s shoulder, the arm reaches {arm_m:.2f} m; bring the {thing} "
+        f"nearer, turn it towards the arm, or correct {guess}."
+    )
+
+
+def _start_is_cut_off(scene: Scene, wanted: int, usable: int, possible: int, start: Array) -> str:
+    gaps, labels = margins(scene.geometry, start)
+    reason = ""
+    if gaps.min() < 0:
+        worst = int(gaps[0].argmin())
+        reason = f" The arm stands too close already: {labels[worst]}, {-1000 * gaps[0, worst]:.0f} mm."
+    return (
+        f"{possible} poses are possible, but from where the arm stands free direct moves lead to only "
+        f"{usable} that belong together; {wanted} are wanted.{reason} Jog the arm to where the camera looks "
+        "at the board from the middle of the room it may use, and plan again."
+    )

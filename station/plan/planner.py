@@ -16,7 +16,7 @@ from calibrate.kinematics import forward
 from station.config import StationConfig
 from station.errors import LimitError
 from station.limits import check_plan
-from station.plan.candidates import Pool, ViewRange, find_candidates, view_range, visible
+from station.plan.candidates import Pool, ViewRange, find_candidates, view_range
 from station.plan.choose import Criterion, Objective, choose, informations, objective_for, sigma_of
 from station.plan.describe import expected_view, planned_pose
 from station.plan.explain import explain_shortage
@@ -24,6 +24,7 @@ from station.plan.groups import best_group
 from station.plan.model import Plan
 from station.plan.order import BLOCKED, move_times, short_order, time_matrix
 from station.plan.scene import Scene, scene_of
+from station.plan.visibility import visible
 
 Progress = Callable[[str, float], None]
 POOL_SIZE = 320
@@ -110,19 +111,20 @@ def _pool(
     scene: Scene, options: PlanOptions, start: Array | None, rng: np.random.Generator
 ) -> tuple[Pool, list[str]]:
     """Candidates of the best branch. LimitError with the reason when the widest range has too few."""
-    best: tuple[Pool, str] | None = None
+    best: tuple[Pool, Pool, str] | None = None
     for view, note in _relaxed(options.view or view_range(scene), _start_roll(scene, start)):
         draws = scene.drawn(_DRAWS, view.doubt, rng)
         found = find_candidates(scene, view, 2 * options.pool, rng, start, draws, _TRIES * options.pool)
         group = best_group(scene, found, start, options.pool, 3 * options.count)
         if best is None or len(group) > len(best[0]):
-            best = group, note
+            best = group, found, note
         if len(group) >= 3 * options.count:
             break
     assert best is not None
-    if len(best[0]) < options.count:
-        raise LimitError(explain_shortage(scene, options.count, best[0]))
-    return best[0], [best[1]] if best[1] else []
+    group, found, note = best
+    if len(group) < options.count:
+        raise LimitError(explain_shortage(scene, options.count, group, found, start))
+    return group, [note] if note else []
 
 
 def _choose_and_order(
@@ -162,7 +164,7 @@ def _choose_and_order(
                 return plan
         gone = places[blocked]
         left, picked = np.setdiff1d(left, gone), [p for p in places if p not in gone]
-    raise LimitError(explain_shortage(scene, options.count, pool.take(left)))
+    raise LimitError(explain_shortage(scene, options.count, pool.take(left), pool, start))
 
 
 def _ordered(scene: Scene, joints: Array, start: Array | None, seed: int) -> tuple[list[int], list[int]]:

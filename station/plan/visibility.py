@@ -1,0 +1,81 @@
+"""Is the whole board in the picture: through the lens, for a wrong guess, and past the arm."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.board import board_points
+from calibrate.geometry import Array, transform_points
+from calibrate.information import camera_matrix, project
+from recordings.messages import BoardSpec, CameraModel
+from station.collision import ARM_BODIES, body_segments, segment_distance
+from station.plan.scene import Scene
+
+
+def visible(camera: CameraModel, points: Array, border_px: float) -> Array:
+    """Points (n, k, 3) in `camera` → (n,) whether all lie inside the picture, true lens included."""
+    n, k = points.shape[:2]
+    in_front = points[..., 2] > 0.02
+    safe = np.where(in_front[..., None], points, [0.0, 0.0, 1.0])
+    pixels = project(camera, safe.reshape(-1, 3))[0].reshape(n, k, 2)
+    size = np.array([camera.width, camera.height]) - 1
+    inside = ((pixels >= border_px) & (pixels <= size - border_px)).all(axis=-1)
+    # Far off the axis a distortion polynomial folds points back into the picture.
+    radius = np.linalg.norm(safe[..., :2] / safe[..., 2:], axis=-1)
+    return np.asarray((inside & in_front & (radius < lens_radius(camera))).all(axis=1))
+
+
+def lens_radius(camera: CameraModel) -> float:
+    """Largest normalised radius up to which the lens model grows, at most 1.3 times the picture's corner."""
+    K, _ = camera_matrix(camera)
+    corner = np.hypot(camera.width, camera.height) / (2 * min(K[0, 0], K[1, 1]))
+    radii = np.linspace(0, 1.3 * corner, 200)
+    line = np.stack([radii, np.zeros(200), np.ones(200)], axis=1)
+    x = project(camera, line)[0][:, 0]
+    falling = np.flatnonzero(np.diff(x) <= 0)
+    return float(radii[falling[0]] if len(falling) else radii[-1])
+
+
+def share_visible(
+    scene: Scene, base_from_flange: Array, border_px: float, draws: list[tuple[Array, Array]]
+) -> Array:
+    """(n,) share of the drawn guesses that show the whole board; 0 where the guess itself does not."""
+    rim = outline(scene.board)
+    share = visible(scene.camera, scene.seen(base_from_flange, rim), border_px).astype(float)
+    if not draws:
+        return share
+    seen = np.flatnonzero(share)
+    hits = np.zeros(len(seen))
+    for X, Y in draws:
+        drawn = replace(scene, X=X, Y=Y)
+        hits += visible(scene.camera, drawn.seen(base_from_flange[seen], rim), border_px)
+    share[seen] = hits / len(draws)
+    return share
+
+
+def outline(board: BoardSpec) -> Array:
+    """Points (8, 3) around the detectable ones, half a square wider: detectors need the rim."""
+    points = board_points(board)
+    low = points.min(axis=0) - board.square_m / 2
+    high = points.max(axis=0) + board.square_m / 2
+    middle = (low + high) / 2
+    xs, ys = (low[0], middle[0], high[0]), (low[1], middle[1], high[1])
+    grid = [(x, y, 0.0) for x in xs for y in ys if (x, y) != (middle[0], middle[1])]
+    return np.array(grid)
+
+
+def sees_past_the_arm(scene: Scene, joints_rad: Array, base_from_flange: Array) -> NDArray[np.bool_]:
+    """(n,) whether no part of the arm stands in the lines of sight to the board's outline."""
+    starts, ends, radii = body_segments(scene.geometry, joints_rad)
+    links = slice(2, len(ARM_BODIES))
+    if scene.mount == "eye-in-hand":
+        eye = transform_points(base_from_flange, scene.X[None, :3, 3])
+        board = np.broadcast_to(transform_points(scene.Y, outline(scene.board)), (len(eye), 8, 3))
+    else:
+        eye = np.broadcast_to(scene.X[:3, 3], (len(joints_rad), 1, 3))
+        board = transform_points(base_from_flange @ scene.Y, outline(scene.board))
+    gap = segment_distance(eye[:, :, None], board[:, :, None], starts[:, None, links], ends[:, None, links])
+    return np.asarray((gap > radii[links]).all(axis=(1, 2)))

@@ -119,7 +119,8 @@ def inverse_all(model: RobotModel, base_from_flange: Array) -> Array:
     """All analytic solutions of the nominal table, (n, 6) with n ≤ 8, each joint in (-π, π].
 
     Source: K. Hawkins, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms" (2013).
-    At a wrist singularity (sin q5 = 0) wrist 3 is set to 0. Unreachable poses give (0, 6).
+    At a wrist singularity (sin q5 = 0) there are infinitely many; only those with wrist 3 = 0 are given, and
+    there may be none near the limit of the reach. Unreachable poses give (0, 6).
     """
     a2, a3 = model.a_m[1], model.a_m[2]
     d1, _, _, d4, d5, d6 = model.d_m
@@ -131,18 +132,13 @@ def inverse_all(model: RobotModel, base_from_flange: Array) -> Array:
         return np.zeros((0, 6))
     for s1 in (1.0, -1.0):
         q1 = np.arctan2(wrist[1], wrist[0]) + s1 * np.arccos(d4 / radius) + np.pi / 2
-        c5 = (T[0, 3] * np.sin(q1) - T[1, 3] * np.cos(q1) - d4) / d6
-        if abs(c5) > 1 + 1e-9:
-            continue
+        # Sideways axis of the arm in the flange: (sin q5 cos q6, -sin q5 sin q6, cos q5). Its two small
+        # entries keep full precision near the wrist singularity, where arccos(cos q5) has none.
+        side = T[0, :3] * np.sin(q1) - T[1, :3] * np.cos(q1)
         for s5 in (1.0, -1.0):
-            q5 = s5 * np.arccos(np.clip(c5, -1, 1))
-            q6 = 0.0
-            if abs(np.sin(q5)) > 1e-9:
-                sign = np.sign(np.sin(q5))
-                q6 = np.arctan2(
-                    sign * (-T[0, 1] * np.sin(q1) + T[1, 1] * np.cos(q1)),
-                    sign * (T[0, 0] * np.sin(q1) - T[1, 0] * np.cos(q1)),
-                )
+            sin_q5 = s5 * np.hypot(side[0], side[1])
+            q5 = np.arctan2(sin_q5, side[2])
+            q6 = np.arctan2(-side[1] / sin_q5, side[0] / sin_q5) if abs(sin_q5) > 1e-9 else 0.0
             solutions += _arm_plane(T, a2, a3, d1, d4, d5, d6, q1, q5, q6)
     if not solutions:
         return np.zeros((0, 6))

@@ -141,7 +141,7 @@ def forward(table: DhTable, joints_rad: Six) -> Rigid:
 
 
 def inverse_all(table: DhTable, base_from_flange: Rigid) -> list[Six]:
-    """Every solution of the nominal geometry, at most 8. At a wrist singularity wrist 3 is set to 0.
+    """Every solution of the nominal geometry, at most 8. At a wrist singularity: those with wrist 3 = 0.
 
     Derived from the geometry: the wrist's centre lies d4 beside the plane of the arm (2 × q1); the angle
     between wrist 2's axis and the flange's axis (2 × q5); then a planar two-link arm (2 × q3).

@@ -61,8 +61,13 @@ class Client:
         self._task = asyncio.create_task(self._read(), name="client-read")
 
     @classmethod
-    async def connect(cls, path: Path, who: str = "", timeout_s: float = CONNECT_S) -> Client:
-        """Raises DaemonGoneError with the remedy when nobody serves there."""
+    async def connect(
+        cls, path: Path, who: str = "", timeout_s: float = CONNECT_S, interactive: bool = False
+    ) -> Client:
+        """Raises DaemonGoneError with the remedy when nobody serves there.
+
+        `interactive`: a person reads and confirms here what is about to move.
+        """
         try:
             async with asyncio.timeout(timeout_s):
                 reader, writer = await asyncio.open_unix_connection(str(path), limit=_ANSWER_LIMIT_BYTES)
@@ -79,7 +84,7 @@ class Client:
         except (OSError, TimeoutError) as error:
             raise DaemonGoneError(f"{path}: the daemon does not answer ({error or 'timeout'}).") from None
         client = cls(path, reader, writer)
-        await client.request("hello", who=who or who_am_i())
+        await client.request("hello", who=who or who_am_i(), interactive=interactive)
         return client
 
     async def request(self, verb: Verb, *, timeout_s: float = ANSWER_S, **args: Any) -> Any:
@@ -111,6 +116,8 @@ class Client:
     async def statuses(self) -> AsyncIterator[StationStatus]:
         """The status now and after every change (slow readers see the newest only)."""
         await self.request("watch")
+        if self._plain_status is not None:  # watched before: what is known is the start
+            self._fresh.set()
         while True:
             await self._fresh.wait()
             self._fresh.clear()
@@ -158,6 +165,17 @@ class Client:
 
     def _gone_error(self) -> DaemonGoneError:
         return DaemonGoneError(f"The station daemon at {self._path} is gone; nothing was sent to the arm.")
+
+
+def default_socket() -> Path:
+    """Where systemd puts it, when it is there; else the user's own runtime folder."""
+    if runtime := os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]:
+        return Path(runtime) / "control.sock"
+    system = Path("/run/station/control.sock")
+    if system.exists():
+        return system
+    own = os.environ.get("XDG_RUNTIME_DIR") or f"/tmp/station-{os.getuid()}"
+    return Path(own) / "station-control.sock"
 
 
 def ask(path: Path, verb: Verb, **args: Any) -> Any:

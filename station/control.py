@@ -26,6 +26,8 @@ log = logging.getLogger(__name__)
 UNSENT_LIMIT_BYTES = 4 * 1024 * 1024
 OPEN_REQUESTS_LIMIT = 8
 HANG_UP_S = 1.0
+STANDING_LIMIT = 48
+STANDING_S = 2.0
 
 
 @dataclass(frozen=True)
@@ -60,6 +62,8 @@ class ControlServer:
         self._connections: set[_Connection] = set()
         self._next_client_id = 1
         self._status = StationStatus()
+        self._standing = 0
+        """Clients beyond the limit that are listened to for a moment."""
 
     async def start(self) -> None:
         """Binds with mode 0660. StationError when another daemon serves here; a stale socket is replaced."""
@@ -97,9 +101,7 @@ class ControlServer:
         self._next_client_id += 1
         connection = _Connection(peer, reader, writer, self._handler, self._full_status)
         if len(self._connections) >= CLIENT_LIMIT:
-            text = f"{CLIENT_LIMIT} clients are connected already: close one."
-            connection.reply(Reply(0, False, error=text))
-            writer.close()
+            await self._turn_away(connection)
             return
         self._connections.add(connection)
         try:
@@ -108,6 +110,18 @@ class ControlServer:
             self._connections.discard(connection)
             self._handler.gone(peer)
             connection.ended.set()
+
+    async def _turn_away(self, connection: _Connection) -> None:
+        """The house is full; STOP still gets in, if it comes at once."""
+        text = f"{CLIENT_LIMIT} clients are connected already: close one."
+        connection.reply(Reply(0, False, error=text))
+        if self._standing < STANDING_LIMIT:
+            self._standing += 1
+            try:
+                await connection.run_stop_only()
+            finally:
+                self._standing -= 1
+        connection.hang_up()
 
     def _full_status(self) -> bytes:
         plain: dict[str, Any] = msgspec.to_builtins(self._status)
@@ -147,7 +161,17 @@ class _Connection:
         finally:
             for task in self._tasks:
                 task.cancel()
-            self._hang_up()
+            self.hang_up()
+
+    async def run_stop_only(self) -> None:
+        """One line, within a short time, and only STOP."""
+        try:
+            async with asyncio.timeout(STANDING_S):
+                request = msgspec.json.decode(await self._reader.readline(), type=Request)
+        except (TimeoutError, OSError, ValueError, msgspec.DecodeError):
+            return
+        if request.verb == "stop":
+            await self._answer_stop(request.id, self._handler.stop_now(self.peer))
 
     def _take(self, request: Request) -> None:
         if request.verb == "stop":
@@ -197,9 +221,9 @@ class _Connection:
         log.warning("client %d (pid %d) is dropped: %s", self.peer.client_id, self.peer.pid, why)
         with contextlib.suppress(OSError):
             self._writer.write(msgspec.json.encode(Reply(0, False, error=f"dropped: {why}")) + b"\n")
-        self._hang_up()
+        self.hang_up()
 
-    def _hang_up(self) -> None:
+    def hang_up(self) -> None:
         """A client that does not read would hold a polite close open for ever."""
         self._writer.close()
         asyncio.get_running_loop().call_later(HANG_UP_S, self._writer.transport.abort)

@@ -223,7 +223,7 @@ def _margin_problems(gaps: Array, labels: Sequence[str], name: str) -> list[Prob
 def check_plan(plan: Plan, start_joints_rad: ArrayLike | None, geometry: CellGeometry) -> PlanCheck:
     """The whole plan from where the arm is now (None: from its first pose), move by move."""
     problems = list(_plan_problems(plan, geometry))
-    geometry = _with_plan_speeds(geometry, plan)
+    geometry = with_plan_speeds(geometry, plan)
     before = start_joints_rad
     moves = []
     for number, pose in enumerate(plan.poses, start=1):
@@ -235,7 +235,7 @@ def check_plan(plan: Plan, start_joints_rad: ArrayLike | None, geometry: CellGeo
     return PlanCheck(tuple(moves), (*problems, *(p for move in moves for p in move.problems)))
 
 
-def _with_plan_speeds(geometry: CellGeometry, plan: Plan) -> CellGeometry:
+def with_plan_speeds(geometry: CellGeometry, plan: Plan) -> CellGeometry:
     """The plan may ask for slower joints than the configuration, never for faster ones."""
     limits = geometry.limits
     slower = msgspec.structs.replace(

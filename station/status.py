@@ -207,8 +207,10 @@ class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     lease: Lease = Lease()
     go: GoSummary | None = None
     """A go that waits for a person's confirmation."""
+    loop_lag_ms: float = 0.0
+    """How late the daemon's working loop came, worst of the last second."""
     events: tuple[Event, ...] = ()
-    """The newest, at most 200."""
+    """The newest, at most 100."""
 
 
 def changed_sections(old: StationStatus, new: StationStatus) -> dict[str, object]:

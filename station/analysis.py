@@ -1,0 +1,99 @@
+"""What runs in the daemon's worker process: looking at pictures, checking and making plans, estimating.
+
+Plain functions of plain data, so that they cross a process border; the daemon's loop never runs them.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.board import board_points
+from calibrate.detect import detect
+from calibrate.geometry import Array
+from recordings.messages import BoardSpec, CameraModel, Vector6
+from station.config import StationConfig
+from station.limits import PlanCheck, check_plan
+from station.plan.model import Plan
+from station.plan.planner import make_plan
+from station.plan.scene import cell_geometry
+from station.status import DetectionStatus
+
+_NICENESS = 5
+
+
+@dataclass(frozen=True, eq=False)
+class Sighting:
+    """What one picture shows."""
+
+    status: DetectionStatus
+    indices: NDArray[np.intp]
+    """(k,) rows of `board_points`"""
+    pixels: Array
+    """(k, 2)"""
+
+
+def start_worker() -> None:
+    """Capture and recording come first on a small machine; one thread leaves a core to them."""
+    with contextlib.suppress(OSError):  # a service may be forbidden to
+        os.nice(_NICENESS)
+    cv2.setNumThreads(1)
+
+
+def warm_up() -> int:
+    """The worker's process id, once it has imported everything."""
+    return os.getpid()
+
+
+def sight(
+    image: NDArray[Any], board: BoardSpec, camera: CameraModel | None, thorough: bool = True
+) -> Sighting:
+    """Looks for the board; distance and tilt where a lens, even a rough one, is given."""
+    found = detect(image, board, thorough)
+    distance_m = tilt_rad = None
+    if found.found and camera is not None and camera.matrix is not None:
+        distance_m, tilt_rad = _distance_and_tilt(found.pixels, board_points(board)[found.indices], camera)
+    status = DetectionStatus(
+        found=found.found,
+        reason=found.reason,
+        corners=found.corners,
+        expected=found.expected,
+        sharpness=round(float(found.sharpness), 4),
+        saturated=round(float(found.saturated), 4),
+        coverage=round(float(found.coverage), 4),
+        tilt_rad=tilt_rad,
+        distance_m=distance_m,
+    )
+    return Sighting(status, found.indices, found.pixels)
+
+
+def _distance_and_tilt(
+    pixels: Array, points: Array, camera: CameraModel
+) -> tuple[float | None, float | None]:
+    """Distance (m) of the board's points' centre, angle (rad) between the optical axis and the normal."""
+    K = np.array(camera.matrix)
+    ok, rotation, translation = cv2.solvePnP(
+        points, pixels, K, np.array(camera.distortion or (0.0,) * 5), flags=cv2.SOLVEPNP_IPPE
+    )
+    if not ok:
+        return None, None
+    R = cv2.Rodrigues(rotation)[0]
+    centre = R @ points.mean(axis=0) + translation.ravel()
+    tilt = float(np.arccos(np.clip(abs(R[2, 2]), 0.0, 1.0)))
+    return round(float(np.linalg.norm(centre)), 4), round(tilt, 4)
+
+
+def check_run(config: StationConfig, plan: Plan, start_joints_rad: Vector6) -> PlanCheck:
+    """The whole way, from where the arm is."""
+    return check_plan(plan, start_joints_rad, cell_geometry(config))
+
+
+def plan_poses(config: StationConfig, start_joints_rad: Vector6 | None, seed: int, count: int) -> Plan:
+    """ConfigError or LimitError with the remedy."""
+    return make_plan(config, start_joints_rad=start_joints_rad, seed=seed, count=count)

@@ -1,0 +1,92 @@
+"""One session from the shell: prepare, ask, go, watch until it rests. For `capture`, `resume` and `demo`."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import msgspec
+
+from station.client import Client, DaemonGoneError
+from station.errors import RefusedError
+from station.status import GoSummary, StationState, StationStatus
+
+Watcher = Callable[[StationStatus], None]
+Confirm = Callable[[GoSummary], bool]
+CONNECT_WAIT_S = 30.0
+_RESTING = (StationState.PAUSED, StationState.STOPPED, StationState.FAULT, StationState.DISCONNECTED)
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a session came to rest."""
+
+    status: StationStatus
+
+    @property
+    def recording(self) -> str:
+        """Path of the sealed recording; empty while there is none."""
+        return self.status.session.recording
+
+    @property
+    def planned(self) -> int:
+        return len(self.status.session.poses)
+
+    @property
+    def captured(self) -> int:
+        return self.status.session.captured
+
+    @property
+    def exit_code(self) -> int:
+        """0 all poses sealed, 3 sealed with fewer, 1 not sealed."""
+        if not self.recording:
+            return 1
+        return 0 if self.captured == self.planned else 3
+
+
+async def wait_until_idle(client: Client) -> StationStatus:
+    """The devices need a moment after the daemon's start. RefusedError names what does not come."""
+    status = StationStatus()
+    with contextlib.suppress(TimeoutError):
+        async with asyncio.timeout(CONNECT_WAIT_S):
+            async for status in client.statuses():
+                if status.state is not StationState.DISCONNECTED and status.camera.connected:
+                    return status
+    missing = "the camera" if status.robot.connected else "the robot"
+    raise RefusedError(f"{missing} did not come within {CONNECT_WAIT_S:.0f} s: `station doctor` says why")
+
+
+async def carry_out(
+    client: Client, purpose: str, *, confirm: Confirm, watch: Watcher, finish_with_loss: bool = False
+) -> Outcome:
+    """Prepares, lets `confirm` decide, goes, and watches. `finish_with_loss`: seal although poses failed.
+
+    RefusedError when the daemon or the person says no. Being cancelled sends STOP.
+    """
+    summary = msgspec.convert(await client.request("prepare", purpose=purpose), GoSummary)
+    if not confirm(summary):
+        raise RefusedError("nothing moved: the go was not given")
+    try:
+        await client.request("go", token=summary.token, plan_sha256=summary.plan_sha256)
+        status = await _watch(client, watch)
+        if status.state is StationState.PAUSED and finish_with_loss and status.session.captured:
+            await client.request("finish")
+            status = await _watch(client, watch)
+    except asyncio.CancelledError:
+        with contextlib.suppress(DaemonGoneError):
+            await client.request("stop")
+        raise
+    return Outcome(status)
+
+
+async def _watch(client: Client, watch: Watcher) -> StationStatus:
+    """The status in which the session rests."""
+    async for status in client.statuses():
+        watch(status)
+        if status.state in _RESTING:
+            return status
+        if status.state is StationState.IDLE and (status.session.recording or status.reason):
+            return status
+    raise DaemonGoneError("the daemon ended during the session; what was saved before is safe")

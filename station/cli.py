@@ -1,0 +1,73 @@
+"""`station`: the command line. Talks to the daemon's socket like any other client."""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calibrate.errors import CalibrationError
+from recordings.errors import RecordingError
+from station.cli_control import app as control
+from station.cli_serve import ensure_daemon, serve_command
+from station.cli_session import capture_command, check_command, demo_command, resume_command
+from station.client import default_socket
+from station.errors import StationError
+from station.plan.cli import plan_command
+
+app = typer.Typer(
+    add_completion=False,
+    no_args_is_help=False,
+    help="A calibration station for a robot cell. Without a command: the operator's screen.",
+)
+app.command("serve")(serve_command)
+app.command("demo")(demo_command)
+app.command("capture")(capture_command)
+app.command("resume")(resume_command)
+app.command("check")(check_command)
+app.command("plan")(plan_command)
+app.registered_commands += control.registered_commands
+
+Socket = Annotated[Path | None, typer.Option(help="The daemon's control socket.")]
+
+
+@app.callback(invoke_without_command=True)
+def screen_by_default(context: typer.Context) -> None:
+    """A calibration station for a robot cell. Without a command: the operator's screen."""
+    if context.invoked_subcommand is None:
+        open_screen(None, None)
+
+
+@app.command("tui")
+def tui_command(
+    socket: Socket = None,
+    replay: Annotated[Path | None, typer.Option(help="Show this recording in the live screen.")] = None,
+) -> None:
+    """Open the operator's screen; starts a daemon if none runs (a simulated cell, if there is no config)."""
+    open_screen(socket, replay)
+
+
+def open_screen(socket: Path | None, replay: Path | None) -> None:
+    if not sys.stdout.isatty() or not sys.stdin.isatty():
+        raise StationError("the screen needs a terminal; without one use `station capture` or `station demo`")
+    path = ensure_daemon(socket or default_socket(), replay)
+    # The screen's library loads only where a screen is wanted.
+    from station.tui.app import run
+
+    run(path)
+
+
+def main() -> None:
+    try:
+        app()
+    except (StationError, RecordingError, CalibrationError) as problem:
+        print(f"station: {problem}", file=sys.stderr)
+        sys.exit(problem.exit_code)
+    except KeyboardInterrupt:
+        sys.exit(130)
+
+
+if __name__ == "__main__":
+    main()

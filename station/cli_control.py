@@ -1,0 +1,136 @@
+"""The small commands: state, STOP, pause, finish, retake, skip, doctor."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from station.client import Client, ask, default_socket
+from station.errors import StationError
+from station.protocol import Verb
+from station.status import StationStatus
+
+app = typer.Typer()
+out = Console(highlight=False, soft_wrap=True)
+
+Socket = Annotated[Path | None, typer.Option(help="The daemon's control socket.")]
+AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout and nothing else.")]
+PoseNumber = Annotated[int, typer.Argument(min=1, help="Pose number, from 1.")]
+_MARKS = {"ok": "[green]ok[/]", "warning": "[yellow]WARN[/]", "failed": "[red]MISSING[/]", "skipped": "-"}
+
+
+def status_now(socket: Path | None) -> StationStatus:
+    async def first() -> StationStatus:
+        async with await Client.connect(socket or default_socket()) as client:
+            async for status in client.statuses():
+                return status
+        raise StationError("the daemon ended before it told its status")
+
+    return asyncio.run(first())
+
+
+@app.command("status")
+def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
+    """What the station is doing."""
+    status = status_now(socket)
+    if as_json:
+        print(msgspec.json.encode(status).decode())
+        return
+    marks = " SIMULATED" if status.simulated else " PLAYBACK" if status.playback else ""
+    out.print(f"[bold]{status.state.value}[/]{marks}  {status.reason}", markup=True)
+    robot, session = status.robot, status.session
+    words = [f"{robot.model} {robot.safety or 'not connected'}", f"slider {100 * robot.slider:.0f} %"]
+    if session.poses:
+        words.append(f"{session.captured} of {len(session.poses)} poses")
+    if session.name:
+        words.append(session.name)
+    if status.lease.holder:
+        words.append(f"commanded by {status.lease.holder}")
+    out.print(", ".join(words))
+    if session.recording:
+        out.print(f"recording {session.recording}")
+
+
+@app.command("stop")
+def stop_command(socket: Socket = None) -> None:
+    """STOP the arm now. The pendant's emergency stop is the safety device."""
+    ask(socket or default_socket(), "stop")
+    out.print("stopped; latched until acknowledged: look at the cell, then `station acknowledge`")
+
+
+@app.command("acknowledge")
+def acknowledge_command(socket: Socket = None) -> None:
+    """Leave `stopped` or `fault` after looking at the cell. Nothing moves."""
+    ask(socket or default_socket(), "acknowledge")
+
+
+@app.command("pause")
+def pause_command(socket: Socket = None) -> None:
+    """Pause after the pose that is being taken."""
+    ask(socket or default_socket(), "pause")
+
+
+@app.command("finish")
+def finish_command(socket: Socket = None) -> None:
+    """Seal what is recorded (a pose under way is taken first)."""
+    _command(socket, "finish")
+
+
+@app.command("retake")
+def retake_command(pose: PoseNumber, socket: Socket = None) -> None:
+    """Plan a pose once more; it is taken at the next go."""
+    _command(socket, "retake", index=pose - 1)
+
+
+@app.command("skip")
+def skip_command(pose: PoseNumber, socket: Socket = None) -> None:
+    """Leave a pose out."""
+    _command(socket, "skip", index=pose - 1)
+
+
+@app.command("doctor")
+def doctor_command(socket: Socket = None, as_json: AsJson = False) -> None:
+    """Look at everything a capture needs; each missing thing with its remedy. Nothing moves."""
+    checks: list[dict[str, Any]] = ask(socket or default_socket(), "doctor")
+    good = all(check["state"] != "failed" for check in checks)
+    if as_json:
+        print(msgspec.json.encode({"ok": good, "checks": checks}).decode())
+    else:
+        table = Table(box=None, show_header=False, pad_edge=False)
+        for check in checks:
+            remedy = f"\n→ {check['remedy']}" if check.get("remedy") and check["state"] != "ok" else ""
+            table.add_row(_MARKS[check["state"]], check["name"], f"{check['text']}{remedy}")
+        out.print(table)
+    if not good:
+        raise typer.Exit(1)
+
+
+PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
+
+
+@app.command("board", context_settings=PASSED_ON)
+def board_command(context: typer.Context) -> None:
+    """Make a printable calibration board (`calibrate board`)."""
+    import subprocess
+
+    done = subprocess.run([sys.executable, "-m", "calibrate.cli", "board", *context.args])
+    raise typer.Exit(done.returncode)
+
+
+def _command(socket: Path | None, verb: Verb, **args: Any) -> None:
+    """A command of the lease's holder: takes it when it is free, and gives it back."""
+
+    async def once(work: Callable[[Client], Awaitable[Any]]) -> None:
+        async with await Client.connect(socket or default_socket()) as client:
+            await client.request("lease", action="take")
+            await work(client)
+
+    asyncio.run(once(lambda client: client.request(verb, **args)))

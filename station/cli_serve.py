@@ -1,0 +1,135 @@
+"""`station serve`, and starting a daemon for a screen that finds none."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Annotated, get_args
+
+import typer
+
+from recordings.messages import Mount
+from station.cell import Cell
+from station.client import DaemonGoneError, ask, default_socket
+from station.errors import ConfigError, StationError
+from station.session.folder import default_root
+from station.simulation.cell import NoiseLevel, SceneName
+
+START_WAIT_S = 30.0
+_RANGES = {"scene": SceneName, "noise": NoiseLevel, "mount": Mount}
+
+
+def serve_command(
+    config: Annotated[Path | None, typer.Option(help="The cell's configuration.")] = None,
+    simulate: Annotated[bool, typer.Option("--simulate", help="A simulated cell, marked so.")] = False,
+    socket: Annotated[Path | None, typer.Option(help="Where to listen.")] = None,
+    root: Annotated[Path | None, typer.Option(help="Where sessions go.")] = None,
+    seed: Annotated[int, typer.Option(help="Of the simulated cell.")] = 0,
+    scene: Annotated[str, typer.Option(help="Simulated: paper or blog.")] = "paper",
+    noise: Annotated[str, typer.Option(help="Simulated: low, mid or high.")] = "low",
+    mount: Annotated[str, typer.Option(help="Simulated: eye-in-hand or eye-to-hand.")] = "eye-in-hand",
+    time_scale: Annotated[float, typer.Option(hidden=True)] = 1.0,
+    end_with_stdin: Annotated[bool, typer.Option("--end-with-stdin", hidden=True)] = False,
+) -> None:
+    """Own the cell and serve it on a Unix socket. Nothing moves without a person's go."""
+    if simulate == (config is not None):
+        raise ConfigError("say what to serve: either --config FILE (a real cell) or --simulate")
+    require_choices(scene=scene, noise=noise, mount=mount)
+    logging.basicConfig(level=logging.INFO, format=_log_format(), stream=sys.stderr)
+    place = root or default_root()
+    if config is not None:
+        asyncio.run(_serve(_real_cell(config, place), place, socket or default_socket(), end_with_stdin))
+        return
+    # Simulation is loaded only where it is wanted.
+    from station.simulation.launch_cell import SimulationOptions, simulated_cell
+
+    options = SimulationOptions(scene, seed, noise, mount, time_scale)  # type: ignore[arg-type]
+    cell = simulated_cell(options, place / "simulation")
+    asyncio.run(_serve(cell, place, socket or default_socket(), end_with_stdin))
+
+
+def require_choices(**chosen: str) -> None:
+    """ConfigError for a word that is not one of the offered ones."""
+    for name, word in chosen.items():
+        if word not in (known := get_args(_RANGES[name])):
+            raise ConfigError(f"--{name} {word}: choose one of {', '.join(known)}")
+
+
+def _real_cell(config: Path, root: Path) -> Cell:
+    from station.cell_factory import configured_cell
+    from station.config_file import load_config
+
+    loaded, text = load_config(config)
+    return configured_cell(loaded, text, root)
+
+
+async def _serve(cell: Cell, root: Path, socket: Path, end_with_stdin: bool) -> None:
+    from station.daemon import Daemon
+
+    try:
+        daemon = Daemon(cell, root, socket)
+        if end_with_stdin:
+            loop = asyncio.get_running_loop()
+            loop.add_reader(sys.stdin.fileno(), lambda: None if os.read(0, 4096) else daemon.end())
+        await daemon.run(lambda: print(json.dumps({"ready": True, "socket": str(socket)}), flush=True))
+    finally:
+        cell.ended()
+
+
+def _log_format() -> str:
+    """The journal has its own clock."""
+    stamp = "" if "JOURNAL_STREAM" in os.environ else "%(asctime)s "
+    return f"{stamp}%(levelname)s %(name)s: %(message)s"
+
+
+def find_config() -> Path | None:
+    """$STATION_CONFIG, the user's, or the system's; None where there is none."""
+    home = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
+    places = [home / "calibration-station" / "station.yaml", Path("/etc/station/station.yaml")]
+    if named := os.environ.get("STATION_CONFIG"):
+        places.insert(0, Path(named))
+    return next((place for place in places if place.is_file()), None)
+
+
+def ensure_daemon(socket: Path, replay: Path | None = None) -> Path:
+    """The socket of a daemon that answers; starts one where none does. StationError when that fails."""
+    if replay is not None:
+        raise StationError("replay is not built yet: open the recording in Foxglove or `recordings info` it")
+    if _answers(socket):
+        return socket
+    root = default_root()
+    root.mkdir(parents=True, exist_ok=True)
+    config = find_config()
+    what = ["--simulate"] if config is None else ["--config", str(config)]
+    log = root / "daemon.log"
+    with log.open("ab") as words:
+        child = subprocess.Popen(
+            [sys.executable, "-m", "station.cli", "serve", *what, "--socket", str(socket)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=words,
+            start_new_session=True,
+        )
+    give_up_s = time.monotonic() + START_WAIT_S
+    while time.monotonic() < give_up_s and child.poll() is None:
+        if _answers(socket):
+            return socket
+        time.sleep(0.2)
+    tail = "\n".join(log.read_text(errors="replace").splitlines()[-3:])
+    raise StationError(f"the daemon did not start; {log} ends with:\n{tail}")
+
+
+def _answers(socket: Path) -> bool:
+    try:
+        ask(socket, "plan")
+    except DaemonGoneError:
+        return False
+    except StationError:
+        return True
+    return True

@@ -1,0 +1,186 @@
+"""The commands that move an arm: `capture`, `resume`, `check`, and the demonstration of all of it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import subprocess
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import typer
+from rich.console import Console
+from rich.table import Table
+
+from station.attend import Confirm, Outcome, carry_out, wait_until_idle
+from station.cli_serve import require_choices
+from station.client import Client, default_socket
+from station.demo import DemoOptions, run_demo
+from station.errors import RefusedError, StationError
+from station.plan.files import load_plan
+from station.plan.model import Plan
+from station.progress import SessionProgress
+from station.session.folder import default_root
+from station.status import GoSummary
+
+out = Console(highlight=False, soft_wrap=True)
+err = Console(stderr=True, highlight=False, soft_wrap=True)
+
+Socket = Annotated[Path | None, typer.Option(help="The daemon's control socket.")]
+AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout and nothing else.")]
+Headless = Annotated[bool, typer.Option("--headless", help="Nobody is asked; no progress bar.")]
+GoHash = Annotated[str, typer.Option("--go", help="Hash of the plan that a person approved.")]
+CHECK_POSES = 6
+
+
+def demo_command(
+    seed: Annotated[int, typer.Option(help="Another seed: another mount, board place, lens, noise.")] = 0,
+    output: Annotated[Path | None, typer.Option("--out", help="Folder for everything it makes.")] = None,
+    scene: Annotated[str, typer.Option(help="paper or blog")] = "paper",
+    mount: Annotated[str, typer.Option(help="eye-in-hand or eye-to-hand")] = "eye-in-hand",
+    noise: Annotated[str, typer.Option(help="low, mid or high")] = "low",
+    poses: Annotated[int, typer.Option(min=4, max=200)] = 25,
+    headless: Headless = False,
+    as_json: AsJson = False,
+    time_scale: Annotated[float, typer.Option(hidden=True)] = 1.0,
+) -> None:
+    """The whole job with no hardware: simulated UR10 and camera to a calibration, compared with the truth."""
+    require_choices(scene=scene, noise=noise, mount=mount)
+    folder = output or default_root() / "demo" / time.strftime("%Y%m%d-%H%M%S")
+    options = DemoOptions(folder, seed, scene, mount, noise, poses, time_scale)
+    started_s = time.monotonic()
+    result = asyncio.run(run_demo(options, SessionProgress(err, quiet=headless or as_json)))
+    if as_json:
+        print(json.dumps(result))
+    else:
+        _show_demo(result, time.monotonic() - started_s)
+    captured, planned = result["poses"]["captured"], result["poses"]["planned"]
+    if not result["gates_passed"]:
+        raise typer.Exit(4)
+    if captured < planned:
+        raise typer.Exit(3)
+
+
+def _show_demo(result: dict[str, Any], duration_s: float) -> None:
+    error, sigma, poses = result["truth_error"], result["sigma"], result["poses"]
+    table = Table(title=f"SIMULATED cell, seed {result['seed']}: {result['mount']}, {result['scene']} scene")
+    for heading in ("", "translation", "rotation"):
+        table.add_column(heading, justify="left" if not heading else "right")
+    for name, value in (("error against the truth", error), ("claimed sigma", sigma)):
+        table.add_row(name, f"{value['translation_mm']:.3f} mm", f"{value['rotation_deg']:.4f}°")
+    out.print(table)
+    verdict = "all gates passed" if result["gates_passed"] else "[red]a gate FAILED[/]"
+    out.print(f"{poses['captured']} of {poses['planned']} poses, {verdict}, {duration_s:.0f} s in all")
+    for name in ("recording", "calibration", "report"):
+        out.print(f"{name:<12} {result[name]}")
+
+
+def capture_command(
+    plan: Annotated[Path, typer.Option(help="The pose plan.")],
+    headless: Headless = False,
+    go: GoHash = "",
+    socket: Socket = None,
+    as_json: AsJson = False,
+) -> None:
+    """One session: load the plan, check it, ask, go, watch, seal. Ctrl-C is STOP."""
+    loaded = load_plan(plan)
+    _finish(asyncio.run(_session(socket, "run", headless, go, as_json, lambda c: _load(c, loaded))), as_json)
+
+
+def resume_command(
+    headless: Headless = False, go: GoHash = "", socket: Socket = None, as_json: AsJson = False
+) -> None:
+    """Go on with a paused or interrupted session, from where the arm is. Ctrl-C is STOP."""
+    _finish(asyncio.run(_session(socket, "resume", headless, go, as_json, None)), as_json)
+
+
+def check_command(
+    poses: Annotated[int, typer.Option(min=4, max=50)] = CHECK_POSES,
+    headless: Headless = False,
+    go: GoHash = "",
+    socket: Socket = None,
+) -> None:
+    """Does the installed calibration still hold? A few poses, then `calibrate check` on them."""
+    outcome = asyncio.run(_session(socket, "run", headless, go, False, lambda c: _make(c, poses)))
+    if not outcome.recording:
+        _finish(outcome, False)
+    done = subprocess.run([sys.executable, "-m", "calibrate.cli", "check", outcome.recording])
+    raise typer.Exit(done.returncode)
+
+
+async def _load(client: Client, plan: Plan) -> None:
+    await client.request("load_plan", plan=msgspec.to_builtins(plan))
+
+
+async def _make(client: Client, poses: int) -> None:
+    await client.request("make_plan", poses=poses, seed=0, timeout_s=180.0)
+
+
+async def _session(
+    socket: Path | None, purpose: str, headless: bool, go: str, quiet: bool, before: Callable[..., Any] | None
+) -> Outcome:
+    path = socket or default_socket()
+    interactive = not headless and sys.stdin.isatty()
+    async with await Client.connect(path, interactive=interactive) as client:
+        await wait_until_idle(client)
+        await client.request("lease", action="take")
+        if before is not None:
+            await before(client)
+        simulated = await _is_simulated(client)
+        progress = SessionProgress(err, quiet=headless or quiet)
+        confirm = _confirmation(go, interactive, simulated)
+        with progress:
+            return await carry_out(
+                client, purpose, confirm=confirm, watch=progress, finish_with_loss=headless
+            )
+
+
+async def _is_simulated(client: Client) -> bool:
+    async for status in client.statuses():
+        return status.simulated
+    raise StationError("the daemon ended")
+
+
+def _confirmation(go: str, interactive: bool, simulated: bool) -> Confirm:
+    """Who says yes: the approved hash, the person, or, for a simulated cell only, nobody."""
+
+    def confirm(summary: GoSummary) -> bool:
+        if go:
+            if not summary.plan_sha256.startswith(go) or len(go) < 12:
+                raise RefusedError(
+                    f"--go {go} is not the hash of this plan ({summary.plan_sha256}): nothing moved"
+                )
+            return True
+        if interactive:
+            return _ask_person(summary)
+        if simulated:
+            return True
+        raise RefusedError(f"nobody is here to confirm: approve the plan with --go {summary.plan_sha256}")
+
+    return confirm
+
+
+def _ask_person(summary: GoSummary) -> bool:
+    err.print(f"\n[bold]The arm will move[/]: {summary.purpose}, {summary.poses} poses")
+    err.print(f"first {summary.first_move}; {summary.path_m:.2f} m, up to {summary.top_speed_m_s:.2f} m/s")
+    err.print(f"about {summary.duration_s:.0f} s, plan {summary.plan_sha256[:12]}")
+    for warning in summary.warnings:
+        err.print(f"[yellow]{warning}[/]")
+    err.print("The emergency stop on the pendant is the safety device. Ctrl-C stops too.")
+    return typer.confirm("Is everybody out of the arm's reach? Move?", default=False, err=True)
+
+
+def _finish(outcome: Outcome, as_json: bool) -> None:
+    if as_json:
+        poses = {"planned": outcome.planned, "captured": outcome.captured}
+        state = outcome.status.state.value
+        print(json.dumps({"state": state, "poses": poses, "recording": outcome.recording}))
+    elif outcome.recording:
+        out.print(f"{outcome.captured} of {outcome.planned} poses, sealed: {outcome.recording}")
+    else:
+        err.print(f"[bold]{outcome.status.state.value}[/]: {outcome.status.reason}")
+    raise typer.Exit(outcome.exit_code)

@@ -1,0 +1,103 @@
+"""`station serve`: one process that owns the cell: session, control socket, systemd, signals."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import signal
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+from station.cell import Cell
+from station.control import ControlServer
+from station.dispatch import SessionDispatcher
+from station.notify import notify, watchdog_period_s
+from station.session.session import Session
+from station.status import StationState
+
+log = logging.getLogger(__name__)
+
+CONTROL_SERVED_S = 1.0
+GATHER_S = 0.04
+
+
+class Watchdog:
+    """Pings systemd from the working loop, and only while the loop and the recorder do their work."""
+
+    def __init__(self, healthy: Callable[[], bool]) -> None:
+        self._healthy = healthy
+        self._period_s = watchdog_period_s()
+        self._pinged_s = 0.0
+
+    def tick(self) -> None:
+        now_s = time.monotonic()
+        if self._period_s is None or now_s - self._pinged_s < min(self._period_s, 1.0):
+            return
+        if self._healthy():
+            self._pinged_s = now_s
+            notify("WATCHDOG=1")
+
+
+class Daemon:
+    def __init__(self, cell: Cell, root: Path, socket: Path) -> None:
+        self._watchdog = Watchdog(self._healthy)
+        self.session = Session(cell, root, ticked=self._watchdog.tick)
+        self._control = ControlServer(socket, SessionDispatcher(self.session))
+        self._changed = asyncio.Event()
+        self._ending = asyncio.Event()
+        self._served_s = time.monotonic()
+        self._said = ""
+
+    async def run(self, ready: Callable[[], None] = lambda: None) -> None:
+        """Until SIGTERM or SIGINT. `ready` is called once the socket listens. Raises StationError."""
+        loop = asyncio.get_running_loop()
+        for number in (signal.SIGTERM, signal.SIGINT):
+            loop.add_signal_handler(number, self.end)
+        await self._control.start()
+        try:
+            await self.session.start()
+            self.session.store.watch(self._changed.set)
+            notify("READY=1")
+            ready()
+            telling = asyncio.create_task(self._tell())
+            await self._ending.wait()
+            telling.cancel()
+        finally:
+            # The order matters: the arm stands, the recording is sealed, then everybody is told.
+            await self.session.close()
+            notify("STOPPING=1")
+            await self._control.close()
+            log.info("ended")
+
+    def end(self) -> None:
+        self._ending.set()
+
+    async def _tell(self) -> None:
+        """Watchers are told of changes, gathered for a moment; the same loop serves their requests."""
+        while True:
+            self._served_s = time.monotonic()
+            with contextlib.suppress(TimeoutError):
+                async with asyncio.timeout(CONTROL_SERVED_S / 4):
+                    await self._changed.wait()
+            self._changed.clear()
+            self._control.publish(self.session.store.status)
+            self._tell_systemd()
+            await asyncio.sleep(GATHER_S)
+
+    def _healthy(self) -> bool:
+        """systemd may restart us when this stays false."""
+        recording = self.session.bench.recording
+        recorder = recording.recorder if recording is not None else None
+        writing = recorder is None or recorder.error is not None or recorder.alive
+        return writing and time.monotonic() - self._served_s < CONTROL_SERVED_S
+
+    def _tell_systemd(self) -> None:
+        status = self.session.store.status
+        text = status.state.value
+        if status.session.poses and status.state is not StationState.IDLE:
+            text += f", pose {status.session.captured} of {len(status.session.poses)}"
+        if text != self._said:
+            self._said = text
+            notify(f"STATUS={text}")

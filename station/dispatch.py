@@ -1,0 +1,251 @@
+"""Verbs to commands: typed arguments, who may, and what comes back. An allow list, never a name lookup."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import pwd
+from collections.abc import Awaitable, Callable
+from typing import Any, cast
+
+import msgspec
+
+from station.control import Peer
+from station.errors import RefusedError
+from station.plan.model import Plan, PlannedPose
+from station.protocol import Verb
+from station.session.checklist import checklist
+from station.session.folder import list_sessions
+from station.session.recording import software
+from station.session.session import Session
+from station.states import refusal
+
+
+class _Args(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    pass
+
+
+class _Hello(_Args, frozen=True):
+    who: str = ""
+    interactive: bool = False
+
+
+class _Lease(_Args, frozen=True):
+    action: str = "take"
+
+
+class _LoadPlan(_Args, frozen=True):
+    plan: Plan
+
+
+class _MakePlan(_Args, frozen=True):
+    poses: int = 25
+    seed: int = 0
+
+
+class _Prepare(_Args, frozen=True):
+    purpose: str = "run"
+    index: int | None = None
+
+
+class _Go(_Args, frozen=True):
+    token: str
+    plan_sha256: str = ""
+
+
+class _Index(_Args, frozen=True):
+    index: int
+
+
+class _Order(_Args, frozen=True):
+    order: list[int]
+
+
+class _Pose(_Args, frozen=True):
+    pose: PlannedPose
+
+
+class _FreeDrive(_Args, frozen=True):
+    on: bool
+    auto: bool = False
+
+
+class _Preview(_Args, frozen=True):
+    width: int = 480
+    height: int = 384
+
+
+class _Path(_Args, frozen=True):
+    path: str
+
+
+PLAN_POSES = (4, 200)
+_WHO_LIMIT = 60
+
+
+class _Caller:
+    """A connection and what it said about itself."""
+
+    def __init__(self, peer: Peer) -> None:
+        self.client_id = peer.client_id
+        self.who = f"{_user(peer.uid)} (pid {peer.pid})"
+        self.interactive = False
+        """A person answers at the other end."""
+        self._peer = peer
+
+    def introduce(self, who: str, interactive: bool) -> None:
+        """The user's name is the kernel's word; the place is the client's."""
+        user = _user(self._peer.uid)
+        said = "".join(c for c in who if c.isprintable())[:_WHO_LIMIT] or user
+        told = said if said.split(" ")[0] == user else f"{user} ({said})"
+        self.who = f"{told} (pid {self._peer.pid})"
+        self.interactive = interactive
+
+
+def _user(uid: int) -> str:
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return f"uid {uid}"
+
+
+class SessionDispatcher:
+    """Behind `station.control.Handler`."""
+
+    def __init__(self, session: Session) -> None:
+        self._session = session
+        self._callers: dict[int, _Caller] = {}
+        self._leaving: set[asyncio.Task[None]] = set()
+        self._table: dict[Verb, tuple[type[_Args], Callable[[_Caller, Any], Awaitable[Any]]]] = {
+            "hello": (_Hello, self._hello),
+            "lease": (_Lease, self._lease),
+            "acknowledge": (_Args, self._acknowledge),
+            "plan": (_Args, self._plan),
+            "load_plan": (_LoadPlan, self._load_plan),
+            "make_plan": (_MakePlan, self._make_plan),
+            "prepare": (_Prepare, self._prepare),
+            "go": (_Go, self._go),
+            "pause": (_Args, self._pause),
+            "finish": (_Args, self._finish),
+            "retake": (_Index, self._retake),
+            "skip": (_Index, self._skip),
+            "reorder": (_Order, self._reorder),
+            "add": (_Pose, self._add),
+            "drop": (_Index, self._drop),
+            "free_drive": (_FreeDrive, self._free_drive),
+            "record": (_Args, self._record),
+            "preview": (_Preview, self._preview),
+            "doctor": (_Args, self._doctor),
+            "sessions": (_Args, self._sessions),
+            "open_replay": (_Path, self._open_replay),
+        }
+
+    def stop_now(self, peer: Peer) -> Awaitable[None]:
+        """STOP is on its way to the arm before anything else is looked at."""
+        return asyncio.create_task(self._session.stop(self._caller(peer).who))
+
+    def gone(self, peer: Peer) -> None:
+        """The arm decelerates at once when this was the commander."""
+        self._callers.pop(peer.client_id, None)
+        task = asyncio.create_task(self._session.lease_lost(peer.client_id))
+        self._leaving.add(task)
+        task.add_done_callback(self._leaving.discard)
+
+    async def handle(self, peer: Peer, verb: str, args: dict[str, Any]) -> Any:
+        """RefusedError for arguments that do not fit the verb."""
+        if verb == "watch":
+            return {}
+        kind, handler = self._table[cast(Verb, verb)]
+        try:
+            typed = msgspec.convert(args, kind)
+        except msgspec.ValidationError as error:
+            raise RefusedError(f"{verb}: wrong arguments ({error})") from None
+        result = await handler(self._caller(peer), typed)
+        return {} if result is None else msgspec.to_builtins(result)
+
+    def _caller(self, peer: Peer) -> _Caller:
+        return self._callers.setdefault(peer.client_id, _Caller(peer))
+
+    async def _hello(self, caller: _Caller, args: _Hello) -> Any:
+        caller.introduce(args.who, args.interactive)
+        return {"version": software()["calibration-station"], "pid": os.getpid()}
+
+    async def _lease(self, caller: _Caller, args: _Lease) -> Any:
+        if args.action == "take":
+            return self._session.take_lease(caller.client_id, caller.who)
+        if args.action == "release":
+            return await self._session.release_lease(caller.client_id)
+        raise RefusedError(f"lease: take or release, not '{args.action}'")
+
+    async def _acknowledge(self, caller: _Caller, args: _Args) -> None:
+        self._session.acknowledge(caller.who)
+
+    async def _plan(self, caller: _Caller, args: _Args) -> Any:
+        queue = self._session.bench.queue
+        return None if queue is None else {"plan": queue.plan, "sha256": queue.sha256}
+
+    async def _load_plan(self, caller: _Caller, args: _LoadPlan) -> Any:
+        self._session.load_plan(caller.client_id, args.plan)
+        return {"sha256": self._session.bench.require_queue().sha256}
+
+    async def _make_plan(self, caller: _Caller, args: _MakePlan) -> Any:
+        low, high = PLAN_POSES
+        if not low <= args.poses <= high:
+            raise RefusedError(f"a plan has {low} to {high} poses, not {args.poses}")
+        plan = await self._session.make_plan(caller.client_id, args.poses, args.seed)
+        return {"poses": len(plan.poses), "sha256": self._session.bench.require_queue().sha256}
+
+    async def _prepare(self, caller: _Caller, args: _Prepare) -> Any:
+        return await self._session.prepare(caller.client_id, args.purpose, args.index)
+
+    async def _go(self, caller: _Caller, args: _Go) -> None:
+        cell, queue = self._session.bench.cell, self._session.bench.queue
+        unseen = not (cell.simulated or caller.interactive)
+        if unseen and (queue is None or args.plan_sha256 != queue.sha256):
+            # Nobody looks at a summary there: the plan that a person approved must be named.
+            raise RefusedError(
+                "without a person at the screen a real arm moves only with the approved plan's hash: "
+                f"--go {queue.sha256 if queue else 'PLAN_SHA'}"
+            )
+        self._session.go(caller.client_id, args.token)
+
+    async def _pause(self, caller: _Caller, args: _Args) -> None:
+        self._session.pause(caller.who)
+
+    async def _finish(self, caller: _Caller, args: _Args) -> None:
+        await self._session.finish(caller.client_id)
+
+    async def _retake(self, caller: _Caller, args: _Index) -> None:
+        self._session.edit(caller.client_id, "retake", lambda queue: queue.retake(args.index))
+
+    async def _skip(self, caller: _Caller, args: _Index) -> None:
+        self._session.edit(caller.client_id, "skip", lambda queue: queue.skip(args.index))
+
+    async def _reorder(self, caller: _Caller, args: _Order) -> None:
+        self._session.edit(caller.client_id, "reorder", lambda queue: queue.reorder(args.order))
+
+    async def _add(self, caller: _Caller, args: _Pose) -> Any:
+        return {"index": self._session.edit(caller.client_id, "add", lambda queue: queue.add(args.pose))}
+
+    async def _drop(self, caller: _Caller, args: _Index) -> None:
+        self._session.edit(caller.client_id, "drop", lambda queue: queue.drop(args.index))
+
+    async def _free_drive(self, caller: _Caller, args: _FreeDrive) -> None:
+        await self._session.switch_free_drive(caller.client_id, args.on, args.auto)
+
+    async def _record(self, caller: _Caller, args: _Args) -> Any:
+        return {"index": await self._session.record(caller.client_id)}
+
+    async def _preview(self, caller: _Caller, args: _Preview) -> Any:
+        return await self._session.previews.preview(args.width, args.height)
+
+    async def _doctor(self, caller: _Caller, args: _Args) -> Any:
+        return await checklist(self._session.bench, self._session.troubles)
+
+    async def _sessions(self, caller: _Caller, args: _Args) -> Any:
+        return list_sessions(self._session.bench.root)
+
+    async def _open_replay(self, caller: _Caller, args: _Path) -> Any:
+        if reason := refusal("open_replay", self._session.store.state):
+            raise RefusedError(reason)
+        raise RefusedError("replay is a daemon of its own: station tui --replay " + args.path)

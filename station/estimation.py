@@ -1,0 +1,101 @@
+"""The running estimate: a quick look at X after each pose, and how sure it is. Never the final one."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.board import board_points
+from calibrate.errors import CalibrationError
+from calibrate.geometry import Array, inverse, pose
+from calibrate.information import Noise, covariance_of, view_information
+from calibrate.intrinsics import calibrate_intrinsics
+from calibrate.pnp import solve_pnp
+from calibrate.views import ImageView, ViewSet
+from recordings.messages import BoardSpec, CameraModel, Mount
+from station.status import EstimateStatus
+
+FEWEST_VIEWS = 4
+FEWEST_FOR_LENS = 6
+GOAL_M = 0.0005
+_WEAK_PRIOR = (1.0, 1.0, 1.0, 0.1, 0.1, 0.1)
+_LENS_PRIOR_SHARE = 0.05
+
+Seen = tuple[int, Array, NDArray[np.intp], Array]
+"""Pose number, base_from_flange (4, 4), rows of `board_points` (k,), pixels (k, 2)."""
+
+
+def running_estimate(
+    mount: Mount, camera: CameraModel, lens_is_known: bool, board: BoardSpec, seen: Sequence[Seen]
+) -> EstimateStatus:
+    """Few views or degenerate motion give an answer without numbers and with advice."""
+    if len(seen) < FEWEST_VIEWS:
+        return EstimateStatus(len(seen), goal_mm=1000 * GOAL_M, advice="too few views yet")
+    try:
+        views = _views(mount, camera, lens_is_known, board, seen)
+        X, Y = _quick_solution(views)
+    except (CalibrationError, cv2.error, np.linalg.LinAlgError):
+        return EstimateStatus(len(seen), goal_mm=1000 * GOAL_M, advice="the motion says too little yet")
+    free_lens = not lens_is_known
+    sigma_m, sigma_rad = _sigma(views, board, X, Y, free_lens)
+    x, y, z = (float(v) for v in 1000 * X[:3, 3])
+    return EstimateStatus(
+        views=len(seen),
+        translation_mm=(round(x, 2), round(y, 2), round(z, 2)),
+        sigma_translation_mm=round(1000 * sigma_m, 3),
+        sigma_rotation_deg=round(math.degrees(sigma_rad), 4),
+        goal_mm=1000 * GOAL_M,
+        enough=sigma_m <= GOAL_M,
+        advice="sure enough: you may finish" if sigma_m <= GOAL_M else "go on: every pose still helps",
+    )
+
+
+def _views(
+    mount: Mount, camera: CameraModel, lens_is_known: bool, board: BoardSpec, seen: Sequence[Seen]
+) -> ViewSet:
+    points = board_points(board)
+    found = tuple(
+        ImageView(index, f"p{index}", flange, points[rows], pixels) for index, flange, rows, pixels in seen
+    )
+    views = ViewSet(mount, found, camera)
+    if not lens_is_known and len(found) >= FEWEST_FOR_LENS:
+        with contextlib.suppress(CalibrationError):  # the rough lens will do
+            views = replace(views, camera=calibrate_intrinsics(views).camera)
+    return solve_pnp(views, board)
+
+
+def _quick_solution(views: ViewSet) -> tuple[Array, Array]:
+    """X and Y in closed form (Park & Martin 1994, by OpenCV), from all views."""
+    flange, board = views.base_from_flange, views.camera_from_board
+    gripper = flange if views.mount == "eye-in-hand" else np.array([inverse(E) for E in flange])
+    R, t = cv2.calibrateHandEye(
+        list(gripper[:, :3, :3]),
+        list(gripper[:, :3, 3]),
+        list(board[:, :3, :3]),
+        list(board[:, :3, 3]),
+        method=cv2.CALIB_HAND_EYE_PARK,
+    )
+    X = pose(np.asarray(R), np.asarray(t).ravel())
+    if not np.isfinite(X).all():
+        raise np.linalg.LinAlgError("no finite solution")
+    return X, np.asarray(gripper[0] @ X @ board[0])
+
+
+def _sigma(views: ViewSet, board: BoardSpec, X: Array, Y: Array, free_lens: bool) -> tuple[float, float]:
+    """1σ of X: translation (m) and rotation (rad), roots of the summed variances."""
+    information = view_information(
+        views.mount, views.camera, views.base_from_flange, X, Y, board_points(board), Noise(), free_lens
+    ).sum(axis=0)
+    prior = np.array([*_WEAK_PRIOR, *_WEAK_PRIOR])
+    if free_lens:
+        focal_px = np.asarray(views.camera.matrix)[0, 0]
+        lens = [1 / (_LENS_PRIOR_SHARE * focal_px) ** 2] * 4
+        prior = np.array([*prior, *lens, *([1.0] * (len(information) - len(prior) - 4))])
+    variances = np.diag(covariance_of(information, prior))
+    return float(np.sqrt(variances[:3].sum())), float(np.sqrt(variances[3:6].sum()))

@@ -1,0 +1,66 @@
+"""A session in a terminal that is no full screen: a bar, and a line for every pose and warning."""
+
+from __future__ import annotations
+
+from types import TracebackType
+
+from rich.console import Console
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+
+from station.status import Event, StationStatus
+
+
+class SessionProgress:
+    """Context manager; call it with every status. Silent when `quiet`."""
+
+    def __init__(self, console: Console, quiet: bool) -> None:
+        self._quiet = quiet
+        self._bar = Progress(
+            TextColumn("{task.description:<34}"),
+            BarColumn(bar_width=24),
+            MofNCompleteColumn(),
+            TimeElapsedColumn(),
+            console=console,
+            disable=quiet,
+        )
+        self._task: TaskID | None = None
+        self._last: Event | None = None
+
+    def __enter__(self) -> SessionProgress:
+        self._bar.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        self._bar.stop()
+
+    def __call__(self, status: StationStatus) -> None:
+        if self._quiet:
+            return
+        session = status.session
+        if self._task is None:
+            self._task = self._bar.add_task("", total=len(session.poses))
+        where = f"pose {session.current + 1} " if session.current is not None else ""
+        self._bar.update(
+            self._task,
+            description=f"{where}{status.state.value}",
+            total=len(session.poses),
+            completed=session.captured,
+        )
+        for event in self._new(status):
+            number = f"pose {event.pose_index + 1:>2}  " if event.pose_index is not None else ""
+            style = {"warning": "yellow", "error": "red"}.get(event.level, "dim")
+            self._bar.console.print(f"[{style}]{number}{escape(event.text)}[/]", highlight=False)
+
+    def _new(self, status: StationStatus) -> list[Event]:
+        events = list(status.events)
+        if self._last in events:
+            events = events[events.index(self._last) + 1 :]
+        if status.events:
+            self._last = status.events[-1]
+        return events

@@ -1,0 +1,81 @@
+"""What every part of a session works with."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.geometry import Array
+from station.cell import Cell
+from station.collision import CellGeometry
+from station.session.queue import PoseQueue
+from station.session.recording import SessionRecording
+from station.session.store import StatusStore
+from station.status import SessionStatus
+from station.stillness import StillnessMonitor
+from station.workers import Workers
+
+
+@dataclass(frozen=True, eq=False)
+class SeenView:
+    """A pose that counts, as far as the running estimate needs it."""
+
+    index: int
+    base_from_flange: Array
+    indices: NDArray[np.intp]
+    pixels: Array
+
+
+@dataclass(eq=False)
+class Bench:
+    """Touched by the event loop's thread only."""
+
+    cell: Cell
+    geometry: CellGeometry
+    store: StatusStore
+    workers: Workers
+    stillness: StillnessMonitor
+    root: Path
+    queue: PoseQueue | None = None
+    recording: SessionRecording | None = None
+    """Of the session that is not sealed yet."""
+    seen: dict[int, SeenView] = field(default_factory=dict)
+    pause_wanted: str = ""
+    """Who asked to pause after this pose; empty = nobody."""
+    finish_wanted: bool = False
+    halting: bool = False
+    """STOP, a fault or a lost lease ends the run: it must not change the state any more."""
+
+    def require_queue(self) -> PoseQueue:
+        """Inside a run there always is one."""
+        assert self.queue is not None
+        return self.queue
+
+    def require_recording(self) -> SessionRecording:
+        assert self.recording is not None
+        return self.recording
+
+    def show_poses(self, current: int | None = None) -> None:
+        """Brings the status up to date with the queue and the recording."""
+        queue, recording = self.queue, self.recording
+        old = self.store.status.session
+        if queue is None:
+            self.store.update(session=SessionStatus(source=self.cell.source))
+            return
+        self.store.update(
+            session=SessionStatus(
+                name=recording.name if recording else old.name,
+                folder=str(recording.folder) if recording else old.folder,
+                plan_sha256=queue.sha256,
+                poses=queue.statuses,
+                current=current,
+                captured=queue.done,
+                elapsed_s=old.elapsed_s,
+                remaining_s=old.remaining_s,
+                recording=old.recording,
+                source=self.cell.source,
+            )
+        )

@@ -1,0 +1,180 @@
+"""One stop of the arm: rest, picture, robot pose of the same moment, disk. It counts only after the disk."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+
+import numpy as np
+
+from calibrate.geometry import Array, inverse, pose_from_rotvec
+from recordings.messages import Matrix4, Picture, RobotState, Stamps, Stillness, Vector6, View
+from station.analysis import Sighting, sight
+from station.devices.frames import mid_exposure
+from station.errors import CameraError, StaleStateError, StationError
+from station.session.bench import Bench, SeenView
+from station.status import PoseState, StationState
+from station.workers import WorkerError
+
+STATE_WAIT_S = 0.3
+"""The robot state of mid-exposure may come a little later than the picture."""
+SIGHT_TIMEOUT_S = 20.0
+SATURATED_LIMIT = 0.05
+
+
+class PoseFailedError(StationError):
+    """This pose gave nothing usable; the message says why. The session goes on."""
+
+
+async def take_pose(bench: Bench, index: int, attempt: int) -> None:
+    """At rest → picture → disk; marks the pose done.
+
+    PoseFailedError when this pose gave nothing; RobotError and RecordingError end the run.
+    """
+    _phase(bench, index, StationState.SETTLING, "settling")
+    still = await bench.stillness.settle(bench.cell.robot.check)
+    _phase(bench, index, StationState.CAPTURING, "capturing")
+    picture = bench.require_recording().number(await _picture(bench, index))
+    device_ns, arrival_ns = picture.stamps.device_ns, picture.stamps.host_monotonic_ns
+    clock = bench.cell.camera.clock
+    mid_ns, camera_bound_s = mid_exposure(device_ns, arrival_ns, picture.exposure_us, clock)
+    state = await _state_at(bench, mid_ns)
+    bench.cell.robot.check()
+    view = _view(bench, index, attempt, picture, state, still, camera_bound_s)
+    _require_bound(bench, view)
+    _phase(bench, index, StationState.WRITING, "writing")
+    writing = asyncio.ensure_future(_write(bench, index, picture, view))
+    try:
+        await asyncio.shield(writing)
+    except asyncio.CancelledError:
+        # STOP halts the arm, never the disk: what was taken is kept.
+        await asyncio.gather(writing, return_exceptions=True)
+        raise
+
+
+def _phase(bench: Bench, index: int, state: StationState, pose_state: PoseState) -> None:
+    bench.require_queue().mark(index, pose_state)
+    bench.store.enter(state)
+    bench.show_poses(index)
+
+
+async def _picture(bench: Bench, index: int) -> Picture:
+    """PoseFailedError once the configured retries are used up."""
+    tries = 1 + bench.cell.config.capture.retries
+    camera = bench.cell.camera
+    for number in range(1, tries + 1):
+        try:
+            if number == tries > 1:  # the last try, with a camera that was opened anew
+                await camera.close()
+                await camera.open()
+            return await camera.capture()
+        except CameraError as error:
+            last = error
+            bench.store.event(f"picture {number} of at most {tries}: {error}", "warning", index)
+    raise PoseFailedError(f"no good picture in {tries} tries: {last}")
+
+
+async def _state_at(bench: Bench, host_monotonic_ns: int) -> RobotState:
+    deadline_s = time.monotonic() + STATE_WAIT_S
+    while True:
+        try:
+            return bench.cell.robot.at(host_monotonic_ns)
+        except StaleStateError:
+            if time.monotonic() > deadline_s:
+                raise
+            await asyncio.sleep(0.01)
+
+
+def flange_pose(state: RobotState, tcp_offset: Vector6) -> Array:
+    """base_from_flange (4, 4): the controller's own tool pose without the tool."""
+    base_from_tcp = pose_from_rotvec(state.tcp_pose[:3], state.tcp_pose[3:])
+    return np.asarray(base_from_tcp @ inverse(pose_from_rotvec(tcp_offset[:3], tcp_offset[3:])))
+
+
+def matrix4(matrix: Array) -> Matrix4:
+    return tuple(tuple(float(x) for x in row) for row in matrix)
+
+
+def _view(
+    bench: Bench,
+    index: int,
+    attempt: int,
+    picture: Picture,
+    state: RobotState,
+    still: Stillness,
+    camera_bound_s: float,
+) -> View:
+    robot_clock = bench.cell.robot.clock()
+    bound_s = camera_bound_s + (robot_clock.bound_s if robot_clock else 0.0)
+    exposure_ns = state.stamps.host_monotonic_ns
+    return View(
+        index=index,
+        name=bench.require_queue().pose(index).name,
+        picture_sequence=picture.sequence,
+        base_from_flange=matrix4(flange_pose(state, bench.cell.robot.identity.tcp_offset)),
+        joints_rad=state.joints_rad,
+        attempt=attempt,
+        stamps=Stamps(
+            host_monotonic_ns=exposure_ns,
+            host_wall_ns=state.stamps.host_wall_ns,
+            controller_s=state.stamps.controller_s,
+            device_ns=picture.stamps.device_ns + round(picture.exposure_us * 500),
+        ),
+        time_bound_s=bound_s,
+        stillness=still,
+    )
+
+
+def _require_bound(bench: Bench, view: View) -> None:
+    limit_s = bench.cell.config.capture.time_bound_s
+    if view.time_bound_s is not None and view.time_bound_s > limit_s:
+        raise PoseFailedError(
+            f"the picture's time is known to ±{1000 * view.time_bound_s:.1f} ms only, the limit is "
+            f"{1000 * limit_s:.1f} ms (capture.time_bound_s): look at the load of this computer"
+        )
+
+
+async def _write(bench: Bench, index: int, picture: Picture, view: View) -> None:
+    """Disk and detection side by side; the view is written, and the pose counted, only with a board in it."""
+    recording, queue = bench.require_recording(), bench.require_queue()
+    recording.picture(picture)
+    sighting = await _sighting(bench, picture, index)
+    reason = _unusable(sighting) if sighting is not None else ""
+    if reason:
+        await recording.sync()
+        raise PoseFailedError(reason)
+    recording.view(view)
+    await recording.sync()
+    if sighting is not None:
+        queue.note(index, corners=sighting.status.corners, coverage=sighting.status.coverage)
+        bench.store.update(detection=sighting.status)
+        bench.seen[index] = SeenView(
+            index, np.array(view.base_from_flange), sighting.indices, sighting.pixels
+        )
+    queue.mark(index, "done")
+    recording.save_state(queue)
+    bench.show_poses(index)
+    corners = f", {sighting.status.corners} corners" if sighting is not None else ""
+    bench.store.event(f"saved{corners}", pose_index=index)
+
+
+async def _sighting(bench: Bench, picture: Picture, index: int) -> Sighting | None:
+    """None when the worker could not say: the data are kept, the offline stage looks again."""
+    config = bench.cell.config
+    try:
+        return await bench.workers.call(
+            sight, picture.image, config.board, config.camera.model, timeout_s=SIGHT_TIMEOUT_S
+        )
+    except WorkerError as error:
+        bench.store.event(f"the picture was not looked at: {error}", "warning", index)
+        return None
+
+
+def _unusable(sighting: Sighting) -> str:
+    """Why a picture does not count; empty when it does."""
+    status = sighting.status
+    if not status.found:
+        return status.reason or "no board in the picture"
+    if status.saturated > SATURATED_LIMIT:
+        return f"over-exposed: {100 * status.saturated:.0f} % of the board's pixels are white; expose less"
+    return ""

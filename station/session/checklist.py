@@ -1,0 +1,121 @@
+"""What a capture needs, what is there, and the remedy for what is not. Looking only."""
+
+from __future__ import annotations
+
+import asyncio
+import shutil
+
+import msgspec
+
+from calibrate.board import BoardError, check_board, describe_board
+from station.devices.ur_condition import mode_word, not_powered, safety_stop, safety_word
+from station.errors import CameraError, RobotError
+from station.session.bench import Bench
+from station.status import StationState
+
+CLOCK_BOUND_S = 0.005
+
+
+class Check(msgspec.Struct, frozen=True):
+    name: str
+    state: str
+    """ok, warning, failed or skipped"""
+    text: str
+    remedy: str = ""
+
+
+async def checklist(bench: Bench, troubles: dict[str, str]) -> list[Check]:
+    """In the order in which a person would go through them."""
+    return [
+        *_robot_checks(bench, troubles),
+        await _camera_check(bench, troubles),
+        _trigger_check(bench, troubles),
+        _board_check(bench),
+        _disk_check(bench),
+        _clock_check(bench),
+    ]
+
+
+def _robot_checks(bench: Bench, troubles: dict[str, str]) -> list[Check]:
+    robot, host = bench.cell.robot, bench.cell.config.robot.host
+    try:
+        state = robot.latest()
+    except RobotError as error:
+        remedy = "check power, network cable and robot.host in the configuration"
+        return [Check("robot", "failed", troubles.get("robot", str(error)), remedy)]
+    identity = robot.identity
+    checks = [Check("robot", "ok", f"{identity.model} {identity.serial} at {host}, {mode_word(state)}")]
+    trouble = safety_stop(state) or not_powered(state)
+    checks.append(
+        Check("safety", "failed", safety_word(state), str(trouble))
+        if trouble is not None
+        else Check("safety", "ok", safety_word(state))
+    )
+    if robot.remote is False:
+        checks.append(Check("remote control", "failed", "local", "switch the pendant to Remote (top right)"))
+    else:
+        words = "remote" if robot.remote else "this controller has no remote switch"
+        checks.append(Check("remote control", "ok", words))
+    return checks
+
+
+async def _camera_check(bench: Bench, troubles: dict[str, str]) -> Check:
+    if "camera" in troubles:
+        return Check("camera", "failed", troubles["camera"], "check cable, power and camera.device")
+    if bench.store.state not in (StationState.IDLE, StationState.DISCONNECTED, StationState.PAUSED):
+        return Check("camera", "skipped", "in use")
+    camera = bench.cell.camera
+    try:
+        async with asyncio.timeout(6.0):
+            picture = await camera.preview()
+    except (CameraError, TimeoutError) as error:
+        return Check("camera", "failed", str(error) or "no answer", "check cable and power of the camera")
+    if picture is None:
+        return Check("camera", "warning", f"{camera.identity.model}: no preview", "take a test picture")
+    height, width = picture.image.shape[:2]
+    return Check("camera", "ok", f"{camera.identity.model} {camera.identity.serial}, {width}×{height}")
+
+
+def _trigger_check(bench: Bench, troubles: dict[str, str]) -> Check:
+    if bench.cell.trigger is None:
+        return Check("trigger", "skipped", "none configured: the camera is triggered by software")
+    if "trigger" in troubles:
+        return Check("trigger", "failed", troubles["trigger"], "check the box's USB cable and trigger.port")
+    return Check("trigger", "ok", "answers")
+
+
+def _board_check(bench: Bench) -> Check:
+    board = bench.cell.config.board
+    try:
+        check_board(board)
+    except BoardError as error:
+        return Check("board", "failed", str(error), "correct `board` in the configuration")
+    return Check("board", "ok", describe_board(board))
+
+
+def _disk_check(bench: Bench) -> Check:
+    reserve = bench.cell.config.capture.free_space_bytes
+    try:
+        free = shutil.disk_usage(bench.root).free
+        probe = bench.root / ".write-test"
+        probe.write_bytes(b"x")
+        probe.unlink()
+    except OSError as error:
+        return Check("disk", "failed", f"{bench.root}: {error.strerror}", "give --root a writable folder")
+    text = f"{free / 1e9:.0f} GB free at {bench.root}"
+    if free < reserve:
+        return Check("disk", "failed", text, f"free {(reserve - free) / 1e9:.1f} GB")
+    return Check("disk", "ok", text)
+
+
+def _clock_check(bench: Bench) -> Check:
+    fits = {"controller": bench.cell.robot.clock(), "camera": bench.cell.camera.clock}
+    known = {name: fit for name, fit in fits.items() if fit is not None}
+    if not known:
+        return Check("clocks", "warning", "not known yet", "wait a few seconds and check again")
+    text = ", ".join(f"{name} ±{1000 * fit.bound_s:.2f} ms" for name, fit in known.items())
+    if max(fit.bound_s for fit in known.values()) > CLOCK_BOUND_S:
+        return Check(
+            "clocks", "warning", text, "the computer or the network is too busy: poses may be refused"
+        )
+    return Check("clocks", "ok", text)

@@ -1,0 +1,45 @@
+"""Keeps the running estimate fresh: one look in the worker after each pose, never two at once."""
+
+from __future__ import annotations
+
+import asyncio
+
+from station.estimation import running_estimate
+from station.session.bench import Bench
+from station.status import EstimateStatus
+from station.workers import WorkerError
+
+
+class Estimator:
+    def __init__(self, bench: Bench) -> None:
+        self._bench = bench
+        self._known: tuple[int, ...] = ()
+        self._woken = asyncio.Event()
+
+    def poke(self) -> None:
+        """Something changed; cheap."""
+        if tuple(self._bench.seen) != self._known:
+            self._woken.set()
+
+    async def run(self) -> None:
+        bench, config = self._bench, self._bench.cell.config
+        while True:
+            await self._woken.wait()
+            self._woken.clear()
+            self._known = tuple(bench.seen)
+            if not self._known:
+                bench.store.update(estimate=EstimateStatus())
+                continue
+            camera = config.camera.model
+            if camera is None or camera.matrix is None:
+                continue
+            seen = [(v.index, v.base_from_flange, v.indices, v.pixels) for v in bench.seen.values()]
+            known = bench.cell.camera_model is not None
+            try:
+                estimate = await bench.workers.call(
+                    running_estimate, config.mount, camera, known, config.board, seen, timeout_s=20.0
+                )
+            except WorkerError as error:
+                bench.store.event(f"no running estimate: {error}", "warning")
+                continue
+            bench.store.update(estimate=estimate)

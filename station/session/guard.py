@@ -1,0 +1,106 @@
+"""The working loop: heartbeat to the arm, watch over what rests, fresh status. Nothing in it may wait.
+
+The arm's watchdog and systemd's hang on this one loop: when it stalls, the arm stops and the daemon is
+restarted. That is why the heartbeat comes from nowhere else.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import deque
+from collections.abc import Callable
+
+import numpy as np
+
+from calibrate.kinematics import forward
+from recordings.messages import Vector6
+from station.errors import RobotError, StaleStateError
+from station.session.bench import Bench
+from station.session.monitor import Monitor
+from station.states import RUNNING
+from station.status import StationState
+
+TICK_S = 0.02
+STATUS_TICKS = 5
+JOGGED_RAD = 0.01
+LAGS_KEPT = 3000
+
+
+class Guard:
+    def __init__(self, bench: Bench, jogged: Callable[[str], None], ticked: Callable[[], None]) -> None:
+        """`jogged`: the resting arm was moved by somebody, in words. `ticked`: after every round."""
+        self._bench = bench
+        self._monitor = Monitor(bench)
+        self._jogged, self._ticked = jogged, ticked
+        self._rest_joints: Vector6 | None = None
+        self.lags_s: deque[float] = deque(maxlen=LAGS_KEPT)
+        """How late each round came."""
+
+    async def run(self) -> None:
+        """For the daemon's life."""
+        due_s, number = time.monotonic(), 0
+        while True:
+            now_s = time.monotonic()
+            self.lags_s.append(max(0.0, now_s - due_s))
+            self._round(number)
+            number += 1
+            due_s = max(due_s + TICK_S, now_s + TICK_S / 2)
+            await asyncio.sleep(max(0.0, due_s - time.monotonic()))
+
+    def _round(self, number: int) -> None:
+        if self._bench.store.state in RUNNING:
+            self._bench.cell.robot.heartbeat()
+        if number % STATUS_TICKS == 0:
+            self._watch_link()
+            self._watch_rest()
+            self._monitor.refresh(self.lag_ms())
+        self._ticked()
+
+    def lag_ms(self) -> float:
+        """Worst of the last second."""
+        recent = list(self.lags_s)[-50:]
+        return 1000 * max(recent, default=0.0)
+
+    def _watch_link(self) -> None:
+        """idle ⇄ disconnected; a running session notices a lost robot by itself."""
+        store, robot = self._bench.store, self._bench.cell.robot
+        try:
+            robot.latest()
+        except StaleStateError as error:
+            if store.state is StationState.IDLE:
+                store.enter(StationState.DISCONNECTED, str(error))
+                store.event(f"robot lost: {error}", "warning")
+            return
+        except RobotError:
+            return
+        if store.state is StationState.DISCONNECTED:
+            resting = StationState.IDLE if self._bench.recording is None else StationState.PAUSED
+            store.enter(resting)
+            store.event("robot connected")
+
+    def _watch_rest(self) -> None:
+        """Says so when the arm is moved by somebody while the session rests; any go is void then."""
+        bench = self._bench
+        if bench.store.state is not StationState.PAUSED:
+            self._rest_joints = None
+            return
+        try:
+            joints = bench.cell.robot.latest().joints_rad
+        except RobotError:
+            return
+        if self._rest_joints is None:
+            self._rest_joints = joints
+            return
+        if np.abs(np.subtract(joints, self._rest_joints)).max() > JOGGED_RAD:
+            self._jogged(displacement(bench, self._rest_joints, joints))
+            self._rest_joints = joints
+
+
+def displacement(bench: Bench, before: Vector6, after: Vector6) -> str:
+    """'84 mm and 22°' of the flange."""
+    poses = forward(bench.geometry.model, [before, after])
+    distance_m = float(np.linalg.norm(poses[1, :3, 3] - poses[0, :3, 3]))
+    cosine = (np.trace(poses[0, :3, :3].T @ poses[1, :3, :3]) - 1) / 2
+    angle = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+    return f"{1000 * distance_m:.0f} mm and {angle:.0f}°"

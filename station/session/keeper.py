@@ -1,0 +1,71 @@
+"""Opens the devices and opens them again: read-only, in the background, for as long as the daemon lives."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+
+from station.errors import CameraError, RobotError, StationError
+from station.session.bench import Bench
+from station.session.monitor import camera_status
+from station.workers import WorkerError
+
+log = logging.getLogger(__name__)
+
+RETRY_S = 3.0
+
+
+class Keeper:
+    def __init__(self, bench: Bench) -> None:
+        self._bench = bench
+        self.troubles: dict[str, str] = {}
+        """Device → why it is not there."""
+
+    async def run(self) -> None:
+        try:
+            await self._bench.workers.start()
+        except WorkerError as error:
+            log.warning("%s", error)
+        robot_open = camera_open = trigger_open = False
+        while not (robot_open and camera_open and trigger_open):
+            robot_open = robot_open or await self._try("robot", self._open_robot())
+            camera_open = camera_open or await self._try("camera", self._open_camera())
+            trigger_open = trigger_open or await self._try("trigger", self._open_trigger())
+            if not (robot_open and camera_open and trigger_open):
+                await asyncio.sleep(RETRY_S)
+
+    async def _try(self, device: str, opening) -> bool:  # type: ignore[no-untyped-def]
+        try:
+            await opening
+        except StationError as error:
+            if self.troubles.get(device) != str(error):
+                self.troubles[device] = str(error)
+                self._bench.store.event(f"{device}: {error}", "warning")
+            return False
+        self.troubles.pop(device, None)
+        return True
+
+    async def _open_robot(self) -> None:
+        identity = await self._bench.cell.robot.connect()
+        self._bench.store.event(f"robot {identity.model} {identity.serial} found")
+
+    async def _open_camera(self) -> None:
+        identity = await self._bench.cell.camera.open()
+        model = self._bench.cell.config.camera.model
+        width, height = (model.width, model.height) if model else (0, 0)
+        self._bench.store.update(camera=camera_status(self._bench, True, width, height, 0))
+        self._bench.store.event(f"camera {identity.model} {identity.serial} found")
+
+    async def _open_trigger(self) -> None:
+        if (trigger := self._bench.cell.trigger) is not None:
+            await trigger.open()
+
+    async def close(self) -> None:
+        cell = self._bench.cell
+        for closing in (cell.camera.close(), cell.robot.close()):
+            with contextlib.suppress(RobotError, CameraError):
+                await closing
+        if cell.trigger is not None:
+            await cell.trigger.close()
+        await asyncio.to_thread(cell.ended)

@@ -1,0 +1,132 @@
+"""Puts what the devices say into the status, ten times a second."""
+
+from __future__ import annotations
+
+import shutil
+import time
+
+import msgspec
+
+from recordings.messages import RobotState
+from station.clocks import ClockFit
+from station.devices.ur_condition import mode_word, program_word, safety_word
+from station.errors import RobotError
+from station.limits import point_speed_m_s
+from station.session.bench import Bench
+from station.session.capture import flange_pose, matrix4
+from station.status import CameraStatus, ClockStatus, RecorderStatus, RobotStatus
+
+DISK_PERIOD_S = 2.0
+
+
+class Monitor:
+    def __init__(self, bench: Bench) -> None:
+        self._bench = bench
+        self._free_bytes = 0
+        self._free_checked_s = -DISK_PERIOD_S
+        self._controller: tuple[float, float] | None = None
+        self._states_seen = 0
+        bench.cell.robot.subscribe(self._count)
+
+    def _count(self, state: RobotState) -> None:
+        """From the reader's thread: one addition."""
+        self._states_seen += 1
+
+    def refresh(self, lag_ms: float) -> None:
+        store = self._bench.store
+        store.update(
+            robot=self._robot(),
+            recorder=self._recorder(),
+            clock=self._clock(),
+            loop_lag_ms=round(lag_ms, 1),
+        )
+
+    def _robot(self) -> RobotStatus:
+        bench, robot = self._bench, self._bench.cell.robot
+        identity, config = robot.identity, bench.cell.config
+        limit = min(config.limits.speed_m_s, 0.25)
+        base = RobotStatus(
+            model=identity.model,
+            serial=identity.serial,
+            controller_version=identity.controller_version,
+            host=config.robot.host,
+            remote=robot.remote,
+            control=robot.control,
+            speed_limit_m_s=limit,
+            rate_hz=self._rate_hz(),
+        )
+        try:
+            state = robot.latest()
+        except RobotError:
+            return base
+        still = bench.stillness.measure()
+        return msgspec.structs.replace(
+            base,
+            connected=True,
+            age_ms=round((time.monotonic_ns() - state.stamps.host_monotonic_ns) / 1e6, 0),
+            safety=safety_word(state),
+            mode=mode_word(state),
+            program=program_word(state),
+            speed_m_s=round(self._speed_m_s(state), 3),
+            slider=round(state.target_speed_fraction, 3),
+            joints_rad=state.joints_rad,
+            base_from_flange=matrix4(flange_pose(state, identity.tcp_offset)),
+            still=still is not None and not bench.stillness.unrest(still),
+        )
+
+    def _speed_m_s(self, state: RobotState) -> float:
+        return point_speed_m_s(self._bench.geometry, state.joints_rad, state.joint_speeds_rad_s)
+
+    def _rate_hz(self) -> float:
+        """Over the last round trip of at least a second."""
+        now_s = time.monotonic()
+        if self._controller is None or now_s - self._controller[0] >= 1.0:
+            last = self._controller
+            seen, self._states_seen = self._states_seen, 0
+            rate = seen / (now_s - last[0]) if last is not None else 0.0
+            self._controller = (now_s, round(rate))
+        return self._controller[1]
+
+    def _recorder(self) -> RecorderStatus:
+        now_s = time.monotonic()
+        if now_s - self._free_checked_s >= DISK_PERIOD_S:
+            self._free_checked_s = now_s
+            self._free_bytes = shutil.disk_usage(self._bench.root).free // 100_000_000 * 100_000_000
+        recording = self._bench.recording
+        recorder = recording.recorder if recording is not None else None
+        if recording is None or recorder is None:
+            return RecorderStatus(free_bytes=self._free_bytes)
+        return RecorderStatus(
+            recording=True,
+            path=str(recorder.part_path),
+            bytes=recorder.bytes_written,
+            drops=recorder.dropped,
+            sync_ms=round(1000 * recorder.last_sync_s, 1),
+            free_bytes=self._free_bytes,
+            error=str(recorder.error or ""),
+        )
+
+    def _clock(self) -> ClockStatus:
+        robot, camera = self._bench.cell.robot.clock(), self._bench.cell.camera.clock
+        return ClockStatus(*_clock_facts(robot), *_clock_facts(camera))
+
+
+def _clock_facts(fit: ClockFit | None) -> tuple[float | None, float | None, float | None]:
+    if fit is None:
+        return None, None, None
+    return round(1000 * fit.offset_s, 1), round(1000 * fit.bound_s, 2), round(fit.drift_ppm, 1)
+
+
+def camera_status(bench: Bench, connected: bool, width: int, height: int, frames: int) -> CameraStatus:
+    identity, config = bench.cell.camera.identity, bench.cell.config.camera
+    return CameraStatus(
+        connected=connected,
+        model=identity.model,
+        serial=identity.serial,
+        driver=identity.driver,
+        width=width,
+        height=height,
+        frames=frames,
+        exposure_us=config.exposure_us,
+        gain_db=config.gain_db,
+    )

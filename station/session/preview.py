@@ -1,0 +1,93 @@
+"""Pictures for the screen: small, shared by all watchers, looked at outside the loop, never recorded."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import time
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from recordings.messages import Picture
+from station.analysis import Sighting, sight
+from station.errors import CameraError
+from station.session.bench import Bench
+from station.status import StationState
+from station.workers import WorkerError
+
+PERIOD_S = 0.2
+JPEG_LIMIT_BYTES = 40_000
+"""In base64 it must fit into one line of the protocol."""
+_QUALITIES = (75, 50, 30, 15)
+SIDES = (16, 1024)
+
+
+class Previewer:
+    """Asks the camera at most once per `PERIOD_S`, however many screens watch."""
+
+    def __init__(self, bench: Bench) -> None:
+        self._bench = bench
+        self._taking = asyncio.Lock()
+        self._picture: Picture | None = None
+        self._sighting: Sighting | None = None
+        self._taken_s = 0.0
+        self._count = 0
+
+    async def preview(self, width: int, height: int) -> dict[str, Any] | None:
+        """A JPEG that fits into width × height, corners as shares of its sides; None without a picture."""
+        async with self._taking:
+            if time.monotonic() - self._taken_s >= PERIOD_S:
+                await self._take()
+        if self._picture is None:
+            return None
+        low, high = SIDES
+        width, height = min(max(width, low), high), min(max(height, low), high)
+        return await asyncio.to_thread(self._encode, self._picture.image, self._sighting, width, height)
+
+    async def _take(self) -> None:
+        bench = self._bench
+        self._taken_s = time.monotonic()
+        if bench.store.state is StationState.CAPTURING or bench.workers.waiting:
+            return  # the capture has the camera, or the worker is needed for more than the screen
+        try:
+            picture = await bench.cell.camera.preview()
+        except CameraError:
+            picture = None
+        if picture is None:
+            return
+        config = bench.cell.config
+        try:
+            sighting = await bench.workers.call(
+                sight, picture.image, config.board, None, False, timeout_s=5.0
+            )
+        except WorkerError:
+            sighting = None
+        self._picture, self._sighting = picture, sighting
+        self._count += 1
+        if sighting is not None and bench.store.state is not StationState.WRITING:
+            bench.store.update(detection=sighting.status)
+
+    def _encode(
+        self, image: NDArray[Any], sighting: Sighting | None, width: int, height: int
+    ) -> dict[str, Any] | None:
+        scale = min(width / image.shape[1], height / image.shape[0], 1.0)
+        size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
+        if image.dtype != np.uint8:
+            image = (image >> 8).astype(np.uint8)
+        small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
+        for quality in _QUALITIES:
+            ok, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])
+            if ok and len(jpeg) <= JPEG_LIMIT_BYTES:
+                sides = image.shape[1::-1]
+                corners = [] if sighting is None else ((sighting.pixels + 0.5) / sides).round(4).tolist()
+                return {
+                    "jpeg_base64": base64.b64encode(jpeg.tobytes()).decode(),
+                    "width": size[0],
+                    "height": size[1],
+                    "corners": corners,
+                    "sequence": self._count,
+                }
+        return None

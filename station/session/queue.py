@@ -1,0 +1,135 @@
+"""The poses of a session and what became of each. Pose numbers never change; the order may."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import msgspec
+
+from station.errors import RefusedError
+from station.plan.model import Plan, PlannedPose, plan_sha256
+from station.status import PoseState, PoseStatus
+
+OPEN: frozenset[PoseState] = frozenset({"planned"})
+BUSY: frozenset[PoseState] = frozenset({"moving", "settling", "capturing", "writing"})
+POSE_LIMIT = 2000
+
+
+class PoseQueue:
+    """Poses in driving order. `index` is a pose's number in the session, counted from 0, for ever."""
+
+    def __init__(self, plan: Plan, restored: Sequence[PoseStatus] = ()) -> None:
+        """`restored`: after a restart, one for each pose of the plan, in its order."""
+        self._plan = plan
+        known = [_after_restart(status) for status in restored]
+        if len(known) != len(plan.poses):
+            known = [_fresh(index, pose) for index, pose in enumerate(plan.poses)]
+        self._poses = {status.index: pose for status, pose in zip(known, plan.poses, strict=True)}
+        self._status = {status.index: status for status in known}
+        self._next_index = max(self._poses, default=-1) + 1
+
+    @property
+    def plan(self) -> Plan:
+        """With every change that was made since it was loaded."""
+        return msgspec.structs.replace(self._plan, poses=tuple(self._poses.values()))
+
+    @property
+    def sha256(self) -> str:
+        """Of the plan and the order: what a go is bound to."""
+        return plan_sha256(self.plan)
+
+    @property
+    def statuses(self) -> tuple[PoseStatus, ...]:
+        return tuple(self._status[i] for i in self._poses)
+
+    @property
+    def open(self) -> tuple[int, ...]:
+        """Poses still to be driven to, in order."""
+        return tuple(i for i in self._poses if self._status[i].state in OPEN)
+
+    @property
+    def done(self) -> int:
+        return sum(s.state == "done" for s in self._status.values())
+
+    @property
+    def failed(self) -> tuple[int, ...]:
+        return tuple(i for i in self._poses if self._status[i].state == "failed")
+
+    def pose(self, index: int) -> PlannedPose:
+        return self._poses[index]
+
+    def status(self, index: int) -> PoseStatus:
+        """RefusedError for a number that does not exist."""
+        if index not in self._status:
+            raise RefusedError(f"there is no pose {index + 1}; the plan has {len(self._poses)}")
+        return self._status[index]
+
+    def mark(self, index: int, state: PoseState, reason: str = "") -> None:
+        self._status[index] = msgspec.structs.replace(self.status(index), state=state, reason=reason)
+
+    def note(self, index: int, *, corners: int | None = None, coverage: float | None = None) -> None:
+        """What the picture showed."""
+        self._status[index] = msgspec.structs.replace(self.status(index), corners=corners, coverage=coverage)
+
+    def start_attempt(self, index: int) -> int:
+        """The number of this attempt, from 1; later ones supersede earlier ones in the recording."""
+        attempt = self.status(index).attempt + 1
+        self._status[index] = msgspec.structs.replace(self._status[index], attempt=attempt)
+        return attempt
+
+    def retake(self, index: int) -> None:
+        """Plans it once more, where it stands in the order."""
+        if self.status(index).state in BUSY:
+            raise RefusedError(f"pose {index + 1} is being taken right now")
+        self.mark(index, "planned", "to be taken again")
+
+    def skip(self, index: int) -> None:
+        state = self.status(index).state
+        if state in BUSY or state == "done":
+            raise RefusedError(
+                f"pose {index + 1} is {state}: only a pose that waits or failed can be skipped"
+            )
+        self.mark(index, "skipped", "skipped by the operator")
+
+    def reorder(self, order: Sequence[int]) -> None:
+        """`order`: every pose number once."""
+        if sorted(order) != sorted(self._poses):
+            raise RefusedError(f"an order names each of the {len(self._poses)} poses exactly once")
+        self._poses = {i: self._poses[i] for i in order}
+
+    def add(self, pose: PlannedPose) -> int:
+        """At the end; returns its number."""
+        if any(pose.name == other.name for other in self._poses.values()):
+            raise RefusedError(f"there is already a pose named '{pose.name}'")
+        if len(self._poses) >= POSE_LIMIT:
+            raise RefusedError(f"a session has at most {POSE_LIMIT} poses")
+        index, self._next_index = self._next_index, self._next_index + 1
+        self._poses[index] = pose
+        self._status[index] = _fresh(index, pose)
+        return index
+
+    def drop(self, index: int) -> None:
+        """Forgets a pose that was never taken."""
+        status = self.status(index)
+        if status.state in BUSY or status.attempt:
+            raise RefusedError(f"pose {index + 1} was already tried: skip it instead")
+        if len(self._poses) == 1:
+            raise RefusedError("the last pose cannot be dropped: finish the session instead")
+        del self._poses[index], self._status[index]
+
+
+def _fresh(index: int, pose: PlannedPose) -> PoseStatus:
+    sigma_m, view = pose.predicted_sigma_m, pose.view
+    return PoseStatus(
+        index,
+        pose.name,
+        why=pose.why,
+        predicted_sigma_mm=None if sigma_m is None else round(1000 * sigma_m, 4),
+        coverage=None if view is None else round(view.coverage, 4),
+    )
+
+
+def _after_restart(old: PoseStatus) -> PoseStatus:
+    """What was on the disk counts; all else is planned again."""
+    kept = old.state if old.state in ("done", "skipped", "failed") else "planned"
+    return msgspec.structs.replace(old, state=kept)

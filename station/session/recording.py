@@ -1,0 +1,185 @@
+"""The recording of a running session: its folder, its open file, and the state that survives a crash."""
+
+from __future__ import annotations
+
+import asyncio
+import platform
+import time
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from recordings.errors import RecordingError
+from recordings.files import require_free_space
+from recordings.messages import CameraModel, CaptureEvent, Picture, RobotState, SessionInfo, Stamps, View
+from recordings.recorder import Recorder
+from station.cell import Cell
+from station.plan.model import Plan
+from station.session.folder import (
+    SessionState,
+    clear_active,
+    mark_active,
+    new_session_folder,
+    part_path,
+    write_state,
+)
+from station.session.queue import PoseQueue
+from station.status import Event
+
+_PACKAGES = (
+    "calibration-station", "numpy", "scipy", "opencv-python-headless", "mcap", "ur-rtde",
+)  # fmt: skip
+SYNC_TIMEOUT_S = 30.0
+
+
+def software() -> dict[str, str]:
+    """Versions of what takes part in a capture."""
+    found = {"python": platform.python_version()}
+    for package in _PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "absent"
+    return found
+
+
+def stamps_now(controller_s: float = 0.0) -> Stamps:
+    return Stamps(time.monotonic_ns(), time.time_ns(), controller_s)
+
+
+class SessionRecording:
+    """Open from a go to sealing. Pictures are numbered here, without gaps or repeats."""
+
+    def __init__(self, root: Path, cell: Cell, folder: Path | None = None, parts: int = 0) -> None:
+        """`folder`, `parts`: of an interrupted session; the new part follows those. Raises RecordingError."""
+        self._root, self._cell = root, cell
+        self.part = parts + 1
+        self.folder = folder or new_session_folder(root, cell.config.name)
+        self._info: SessionInfo | None = None
+        self.recorder: Recorder | None = None
+        self._sequence = 0
+
+    @property
+    def name(self) -> str:
+        return self.folder.name
+
+    def open(self, plan: Plan, plan_sha256: str, first_picture: Picture | None = None) -> None:
+        """Creates the file with everything needed to re-solve it. Blocking. Raises RecordingError."""
+        config = self._cell.config
+        require_free_space(self.folder, config.capture.free_space_bytes)
+        info = SessionInfo(
+            name=self.name,
+            mount=config.mount,
+            source=self._cell.source,
+            board=config.board,
+            camera=self._session_camera(first_picture),
+            robot=self._cell.robot.identity,
+            camera_identity=self._cell.camera.identity,
+            part=self.part,
+            created_wall_ns=time.time_ns(),
+            plan_sha256=plan_sha256,
+            config_sha256=self._cell.config_sha256,
+            software=software(),
+        )
+        self._info = info
+        path = part_path(self.folder, self.part)
+        self.recorder = Recorder(path, info, lossless_png=config.capture.lossless_png)
+        self.recorder.attach("plan.yaml", "application/yaml", msgspec.yaml.encode(plan))
+        self.recorder.attach("config.yaml", "application/yaml", self._cell.config_yaml)
+        for name, content in self._cell.attachments.items():
+            self.recorder.attach(name, "application/json", content)
+        self.recorder.camera_model(info.camera)
+
+    def _session_camera(self, picture: Picture | None) -> CameraModel:
+        """Known intrinsics, or at least the size of the pictures."""
+        if (known := self._cell.camera_model) is not None:
+            return known
+        if picture is not None:
+            height, width = picture.image.shape[:2]
+            return CameraModel(width=width, height=height)
+        rough = self._cell.config.camera.model
+        return CameraModel(width=rough.width if rough else 0, height=rough.height if rough else 0)
+
+    def robot_state(self, state: RobotState) -> None:
+        """From the reader's thread."""
+        if (recorder := self.recorder) is not None:
+            recorder.robot_state(state)
+
+    def event(self, event: Event) -> None:
+        """What people were told is kept; a failing disk is reported elsewhere."""
+        if self.recorder is not None and self.recorder.error is None:
+            stamps = Stamps(host_monotonic_ns=time.monotonic_ns(), host_wall_ns=event.wall_ns)
+            self.recorder.event(CaptureEvent(stamps, "station", event.pose_index, event.text, event.level))
+
+    def number(self, picture: Picture) -> Picture:
+        """The same picture with its number in this session."""
+        numbered = msgspec.structs.replace(picture, sequence=self._sequence, image=_own(picture.image))
+        self._sequence += 1
+        return numbered
+
+    def picture(self, picture: Picture) -> None:
+        """Hands it to the writer. Raises RecordingError when the disk cannot keep up or has failed."""
+        recorder = self._require()
+        if not recorder.picture(picture):
+            raise recorder.error or RecordingError("the disk cannot keep up: a picture was dropped")
+
+    def view(self, view: View) -> None:
+        self._require().view(view)
+
+    async def sync(self) -> None:
+        """Returns when all of the above is on the disk (fdatasync). Raises RecordingError."""
+        try:
+            async with asyncio.timeout(SYNC_TIMEOUT_S):
+                await asyncio.shield(asyncio.wrap_future(self._require().sync()))
+        except TimeoutError as error:
+            raise RecordingError(
+                f"the disk did not take the data within {SYNC_TIMEOUT_S:.0f} s: look at {self.folder}"
+            ) from error
+
+    def require_space(self) -> None:
+        """Before a pose starts. RecordingError with how much to free."""
+        require_free_space(self.folder, self._cell.config.capture.free_space_bytes)
+
+    def save_state(self, queue: PoseQueue, recording: Path | None = None) -> None:
+        """What a restarted daemon needs; `recording`: set once it is sealed."""
+        state = SessionState(
+            name=self.name,
+            source=self._cell.source,
+            plan=queue.plan,
+            poses=queue.statuses,
+            parts=self.part,
+            sealed=recording is not None,
+            recording=str(recording or ""),
+        )
+        write_state(self.folder, state)
+        if recording is None:
+            mark_active(self._root, self.folder)
+        else:
+            clear_active(self._root)
+
+    async def seal(self, queue: PoseQueue) -> Path:
+        """Finishes the file; returns the recording: the file, or the folder where there are several parts."""
+        # Shielded: a cancelled waiter must not cancel what the writer's thread is doing.
+        path = await asyncio.shield(asyncio.wrap_future(self._require().finish()))
+        self.recorder = None
+        whole = path if self.part == 1 else self.folder
+        self.save_state(queue, whole)
+        return whole
+
+    def abandon(self) -> None:
+        """After a write error: the `.part` file stays as it is, for `recordings recover`."""
+        if self.recorder is not None:
+            self.recorder.close()
+            self.recorder = None
+
+    def _require(self) -> Recorder:
+        if self.recorder is None:
+            raise RecordingError(f"the recording in {self.folder} is not open")
+        return self.recorder
+
+
+def _own(image: np.ndarray) -> np.ndarray:
+    """A camera may reuse its buffer; the writer's thread reads this one later."""
+    return np.array(image, copy=True)

@@ -1,0 +1,200 @@
+"""Carries out one go: pose after pose, until all are done, a person says otherwise, or something fails."""
+
+from __future__ import annotations
+
+import time
+
+import msgspec
+import numpy as np
+
+from recordings.errors import RecordingError
+from recordings.messages import Picture
+from station.errors import LimitError, RobotError, SafetyStopError, StationError
+from station.limits import MoveCheck, check_path, with_plan_speeds
+from station.session.bench import Bench
+from station.session.capture import PoseFailedError, take_pose
+from station.session.lease import Go
+from station.session.recording import SessionRecording
+from station.status import StationState
+from station.stillness import NotStillError
+
+ARRIVED_RAD = 1e-4
+"""Nearer to its target than this the arm need not move."""
+FAILURES_IN_A_ROW = 3
+
+
+class Run:
+    """The owner calls `drive` as a task; cancelling it ends it where it is, after the disk has its data."""
+
+    def __init__(self, bench: Bench, go: Go) -> None:
+        self._bench = bench
+        self._go = go
+        self._geometry = with_plan_speeds(bench.geometry, bench.require_queue().plan)
+        self._failures = 0
+
+    async def drive(self) -> None:
+        """From checking to paused, stopped, fault or idle; raises only when cancelled."""
+        try:
+            if await self._begin():
+                await self._poses()
+        except SafetyStopError as error:
+            self._halt(StationState.STOPPED, str(error))
+        except RobotError as error:
+            self._halt(StationState.FAULT, str(error))
+        except RecordingError as error:
+            self._bench.require_recording().abandon()
+            self._halt(StationState.FAULT, f"recording: {error}. What was saved before is safe.")
+        finally:
+            await self._bench.cell.robot.end_control()
+
+    def _halt(self, state: StationState, reason: str) -> None:
+        """The run's own end for a reason; nothing when STOP or a lost lease already ended it."""
+        bench = self._bench
+        if bench.halting:
+            return
+        bench.store.enter(state, reason)
+        bench.store.event(reason, "error", bench.store.status.session.current)
+        unmark_busy(bench)
+
+    async def _begin(self) -> bool:
+        """Opens control and the recording. False when refused: the state is as before the go."""
+        bench = self._bench
+        resting = StationState.PAUSED if bench.recording is not None else StationState.IDLE
+        try:
+            await bench.cell.robot.start_control()
+            await self._open_recording()
+        except SafetyStopError:
+            raise
+        except (StationError, RecordingError) as error:
+            if not bench.halting:
+                bench.store.enter(resting, str(error))
+                bench.store.event(f"not started: {error}", "error")
+            return False
+        return True
+
+    async def _open_recording(self) -> None:
+        bench = self._bench
+        queue = bench.require_queue()
+        recording = bench.recording
+        if recording is not None and recording.recorder is not None:
+            return
+        first: Picture | None = None
+        if bench.cell.config.camera.model is None:
+            first = await bench.cell.camera.capture()
+        fresh = recording or SessionRecording(bench.root, bench.cell)
+        fresh.open(queue.plan, queue.sha256, first)
+        bench.recording = fresh
+        fresh.save_state(queue)
+        bench.show_poses()
+        bench.store.event(f"recording to {fresh.folder}, part {fresh.part}")
+
+    async def _poses(self) -> None:
+        bench = self._bench
+        queue = bench.require_queue()
+        started_s, taken = time.monotonic(), 0
+        todo = [index for index in self._go.poses if queue.status(index).state == "planned"]
+        while not bench.halting:
+            todo = [index for index in todo if index in queue.open]
+            if self._wants_rest() or not todo or self._failures >= FAILURES_IN_A_ROW:
+                break
+            index = todo.pop(0)
+            bench.require_recording().require_space()
+            await self._pose(index)
+            taken += 1
+            self._show_times(started_s, taken, len(todo))
+        if not bench.halting:
+            await self._rest()
+
+    def _wants_rest(self) -> bool:
+        return bool(self._bench.pause_wanted) or self._bench.finish_wanted
+
+    async def _pose(self, index: int) -> None:
+        bench = self._bench
+        queue = bench.require_queue()
+        attempt = queue.start_attempt(index)
+        try:
+            await self._move_to(index)
+            await take_pose(bench, index, attempt)
+            self._failures = 0
+        except (PoseFailedError, NotStillError, LimitError) as error:
+            self._failures += 1
+            queue.mark(index, "failed", str(error))
+            bench.store.event(str(error), "warning", index)
+            bench.require_recording().save_state(queue)
+            bench.show_poses(index)
+
+    async def _move_to(self, index: int) -> None:
+        """From where the arm really is. LimitError when that way is not free."""
+        bench = self._bench
+        robot, queue = bench.cell.robot, bench.require_queue()
+        robot.check()
+        here, target = robot.latest().joints_rad, queue.pose(index).joints_rad
+        queue.mark(index, "moving")
+        bench.store.enter(StationState.MOVING)
+        bench.show_poses(index)
+        if np.abs(np.subtract(target, here)).max() < ARRIVED_RAD:
+            return
+        check = check_path(self._geometry, here, target, f"pose {index + 1}")
+        if check.problems:
+            raise LimitError("; ".join(map(str, check.problems)))
+        await self._drive_checked(target, check)
+
+    async def _drive_checked(self, target: tuple[float, ...], check: MoveCheck) -> None:
+        await self._bench.cell.robot.move(target, check.joint_speed_rad_s, check.joint_acceleration_rad_s2)
+
+    def _show_times(self, started_s: float, taken: int, left: int) -> None:
+        """Elapsed and remaining, by the average so far."""
+        elapsed_s = time.monotonic() - started_s
+        session = self._bench.store.status.session
+        self._bench.store.update(
+            session=msgspec.structs.replace(
+                session, elapsed_s=round(elapsed_s, 1), remaining_s=round(elapsed_s / taken * left, 1)
+            )
+        )
+
+    async def _rest(self) -> None:
+        """Where the session stands when its go is used up."""
+        bench = self._bench
+        queue = bench.require_queue()
+        if bench.finish_wanted or (not queue.open and not queue.failed):
+            await seal(bench)
+            return
+        if bench.pause_wanted:
+            reason = f"paused by {bench.pause_wanted}: give a new go to go on"
+        elif self._failures >= FAILURES_IN_A_ROW:
+            reason = f"{self._failures} poses in a row failed: look at the reasons, then go on or finish"
+        elif queue.open:
+            reason = f"{len(queue.open)} poses are left: give a new go to go on"
+        else:
+            failed = ", ".join(str(index + 1) for index in queue.failed)
+            reason = f"poses {failed} failed: retake or skip them, or finish"
+        bench.pause_wanted = ""
+        bench.store.enter(StationState.PAUSED, reason)
+        bench.store.event(reason)
+        bench.show_poses()
+
+
+async def seal(bench: Bench) -> None:
+    """sealing → idle. A disk that fails leaves a fault; the `.part` file is kept for recovery."""
+    recording, queue = bench.require_recording(), bench.require_queue()
+    bench.store.enter(StationState.SEALING)
+    bench.show_poses()
+    bench.pause_wanted, bench.finish_wanted = "", False
+    path = await recording.seal(queue)
+    bench.recording = None
+    session = msgspec.structs.replace(bench.store.status.session, recording=str(path), remaining_s=0.0)
+    bench.store.update(session=session)
+    bench.store.event(f"sealed: {path}, {queue.done} of {len(queue.statuses)} poses")
+    if bench.store.state is StationState.SEALING:
+        bench.store.enter(StationState.IDLE)
+
+
+def unmark_busy(bench: Bench) -> None:
+    """After a halt: what was not written is planned again."""
+    queue = bench.queue
+    if queue is None:
+        return
+    for status in queue.statuses:
+        if status.state in ("moving", "settling", "capturing", "writing"):
+            queue.mark(status.index, "planned", "interrupted")
+    bench.show_poses()

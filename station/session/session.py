@@ -1,0 +1,335 @@
+"""The session's state machine: what a person may command, and what becomes of it.
+
+One at a time: every command here runs in the event loop; `stop` and a lost lease cut in at once.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from recordings.errors import RecordingError
+from station.analysis import plan_poses
+from station.cell import Cell
+from station.errors import RefusedError, RobotError
+from station.plan.model import Plan
+from station.plan.scene import cell_geometry
+from station.session.bench import Bench
+from station.session.estimate import Estimator
+from station.session.folder import interrupted_session
+from station.session.free_drive import FreeDrive
+from station.session.guard import Guard
+from station.session.keeper import Keeper
+from station.session.lease import GoDesk, LeaseDesk
+from station.session.preview import Previewer
+from station.session.queue import PoseQueue
+from station.session.recording import SessionRecording
+from station.session.run import Run, seal, unmark_busy
+from station.session.store import StatusStore
+from station.session.summary import poses_to_drive, summarise
+from station.states import RUNNING, refusal
+from station.status import GoSummary, Lease, StationState, StationStatus
+from station.stillness import StillnessMonitor
+from station.workers import Workers
+
+END_RUN_S = 10.0
+PLAN_TIMEOUT_S = 180.0
+
+
+class Session:
+    """Knows devices through `cell`, and nothing of sockets and screens."""
+
+    def __init__(self, cell: Cell, root: Path, ticked: Callable[[], None] = lambda: None) -> None:
+        geometry = cell_geometry(cell.config)
+        self.store = StatusStore(
+            StationStatus(
+                simulated=cell.simulated,
+                playback=cell.source == "playback",
+                cell=cell.config.name,
+                mount=cell.config.mount,
+            )
+        )
+        monitor = StillnessMonitor(geometry.model, cell.config.stillness)
+        self.bench = Bench(cell, geometry, self.store, Workers(), monitor, root)
+        self.leases = LeaseDesk()
+        self._goes = GoDesk(time.monotonic)
+        self.guard = Guard(self.bench, self._jogged, ticked)
+        self._keeper = Keeper(self.bench)
+        self._estimator = Estimator(self.bench)
+        self.previews = Previewer(self.bench)
+        self.free_drive = FreeDrive(self.bench)
+        self._run: asyncio.Task[None] | None = None
+        self._tasks: list[asyncio.Task[None]] = []
+        self._notes: tuple[str, ...] = ()
+        cell.robot.subscribe(monitor.add)
+        cell.robot.subscribe(self._record_state)
+        self.store.on_event(self._record_event)
+        self.store.watch(self._estimator.poke)
+
+    # -- life -------------------------------------------------------------------------------------------
+
+    async def start(self) -> None:
+        """Connects, read-only, and keeps trying. Nothing moves. A session that a crash cut is found again."""
+        self.bench.root.mkdir(parents=True, exist_ok=True)
+        self._find_interrupted()
+        loops = (self.guard.run(), self._keeper.run(), self._estimator.run())
+        self._tasks = [asyncio.create_task(loop) for loop in loops]
+
+    def _find_interrupted(self) -> None:
+        found = interrupted_session(self.bench.root)
+        if found is None:
+            return
+        folder, state = found
+        self.bench.queue = PoseQueue(state.plan, state.poses)
+        self.bench.recording = SessionRecording(self.bench.root, self.bench.cell, folder, state.parts)
+        reason = (
+            f"the daemon ended during session {folder.name}; its {self.bench.queue.done} poses are on "
+            "the disk. Look at the arm, acknowledge, then resume or finish."
+        )
+        self.store.enter(StationState.STOPPED, reason)
+        self.bench.show_poses()
+        self.store.event(reason, "warning")
+
+    async def close(self) -> None:
+        """In this order: the arm stands, the recording is sealed, devices and worker end."""
+        self._goes.void()
+        if self.store.state in RUNNING:
+            await self._halt(StationState.STOPPED, "the station is ending")
+        if self.bench.recording is not None and self.bench.recording.recorder is not None:
+            with contextlib.suppress(RecordingError):
+                path = await self.bench.recording.seal(self.bench.require_queue())
+                self.store.event(f"sealed before the end: {path}")
+        for task in self._tasks:
+            task.cancel()
+        await asyncio.gather(*self._tasks, return_exceptions=True)
+        self.bench.workers.close()
+        await self._keeper.close()
+
+    # -- stopping, by anyone and anything ----------------------------------------------------------------
+
+    async def stop(self, who: str) -> None:
+        """Now, from anyone, in any state; latched until acknowledged."""
+        if self.store.state is StationState.STOPPED:
+            await self.bench.cell.robot.stop(f"STOP by {who}")
+            return
+        await self._halt(StationState.STOPPED, f"STOP by {who}: look at the cell, then acknowledge")
+
+    async def lease_lost(self, client_id: int) -> None:
+        """The connection that commands is gone: decelerate at once; go on only with a new go."""
+        holder = self.leases.lease.holder
+        if not self.leases.release(client_id):
+            return
+        self._void_go()
+        self.store.update(lease=self.leases.lease)
+        if self.store.state in RUNNING and self.store.state is not StationState.SEALING:
+            reason = f"the connection of {holder} was lost: give a new go to go on"
+            await self._halt(StationState.PAUSED, reason)
+
+    async def _halt(self, state: StationState, reason: str) -> None:
+        bench, run = self.bench, self._run
+        keep_running = self.store.state in (StationState.WRITING, StationState.SEALING)
+        self._void_go()
+        bench.halting, bench.pause_wanted, bench.finish_wanted = True, "", False
+        self.store.enter(state, reason)
+        if run is not None and not keep_running:
+            run.cancel()
+        await bench.cell.robot.stop(reason)
+        self.store.event(reason, "warning")
+        if run is not None:
+            await asyncio.wait({run}, timeout=END_RUN_S)
+        unmark_busy(bench)
+
+    def acknowledge(self, who: str) -> None:
+        """A person looked. RefusedError while the cause is still there."""
+        self._require("acknowledge")
+        try:
+            self.bench.cell.robot.latest()
+            resting = StationState.IDLE if self.bench.recording is None else StationState.PAUSED
+        except RobotError:
+            resting = StationState.DISCONNECTED
+        self.store.enter(resting)
+        self.store.event(f"acknowledged by {who}")
+
+    # -- the way to a motion -----------------------------------------------------------------------------
+
+    async def prepare(self, client_id: int, purpose: str, index: int | None = None) -> GoSummary:
+        """Checks the whole way from where the arm is and offers a one-use go for it."""
+        self.leases.require(client_id)
+        self._require("prepare")
+        if purpose == "run" and self.bench.recording is None and self.bench.queue is not None:
+            self.bench.queue = PoseQueue(self.bench.queue.plan)
+            self.bench.show_poses()
+        poses = poses_to_drive(self.bench, purpose, index)
+        summary = await summarise(self.bench, purpose, poses, self._notes)
+        self._require("prepare")
+        self.leases.require(client_id)
+        assert summary.start_joints_rad is not None
+        self._goes.offer(summary, client_id, summary.start_joints_rad, poses)
+        self.store.update(go=summary)
+        return summary
+
+    def go(self, client_id: int, token: str) -> None:
+        """The person's yes to exactly that summary. RefusedError when anything changed since."""
+        self.leases.require(client_id)
+        self._require("go")
+        if self._run is not None and not self._run.done():
+            raise RefusedError("the last run is still ending: try again in a moment")
+        queue = self.bench.require_queue()
+        joints = self.bench.cell.robot.latest().joints_rad
+        try:
+            go = self._goes.redeem(token, client_id, queue.sha256, joints)
+        finally:
+            self.store.update(go=None)
+        self._notes = ()
+        self.bench.halting = False
+        self.bench.pause_wanted, self.bench.finish_wanted = "", False
+        if self.bench.recording is None:
+            self.bench.seen.clear()
+            session = self.store.status.session
+            self.store.update(session=msgspec.structs.replace(session, name="", folder="", recording=""))
+        self.store.enter(StationState.CHECKING)
+        self.store.event(f"go by {self.leases.lease.holder}: {go.summary.purpose}")
+        self._run = asyncio.create_task(Run(self.bench, go).drive())
+
+    def pause(self, who: str) -> None:
+        """After this pose. Anyone may: it only ever makes the arm do less."""
+        self._require("pause")
+        self.bench.pause_wanted = who
+        self.store.event(f"{who} asks to pause after this pose")
+
+    async def finish(self, client_id: int) -> None:
+        """Seals what is there; a pose under way is taken first."""
+        self.leases.require(client_id)
+        self._require("finish")
+        self._void_go()
+        if self.store.state in RUNNING:
+            self.bench.finish_wanted = True
+            self.store.event("finish after this pose")
+            return
+        if self.bench.recording is None:
+            raise RefusedError("nothing is recorded yet: there is nothing to finish")
+        await self._seal()
+
+    async def _seal(self) -> None:
+        recording = self.bench.require_recording()
+        if recording.recorder is None:  # of an interrupted session: its part was sealed or recovered
+            recording.save_state(self.bench.require_queue(), recording.folder)
+            self.bench.recording = None
+            self.store.enter(StationState.IDLE)
+            self.store.event(f"session {recording.name} is closed; `recordings recover` repairs its parts")
+            return
+        try:
+            await seal(self.bench)
+        except RecordingError as error:
+            recording.abandon()
+            self.store.enter(StationState.FAULT, f"recording: {error}")
+
+    # -- the lease ---------------------------------------------------------------------------------------
+
+    def take_lease(self, client_id: int, who: str) -> Lease:
+        lease = self.leases.take(client_id, who, time.time_ns())
+        self.store.update(lease=lease)
+        return lease
+
+    async def release_lease(self, client_id: int) -> None:
+        """Letting go during a run is losing it: the arm decelerates."""
+        await self.lease_lost(client_id)
+
+    # -- the plan ----------------------------------------------------------------------------------------
+
+    def load_plan(self, client_id: int, plan: Plan) -> None:
+        self.leases.require(client_id)
+        self._require("load_plan")
+        if self.bench.recording is not None:
+            raise RefusedError("a session is open: finish it before another plan is loaded")
+        self._replace_plan(plan)
+
+    async def make_plan(self, client_id: int, poses: int, seed: int) -> Plan:
+        """Made in the worker. ConfigError and LimitError say what is missing or in the way."""
+        self.leases.require(client_id)
+        self._require("make_plan")
+        try:
+            start = self.bench.cell.robot.latest().joints_rad
+        except RobotError:
+            start = None
+        self.store.event(f"planning {poses} poses")
+        plan = await self.bench.workers.call(
+            plan_poses, self.bench.cell.config, start, seed, poses, timeout_s=PLAN_TIMEOUT_S
+        )
+        self._require("make_plan")
+        self._replace_plan(plan)
+        return plan
+
+    def _replace_plan(self, plan: Plan) -> None:
+        self._void_go()
+        self.bench.queue = PoseQueue(plan)
+        self.bench.seen.clear()
+        session = self.store.status.session
+        self.store.update(session=msgspec.structs.replace(session, name="", folder="", recording=""))
+        self.bench.show_poses()
+        self.store.event(f"plan of {len(plan.poses)} poses loaded")
+
+    def edit(self, client_id: int, verb: Any, change: Callable[[PoseQueue], object]) -> object:
+        """Retake, skip, reorder, add, drop: voids a waiting go."""
+        self.leases.require(client_id)
+        self._require(verb)
+        if self.bench.queue is None:
+            raise RefusedError("no plan is loaded: load or make one first")
+        result = change(self.bench.queue)
+        self._void_go()
+        if self.bench.recording is not None:
+            self.bench.recording.save_state(self.bench.queue)
+        self.bench.show_poses(self.store.status.session.current)
+        return result
+
+    # -- without control --------------------------------------------------------------------------------
+
+    async def switch_free_drive(self, client_id: int, on: bool, auto: bool) -> None:
+        self.leases.require(client_id)
+        self._require("free_drive")
+        self._void_go()
+        if on:
+            await self.free_drive.begin(auto)
+        else:
+            self.free_drive.end()
+
+    async def record(self, client_id: int) -> int:
+        self.leases.require(client_id)
+        self._require("record")
+        return await self.free_drive.record()
+
+    @property
+    def troubles(self) -> dict[str, str]:
+        """Device → why it is not there."""
+        return self._keeper.troubles
+
+    # -- inside ------------------------------------------------------------------------------------------
+
+    def _require(self, verb: Any) -> None:
+        if reason := refusal(verb, self.store.state):
+            raise RefusedError(reason)
+
+    def _void_go(self) -> None:
+        self._goes.void()
+        self.store.update(go=None)
+
+    def _jogged(self, how_far: str) -> None:
+        text = f"the arm was moved by {how_far} while paused: the way on is checked again, a new go is needed"
+        self._notes = (f"the arm was moved by {how_far} since the pause",)
+        self._void_go()
+        self.store.event(text, "warning")
+
+    def _record_state(self, state: Any) -> None:
+        if (recording := self.bench.recording) is not None:
+            recording.robot_state(state)
+
+    def _record_event(self, event: Any) -> None:
+        if self.bench.recording is not None:
+            with contextlib.suppress(RecordingError):
+                self.bench.recording.event(event)

@@ -1,0 +1,89 @@
+"""What a person is asked before anything moves: checked, from where the arm stands now."""
+
+from __future__ import annotations
+
+import msgspec
+
+from station.analysis import check_run
+from station.errors import LimitError, RefusedError
+from station.limits import PlanCheck
+from station.session.bench import Bench
+from station.session.guard import displacement
+from station.session.lease import GoDesk
+from station.status import GoSummary, StationState
+
+POSE_OVERHEAD_S = 0.8
+"""Settle, expose, look, write: what a stop takes beside the move."""
+_PROBLEMS_SHOWN = 12
+_SLOW_SLIDER = 0.99
+
+
+def poses_to_drive(bench: Bench, purpose: str, index: int | None) -> tuple[int, ...]:
+    """The poses a go for this purpose covers. RefusedError when there are none."""
+    queue = bench.queue
+    if queue is None:
+        raise RefusedError("no plan is loaded: load or make one first")
+    if purpose == "retake":
+        if index is None:
+            raise RefusedError("say which pose to retake")
+        if queue.status(index).state != "planned":
+            queue.retake(index)
+        return (index,)
+    if purpose not in ("run", "resume"):
+        raise RefusedError(f"unknown purpose '{purpose}'; known are run, resume, retake")
+    if not queue.open:
+        raise RefusedError("no pose is left to take: retake some, or finish")
+    return queue.open
+
+
+async def summarise(bench: Bench, purpose: str, poses: tuple[int, ...], notes: tuple[str, ...]) -> GoSummary:
+    """Checks the whole way in the worker. LimitError lists what is wrong with it, RobotError with the arm."""
+    robot, queue = bench.cell.robot, bench.queue
+    assert queue is not None
+    robot.check()
+    start = robot.latest().joints_rad
+    plan = queue.plan
+    part = msgspec.structs.replace(plan, poses=tuple(queue.pose(index) for index in poses))
+    check: PlanCheck = await bench.workers.call(check_run, bench.cell.config, part, start)
+    if check.problems:
+        raise LimitError(_problem_text(check))
+    return GoSummary(
+        token=GoDesk.new_token(),
+        purpose=_purpose_words(bench, purpose, poses),
+        plan_sha256=queue.sha256,
+        poses=len(poses),
+        path_m=round(check.path_m, 3),
+        largest_step_rad=round(check.largest_step_rad, 4),
+        top_speed_m_s=round(check.top_speed_m_s, 3),
+        duration_s=round(check.duration_s + POSE_OVERHEAD_S * len(poses), 1),
+        first_move=f"{displacement(bench, start, part.poses[0].joints_rad)} to pose {poses[0] + 1}",
+        warnings=(*notes, *_warnings(bench)),
+        start_joints_rad=start,
+    )
+
+
+def _problem_text(check: PlanCheck) -> str:
+    shown = [str(problem) for problem in check.problems[:_PROBLEMS_SHOWN]]
+    more = len(check.problems) - len(shown)
+    tail = [f"… and {more} more"] if more > 0 else []
+    return "the plan is refused, nothing moved:\n" + "\n".join([*shown, *tail])
+
+
+def _purpose_words(bench: Bench, purpose: str, poses: tuple[int, ...]) -> str:
+    if purpose == "retake":
+        return f"retake pose {poses[0] + 1}"
+    if bench.recording is None:
+        return "run plan"
+    return f"go on with session {bench.recording.name}"
+
+
+def _warnings(bench: Bench) -> list[str]:
+    warnings = []
+    slider = bench.cell.robot.latest().target_speed_fraction
+    if slider < _SLOW_SLIDER:
+        warnings.append(f"the speed slider stands at {100 * slider:.0f} %")
+    if bench.recording is None and bench.store.state is StationState.PAUSED:
+        warnings.append("this begins a new recording")
+    if bench.cell.simulated:
+        warnings.append("SIMULATED cell: nothing real moves")
+    return warnings

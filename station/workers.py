@@ -1,0 +1,64 @@
+"""One worker process for everything that would hold up the daemon's loop. It is disposable."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from typing import Any, TypeVar
+
+from station.analysis import start_worker, warm_up
+from station.errors import StationError
+
+log = logging.getLogger(__name__)
+
+R = TypeVar("R")
+
+
+class WorkerError(StationError):
+    """The worker died or took too long; it is replaced, and what it was asked is not answered."""
+
+
+class Workers:
+    """Calls run one after the other, in the order they were made."""
+
+    def __init__(self) -> None:
+        self._pool: ProcessPoolExecutor | None = None
+        self.waiting = 0
+        """Calls under way: a preview is not worth queueing for."""
+
+    async def start(self) -> None:
+        """Returns when the worker has loaded what it needs (about a second)."""
+        await self.call(warm_up, timeout_s=60.0)
+
+    async def call(self, function: Callable[..., R], *args: Any, timeout_s: float = 60.0) -> R:
+        """The function's result or exception. WorkerError when the process fails or is too slow."""
+        if self._pool is None:
+            self._pool = ProcessPoolExecutor(1, get_context("spawn"), initializer=start_worker)
+        pool = self._pool
+        self.waiting += 1
+        try:
+            async with asyncio.timeout(timeout_s):
+                return await asyncio.wrap_future(pool.submit(function, *args))
+        except (BrokenProcessPool, TimeoutError) as error:
+            self._discard(pool)
+            what = "took too long" if isinstance(error, TimeoutError) else "died"
+            raise WorkerError(f"the worker process {what} in {function.__name__}; it is replaced") from error
+        finally:
+            self.waiting -= 1
+
+    def close(self) -> None:
+        if self._pool is not None:
+            self._discard(self._pool)
+
+    def _discard(self, pool: ProcessPoolExecutor) -> None:
+        if self._pool is pool:
+            self._pool = None
+        processes = list((pool._processes or {}).values())
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in processes:
+            process.kill()
+            process.join(1.0)

@@ -12,18 +12,19 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from calibrate import cli_install
+from calibrate import cli_check, cli_install
 from calibrate.calibration import write_calibration
 from calibrate.cli_files import read_board, read_camera
 from calibrate.cli_output import AsJson, check_target, detection_progress, out, print_json
 from calibrate.errors import CalibrationError
 from calibrate.gates import GateLimits, read_limits
-from calibrate.pipeline import JobOptions, SolvedRecording, solve_recording
+from calibrate.pipeline import JobOptions, SolvedRecording, prepare_views, solve_recording, solver_options
 from calibrate.summary import summary
 from recordings.errors import RecordingError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, help="From a recording to a calibration.")
 cli_install.register(app)
+cli_check.register(app)
 Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session folder", show_default=False)]
 GATE_FAILED = 4
 
@@ -112,9 +113,7 @@ def solve(
         job = solve_recording(recording, options, progress)
     write_calibration(job.calibration, target)
     if report is not None:
-        from calibrate.report import write_report  # matplotlib is slow to load
-
-        write_report(job, report)
+        _write_report(job, report, options)
     if as_json:
         print_json(solve_json(job))
     else:
@@ -151,6 +150,46 @@ def solve_json(job: SolvedRecording) -> dict[str, Any]:
     }
 
 
+@app.command("report")
+def report_file(
+    recording: Rec,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Default: NAME.report.html in this folder")
+    ] = None,
+    profile: Profile = ProfileName.robust,
+    seed: Seed = 0,
+    board: BoardFile = None,
+    square_mm: SquareMm = None,
+    camera: CameraFile = None,
+    find_intrinsics: Find = False,
+    lens: LensKind = LensName.plumb_bob,
+    gates: GatesFile = None,
+    threads: Threads = None,
+    working_distance_mm: Distance = None,
+    root: cli_install.Root = None,
+) -> None:
+    """Solve a recording again and write its report: one HTML file. With the history of what is installed."""
+    options = job_options(
+        profile, seed, board, square_mm, camera, find_intrinsics, lens, gates, threads, working_distance_mm
+    )
+    target = output or Path(f"{recording.name.removesuffix('.mcap')}.report.html")
+    with detection_progress() as progress:
+        job = solve_recording(recording, options, progress)
+    _write_report(job, target, options, root)
+    out.print(f"written: {target}")
+
+
+def _write_report(job: SolvedRecording, target: Path, options: JobOptions, root: Path | None = None) -> None:
+    from calibrate.peers import compare_all  # like matplotlib, slow to load
+    from calibrate.report import write_report
+
+    try:
+        peers = compare_all(job.views, solver_options(options, job))
+    except CalibrationError:  # the report stands without the comparison
+        peers = []
+    write_report(job, target, peers, cli_install.history_rows(root))
+
+
 @app.command()
 def compare(
     recording: Rec,
@@ -164,19 +203,19 @@ def compare(
     threads: Threads = None,
 ) -> None:
     """Every method side by side on the same views."""
-    from calibrate.peers import compare as compare_methods
+    from calibrate.peers import compare_all
 
     options = job_options(
         ProfileName.robust, seed, board, square_mm, camera, find_intrinsics, lens, None, threads, None
     )
     with detection_progress() as progress:
-        job = solve_recording(recording, options, progress)
-    results = compare_methods(job.views, job.solution)
+        prepared = prepare_views(recording, options, progress)
+    results = compare_all(prepared.views, solver_options(options, prepared))
     if as_json:
         print_json(
             {
-                "mount": job.solution.mount,
-                "views": {"used": list(job.solution.used)},
+                "mount": prepared.views.mount,
+                "views": [view.index for view in prepared.views],
                 "methods": [peer_plain(peer) for peer in results],
             }
         )

@@ -190,6 +190,14 @@ def list_installed(root: Root = None, as_json: AsJson = False) -> None:
     out.print(table)
 
 
+def history_rows(root: Path | None) -> list[tuple[str, str, str, str]]:
+    """For the report: generation, when and by whom, what was done, change."""
+    return [
+        (str(entry.generation), f"{entry.wall}, {entry.who}", entry.action, entry.change)
+        for entry in read_log(root)
+    ]
+
+
 def _plain(generation: Generation) -> dict[str, Any]:
     calibration = generation.calibration
     return {

@@ -167,7 +167,7 @@ def _refuse_foreign_source(
         }[cell]
         raise InstallError(
             f"{path} is {calibration.source} and is not installed on a {cell} cell. {hint} "
-            f"Files from elsewhere go to a place of their own: calibrate install --cell {kind} --root FOLDER {path}"
+            f"Files from elsewhere have their own place: calibrate install --cell {kind} --root FOLDER {path}"
         )
     if before is not None and _CELL_OF[before.source] != kind:
         raise InstallError(

@@ -44,12 +44,13 @@ def load_views(
     camera: CameraModel | None = None,
     progress: Progress | None = None,
     threads: int | None = None,
+    fewest: int = FEWEST_VIEWS,
 ) -> LoadedViews:
     """Finds the board in every picture of the recording.
 
     `board` and `camera` replace the recorded ones (another size, known intrinsics). OpenCV works single-
     threaded inside each of `threads` workers, so that the result does not depend on their number. Raises
-    BadViewsError for pictures or poses that cannot be, TooFewViewsError when fewer than 4 show the board.
+    BadViewsError for pictures or poses that cannot be, TooFewViewsError when fewer than `fewest` show it.
     """
     info = recording.info
     spec = board or info.board
@@ -63,8 +64,8 @@ def load_views(
             views.append(_image_view(view, detection, spec))
         else:
             missing.append(RejectedView(view.index, view.name, detection.reason, "corners"))
-    if len(views) < FEWEST_VIEWS:
-        raise TooFewViewsError(_too_few_text(recording, len(views), len(seen), missing))
+    if len(views) < fewest:
+        raise TooFewViewsError(_too_few_text(recording, len(views), len(seen), missing, fewest))
     model = CameraModel(
         model.width or next(iter(seen.values())).width,
         model.height or next(iter(seen.values())).height,
@@ -154,13 +155,15 @@ def _image_view(view: View, detection: Detection, spec: BoardSpec) -> ImageView:
     )
 
 
-def _too_few_text(recording: Recording, found: int, total: int, missing: list[RejectedView]) -> str:
+def _too_few_text(
+    recording: Recording, found: int, total: int, missing: list[RejectedView], fewest: int
+) -> str:
     text = (
-        f"{recording.path}: the board is seen in {found} of {total} pictures; at least {FEWEST_VIEWS} views "
+        f"{recording.path}: the board is seen in {found} of {total} pictures; at least {fewest} views "
         "are needed."
     )
     if missing:
         text += f" First reason, view {missing[0].index} ({missing[0].name}): {missing[0].reason}."
-    if total >= FEWEST_VIEWS:
+    if total >= fewest:
         text += " Check the board's kind, columns and rows; solve again with --board to try another."
     return text

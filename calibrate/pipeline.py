@@ -12,13 +12,13 @@ import cv2
 import msgspec
 import numpy as np
 
-from calibrate.board import ambiguity_text, check_board
+from calibrate.board import check_board
 from calibrate.calibration import Calibration
 from calibrate.document import make_calibration
 from calibrate.errors import BadViewsError
 from calibrate.gates import Evidence, Gate, GateLimits, judge
 from calibrate.intrinsics import Intrinsics, LensModel, calibrate_intrinsics
-from calibrate.load import LoadedViews, Progress, load_views
+from calibrate.load import FEWEST_VIEWS, LoadedViews, Progress, load_views
 from calibrate.pnp import solve_pnp, view_rms_px
 from calibrate.scale import ScaleCheck, check_scale
 from calibrate.solution import Profile, Solution, SolveOptions
@@ -51,29 +51,40 @@ class JobOptions:
 
 
 @dataclass(frozen=True, eq=False)
-class SolvedRecording:
+class PreparedViews:
+    """A recording's views with lens and board poses: what every solver starts from."""
+
     recording: Recording
     loaded: LoadedViews
     views: ViewSet
-    """With intrinsics and board poses, as the solver got them."""
     intrinsics: Intrinsics | None
     """None when they were given."""
+    stage_ms: dict[str, float]
+
+
+@dataclass(frozen=True, eq=False)
+class SolvedRecording(PreparedViews):
     solution: Solution
     scale: ScaleCheck | None
     coverage: float
     gates: tuple[Gate, ...]
     calibration: Calibration
-    stage_ms: dict[str, float]
 
     @property
     def passed(self) -> bool:
         return all(gate.passed for gate in self.gates)
 
 
-def solve_recording(
-    path: Path, options: JobOptions | None = None, progress: Progress | None = None
-) -> SolvedRecording:
-    """Raises RecordingError (unsealed, damaged) or CalibrationError; each says what to do next."""
+def prepare_views(
+    path: Path,
+    options: JobOptions | None = None,
+    progress: Progress | None = None,
+    fewest: int = FEWEST_VIEWS,
+) -> PreparedViews:
+    """Opens, finds the boards, the lens where it is not known, and the board poses.
+
+    Raises RecordingError (unsealed, damaged) or CalibrationError; each says what to do next.
+    """
     options = options or JobOptions()
     clock = _Stages()
     with clock.stage("open"):
@@ -84,7 +95,7 @@ def solve_recording(
             recorded = recording.info.camera
             camera = CameraModel(recorded.width, recorded.height)
         board = _board(options, recording.info.board)
-        loaded = load_views(recording, board, camera, progress, options.threads)
+        loaded = load_views(recording, board, camera, progress, options.threads, fewest)
     views, intrinsics = loaded.views, None
     with clock.stage("intrinsics"):
         if views.camera.matrix is None:
@@ -93,16 +104,28 @@ def solve_recording(
     with clock.stage("board poses"):
         views = solve_pnp(views, loaded.board)
         _check_lens_fits(views)
+    return PreparedViews(recording, loaded, views, intrinsics, clock.ms)
+
+
+def solver_options(options: JobOptions, prepared: PreparedViews) -> SolveOptions:
+    return SolveOptions(
+        profile=options.profile,
+        seed=options.seed,
+        intrinsics_from_same_pictures=prepared.intrinsics is not None,
+        working_distance_m=options.working_distance_m,
+    )
+
+
+def solve_recording(
+    path: Path, options: JobOptions | None = None, progress: Progress | None = None
+) -> SolvedRecording:
+    """The whole job. Raises RecordingError or CalibrationError; each says what to do next."""
+    options = options or JobOptions()
+    prepared = prepare_views(path, options, progress)
+    recording, loaded, views = prepared.recording, prepared.loaded, prepared.views
+    clock = _Stages()
     with clock.stage("solve"):
-        solution = solve_views(
-            views,
-            SolveOptions(
-                profile=options.profile,
-                seed=options.seed,
-                intrinsics_from_same_pictures=intrinsics is not None,
-                working_distance_m=options.working_distance_m,
-            ),
-        )
+        solution = solve_views(views, solver_options(options, prepared))
     with clock.stage("judge"):
         used = views.select([k for k, view in enumerate(views) if view.index in set(solution.used)])
         scale = None
@@ -112,12 +135,25 @@ def solve_recording(
             )
         coverage = picture_coverage(used)
         evidence = Evidence(
-            scale, coverage if intrinsics is not None else None, _clock_bound_s(recording, solution)
+            scale,
+            coverage if prepared.intrinsics is not None else None,
+            _clock_bound_s(recording, solution),
         )
         gates = judge(solution, evidence, options.limits)
-        calibration = make_calibration(recording, loaded, views, intrinsics, solution, scale, gates, options)
+        calibration = make_calibration(
+            recording, loaded, views, prepared.intrinsics, solution, scale, gates, options
+        )
     return SolvedRecording(
-        recording, loaded, views, intrinsics, solution, scale, coverage, gates, calibration, clock.ms
+        recording,
+        loaded,
+        views,
+        prepared.intrinsics,
+        prepared.stage_ms | clock.ms,
+        solution,
+        scale,
+        coverage,
+        gates,
+        calibration,
     )
 
 
@@ -155,15 +191,6 @@ def _clock_bound_s(recording: Recording, solution: Solution) -> float | None:
     used = set(solution.used)
     bounds = [v.time_bound_s for v in recording.views() if v.index in used and v.time_bound_s is not None]
     return max(bounds) if bounds else None
-
-
-def notes(job: SolvedRecording) -> list[str]:
-    """Sentences that a person should read beside the result."""
-    found = [ambiguity_text(job.loaded.board)] if ambiguity_text(job.loaded.board) else []
-    if job.intrinsics is not None:
-        found += list(job.intrinsics.held)
-        found += [f"view {i}: left out of the lens: {why}" for i, why in job.intrinsics.dropped.items()]
-    return found + list(job.solution.warnings)
 
 
 class _Stages:

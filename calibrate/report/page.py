@@ -260,7 +260,7 @@ def _views(job: SolvedRecording) -> Iterator[str]:
 def _history(history: Sequence[Sequence[str]]) -> Iterator[str]:
     if history:
         yield html.heading("Installed before")
-        yield html.table(("generation", "installed", "result", "change"), history)
+        yield html.table(("generation", "when", "what", "change"), history)
 
 
 def _provenance(job: SolvedRecording) -> Iterator[str]:

@@ -1,0 +1,100 @@
+"""`calibrate check`: does the installed calibration still hold on this recording."""
+
+from __future__ import annotations
+
+import time
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calibrate.calibration import Calibration, read_calibration
+from calibrate.checks import CheckEntry, append_check, read_checks, trend_text
+from calibrate.cli_install import Root
+from calibrate.cli_output import AsJson, OutputError, detection_progress, out, print_json
+from calibrate.drift import FEWEST_VIEWS, DriftCheck, check_drift
+from calibrate.generations import generations
+from calibrate.install import load_installed
+from calibrate.pipeline import JobOptions, prepare_views
+
+DRIFTED = 4
+
+
+def register(app: typer.Typer) -> None:
+    app.command("check")(check)
+
+
+def check(
+    recording: Annotated[Path, typer.Argument(help="3 to 5 views of a board, or a whole session")],
+    calibration_file: Annotated[
+        Path | None, typer.Option("--calibration", help="Instead of the installed one; nothing is noted")
+    ] = None,
+    root: Root = None,
+    as_json: AsJson = False,
+    threads: Annotated[int | None, typer.Option(help="For finding boards")] = None,
+) -> None:
+    """Test the installed calibration on new views. Exit 4: it does not hold any more."""
+    if calibration_file is None:
+        calibration = load_installed(root, allow_simulated=True)
+    else:
+        calibration = read_calibration(calibration_file)
+    options = JobOptions(camera=calibration.intrinsics.model, threads=threads)
+    with detection_progress() as progress:
+        prepared = prepare_views(recording, options, progress, fewest=FEWEST_VIEWS)
+    info = prepared.recording.info
+    if info.mount != calibration.mount:
+        raise OutputError(f"{recording} is {info.mount}, the calibration {calibration.mount}.")
+    if (info.source == "simulated") != (calibration.source == "simulated"):
+        raise OutputError(f"{recording} is {info.source}, the calibration {calibration.source}.")
+    result = check_drift(prepared.views, calibration)
+    trend = ""
+    if calibration_file is None:
+        number = next((g.number for g in generations(root) if g.current), 0)
+        wall_s = info.created_wall_ns / 1e9 or time.time()
+        append_check(CheckEntry.of(result, wall_s, number, recording.name), root)
+        trend = trend_text(read_checks(root), number)
+    if as_json:
+        print_json(_plain(result, trend))
+    else:
+        out.print(check_text(result, calibration), style="green" if result.passed else "bold red")
+        if trend:
+            out.print(trend, style="yellow")
+    if not result.passed:
+        raise typer.Exit(DRIFTED)
+
+
+def check_text(result: DriftCheck, calibration: Calibration) -> str:
+    """What a person should know: holds or not, by how much, and what this test could have seen."""
+    frame = f"{calibration.result.parent_frame}_from_{calibration.result.child_frame}"
+    if result.passed:
+        text = f"HOLDS: {frame} fits {result.views} new views (p = {result.p_value:.2f})."
+    else:
+        text = (
+            f"DOES NOT HOLD: the camera seems to have moved by {result.shift_mm:.2f} mm and "
+            f"{result.shift_deg:.3f}° (p = {result.p_value:.1e}). Check its mount, and calibrate again."
+        )
+    text += (
+        f" This check notices a shift of 0.5 mm in {result.power_translation:.0%} and a turn of 0.1° in "
+        f"{result.power_rotation:.0%} of cases, whatever the direction; false alarms: 5 %."
+    )
+    if result.disagreement > 3:
+        text += (
+            f" The views disagree {result.disagreement:.1f} times more than when the cell was calibrated: "
+            "board or robot are not what they were, or a view is bad."
+        )
+    return text
+
+
+def _plain(result: DriftCheck, trend: str) -> dict[str, object]:
+    return {
+        "passed": result.passed,
+        "shift": result.shift.tolist(),
+        "covariance": result.covariance.tolist(),
+        "statistic": result.statistic,
+        "threshold": result.threshold,
+        "p_value": result.p_value,
+        "power": {"translation_0_5_mm": result.power_translation, "rotation_0_1_deg": result.power_rotation},
+        "disagreement": result.disagreement,
+        "views": result.views,
+        "trend": trend,
+    }

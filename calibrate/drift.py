@@ -1,0 +1,171 @@
+"""Does the installed calibration still hold? A few new views, one statistical test, its power stated.
+
+The shift δX of the camera is fitted to the new views together with the board's place (the board may have been
+moved since). If nothing changed, δX is normal with covariance S = S_fit + S_installed, so δᵀ S⁻¹ δ follows
+6·F(6, ν), ν the degrees of freedom that the noise scales were estimated with. δ as in `geometry.perturb`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from calibrate.calibration import Calibration
+from calibrate.errors import BadViewsError, TooFewViewsError
+from calibrate.geometry import Array, difference, inverse, perturb
+from calibrate.lens import project
+from calibrate.views import ViewSet
+from recordings.messages import CameraModel
+
+FEWEST_VIEWS = 3
+FALSE_ALARM = 0.05
+_STEP = 1e-6
+_ITERATIONS = 4
+
+
+@dataclass(frozen=True, eq=False)
+class DriftCheck:
+    passed: bool
+    shift: Array
+    """(6,) [δt (m), δφ (rad)]: where the camera seems to be against where it was installed."""
+    covariance: Array
+    """(6, 6) of `shift` if nothing changed."""
+    statistic: float
+    threshold: float
+    p_value: float
+    power_translation: float
+    """Probability to notice a shift of 0.5 mm in the direction that is hardest to see."""
+    power_rotation: float
+    """… a turn of 0.1°."""
+    disagreement: float
+    """Misfit after the best shift, per degree of freedom: about 1 when the noise is as it was."""
+    views: int
+
+    @property
+    def shift_mm(self) -> float:
+        return float(np.linalg.norm(self.shift[:3]) * 1e3)
+
+    @property
+    def shift_deg(self) -> float:
+        return float(np.degrees(np.linalg.norm(self.shift[3:])))
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Standard deviations per axis."""
+
+    corner_px: float
+    robot_m: float
+    robot_rad: float
+    degrees_of_freedom: float
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> Noise:
+        noise = calibration.quality.noise
+        if not noise:
+            raise BadViewsError(
+                "The calibration does not say how noisy its robot and corners were (paper profile); "
+                "solve its recording again with --profile robust and install that."
+            )
+        return cls(
+            max(noise["corner_px"], 0.02),
+            noise["robot_mm"] / 1e3,
+            float(np.radians(noise["robot_deg"])),
+            max(3.0 * len(calibration.views.used) - 6.0, 3.0),
+        )
+
+
+def check_drift(views: ViewSet, calibration: Calibration) -> DriftCheck:
+    """Tests the calibration on views (3 or more) with board poses from its own lens.
+
+    Raises TooFewViewsError, or BadViewsError where the views do not determine a shift.
+    """
+    return judge_shift(
+        views, calibration.transform.matrix, np.array(calibration.covariance), Noise.of(calibration)
+    )
+
+
+def judge_shift(views: ViewSet, installed: Array, covariance: Array, noise: Noise) -> DriftCheck:
+    """The test itself. installed: (4, 4) X; covariance: (6, 6) of it."""
+    if len(views) < FEWEST_VIEWS:
+        raise TooFewViewsError(f"{len(views)} views are too few for a check: {FEWEST_VIEWS} to 5 are needed.")
+    flanges = views.base_from_flange if views.mount == "eye-in-hand" else inverse(views.base_from_flange)
+    seen = views.camera_from_board
+    pnp = np.array(
+        [pnp_covariance(v.board_points, views.camera, c) for v, c in zip(views, seen, strict=True)]
+    )
+    pnp *= noise.corner_px**2
+    robot = np.diag([noise.robot_m**2] * 3 + [noise.robot_rad**2] * 3)
+    X, P = installed.copy(), flanges[0] @ installed @ seen[0]
+    for _ in range(_ITERATIONS):
+        information, gradient, misfit = _normal_equations(flanges, seen, X, P, robot, pnp)
+        try:
+            step = -np.linalg.solve(information, gradient)
+            fitted = np.linalg.inv(information)[:6, :6]
+        except np.linalg.LinAlgError:
+            step = np.full(12, np.nan)
+        if not np.isfinite(step).all():
+            raise BadViewsError("These views turn about one axis only and do not tell a shift; tilt further.")
+        X, P = perturb(X, step[:6]), perturb(P, step[6:])
+    _, _, misfit = _normal_equations(flanges, seen, X, P, robot, pnp)
+    shift = difference(X, installed)
+    total = fitted + covariance
+    weight: Any = np.linalg.inv(total)
+    statistic = float(shift @ weight @ shift)
+    nu = noise.degrees_of_freedom
+    threshold = float(6 * stats.f.ppf(1 - FALSE_ALARM, 6, nu))
+    return DriftCheck(
+        passed=statistic <= threshold,
+        shift=shift,
+        covariance=total,
+        statistic=statistic,
+        threshold=threshold,
+        p_value=float(stats.f.sf(statistic / 6, 6, nu)),
+        power_translation=_power(weight[:3, :3], 0.5e-3, threshold, nu),
+        power_rotation=_power(weight[3:, 3:], float(np.radians(0.1)), threshold, nu),
+        disagreement=float(misfit / max(6 * len(views) - 12, 1)),
+        views=len(views),
+    )
+
+
+def _power(weight: Array, size: float, threshold: float, nu: float) -> float:
+    noncentrality = size**2 * float(np.linalg.eigvalsh(weight)[0])
+    return float(stats.ncf.sf(threshold / 6, 6, nu, noncentrality))
+
+
+def _normal_equations(
+    flanges: Array, seen: Array, X: Array, P: Array, robot: Array, pnp: Array
+) -> tuple[Array, Array, float]:
+    """(12, 12) information of [δX, δP], (12,) gradient, and the misfit r'Wr.
+
+    flanges: base_from_flange, or its inverse for eye-to-hand (there P is flange_from_board).
+    """
+    steps = _STEP * np.eye(6)[:, None]
+
+    def miss(F: Array, X: Array, P: Array) -> Array:
+        return difference(seen, inverse(F @ X) @ P)
+
+    def slope(moved: Array, r: Array) -> Array:
+        """(6, n, 6) misses after each step → (n, 6, 6) Jacobians."""
+        return np.moveaxis((moved - r) / _STEP, 0, 2)
+
+    r = miss(flanges, X, P)
+    J_X = slope(miss(flanges, perturb(X, steps), P), r)
+    J_P = slope(miss(flanges, X, perturb(P, steps)), r)
+    J_F = slope(miss(perturb(flanges, steps), X, P), r)
+    W = np.linalg.inv(J_F @ robot @ np.swapaxes(J_F, 1, 2) + pnp)
+    J = np.concatenate([J_X, J_P], axis=2)
+    information = np.einsum("nia,nij,njb->ab", J, W, J)
+    gradient = np.einsum("nia,nij,nj->a", J, W, r)
+    return information, gradient, float(np.einsum("ni,nij,nj->", r, W, r))
+
+
+def pnp_covariance(points: Array, camera: CameraModel, camera_from_board: Array) -> Array:
+    """(6, 6) of the board's pose in `camera`, for corner noise of 1 px per axis."""
+    base = project(camera, camera_from_board, points)
+    moved = perturb(camera_from_board, _STEP * np.eye(6))
+    J = np.stack([(project(camera, m, points) - base).ravel() / _STEP for m in moved], axis=1)
+    return np.asarray(np.linalg.inv(J.T @ J))

@@ -9,8 +9,10 @@ from typing import Any
 
 import pytest
 
+from station.errors import StationError
 from station.simulation.admin import AdminClient
 from station.simulation.launch import SimulatedController, start_controller
+from station.simulation.netns import isolated_thread
 
 DATASETS = Path(os.environ.get("STATION_DATASETS", Path(__file__).parents[2] / "shared" / "datasets"))
 
@@ -63,3 +65,18 @@ def controller() -> Iterator[Callable[..., SimulatedController]]:
     finally:
         for child in running:
             child.stop()
+
+
+@pytest.fixture(scope="module")
+def lonely_network() -> Iterator[None]:
+    """Only `lo`, for the module that asks and whatever it starts. Skipped, with the reason, where not permitted."""
+    pytest.importorskip("gi", reason="GenICam cameras need Debian's python3-gi and gir1.2-aravis-0.8")
+    network = isolated_thread()
+    try:
+        network.__enter__()
+    except StationError as error:
+        pytest.skip(str(error))
+    try:
+        yield
+    finally:
+        network.__exit__(None, None, None)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+import warnings
 from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
@@ -30,10 +31,12 @@ _INSTALL = (
 
 def _aravis() -> tuple[Any, Any]:
     try:
-        import gi
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ImportWarning)  # PyGObject 3.42 has an importer of the old kind
+            import gi
 
-        gi.require_version("Aravis", "0.8")
-        from gi.repository import Aravis, GLib
+            gi.require_version("Aravis", "0.8")
+            from gi.repository import Aravis, GLib
     except (ImportError, ValueError) as error:
         raise CameraError(f"{_INSTALL}: {error}") from error
     return Aravis, GLib
@@ -47,6 +50,7 @@ class GenicamDevice:
         self._aravis, self._glib = _aravis()
         self._camera: Any = None
         self._stream: Any = None
+        self._region = (0, 0, 0, 0)
         self._latched_ns = 0
         self.lost = threading.Event()
         self.identity = CameraIdentity(driver="aravis")
@@ -54,8 +58,16 @@ class GenicamDevice:
     def open(self, serial: str = "") -> CameraIdentity:
         """Finds, sets up and starts the camera. `serial`: only this very one."""
         bits_per_pixel(self._config.pixel_format)
+        try:
+            self._open(serial or self._config.device)
+        except BaseException:
+            self.close()
+            raise
+        return self.identity
+
+    def _open(self, wanted: str) -> None:
         with self._explained("opening the camera"):
-            self._camera = self._aravis.Camera.new(_find(self._aravis, serial or self._config.device))
+            self._camera = self._aravis.Camera.new(_find(self._aravis, wanted))
             self._camera.get_device().connect("control-lost", lambda _: self.lost.set())
             self.identity = CameraIdentity(
                 vendor=self._camera.get_vendor_name() or "",
@@ -72,16 +84,19 @@ class GenicamDevice:
                 self._stream.push_buffer(self._aravis.Buffer.new_allocate(payload))
             self._camera.start_acquisition()
         self.check_settings()
-        return self.identity
 
     def close(self) -> None:
         """Takes seconds when the camera is gone; never raises."""
-        if self._camera is not None and not self.lost.is_set():
-            try:
-                self._camera.stop_acquisition()
-            except self._glib.Error:
-                self.lost.set()
-        self._stream = self._camera = None
+        camera, self._camera, self._stream = self._camera, None, None
+        if camera is None or self.lost.is_set():
+            return
+        try:
+            camera.stop_acquisition()
+            if camera.is_gv_device():
+                # Others may hold a reference still, in a traceback for instance: let go of the camera now.
+                camera.get_device().leave_control()
+        except self._glib.Error:
+            self.lost.set()
 
     def _set_up(self) -> None:
         camera, config = self._camera, self._config
@@ -92,8 +107,9 @@ class GenicamDevice:
             if camera.is_feature_available(automatic):
                 camera.set_string(automatic, "Off")
         camera.set_pixel_format_from_string(config.pixel_format)
-        if config.region is not None:
-            camera.set_region(*config.region)
+        # Cameras keep the region of whoever used them last.
+        self._region = config.region or (0, 0, *camera.get_sensor_size())
+        camera.set_region(*self._region)
         camera.set_exposure_time(config.exposure_us)
         if camera.is_gain_available():
             camera.set_gain(config.gain_db)
@@ -130,11 +146,11 @@ class GenicamDevice:
         if (
             abs(exposure_us - wanted.exposure_us) > _EXPOSURE_TOLERANCE * wanted.exposure_us
             or abs(gain_db - wanted.gain_db) > _GAIN_TOLERANCE_DB
-            or (wanted.region is not None and actual != wanted.region)
+            or actual != self._region
         ):
             raise CameraError(
                 f"the camera stands at {exposure_us:g} µs, {gain_db:g} dB, region {actual}; set were "
-                f"{wanted.exposure_us:g} µs, {wanted.gain_db:g} dB, region {wanted.region or 'whole'}: the "
+                f"{wanted.exposure_us:g} µs, {wanted.gain_db:g} dB, region {self._region}: the "
                 "camera cannot do that, or another program changes its settings"
             )
         return exposure_us, gain_db

@@ -13,13 +13,11 @@ VENDOR_ADDRESS, MODEL_ADDRESS, VERSION_ADDRESS, INFO_ADDRESS, SERIAL_ADDRESS = 0
 SENSOR_HEIGHT, SENSOR_WIDTH = 0x118, 0x11C
 WIDTH, HEIGHT, GAIN, EXPOSURE = 0x100, 0x104, 0x110, 0x120
 PIXEL_FORMAT, FRAME_PERIOD = 0x128, 0x138
-TIMESTAMP_LATCH, TIMESTAMP_VALUE, EXPOSURE_AUTO, GAIN_AUTO, FIRST_FREE = (
-    0xA000,
-    0xA008,
-    0xA010,
-    0xA014,
-    0xA018,
-)
+TIMESTAMP_LATCH, TIMESTAMP_VALUE, EXPOSURE_AUTO, GAIN_AUTO = 0xA000, 0xA008, 0xA010, 0xA014
+TRIGGER_SOURCE, FIRST_FREE = 0xA018, 0xA01C
+TRIGGER_PULSE, FAKE_TRIGGER_SOURCE = 0x30C, 0x304
+FAKE_TRIGGER_SOFTWARE = 1
+"""The only source Aravis's fake camera reacts to: pulses on a line are written to TRIGGER_PULSE, too."""
 PIXEL_FORMATS = {
     "Mono8": 0x01080001,
     "Mono10": 0x01100003,
@@ -69,9 +67,9 @@ def genicam_xml() -> str:
         _enumeration("GainAuto", GAIN_AUTO, {"Off": 0, "Continuous": 1, "Once": 2}),
         _TRIGGER_SELECTOR,
         _enumeration("TriggerMode", 0x300, {"Off": 0, "On": 1}),
-        _enumeration("TriggerSource", 0x304, {"Line0": 0, "Software": 1, "Line2": 2, "Line3": 3}),
+        _enumeration("TriggerSource", TRIGGER_SOURCE, {"Line0": 0, "Software": 1, "Line2": 2, "Line3": 3}),
         _enumeration("TriggerActivation", 0x308, {"RisingEdge": 0}),
-        _command("TriggerSoftware", 0x30C, 1),
+        _command("TriggerSoftware", TRIGGER_PULSE, 1),
         _command("GevTimestampControlLatch", TIMESTAMP_LATCH, 1),
         _integer("GevTimestampValue", TIMESTAMP_VALUE, access="RO", length=8),
         f"<Integer Name='GevTimestampTickFrequency' NameSpace='Standard'><Value>{TICK_HZ}</Value></Integer>",

@@ -101,6 +101,7 @@ class GigeCamera:
             (genicam.PIXEL_FORMAT, genicam.PIXEL_FORMATS["Mono8"]),
             (genicam.EXPOSURE, 10_000),
             (genicam.GAIN, 0),
+            (genicam.FAKE_TRIGGER_SOURCE, genicam.FAKE_TRIGGER_SOFTWARE),
             *((address, 0) for address in range(genicam.TIMESTAMP_LATCH, genicam.FIRST_FREE, 4)),
         ):
             self.set_register(address, value)
@@ -161,15 +162,18 @@ def rendered_source(camera: CameraProcess) -> Source:
     return source
 
 
-def numbered_source(clock: Callable[[], int]) -> Source:
+class NumberedSource:
     """For throughput: frame n is `numbered_picture(n)`, at next to no cost. `clock`: the device's, ns."""
-    count = [0]
 
-    def source(width: int, height: int, exposure_us: float, gain_db: float) -> tuple[NDArray[np.uint8], int]:
-        count[0] += 1
-        return numbered_picture(count[0] - 1, width, height), clock()
+    def __init__(self, clock: Callable[[], int]) -> None:
+        self.next_number = 0
+        self._clock = clock
 
-    return source
+    def __call__(
+        self, width: int, height: int, exposure_us: float, gain_db: float
+    ) -> tuple[NDArray[np.uint8], int]:
+        self.next_number += 1
+        return numbered_picture(self.next_number - 1, width, height), self._clock()
 
 
 _noise: dict[tuple[int, int], NDArray[np.uint8]] = {}
@@ -202,7 +206,8 @@ def main(
     def clock() -> int:
         return rendered.device_ns(time.monotonic_ns())
 
-    source = numbered_source(clock) if numbered else rendered_source(rendered)
+    numbers = NumberedSource(clock)
+    source = numbers if numbered else rendered_source(rendered)
     try:
         camera = GigeCamera(source, cell.camera.width, cell.camera.height, address, serial)
     except CameraError as error:
@@ -214,6 +219,10 @@ def main(
         request = json.loads(line)
         if request["name"] == "packet-loss":
             camera.set_packet_loss(float(request["value"]))
+        elif request["name"] == "number":
+            numbers.next_number = int(request["value"])
+        elif request["name"] == "pulse":
+            camera.set_register(genicam.TRIGGER_PULSE, 1)
         elif request["name"] == "register":
             camera.set_register(*request["value"])
         else:

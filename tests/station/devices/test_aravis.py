@@ -1,0 +1,223 @@
+"""GenICam cameras over real GVCP and GVSP, against the simulated MER-131-75GM on a network of its own."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from itertools import pairwise
+from typing import Any
+
+import numpy as np
+import pytest
+
+from recordings.messages import Picture
+from station.config import CameraConfig
+from station.devices.aravis import AravisCamera
+from station.devices.base import TriggerPulse
+from station.devices.frames import mid_exposure, next_frame_id
+from station.devices.pixels import decode, encode
+from station.errors import CameraError
+from station.simulation import genicam
+from station.simulation.gige import numbered_picture
+from station.simulation.gige_launch import SimulatedGige, start_gige
+
+pytestmark = pytest.mark.gige
+ADDRESS = CameraConfig(device="127.0.0.1", packet_size=8996)
+
+
+@pytest.fixture(scope="module")
+def simulator(lonely_network: None) -> Iterator[SimulatedGige]:
+    with start_gige(numbered=True, serial="KJ0042") as running:
+        yield running
+
+
+@pytest.fixture
+def server(simulator: SimulatedGige) -> SimulatedGige:
+    """Its next picture is number 0."""
+    simulator.inject("number", 0)
+    return simulator
+
+
+class Opened:
+    """An opened camera for the length of an `async with`."""
+
+    def __init__(self, config: CameraConfig = ADDRESS, trigger: Any = None) -> None:
+        self._camera = AravisCamera(config, trigger)
+
+    async def __aenter__(self) -> AravisCamera:
+        await self._camera.open()
+        return self._camera
+
+    async def __aexit__(self, *_: object) -> None:
+        await self._camera.close()
+
+
+def number_of(picture: Picture) -> int:
+    return int.from_bytes(picture.image.reshape(-1)[:8].tobytes(), "little")
+
+
+@pytest.mark.parametrize("device", ["", "KJ0042", "127.0.0.1", "MER-131-75GM"])
+async def test_a_camera_is_found_by_serial_address_or_name(server: SimulatedGige, device: str) -> None:
+    async with Opened(CameraConfig(device=device)) as camera:
+        assert camera.identity.serial == "KJ0042" and camera.identity.model == "MER-131-75GM"
+        assert camera.identity.vendor == "Daheng Imaging" and camera.identity.driver == "aravis"
+
+
+async def test_an_unknown_camera_is_refused_with_what_was_found(server: SimulatedGige) -> None:
+    with pytest.raises(CameraError, match=r"no camera 'KJ0043': found MER-131-75GM KJ0042 at 127\.0\.0\.1"):
+        await AravisCamera(CameraConfig(device="KJ0043")).open()
+
+
+async def test_settings_are_made_and_read_back(server: SimulatedGige) -> None:
+    config = CameraConfig(
+        device="127.0.0.1", region=(64, 32, 640, 512), exposure_us=5000.0, gain_db=3.0, packet_size=4000
+    )
+    async with Opened(config) as camera:
+        picture = await camera.capture()
+        assert picture.image.shape == (512, 640) and picture.exposure_us == 5000.0 and picture.gain_db == 3.0
+        assert await camera.settings() == {
+            "pixel_format": "Mono8",
+            "region": [64, 32, 640, 512],
+            "exposure_us": 5000.0,
+            "gain_db": 3.0,
+            "packet_size": 4000,
+        }
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"region": (0, 0, 5000, 512)}, "Width"),
+        ({"exposure_us": 5.0}, "ExposureTime"),
+        ({"gain_db": 60.0}, "Gain"),
+        ({"pixel_format": "Mono16"}, "Mono16"),
+        ({"pixel_format": "YUV422"}, "not supported"),
+    ],
+)
+async def test_what_the_camera_cannot_do_is_refused(
+    server: SimulatedGige, change: dict[str, Any], words: str
+) -> None:
+    with pytest.raises(CameraError, match=words):
+        await AravisCamera(CameraConfig(device="127.0.0.1", **change)).open()
+
+
+async def test_one_trigger_gives_one_picture_to_the_bit_over_the_wrap_of_the_ids(
+    server: SimulatedGige,
+) -> None:
+    async with Opened() as camera:
+        pictures = [await camera.capture() for _ in range(140)]
+    ids = [p.frame_id for p in pictures]
+    assert 65_535 in ids and all(b == next_frame_id(a) for a, b in pairwise(ids))
+    assert [p.sequence for p in pictures] == list(range(140))
+    assert [number_of(p) for p in pictures] == list(range(140))
+    assert all(np.array_equal(p.image, numbered_picture(n, 1280, 1024)) for n, p in enumerate(pictures))
+
+
+@pytest.mark.parametrize("name", list(genicam.PIXEL_FORMATS))
+async def test_every_pixel_format_arrives(server: SimulatedGige, name: str) -> None:
+    config = CameraConfig(device="127.0.0.1", pixel_format=name, region=(0, 0, 320, 240), packet_size=8996)
+    async with Opened(config) as camera:
+        picture = await camera.capture()
+    sent = encode(np.ascontiguousarray(numbered_picture(0, 320, 240)), name)
+    assert np.array_equal(picture.image, decode(sent, 320, 240, name))
+    assert picture.pixel_format == ("BGR8" if name.startswith(("Bayer", "RGB")) else name)
+
+
+async def test_the_cameras_clock_is_known_within_its_bound(server: SimulatedGige) -> None:
+    async with Opened() as camera:
+        before_ns = time.monotonic_ns()
+        picture = await camera.capture()
+        after_ns = time.monotonic_ns()
+        assert camera.clock is not None
+    stamps = picture.stamps
+    middle_ns, bound_s = mid_exposure(stamps.device_ns, stamps.host_monotonic_ns, 0.0, camera.clock)
+    assert bound_s < 0.02
+    assert before_ns - bound_s * 1e9 < middle_ns < after_ns + bound_s * 1e9
+    assert abs(stamps.device_ns - before_ns) > 1e9, "the device's epoch is another"
+
+
+async def test_a_preview_takes_no_sequence_number(server: SimulatedGige) -> None:
+    async with Opened() as camera:
+        first = await camera.capture()
+        preview = await camera.preview()
+        second = await camera.capture()
+    assert preview is not None and number_of(preview) == number_of(first) + 1
+    assert (first.sequence, second.sequence) == (0, 1) and number_of(second) == 2
+
+
+class Box:
+    """A trigger box whose pulses reach the simulated camera's line; it can forget or add some."""
+
+    def __init__(self, server: SimulatedGige) -> None:
+        self.server = server
+        self.count = 100
+        self.wired = True
+
+    async def open(self) -> str:
+        return "box"
+
+    async def fire(self) -> TriggerPulse:
+        self.count += 1
+        if self.wired:
+            self.server.inject("pulse")
+        return TriggerPulse(self.count, 0, time.monotonic_ns())
+
+    async def light(self, level: float) -> None: ...
+
+    async def close(self) -> None: ...
+
+
+async def test_hardware_trigger_pairs_by_the_boxs_count(server: SimulatedGige) -> None:
+    box = Box(server)
+    async with Opened(CameraConfig(device="127.0.0.1", trigger="hardware"), box) as camera:
+        assert [(await camera.capture()).trigger_count for _ in range(3)] == [101, 102, 103]
+        box.count += 1  # a pulse that nobody asked for
+        with pytest.raises(CameraError, match="2 pulses for one picture"):
+            await camera.capture()
+        assert (await camera.capture()).trigger_count == 106
+        box.wired = False
+        with pytest.raises(CameraError, match="no picture within"):
+            await camera.capture(timeout_s=0.3)
+        box.wired = True
+        assert number_of(await camera.capture()) == 5
+
+
+def test_hardware_trigger_needs_a_box() -> None:
+    with pytest.raises(CameraError, match="no trigger box"):
+        AravisCamera(CameraConfig(trigger="hardware"))
+
+
+async def test_free_running_frames_come_in_order_and_complete(server: SimulatedGige) -> None:
+    server.inject("register", [genicam.FRAME_PERIOD, 13_333])  # 75 fps
+    pictures: list[Picture] = []
+    async with Opened(CameraConfig(device="127.0.0.1", trigger="free-running", packet_size=8996)) as camera:
+        stop = threading.Event()
+
+        def keep(picture: Picture) -> None:
+            pictures.append(picture)
+            if len(pictures) == 60:
+                stop.set()
+
+        await asyncio.wait_for(camera.stream(keep, stop), 20)
+        newest = await camera.capture()
+        assert number_of(newest) > number_of(pictures[-1]), "never an older frame"
+        assert camera.counter.missing == 0
+    numbers = [number_of(p) for p in pictures]
+    assert numbers == list(range(numbers[0], numbers[0] + 60))
+    assert [p.sequence for p in pictures] == list(range(60))
+
+
+async def test_without_pygobject_the_operator_is_told_what_to_install(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setitem(sys.modules, "gi", None)
+    with pytest.raises(CameraError, match="apt install"):
+        await AravisCamera(CameraConfig()).open()
+
+
+async def test_no_camera_at_all(lonely_network: None) -> None:
+    with pytest.raises(CameraError, match="opening the camera failed"):
+        await AravisCamera(CameraConfig(device="127.0.0.9")).open()

@@ -1,0 +1,58 @@
+"""Every pixel format comes back as it was sent; cut pictures are refused."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+import pytest
+
+from station.devices.pixels import FORMATS, decode, encode
+from station.errors import CameraError
+
+GREY = np.random.default_rng(1).integers(0, 256, (6, 8), np.uint8)
+
+
+@pytest.mark.parametrize("name", [f for f in FORMATS if not f.startswith("Bayer")])
+def test_what_was_sent_comes_back(name: str) -> None:
+    image = decode(encode(GREY, name), 8, 6, name)
+    if name in ("RGB8", "BGR8"):
+        assert np.array_equal(image, np.repeat(GREY[:, :, None], 3, axis=2))
+        return
+    bits = int("".join(filter(str.isdigit, name)))
+    assert np.array_equal(image >> (bits - 8), GREY)
+    assert image.max() < 1 << bits
+
+
+def test_known_bytes_of_the_packed_formats() -> None:
+    """From the standards: GigE Vision 1.2 figures of Mono10Packed and Mono12Packed, PFNC of Mono12p."""
+    assert decode(b"\xab\xdc\xef", 2, 1, "Mono12Packed").tolist() == [[0xABC, 0xEFD]]
+    assert decode(b"\xff\x20\x01", 2, 1, "Mono10Packed").tolist() == [[0x3FC, 0x006]]
+    assert decode(b"\xbc\xfa\xde", 2, 1, "Mono12p").tolist() == [[0xABC, 0xDEF]]
+
+
+def test_an_odd_number_of_packed_pixels() -> None:
+    odd = GREY[:3, :5]
+    assert np.array_equal(decode(encode(odd, "Mono12Packed"), 5, 3, "Mono12Packed") >> 4, odd)
+
+
+@pytest.mark.parametrize("name", ["RG", "BG", "GR", "GB"])
+def test_colours_of_a_mosaic_are_where_genicam_says(name: str) -> None:
+    """The two letters are the first two pixels of the first row."""
+    colour = {"R": (0, 0, 200), "G": (0, 100, 0), "B": (50, 0, 0)}
+    row = [name[0], name[1]]
+    other = {"RG": "GB", "BG": "GR", "GR": "BG", "GB": "RG"}[name]
+    tile = np.array([[max(colour[c]) for c in row], [max(colour[c]) for c in other]], np.uint8)
+    image = decode(np.tile(tile, (8, 8)).tobytes(), 16, 16, f"Bayer{name}8")
+    assert np.allclose(image[4:12, 4:12], [50, 100, 200], atol=1)
+
+
+def test_a_short_picture_and_an_unknown_format_are_refused() -> None:
+    with pytest.raises(CameraError, match="47 bytes"):
+        decode(b"x" * 47, 8, 6, "Mono8")
+    with pytest.raises(CameraError, match="Mono8"):
+        decode(b"", 8, 6, "YUV422")
+
+
+def test_colours_are_given_in_opencvs_order() -> None:
+    assert decode(bytes([200, 100, 50]), 1, 1, "RGB8").tolist() == [[[50, 100, 200]]]
+    assert cv2.cvtColor(decode(bytes([255, 0, 0]), 1, 1, "RGB8"), cv2.COLOR_BGR2GRAY)[0, 0] == 76

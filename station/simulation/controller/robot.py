@@ -31,6 +31,8 @@ from station.simulation.controller.variables import INPUT_TYPES, OUTPUT_TYPES, V
 
 PROGRAM_START_S = 0.05
 UNLOCK_AFTER_S = 5.0
+_DIGITAL_OUTPUTS = {"standard_digital": 0, "configurable_digital": 8, "tool_digital": 16}
+"""Kind → first bit of `actual_digital_output_bits`."""
 CB3_VERSION = (3, 15, 8, 106339)
 E_SERIES_VERSION = (5, 11, 1, 108318)
 
@@ -151,6 +153,22 @@ class SimulatedRobot:
         """A data packet carried this input_int_register."""
         if isinstance(self.program, ControlScript) and index == self.program.offset_int:
             self._silence_s = 0.0
+
+    def inputs_written(self, names: tuple[str, ...]) -> None:
+        """A data packet carried these inputs: what acts at once acts now, registers wait for the program."""
+        for name in names:
+            if name.startswith("input_int_register_"):
+                self.command_register_written(int(name.rpartition("_")[2]))
+        if "speed_slider_mask" in names and self.inputs.get("speed_slider_mask"):
+            self.slider = max(0.0, min(1.0, self.inputs.get("speed_slider_fraction")))
+            self.journal.note("rtde", "speed slider", fraction=self.slider)
+        for kind, first_bit in _DIGITAL_OUTPUTS.items():
+            if f"{kind}_output_mask" in names:
+                mask = int(self.inputs.get(f"{kind}_output_mask")) << first_bit
+                wanted = int(self.inputs.get(f"{kind}_output")) << first_bit
+                before = int(self.outputs.get("actual_digital_output_bits"))
+                self.outputs.set("actual_digital_output_bits", before & ~mask | wanted & mask)
+                self.journal.note("rtde", f"{kind}_output", mask=mask >> first_bit, value=wanted >> first_bit)
 
     # -- the program --------------------------------------------------------------------------------
 

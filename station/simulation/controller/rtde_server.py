@@ -153,15 +153,7 @@ class RtdeConnection(Connection):
         recipe = self._inputs[number - 1]
         robot = self._robot
         robot.inputs.write(recipe.names, recipe.unpack_elements(payload))
-        for name in recipe.names:
-            if name.startswith("input_int_register_"):
-                robot.command_register_written(int(name.rpartition("_")[2]))
-        if "speed_slider_mask" in recipe.names and robot.inputs.get("speed_slider_mask"):
-            robot.slider = max(0.0, min(1.0, robot.inputs.get("speed_slider_fraction")))
-            robot.journal.note("rtde", "speed slider", fraction=robot.slider)
-        for name in recipe.names:
-            if name.endswith("_output") and "digital" in name:
-                robot.journal.note("rtde", name, value=robot.inputs.get(name))
+        robot.inputs_written(recipe.names)
 
     def send_state(self) -> None:
         server = self._server

@@ -257,6 +257,10 @@ def test_speed_slider_by_the_wheel_and_on_the_pendant(controller: Start, wheel: 
         io.setSpeedSlider(0.25)
         time.sleep(0.3)
         result["fraction"] = receive.getTargetSpeedFraction()
+        io.setStandardDigitalOut(3, True)
+        io.setToolDigitalOut(1, True)
+        time.sleep(0.05)
+        result["outputs"] = receive.getActualDigitalOutputBits()
         control.moveJ(FAR, 1.0, 10.0, True)
         time.sleep(0.5)
         result["slow"] = fastest(receive.getTargetQd())
@@ -268,6 +272,7 @@ def test_speed_slider_by_the_wheel_and_on_the_pendant(controller: Start, wheel: 
         """,
     )
     assert result["fraction"] == pytest.approx(0.25) and result["slow"] == pytest.approx(0.25, abs=0.01)
+    assert result["outputs"] == 1 << 3 | 1 << 17
     assert result["zero"][0] < 1e-6 and result["zero"][1] == 0
 
 

@@ -75,6 +75,18 @@ def _parser() -> argparse.ArgumentParser:
         "--time-scale", type=float, default=1.0, metavar="F", help="the arm moves F times faster; for tests"
     )
     parser.add_argument(
+        "--input-delay",
+        type=int,
+        default=0,
+        metavar="CYCLES",
+        help="registers act this much later; default 0",
+    )
+    parser.add_argument(
+        "--protective-stop-ends-program",
+        action="store_true",
+        help="runtime state 1 instead of 4 after a protective stop (controllers differ)",
+    )
+    parser.add_argument(
         "--die-with-parent", action="store_true", help="end when standard input closes or the parent is gone"
     )
     return parser
@@ -85,6 +97,8 @@ def _settings(options: argparse.Namespace) -> Settings:
         raise ValueError(f"--time-scale must be > 0, not {options.time_scale}")
     given: dict[str, object] = {"model": options.model, "time_scale": options.time_scale}
     given["remote"] = not options.local
+    given["input_delay_cycles"] = max(0, options.input_delay)
+    given["paused_by_protective_stop"] = not options.protective_stop_ends_program
     options.drift_ppm = 0.0
     if options.truth is not None:
         from station.simulation.cell import read_truth  # loads numpy: only when it is asked for

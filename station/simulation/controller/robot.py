@@ -6,6 +6,7 @@ Knows no socket, so that every rule here can be tested without one.
 from __future__ import annotations
 
 import random
+from collections import deque
 from dataclasses import dataclass
 from math import inf
 
@@ -52,6 +53,8 @@ class Settings:
     remote: bool = True
     paused_by_protective_stop: bool = True
     """runtime_state after a protective stop: paused (4), else stopped (1)."""
+    input_delay_cycles: int = 0
+    """Registers act this many cycles later than the next one."""
 
     @property
     def is_e_series(self) -> bool:
@@ -78,6 +81,8 @@ class SimulatedRobot:
         self.history = History(self.dt_s)
         self.inputs = VariableStore(INPUT_TYPES)
         self.outputs = VariableStore(OUTPUT_TYPES)
+        self._waiting: deque[tuple[int, tuple[str, ...], tuple[float, ...]]] = deque()
+        """Inputs on their way: cycle in which they act, names, elements."""
         self.tcp: Six = (0.0,) * 6
         self.payload_kg = 0.0
         self.payload_cog: Six = (0.0,) * 3
@@ -108,6 +113,8 @@ class SimulatedRobot:
         process was held up; such time does not count as the client's silence."""
         self.ticks += 1
         self.time_s = self.ticks * self.dt_s
+        while self._waiting and self._waiting[0][0] <= self.ticks:
+            self._write_inputs(*self._waiting.popleft()[1:])
         if self._starting is not None:
             self._count_down()
         if self.program is not None and self.runtime_state == RuntimeState.PLAYING:
@@ -154,8 +161,15 @@ class SimulatedRobot:
         if isinstance(self.program, ControlScript) and index == self.program.offset_int:
             self._silence_s = 0.0
 
-    def inputs_written(self, names: tuple[str, ...]) -> None:
-        """A data packet carried these inputs: what acts at once acts now, registers wait for the program."""
+    def receive_inputs(self, names: tuple[str, ...], elements: tuple[float, ...]) -> None:
+        """A data packet: it acts in the next cycle, or `input_delay_cycles` later."""
+        if self.settings.input_delay_cycles:
+            self._waiting.append((self.ticks + 1 + self.settings.input_delay_cycles, names, elements))
+        else:
+            self._write_inputs(names, elements)
+
+    def _write_inputs(self, names: tuple[str, ...], elements: tuple[float, ...]) -> None:
+        self.inputs.write(names, elements)
         for name in names:
             if name.startswith("input_int_register_"):
                 self.command_register_written(int(name.rpartition("_")[2]))
@@ -293,6 +307,7 @@ class SimulatedRobot:
         """After a reboot: time 0, empty registers; installation and the arm's place survive."""
         self.inputs, self.outputs = VariableStore(INPUT_TYPES), VariableStore(OUTPUT_TYPES)
         self.history = History(self.dt_s)
+        self._waiting.clear()
         self.ticks, self.time_s, self.slider = 0, 0.0, 1.0
         self._safety(SafetyMode.NORMAL)
         self.robot_mode = RobotMode.RUNNING if running else RobotMode.POWER_OFF

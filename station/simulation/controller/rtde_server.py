@@ -151,9 +151,7 @@ class RtdeConnection(Connection):
         if not 1 <= number <= len(self._inputs):
             raise RtdeError(f"data for input recipe {number}, which was never set up")
         recipe = self._inputs[number - 1]
-        robot = self._robot
-        robot.inputs.write(recipe.names, recipe.unpack_elements(payload))
-        robot.inputs_written(recipe.names)
+        self._robot.receive_inputs(recipe.names, recipe.unpack_elements(payload))
 
     def send_state(self) -> None:
         server = self._server

@@ -46,11 +46,11 @@ def _info_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "views", f"{views['poses']} poses" + (f", {retakes} retaken" if retakes else "")
     if states := facts["robot_states"]:
         rate = f"{states['rate_hz']:.1f} Hz" if states["rate_hz"] else "controller time stands still"
-        gaps = (
-            f"{states['gaps']} gaps, largest {states['largest_gap_s'] * 1e3:.0f} ms"
-            if states["gaps"]
-            else "no gap"
-        )
+        count = states["gaps"]
+        gaps = "no gap"
+        if count:
+            plural = "s" if count > 1 else ""
+            gaps = f"{count} gap{plural}, largest {states['largest_gap_s'] * 1e3:.0f} ms"
         yield "robot states", f"{states['count']} at {rate}, {gaps}"
     for name, clock in facts["clocks"].items():
         if clock:

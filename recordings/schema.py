@@ -188,6 +188,8 @@ def schema_difference(ours: bytes, theirs: bytes) -> str:
     for key, meaning in stored.items():
         if key not in known:
             return f"unknown field {key[0]}.{meaning[0]} (a newer version wrote this file)"
+        if known[key][0] == meaning[0] and known[key] != meaning:
+            return f"{key[0]} field {key[1]} '{meaning[0]}' has another type"
         if known[key] != meaning:
             return f"{key[0]} field {key[1]} is '{meaning[0]}', expected '{known[key][0]}'"
     return ""

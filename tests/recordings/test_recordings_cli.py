@@ -1,0 +1,128 @@
+"""`recordings` as people and scripts meet it: words, exit codes, one JSON object."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import msgspec
+import pytest
+from typer.testing import CliRunner, Result
+
+from recordings.cli import main
+from recordings.info import recording_info
+from recordings.messages import Stamps
+from recordings.reader import open_recording
+from recordings.writer import RecordingWriter
+from tests.recordings.small_recording import (
+    START_NS,
+    make_info,
+    make_picture,
+    make_state,
+    make_view,
+    write_small,
+)
+
+
+def run(*arguments: object) -> Result:
+    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+
+
+def write_with_clocks(path: Path, drift_ppm: float, missing: range) -> Path:
+    """1000 robot states at 500 Hz by the controller, whose clock is `drift_ppm` slow against the host."""
+    with RecordingWriter(path, make_info()) as writer:
+        for count in range(1000):
+            if count in missing:
+                continue
+            controller_s = 50 + count * 0.002
+            host_ns = round(7e9 + count * 0.002e9 * (1 + drift_ppm * 1e-6))
+            stamps = Stamps(host_ns, START_NS + host_ns, controller_s)
+            writer.robot_state(msgspec.structs.replace(make_state(0), stamps=stamps))
+        for sequence, frame_id in enumerate([65534, 65535, 1, 2, 5]):
+            writer.picture(msgspec.structs.replace(make_picture(sequence), frame_id=frame_id))
+            writer.view(make_view(sequence % 4, sequence, 1 + sequence // 4))
+        return writer.finish()
+
+
+def test_info_measures_rate_gaps_drift_and_lost_frames(tmp_path: Path) -> None:
+    path = write_with_clocks(tmp_path / "a.mcap", drift_ppm=40, missing=range(500, 510))
+    info = recording_info(open_recording(path))
+    states = info["robot_states"]
+    assert states["rate_hz"] == pytest.approx(500)
+    assert (states["count"], states["gaps"]) == (990, 1)
+    assert states["largest_gap_s"] == pytest.approx(0.022)
+    assert info["clocks"]["controller"]["drift_ppm"] == pytest.approx(40, abs=0.01)
+    assert info["clocks"]["controller"]["spread_max_ms"] < 0.001
+    assert info["pictures"]["frame_id_jumps"] == 1  # 65535 → 1 is a wrap, 2 → 5 is a loss
+    assert info["views"] == {"poses": 4, "attempts": 5, "names": [f"pose-{i}" for i in range(4)]}
+    assert info["size_bytes"] == path.stat().st_size
+
+
+def test_info_for_people_says_the_same(tmp_path: Path) -> None:
+    path = write_with_clocks(tmp_path / "a.mcap", drift_ppm=40, missing=range(500, 510))
+    result = run("info", path)
+    assert result.exit_code == 0
+    text = " ".join(result.output.split())
+    for words in (
+        "simulated eye-in-hand",
+        "chessboard 7×6, 25 mm",
+        "4 poses, 1 retaken",
+        "990 at 500.0 Hz, 1 gap, largest 22 ms",
+        "drift +40.0 ppm",
+    ):
+        assert words in text, f"'{words}' is missing in: {text}"
+
+
+def test_info_json_is_one_object(small: Path) -> None:
+    result = run("info", small, "--json")
+    assert json.loads(result.stdout)["name"] == "test-cell"
+
+
+def test_info_of_an_empty_recording(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        path = writer.finish()
+    result = run("info", path)
+    assert result.exit_code == 0, result.output
+    assert recording_info(open_recording(path))["robot_states"] is None
+
+
+@pytest.mark.parametrize("command", ["info", "recover"])
+def test_a_missing_file_is_one_sentence_and_1(tmp_path: Path, command: str) -> None:
+    result = run(command, tmp_path / "none.mcap")
+    assert result.exit_code == 1
+    assert result.stderr == f"error: cannot open {tmp_path}/none.mcap: No such file or directory\n"
+
+
+def test_a_device_or_a_pipe_is_no_recording() -> None:
+    assert run("info", "/dev/zero").exit_code == 1
+
+
+def test_recover_ends_with_3_when_it_had_to_rebuild_and_with_0_when_not(tmp_path: Path) -> None:
+    path = write_small(tmp_path / "a.mcap")
+    assert run("recover", path).exit_code == 0
+    path.write_bytes(path.read_bytes()[:-9000])
+    refused = run("info", path)
+    assert refused.exit_code == 1
+    assert "recordings recover" in refused.stderr
+    result = run("recover", path)
+    assert result.exit_code == 3
+    assert "saved 3 poses" in result.output
+    assert "a.mcap.damaged" in "".join(result.output.split())
+    assert run("info", path).exit_code == 0
+
+
+def test_recover_json_lists_what_was_lost(tmp_path: Path) -> None:
+    path = write_small(tmp_path / "a.mcap")
+    data = bytearray(path.read_bytes())
+    data[14_000] ^= 1
+    path.write_bytes(data)
+    result = run("recover", path, "--json")
+    assert result.exit_code == 3
+    (report,) = json.loads(result.stdout)
+    assert report["lost_bytes"] > 0
+    assert report["losses"][0].startswith("bytes ")
+
+
+def test_unknown_options_and_no_arguments_are_usage_errors() -> None:
+    assert run("info").exit_code == 2
+    assert run("export", "a", "--to", "bag", "-o", "b").exit_code == 2

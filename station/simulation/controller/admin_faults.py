@@ -69,8 +69,8 @@ def black_hole(machine: Machine, on: bool = True, ports: list[str] | None = None
 
 
 def restart(machine: Machine, down_s: float = 1.0, running: bool = False) -> None:
-    """The controller reboots: links reset, ports closed for down_s, time 0, powered off unless running."""
-    machine.background(machine.reboot(number("down_s", down_s, 0.0, 60.0), running))
+    """The controller reboots: links reset, ports closed for down_s, time 0, no power unless running."""
+    machine.reboot(number("down_s", down_s, 0.0, 60.0), running)
 
 
 def late(machine: Machine, ms: float) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-from collections.abc import Coroutine
 
 from station.simulation.controller.clock import Clock
 from station.simulation.controller.dashboard import dashboard_service
@@ -26,9 +25,7 @@ class Machine:
         scripts = (primary_service(host, self.robot), *script_services(host, self.robot))
         self.services = [self.rtde.service, *scripts, self.dashboard]
         self.lose_packets = 0
-        self.off = False
-        """Rebooting: nothing listens."""
-        self._tasks: set[asyncio.Task[None]] = set()
+        self._rebooting: asyncio.Task[None] | None = None
 
     def open(self) -> None:
         """Raises OSError when a port of the address is taken."""
@@ -50,7 +47,9 @@ class Machine:
             self.rtde.send_states()
 
     def chosen(self, ports: list[str] | None) -> list[Service]:
-        """Services whose name begins with one of these words; all for None. ValueError for none."""
+        """Services whose name begins with one of these words; all for None. ValueError for none, and while
+        the controller reboots."""
+        self._refuse_while_rebooting()
         if ports is None:
             return self.services
         services = [s for s in self.services if any(s.name.startswith(p) for p in ports)]
@@ -61,18 +60,21 @@ class Machine:
     def cut(self, how: Cut, ports: list[str] | None) -> int:
         return sum(service.cut(how) for service in self.chosen(ports))
 
-    def background(self, work: Coroutine[None, None, None]) -> None:
-        task = asyncio.get_running_loop().create_task(work)
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-
-    async def reboot(self, down_s: float, running: bool) -> None:
+    def reboot(self, down_s: float, running: bool) -> None:
         """All links reset, all ports closed for a while, then a fresh controller: time 0, empty registers.
 
-        The installation (TCP, payload) survives; the arm stays where it is, powered off unless `running`.
+        The installation (TCP, payload) survives, faults of links do not; the arm stays where it is, powered
+        off unless `running`. ValueError while it reboots already.
         """
+        self._refuse_while_rebooting()
+        self._rebooting = asyncio.get_running_loop().create_task(self._reboot(down_s, running))
+
+    def _refuse_while_rebooting(self) -> None:
+        if self._rebooting is not None and not self._rebooting.done():
+            raise ValueError("the controller is rebooting")
+
+    async def _reboot(self, down_s: float, running: bool) -> None:
         robot = self.robot
-        self.off = True
         robot.power_off()
         for service in self.services:
             service.close()
@@ -80,9 +82,9 @@ class Machine:
         robot.reset(running)
         self.clock.restart()
         self._begin()
+        self.rtde.stalled = self.rtde.frozen = False
         for service in self.services:
             service.open()
-        self.off = False
 
     def close(self) -> None:
         for service in self.services:

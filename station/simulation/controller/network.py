@@ -70,6 +70,7 @@ class Service:
 
     def open(self) -> None:
         """Binds and listens. Raises OSError when the port is taken."""
+        self.silent = False
         self._socket = socket.create_server((self.host, self.port), backlog=BACKLOG)
         self._socket.setblocking(False)
         self._watch()

@@ -250,12 +250,16 @@ def test_a_reboot_resets_links_closes_ports_and_starts_at_time_zero(controller, 
     client = rtde(running)
     client.start("timestamp")
     before_s = client.sample()["timestamp"]
+    ask.ask("black_hole")
     ask.ask("restart", down_s=0.4)
     with pytest.raises(ConnectionError):
         while True:
             client.receive()
     with pytest.raises(ConnectionRefusedError):
         socket.create_connection((running.host, 30004), 1)
+    for command in ("restart", "black_hole", "drop"):
+        with pytest.raises(RobotError, match="rebooting"):
+            ask.ask(command)
     deadline = time.monotonic() + 5
     while True:
         try:

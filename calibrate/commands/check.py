@@ -10,8 +10,8 @@ import typer
 
 from calibrate.calibration import Calibration, read_calibration
 from calibrate.checks import CheckEntry, append_check, read_checks, trend_text
-from calibrate.cli_install import Root
-from calibrate.cli_output import AsJson, OutputError, detection_progress, out, print_json
+from calibrate.commands.install import Root
+from calibrate.commands.output import AsJson, OutputError, detection_progress, out, print_json
 from calibrate.drift import FEWEST_VIEWS, DriftCheck, check_drift
 from calibrate.generations import generations
 from calibrate.install import load_installed

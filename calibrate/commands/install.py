@@ -12,8 +12,8 @@ import typer
 from rich.table import Table
 
 from calibrate.calibration import Calibration, read_calibration, write_atomically
-from calibrate.cli_files import read_cell_serials
-from calibrate.cli_output import AsJson, OutputError, err, out, print_json
+from calibrate.commands.files import read_cell_serials
+from calibrate.commands.output import AsJson, OutputError, err, out, print_json
 from calibrate.formats import FORMATS, export
 from calibrate.formats.frames import FrameNames
 from calibrate.generations import Generation, generations, read_log, state_root

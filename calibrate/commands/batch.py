@@ -1,0 +1,65 @@
+"""`calibrate batch`: solve many recordings again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from calibrate.batch import BatchResult, run_batch
+from calibrate.commands.output import AsJson, OutputError, err, out
+from calibrate.commands.solve import GatesFile, Profile, ProfileName, Seed
+from calibrate.gates import GateLimits, read_limits
+from calibrate.pipeline import JobOptions
+
+DONE_WITH_LOSS = 3
+
+
+def register(app: typer.Typer) -> None:
+    app.command("batch")(batch)
+
+
+def batch(
+    recordings: Annotated[list[Path], typer.Argument(help="Recordings or session folders")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the results")] = Path("batch"),
+    workers: Annotated[int | None, typer.Option(help="Processes; default: one per core")] = None,
+    profile: Profile = ProfileName.robust,
+    seed: Seed = 0,
+    gates: GatesFile = None,
+    as_json: AsJson = False,
+) -> None:
+    """Solve many recordings; resumable. Exit 3: done, but some recordings could not be solved."""
+    if output.exists() and not output.is_dir():
+        raise OutputError(f"{output} is a file; the results need a folder.")
+    limits = GateLimits() if gates is None else read_limits(gates)
+    options = JobOptions(profile=profile.value, seed=seed, limits=limits)
+    with ExitStack() as stack:
+        results = run_batch(recordings, output, options, workers, _progress(stack))
+    failed = [result for result in results if not result.solved]
+    if as_json:
+        for result in results:
+            typer.echo(msgspec.json.encode(result).decode())
+    else:
+        good = sum(result.passed for result in results)
+        out.print(
+            f"{len(results)} recordings: {good} good, {len(results) - good - len(failed)} below a gate, "
+            f"{len(failed)} not solved. {output}/results.csv, results.jsonl"
+        )
+        for result in failed:
+            err.print(f"{result.recording}: {result.error}")
+    if failed:
+        raise typer.Exit(DONE_WITH_LOSS)
+
+
+def _progress(stack: ExitStack) -> Callable[[int, int, BatchResult], None] | None:
+    if not err.is_terminal:
+        return None
+    columns = (TextColumn("solving"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    bar = stack.enter_context(Progress(*columns, console=err, transient=True))
+    task = bar.add_task("", total=None)
+    return lambda done, total, result: bar.update(task, completed=done, total=total)

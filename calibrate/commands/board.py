@@ -1,0 +1,61 @@
+"""`calibrate board`: a board to print at true scale."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calibrate.board import ambiguity_text, describe_board
+from calibrate.boardprint import PAPER_MM, board_sheet
+from calibrate.calibration import write_atomically
+from calibrate.commands.files import read_board
+from calibrate.commands.output import OutputError, err, out
+from calibrate.vector import pdf, svg
+from recordings.messages import BoardKind, BoardSpec
+
+
+def register(app: typer.Typer) -> None:
+    app.command("board")(board)
+
+
+def board(
+    output: Annotated[Path, typer.Option("-o", "--output", help="NAME.pdf or NAME.svg")] = Path("board.pdf"),
+    board_file: Annotated[
+        Path | None,
+        typer.Option("--board", help="YAML with a board: dataset.yaml, a station's configuration"),
+    ] = None,
+    kind: Annotated[BoardKind, typer.Option(help="Of board")] = BoardKind.CHESSBOARD,
+    columns: Annotated[int, typer.Option(help="Inner corners; circles; tags; charuco: squares")] = 7,
+    rows: Annotated[int, typer.Option()] = 6,
+    square_mm: Annotated[float, typer.Option(help="Square; circle distance; april-grid: tag")] = 25.0,
+    marker_mm: Annotated[float | None, typer.Option(help="charuco: marker; april-grid: gap")] = None,
+    dictionary: Annotated[str | None, typer.Option(help="Of markers, such as DICT_6X6_250")] = None,
+    legacy: Annotated[bool, typer.Option(help="charuco: layout before OpenCV 4.6")] = False,
+    paper: Annotated[
+        str | None, typer.Option(help=f"{', '.join(PAPER_MM)}; default: as large as needed")
+    ] = None,
+) -> None:
+    """Write a printable board (PDF or SVG, true scale). Without options: 8 × 7 squares of 25 mm."""
+    if output.suffix.lower() not in (".pdf", ".svg"):
+        raise OutputError(f"{output}: the name must end in .pdf or .svg.")
+    if not output.parent.is_dir():
+        raise OutputError(f"{output}: the folder {output.parent} does not exist.")
+    marker_m = None if marker_mm is None else marker_mm / 1000
+    if marker_m is None and kind in (BoardKind.CHARUCO, BoardKind.APRIL_GRID):
+        marker_m = square_mm / 1000 * (0.75 if kind is BoardKind.CHARUCO else 0.3)
+    if dictionary is None and kind is BoardKind.CHARUCO:
+        dictionary = "DICT_6X6_250"
+    spec = BoardSpec(kind, columns, rows, square_mm / 1000, marker_m, dictionary, legacy)
+    if board_file is not None:
+        spec = read_board(board_file)
+    sheet = board_sheet(spec, paper)
+    content = pdf(sheet) if output.suffix.lower() == ".pdf" else svg(sheet).encode()
+    write_atomically(output, lambda file: file.write(content))
+    out.print(f"written: {output} ({describe_board(spec)}, {sheet.width_mm:.0f} × {sheet.height_mm:.0f} mm)")
+    out.print(
+        "print at 100 % (no fitting to the page), glue it on something flat, measure the bar and one square"
+    )
+    if warning := ambiguity_text(spec):
+        err.print(warning, style="yellow")

@@ -27,6 +27,7 @@ TOLERANCE = 1e-6
 FLOOR = 1e-8
 """Of the form's trace: below this an objective counts as zero in the relative gap."""
 _UNIQUE = 1e-9
+"""Of the form's trace."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,7 +57,7 @@ def certify(objective: Objective, problem: str = "") -> Proof:
         lower_bound=lower * scale,
         floor=FLOOR * scale,
         tolerance=TOLERANCE,
-        unique=bool(second > _UNIQUE),
+        unique=bool(second > _UNIQUE and objective.translation_rank() == 3),
         problem=problem,
         pairs=objective.pairs,
     )

@@ -32,6 +32,6 @@ def check_lens(observed: Observations, held: Estimate) -> str:
     shift_mm = 1e3 * float(np.linalg.norm(free.state.X[:3, 3] - held.state.X[:3, 3]))
     return (
         f"The given intrinsics do not fit these pictures (misfit {statistic / limit:.1f} times the limit; "
-        f"refining them would move X by {shift_mm:.2f} mm). Calibrate the camera again, or find the intrinsics "
-        "from these pictures."
+        f"refining them would move X by {shift_mm:.2f} mm). Calibrate the camera again, or find the "
+        "intrinsics from these pictures."
     )

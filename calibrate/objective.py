@@ -54,6 +54,10 @@ class Objective:
         reduced = self.gram[np.ix_(_REST, _REST)] - cross @ self._b_inverse() @ cross.T
         return np.asarray((reduced + reduced.T) / 2)
 
+    def translation_rank(self) -> int:
+        """3 where the pairs determine all of b, given R; 2 where all rotations are about one axis."""
+        return int(np.linalg.matrix_rank(self.gram[9:12, 9:12], tol=1e-9 * np.trace(self.gram[9:12, 9:12])))
+
     def curvature(self, X: Array) -> Array:
         """(6, 6) half the Gauss-Newton Hessian at X, for `geometry.perturb`'s delta."""
         J = np.zeros((13, 6))

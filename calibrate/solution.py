@@ -80,7 +80,7 @@ class Certificate:
     """Absolute floor of the denominator, 1e-8 times the trace of the form."""
     tolerance: float
     unique: bool
-    """False where another rotation reaches the same value (all axes parallel)."""
+    """False where another X reaches the same value (all axes parallel)."""
     distance_sigma: float | None = None
     """Largest number of sigmas, over all directions, between the certified X and the final X."""
     problem: str = ""

@@ -69,7 +69,7 @@ def controller() -> Iterator[Callable[..., SimulatedController]]:
 
 @pytest.fixture(scope="module")
 def lonely_network() -> Iterator[None]:
-    """Only `lo`, for the module that asks and whatever it starts. Skipped, with the reason, where not permitted."""
+    """Only `lo`, for the module that asks and whatever it starts. Skipped where that is not permitted."""
     pytest.importorskip("gi", reason="GenICam cameras need Debian's python3-gi and gir1.2-aravis-0.8")
     network = isolated_thread()
     try:

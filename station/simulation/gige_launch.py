@@ -21,7 +21,7 @@ class SimulatedGige:
         self.process = process
 
     def inject(self, fault: str, value: Any = None) -> None:
-        """A fault of `camera_faults`, or `packet-loss` with a share of packets; returns once it is in force."""
+        """A fault of `camera_faults`, or `packet-loss` with a share of packets; then it is in force."""
         assert self.process.stdin is not None and self.process.stdout is not None
         self.process.stdin.write(json.dumps({"name": fault, "value": value}) + "\n")
         self.process.stdin.flush()

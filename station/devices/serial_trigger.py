@@ -1,0 +1,210 @@
+"""The serial trigger box, and the plain mode that pulses RTS or DTR of any USB-serial adapter.
+
+The only module that touches `serial`. All waiting happens in one worker thread.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from typing import Any, TypeVar
+
+from station.config import TriggerConfig
+from station.devices.base import TriggerPulse
+from station.devices.trigger_lines import BAUD, PRODUCT, PROTOCOL, LineReader, frame
+from station.errors import TriggerError
+
+T = TypeVar("T")
+ANSWER_TIMEOUT_S = 1.0
+HANDSHAKE_TIMEOUT_S = 3.0
+"""Many boards restart when their port is opened, and take two seconds for it."""
+BAD_LINES_LIMIT = 50
+_COUNTS = 1 << 32
+
+
+class SerialTrigger:
+    """`station.devices.base.Trigger`. `open_port` is for tests of adapters that no pty has."""
+
+    def __init__(self, config: TriggerConfig, open_port: Callable[[str], Any] | None = None) -> None:
+        self._config = config
+        self._open_port = open_port or _open_port
+        self._port: Any = None
+        self._worker: ThreadPoolExecutor | None = None
+        self._lines = LineReader()
+        self._boot_id = ""
+        self._count = 0
+        """Pulses, unwrapped: the box's own count starts over at 2^32."""
+
+    @property
+    def bad_lines(self) -> int:
+        """Garbage seen on the line so far."""
+        return self._lines.bad_lines
+
+    async def open(self) -> str:
+        return await self._run(self._connect)
+
+    async def fire(self) -> TriggerPulse:
+        return await self._run(self._fire if self._config.mode == "box" else self._pulse_line)
+
+    async def light(self, level: float) -> None:
+        """0 = off, 1 = full. TriggerError where the adapter has no light."""
+        if self._config.mode != "box":
+            raise TriggerError(f"trigger.mode '{self._config.mode}' has no light; it needs a trigger box")
+        permille = round(1000 * min(max(level, 0.0), 1.0))
+        await self._run(partial(self._ask, f"LIGHT {permille}", "LIGHT", 1))
+
+    async def close(self) -> None:
+        if self._worker is not None:
+            worker, self._worker = self._worker, None
+            await asyncio.get_running_loop().run_in_executor(worker, self._disconnect)
+            worker.shutdown(wait=False)
+
+    async def _run(self, job: Callable[[], T]) -> T:
+        if self._worker is None:
+            self._worker = ThreadPoolExecutor(1, "trigger")
+        return await asyncio.get_running_loop().run_in_executor(self._worker, job)
+
+    def _connect(self) -> str:
+        self._disconnect()
+        try:
+            self._port = self._open_port(self._config.port)
+        except (OSError, ValueError) as error:
+            raise TriggerError(
+                f"trigger port {self._config.port} cannot be opened ({error}); is the box plugged in, "
+                "and is this user in the group dialout?"
+            ) from error
+        self._lines = LineReader()
+        self._count = 0
+        if self._config.mode != "box":
+            return f"{self._config.mode.upper()} of {self._config.port}"
+        try:
+            return self._handshake()
+        except TriggerError:
+            self._disconnect()
+            raise
+
+    def _handshake(self) -> str:
+        end_s = time.monotonic() + HANDSHAKE_TIMEOUT_S
+        while True:
+            try:
+                product, protocol, serial = self._ask("ID?", "ID", 3, timeout_s=ANSWER_TIMEOUT_S / 2)
+                break
+            except _NoAnswerError as error:
+                if time.monotonic() > end_s:
+                    raise TriggerError(
+                        f"what is on {self._config.port} does not answer like a trigger box: wrong port, or "
+                        "another device? A udev rule gives the box a name of its own (docs/trigger-box.md)"
+                    ) from error
+        if (product, protocol) != (PRODUCT, PROTOCOL):
+            raise TriggerError(
+                f"{self._config.port} is a '{product}' with protocol {protocol}, not a {PRODUCT} with "
+                f"protocol {PROTOCOL}; check trigger.port"
+            )
+        self._boot_id, count, _ = self._status()
+        self._count = count
+        return f"{product} {serial}"
+
+    def _fire(self) -> TriggerPulse:
+        asked_ns = time.monotonic_ns()
+        try:
+            boot_id, count, device_us = self._ask(f"FIRE {self._config.pulse_us}", "FIRED", 3)
+        except _NoAnswerError:
+            # Whether the camera was triggered decides what its next frame belongs to: ask.
+            before = self._count
+            self._settle_count(*self._status()[:2])
+            if (self._count - before) != 1:
+                raise TriggerError("the trigger box did not confirm a pulse; take this pose again") from None
+            return TriggerPulse(self._count, 0, asked_ns)
+        answered_ns = time.monotonic_ns()
+        self._settle_count(boot_id, _number(count))
+        return TriggerPulse(self._count, _number(device_us), (asked_ns + answered_ns) // 2)
+
+    def _settle_count(self, boot_id: str, count: int) -> None:
+        if boot_id != self._boot_id:
+            raise TriggerError(
+                "the trigger box restarted (power, cable?): its count is void and pictures cannot be paired; "
+                "check its supply, then open the cell again"
+            )
+        self._count += (count - self._count) % _COUNTS
+
+    def _status(self) -> tuple[str, int, int]:
+        """Boot id, pulses so far, light in permille."""
+        try:
+            boot_id, count, light = self._ask("STATUS?", "STATUS", 3)
+        except _NoAnswerError as error:
+            raise TriggerError(f"trigger box lost: {error}") from error
+        return boot_id, _number(count), _number(light)
+
+    def _ask(self, request: str, answer: str, fields: int, timeout_s: float = ANSWER_TIMEOUT_S) -> list[str]:
+        """The answer's fields. Lines that are no answer to this are skipped; garbage is counted."""
+        port = self._require_port()
+        end_s = time.monotonic() + timeout_s
+        try:
+            port.reset_input_buffer()
+            self._lines.restart()
+            port.write(frame(request))
+            while time.monotonic() < end_s:
+                for text in self._lines.feed(port.read(port.in_waiting or 1)):
+                    words = text.split()
+                    if words[:1] == [answer] and len(words) == fields + 1:
+                        return words[1:]
+                    if words[:1] == ["ERR"]:
+                        raise TriggerError(f"the trigger box refused '{request}': {text[4:]}")
+                if self._lines.bad_lines > BAD_LINES_LIMIT:
+                    raise TriggerError(
+                        f"{self._lines.bad_lines} garbled lines from {self._config.port}: wrong baud rate, a "
+                        "bad cable, or not a trigger box"
+                    )
+        except OSError as error:  # pyserial's SerialException is one
+            self._disconnect()
+            raise TriggerError(f"trigger box lost: {self._config.port} is gone ({error})") from error
+        raise _NoAnswerError(f"no answer to '{request}' within {timeout_s:g} s on {self._config.port}")
+
+    def _pulse_line(self) -> TriggerPulse:
+        port = self._require_port()
+        line = self._config.mode
+        try:
+            fired_ns = time.monotonic_ns()
+            setattr(port, line, True)
+            time.sleep(self._config.pulse_us / 1e6)
+            setattr(port, line, False)
+        except OSError as error:
+            self._disconnect()
+            raise TriggerError(f"the adapter on {self._config.port} is gone ({error})") from error
+        self._count += 1
+        return TriggerPulse(self._count, fired_ns // 1000, fired_ns)
+
+    def _require_port(self) -> Any:
+        if self._port is None:
+            raise TriggerError("the trigger box is not open (or was lost); open it again")
+        return self._port
+
+    def _disconnect(self) -> None:
+        port, self._port = self._port, None
+        if port is not None:
+            port.close()
+
+
+class _NoAnswerError(TriggerError):
+    pass
+
+
+def _number(text: str) -> int:
+    if not text.isdecimal():
+        raise TriggerError(f"the trigger box sent '{text}' where a number belongs")
+    return int(text)
+
+
+def _open_port(path: str) -> Any:
+    import serial
+
+    port = serial.Serial()
+    port.port, port.baudrate = path, BAUD
+    port.timeout = port.write_timeout = 0.1
+    port.exclusive = True
+    port.rts = port.dtr = False
+    port.open()
+    return port

@@ -1,0 +1,97 @@
+"""A trigger box at the other end of a pty, with the faults that real ones show."""
+
+from __future__ import annotations
+
+import os
+import select
+import threading
+import time
+import tty
+from collections.abc import Callable
+
+from station.devices.trigger_lines import PRODUCT, PROTOCOL, LineReader, frame
+
+_COUNTS = 1 << 32
+
+
+class SimulatedTriggerBox:
+    """Serves from a thread; `port` is the path to open. `on_pulse` is the trigger line's other end.
+
+    Faults are attributes: set them, and they hold until set back.
+    """
+
+    def __init__(self, on_pulse: Callable[[], None] = lambda: None, serial: str = "SIM1") -> None:
+        self.on_pulse = on_pulse
+        self.product = PRODUCT
+        """Another one = some other device sits on this port"""
+        self.count = 0
+        self.light_permille = 0
+        self.silent = False
+        self.garbage = b""
+        """Sent before every answer"""
+        self.cut_answers = 0
+        """So many answers end in the middle, without a newline"""
+        self._serial = serial
+        self._boot_id = "00000001"
+        self._start_s = time.monotonic()
+        self._lines = LineReader()
+        self._master, self._slave = os.openpty()
+        tty.setraw(self._slave)
+        self.port = os.ttyname(self._slave)
+        self._stop_read, self._stop_write = os.pipe()
+        self._thread = threading.Thread(target=self._serve, name="trigger box", daemon=True)
+        self._thread.start()
+
+    def reset(self) -> None:
+        """Power failed for a moment: count and light are zero, the boot id is another."""
+        self._boot_id = f"{int(self._boot_id, 16) + 1:08x}"
+        self.count = self.light_permille = 0
+        self._start_s = time.monotonic()
+
+    def unplug(self) -> None:
+        """The port vanishes. Idempotent."""
+        if self._thread.is_alive():
+            os.write(self._stop_write, b"x")
+            self._thread.join()
+            for descriptor in (self._master, self._slave, self._stop_read, self._stop_write):
+                os.close(descriptor)
+
+    def __enter__(self) -> SimulatedTriggerBox:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.unplug()
+
+    def _serve(self) -> None:
+        while True:
+            ready, _, _ = select.select([self._master, self._stop_read], [], [])
+            if self._stop_read in ready:
+                return
+            for text in self._lines.feed(os.read(self._master, 4096)):
+                answer = self._answer(text.split())
+                if not self.silent:
+                    self._send(frame(answer))
+
+    def _send(self, line: bytes) -> None:
+        if self.cut_answers > 0:
+            self.cut_answers -= 1
+            line = line[: len(line) // 2]
+        os.write(self._master, self.garbage + line)
+
+    def _answer(self, words: list[str]) -> str:
+        match words:
+            case ["ID?"]:
+                return f"ID {self.product} {PROTOCOL} {self._serial}"
+            case ["STATUS?"]:
+                return f"STATUS {self._boot_id} {self.count} {self.light_permille}"
+            case ["FIRE", width] if width.isdecimal() and 10 <= int(width) <= 100_000:
+                self.count = (self.count + 1) % _COUNTS
+                self.on_pulse()
+                return f"FIRED {self._boot_id} {self.count} {self._uptime_us()}"
+            case ["LIGHT", level] if level.isdecimal() and int(level) <= 1000:
+                self.light_permille = int(level)
+                return f"LIGHT {self.light_permille}"
+        return f"ERR {' '.join(words)}"
+
+    def _uptime_us(self) -> int:
+        return int((time.monotonic() - self._start_s) * 1e6)

@@ -1,0 +1,155 @@
+"""The trigger box on a pty: its answers, and what the operator reads when it misbehaves."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import AsyncIterator, Iterator
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from station.config import TriggerConfig
+from station.devices import serial_trigger
+from station.devices.serial_trigger import SerialTrigger
+from station.devices.trigger_lines import LINE_LIMIT, LineReader, checksum, frame
+from station.errors import TriggerError
+from station.simulation.trigger import SimulatedTriggerBox
+
+
+@pytest.fixture(autouse=True)
+def impatient(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(serial_trigger, "HANDSHAKE_TIMEOUT_S", 0.3)
+    monkeypatch.setattr(serial_trigger.SerialTrigger._ask, "__defaults__", (0.3,))
+
+
+@pytest.fixture
+def box() -> Iterator[SimulatedTriggerBox]:
+    with SimulatedTriggerBox() as simulated:
+        yield simulated
+
+
+@pytest.fixture
+async def trigger(box: SimulatedTriggerBox) -> AsyncIterator[SerialTrigger]:
+    device = SerialTrigger(TriggerConfig(port=box.port))
+    await device.open()
+    yield device
+    await device.close()
+
+
+async def test_a_pulse_has_a_count_and_both_times(box: SimulatedTriggerBox, trigger: SerialTrigger) -> None:
+    pulses = []
+    box.on_pulse = lambda: pulses.append(time.monotonic_ns())
+    first, second = await trigger.fire(), await trigger.fire()
+    assert (first.count, second.count) == (1, 2) and len(pulses) == 2
+    assert second.device_us > first.device_us
+    assert abs(first.host_monotonic_ns - pulses[0]) < 50_000_000
+
+
+async def test_the_box_says_who_it_is_and_lights(box: SimulatedTriggerBox, trigger: SerialTrigger) -> None:
+    assert await trigger.open() == "calibration-trigger SIM1"
+    for level, permille in ((0.25, 250), (7.0, 1000), (0.0, 0)):
+        await trigger.light(level)
+        assert box.light_permille == permille
+
+
+async def test_a_missing_port_names_port_and_remedy() -> None:
+    with pytest.raises(TriggerError, match=r"/dev/no-such-box.*dialout"):
+        await SerialTrigger(TriggerConfig(port="/dev/no-such-box")).open()
+
+
+async def test_a_closed_box_is_refused_and_can_be_opened_again(trigger: SerialTrigger) -> None:
+    await trigger.close()
+    with pytest.raises(TriggerError, match="not open"):
+        await trigger.fire()
+    await trigger.open()
+    assert (await trigger.fire()).count == 1
+
+
+async def test_the_port_is_ours_alone(box: SimulatedTriggerBox, trigger: SerialTrigger) -> None:
+    with pytest.raises(TriggerError, match="cannot be opened"):
+        await SerialTrigger(TriggerConfig(port=box.port)).open()
+
+
+async def test_an_answer_cut_short_is_settled_by_the_boxs_own_count(
+    box: SimulatedTriggerBox, trigger: SerialTrigger
+) -> None:
+    await trigger.fire()
+    box.cut_answers = 1
+    assert (await trigger.fire()).count == 2, "it did fire: the status says so"
+    assert (await trigger.fire()).count == 3
+
+
+async def test_a_pulse_width_the_box_cannot_do_is_refused(box: SimulatedTriggerBox) -> None:
+    device = SerialTrigger(TriggerConfig(port=box.port, pulse_us=5))
+    await device.open()
+    with pytest.raises(TriggerError, match="refused 'FIRE 5'"):
+        await device.fire()
+    await device.close()
+
+
+class Adapter:
+    """A USB-serial adapter's lines; ptys have none."""
+
+    def __init__(self) -> None:
+        self.edges: list[tuple[str, bool, float]] = []
+        self.pulled = False
+
+    def __setattr__(self, name: str, value: object) -> None:
+        if name in ("rts", "dtr"):
+            if self.pulled:
+                raise OSError(5, "Input/output error")
+            self.edges.append((name, bool(value), time.monotonic()))
+        else:
+            super().__setattr__(name, value)
+
+    def close(self) -> None: ...
+
+
+@pytest.mark.parametrize("mode", ["rts", "dtr"])
+async def test_a_plain_adapter_pulses_its_line(mode: str) -> None:
+    adapter = Adapter()
+    config = TriggerConfig(port="/dev/ttyUSB0", mode=mode, pulse_us=20_000)  # type: ignore[arg-type]
+    device = SerialTrigger(config, open_port=lambda path: adapter)
+    assert await device.open() == f"{mode.upper()} of /dev/ttyUSB0"
+    assert [(await device.fire()).count for _ in range(2)] == [1, 2]
+    assert [(name, level) for name, level, _ in adapter.edges] == [(mode, True), (mode, False)] * 2
+    assert adapter.edges[1][2] - adapter.edges[0][2] >= 0.02
+    with pytest.raises(TriggerError, match="no light"):
+        await device.light(1.0)
+    adapter.pulled = True
+    with pytest.raises(TriggerError, match="is gone"):
+        await device.fire()
+    await device.close()
+
+
+def test_checksum_of_a_known_sentence() -> None:
+    assert checksum("GPGLL,5300.97914,N,00259.98174,E,125926,A") == "28"  # NMEA 0183's usual example
+
+
+@given(st.lists(st.binary(max_size=300), max_size=8), st.integers(1, 7))
+def test_no_garbage_hides_the_good_lines_after_it(garbage: list[bytes], step: int) -> None:
+    reader = LineReader()
+    stream = b"".join(garbage) + b"\n" + frame("FIRED 1 2 3") + frame("ID x 1 y")
+    lines: list[str] = []
+    for i in range(0, len(stream), step):
+        lines += reader.feed(stream[i : i + step])
+    assert lines[-2:] == ["FIRED 1 2 3", "ID x 1 y"]
+    assert len(reader._pending) <= LINE_LIMIT
+
+
+@given(st.text(st.characters(codec="ascii", exclude_characters="\r\n*"), min_size=1, max_size=60), st.data())
+def test_a_changed_byte_is_noticed(text: str, data: st.DataObject) -> None:
+    line = bytearray(frame(text))
+    place = data.draw(st.integers(0, len(line) - 2))
+    line[place] ^= 1 << data.draw(st.integers(0, 6))
+    assert LineReader().feed(bytes(line)) == []
+
+
+def test_an_endless_line_takes_no_memory() -> None:
+    reader = LineReader()
+    for _ in range(1000):
+        assert reader.feed(os.urandom(1000).replace(b"\n", b"")) == []
+    assert len(reader._pending) <= LINE_LIMIT
+    assert reader.feed(b"\n" + frame("OK")) == ["OK"] and reader.bad_lines == 1

@@ -172,11 +172,13 @@ def _checks(
 
 
 def _limit_of(label: str, scene: Scene) -> str:
-    """'forearm against table' → 'table'; bodies of the arm against each other are one limit."""
+    """'forearm against table' → 'the table'; bodies of the arm against each other are one limit."""
     _, against, other = label.partition(" against ")
     if not against:
-        return label.replace("flange or camera outside ", "")
-    return "the arm touching itself or its tool" if other in scene.geometry.body_names else other
+        return "the workspace box"
+    if other in scene.geometry.body_names:
+        return "the arm touching itself or its tool"
+    return "the " + other.removeprefix("the ")
 
 
 def _all_branches(scene: Scene, flange: Array, near: Array | None) -> tuple[NDArray[np.intp], Array]:

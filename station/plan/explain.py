@@ -16,6 +16,7 @@ _REMEDIES = {
     "singular postures": "move the board sideways, so that the arm need not stretch or fold",
     "the arm itself, between camera and board": "turn the board to face the camera, or mount the camera so "
     "that it looks away from the arm (is camera_guess right?)",
+    "the workspace box": "widen limits.workspace_min_m and workspace_max_m, or move the board to its middle",
     "the arm touching itself or its tool": "check limits.solids, or move the board further from the base",
     "the board": "lower limits.board_clearance_m, measure board_guess better (its sigma counts), or turn it",
     "the camera": "work further from the camera, or measure camera_guess better (its sigma counts)",
@@ -45,11 +46,10 @@ def explain_shortage(scene: Scene, wanted: int, group: Pool, found: Pool, start:
 
 
 def _remedy(limit: str) -> str:
-    if "workspace" in limit:
-        bound = "workspace_min_m" if "minimum" in limit else "workspace_max_m"
-        return f"widen limits.{bound}, or move the board into the box"
     return _REMEDIES.get(
-        limit, f"move the board away from the {limit}, or correct its place in limits.planes"
+        limit,
+        f"move the board away from {limit}, or correct limits.planes (or is board_guess turned over? The "
+        "board's z axis points into the board)",
     )
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from itertools import pairwise
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibrate.geometry import Array
 from station.collision import CellGeometry, margins, moving_points
@@ -17,34 +18,50 @@ from station.limits import (
     trapezoid,
 )
 
-_SAMPLES = 13
+_SAMPLES = (9, 33, 129)
+"""Along one move: few at first."""
 BLOCKED = np.inf
 
 
 def move_times(geometry: CellGeometry, joints_from: Array, joints_to: Array) -> Array:
     """Durations (n,) in seconds of joint moves (n, 6) → (n, 6); BLOCKED where the path breaks a limit.
 
-    Coarse but on the safe side: margins shrink by half of what modelled points travel between samples.
+    On the safe side: margins shrink by half of what modelled points travel between samples. Only moves that
+    few samples cannot decide are sampled more densely.
     """
+    times = np.full(len(joints_from), BLOCKED)
+    open_moves = np.flatnonzero(
+        np.abs(joints_to - joints_from).max(axis=1, initial=0.0) <= geometry.limits.joint_step_rad
+    )
+    for samples in _SAMPLES:
+        if len(open_moves) == 0:
+            break
+        seconds, free, hopeless = _sampled(geometry, joints_from[open_moves], joints_to[open_moves], samples)
+        times[open_moves[free]] = seconds[free]
+        open_moves = open_moves[~free & ~hopeless]
+    return times
+
+
+def _sampled(
+    geometry: CellGeometry, joints_from: Array, joints_to: Array, samples: int
+) -> tuple[Array, NDArray[np.bool_], NDArray[np.bool_]]:
+    """Durations (n,) of moves; which are free for certain; which certainly break a limit."""
     n = len(joints_from)
-    if n == 0:
-        return np.zeros(0)
-    fractions = np.linspace(0, 1, _SAMPLES)
-    paths = joints_from[:, None] + fractions[:, None] * (joints_to - joints_from)[:, None]
+    paths = joints_from[:, None] + np.linspace(0, 1, samples)[:, None] * (joints_to - joints_from)[:, None]
     flat = paths.reshape(-1, 6)
-    points = moving_points(geometry, flat).reshape(n, _SAMPLES, -1, 3)
+    points = moving_points(geometry, flat).reshape(n, samples, -1, 3)
     travel = np.linalg.norm(np.diff(points, axis=1), axis=-1).max(axis=(1, 2))
+    gaps = margins(geometry, flat)[0].reshape(n, samples, -1)
     slack = np.maximum(1.1 * travel, SPACING_M) / 2
-    gaps = margins(geometry, flat)[0].reshape(n, _SAMPLES, -1) - slack[:, None, None]
-    worst = leaving(gaps).min(axis=(1, 2))
-    limits = geometry.limits
+    free = leaving(gaps - slack[:, None, None]).min(axis=(1, 2)) >= 0
+    hopeless = leaving(gaps - SPACING_M / 2).min(axis=(1, 2)) < 0
     step = np.abs(joints_to - joints_from).max(axis=1)
-    rate = travel * (_SAMPLES - 1) / np.maximum(step, 1e-9)
-    speed = np.minimum(limits.joint_speed_rad_s, JOINT_SPEED_CAP_RAD_S)
+    rate = travel * (samples - 1) / np.maximum(step, 1e-9)
+    limits = geometry.limits
+    speed = min(limits.joint_speed_rad_s, JOINT_SPEED_CAP_RAD_S)
     speed = np.minimum(speed, 0.97 * min(limits.speed_m_s, SPEED_CAP_M_S) / np.maximum(rate, 1e-9))
     duration, _ = trapezoid(step, speed, min(limits.joint_acceleration_rad_s2, JOINT_ACCELERATION_CAP_RAD_S2))
-    bad = (worst < 0) | (step > limits.joint_step_rad)
-    return np.where(bad, BLOCKED, duration)
+    return duration, np.asarray(free), np.asarray(hopeless)
 
 
 def time_matrix(geometry: CellGeometry, joints_rad: Array) -> Array:

@@ -71,6 +71,31 @@ def test_types_are_the_documented_ones(controller, rtde) -> None:
     assert reply[1:] == b"DOUBLE,VECTOR6D,INT32,UINT32,VECTOR6INT32,UINT64,VECTOR3D,INT32"
 
 
+@pytest.mark.parametrize(("model", "extra", "size"), [("UR10", "", 1132), ("UR10e", "ft_raw_wrench", 1180)])
+def test_ur_rtdes_default_recipe_has_its_size(controller, rtde, model, extra, size) -> None:
+    """57 variables on CB3, 58 on e-Series: packet lengths as seen on the wire."""
+    running = controller(model)
+    client = rtde(running)
+    names = f"""timestamp target_q target_qd target_qdd target_current target_moment actual_q actual_qd
+        actual_current joint_control_output actual_TCP_pose actual_TCP_speed actual_TCP_force target_TCP_pose
+        target_TCP_speed actual_digital_input_bits joint_temperatures actual_execution_time robot_mode
+        joint_mode safety_mode actual_tool_accelerometer speed_scaling target_speed_fraction actual_momentum
+        actual_main_voltage actual_robot_voltage actual_robot_current actual_joint_voltage
+        actual_digital_output_bits runtime_state standard_analog_input0 standard_analog_input1
+        standard_analog_output0 standard_analog_output1 robot_status_bits safety_status_bits {extra} payload
+        payload_cog payload_inertia output_int_register_2""".split()
+    names += [f"output_{kind}_register_{i}" for kind in ("int", "double") for i in range(12, 20)]
+    client.start(*names)
+    kind, payload = client.receive()
+    assert kind == PacketType.DATA and len(payload) + 3 == size
+    control = rtde(running)
+    control.start(
+        "timestamp", "robot_status_bits", "safety_status_bits", "runtime_state",
+        *(f"output_int_register_{i}" for i in range(3)), *(f"output_double_register_{i}" for i in range(6)),
+    )  # fmt: skip
+    assert len(control.receive()[1]) + 3 == 84
+
+
 def test_unknown_names_and_wrong_generation_are_not_found(controller, rtde) -> None:
     client = rtde(controller("UR10"))
     ask = struct.pack(">d", 125.0) + b"timestamp,ft_raw_wrench,nonsense"

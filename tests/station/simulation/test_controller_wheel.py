@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Callable
 from typing import Any
 
 import pytest
 
+from station.simulation.admin import AdminClient
 from station.simulation.launch import SimulatedController
 
 pytestmark = pytest.mark.process
@@ -337,6 +339,26 @@ def test_local_control_refuses_the_wheel(controller: Start, wheel: Wheel) -> Non
     assert result["remote"] is False and "Remote Control" in result["stop"]
     assert "Remote Control" in result["same connection"]
     assert result["running"] is True and result["local again"] is False
+
+
+def test_a_killed_client_leaves_the_arm_moving_and_the_registers_free(
+    controller: Start, wheel: Wheel, admin: Callable[[SimulatedController], AdminClient]
+) -> None:
+    """Why a driver needs the watchdog: without it the program runs on alone."""
+    running = controller("UR10")
+    wheel(
+        running,
+        "rtde_control.RTDEControlInterface(host).moveJ(FAR, 1.0, 2.0, True)\nos.kill(os.getpid(), 9)",
+        ends=False,
+    )
+    ask = admin(running)
+    state = ask.ask("state")
+    assert state["moving"] and state["runtime_state"] == "PLAYING" and state["claims"] == []
+    deadline = time.monotonic() + 5
+    while ask.ask("state")["moving"]:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    assert ask.ask("state")["target_joints_rad"][0] == pytest.approx(1.2)
 
 
 def test_a_second_client_and_a_foreign_program(controller: Start, wheel: Wheel) -> None:

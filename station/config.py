@@ -113,8 +113,9 @@ class StillnessConfig(Section, frozen=True):
 
 class CaptureConfig(Section, frozen=True):
     lossless_png: bool = False
-    time_bound_s: float = 0.005
-    """A pose whose time bound is worse is refused (the arm is at rest: this is generous)."""
+    time_bound_s: float = 0.02
+    """A pose whose time bound is worse is refused. The arm is at rest: at the stillness limit of 2 mrad/s
+    this is 0.04 mm at one metre."""
     free_space_bytes: int = 2_000_000_000
     retries: int = 2
 

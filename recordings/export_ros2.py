@@ -8,17 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from mcap.writer import CompressionType, Writer
 
 from recordings.cdr import definition_text, encode_cdr
-from recordings.files import create_exclusively
+from recordings.mcap_file import McapFile
 from recordings.messages import CameraModel, View
 from recordings.part import RecordingPart
 from recordings.pictures import raw_encoding
 from recordings.reader import Recording
 from recordings.topics import Topic
 from recordings.viewing import CAMERA_FRAME, quaternion_xyzw
-from recordings.writer import CHUNK_BYTES, LIBRARY, DirectFile
 
 _NS = 1_000_000_000
 _BAG_VERSION = 8
@@ -33,8 +31,9 @@ _DISTORTION_COUNT = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
 def write_ros2(recording: Recording, folder: Path) -> None:
     """Fills the folder with `NAME.mcap` and `metadata.yaml`. Wall time is the bag's time."""
     name = f"{recording.info.name}.mcap"
-    file = DirectFile(create_exclusively(folder / name))
+    file = McapFile(folder / name)
     try:
+        file.start(profile="ros2")
         bag = _Bag(file)
         for part in recording.parts:
             _write_part(bag, recording, part)
@@ -129,13 +128,8 @@ def _transform(view: View, time_ns: int) -> dict[str, Any]:
 class _Bag:
     """An MCAP with rosbag2's conventions, and the counts that metadata.yaml needs."""
 
-    def __init__(self, file: DirectFile) -> None:
-        self._writer = Writer(
-            file,  # type: ignore[arg-type]  # write, tell and flush are all it uses
-            chunk_size=CHUNK_BYTES,
-            compression=CompressionType.NONE,
-        )
-        self._writer.start(profile="ros2", library=LIBRARY)
+    def __init__(self, file: McapFile) -> None:
+        self._file = file
         self._channels: dict[str, int] = {}
         self._kinds: dict[str, str] = {}
         self._counts: Counter[str] = Counter()
@@ -145,18 +139,15 @@ class _Bag:
         if topic not in self._channels:
             package, name = kind.split("/")
             self._kinds[topic] = f"{package}/msg/{name}"
-            schema = self._writer.register_schema(
-                self._kinds[topic], "ros2msg", definition_text(kind).encode()
-            )
-            qos = {"offered_qos_profiles": ""}
-            self._channels[topic] = self._writer.register_channel(topic, "cdr", schema, qos)
-        sequence = self._counts[topic]
-        self._writer.add_message(self._channels[topic], time_ns, encode_cdr(kind, message), time_ns, sequence)
+            schema = (self._kinds[topic], "ros2msg", definition_text(kind).encode())
+            self._channels[topic] = self._file.register(topic, "cdr", schema, {"offered_qos_profiles": ""})
+        content = encode_cdr(kind, message)
+        self._file.message(self._channels[topic], [content], time_ns, self._counts[topic])
         self._counts[topic] += 1
         self._times_ns = [min([*self._times_ns, time_ns]), max([*self._times_ns, time_ns])]
 
     def finish(self) -> None:
-        self._writer.finish()  # type: ignore[no-untyped-call]
+        self._file.finish()
 
     def metadata(self, file_name: str) -> bytes:
         first, last = self._times_ns or (0, 0)

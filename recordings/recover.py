@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
-from mcap.writer import CompressionType, Writer
 
 from recordings.contents import Contents
 from recordings.errors import CorruptRecordingError, RecordingError, UnsealedRecordingError
-from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, create_exclusively, lock, rename_new, sync_folder
+from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, lock, rename_new, sync_folder
+from recordings.mcap_file import McapFile
 from recordings.messages import View
 from recordings.part import RecordingPart
 from recordings.records import MESSAGE_HEAD, RECORD_HEAD, Opcode, split_records, with_crc
@@ -19,7 +19,6 @@ from recordings.salvage import CompressedError, Salvage, salvage
 from recordings.scan import open_file
 from recordings.schema import SESSION_RECORDS, SchemaError, decode
 from recordings.topics import Topic
-from recordings.writer import CHUNK_BYTES, LIBRARY, DirectFile
 
 DAMAGED_SUFFIX = ".damaged"
 
@@ -130,7 +129,7 @@ def _rebuild(descriptor: int, source: Path, final: Path, in_place: bool) -> Reco
     dropped, reasons = _orphans(descriptor, found.contents)
     losses = (*(f"bytes {start} to {end}: {why}" for start, end, why in found.lost), *reasons)
     temporary = final.with_name(final.name + ".recovering")
-    file = DirectFile(create_exclusively(temporary))
+    file = McapFile(temporary)
     try:
         _write(file, descriptor, found, session, dropped, losses)
         os.fsync(file.descriptor)
@@ -189,7 +188,7 @@ def _orphans(descriptor: int, contents: Contents) -> tuple[set[int], list[str]]:
 
 
 def _write(
-    file: DirectFile,
+    file: McapFile,
     descriptor: int,
     found: Salvage,
     session: dict[str, str],
@@ -197,34 +196,27 @@ def _write(
     losses: tuple[str, ...],
 ) -> None:
     """The good chunks' messages, as they were, into a new sealed file."""
-    writer = Writer(
-        file,  # type: ignore[arg-type]  # write, tell and flush are all it uses
-        chunk_size=CHUNK_BYTES,
-        compression=CompressionType.NONE,
-        enable_data_crcs=True,
-    )
-    writer.start(profile="", library=LIBRARY)
+    file.start()
     contents = found.contents
     for name in SESSION_RECORDS:
-        writer.add_metadata(name, session)
+        file.metadata(name, session)
     note = {"lost_bytes": str(found.lost_bytes), "losses": msgspec.json.encode(losses[:100]).decode()}
-    writer.add_metadata("recovery", with_crc(note))
+    file.metadata("recovery", with_crc(note))
     for name, data in contents.attachments.items():
-        writer.add_attachment(0, 0, name, contents.media_types[name], data)
+        file.attachment(name, contents.media_types[name], data, 0)
     numbers: dict[int, int] = {}
     for start, length in found.chunks:
         for place, opcode, content in split_records(memoryview(os.pread(descriptor, length, start))):
             if opcode != Opcode.MESSAGE or start + place + _DATA_OFFSET in dropped:
                 continue
-            number, sequence, log_ns, publish_ns = MESSAGE_HEAD.unpack_from(content)
+            number, sequence, time_ns, _ = MESSAGE_HEAD.unpack_from(content)
             if number not in contents.channels:
                 continue
             if number not in numbers:
                 channel = contents.channels[number]
                 schema = contents.schemas[channel.schema_id]
-                schema_id = writer.register_schema(schema.name, schema.encoding, schema.data)
-                numbers[number] = writer.register_channel(channel.topic, channel.encoding, schema_id)
-            data = bytes(content[MESSAGE_HEAD.size :])
-            writer.add_message(numbers[number], log_ns, data, publish_ns, sequence)
-        writer.flush()  # type: ignore[no-untyped-call]
-    writer.finish()  # type: ignore[no-untyped-call]
+                declared = (schema.name, schema.encoding, schema.data)
+                numbers[number] = file.register(channel.topic, channel.encoding, declared)
+            file.message(numbers[number], [content[MESSAGE_HEAD.size :]], time_ns, sequence)
+        file.end_chunk()
+    file.finish()

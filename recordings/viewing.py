@@ -12,6 +12,7 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from numpy.typing import NDArray
 
+from recordings.mcap_file import Piece
 from recordings.messages import CameraModel, CaptureEvent, Matrix4, View
 from recordings.pictures import raw_encoding
 
@@ -26,25 +27,34 @@ def _stamp(message: Any, time_ns: int) -> None:
     message.timestamp.seconds, message.timestamp.nanos = divmod(time_ns, _NS)
 
 
-def raw_image(image: NDArray[Any], pixel_format: str, time_ns: int) -> Any:
-    """A picture as it came, no compression. PictureError for an array no viewer could show."""
-    data = image.tobytes()
+def raw_image(image: NDArray[Any], pixel_format: str, time_ns: int) -> list[Piece]:
+    """A picture as it came: the message in pieces, the pixels not copied. PictureError for odd arrays."""
+    encoding = raw_encoding(image, pixel_format)
+    pixels = np.ascontiguousarray(image).data.cast("B")
+    height, width = image.shape[:2]
     message = RawImage(
-        frame_id=CAMERA_FRAME,
-        width=image.shape[1],
-        height=image.shape[0],
-        encoding=raw_encoding(image, pixel_format),
-        step=len(data) // image.shape[0],
-        data=data,
+        frame_id=CAMERA_FRAME, width=width, height=height, encoding=encoding, step=len(pixels) // height
     )
     _stamp(message, time_ns)
-    return message
+    return _with_data(message, pixels)
 
 
-def compressed_image(data: bytes, format: str, time_ns: int) -> Any:
-    message = CompressedImage(frame_id=CAMERA_FRAME, data=data, format=format)
+def compressed_image(data: bytes, format: str, time_ns: int) -> list[Piece]:
+    """A picture file: the message in pieces."""
+    message = CompressedImage(frame_id=CAMERA_FRAME, format=format)
     _stamp(message, time_ns)
-    return message
+    return _with_data(message, data)
+
+
+def _with_data(message: Any, data: Piece) -> list[Piece]:
+    """The message's bytes with its `data` field behind the others, where protobuf allows it to stand."""
+    tag = message.DESCRIPTOR.fields_by_name["data"].number << 3 | 2
+    length, rest = bytearray(), len(data)
+    while rest > 127:
+        length.append(rest & 127 | 128)
+        rest >>= 7
+    length.append(rest)
+    return [message.SerializeToString() + bytes([tag]) + length, data]
 
 
 def camera_calibration(model: CameraModel, time_ns: int) -> Any:

@@ -12,59 +12,28 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import Self
 
 import msgspec
-from mcap.writer import CompressionType, Writer
 
 from recordings import viewing
 from recordings.errors import RecordingError
 from recordings.files import (
     PART_SUFFIX,
-    create_exclusively,
     is_attachment_name,
     is_session_name,
     rename_new,
     sync_folder,
 )
+from recordings.mcap_file import McapFile, Piece
 from recordings.messages import CameraModel, CaptureEvent, Picture, RobotState, SessionInfo, Stamps, View
 from recordings.pictures import PictureError, encode_png, read_header
 from recordings.records import with_crc
 from recordings.schema import FORMAT, SESSION_RECORDS, PictureFacts, encode
 from recordings.topics import Topic, schema_bytes, schema_name
 
-CHUNK_BYTES = 1024 * 1024
 ATTACHMENT_LIMIT_BYTES = 16 * 1024 * 1024
-LIBRARY = "calibration-station"
 _SECOND_NS = 1_000_000_000
-
-
-class DirectFile:
-    """Writes straight to the descriptor: whole chunks come as one call, and an error shows at once."""
-
-    def __init__(self, descriptor: int) -> None:
-        self.descriptor = descriptor
-        self.closed = False
-        self._position = 0
-
-    def write(self, data: bytes) -> int:
-        rest = memoryview(data)
-        while rest:
-            done = os.write(self.descriptor, rest)
-            self._position += done
-            rest = rest[done:]
-        return len(data)
-
-    def tell(self) -> int:
-        return self._position
-
-    def flush(self) -> None:
-        """Nothing is held back."""
-
-    def close(self) -> None:
-        if not self.closed:
-            self.closed = True
-            os.close(self.descriptor)
 
 
 class RecordingWriter:
@@ -91,25 +60,18 @@ class RecordingWriter:
         self._sequences: dict[Topic, int] = {}
         self._pictures: set[int] = set()
         self._attachments: set[str] = set()
-        self._file = DirectFile(create_exclusively(self.part_path))
-        self._writer = Writer(
-            self._file,  # type: ignore[arg-type]  # write, tell and flush are all it uses
-            chunk_size=CHUNK_BYTES,
-            compression=CompressionType.NONE,
-            enable_crcs=True,
-            enable_data_crcs=True,
-        )
+        self._file = McapFile(self.part_path)
         with self._disk():
-            self._writer.start(profile="", library=LIBRARY)
+            self._file.start()
             content = with_crc({"format": FORMAT, "session": msgspec.json.encode(info).decode()})
             for name in SESSION_RECORDS:
-                self._writer.add_metadata(name, content)
+                self._file.metadata(name, content)
             sync_folder(path.parent)
         if info.camera.matrix is not None:
             self.camera_model(info.camera)
 
     def robot_state(self, state: RobotState) -> None:
-        self._add(Topic.ROBOT_STATE, encode(state), self._time_ns(state.stamps))
+        self._add(Topic.ROBOT_STATE, [encode(state)], self._time_ns(state.stamps))
 
     def picture(self, picture: Picture, encoded: bytes | None = None) -> None:
         """`encoded`: the same picture's PNG or JPEG bytes, stored instead of the array (imported files)."""
@@ -138,12 +100,12 @@ class RecordingWriter:
             topic, image = self._image(picture, encoded, time_ns)
         except PictureError as error:
             raise RecordingError(f"picture {picture.sequence}: {error}") from error
-        self._add(Topic.PICTURE_FACTS, encode(facts), time_ns, picture.sequence)
-        self._add(topic, image.SerializeToString(), time_ns, picture.sequence)
+        self._add(Topic.PICTURE_FACTS, [encode(facts)], time_ns, picture.sequence)
+        self._add(topic, image, time_ns, picture.sequence)
         self._pictures.add(picture.sequence)
         self.flush()
 
-    def _image(self, picture: Picture, encoded: bytes | None, time_ns: int) -> tuple[Topic, Any]:
+    def _image(self, picture: Picture, encoded: bytes | None, time_ns: int) -> tuple[Topic, list[Piece]]:
         if encoded is None and self._lossless_png:
             encoded = encode_png(picture.image)
         if encoded is None:
@@ -158,19 +120,19 @@ class RecordingWriter:
                 "take the pose again"
             )
         time_ns = self._time_ns(view.stamps, view.picture_sequence)
-        self._add(Topic.VIEW, encode(view), time_ns)
-        self._add(Topic.TRANSFORM, viewing.flange_transform(view, time_ns).SerializeToString(), time_ns)
+        self._add(Topic.VIEW, [encode(view)], time_ns)
+        self._add(Topic.TRANSFORM, [viewing.flange_transform(view, time_ns).SerializeToString()], time_ns)
         self.flush()
 
     def event(self, event: CaptureEvent) -> None:
         time_ns = self._time_ns(event.stamps)
-        self._add(Topic.EVENT, encode(event), time_ns)
-        self._add(Topic.LOG, viewing.log_line(event, time_ns).SerializeToString(), time_ns)
+        self._add(Topic.EVENT, [encode(event)], time_ns)
+        self._add(Topic.LOG, [viewing.log_line(event, time_ns).SerializeToString()], time_ns)
 
     def camera_model(self, model: CameraModel) -> None:
         """Intrinsics for viewers; what calibrate uses is `SessionInfo.camera`."""
         message = viewing.camera_calibration(model, self._start_ns)
-        self._add(Topic.CAMERA_CALIBRATION, message.SerializeToString(), self._start_ns)
+        self._add(Topic.CAMERA_CALIBRATION, [message.SerializeToString()], self._start_ns)
 
     def attach(self, name: str, media_type: str, content: bytes) -> None:
         """A small file that rides along, like `plan.yaml`."""
@@ -179,13 +141,13 @@ class RecordingWriter:
         if len(content) > ATTACHMENT_LIMIT_BYTES:
             raise RecordingError(f"attachment {name} is larger than {ATTACHMENT_LIMIT_BYTES >> 20} MiB")
         with self._disk():
-            self._writer.add_attachment(self._start_ns, self._start_ns, name, media_type, content)
+            self._file.attachment(name, media_type, content, self._start_ns)
         self._attachments.add(name)
 
     def flush(self) -> None:
         """Ends the open chunk and hands everything to the operating system: survives a killed process."""
         with self._disk():
-            self._writer.flush()  # type: ignore[no-untyped-call]
+            self._file.end_chunk()
 
     def sync(self) -> None:
         """Everything so far is on the disk when this returns: survives a power loss."""
@@ -196,7 +158,7 @@ class RecordingWriter:
     def finish(self) -> Path:
         """Seals the file, renames it, and returns its final path."""
         with self._disk():
-            self._writer.finish()  # type: ignore[no-untyped-call]
+            self._file.finish()
             os.fsync(self._file.descriptor)
             rename_new(self.part_path, self.path)
         self.close()
@@ -217,24 +179,21 @@ class RecordingWriter:
     @property
     def bytes_written(self) -> int:
         """Handed to the operating system so far."""
-        return self._file.tell()
+        return self._file.size_bytes
 
     def _time_ns(self, stamps: Stamps, place: int = 0) -> int:
         """Wall time where there is one; imported pictures have none and follow each other by a second."""
         return stamps.host_wall_ns or self._start_ns + place * _SECOND_NS
 
-    def _add(self, topic: Topic, content: bytes, time_ns: int, sequence: int | None = None) -> None:
+    def _add(self, topic: Topic, pieces: list[Piece], time_ns: int, sequence: int | None = None) -> None:
         if sequence is None:
             sequence = self._sequences.get(topic, 0)
             self._sequences[topic] = sequence + 1
         with self._disk():
-            self._writer.add_message(self._channel(topic), time_ns, content, time_ns, sequence & 0xFFFFFFFF)
-
-    def _channel(self, topic: Topic) -> int:
-        if topic not in self._channels:
-            schema_id = self._writer.register_schema(schema_name(topic), "protobuf", schema_bytes(topic))
-            self._channels[topic] = self._writer.register_channel(topic.value, "protobuf", schema_id)
-        return self._channels[topic]
+            if topic not in self._channels:
+                schema = (schema_name(topic), "protobuf", schema_bytes(topic))
+                self._channels[topic] = self._file.register(topic.value, "protobuf", schema)
+            self._file.message(self._channels[topic], pieces, time_ns, sequence)
 
     @contextmanager
     def _disk(self) -> Iterator[None]:

@@ -156,17 +156,17 @@ def test_the_callers_never_wait_for_the_disk(tmp_path: Path, monkeypatch: pytest
 
 
 def break_disk_after(monkeypatch: pytest.MonkeyPatch, good_writes: int) -> None:
-    real_write = os.write
+    real_write = os.writev
     count = 0
 
-    def write(descriptor: int, data: bytes) -> int:
+    def write(descriptor: int, data: list[bytes]) -> int:
         nonlocal count
         count += 1
         if count > good_writes:
             raise OSError(28, "No space left on device")
         return real_write(descriptor, data)
 
-    monkeypatch.setattr("recordings.writer.os.write", write)
+    monkeypatch.setattr("recordings.mcap_file.os.writev", write)
 
 
 def test_the_first_write_error_is_final_and_said_to_everyone(

@@ -1,0 +1,220 @@
+"""Writes the MCAP format: chunks without compression, every checksum, indexes and statistics.
+
+Source: the MCAP format specification, version 0 (mcap.dev/spec). Unlike the reference library's writer it
+copies no picture: large contents go from the caller's memory to the kernel as they are. And it never makes
+a good-looking file after a failed write: an OSError passes through, and the caller closes the file for good.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import zlib
+from collections.abc import Sequence
+from pathlib import Path
+
+from recordings.files import create_exclusively
+from recordings.records import FOOTER, MAGIC, MESSAGE_HEAD, RECORD_HEAD, Opcode, Statistics
+
+CHUNK_BYTES = 1024 * 1024
+LIBRARY = "calibration-station"
+_LARGE_BYTES = 32 * 1024
+Piece = bytes | bytearray | memoryview
+
+
+class McapFile:
+    """An open, locked file. Large message contents must not change before the chunk's end."""
+
+    def __init__(self, path: Path) -> None:
+        """Creates the empty file exclusively. RecordingError when that fails."""
+        self.descriptor = create_exclusively(path)
+        self.closed = False
+        self.size_bytes = 0
+        self._crc = 0
+        self._declarations: list[tuple[bytes, bytes]] = []
+        """(schema record, channel record) of channel 1, 2 …; the schema has the channel's number."""
+        self._indexes: list[bytes] = []
+        """Of chunks, attachments and metadata, for the summary."""
+        self._counts = dict.fromkeys(Statistics._fields[:6], 0)
+        self._per_channel: dict[int, int] = {}
+        self._span_ns: tuple[int, int] | None = None
+        self._chunk = _Chunk()
+
+    def start(self, profile: str = "") -> None:
+        """Writes the head; comes first."""
+        self._put([MAGIC, _record(Opcode.HEADER, _text(profile) + _text(LIBRARY))])
+
+    def register(
+        self,
+        topic: str,
+        encoding: str,
+        schema: tuple[str, str, bytes],
+        metadata: dict[str, str] | None = None,
+    ) -> int:
+        """`schema`: name, encoding, data. Returns the channel's number."""
+        number = len(self._declarations) + 1
+        name, schema_encoding, data = schema
+        schema_content = struct.pack("<H", number) + _text(name) + _text(schema_encoding) + _sized(data)
+        channel_content = struct.pack("<HH", number, number) + _text(topic) + _text(encoding)
+        pair = (
+            _record(Opcode.SCHEMA, schema_content),
+            _record(Opcode.CHANNEL, channel_content + _map(metadata or {})),
+        )
+        self._declarations.append(pair)
+        for record in pair:
+            self._chunk.add(record)
+        self._counts["schemas"] += 1
+        self._counts["channels"] += 1
+        return number
+
+    def message(self, channel: int, pieces: Sequence[Piece], time_ns: int, sequence: int) -> None:
+        """A message whose content comes in pieces; ends the chunk when it is full."""
+        length = MESSAGE_HEAD.size + sum(len(piece) for piece in pieces)
+        self._chunk.note(channel, time_ns)
+        self._chunk.add(RECORD_HEAD.pack(Opcode.MESSAGE, length))
+        self._chunk.add(MESSAGE_HEAD.pack(channel, sequence & 0xFFFFFFFF, time_ns, time_ns))
+        for piece in pieces:
+            self._chunk.add(piece)
+        self._counts["messages"] += 1
+        self._per_channel[channel] = self._per_channel.get(channel, 0) + 1
+        first, last = self._span_ns or (time_ns, time_ns)
+        self._span_ns = (min(first, time_ns), max(last, time_ns))
+        if self._chunk.size_bytes > CHUNK_BYTES:
+            self.end_chunk()
+
+    def attachment(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
+        content = struct.pack("<QQ", time_ns, time_ns) + _text(name) + _text(media_type)
+        content += struct.pack("<Q", len(data)) + data
+        record = _record(Opcode.ATTACHMENT, content + struct.pack("<I", zlib.crc32(content)))
+        self.end_chunk()
+        place = struct.pack("<QQQQQ", self.size_bytes, len(record), time_ns, time_ns, len(data))
+        self._put([record])
+        self._indexes.append(_record(Opcode.ATTACHMENT_INDEX, place + _text(name) + _text(media_type)))
+        self._counts["attachments"] += 1
+
+    def metadata(self, name: str, content: dict[str, str]) -> None:
+        record = _record(Opcode.METADATA, _text(name) + _map(content))
+        self.end_chunk()
+        place = struct.pack("<QQ", self.size_bytes, len(record))
+        self._put([record])
+        self._indexes.append(_record(Opcode.METADATA_INDEX, place + _text(name)))
+        self._counts["metadata"] += 1
+
+    def end_chunk(self) -> None:
+        """Hands the open chunk to the operating system, with the indexes of its messages."""
+        chunk, self._chunk = self._chunk, _Chunk()
+        if not chunk.pieces:
+            return
+        start, head = self.size_bytes, chunk.head()
+        self._put([head, *chunk.pieces])
+        index_start = self.size_bytes
+        offsets = b""
+        records: list[bytes] = []
+        for channel, entries in chunk.entries.items():
+            offsets += struct.pack("<HQ", channel, index_start + sum(len(record) for record in records))
+            packed = b"".join(struct.pack("<QQ", *entry) for entry in entries)
+            records.append(_record(Opcode.MESSAGE_INDEX, struct.pack("<H", channel) + _sized(packed)))
+        self._put(records)
+        first, last = chunk.span_ns
+        content = struct.pack("<QQQQ", first, last, start, index_start - start) + _sized(offsets)
+        content += struct.pack("<Q", self.size_bytes - index_start) + _text("")
+        content += struct.pack("<QQ", chunk.size_bytes, chunk.size_bytes)
+        self._indexes.append(_record(Opcode.CHUNK_INDEX, content))
+        self._counts["chunks"] += 1
+
+    def finish(self) -> None:
+        """Writes the summary and the end mark. Does not sync or close."""
+        self.end_chunk()
+        self._put([_record(Opcode.DATA_END, struct.pack("<I", self._crc))])
+        start = self.size_bytes
+        summary = b"".join(
+            [
+                *(schema for schema, _ in self._declarations),
+                *(channel for _, channel in self._declarations),
+                self._statistics(),
+                *sorted(self._indexes),  # grouped by kind, as readers expect
+            ]
+        )
+        footer = RECORD_HEAD.pack(Opcode.FOOTER, FOOTER.size) + struct.pack("<QQ", start, 0)
+        crc = zlib.crc32(footer, zlib.crc32(summary))
+        self._put([summary, footer, struct.pack("<I", crc), MAGIC])
+
+    def close(self) -> None:
+        """Idempotent; what is in the open chunk is thrown away."""
+        if not self.closed:
+            self.closed = True
+            os.close(self.descriptor)
+
+    def _statistics(self) -> bytes:
+        c = self._counts
+        fixed = struct.pack("<QHIIII", *(c[name] for name in Statistics._fields[:6]))
+        pairs = b"".join(struct.pack("<HQ", *pair) for pair in self._per_channel.items())
+        return _record(
+            Opcode.STATISTICS, fixed + struct.pack("<QQ", *(self._span_ns or (0, 0))) + _sized(pairs)
+        )
+
+    def _put(self, pieces: Sequence[Piece]) -> None:
+        """Everything, however often the kernel takes only a part."""
+        rest = [memoryview(piece) for piece in pieces if len(piece)]
+        for piece in rest:
+            self._crc = zlib.crc32(piece, self._crc)
+        while rest:
+            done = os.writev(self.descriptor, rest)
+            self.size_bytes += done
+            while rest and done >= len(rest[0]):
+                done -= len(rest.pop(0))
+            if done:
+                rest[0] = rest[0][done:]
+
+
+class _Chunk:
+    """Records on their way: small ones gathered, large pieces referred to."""
+
+    def __init__(self) -> None:
+        self.pieces: list[Piece] = []
+        self.size_bytes = 0
+        self.entries: dict[int, list[tuple[int, int]]] = {}
+        """Channel → (time, offset) of its messages."""
+
+    def add(self, piece: Piece) -> None:
+        self.size_bytes += len(piece)
+        if len(piece) >= _LARGE_BYTES:
+            self.pieces.append(piece)
+        elif self.pieces and isinstance(self.pieces[-1], bytearray):
+            self.pieces[-1] += piece
+        else:
+            self.pieces.append(bytearray(piece))
+
+    def note(self, channel: int, time_ns: int) -> None:
+        """A message starts here."""
+        self.entries.setdefault(channel, []).append((time_ns, self.size_bytes))
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        times = [time_ns for entries in self.entries.values() for time_ns, _ in entries]
+        return (min(times), max(times)) if times else (0, 0)
+
+    def head(self) -> bytes:
+        """The chunk record up to its records."""
+        crc = 0
+        for piece in self.pieces:
+            crc = zlib.crc32(piece, crc)
+        content = struct.pack("<QQQI", *self.span_ns, self.size_bytes, crc) + _text("")
+        content += struct.pack("<Q", self.size_bytes)
+        return RECORD_HEAD.pack(Opcode.CHUNK, len(content) + self.size_bytes) + content
+
+
+def _record(opcode: int, content: bytes) -> bytes:
+    return RECORD_HEAD.pack(opcode, len(content)) + content
+
+
+def _sized(data: bytes) -> bytes:
+    return struct.pack("<I", len(data)) + data
+
+
+def _text(value: str) -> bytes:
+    return _sized(value.encode())
+
+
+def _map(content: dict[str, str]) -> bytes:
+    return _sized(b"".join(_text(key) + _text(value) for key, value in content.items()))

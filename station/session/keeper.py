@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+from collections.abc import Awaitable, Callable
 
 from station.errors import CameraError, RobotError, StationError
 from station.session.bench import Bench
@@ -23,28 +24,32 @@ class Keeper:
         """Device → why it is not there."""
 
     async def run(self) -> None:
+        """Everything at once: none waits for another."""
+        await asyncio.gather(
+            self._start_worker(),
+            self._until_open("robot", self._open_robot),
+            self._until_open("camera", self._open_camera),
+            self._until_open("trigger", self._open_trigger),
+        )
+
+    async def _start_worker(self) -> None:
         try:
             await self._bench.workers.start()
         except WorkerError as error:
             log.warning("%s", error)
-        robot_open = camera_open = trigger_open = False
-        while not (robot_open and camera_open and trigger_open):
-            robot_open = robot_open or await self._try("robot", self._open_robot())
-            camera_open = camera_open or await self._try("camera", self._open_camera())
-            trigger_open = trigger_open or await self._try("trigger", self._open_trigger())
-            if not (robot_open and camera_open and trigger_open):
-                await asyncio.sleep(RETRY_S)
 
-    async def _try(self, device: str, opening) -> bool:  # type: ignore[no-untyped-def]
-        try:
-            await opening
-        except StationError as error:
-            if self.troubles.get(device) != str(error):
-                self.troubles[device] = str(error)
-                self._bench.store.event(f"{device}: {error}", "warning")
-            return False
-        self.troubles.pop(device, None)
-        return True
+    async def _until_open(self, device: str, opening: Callable[[], Awaitable[None]]) -> None:
+        while True:
+            try:
+                await opening()
+            except StationError as error:
+                if self.troubles.get(device) != str(error):
+                    self.troubles[device] = str(error)
+                    self._bench.store.event(f"{device}: {error}", "warning")
+                await asyncio.sleep(RETRY_S)
+            else:
+                self.troubles.pop(device, None)
+                return
 
     async def _open_robot(self) -> None:
         identity = await self._bench.cell.robot.connect()

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from recordings.errors import RecordingError
-from recordings.files import require_free_space
+from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, require_free_space
 from recordings.messages import CameraModel, CaptureEvent, Picture, RobotState, SessionInfo, Stamps, View
 from recordings.recorder import Recorder
 from station.cell import Cell
@@ -60,6 +60,21 @@ class SessionRecording:
         self._info: SessionInfo | None = None
         self.recorder: Recorder | None = None
         self._sequence = 0
+
+    @property
+    def unsealed_parts(self) -> bool:
+        """Files that a crash left open."""
+        return any(self.folder.glob(f"*.mcap{PART_SUFFIX}"))
+
+    def count_parts(self) -> None:
+        """The next part follows those that are whole, and those that recovery found empty."""
+        self.part = 1 + len([*self.folder.glob("*.mcap"), *self.folder.glob(f"*.mcap*{EMPTY_SUFFIX}")])
+
+    @property
+    def whole(self) -> Path:
+        """The one file, or the folder where there are several."""
+        files = list(self.folder.glob("*.mcap"))
+        return files[0] if len(files) == 1 else self.folder
 
     @property
     def name(self) -> str:
@@ -162,11 +177,10 @@ class SessionRecording:
     async def seal(self, queue: PoseQueue) -> Path:
         """Finishes the file; returns the recording: the file, or the folder where there are several parts."""
         # Shielded: a cancelled waiter must not cancel what the writer's thread is doing.
-        path = await asyncio.shield(asyncio.wrap_future(self._require().finish()))
+        await asyncio.shield(asyncio.wrap_future(self._require().finish()))
         self.recorder = None
-        whole = path if self.part == 1 else self.folder
-        self.save_state(queue, whole)
-        return whole
+        self.save_state(queue, self.whole)
+        return self.whole
 
     def abandon(self) -> None:
         """After a write error: the `.part` file stays as it is, for `recordings recover`."""

@@ -9,6 +9,7 @@ import numpy as np
 
 from recordings.errors import RecordingError
 from recordings.messages import Picture
+from recordings.recover import recover
 from station.errors import LimitError, RobotError, SafetyStopError, StationError
 from station.limits import MoveCheck, check_path, with_plan_speeds
 from station.session.bench import Bench
@@ -81,6 +82,8 @@ class Run:
         first: Picture | None = None
         if bench.cell.config.camera.model is None:
             first = await bench.cell.camera.capture()
+        if recording is not None:
+            await recover_parts(bench, recording)
         fresh = recording or SessionRecording(bench.root, bench.cell)
         fresh.open(queue.plan, queue.sha256, first)
         bench.recording = fresh
@@ -172,6 +175,14 @@ class Run:
         bench.store.enter(StationState.PAUSED, reason)
         bench.store.event(reason)
         bench.show_poses()
+
+
+async def recover_parts(bench: Bench, recording: SessionRecording) -> None:
+    """Of an interrupted session: what its crash left open is made whole before another part follows."""
+    if recording.unsealed_parts:
+        for found in await bench.workers.call(recover, recording.folder):
+            bench.store.event(f"recovered {found.path}: {found.poses} poses, {found.lost_bytes} bytes lost")
+    recording.count_parts()
 
 
 async def seal(bench: Bench) -> None:

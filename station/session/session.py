@@ -30,7 +30,7 @@ from station.session.lease import GoDesk, LeaseDesk
 from station.session.preview import Previewer
 from station.session.queue import PoseQueue
 from station.session.recording import SessionRecording
-from station.session.run import Run, seal, unmark_busy
+from station.session.run import Run, recover_parts, seal, unmark_busy
 from station.session.store import StatusStore
 from station.session.summary import poses_to_drive, summarise
 from station.states import RUNNING, refusal
@@ -218,17 +218,25 @@ class Session:
 
     async def _seal(self) -> None:
         recording = self.bench.require_recording()
-        if recording.recorder is None:  # of an interrupted session: its part was sealed or recovered
-            recording.save_state(self.bench.require_queue(), recording.folder)
-            self.bench.recording = None
-            self.store.enter(StationState.IDLE)
-            self.store.event(f"session {recording.name} is closed; `recordings recover` repairs its parts")
-            return
         try:
-            await seal(self.bench)
+            if recording.recorder is None:
+                await self._close_interrupted(recording)
+            else:
+                await seal(self.bench)
         except RecordingError as error:
             recording.abandon()
             self.store.enter(StationState.FAULT, f"recording: {error}")
+
+    async def _close_interrupted(self, recording: SessionRecording) -> None:
+        """Nothing was added since the crash: what is whole becomes the recording."""
+        await recover_parts(self.bench, recording)
+        queue = self.bench.require_queue()
+        whole = recording.whole
+        recording.save_state(queue, whole)
+        self.bench.recording = None
+        self.store.update(session=msgspec.structs.replace(self.store.status.session, recording=str(whole)))
+        self.store.enter(StationState.IDLE)
+        self.store.event(f"sealed: {whole}, {queue.done} of {len(queue.statuses)} poses")
 
     # -- the lease ---------------------------------------------------------------------------------------
 

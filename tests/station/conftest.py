@@ -1,0 +1,43 @@
+"""Sessions with devices in memory."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from station.plan.model import Plan
+from station.plan.planner import make_plan
+from station.status import StationState
+from tests.station.session_rig import POSES, TRUTH, NewRig, Rig, memory_config
+
+
+@pytest.fixture(scope="session")
+def small_plan() -> Plan:
+    return make_plan(memory_config(), start_joints_rad=TRUTH.start_joints_rad, seed=3, count=POSES)
+
+
+@pytest.fixture
+async def new_rig(tmp_path: Path, small_plan: Plan) -> AsyncIterator[NewRig]:
+    rigs: list[Rig] = []
+
+    async def make(*, with_plan: bool = True, source: Any = "simulated") -> Rig:
+        rig = Rig(tmp_path / "root", source)
+        rigs.append(rig)
+        await rig.start()
+        if with_plan:
+            await rig.until(StationState.IDLE)
+            rig.session.take_lease(1, "anna")
+            rig.session.load_plan(1, small_plan)
+        return rig
+
+    yield make
+    for rig in rigs:
+        await rig.session.close()
+
+
+@pytest.fixture
+async def rig(new_rig: NewRig) -> Rig:
+    return await new_rig()

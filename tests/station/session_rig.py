@@ -1,0 +1,243 @@
+"""A session with devices in memory: an arm that jumps or waits as told, a camera, a worker."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Awaitable, Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from calibrate.board import board_points
+from calibrate.geometry import rotation_log
+from calibrate.kinematics import MODELS, forward
+from recordings.messages import CameraIdentity, Picture, RobotIdentity, RobotState, Stamps
+from station.analysis import Sighting, sight
+from station.cell import Cell
+from station.config import StationConfig
+from station.errors import CameraError, RobotError, StaleStateError
+from station.session import Session
+from station.simulation.cell import make_cell
+from station.simulation.scenes import cell_config
+from station.status import DetectionStatus, StationState
+
+TRUTH = make_cell()
+POSES = 4
+RUNNING, NORMAL, STOPPED = 7, 1, 1
+
+
+class ArmInMemory:
+    """Arrives at once, or when `arrive` is set while `slow`. Speaks of what it was asked in `log`."""
+
+    def __init__(self) -> None:
+        self.identity = RobotIdentity(model="UR10", serial="DOUBLE")
+        self.joints = TRUTH.start_joints_rad
+        self.log: list[str] = []
+        self.control, self.notice, self.remote = False, "", None
+        self.slow = False
+        self.arrive = asyncio.Event()
+        self.trouble: RobotError | None = None
+        self.refuse_control: RobotError | None = None
+        self.stale = False
+        self.beats = 0
+        self._callbacks: list[Callable[[RobotState], None]] = []
+        self._controller_s = 100.0
+        self._stopped = asyncio.Event()
+
+    async def connect(self) -> RobotIdentity:
+        self.rest()
+        return self.identity
+
+    def subscribe(self, callback: Callable[[RobotState], None]) -> None:
+        self._callbacks.append(callback)
+
+    def rest(self) -> None:
+        """Half a second of samples of an arm at rest, all at once."""
+        for _ in range(60):
+            self._controller_s += 0.008
+            state = self._state()
+            for callback in self._callbacks:
+                callback(state)
+
+    def _state(self) -> RobotState:
+        flange = forward(MODELS["UR10"], self.joints)
+        x, y, z, rx, ry, rz = np.concatenate([flange[:3, 3], rotation_log(flange[:3, :3])]).tolist()
+        zero = (0.0,) * 6
+        return RobotState(
+            stamps=Stamps(time.monotonic_ns(), time.time_ns(), self._controller_s),
+            joints_rad=self.joints,
+            joint_speeds_rad_s=zero,
+            target_joints_rad=self.joints,
+            tcp_pose=(x, y, z, rx, ry, rz),
+            robot_mode=RUNNING,
+            safety_mode=NORMAL,
+            safety_status_bits=1,
+            runtime_state=STOPPED,
+            robot_status_bits=1,
+            speed_scaling=1.0,
+            target_speed_fraction=1.0,
+        )
+
+    def latest(self) -> RobotState:
+        if self.stale:
+            raise StaleStateError("no news from the robot")
+        return self._state()
+
+    def at(self, host_monotonic_ns: int) -> RobotState:
+        stamps = Stamps(host_monotonic_ns, time.time_ns(), self._controller_s)
+        return msgspec.structs.replace(self.latest(), stamps=stamps)
+
+    def clock(self) -> None:
+        return None
+
+    def check(self) -> None:
+        if self.trouble is not None:
+            raise self.trouble
+        self.latest()
+
+    async def start_control(self) -> None:
+        self.log.append("start control")
+        if self.refuse_control is not None:
+            raise self.refuse_control
+        self.control = True
+
+    async def move(self, joints_rad: Sequence[float], speed_rad_s: float, acceleration_rad_s2: float) -> None:
+        self.log.append("move")
+        self._stopped.clear()
+        if self.slow:
+            waits = [asyncio.ensure_future(e.wait()) for e in (self.arrive, self._stopped)]
+            try:
+                await asyncio.wait(waits, return_when=asyncio.FIRST_COMPLETED)
+            finally:
+                for wait in waits:
+                    wait.cancel()
+            self.arrive.clear()
+        if self._stopped.is_set():
+            raise RobotError("stopped")
+        if self.trouble is not None:
+            raise self.trouble
+        a, b, c, d, e, f = joints_rad
+        self.joints = (a, b, c, d, e, f)
+        self.rest()
+
+    def heartbeat(self) -> None:
+        self.beats += 1
+
+    async def stop(self, reason: str) -> None:
+        self.log.append("stop")
+        self._stopped.set()
+
+    async def end_control(self) -> None:
+        self.log.append("end control")
+        self.control = False
+
+    async def close(self) -> None:
+        self.log.append("close")
+
+
+class CameraInMemory:
+    """Grey pictures of the right size; `fail` says why there is none, as often as it is listed."""
+
+    def __init__(self) -> None:
+        self.identity = CameraIdentity(model="double", serial="1", driver="rendered")
+        self.clock = None
+        self.fail: list[str] = []
+        self.taken = 0
+
+    async def open(self) -> CameraIdentity:
+        return self.identity
+
+    async def capture(self, timeout_s: float = 5.0) -> Picture:
+        if self.fail:
+            raise CameraError(self.fail.pop(0))
+        self.taken += 1
+        shape = (TRUTH.camera.height, TRUTH.camera.width)
+        return Picture(
+            image=np.full(shape, 90, np.uint8),
+            stamps=Stamps(time.monotonic_ns(), time.time_ns(), device_ns=time.monotonic_ns()),
+            frame_id=self.taken,
+            sequence=0,
+            exposure_us=1000.0,
+        )
+
+    async def preview(self) -> Picture | None:
+        return await self.capture()
+
+    async def close(self) -> None:
+        return None
+
+
+class WorkerInThisProcess:
+    """Calls at once; `sees` is what every picture shows."""
+
+    def __init__(self) -> None:
+        self.waiting = 0
+        points = board_points(TRUTH.board)
+        pixels = 300 + 5000 * points[:, :2]
+        status = DetectionStatus(found=True, corners=len(points), expected=len(points))
+        self.sees = Sighting(status, np.arange(len(points)), pixels)
+
+    async def start(self) -> None:
+        return None
+
+    async def call(self, function: Callable[..., Any], *args: Any, timeout_s: float = 60.0) -> Any:
+        await asyncio.sleep(0)
+        return self.sees if function is sight else function(*args)
+
+    def close(self) -> None:
+        return None
+
+
+def memory_config() -> StationConfig:
+    config = cell_config(TRUTH, "127.0.0.1")
+    capture = msgspec.structs.replace(config.capture, free_space_bytes=1, time_bound_s=1.0)
+    stillness = msgspec.structs.replace(config.stillness, timeout_s=0.3)
+    return msgspec.structs.replace(config, capture=capture, stillness=stillness)
+
+
+class Rig:
+    """A started session and its devices. Client 1 is the operator, 2 somebody else."""
+
+    def __init__(self, root: Path, source: Any = "simulated") -> None:
+        self.arm, self.camera, self.worker = ArmInMemory(), CameraInMemory(), WorkerInThisProcess()
+        cell = Cell(memory_config(), self.arm, self.camera, source, attachments={"truth.json": b"{}"})
+        self.session = Session(cell, root)
+        self.session.bench.workers = self.worker  # type: ignore[assignment]
+        self.states: list[StationState] = []
+        self.session.store.watch(self._note)
+
+    def _note(self) -> None:
+        state = self.session.store.state
+        if not self.states or self.states[-1] is not state:
+            self.states.append(state)
+
+    async def start(self) -> None:
+        await self.session.start()
+
+    @property
+    def state(self) -> StationState:
+        return self.session.store.state
+
+    async def until(self, *states: StationState) -> None:
+        async with asyncio.timeout(10):
+            while self.state not in states:
+                await asyncio.sleep(0.002)
+
+    async def until_true(self, condition: Callable[[], bool]) -> None:
+        async with asyncio.timeout(10):
+            while not condition():
+                await asyncio.sleep(0.002)
+
+    async def give_go(self, purpose: str = "run") -> None:
+        summary = await self.session.prepare(1, purpose)
+        self.session.go(1, summary.token)
+
+    @property
+    def pose_states(self) -> list[str]:
+        return [pose.state for pose in self.session.store.status.session.poses]
+
+
+NewRig = Callable[..., Awaitable[Rig]]

@@ -1,0 +1,450 @@
+"""A whole session with devices in memory: what it promises the operator, step by step."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from recordings.errors import RecordingError
+from recordings.reader import open_recording
+from station.errors import LimitError, RefusedError, RobotError, SafetyStopError
+from station.plan.model import Plan
+from station.session.recording import SessionRecording
+from station.status import StationState as S
+from tests.station.session_rig import POSES, NewRig, Rig
+
+WHOLE_POSE = [S.MOVING, S.SETTLING, S.CAPTURING, S.WRITING]
+
+
+def sealed(rig: Rig) -> Any:
+    return open_recording(Path(rig.session.store.status.session.recording))
+
+
+async def test_a_go_takes_every_pose_and_seals(rig: Rig, small_plan: Plan) -> None:
+    await rig.give_go()
+    await rig.until(S.IDLE)
+    assert rig.states == [S.IDLE, S.CHECKING, *WHOLE_POSE * POSES, S.SEALING, S.IDLE]
+    assert rig.pose_states == ["done"] * POSES
+    recording = sealed(rig)
+    views = recording.views()
+    assert [view.index for view in views] == list(range(POSES))
+    for view, pose in zip(views, small_plan.poses, strict=True):
+        np.testing.assert_allclose(view.base_from_flange, pose.base_from_flange, atol=1e-9)
+        assert recording.picture(view).sequence == view.picture_sequence
+        assert view.stillness is not None
+    assert set(recording.attachments()) == {"plan.yaml", "config.yaml", "truth.json"}
+    assert recording.info.source == "simulated"
+    assert any("saved" in event.detail for event in recording.events())
+    assert sum(1 for _ in recording.robot_states()) > POSES * 50
+
+
+async def test_control_lives_only_for_a_go(rig: Rig) -> None:
+    assert "start control" not in rig.arm.log
+    await rig.session.prepare(1, "run")
+    assert "start control" not in rig.arm.log
+    await rig.give_go()
+    await rig.until(S.IDLE)
+    await rig.until_true(lambda: rig.arm.log[-1] == "end control")
+    assert rig.arm.log.count("start control") == 1
+    assert not rig.arm.control
+
+
+async def test_the_heart_beats_only_while_a_go_is_carried_out(rig: Rig) -> None:
+    await asyncio.sleep(0.1)
+    assert rig.arm.beats == 0
+    rig.arm.slow = True
+    await rig.give_go()
+    await rig.until(S.MOVING)
+    await rig.until_true(lambda: rig.arm.beats > 3)
+    await rig.session.stop("anna")
+    beats = rig.arm.beats
+    await asyncio.sleep(0.1)
+    assert rig.arm.beats == beats
+
+
+async def test_a_pose_counts_only_once_it_is_on_the_disk(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    on_disk = asyncio.Event()
+    sync = SessionRecording.sync
+
+    async def slow_sync(self: SessionRecording) -> None:
+        await on_disk.wait()
+        await sync(self)
+
+    monkeypatch.setattr(SessionRecording, "sync", slow_sync)
+    await rig.give_go()
+    await rig.until(S.WRITING)
+    await asyncio.sleep(0.05)
+    assert rig.state is S.WRITING
+    assert rig.pose_states[0] == "writing"
+    assert rig.session.store.status.session.captured == 0
+    on_disk.set()
+    await rig.until(S.IDLE)
+    assert rig.pose_states == ["done"] * POSES
+
+
+async def test_pause_is_after_this_pose_and_going_on_needs_a_new_go(rig: Rig) -> None:
+    rig.arm.slow = True
+    await rig.give_go()
+    await rig.until(S.MOVING)
+    rig.session.pause("bert")
+    rig.arm.arrive.set()
+    await rig.until(S.PAUSED)
+    assert rig.pose_states == ["done", "planned", "planned", "planned"]
+    assert "bert" in rig.session.store.status.reason
+    await asyncio.sleep(0.05)
+    assert rig.arm.log.count("move") == 1
+    rig.arm.slow = False
+    await rig.give_go("resume")
+    await rig.until(S.IDLE)
+    assert len(sealed(rig).views()) == POSES
+
+
+async def test_stop_is_latched_and_the_go_is_gone(rig: Rig) -> None:
+    rig.arm.slow = True
+    await rig.give_go()
+    await rig.until(S.MOVING)
+    await rig.session.stop("bert")
+    assert rig.state is S.STOPPED
+    assert "stop" in rig.arm.log
+    assert rig.pose_states == ["planned"] * POSES
+    for forbidden in (rig.give_go("resume"), rig.session.prepare(1, "run"), rig.session.finish(1)):
+        with pytest.raises(RefusedError, match="STOP is latched"):
+            await forbidden
+    rig.session.acknowledge("anna")
+    assert rig.state is S.PAUSED
+    moves = rig.arm.log.count("move")
+    await asyncio.sleep(0.05)
+    assert rig.arm.log.count("move") == moves
+    rig.arm.slow = False
+    await rig.give_go("resume")
+    await rig.until(S.IDLE)
+    assert len(sealed(rig).views()) == POSES
+
+
+async def test_stop_voids_a_go_that_waits(rig: Rig) -> None:
+    summary = await rig.session.prepare(1, "run")
+    await rig.session.stop("bert")
+    rig.session.acknowledge("anna")
+    with pytest.raises(RefusedError, match="not valid"):
+        rig.session.go(1, summary.token)
+    assert rig.session.store.status.go is None
+
+
+@pytest.mark.parametrize("phase", [S.SETTLING, S.CAPTURING, S.WRITING, S.SEALING])
+async def test_stop_in_every_phase_keeps_what_was_taken(rig: Rig, phase: S) -> None:
+    stopped = asyncio.Event()
+
+    def press() -> None:
+        if rig.state is phase and not stopped.is_set():
+            stopped.set()
+            presses.append(asyncio.ensure_future(rig.session.stop("anna")))
+
+    presses: list[asyncio.Future[None]] = []
+    rig.session.store.watch(press)
+    await rig.give_go()
+    await stopped.wait()
+    await asyncio.gather(*presses)
+    assert rig.state is S.STOPPED
+    assert "stop" in rig.arm.log
+    assert not {"moving", "settling", "capturing", "writing"} & set(rig.pose_states)
+    rig.session.acknowledge("anna")
+    if phase is S.SEALING:
+        assert rig.state is S.IDLE
+    else:
+        await rig.give_go("resume")
+        await rig.until(S.IDLE)
+    assert len(sealed(rig).views()) == POSES
+
+
+async def test_a_lost_commander_stops_the_arm_at_once(rig: Rig) -> None:
+    rig.arm.slow = True
+    await rig.give_go()
+    await rig.until(S.MOVING)
+    await rig.session.lease_lost(2)
+    assert rig.state is S.MOVING
+    await rig.session.lease_lost(1)
+    assert rig.state is S.PAUSED
+    assert "stop" in rig.arm.log
+    assert "connection of anna" in rig.session.store.status.reason
+    with pytest.raises(RefusedError, match="take the lease"):
+        await rig.session.prepare(1, "resume")
+    rig.session.take_lease(2, "bert")
+    rig.arm.slow = False
+    summary = await rig.session.prepare(2, "resume")
+    rig.session.go(2, summary.token)
+    await rig.until(S.IDLE)
+    assert len(sealed(rig).views()) == POSES
+
+
+async def test_finish_seals_what_is_there(rig: Rig) -> None:
+    rig.arm.slow = True
+    await rig.give_go()
+    await rig.until(S.MOVING)
+    await rig.session.finish(1)
+    rig.arm.arrive.set()
+    await rig.until(S.IDLE)
+    assert len(sealed(rig).views()) == 1
+
+
+async def test_a_retake_supersedes(rig: Rig) -> None:
+    rig.arm.slow = True
+    await rig.give_go()
+    for _ in range(2):
+        await rig.until(S.MOVING)
+        rig.arm.arrive.set()
+        await rig.until(S.WRITING)
+    rig.session.pause("anna")
+    await rig.until(S.PAUSED, S.MOVING)
+    rig.arm.arrive.set()
+    await rig.until(S.PAUSED)
+    rig.arm.slow = False
+    done = rig.pose_states.count("done")
+    summary = await rig.session.prepare(1, "retake", 0)
+    assert summary.purpose == "retake pose 1"
+    assert summary.poses == 1
+    rig.session.go(1, summary.token)
+    store = rig.session.store
+    await rig.until_true(lambda: rig.state is S.PAUSED and store.status.session.poses[0].attempt == 2)
+    assert rig.pose_states.count("done") == done
+    await rig.session.finish(1)
+    assert sealed(rig).views()[0].attempt == 2
+
+
+async def test_plans_can_be_changed_and_a_waiting_go_is_void_then(rig: Rig, small_plan: Plan) -> None:
+    session = rig.session
+    summary = await session.prepare(1, "run")
+    session.edit(1, "skip", lambda queue: queue.skip(1))
+    with pytest.raises(RefusedError, match="not valid"):
+        session.go(1, summary.token)
+    session.edit(1, "reorder", lambda queue: queue.reorder([3, 2, 1, 0]))
+    session.edit(1, "drop", lambda queue: queue.drop(0))
+    extra = msgspec.structs.replace(small_plan.poses[0], name="again")
+    assert session.edit(1, "add", lambda queue: queue.add(extra)) == POSES
+    with pytest.raises(RefusedError, match="no pose 1"):
+        session.edit(1, "retake", lambda queue: queue.retake(0))
+    assert [pose.index for pose in session.store.status.session.poses] == [3, 2, 1, 4]
+    with pytest.raises(RefusedError, match="watch and STOP"):
+        session.edit(2, "skip", lambda queue: queue.skip(2))
+
+
+async def test_a_plan_that_leaves_its_limits_is_refused_whole(rig: Rig, small_plan: Plan) -> None:
+    far = (*small_plan.poses[2].joints_rad[:5], 7.5)
+    poses = list(small_plan.poses)
+    poses[2] = msgspec.structs.replace(poses[2], joints_rad=far, base_from_flange=None)
+    rig.session.load_plan(1, msgspec.structs.replace(small_plan, poses=tuple(poses)))
+    with pytest.raises(LimitError, match="wrist 3"):
+        await rig.session.prepare(1, "run")
+    assert "move" not in rig.arm.log
+
+
+async def test_a_refused_control_leaves_everything_as_it_was(rig: Rig, tmp_path: Path) -> None:
+    rig.arm.refuse_control = RobotError("the robot is in local control: switch the pendant to Remote")
+    await rig.give_go()
+    await rig.until(S.IDLE)
+    assert "switch the pendant" in rig.session.store.status.reason
+    assert not list(tmp_path.rglob("*.part"))
+    rig.arm.refuse_control = None
+    await rig.give_go()
+    await rig.until_true(lambda: bool(rig.session.store.status.session.recording))
+
+
+async def test_a_bad_picture_is_taken_again_and_then_the_pose_fails_alone(rig: Rig) -> None:
+    rig.camera.fail = ["frame lost", "frame lost"]
+    await rig.give_go()
+    await rig.until(S.IDLE)
+    assert rig.pose_states == ["done"] * POSES
+    rig.camera.fail = ["gone"] * 3
+    await rig.give_go()
+    await rig.until(S.PAUSED)
+    assert rig.pose_states == ["failed", "done", "done", "done"]
+    assert "poses 1 failed" in rig.session.store.status.reason
+    await rig.session.finish(1)
+    assert [view.index for view in sealed(rig).views()] == [1, 2, 3]
+
+
+async def test_a_picture_without_the_board_does_not_count(rig: Rig) -> None:
+    shown = rig.worker.sees
+    hidden = msgspec.structs.replace(shown.status, found=False, corners=0, reason="board half hidden")
+    rig.worker.sees = type(shown)(hidden, shown.indices[:0], shown.pixels[:0])
+    await rig.give_go()
+    await rig.until(S.PAUSED)
+    status = rig.session.store.status
+    assert rig.pose_states == ["failed"] * 3 + ["planned"]
+    assert status.session.poses[0].reason == "board half hidden"
+    assert "3 poses in a row" in status.reason
+    assert status.session.captured == 0
+
+
+async def test_an_arm_that_does_not_rest_fails_the_pose(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rig.session.bench.stillness, "unrest", lambda found: "wrist 2 moves at 0.5°/s")
+    await rig.give_go()
+    await rig.until(S.PAUSED)
+    assert "wrist 2 moves" in rig.session.store.status.session.poses[0].reason
+
+
+async def test_a_protective_stop_stops_and_sends_nothing(rig: Rig) -> None:
+    rig.arm.slow = True
+    await rig.give_go()
+    await rig.until(S.MOVING)
+    rig.arm.trouble = SafetyStopError("protective stop: find what the arm ran into")
+    rig.arm.arrive.set()
+    await rig.until(S.STOPPED)
+    assert "protective stop" in rig.session.store.status.reason
+    await rig.until_true(lambda: not rig.arm.control)
+    assert set(rig.arm.log) <= {"start control", "move", "end control"}
+    rig.session.acknowledge("anna")
+    with pytest.raises(SafetyStopError):
+        await rig.session.prepare(1, "resume")
+
+
+async def test_a_tcp_changed_on_the_pendant_is_a_fault(rig: Rig) -> None:
+    rig.arm.slow = True
+    await rig.give_go()
+    await rig.until(S.MOVING)
+    rig.arm.arrive.set()
+    await rig.until(S.WRITING)
+    await rig.until(S.MOVING)
+    rig.arm.slow = False
+    rig.arm.trouble = RobotError("TCP mix-up: the TCP offset on the pendant was changed")
+    rig.arm.arrive.set()
+    await rig.until(S.FAULT)
+    assert "TCP" in rig.session.store.status.reason
+    assert rig.pose_states.count("done") == 1
+
+
+async def test_a_disk_that_fails_is_a_fault_and_never_a_pose(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def full(self: SessionRecording) -> None:
+        raise RecordingError("no space left on the device: free 4 GB")
+
+    monkeypatch.setattr(SessionRecording, "sync", full)
+    await rig.give_go()
+    await rig.until(S.FAULT)
+    assert "free 4 GB" in rig.session.store.status.reason
+    assert "done" not in rig.pose_states
+
+
+async def test_a_full_disk_is_noticed_before_the_pose(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    def none_left(self: SessionRecording) -> None:
+        raise RecordingError("only 0.1 GB are free")
+
+    monkeypatch.setattr(SessionRecording, "require_space", none_left)
+    await rig.give_go()
+    await rig.until(S.FAULT)
+    assert "move" not in rig.arm.log
+
+
+async def test_a_jogged_arm_is_named_and_its_go_is_void(rig: Rig) -> None:
+    rig.arm.slow = True
+    await rig.give_go()
+    await rig.until(S.MOVING)
+    rig.session.pause("anna")
+    rig.arm.arrive.set()
+    await rig.until(S.PAUSED)
+    summary = await rig.session.prepare(1, "resume")
+    await asyncio.sleep(0.3)
+    rig.arm.joints = (*rig.arm.joints[:5], rig.arm.joints[5] + 0.3)
+    store = rig.session.store
+    await rig.until_true(lambda: any("was moved by 0 mm and 17°" in e.text for e in store.status.events))
+    with pytest.raises(RefusedError, match="not valid"):
+        rig.session.go(1, summary.token)
+    again = await rig.session.prepare(1, "resume")
+    assert any("was moved" in warning for warning in again.warnings)
+
+
+async def test_a_robot_that_is_lost_at_rest_comes_back(rig: Rig) -> None:
+    rig.arm.stale = True
+    await rig.until(S.DISCONNECTED)
+    with pytest.raises(RefusedError, match="not connected"):
+        await rig.session.prepare(1, "run")
+    rig.arm.stale = False
+    await rig.until(S.IDLE)
+
+
+async def test_a_session_cut_by_a_crash_waits_for_a_person_and_goes_on_in_a_new_part(
+    new_rig: NewRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = await new_rig()
+    first.arm.slow = True
+    await first.give_go()
+    await first.until(S.MOVING)
+    first.arm.arrive.set()
+    await first.until(S.WRITING)
+    await first.until(S.MOVING)
+    crash(first)
+
+    second = await new_rig(with_plan=False)
+    assert second.state is S.STOPPED
+    assert "look at the arm" in second.session.store.status.reason.lower()
+    assert second.pose_states == ["done", "planned", "planned", "planned"]
+    await asyncio.sleep(0.1)
+    assert second.state is S.STOPPED
+    second.session.take_lease(1, "anna")
+    second.session.acknowledge("anna")
+    assert second.state is S.PAUSED
+    await second.give_go("resume")
+    await second.until(S.IDLE)
+    recording = sealed(second)
+    assert [view.index for view in recording.views()] == list(range(POSES))
+    assert second.arm.log.count("move") == POSES - 1
+
+
+def crash(rig: Rig) -> None:
+    """What SIGKILL leaves: no sealing, no goodbye, the file as the disk has it."""
+    for task in (*rig.session._tasks, rig.session._run):
+        if task is not None:
+            task.cancel()
+    assert rig.session.bench.recording is not None
+    rig.session.bench.recording.abandon()
+    rig.session.bench.recording = None
+
+
+async def test_a_free_hand_records_without_control(new_rig: NewRig) -> None:
+    rig = await new_rig(with_plan=False)
+    await rig.until(S.IDLE)
+    rig.session.take_lease(1, "anna")
+    await rig.session.switch_free_drive(1, True, auto=False)
+    assert rig.state is S.FREE_DRIVE
+    for turn in (0.0, 0.2):
+        rig.arm.joints = (*rig.arm.joints[:5], rig.arm.joints[5] + turn)
+        rig.arm.rest()
+        await rig.session.record(1)
+    await rig.session.switch_free_drive(1, False, auto=False)
+    await rig.session.finish(1)
+    assert [view.name for view in sealed(rig).views()] == ["hand-01", "hand-02"]
+    assert "start control" not in rig.arm.log
+
+
+async def test_auto_record_takes_a_new_place_once(new_rig: NewRig) -> None:
+    rig = await new_rig(with_plan=False)
+    await rig.until(S.IDLE)
+    rig.session.take_lease(1, "anna")
+    rig.arm.rest()
+    await rig.session.switch_free_drive(1, True, auto=True)
+    await rig.until_true(lambda: rig.session.store.status.session.captured == 1)
+    await asyncio.sleep(0.3)
+    assert rig.session.store.status.session.captured == 1
+    rig.arm.joints = (*rig.arm.joints[:5], rig.arm.joints[5] + 0.2)
+    rig.arm.rest()
+    await rig.until_true(lambda: rig.session.store.status.session.captured == 2)
+    await rig.session.stop("anna")
+    assert rig.state is S.STOPPED
+
+
+async def test_the_end_of_the_daemon_stops_then_seals(rig: Rig) -> None:
+    rig.arm.slow = True
+    await rig.give_go()
+    await rig.until(S.MOVING)
+    rig.arm.arrive.set()
+    await rig.until(S.WRITING)
+    await rig.until(S.MOVING)
+    folder = Path(rig.session.store.status.session.folder)
+    await rig.session.close()
+    assert rig.arm.log.index("stop") < rig.arm.log.index("close")
+    assert len(open_recording(folder).views()) == 1

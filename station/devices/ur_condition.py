@@ -43,7 +43,7 @@ _SAFETY_SENTENCES: tuple[tuple[SafetyStatus, frozenset[SafetyMode], str], ...] =
         "stopped for a safety reason: read the pendant",
     ),
 )
-_MODE_SENTENCES = {
+_MODE_SENTENCES: dict[int, str] = {
     RobotMode.NO_CONTROLLER: "the controller is not running; restart the robot",
     RobotMode.DISCONNECTED: "the arm is not connected to its controller; restart the robot",
     RobotMode.CONFIRM_SAFETY: "the pendant asks for the safety configuration to be confirmed",
@@ -53,7 +53,7 @@ _MODE_SENTENCES = {
     RobotMode.IDLE: "the brakes are on: release them on the pendant",
     RobotMode.BACKDRIVE: "the arm is in backdrive: end it on the pendant",
 }
-_PROGRAM_WORDS = {
+_PROGRAM_WORDS: dict[int, str] = {
     RuntimeState.STOPPING: "stopping",
     RuntimeState.STOPPED: "stopped",
     RuntimeState.PLAYING: "playing",
@@ -61,7 +61,8 @@ _PROGRAM_WORDS = {
     RuntimeState.PAUSED: "paused",
     RuntimeState.RESUMING: "resuming",
 }
-_SAFETY_WORDS = {mode: mode.name.replace("_", " ") for mode in SafetyMode}
+_SAFETY_WORDS: dict[int, str] = {mode: mode.name.replace("_", " ") for mode in SafetyMode}
+_MODE_WORDS: dict[int, str] = {mode: mode.name.replace("_", " ") for mode in RobotMode}
 
 
 def safety_stop(state: RobotState) -> SafetyStopError | None:
@@ -75,12 +76,8 @@ def safety_stop(state: RobotState) -> SafetyStopError | None:
 def not_powered(state: RobotState) -> RobotError | None:
     if state.robot_mode == RobotMode.RUNNING:
         return None
-    return RobotError(
-        _MODE_SENTENCES.get(
-            RobotMode(state.robot_mode) if state.robot_mode in _MODES else RobotMode.NO_CONTROLLER,
-            f"the robot is in mode {state.robot_mode}",
-        )
-    )
+    unknown = f"the robot is in mode {state.robot_mode}, which this software does not know: see the pendant"
+    return RobotError(_MODE_SENTENCES.get(state.robot_mode, unknown))
 
 
 def program_not_running(state: RobotState) -> RobotError | None:
@@ -105,15 +102,12 @@ def foreign_program(state: RobotState, name: str) -> RobotError | None:
 
 
 def program_word(state: RobotState) -> str:
-    return _PROGRAM_WORDS.get(state.runtime_state, f"in state {state.runtime_state}")  # type: ignore[call-overload, no-any-return]
+    return _PROGRAM_WORDS.get(state.runtime_state, f"in state {state.runtime_state}")
 
 
 def safety_word(state: RobotState) -> str:
-    return _SAFETY_WORDS.get(state.safety_mode, f"SAFETY MODE {state.safety_mode}")  # type: ignore[call-overload, no-any-return]
+    return _SAFETY_WORDS.get(state.safety_mode, f"SAFETY MODE {state.safety_mode}")
 
 
 def mode_word(state: RobotState) -> str:
-    return RobotMode(state.robot_mode).name.replace("_", " ") if state.robot_mode in _MODES else "UNKNOWN"
-
-
-_MODES = frozenset(int(mode) for mode in RobotMode)
+    return _MODE_WORDS.get(state.robot_mode, f"MODE {state.robot_mode}")

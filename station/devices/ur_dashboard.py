@@ -62,14 +62,14 @@ class Dashboard:
 
     @property
     def alive(self) -> bool:
-        return not self._task.done()
+        return not self._task.done() and not self._writer.is_closing()
 
     def send(self, command: str) -> asyncio.Future[str]:
         """Puts the line on the wire before it returns; the future gives the reply."""
         if command not in ALLOWED:
             raise ValueError(f"the dashboard command {command!r} is never sent by this station")
         reply: asyncio.Future[str] = asyncio.get_running_loop().create_future()
-        if not self.alive or self._writer.is_closing():
+        if not self.alive:
             reply.set_exception(DashboardError(f"the dashboard connection to {self._host} is gone"))
             return reply
         self._waiting.append(reply)

@@ -28,6 +28,7 @@ KINEMATICS_INFO = 5
 MESSAGE_LIMIT = 64 * 1024
 SILENCE_S = 3.0
 _HEADER = struct.Struct(">iB")
+PACKED_HEADER_BYTES = _HEADER.size
 _CARTESIAN = struct.Struct(">12d")
 """TCP pose, then TCP offset: x y z [m], rotation vector [rad] each"""
 _KINEMATICS = struct.Struct(">6I24dI")

@@ -24,6 +24,7 @@ log = logging.getLogger(__name__)
 NOMINAL_TOLERANCE = (0.006, math.radians(1.0))
 CALIBRATED_TOLERANCE = (0.0005, math.radians(0.1))
 STATED_TOLERANCE = (1e-6, 1e-6)
+FACTORY_LIMIT = (0.02, math.radians(2.0))
 LONGEST_M = 1.0
 _MODEL_REMEDY = "check robot.model and robot.kinematics in the configuration"
 _CHANGED = "the TCP offset on the pendant was changed during the session"
@@ -53,8 +54,15 @@ class TcpCheck:
             self.agree(self._stated)
 
     def _try_controllers_model(self, model: RobotModel, first: RobotState) -> None:
-        """Uses the controller's own kinematics if they explain its own tool pose, as they should."""
+        """Uses the controller's own kinematics if they explain its own tool pose, as they should.
+
+        Raises RobotError when they are those of another model: a factory calibration moves the flange by
+        millimetres (though single lengths in it may be far off, where axes are parallel).
+        """
         assert self._stated is not None
+        ours, theirs = (forward(m, first.joints_rad) for m in (self._model, model))
+        what = f"the controller's own kinematics are not those of a {self._model.name}"
+        _compare(theirs, ours, FACTORY_LIMIT, what, _MODEL_REMEDY)
         own = _flange_from_tcp(model, first)
         if _exceeds(difference(own, _pose(self._stated)), CALIBRATED_TOLERANCE):
             log.warning("the kinematics stated by the controller do not explain its tool pose; using ours")

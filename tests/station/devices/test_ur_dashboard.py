@@ -1,0 +1,107 @@
+"""The dashboard client against servers that answer, mumble, and say nothing."""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+
+import pytest
+
+from station.devices.ur_dashboard import PORT, Dashboard, DashboardError
+from station.devices.ur_probe import identify, probe
+
+GREETING = b"Connected: Universal Robots Dashboard Server\n"
+Serve = Callable[..., Awaitable[str]]
+E_SERIES = {
+    "PolyscopeVersion": "URSoftware 5.11.1.108318 (Mar 31 2020)",
+    "get robot model": "UR10",
+    "get serial number": "20195500001",
+    "is in remote control": "false",
+    "programState": "STOPPED <unnamed>",
+}
+
+
+@pytest.fixture
+async def serve() -> AsyncIterator[Serve]:
+    """`await serve(answers, greeting=…)`: the address of a dashboard with these answers."""
+    servers: list[asyncio.Server] = []
+
+    async def start(answers: dict[str, str], greeting: bytes = GREETING, silent_after: int = 1000) -> str:
+        async def talk(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+            writer.write(greeting)
+            for _ in range(silent_after):
+                line = await reader.readline()
+                if not line:
+                    break
+                text = line.decode().strip()
+                writer.write(answers.get(text, f"could not understand: {text}").encode() + b"\n")
+            else:
+                await reader.read()
+            writer.close()
+
+        host = f"127.{random.randint(1, 254)}.{random.randint(0, 255)}.{random.randint(1, 254)}"
+        servers.append(await asyncio.start_server(talk, host, PORT))
+        return host
+
+    yield start
+    for server in servers:
+        server.close()
+
+
+async def test_answers_keep_their_order_without_waiting(serve: Serve) -> None:
+    dashboard = await Dashboard.open(await serve({"robotmode": "Robotmode: RUNNING", "stop": "Stopped"}))
+    first, second = dashboard.send("robotmode"), dashboard.send("stop")
+    assert (await first, await second) == ("Robotmode: RUNNING", "Stopped")
+    await dashboard.close()
+
+
+async def test_the_e_series_leaves_its_letter_out(serve: Serve) -> None:
+    dashboard = await Dashboard.open(await serve(E_SERIES))
+    found = await identify(dashboard)
+    assert (found.model, found.serial, found.version_text) == ("UR10e", "20195500001", "5.11.1.108318")
+    assert found.remote is False and found.is_e_series
+    await dashboard.close()
+
+
+async def test_an_old_controller_that_knows_few_questions(serve: Serve) -> None:
+    dashboard = await Dashboard.open(
+        await serve({"PolyscopeVersion": "3.5.3.10825", "get robot model": "UR10"})
+    )
+    found = await identify(dashboard)
+    assert (found.model, found.serial, found.remote) == ("UR10", "", None)
+    await dashboard.close()
+
+
+@pytest.mark.parametrize("greeting", [b"", b"SSH-2.0-OpenSSH_9.2\n", b"x" * 100_000])
+async def test_something_else_on_the_port(serve: Serve, greeting: bytes) -> None:
+    host = await serve({}, greeting=greeting)
+    begun = time.monotonic()
+    with pytest.raises(DashboardError):
+        await Dashboard.open(host, timeout_s=0.3)
+    assert time.monotonic() - begun < 1.0
+
+
+async def test_a_reply_that_is_too_late_breaks_the_connection(serve: Serve) -> None:
+    dashboard = await Dashboard.open(await serve(E_SERIES, silent_after=1))
+    await dashboard.ask("programState")
+    with pytest.raises(DashboardError, match="no reply to 'programState' within 0.1 s"):
+        await dashboard.ask("programState", timeout_s=0.1)
+    with pytest.raises(DashboardError, match="gone"):
+        await dashboard.ask("programState")
+    assert not dashboard.alive
+    await dashboard.close()
+
+
+async def test_the_probe_names_every_port_that_does_not_answer(serve: Serve) -> None:
+    found = await probe(await serve(E_SERIES))
+    assert found.model == "UR10e"
+    assert len(found.problems) == 2
+    assert ":30002" in found.problems[0] and ":30004" in found.problems[1]
+
+
+async def test_the_probe_of_nobody_has_remedies_and_does_not_raise() -> None:
+    found = await probe("127.255.3.9")
+    assert found.model == "" and len(found.problems) == 3
+    assert "check cable" in found.problems[0]

@@ -1,0 +1,124 @@
+"""The end of a move is told from the operation count, the state and the arm, never from time alone."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import pytest
+
+from recordings.messages import RobotState, Stamps
+from station.devices.rtde import RobotMode, RuntimeState, SafetyMode, SafetyStatus
+from station.devices.ur_moves import MoveWatch
+from station.errors import RobotError, SafetyStopError, StaleStateError
+
+START = (0.0,) * 6
+GOAL = (0.5, 0.0, 0.0, 0.0, 0.0, 0.0)
+BEFORE = 3 << 24
+RUNNING = 4 << 24 | 1 << 15
+ENDED = 4 << 24
+STATE = RobotState(
+    stamps=Stamps(),
+    joints_rad=START,
+    joint_speeds_rad_s=(0.0,) * 6,
+    target_joints_rad=START,
+    tcp_pose=(0.0,) * 6,
+    robot_mode=RobotMode.RUNNING,
+    safety_mode=SafetyMode.NORMAL,
+    safety_status_bits=SafetyStatus.NORMAL,
+    runtime_state=RuntimeState.PLAYING,
+    robot_status_bits=3,
+    speed_scaling=1.0,
+    target_speed_fraction=1.0,
+)
+
+
+def state(joint_rad: float = 0.0, **changes: Any) -> RobotState:
+    return msgspec.structs.replace(STATE, joints_rad=(joint_rad, 0.0, 0.0, 0.0, 0.0, 0.0), **changes)
+
+
+@pytest.fixture
+def watch() -> MoveWatch:
+    return MoveWatch(GOAL, BEFORE, begun_s=0.0)
+
+
+def test_a_move_that_was_just_accepted_still_looks_finished(watch: MoveWatch) -> None:
+    assert not watch.step(state(0.5), BEFORE, 0.0, 0.01)
+
+
+def test_arrived(watch: MoveWatch) -> None:
+    assert not watch.step(state(0.2), RUNNING, 0.0, 0.5)
+    assert watch.step(state(0.4999), ENDED, 0.0, 1.0)
+
+
+def test_the_operation_count_wraps() -> None:
+    watch = MoveWatch(GOAL, 0x7F << 24, begun_s=0.0)
+    assert watch.step(state(0.5), 0, 0.0, 1.0)
+
+
+def test_ended_short_is_believed_only_after_a_moment(watch: MoveWatch) -> None:
+    assert not watch.step(state(0.3), ENDED, 0.0, 1.0)
+    with pytest.raises(RobotError, match=r"0.200 rad short on joint 1"):
+        watch.step(state(0.3), ENDED, 0.0, 1.3)
+
+
+def test_a_late_sample_of_an_ended_move_is_waited_for(watch: MoveWatch) -> None:
+    assert not watch.step(state(0.45), ENDED, 0.0, 1.0)
+    assert watch.step(state(0.5), ENDED, 0.0, 1.1)
+
+
+@pytest.mark.parametrize(
+    ("changes", "error", "words"),
+    [
+        ({"safety_status_bits": SafetyStatus.PROTECTIVE_STOPPED}, SafetyStopError, "protective stop"),
+        ({"safety_mode": SafetyMode.PROTECTIVE_STOP}, SafetyStopError, "protective stop"),
+        ({"safety_status_bits": SafetyStatus.ROBOT_EMERGENCY_STOPPED}, SafetyStopError, "emergency stop"),
+        ({"safety_mode": SafetyMode.SYSTEM_EMERGENCY_STOP}, SafetyStopError, "emergency stop"),
+        ({"safety_status_bits": SafetyStatus.SAFEGUARD_STOPPED}, SafetyStopError, "safeguard stop"),
+        ({"safety_status_bits": SafetyStatus.VIOLATION}, SafetyStopError, "violation"),
+        ({"safety_status_bits": SafetyStatus.STOPPED_DUE_TO_SAFETY}, SafetyStopError, "safety reason"),
+        ({"robot_mode": RobotMode.POWER_OFF}, RobotError, "power on and release the brakes on the pendant"),
+        ({"robot_mode": 42}, RobotError, "robot is in mode 42"),
+        ({"runtime_state": RuntimeState.PAUSED}, RobotError, "program is paused"),
+        ({"runtime_state": RuntimeState.STOPPED}, RobotError, "program is stopped"),
+    ],
+)
+def test_what_the_state_says_ends_the_move_even_if_the_word_says_finished(
+    watch: MoveWatch, changes: dict[str, int], error: type[RobotError], words: str
+) -> None:
+    with pytest.raises(error, match=words):
+        watch.step(state(0.5, **changes), ENDED, 0.0, 1.0)
+
+
+def test_reduced_mode_is_no_fault(watch: MoveWatch) -> None:
+    reduced = state(0.5, safety_mode=SafetyMode.REDUCED, safety_status_bits=SafetyStatus.REDUCED)
+    assert watch.step(reduced, ENDED, 0.0, 1.0)
+
+
+def test_old_news_end_the_move(watch: MoveWatch) -> None:
+    assert not watch.step(state(0.1), RUNNING, 0.24, 1.0)
+    with pytest.raises(StaleStateError, match="no news from the robot for 260 ms"):
+        watch.step(state(0.1), RUNNING, 0.26, 1.0)
+
+
+def test_a_slow_arm_is_no_fault_however_long_it_takes(watch: MoveWatch) -> None:
+    for second in range(300):
+        slow = state(0.0015 * second, target_speed_fraction=0.05)
+        assert not watch.step(slow, RUNNING, 0.0, float(second))
+    assert watch.notice == "speed slider at 5 %"
+
+
+def test_an_arm_that_does_not_move_is_a_fault(watch: MoveWatch) -> None:
+    assert not watch.step(state(0.1), RUNNING, 0.0, 0.1)
+    assert not watch.step(state(0.1), RUNNING, 0.0, 3.0)
+    with pytest.raises(RobotError, match="has not moved for 3 s"):
+        watch.step(state(0.1), RUNNING, 0.0, 3.2)
+
+
+def test_at_slider_zero_the_operator_is_told_and_later_it_is_given_up(watch: MoveWatch) -> None:
+    held = state(0.1, target_speed_fraction=0.0)
+    assert not watch.step(held, RUNNING, 0.0, 0.1)
+    assert not watch.step(held, RUNNING, 0.0, 9.0)
+    assert "slider on the pendant is at 0" in watch.notice
+    with pytest.raises(RobotError, match="stood at 0 for 10 s"):
+        watch.step(held, RUNNING, 0.0, 10.2)

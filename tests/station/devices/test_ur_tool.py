@@ -1,0 +1,106 @@
+"""TCP mix-ups: offset and pose must fit the arm's kinematics, and stay as they are."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from calibrate.geometry import pose_from_rotvec, rotation_log
+from calibrate.kinematics import MODELS, DhDeltas, RobotModel, forward
+from recordings.messages import RobotState, Vector6
+from station.devices.ur_primary import (
+    PACKED_HEADER_BYTES,
+    DhParameters,
+    Installation,
+    PrimaryError,
+    pack_state,
+    read_state,
+)
+from station.devices.ur_tool import TcpCheck
+from station.errors import RobotError
+
+UR10 = MODELS["UR10"]
+NO_TOOL: Vector6 = (0.0,) * 6
+TOOL: Vector6 = (0.01, -0.02, 0.15, 0.1, 0.0, 0.5)
+HERE: Vector6 = (0.3, -1.2, 1.4, -1.5, -1.4, 0.2)
+THERE: Vector6 = (-0.8, -1.7, 1.9, -0.9, 1.2, 2.0)
+FACTORY = DhDeltas(a_m=(0.0, 0.0008, -0.0006, 0.0, 0.0, 0.0), theta_rad=(0.0, 0.001, -0.002, 0.001, 0.0, 0.0))
+
+
+def sample(arm: RobotModel, joints_rad: Vector6, tool: Vector6) -> RobotState:
+    """What a controller with this arm reports."""
+    T = forward(arm, joints_rad) @ pose_from_rotvec(tool[:3], tool[3:])
+    pose = tuple(np.concatenate([T[:3, 3], rotation_log(T[:3, :3])]).tolist())
+    fields = dict.fromkeys(RobotState.__struct_fields__, 0)
+    return msgspec.convert(
+        fields
+        | {"stamps": {}, "joints_rad": joints_rad, "tcp_pose": pose}
+        | dict.fromkeys(("joint_speeds_rad_s", "target_joints_rad"), NO_TOOL),
+        RobotState,
+    )
+
+
+def stated(arm: RobotModel, tool: Vector6) -> Installation:
+    return Installation(tool, DhParameters(arm.theta_offset_rad, arm.a_m, arm.d_m, arm.alpha_rad))  # type: ignore[arg-type]
+
+
+def test_the_controllers_words_are_taken_when_they_fit() -> None:
+    check = TcpCheck(UR10, False, sample(UR10, HERE, TOOL), stated(UR10, TOOL))
+    assert check.offset == TOOL
+    check.check(sample(UR10, THERE, TOOL), stated(UR10, TOOL))
+
+
+def test_without_words_the_offset_is_derived() -> None:
+    check = TcpCheck(UR10, False, sample(UR10, HERE, TOOL), Installation())
+    assert check.offset == pytest.approx(TOOL, abs=1e-9)
+
+
+@pytest.mark.parametrize("arm", ["UR5", "UR10e"])
+def test_the_wrong_model_is_noticed(arm: str) -> None:
+    with pytest.raises(RobotError, match=r"not those of a UR10 .* check robot.model"):
+        TcpCheck(UR10, False, sample(MODELS[arm], HERE, TOOL), stated(MODELS[arm], TOOL))
+    with pytest.raises(RobotError, match=r"do not fit its TCP offset .* check robot.model"):
+        TcpCheck(UR10, False, sample(MODELS[arm], HERE, TOOL), Installation(TOOL))
+
+
+def test_a_tool_that_is_not_the_stated_one_is_noticed() -> None:
+    with pytest.raises(RobotError, match="do not fit its TCP offset"):
+        TcpCheck(UR10, False, sample(UR10, HERE, TOOL), Installation(NO_TOOL))
+
+
+def test_factory_calibration_is_no_mix_up_and_makes_the_check_fine() -> None:
+    arm = UR10.calibrated(FACTORY)
+    check = TcpCheck(UR10, False, sample(arm, HERE, TOOL), stated(arm, TOOL))
+    check.check(sample(arm, THERE, TOOL), stated(arm, TOOL))
+    moved = (TOOL[0] + 0.001, *TOOL[1:])
+    with pytest.raises(RobotError, match="changed during the session"):
+        check.check(sample(arm, THERE, moved), stated(arm, TOOL))
+
+
+def test_with_the_nominal_table_alone_the_check_is_coarse_but_there() -> None:
+    arm = UR10.calibrated(FACTORY)
+    check = TcpCheck(UR10, False, sample(arm, HERE, TOOL), Installation())
+    check.check(sample(arm, THERE, TOOL), Installation())
+    with pytest.raises(RobotError, match="changed"):
+        check.check(sample(arm, THERE, (TOOL[0] + 0.015, *TOOL[1:])), Installation())
+
+
+def test_a_changed_statement_is_noticed_before_the_arm_shows_it() -> None:
+    check = TcpCheck(UR10, False, sample(UR10, HERE, TOOL), stated(UR10, TOOL))
+    with pytest.raises(RobotError, match="set it back"):
+        check.check(sample(UR10, HERE, TOOL), stated(UR10, (*TOOL[:5], 0.5001)))
+
+
+def test_statements_survive_the_wire() -> None:
+    said = stated(UR10.calibrated(FACTORY), TOOL)
+    message = pack_state(NO_TOOL, TOOL, said.dh)
+    assert read_state(message[PACKED_HEADER_BYTES:]) == said
+    assert len(message) == PACKED_HEADER_BYTES + 101 + 225  # sizes by Universal Robots' document
+
+
+@pytest.mark.parametrize("cut", range(1, 60, 7))
+def test_a_damaged_message_is_refused(cut: int) -> None:
+    message = pack_state(NO_TOOL, TOOL, None)[PACKED_HEADER_BYTES:-cut]
+    with pytest.raises(PrimaryError, match="claims 101 bytes"):
+        read_state(message)

@@ -1,0 +1,110 @@
+"""`station plan` as a person and as a script see it, and what it leaves on the disk."""
+
+from __future__ import annotations
+
+import json
+
+import msgspec
+import numpy as np
+import pytest
+import typer
+from mcap.reader import make_reader
+from typer.testing import CliRunner
+
+from station.plan.cli import plan_command
+from station.plan.files import load_plan, save_plan
+from station.simulation.scenes import build_cell, cell_config
+
+app = typer.Typer()
+app.command()(plan_command)
+
+
+def run(*args):
+    return CliRunner().invoke(app, [str(a) for a in args])
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("plan")
+    files = {name: folder / name for name in ("plan.yaml", "plan.png", "plan.mcap")}
+    options = ["-o", files["plan.yaml"], "--picture", files["plan.png"], "--foxglove", files["plan.mcap"]]
+    return run("--poses", 12, *options), files
+
+
+def test_a_plan_is_made_shown_and_saved(made):
+    result, files = made
+    assert result.exit_code == 0, result.output
+    assert "12 poses" in result.output and "check: passed" in result.output
+    assert "board points in the picture" in result.output
+    assert len(load_plan(files["plan.yaml"]).poses) == 12
+    assert files["plan.png"].read_bytes()[:4] == b"\x89PNG"
+
+
+def test_the_scene_file_opens_and_shows_the_arm_moving(made):
+    with made[1]["plan.mcap"].open("rb") as stream:
+        reader = make_reader(stream)
+        messages = list(reader.iter_messages())
+    assert {schema.name for schema, _, _ in messages} == {"foxglove.SceneUpdate"}
+    times = [message.log_time for _, _, message in messages]
+    assert times == sorted(times)
+    assert 10e9 < times[-1] < 60e9
+
+
+def test_json_is_one_object_and_nothing_else(made):
+    result = run("--check", made[1]["plan.yaml"], "--json")
+    summary = json.loads(result.stdout)
+    assert result.exit_code == 0
+    assert summary["poses"] == 12
+    assert summary["problems"] == []
+    assert summary["top_speed_m_s"] <= 0.25
+    assert summary["duration_s"] == pytest.approx(sum_of(made), rel=0.2)
+
+
+def sum_of(made):
+    return float(
+        next(line for line in made[0].output.splitlines() if "s of motion" in line).split(",")[1].split()[0]
+    )
+
+
+def test_an_edited_plan_that_hits_something_fails_the_check_with_1(made, tmp_path):
+    plan = load_plan(made[1]["plan.yaml"])
+    low = np.deg2rad([0.0, -10.0, 40.0, -120.0, -90.0, 0.0])
+    bad = msgspec.structs.replace(plan.poses[3], joints_rad=tuple(low.tolist()), base_from_flange=None)
+    poses = (*plan.poses[:3], bad, *plan.poses[4:])
+    save_plan(msgspec.structs.replace(plan, poses=poses), tmp_path / "bad.yaml")
+    result = run("--check", tmp_path / "bad.yaml")
+    assert result.exit_code == 1
+    assert "pose 4 (p04)" in result.output and "table" in result.output
+    assert "FAILED" in result.output
+    summary = json.loads(run("--check", tmp_path / "bad.yaml", "--json").stdout)
+    assert {problem["limit"] for problem in summary["problems"]} >= {"clearance"}
+
+
+@pytest.mark.parametrize(
+    ("args", "code", "told"),
+    [
+        (["--check", "missing.yaml"], 2, "cannot read"),
+        (["--start", "1,2,3"], 2, "six joint angles"),
+        (["--check", "a", "--from-list", "b"], 2, "exclude"),
+        (["--scene", "moon"], 2, "moon"),
+        (["--config", "missing.yaml"], 2, "missing.yaml"),
+    ],
+)
+def test_wrong_use_is_a_sentence_and_exit_code_2(args, code, told):
+    result = run(*args)
+    assert result.exit_code == code
+    assert told in result.output.replace("\n", " ")
+    assert "Traceback" not in result.output
+
+
+def test_a_list_from_elsewhere_is_checked_like_any_plan(tmp_path):
+    truth = build_cell("paper", 0, "low", "eye-in-hand")
+    config = msgspec.structs.replace(cell_config(truth, "127.0.0.1"))
+    (tmp_path / "cell.yaml").write_bytes(msgspec.yaml.encode(config))
+    header = ",".join(f"j{i}_rad" for i in range(1, 7))
+    rows = [np.array(truth.start_joints_rad) + step for step in (0.0, 0.05, 0.1)]
+    (tmp_path / "list.csv").write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]))
+    out = tmp_path / "plan.yaml"
+    result = run("--config", tmp_path / "cell.yaml", "--from-list", tmp_path / "list.csv", "-o", out)
+    assert result.exit_code == 0, result.output
+    assert [pose.why for pose in load_plan(out).poses] == ["from list.csv"] * 3

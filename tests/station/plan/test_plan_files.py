@@ -1,0 +1,132 @@
+"""Plans as files: what is written comes back, and what is wrong is named with its place."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from calibrate.geometry import quaternion_from_matrix
+from calibrate.kinematics import MODELS, forward
+from station.errors import ConfigError
+from station.plan.files import import_list, load_plan, parse_plan, save_plan, taught_plan
+from station.plan.model import ExpectedView, Plan, PlannedPose, plan_sha256
+
+Q = (0.1, -1.7, -1.6, -1.3, 1.5, 0.2)
+
+
+def plan():
+    rows = tuple(map(tuple, forward(MODELS["UR10"], Q).tolist()))
+    view = ExpectedView(0.45, 0.3, -0.1, (640.5, 500.0), 0.31)
+    first = PlannedPose("p01", Q, rows, view, "tilt 17°, board left", 0.0003)
+    return Plan("UR10", "eye-in-hand", (first, PlannedPose("no", (0.0,) * 6)), seed=7, note="a: b # c")
+
+
+def test_a_saved_plan_comes_back_the_same_to_the_bit(tmp_path):
+    save_plan(plan(), tmp_path / "plan.yaml")
+    assert load_plan(tmp_path / "plan.yaml") == plan()
+    assert plan_sha256(load_plan(tmp_path / "plan.yaml")) == plan_sha256(plan())
+
+
+def test_the_hash_depends_on_every_joint():
+    other = Plan("UR10", "eye-in-hand", (PlannedPose("p01", (*Q[:5], 0.2000001)), plan().poses[1]))
+    assert plan_sha256(other) != plan_sha256(plan())
+
+
+def test_saving_into_a_missing_folder_says_so(tmp_path):
+    with pytest.raises(ConfigError, match="cannot write the plan"):
+        save_plan(plan(), tmp_path / "nowhere" / "plan.yaml")
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "told"),
+    [
+        ("robot: UR10", "robot: UR99", "unknown"),
+        ("name: p01", "nam: p01", "did you mean 'name'"),
+        ("[0.1,", "[x,", "line"),
+        ("distance_m: 0.45", "distance_m: .inf", "finite"),
+        ("mount: eye-in-hand", "mount: eye-in-foot", "mount"),
+    ],
+)
+def test_a_wrong_value_is_named_with_its_line(tmp_path, old, new, told):
+    save_plan(plan(), tmp_path / "plan.yaml")
+    text = (tmp_path / "plan.yaml").read_text()
+    assert old in text
+    text = text.replace(old, new)
+    with pytest.raises(ConfigError, match=told) as caught:
+        parse_plan(text.encode(), "plan.yaml")
+    assert "plan.yaml" in str(caught.value)
+    assert caught.value.exit_code == 2
+
+
+def test_all_problems_are_told_at_once():
+    poses = (PlannedPose("a", (900.0, 0, 0, 0, 0, 0)), PlannedPose("a", (0.0,) * 6, ((1.0, 0.0),)))
+    wrong = Plan("UR77", "eye-in-hand", poses, joint_speed_rad_s=0.0)
+    with pytest.raises(ConfigError) as caught:
+        parse_plan(msgspec.yaml.encode(wrong), "mine")
+    text = str(caught.value)
+    for part in ("UR77", "joint_speed_rad_s", "twice", "not degrees", "4 rows"):
+        assert part in text
+
+
+@pytest.mark.parametrize("content", [b"", b"\xff\xfe", b"poses: [", b"- 1\n- 2\n", b"x" * 300_000])
+def test_what_is_no_plan_is_refused_without_a_traceback(content):
+    with pytest.raises(ConfigError):
+        parse_plan(content)
+
+
+def test_a_missing_file_is_a_sentence(tmp_path):
+    with pytest.raises(ConfigError, match="cannot read"):
+        load_plan(tmp_path / "none.yaml")
+
+
+def test_joint_lists_in_degrees_and_radians(tmp_path):
+    header = ",".join(f"j{i}_deg" for i in range(1, 7))
+    (tmp_path / "d.csv").write_text(
+        f"name,{header}\nfirst,0,-90,90,-90,-90,0\n\nsecond,10,-90,90,-90,-90,0\n"
+    )
+    made = import_list(tmp_path / "d.csv", "UR10", "eye-in-hand")
+    assert [pose.name for pose in made.poses] == ["first", "second"]
+    np.testing.assert_allclose(made.poses[1].joints_rad, np.deg2rad([10, -90, 90, -90, -90, 0]))
+    (tmp_path / "r.csv").write_text(header.replace("deg", "rad") + "\n" + ",".join(map(str, Q)) + "\n")
+    assert import_list(tmp_path / "r.csv", "UR10", "eye-in-hand").poses[0].joints_rad == pytest.approx(Q)
+
+
+def test_flange_poses_take_the_branch_of_the_arm(tmp_path):
+    near = np.array(Q)
+    lines = ["x,y,z,qx,qy,qz,qw"]
+    for step in range(3):
+        T = forward(MODELS["UR10"], near + 0.1 * step)
+        lines.append(",".join(f"{v:.9f}" for v in [*T[:3, 3], *quaternion_from_matrix(T[:3, :3])]))
+    (tmp_path / "poses.csv").write_text("\n".join(lines))
+    made = import_list(tmp_path / "poses.csv", "UR10", "eye-in-hand", Q)
+    for step, pose in enumerate(made.poses):
+        np.testing.assert_allclose(pose.joints_rad, near + 0.1 * step, atol=1e-5)
+    with pytest.raises(ConfigError, match="--start"):
+        import_list(tmp_path / "poses.csv", "UR10", "eye-in-hand")
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "empty"),
+        ("a,b\n1,2\n", "columns"),
+        ("j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n1,2,3\n", "row 2"),
+        ("j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n1,2,3,4,5,six\n", "row 2"),
+        ("j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n1,2,3,4,5,nan\n", "finite"),
+        ("x,y,z,qx,qy,qz,qw\n900,0,300,0,0,0,1\n", "metres"),
+        ("x,y,z,qx,qy,qz,qw\n0.5,0,0.3,0,0,0,0\n", "quaternion"),
+    ],
+)
+def test_a_wrong_list_names_row_and_remedy(tmp_path, text, told):
+    (tmp_path / "list.csv").write_text(text)
+    with pytest.raises(ConfigError, match=told):
+        import_list(tmp_path / "list.csv", "UR10", "eye-in-hand", Q)
+
+
+def test_taught_poses_carry_their_flange_pose():
+    made = taught_plan("UR5e", "eye-to-hand", [Q, np.zeros(6)])
+    assert [pose.name for pose in made.poses] == ["p01", "p02"]
+    np.testing.assert_allclose(made.poses[0].base_from_flange, forward(MODELS["UR5e"], Q))
+    with pytest.raises(ConfigError, match="UR1000"):
+        taught_plan("UR1000", "eye-in-hand", [Q])

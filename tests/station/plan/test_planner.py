@@ -1,0 +1,221 @@
+"""What a user may rely on: a plan is safe, varied, seen, short, the same for the same seed, or explained."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+from itertools import pairwise
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+
+from calibrate.board import board_points
+from calibrate.geometry import (
+    inverse,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    rotation_angle,
+    rotation_exp,
+)
+from calibrate.information import Noise
+from calibrate.kinematics import MODELS, forward
+from station.errors import ConfigError, LimitError
+from station.limits import SPEED_CAP_M_S, check_plan
+from station.plan.candidates import ViewRange, branch_of, find_candidates, view_range
+from station.plan.choose import choose, informations, objective_for
+from station.plan.planner import PlanOptions, make_plan, plan_scene
+from station.plan.scene import cell_geometry, scene_of
+from station.plan.visibility import lens_radius, visible
+from station.simulation.scenes import build_cell, cell_config
+
+CELLS = [
+    ("paper", "eye-in-hand", 0),
+    ("paper", "eye-in-hand", 3),
+    ("paper", "eye-to-hand", 1),
+    ("blog", "eye-in-hand", 0),
+]
+
+
+@cache
+def cell(scene="paper", mount="eye-in-hand", seed=0):
+    truth = build_cell(scene, seed, "low", mount)
+    return truth, cell_config(truth)
+
+
+@cache
+def planned(scene="paper", mount="eye-in-hand", seed=0, count=25):
+    truth, config = cell(scene, mount, seed)
+    return make_plan(config, start_joints_rad=truth.start_joints_rad, seed=1, count=count)
+
+
+@pytest.mark.parametrize("which", CELLS)
+def test_25_poses_pass_the_check_and_fit_into_a_minute(which):
+    truth, config = cell(*which)
+    plan = planned(*which)
+    check = check_plan(plan, truth.start_joints_rad, cell_geometry(config))
+    assert len(plan.poses) == 25
+    assert check.problems == ()
+    assert check.duration_s < 60
+    assert check.top_speed_m_s <= SPEED_CAP_M_S
+
+
+@pytest.mark.parametrize("which", CELLS)
+def test_the_true_camera_sees_the_whole_board_from_every_pose(which):
+    """By OpenCV's projection of the truth, which the planner never saw."""
+    truth, _ = cell(*which)
+    X, Y = np.array(truth.camera_mount), np.array(truth.board_place)
+    points = board_points(truth.board)
+    for pose in planned(*which).poses:
+        E = forward(MODELS["UR10"], pose.joints_rad)
+        C = inverse(E @ X) @ Y if truth.mount == "eye-in-hand" else inverse(X) @ E @ Y
+        K, D = np.array(truth.camera.matrix), np.array(truth.camera.distortion or (0.0,) * 5)
+        pixels = cv2.projectPoints(points, cv2.Rodrigues(C[:3, :3])[0], C[:3, 3], K, D)[0].reshape(-1, 2)
+        assert (C[:3, :3] @ points.T + C[:3, 3:])[2].min() > 0.1
+        assert pixels.min() > 0
+        assert (pixels < [truth.camera.width, truth.camera.height]).all()
+
+
+def test_poses_are_varied_and_say_why_they_are_there():
+    plan = planned()
+    views = [pose.view for pose in plan.poses]
+    tilts = np.rad2deg([v.tilt_rad for v in views])
+    assert np.ptp([v.distance_m for v in views]) > 0.1
+    assert tilts.max() > 25 and tilts.max() < 45
+    E = np.array([pose.base_from_flange for pose in plan.poses])
+    turns = [rotation_angle(a[:3, :3].T @ b[:3, :3]) for a in E for b in E]
+    assert np.rad2deg(max(turns)) > 45
+    assert all("mm" in pose.why and "tilt" in pose.why for pose in plan.poses)
+    sigmas = [pose.predicted_sigma_m for pose in plan.poses]
+    assert all(b <= a * (1 + 1e-9) for a, b in pairwise(sigmas))
+    assert sigmas[-1] < 0.0005
+
+
+def test_all_poses_stand_in_one_arm_branch():
+    _, config = cell()
+    joints = np.array([pose.joints_rad for pose in planned().poses])
+    assert len(set(branch_of(scene_of(config), joints).tolist())) == 1
+
+
+def test_the_same_seed_gives_the_same_plan_and_another_seed_another():
+    truth, config = cell()
+    again = make_plan(config, start_joints_rad=truth.start_joints_rad, seed=1)
+    other = make_plan(config, start_joints_rad=truth.start_joints_rad, seed=2)
+    assert again == planned()
+    assert other.poses != again.poses
+
+
+def test_progress_rises_to_one():
+    truth, config = cell()
+    seen = []
+    make_plan(
+        config,
+        start_joints_rad=truth.start_joints_rad,
+        count=5,
+        progress=lambda text, done: seen.append(done),
+    )
+    assert seen == sorted(seen)
+    assert seen[-1] == 1.0
+
+
+def test_the_choice_beats_random_poses_of_the_same_pool():
+    _, config = cell()
+    scene = scene_of(config)
+    rng = np.random.default_rng(0)
+    pool = find_candidates(scene, view_range(scene), 200, rng, None, [])
+    each = informations(scene, pool.base_from_flange, Noise(), True)
+    for criterion in ("A", "D"):
+        objective = objective_for(scene, criterion, True)
+        best = float(objective(each[choose(each, 15, objective, rng)].sum(axis=0)))
+        scores = [float(objective(each[rng.permutation(len(each))[:15]].sum(axis=0))) for _ in range(40)]
+        assert best < min(scores)
+
+
+def test_kept_poses_stay_chosen():
+    _, config = cell()
+    scene = scene_of(config)
+    rng = np.random.default_rng(0)
+    pool = find_candidates(scene, view_range(scene), 100, rng, None, [])
+    each = informations(scene, pool.base_from_flange, Noise(), True)
+    chosen = choose(each, 8, objective_for(scene, "A", True), rng, keep=(3, 5))
+    assert chosen[:2] == [3, 5]
+    assert len(set(chosen)) == 8
+
+
+def moved(config, **changes):
+    return msgspec.structs.replace(config, **changes)
+
+
+def turned(guess, rotvec):
+    q = quaternion_from_matrix(matrix_from_quaternion(guess.rotation_xyzw) @ rotation_exp(rotvec))
+    return moved(guess, rotation_xyzw=tuple(q.tolist()))
+
+
+def impossible(name):
+    truth, config = cell()
+    limits, board = config.limits, config.board_guess
+    start = np.array(truth.start_joints_rad)
+    return {
+        "board out of reach": moved(config, board_guess=moved(board, translation_m=(2.2, 0.0, 0.0))),
+        "board turned over": moved(config, board_guess=turned(board, [np.pi, 0, 0])),
+        "box too small": moved(
+            config, limits=moved(limits, workspace_min_m=(0.6, -0.1, 0.3), workspace_max_m=(0.7, 0.05, 0.5))
+        ),
+        "few reachable": moved(
+            config,
+            limits=moved(limits, joints_min_rad=tuple(start - 0.12), joints_max_rad=tuple(start + 0.12)),
+        ),
+        "guess too rough": moved(config, camera_guess=moved(config.camera_guess, sigma_rad=0.6)),
+    }[name], truth.start_joints_rad
+
+
+@pytest.mark.parametrize(
+    ("name", "told"),
+    [
+        ("board out of reach", ["No pose", "reach", "2.2", "1.30 m", "board_guess"]),
+        ("board turned over", ["No pose", "the table", "z axis"]),
+        ("box too small", ["of the wanted 25", "workspace box", "workspace_max_m"]),
+        ("few reachable", ["of the wanted 25", "joint range", "joints_min_rad"]),
+        ("guess too rough", ["not wholly in the picture", "camera_guess"]),
+    ],
+)
+def test_an_impossible_plan_is_explained(name, told):
+    config, start = impossible(name)
+    with pytest.raises(LimitError) as caught:
+        make_plan(config, start_joints_rad=start)
+    for part in told:
+        assert part in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_what_planning_needs_is_asked_for():
+    _, config = cell()
+    with pytest.raises(ConfigError, match="board_guess"):
+        make_plan(moved(config, board_guess=None))
+    with pytest.raises(ConfigError, match="camera_guess"):
+        make_plan(moved(config, camera_guess=None))
+    with pytest.raises(ConfigError, match="lens"):
+        make_plan(moved(config, camera=moved(config.camera, model=None)))
+    with pytest.raises(ConfigError, match="UR10000"):
+        make_plan(moved(config, robot=moved(config.robot, model="UR10000")))
+
+
+def test_a_folding_lens_does_not_show_points_that_it_cannot_see():
+    _, config = cell()
+    folding = moved(config.camera.model, distortion=(-0.9, 0.0, 0.0, 0.0, 0.0))
+    edge = lens_radius(folding)
+    assert edge == pytest.approx(1 / np.sqrt(3 * 0.9), rel=0.02)
+    outside = np.array([[[1.02 * edge, 0.0, 1.0]]])
+    assert not visible(folding, outside, 0.0)[0]
+    behind = np.array([[[0.0, 0.0, -0.5]]])
+    assert not visible(config.camera.model, behind, 0.0)[0]
+
+
+def test_a_plan_without_a_start_and_with_few_poses():
+    _, config = cell()
+    plan = plan_scene(
+        scene_of(config), PlanOptions(count=4, criterion="D", view=replace(ViewRange(), doubt=1.0))
+    )
+    assert len(plan.poses) == 4
+    assert check_plan(plan, None, cell_geometry(config)).problems == ()

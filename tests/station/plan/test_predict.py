@@ -1,0 +1,71 @@
+"""Forecasts fall as poses come in; advice says enough when it is, and offers a pose that helps when not."""
+
+from __future__ import annotations
+
+from functools import cache
+
+import numpy as np
+import pytest
+
+from calibrate.information import Noise
+from calibrate.kinematics import forward
+from station.limits import check_path
+from station.plan.planner import make_plan
+from station.plan.predict import AdviceOptions, advise, forecast, forecast_views
+from station.plan.scene import scene_of
+from station.simulation.scenes import build_cell, cell_config
+
+
+@cache
+def world():
+    truth = build_cell("paper", 0, "low", "eye-in-hand")
+    config = cell_config(truth)
+    plan = make_plan(config, start_joints_rad=truth.start_joints_rad)
+    scene = scene_of(config)
+    return scene, plan, np.array([pose.base_from_flange for pose in plan.poses])
+
+
+def test_the_forecast_is_what_the_plan_says_and_only_falls():
+    scene, plan, _ = world()
+    steps = forecast(scene, plan, Noise())
+    assert [s.sigma_m for s in steps] == pytest.approx([p.predicted_sigma_m for p in plan.poses], rel=1e-4)
+    assert (np.diff([s.sigma_m for s in steps]) <= 1e-12).all()
+
+
+def test_a_known_lens_and_less_noise_make_it_better():
+    scene, _, flange = world()
+    usual = forecast_views(scene, flange, Noise())[-1].sigma_m
+    assert forecast_views(scene, flange, Noise(), free_intrinsics=False)[-1].sigma_m < usual
+    half = Noise(0.075, 5e-5, 8.5e-5)
+    assert forecast_views(scene, flange, half)[-1].sigma_m == pytest.approx(usual / 2, rel=0.05)
+
+
+def test_enough_is_said_when_the_goal_is_reached():
+    scene, plan, flange = world()
+    advice = advise(scene, flange, 0.001, plan.poses[-1].joints_rad)
+    assert advice.enough
+    assert advice.next_pose is None
+    assert "enough" in advice.text
+
+
+def test_the_next_best_pose_helps_and_is_free_to_reach():
+    scene, plan, flange = world()
+    here = np.array(plan.poses[7].joints_rad)
+    advice = advise(scene, flange[:8], 0.0003, here)
+    assert not advice.enough
+    assert advice.next_pose is not None
+    assert check_path(scene.geometry, here, advice.next_pose.joints_rad).problems == ()
+    more = np.concatenate([flange[:8], forward(scene.geometry.model, advice.next_pose.joints_rad)[None]])
+    found = forecast_views(scene, more, Noise())[-1].sigma_m
+    assert found < advice.now.sigma_m
+    assert found == pytest.approx(advice.next_pose.predicted_sigma_m, rel=1e-6)
+    assert advice.poses_missing is not None and 1 < advice.poses_missing < 25
+    assert "0.30 mm" in advice.text
+
+
+def test_a_goal_beyond_the_arm_is_not_promised():
+    scene, plan, flange = world()
+    advice = advise(scene, flange, 1e-6, plan.poses[-1].joints_rad, AdviceOptions(pool=60))
+    assert not advice.enough
+    assert advice.poses_missing is None
+    assert "better camera or arm" in advice.text

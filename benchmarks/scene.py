@@ -1,8 +1,8 @@
 """Cells made of numbers: corners straight from a projection, no pictures. Only for benchmarks and tests.
 
 Paper: 1280×1024, 8 mm lens on 4.8 µm pixels, 7×6 inner corners of 25 mm, 0.38-0.60 m away, tilted up to
-30°, rolled up to ±45°, X of eq. 23. Blog: 960×720, fovy 31.0482°, 9×6 inner corners of 30 mm, X = Ry(-15°), 0.1 m.
-Noise: corners iid in both axes, robot iid per axis at every stop.
+30°, rolled up to ±45°, X of eq. 23. Blog: 960×720, fovy 31.0482°, 9×6 inner corners of 30 mm, X = Ry(-15°)
+and 0.1 m along x. Noise: corners iid in both axes, robot iid per axis at every stop.
 """
 
 from __future__ import annotations
@@ -76,8 +76,12 @@ def make_cell(
     mount: Mount = "eye-in-hand",
     X: Array | None = None,
     refit_camera: bool = False,
+    with_pnp: bool = True,
 ) -> Cell:
-    """One cell; `X` None = the scene's own. `refit_camera`: intrinsics by Zhang from the same corners."""
+    """One cell; `X` None = the scene's own. `refit_camera`: intrinsics by Zhang from the same corners.
+
+    with_pnp False: true board poses instead, for callers that find them themselves.
+    """
     camera = PAPER_CAMERA if scene == "paper" else BLOG_CAMERA
     board = grid(7, 6, 0.025) if scene == "paper" else grid(9, 6, 0.03)
     X = (PAPER_X if scene == "paper" else BLOG_X) if X is None else X
@@ -90,7 +94,8 @@ def make_cell(
     seen = project(camera, board @ np.swapaxes(C[:, :3, :3], 1, 2) + C[:, None, :3, 3]).pixels
     pixels = seen + rng.normal(size=seen.shape) * noise.corner_px
     known = zhang(board, pixels, camera) if refit_camera else camera
-    return Cell(view_set(measured, board, pixels, known, mount), X, Y, camera, flange, C)
+    seen_from = None if with_pnp else C
+    return Cell(view_set(measured, board, pixels, known, mount, seen_from), X, Y, camera, flange, C)
 
 
 def grid(columns: int, rows: int, square_m: float) -> Array:
@@ -99,11 +104,19 @@ def grid(columns: int, rows: int, square_m: float) -> Array:
     return np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1) * square_m
 
 
-def view_set(flange: Array, board: Array, pixels: Array, camera: CameraModel, mount: Mount) -> ViewSet:
-    found = [
-        ImageView(i, f"view {i}", flange[i], board, pixels[i], None, pnp(board, pixels[i], camera))
-        for i in range(len(flange))
-    ]
+def view_set(
+    flange: Array,
+    board: Array,
+    pixels: Array,
+    camera: CameraModel,
+    mount: Mount,
+    camera_from_board: Array | None = None,
+) -> ViewSet:
+    """Views with board poses given or, None, by PnP."""
+    C = camera_from_board
+    if C is None:
+        C = np.array([pnp(board, seen, camera) for seen in pixels])
+    found = [ImageView(i, f"view {i}", flange[i], board, pixels[i], None, C[i]) for i in range(len(flange))]
     return ViewSet(mount, tuple(found), camera)
 
 

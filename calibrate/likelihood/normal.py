@@ -55,7 +55,7 @@ class Normal:
         W = np.tensordot(precision, self.W, axes=1)
         V_inverse = np.asarray(np.linalg.inv(V), dtype=float)
         elimination = W @ V_inverse
-        S = np.tensordot(precision, self.U, axes=1) - np.einsum("nai,nbi->ab", elimination, W, optimize=True)
+        S = np.tensordot(precision, self.U, axes=1) - np.tensordot(elimination, W, axes=([0, 2], [0, 2]))
         h = precision @ self.h.reshape(4, -1)
         h = h.reshape(-1, 6)
         right = precision @ self.g - np.einsum("nai,ni->a", elimination, h)
@@ -92,9 +92,9 @@ class Solved:
         """(4,) sums of squares that the linear model predicts at the step's end."""
         n, x, c = self.normal, self.step, self.by_view
         linear = n.g @ x + np.einsum("gni,ni->g", n.h, c)
-        quadratic = np.einsum("gab,a,b->g", n.U, x, x, optimize=True)
-        quadratic += 2 * np.einsum("gnai,a,ni->g", n.W, x, c, optimize=True)
-        quadratic += np.einsum("gnij,ni,nj->g", n.V, c, c, optimize=True)
+        quadratic = (n.U @ x) @ x
+        quadratic += 2 * ((x @ n.W) * c).sum(axis=(1, 2))
+        quadratic += ((n.V @ c[..., None])[..., 0] * c).sum(axis=(1, 2))
         return np.asarray(np.maximum(n.square - 2 * linear + quadratic, 0.0))
 
     def traces(self) -> Array:

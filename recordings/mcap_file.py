@@ -1,8 +1,8 @@
 """Writes the MCAP format: chunks without compression, every checksum, indexes and statistics.
 
 Source: the MCAP format specification, version 0 (mcap.dev/spec). Unlike the reference library's writer it
-copies no picture: large contents go from the caller's memory to the kernel as they are. And it never makes
-a good-looking file after a failed write: an OSError passes through, and the caller closes the file for good.
+copies no picture and reads it once: large contents go from the caller's memory to the kernel. And it never
+makes a good-looking file after a failed write: an OSError passes through, and the caller closes the file.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
+from recordings.checksum import joined_crc
 from recordings.files import create_exclusively
 from recordings.records import FOOTER, MAGIC, MESSAGE_HEAD, RECORD_HEAD, Opcode, Statistics
 
@@ -105,8 +106,10 @@ class McapFile:
         chunk, self._chunk = self._chunk, _Chunk()
         if not chunk.pieces:
             return
-        start, head = self.size_bytes, chunk.head()
-        self._put([head, *chunk.pieces])
+        start, crc = self.size_bytes, chunk.crc()
+        head = chunk.head(crc)
+        file_crc = joined_crc(zlib.crc32(head, self._crc), crc, chunk.size_bytes)
+        self._put([head, *chunk.pieces], file_crc)
         index_start = self.size_bytes
         offsets = b""
         records: list[bytes] = []
@@ -153,11 +156,14 @@ class McapFile:
             Opcode.STATISTICS, fixed + struct.pack("<QQ", *(self._span_ns or (0, 0))) + _sized(pairs)
         )
 
-    def _put(self, pieces: Sequence[Piece]) -> None:
-        """Everything, however often the kernel takes only a part."""
+    def _put(self, pieces: Sequence[Piece], crc: int | None = None) -> None:
+        """Everything, however often the kernel takes only a part. `crc`: the file's so far, when known."""
         rest = [memoryview(piece) for piece in pieces if len(piece)]
-        for piece in rest:
-            self._crc = zlib.crc32(piece, self._crc)
+        if crc is None:
+            crc = self._crc
+            for piece in rest:
+                crc = zlib.crc32(piece, crc)
+        self._crc = crc
         while rest:
             done = os.writev(self.descriptor, rest)
             self.size_bytes += done
@@ -194,11 +200,14 @@ class _Chunk:
         times = [time_ns for entries in self.entries.values() for time_ns, _ in entries]
         return (min(times), max(times)) if times else (0, 0)
 
-    def head(self) -> bytes:
-        """The chunk record up to its records."""
+    def crc(self) -> int:
         crc = 0
         for piece in self.pieces:
             crc = zlib.crc32(piece, crc)
+        return crc
+
+    def head(self, crc: int) -> bytes:
+        """The chunk record up to its records."""
         content = struct.pack("<QQQI", *self.span_ns, self.size_bytes, crc) + _text("")
         content += struct.pack("<Q", self.size_bytes)
         return RECORD_HEAD.pack(Opcode.CHUNK, len(content) + self.size_bytes) + content

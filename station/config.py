@@ -53,6 +53,8 @@ class CameraConfig(Section, frozen=True):
     """x, y, width, height"""
     packet_size: int | None = None
     """None = negotiated"""
+    playback_pace: float = 0.0
+    """playback: 0 = as fast as asked, 1 = at its own pace."""
     model: CameraModel | None = None
     """Known intrinsics; None = found from the session's pictures."""
     model_is_rough: bool = False

@@ -1,0 +1,282 @@
+"""Plays pictures as a camera, and a recording as camera and robot together.
+
+Nothing played is ever taken for real: its driver is `playback`, and so is the source of what is recorded.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from calibrate.geometry import Array, interpolate, pose_from_rotvec, rotation_log
+from recordings.errors import RecordingError
+from recordings.messages import CameraIdentity, Picture, RobotIdentity, RobotState, Stamps, Vector6, View
+from recordings.reader import Recording, open_recording
+from station.clocks import ClockFit
+from station.config import CameraConfig
+from station.devices.frames import next_frame_id
+from station.devices.playback_source import Played, Source, open_source
+from station.errors import CameraError, RobotError, StaleStateError
+from station.plan.model import Plan, PlannedPose
+
+STATE_RATE_HZ = 100.0
+MOVE_S = 0.2
+"""Every move takes this long, whatever the recorded one took."""
+_SAME_JOINTS_RAD = 0.02
+_HOST_CLOCK = ClockFit(
+    reference_s=0.0,
+    offset_ns=0.0,
+    drift=0.0,
+    residual_s=0.0,
+    drift_uncertainty=0.0,
+    latency_s=1e-6,
+    samples=1,
+    span_s=0.0,
+)
+"""Played pictures are stamped by the host's own clock."""
+
+
+class PlaybackCamera:
+    """`station.devices.base.Camera` over `config.device`; with a robot, it shows what that robot looks at.
+
+    `config.playback_pace`: 0 = as fast as asked, 1 = at its own pace, 2 = twice as fast.
+    """
+
+    def __init__(self, config: CameraConfig, robot: PlaybackRobot | None = None) -> None:
+        self._config = config
+        self._robot = robot
+        self._source: Source | None = None
+        self._newest: Picture | None = None
+        self._frame_id = 0
+        self._taken = 0
+        self._start_s: float | None = None
+        self._busy = asyncio.Lock()
+        self._identity = CameraIdentity(driver="playback")
+
+    @property
+    def identity(self) -> CameraIdentity:
+        return self._identity
+
+    @property
+    def clock(self) -> ClockFit | None:
+        return _HOST_CLOCK
+
+    async def open(self) -> CameraIdentity:
+        self._source = await asyncio.to_thread(open_source, Path(self._config.device))
+        self._identity = self._source.identity
+        self._start_s = None
+        return self._identity
+
+    async def capture(self, timeout_s: float = 5.0) -> Picture:
+        """The next picture; CameraError at the end, or when it is not due within `timeout_s`."""
+        async with self._busy:
+            if self._source is None:
+                raise CameraError("nothing is being played; open the camera first")
+            if self._robot is not None:
+                picture = await asyncio.to_thread(self._robot.picture)
+            else:
+                played = await asyncio.to_thread(next, self._source.frames, None)
+                if played is None:
+                    raise CameraError(
+                        f"'{self._source.name}' is at its end after {self._taken} pictures; open it again"
+                    )
+                await self._wait_for(played, timeout_s)
+                picture = played.picture
+            self._frame_id = next_frame_id(self._frame_id)
+            now_ns = time.monotonic_ns()
+            self._newest = msgspec.structs.replace(
+                picture,
+                stamps=Stamps(host_monotonic_ns=now_ns, host_wall_ns=time.time_ns(), device_ns=now_ns),
+                frame_id=self._frame_id,
+                sequence=self._taken,
+            )
+            self._taken += 1
+            return self._newest
+
+    async def preview(self) -> Picture | None:
+        """The newest picture; with a robot, what it looks at now."""
+        if self._robot is not None and self._source is not None:
+            try:
+                return await asyncio.to_thread(self._robot.picture)
+            except CameraError:
+                return None
+        return self._newest
+
+    async def close(self) -> None:
+        self._source = None
+
+    async def _wait_for(self, played: Played, timeout_s: float) -> None:
+        if self._config.playback_pace <= 0:
+            return
+        now_s = time.monotonic()
+        self._start_s = now_s if self._start_s is None else self._start_s
+        left_s = self._start_s + played.at_s / self._config.playback_pace - now_s
+        if left_s > timeout_s:
+            await asyncio.sleep(timeout_s)
+            raise CameraError(f"the next picture was taken {left_s:.0f} s later; raise camera.playback_pace")
+        await asyncio.sleep(max(0.0, left_s))
+
+
+class PlaybackRobot:
+    """`station.devices.base.Robot` that stands where the recorded arm stood.
+
+    It can move only to joints that the recording has a picture from.
+    """
+
+    def __init__(self, recording: Path) -> None:
+        """Raises RobotError for a recording that cannot be read or has no joints."""
+        try:
+            self._recording: Recording = open_recording(recording)
+            self.views: list[View] = self._recording.views()
+        except RecordingError as error:
+            raise RobotError(f"{recording} cannot be played: {error}") from error
+        if not self.views or any(v.joints_rad is None for v in self.views):
+            raise RobotError(f"{recording} has no joints for every view: it plays as a camera only")
+        self._lock = threading.Lock()
+        self._from = self._to = self.views[0]
+        self._move_start_s = -MOVE_S
+        self._halted_at: float | None = None
+        self._callbacks: list[Callable[[RobotState], None]] = []
+        self._ending = threading.Event()
+        self._thread: threading.Thread | None = None
+        self._controlled = False
+
+    @property
+    def identity(self) -> RobotIdentity:
+        return self._recording.info.robot
+
+    @property
+    def control(self) -> bool:
+        return self._controlled
+
+    @property
+    def notice(self) -> str:
+        return ""
+
+    @property
+    def remote(self) -> bool | None:
+        return None
+
+    def plan(self) -> Plan:
+        """The recorded poses as a plan."""
+        poses = tuple(
+            PlannedPose(v.name, _joints(v), v.base_from_flange, why="as recorded") for v in self.views
+        )
+        return Plan(self.identity.model, self._recording.info.mount, poses, note="playback")
+
+    def picture(self) -> Picture:
+        """Of the view the arm stands at; CameraError between two."""
+        view, moving = self._standing()
+        if moving:
+            raise CameraError("playback has pictures only from where the recorded arm stood")
+        return self._recording.picture(view)
+
+    async def connect(self) -> RobotIdentity:
+        if self._thread is None:
+            self._thread = threading.Thread(target=self._publish, name="playback robot", daemon=True)
+            self._thread.start()
+        return self.identity
+
+    def subscribe(self, callback: Callable[[RobotState], None]) -> None:
+        self._callbacks.append(callback)
+
+    def latest(self) -> RobotState:
+        return self.at(time.monotonic_ns())
+
+    def at(self, host_monotonic_ns: int) -> RobotState:
+        age_s = (time.monotonic_ns() - host_monotonic_ns) / 1e9
+        if not -0.01 <= age_s <= 10.0:
+            raise StaleStateError(f"no played state {age_s:.1f} s ago")
+        with self._lock:
+            before, after, fraction = self._from, self._to, self._fraction(host_monotonic_ns / 1e9)
+        a, b = np.array(before.joints_rad), np.array(after.joints_rad)
+        flange = interpolate(np.array(before.base_from_flange), np.array(after.base_from_flange), fraction)
+        speed = (b - a) / MOVE_S if 0 < fraction < 1 and self._halted_at is None else np.zeros(6)
+        tool = flange @ pose_from_rotvec(self.identity.tcp_offset[:3], self.identity.tcp_offset[3:])
+        return RobotState(
+            stamps=Stamps(
+                host_monotonic_ns=host_monotonic_ns,
+                host_wall_ns=time.time_ns() - round(age_s * 1e9),
+                controller_s=host_monotonic_ns / 1e9,
+            ),
+            joints_rad=_vector6(a + fraction * (b - a)),
+            joint_speeds_rad_s=_vector6(speed),
+            target_joints_rad=_joints(after),
+            tcp_pose=_vector6(np.concatenate([tool[:3, 3], rotation_log(tool[:3, :3])])),
+            robot_mode=7,
+            safety_mode=1,
+            safety_status_bits=1,
+            runtime_state=2 if self._controlled else 1,
+            robot_status_bits=1,
+            speed_scaling=1.0,
+            target_speed_fraction=1.0,
+        )
+
+    def clock(self) -> ClockFit | None:
+        return _HOST_CLOCK
+
+    def check(self) -> None: ...
+
+    async def start_control(self) -> None:
+        self._controlled = True
+
+    async def move(self, joints_rad: Sequence[float], speed_rad_s: float, acceleration_rad_s2: float) -> None:
+        """RobotError where the recording was never at these joints."""
+        target = np.asarray(joints_rad, dtype=float)
+        off = [float(np.abs(np.array(v.joints_rad) - target).max()) for v in self.views]
+        nearest = int(np.argmin(off))
+        if not self._controlled or off[nearest] > _SAME_JOINTS_RAD:
+            reason = "it has no go" if not self._controlled else "the recorded arm never stood there"
+            raise RobotError(f"playback cannot move to these joints: {reason}")
+        with self._lock:
+            self._from, self._to, self._halted_at = self._to, self.views[nearest], None
+            self._move_start_s = time.monotonic()
+        await asyncio.sleep(MOVE_S)
+
+    def heartbeat(self) -> None: ...
+
+    async def stop(self, reason: str) -> None:
+        with self._lock:
+            if self._fraction(time.monotonic()) < 1 and self._halted_at is None:
+                self._halted_at = self._fraction(time.monotonic())
+        self._controlled = False
+
+    async def end_control(self) -> None:
+        self._controlled = False
+
+    async def close(self) -> None:
+        self._ending.set()
+        if self._thread is not None:
+            await asyncio.to_thread(self._thread.join)
+
+    def _standing(self) -> tuple[View, bool]:
+        with self._lock:
+            return self._to, self._fraction(time.monotonic()) < 1
+
+    def _fraction(self, at_s: float) -> float:
+        """Of the current move, 0 … 1."""
+        if self._halted_at is not None:
+            return self._halted_at
+        return float(np.clip((at_s - self._move_start_s) / MOVE_S, 0.0, 1.0))
+
+    def _publish(self) -> None:
+        while not self._ending.wait(1 / STATE_RATE_HZ):
+            state = self.latest()
+            for callback in self._callbacks:
+                callback(state)
+
+
+def _joints(view: View) -> Vector6:
+    assert view.joints_rad is not None
+    return view.joints_rad
+
+
+def _vector6(values: Array) -> Vector6:
+    a, b, c, d, e, f = (float(x) for x in values)
+    return a, b, c, d, e, f

@@ -1,0 +1,195 @@
+"""A folder, a video or a recording plays as a camera; a recording also as the robot that was there."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calibrate.geometry import difference, pose_from_rotvec
+from calibrate.kinematics import MODELS, forward
+from recordings.messages import (
+    CameraIdentity,
+    CameraModel,
+    Picture,
+    RobotIdentity,
+    SessionInfo,
+    Stamps,
+    View,
+)
+from recordings.writer import RecordingWriter
+from station.config import PAPER_BOARD, CameraConfig
+from station.devices.playback import PlaybackCamera, PlaybackRobot
+from station.errors import CameraError, RobotError, StaleStateError
+
+STARTS = [(0.1 * i, -1.5, -1.5, -1.6, 1.57, 0.2 * i) for i in range(3)]
+TCP = (0.0, 0.0, 0.1, 0.0, 0.0, 0.3)
+
+
+def image(number: int) -> np.ndarray:
+    return np.full((24, 32), 40 + 10 * number, np.uint8)
+
+
+def config(path: Path, pace: float = 0.0) -> CameraConfig:
+    return CameraConfig(driver="playback", device=str(path), playback_pace=pace)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    for number in range(3):
+        cv2.imwrite(str(tmp_path / f"{number}.png"), image(number))
+    (tmp_path / "notes.txt").write_text("not a picture")
+    return tmp_path
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    return record(tmp_path / "session.mcap", joints=True)
+
+
+def record(path: Path, *, joints: bool) -> Path:
+    info = SessionInfo(
+        name="session",
+        mount="eye-in-hand",
+        source="simulated",
+        board=PAPER_BOARD,
+        camera=CameraModel(32, 24),
+        robot=RobotIdentity(model="UR10", serial="R1", tcp_offset=TCP),
+        camera_identity=CameraIdentity("Daheng Imaging", "MER-131-75GM", "KJ1", "rendered"),
+    )
+    writer = RecordingWriter(path, info)
+    for i, start in enumerate(STARTS):
+        stamps = Stamps(host_monotonic_ns=10**9 + i * 200_000_000, host_wall_ns=10**18, device_ns=5)
+        writer.picture(Picture(image(i), stamps, frame_id=i + 1, sequence=i))
+        flange = forward(MODELS["UR10"], start)
+        matrix = tuple(tuple(float(x) for x in row) for row in flange)
+        writer.view(View(i, f"pose {i}", i, matrix, joints_rad=start if joints else None, stamps=stamps))
+    return writer.finish()
+
+
+async def played(path: Path, pace: float = 0.0) -> list[Picture]:
+    camera = PlaybackCamera(config(path, pace))
+    await camera.open()
+    pictures = [await camera.capture() for _ in range(3)]
+    with pytest.raises(CameraError, match="at its end after 3 pictures"):
+        await camera.capture()
+    await camera.close()
+    return pictures
+
+
+async def test_a_folder_plays_in_the_order_of_its_names(folder: Path) -> None:
+    pictures = await played(folder)
+    assert all(np.array_equal(p.image, image(i)) for i, p in enumerate(pictures))
+    assert [p.sequence for p in pictures] == [0, 1, 2] and [p.frame_id for p in pictures] == [1, 2, 3]
+    assert all(p.pixel_format == "Mono8" for p in pictures)
+    assert pictures[0].stamps.host_monotonic_ns < pictures[2].stamps.host_monotonic_ns
+
+
+async def test_a_video_plays_every_frame(tmp_path: Path) -> None:
+    path = tmp_path / "film.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), 20.0, (32, 24))
+    for number in range(3):
+        writer.write(cv2.cvtColor(image(number), cv2.COLOR_GRAY2BGR))
+    writer.release()
+    pictures = await played(path)
+    assert [round(float(p.image.mean()), -1) for p in pictures] == [40, 50, 60]
+    assert pictures[0].image.shape == (24, 32, 3) and pictures[0].pixel_format == "BGR8"
+
+
+async def test_a_recording_plays_its_views_and_keeps_the_cameras_name(recording: Path) -> None:
+    pictures = await played(recording)
+    assert all(np.array_equal(p.image, image(i)) for i, p in enumerate(pictures))
+    camera = PlaybackCamera(config(recording))
+    identity = await camera.open()
+    assert (identity.model, identity.serial, identity.driver) == ("MER-131-75GM", "KJ1", "playback")
+
+
+async def test_its_own_pace_is_kept_and_a_faster_one_is_faster(recording: Path) -> None:
+    start_s = time.monotonic()
+    await played(recording, pace=1.0)
+    own_s = time.monotonic() - start_s
+    await played(recording, pace=8.0)
+    faster_s = time.monotonic() - start_s - own_s
+    assert own_s >= 0.4 and faster_s < own_s - 0.2
+
+
+async def test_a_picture_that_is_not_due_in_time_is_refused(folder: Path) -> None:
+    camera = PlaybackCamera(config(folder, pace=0.01))
+    await camera.open()
+    await camera.capture()
+    with pytest.raises(CameraError, match="playback_pace"):
+        await camera.capture(timeout_s=0.05)
+
+
+async def test_what_cannot_be_played_is_named(tmp_path: Path) -> None:
+    (tmp_path / "empty").mkdir()
+    (tmp_path / "bad").mkdir()
+    (tmp_path / "bad" / "0.png").write_bytes(b"no picture")
+    (tmp_path / "cut.mcap").write_bytes(b"\x89MCAP0\r\n")
+    for name, words in (("none", "nothing to play"), ("empty", "no pictures"), ("cut.mcap", "cut.mcap")):
+        with pytest.raises(CameraError, match=words):
+            await PlaybackCamera(config(tmp_path / name)).open()
+    camera = PlaybackCamera(config(tmp_path / "bad"))
+    with pytest.raises(CameraError, match="nothing is being played"):
+        await camera.capture()
+    await camera.open()
+    with pytest.raises(CameraError, match=r"0\.png"):
+        await camera.capture()
+
+
+async def test_robot_and_camera_stand_where_the_recorded_ones_stood(recording: Path) -> None:
+    robot = PlaybackRobot(recording)
+    camera = PlaybackCamera(config(recording), robot)
+    await robot.connect()
+    await camera.open()
+    await robot.start_control()
+    plan = robot.plan()
+    assert [p.joints_rad for p in plan.poses] == STARTS and plan.robot == "UR10"
+    for number in (2, 0, 1):
+        await robot.move(STARTS[number], 0.6, 1.0)
+        state = robot.latest()
+        assert np.allclose(state.joints_rad, STARTS[number]) and not any(state.joint_speeds_rad_s)
+        base_from_tcp = pose_from_rotvec(state.tcp_pose[:3], state.tcp_pose[3:])
+        expected = forward(MODELS["UR10"], STARTS[number]) @ pose_from_rotvec(TCP[:3], TCP[3:])
+        assert np.abs(difference(base_from_tcp, expected)).max() < 1e-9
+        assert np.array_equal((await camera.capture()).image, image(number))
+    await robot.close()
+
+
+async def test_the_played_robot_needs_a_go_and_known_joints(recording: Path) -> None:
+    robot = PlaybackRobot(recording)
+    with pytest.raises(RobotError, match="no go"):
+        await robot.move(STARTS[1], 0.6, 1.0)
+    await robot.start_control()
+    with pytest.raises(RobotError, match="never stood there"):
+        await robot.move([0.5] * 6, 0.6, 1.0)
+    with pytest.raises(StaleStateError):
+        robot.at(time.monotonic_ns() - 20 * 10**9)
+
+
+async def test_states_are_published_and_stop_halts_a_move(recording: Path) -> None:
+    robot = PlaybackRobot(recording)
+    states = []
+    robot.subscribe(states.append)
+    await robot.connect()
+    await robot.start_control()
+    moving = robot.move(STARTS[2], 0.6, 1.0)
+    task = asyncio.ensure_future(moving)
+    await asyncio.sleep(0.08)
+    await robot.stop("test")
+    halted = robot.latest()
+    await task
+    await robot.close()
+    assert not robot.control
+    assert STARTS[0][5] < halted.joints_rad[5] < STARTS[2][5]
+    assert robot.latest().joints_rad == halted.joints_rad
+    assert len(states) > 5 and any(any(s.joint_speeds_rad_s) for s in states)
+
+
+def test_a_recording_without_joints_plays_as_a_camera_only(tmp_path: Path) -> None:
+    with pytest.raises(RobotError, match="camera only"):
+        PlaybackRobot(record(tmp_path / "imported.mcap", joints=False))

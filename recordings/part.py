@@ -42,6 +42,7 @@ class RecordingPart:
             self._topics = self._check_channels()
             self.info = self._session_info()
             self.attachments = self._checked_attachments()
+            self.media_types = dict(self._contents.media_types)
             self._facts = self._index_pictures(Topic.PICTURE_FACTS)
             self._raw = self._index_pictures(Topic.RAW_IMAGE)
             self._compressed = self._index_pictures(Topic.COMPRESSED_IMAGE)

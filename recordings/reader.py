@@ -74,6 +74,10 @@ class Recording:
             merged.update(part.attachments)
         return merged
 
+    def media_types(self) -> dict[str, str]:
+        """Of the attachments."""
+        return {name: kind for part in self.parts for name, kind in part.media_types.items()}
+
 
 def open_recording(path: Path) -> Recording:
     """Reads and proves the whole recording. At most 256 MiB of memory, whatever the file says.

@@ -9,6 +9,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 import yaml
@@ -18,8 +19,10 @@ from typer.testing import CliRunner
 from recordings.cdr import definition_text, encode_cdr
 from recordings.cli import main
 from recordings.errors import RecordingError
+from recordings.excerpt import write_excerpt
 from recordings.export import Target, export_recording
 from recordings.importer import import_folder
+from recordings.messages import Stamps
 from recordings.reader import open_recording
 from recordings.viewing import quaternion_xyzw
 from recordings.writer import RecordingWriter
@@ -98,6 +101,26 @@ def test_an_export_that_fails_halfway_leaves_nothing(small: Path, tmp_path: Path
     with pytest.raises(RecordingError, match="cannot write"):
         export_recording(recording, tmp_path / "out", Target.FOLDER)
     assert not (tmp_path / "out").exists()
+
+
+def test_an_excerpt_keeps_the_views_and_the_states_around_them(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        writer.attach("plan.yaml", "application/yaml", b"poses: 2\n")
+        for count in range(1000):  # 2 s at 500 Hz
+            writer.robot_state(make_state(count))
+        for sequence, (index, attempt, at_s) in enumerate([(0, 1, 0.2), (0, 2, 0.5), (1, 1, 1.5)]):
+            writer.picture(make_picture(sequence))
+            stamps = Stamps(host_monotonic_ns=round(at_s * 1e9), host_wall_ns=START_NS)
+            writer.view(msgspec.structs.replace(make_view(index, sequence, attempt), stamps=stamps))
+        original = open_recording(writer.finish())
+    excerpt = open_recording(write_excerpt(original, tmp_path / "b.mcap", window_s=0.1))
+    assert [(v.index, v.attempt) for v in excerpt.views()] == [(0, 2), (1, 1)]
+    np.testing.assert_array_equal(excerpt.picture(excerpt.views()[0]).image, make_image(1))
+    kept_s = [state.stamps.host_monotonic_ns / 1e9 for state in excerpt.robot_states()]
+    assert kept_s == pytest.approx(
+        [0.4 + 0.002 * i for i in range(101)] + [1.4 + 0.002 * i for i in range(101)]
+    )
+    assert excerpt.attachments() == original.attachments()
 
 
 @pytest.mark.parametrize("target", ["folder", "csv", "ros2"])

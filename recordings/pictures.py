@@ -75,7 +75,7 @@ def _png_header(data: bytes) -> PictureHeader:
 
 def _jpeg_header(data: bytes) -> PictureHeader:
     position = 2
-    while position + 9 <= len(data):
+    while position + 10 <= len(data):
         if data[position] != 0xFF:
             break
         marker = data[position + 1]

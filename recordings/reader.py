@@ -110,7 +110,7 @@ def _open_parts(folder: Path) -> list[RecordingPart]:
             f"{folder} holds {len(files)} recordings: name one of them, or one session's folder"
         )
     parts = sorted((RecordingPart(folder / name) for name in files), key=lambda part: part.info.part)
-    _check_one_session(folder, parts, sum(name.endswith(EMPTY_SUFFIX) for name in names))
+    _check_one_session(folder, parts, sum(f".part{EMPTY_SUFFIX}" in name for name in names))
     return parts
 
 

@@ -68,7 +68,7 @@ def _recover_part(source: Path) -> Recovery:
     try:
         return _recover_file(source, None)
     except NothingToSaveError as error:
-        aside = source.with_name(source.name + EMPTY_SUFFIX)
+        aside = _free_name(source.with_name(source.name + EMPTY_SUFFIX))
         rename_new(source, aside)
         return Recovery(source, aside, 0, 0, 0, aside.stat().st_size, (str(error),))
 
@@ -136,7 +136,7 @@ def _rebuild(descriptor: int, source: Path, final: Path, in_place: bool) -> Reco
         part = _verified(temporary, source)
         original = source
         if in_place:
-            original = source.with_name(source.name + DAMAGED_SUFFIX)
+            original = _free_name(source.with_name(source.name + DAMAGED_SUFFIX))
             rename_new(source, original)
         rename_new(temporary, final)
         return _report(final, part, original, found.lost_bytes, losses)
@@ -148,6 +148,15 @@ def _rebuild(descriptor: int, source: Path, final: Path, in_place: bool) -> Reco
         file.close()
         temporary.unlink(missing_ok=True)
         sync_folder(final.parent)
+
+
+def _free_name(path: Path) -> Path:
+    """The path, or with -2, -3 … where an earlier recovery left one."""
+    count, free = 1, path
+    while os.path.lexists(free):
+        count += 1
+        free = path.with_name(f"{path.name}-{count}")
+    return free
 
 
 def _verified(temporary: Path, source: Path) -> RecordingPart:

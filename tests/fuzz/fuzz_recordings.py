@@ -18,6 +18,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import atheris
+import cv2
 
 zlib.crc32 = lambda data, value=0: 0  # type: ignore[assignment]
 sys.path.insert(0, str(Path(__file__).parents[2]))
@@ -26,18 +27,39 @@ with atheris.instrument_imports(include=["recordings"]):
     from recordings.errors import RecordingError
     from recordings.reader import open_recording
     from recordings.recover import recover
+    from recordings.writer import RecordingWriter
 
-from tests.recordings.small_recording import write_small  # noqa: E402  # after instrumentation
+from tests.recordings.small_recording import (  # noqa: E402  # after instrumentation
+    make_info,
+    make_picture,
+    make_view,
+    write_small,
+)
 
 SCRATCH = Path("/dev/shm") / f"fuzz-recordings-{os.getpid()}"
 MEMORY_LIMIT_BYTES = 256 * 1024 * 1024
 
 
 def seeds(corpus: Path) -> None:
-    for poses in (0, 1, 2):
-        path = corpus / f"seed-{poses}.mcap"
+    """Small recordings: raw pictures, PNG and JPEG."""
+    for name, make in {
+        "raw-0": lambda path: write_small(path, poses=0),
+        "raw-1": lambda path: write_small(path, poses=1),
+        "raw-2": lambda path: write_small(path, poses=2),
+        "png": lambda path: write_encoded(path, ".png"),
+        "jpeg": lambda path: write_encoded(path, ".jpg"),
+    }.items():
+        path = corpus / f"seed-{name}.mcap"
         if not path.exists():
-            write_small(path, poses=poses)
+            make(path)
+
+
+def write_encoded(path: Path, extension: str) -> None:
+    with RecordingWriter(path, make_info()) as writer:
+        picture = make_picture(0)
+        writer.picture(picture, encoded=cv2.imencode(extension, picture.image)[1].tobytes())
+        writer.view(make_view(0))
+        writer.finish()
 
 
 def read_all(path: Path) -> None:

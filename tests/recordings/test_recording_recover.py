@@ -113,3 +113,12 @@ def test_a_leftover_of_an_earlier_attempt_is_not_trodden_on(tmp_path: Path) -> N
         recover(part)
     assert part.exists()
     assert (tmp_path / "a.mcap.recovering").read_text() == "left over"
+
+
+def test_what_an_earlier_recovery_kept_is_kept(tmp_path: Path) -> None:
+    for _ in range(3):
+        path = tmp_path / "a.mcap"
+        path.unlink(missing_ok=True)
+        recover(write_unfinished(path))
+    names = {p.name for p in tmp_path.iterdir()}
+    assert names == {"a.mcap", "a.mcap.part.damaged", "a.mcap.part.damaged-2", "a.mcap.part.damaged-3"}

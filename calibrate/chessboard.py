@@ -15,13 +15,15 @@ from recordings.messages import BoardSpec
 
 _CLASSIC = cv2.CALIB_CB_ADAPTIVE_THRESH | cv2.CALIB_CB_NORMALIZE_IMAGE
 _LARGE_SIDE_PX = 1000
+_SMALL_SIDE_PX = 800
+_PREVIEW_SIDE_PX = 640
 
 
 def find_chessboard(grey: Grey, spec: BoardSpec, thorough: bool = True) -> Array | None:
     """All inner corners in board order, (rows·columns, 2) pixels, or None.
 
     The colours of the squares decide the orientation where they can; otherwise the order is one of the turns
-    after which the board looks the same. `thorough` adds the slow detectors when the quick ones fail.
+    after which the board looks the same. `thorough=False` makes one quick attempt on a smaller picture.
     """
     for found in _attempts(grey, (spec.columns, spec.rows), thorough):
         if found is None:
@@ -38,16 +40,18 @@ def find_chessboard(grey: Grey, spec: BoardSpec, thorough: bool = True) -> Array
 
 
 def _attempts(grey: Grey, size: tuple[int, int], thorough: bool) -> Iterator[Array | None]:
+    largest = max(grey.shape)
+    if not thorough:
+        yield _scaled(grey, min(1.0, _PREVIEW_SIDE_PX / largest), lambda small: _classic(small, size))
+        return
     yield _classic(grey, size)
     yield _sector(grey, size, 0)
-    if not thorough:
-        return
-    if max(grey.shape) > _LARGE_SIDE_PX:
+    if largest > _LARGE_SIDE_PX:
         yield _scaled(grey, 0.5, lambda small: _classic(small, size))
     equalised: Any = cv2.createCLAHE(clipLimit=4.0, tileGridSize=(8, 8)).apply(grey)
     yield _classic(equalised, size)
     yield _sector(equalised, size, cv2.CALIB_CB_EXHAUSTIVE)
-    if max(grey.shape) <= 2 * _LARGE_SIDE_PX:
+    if largest <= _SMALL_SIDE_PX:
         yield _scaled(grey, 2.0, lambda large: _classic(large, size))
 
 
@@ -80,8 +84,8 @@ def _orient(grey: Grey, grid: Array, spec: BoardSpec) -> Array:
 
 
 def seen_size(grey: Grey) -> tuple[int, int] | None:
-    """Columns and rows of whatever chessboard is there, for the message that a wrong one is used."""
+    """Sides in corners, the longer first, of whatever chessboard is there: a wrong one may be used."""
     factor = min(1.0, _LARGE_SIDE_PX / max(grey.shape))
     small = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     found, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), cv2.CALIB_CB_LARGER)
-    return (meta.shape[1], meta.shape[0]) if found else None
+    return (max(meta.shape), min(meta.shape)) if found else None

@@ -91,16 +91,15 @@ def _reason(grey: Grey, spec: BoardSpec, count: int, fewest: int, thorough: bool
     if count:
         return f"only {count} corners of the board are seen, {fewest} are needed"
     level = float(grey.mean())
-    if float(grey.std()) < 3.0:
-        return f"the picture is empty (grey {level:.0f}, no contrast)"
-    if float((grey >= _SATURATED_GREY).mean()) > 0.5:
-        return "the picture is over-exposed: more than half of it is saturated"
     if level < 12.0:
         return f"the picture is too dark (mean grey {level:.0f})"
+    if float((grey >= _SATURATED_GREY).mean()) > 0.5:
+        return "the picture is over-exposed: more than half of it is saturated"
+    if float(grey.std()) < 3.0:
+        return f"the picture is empty (grey {level:.0f}, no contrast)"
     if thorough and spec.kind is BoardKind.CHESSBOARD:
         seen = seen_size(grey)
-        expected = (spec.columns, spec.rows)
-        if seen is not None and sorted(seen) != sorted(expected):
+        if seen is not None and sorted(seen) != sorted((spec.columns, spec.rows)):
             return (
                 f"board {spec.columns}×{spec.rows} expected, {seen[0]}×{seen[1]} seen "
                 "(inner corners; partly hidden, or another board)"

@@ -74,15 +74,17 @@ def _snap_to_corners(
     chosen = np.flatnonzero(known & inside & (spacing > 5.0))
     if len(chosen) == 0:
         return _NOTHING
-    corners = refine(grey, predicted[chosen], 0.8 * spacing[chosen])
-    good = is_saddle(grey, corners, spacing[chosen])
+    # No edge of a marker may come into the window: they run beside the corner, not through it.
+    margin_share = 0.5 * (1.0 - (spec.marker_m or 0.0) / spec.square_m)
+    corners = refine(grey, predicted[chosen], min(0.8, 2.8 * margin_share) * spacing[chosen])
+    good = is_saddle(grey, corners, min(0.25, 1.2 * margin_share) * spacing[chosen])
     return chosen[good], corners[good]
 
 
-def is_saddle(grey: Grey, corners: Array, spacing_px: Array) -> NDArray[np.bool_]:
+def is_saddle(grey: Grey, corners: Array, radius_px: Array) -> NDArray[np.bool_]:
     """A chessboard corner: round it bright and dark alternate twice, opposite sides alike."""
     angles = np.arange(16) * (2 * np.pi / 16)
-    radius = np.clip(0.25 * spacing_px, 2.0, 12.0)[:, None]
+    radius = np.clip(radius_px, 2.0, 12.0)[:, None]
     circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
     ring = sample(grey, corners[:, None] + radius[..., None] * circle)
     ring -= ring.mean(axis=1, keepdims=True)

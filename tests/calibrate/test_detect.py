@@ -1,0 +1,146 @@
+"""Boards are found where the projection puts them, the right way round, or refused with the reason."""
+
+from __future__ import annotations
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+
+from calibrate.board import BoardError, ambiguity_text, board_from_turned, board_points, looks_same_turns
+from calibrate.detect import detect
+from calibrate.geometry import pose, rotation_exp
+from calibrate.lens import project
+from recordings.messages import BoardKind, BoardSpec
+from station.simulation.renderer import Light, render
+from tests.calibrate.sessions import CAMERA, PAPER_BOARD, looking
+
+CHARUCO = BoardSpec(BoardKind.CHARUCO, 8, 6, 0.024, 0.018, "DICT_5X5_100")
+BOARDS = [
+    PAPER_BOARD,
+    BoardSpec(BoardKind.CHESSBOARD, 6, 7, 0.024),
+    CHARUCO,
+    msgspec.structs.replace(CHARUCO, legacy=True),
+    BoardSpec(BoardKind.ASYMMETRIC_CIRCLES, 4, 11, 0.013),
+    BoardSpec(BoardKind.APRIL_GRID, 4, 3, 0.036, 0.0108),
+]
+EXACT_LIMIT_PX = {BoardKind.APRIL_GRID: 0.25, BoardKind.ASYMMETRIC_CIRCLES: 0.12}
+
+
+def picture(spec: BoardSpec, seed: int, **light: float) -> tuple[np.ndarray, np.ndarray]:
+    """(image, camera_from_board)"""
+    rng = np.random.default_rng(seed)
+    seen = looking(spec, rng)
+    return render(CAMERA, spec, seen, Light(**({"pixel_noise": 1.5} | light)), rng), seen
+
+
+@pytest.mark.parametrize(
+    "spec", BOARDS, ids=lambda s: f"{s.kind.value}{'-legacy' if s.legacy else ''}-{s.columns}"
+)
+def test_points_lie_where_the_projection_puts_them(spec: BoardSpec) -> None:
+    """Identity of every point included: a turned or mirrored order would miss by a whole board."""
+    for seed in range(3):
+        image, seen = picture(spec, seed)
+        found = detect(image, spec)
+        assert found.reason == ""
+        assert found.corners >= 0.9 * found.expected
+        truth = project(CAMERA, seen, board_points(spec)[found.indices])
+        miss = np.linalg.norm(found.pixels - truth, axis=1)
+        assert np.sqrt(np.square(miss).mean()) < EXACT_LIMIT_PX.get(spec.kind, 0.10)
+
+
+@pytest.mark.parametrize(
+    "spec", [BoardSpec(BoardKind.CHESSBOARD, 7, 5, 0.025), BoardSpec(BoardKind.CIRCLES, 7, 5, 0.022)]
+)
+def test_a_symmetric_board_is_found_in_one_of_its_turns(spec: BoardSpec) -> None:
+    image, seen = picture(spec, 4)
+    found = detect(image, spec)
+    readings = [
+        project(CAMERA, seen @ board_from_turned(spec, t), board_points(spec)) for t in looks_same_turns(spec)
+    ]
+    assert min(np.abs(found.pixels - r).max() for r in readings) < 0.6
+    assert "looks the same" in ambiguity_text(spec)
+
+
+@pytest.mark.parametrize(
+    ("columns", "rows", "turns"), [(7, 6, 1), (11, 9, 2), (8, 6, 2), (6, 6, 4), (5, 5, 2)]
+)
+def test_colours_decide_only_where_columns_and_rows_differ_in_parity(
+    columns: int, rows: int, turns: int
+) -> None:
+    assert len(looks_same_turns(BoardSpec(BoardKind.CHESSBOARD, columns, rows, 0.02))) == turns
+
+
+def test_a_turned_picture_gives_the_same_corner_order() -> None:
+    """The paper's board: turning the picture by 180° turns every corner's place, not its identity."""
+    image, _ = picture(PAPER_BOARD, 5)
+    straight, turned = (
+        detect(image, PAPER_BOARD),
+        detect(np.ascontiguousarray(image[::-1, ::-1]), PAPER_BOARD),
+    )
+    mirrored = np.array([CAMERA.width - 1, CAMERA.height - 1]) - turned.pixels
+    assert np.abs(mirrored - straight.pixels).max() < 0.15
+
+
+def test_partial_charuco_is_used_and_its_points_keep_their_identity() -> None:
+    image, seen = picture(CHARUCO, 6)
+    image[:, : CAMERA.width // 2] = 90
+    found = detect(image, CHARUCO)
+    assert 6 <= found.corners < found.expected
+    truth = project(CAMERA, seen, board_points(CHARUCO)[found.indices])
+    assert np.linalg.norm(found.pixels - truth, axis=1).max() < 0.6
+
+
+def test_sixteen_bits_and_colour_give_the_corners_of_eight_bits() -> None:
+    image, _ = picture(PAPER_BOARD, 7)
+    plain = detect(image, PAPER_BOARD)
+    assert (
+        np.abs(detect(cv2.cvtColor(image, cv2.COLOR_GRAY2BGR), PAPER_BOARD).pixels - plain.pixels).max()
+        < 0.02
+    )
+    twelve_bits = image.astype(np.uint16) << 4
+    twelve_bits[0, 0] = 4095
+    assert np.abs(detect(twelve_bits, PAPER_BOARD).pixels - plain.pixels)[1:].max() < 0.02
+
+
+def test_reasons_are_for_people() -> None:
+    image, _ = picture(PAPER_BOARD, 8)
+    nothing = np.full_like(image, 120)
+    assert "empty" in detect(nothing, PAPER_BOARD).reason
+    glare = image.copy()
+    glare[60:] = 255
+    assert "over-exposed" in detect(glare, PAPER_BOARD).reason
+    assert "too dark" in detect(image // 80, PAPER_BOARD).reason
+    other = BoardSpec(BoardKind.CHESSBOARD, 9, 6, 0.025)
+    assert "board 9×6 expected, 7×6 seen" in detect(image, other).reason
+    hidden = image.copy()
+    hidden[:, CAMERA.width // 2 :] = 60
+    assert detect(hidden, PAPER_BOARD).found is False
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        BoardSpec(BoardKind.CHESSBOARD, 1, 6, 0.025),
+        BoardSpec(BoardKind.CHESSBOARD, 7, 6, 25.0),
+        BoardSpec(BoardKind.CHESSBOARD, 7, 6, float("nan")),
+        BoardSpec(BoardKind.CHARUCO, 7, 6, 0.025, 0.03, "DICT_5X5_100"),
+        BoardSpec(BoardKind.CHARUCO, 7, 6, 0.025, 0.02, "DICT_NONE"),
+    ],
+)
+def test_impossible_boards_are_refused(spec: BoardSpec) -> None:
+    with pytest.raises(BoardError, match="board:"):
+        detect(np.zeros((100, 100), np.uint8), spec)
+
+
+@pytest.mark.parametrize("tilt_deg", [45, 60])
+def test_strong_tilt_blur_and_low_light(tilt_deg: float) -> None:
+    rng = np.random.default_rng(9)
+    centre = np.append(board_points(PAPER_BOARD)[:, :2].mean(axis=0), 0)
+    R = rotation_exp([np.radians(tilt_deg), 0, 0])
+    seen = pose(R, np.array([0, 0, 0.36]) - R @ centre)
+    light = Light(illumination=0.35, blur_px=1.2, pixel_noise=3.0)
+    found = detect(render(CAMERA, PAPER_BOARD, seen, light, rng), PAPER_BOARD)
+    assert found.found
+    truth = project(CAMERA, seen, board_points(PAPER_BOARD))
+    assert np.sqrt(np.square(found.pixels - truth).sum(axis=1).mean()) < 0.4

@@ -1,0 +1,170 @@
+"""A recording goes in, a right calibration comes out: rendered with a known truth, and other people's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import yaml
+
+from calibrate.calibration import encode_calibration
+from calibrate.errors import BadViewsError, CalibrationError, TooFewViewsError
+from calibrate.geometry import Array, difference
+from calibrate.load import load_views
+from calibrate.pipeline import JobOptions, SolvedRecording, prepare_views, solve_recording
+from recordings.importer import import_folder
+from recordings.messages import BoardKind, BoardSpec, CameraModel
+from recordings.reader import open_recording
+from tests.calibrate.sessions import CAMERA, SYMMETRIC_BOARD, X_TRUE, Scene, write_session
+
+
+def error_mm_deg(X: Array, truth: Array) -> tuple[float, float]:
+    delta = difference(X, truth)
+    return float(np.linalg.norm(delta[:3]) * 1e3), float(np.degrees(np.linalg.norm(delta[3:])))
+
+
+def test_the_camera_is_found_with_an_unknown_lens(solved: SolvedRecording) -> None:
+    mm, degrees = error_mm_deg(solved.solution.matrix, X_TRUE)
+    assert mm < 1.0
+    assert degrees < 0.1
+    assert solved.intrinsics is not None
+    assert solved.calibration.intrinsics.matrix[0][0] == pytest.approx(620.0, rel=0.005)
+    assert solved.calibration.source == "simulated"
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_a_symmetric_board_solves_by_the_robots_motion(tmp_path: Path, mount: str) -> None:
+    """Every picture is read one of two ways; a single wrong one would miss by half a turn."""
+    scene = Scene(board=SYMMETRIC_BOARD, mount=mount, seed=3, roll_rad=3.1)  # type: ignore[arg-type]
+    path = write_session(tmp_path / "s.mcap", scene, known_lens=True)
+    views = load_views(open_recording(path)).views
+    prepared = prepare_views(path)
+    turned = [
+        not np.allclose(a.board_points, b.board_points) for a, b in zip(views, prepared.views, strict=True)
+    ]
+    assert 0 < sum(turned) < len(turned), "the scene does not show what it should"
+    mm, degrees = error_mm_deg(solve_recording(path).solution.matrix, X_TRUE)
+    assert mm < 1.0
+    assert degrees < 0.15
+
+
+def test_the_number_of_threads_changes_nothing(real_session_file: Path) -> None:
+    files = []
+    for threads in (1, 3):
+        job = solve_recording(real_session_file, JobOptions(threads=threads))
+        files.append(encode_calibration(job.calibration).decode().splitlines())
+    different = [a for a, b in zip(*files, strict=True) if a != b]
+    assert all(line.startswith("created:") for line in different)
+
+
+def test_a_wrong_square_size_is_found_and_said(real_session_file: Path) -> None:
+    job = solve_recording(real_session_file, JobOptions(square_m=0.026))
+    assert job.scale is not None
+    assert job.scale.square_m == pytest.approx(0.025, rel=0.005)
+    gate = next(gate for gate in job.gates if gate.name == "board scale")
+    assert not gate.passed
+    assert "25.0" in gate.text
+    assert "26 mm are configured" in gate.text
+    right = solve_recording(real_session_file)
+    assert next(gate for gate in right.gates if gate.name == "board scale").passed
+
+
+def test_another_board_or_lens_can_be_tried_on_the_old_pictures(real_session_file: Path) -> None:
+    found = solve_recording(real_session_file, JobOptions(find_intrinsics=True))
+    assert found.intrinsics is not None
+    given = solve_recording(real_session_file, JobOptions(camera=CAMERA))
+    assert given.intrinsics is None
+    assert given.calibration.provenance.options["camera"]["width"] == CAMERA.width
+    with pytest.raises(TooFewViewsError, match="board 9×6 expected, 7×6 seen"):
+        solve_recording(real_session_file, JobOptions(board=BoardSpec(BoardKind.CHESSBOARD, 9, 6, 0.025)))
+
+
+def test_a_lens_of_another_camera_is_refused(real_session_file: Path) -> None:
+    other = CameraModel(480, 384, ((6200.0, 0, 243), (0, 6200, 189), (0, 0, 1)), (-0.9, 2.0, 0.0, 0.0, 0.0))
+    with pytest.raises(BadViewsError, match=r"another camera|do not belong"):
+        solve_recording(real_session_file, JobOptions(camera=other))
+    small = replace_size(CAMERA, 640, 480)
+    with pytest.raises(BadViewsError, match=r"view 0 .*480×384.*640×480"):
+        solve_recording(real_session_file, JobOptions(camera=small))
+
+
+def replace_size(camera: CameraModel, width: int, height: int) -> CameraModel:
+    return CameraModel(width, height, camera.matrix, camera.distortion)
+
+
+def test_three_views_are_too_few(tmp_path: Path) -> None:
+    path = write_session(tmp_path / "few.mcap", Scene(views=3), known_lens=True)
+    with pytest.raises(TooFewViewsError, match="at least 4 views"):
+        solve_recording(path)
+
+
+def test_turns_about_one_axis_are_refused_with_the_missing_direction(tmp_path: Path) -> None:
+    """Fault 41: the camera only rolls about its own axis."""
+    from calibrate.board import board_points
+    from calibrate.geometry import pose, rotation_exp
+    from tests.calibrate.sessions import PAPER_BOARD
+
+    centre = (board_points(PAPER_BOARD).min(axis=0) + board_points(PAPER_BOARD).max(axis=0)) / 2
+    rolls = [rotation_exp([0, 0, a]) for a in np.linspace(-0.9, 0.9, 8)]
+    seen = np.array([pose(R, np.array([0, 0, 0.36]) - R @ centre) for R in rolls])
+
+    class OneAxis(Scene):
+        def camera_from_board(self) -> Array:
+            return seen
+
+        def flange_poses(self) -> tuple[Array, Array]:
+            from calibrate.geometry import inverse
+            from tests.calibrate.sessions import BOARD_PLACE
+
+            true = BOARD_PLACE @ inverse(seen) @ inverse(self.X)
+            return true, true
+
+    path = write_session(tmp_path / "axis.mcap", OneAxis(), known_lens=True)
+    with pytest.raises(CalibrationError, match="axis"):
+        solve_recording(path)
+
+
+DATASETS = {
+    # name: (views used at least, spread of the board in mm at most, truth error in mm or None)
+    "ur5-chessboard": (19, 6.0, None),
+    "charuco-eye-to-hand": (14, 4.0, None),
+    "denso-long": (40, 15.0, None),
+    "six-views": (6, 2.0, None),
+    "rendered-truth": (24, 0.5, 1.0),
+    "rendered-truth-eye-to-hand": (27, 2.0, 8.0),
+}
+
+
+@pytest.mark.parametrize("name", DATASETS)
+def test_other_peoples_recordings_solve(datasets: Path, tmp_path: Path, name: str) -> None:
+    fewest, spread_mm, truth_mm = DATASETS[name]
+    import_folder(datasets / name, tmp_path / "r.mcap")
+    job = solve_recording(tmp_path / "r.mcap")
+    assert len(job.solution.used) >= fewest
+    assert job.solution.board_spread_m is not None
+    assert job.solution.board_spread_m * 1e3 < spread_mm
+    assert job.solution.certificate.certified
+    if truth_mm is not None:
+        plain = yaml.safe_load((datasets / name / "truth.yaml").read_text())
+        assert error_mm_deg(job.solution.matrix, np.array(plain["matrix"]))[0] < truth_mm
+
+
+def test_the_colours_decide_the_small_board_in_every_view(datasets: Path, tmp_path: Path) -> None:
+    import_folder(datasets / "rendered-truth-eye-to-hand", tmp_path / "r.mcap")
+    prepared = prepare_views(tmp_path / "r.mcap")
+    assert len(prepared.views) == 29
+    truth = np.array(
+        yaml.safe_load((datasets / "rendered-truth-eye-to-hand/truth.yaml").read_text())["matrix"]
+    )
+    places = [np.linalg.inv(v.base_from_flange) @ truth @ v.camera_from_board for v in prepared.views]  # type: ignore[operator]
+    turns = [np.degrees(np.linalg.norm(difference(p, places[0])[3:])) for p in places]
+    assert max(turns) < 5.0, "a view was read turned by 180°"
+
+
+def test_options_leave_a_trace_and_threads_do_not(real_session_file: Path) -> None:
+    options = JobOptions(working_distance_m=0.3, threads=1)
+    job = solve_recording(real_session_file, replace(options, seed=4))
+    assert job.calibration.provenance.options == {"working_distance_m": 0.3}
+    assert job.calibration.provenance.seed == 4

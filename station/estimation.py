@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import cv2
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
@@ -24,6 +25,7 @@ from station.status import EstimateStatus
 FEWEST_VIEWS = 4
 FEWEST_FOR_LENS = 6
 GOAL_M = 0.0005
+COVERAGE_ROWS, COVERAGE_COLUMNS = 4, 6
 _WEAK_PRIOR = (1.0, 1.0, 1.0, 0.1, 0.1, 0.1)
 _LENS_PRIOR_SHARE = 0.05
 
@@ -35,25 +37,38 @@ def running_estimate(
     mount: Mount, camera: CameraModel, lens_is_known: bool, board: BoardSpec, seen: Sequence[Seen]
 ) -> EstimateStatus:
     """Few views or degenerate motion give an answer without numbers and with advice."""
+    coverage = image_coverage(camera, [pixels for _, _, _, pixels in seen])
+    blank = EstimateStatus(len(seen), goal_mm=1000 * GOAL_M, image_coverage=coverage)
     if len(seen) < FEWEST_VIEWS:
-        return EstimateStatus(len(seen), goal_mm=1000 * GOAL_M, advice="too few views yet")
+        return msgspec.structs.replace(blank, advice="too few views yet")
     try:
         views = _views(mount, camera, lens_is_known, board, seen)
         X, Y = _quick_solution(views)
     except (CalibrationError, cv2.error, np.linalg.LinAlgError):
-        return EstimateStatus(len(seen), goal_mm=1000 * GOAL_M, advice="the motion says too little yet")
+        return msgspec.structs.replace(blank, advice="the motion says too little yet")
     free_lens = not lens_is_known
     sigma_m, sigma_rad = _sigma(views, board, X, Y, free_lens)
     x, y, z = (float(v) for v in 1000 * X[:3, 3])
-    return EstimateStatus(
-        views=len(seen),
+    return msgspec.structs.replace(
+        blank,
         translation_mm=(round(x, 2), round(y, 2), round(z, 2)),
         sigma_translation_mm=round(1000 * sigma_m, 3),
         sigma_rotation_deg=round(math.degrees(sigma_rad), 4),
-        goal_mm=1000 * GOAL_M,
         enough=sigma_m <= GOAL_M,
         advice="sure enough: you may finish" if sigma_m <= GOAL_M else "go on: every pose still helps",
     )
+
+
+def image_coverage(camera: CameraModel, pixels: Sequence[Array]) -> tuple[tuple[int, ...], ...]:
+    """How many corners fell into each part of the picture, COVERAGE_ROWS × COVERAGE_COLUMNS."""
+    points = np.concatenate([np.zeros((0, 2)), *pixels])
+    counts, _, _ = np.histogram2d(
+        points[:, 1],
+        points[:, 0],
+        bins=(COVERAGE_ROWS, COVERAGE_COLUMNS),
+        range=((0, camera.height), (0, camera.width)),
+    )
+    return tuple(tuple(int(n) for n in row) for row in counts)
 
 
 def _views(

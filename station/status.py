@@ -138,6 +138,8 @@ class EstimateStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     goal_mm: float | None = None
     enough: bool = False
     advice: str = ""
+    image_coverage: tuple[tuple[int, ...], ...] = ()
+    """Corners seen so far in each part of the picture, rows from the top."""
 
 
 class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):

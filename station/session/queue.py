@@ -126,6 +126,7 @@ def _fresh(index: int, pose: PlannedPose) -> PoseStatus:
         why=pose.why,
         predicted_sigma_mm=None if sigma_m is None else round(1000 * sigma_m, 4),
         coverage=None if view is None else round(view.coverage, 4),
+        base_from_flange=pose.base_from_flange,
     )
 
 

@@ -25,6 +25,7 @@ class LiveScreen(StationScreen):
             with Vertical(id="live-right"):
                 yield panels.Panel("Devices", panels.device_lines, id="devices")
                 yield panels.Panel("Poses", panels.pose_map_lines, id="poses")
+                yield panels.Panel("Image coverage", panels.coverage_lines, id="coverage")
                 yield panels.Panel("Estimate (not final)", panels.estimate_lines, id="estimate")
                 yield panels.Panel("Robot", panels.robot_lines, id="robot")
         yield Events()

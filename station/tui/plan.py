@@ -105,11 +105,12 @@ class PlanScreen(StationScreen):
         self.table.move_cursor(row=line + by)
 
     def action_add(self) -> None:
-        robot = self.station.status.robot if self.station.status else None
-        if robot is None or robot.joints_rad is None:
+        status = self.station.status
+        if status is None or status.robot.joints_rad is None:
             self.notify("The arm's posture is not known: no robot state.", severity="warning")
             return
-        pose = {"name": "here", "joints_rad": list(robot.joints_rad), "why": "added on the screen"}
+        name = f"here-{len(status.session.poses) + 1}"
+        pose = {"name": name, "joints_rad": status.robot.joints_rad, "why": "added on the screen"}
         self.station.send("add", pose=pose)
 
     def action_make(self) -> None:

@@ -9,8 +9,8 @@ from rich.text import Text
 from textual.reactive import reactive
 from textual.widgets import Static
 
-from station.status import StationState, StationStatus
-from station.tui.words import POSE_MARKS, degrees, mm, size
+from station.status import StationStatus
+from station.tui.words import POSE_MARKS, degrees, mm
 
 Lines = Callable[[StationStatus], list[str]]
 
@@ -60,7 +60,7 @@ def detection_lines(status: StationStatus) -> list[str]:
     tilt = "-" if seen.tilt_rad is None else degrees(seen.tilt_rad, 0)
     far = "-" if seen.distance_m is None else mm(seen.distance_m, 0)
     return [
-        f"board {seen.corners}/{seen.expected}  sharp {seen.sharpness:.0f}  sat {100 * seen.saturated:.1f} %",
+        f"board {seen.corners}/{seen.expected}  sharp {seen.sharpness:.1f}  sat {100 * seen.saturated:.1f} %",
         f"fills {100 * seen.coverage:.0f} %  tilt {tilt}  at {far}",
     ]
 
@@ -83,14 +83,28 @@ def progress_lines(status: StationStatus) -> list[str]:
     steps = ("moving", "settling", "capturing", "writing")
     at = steps.index(pose.state) if pose.state in steps else (4 if pose.state == "done" else -1)
     words = ("move", "settle", "capture", "write")
-    marks = [f"{w} {'█████' if i < at else '██▒░░' if i == at else '░░░░░'}" for i, w in enumerate(words)]
-    return [f"{pose.name}: {pose.why}"[:60], " ".join(marks)]
+    marks = [f"{w} {'███' if i < at else '█▒░' if i == at else '░░░'}" for i, w in enumerate(words)]
+    return [f"{pose.name}: {pose.why}", " ".join(marks)]
 
 
 def pose_map_lines(status: StationStatus) -> list[str]:
     marks = "".join(POSE_MARKS[p.state] for p in status.session.poses)
     rows = [" ".join(marks[i : i + 13]) for i in range(0, len(marks), 13)]
-    return [*rows, "+ done  - skipped  x failed"] if marks else ["no plan loaded"]
+    return [*rows, "+ done - skipped x failed"] if marks else ["no plan: 2, then n makes one"]
+
+
+_SHADES = " ░▒▓█"
+
+
+def coverage_lines(status: StationStatus) -> list[str]:
+    """The picture as a grid: the fuller a part, the more corners were seen there."""
+    counts = status.estimate.image_coverage
+    if not counts:
+        return ["no corners yet"]
+    expected = max(1, status.detection.expected)
+    return [
+        " ".join(_SHADES[min(len(_SHADES) - 1, -(-count // expected))] * 3 for count in row) for row in counts
+    ]
 
 
 def estimate_lines(status: StationStatus) -> list[str]:
@@ -104,20 +118,3 @@ def estimate_lines(status: StationStatus) -> list[str]:
         f"± {estimate.sigma_translation_mm:.2f} mm{rotation}",
         "enough" if estimate.enough else estimate.advice or "not final",
     ]
-
-
-def footer_hint(status: StationStatus) -> str:
-    """What the operator would do next, in a few words."""
-    if status.state is StationState.IDLE and status.session.poses:
-        return "F5 shows what would move and asks"
-    if status.state in (StationState.STOPPED, StationState.FAULT):
-        return "look at the arm, then F8 to acknowledge"
-    if status.state is StationState.PAUSED:
-        return "F5 to go on, F7 to finish with what is there"
-    return ""
-
-
-def recorder_line(status: StationStatus) -> str:
-    recorder = status.recorder
-    drops = f"  {recorder.drops} DROPPED" if recorder.drops else ""
-    return f"{size(recorder.bytes)} written{drops}"

@@ -65,7 +65,11 @@ class AravisCamera:
             if self._config.trigger == "hardware":
                 assert self._trigger is not None
                 pulse = (await self._trigger.fire()).count
-            picture = await self._run(partial(self._take, timeout_s))
+            try:
+                picture = await self._run(partial(self._take, timeout_s))
+            except CameraError:
+                self.counter.lost(pulse)
+                raise
             sequence = self.counter.accept(picture.frame_id, pulse)
             self._newest = msgspec.structs.replace(
                 picture, sequence=sequence, exposure_us=exposure_us, gain_db=gain_db, trigger_count=pulse
@@ -82,6 +86,7 @@ class AravisCamera:
                 picture = await self._run(partial(self._take, 1.0))
                 self.counter.accept(picture.frame_id, sequenced=False)
             except CameraError:
+                self.counter.restart()
                 return None
         return picture
 
@@ -135,13 +140,8 @@ class AravisCamera:
             self.counter.restart()
         elif self._config.trigger == "software":
             device.trigger()
-        try:
-            picture = device.frame(timeout_s)
-        except CameraError:
-            self.counter.lost()
-            raise
+        picture = device.frame(timeout_s)
         if picture is None:
-            self.counter.lost()
             raise CameraError(
                 f"the camera sent no picture within {timeout_s:g} s of its trigger; take this pose again "
                 "(with hardware trigger: check the line)"

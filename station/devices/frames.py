@@ -81,10 +81,11 @@ class FrameCounter:
         self.frames += 1
         return self.frames - 1
 
-    def lost(self) -> None:
-        """A trigger had no frame."""
+    def lost(self, pulse_count: int | None = None) -> None:
+        """A trigger, with this count of the trigger box, had no frame."""
         self.missing += 1
         self.restart()
+        self._last_pulse = pulse_count
 
     def surplus(self, frames: int) -> CameraError:
         """The error for frames that came without a trigger."""

@@ -6,6 +6,7 @@ The only module that touches `serial`. All waiting happens in one worker thread.
 from __future__ import annotations
 
 import asyncio
+import termios
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
@@ -145,20 +146,22 @@ class SerialTrigger:
         try:
             port.reset_input_buffer()
             self._lines.restart()
+            bad_before = self._lines.bad_lines
             port.write(frame(request))
             while time.monotonic() < end_s:
-                for text in self._lines.feed(port.read(port.in_waiting or 1)):
+                texts = self._lines.feed(port.read(port.in_waiting or 1))
+                if self._lines.bad_lines - bad_before > BAD_LINES_LIMIT:
+                    raise TriggerError(
+                        f"more than {BAD_LINES_LIMIT} garbled lines for one answer from {self._config.port}: "
+                        "wrong baud rate, a bad cable, or not a trigger box"
+                    )
+                for text in texts:
                     words = text.split()
                     if words[:1] == [answer] and len(words) == fields + 1:
                         return words[1:]
                     if words[:1] == ["ERR"]:
                         raise TriggerError(f"the trigger box refused '{request}': {text[4:]}")
-                if self._lines.bad_lines > BAD_LINES_LIMIT:
-                    raise TriggerError(
-                        f"{self._lines.bad_lines} garbled lines from {self._config.port}: wrong baud rate, a "
-                        "bad cable, or not a trigger box"
-                    )
-        except OSError as error:  # pyserial's SerialException is one
+        except (OSError, termios.error) as error:  # pyserial's SerialException is an OSError
             self._disconnect()
             raise TriggerError(f"trigger box lost: {self._config.port} is gone ({error})") from error
         raise _NoAnswerError(f"no answer to '{request}' within {timeout_s:g} s on {self._config.port}")
@@ -171,7 +174,7 @@ class SerialTrigger:
             setattr(port, line, True)
             time.sleep(self._config.pulse_us / 1e6)
             setattr(port, line, False)
-        except OSError as error:
+        except (OSError, termios.error) as error:
             self._disconnect()
             raise TriggerError(f"the adapter on {self._config.port} is gone ({error})") from error
         self._count += 1

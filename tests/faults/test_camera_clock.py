@@ -1,0 +1,86 @@
+"""Faults 24 and 25: steps of the host's clock and drift of the camera's do not reach the pairing."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from station.devices.frames import DeviceClock, mid_exposure
+from station.simulation.camera import RenderedCamera
+from station.simulation.cell import make_cell, write_truth
+from station.simulation.launch import SimulatedController
+
+
+@pytest.mark.process
+async def test_24_an_ntp_step_of_an_hour_moves_no_mid_exposure(
+    controller: Callable[..., SimulatedController], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    cell = make_cell()
+    write_truth(cell, tmp_path / "truth.json")
+    camera = RenderedCamera(cell, controller(truth=tmp_path / "truth.json").host)
+    await camera.open()
+    try:
+        before = await camera.capture()
+        true_time_ns = time.time_ns
+        monkeypatch.setattr(time, "time_ns", lambda: true_time_ns() + 3600 * 10**9)
+        asked_ns = time.monotonic_ns()
+        after = await camera.capture()
+        stamps = after.stamps
+        middle_ns, bound_s = mid_exposure(
+            stamps.device_ns, stamps.host_monotonic_ns, after.exposure_us, camera.clock
+        )
+        assert asked_ns - bound_s * 1e9 < middle_ns < time.monotonic_ns()
+        stepped_s = (stamps.host_wall_ns - before.stamps.host_wall_ns) / 1e9
+        assert 3600 < stepped_s < 3630, "the wall clock is recorded as it was"
+    finally:
+        await camera.close()
+
+
+def simulated_readings(
+    rng: np.random.Generator, drift_ppm: float, seconds: int
+) -> tuple[DeviceClock, Callable[[int], int]]:
+    """A clock read once a second over a line with uneven delays, and the truth: host → device time."""
+    start_ns, offset_ns = 10**12, int(rng.integers(-(10**15), 10**15))
+
+    def device_at(host_ns: int) -> int:
+        return round(host_ns + (host_ns - start_ns) * drift_ppm * 1e-6) + offset_ns
+
+    clock = DeviceClock()
+    for second in range(seconds):
+        asked_ns = start_ns + second * 10**9
+        there_ns, back_ns = (int(200_000 + rng.exponential(150_000)) for _ in range(2))
+        clock.reading(device_at(asked_ns + there_ns), asked_ns, asked_ns + there_ns + back_ns)
+    return clock, device_at
+
+
+@pytest.mark.parametrize("drift_ppm", [-80.0, 0.0, 40.0])
+def test_25_offset_and_drift_are_within_their_bound(drift_ppm: float) -> None:
+    rng = np.random.default_rng(7)
+    inside = 0
+    for _ in range(100):
+        clock, device_at = simulated_readings(rng, drift_ppm, seconds=60)
+        fit = clock.fit
+        assert fit is not None and abs(-fit.drift_ppm - drift_ppm) < 15
+        host_ns = 10**12 + int(rng.uniform(20, 60) * 1e9)
+        estimated_ns, bound_s = mid_exposure(device_at(host_ns), 0, 0.0, fit)
+        inside += abs(estimated_ns - host_ns) / 1e9 <= bound_s
+        assert bound_s < 0.003
+    assert inside >= 93
+
+
+def test_25_without_readings_the_bound_says_how_little_is_known() -> None:
+    """The session refuses a pose whose bound is over its limit of 5 ms."""
+    middle_ns, bound_s = mid_exposure(123, 10**12, 10_000, None)
+    assert bound_s == 0.025
+    assert abs(middle_ns - (10**12 - 5_000_000)) <= 0.025e9
+
+
+def test_25_a_camera_that_restarts_its_clock_is_followed() -> None:
+    clock, _ = simulated_readings(np.random.default_rng(1), 20.0, seconds=20)
+    assert clock.fit is not None
+    clock.restart()
+    assert clock.fit is None

@@ -1,0 +1,102 @@
+"""Faults 17 to 19: missing, dropped and surplus frames never shift a picture to another pose."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from station.devices.frames import LAST_FRAME_ID, FrameCounter, next_frame_id
+from station.errors import CameraError
+from station.simulation.camera import RenderedCamera
+from station.simulation.cell import make_cell, write_truth
+from station.simulation.launch import SimulatedController
+
+
+@pytest.fixture
+async def camera(
+    controller: Callable[..., SimulatedController], tmp_path: Path
+) -> AsyncIterator[RenderedCamera]:
+    cell = make_cell()
+    write_truth(cell, tmp_path / "truth.json")
+    rendered = RenderedCamera(cell, controller(truth=tmp_path / "truth.json").host)
+    await rendered.open()
+    yield rendered
+    await rendered.close()
+
+
+@pytest.mark.process
+async def test_17_a_trigger_without_a_frame_is_retaken_and_counted(camera: RenderedCamera) -> None:
+    await camera.capture()
+    await camera.inject("missed-trigger")
+    with pytest.raises(CameraError, match=r"no picture within 0\.5 s of its trigger; take this pose again"):
+        await camera.capture(timeout_s=0.5)
+    again = await camera.capture()
+    assert again.sequence == 1 and camera.counter.missing == 1
+
+
+@pytest.mark.process
+async def test_18_a_frame_lost_on_the_way_costs_one_pose_and_no_more(camera: RenderedCamera) -> None:
+    await camera.capture()
+    await camera.inject("lost-frame")
+    with pytest.raises(CameraError, match="no picture"):
+        await camera.capture(timeout_s=0.5)
+    before = camera.counter.frames
+    assert (await camera.capture()).sequence == before
+    assert camera.counter.missing == 1
+
+
+@pytest.mark.process
+async def test_19_a_second_frame_for_one_trigger_is_never_taken_for_the_next_pose(
+    camera: RenderedCamera,
+) -> None:
+    await camera.inject("double-frame")
+    first = await camera.capture()
+    with pytest.raises(CameraError, match=r"1 frame\(s\) came without a trigger"):
+        await camera.capture()
+    third = await camera.capture()
+    assert camera.counter.unexpected == 1
+    assert third.frame_id == next_frame_id(next_frame_id(first.frame_id))
+
+
+def test_19_an_extra_pulse_is_noticed_by_the_boxs_count() -> None:
+    counter = FrameCounter()
+    counter.accept(10, 100)
+    with pytest.raises(CameraError, match="2 pulses for one picture"):
+        counter.accept(11, 102)
+    assert counter.accept(12, 103) == 1, "from there on, all is well again"
+
+
+def test_18_a_gap_in_the_frame_ids_is_an_error_even_where_a_picture_came() -> None:
+    counter = FrameCounter()
+    counter.accept(LAST_FRAME_ID)
+    with pytest.raises(CameraError, match="frames 1 … were lost before frame 3"):
+        counter.accept(3)
+    assert counter.missing == 2 and counter.accept(4) == 1
+    with pytest.raises(CameraError, match="twice"):
+        counter.accept(4)
+    with pytest.raises(CameraError, match="frame ids are 1"):
+        counter.accept(0)
+
+
+@given(st.integers(1, LAST_FRAME_ID), st.lists(st.sampled_from(["good", "lost", "extra pulse"]), max_size=40))
+def test_whatever_happens_only_undisturbed_pictures_are_accepted(first_id: int, events: list[str]) -> None:
+    """A camera and a box that miscount at random: no accepted picture follows an unnoticed disturbance."""
+    counter, frame_id, pulse = FrameCounter(), first_id, 50
+    counter.accept(frame_id, pulse)
+    accepted = 1
+    for event in events:
+        frame_id, pulse = next_frame_id(frame_id), pulse + 1
+        if event == "lost":  # this trigger's frame never comes; the driver says so and goes on
+            counter.lost(pulse)
+            continue
+        if event == "extra pulse":
+            pulse += 1
+            with pytest.raises(CameraError):
+                counter.accept(frame_id, pulse)
+            continue
+        assert counter.accept(frame_id, pulse) == accepted
+        accepted += 1

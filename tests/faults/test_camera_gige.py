@@ -1,0 +1,122 @@
+"""Packet loss, a pulled cable and a frozen camera over real GigE Vision: named, survived, never blocking."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import time
+from collections.abc import Iterator
+
+import pytest
+
+from station.config import CameraConfig
+from station.devices.aravis import AravisCamera
+from station.errors import CameraError
+from station.simulation import genicam
+from station.simulation.gige_launch import SimulatedGige, start_gige
+
+pytestmark = pytest.mark.gige
+CONFIG = CameraConfig(device="127.0.0.1", packet_size=8996)
+
+
+@pytest.fixture
+def server(lonely_network: None) -> Iterator[SimulatedGige]:
+    with start_gige(numbered=True, serial="KJ0042") as running:
+        yield running
+
+
+async def test_18_an_incomplete_frame_is_refused_and_the_next_one_good(server: SimulatedGige) -> None:
+    camera = AravisCamera(CONFIG)
+    await camera.open()
+    try:
+        await camera.capture()
+        server.inject("packet-loss", 0.5)
+        with pytest.raises(CameraError, match=r"came incomplete|no picture within"):
+            await camera.capture(timeout_s=2.0)
+        server.inject("packet-loss", 0.0)
+        assert (await camera.capture()).image.shape == (1024, 1280)
+        assert camera.counter.missing == 1
+    finally:
+        await camera.close()
+
+
+async def test_19_frames_nobody_asked_for_are_noticed(server: SimulatedGige) -> None:
+    camera = AravisCamera(CONFIG)
+    await camera.open()
+    try:
+        await camera.capture()
+        server.inject("pulse")
+        await asyncio.sleep(0.3)
+        with pytest.raises(CameraError, match=r"1 frame\(s\) came without a trigger"):
+            await camera.capture()
+        await camera.capture()
+    finally:
+        await camera.close()
+
+
+async def test_23_settings_changed_behind_our_back_are_refused(server: SimulatedGige) -> None:
+    camera = AravisCamera(CONFIG)
+    await camera.open()
+    try:
+        for register, value, words in (
+            (genicam.EXPOSURE, 4000, "4000 µs"),
+            (genicam.GAIN, 100, "10 dB"),
+            (genicam.WIDTH, 640, "640"),
+        ):
+            before = {genicam.EXPOSURE: 10_000, genicam.GAIN: 0, genicam.WIDTH: 1280}[register]
+            server.inject("register", [register, value])
+            with pytest.raises(CameraError, match=words):
+                await camera.capture()
+            server.inject("register", [register, before])
+        await camera.capture()
+    finally:
+        await camera.close()
+
+
+async def test_an_unplugged_camera_is_gone_and_comes_back_by_its_serial(server: SimulatedGige) -> None:
+    camera = AravisCamera(CONFIG)
+    await camera.open()
+    try:
+        await camera.capture()
+        server.process.kill()
+        beats = 0
+
+        async def beat() -> None:
+            nonlocal beats
+            while True:
+                await asyncio.sleep(0.01)
+                beats += 1
+
+        beating = asyncio.create_task(beat())
+        start_s = time.monotonic()
+        with pytest.raises(CameraError, match=r"gone|failed|no picture"):
+            await camera.capture(timeout_s=4.0)
+        assert time.monotonic() - start_s < 8
+        assert beats > 50, "the daemon's loop goes on while Aravis waits"
+        beating.cancel()
+        with start_gige(numbered=True, serial="KJ0042"):
+            assert (await camera.capture()).image.shape == (1024, 1280)
+            assert camera.identity.serial == "KJ0042"
+    finally:
+        await camera.close()
+
+
+async def test_a_frozen_camera_is_noticed_and_used_again_after_it_thaws(server: SimulatedGige) -> None:
+    camera = AravisCamera(CONFIG)
+    await camera.open()
+    try:
+        await camera.capture()
+        os.kill(server.process.pid, signal.SIGSTOP)
+        with pytest.raises(CameraError):
+            await camera.capture(timeout_s=1.0)
+        os.kill(server.process.pid, signal.SIGCONT)
+        for _ in range(3):
+            try:
+                picture = await camera.capture()
+                break
+            except CameraError:
+                await asyncio.sleep(1.0)
+        assert picture.image.shape == (1024, 1280)
+    finally:
+        await camera.close()

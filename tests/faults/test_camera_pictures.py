@@ -1,0 +1,71 @@
+"""Faults 23 and 26: changed settings and pictures that show the board badly are refused with the reason."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from calibrate.detect import detect
+from recordings.messages import BoardKind, BoardSpec
+from station.config import PAPER_BOARD
+from station.errors import CameraError
+from station.exposure import assess
+from station.simulation.camera import RenderedCamera
+from station.simulation.cell import make_cell, write_truth
+from station.simulation.launch import SimulatedController
+
+pytestmark = pytest.mark.process
+
+
+@pytest.fixture
+async def camera(
+    controller: Callable[..., SimulatedController], tmp_path: Path
+) -> AsyncIterator[RenderedCamera]:
+    cell = make_cell()
+    write_truth(cell, tmp_path / "truth.json")
+    rendered = RenderedCamera(cell, controller(truth=tmp_path / "truth.json").host)
+    await rendered.open()
+    yield rendered
+    await rendered.close()
+
+
+async def test_23_a_camera_that_changes_its_exposure_is_refused(camera: RenderedCamera) -> None:
+    await camera.capture()
+    await camera.inject("exposure", 7000)
+    with pytest.raises(CameraError, match="exposed 7000 µs at 0 dB, set were 10000 µs"):
+        await camera.capture()
+    await camera.inject("exposure")
+    await camera.capture()
+
+
+@pytest.mark.parametrize(
+    ("fault", "value", "words"),
+    [
+        ("cover", 0.5, "board"),
+        ("board", msgspec.to_builtins(BoardSpec(BoardKind.CHESSBOARD, 8, 5, 0.025)), "8×5"),
+    ],
+)
+async def test_26_a_hidden_or_wrong_board_is_not_found_and_the_reason_is_said(
+    camera: RenderedCamera, fault: str, value: Any, words: str
+) -> None:
+    assert detect((await camera.capture()).image, PAPER_BOARD).found
+    await camera.inject(fault, value)
+    seen = detect((await camera.capture()).image, PAPER_BOARD)
+    assert not seen.found and words in seen.reason
+
+
+@pytest.mark.parametrize(("light", "words"), [(4.0, "too bright"), (0.08, "too dark")])
+async def test_26_over_and_under_exposure_are_named_with_what_to_set(
+    camera: RenderedCamera, light: float, words: str
+) -> None:
+    good = await camera.capture()
+    assert assess(good.image, None, good.exposure_us, good.gain_db).warnings == ()
+    await camera.inject("illumination", light)
+    bad = await camera.capture()
+    advice = assess(bad.image, None, bad.exposure_us, bad.gain_db)
+    assert any(words in warning for warning in advice.warnings)
+    assert (advice.exposure_us < bad.exposure_us) == (light > 1)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 import re
+import struct
 import zlib
 from collections.abc import Iterator
 from contextlib import suppress
@@ -34,6 +35,12 @@ _LIKE_A_RECORD = re.compile(rb"[\x06\x09\x0c].{4}\x00{4}", re.DOTALL)
 """Opcode of a chunk, attachment or metadata record, and a length below 4 GiB."""
 _BLOCK_BYTES = 1024 * 1024
 _DATA_END_LENGTH = 4
+_PEEK_BYTES = 40
+"""Of an uncompressed chunk's content before its records."""
+_CHUNK_PEEK = struct.Struct("<QIIQ")
+"""Uncompressed size, checksum, length of the compression's name, stored size."""
+_NAME_LIMIT = 60
+_SMALL_RECORD_LIMIT_BYTES = 20 * 1024 * 1024
 
 
 @dataclass
@@ -159,8 +166,22 @@ class _Walk:
             block = self._read(start, _BLOCK_BYTES + overlap)
             at = 0
             while (match := _LIKE_A_RECORD.search(block, at)) is not None and match.start() < _BLOCK_BYTES:
-                yield start + match.start()
+                if self._plausible(start + match.start()):
+                    yield start + match.start()
                 at = match.start() + 1
+
+    def _plausible(self, position: int) -> bool:
+        """Whether the first bytes fit the kind: dark pictures are full of patterns that look like records."""
+        head = self._read(position, RECORD_HEAD.size + _PEEK_BYTES)
+        if len(head) < RECORD_HEAD.size + _PEEK_BYTES:
+            return False
+        opcode, length = RECORD_HEAD.unpack_from(head)
+        content = head[RECORD_HEAD.size :]
+        if opcode == Opcode.CHUNK:
+            size, _, compression, stored = _CHUNK_PEEK.unpack_from(content, 16)
+            return bool(compression == 0 and size == stored == length - _PEEK_BYTES)
+        (name_length,) = struct.unpack_from("<I", content, 16 if opcode == Opcode.ATTACHMENT else 0)
+        return bool(0 < name_length <= _NAME_LIMIT and length <= _SMALL_RECORD_LIMIT_BYTES)
 
     def _declarations_from_summary(self) -> None:
         """A sealed file repeats its channels at the end: they help when the chunk that had them is lost."""

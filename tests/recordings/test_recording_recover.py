@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from recordings.errors import RecordingError
+from recordings.messages import CameraModel
 from recordings.reader import open_recording
 from recordings.recover import recover
 from recordings.topics import Topic
@@ -122,3 +125,32 @@ def test_what_an_earlier_recovery_kept_is_kept(tmp_path: Path) -> None:
         recover(write_unfinished(path))
     names = {p.name for p in tmp_path.iterdir()}
     assert names == {"a.mcap", "a.mcap.part.damaged", "a.mcap.part.damaged-2", "a.mcap.part.damaged-3"}
+
+
+def test_a_lost_dark_picture_does_not_make_recovery_slow(tmp_path: Path) -> None:
+    """Its bytes look like record heads everywhere; each must be dismissed without reading what it claims."""
+    pattern = np.array([6, 0, 0, 8, 0, 0, 0, 0, 0], np.uint8)  # "a chunk of 512 KiB starts here"
+    dark = np.resize(pattern, (1000, 1000))
+    with RecordingWriter(tmp_path / "a.mcap", make_info(camera=CameraModel(1000, 1000))) as writer:
+        for index in range(3):
+            writer.picture(make_picture(index, dark))
+            writer.view(make_view(index))
+        path = writer.finish()
+    data = bytearray(path.read_bytes())
+    data[open_recording(path).parts[0].messages(Topic.RAW_IMAGE).offsets[1] - 40] ^= 1
+    path.write_bytes(data)
+    start_s = time.perf_counter()
+    recover(path)
+    assert time.perf_counter() - start_s < 8
+    assert [view.index for view in open_recording(path).views()] == [0, 2]
+
+
+def test_after_a_destroyed_record_head_the_search_finds_the_next_whole_chunk(tmp_path: Path) -> None:
+    path = write_small(tmp_path / "a.mcap", poses=4)
+    data = bytearray(path.read_bytes())
+    at = open_recording(path).parts[0].messages(Topic.RAW_IMAGE).offsets[1]
+    head = data.rindex(b"\x06", 0, at - 700)  # of pose 1's chunk, or a byte before it
+    data[head : head + 9] = b"\xff" * 9
+    path.write_bytes(data)
+    recover(path)
+    assert {0, 2, 3} <= {view.index for view in open_recording(path).views()}

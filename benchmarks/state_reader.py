@@ -63,8 +63,12 @@ def _read(host: str, seconds: float, answer: Connection) -> None:
     answer.send_bytes(msgspec.msgpack.encode(Read(table.tobytes(), first_ns, reader.lost, share, memory_mb)))
 
 
-def run(seconds: float = SECONDS) -> str:
+def run() -> str:
     """A markdown table."""
+    return measure(SECONDS)
+
+
+def measure(seconds: float) -> str:
     with tempfile.TemporaryDirectory() as folder:
         truth = msgspec.structs.replace(make_cell(seed=1), controller_clock_drift_ppm=DRIFT_PPM)
         path = Path(folder) / "truth.json"
@@ -115,4 +119,4 @@ def _spread(errors_ns: NDArray[np.float64]) -> str:
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seconds", type=float, default=SECONDS)
-    print(run(parser.parse_args().seconds))
+    print(measure(parser.parse_args().seconds))

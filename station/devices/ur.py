@@ -90,10 +90,7 @@ class UrRobot(UrLink):
     async def _may_start(self) -> None:
         """Raises RobotError, with the remedy, while starting control would disturb somebody or must fail."""
         # A connection that was opened in local mode stays refused: e-Series want a new one.
-        fresh = await Dashboard.open(self.config.host)
-        if self.dashboard is not None:
-            await self.dashboard.close()
-        self.dashboard = fresh
+        fresh = await self.renew_dashboard()
         self.remote = await fresh.remote()
         state = self.latest()
         if self.remote is False:
@@ -170,7 +167,7 @@ class UrRobot(UrLink):
             return stop
         if reader.ended is not None:
             return StaleStateError(self._stale_words(self.age_s()))
-        if state.runtime_state == RuntimeState.PLAYING:
+        if state.runtime_state != RuntimeState.STOPPED:
             return error
         pause_s = self._heart.worst_s()
         if pause_s > WATCHDOG_S:
@@ -216,6 +213,11 @@ class UrRobot(UrLink):
         except Exception:
             log.exception("a path of the stop failed")
 
+    async def idle(self) -> None:
+        """Returns when everything behind a stop is done: control ended, its process gone."""
+        while self._background:
+            await asyncio.wait(self._background)
+
     async def _finish_stop(self, child: ControlChild | None, fallback: bool) -> None:
         """Behind the stop: the dashboard again by a new connection if need be, then the end of the child."""
         ending = [_end_after_stop(child)] if child is not None else []
@@ -245,9 +247,12 @@ class UrRobot(UrLink):
         except RobotError as error:
             log.warning("dashboard stop: %s", error)
             return
-        with contextlib.suppress(RobotError):
+        try:
             await dashboard.ask(STOP)
-        await dashboard.close()
+        except RobotError as error:
+            log.warning("dashboard stop: %s", error)
+        finally:
+            await dashboard.close()
 
     def on_link_lost(self, why: str) -> None:
         """ur_rtde would now reconnect by itself and load its program again: its process ends first."""

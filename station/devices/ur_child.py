@@ -180,8 +180,8 @@ class ControlChild:
     def _receive(self) -> None:
         try:
             message = self._channel.recv(65536)
-        except BlockingIOError:
-            return
+        except (BlockingIOError, ConnectionResetError):
+            return  # a reset tells of heartbeats it never read; its last words come with the next call
         except OSError:
             message = b""
         if not message:

@@ -45,20 +45,19 @@ class Dashboard:
             async with asyncio.timeout(timeout_s):
                 reader, writer = await asyncio.open_connection(host, PORT, limit=LINE_LIMIT)
                 greeting = await reader.readline()
-        except TimeoutError:
+            if b"Dashboard Server" not in greeting:
+                raise DashboardError(f"{where}: unexpected greeting {greeting[:80]!r}; is this a robot?")
+            return cls(host, reader, writer)
+        except BaseException as error:
             if writer is not None:
                 writer.transport.abort()
-            raise DashboardError(f"{where}: no answer within {timeout_s:g} s; is this the robot?") from None
-        except (OSError, ValueError) as error:
-            if writer is not None:
-                writer.transport.abort()
-            raise DashboardError(
-                f"{where}: {error.__class__.__name__}: {error}; check cable, address and that it is on"
-            ) from None
-        if b"Dashboard Server" not in greeting:
-            writer.transport.abort()
-            raise DashboardError(f"{where}: unexpected greeting {greeting[:80]!r}; is this a robot?")
-        return cls(host, reader, writer)
+            if isinstance(error, TimeoutError):
+                words = f"no answer within {timeout_s:g} s; is this the robot?"
+                raise DashboardError(f"{where}: {words}") from None
+            if isinstance(error, OSError | ValueError):
+                words = f"{type(error).__name__}: {error}; check cable, address and that it is on"
+                raise DashboardError(f"{where}: {words}") from None
+            raise
 
     @property
     def alive(self) -> bool:

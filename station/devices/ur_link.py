@@ -259,10 +259,19 @@ class UrLink:
                 failures += 1
                 log.exception("the robot's supervision failed; it goes on")
 
+    async def renew_dashboard(self) -> Dashboard:
+        """Opens a fresh connection in place of the present one. Raises DashboardError."""
+        fresh = await Dashboard.open(self.config.host)
+        old, self.dashboard = self.dashboard, fresh
+        if old is not None:
+            await old.close()
+        return fresh
+
     async def supervise_more(self) -> None:
         """Asks the dashboard what the state stream does not say. Raises StationError."""
         if self.dashboard is None or not self.dashboard.alive:
-            self.dashboard = await Dashboard.open(self.config.host)
+            await self.renew_dashboard()
+        assert self.dashboard is not None
         if self._primary is not None and self._primary.dead:
             self._primary = PrimaryReader(self.config.host)
         if self.remote is not None:

@@ -86,7 +86,7 @@ async def test_something_else_on_the_port(serve: Serve, greeting: bytes) -> None
 async def test_a_reply_that_is_too_late_breaks_the_connection(serve: Serve) -> None:
     dashboard = await Dashboard.open(await serve(E_SERIES, silent_after=1))
     await dashboard.ask("programState")
-    with pytest.raises(DashboardError, match="no reply to 'programState' within 0.1 s"):
+    with pytest.raises(DashboardError, match=r"no reply to 'programState' within 0.1 s"):
         await dashboard.ask("programState", timeout_s=0.1)
     with pytest.raises(DashboardError, match="gone"):
         await dashboard.ask("programState")

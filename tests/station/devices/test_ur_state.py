@@ -1,4 +1,4 @@
-"""The state stream: every sample, in order, with the time it came; and what is said when samples are missing."""
+"""The state stream: every sample, in order, with the time it came; what is said when some are missing."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import asyncio
 import math
 import time
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +57,7 @@ def test_every_sample_comes_once_in_order(
     s = stream(controller(model))
     states = s.collect(2.0)
     times = [x.stamps.controller_s for x in states]
-    steps = [b - a for a, b in zip(times, times[1:], strict=False)]
+    steps = [b - a for a, b in pairwise(times)]
     assert len(states) > 0.9 * 2.0 * rate_hz
     assert max(abs(step - 1 / rate_hz) for step in steps) < 1e-9
     assert s.reader.rate_hz == rate_hz

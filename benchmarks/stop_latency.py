@@ -1,0 +1,150 @@
+"""How long from the daemon's call of STOP until its bytes are out, and until the arm begins to slow down?
+
+A simulated UR10e (500 Hz) cruises at 0.5 rad/s; STOP comes at a random moment. Three ways: `stop()` as the
+daemon calls it (both paths at once), the control process alone, the dashboard alone. The controller notes
+when a stop reached it, on the same host clock. First deceleration: the first cycle whose commanded step is
+smaller than the one before by more than 1 %, its time by the fitted clock.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import random
+import tempfile
+import time
+from collections import defaultdict
+from collections.abc import Awaitable, Callable
+from contextlib import suppress
+from pathlib import Path
+
+import numpy as np
+
+from benchmarks.trials import table, trials
+from recordings.messages import RobotState
+from station.config import RobotConfig
+from station.devices.ur import UrRobot
+from station.devices.ur_dashboard import STOP
+from station.errors import RobotError
+from station.simulation.admin import AdminClient
+from station.simulation.launch import start_controller
+
+TRIALS = 200
+CRUISE_RAD_S = 0.5
+Times = dict[str, list[float]]
+"""Milliseconds since the call, by what happened."""
+
+
+class Bench:
+    """One arm that swings its base joint to and fro."""
+
+    def __init__(self, robot: UrRobot, admin: AdminClient) -> None:
+        self.robot = robot
+        self.admin = admin
+        self.states: list[RobotState] = []
+        self._forth = True
+        robot.subscribe(self.states.append)
+
+    async def cruise(self) -> asyncio.Task[None]:
+        if not self.robot.control:
+            await self.robot.start_control()
+        goal = list(self.robot.latest().joints_rad)
+        goal[0] += 1.5 if self._forth else -1.5
+        self._forth = not self._forth
+        move = asyncio.create_task(self.robot.move(goal, CRUISE_RAD_S, 1.4))
+        while abs(self.robot.latest().joint_speeds_rad_s[0]) < 0.99 * CRUISE_RAD_S:
+            await asyncio.sleep(0.005)
+        await asyncio.sleep(random.uniform(0.02, 0.12))
+        self.states.clear()
+        return move
+
+    async def rest(self, move: asyncio.Task[None]) -> None:
+        with suppress(RobotError):
+            await move
+        while abs(self.robot.newest().state.joint_speeds_rad_s[0]) > 1e-3:
+            await asyncio.sleep(0.005)
+        await self.robot.idle()
+
+    def deceleration_ns(self) -> int:
+        """Host time of the first cycle with a shorter step."""
+        clock = self.robot.clock()
+        assert clock is not None
+        targets = np.array([s.target_joints_rad[0] for s in self.states])
+        steps = np.abs(np.diff(targets))
+        shorter = int(np.argmax(steps < 0.99 * steps[0]))
+        return clock.to_host_ns(self.states[shorter + 1].stamps.controller_s)
+
+    def received_ns(self, source: str, verb: str, since_ns: int) -> int | None:
+        """When the controller noted it."""
+        entries = self.admin.ask("log", since_monotonic_ns=since_ns)["entries"]
+        return next((e["monotonic_ns"] for e in entries if (e["source"], e["verb"]) == (source, verb)), None)
+
+
+async def trial(bench: Bench, way: str, times: Times) -> None:
+    move = await bench.cruise()
+    robot = bench.robot
+    child, dashboard = robot._child, robot.dashboard
+    assert child is not None and dashboard is not None
+    ways: dict[str, Callable[[], Awaitable[object] | None]] = {
+        "both": lambda: robot.stop("benchmark"),
+        "control process": child.stop,
+        "dashboard": lambda: dashboard.send(STOP),
+    }
+    begun_ns = time.monotonic_ns()
+    going = ways[way]()
+    if way == "both":
+        assert going is not None
+        task = asyncio.ensure_future(going)
+        await asyncio.sleep(0)  # stop() writes to both paths before it first waits
+        handed_ns = time.monotonic_ns()
+        await task
+        times["stop() returned"].append((time.monotonic_ns() - begun_ns) / 1e6)
+    else:
+        handed_ns = time.monotonic_ns()
+    times["bytes handed to the kernel"].append((handed_ns - begun_ns) / 1e6)
+    await bench.rest(move)
+    source, verb = ("script", "stopJ") if way == "control process" else ("dashboard", "stop")
+    received_ns = bench.received_ns(source, verb, begun_ns)
+    if received_ns is not None:
+        times[f"{source} {verb} reached the controller"].append((received_ns - begun_ns) / 1e6)
+    times["first deceleration"].append((bench.deceleration_ns() - begun_ns) / 1e6)
+
+
+async def measure(host: str, admin: AdminClient, folder: Path, count: int) -> list[tuple[str, ...]]:
+    robot = UrRobot(RobotConfig(model="UR10e", host=host), folder / "log", folder / "lock")
+    await robot.connect()
+
+    async def heart() -> None:
+        while True:
+            robot.heartbeat()
+            await asyncio.sleep(0.03)
+
+    beating = asyncio.create_task(heart())
+    bench = Bench(robot, admin)
+    rows = []
+    for way in ("both", "control process", "dashboard"):
+        times: Times = defaultdict(list)
+        for _ in range(count):
+            await trial(bench, way, times)
+        rows += [(way, event, str(len(ms)), *_spread(ms)) for event, ms in times.items()]
+    beating.cancel()
+    await robot.close()
+    return rows
+
+
+def _spread(milliseconds: list[float]) -> tuple[str, ...]:
+    return tuple(f"{v:.2f}" for v in np.percentile(milliseconds, [50, 90, 99, 100]))
+
+
+def run() -> str:
+    """A markdown table."""
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        start_controller("UR10e") as controller,
+        controller.admin() as admin,
+    ):
+        rows = asyncio.run(measure(controller.host, admin, Path(folder), trials(TRIALS)))
+    return table(("path", "from the call until", "n", "p50 ms", "p90", "p99", "max"), rows)
+
+
+if __name__ == "__main__":
+    print(run())

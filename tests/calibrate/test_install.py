@@ -1,0 +1,262 @@
+"""Old or new, never neither; and only what belongs on this cell."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from calibrate.calibration import (
+    Calibration,
+    CalibrationFileError,
+    FramePose,
+    read_calibration,
+    write_calibration,
+)
+from calibrate.gates import Gate
+from calibrate.generations import InstallError, generations, read_log
+from calibrate.geometry import Transform, perturb
+from calibrate.install import InstallGateError, install, load_installed, rollback
+from calibrate.pipeline import SolvedRecording
+
+
+@pytest.fixture
+def make_file(solved_real: SolvedRecording, tmp_path: Path):  # type: ignore[no-untyped-def]
+    """make_file(shift_m, **changes) → path of a calibration file like the real one."""
+    count = 0
+
+    def make(shift_m: float = 0.0, **changes: object) -> Path:
+        nonlocal count
+        count += 1
+        base = solved_real.calibration
+        moved = perturb(base.transform.matrix, np.array([shift_m, 0, 0, 0, 0, 0.0]))
+        result = FramePose.of(Transform("flange", "camera", moved))
+        path = tmp_path / f"made-{count}.yaml"
+        write_calibration(msgspec.structs.replace(base, result=result, **changes), path)
+        return path
+
+    return make
+
+
+def test_install_list_rollback(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    root = tmp_path / "state"
+    first, second = make_file(), make_file(0.001)
+    install(first, root)
+    install(second, root)
+    assert load_installed(root).result == read_calibration(second).result
+    assert [(g.number, g.current) for g in generations(root)] == [(1, False), (2, True)]
+    rollback(root)
+    assert load_installed(root).result == read_calibration(first).result
+    rollback(root, to=2)
+    assert load_installed(root).result == read_calibration(second).result
+    assert [entry.action for entry in read_log(root)] == ["install", "install", "rollback", "rollback"]
+    assert read_log(root)[1].change.startswith("1.000 mm, 0.0000°")
+    assert (root / "calibrations/current").is_symlink()
+
+
+def test_nothing_installed_and_nothing_older_are_said(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(InstallError, match="nothing is installed"):
+        load_installed(tmp_path)
+    install(make_file(), tmp_path)
+    with pytest.raises(InstallError, match="no older"):
+        rollback(tmp_path)
+    with pytest.raises(InstallError, match="no generation 9; there are: 1"):
+        rollback(tmp_path, to=9)
+
+
+@pytest.mark.parametrize("source", ["simulated", "playback", "imported"])
+def test_nothing_unreal_installs_on_a_real_cell_whatever_the_reason(  # type: ignore[no-untyped-def]
+    make_file, tmp_path: Path, source: str
+) -> None:
+    path = make_file(source=source)
+    with pytest.raises(InstallError, match=f"is {source} and is not installed on a real cell"):
+        install(path, tmp_path / "s", override="I insist")
+    assert not (tmp_path / "s/calibrations/current").exists()
+
+
+def test_kinds_of_cells_do_not_mix(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    root = tmp_path / "s"
+    install(make_file(), root)
+    with pytest.raises(InstallError, match="does not follow a real calibration"):
+        install(make_file(source="simulated"), root, cell="simulated")
+    simulated = tmp_path / "simulated"
+    install(make_file(source="simulated"), simulated, cell="simulated")
+    with pytest.raises(InstallError, match="not of a real cell"):
+        load_installed(simulated)
+    assert load_installed(simulated, allow_simulated=True).source == "simulated"
+
+
+def test_a_failed_gate_needs_a_persons_reason_which_goes_into_the_file(  # type: ignore[no-untyped-def]
+    make_file, solved_real: SolvedRecording, tmp_path: Path
+) -> None:
+    bad = Gate("hold-out", False, 0.1, 0.005, "predicted to 100 mm")
+    path = make_file(quality=msgspec.structs.replace(solved_real.calibration.quality, gates=[bad]))
+    with pytest.raises(InstallGateError, match="predicted to 100 mm") as refused:
+        install(path, tmp_path / "s")
+    assert refused.value.exit_code == 4
+    with pytest.raises(InstallGateError):
+        install(path, tmp_path / "s", override="   ")
+    install(path, tmp_path / "s", override="line is down, checked with a pointer")
+    override = load_installed(tmp_path / "s").override
+    assert override is not None
+    assert override.reason == "line is down, checked with a pointer"
+    assert "hold-out" in override.overridden[0]
+
+
+def test_another_robot_or_camera_is_refused(make_file, solved_real: SolvedRecording, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    """Fault 47."""
+    root = tmp_path / "s"
+    install(make_file(), root)
+    before = (root / "calibrations/current").read_bytes()
+    robot = msgspec.structs.replace(solved_real.calibration.robot, serial="2099999999")
+    camera = msgspec.structs.replace(solved_real.calibration.camera, serial="99")
+    for changes, text in (({"robot": robot}, "robot UR10 2099999999"), ({"camera": camera}, "camera MER 99")):
+        with pytest.raises(InstallError, match=text):
+            install(make_file(**changes), root)
+    with pytest.raises(InstallError, match="the cell has 4711"):
+        install(make_file(), tmp_path / "t", robot_serial="4711")
+    assert (root / "calibrations/current").read_bytes() == before
+
+
+def test_a_damaged_file_is_not_installed_and_a_damaged_generation_not_used(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    root = tmp_path / "s"
+    good, broken = make_file(), tmp_path / "broken.yaml"
+    broken.write_bytes(good.read_bytes()[:-40])
+    with pytest.raises(CalibrationFileError):
+        install(broken, root)
+    install(good, root)
+    install(make_file(0.001), root)
+    generation = generations(root)[0].path
+    generation.chmod(0o600)
+    generation.write_bytes(generation.read_bytes().replace(b"eye-in-hand", b"eye-to-hand"))
+    assert "hash" in generations(root)[0].problem
+    with pytest.raises(InstallError, match="no older"):
+        rollback(root)
+    with pytest.raises(InstallError, match="damaged"):
+        rollback(root, to=1)
+
+
+def test_identity_is_still_checked_when_the_current_file_is_damaged(  # type: ignore[no-untyped-def]
+    make_file, solved_real: SolvedRecording, tmp_path: Path
+) -> None:
+    root = tmp_path / "s"
+    install(make_file(), root)
+    install(make_file(0.001), root)
+    current = (root / "calibrations/current").resolve()
+    current.chmod(0o600)
+    current.write_bytes(b"garbage")
+    robot = msgspec.structs.replace(solved_real.calibration.robot, serial="2099999999")
+    with pytest.raises(InstallError, match="2099999999"):
+        install(make_file(robot=robot), root)
+    install(make_file(0.002), root)
+    assert load_installed(root).result.translation_m[0] == pytest.approx(
+        solved_real.calibration.result.translation_m[0] + 0.002
+    )
+
+
+def test_an_unwritable_place_is_said(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InstallError, match="--root"):
+        install(make_file(), tmp_path / "file")
+
+
+INSTALL = """
+import sys
+from pathlib import Path
+from calibrate.install import install
+install(Path(sys.argv[1]), Path(sys.argv[2]))
+"""
+_SYSCALLS = "openat,write,fsync,rename,renameat,renameat2,symlink,symlinkat,unlink,unlinkat,mkdir,close,flock"
+
+
+@pytest.mark.process
+@pytest.mark.skipif(shutil.which("strace") is None, reason="strace is not installed")
+@pytest.mark.parametrize("points", [9, pytest.param(1000, marks=pytest.mark.soak)])
+def test_a_kill_at_any_system_call_leaves_old_or_new(make_file, tmp_path: Path, points: int) -> None:  # type: ignore[no-untyped-def]
+    """Fault 46: SIGKILL on entry to file system calls between the first and the last touch of the root."""
+    old, new = make_file(), make_file(0.001)
+    template = tmp_path / "template"
+    install(old, template)
+    results = {name: read_calibration(path).result for name, path in (("old", old), ("new", new))}
+    calls = _touching_calls(new, template, tmp_path)
+    assert len(calls) >= 12
+    calls = [calls[k] for k in np.unique(np.linspace(0, len(calls) - 1, points).astype(int))]
+    seen = []
+    for name, place in calls:
+        root = tmp_path / "kill"
+        shutil.copytree(template, root, symlinks=True)
+        inject = f"inject={name}:signal=KILL:when={place}"
+        command = [
+            "strace",
+            "-f",
+            "-qq",
+            "-o",
+            "/dev/null",
+            "-e",
+            inject,
+            sys.executable,
+            "-c",
+            INSTALL,
+            str(new),
+            str(root),
+        ]
+        done = subprocess.run(command, capture_output=True, timeout=60, check=False)
+        assert done.returncode != 0, f"{name} {place} was not reached"
+        found = load_installed(root).result
+        assert found in results.values(), (name, place)
+        seen.append("new" if found == results["new"] else "old")
+        assert all(not g.problem for g in generations(root)), (name, place)
+        install(new, root)  # what a person does next works
+        assert load_installed(root).result == results["new"]
+        shutil.rmtree(root)
+    assert seen == sorted(seen, reverse=True), "it went back"
+    assert {"old", "new"} == set(seen)
+
+
+def _touching_calls(new: Path, template: Path, tmp_path: Path) -> list[tuple[str, int]]:
+    """(system call, its how-manieth) for every call of an undisturbed run after it first touches the root."""
+    root, trace = tmp_path / "traced", tmp_path / "trace"
+    shutil.copytree(template, root, symlinks=True)
+    command = [
+        "strace",
+        "-f",
+        "-qq",
+        "-o",
+        str(trace),
+        "-e",
+        f"trace={_SYSCALLS}",
+        sys.executable,
+        "-c",
+        INSTALL,
+    ]
+    subprocess.run([*command, str(new), str(root)], check=True, timeout=60)
+    counts: dict[str, int] = {}
+    found: list[tuple[str, int]] = []
+    begun = False
+    lines = trace.read_text().splitlines()
+    last = max(k for k, line in enumerate(lines) if "log.jsonl" in line)
+    for line in lines[: last + 4]:
+        match = re.match(r"\d+ +(\w+)\(", line)
+        if match is None:
+            continue
+        name = match[1]
+        counts[name] = counts.get(name, 0) + 1
+        begun = begun or f"{root}/calibrations/lock" in line
+        if begun and (name != "close" or len(found) % 3 == 0):
+            found.append((name, counts[name]))
+    shutil.rmtree(root)
+    return found
+
+
+def test_consumers_get_frames_in_the_name(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    install(make_file(), tmp_path)
+    calibration: Calibration = load_installed(tmp_path)
+    assert (calibration.transform.parent, calibration.transform.child) == ("flange", "camera")
+    assert calibration.intrinsics.model.width == 480
+    assert (tmp_path / "calibrations/current").readlink().parts[0] == "gen"

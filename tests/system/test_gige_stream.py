@@ -1,0 +1,40 @@
+"""Free-running frames from the simulated GigE camera into files, each picture to the bit."""
+
+from __future__ import annotations
+
+import pytest
+
+from benchmarks.gige_throughput import measure
+from station.config import CameraConfig
+from station.devices.aravis_device import GenicamDevice
+from station.errors import StationError
+from station.simulation.netns import isolated_thread
+
+
+@pytest.fixture(autouse=True)
+def permitted() -> None:
+    """Skipped, with the reason, where there is no Aravis or no right to a network of its own."""
+    try:
+        GenicamDevice(CameraConfig())
+        with isolated_thread():
+            pass
+    except StationError as error:
+        pytest.skip(str(error))
+
+
+@pytest.mark.gige
+def test_a_few_seconds_arrive_complete() -> None:
+    outcome = measure(30.0, 3.0)
+    assert outcome.frames > 30 and outcome.states > 500
+    assert (outcome.lost, outcome.dropped, outcome.wrong) == (0, 0, 0)
+    assert outcome.verified == outcome.frames
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize(("fps", "seconds"), [(75.0, 600.0), (150.0, 120.0)])
+def test_minutes_of_full_rate_lose_nothing(fps: float, seconds: float) -> None:
+    outcome = measure(fps, seconds)
+    assert outcome.frames > 0.9 * fps * seconds
+    assert (outcome.lost, outcome.dropped, outcome.wrong) == (0, 0, 0)
+    assert outcome.verified == outcome.frames and outcome.memory_mib < 600

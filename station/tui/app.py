@@ -7,23 +7,26 @@ makes the daemon decelerate the arm and pause.
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Iterable
+from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 import msgspec
 from textual import work
-from textual.app import App
+from textual.app import App, SystemCommand
 from textual.binding import Binding, BindingType
 from textual.message import Message
 from textual.reactive import reactive
+from textual.screen import Screen
 
 from station.client import Client
 from station.errors import RefusedError, StationError
 from station.protocol import Verb
 from station.status import GoSummary, StationState, StationStatus
+from station.tui import offline
 from station.tui.checklist import ChecklistScreen
 from station.tui.confirm import Confirm, ConfirmGo
-from station.tui.jobs import JobScreen
 from station.tui.link import Connect, Link
 from station.tui.live import LiveScreen
 from station.tui.log import LogScreen
@@ -63,12 +66,15 @@ class StationApp(App[None]):
         Binding("f6", "pause", "Pause", id="pause", tooltip="Stop after this pose; nothing is lost"),
         Binding("f7", "finish", "Finish", id="finish", tooltip="Seal the recording with what is there"),
         Binding("f8", "acknowledge", "Ack", id="acknowledge", tooltip="I looked: leave STOPPED or FAULT"),
+        Binding("f3", "free_drive", "Hand", id="free-drive", tooltip="Free-drive: move the arm by hand"),
+        Binding("f2", "record", "Take", id="record", tooltip="Take a picture here (free-drive)"),
         Binding("1", "switch_mode('live')", "Live", id="live", tooltip="The running capture"),
         Binding("2", "switch_mode('plan')", "Plan", id="plan", tooltip="All poses, their state and reasons"),
         Binding("3", "switch_mode('result')", "Result", id="result", tooltip="May it be trusted?"),
         Binding("4", "switch_mode('sessions')", "Sessions", id="sessions", tooltip="Past recordings"),
         Binding("5", "switch_mode('log')", "Log", id="log", tooltip="Everything that was said"),
         Binding("6", "switch_mode('checklist')", "Check", id="checklist", tooltip="Is everything there?"),
+        Binding("f1", "show_help_panel", "Help", id="help", tooltip="Keys and help for what is on screen"),
         Binding("ctrl+q", "leave", "Quit", id="quit", tooltip="Close this screen; the daemon goes on"),
     ]
     status: reactive[StationStatus | None] = reactive(None)
@@ -120,6 +126,17 @@ class StationApp(App[None]):
             if isinstance(screen, StationScreen) and screen.is_mounted:
                 screen.show(message.status)
 
+    def get_system_commands(self, screen: Screen[Any]) -> Iterable[SystemCommand]:
+        """Every key's action by name too; what moves the arm asks the same question from here."""
+        yield from super().get_system_commands(screen)
+        for binding in (b for b in self.BINDINGS if isinstance(b, Binding)):
+            action = binding.action
+            yield SystemCommand(
+                f"{binding.description} ({binding.key})",
+                binding.tooltip,
+                partial(self.call_later, self.run_action, action),
+            )
+
     # --- the operator → the daemon ---
 
     async def ask(self, verb: Verb, **args: Any) -> Any:
@@ -170,40 +187,48 @@ class StationApp(App[None]):
             await self.ask("finish")
 
     @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_free_drive(self) -> None:
+        """The operator moves the arm with the pendant's free-drive button; the station only looks."""
+        if self.status is None:
+            return
+        on = self.status.state is not StationState.FREE_DRIVE
+        if await self.ask("lease", action="take") is not None:
+            await self.ask("free_drive", on=on)
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_record(self) -> None:
+        await self.ask("record")
+
+    @work(exclusive=True, group="command", exit_on_error=False)
     async def action_acknowledge(self) -> None:
         await self.ask("acknowledge")
 
-    # --- work in processes of its own ---
-
-    @work(exclusive=True, group="job", exit_on_error=False)
-    async def solve(self, recording: str, folder: str) -> None:
-        output, report = (str(Path(folder) / name) for name in ("calibration.yaml", "report.html"))
-        to = ("-o", output, "--report", report)
-        job = JobScreen(f"Solving {recording}", "calibrate.cli", "solve", recording, *to)
-        if await self.push_screen_wait(job) >= 0:
-            await self.show_result(output)
+    # --- results ---
 
     async def show_result(self, calibration: str) -> None:
         self.result_path = calibration
         await self.switch_mode("result")
 
     @work(exclusive=True, group="job", exit_on_error=False)
+    async def solve(self, recording: str, folder: str) -> None:
+        if (calibration := await offline.solve(self, recording, folder)) is not None:
+            await self.show_result(calibration)
+
+    @work(exclusive=True, group="job", exit_on_error=False)
     async def recover(self, folder: str) -> None:
-        await self.push_screen_wait(JobScreen(f"Recovering {folder}", "recordings.cli", "recover", folder))
+        await offline.recover(self, folder)
 
     @work(exclusive=True, group="job", exit_on_error=False)
     async def install(self, calibration: str) -> None:
-        body = (
-            f"{calibration}\nbecomes what every consumer of this cell reads. `calibrate rollback` undoes it."
-        )
-        if await self.push_screen_wait(Confirm("Install this calibration?", body, yes="Install")):
-            await self.push_screen_wait(JobScreen("Installing", "calibrate.cli", "install", calibration))
+        await offline.install(self, calibration)
+
+    @work(exclusive=True, group="job", exit_on_error=False)
+    async def export(self, calibration: str) -> None:
+        await offline.export(self, calibration)
 
     @work(exclusive=True, group="job", exit_on_error=False)
     async def discard(self, calibration: str) -> None:
-        body = f"{calibration}\nis deleted. The recording stays and can be solved again."
-        if await self.push_screen_wait(Confirm("Discard this result?", body, yes="Discard")):
-            Path(calibration).unlink(missing_ok=True)
+        if await offline.discard(self, calibration):
             self.result_path = None
             await self.switch_mode("sessions")
 

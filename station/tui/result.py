@@ -14,6 +14,8 @@ from textual.widgets import Static
 
 from calibrate.calibration import Calibration, read_calibration
 from calibrate.errors import CalibrationError
+from calibrate.geometry import difference
+from station.tui.offline import installed_beside
 from station.tui.screen import StationScreen
 
 if TYPE_CHECKING:
@@ -67,10 +69,24 @@ def residual_text(calibration: Calibration) -> Text:
     return Text("\n".join(["reprojection per view", *lines, *rejected]))
 
 
+def change_text(calibration: Calibration, installed: Calibration | None) -> Text:
+    """What installing would change."""
+    if installed is None:
+        return Text("\nnothing is installed yet")
+    if installed.mount != calibration.mount:
+        return Text(f"\ninstalled: {installed.mount}, this one: {calibration.mount}")
+    delta = difference(calibration.transform.matrix, installed.transform.matrix)
+    moved_mm, turned_deg = 1000 * np.linalg.norm(delta[:3]), np.degrees(np.linalg.norm(delta[3:]))
+    return Text(
+        f"\nagainst the installed one the camera moved {moved_mm:.2f} mm and turned {turned_deg:.3f}°"
+    )
+
+
 class ResultScreen(StationScreen):
     HELP = "The newest result, or the one picked on the sessions screen. Installing can be undone."
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("i", "install", "Install", tooltip="Make this the cell's calibration; rollback undoes it"),
+        Binding("e", "export", "Export", tooltip="Write it for ROS, OpenCV, URDF … beside the recording"),
         Binding("x", "discard", "Discard", tooltip="Delete this result; the recording stays"),
     ]
 
@@ -84,6 +100,7 @@ class ResultScreen(StationScreen):
                 yield Static("No result yet: capture a session, then F9 solves it.", id="verdict")
             with VerticalScroll(id="result-right"):
                 yield Static(id="answer")
+                yield Static(id="change")
                 yield Static(id="residuals")
 
     @property
@@ -106,6 +123,7 @@ class ResultScreen(StationScreen):
             return
         self.query_one("#verdict", Static).update(verdict_text(self._calibration))
         self.query_one("#answer", Static).update(answer_text(self._calibration))
+        self.query_one("#change", Static).update(change_text(self._calibration, installed_beside(path)))
         self.query_one("#residuals", Static).update(residual_text(self._calibration))
 
     def _path(self) -> str | None:
@@ -117,6 +135,10 @@ class ResultScreen(StationScreen):
     def action_install(self) -> None:
         if (path := self._path()) is not None:
             self.station.install(path)
+
+    def action_export(self) -> None:
+        if (path := self._path()) is not None:
+            self.station.export(path)
 
     def action_discard(self) -> None:
         if (path := self._path()) is not None:

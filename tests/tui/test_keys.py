@@ -87,3 +87,97 @@ async def test_a_dead_daemon_is_said(link: FakeLink) -> None:
         link.show(None)
         await pilot.pause()
         assert "no connection to the daemon" in text_of(pilot.app, "#bar")
+
+
+@pytest.mark.parametrize(
+    ("key", "verbs"),
+    [
+        ("f6", ["pause"]),
+        ("f8", ["acknowledge"]),
+        ("f3", ["lease", "free_drive"]),
+        ("f2", ["record"]),
+        ("f12", ["stop"]),
+    ],
+)
+async def test_a_key_sends_its_wish_at_once(link: FakeLink, key: str, verbs: list[str]) -> None:
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await pilot.pause()
+        await pilot.press(key)
+        await pilot.pause()
+        assert link.verbs == verbs
+
+
+async def test_finish_asks_and_then_seals(link: FakeLink) -> None:
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await pilot.pause()
+        await pilot.press("f7")
+        await pilot.pause()
+        assert link.verbs == []
+        await pilot.click("#yes")
+        await pilot.pause()
+        assert link.verbs == ["finish"]
+
+
+@pytest.mark.parametrize(
+    ("key", "request_"),
+    [
+        ("r", ("retake", {"index": 2})),
+        ("s", ("skip", {"index": 2})),
+        ("d", ("drop", {"index": 2})),
+        ("ctrl+up", ("reorder", {"order": [0, 2, 1, *range(3, 25)]})),
+        ("ctrl+down", ("reorder", {"order": [0, 1, 3, 2, *range(4, 25)]})),
+        ("n", ("make_plan", {"poses": 25, "seed": 1})),
+    ],
+)
+async def test_the_plan_screen_asks_for_changes_of_the_highlighted_pose(
+    link: FakeLink, key: str, request_: tuple[str, dict[str, object]]
+) -> None:
+    async with app_on(link).run_test(size=(120, 34)) as pilot:
+        await pilot.pause()
+        await pilot.press("2")
+        await pilot.pause()
+        await pilot.press("down", "down", key)
+        await pilot.pause()
+        assert request_ in link.asked
+
+
+async def test_every_screen_opens_and_stop_works_on_each(link: FakeLink) -> None:
+    link.answers["sessions"] = []
+    link.answers["doctor"] = [{"name": "camera", "state": "failed", "text": "none", "remedy": "plug it in"}]
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await pilot.pause()
+        for stops, key in enumerate("123456", start=1):
+            await pilot.press(key)
+            await pilot.pause()
+            await pilot.press("f12")
+            await pilot.pause()
+            assert link.verbs.count("stop") == stops, key
+        assert "plug&#160;it&#160;in" in pilot.app.export_screenshot()
+
+
+async def test_stop_works_in_the_command_palette(link: FakeLink) -> None:
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await pilot.pause()
+        await pilot.press("ctrl+p")
+        await pilot.pause()
+        await pilot.press("x", "f12")
+        await pilot.pause()
+        assert link.verbs == ["stop"]
+
+
+async def test_quitting_asks_while_a_session_runs(link: FakeLink) -> None:
+    link.show(idle(StationState.MOVING))
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await pilot.pause()
+        await pilot.press("ctrl+q")
+        await pilot.pause()
+        assert "decelerates" in str(pilot.app.screen.query_one("#confirm-body", Static).render())
+
+
+async def test_a_hundred_resizes_leave_a_working_screen(link: FakeLink) -> None:
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        for i in range(100):
+            await pilot.resize_terminal(60 + i, 20 + i % 40)
+        await pilot.resize_terminal(80, 24)
+        await pilot.pause()
+        assert "F12=STOP" in text_of(pilot.app, "#bar")

@@ -10,6 +10,7 @@ into the bound.
 from __future__ import annotations
 
 import threading
+import time
 from collections import deque
 from dataclasses import dataclass
 
@@ -20,6 +21,17 @@ DRIFT_SPAN_S = 5.0
 DRIFT_LIMIT = 500e-6
 """Quartz clocks are far better; a steeper edge comes from too few arrivals."""
 UNFITTED_DRIFT = 100e-6
+
+
+def monotonic_from_wall_ns(wall_ns: int) -> int:
+    """Host monotonic time of a recent moment that the kernel stamped by the wall clock; never too early.
+
+    A thread held up between reading the two clocks would be wrong by as much. The wall clock is read first,
+    so such a stamp comes out too late, which a fit through the earliest arrivals overlooks; too early it
+    would spoil the fit for a whole window.
+    """
+    age_ns = time.time_ns() - wall_ns
+    return time.monotonic_ns() - age_ns
 
 
 @dataclass(frozen=True)

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any
 
 from recordings.messages import CameraIdentity, Picture, Stamps
+from station.clocks import monotonic_from_wall_ns
 from station.config import CameraConfig
 from station.devices.frames import DeviceClock
 from station.devices.pixels import bits_per_pixel, decode
@@ -220,7 +221,7 @@ class GenicamDevice:
         return Picture(
             image=image,
             stamps=Stamps(
-                host_monotonic_ns=time.monotonic_ns() - (time.time_ns() - wall_ns),
+                host_monotonic_ns=monotonic_from_wall_ns(wall_ns),
                 host_wall_ns=wall_ns,
                 device_ns=buffer.get_timestamp(),
             ),

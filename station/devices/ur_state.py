@@ -18,7 +18,7 @@ from concurrent.futures import Future
 from typing import NamedTuple
 
 from recordings.messages import RobotState, Stamps
-from station.clocks import ClockEstimator
+from station.clocks import ClockEstimator, monotonic_from_wall_ns
 from station.devices.rtde import (
     PORT,
     PROTOCOL_VERSION,
@@ -225,11 +225,10 @@ class StateReader(threading.Thread):
 
 def _arrival(ancillary: list[tuple[int, int, bytes]]) -> tuple[int, int]:
     """Host monotonic and wall time of the newest bytes, as the kernel saw them come."""
-    monotonic_ns, wall_ns = time.monotonic_ns(), time.time_ns()
     for level, kind, value in ancillary:
         if level == socket.SOL_SOCKET and kind == SO_TIMESTAMPNS:
             seconds, ns = _TIMESPEC.unpack(value)
-            age_ns = wall_ns - (seconds * 1_000_000_000 + ns)
-            if 0 <= age_ns < 10_000_000_000:  # else the wall clock was set in between
-                return monotonic_ns - age_ns, wall_ns - age_ns
-    return monotonic_ns, wall_ns
+            wall_ns = seconds * 1_000_000_000 + ns
+            if 0 <= time.time_ns() - wall_ns < 10_000_000_000:  # else the wall clock was set in between
+                return monotonic_from_wall_ns(wall_ns), wall_ns
+    return time.monotonic_ns(), time.time_ns()

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from station.clocks import ClockEstimator, ClockFit
+from station.clocks import ClockEstimator, ClockFit, monotonic_from_wall_ns
 
 OFFSET_NS = 5_000_000_000_000
 
@@ -110,3 +110,20 @@ def test_memory_is_bounded_and_old_arrivals_are_forgotten() -> None:
     feed(clock, 200, 500, 0.0, 0.0002, seed=5)
     assert len(clock._bins) <= 301
     assert fit(clock).span_s <= 10.1
+
+
+@pytest.mark.parametrize("held_up_ns", [0, 5_000_000])
+def test_a_thread_held_up_between_two_clocks_never_stamps_too_early(
+    held_up_ns: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_ns = 1_000_000_000
+
+    def read(offset_ns: int) -> int:
+        nonlocal now_ns
+        now_ns += held_up_ns
+        return now_ns + offset_ns
+
+    monkeypatch.setattr("station.clocks.time.monotonic_ns", lambda: read(0))
+    monkeypatch.setattr("station.clocks.time.time_ns", lambda: read(OFFSET_NS))
+    arrived_ns = now_ns - 300_000
+    assert arrived_ns <= monotonic_from_wall_ns(arrived_ns + OFFSET_NS) <= arrived_ns + held_up_ns

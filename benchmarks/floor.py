@@ -46,7 +46,7 @@ def run() -> str:
     text = (
         f"{count} trials per row, each a new scene (paper's cell); ± is one standard error. Bound: root of "
         "the trace of the inverse Fisher information at the truth with the true noise scales, which the "
-        "estimator is not told. Noise (corner px / robot mm / robot °): low 0.1/0.05/0.005, mid 0.2/0.3/0.03, "
+        "estimator is not told. Noise (corner px, robot mm, robot °): low 0.1/0.05/0.005, mid 0.2/0.3/0.03, "
         "high 0.5/1/0.1."
     )
     return text + "\n\n" + table(header, rows)

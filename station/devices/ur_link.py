@@ -179,6 +179,11 @@ class UrLink:
                 log.exception("a subscriber of the robot's state failed and is dropped")
                 self._subscribers = [s for s in self._subscribers if s is not callback]
 
+    @property
+    def connected(self) -> bool:
+        """The state stream lives; whether its news are fresh says `latest`."""
+        return self.reader is not None and self.reader.ended is None and self.reader.newest is not None
+
     def newest(self) -> Sample:
         """Whatever came last, however old. Raises StaleStateError when nothing ever came."""
         sample = self.reader.newest if self.reader is not None else None
@@ -196,7 +201,7 @@ class UrLink:
     def latest(self) -> RobotState:
         """Newest state; StaleStateError when older than 100 ms or its controller time stands still."""
         sample, age_s = self.newest(), self.age_s()
-        if age_s > STALE_S:
+        if age_s > STALE_S or not self.connected:
             raise StaleStateError(self._stale_words(age_s))
         return sample.state
 

@@ -1,0 +1,108 @@
+"""Links that drop and come back, again and again: nothing hangs, nothing leaks."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+import os
+import threading
+import time
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from station.errors import RobotError
+from station.simulation.launch import SimulatedController
+
+pytestmark = pytest.mark.process
+
+Make = Callable[..., Awaitable[Any]]
+CYCLE_LIMIT_S = 5.0
+WARM_UP = 10
+
+
+def descriptors() -> int:
+    return len(os.listdir("/proc/self/fd"))  # noqa: PTH208  # Path.iterdir would hold one itself
+
+
+def children() -> set[str]:
+    own = Path(f"/proc/self/task/{os.getpid()}/children").read_text().split()
+    return set(own)
+
+
+def memory_mb() -> float:
+    pages = int(Path("/proc/self/statm").read_text().split()[1])
+    return pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+
+
+async def cycle(c: Any, number: int) -> None:
+    """One drop and recovery; every fifth with control alive, every tenth with the arm in motion."""
+    move = None
+    if number % 5 == 0:
+        await c.robot.start_control()
+        if number % 10 == 0:
+            move = c.far_move() if c.joints_rad()[0] < 2.0 else None
+    lost = c.robot.lost
+    c.admin.ask("drop", how="rst" if number % 2 else "fin")
+    await c.until(lambda: c.robot.lost > lost, CYCLE_LIMIT_S)
+    if move is not None:
+        with pytest.raises(RobotError):
+            await asyncio.wait_for(move, CYCLE_LIMIT_S)
+    await c.until(lambda: c.robot.connected and not c.robot.control, CYCLE_LIMIT_S)
+    await asyncio.wait_for(c.robot.idle(), CYCLE_LIMIT_S)
+
+
+async def run_cycles(c: Any, count: int) -> None:
+    before: dict[str, Any] = {}
+    for number in range(count):
+        await cycle(c, number)
+        if number == min(WARM_UP, count // 2):
+            gc.collect()
+            before = {"fds": descriptors(), "children": children(), "threads": threading.active_count()}
+            before["memory"] = memory_mb()
+    gc.collect()
+    await asyncio.sleep(0.5)
+    assert children() == before["children"]
+    assert abs(descriptors() - before["fds"]) <= 3  # a supervisor may be in the middle of a question
+    assert abs(threading.active_count() - before["threads"]) <= 1
+    growth_mb = memory_mb() - before["memory"]
+    assert growth_mb < 5 + 0.01 * count, f"grew by {growth_mb:.1f} MB in {count} cycles"
+
+
+@pytest.mark.timeout(120)
+async def test_fifty_cycles(cell: Make) -> None:
+    await run_cycles(await cell(control=False), 50)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(3600)
+async def test_a_thousand_cycles(cell: Make) -> None:
+    await run_cycles(await cell(control=False), 1000)
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(900)
+def test_ten_minutes_at_full_rate_without_a_lost_sample(
+    controller: Callable[..., SimulatedController],
+) -> None:
+    from station.devices.ur_state import StateReader
+
+    seconds: float = 600
+    count = 0
+
+    def take(_: object) -> None:
+        nonlocal count
+        count += 1
+
+    reader = StateReader(controller("UR10e").host, take, lambda _: None)
+    reader.start()
+    reader.started.result(3.0)
+    cpu_s = time.process_time()
+    time.sleep(seconds)
+    cpu_s = time.process_time() - cpu_s
+    reader.close()
+    assert reader.lost == 0 and reader.frozen == 0
+    assert count > 0.99 * seconds * 500
+    assert cpu_s / seconds < 0.10

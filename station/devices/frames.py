@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 from collections import deque
+from typing import NamedTuple
 
-from station.clocks import ClockEstimator, ClockFit
+from station.clocks import DRIFT_SPAN_S, UNFITTED_DRIFT, ClockFit
 from station.errors import CameraError
 
 LAST_FRAME_ID = 65_535
 """GigE Vision block ids run from 1 to this and start over at 1; 0 means "no frame"."""
 UNKNOWN_READOUT_S = 0.05
-GOOD_ROUND_TRIP_NS = 2_000_000
-"""A slower reading of the device clock counts only if it is at most twice as slow as the quickest one."""
 READINGS_KEPT = 200
 
 
@@ -97,30 +96,65 @@ class FrameCounter:
         )
 
 
+class _Reading(NamedTuple):
+    device_s: float
+    offset_ns: float
+    """Host monotonic minus device time, at the middle of the round trip."""
+    half_s: float
+    """Half the round trip: the offset is wrong by this at most."""
+
+
 class DeviceClock:
-    """A camera's clock, read over the wire: half of the round trip is all that is not known of a reading."""
+    """A camera's clock, read over the wire. The bound holds whatever the delays there and back were.
+
+    The newest good reading gives the offset, the quickest ones early and late in the window the drift.
+    """
 
     def __init__(self) -> None:
-        self._estimator = ClockEstimator()
-        self._round_trips_ns: deque[int] = deque(maxlen=READINGS_KEPT)
+        self._readings: deque[_Reading] = deque(maxlen=READINGS_KEPT)
 
     def reading(self, device_ns: int, asked_monotonic_ns: int, answered_monotonic_ns: int) -> None:
         """The device showed `device_ns` at some moment between asking and the answer."""
-        round_trip_ns = max(answered_monotonic_ns - asked_monotonic_ns, 1)
-        quickest_ns = min(self._round_trips_ns, default=round_trip_ns)
-        if round_trip_ns > max(2 * quickest_ns, GOOD_ROUND_TRIP_NS):
-            return
-        self._round_trips_ns.append(round_trip_ns)
-        self._estimator.latency_s = max(self._round_trips_ns) / 2e9
-        self._estimator.add(device_ns / 1e9, asked_monotonic_ns + round_trip_ns // 2)
+        half_ns = (answered_monotonic_ns - asked_monotonic_ns) / 2
+        offset_ns = float(asked_monotonic_ns - device_ns) + half_ns
+        self._readings.append(_Reading(device_ns / 1e9, offset_ns, half_ns / 1e9))
 
     def restart(self) -> None:
-        self._estimator.reset()
-        self._round_trips_ns.clear()
+        self._readings.clear()
 
     @property
     def fit(self) -> ClockFit | None:
-        return self._estimator.fit()
+        """None before the first reading."""
+        readings = list(self._readings)
+        if not readings:
+            return None
+        drift, doubt = _drift(readings)
+        now_s = readings[-1].device_s
+        best = min(readings, key=lambda r: r.half_s + doubt * (now_s - r.device_s))
+        return ClockFit(
+            reference_s=best.device_s,
+            offset_ns=best.offset_ns,
+            drift=drift,
+            residual_s=0.0,
+            drift_uncertainty=doubt,
+            latency_s=best.half_s,
+            samples=len(readings),
+            span_s=0.0,
+        )
+
+
+def _drift(readings: list[_Reading]) -> tuple[float, float]:
+    """Host seconds per device second minus 1, and how far it can be off."""
+    span_s = readings[-1].device_s - readings[0].device_s
+    third = max(1, len(readings) // 3)
+    early, late = (min(part, key=lambda r: r.half_s) for part in (readings[:third], readings[-third:]))
+    apart_s = late.device_s - early.device_s
+    if span_s < DRIFT_SPAN_S or apart_s <= 0:
+        return 0.0, UNFITTED_DRIFT
+    doubt = (early.half_s + late.half_s) / apart_s
+    if doubt >= UNFITTED_DRIFT:
+        return 0.0, UNFITTED_DRIFT
+    return (late.offset_ns - early.offset_ns) / 1e9 / apart_s, doubt
 
 
 def mid_exposure(
@@ -135,7 +169,7 @@ def mid_exposure(
     half_ns = round(exposure_us * 500)
     if clock is not None and start_device_ns:
         device_s = start_device_ns / 1e9
-        beyond_s = clock.drift_uncertainty * max(0.0, device_s - clock.reference_s)
+        beyond_s = clock.drift_uncertainty * abs(device_s - clock.reference_s)
         return clock.to_host_ns(device_s) + half_ns, clock.bound_s + beyond_s
     readout_ns = round(UNKNOWN_READOUT_S * 1e9)
     return arrival_monotonic_ns - readout_ns // 2 - half_ns, readout_ns / 2e9

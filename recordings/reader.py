@@ -87,9 +87,10 @@ def open_recording(path: Path) -> Recording:
     """
     path = Path(path)
     if not path.is_dir():
-        if path.name.endswith(PART_SUFFIX) and path.is_file():
+        unfinished = path if path.name.endswith(PART_SUFFIX) else path.with_name(path.name + PART_SUFFIX)
+        if unfinished.is_file() and (unfinished == path or not path.exists()):
             raise UnsealedRecordingError(
-                f"{path} was never finished. Save what is whole: recordings recover {path}"
+                f"{path} was never finished. Save what is whole: recordings recover {unfinished}"
             )
         return Recording(path, [RecordingPart(path)])
     return Recording(path, _open_parts(path))

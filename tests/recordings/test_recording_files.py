@@ -55,8 +55,8 @@ def test_content_name_and_folder_reach_the_disk_in_this_order(
 def test_an_unfinished_file_names_recover(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
         writer.picture(make_picture(0))
-    for place in (writer.part_path, tmp_path):
-        with pytest.raises(UnsealedRecordingError, match="recordings recover"):
+    for place in (writer.part_path, writer.path, tmp_path):
+        with pytest.raises(UnsealedRecordingError, match=r"recordings recover /.*"):
             open_recording(place)
 
 

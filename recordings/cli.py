@@ -15,6 +15,7 @@ from rich.console import Console
 from rich.progress import Progress
 
 from recordings.errors import RecordingError
+from recordings.excerpt import write_excerpt
 from recordings.export import Target, export_recording
 from recordings.importer import import_folder
 from recordings.info import recording_info
@@ -78,6 +79,18 @@ def export(
     """A recording as a folder of pictures and poses, as CSV tables, or as a ROS 2 bag."""
     with _errors_for_people():
         written = export_recording(open_recording(recording), output, to)
+    print(json.dumps({"output": str(written)}) if json_ else f"{written} written")
+
+
+@main.command()
+def excerpt(
+    recording: Path,
+    output: Annotated[Path, typer.Option("-o", "--output", help="The smaller recording (.mcap) to write.")],
+    json_: Json = False,
+) -> None:
+    """A smaller recording that solves like the whole: lossless PNG, robot states only around the pictures."""
+    with _errors_for_people():
+        written = write_excerpt(open_recording(recording), output)
     print(json.dumps({"output": str(written)}) if json_ else f"{written} written")
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import logging
 import os
@@ -22,6 +23,8 @@ from station.session.folder import default_root
 from station.simulation.cell import NoiseLevel, SceneName
 
 START_WAIT_S = 30.0
+PRIORITY = -5
+"""The arm's watchdog hangs on the daemon's loop and the control process: they go before other programs."""
 _RANGES = {"scene": SceneName, "noise": NoiseLevel, "mount": Mount}
 
 
@@ -31,9 +34,10 @@ def serve_command(
     socket: Annotated[Path | None, typer.Option(help="Where to listen.")] = None,
     root: Annotated[Path | None, typer.Option(help="Where sessions go.")] = None,
     seed: Annotated[int, typer.Option(help="Of the simulated cell.")] = 0,
-    scene: Annotated[str, typer.Option(help="Simulated: paper or blog.")] = "paper",
+    scene: Annotated[str, typer.Option(help="Simulated: paper, blog or paper-binned.")] = "paper",
     noise: Annotated[str, typer.Option(help="Simulated: low, mid or high.")] = "low",
     mount: Annotated[str, typer.Option(help="Simulated: eye-in-hand or eye-to-hand.")] = "eye-in-hand",
+    gige: Annotated[bool, typer.Option("--gige", hidden=True)] = False,
     time_scale: Annotated[float, typer.Option(hidden=True)] = 1.0,
     end_with_stdin: Annotated[bool, typer.Option("--end-with-stdin", hidden=True)] = False,
 ) -> None:
@@ -44,14 +48,14 @@ def serve_command(
     logging.basicConfig(level=logging.INFO, format=_log_format(), stream=sys.stderr)
     place = root or default_root()
     if config is not None:
-        asyncio.run(_serve(_real_cell(config, place), place, socket or default_socket(), end_with_stdin))
+        asyncio.run(serve_cell(_real_cell(config, place), place, socket or default_socket(), end_with_stdin))
         return
     # Simulation is loaded only where it is wanted.
     from station.simulation.launch_cell import SimulationOptions, simulated_cell
 
-    options = SimulationOptions(scene, seed, noise, mount, time_scale)  # type: ignore[arg-type]
+    options = SimulationOptions(scene, seed, noise, mount, time_scale, gige)  # type: ignore[arg-type]
     cell = simulated_cell(options, place / "simulation")
-    asyncio.run(_serve(cell, place, socket or default_socket(), end_with_stdin))
+    asyncio.run(serve_cell(cell, place, socket or default_socket(), end_with_stdin))
 
 
 def require_choices(**chosen: str) -> None:
@@ -69,9 +73,11 @@ def _real_cell(config: Path, root: Path) -> Cell:
     return configured_cell(loaded, text, root)
 
 
-async def _serve(cell: Cell, root: Path, socket: Path, end_with_stdin: bool) -> None:
+async def serve_cell(cell: Cell, root: Path, socket: Path, end_with_stdin: bool) -> None:
     from station.daemon import Daemon
 
+    with contextlib.suppress(OSError):  # who may not goes on as before; the unit file asks for it too
+        os.setpriority(os.PRIO_PROCESS, 0, PRIORITY)
     try:
         daemon = Daemon(cell, root, socket)
         if end_with_stdin:

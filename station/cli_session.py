@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import os
 import subprocess
 import sys
 import time
@@ -25,6 +26,7 @@ from station.plan.files import load_plan
 from station.plan.model import Plan
 from station.progress import SessionProgress
 from station.session.folder import default_root
+from station.simulation.netns import is_isolated, isolated_command
 from station.status import GoSummary
 
 out = Console(highlight=False, soft_wrap=True)
@@ -40,18 +42,23 @@ CHECK_POSES = 6
 def demo_command(
     seed: Annotated[int, typer.Option(help="Another seed: another mount, board place, lens, noise.")] = 0,
     output: Annotated[Path | None, typer.Option("--out", help="Folder for everything it makes.")] = None,
-    scene: Annotated[str, typer.Option(help="paper or blog")] = "paper",
+    scene: Annotated[str, typer.Option(help="paper, blog or paper-binned (640×512)")] = "paper",
     mount: Annotated[str, typer.Option(help="eye-in-hand or eye-to-hand")] = "eye-in-hand",
     noise: Annotated[str, typer.Option(help="low, mid or high")] = "low",
     poses: Annotated[int, typer.Option(min=4, max=200)] = 25,
+    gige: Annotated[bool, typer.Option("--gige", help="The camera over GigE Vision.")] = False,
     headless: Headless = False,
     as_json: AsJson = False,
     time_scale: Annotated[float, typer.Option(hidden=True)] = 1.0,
 ) -> None:
     """The whole job with no hardware: simulated UR10 and camera to a calibration, compared with the truth."""
     require_choices(scene=scene, noise=noise, mount=mount)
+    if gige and not is_isolated():
+        # Discovery broadcasts on every network: the same command again, where there is only loopback.
+        command = isolated_command([sys.executable, "-m", "station.cli", *sys.argv[1:]])
+        os.execv(command[0], command)
     folder = output or default_root() / "demo" / time.strftime("%Y%m%d-%H%M%S")
-    options = DemoOptions(folder, seed, scene, mount, noise, poses, time_scale)
+    options = DemoOptions(folder, seed, scene, mount, noise, poses, time_scale, gige)
     started_s = time.monotonic()
     result = asyncio.run(run_demo(options, SessionProgress(err, quiet=headless or as_json)))
     if as_json:

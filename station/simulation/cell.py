@@ -14,7 +14,7 @@ import msgspec
 from recordings.messages import BoardSpec, CameraModel, Matrix4, Mount, Vector6
 from station.errors import ConfigError
 
-SceneName = Literal["paper", "blog"]
+SceneName = Literal["paper", "blog", "paper-binned"]
 NoiseLevel = Literal["low", "mid", "high"]
 
 

@@ -64,7 +64,7 @@ _NOISE = {
 
 def build_cell(scene: SceneName, seed: int, noise: NoiseLevel, mount: Mount) -> CellTruth:
     """The truth of a cell; the same arguments give the same cell. ConfigError for an unknown name."""
-    scenes = {"paper": _paper_scene, "blog": _blog_scene}
+    scenes = {"paper": _paper_scene, "blog": _blog_scene, "paper-binned": _paper_binned_scene}
     if scene not in scenes or noise not in _NOISE or mount not in ("eye-in-hand", "eye-to-hand"):
         raise ConfigError(
             f"no simulated cell '{scene}' with noise '{noise}' and mount '{mount}'; there are the scenes "
@@ -98,6 +98,16 @@ def _paper_scene() -> _Scene:
     )
     rows = np.array(PAPER_X)
     return _Scene(PAPER_BOARD, camera, pose(project_to_rotation(rows[:, :3]), rows[:, 3]))
+
+
+def _paper_binned_scene() -> _Scene:
+    """The paper's scene with 2 × 2 pixels read as one: small recordings."""
+    paper = _paper_scene()
+    assert paper.camera.matrix is not None
+    (fx, _, cx), (_, fy, cy), _ = paper.camera.matrix
+    # Pixel 0 is centred on 0: the centre of the first pair lies at 0.5 of the old pixels.
+    binned = ((fx / 2, 0.0, cx / 2 - 0.25), (0.0, fy / 2, cy / 2 - 0.25), (0.0, 0.0, 1.0))
+    return paper._replace(camera=msgspec.structs.replace(paper.camera, width=640, height=512, matrix=binned))
 
 
 def _blog_scene() -> _Scene:

@@ -1,0 +1,58 @@
+"""The first thing a newcomer tries: the shipped recording solves, near its own truth, the same twice."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from calibrate.geometry import difference
+from recordings.reader import open_recording
+from station.simulation.cell import CellTruth, read_truth
+
+SAMPLE = Path(__file__).parents[2] / "recordings" / "samples" / "paper-640.mcap"
+
+
+def solve(profile: str, output: Path) -> dict[str, Any]:
+    done = subprocess.run(
+        [sys.executable, "-m", "calibrate.cli", "solve", str(SAMPLE), "--profile", profile]
+        + ["-o", str(output), "--json"],
+        capture_output=True,
+        text=True,
+    )
+    assert done.returncode in (0, 4), done.stderr
+    answer: dict[str, Any] = json.loads(done.stdout)
+    return answer
+
+
+@pytest.fixture(scope="module")
+def truth(tmp_path_factory: pytest.TempPathFactory) -> CellTruth:
+    path = tmp_path_factory.mktemp("truth") / "truth.json"
+    path.write_bytes(open_recording(SAMPLE).attachments()["truth.json"])
+    return read_truth(path)
+
+
+def test_it_is_small_and_marked_as_simulated() -> None:
+    assert SAMPLE.stat().st_size <= 6_000_000
+    assert open_recording(SAMPLE).info.source == "simulated"
+
+
+def test_the_default_profile_finds_the_truth_within_its_claim(truth: CellTruth, tmp_path: Path) -> None:
+    answer = solve("robust", tmp_path / "a.yaml")
+    error = difference(np.array(answer["result"]["matrix"]), np.array(truth.camera_mount))
+    assert np.linalg.norm(error[:3]) < 5e-4
+    assert np.degrees(np.linalg.norm(error[3:])) < 0.05
+    # 22.5: the 99.9 % quantile of chi-square with 6 degrees of freedom.
+    assert error @ np.linalg.solve(np.array(answer["covariance"]), error) < 22.5
+    assert answer["certificate"]["certified"]
+
+
+def test_the_papers_profile_gives_the_same_bits_in_two_processes(tmp_path: Path) -> None:
+    first, second = (solve("paper", tmp_path / name) for name in ("a.yaml", "b.yaml"))
+    assert first["result"] == second["result"]
+    assert first["holdout"] == second["holdout"]

@@ -26,6 +26,8 @@ _FALSE_ALARM = 2e-4
 _BLURRED = 5.0
 """A view whose typical corner error is this many times the others' is not trusted."""
 _BLURRED_PX = 0.5
+_OTHER_SIZE = 0.02
+"""A board that seems larger or smaller by less than this is not taken for one of another size."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,7 +177,7 @@ def _fitting_scale(views: ViewSet, state: State, i: int, verdict: Judgement) -> 
     ray = camera_in_place[:3, :3] @ state.C[i, :3, 3]
     target = state.Y[:3, 3] - camera_in_place[:3, 3]
     scale = float(ray @ target / (ray @ ray))
-    tolerance = 2 * _tolerance(verdict)
+    tolerance = _tolerance(verdict)
     left = np.linalg.norm(scale * ray - target)
     turn = np.linalg.norm(verdict.miss[i, 3:])
-    return scale if left < tolerance[0] and turn < tolerance[1] and abs(scale - 1) > 0.005 else None
+    return scale if left < tolerance[0] and turn < tolerance[1] and abs(scale - 1) > _OTHER_SIZE else None

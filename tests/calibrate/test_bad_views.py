@@ -1,0 +1,157 @@
+"""Bad views, one kind at a time: found, named, and the good ones kept."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibrate.errors import BadViewsError
+from calibrate.evolution_robust import solve_geman_mcclure
+from calibrate.geometry import inverse, perturb, pose, rotation_exp, transform_points
+from calibrate.pairs import all_pairs
+from calibrate.screening import detect_shift, screen
+from calibrate.solve import SolveOptions, solve_views
+from calibrate.views import ViewSet
+from tests.calibrate.cells import MID, error_mm_deg, make_cell, with_flange
+
+QUICK = SolveOptions(holdout=False)
+
+
+def cell(seed=0, views=20):
+    return make_cell(np.random.default_rng(seed), views, MID)
+
+
+def changed(views: ViewSet, places, **fields) -> ViewSet:
+    """Views with fields replaced by functions of the old view."""
+    out = list(views.views)
+    for i in places:
+        out[i] = replace(out[i], **{name: make(out[i]) for name, make in fields.items()})
+    return replace(views, views=tuple(out))
+
+
+def half_turn(view) -> np.ndarray:
+    return pose(rotation_exp([0, 0, np.pi]), [*view.board_points[:, :2].max(axis=0), 0.0])
+
+
+def test_clean_views_are_all_kept():
+    for seed in range(8):
+        solution = solve_views(cell(seed).views, QUICK)
+        assert solution.rejected == ()
+        assert len(solution.used) == 20
+
+
+def test_a_pose_of_another_view_is_named():
+    c = cell()
+    other = c.views.views[11].base_from_flange
+    solution = solve_views(changed(c.views, [4], base_from_flange=lambda _: other), QUICK)
+    (rejected,) = solution.rejected
+    assert (rejected.index, rejected.kind) == (4, "wrong-pose")
+    assert "view 11" in rejected.reason
+
+
+def test_a_nudged_robot_pose_is_named_with_its_size():
+    c = cell()
+    nudge = [0.004, 0, 0, 0, 0, 0]  # 13 sigmas
+    views = changed(c.views, [7], base_from_flange=lambda v: perturb(v.base_from_flange, nudge))
+    (rejected,) = solve_views(views, QUICK).rejected
+    assert (rejected.index, rejected.kind) == (7, "inconsistent")
+    assert "4." in rejected.reason or "3." in rejected.reason
+
+
+def test_turned_boards_are_set_right_and_used():
+    c = cell()
+    views = changed(
+        c.views,
+        [2, 9, 15],
+        board_points=lambda v: transform_points(half_turn(v), v.board_points),
+        camera_from_board=lambda v: v.camera_from_board @ half_turn(v),
+    )
+    solution = solve_views(views, QUICK)
+    assert solution.turned == (2, 9, 15)
+    assert solution.rejected == ()
+    np.testing.assert_allclose(solution.matrix, solve_views(c.views, QUICK).matrix, atol=1e-5)
+
+
+def test_a_board_that_was_moved_is_seen_as_one_event():
+    c = cell()
+    place = perturb(c.Y, [0.03, 0.01, 0, 0, 0, 0.1])
+    views = changed(
+        c.views,
+        [16, 17, 18],
+        base_from_flange=lambda v: place @ inverse(v.camera_from_board) @ inverse(c.X),
+    )
+    rejected = solve_views(views, QUICK).rejected
+    assert [r.index for r in rejected] == [16, 17, 18]
+    assert {r.kind for r in rejected} == {"moved-board"}
+
+
+def test_another_board_size_in_one_view_is_named():
+    c = cell()
+
+    def larger(view):
+        C = view.camera_from_board.copy()
+        C[:3, 3] *= 1.1
+        return C
+
+    views = changed(c.views, [3], camera_from_board=larger, board_points=lambda v: 1.1 * v.board_points)
+    (rejected,) = solve_views(views, QUICK).rejected
+    assert (rejected.index, rejected.kind) == (3, "wrong-square-size")
+    assert "0.9" in rejected.reason
+
+
+def test_a_blurred_picture_is_named():
+    c = cell()
+    noise = np.random.default_rng(1).normal(size=(42, 2)) * 5
+    (rejected,) = solve_views(changed(c.views, [6], pixels=lambda v: v.pixels + noise), QUICK).rejected
+    assert (rejected.index, rejected.kind) == (6, "corners")
+
+
+@pytest.mark.parametrize("shift", [-1, 1])
+def test_poses_shifted_against_pictures_are_recognised(shift):
+    c = cell()
+    views = with_flange(c.views, np.roll(c.views.base_from_flange, shift, axis=0))
+    with pytest.raises(BadViewsError, match="shifted by 1"):
+        solve_views(views, QUICK)
+    assert detect_shift(c.views.base_from_flange, c.views.camera_from_board) == 0
+
+
+def test_poses_of_another_recording_are_refused():
+    with pytest.raises(BadViewsError, match=r"do not belong to these pictures|agree"):
+        solve_views(with_flange(cell(0).views, cell(1).views.base_from_flange), QUICK)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.4])
+def test_swapped_poses_cost_no_more_than_their_views(share):
+    ours, oracle = [], []
+    for seed in range(6):
+        c = cell(seed, 25)
+        bad = np.random.default_rng(seed).choice(25, round(25 * share), replace=False)
+        flange = c.views.base_from_flange.copy()
+        flange[bad] = flange[np.roll(bad, 1)]
+        solution = solve_views(with_flange(c.views, flange), QUICK)
+        assert not set(bad) & set(solution.used)
+        good = [i for i in range(25) if i not in set(bad)]
+        known = solve_views(c.views.select(good), replace(QUICK, reject_outliers=False))
+        ours.append(error_mm_deg(solution.matrix, c.X)[0])
+        oracle.append(error_mm_deg(known.matrix, c.X)[0])
+    assert np.mean(ours) < 1.1 * np.mean(oracle)
+
+
+def test_screening_finds_the_good_group_without_any_X():
+    c = cell(2, 25)
+    flange = c.views.base_from_flange.copy()
+    bad = [1, 5, 8, 13, 20, 22, 24, 3, 9, 17]
+    flange[bad] = flange[np.roll(bad, 1)]
+    group = screen(flange, c.views.camera_from_board).group
+    assert set(group) == set(range(25)) - set(bad)
+
+
+def test_the_saturating_loss_finds_X_among_forty_percent_bad_views():
+    c = cell(3, 25)
+    flange = c.views.base_from_flange.copy()
+    bad = np.arange(0, 20, 2)
+    flange[bad] = flange[np.roll(bad, 1)]
+    X = solve_geman_mcclure(all_pairs(flange, c.views.camera_from_board), seed=0)
+    miss_mm, miss_deg = error_mm_deg(X, c.X)
+    assert miss_mm < 5
+    assert miss_deg < 0.5

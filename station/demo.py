@@ -41,12 +41,15 @@ class DemoOptions:
     noise: str = "low"
     poses: int = 25
     time_scale: float = 1.0
+    gige: bool = False
+    """The camera over GigE Vision; this process must be in a network namespace with only `lo`."""
 
     @property
     def serve_arguments(self) -> list[str]:
         return [
             *("--seed", str(self.seed), "--scene", self.scene, "--mount", self.mount, "--noise", self.noise),
             *("--time-scale", str(self.time_scale)),
+            *(["--gige"] if self.gige else []),
         ]
 
 

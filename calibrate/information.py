@@ -2,8 +2,8 @@
 
 The model is that of the maximum-likelihood estimate: pixel noise on every corner, and on every robot
 pose an independent error (translation and rotation, per axis) that is a nuisance of its own view.
-Parameter order: δX (6), δY (6), then intrinsics fx fy cx cy and distortion when they are free. Deltas are
-those of `geometry.perturb`. X = flange_from_camera, Y = base_from_board (eye-in-hand), or
+Parameter order: δX (6), δY (6), then `projection.INTRINSICS` when they are free. Deltas are those of
+`geometry.perturb`. X = flange_from_camera, Y = base_from_board (eye-in-hand), or
 X = base_from_camera, Y = flange_from_board (eye-to-hand).
 """
 
@@ -11,11 +11,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import cv2
 import numpy as np
-from numpy.typing import ArrayLike
 
 from calibrate.geometry import Array, skew
+from calibrate.projection import project
 from recordings.messages import CameraModel, Mount
 
 
@@ -26,35 +25,6 @@ class Noise:
     pixel_px: float = 0.15
     robot_m: float = 0.0001
     robot_rad: float = 0.00017
-
-
-def camera_matrix(camera: CameraModel) -> tuple[Array, Array]:
-    """(3, 3) matrix and (d,) distortion. ValueError while the matrix is unknown."""
-    if camera.matrix is None:
-        raise ValueError("the camera's matrix is not known")
-    distortion = camera.distortion or (0.0,) * 5
-    return np.array(camera.matrix, dtype=float), np.array(distortion, dtype=float)
-
-
-def project(camera: CameraModel, points: Array) -> tuple[Array, Array, Array]:
-    """Points (n, 3) in `camera` → pixels (n, 2), d pixel/d point (n, 2, 3), d pixel/d intrinsics (n, 2, 4+d).
-
-    Intrinsics in the order fx fy cx cy, distortion. Points must lie in front of the camera.
-    """
-    K, D = camera_matrix(camera)
-    zero = np.zeros(3)
-    flat = np.ascontiguousarray(points, dtype=float).reshape(-1, 1, 3)
-    if camera.distortion_model == "equidistant":
-        pixels, jac = cv2.fisheye.projectPoints(flat, zero, zero, K, D[:4])
-        jac = jac.reshape(-1, 2, jac.shape[-1])
-        return _floats(pixels.reshape(-1, 2)), _floats(jac[..., 11:14]), _floats(jac[..., :8])
-    pixels, jac = cv2.projectPoints(flat, zero, zero, K, D)
-    jac = np.asarray(jac).reshape(-1, 2, jac.shape[-1])
-    return _floats(pixels).reshape(-1, 2), _floats(jac[..., 3:6]), _floats(jac[..., 6:])
-
-
-def _floats(values: ArrayLike) -> Array:
-    return np.asarray(values, dtype=float)
 
 
 def _chain(mount: Mount, E: Array, X: Array, Y: Array, points: Array) -> tuple[Array, Array, Array, Array]:
@@ -90,17 +60,17 @@ def view_information(
     noise: Noise,
     free_intrinsics: bool,
 ) -> Array:
-    """Information of each view, (n, p, p): p = 12, or 16 + distortion when the intrinsics are free.
+    """Information of each view, (n, p, p): p = 12, or 21 when the intrinsics are free (plumb_bob only).
 
     The view's own robot error is marginalised (Woodbury), so views simply add.
     """
     n, k = len(base_from_flange), len(board_points)
     points, dX, dY, dE = _chain(mount, base_from_flange, X, Y, board_points)
-    _, by_point, by_lens = project(camera, points.reshape(-1, 3))
-    by_point = by_point.reshape(n, k, 2, 3)
+    seen = project(camera, points, with_intrinsics=free_intrinsics)
+    by_point = seen.by_point
     blocks = [by_point @ dX, by_point @ dY]
-    if free_intrinsics:
-        blocks.append(by_lens.reshape(n, k, 2, -1))
+    if seen.by_intrinsics is not None:
+        blocks.append(seen.by_intrinsics)
     J = np.concatenate(blocks, axis=-1).reshape(n, 2 * k, -1) / noise.pixel_px
     G = (by_point @ dE).reshape(n, 2 * k, 6) / noise.pixel_px
     G = G * np.repeat([noise.robot_m, noise.robot_rad], 3)

@@ -10,38 +10,18 @@ from numpy.typing import NDArray
 
 from calibrate.board import board_points
 from calibrate.geometry import Array, pose, rotation_exp
-from calibrate.information import camera_matrix
 from calibrate.kinematics import inverse_all, singularity_measure
+from calibrate.projection import camera_matrix
 from station.collision import margins
 from station.limits import joint_bounds
 from station.plan.scene import Scene
-from station.plan.visibility import outline, sees_past_the_arm, share_visible
+from station.plan.view_range import ViewRange
+from station.plan.visibility import seen_for_certain, sees_past_the_arm
 
 NOT_IN_PICTURE = "the board is not wholly in the picture"
 OUT_OF_REACH = "the arm's reach"
 _PATH_RESERVE_M = 0.01
 """Poses stand this far from every limit, so that moves between neighbours have room."""
-
-
-@dataclass(frozen=True)
-class ViewRange:
-    """From where the board may be looked at."""
-
-    distance_m: tuple[float, float] = (0.38, 0.60)
-    tilt_rad: tuple[float, float] = (0.0, 0.70)
-    roll_rad: float = 0.80
-    """Either way from `roll_centre_rad`."""
-    roll_centre_rad: float = 0.0
-    off_centre: float = 0.35
-    """Share of half the picture that the board's centre may be away from the picture's centre."""
-    border_px: float = 12.0
-    doubt: float = 1.6
-    """The guess is taken to be wrong by so many times its sigmas."""
-    visible_share: float = 1.0
-    """Share of such wrong guesses for which the whole board must still be in the picture."""
-    smallest_singular: float = 0.03
-    free_sight: bool = True
-    """No part of the arm between camera and board."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,26 +57,6 @@ class Pool:
         )
 
 
-_NEAR_FILL, _FAR_FILL = 0.64, 0.40
-"""Share of the picture's width or height that the board's outline fills, at the nearest and farthest."""
-_FOCUS = (0.6, 1.6)
-"""Pictures are sharp within these multiples of the working distance."""
-
-
-def view_range(scene: Scene) -> ViewRange:
-    """Distances at which the board fills the picture well, as far as they lie near the working distance."""
-    K, _ = camera_matrix(scene.camera)
-    rim = outline(scene.board)
-    size_m = (rim.max(axis=0) - rim.min(axis=0))[:2]
-    picture = np.array([scene.camera.width, scene.camera.height])
-    full_m = float((np.diag(K)[:2] * size_m / picture).max())
-    focus = np.array(_FOCUS) * scene.working_distance_m
-    near, far = (float(d) for d in np.clip([full_m / _NEAR_FILL, full_m / _FAR_FILL], *focus))
-    if far < 1.2 * near:
-        near, far = full_m / _NEAR_FILL, full_m / _FAR_FILL
-    return ViewRange(distance_m=(near, far))
-
-
 def camera_views(scene: Scene, view: ViewRange, count: int, rng: np.random.Generator) -> Array:
     """Camera poses around the board, camera_from_board (count, 4, 4), spread over the range."""
     low, high = view.distance_m
@@ -111,7 +71,7 @@ def camera_views(scene: Scene, view: ViewRange, count: int, rng: np.random.Gener
     turn = rotation_exp(axis * tilt[:, None])
     rolled = rotation_exp(np.stack([np.zeros(count), np.zeros(count), roll], axis=1))
     R = rolled @ turn
-    K, _ = camera_matrix(scene.camera)
+    K = camera_matrix(scene.camera)
     half = np.array([scene.camera.width, scene.camera.height]) / 2
     aim = half + view.off_centre * half * rng.uniform(-1, 1, (count, 2))
     ray = np.concatenate([(aim - K[:2, 2]) / np.diag(K)[:2], np.ones((count, 1))], axis=1)
@@ -134,7 +94,7 @@ def find_candidates(
     """
     views = camera_views(scene, view, tries or count, rng)
     flange = scene.base_from_flange(views)
-    seen = share_visible(scene, flange, view.border_px, draws) >= view.visible_share
+    seen = seen_for_certain(scene, flange, view, draws)
     lost = Counter({NOT_IN_PICTURE: int((~seen).sum())})
     views, flange = views[seen][:count], flange[seen][:count]
     rows, joints = _all_branches(scene, flange, near_joints_rad)

@@ -7,7 +7,7 @@ import numpy as np
 
 from calibrate.board import board_points
 from calibrate.geometry import Array
-from calibrate.information import project
+from calibrate.projection import project
 from station.plan.model import ExpectedView, PlannedPose
 from station.plan.scene import Scene, board_extent
 
@@ -23,7 +23,7 @@ def expected_view(scene: Scene, base_from_flange: Array) -> ExpectedView:
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     R, t = camera_from_board[:3, :3], camera_from_board[:3, 3]
     seen = np.vstack([centre, outline]) @ R.T + t
-    pixels = project(scene.camera, np.maximum(seen, [-np.inf, -np.inf, 0.02]))[0]
+    pixels = project(scene.camera, np.maximum(seen, [-np.inf, -np.inf, 0.02])).pixels
     area = abs(float(cv2.contourArea(pixels[1:].astype(np.float32))))
     return ExpectedView(
         distance_m=float(np.linalg.norm(seen[0])),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -21,6 +22,7 @@ from station.limits import (
 _SAMPLES = (9, 33, 129)
 """Along one move: few at first."""
 BLOCKED = np.inf
+_NEAR_STARTS, _OTHER_STARTS, _LONG_TOUR = 8, 4, 60
 
 
 def move_times(geometry: CellGeometry, joints_from: Array, joints_to: Array) -> Array:
@@ -82,10 +84,10 @@ def short_order(times: Array, first_leg: Array, seed: int) -> list[int]:
     n = len(times)
     cost = np.where(np.isfinite(times), times, 1e4)
     lead = np.where(np.isfinite(first_leg), first_leg, 1e4)
+    patterns = _patterns(n)
     rng = np.random.default_rng(seed)
-    starts = list(np.argsort(lead, kind="stable")[: min(n, 8)])
-    starts += [s for s in rng.permutation(n)[:4] if s not in starts]
-    tours = [_improve(_nearest(cost, int(s)), cost, lead) for s in starts]
+    starts = [*np.argsort(lead, kind="stable")[:_NEAR_STARTS], *rng.permutation(n)[:_OTHER_STARTS]]
+    tours = [_improve(_nearest(cost, int(s)), cost, lead, patterns) for s in dict.fromkeys(starts)]
     return min(tours, key=lambda tour: path_time(tour, cost, lead))
 
 
@@ -101,25 +103,26 @@ def _nearest(cost: Array, start: int) -> list[int]:
     return tour
 
 
-def _improve(tour: list[int], cost: Array, lead: Array) -> list[int]:
+def _improve(tour: list[int], cost: Array, lead: Array, patterns: NDArray[np.intp]) -> list[int]:
+    """Takes the best of all neighbouring tours until none is shorter."""
+    now = np.array(tour)
     best = path_time(tour, cost, lead)
-    improved = True
-    while improved:
-        improved = False
-        for candidate in _neighbours(tour):
-            length = path_time(candidate, cost, lead)
-            if length < best - 1e-9:
-                tour, best, improved = candidate, length, True
-                break
-    return tour
+    while True:
+        tours = now[patterns]
+        lengths = lead[tours[:, 0]] + cost[tours[:, :-1], tours[:, 1:]].sum(axis=1)
+        shortest = int(np.argmin(lengths))
+        if lengths[shortest] >= best - 1e-9:
+            return [int(place) for place in now]
+        now, best = tours[shortest], float(lengths[shortest])
 
 
-def _neighbours(tour: list[int]) -> list[list[int]]:
-    n = len(tour)
-    reversals = [tour[:i] + tour[i : j + 1][::-1] + tour[j + 1 :] for i in range(n) for j in range(i + 1, n)]
-    moved = []
-    for size in (1, 2, 3):
+@lru_cache(maxsize=4)
+def _patterns(n: int) -> NDArray[np.intp]:
+    """Rearrangements (m, n) of places: every stretch reversed; for short tours every short piece moved."""
+    places = list(range(n))
+    found = [places[:i] + places[i : j + 1][::-1] + places[j + 1 :] for i in places for j in range(i + 1, n)]
+    for size in (1, 2, 3) if n <= _LONG_TOUR else ():
         for i in range(n - size + 1):
-            piece, rest = tour[i : i + size], tour[:i] + tour[i + size :]
-            moved += [rest[:k] + piece + rest[k:] for k in range(len(rest) + 1) if k != i]
-    return reversals + moved
+            piece, rest = places[i : i + size], places[:i] + places[i + size :]
+            found += [rest[:k] + piece + rest[k:] for k in range(len(rest) + 1) if k != i]
+    return np.array(found or [places])

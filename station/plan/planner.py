@@ -16,7 +16,7 @@ from calibrate.kinematics import forward
 from station.config import StationConfig
 from station.errors import LimitError
 from station.limits import check_plan
-from station.plan.candidates import Pool, ViewRange, find_candidates, view_range
+from station.plan.candidates import Pool, find_candidates
 from station.plan.choose import Criterion, Objective, choose, informations, objective_for, sigma_of
 from station.plan.describe import expected_view, planned_pose
 from station.plan.explain import explain_shortage
@@ -24,6 +24,7 @@ from station.plan.groups import best_group
 from station.plan.model import Plan
 from station.plan.order import BLOCKED, move_times, short_order, time_matrix
 from station.plan.scene import Scene, scene_of
+from station.plan.view_range import ViewRange, view_range
 from station.plan.visibility import visible
 
 Progress = Callable[[str, float], None]
@@ -73,7 +74,7 @@ def plan_scene(
     rng = np.random.default_rng(options.seed)
     start = None if start_joints_rad is None else np.asarray(start_joints_rad, dtype=float)
     progress("looking for poses", 0.0)
-    pool, notes = _pool(scene, options, start, rng)
+    pool, notes = candidate_pool(scene, options, start, rng)
     plan = _choose_and_order(scene, options, pool, start, rng, progress)
     progress("done", 1.0)
     return msgspec.structs.replace(plan, note="; ".join(notes))
@@ -107,7 +108,7 @@ def _start_roll(scene: Scene, start: Array | None) -> float | None:
     return expected_view(scene, flange).roll_rad
 
 
-def _pool(
+def candidate_pool(
     scene: Scene, options: PlanOptions, start: Array | None, rng: np.random.Generator
 ) -> tuple[Pool, list[str]]:
     """Candidates of the best branch. LimitError with the reason when the widest range has too few."""

@@ -12,11 +12,12 @@ from calibrate.geometry import Array
 from calibrate.information import Noise
 from calibrate.kinematics import forward
 from station.limits import check_path
-from station.plan.candidates import ViewRange, find_candidates, view_range
+from station.plan.candidates import find_candidates
 from station.plan.choose import informations, objective_for, sigma_of
 from station.plan.describe import planned_pose
 from station.plan.model import Plan, PlannedPose
 from station.plan.scene import Scene
+from station.plan.view_range import ViewRange, view_range
 
 _FURTHER_POSES = 60
 _TRIES = 12

@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from calibrate.geometry import Array, transform_points
-from calibrate.information import camera_matrix
+from calibrate.projection import camera_matrix
 from station.collision import body_segments
 from station.errors import ConfigError
 from station.plan.model import Plan
@@ -75,7 +75,7 @@ def _draw_space(axes: Any, scene: Scene, plan: Plan) -> None:
 
 def camera_frustum(scene: Scene, base_from_camera: Array) -> list[Array]:
     """Edges of the picture's pyramid, polylines (m, 3) in `base`."""
-    K, _ = camera_matrix(scene.camera)
+    K = camera_matrix(scene.camera)
     w, h = scene.camera.width, scene.camera.height
     rays = np.array([[u, v, 1.0] for u, v in ((0, 0), (w, 0), (w, h), (0, h))]) @ np.linalg.inv(K).T
     corners = transform_points(base_from_camera, _FRUSTUM_M * rays)

@@ -6,8 +6,8 @@ import numpy as np
 
 from calibrate.board import board_points
 from calibrate.geometry import Array, transform_points
-from calibrate.information import project
 from calibrate.kinematics import forward
+from calibrate.projection import project
 from station.plan.model import Plan
 from station.plan.scene import Scene
 
@@ -25,7 +25,7 @@ def expected_pixels(scene: Scene, plan: Plan) -> Array:
     """Where every board point is expected in every picture, (n, k, 2) pixels; NaN behind the camera."""
     points = board_points(scene.board)
     seen = scene.seen(flange_poses(scene, plan), points)
-    pixels = project(scene.camera, np.maximum(seen.reshape(-1, 3), [-np.inf, -np.inf, 1e-3]))[0]
+    pixels = project(scene.camera, np.maximum(seen.reshape(-1, 3), [-np.inf, -np.inf, 1e-3])).pixels
     pixels[seen.reshape(-1, 3)[:, 2] <= 1e-3] = np.nan
     return pixels.reshape(len(seen), len(points), 2)
 

@@ -9,18 +9,18 @@ from numpy.typing import NDArray
 
 from calibrate.board import board_points
 from calibrate.geometry import Array, transform_points
-from calibrate.information import camera_matrix, project
+from calibrate.projection import camera_matrix, project
 from recordings.messages import BoardSpec, CameraModel
 from station.collision import ARM_BODIES, body_segments, segment_distance
 from station.plan.scene import Scene
+from station.plan.view_range import ViewRange
 
 
-def visible(camera: CameraModel, points: Array, border_px: float) -> Array:
+def visible(camera: CameraModel, points: Array, border_px: float) -> NDArray[np.bool_]:
     """Points (n, k, 3) in `camera` → (n,) whether all lie inside the picture, true lens included."""
-    n, k = points.shape[:2]
     in_front = points[..., 2] > 0.02
     safe = np.where(in_front[..., None], points, [0.0, 0.0, 1.0])
-    pixels = project(camera, safe.reshape(-1, 3))[0].reshape(n, k, 2)
+    pixels = project(camera, safe).pixels
     size = np.array([camera.width, camera.height]) - 1
     inside = ((pixels >= border_px) & (pixels <= size - border_px)).all(axis=-1)
     # Far off the axis a distortion polynomial folds points back into the picture.
@@ -30,30 +30,28 @@ def visible(camera: CameraModel, points: Array, border_px: float) -> Array:
 
 def lens_radius(camera: CameraModel) -> float:
     """Largest normalised radius up to which the lens model grows, at most 1.3 times the picture's corner."""
-    K, _ = camera_matrix(camera)
+    K = camera_matrix(camera)
     corner = np.hypot(camera.width, camera.height) / (2 * min(K[0, 0], K[1, 1]))
     radii = np.linspace(0, 1.3 * corner, 200)
     line = np.stack([radii, np.zeros(200), np.ones(200)], axis=1)
-    x = project(camera, line)[0][:, 0]
+    x = project(camera, line).pixels[:, 0]
     falling = np.flatnonzero(np.diff(x) <= 0)
     return float(radii[falling[0]] if len(falling) else radii[-1])
 
 
-def share_visible(
-    scene: Scene, base_from_flange: Array, border_px: float, draws: list[tuple[Array, Array]]
-) -> Array:
-    """(n,) share of the drawn guesses that show the whole board; 0 where the guess itself does not."""
+def seen_for_certain(
+    scene: Scene, base_from_flange: Array, view: ViewRange, draws: list[tuple[Array, Array]]
+) -> NDArray[np.bool_]:
+    """(n,) whether guess and the wanted share of the drawn guesses show the whole board."""
     rim = outline(scene.board)
-    share = visible(scene.camera, scene.seen(base_from_flange, rim), border_px).astype(float)
-    if not draws:
-        return share
-    seen = np.flatnonzero(share)
-    hits = np.zeros(len(seen))
+    left = np.flatnonzero(visible(scene.camera, scene.seen(base_from_flange, rim), view.border_px))
+    misses = np.zeros(len(left))
+    allowed = (1 - view.visible_share) * len(draws) + 1e-9
     for X, Y in draws:
         drawn = replace(scene, X=X, Y=Y)
-        hits += visible(scene.camera, drawn.seen(base_from_flange[seen], rim), border_px)
-    share[seen] = hits / len(draws)
-    return share
+        misses += ~visible(scene.camera, drawn.seen(base_from_flange[left], rim), view.border_px)
+        left, misses = left[misses <= allowed], misses[misses <= allowed]
+    return np.isin(np.arange(len(base_from_flange)), left)
 
 
 def outline(board: BoardSpec) -> Array:

@@ -16,8 +16,9 @@ from recordings.messages import BoardSpec, CameraModel, Mount
 from station.collision import body_segments, margins, segment_distance
 from station.config import CameraConfig, LimitsConfig, Plane, PoseGuess, RobotConfig, StationConfig
 from station.errors import ConfigError
-from station.plan.candidates import find_candidates, view_range
+from station.plan.candidates import find_candidates
 from station.plan.scene import Scene, scene_of
+from station.plan.view_range import view_range
 
 ROBOT = "UR10"
 TABLE = Plane("table", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))

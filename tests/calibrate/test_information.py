@@ -7,9 +7,10 @@ import pytest
 
 from calibrate.board import board_points
 from calibrate.geometry import inverse, perturb, pose, random_rotation, rotation_exp, transform_points
-from calibrate.information import Noise, covariance_of, project, view_information
+from calibrate.information import Noise, covariance_of, view_information
 from calibrate.likelihood.model import Observations, State
 from calibrate.likelihood.residuals import linearise
+from calibrate.projection import project
 from recordings.messages import BoardKind, BoardSpec, CameraModel
 
 BOARD = board_points(BoardSpec(BoardKind.CHESSBOARD, 7, 6, 0.025))
@@ -37,7 +38,7 @@ def scene(mount, n=12, seed=3):
 def test_covariance_equals_the_estimates(mount, free):
     X, Y, C, E = scene(mount)
     n, k = len(C), len(BOARD)
-    pixels = project(LENS, transform_points(C, BOARD).reshape(-1, 3))[0].reshape(n, k, 2)
+    pixels = project(LENS, transform_points(C, BOARD)).pixels
     points = np.broadcast_to(BOARD, (n, k, 3))
     observed = Observations(mount, E, points, pixels, np.ones((n, k)))
     normal = linearise(observed, State(X, Y, C, LENS, np.zeros(0)), np.ones((n, k)), free)
@@ -57,7 +58,7 @@ def test_information_is_that_of_finite_differences(mount):
 
     def pixels(x, y):
         C = inverse(E @ x) @ y if mount == "eye-in-hand" else inverse(x) @ E @ y
-        return project(LENS, transform_points(C, BOARD).reshape(-1, 3))[0].ravel()
+        return project(LENS, transform_points(C, BOARD)).pixels.ravel()
 
     step = 1e-6
     eye = np.eye(6) * step

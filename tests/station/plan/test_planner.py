@@ -23,10 +23,11 @@ from calibrate.information import Noise
 from calibrate.kinematics import MODELS, forward
 from station.errors import ConfigError, LimitError
 from station.limits import SPEED_CAP_M_S, check_plan
-from station.plan.candidates import ViewRange, branch_of, find_candidates, view_range
+from station.plan.candidates import branch_of, find_candidates
 from station.plan.choose import choose, informations, objective_for
 from station.plan.planner import PlanOptions, make_plan, plan_scene
 from station.plan.scene import cell_geometry, scene_of
+from station.plan.view_range import ViewRange, view_range
 from station.plan.visibility import lens_radius, visible
 from station.simulation.scenes import build_cell, cell_config
 

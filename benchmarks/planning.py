@@ -1,0 +1,219 @@
+"""Are planned poses worth it? Error of X, its prediction, safety, time, and plans from a bad first guess.
+
+Cells come from `random_cells`, every check of a plan too. X is estimated by the product's own
+maximum-likelihood estimate with the lens free, from simulated corners and robot poses at mid noise (0.2 px,
+0.3 mm, 0.03°).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from itertools import pairwise
+
+import msgspec
+import numpy as np
+
+from benchmarks.random_cells import ARM, CAMERA, POINTS, RandomCell, is_free, random_cell, shows_board
+from benchmarks.scene import MID
+from benchmarks.trials import percentiles, rms, rms_spread, table, trials
+from calibrate.estimate import estimate
+from calibrate.geometry import Array, difference, perturb, pose, rotation_exp
+from calibrate.information import Noise
+from calibrate.kinematics import forward
+from calibrate.likelihood.model import Observations, State
+from calibrate.projection import project
+from station.errors import LimitError
+from station.limits import allowed_speed, check_plan, sample_path
+from station.plan.bootstrap import Glimpse, improved_config, next_move
+from station.plan.choose import choose, informations, objective_for
+from station.plan.model import Plan
+from station.plan.planner import PlanOptions, candidate_pool, plan_scene
+from station.plan.scene import Scene, scene_of
+from station.plan.view_range import ViewRange
+from station.simulation.placement import guess_of
+
+CELLS = 200
+NOISE = Noise(MID.corner_px, MID.robot_m, MID.robot_rad)
+MODERATE = ViewRange((0.38, 0.60), (0.0, np.deg2rad(30)), roll_rad=np.pi / 4, doubt=0.0)
+WIDE = ViewRange((0.34, 0.75), (0.0, np.deg2rad(50)), roll_rad=np.pi / 2, off_centre=0.8, doubt=0.0)
+RANDOM_ORDERS = 3
+
+
+@dataclass
+class Tally:
+    """What all cells add up to."""
+
+    errors: dict[str, list[Array]] = field(default_factory=dict)
+    """Name → X errors (6,) of every cell"""
+    predicted: list[float] = field(default_factory=list)
+    achieved: list[float] = field(default_factory=list)
+    planned: int = 0
+    unseen: int = 0
+    colliding: int = 0
+    seconds: list[float] = field(default_factory=list)
+    motion: list[float] = field(default_factory=list)
+    motion_random: list[float] = field(default_factory=list)
+    bootstrapped: int = 0
+    boot_moves: list[int] = field(default_factory=list)
+    boot_unseen: int = 0
+    failures: list[str] = field(default_factory=list)
+    drawn: int = 0
+
+
+def run() -> str:
+    count, tally = trials(CELLS), Tally()
+    for seed in range(count):
+        cell, drawn = random_cell(seed)
+        tally.drawn += drawn
+        rng = np.random.default_rng([32, seed])
+        _compare_choices(cell, tally, rng, seed)
+        _plan_and_check(cell, tally, rng, seed)
+        _bootstrap(cell, tally, rng, seed)
+        if seed % 20 == 19:
+            print(f"{seed + 1} cells: {tally.planned} planned, {tally.bootstrapped} bootstrapped", flush=True)
+    return _report(tally, count)
+
+
+def _compare_choices(cell: RandomCell, tally: Tally, rng: np.random.Generator, seed: int) -> None:
+    """Planned against random poses of one pool; the pool is of poses that truly see the board."""
+    scene = scene_of(cell.exact())
+    for name, view in (("moderate", MODERATE), ("wide", WIDE)):
+        options = PlanOptions(seed=seed, noise=NOISE, view=view)
+        pool, _ = candidate_pool(scene, options, cell.start, rng)
+        each = informations(scene, pool.base_from_flange, NOISE, True)
+        objective = objective_for(scene, "A", True)
+        for label, places in (
+            (f"{name} planned 25", choose(each, 25, objective, rng)),
+            (f"{name} planned 12", choose(each, 12, objective, rng)),
+            (f"{name} random 25", rng.permutation(len(pool))[:25].tolist()),
+        ):
+            error = _x_error(cell, pool.base_from_flange[places], rng)
+            tally.errors.setdefault(label, []).append(error)
+
+
+def _plan_and_check(cell: RandomCell, tally: Tally, rng: np.random.Generator, seed: int) -> None:
+    scene = scene_of(cell.config)
+    begin = time.perf_counter()
+    try:
+        plan = plan_scene(scene, PlanOptions(seed=seed, noise=NOISE), cell.start.tolist())
+    except LimitError as error:
+        tally.failures.append(f"cell {seed}: {error}")
+        return
+    tally.seconds.append(time.perf_counter() - begin)
+    tally.planned += len(plan.poses) == 25
+    joints = np.array([cell.start, *(p.joints_rad for p in plan.poses)])
+    tally.colliding += sum(not _path_is_free(a, b, cell) for a, b in pairwise(joints))
+    flange = forward(ARM, joints[1:])
+    tally.unseen += sum(not shows_board(cell.camera_from_board(E)) for E in flange)
+    tally.motion.append(check_plan(plan, cell.start, scene.geometry).duration_s)
+    tally.motion_random += [_random_time(scene, plan, cell, rng) for _ in range(RANDOM_ORDERS)]
+    last = plan.poses[-1].predicted_sigma_m
+    assert last is not None
+    tally.predicted.append(last)
+    tally.achieved.append(float(np.linalg.norm(_x_error(cell, flange, rng)[:3])))
+
+
+def _path_is_free(start: Array, target: Array, cell: RandomCell) -> bool:
+    """200 postures along the move, against the true board and camera."""
+    path = start + np.linspace(0, 1, 200)[:, None] * (target - start)
+    return bool(is_free(path, cell.X, cell.Y, -0.002).all())
+
+
+def _random_time(scene: Scene, plan: Plan, cell: RandomCell, rng: np.random.Generator) -> float:
+    """Motion time of the same poses in random order, each move as fast as its limits allow."""
+    order = rng.permutation(len(plan.poses))
+    joints = [cell.start, *(np.array(plan.poses[i].joints_rad) for i in order)]
+    moves = pairwise(joints)
+    return sum(allowed_speed(scene.geometry, sample_path(scene.geometry, a, b, 0.02))[2] for a, b in moves)
+
+
+def _x_error(cell: RandomCell, flange: Array, rng: np.random.Generator) -> Array:
+    """Error (6,) of the estimate from one noisy visit to these flange poses (n, 4, 4)."""
+    n, k = len(flange), len(POINTS)
+    there = perturb(flange, rng.normal(size=(n, 6)) * np.repeat([NOISE.robot_m, NOISE.robot_rad], 3))
+    C = cell.camera_from_board(there)
+    points = np.einsum("nij,kj->nki", C[:, :3, :3], POINTS) + C[:, None, :3, 3]
+    pixels = project(CAMERA, points).pixels + rng.normal(0, NOISE.pixel_px, (n, k, 2))
+    observed = Observations(
+        "eye-in-hand", flange, np.broadcast_to(POINTS, (n, k, 3)), pixels, np.ones((n, k))
+    )
+    nominal = cell.camera_from_board(flange)
+    found = estimate(observed, State(cell.X, cell.Y, nominal, CAMERA, np.zeros(0)), intrinsics_free=True)
+    return difference(found.state.X, cell.X)
+
+
+def _bootstrap(cell: RandomCell, tally: Tally, rng: np.random.Generator, seed: int) -> None:
+    """From a mount guess wrong by 30° and 100 mm and no idea of the board's place."""
+
+    def unit() -> Array:
+        v = rng.normal(size=3)
+        return np.asarray(v / np.linalg.norm(v))
+
+    wrong = pose(rotation_exp(unit() * np.deg2rad(30)) @ cell.X[:3, :3], cell.X[:3, 3] + 0.1 * unit())
+    config = msgspec.structs.replace(cell.config, camera_guess=guess_of(wrong, 0.06, 0.3), board_guess=None)
+
+    def glimpse(joints: Sequence[float]) -> Glimpse:
+        C = cell.camera_from_board(forward(ARM, joints))
+        tally.boot_unseen += not shows_board(C)
+        seen = perturb(C, rng.normal(size=6) * np.repeat([4e-4, 8e-4], 3))
+        return Glimpse(np.array(joints), seen)
+
+    glimpses = [glimpse(cell.start.tolist())]
+    try:
+        while (move := next_move(config, glimpses)) is not None:
+            tally.colliding += not _path_is_free(glimpses[-1].joints_rad, np.array(move.joints_rad), cell)
+            glimpses.append(glimpse(move.joints_rad))
+        scene = scene_of(improved_config(config, glimpses))
+        plan = plan_scene(scene, PlanOptions(seed=seed, noise=NOISE), glimpses[-1].joints_rad.tolist())
+    except LimitError as error:
+        tally.failures.append(f"bootstrap of cell {seed}: {error}")
+        return
+    tally.bootstrapped += len(plan.poses) == 25
+    tally.boot_moves.append(len(glimpses) - 1)
+    tally.boot_unseen += sum(
+        not shows_board(cell.camera_from_board(forward(ARM, p.joints_rad))) for p in plan.poses
+    )
+
+
+def _report(tally: Tally, count: int) -> str:
+    mm = {name: 1000 * np.linalg.norm(np.array(e)[:, :3], axis=1) for name, e in tally.errors.items()}
+    rows = []
+    for pool, goals in (("moderate", ("0.70", "1.0")), ("wide", ("0.78", "1.0"))):
+        base = mm[f"{pool} random 25"]
+        rows.append([pool, "random 25", f"{rms(base):.3f} ± {rms_spread(base):.3f}", "1", ""])
+        for number, goal in zip((25, 12), goals, strict=True):
+            mine = mm[f"{pool} planned {number}"]
+            rows.append(
+                [pool, f"planned {number}", f"{rms(mine):.3f}", f"{rms(mine) / rms(base):.3f}", f"≤ {goal}"]
+            )
+    ratio = np.array(tally.achieved) / tally.predicted
+    facts = [
+        ["full plan of 25", f"{tally.planned} of {count}", "≥ 99 %"],
+        [
+            "planned poses from which the true camera misses a corner",
+            f"{tally.unseen} of {25 * tally.planned}",
+            "",
+        ],
+        ["moves (plan and bootstrap) that touch something in the dense check", str(tally.colliding), "0"],
+        ["planning, s", f"{percentiles(np.array(tally.seconds))}, most {max(tally.seconds):.1f}", "≤ 20"],
+        ["arm motion, s", percentiles(np.array(tally.motion)), ""],
+        [
+            "motion time / random order",
+            f"{np.mean(tally.motion) / np.mean(tally.motion_random):.3f}",
+            "≤ 0.6",
+        ],
+        [
+            "predicted / achieved sigma, pooled",
+            f"{1 / rms(ratio):.3f} ± {rms_spread(ratio) / rms(ratio):.3f}",
+            "0.9-1.1",
+        ],
+        ["full plan from a guess wrong by 30°, 100 mm", f"{tally.bootstrapped} of {count}", "≥ 99 %"],
+        ["bootstrap moves", percentiles(np.array(tally.boot_moves)), "3-5"],
+        ["bootstrap and its plan: views without the whole board", str(tally.boot_unseen), ""],
+    ]
+    text = f"{count} random cells ({tally.drawn} drawn; the rest has no room by an independent check).\n\n"
+    text += table(["pool", "poses", "X error rms mm", "ratio", "goal"], rows) + "\n\n"
+    text += table(["what", "measured", "goal"], facts)
+    return text + ("\n\nFailures: " + "; ".join(tally.failures) if tally.failures else "")

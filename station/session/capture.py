@@ -152,7 +152,7 @@ async def _write(bench: Bench, index: int, picture: Picture, view: View) -> None
             index, np.array(view.base_from_flange), sighting.indices, sighting.pixels
         )
     queue.mark(index, "done")
-    recording.save_state(queue)
+    await recording.save_state(queue)
     bench.show_poses(index)
     corners = f", {sighting.status.corners} corners" if sighting is not None else ""
     bench.store.event(f"saved{corners}", pose_index=index)

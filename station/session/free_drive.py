@@ -41,9 +41,8 @@ class FreeDrive:
         if bench.recording is None or bench.recording.recorder is None:
             recording = bench.recording or SessionRecording(bench.root, bench.cell)
             picture = await bench.cell.camera.capture() if bench.cell.config.camera.model is None else None
-            recording.open(bench.queue.plan, bench.queue.sha256, picture)
+            await recording.open(bench.queue, picture)
             bench.recording = recording
-            recording.save_state(bench.queue)
         bench.halting = False
         bench.store.enter(StationState.FREE_DRIVE, "guide the arm by hand; the station does not move it")
         bench.show_poses()

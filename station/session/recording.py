@@ -57,9 +57,9 @@ class SessionRecording:
         self._root, self._cell = root, cell
         self.part = parts + 1
         self.folder = folder or new_session_folder(root, cell.config.name)
-        self._info: SessionInfo | None = None
         self.recorder: Recorder | None = None
         self._sequence = 0
+        self._saving = asyncio.Lock()
 
     @property
     def unsealed_parts(self) -> bool:
@@ -80,8 +80,12 @@ class SessionRecording:
     def name(self) -> str:
         return self.folder.name
 
-    def open(self, plan: Plan, plan_sha256: str, first_picture: Picture | None = None) -> None:
-        """Creates the file with everything needed to re-solve it. Blocking. Raises RecordingError."""
+    async def open(self, queue: PoseQueue, first_picture: Picture | None = None) -> None:
+        """Creates the file with everything needed to re-solve it. Raises RecordingError."""
+        await asyncio.to_thread(self._open, queue.plan, queue.sha256, first_picture)
+        await self.save_state(queue)
+
+    def _open(self, plan: Plan, plan_sha256: str, first_picture: Picture | None) -> None:
         config = self._cell.config
         require_free_space(self.folder, config.capture.free_space_bytes)
         info = SessionInfo(
@@ -98,14 +102,14 @@ class SessionRecording:
             config_sha256=self._cell.config_sha256,
             software=software(),
         )
-        self._info = info
         path = part_path(self.folder, self.part)
-        self.recorder = Recorder(path, info, lossless_png=config.capture.lossless_png)
-        self.recorder.attach("plan.yaml", "application/yaml", msgspec.yaml.encode(plan))
-        self.recorder.attach("config.yaml", "application/yaml", self._cell.config_yaml)
+        recorder = Recorder(path, info, lossless_png=config.capture.lossless_png)
+        recorder.attach("plan.yaml", "application/yaml", msgspec.yaml.encode(plan))
+        recorder.attach("config.yaml", "application/yaml", self._cell.config_yaml)
         for name, content in self._cell.attachments.items():
-            self.recorder.attach(name, "application/json", content)
-        self.recorder.camera_model(info.camera)
+            recorder.attach(name, "application/json", content)
+        recorder.camera_model(info.camera)
+        self.recorder = recorder
 
     def _session_camera(self, picture: Picture | None) -> CameraModel:
         """Known intrinsics, or at least the size of the pictures."""
@@ -157,8 +161,11 @@ class SessionRecording:
         """Before a pose starts. RecordingError with how much to free."""
         require_free_space(self.folder, self._cell.config.capture.free_space_bytes)
 
-    def save_state(self, queue: PoseQueue, recording: Path | None = None) -> None:
-        """What a restarted daemon needs; `recording`: set once it is sealed."""
+    async def save_state(self, queue: PoseQueue, recording: Path | None = None) -> None:
+        """What a restarted daemon needs; `recording`: set once it is sealed. Raises RecordingError.
+
+        In a thread: a disk may take long over an fsync, and the arm's heartbeat does not wait.
+        """
         state = SessionState(
             name=self.name,
             source=self._cell.source,
@@ -168,18 +175,25 @@ class SessionRecording:
             sealed=recording is not None,
             recording=str(recording or ""),
         )
-        write_state(self.folder, state)
-        if recording is None:
-            mark_active(self._root, self.folder)
-        else:
-            clear_active(self._root)
+        async with self._saving:
+            await asyncio.to_thread(self._write_state, state)
+
+    def _write_state(self, state: SessionState) -> None:
+        try:
+            write_state(self.folder, state)
+            if state.sealed:
+                clear_active(self._root)
+            else:
+                mark_active(self._root, self.folder)
+        except OSError as error:
+            raise RecordingError(f"cannot write to {self.folder}: {error.strerror}") from error
 
     async def seal(self, queue: PoseQueue) -> Path:
         """Finishes the file; returns the recording: the file, or the folder where there are several parts."""
         # Shielded: a cancelled waiter must not cancel what the writer's thread is doing.
         await asyncio.shield(asyncio.wrap_future(self._require().finish()))
         self.recorder = None
-        self.save_state(queue, self.whole)
+        await self.save_state(queue, self.whole)
         return self.whole
 
     def abandon(self) -> None:

@@ -85,9 +85,14 @@ class Run:
         if recording is not None:
             await recover_parts(bench, recording)
         fresh = recording or SessionRecording(bench.root, bench.cell)
-        fresh.open(queue.plan, queue.sha256, first)
-        bench.recording = fresh
-        fresh.save_state(queue)
+        bench.recording = (
+            fresh  # before it is open: STOP may come meanwhile, and what is there must be closed
+        )
+        try:
+            await fresh.open(queue, first)
+        except RecordingError:
+            bench.recording = recording
+            raise
         bench.show_poses()
         bench.store.event(f"recording to {fresh.folder}, part {fresh.part}")
 
@@ -123,7 +128,7 @@ class Run:
             self._failures += 1
             queue.mark(index, "failed", str(error))
             bench.store.event(str(error), "warning", index)
-            bench.require_recording().save_state(queue)
+            await bench.require_recording().save_state(queue)
             bench.show_poses(index)
 
     async def _move_to(self, index: int) -> None:

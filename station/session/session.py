@@ -66,6 +66,7 @@ class Session:
         self.free_drive = FreeDrive(self.bench)
         self._run: asyncio.Task[None] | None = None
         self._tasks: list[asyncio.Task[None]] = []
+        self._saving: asyncio.Task[None] | None = None
         self._notes: tuple[str, ...] = ()
         cell.robot.subscribe(monitor.add)
         cell.robot.subscribe(self._record_state)
@@ -232,7 +233,7 @@ class Session:
         await recover_parts(self.bench, recording)
         queue = self.bench.require_queue()
         whole = recording.whole
-        recording.save_state(queue, whole)
+        await recording.save_state(queue, whole)
         self.bench.recording = None
         self.store.update(session=msgspec.structs.replace(self.store.status.session, recording=str(whole)))
         self.store.enter(StationState.IDLE)
@@ -292,7 +293,7 @@ class Session:
         result = change(self.bench.queue)
         self._void_go()
         if self.bench.recording is not None:
-            self.bench.recording.save_state(self.bench.queue)
+            self._saving = asyncio.create_task(self.bench.recording.save_state(self.bench.queue))
         self.bench.show_poses(self.store.status.session.current)
         return result
 

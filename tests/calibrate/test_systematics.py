@@ -1,0 +1,56 @@
+"""A worn arm: its errors are found, said, and no longer hidden in a sigma that is far too small."""
+
+import numpy as np
+
+from benchmarks.kinematics import _worn_cell
+from calibrate.geometry import difference
+from calibrate.likelihood.kinematics import kinematic_derivatives
+from calibrate.solve import SolveOptions, solve_views
+
+AUTO = SolveOptions(holdout=False)
+OFF = SolveOptions(holdout=False, kinematic_prior="off")
+
+
+def squared_sigmas(solution, X):
+    delta = difference(solution.matrix, X)
+    return delta @ np.linalg.solve(solution.covariance, delta)
+
+
+def test_table_errors_are_found_and_coverage_comes_back():
+    rng = np.random.default_rng(0)
+    inside_auto = inside_off = 0
+    for _ in range(6):
+        worn = _worn_cell(rng, 0.4)
+        auto, off = solve_views(worn.views, AUTO), solve_views(worn.views, OFF)
+        assert auto.systematics.detected
+        assert auto.systematics.prior_applied
+        assert auto.systematics.worst_joint in auto.systematics.text
+        assert any("follow its joints" in text for text in auto.warnings)
+        assert not off.systematics.prior_applied
+        assert auto.systematics.scale_mm < 1.0
+        inside_auto += squared_sigmas(auto, worn.X) < auto.confidence_threshold
+        inside_off += squared_sigmas(off, worn.X) < off.confidence_threshold
+        assert auto.rejected == ()
+    assert inside_auto >= 5
+    assert inside_off <= 2
+
+
+def test_a_good_arm_is_not_accused():
+    rng = np.random.default_rng(1)
+    for _ in range(6):
+        solution = solve_views(_worn_cell(rng, 0.0).views, AUTO)
+        assert not solution.systematics.detected
+        assert not solution.systematics.prior_applied
+
+
+def test_without_joints_or_with_foreign_joints_nothing_is_claimed():
+    from dataclasses import replace
+
+    views = _worn_cell(np.random.default_rng(2), 0.4).views
+    for changed in (
+        replace(views, robot_model="unknown"),
+        replace(views, robot_model="UR5"),
+        replace(views, views=tuple(replace(view, joints_rad=None) for view in views)),
+    ):
+        assert kinematic_derivatives(changed) is None
+        assert solve_views(changed, AUTO).systematics is None

@@ -15,7 +15,8 @@ from collections import deque
 from dataclasses import dataclass
 
 BINS = 300
-LEAST_SAMPLES = 5
+LEAST_BINS = 5
+FIRST_BIN_S = 0.02
 DRIFT_SPAN_S = 5.0
 """Over a shorter span no drift is fitted."""
 DRIFT_LIMIT = 500e-6
@@ -78,10 +79,10 @@ class ClockEstimator:
     best round trip, for instance). A device time that goes back starts afresh: the device restarted.
     """
 
-    def __init__(self, window_s: float = 60.0, latency_s: float = 0.0) -> None:
+    def __init__(self, window_s: float = 300.0, latency_s: float = 0.0) -> None:
         self.latency_s = latency_s
         self._window_s = window_s
-        self._bin_s = window_s / BINS
+        self._bin_s = min(FIRST_BIN_S, window_s / BINS)
         self._bins: deque[tuple[float, float]] = deque()
         """(device time, smallest host − device in ns) of each stretch of time, oldest first."""
         self._bin_start_s = 0.0
@@ -95,8 +96,7 @@ class ClockEstimator:
         gap_ns = host_monotonic_ns - device_s * 1e9
         with self._lock:
             if self._bins and device_s < self._newest_s - self._bin_s:
-                self._bins.clear()
-                self._samples, self._fit = 0, None
+                self._forget()
             self._newest_s = device_s
             self._samples += 1
             if not self._bins or device_s >= self._bin_start_s + self._bin_s:
@@ -104,18 +104,31 @@ class ClockEstimator:
                 self._bin_start_s = device_s
                 while self._bins[0][0] < device_s - self._window_s:
                     self._bins.popleft()
+                if len(self._bins) > 2 * BINS:
+                    self._merge()
             elif gap_ns < self._bins[-1][1]:
                 self._bins[-1] = (device_s, gap_ns)
 
     def reset(self) -> None:
         with self._lock:
-            self._bins.clear()
-            self._samples, self._fit = 0, None
+            self._forget()
+
+    def _forget(self) -> None:
+        self._bins.clear()
+        self._bin_s = min(FIRST_BIN_S, self._window_s / BINS)
+        self._samples, self._fit = 0, None
+
+    def _merge(self) -> None:
+        """Pairs of bins become one: short bins are for the beginning, when there is little else."""
+        bins = list(self._bins)
+        pairs = [min(bins[i : i + 2], key=lambda b: b[1]) for i in range(0, len(bins), 2)]
+        self._bins = deque(pairs)
+        self._bin_s *= 2
 
     def fit(self) -> ClockFit | None:
         """The newest estimate; None before there is enough to say anything."""
         with self._lock:
-            if self._samples < LEAST_SAMPLES:
+            if len(self._bins) < LEAST_BINS:
                 return None
             if self._fit is None or self._fitted_bin_s != self._bin_start_s:
                 self._fit = self._estimate(list(self._bins))

@@ -81,6 +81,7 @@ class ControlChild:
                 f"the control process was not ready within {timeout_s:g} s and was killed; "
                 f"see {self._log_path}"
             ) from None
+        self._beat_ns = 0  # beats that waited for it to be ready are no sign of hanging
         if "refused" in answer:
             self.kill()
             await self.reap()
@@ -190,7 +191,7 @@ class ControlChild:
         answer = json.loads(message)
         if "beat" in answer:
             self._answered_ns = max(self._answered_ns, int(answer["beat"]))
-            self.kicks_refused = not answer["kicked"]
+            self.kicks_refused = bool(answer["lost"])
         elif "id" in answer:
             waiter = self._moves.get(answer["id"])
             if waiter is not None and not waiter.done():

@@ -8,7 +8,7 @@ Requests: {"do": "beat", "ns": N}   N = host monotonic time of the session loop;
           {"do": "move", "id": I, "joints": [6], "speed": rad/s, "acceleration": rad/s²}
           {"do": "stop", "deceleration": …}
           {"do": "end"}
-Answers:  {"ready": true, "tcp": [6] | null} · {"refused": text} · {"beat": N, "kicked": bool}
+Answers:  {"ready": true, "tcp": [6] | null} · {"refused": text} · {"beat": N, "lost": bool}
           {"id": I, "ok": bool, "error": text} · {"stopped": true}
 """
 
@@ -43,7 +43,7 @@ class ControlServer:
         self._control = control
         self._channel = channel
         self._beat_ns = 0
-        self._watched = False
+        self._armed = False
         self._script_lost = False
 
     def serve(self) -> None:
@@ -70,18 +70,17 @@ class ControlServer:
         return time.monotonic_ns() - self._beat_ns <= BEAT_FRESH_NS
 
     def _beat(self, beat_ns: int) -> None:
+        """A beat that waited too long kicks nothing. A script that took no kick is never kicked again."""
         self._beat_ns = beat_ns
-        kicked = self._fresh() and not self._script_lost
-        if kicked:
-            kicked = self._watch() and self._control.kickWatchdog()
-            self._script_lost = not kicked
-        self.answer({"beat": beat_ns, "kicked": kicked})
+        if self._fresh() and not self._script_lost:
+            armed = self._armed or self._arm()
+            self._script_lost = not (armed and self._control.kickWatchdog())
+        self.answer({"beat": beat_ns, "lost": self._script_lost})
 
-    def _watch(self) -> bool:
-        """Arms the watchdog once; from then on the script lives only as long as it is kicked."""
-        if not self._watched:
-            self._watched = bool(self._control.setWatchdog(WATCHDOG_HZ))
-        return self._watched
+    def _arm(self) -> bool:
+        """From now on the script lives only as long as it is kicked."""
+        self._armed = bool(self._control.setWatchdog(WATCHDOG_HZ))
+        return self._armed
 
     def _move(self, request: dict[str, Any]) -> str:
         joints = [float(q) for q in request["joints"]]
@@ -89,7 +88,8 @@ class ControlServer:
             return f"six finite joint angles are needed, not {joints}"
         if not self._fresh():
             return "the session's heartbeat is missing"
-        if self._script_lost or not self._watch():
+        # Before every move: a connection that dropped unseen would have loaded the script anew, unwatched.
+        if self._script_lost or not self._arm():
             return "the control program is not running or its watchdog could not be armed"
         try:
             ok = self._control.moveJ(joints, float(request["speed"]), float(request["acceleration"]), True)

@@ -39,6 +39,7 @@ SILENCE_S = 2.0
 HANDSHAKE_S = 2.0
 SO_TIMESTAMPNS = 35
 """Linux, 64 bit: receive time by the kernel, wall clock; `socket` does not name it."""
+RECEIVE_BUFFER_BYTES = 1 << 20
 _TIMESPEC = struct.Struct("@qq")
 _ANCILLARY_BYTES = socket.CMSG_SPACE(_TIMESPEC.size)
 
@@ -91,7 +92,11 @@ class StateReader(threading.Thread):
     def run(self) -> None:
         why = "closed here"
         try:
-            with socket.create_connection((self.host, PORT), timeout=HANDSHAKE_S) as link:
+            with socket.socket() as link:
+                # A controller skips samples when the receiver is full: seconds of them fit into this.
+                link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
+                link.settimeout(HANDSHAKE_S)
+                link.connect((self.host, PORT))
                 recipe = self._handshake(link)
                 self._follow(link, recipe)
         except TimeoutError:
@@ -199,6 +204,8 @@ class StateReader(threading.Thread):
             if gap == 0:
                 self.frozen += 1
                 return
+            if gap < 0:
+                self.history.clear()  # the controller's clock was set back
             self.lost += max(0, round(gap) - 1)
         state = RobotState(
             stamps=Stamps(host_monotonic_ns=monotonic_ns, host_wall_ns=wall_ns, controller_s=controller_s),

@@ -113,6 +113,9 @@ def _fit(views: ViewSet, flags: int) -> _Fit:
     object_points = [v.board_points.astype(np.float32) for v in views]
     pixels = [v.pixels.astype(np.float32) for v in views]
     size = (views.camera.width, views.camera.height)
+    before = cv2.getNumThreads()
+    # OpenCV's threads sum in the order they finish: the last bits would differ from run to run.
+    cv2.setNumThreads(1)
     try:
         unknown: Any = None
         rms, K, D, _, _, sigma, _, per_view = cv2.calibrateCameraExtended(
@@ -122,6 +125,8 @@ def _fit(views: ViewSet, flags: int) -> _Fit:
         raise BadViewsError(
             f"The lens cannot be found from these corners ({problem.err}). Check the board's size."
         ) from None
+    finally:
+        cv2.setNumThreads(before)
     count = 8 if flags & cv2.CALIB_RATIONAL_MODEL else 5
     return _Fit(
         flags, float(rms), _floats(K), _floats(D)[:count], _floats(sigma)[: 4 + count], _floats(per_view)

@@ -45,7 +45,7 @@ class BoardSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_de
     """A chessboard with OpenCV's three-dot marker."""
 
 
-class RobotIdentity(msgspec.Struct, frozen=True, omit_defaults=True):
+class RobotIdentity(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     model: str = "unknown"
     serial: str = ""
     controller_version: str = ""
@@ -55,7 +55,7 @@ class RobotIdentity(msgspec.Struct, frozen=True, omit_defaults=True):
     safety_checksum: str = ""
 
 
-class CameraIdentity(msgspec.Struct, frozen=True, omit_defaults=True):
+class CameraIdentity(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     vendor: str = ""
     model: str = "unknown"
     serial: str = ""
@@ -63,7 +63,7 @@ class CameraIdentity(msgspec.Struct, frozen=True, omit_defaults=True):
     """aravis, playback, rendered, imported"""
 
 
-class CameraModel(msgspec.Struct, frozen=True, omit_defaults=True):
+class CameraModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """Intrinsics. Pixel (0, 0) is the centre of the top left pixel, as in OpenCV."""
 
     width: int
@@ -74,7 +74,7 @@ class CameraModel(msgspec.Struct, frozen=True, omit_defaults=True):
     distortion_model: Literal["plumb_bob", "rational_polynomial", "equidistant"] = "plumb_bob"
 
 
-class SessionInfo(msgspec.Struct, frozen=True, omit_defaults=True):
+class SessionInfo(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """Written first, as metadata: everything needed to re-solve with nothing else at hand."""
 
     name: str

@@ -12,6 +12,7 @@ from pathlib import Path
 
 import cv2
 import lz4.frame
+import msgspec
 import numpy as np
 import pytest
 import zstandard
@@ -100,6 +101,11 @@ def bomb(compression: str) -> bytes:
     return with_chunk(b"", compression=compression, stored=packed, size=BOMB_BYTES)
 
 
+def future_session() -> bytes:
+    described = msgspec.json.encode({**msgspec.to_builtins(make_info()), "gravity": 9.81}).decode()
+    return metadata("session", {"format": "station-recording/1", "session": described})
+
+
 OTHER_CHANNEL = channel(1, 1, "/session/view")
 LIES: dict[str, tuple[bytes, str]] = {
     "unknown compression": (with_chunk(DECLARED + STATE, compression="lzma"), "compressed"),
@@ -174,6 +180,10 @@ LIES: dict[str, tuple[bytes, str]] = {
     "a format of the future": (
         sealed(session_metadata(file_format="station-recording/2"), Counts()),
         "format is 'station-recording/2', this version reads 'station-recording/1'",
+    ),
+    "a session description of the future": (
+        sealed(future_session(), Counts()),
+        "description does not fit this version: Object contains unknown field `gravity`",
     ),
     "session named a path": (
         sealed(session_metadata(make_info(name="../x")), Counts()),

@@ -140,6 +140,10 @@ BAD: dict[str, tuple[Change, str]] = {
     "outside": (edit("poses.csv", "images/1.png", "../../secret.png"), r"line 3: .*outside the folder"),
     "unknown mount": (edit("dataset.yaml", "eye-in-hand", "on-hand"), r"Invalid enum value 'on-hand'.*mount"),
     "unknown key": (edit("dataset.yaml", "note:", "nota:"), r"unknown field `nota`"),
+    "unknown camera key": (
+        edit("dataset.yaml", "height: 24", "height: 24, distorsion: [0.1]"),
+        r"unknown field `distorsion`.*camera",
+    ),
     "board kind": (
         edit("dataset.yaml", "kind: chessboard", "kind: chess"),
         r"Invalid enum value 'chess'.*board.kind",

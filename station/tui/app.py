@@ -66,6 +66,7 @@ class StationApp(App[None]):
         Binding("f6", "pause", "Pause", id="pause", tooltip="Stop after this pose; nothing is lost"),
         Binding("f7", "finish", "Finish", id="finish", tooltip="Seal the recording with what is there"),
         Binding("f8", "acknowledge", "Ack", id="acknowledge", tooltip="I looked: leave STOPPED or FAULT"),
+        Binding("f9", "solve_newest", "Solve", id="solve", tooltip="Solve the session just recorded"),
         Binding("f3", "free_drive", "Hand", id="free-drive", tooltip="Free-drive: move the arm by hand"),
         Binding("f2", "record", "Take", id="record", tooltip="Take a picture here (free-drive)"),
         Binding("1", "switch_mode('live')", "Live", id="live", tooltip="The running capture"),
@@ -213,6 +214,13 @@ class StationApp(App[None]):
     async def solve(self, recording: str, folder: str) -> None:
         if (calibration := await offline.solve(self, recording, folder)) is not None:
             await self.show_result(calibration)
+
+    def action_solve_newest(self) -> None:
+        session = self.status.session if self.status is not None else None
+        if session is None or not session.recording:
+            self.notify("Nothing is sealed yet: F7 finishes a session; older ones are on screen 4.")
+            return
+        self.solve(session.recording, session.folder)
 
     @work(exclusive=True, group="job", exit_on_error=False)
     async def recover(self, folder: str) -> None:

@@ -14,8 +14,9 @@ _WORDS = {"debug": "", "info": "", "warning": "WARN ", "error": "ERROR "}
 
 
 def event_text(event: Event) -> Text:
+    pose = "" if event.pose_index is None else f"pose {event.pose_index + 1} "
     return Text.assemble(
-        (clock(event.wall_ns), "dim"), " ", (_WORDS[event.level] + event.text, _STYLES[event.level])
+        (clock(event.wall_ns), "dim"), " ", (_WORDS[event.level] + pose + event.text, _STYLES[event.level])
     )
 
 

@@ -70,8 +70,12 @@ def robot_lines(status: StationStatus) -> list[str]:
     if robot.joints_rad is None or robot.base_from_flange is None:
         return ["no robot state"]
     x, y, z = (row[3] * 1000 for row in robot.base_from_flange[:3])
-    joints = " ".join(f"{math.degrees(q):6.1f}" for q in robot.joints_rad)
-    return [f"flange {x:8.1f} {y:8.1f} {z:8.1f} mm", f"joints {joints}"]
+    joints = [f"{math.degrees(q):8.1f}" for q in robot.joints_rad]
+    return [
+        f"flange {x:8.1f} {y:8.1f} {z:8.1f} mm",
+        f"joints {' '.join(joints[:3])} °",
+        f"       {' '.join(joints[3:])} °",
+    ]
 
 
 def progress_lines(status: StationStatus) -> list[str]:

@@ -69,6 +69,7 @@ class UrRobot(UrLink):
         """Spawns the control process, which loads its program. Only in answer to a go. Raises RobotError."""
         if self._child is not None:
             raise RobotError("control is already started")
+        await self.fresh()
         self.check()
         await self._may_start()
         self._stop_reason = ""
@@ -92,7 +93,7 @@ class UrRobot(UrLink):
         # A connection that was opened in local mode stays refused: e-Series want a new one.
         fresh = await self.renew_dashboard()
         self.remote = await fresh.remote()
-        state = self.latest()
+        state = await self.fresh()
         if self.remote is False:
             raise RobotError(LOCAL_CONTROL)
         self.program = await fresh.ask("programState")
@@ -130,6 +131,7 @@ class UrRobot(UrLink):
             raise RobotError("a move is already under way")
         self._moving = True
         try:
+            await self.fresh()
             self.check()
             sample = self.newest()
             watch = MoveWatch(joints_rad, sample.operation, time.monotonic())

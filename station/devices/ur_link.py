@@ -29,6 +29,7 @@ from station.errors import RobotError, StaleStateError, StationError
 log = logging.getLogger(__name__)
 
 STALE_S = 0.1
+PATIENCE_S = 0.25
 FIRST_STATE_S = 4.0
 SUPERVISE_S = 0.2
 RECONNECT_S = (0.2, 0.5, 1.0, 2.0)
@@ -204,6 +205,17 @@ class UrLink:
         if age_s > STALE_S or not self.connected:
             raise StaleStateError(self._stale_words(age_s))
         return sample.state
+
+    async def fresh(self) -> RobotState:
+        """`latest`, but lets a hiccup of this computer pass. StaleStateError after 0.25 s."""
+        give_up_s = time.monotonic() + PATIENCE_S
+        while True:
+            try:
+                return self.latest()
+            except StaleStateError:
+                if time.monotonic() > give_up_s or not self.connected:
+                    raise
+            await asyncio.sleep(0.005)
 
     def _stale_words(self, age_s: float) -> str:
         reader = self.reader

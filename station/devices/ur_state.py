@@ -101,6 +101,8 @@ class StateReader(threading.Thread):
                 self._follow(link, recipe)
         except TimeoutError:
             why = f"no answer from {self.host}:{PORT} within {HANDSHAKE_S:g} s"
+        except ConnectionResetError:
+            why = "the robot reset the connection"
         except (OSError, RtdeError) as error:
             why = str(error)
         finally:

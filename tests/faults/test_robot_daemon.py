@@ -32,7 +32,7 @@ async def main(host, folder):
             await asyncio.sleep(0.03)
     beating = asyncio.create_task(heart())
     await robot.start_control()
-    goal = list(robot.latest().joints_rad)
+    goal = list(robot.newest().state.joints_rad)
     goal[0] += 1.5
     print(robot.control_pid, flush=True)
     await robot.move(goal, 0.5, 1.0)

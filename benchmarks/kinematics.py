@@ -59,7 +59,7 @@ def _row(size_mm: float, count: int) -> list[str]:
     inside, errors = np.zeros((count, 2)), np.zeros((count, 2))
     spread, detected, flange = np.zeros((count, 2)), 0, np.zeros(count)
     for k in range(count):
-        worn = _worn_cell(rng, size_mm)
+        worn = worn_cell(rng, size_mm)
         flange[k] = worn.flange_error_m
         for j, prior in enumerate(("off", "auto")):
             solution = solve_views(worn.views, SolveOptions(holdout=False, kinematic_prior=prior))
@@ -90,7 +90,7 @@ def _spread(worn: Worn, X: Array, solution: Solution | None) -> float:
     return board_spread(reported, worn.new_board_poses, X)[0]
 
 
-def _worn_cell(rng: np.random.Generator, size_mm: float) -> Worn:
+def worn_cell(rng: np.random.Generator, size_mm: float) -> Worn:
     joints, Y = _reachable(rng, 50)
     a, d, alpha, theta = (tuple(part) for part in 1e-3 * size_mm * rng.normal(size=(4, 6)))
     true = forward(_MODEL.calibrated(DhDeltas(a, d, alpha, theta)), joints)

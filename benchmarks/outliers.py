@@ -26,9 +26,8 @@ def run() -> str:
     text = (
         f"{count} trials per row, paper's cell, 25 views, mid noise, intrinsics known. Swapped: robot poses "
         "exchanged; turned: corners in the order of the board turned by 180°; nudged: robot pose off by "
-        "10 … 60 sigmas in every component. Oracle: the same estimate on the good views only (turned views "
-        "we set right, so ours can beat it). Kept bad: bad views still used as they are, injected error "
-        "above 6 sigmas."
+        "10 … 60 robot sigmas in every component. Oracle: the same estimate on the good views only (turned "
+        "views we set right, so ours can beat it). Kept bad: bad views still used as they are."
     )
     header = ["bad views", "share", "ours rms mm", "oracle rms mm", "ours / oracle", "rotation ours / oracle",
               "kept bad", "good lost", "failed", "Park-Martin rms mm"]  # fmt: skip

@@ -22,7 +22,9 @@ from calibrate.solution import RejectedView
 from calibrate.views import ImageView, ViewSet
 
 _FALSE_ALARM = 2e-4
-"""Probability that a good view is rejected."""
+"""Probability that a good view is rejected (more with few views, by the limit below)."""
+_LARGEST_SIGMAS = 6.0
+"""No view that is farther out than this is kept, however few there are."""
 _BLURRED = 5.0
 """A view whose typical corner error is this many times the others' is not trusted."""
 _BLURRED_PX = 0.5
@@ -64,7 +66,8 @@ def judge_views(observed: Observations, result: Estimate, boards: BoardPoses, fi
     J = np.concatenate(parts, axis=2)[others]
     covariance[others] += J @ result.joint_covariance @ np.swapaxes(J, 1, 2)
     distance2 = np.einsum("ni,ni->n", miss, np.linalg.solve(covariance, miss[..., None])[..., 0])
-    limit = float(6 * stats.f.ppf(1 - _FALSE_ALARM, 6, max(3 * len(fitted) - 6, 3)))
+    chance = float(6 * stats.f.ppf(1 - _FALSE_ALARM, 6, max(3 * len(fitted) - 6, 3)))
+    limit = min(chance, _LARGEST_SIGMAS**2)
     typical = float(np.median(boards.typical_px))
     blurred = boards.typical_px > max(_BLURRED * typical, _BLURRED_PX)
     return Judgement(distance2, miss, modelled_flange(observed, state), limit, blurred)

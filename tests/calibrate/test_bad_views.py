@@ -155,3 +155,15 @@ def test_the_saturating_loss_finds_X_among_forty_percent_bad_views():
     miss_mm, miss_deg = error_mm_deg(X, c.X)
     assert miss_mm < 5
     assert miss_deg < 0.5
+
+
+def test_when_hardly_half_the_views_are_good_evolution_is_asked_as_well():
+    for seed in range(3):
+        c = cell(seed, 25)
+        rng = np.random.default_rng(seed)
+        bad = rng.choice(25, 12, replace=False)
+        flange = c.views.base_from_flange.copy()
+        flange[bad] = perturb(flange[bad], rng.uniform(-1, 1, (12, 6)) * np.repeat([0.1, 0.3], 3))
+        assert screen(flange, c.views.camera_from_board).share < 0.55
+        solution = solve_views(with_flange(c.views, flange), QUICK)
+        assert set(solution.used) == set(range(25)) - set(bad)

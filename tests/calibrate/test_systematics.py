@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from benchmarks.kinematics import _worn_cell
+from benchmarks.kinematics import worn_cell
 from calibrate.geometry import difference
 from calibrate.likelihood.kinematics import kinematic_derivatives
 from calibrate.solve import SolveOptions, solve_views
@@ -20,7 +20,7 @@ def test_table_errors_are_found_and_coverage_comes_back():
     rng = np.random.default_rng(0)
     inside_auto = inside_off = 0
     for _ in range(6):
-        worn = _worn_cell(rng, 0.4)
+        worn = worn_cell(rng, 0.4)
         auto, off = solve_views(worn.views, AUTO), solve_views(worn.views, OFF)
         assert auto.systematics.detected
         assert auto.systematics.prior_applied
@@ -38,7 +38,7 @@ def test_table_errors_are_found_and_coverage_comes_back():
 def test_a_good_arm_is_not_accused():
     rng = np.random.default_rng(1)
     for _ in range(6):
-        solution = solve_views(_worn_cell(rng, 0.0).views, AUTO)
+        solution = solve_views(worn_cell(rng, 0.0).views, AUTO)
         assert not solution.systematics.detected
         assert not solution.systematics.prior_applied
 
@@ -46,7 +46,7 @@ def test_a_good_arm_is_not_accused():
 def test_without_joints_or_with_foreign_joints_nothing_is_claimed():
     from dataclasses import replace
 
-    views = _worn_cell(np.random.default_rng(2), 0.4).views
+    views = worn_cell(np.random.default_rng(2), 0.4).views
     for changed in (
         replace(views, robot_model="unknown"),
         replace(views, robot_model="UR5"),

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -44,9 +45,9 @@ def check_target(target: Path) -> None:
 
 @contextmanager
 def detection_progress() -> Iterator[LoadProgress | None]:
-    """A bar on stderr, only on a terminal."""
+    """On stderr: a bar on a terminal, plain lines where CALIBRATE_PROGRESS=lines asks for them."""
     if not err.is_terminal:
-        yield None
+        yield _progress_line if os.environ.get("CALIBRATE_PROGRESS") == "lines" else None
         return
     columns = (
         TextColumn("finding the board"),
@@ -57,6 +58,12 @@ def detection_progress() -> Iterator[LoadProgress | None]:
     with Progress(*columns, console=err, transient=True) as bar:
         task = bar.add_task("", total=None)
         yield lambda done, total, name: bar.update(task, completed=done, total=total, description=name)
+
+
+def _progress_line(done: int, total: int, name: str) -> None:
+    if done == total or done % 5 == 0:
+        sys.stderr.write(f"finding the board: {done} of {total}\n")
+        sys.stderr.flush()
 
 
 def print_json(value: object) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import sys
 from typing import ClassVar
 
@@ -46,6 +47,7 @@ class JobScreen(ModalScreen[int]):
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.STDOUT,
+            env=os.environ | {"CALIBRATE_PROGRESS": "lines", "PYTHONUNBUFFERED": "1"},
         )
         assert self._process.stdout is not None
         lines = self.query_one("#job-lines", RichLog)

@@ -1,0 +1,69 @@
+"""Long work in a process of its own: progress is shown, failures stay readable, cancelling ends it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+from textual.widgets import Button, RichLog
+
+from station.tui.app import StationApp
+from station.tui.jobs import JobScreen
+from tests.tui.conftest import FakeLink
+from tests.tui.test_keys import app_on
+
+
+@pytest.fixture
+def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """A module that the job can run, written by the test."""
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    return tmp_path / "some_job.py"
+
+
+async def run_job(app: StationApp, *args: str) -> list[int | None]:
+    codes: list[int | None] = []
+    await app.push_screen(JobScreen("Working", "some_job", *args), codes.append)
+    return codes
+
+
+async def until(pilot: object, condition: object) -> None:
+    for _ in range(200):
+        if condition():  # type: ignore[operator]
+            return
+        await pilot.pause(0.05)  # type: ignore[attr-defined]
+    raise AssertionError("it did not come to that")
+
+
+async def test_its_exit_code_comes_back(link: FakeLink, job: Path) -> None:
+    job.write_text("import sys; print('half way', flush=True); sys.exit(int(sys.argv[1]))")
+    async with app_on(link).run_test() as pilot:
+        codes = await run_job(pilot.app, "4")  # type: ignore[arg-type]
+        await until(pilot, lambda: codes)
+        assert codes == [4]
+
+
+async def test_a_failure_stays_on_the_screen_until_it_is_read(link: FakeLink, job: Path) -> None:
+    job.write_text("import sys; sys.exit('no board in any view')")
+    async with app_on(link).run_test() as pilot:
+        codes = await run_job(pilot.app)  # type: ignore[arg-type]
+        button = pilot.app.screen.query_one("#job-cancel", Button)
+        await until(pilot, lambda: str(button.label) == "Close")
+        assert any("no board in any view" in line.text for line in pilot.app.screen.query_one(RichLog).lines)
+        assert codes == []
+        await pilot.press("escape")
+        await until(pilot, lambda: codes)
+        assert codes == [1]
+
+
+async def test_cancelling_ends_the_process(link: FakeLink, job: Path, tmp_path: Path) -> None:
+    pid_file = tmp_path / "pid"
+    job.write_text(f"import os, time; open({str(pid_file)!r}, 'w').write(str(os.getpid())); time.sleep(600)")
+    async with app_on(link).run_test() as pilot:
+        codes = await run_job(pilot.app)  # type: ignore[arg-type]
+        await until(pilot, lambda: pid_file.exists() and pid_file.read_text())
+        await pilot.press("escape")
+        await until(pilot, lambda: codes)
+        assert codes == [-1]
+        with pytest.raises(ProcessLookupError):
+            os.kill(int(pid_file.read_text()), 0)

@@ -1,0 +1,146 @@
+"""How well is the arm's pose known at mid-exposure, at rest and while it moves?
+
+A simulated UR10 and a rendered camera, both with drifting clocks of their own, in processes of their own. The
+robot's pose is interpolated at the estimated middle of the exposure and compared with the joints that the
+arm truly had at the true middle. The arm is jogged to and fro for the moving part. Jogging and camera share
+the machine's cores with whatever else runs.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.geometry import difference
+from calibrate.kinematics import MODELS, forward
+from recordings.messages import Picture
+from station.config import RobotConfig
+from station.devices.frames import mid_exposure
+from station.devices.ur import UrRobot
+from station.simulation.admin import AdminClient
+from station.simulation.camera import RenderedCamera
+from station.simulation.cell import CellTruth, make_cell, write_truth
+from station.simulation.launch import start_controller
+
+SHARE = float(os.environ.get("BENCH_SHARE", "1"))
+PICTURES = max(20, round(400 * SHARE))
+SETTLE_S = 8.0
+"""Both clocks' drift is known from here on."""
+_JOG_RAD = (0.35, 0.12, -0.1, 0.1, 0.2, 0.3)
+_JOG_SPEED_RAD_S = 0.25
+
+
+@dataclass
+class Sync:
+    time_error_ms: NDArray[np.float64]
+    """Estimated minus true middle of the exposure"""
+    bound_ms: NDArray[np.float64]
+    position_error_mm: NDArray[np.float64]
+    rotation_error_deg: NDArray[np.float64]
+    speed_mm_s: NDArray[np.float64]
+    """Of the flange at that moment"""
+
+
+def run() -> str:
+    columns = (
+        "arm|pictures|speed of the flange|time error p50 / p99|inside the bound|bound p50"
+        "|position error p50 / p99|rotation error p99"
+    )
+    lines = [f"| {columns.replace('|', ' | ')} |", "|" + "---|" * 8]
+    for name, moving in (("at rest", False), ("moving", True)):
+        s = asyncio.run(measure(PICTURES, moving))
+        late = np.abs(s.time_error_ms)
+        p50, p99 = np.percentile(s.position_error_mm, [50, 99])
+        lines.append(
+            f"| {name} | {len(late)} | {np.median(s.speed_mm_s):.0f} mm/s "
+            f"| {np.median(late):.3f} / {np.percentile(late, 99):.3f} ms "
+            f"| {np.mean(late <= s.bound_ms):.1%} | {np.median(s.bound_ms):.2f} ms "
+            f"| {p50:.4f} / {p99:.4f} mm | {np.percentile(s.rotation_error_deg, 99):.5f}° |"
+        )
+    return "\n".join(lines)
+
+
+async def measure(pictures: int, moving: bool, settle_s: float = SETTLE_S) -> Sync:
+    truth = make_cell(seed=3)
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "truth.json"
+        write_truth(truth, file)
+        controller = await asyncio.to_thread(start_controller, truth=file)
+        robot = UrRobot(RobotConfig("UR10", controller.host), Path(folder), Path(folder))
+        camera = RenderedCamera(truth, controller.host)
+        jogging = asyncio.create_task(jog(controller.host, truth)) if moving else None
+        try:
+            await robot.connect()
+            await camera.open()
+            end_s = asyncio.get_running_loop().time() + settle_s
+            while asyncio.get_running_loop().time() < end_s:
+                await camera.preview()
+                await camera.capture()
+            rows = [await one(robot, camera, controller.host, truth) for _ in range(pictures)]
+        finally:
+            if jogging is not None:
+                jogging.cancel()
+            await camera.close()
+            await robot.close()
+            await asyncio.to_thread(controller.stop)
+    return Sync(*np.array(rows).T)
+
+
+async def one(
+    robot: UrRobot, camera: RenderedCamera, host: str, truth: CellTruth
+) -> tuple[float, float, float, float, float]:
+    picture = await camera.capture()
+    stamps = picture.stamps
+    middle_ns, bound_s = mid_exposure(
+        stamps.device_ns, stamps.host_monotonic_ns, picture.exposure_us, camera.clock
+    )
+    state = robot.at(middle_ns)
+    true_ns = true_middle_ns(picture, truth)
+    true_joints = (await asyncio.to_thread(ask_truth, host, true_ns))["joints_rad"]
+    model = MODELS[truth.robot_model]
+    delta = difference(forward(model, state.joints_rad), forward(model, true_joints))
+    step = np.asarray(state.joint_speeds_rad_s) * 1e-4
+    moved = (
+        forward(model, np.asarray(state.joints_rad) + step)[:3, 3] - forward(model, state.joints_rad)[:3, 3]
+    )
+    return (
+        (middle_ns - true_ns) / 1e6,
+        bound_s * 1e3,
+        1e3 * float(np.linalg.norm(delta[:3])),
+        float(np.degrees(np.linalg.norm(delta[3:]))),
+        1e3 * float(np.linalg.norm(moved)) / 1e-4,
+    )
+
+
+def true_middle_ns(picture: Picture, truth: CellTruth) -> int:
+    """By the truth of the camera's clock, which no estimate may look at."""
+    rate = 1 + truth.camera_clock_drift_ppm * 1e-6
+    start_ns = (picture.stamps.device_ns - truth.camera_clock_offset_ns) / rate
+    return round(start_ns + picture.exposure_us * 500)
+
+
+def ask_truth(host: str, at_ns: int) -> dict[str, list[float]]:
+    with AdminClient(host) as admin:
+        return admin.ask("truth", at_monotonic_ns=at_ns)
+
+
+async def jog(host: str, truth: CellTruth) -> None:
+    """To and fro until cancelled."""
+    start = np.array(truth.start_joints_rad)
+    with AdminClient(host) as admin:
+        for turn in range(10_000):
+            target = start + (np.array(_JOG_RAD) if turn % 2 == 0 else 0.0)
+            await asyncio.to_thread(
+                admin.ask, "jog", joints_rad=target.tolist(), speed_rad_s=_JOG_SPEED_RAD_S
+            )
+            await asyncio.sleep(0.5 + float(np.max(np.abs(_JOG_RAD))) / _JOG_SPEED_RAD_S)
+
+
+if __name__ == "__main__":
+    print(run())

@@ -24,6 +24,7 @@ FEWEST_VIEWS = 3
 FALSE_ALARM = 0.05
 _STEP = 1e-6
 _ITERATIONS = 4
+_SMALLEST_EIGENVALUE = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,13 +103,9 @@ def judge_shift(views: ViewSet, installed: Array, covariance: Array, noise: Nois
     X, P = installed.copy(), flanges[0] @ installed @ seen[0]
     for _ in range(_ITERATIONS):
         information, gradient, misfit = _normal_equations(flanges, seen, X, P, robot, pnp)
-        try:
-            step = -np.linalg.solve(information, gradient)
-            fitted = np.linalg.inv(information)[:6, :6]
-        except np.linalg.LinAlgError:
-            step = np.full(12, np.nan)
-        if not np.isfinite(step).all():
-            raise BadViewsError("These views turn about one axis only and do not tell a shift; tilt further.")
+        fitted_all = _inverse(information)
+        step = -fitted_all @ gradient
+        fitted = fitted_all[:6, :6]
         X, P = perturb(X, step[:6]), perturb(P, step[6:])
     _, _, misfit = _normal_equations(flanges, seen, X, P, robot, pnp)
     shift = difference(X, installed)
@@ -129,6 +126,19 @@ def judge_shift(views: ViewSet, installed: Array, covariance: Array, noise: Nois
         disagreement=float(misfit / max(6 * len(views) - 12, 1)),
         views=len(views),
     )
+
+
+def _inverse(information: Array) -> Array:
+    """BadViewsError where a direction is not determined: eigenvalues are of the matrix scaled to ones."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    values, vectors = np.linalg.eigh(information * scale * scale[:, None])
+    if not values[0] > _SMALLEST_EIGENVALUE:
+        raise BadViewsError(
+            "These views do not tell a shift of the camera: they turn about one axis only, or too little. "
+            "Take views that tilt by 20° and more about different axes."
+        )
+    root = scale[:, None] * vectors / np.sqrt(values)
+    return np.asarray(root @ root.T)
 
 
 def _power(weight: Array, size: float, threshold: float, nu: float) -> float:

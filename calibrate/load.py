@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field
 
-import cv2
 import numpy as np
 
 from calibrate.board import board_points
@@ -48,8 +47,8 @@ def load_views(
 ) -> LoadedViews:
     """Finds the board in every picture of the recording.
 
-    `board` and `camera` replace the recorded ones (another size, known intrinsics). OpenCV works single-
-    threaded inside each of `threads` workers, so that the result does not depend on their number. Raises
+    `board` and `camera` replace the recorded ones (another size, known intrinsics). The result does not
+    depend on the number of `threads`, as long as OpenCV itself uses one thread in each. Raises
     BadViewsError for pictures or poses that cannot be, TooFewViewsError when fewer than `fewest` show it.
     """
     info = recording.info
@@ -89,8 +88,6 @@ def _detect_all(
     total = len(recording.views())
     waiting: deque[tuple[View, Future[Detection]]] = deque()
     done = 0
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
     pool = ThreadPoolExecutor(workers, thread_name_prefix="detect")
     try:
         for view in recording.views():
@@ -108,7 +105,6 @@ def _detect_all(
                 progress(done, total, name)
     finally:
         pool.shutdown(cancel_futures=True)
-        cv2.setNumThreads(before)
 
 
 def _finished(waiting: deque[tuple[View, Future[Detection]]]) -> tuple[View, Detection]:

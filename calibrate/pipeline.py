@@ -86,6 +86,22 @@ def prepare_views(
     Raises RecordingError (unsealed, damaged) or CalibrationError; each says what to do next.
     """
     options = options or JobOptions()
+    with single_threaded_opencv():
+        return _prepare(path, options, progress, fewest)
+
+
+@contextmanager
+def single_threaded_opencv() -> Iterator[None]:
+    """OpenCV adds up in another order on every run when it uses its own threads."""
+    before = cv2.getNumThreads()
+    cv2.setNumThreads(1)
+    try:
+        yield
+    finally:
+        cv2.setNumThreads(before)
+
+
+def _prepare(path: Path, options: JobOptions, progress: Progress | None, fewest: int) -> PreparedViews:
     clock = _Stages()
     with clock.stage("open"):
         recording = open_recording(path)
@@ -124,7 +140,7 @@ def solve_recording(
     prepared = prepare_views(path, options, progress)
     recording, loaded, views = prepared.recording, prepared.loaded, prepared.views
     clock = _Stages()
-    with clock.stage("solve"):
+    with clock.stage("solve"), single_threaded_opencv():
         solution = solve_views(views, solver_options(options, prepared))
     with clock.stage("judge"):
         used = views.select([k for k, view in enumerate(views) if view.index in set(solution.used)])

@@ -1,0 +1,267 @@
+"""The command line's contract: JSON objects, exit codes, one-paragraph errors, nothing half-written."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+import shutil
+import subprocess
+import sys
+from contextlib import redirect_stderr, redirect_stdout
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from calibrate.calibration import read_calibration, write_calibration
+from calibrate.cli import main
+from recordings.messages import CameraModel
+from tests.calibrate.sessions import Scene, write_session
+
+
+@dataclass
+class Done:
+    returncode: int
+    stdout: str
+    stderr: str
+
+
+def run(*arguments: object, cwd: Path) -> Done:
+    """The command in this process: the same entry point as the script's, without its start-up time."""
+    out, err, code = io.StringIO(), io.StringIO(), 0
+    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
+        patch.chdir(cwd)
+        patch.setenv("XDG_STATE_HOME", str(cwd / "state"))
+        patch.delenv("STATE_DIRECTORY", raising=False)
+        patch.setattr(sys, "argv", ["calibrate", *map(str, arguments)])
+        try:
+            main()
+        except SystemExit as end:
+            code = int(end.code or 0)
+    return Done(code, out.getvalue(), err.getvalue())
+
+
+def refused(done: Done, code: int, *words: str) -> None:
+    assert done.returncode == code, done.stderr
+    assert done.stdout == ""
+    assert "Traceback" not in done.stderr
+    for word in words:
+        assert word in " ".join(done.stderr.split())
+
+
+def test_solve_json_is_exactly_the_contract(session_file: Path, tmp_path: Path) -> None:
+    done = run("solve", session_file, "-o", tmp_path / "c.yaml", "--json", cwd=tmp_path)
+    assert done.returncode in (0, 4), done.stderr
+    assert done.stdout.count("\n") == 1
+    answer = json.loads(done.stdout)
+    assert list(answer) == [
+        "mount", "result", "sigma", "covariance", "views", "intrinsics", "holdout", "certificate", "gates",
+        "solve_ms",
+    ]  # fmt: skip
+    assert set(answer["result"]) == {
+        "parent_frame",
+        "child_frame",
+        "translation_m",
+        "rotation_xyzw",
+        "matrix",
+    }
+    assert set(answer["sigma"]) == {"translation_mm", "rotation_deg"}
+    assert set(answer["views"]) == {"used", "rejected"}
+    assert set(answer["intrinsics"]) == {"width", "height", "matrix", "distortion", "rms_px"}
+    assert answer["holdout"] is None or set(answer["holdout"]) == {"e_t_m", "e_R"}
+    assert set(answer["certificate"]) == {"certified", "relative_gap", "objective", "distance_sigma"}
+    assert all(set(gate) == {"name", "passed", "value", "limit", "text"} for gate in answer["gates"])
+    assert np.array(answer["covariance"]).shape == (6, 6)
+    assert np.array(answer["result"]["matrix"]).shape == (4, 4)
+    assert done.returncode == (0 if all(gate["passed"] for gate in answer["gates"]) else 4)
+    written = read_calibration(tmp_path / "c.yaml")
+    assert written.result.translation_m == tuple(answer["result"]["translation_m"])
+
+
+def test_a_failed_gate_is_exit_4_and_the_file_is_written_and_will_not_install(
+    real_session_file: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "gates.yaml").write_text("views: 20\n")
+    done = run("solve", real_session_file, "-o", "c.yaml", "--gates", "gates.yaml", cwd=tmp_path)
+    assert done.returncode == 4
+    assert "14 views were used" in done.stdout
+    refused(run("install", "c.yaml", cwd=tmp_path), 4, "not installed", "--override")
+    assert run("install", "c.yaml", "--override", "trial", cwd=tmp_path).returncode == 0
+    shown = run("show", "--json", cwd=tmp_path)
+    assert json.loads(shown.stdout)["override"]["reason"] == "trial"
+
+
+def test_solve_install_check_diff_rollback(real_session_file: Path, real_file: Path, tmp_path: Path) -> None:
+    """The operator's round: two calibrations, a look at each, a check, and back."""
+    second = tmp_path / "second.yaml"
+    calibration = read_calibration(real_file)
+    moved = np.array(calibration.result.matrix)
+    moved[0, 3] += 0.02
+    result = msgspec.structs.replace(
+        calibration.result,
+        matrix=tuple(map(tuple, moved.tolist())),
+        translation_m=tuple(moved[:3, 3].tolist()),
+    )
+    write_calibration(msgspec.structs.replace(calibration, result=result), second)
+    assert run("install", real_file, cwd=tmp_path).returncode == 0
+    holds = run("check", real_session_file, "--json", cwd=tmp_path)
+    assert holds.returncode == 0, holds.stdout + holds.stderr
+    assert json.loads(holds.stdout)["passed"] is True
+    installed = run("install", second, "--json", cwd=tmp_path)
+    assert json.loads(installed.stdout)["generation"] == 2
+    drifted = run("check", real_session_file, cwd=tmp_path)
+    assert drifted.returncode == 4
+    assert "DOES NOT HOLD" in drifted.stdout
+    apart = json.loads(run("diff", real_file, "--json", cwd=tmp_path).stdout)
+    assert apart["translation_mm"] == pytest.approx(20.0, abs=1e-6)
+    assert run("rollback", "--reason", "moved", cwd=tmp_path).returncode == 0
+    listed = json.loads(run("list", "--json", cwd=tmp_path).stdout)
+    assert [(row["generation"], row["current"]) for row in listed] == [(1, True), (2, False)]
+    text = run("export", "--to", "urdf", cwd=tmp_path)
+    assert text.stdout.count("<joint") == 2
+
+
+def test_simulated_never_installs_on_a_real_cell(session_file: Path, tmp_path: Path) -> None:
+    run("solve", session_file, "-o", "c.yaml", cwd=tmp_path)
+    refused(run("install", "c.yaml", "--override", "x", cwd=tmp_path), 1, "is simulated and is not installed")
+
+
+@pytest.mark.process
+def test_the_same_bits_in_two_processes(session_file: Path, tmp_path: Path) -> None:
+    """The lens is found from the pictures too; only the date may differ."""
+    for name, profile in (
+        ("a.yaml", "robust"),
+        ("b.yaml", "robust"),
+        ("c.yaml", "paper"),
+        ("d.yaml", "paper"),
+    ):
+        command = [
+            sys.executable,
+            "-m",
+            "calibrate.cli",
+            "solve",
+            str(session_file),
+            "-o",
+            str(tmp_path / name),
+        ]
+        done = subprocess.run(
+            [*command, "--profile", profile], capture_output=True, text=True, timeout=100, check=False
+        )
+        assert done.returncode in (0, 4), done.stderr
+    texts = [(tmp_path / f"{name}.yaml").read_text().splitlines() for name in "abcd"]
+    for first, second in (texts[:2], texts[2:]):
+        different = [a for a, b in zip(first, second, strict=True) if a != b]
+        assert all(line.startswith("created:") for line in different), different
+
+
+def test_recordings_that_are_not_whole(session_file: Path, tmp_path: Path) -> None:
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(session_file.read_bytes()[:-5000])
+    refused(run("solve", cut, cwd=tmp_path), 1, "cut.mcap", "recordings recover")
+    part = tmp_path / "x.mcap.part"
+    shutil.copy(session_file, part)
+    refused(run("solve", part, cwd=tmp_path), 1, "recordings recover")
+    refused(run("solve", "nowhere.mcap", cwd=tmp_path), 1, "nowhere.mcap")
+    flipped = bytearray(session_file.read_bytes())
+    flipped[len(flipped) // 2] ^= 4
+    (tmp_path / "flip.mcap").write_bytes(flipped)
+    refused(run("solve", "flip.mcap", cwd=tmp_path), 1, "flip.mcap")
+    assert not list(tmp_path.glob("*.yaml"))
+    assert not list(tmp_path.glob(".*tmp"))
+
+
+def test_wrong_usage_is_exit_2_and_says_what_is_allowed(session_file: Path, tmp_path: Path) -> None:
+    (tmp_path / "precious.yaml").write_text("not: a calibration\n")
+    refused(run("solve", session_file, "-o", "precious.yaml", cwd=tmp_path), 2, "precious.yaml", "-o")
+    assert (tmp_path / "precious.yaml").read_text() == "not: a calibration\n"
+    refused(run("solve", session_file, "-o", "no/such/c.yaml", cwd=tmp_path), 2, "no/such")
+    (tmp_path / "gates.yaml").write_text("view: 20\n")
+    refused(run("solve", session_file, "--gates", "gates.yaml", cwd=tmp_path), 2, "gates.yaml", "view")
+    (tmp_path / "camera.yaml").write_text("image_width: 3\ncamera_matrix: {data: [1]}\n")
+    refused(run("solve", session_file, "--camera", "camera.yaml", cwd=tmp_path), 2, "camera_info")
+    refused(run("solve", session_file, "--square-mm", "-4", cwd=tmp_path), 2, "square_m")
+    refused(run("solve", session_file, "--profile", "nix", cwd=tmp_path), 2, "robust")
+    refused(run("solve", cwd=tmp_path), 2)
+    refused(run("export", "c.yaml", "--to", "nix", cwd=tmp_path), 2, "urdf")
+
+
+def test_nothing_installed_is_said(session_file: Path, tmp_path: Path) -> None:
+    refused(run("check", session_file, cwd=tmp_path), 1, "nothing is installed")
+    refused(run("rollback", cwd=tmp_path), 1, "no older")
+    refused(run("show", cwd=tmp_path), 1, "nothing is installed")
+
+
+def test_a_check_of_the_wrong_kind_is_refused(session_file: Path, real_file: Path, tmp_path: Path) -> None:
+    refused(run("check", session_file, "--calibration", real_file, cwd=tmp_path), 2, "simulated", "real")
+
+
+def test_mixed_picture_sizes_name_the_view(session_file: Path, tmp_path: Path) -> None:
+    (tmp_path / "camera.yaml").write_text(
+        "width: 640\nheight: 480\nmatrix: [[600, 0, 320], [0, 600, 240], [0, 0, 1]]\n"
+    )
+    refused(run("solve", session_file, "--camera", "camera.yaml", cwd=tmp_path), 1, "view 0", "640×480")
+
+
+def test_the_board_prints(tmp_path: Path) -> None:
+    done = run("board", "-o", "b.pdf", "--paper", "A4", cwd=tmp_path)
+    assert done.returncode == 0
+    assert (tmp_path / "b.pdf").read_bytes().startswith(b"%PDF-")
+    warned = run("board", "-o", "b.svg", "--columns", 11, "--rows", 9, cwd=tmp_path)
+    assert "looks the same when turned by 180°" in " ".join(warned.stderr.split())
+    refused(run("board", "-o", "b.png", cwd=tmp_path), 2, ".pdf or .svg")
+
+
+def test_batch_solves_the_rest_and_goes_on_where_it_was(session_file: Path, tmp_path: Path) -> None:
+    recordings = [shutil.copy(session_file, tmp_path / f"r{k}.mcap") for k in range(2)]
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(session_file.read_bytes()[:-5000])
+    done = run("batch", *recordings, cut, "-o", "out", "--json", cwd=tmp_path)
+    assert done.returncode == 3, done.stderr
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [row["solved"] for row in rows] == [True, True, False]
+    assert "recordings recover" in rows[2]["error"]
+    assert rows[0]["translation_m"] == rows[1]["translation_m"]
+    with (tmp_path / "out/results.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == 3
+    before = (tmp_path / "out/results.jsonl").read_text().splitlines()
+    again = run("batch", *recordings, "-o", "out", "--json", cwd=tmp_path)
+    assert again.returncode == 0
+    assert (tmp_path / "out/results.jsonl").read_text().splitlines() == before
+    alone = run("solve", recordings[0], "-o", "alone.yaml", cwd=tmp_path)
+    assert alone.returncode in (0, 4)
+    pooled = read_calibration(tmp_path / "out" / rows[0]["calibration"])
+    assert pooled.result == read_calibration(tmp_path / "alone.yaml").result
+
+
+def test_the_report_is_one_page_with_no_network(session_file: Path, tmp_path: Path) -> None:
+    done = run("report", session_file, "-o", "r.html", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "r.html").read_text()
+    body = page.replace("http://www.w3.org/", "")
+    assert "http://" not in body.replace("http://purl.org/", "").replace("http://creativecommons.org/", "")
+    assert "https://" not in body
+    assert "<script" not in body
+    first = page.index('class="verdict')
+    assert first < page.index("Gates")
+    assert "SIMULATED" in page[: first + 200]
+    assert page.count("data:image/jpeg") == 10
+    for heading in ("Where the error comes from", "Residuals", "Every method", "Lens", "Where it comes from"):
+        assert heading in page
+
+
+def test_a_lens_known_before_can_be_given(session_file: Path, real_file: Path, tmp_path: Path) -> None:
+    exported = run("export", real_file, "--to", "ros-camera-info", "-o", "info.yaml", cwd=tmp_path)
+    assert exported.returncode == 0, exported.stderr
+    by_info = run("solve", session_file, "--camera", "info.yaml", "-o", "a.yaml", "--json", cwd=tmp_path)
+    by_file = run("solve", session_file, "--camera", real_file, "-o", "b.yaml", "--json", cwd=tmp_path)
+    first, second = json.loads(by_info.stdout), json.loads(by_file.stdout)
+    assert first["result"] == second["result"]
+    assert CameraModel(480, 384).width == first["intrinsics"]["width"]
+
+
+def test_few_views_are_refused(tmp_path: Path) -> None:
+    path = write_session(tmp_path / "few.mcap", Scene(views=3), known_lens=True)
+    refused(run("solve", path, cwd=tmp_path), 1, "at least 4 views")

@@ -1,0 +1,135 @@
+"""The check notices what it promises to, and cries wolf no more often than it says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from calibrate.board import board_points
+from calibrate.checks import CheckEntry, append_check, read_checks, trend_text
+from calibrate.drift import DriftCheck, Noise, judge_shift, pnp_covariance
+from calibrate.errors import BadViewsError, TooFewViewsError
+from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp
+from calibrate.lens import project
+from calibrate.pnp import solve_pnp
+from calibrate.views import ImageView, ViewSet
+from recordings.messages import CameraModel, Mount
+from tests.calibrate.sessions import PAPER_BOARD, X_TRUE, looking
+
+CAMERA = CameraModel(1280, 1024, ((1667.0, 0, 639.5), (0, 1667.0, 511.5), (0, 0, 1)), (0.0,) * 5)
+NOISE = Noise(corner_px=0.1, robot_m=0.00005, robot_rad=float(np.radians(0.005)), degrees_of_freedom=69)
+INSTALLED_COVARIANCE = np.diag([(0.03e-3) ** 2] * 3 + [float(np.radians(0.0035)) ** 2] * 3)
+BOARD = pose(rotation_exp([np.pi - 0.2, 0.1, 0.4]), [0.6, 0.1, 0.0])
+
+
+def few_views(rng: np.random.Generator, X: Array, count: int = 5, mount: Mount = "eye-in-hand") -> ViewSet:
+    """New views of a cell whose camera is truly at X."""
+    found = []
+    for k in range(count):
+        seen = looking(PAPER_BOARD, rng, (0.25, 0.6), 0.45, 1.2)
+        flange = BOARD @ inverse(X @ seen) if mount == "eye-in-hand" else X @ seen @ inverse(BOARD)
+        error = np.r_[rng.normal(size=3) * NOISE.robot_m, rng.normal(size=3) * NOISE.robot_rad]
+        pixels = project(CAMERA, seen, board_points(PAPER_BOARD)) + rng.normal(size=(42, 2)) * NOISE.corner_px
+        found.append(ImageView(k, str(k), perturb(flange, error), board_points(PAPER_BOARD), pixels))
+    return solve_pnp(ViewSet(mount, tuple(found), CAMERA))
+
+
+def checks(
+    count: int, shift_m: float, shift_rad: float, seed: int, mount: Mount = "eye-in-hand"
+) -> list[DriftCheck]:
+    """As after an installation with its own error, and a shift in a random direction since."""
+    rng = np.random.default_rng(seed)
+    root = np.linalg.cholesky(INSTALLED_COVARIANCE)
+    found = []
+    for _ in range(count):
+        way = rng.normal(size=(2, 3))
+        way /= np.linalg.norm(way, axis=1, keepdims=True)
+        moved = perturb(X_TRUE, np.r_[way[0] * shift_m, way[1] * shift_rad])
+        installed = perturb(X_TRUE, root @ rng.normal(size=6))
+        found.append(judge_shift(few_views(rng, moved, mount=mount), installed, INSTALLED_COVARIANCE, NOISE))
+    return found
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_false_alarms_and_detections(mount: Mount) -> None:
+    """Few trials; `make soak` runs 400. Limits allow for the chance of so few."""
+    quiet = checks(60, 0, 0, 1, mount)
+    assert sum(not c.passed for c in quiet) <= stats.binom.ppf(0.999, 60, 0.05)
+    assert np.mean([c.disagreement for c in quiet]) == pytest.approx(1.0, abs=0.2)
+    assert sum(not c.passed for c in checks(30, 0.5e-3, 0, 2, mount)) >= 27
+    assert sum(not c.passed for c in checks(30, 0, float(np.radians(0.1)), 3, mount)) >= 27
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_the_promise_in_400_trials_each(mount: Mount) -> None:
+    assert sum(not c.passed for c in checks(400, 0, 0, 11, mount)) <= stats.binom.ppf(0.99, 400, 0.05)
+    assert sum(not c.passed for c in checks(400, 0.5e-3, 0, 12, mount)) >= 380
+    assert sum(not c.passed for c in checks(400, 0, float(np.radians(0.1)), 13, mount)) >= 380
+
+
+def test_the_shift_is_named_and_the_stated_power_is_a_lower_bound() -> None:
+    found = checks(40, 2e-3, 0, 4)
+    assert np.median([c.shift_mm for c in found]) == pytest.approx(2.0, abs=0.3)
+    stated = np.mean([c.power_translation for c in checks(20, 0, 0, 5)])
+    noticed = np.mean([not c.passed for c in checks(40, 0.5e-3, 0, 6)])
+    assert 0.5 < stated <= noticed + 0.05
+
+
+def test_noisier_views_are_said_to_disagree() -> None:
+    rng = np.random.default_rng(7)
+    quiet = replace(NOISE, corner_px=0.02, robot_m=0.00001, robot_rad=0.00001)
+    result = judge_shift(few_views(rng, X_TRUE), X_TRUE, INSTALLED_COVARIANCE, quiet)
+    assert result.disagreement > 3
+
+
+def test_too_few_or_untelling_views_are_refused() -> None:
+    rng = np.random.default_rng(8)
+    with pytest.raises(TooFewViewsError, match="3 to 5"):
+        judge_shift(few_views(rng, X_TRUE, 2), X_TRUE, INSTALLED_COVARIANCE, NOISE)
+    views = few_views(rng, X_TRUE, 3)
+    same = replace(views, views=(views.views[0],) * 3)
+    with pytest.raises(BadViewsError, match="tilt"):
+        judge_shift(same, X_TRUE, INSTALLED_COVARIANCE, NOISE)
+
+
+def test_the_pose_covariance_is_that_of_many_repetitions() -> None:
+    rng = np.random.default_rng(9)
+    seen = looking(PAPER_BOARD, rng, (0.4, 0.41), 0.45)
+    points = board_points(PAPER_BOARD)
+    exact = project(CAMERA, seen, points)
+    errors = []
+    for _ in range(300):
+        view = ImageView(0, "", np.eye(4), points, exact + rng.normal(size=exact.shape) * 0.1)
+        got = solve_pnp(ViewSet("eye-in-hand", (view,), CAMERA)).camera_from_board[0]
+        errors.append(np.r_[got[:3, 3] - seen[:3, 3]])
+    measured = np.cov(np.array(errors).T)
+    predicted = pnp_covariance(points, CAMERA, seen)[:3, :3] * 0.01
+    assert np.sqrt(np.diag(measured)) == pytest.approx(np.sqrt(np.diag(predicted)), rel=0.15)
+
+
+def entry(day: float, shift_mm: float, generation: int = 1) -> CheckEntry:
+    covariance = np.diag([(0.05e-3) ** 2] * 3 + [1e-10] * 3)
+    rows = tuple(tuple(row) for row in covariance.tolist())
+    return CheckEntry(day * 86400, generation, "r", True, (shift_mm / 1e3, 0, 0, 0, 0, 0), rows, 1.0, 13.0)
+
+
+def test_a_trend_is_warned_of_before_a_check_fails(tmp_path: Path) -> None:
+    for day in range(8):
+        append_check(entry(day, 0.05 * day), tmp_path)
+    assert "about 1.50 mm" in trend_text(read_checks(tmp_path), 1)
+    assert trend_text(read_checks(tmp_path), 2) == ""
+    steady = [entry(day, 0.1) for day in range(8)]
+    assert trend_text(steady, 1) == ""
+    assert trend_text(steady[:3], 1) == ""
+
+
+def test_a_cut_history_line_is_skipped(tmp_path: Path) -> None:
+    append_check(entry(1, 0.0), tmp_path)
+    path = tmp_path / "calibrations/checks.jsonl"
+    path.write_bytes(path.read_bytes() + b'{"wall_s": 12')
+    assert len(read_checks(tmp_path)) == 1

@@ -143,15 +143,18 @@ def shows_board(C: Array, camera: CameraModel = CAMERA) -> bool:
     return bool((pixels > 2).all() and (pixels < [camera.width - 3, camera.height - 3]).all())
 
 
-def is_free(joints: Array, X: Array, Y: Array, spare_m: float = 0.0) -> Array:
-    """(n, 6) → (n,): spheres of arm and camera clear of themselves, the table and the board's plate."""
+def is_free(joints: Array, X: Array, Y: Array, spare_m: float = 0.0, clearance: float = 1.0) -> Array:
+    """(n, 6) → (n,): spheres of arm and camera clear of themselves, the table and the board's plate.
+
+    `clearance`: share of the wanted clearances from table and board that must be kept.
+    """
     centres, radii, body = _spheres(joints, X)
     moving = body >= 2
-    table = (centres[:, moving, 2] - radii[moving] - _TABLE_CLEARANCE_M).min(axis=1)
+    table = (centres[:, moving, 2] - radii[moving] - clearance * _TABLE_CLEARANCE_M).min(axis=1)
     local = (centres[:, moving] - Y[:3, 3]) @ Y[:3, :3]
     low, high = plate_points().min(axis=0), plate_points().max(axis=0)
     far = np.linalg.norm(local - np.clip(local, low, high), axis=-1) - radii[moving]
-    board = far.min(axis=1) - _BOARD_CLEARANCE_M
+    board = far.min(axis=1) - clearance * _BOARD_CLEARANCE_M
     gap = np.linalg.norm(centres[:, :, None] - centres[:, None], axis=-1) - radii[:, None] - radii
     apart = body[None, :] - body[:, None] >= np.where(
         body[:, None] == 3, 3, np.where(body[:, None] == 1, 2, 2)

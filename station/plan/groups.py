@@ -10,6 +10,8 @@ from station.plan.order import move_times
 from station.plan.scene import Scene
 
 _HUBS = 6
+_NEARLY_ALL = 0.85
+"""Of the branch: no other hub needs to be looked at."""
 _REACH_RAD = 2.6
 """Members turn no joint further than this from the hub: no flips of the wrist, no wound-up cables."""
 
@@ -41,6 +43,8 @@ def _best_of_branch(scene: Scene, branch: Pool, start: Array | None) -> Pool:
         group = branch.take(np.flatnonzero(free))
         if start is None or np.isfinite(_moves(scene, start, group.joints_rad, reach_rad=np.inf)).any():
             groups.append(group)
+        if len(groups[-1]) >= _NEARLY_ALL * len(branch):
+            break
     return max(groups, key=len)
 
 

@@ -51,7 +51,9 @@ class Scene:
         return transform_points(self.camera_from_board(base_from_flange), points)
 
     def drawn(self, draws: int, doubt: float, rng: np.random.Generator) -> list[tuple[Array, Array]]:
-        """Other (X, Y) that the guess allows, `doubt` times its sigmas away."""
+        """Other (X, Y) that the guess allows, `doubt` times its sigmas away; none without doubt."""
+        if doubt * max(*self.x_sigma, *self.y_sigma) == 0:
+            return []
 
         def disturbed(matrix: Array, sigma: tuple[float, float]) -> Array:
             # A guess is wrong about where the thing is and how it is turned, each about itself.

@@ -23,6 +23,8 @@ from station.status import StationState
 
 TICK_S = 0.02
 STATUS_TICKS = 5
+LOST_ROUNDS = 10
+"""A resting arm may be silent for this many status rounds (1 s); a moving one never."""
 JOGGED_RAD = 0.01
 LAGS_KEPT = 3000
 
@@ -34,6 +36,7 @@ class Guard:
         self._monitor = Monitor(bench)
         self._jogged, self._ticked = jogged, ticked
         self._rest_joints: Vector6 | None = None
+        self._stale_rounds = 0
         self.lags_s: deque[float] = deque(maxlen=LAGS_KEPT)
         """How late each round came."""
 
@@ -68,12 +71,14 @@ class Guard:
         try:
             robot.latest()
         except StaleStateError as error:
-            if store.state is StationState.IDLE:
+            self._stale_rounds += 1
+            if store.state is StationState.IDLE and self._stale_rounds >= LOST_ROUNDS:
                 store.enter(StationState.DISCONNECTED, str(error))
                 store.event(f"robot lost: {error}", "warning")
             return
         except RobotError:
             return
+        self._stale_rounds = 0
         if store.state is StationState.DISCONNECTED:
             resting = StationState.IDLE if self._bench.recording is None else StationState.PAUSED
             store.enter(resting)

@@ -85,9 +85,8 @@ class Run:
         if recording is not None:
             await recover_parts(bench, recording)
         fresh = recording or SessionRecording(bench.root, bench.cell)
-        bench.recording = (
-            fresh  # before it is open: STOP may come meanwhile, and what is there must be closed
-        )
+        # Before it is open: after a STOP in between, what is there must be closed.
+        bench.recording = fresh
         try:
             await fresh.open(queue, first)
         except RecordingError:

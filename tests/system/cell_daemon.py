@@ -1,0 +1,43 @@
+"""The real daemon in front of a simulated controller that outlives it: python -m tests.system.cell_daemon …
+
+`station serve --simulate` owns its controller, which ends with it; here a test can look at the arm of a
+daemon that was killed.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import sys
+from pathlib import Path
+
+import msgspec
+
+from station.cell import Cell
+from station.cli_serve import serve_cell
+from station.devices.ur import UrRobot
+from station.simulation.camera import RenderedCamera
+from station.simulation.cell import read_truth
+from station.simulation.scenes import cell_config
+
+
+def main() -> None:
+    host, truth_file, root, socket = sys.argv[1:5]
+    logging.basicConfig(level=logging.INFO, stream=sys.stderr)
+    truth = read_truth(Path(truth_file))
+    config = cell_config(truth, host)
+    capture = msgspec.structs.replace(config.capture, free_space_bytes=1)
+    config = msgspec.structs.replace(config, capture=capture)
+    place = Path(root)
+    cell = Cell(
+        config=config,
+        robot=UrRobot(config.robot, place, place),
+        camera=RenderedCamera(truth, host, config.camera),
+        source="simulated",
+        attachments={"truth.json": Path(truth_file).read_bytes()},
+    )
+    asyncio.run(serve_cell(cell, place, Path(socket), end_with_stdin=True))
+
+
+if __name__ == "__main__":
+    main()

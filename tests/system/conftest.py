@@ -1,0 +1,193 @@
+"""A daemon as a process, an operator as a client, and the arm as the controller itself reports it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from station.client import Client
+from station.plan.model import Plan
+from station.plan.planner import make_plan
+from station.simulation.admin import AdminClient
+from station.simulation.cell import make_cell, write_truth
+from station.simulation.launch import SimulatedController
+from station.simulation.scenes import cell_config
+from station.status import StationState, StationStatus
+
+TRUTH = make_cell(seed=5)
+AT_REST_RAD_S = 1e-3
+PROGRAM = (sys.executable, "-m", "tests.system.cell_daemon")
+
+
+@pytest.fixture(scope="session")
+def short_plan() -> Plan:
+    """Four poses, driven slowly enough to be caught in mid-move."""
+    plan = make_plan(cell_config(TRUTH), start_joints_rad=TRUTH.start_joints_rad, seed=5, count=4)
+    return msgspec.structs.replace(plan, joint_speed_rad_s=0.4)
+
+
+class Notified:
+    """What systemd would hear."""
+
+    def __init__(self, folder: Path) -> None:
+        self.path = folder / "notify"
+        self._link = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+        self._link.bind(str(self.path))
+        self._link.setblocking(False)
+
+    def heard(self) -> list[str]:
+        lines: list[str] = []
+        with contextlib.suppress(BlockingIOError):
+            while True:
+                lines += self._link.recv(4096).decode().splitlines()
+        return lines
+
+    def close(self) -> None:
+        self._link.close()
+
+
+class DaemonProcess:
+    """One life of the daemon. The controller outlives it."""
+
+    def __init__(self, controller: SimulatedController, folder: Path, root: Path, number: int) -> None:
+        self.controller, self.root = controller, root
+        self.socket = folder / f"{number}.sock"
+        self.notified = Notified(folder) if number == 1 else None
+        truth = folder / "truth.json"
+        environment = dict(os.environ)
+        if self.notified is not None:
+            environment |= {"NOTIFY_SOCKET": str(self.notified.path), "WATCHDOG_USEC": "1000000"}
+        self._words = (root / f"daemon-{number}.log").open("wb")
+        self.process = subprocess.Popen(
+            [*PROGRAM, controller.host, str(truth), str(root), str(self.socket)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=self._words,
+            env=environment,
+            start_new_session=True,
+        )
+
+    async def ready(self) -> None:
+        assert self.process.stdout is not None
+        line = await asyncio.wait_for(asyncio.to_thread(self.process.stdout.readline), 30)
+        assert line, "the daemon ended at once; see its log"
+
+    async def client(self) -> Client:
+        return await Client.connect(self.socket, interactive=True)
+
+    def end(self) -> None:
+        if self.process.poll() is None:
+            with contextlib.suppress(ProcessLookupError):
+                self.process.send_signal(signal.SIGCONT)
+            assert self.process.stdin is not None
+            self.process.stdin.close()
+            try:
+                self.process.wait(10)
+            except subprocess.TimeoutExpired:
+                self.process.kill()
+                self.process.wait()
+        for pipe in (self.process.stdin, self.process.stdout, self._words):
+            if pipe is not None:
+                pipe.close()
+        if self.notified is not None:
+            self.notified.close()
+
+
+class SystemRig:
+    """A controller, the daemons that came and went before it, and a look at the arm."""
+
+    def __init__(self, controller: SimulatedController, folder: Path, root: Path) -> None:
+        self.controller, self.folder, self.root = controller, folder, root
+        self.admin: AdminClient = controller.admin()
+        self.daemons: list[DaemonProcess] = []
+
+    async def daemon(self) -> DaemonProcess:
+        made = DaemonProcess(self.controller, self.folder, self.root, len(self.daemons) + 1)
+        self.daemons.append(made)
+        await made.ready()
+        return made
+
+    def speed_rad_s(self) -> float:
+        return max(map(abs, self.admin.ask("state")["joint_speeds_rad_s"]))
+
+    async def until(self, condition: Callable[[], bool], timeout_s: float = 20.0) -> float:
+        """Seconds until it holds."""
+        begun_s = time.monotonic()
+        while not condition():
+            assert time.monotonic() - begun_s < timeout_s, "it did not come about in time"
+            await asyncio.sleep(0.005)
+        return time.monotonic() - begun_s
+
+    async def moving(self) -> None:
+        await self.until(lambda: self.speed_rad_s() > 0.1)
+
+    async def at_rest(self, timeout_s: float = 3.0) -> float:
+        return await self.until(lambda: self.speed_rad_s() < AT_REST_RAD_S, timeout_s)
+
+    async def stays_at_rest(self, seconds: float = 0.5) -> None:
+        before = self.admin.ask("state")["joints_rad"]
+        await asyncio.sleep(seconds)
+        after = self.admin.ask("state")["joints_rad"]
+        assert max(abs(a - b) for a, b in zip(before, after, strict=True)) < 1e-3
+
+    def end(self) -> None:
+        for daemon in self.daemons:
+            daemon.end()
+        self.admin.close()
+
+
+async def status_when(
+    client: Client, condition: Callable[[StationStatus], bool], timeout_s: float = 40.0
+) -> StationStatus:
+    """The first status for which it holds."""
+    async with asyncio.timeout(timeout_s):
+        async for status in client.statuses():
+            if condition(status):
+                return status
+    raise AssertionError("the daemon ended first")
+
+
+async def go(client: Client, plan: Plan | None, purpose: str = "run") -> None:
+    """What an operator does up to the first motion."""
+    rest = (StationState.IDLE, StationState.PAUSED)
+    await status_when(client, lambda s: s.state in rest and s.camera.connected)
+    await client.request("lease", action="take")
+    if plan is not None:
+        await client.request("load_plan", plan=msgspec.to_builtins(plan))
+    summary = await client.request("prepare", purpose=purpose)
+    await client.request("go", token=summary["token"])
+
+
+MakeRig = Callable[[], Awaitable[SystemRig]]
+
+
+@pytest.fixture
+def short_folder() -> Iterator[Path]:
+    """Unix sockets have short names."""
+    folder = Path(tempfile.mkdtemp(prefix="st-"))
+    yield folder
+    shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture
+async def rig(
+    controller: Callable[..., SimulatedController], short_folder: Path, tmp_path: Path
+) -> AsyncIterator[SystemRig]:
+    truth = short_folder / "truth.json"
+    write_truth(TRUTH, truth)
+    made = SystemRig(await asyncio.to_thread(controller, "UR10", truth=truth), short_folder, tmp_path)
+    yield made
+    await asyncio.to_thread(made.end)

@@ -1,0 +1,186 @@
+"""The real daemon, driver and controller: stop, lost operators, and every way a daemon can end."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import signal
+import socket
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from recordings.reader import open_recording
+from station.client import Client, DaemonGoneError
+from station.plan.model import Plan
+from station.status import StationState as S
+from tests.system.conftest import DaemonProcess, SystemRig, go, status_when
+
+pytestmark = pytest.mark.process
+
+
+async def test_stop_from_a_watcher_halts_the_arm_and_is_latched(rig: SystemRig, short_plan: Plan) -> None:
+    daemon = await rig.daemon()
+    async with await daemon.client() as anna, await daemon.client() as bert:
+        await go(anna, short_plan)
+        await rig.moving()
+        pressed_s = time.monotonic()
+        await bert.request("stop")
+        answered_s = time.monotonic() - pressed_s
+        stopped_s = await rig.at_rest()
+        assert answered_s < 0.3
+        assert stopped_s < 1.0
+        status = await status_when(anna, lambda s: s.state is S.STOPPED)
+        assert "STOP by" in status.reason
+        await rig.stays_at_rest()
+        await anna.request("acknowledge")
+        await go(anna, None, "resume")
+        done = await status_when(anna, lambda s: bool(s.session.recording))
+        assert len(open_recording(Path(done.session.recording)).views()) == 4
+
+
+async def test_a_killed_operator_stops_the_arm(rig: SystemRig, short_plan: Plan) -> None:
+    daemon = await rig.daemon()
+    anna = await daemon.client()
+    async with await daemon.client() as watcher:
+        await go(anna, short_plan)
+        await rig.moving()
+        anna._writer.transport.abort()  # what the kernel does to a killed screen
+        assert await rig.at_rest() < 1.0
+        status = await status_when(watcher, lambda s: s.state is S.PAUSED)
+        assert "connection" in status.reason
+        assert not status.lease.holder
+        await rig.stays_at_rest()
+    await anna.close()
+
+
+async def test_a_killed_daemon_stops_the_arm_and_the_next_one_waits_for_a_person(
+    rig: SystemRig, short_plan: Plan
+) -> None:
+    first = await rig.daemon()
+    async with await first.client() as anna:
+        await go(anna, short_plan)
+        await status_when(anna, lambda s: s.session.captured == 1)
+        await rig.moving()
+        first.process.kill()
+        assert await rig.at_rest() < 1.5
+    second = await rig.daemon()
+    async with await second.client() as anna:
+        status = await status_when(anna, lambda s: s.state is S.STOPPED)
+        assert status.session.captured >= 1
+        await rig.stays_at_rest()
+        await status_when(anna, lambda s: s.robot.connected)
+        await anna.request("lease", action="take")
+        await anna.request("acknowledge")
+        await anna.request("finish")
+        done = await status_when(anna, lambda s: bool(s.session.recording))
+        assert len(open_recording(Path(done.session.recording)).views()) == status.session.captured
+
+
+async def test_a_daemon_that_hangs_stops_the_arm_and_goes_silent(rig: SystemRig, short_plan: Plan) -> None:
+    daemon = await rig.daemon()
+    assert daemon.notified is not None
+    async with await daemon.client() as anna:
+        await go(anna, short_plan)
+        await rig.moving()
+        heard = daemon.notified.heard()
+        assert "READY=1" in heard and "WATCHDOG=1" in heard
+        daemon.process.send_signal(signal.SIGSTOP)
+        assert await rig.at_rest() < 1.5
+        daemon.notified.heard()
+        await asyncio.sleep(1.2)
+        assert "WATCHDOG=1" not in daemon.notified.heard()
+        daemon.process.send_signal(signal.SIGCONT)
+        status = await status_when(anna, lambda s: s.state in (S.FAULT, S.STOPPED))
+        assert status.reason
+        await rig.stays_at_rest()
+
+
+async def test_sigterm_stops_the_arm_then_seals_then_ends(rig: SystemRig, short_plan: Plan) -> None:
+    daemon = await rig.daemon()
+    assert daemon.notified is not None
+    async with await daemon.client() as anna:
+        await go(anna, short_plan)
+        running = await status_when(anna, lambda s: s.session.captured == 1)
+        await rig.moving()
+        daemon.notified.heard()  # room for what comes now: the queue of a datagram socket is short
+        begun_s = time.monotonic()
+        daemon.process.terminate()
+        assert await rig.at_rest() < 1.0
+        await asyncio.to_thread(daemon.process.wait, 6)
+        assert time.monotonic() - begun_s < 5.0
+    assert daemon.process.returncode == 0
+    folder = Path(running.session.folder)
+    assert not list(folder.glob("*.part"))
+    views = len(open_recording(folder).views())
+    assert views >= 1
+    words = (rig.root / "daemon-1.log").read_text()
+    order = [words.index(text) for text in ("the station is ending", "sealed before the end", ":ended")]
+    assert order == sorted(order)
+    assert daemon.notified.heard()[-1] == "STOPPING=1"
+    assert not daemon.socket.exists()
+
+
+async def test_one_station_per_socket_and_per_robot(rig: SystemRig) -> None:
+    daemon = await rig.daemon()
+    command = [sys.executable, "-m", "tests.system.cell_daemon", rig.controller.host]
+    command += [str(rig.folder / "truth.json"), str(rig.root), str(daemon.socket)]
+    twin = await asyncio.to_thread(
+        subprocess.run, command, input="", capture_output=True, text=True, timeout=40
+    )
+    assert twin.returncode != 0
+    assert "already serves" in twin.stderr
+    async with await daemon.client() as anna:
+        await status_when(anna, lambda s: s.robot.connected)
+    other = await rig.daemon()
+    async with await other.client() as bert:
+        said = await status_when(bert, lambda s: any("owned by another station" in e.text for e in s.events))
+        assert said.state is S.DISCONNECTED
+
+
+async def test_a_crowd_does_not_keep_stop_out(rig: SystemRig, short_plan: Plan) -> None:
+    daemon = await rig.daemon()
+    async with await daemon.client() as anna:
+        await go(anna, short_plan)
+        crowd = []
+        for _ in range(200):
+            link = socket.socket(socket.AF_UNIX)
+            link.settimeout(1.0)
+            with contextlib.suppress(OSError):
+                link.connect(str(daemon.socket))
+            crowd.append(link)
+        await rig.moving()
+        await asyncio.sleep(2.2)  # those that stand beyond the seats are sent away after this
+        await rig.moving()
+        await asyncio.to_thread(_press_stop, daemon)
+        assert await rig.at_rest() < 1.0
+        for link in crowd:
+            link.close()
+
+
+def _press_stop(daemon: DaemonProcess) -> None:
+    with socket.socket(socket.AF_UNIX) as link:
+        link.settimeout(5.0)
+        link.connect(str(daemon.socket))
+        link.sendall(b'{"id": 1, "verb": "stop"}\n')
+        said = b""
+        while b'"id":1' not in said.replace(b" ", b""):
+            piece = link.recv(4096)
+            assert piece, said
+            said += piece
+
+
+async def test_a_stale_socket_of_a_crash_is_no_obstacle(rig: SystemRig) -> None:
+    first = await rig.daemon()
+    first.process.kill()
+    await asyncio.to_thread(first.process.wait)
+    assert first.socket.exists()
+    with pytest.raises(DaemonGoneError):
+        await Client.connect(first.socket)
+    first.socket.rename(rig.folder / "2.sock")
+    second = await rig.daemon()
+    async with await second.client() as anna:
+        await status_when(anna, lambda s: s.robot.connected)

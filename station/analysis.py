@@ -19,6 +19,7 @@ from calibrate.detect import detect
 from calibrate.geometry import Array
 from recordings.messages import BoardSpec, CameraModel, Vector6
 from station.config import StationConfig
+from station.exposure import assess
 from station.limits import PlanCheck, check_plan
 from station.plan.model import Plan
 from station.plan.planner import make_plan
@@ -52,13 +53,23 @@ def warm_up() -> int:
 
 
 def sight(
-    image: NDArray[Any], board: BoardSpec, camera: CameraModel | None, thorough: bool = True
+    image: NDArray[Any],
+    board: BoardSpec,
+    camera: CameraModel | None,
+    thorough: bool = True,
+    exposure: tuple[float, float] | None = None,
 ) -> Sighting:
-    """Looks for the board; distance and tilt where a lens, even a rough one, is given."""
+    """Looks for the board; distance and tilt where a lens, even a rough one, is given.
+
+    `exposure`: what the picture was taken with (µs, dB); with it comes advice on what to set.
+    """
     found = detect(image, board, thorough)
     distance_m = tilt_rad = None
     if found.found and camera is not None and camera.matrix is not None:
         distance_m, tilt_rad = _distance_and_tilt(found.pixels, board_points(board)[found.indices], camera)
+    advice = ""
+    if exposure is not None:
+        advice = "; ".join(assess(image, found.pixels if found.found else None, *exposure).warnings)
     status = DetectionStatus(
         found=found.found,
         reason=found.reason,
@@ -69,6 +80,7 @@ def sight(
         coverage=round(float(found.coverage), 4),
         tilt_rad=tilt_rad,
         distance_m=distance_m,
+        advice=advice,
     )
     return Sighting(status, found.indices, found.pixels)
 

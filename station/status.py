@@ -97,6 +97,8 @@ class DetectionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     coverage: float = 0.0
     tilt_rad: float | None = None
     distance_m: float | None = None
+    advice: str = ""
+    """What is wrong with the light or the focus and what to set; empty = nothing."""
 
 
 class RecorderStatus(msgspec.Struct, frozen=True, omit_defaults=True):

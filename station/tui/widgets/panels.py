@@ -56,12 +56,12 @@ def device_lines(status: StationStatus) -> list[str]:
 def detection_lines(status: StationStatus) -> list[str]:
     seen = status.detection
     if not seen.found:
-        return [seen.reason or "no board in view", f"saturated {100 * seen.saturated:.1f} %"]
+        return [seen.reason or "no board in view", seen.advice or f"saturated {100 * seen.saturated:.1f} %"]
     tilt = "-" if seen.tilt_rad is None else degrees(seen.tilt_rad, 0)
     far = "-" if seen.distance_m is None else mm(seen.distance_m, 0)
     return [
         f"board {seen.corners}/{seen.expected}  sharp {seen.sharpness:.1f}  sat {100 * seen.saturated:.1f} %",
-        f"fills {100 * seen.coverage:.0f} %  tilt {tilt}  at {far}",
+        seen.advice or f"fills {100 * seen.coverage:.0f} %  tilt {tilt}  at {far}",
     ]
 
 

@@ -211,8 +211,7 @@ def report(tally: Tally) -> str:
             "",
         ],
         [
-            "moves (plan and bootstrap) that touch something or come nearer than half of the wanted clearance "
-            "to the true table or board",
+            "moves, plan and bootstrap, that touch something or halve the wanted clearance to table or board",
             f"{tally.colliding} of {tally.moves}",
             "0",
         ],

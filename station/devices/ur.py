@@ -167,7 +167,7 @@ class UrRobot(UrLink):
         stop = safety_stop(state) or not_powered(state)
         if stop is not None:
             return stop
-        if reader.ended is not None:
+        if reader.ended is not None or isinstance(error, StaleStateError):
             return StaleStateError(self._stale_words(self.age_s()))
         if state.runtime_state != RuntimeState.STOPPED:
             return error

@@ -85,9 +85,11 @@ def program_not_running(state: RobotState) -> RobotError | None:
     if state.runtime_state == RuntimeState.PLAYING:
         return None
     word = program_word(state)
+    by = "on the pendant, by the switch to local control, or by its watchdog"
+    if state.runtime_state in (RuntimeState.PAUSED, RuntimeState.PAUSING):
+        by = "on the pendant"
     return RobotError(
-        f"the control program is {word}: stopped or paused on the pendant, by remote control being switched "
-        "off, or by its watchdog. Look at the cell, acknowledge here and give a new go."
+        f"the control program was {word} {by}. Look at the cell, acknowledge here and give a new go."
     )
 
 

@@ -222,7 +222,7 @@ class UrLink:
         assert reader is not None
         if reader.ended is not None:
             return f"connection to the robot lost ({reader.ended}): check cable and controller"
-        if reader.frozen:
+        if reader.stands_still:
             return f"the controller's clock stands still since {age_s * 1000:.0f} ms: restart the controller"
         return f"no news from the robot for {age_s * 1000:.0f} ms: check cable and network"
 

@@ -79,6 +79,8 @@ class StateReader(threading.Thread):
         """Samples that the controller made and that never came."""
         self.frozen = 0
         """Packets whose controller time did not advance."""
+        self.stands_still = False
+        """The newest packet was such a one."""
         self.ended: str | None = None
         """Why the connection is over; None while it lives."""
         self._on_state = on_state
@@ -205,6 +207,7 @@ class StateReader(threading.Thread):
             gap = (controller_s - before.state.stamps.controller_s) * self.rate_hz
             if gap == 0:
                 self.frozen += 1
+                self.stands_still = True
                 return
             if gap < 0:
                 self.history.clear()  # the controller's clock was set back
@@ -224,6 +227,7 @@ class StateReader(threading.Thread):
             target_speed_fraction=v[31],
         )
         self.samples += 1
+        self.stands_still = False
         self.clock.add(controller_s, monotonic_ns)
         self.history.append(state)
         self.newest = Sample(state, int(v[32]), v[33] if len(v) > 33 else 0.0)

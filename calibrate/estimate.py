@@ -16,7 +16,7 @@ from calibrate.errors import BadViewsError
 from calibrate.geometry import Array
 from calibrate.likelihood.model import Observations, State
 from calibrate.likelihood.noise import FLOOR, reml_scales
-from calibrate.likelihood.normal import Normal, Solved
+from calibrate.likelihood.normal import PRIOR, Normal, Solved
 from calibrate.likelihood.residuals import corner_residuals, linearise, robot_residuals
 from calibrate.projection import INTRINSICS
 from recordings.messages import CameraModel
@@ -49,8 +49,17 @@ class Estimate:
 
     @property
     def threshold(self) -> float:
-        """95 % ellipsoid δᵀ C⁻¹ δ: 6·F(6, 3N - 6), as the scales come from N robot poses."""
-        return float(6 * stats.f.ppf(0.95, 6, max(3 * len(self.state.C) - 6, 1)))
+        """95 % ellipsoid δᵀ C⁻¹ δ: 6·F(6, ν), ν = 3N - 6 as the scales come from N robot poses.
+
+        With kinematic errors their scale dominates and is known worst: then ν is the number of them that
+        the data leave free (24 minus the trace), if that is less.
+        """
+        freedom = 3.0 * len(self.state.C) - 6.0
+        if len(self.state.theta):
+            precision = self.sigma**-2
+            used = self.normal.solve(precision).traces() * precision
+            freedom = min(freedom, float(self.normal.count[PRIOR] - used[PRIOR]))
+        return float(6 * stats.f.ppf(0.95, 6, max(freedom, 1.0)))
 
 
 def first_state(observed: Observations, X: Array, C: Array, H: Array, camera: CameraModel) -> State:

@@ -160,7 +160,7 @@ class Solution:
     covariance: Array
     """(6, 6)"""
     confidence_threshold: float
-    """δᵀ C⁻¹ δ below this holds the truth in 95 % of cases: 6·F(6, ν), ν = 3N - 6 or fewer (see `Estimate`)."""
+    """δᵀ C⁻¹ δ below this holds the truth in 95 % of cases: 6·F(6, ν), ν ≤ 3N - 6 (see `Estimate`)."""
     board_place: Transform
     """base_from_board or flange_from_board."""
     camera: CameraModel

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Protocol
+from typing import Any, Protocol
 
 import msgspec
 
@@ -78,6 +78,9 @@ class Camera(Protocol):
     @property
     def clock(self) -> ClockFit | None:
         """The camera's clock against the host's; None while not known. For `frames.mid_exposure`."""
+
+    async def settings(self) -> dict[str, Any]:
+        """As the camera reports them now, for the recording; JSON types only. Raises CameraError."""
 
     async def preview(self) -> Picture | None:
         """A recent picture for the screen; None when there is none. Never recorded."""

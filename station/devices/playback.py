@@ -10,6 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -98,6 +99,9 @@ class PlaybackCamera:
             )
             self._taken += 1
             return self._newest
+
+    async def settings(self) -> dict[str, Any]:
+        return {"device": self._config.device, "pace": self._config.playback_pace}
 
     async def preview(self) -> Picture | None:
         """The newest picture; with a robot, what it looks at now."""

@@ -7,6 +7,7 @@ import platform
 import time
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -16,6 +17,7 @@ from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, require_free_space
 from recordings.messages import CameraModel, CaptureEvent, Picture, RobotState, SessionInfo, Stamps, View
 from recordings.recorder import Recorder
 from station.cell import Cell
+from station.errors import CameraError
 from station.plan.model import Plan
 from station.session.folder import (
     SessionState,
@@ -82,10 +84,16 @@ class SessionRecording:
 
     async def open(self, queue: PoseQueue, first_picture: Picture | None = None) -> None:
         """Creates the file with everything needed to re-solve it. Raises RecordingError."""
-        await asyncio.to_thread(self._open, queue.plan, queue.sha256, first_picture)
+        try:
+            settings = await self._cell.camera.settings()
+        except CameraError as error:
+            settings = {"error": str(error)}  # its pictures will say the same
+        await asyncio.to_thread(self._open, queue.plan, queue.sha256, first_picture, settings)
         await self.save_state(queue)
 
-    def _open(self, plan: Plan, plan_sha256: str, first_picture: Picture | None) -> None:
+    def _open(
+        self, plan: Plan, plan_sha256: str, first_picture: Picture | None, settings: dict[str, Any]
+    ) -> None:
         config = self._cell.config
         require_free_space(self.folder, config.capture.free_space_bytes)
         info = SessionInfo(
@@ -106,6 +114,7 @@ class SessionRecording:
         recorder = Recorder(path, info, lossless_png=config.capture.lossless_png)
         recorder.attach("plan.yaml", "application/yaml", msgspec.yaml.encode(plan))
         recorder.attach("config.yaml", "application/yaml", self._cell.config_yaml)
+        recorder.attach("camera.json", "application/json", msgspec.json.encode(settings))
         for name, content in self._cell.attachments.items():
             recorder.attach(name, "application/json", content)
         recorder.camera_model(info.camera)

@@ -101,6 +101,14 @@ class RenderedCamera:
             self._check_settings(frame)
             return msgspec.structs.replace(frame, sequence=sequence)
 
+    async def settings(self) -> dict[str, Any]:
+        return {
+            "pixel_format": "Mono8",
+            "region": [0, 0, self._truth.camera.width, self._truth.camera.height],
+            "exposure_us": self._exposure_us,
+            "gain_db": self._gain_db,
+        }
+
     async def preview(self) -> Picture | None:
         """At half the size, rendered anew."""
         try:

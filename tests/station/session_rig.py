@@ -163,6 +163,9 @@ class CameraInMemory:
             exposure_us=1000.0,
         )
 
+    async def settings(self) -> dict[str, object]:
+        return {"exposure_us": 1000.0}
+
     async def preview(self) -> Picture | None:
         return await self.capture()
 

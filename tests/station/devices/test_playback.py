@@ -193,3 +193,8 @@ async def test_states_are_published_and_stop_halts_a_move(recording: Path) -> No
 def test_a_recording_without_joints_plays_as_a_camera_only(tmp_path: Path) -> None:
     with pytest.raises(RobotError, match="camera only"):
         PlaybackRobot(record(tmp_path / "imported.mcap", joints=False))
+
+
+async def test_what_is_played_is_in_the_settings(folder: Path) -> None:
+    settings = await PlaybackCamera(config(folder, pace=2.0)).settings()
+    assert settings == {"device": str(folder), "pace": 2.0}

@@ -37,7 +37,7 @@ async def test_a_go_takes_every_pose_and_seals(rig: Rig, small_plan: Plan) -> No
         np.testing.assert_allclose(view.base_from_flange, pose.base_from_flange, atol=1e-9)
         assert recording.picture(view).sequence == view.picture_sequence
         assert view.stillness is not None
-    assert set(recording.attachments()) == {"plan.yaml", "config.yaml", "truth.json"}
+    assert set(recording.attachments()) == {"plan.yaml", "config.yaml", "camera.json", "truth.json"}
     assert recording.info.source == "simulated"
     assert any("saved" in event.detail for event in recording.events())
     assert sum(1 for _ in recording.robot_states()) > POSES * 50

@@ -9,6 +9,7 @@ from calibrate.geometry import is_rigid
 from calibrate.views import ImageView, ViewSet
 
 MIN_VIEWS = 4
+FEWEST_CORNERS = 4
 MAX_VIEWS = 20_000
 """Beyond this the last stage would need more than a minute and a gigabyte."""
 
@@ -25,8 +26,9 @@ def require_solvable(views: ViewSet) -> None:
             f"{len(views)} views; at most {MAX_VIEWS} are solved at once. Split the recording."
         )
     _require_camera(views)
+    fewest = FEWEST_CORNERS if any(len(view.pixels) for view in views) else 0
     for view in views:
-        _require_view(view)
+        _require_view(view, fewest)
     first = views.views[0].base_from_flange
     if all(np.abs(view.base_from_flange - first).max() < 1e-9 for view in views):
         raise BadViewsError("All robot poses are identical. Check how the poses were recorded.")
@@ -52,7 +54,7 @@ def _require_camera(views: ViewSet) -> None:
         raise BadViewsError("The lens distortion contains NaN or infinity.")
 
 
-def _require_view(view: ImageView) -> None:
+def _require_view(view: ImageView, fewest_corners: int) -> None:
     where = f"View {view.index} ({view.name})"
     if not is_rigid(np.asarray(view.base_from_flange)):
         raise BadViewsError(
@@ -69,5 +71,9 @@ def _require_view(view: ImageView) -> None:
         raise BadViewsError(f"{where}: the board pose lies behind the camera. Check corners and intrinsics.")
     if len(view.pixels) != len(view.board_points):
         raise BadViewsError(f"{where}: {len(view.pixels)} pixels for {len(view.board_points)} board points.")
+    if len(view.pixels) < fewest_corners:
+        raise BadViewsError(
+            f"{where}: {len(view.pixels)} corners, at least {fewest_corners} are needed. Remove this view."
+        )
     if not (np.isfinite(view.pixels).all() and np.isfinite(view.board_points).all()):
         raise BadViewsError(f"{where}: NaN among its corners. Remove this view.")

@@ -165,7 +165,8 @@ def test_identical_views_are_refused():
 def broken(field, value):
     cell = make_cell(np.random.default_rng(0), 8, LOW)
     views = list(cell.views.views)
-    views[3] = replace(views[3], **{field: value(np.array(getattr(views[3], field)))})
+    fields = ("pixels", "board_points") if field == "both" else (field,)
+    views[3] = replace(views[3], **{name: value(np.array(getattr(views[3], name))) for name in fields})
     return replace(cell.views, views=tuple(views))
 
 
@@ -183,6 +184,7 @@ def mirrored(C):
         ("camera_from_board", lambda C: C @ pose(np.eye(3), [0, 0, -9.0]), "behind"),
         ("pixels", lambda p: p * np.nan, "NaN"),
         ("pixels", lambda p: p[:-1], "pixels for"),
+        ("both", lambda p: p[:3], "3 corners, at least 4"),
     ],
 )
 def test_a_broken_view_is_named(profile, field, value, says):

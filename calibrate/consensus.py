@@ -32,8 +32,6 @@ class Consensus:
     """Those that agree."""
     turned: frozenset[int]
     """Places of the views set right."""
-    pairs: Pairs
-    """All pairs of the agreeing views."""
     start: GlobalResult
 
 
@@ -46,7 +44,7 @@ def find_consensus(views: ViewSet, seed: int, reject: bool = True) -> Consensus:
     if not reject:
         pairs = all_pairs(H, C)
         require_motion(pairs)
-        return Consensus(views, np.arange(len(H)), frozenset(), pairs, _solve(pairs, seed, len(H)))
+        return Consensus(views, np.arange(len(H)), frozenset(), _solve(pairs, seed, len(H)))
     _require_no_shift(views, H, C)
     places = _first_group(H, C, seed)
     turned: frozenset[int] = frozenset()
@@ -63,7 +61,7 @@ def find_consensus(views: ViewSet, seed: int, reject: bool = True) -> Consensus:
         if np.array_equal(agreeing, places):
             break
         places = agreeing if len(agreeing) >= _FEWEST else places
-    return Consensus(views, places, turned, pairs, start)
+    return Consensus(views, places, turned, start)
 
 
 def pose_arrays(views: ViewSet) -> tuple[Array, Array]:

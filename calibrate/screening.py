@@ -31,8 +31,6 @@ class Screening:
     group: Places
     """Places of the views that agree with each other."""
     voters: Places
-    agreement: float
-    """Share of all voters' pairs that agree."""
     scale_rad: float
     scale_m: float
 
@@ -53,7 +51,7 @@ def screen(H: Array, camera_from_board: Array) -> Screening:
     matrix = np.eye(len(voters), dtype=bool)
     matrix[first, second] = matrix[second, first] = agree
     group = _largest_group(matrix)
-    return Screening(voters[group], voters, float(agree.mean()), float(scale[0]), float(scale[1]))
+    return Screening(voters[group], voters, float(scale[0]), float(scale[1]))
 
 
 def detect_shift(H: Array, camera_from_board: Array) -> int:

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from calibrate.geometry import Array, difference
-from calibrate.kinematics import JOINT_NAMES, MODELS, RobotModel, forward, link_frames
+from calibrate.kinematics import MODELS, RobotModel, forward, link_frames
 from calibrate.views import ViewSet
 
 UNIT = 1e-3
 """θ = 1 means 1 mm for lengths and 1 mrad for angles: equal harm at an arm's length of 1 m."""
-PARAMETERS = tuple(f"{kind} of {joint}" for kind in ("a", "d", "alpha", "theta") for joint in JOINT_NAMES)
 _SAME_M, _SAME_RAD = 0.02, np.radians(2.0)
 """Recorded joints and flange pose belong together when the table agrees within this."""
 

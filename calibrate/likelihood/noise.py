@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from calibrate.geometry import Array
-from calibrate.likelihood.normal import CORNERS, PRIOR, Normal
+from calibrate.likelihood.normal import CORNERS, Normal
 
 FLOOR = np.array([1e-4, 1e-6, 1e-6, 1e-4])
 """No source is taken as better than this: px, m, rad, and the kinematic prior's unit."""
@@ -43,8 +43,3 @@ def restricted_deviance(normal: Normal, sigma: Array) -> float:
     return float(
         (squares / sigma**2).sum() + 2 * (normal.count * np.log(sigma)).sum() + solved.log_determinant
     )
-
-
-def kinematics_vanish(sigma: Array) -> bool:
-    """Has the fit driven the kinematic prior's scale to its floor: nothing systematic there?"""
-    return bool(sigma[PRIOR] <= 2 * FLOOR[PRIOR])

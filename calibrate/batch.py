@@ -19,6 +19,7 @@ import msgspec
 
 from calibrate.calibration import content_sha256, write_atomically, write_calibration
 from calibrate.errors import CalibrationError
+from calibrate.lines import append_line, read_lines
 from calibrate.pipeline import JobOptions, SolvedRecording, solve_recording
 from recordings.errors import RecordingError
 
@@ -83,14 +84,11 @@ def run_batch(
         keys = [(str(path.resolve()), batch_key(path, options)) for path in recordings]
         todo = [(path, key) for path, key in dict.fromkeys(keys) if key not in done]
         solve = solver or _pool_solver(workers)
-        with (output / RESULTS).open("ab") as file:
-            for count, result in enumerate(solve(todo, options, str(output)), 1):
-                done[result.key] = result
-                file.write(msgspec.json.encode(result) + b"\n")
-                file.flush()
-                os.fsync(file.fileno())
-                if progress:
-                    progress(count, len(todo), result)
+        for count, result in enumerate(solve(todo, options, str(output)), 1):
+            done[result.key] = result
+            append_line(output / RESULTS, result)
+            if progress:
+                progress(count, len(todo), result)
         results = [done[key] for _, key in keys]
         write_atomically(output / "results.csv", lambda target: target.write(_csv(results)))
     except OSError as problem:
@@ -110,15 +108,8 @@ def batch_key(path: Path, options: JobOptions) -> str:
 
 
 def read_results(output: Path) -> list[BatchResult]:
-    """Of earlier runs, oldest first; a line that a crash cut is left out."""
-    path = output / RESULTS
-    found = []
-    for line in path.read_bytes().splitlines() if path.exists() else []:
-        try:
-            found.append(msgspec.json.decode(line, type=BatchResult))
-        except msgspec.DecodeError:
-            continue
-    return found
+    """Of earlier runs, oldest first."""
+    return read_lines(output / RESULTS, BatchResult)
 
 
 def solve_one(recording: str, key: str, options: JobOptions, output: str) -> BatchResult:

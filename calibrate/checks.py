@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -12,6 +11,7 @@ from scipy import stats
 
 from calibrate.drift import DriftCheck
 from calibrate.generations import InstallError, calibrations_folder
+from calibrate.lines import append_line, read_lines
 
 _FEWEST_FOR_TREND = 5
 _TREND_P = 0.01
@@ -48,24 +48,14 @@ def append_check(entry: CheckEntry, root: Path | None = None) -> None:
     folder = calibrations_folder(root)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        with (folder / "checks.jsonl").open("ab") as file:
-            file.write(msgspec.json.encode(entry) + b"\n")
-            file.flush()
-            os.fsync(file.fileno())
+        append_line(folder / "checks.jsonl", entry)
     except OSError as problem:
         raise InstallError(f"{folder}: the check cannot be noted: {problem.strerror}.") from None
 
 
 def read_checks(root: Path | None = None) -> list[CheckEntry]:
-    """Oldest first; lines that a crash cut are left out."""
-    path = calibrations_folder(root) / "checks.jsonl"
-    entries = []
-    for line in path.read_bytes().splitlines() if path.exists() else []:
-        try:
-            entries.append(msgspec.json.decode(line, type=CheckEntry))
-        except msgspec.DecodeError:
-            continue
-    return entries
+    """Oldest first."""
+    return read_lines(calibrations_folder(root) / "checks.jsonl", CheckEntry)
 
 
 def trend_text(history: Sequence[CheckEntry], generation: int) -> str:

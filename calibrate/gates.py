@@ -12,6 +12,7 @@ import numpy as np
 from calibrate.errors import CalibrationError
 from calibrate.scale import ScaleCheck
 from calibrate.solution import Solution
+from recordings import strict_yaml
 
 
 class GatesError(CalibrationError):
@@ -70,8 +71,8 @@ class Evidence:
 def read_limits(path: Path) -> GateLimits:
     """YAML with some of GateLimits' fields. Raises GatesError naming file and field."""
     try:
-        return msgspec.yaml.decode(path.read_bytes(), type=GateLimits)
-    except (OSError, msgspec.DecodeError) as problem:
+        return strict_yaml.load(path.read_bytes(), GateLimits)
+    except (OSError, strict_yaml.StrictYamlError) as problem:
         raise GatesError(f"{path}: {problem}. Allowed: {', '.join(GateLimits.__struct_fields__)}.") from None
 
 

@@ -24,6 +24,7 @@ import msgspec
 
 from calibrate.calibration import Calibration, CalibrationFileError, fsync_folder, read_calibration
 from calibrate.errors import CalibrationError
+from calibrate.lines import append_line, read_lines
 
 _NAME = re.compile(r"(\d{4,})-[0-9a-f]{8}\.yaml")
 
@@ -81,15 +82,8 @@ def generations(root: Path | None = None) -> list[Generation]:
 
 
 def read_log(root: Path | None = None) -> list[LogEntry]:
-    """Oldest first; lines that a crash cut are left out."""
-    path = calibrations_folder(root) / "log.jsonl"
-    entries = []
-    for line in path.read_bytes().splitlines() if path.exists() else []:
-        try:
-            entries.append(msgspec.json.decode(line, type=LogEntry))
-        except msgspec.DecodeError:
-            continue
-    return entries
+    """Oldest first."""
+    return read_lines(calibrations_folder(root) / "log.jsonl", LogEntry)
 
 
 def content_name(content: bytes) -> str:
@@ -140,10 +134,7 @@ def switch(folder: Path, name: str, content: bytes) -> None:
 
 
 def append_log(folder: Path, entry: LogEntry) -> None:
-    with (folder / "log.jsonl").open("ab") as file:
-        file.write(msgspec.json.encode(entry) + b"\n")
-        file.flush()
-        os.fsync(file.fileno())
+    append_line(folder / "log.jsonl", entry)
 
 
 @contextmanager

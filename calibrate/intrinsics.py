@@ -20,6 +20,7 @@ LensModel = Literal["plumb_bob", "rational_polynomial", "equidistant"]
 
 FEWEST_VIEWS = 3
 _SIGNIFICANT_SIGMAS = 2.0
+_LARGEST_BEND_PX = 1.0
 _LARGEST_CENTRE_SIGMA_SHARE = 0.03
 _STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-9)
 _NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
@@ -143,9 +144,18 @@ def _undetermined(fit: _Fit, camera: CameraModel) -> tuple[int, str] | None:
     k1, k2, p1, p2, k3 = fit.D[:5]
     s = fit.sigma
     rational = bool(fit.flags & cv2.CALIB_RATIONAL_MODEL)
+    centre, focal = fit.K[:2, 2], float(fit.K[0, 0])
+    corner = float(np.linalg.norm(np.maximum(centre, [camera.width, camera.height] - centre))) / focal
 
-    def small(value: float, sigma: float) -> bool:
-        return abs(value) < _SIGNIFICANT_SIGMAS * sigma
+    def unknown(power: int, value: float, sigma: float) -> bool:
+        """Not told from zero, and left free it could bend the picture's corner by more than a pixel.
+
+        A value that would throw the corner out of the picture comes from a singular fit, whatever its sigma.
+        """
+        bend_px, doubt_px = focal * abs(value) * corner**power, focal * sigma * corner**power
+        if bend_px > max(camera.width, camera.height):
+            return True
+        return abs(value) < _SIGNIFICANT_SIGMAS * sigma and doubt_px > _LARGEST_BEND_PX
 
     if not fit.flags & cv2.CALIB_FIX_PRINCIPAL_POINT and max(s[2], s[3]) > (
         _LARGEST_CENTRE_SIGMA_SHARE * max(camera.width, camera.height)
@@ -156,16 +166,16 @@ def _undetermined(fit: _Fit, camera: CameraModel) -> tuple[int, str] | None:
         )
     if rational:
         return None
-    if not fit.flags & cv2.CALIB_FIX_K3 and small(k3, s[8]):
+    if not fit.flags & cv2.CALIB_FIX_K3 and unknown(7, k3, s[8]):
         return cv2.CALIB_FIX_K3, f"k3 held at 0: found {k3:.3g} ± {s[8]:.2g}"
-    if not fit.flags & cv2.CALIB_ZERO_TANGENT_DIST and small(p1, s[6]) and small(p2, s[7]):
+    if not fit.flags & cv2.CALIB_ZERO_TANGENT_DIST and unknown(2, p1, s[6]) and unknown(2, p2, s[7]):
         return (
             cv2.CALIB_ZERO_TANGENT_DIST,
             f"p1, p2 held at 0: found {p1:.2g} ± {s[6]:.1g}, {p2:.2g} ± {s[7]:.1g}",
         )
-    if fit.flags & cv2.CALIB_FIX_K3 and not fit.flags & cv2.CALIB_FIX_K2 and small(k2, s[5]):
+    if fit.flags & cv2.CALIB_FIX_K3 and not fit.flags & cv2.CALIB_FIX_K2 and unknown(5, k2, s[5]):
         return cv2.CALIB_FIX_K2, f"k2 held at 0: found {k2:.3g} ± {s[5]:.2g}"
-    if fit.flags & cv2.CALIB_FIX_K2 and not fit.flags & cv2.CALIB_FIX_K1 and small(k1, s[4]):
+    if fit.flags & cv2.CALIB_FIX_K2 and not fit.flags & cv2.CALIB_FIX_K1 and unknown(3, k1, s[4]):
         return cv2.CALIB_FIX_K1, f"k1 held at 0: found {k1:.3g} ± {s[4]:.2g}"
     return None
 

@@ -1,0 +1,34 @@
+"""Files of JSON lines that only grow: a line is durable when written, and a cut one costs only itself."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TypeVar
+
+import msgspec
+
+S = TypeVar("S", bound=msgspec.Struct)
+
+
+def append_line(path: Path, entry: msgspec.Struct) -> None:
+    """Raises OSError. Whatever a crash left half-written is ended first."""
+    with path.open("a+b") as file:
+        if file.tell() > 0:
+            file.seek(-1, os.SEEK_END)
+            if file.read(1) != b"\n":
+                file.write(b"\n")
+        file.write(msgspec.json.encode(entry) + b"\n")
+        file.flush()
+        os.fsync(file.fileno())
+
+
+def read_lines(path: Path, kind: type[S]) -> list[S]:
+    """Oldest first; empty when there is no file. Lines that are no `kind` are left out."""
+    found = []
+    for line in path.read_bytes().splitlines() if path.exists() else []:
+        try:
+            found.append(msgspec.json.decode(line, type=kind))
+        except (msgspec.DecodeError, UnicodeDecodeError):
+            continue
+    return found

@@ -1,0 +1,182 @@
+"""The control process: kicks only for a fresh heartbeat, moves only when watched; the parent's deadlines."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import socket
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from station.devices.ur_child import ControlChild
+from station.devices.ur_control import BEAT_FRESH_NS, WATCHDOG_HZ, ControlServer
+from station.errors import RobotError
+from station.simulation.launch import SimulatedController
+
+GOAL = [0.0, -1.5, 1.5, -1.5, -1.5, 0.0]
+
+
+class Library:
+    """Notes what it was asked; `deaf`: these calls fail."""
+
+    def __init__(self) -> None:
+        self.calls: list[tuple[str, Any]] = []
+        self.deaf: set[str] = set()
+
+    def _note(self, name: str, *arguments: Any) -> bool:
+        self.calls.append((name, arguments))
+        return name not in self.deaf
+
+    def setWatchdog(self, minimum_hz: float) -> bool:
+        return self._note("setWatchdog", minimum_hz)
+
+    def kickWatchdog(self) -> bool:
+        return self._note("kickWatchdog")
+
+    def moveJ(self, q: list[float], speed: float, acceleration: float, asynchronous: bool) -> bool:
+        return self._note("moveJ", asynchronous)
+
+    def stopJ(self, deceleration: float, asynchronous: bool) -> None:
+        self._note("stopJ", asynchronous)
+
+    def stopScript(self) -> None:
+        self._note("stopScript")
+
+    @property
+    def names(self) -> list[str]:
+        return [name for name, _ in self.calls]
+
+
+class Conversation:
+    def __init__(self) -> None:
+        self.library = Library()
+        ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        ours.settimeout(1.0)
+        self.ours = ours
+        self._theirs = theirs
+        self._server = ControlServer(self.library, theirs)
+
+    def say(self, *requests: dict[str, Any]) -> list[dict[str, Any]]:
+        """All requests, then the end; the answers."""
+        for request in (*requests, {"do": "end"}):
+            self.ours.send(json.dumps(request).encode())
+        self._server.serve()
+        self.ours.setblocking(False)
+        answers = []
+        try:
+            while True:
+                answers.append(json.loads(self.ours.recv(4096)))
+        except BlockingIOError:
+            return answers
+
+    def close(self) -> None:
+        self.ours.close()
+        self._theirs.close()
+
+
+@pytest.fixture
+def child() -> Any:
+    conversation = Conversation()
+    yield conversation
+    conversation.close()
+
+
+def beat(age_ns: int = 0) -> dict[str, Any]:
+    return {"do": "beat", "ns": time.monotonic_ns() - age_ns}
+
+
+def move(joints: list[float] | None = None) -> dict[str, Any]:
+    return {"do": "move", "id": 7, "joints": joints or GOAL, "speed": 0.5, "acceleration": 1.0}
+
+
+def test_a_fresh_beat_arms_the_watchdog_once_and_kicks_it_each_time(child: Conversation) -> None:
+    answers = child.say(beat(), beat(), beat())
+    assert child.library.calls[0] == ("setWatchdog", (WATCHDOG_HZ,))
+    assert child.library.names == ["setWatchdog", *["kickWatchdog"] * 3, "stopScript"]
+    assert [a["lost"] for a in answers] == [False] * 3
+
+
+def test_a_beat_that_waited_too_long_kicks_nothing(child: Conversation) -> None:
+    child.say(beat(age_ns=BEAT_FRESH_NS + 1_000_000))
+    assert child.library.names == ["stopScript"]
+
+
+def test_a_script_that_took_no_kick_is_never_kicked_again(child: Conversation) -> None:
+    child.library.deaf = {"kickWatchdog"}
+    answers = child.say(beat(), beat(), move())
+    assert child.library.names.count("kickWatchdog") == 1
+    assert [a.get("lost") for a in answers[:2]] == [True, True]
+    assert not answers[2]["ok"] and "moveJ" not in child.library.names
+
+
+@pytest.mark.parametrize("before", [[], [beat(age_ns=10 * BEAT_FRESH_NS)]])
+def test_nothing_moves_without_a_heartbeat(child: Conversation, before: list[dict[str, Any]]) -> None:
+    answer = child.say(*before, move())[-1]
+    assert answer == {"id": 7, "ok": False, "error": "the session's heartbeat is missing"}
+    assert "moveJ" not in child.library.names
+
+
+def test_the_watchdog_is_armed_before_every_move_and_moves_are_asynchronous(child: Conversation) -> None:
+    answers = child.say(beat(), move(), move())
+    assert [a["ok"] for a in answers if "id" in a] == [True, True]
+    names = child.library.names
+    assert [names[i - 1] for i, name in enumerate(names) if name == "moveJ"] == ["setWatchdog"] * 2
+    assert ("moveJ", (True,)) in child.library.calls
+
+
+def test_nothing_moves_when_the_watchdog_cannot_be_armed(child: Conversation) -> None:
+    child.library.deaf = {"setWatchdog"}
+    answers = child.say(beat(), move())
+    assert not answers[-1]["ok"] and "moveJ" not in child.library.names
+
+
+@pytest.mark.parametrize(
+    "joints", [[0.0] * 5, [0.0] * 7, [float("nan"), *[0.0] * 5], [float("inf"), *[0.0] * 5]]
+)
+def test_numbers_the_library_would_pass_on_are_refused(child: Conversation, joints: list[float]) -> None:
+    answers = child.say(beat(), move(joints))
+    assert "six finite joint angles" in answers[-1]["error"] and "moveJ" not in child.library.names
+
+
+def test_stop_is_asynchronous(child: Conversation) -> None:
+    assert child.say({"do": "stop", "deceleration": 2.0}) == [{"stopped": True}]
+    assert child.library.calls[0] == ("stopJ", (True,))
+
+
+# -- the parent's side, with the real library -----------------------------------------------------------
+
+
+@pytest.mark.process
+async def test_a_constructor_that_hangs_is_killed_at_its_deadline(
+    controller: Callable[..., SimulatedController], tmp_path: Path
+) -> None:
+    running = await asyncio.to_thread(controller)
+    with running.admin() as admin:
+        admin.ask("mute", ports=["rtde"])
+        child = ControlChild.spawn(running.host, tmp_path / "control.log")
+        begun = time.monotonic()
+        with pytest.raises(RobotError, match=r"not ready within 0.7 s and was killed; see .*control.log"):
+            await child.ready(timeout_s=0.7)
+        assert time.monotonic() - begun < 1.5
+        with pytest.raises(ProcessLookupError):
+            os.kill(child.pid, 0)
+        admin.ask("mute", on=False, ports=["rtde"])
+
+
+@pytest.mark.process
+async def test_its_words_go_to_the_log_and_the_log_is_bounded(
+    controller: Callable[..., SimulatedController], tmp_path: Path
+) -> None:
+    running = await asyncio.to_thread(controller)
+    log = tmp_path / "control.log"
+    log.write_bytes(b"x" * 1_000_001)
+    child = ControlChild.spawn(running.host, log)
+    await child.ready()
+    await child.end()
+    assert (tmp_path / "control.log.1").stat().st_size == 1_000_001
+    assert log.stat().st_size < 10_000

@@ -1,8 +1,12 @@
-"""`station`: the command line. Talks to the daemon's socket like any other client."""
+"""`station`: the command line. Talks to the daemon's socket like any other client.
+
+Only what a command needs is loaded: STOP from a shell must not wait for a planner's libraries.
+"""
 
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
@@ -11,36 +15,43 @@ import typer
 from calibrate.errors import CalibrationError
 from recordings.errors import RecordingError
 from station.cli_control import app as control
-from station.cli_serve import ensure_daemon, serve_command
-from station.cli_session import capture_command, check_command, demo_command, resume_command
 from station.client import default_socket
 from station.errors import StationError
-from station.plan.cli import plan_command
-
-app = typer.Typer(
-    add_completion=False,
-    no_args_is_help=False,
-    help="A calibration station for a robot cell. Without a command: the operator's screen.",
-)
-app.command("serve")(serve_command)
-app.command("demo")(demo_command)
-app.command("capture")(capture_command)
-app.command("resume")(resume_command)
-app.command("check")(check_command)
-app.command("plan")(plan_command)
-app.registered_commands += control.registered_commands
 
 Socket = Annotated[Path | None, typer.Option(help="The daemon's control socket.")]
 
 
-@app.callback(invoke_without_command=True)
+def command_line(arguments: Sequence[str]) -> typer.Typer:
+    """All commands, or the small ones alone when one of them is called."""
+    app = typer.Typer(add_completion=False, no_args_is_help=False)
+    app.callback(invoke_without_command=True)(screen_by_default)
+    app.registered_commands += control.registered_commands
+    small = {command.name for command in control.registered_commands}
+    if not arguments or arguments[0] not in small:
+        _add_large_commands(app)
+    return app
+
+
+def _add_large_commands(app: typer.Typer) -> None:
+    from station.cli_serve import serve_command
+    from station.cli_session import capture_command, check_command, demo_command, resume_command
+    from station.plan.cli import plan_command
+
+    app.command("tui")(tui_command)
+    app.command("serve")(serve_command)
+    app.command("demo")(demo_command)
+    app.command("capture")(capture_command)
+    app.command("resume")(resume_command)
+    app.command("check")(check_command)
+    app.command("plan")(plan_command)
+
+
 def screen_by_default(context: typer.Context) -> None:
     """A calibration station for a robot cell. Without a command: the operator's screen."""
     if context.invoked_subcommand is None:
         open_screen(None, None)
 
 
-@app.command("tui")
 def tui_command(
     socket: Socket = None,
     replay: Annotated[Path | None, typer.Option(help="Show this recording in the live screen.")] = None,
@@ -52,16 +63,15 @@ def tui_command(
 def open_screen(socket: Path | None, replay: Path | None) -> None:
     if not sys.stdout.isatty() or not sys.stdin.isatty():
         raise StationError("the screen needs a terminal; without one use `station capture` or `station demo`")
-    path = ensure_daemon(socket or default_socket(), replay)
-    # The screen's library loads only where a screen is wanted.
+    from station.cli_serve import ensure_daemon
     from station.tui.app import run
 
-    run(path)
+    run(ensure_daemon(socket or default_socket(), replay))
 
 
 def main() -> None:
     try:
-        app()
+        command_line(sys.argv[1:])()
     except (StationError, RecordingError, CalibrationError) as problem:
         print(f"station: {problem}", file=sys.stderr)
         sys.exit(problem.exit_code)

@@ -11,7 +11,6 @@ from typing import Annotated, Any
 import msgspec
 import typer
 from rich.console import Console
-from rich.table import Table
 
 from station.client import Client, ask, default_socket
 from station.errors import StationError
@@ -104,6 +103,8 @@ def doctor_command(socket: Socket = None, as_json: AsJson = False) -> None:
     if as_json:
         print(msgspec.json.encode({"ok": good, "checks": checks}).decode())
     else:
+        from rich.table import Table
+
         table = Table(box=None, show_header=False, pad_edge=False)
         for check in checks:
             remedy = f"\n→ {check['remedy']}" if check.get("remedy") and check["state"] != "ok" else ""

@@ -1,0 +1,134 @@
+"""The shell's contract: exit codes, one JSON object, errors in words; and the daemon behind it."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from station.cli import main
+from station.plan.files import load_plan
+from station.plan.model import plan_sha256
+from tests.system.conftest import short_folder
+
+pytestmark = pytest.mark.process
+__all__ = ["short_folder"]
+
+
+def station(*args: str, timeout_s: float = 100.0, **environment: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-m", "station.cli", *args],
+        capture_output=True,
+        text=True,
+        timeout=timeout_s,
+        stdin=subprocess.DEVNULL,
+        env=dict(os.environ) | environment,
+    )
+
+
+class Shell:
+    def __init__(self, socket: Path, root: Path) -> None:
+        self.socket, self.root = socket, root
+
+    def __call__(self, *args: str) -> subprocess.CompletedProcess[str]:
+        return station(*args, "--socket", str(self.socket))
+
+
+@pytest.fixture
+def shell(short_folder: Path, tmp_path: Path) -> Iterator[Shell]:
+    """Beside a simulated daemon, faster than real time."""
+    socket = short_folder / "s"
+    command = [sys.executable, "-m", "station.cli", "serve", "--simulate", "--end-with-stdin"]
+    command += ["--socket", str(socket), "--root", str(tmp_path), "--time-scale", "4"]
+    with (tmp_path / "log").open("wb") as words:
+        daemon = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=words)
+    assert daemon.stdin is not None and daemon.stdout is not None
+    try:
+        assert json.loads(daemon.stdout.readline())["ready"]
+        yield Shell(socket, tmp_path)
+    finally:
+        daemon.stdin.close()
+        daemon.wait(15)
+        daemon.stdout.close()
+
+
+def test_a_session_from_the_shell(shell: Shell, tmp_path: Path) -> None:
+    plan = tmp_path / "plan.yaml"
+    made = station("plan", "--poses", "4", "-o", str(plan), "--json")
+    assert made.returncode == 0, made.stderr
+
+    wrong = shell("capture", "--plan", str(plan), "--headless", "--go", "ab" * 32)
+    assert wrong.returncode == 1
+    assert "is not the hash of this plan" in wrong.stderr and "nothing moved" in wrong.stderr
+
+    sha = plan_sha256(load_plan(plan))
+    done = shell("capture", "--plan", str(plan), "--headless", "--go", sha[:12], "--json")
+    assert done.returncode in (0, 3), done.stderr
+    result = json.loads(done.stdout)
+    assert result["poses"]["planned"] == 4
+    assert Path(result["recording"]).is_file()
+
+    status = json.loads(shell("status", "--json").stdout)
+    assert status["state"] == "idle" and status["simulated"]
+    assert "SIMULATED" in shell("status").stdout
+    doctor = shell("doctor", "--json")
+    assert doctor.returncode == 0 and json.loads(doctor.stdout)["ok"]
+    refused = shell("pause")
+    assert refused.returncode == 1 and "no session is running" in refused.stderr
+    assert shell("stop").returncode == 0
+    assert json.loads(shell("status", "--json").stdout)["state"] == "stopped"
+    assert shell("acknowledge").returncode == 0
+    assert shell("retake", "9").returncode == 1
+
+
+def test_the_demo_finds_the_truth(tmp_path: Path) -> None:
+    faster = ("--poses", "12", "--time-scale", "4")
+    done = station("demo", "--headless", "--json", "--seed", "4", "--out", str(tmp_path), *faster)
+    assert done.returncode in (0, 4), done.stderr  # 12 poses may be too few for a gate
+    result = json.loads(done.stdout)
+    assert result["poses"] == {"planned": 12, "captured": 12}
+    assert result["truth_error"]["translation_mm"] <= 0.5
+    assert result["truth_error"]["rotation_deg"] <= 0.05
+    for name in ("recording", "calibration", "report"):
+        assert Path(result[name]).is_file()
+
+
+@pytest.mark.parametrize(
+    ("args", "code", "said"),
+    [
+        (("serve",), 2, "--simulate"),
+        (("serve", "--simulate", "--scene", "moon"), 2, "paper, blog"),
+        (("serve", "--config", "absent.yaml"), 2, "absent.yaml"),
+        (("status", "--socket", "/nowhere/s"), 1, "station serve"),
+        (("capture", "--plan", "absent.yaml"), 2, "absent.yaml"),
+        (("tui",), 1, "needs a terminal"),
+        (("dance",), 2, "No such command"),
+        (("retake", "0"), 2, "greater than or equal to 1"),
+    ],
+)
+def test_what_a_user_can_cause_has_words_and_a_code(
+    args: tuple[str, ...],
+    code: int,
+    said: str,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["station", *args])
+    with pytest.raises(SystemExit) as ended:
+        main()
+    out, err = capsys.readouterr()
+    assert ended.value.code == code
+    assert said in " ".join(err.replace("│", " ").split())
+    assert out == ""
+
+
+def test_the_command_line_loads_no_screen_and_no_driver() -> None:
+    foreign = ("textual", "gi", "serial", "rtde_control")
+    program = f"import sys, station.cli; print([m for m in {foreign} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -1,0 +1,131 @@
+"""Verbs over the socket: typed arguments, who may, and the rule for arms that are real."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from station.client import Client
+from station.control import ControlServer
+from station.dispatch import SessionDispatcher
+from station.errors import RefusedError
+from station.plan.model import Plan, plan_sha256
+from station.status import StationState
+from tests.station.session_rig import POSES, NewRig, Rig
+
+
+class Served:
+    def __init__(self, rig: Rig, path: Path) -> None:
+        self.rig, self.path = rig, path
+        self.control = ControlServer(path, SessionDispatcher(rig.session))
+
+    async def client(self, interactive: bool = True) -> Client:
+        return await Client.connect(self.path, "tty1", interactive=interactive)
+
+
+@pytest.fixture
+async def served(new_rig: NewRig, tmp_path: Path) -> AsyncIterator[Served]:
+    rig = await new_rig(with_plan=False)
+    await rig.until(StationState.IDLE)
+    made = Served(rig, tmp_path / "s")
+    await made.control.start()
+    yield made
+    await made.control.close()
+
+
+async def test_a_capture_over_the_socket(served: Served, small_plan: Plan) -> None:
+    async with await served.client() as anna:
+        lease = await anna.request("lease", action="take")
+        assert "tty1" in lease["holder"] and "pid" in lease["holder"]
+        answer = await anna.request("load_plan", plan=msgspec.to_builtins(small_plan))
+        assert answer["sha256"] == plan_sha256(small_plan)
+        summary = await anna.request("prepare", purpose="run")
+        assert summary["poses"] == POSES
+        assert any("SIMULATED" in warning for warning in summary["warnings"])
+        await anna.request("go", token=summary["token"])
+        await served.rig.until_true(lambda: bool(served.rig.session.store.status.session.recording))
+        sessions = await anna.request("sessions")
+        assert sessions[0]["sealed"] and sessions[0]["views"] == POSES
+        checks = {check["name"]: check for check in await anna.request("doctor")}
+        assert checks["robot"]["state"] == checks["disk"]["state"] == "ok"
+        preview = await anna.request("preview", width=160, height=128)
+        assert (preview["width"], preview["height"]) == (160, 128)
+        assert all(0 <= x <= 1 and 0 <= y <= 1 for x, y in preview["corners"])
+
+
+async def test_the_second_operator_may_watch_pause_and_stop_only(served: Served, small_plan: Plan) -> None:
+    async with await served.client() as anna, await served.client() as bert:
+        await anna.request("lease", action="take")
+        for verb, args in (
+            ("lease", {"action": "take"}),
+            ("load_plan", {"plan": msgspec.to_builtins(small_plan)}),
+            ("prepare", {}),
+            ("finish", {}),
+            ("skip", {"index": 0}),
+            ("free_drive", {"on": True}),
+        ):
+            with pytest.raises(RefusedError, match=r"held by .*tty1"):
+                await bert.request(verb, **args)
+        await bert.request("stop")
+        assert served.rig.state is StationState.STOPPED
+        await anna.request("lease", action="release")
+        await bert.request("lease", action="take")
+
+
+@pytest.mark.parametrize(
+    ("verb", "args"),
+    [
+        ("skip", {"index": "one"}),
+        ("skip", {"index": 0, "now": True}),
+        ("go", {}),
+        ("make_plan", {"poses": 1_000_000}),
+        ("reorder", {"order": [0, 0]}),
+        ("load_plan", {"plan": {"robot": "UR10"}}),
+        ("lease", {"action": "steal"}),
+        ("prepare", {"purpose": "dance"}),
+    ],
+)
+async def test_arguments_that_do_not_fit_are_refused_in_words(
+    served: Served, verb: str, args: dict[str, object]
+) -> None:
+    async with await served.client() as anna:
+        await anna.request("lease", action="take")
+        with pytest.raises(RefusedError) as caught:
+            await anna.request(verb, **args)  # type: ignore[arg-type]
+        assert len(str(caught.value).split()) > 3
+
+
+async def test_without_a_person_a_real_arm_needs_the_plans_hash(
+    new_rig: NewRig, small_plan: Plan, tmp_path: Path
+) -> None:
+    real = await new_rig(with_plan=False, source="real")
+    await real.until(StationState.IDLE)
+    served = Served(real, tmp_path / "r")
+    await served.control.start()
+    async with await served.client(interactive=False) as program:
+        await program.request("lease", action="take")
+        await program.request("load_plan", plan=msgspec.to_builtins(small_plan))
+        for wrong in ({}, {"plan_sha256": "ab" * 32}):
+            summary = await program.request("prepare")
+            with pytest.raises(RefusedError, match="approved plan"):
+                await program.request("go", token=summary["token"], **wrong)
+        assert "move" not in real.arm.log
+        summary = await program.request("prepare")
+        await program.request("go", token=summary["token"], plan_sha256=plan_sha256(small_plan))
+        await real.until_true(lambda: "move" in real.arm.log)
+    await served.control.close()
+
+
+async def test_leaving_voids_the_go(served: Served, small_plan: Plan) -> None:
+    async with await served.client() as anna:
+        await anna.request("lease", action="take")
+        await anna.request("load_plan", plan=msgspec.to_builtins(small_plan))
+        summary = await anna.request("prepare")
+    async with await served.client() as bert:
+        await served.rig.until_true(lambda: not served.rig.session.store.status.lease.holder)
+        await bert.request("lease", action="take")
+        with pytest.raises(RefusedError, match="not valid"):
+            await bert.request("go", token=summary["token"])

@@ -36,6 +36,7 @@ class SerialTrigger:
         self._worker: ThreadPoolExecutor | None = None
         self._lines = LineReader()
         self._boot_id = ""
+        self._opened = False
         self._count = 0
         """Pulses, unwrapped: the box's own count starts over at 2^32."""
 
@@ -51,15 +52,15 @@ class SerialTrigger:
         return await self._run(self._fire if self._config.mode == "box" else self._pulse_line)
 
     async def light(self, level: float) -> None:
-        """0 = off, 1 = full. TriggerError where the adapter has no light."""
+        """0 = off, 1 = full. TriggerError where there is no light. Opening sets `config.light_level`."""
         if self._config.mode != "box":
             raise TriggerError(f"trigger.mode '{self._config.mode}' has no light; it needs a trigger box")
-        permille = round(1000 * min(max(level, 0.0), 1.0))
-        await self._run(partial(self._ask, f"LIGHT {permille}", "LIGHT", 1))
+        await self._run(partial(self._set_light, level))
 
     async def close(self) -> None:
         if self._worker is not None:
             worker, self._worker = self._worker, None
+            self._opened = False
             await asyncio.get_running_loop().run_in_executor(worker, self._disconnect)
             worker.shutdown(wait=False)
 
@@ -70,6 +71,7 @@ class SerialTrigger:
 
     def _connect(self) -> str:
         self._disconnect()
+        self._opened = True
         try:
             self._port = self._open_port(self._config.port)
         except (OSError, ValueError) as error:
@@ -82,10 +84,13 @@ class SerialTrigger:
         if self._config.mode != "box":
             return f"{self._config.mode.upper()} of {self._config.port}"
         try:
-            return self._handshake()
+            identity = self._handshake()
+            if self._config.light_level is not None:
+                self._set_light(self._config.light_level)
         except TriggerError:
             self._disconnect()
             raise
+        return identity
 
     def _handshake(self) -> str:
         end_s = time.monotonic() + HANDSHAKE_TIMEOUT_S
@@ -108,7 +113,13 @@ class SerialTrigger:
         self._count = count
         return f"{product} {serial}"
 
+    def _set_light(self, level: float) -> None:
+        permille = round(1000 * min(max(level, 0.0), 1.0))
+        self._ask(f"LIGHT {permille}", "LIGHT", 1)
+
     def _fire(self) -> TriggerPulse:
+        if self._port is None and self._opened:
+            self._connect()  # it was lost; the next go begins with a new count
         asked_ns = time.monotonic_ns()
         try:
             boot_id, count, device_us = self._ask(f"FIRE {self._config.pulse_us}", "FIRED", 3)
@@ -125,9 +136,10 @@ class SerialTrigger:
 
     def _settle_count(self, boot_id: str, count: int) -> None:
         if boot_id != self._boot_id:
+            self._disconnect()
             raise TriggerError(
-                "the trigger box restarted (power, cable?): its count is void and pictures cannot be paired; "
-                "check its supply, then open the cell again"
+                "the trigger box restarted (power, cable?): its count is void, and the picture belongs to no "
+                "known pulse; check its supply"
             )
         self._count += (count - self._count) % _COUNTS
 

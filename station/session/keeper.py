@@ -10,6 +10,7 @@ from collections.abc import Awaitable, Callable
 from station.errors import CameraError, RobotError, StationError
 from station.session.bench import Bench
 from station.session.monitor import camera_status
+from station.status import TriggerStatus
 from station.workers import WorkerError
 
 log = logging.getLogger(__name__)
@@ -64,7 +65,9 @@ class Keeper:
 
     async def _open_trigger(self) -> None:
         if (trigger := self._bench.cell.trigger) is not None:
-            await trigger.open()
+            identity = await trigger.open()
+            self._bench.store.update(trigger=TriggerStatus(present=True, identity=identity))
+            self._bench.store.event(f"trigger {identity} found")
 
     async def close(self) -> None:
         cell = self._bench.cell

@@ -10,7 +10,7 @@ import numpy as np
 from recordings.errors import RecordingError
 from recordings.messages import Picture
 from recordings.recover import recover
-from station.errors import LimitError, RobotError, SafetyStopError, StationError
+from station.errors import LimitError, RobotError, SafetyStopError, StationError, TriggerError
 from station.limits import MoveCheck, check_path, with_plan_speeds
 from station.session.bench import Bench
 from station.session.capture import PoseFailedError, take_pose
@@ -40,7 +40,7 @@ class Run:
                 await self._poses()
         except SafetyStopError as error:
             self._halt(StationState.STOPPED, str(error))
-        except RobotError as error:
+        except (RobotError, TriggerError) as error:
             self._halt(StationState.FAULT, str(error))
         except RecordingError as error:
             self._bench.require_recording().abandon()

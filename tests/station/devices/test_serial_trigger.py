@@ -54,6 +54,13 @@ async def test_the_box_says_who_it_is_and_lights(box: SimulatedTriggerBox, trigg
         assert box.light_permille == permille
 
 
+async def test_the_configured_light_is_on_from_the_start(box: SimulatedTriggerBox) -> None:
+    device = SerialTrigger(TriggerConfig(port=box.port, light_level=0.4))
+    await device.open()
+    assert box.light_permille == 400
+    await device.close()
+
+
 async def test_a_missing_port_names_port_and_remedy() -> None:
     with pytest.raises(TriggerError, match=r"/dev/no-such-box.*dialout"):
         await SerialTrigger(TriggerConfig(port="/dev/no-such-box")).open()

@@ -85,8 +85,7 @@ class UrLink:
 
     async def _open(self) -> None:
         host = self.config.host
-        self.dashboard = await Dashboard.open(host)
-        found = await identify(self.dashboard)
+        found = await identify(await self.renew_dashboard())
         self._check_identity(found)
         if self._lock is None:
             self._lock = RobotLock(lock_name(host, found.serial), self._lock_dir)

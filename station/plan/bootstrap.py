@@ -32,9 +32,10 @@ from recordings.messages import Mount
 from station.collision import CellGeometry, margins
 from station.config import PoseGuess, StationConfig
 from station.errors import ConfigError, LimitError
-from station.limits import SPACING_M, check_path
+from station.limits import SPACING_M
 from station.plan.describe import planned_pose
 from station.plan.model import PlannedPose
+from station.plan.order import move_times
 from station.plan.scene import Scene, arm_model, geometry_of
 from station.plan.visibility import outline, visible
 
@@ -45,7 +46,6 @@ _PLACE_M, _PLACE_RAD = 0.002, 0.003
 """How far the board's place may be off as seen through one picture and the arm; generous."""
 _LEVER_M = 0.5
 _SAMPLES = 40
-_CHECKED_CELLS = 5
 _ANGLES_RAD = tuple(np.deg2rad([2.0, 4.0, 7.0, 11.0, 16.0, 22.0]))
 _BACK_M = (0.0, 0.02, 0.05, 0.10)
 _BORDER_PX = 15.0
@@ -118,7 +118,7 @@ def next_move(config: StationConfig, glimpses: Sequence[Glimpse]) -> PlannedPose
     cells = _possible_cells(config, glimpses, samples) or [geometry_of(config, None, None, 0.0)]
     for target in targets[np.argsort(gain, kind="stable")]:
         joints = inverse_nearest(arm_model(config), target, here)
-        if joints is not None and not any(check_path(cell, here, joints).problems for cell in cells):
+        if joints is not None and all(_is_free(cell, here, joints) for cell in cells):
             return _described(config, glimpses[0], belief, moves, joints)
     raise LimitError(
         f"No bootstrap move is safe for every camera mount within the guess ({1000 * belief.sigma_m:.0f} mm, "
@@ -239,7 +239,7 @@ def _stays_in_view(
 
 
 def _possible_cells(config: StationConfig, glimpses: Sequence[Glimpse], samples: Array) -> list[CellGeometry]:
-    """Cells with some of the possible mounts, but none in which the arm could not have stood where it did."""
+    """Cells with the possible mounts, but none in which the arm could not have stood where it did."""
     taught, stood = glimpses[0], np.array([g.joints_rad for g in glimpses])
     E = forward(arm_model(config), taught.joints_rad)
     cells = []
@@ -248,9 +248,11 @@ def _possible_cells(config: StationConfig, glimpses: Sequence[Glimpse], samples:
         cell = geometry_of(config, X, Y, 0.0)
         if margins(cell, stood)[0].min() >= SPACING_M / 2:
             cells.append(cell)
-        if len(cells) == _CHECKED_CELLS:
-            break
     return cells
+
+
+def _is_free(cell: CellGeometry, here: Array, joints: Array) -> bool:
+    return bool(np.isfinite(move_times(cell, here[None], joints[None]))[0])
 
 
 def _after(config: StationConfig, glimpses: Sequence[Glimpse], belief: Belief, target: Array) -> Array:

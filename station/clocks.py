@@ -16,6 +16,7 @@ from dataclasses import dataclass
 
 BINS = 300
 LEAST_BINS = 5
+STRETCHES = 10
 FIRST_BIN_S = 0.02
 DRIFT_SPAN_S = 5.0
 """Over a shorter span no drift is fitted."""
@@ -44,7 +45,7 @@ class ClockFit:
     drift: float
     """Host seconds per device second, minus 1."""
     residual_s: float
-    """95 % of the shortest delays lie within this above the line."""
+    """The shortest delay of each tenth of the window lies within this above the line."""
     drift_uncertainty: float
     latency_s: float
     samples: int
@@ -142,8 +143,8 @@ class ClockEstimator:
         else:
             drift, (at_s, gap_ns) = _supporting_line(points)
         offset_ns = gap_ns + drift * (self._newest_s - at_s) * 1e9
-        above = sorted(g - offset_ns - drift * (d - self._newest_s) * 1e9 for d, g in points)
-        residual_s = above[min(len(above) - 1, int(0.95 * len(above)))] / 1e9
+        above = [(d, g - offset_ns - drift * (d - self._newest_s) * 1e9) for d, g in points]
+        residual_s = _worst_best(above, points[0][0], span_s) / 1e9
         uncertainty = UNFITTED_DRIFT if span_s < DRIFT_SPAN_S else min(UNFITTED_DRIFT, residual_s / span_s)
         return ClockFit(
             reference_s=self._newest_s,
@@ -171,6 +172,15 @@ def _supporting_line(points: list[tuple[float, float]]) -> tuple[float, tuple[fl
     if abs(drift) <= DRIFT_LIMIT:
         return drift, (d0, g0)
     return 0.0, min(points, key=lambda p: p[1])
+
+
+def _worst_best(points: list[tuple[float, float]], begin_s: float, span_s: float) -> float:
+    """The largest among the smallest values of each stretch of time: how well the line is held everywhere."""
+    best: dict[int, float] = {}
+    for d, value in points:
+        stretch = min(STRETCHES - 1, int(STRETCHES * (d - begin_s) / span_s)) if span_s > 0 else 0
+        best[stretch] = min(value, best.get(stretch, value))
+    return max(best.values())
 
 
 def _turns_right(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:

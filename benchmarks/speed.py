@@ -156,9 +156,10 @@ def _stages() -> str:
             stages.setdefault(f"{name}, wall", []).append(ms)
     rows = [[name, percentiles(np.array(ms))] for name, ms in stages.items()]
     text = (
-        f"{count} cells of 25 views, intrinsics refined. CPU: the two stages alone (evolution, polish, proof; "
-        "maximum likelihood). Wall: `solve_views` by stage, where the optimum is certified twice (before, and "
-        f"after the estimate) and the hold-out is a second fit. Load of the machine meanwhile: {_load()}."
+        f"{count} cells of 25 views, intrinsics refined. CPU: the two stages alone (evolution, polish and "
+        "proof; maximum likelihood). Wall: `solve_views` by stage, where the optimum is certified twice "
+        "(before and after the estimate) and the hold-out is a second fit. Load of the machine meanwhile: "
+        f"{_load()}."
     )
     return text + "\n\n" + table(["stage", "ms, median (5 … 95 %)"], rows)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import importlib
 from pathlib import Path
 
 from recordings.messages import Source
@@ -43,6 +42,6 @@ def _camera(config: StationConfig, trigger: Trigger | None) -> tuple[Camera, Sou
 def _trigger(config: StationConfig) -> Trigger | None:
     if config.trigger is None:
         return None
-    module = importlib.import_module("station.devices.serial_trigger")
-    trigger: Trigger = module.SerialTrigger(config.trigger)
-    return trigger
+    from station.devices.serial_trigger import SerialTrigger
+
+    return SerialTrigger(config.trigger)

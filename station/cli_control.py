@@ -96,8 +96,22 @@ def skip_command(pose: PoseNumber, socket: Socket = None) -> None:
 
 
 @app.command("doctor")
-def doctor_command(socket: Socket = None, as_json: AsJson = False) -> None:
+def doctor_command(
+    socket: Socket = None,
+    as_json: AsJson = False,
+    config: Annotated[Path | None, typer.Option(help="Only check this configuration; no daemon.")] = None,
+    example: Annotated[bool, typer.Option("--example", help="Print a configuration to start from.")] = False,
+) -> None:
     """Look at everything a capture needs; each missing thing with its remedy. Nothing moves."""
+    if example:
+        print((Path(__file__).parent / "example.yaml").read_text(), end="")
+        return
+    if config is not None:
+        from station.config_file import load_config
+
+        found, _ = load_config(config)
+        out.print(f"{config}: good; {found.robot.model} at {found.robot.host}, {found.mount}")
+        return
     checks: list[dict[str, Any]] = ask(socket or default_socket(), "doctor")
     good = all(check["state"] != "failed" for check in checks)
     if as_json:

@@ -13,6 +13,8 @@ from station.config import PoseGuess, StationConfig
 from station.errors import ConfigError
 
 SPEED_CAP_M_S = 0.25
+LARGEST_SQUARE_M, LARGEST_REACH_M = 0.5, 5.0
+"""Beyond these somebody wrote millimetres."""
 
 
 def load_config(path: Path) -> tuple[StationConfig, bytes]:
@@ -63,7 +65,13 @@ def _meaning_problems(config: StationConfig) -> Iterator[str]:
         yield "camera.trigger: hardware needs a section 'trigger' with the box's port"
     if config.board.square_m <= 0 or config.board.columns < 2 or config.board.rows < 2:
         yield "board: columns and rows must be at least 2 and square_m above 0"
+    if config.board.square_m > LARGEST_SQUARE_M:
+        yield f"board.square_m: {config.board.square_m} m is no board's square; lengths are in metres"
+    if not 0 < config.working_distance_m <= LARGEST_REACH_M:
+        yield f"working_distance_m: {config.working_distance_m} is out of reach; lengths are in metres"
     for name in ("camera_guess", "board_guess"):
         guess: PoseGuess | None = getattr(config, name)
+        if guess is not None and np.linalg.norm(guess.translation_m) > LARGEST_REACH_M:
+            yield f"{name}.translation_m: further than {LARGEST_REACH_M} m; lengths are in metres"
         if guess is not None and not 0.9 < float(np.linalg.norm(guess.rotation_xyzw)) < 1.1:
             yield f"{name}.rotation_xyzw: its length must be 1 (x, y, z, w)"

@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+import station
+from station.cell_factory import configured_cell
 from station.config_file import load_config
 from station.errors import ConfigError
 
@@ -41,6 +43,7 @@ def test_a_missing_file_says_what_to_do(tmp_path: Path) -> None:
         ("normal: [0, 0, 1]", "normal: [0, 0, 0]", "'table' is zero"),
         ("device: KJ001", "device: KJ001, trigger: hardware", "section 'trigger'"),
         ("host: 192.0.2.10", "host: ''", "robot.host"),
+        ("square_m: 0.025", "square_m: 25", "lengths are in metres"),
         ("speed_m_s: 0.2", "speed_mm_s: 200", "did you mean 'speed_m_s'"),
     ],
 )
@@ -51,3 +54,52 @@ def test_what_cannot_be_is_said(tmp_path: Path, old: str, new: str, said: str) -
         load_config(path)
     assert said in str(caught.value)
     assert "station.yaml" in str(caught.value)
+
+
+def test_every_trap_of_yaml_is_named_in_one_report_with_its_line(tmp_path: Path) -> None:
+    path = tmp_path / "station.yaml"
+    path.write_text(
+        "robot: {model: UR10, host: 192.0.2.10}\n"
+        "camera: {driver: aravis, gain_db: .nan, exposure_us: 12:30:45}\n"
+        "board: {kind: chessboard, columns: 7, rows: 010, square_m: 25, radon_marker: no}\n"
+        "capture: {lossless_png: no}\n"
+        "name: one\n"
+        "name: two\n"
+    )
+    with pytest.raises(ConfigError) as caught:
+        load_config(path)
+    said = str(caught.value)
+    for line in (2, 3, 4, 6):
+        assert f"line {line}: " in said, said
+    assert said.count("\n") >= 6
+
+
+def test_aliases_that_could_explode_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "station.yaml"
+    path.write_text(GOOD + "name: &n cell\nstillness: {window_s: *n}\n")
+    with pytest.raises(ConfigError, match="line 7: anchors"):
+        load_config(path)
+
+
+def test_the_example_is_good() -> None:
+    example = Path(station.__file__).parent / "example.yaml"
+    config, _ = load_config(example)
+    assert config.camera.model_is_rough
+
+
+def test_the_configuration_is_read_once(tmp_path: Path) -> None:
+    path = tmp_path / "station.yaml"
+    path.write_text(GOOD)
+    cell = configured_cell(*load_config(path), tmp_path)
+    before = cell.config_sha256
+    path.write_text(GOOD.replace("0.2\n", "0.1\n"))
+    assert cell.config_sha256 == before
+    assert cell.config_yaml == GOOD.encode()
+    assert cell.config.limits.speed_m_s == 0.2
+
+
+def test_pictures_that_are_not_real_never_stand_beside_a_real_arm(tmp_path: Path) -> None:
+    path = tmp_path / "station.yaml"
+    path.write_text(GOOD.replace("driver: aravis", "driver: rendered"))
+    with pytest.raises(ConfigError, match="beside a real arm"):
+        configured_cell(*load_config(path), tmp_path)

@@ -25,6 +25,8 @@ _SPEED_RESERVE = 0.97
 """Between samples a point may be a little faster than at them."""
 SPACING_M = 0.01
 """No modelled point moves further between two checked samples; margins are reduced by half of it."""
+_LONGEST_TURN_RAD = 4 * np.pi
+"""From one end of a joint's range to the other; whatever turns further is out of range."""
 _FLANGE_TOLERANCE_M, _FLANGE_TOLERANCE_RAD = 0.002, 0.005
 
 
@@ -127,9 +129,10 @@ def check_path(
     """Everything that can be wrong with one move, and the speed it may be driven at."""
     start, target = (np.asarray(q, dtype=float) for q in (from_joints_rad, to_joints_rad))
     if start.shape != (6,) or target.shape != (6,) or not np.isfinite([start, target]).all():
-        broken = Problem(name, "joints", "six finite joint angles in radians are needed")
-        return MoveCheck(name, (broken,), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -np.inf)
+        return _refused(name, [Problem(name, "joints", "six finite joint angles in radians are needed")])
     problems = _joint_problems(geometry, start, target, name)
+    if np.abs(target - start).max() > _LONGEST_TURN_RAD:
+        return _refused(name, problems)
     samples = sample_path(geometry, start, target, spacing_m)
     gaps, labels = margins(geometry, samples)
     problems += _margin_problems(leaving(gaps - spacing_m / 2), labels, name)
@@ -146,6 +149,11 @@ def check_path(
         top_speed_m_s=peak,
         margin_m=float(gaps.min()),
     )
+
+
+def _refused(name: str, problems: list[Problem]) -> MoveCheck:
+    """A move that is not worth sampling; speed zero."""
+    return MoveCheck(name, tuple(problems), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -np.inf)
 
 
 def allowed_speed(geometry: CellGeometry, samples: Array) -> tuple[float, float, float, float]:

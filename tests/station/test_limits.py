@@ -105,6 +105,12 @@ def test_joints_that_are_no_joints_are_a_problem_not_a_crash(bad):
     assert move.joint_speed_rad_s == 0.0
 
 
+def test_degrees_in_place_of_radians_are_refused_at_once():
+    move = check_path(FREE, REST, np.rad2deg(REST) * 1e6)
+    assert {p.limit for p in move.problems} == {"joint range", "joint step"}
+    assert move.joint_speed_rad_s == 0.0
+
+
 def test_an_arm_that_stands_too_close_may_leave_but_not_come_nearer():
     table = Plane("table", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 

@@ -190,6 +190,13 @@ def test_an_impossible_plan_is_explained(name, told):
     assert "\n" not in str(caught.value)
 
 
+def test_a_fixed_camera_that_looks_away_from_the_arm_is_explained():
+    truth, config = cell("paper", "eye-to-hand", 1)
+    away = moved(config, camera_guess=turned(config.camera_guess, [0, np.pi, 0]))
+    with pytest.raises(LimitError, match=r"reach.*camera.*turn it towards the arm.*camera_guess"):
+        make_plan(away, start_joints_rad=truth.start_joints_rad)
+
+
 def test_what_planning_needs_is_asked_for():
     _, config = cell()
     with pytest.raises(ConfigError, match="board_guess"):

@@ -11,6 +11,7 @@ import msgspec
 from recordings.messages import CameraModel, Source
 from station.config import StationConfig
 from station.devices.base import Camera, Robot, Trigger
+from station.plan.model import Plan
 
 
 @dataclass(frozen=True)
@@ -25,6 +26,8 @@ class Cell:
     """As it was read, for the recording."""
     attachments: dict[str, bytes] = field(default_factory=dict)
     """More for every recording of this cell: a simulated one's truth."""
+    plan: Plan | None = None
+    """Loaded at the start: what a played-back cell can show."""
     ended: Callable[[], None] = lambda: None
     """Called once the devices are closed: ends child processes of a simulated cell."""
 

@@ -9,6 +9,7 @@ import logging
 import os
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 from typing import Annotated, get_args
@@ -31,6 +32,7 @@ _RANGES = {"scene": SceneName, "noise": NoiseLevel, "mount": Mount}
 def serve_command(
     config: Annotated[Path | None, typer.Option(help="The cell's configuration.")] = None,
     simulate: Annotated[bool, typer.Option("--simulate", help="A simulated cell, marked so.")] = False,
+    replay: Annotated[Path | None, typer.Option(help="Play this recording as a cell.")] = None,
     socket: Annotated[Path | None, typer.Option(help="Where to listen.")] = None,
     root: Annotated[Path | None, typer.Option(help="Where sessions go.")] = None,
     seed: Annotated[int, typer.Option(help="Of the simulated cell.")] = 0,
@@ -42,13 +44,21 @@ def serve_command(
     end_with_stdin: Annotated[bool, typer.Option("--end-with-stdin", hidden=True)] = False,
 ) -> None:
     """Own the cell and serve it on a Unix socket. Nothing moves without a person's go."""
-    if simulate == (config is not None):
-        raise ConfigError("say what to serve: either --config FILE (a real cell) or --simulate")
+    if [simulate, config is not None, replay is not None].count(True) != 1:
+        raise ConfigError(
+            "say what to serve, one of: --config FILE (a real cell), --simulate, --replay RECORDING"
+        )
     require_choices(scene=scene, noise=noise, mount=mount)
     logging.basicConfig(level=logging.INFO, format=_log_format(), stream=sys.stderr)
     place = root or default_root()
     if config is not None:
         asyncio.run(serve_cell(_real_cell(config, place), place, socket or default_socket(), end_with_stdin))
+        return
+    if replay is not None:
+        from station.playback_cell import playback_cell
+
+        played = playback_cell(replay)
+        asyncio.run(serve_cell(played, place, socket or default_socket(), end_with_stdin))
         return
     # Simulation is loaded only where it is wanted.
     from station.simulation.launch_cell import SimulationOptions, simulated_cell
@@ -104,20 +114,27 @@ def find_config() -> Path | None:
 
 
 def ensure_daemon(socket: Path, replay: Path | None = None) -> Path:
-    """The socket of a daemon that answers; starts one where none does. StationError when that fails."""
+    """The socket of a daemon that answers; starts one where none does. StationError when that fails.
+
+    A replay gets a daemon of its own, which ends with this process.
+    """
     if replay is not None:
-        raise StationError("replay is not built yet: open the recording in Foxglove or `recordings info` it")
-    if _answers(socket):
+        socket = Path(tempfile.mkdtemp(prefix="station-replay-")) / "control.sock"
+    elif _answers(socket):
         return socket
     root = default_root()
+    if replay is not None:
+        root /= "replay"
+        what = ["--replay", str(replay), "--root", str(root), "--end-with-stdin"]
+    else:
+        config = find_config()
+        what = ["--simulate"] if config is None else ["--config", str(config)]
     root.mkdir(parents=True, exist_ok=True)
-    config = find_config()
-    what = ["--simulate"] if config is None else ["--config", str(config)]
     log = root / "daemon.log"
     with log.open("ab") as words:
         child = subprocess.Popen(
             [sys.executable, "-m", "station.cli", "serve", *what, "--socket", str(socket)],
-            stdin=subprocess.DEVNULL,
+            stdin=subprocess.DEVNULL if replay is None else subprocess.PIPE,
             stdout=subprocess.DEVNULL,
             stderr=words,
             start_new_session=True,

@@ -79,6 +79,8 @@ class Session:
         """Connects, read-only, and keeps trying. Nothing moves. A session that a crash cut is found again."""
         self.bench.root.mkdir(parents=True, exist_ok=True)
         self._find_interrupted()
+        if self.bench.cell.plan is not None and self.bench.queue is None:
+            self._replace_plan(self.bench.cell.plan)
         loops = (self.guard.run(), self._keeper.run(), self._estimator.run())
         self._tasks = [asyncio.create_task(loop) for loop in loops]
 

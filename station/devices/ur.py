@@ -69,6 +69,7 @@ class UrRobot(UrLink):
         """Spawns the control process, which loads its program. Only in answer to a go. Raises RobotError."""
         if self._child is not None:
             raise RobotError("control is already started")
+        await self.idle()  # a child that is still ending holds the registers
         await self.fresh()
         self.check()
         await self._may_start()

@@ -100,6 +100,20 @@ async def test_stop_while_control_starts(cell: Make) -> None:
     assert not c.robot.control and c.robot.control_pid is None
 
 
+async def test_a_new_go_right_after_a_stop(cell: Make) -> None:
+    c = await cell()
+    for _ in range(3):
+        move = await c.cruising()
+        await c.robot.stop("operator")
+        with pytest.raises(RobotError):
+            await move
+        await c.robot.start_control()  # waits for the old control to be gone
+    assert c.robot.control
+    goal = c.joints_rad()
+    goal[5] += 0.05
+    await c.robot.move(goal, 0.5, 1.0)
+
+
 async def test_a_cancelled_move_stops_the_arm(cell: Make) -> None:
     c = await cell()
     move = await c.cruising()

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import ast
 import re
+import socket
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
-from station.devices.ur_dashboard import ALLOWED, Dashboard
+from station.devices.ur_dashboard import ALLOWED, PORT, Dashboard
+from station.simulation.launch import start_controller
 
 ROOT = Path(__file__).parents[2]
 DASHBOARD_COMMANDS = {
@@ -73,6 +76,32 @@ def test_no_other_file_quotes_one() -> None:
 )
 def test_the_search_finds_what_it_looks_for(offence: str) -> None:
     assert offences(offence)
+
+
+def test_the_vendors_library_has_one_door() -> None:
+    doors = []
+    for path in sources("*.py"):
+        for node in ast.walk(ast.parse(path.read_text())):
+            names = [a.name for a in node.names] if isinstance(node, ast.Import) else []
+            names += [node.module or ""] if isinstance(node, ast.ImportFrom) else []
+            if any(n.split(".")[0] in ("rtde_control", "rtde_receive", "rtde_io") for n in names):
+                doors.append(path.name)
+    assert doors == ["ur_control.py"]
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("order", ["power on", "unlock protective stop", "play", "popup hello"])
+def test_the_list_of_what_may_be_sent_is_enforced(
+    only_allowed_was_sent: Callable[[str], None], order: str
+) -> None:
+    with start_controller() as running:
+        only_allowed_was_sent(running.host)
+        with socket.create_connection((running.host, PORT), 2) as link:
+            link.recv(200)
+            link.sendall(order.encode() + b"\n")
+            link.recv(200)
+        with pytest.raises(AssertionError, match="not on the list"):
+            only_allowed_was_sent(running.host)
 
 
 @pytest.mark.parametrize("command", [*sorted(DASHBOARD_COMMANDS), "play", "load x", "shutdown"])

@@ -27,6 +27,11 @@ class Noise:
     robot_rad: float = 0.00017
 
 
+def lens_can_be_free(camera: CameraModel) -> bool:
+    """The estimate refines only this model; other lenses count as known."""
+    return camera.distortion_model == "plumb_bob"
+
+
 def _chain(mount: Mount, E: Array, X: Array, Y: Array, points: Array) -> tuple[Array, Array, Array, Array]:
     """Points in camera, and their derivatives by δX, δY, δE: (n, k, 3), three times (n, k, 3, 6)."""
     Rx, tx, Ry, ty = X[:3, :3], X[:3, 3], Y[:3, :3], Y[:3, 3]
@@ -66,7 +71,7 @@ def view_information(
     """
     n, k = len(base_from_flange), len(board_points)
     points, dX, dY, dE = _chain(mount, base_from_flange, X, Y, board_points)
-    seen = project(camera, points, with_intrinsics=free_intrinsics)
+    seen = project(camera, points, with_intrinsics=free_intrinsics and lens_can_be_free(camera))
     by_point = seen.by_point
     blocks = [by_point @ dX, by_point @ dY]
     if seen.by_intrinsics is not None:

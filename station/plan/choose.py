@@ -10,7 +10,8 @@ import numpy as np
 
 from calibrate.board import board_points
 from calibrate.geometry import Array
-from calibrate.information import Noise, covariance_of, view_information
+from calibrate.information import Noise, covariance_of, lens_can_be_free, view_information
+from calibrate.projection import INTRINSICS, camera_matrix
 from station.plan.scene import Scene
 
 Criterion = Literal["A", "D"]
@@ -52,9 +53,9 @@ def informations(scene: Scene, base_from_flange: Array, noise: Noise, free_intri
 
 def objective_for(scene: Scene, criterion: Criterion, free_intrinsics: bool) -> Objective:
     lens: list[float] = []
-    if free_intrinsics:
-        f = float(np.asarray(scene.camera.matrix)[0, 0])
-        lens = [1 / (LENS_PRIOR_SHARE * f) ** 2] * 4 + [1.0] * len(scene.camera.distortion or (0.0,) * 5)
+    if free_intrinsics and lens_can_be_free(scene.camera):
+        f = float(camera_matrix(scene.camera)[0, 0])
+        lens = [1 / (LENS_PRIOR_SHARE * f) ** 2] * 4 + [1.0] * (len(INTRINSICS) - 4)
     # A metre and three radians: no knowledge, only so that the first few views have a finite sigma.
     return Objective(criterion, scene.working_distance_m, np.array([1.0, 1, 1, 0.1, 0.1, 0.1] * 2 + lens))
 

@@ -220,6 +220,23 @@ def test_a_folding_lens_does_not_show_points_that_it_cannot_see():
     assert not visible(config.camera.model, behind, 0.0)[0]
 
 
+@pytest.mark.parametrize(
+    ("kind", "distortion"),
+    [
+        ("plumb_bob", (-0.1, 0.1, 0.0, 0.0)),
+        ("rational_polynomial", (-0.1, 0.1, 0.0, 0.0, 0.0, 0.01, 0.0, 0.0)),
+        ("equidistant", (0.05, -0.01, 0.0, 0.0)),
+    ],
+)
+def test_every_lens_model_can_be_planned_with(kind, distortion):
+    truth, config = cell()
+    lens = moved(config.camera.model, distortion=distortion, distortion_model=kind)
+    other = moved(config, camera=moved(config.camera, model=lens))
+    plan = make_plan(other, start_joints_rad=truth.start_joints_rad, count=6)
+    assert len(plan.poses) == 6
+    assert plan.poses[-1].predicted_sigma_m < 0.01
+
+
 def test_a_plan_without_a_start_and_with_few_poses():
     _, config = cell()
     plan = plan_scene(

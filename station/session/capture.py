@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 
+import msgspec
 import numpy as np
 
 from calibrate.geometry import Array, inverse, pose_from_rotvec
@@ -35,6 +36,7 @@ async def take_pose(bench: Bench, index: int, attempt: int) -> None:
     still = await bench.stillness.settle(bench.cell.robot.check)
     _phase(bench, index, StationState.CAPTURING, "capturing")
     picture = bench.require_recording().number(await _picture(bench, index))
+    _show_frame(bench, picture)
     device_ns, arrival_ns = picture.stamps.device_ns, picture.stamps.host_monotonic_ns
     clock = bench.cell.camera.clock
     mid_ns, camera_bound_s = mid_exposure(device_ns, arrival_ns, picture.exposure_us, clock)
@@ -72,6 +74,20 @@ async def _picture(bench: Bench, index: int) -> Picture:
             last = error
             bench.store.event(f"picture {number} of at most {tries}: {error}", "warning", index)
     raise PoseFailedError(f"no good picture in {tries} tries: {last}")
+
+
+def _show_frame(bench: Bench, picture: Picture) -> None:
+    height, width = picture.image.shape[:2]
+    shown = msgspec.structs.replace(
+        bench.store.status.camera,
+        connected=True,
+        frames=picture.sequence + 1,
+        width=width,
+        height=height,
+        exposure_us=picture.exposure_us,
+        gain_db=picture.gain_db,
+    )
+    bench.store.update(camera=shown)
 
 
 async def _state_at(bench: Bench, host_monotonic_ns: int) -> RobotState:

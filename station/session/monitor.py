@@ -14,7 +14,7 @@ from station.errors import RobotError
 from station.limits import point_speed_m_s
 from station.session.bench import Bench
 from station.session.capture import flange_pose, matrix4
-from station.status import CameraStatus, ClockStatus, RecorderStatus, RobotStatus
+from station.status import CameraStatus, ClockStatus, RecorderStatus, RobotStatus, StationState
 
 DISK_PERIOD_S = 2.0
 
@@ -33,7 +33,9 @@ class Monitor:
         self._states_seen += 1
 
     def refresh(self, lag_ms: float) -> None:
-        store = self._bench.store
+        store, notice = self._bench.store, self._bench.cell.robot.notice
+        if store.state is StationState.MOVING:
+            store.update(reason=notice)  # 'speed slider at 5 %': no fault, but a person wants to know
         store.update(
             robot=self._robot(),
             recorder=self._recorder(),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -22,15 +23,15 @@ from station.plan.model import Plan
 from station.plan.scene import cell_geometry
 from station.session.bench import Bench
 from station.session.estimate import Estimator
-from station.session.folder import interrupted_session
 from station.session.free_drive import FreeDrive
 from station.session.guard import Guard
+from station.session.interrupted import close_interrupted, find_interrupted
 from station.session.keeper import Keeper
 from station.session.lease import GoDesk, LeaseDesk
+from station.session.logbook import Logbook
 from station.session.preview import Previewer
 from station.session.queue import PoseQueue
-from station.session.recording import SessionRecording
-from station.session.run import Run, recover_parts, seal, unmark_busy
+from station.session.run import Run, seal, unmark_busy
 from station.session.store import StatusStore
 from station.session.summary import poses_to_drive, summarise
 from station.states import RUNNING, refusal
@@ -72,32 +73,19 @@ class Session:
         cell.robot.subscribe(self._record_state)
         self.store.on_event(self._record_event)
         self.store.watch(self._estimator.poke)
+        self._logbook = Logbook(lambda: self.bench.recording)
 
     # -- life -------------------------------------------------------------------------------------------
 
     async def start(self) -> None:
         """Connects, read-only, and keeps trying. Nothing moves. A session that a crash cut is found again."""
         self.bench.root.mkdir(parents=True, exist_ok=True)
-        self._find_interrupted()
+        logging.getLogger("station").addHandler(self._logbook)
+        find_interrupted(self.bench)
         if self.bench.cell.plan is not None and self.bench.queue is None:
             self._replace_plan(self.bench.cell.plan)
         loops = (self.guard.run(), self._keeper.run(), self._estimator.run())
         self._tasks = [asyncio.create_task(loop) for loop in loops]
-
-    def _find_interrupted(self) -> None:
-        found = interrupted_session(self.bench.root)
-        if found is None:
-            return
-        folder, state = found
-        self.bench.queue = PoseQueue(state.plan, state.poses)
-        self.bench.recording = SessionRecording(self.bench.root, self.bench.cell, folder, state.parts)
-        reason = (
-            f"the daemon ended during session {folder.name}; its {self.bench.queue.done} poses are on "
-            "the disk. Look at the arm, acknowledge, then resume or finish."
-        )
-        self.store.enter(StationState.STOPPED, reason)
-        self.bench.show_poses()
-        self.store.event(reason, "warning")
 
     async def close(self) -> None:
         """In this order: the arm stands, the recording is sealed, devices and worker end."""
@@ -108,6 +96,7 @@ class Session:
             with contextlib.suppress(RecordingError):
                 path = await self.bench.recording.seal(self.bench.require_queue())
                 self.store.event(f"sealed before the end: {path}")
+        logging.getLogger("station").removeHandler(self._logbook)
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
@@ -223,23 +212,12 @@ class Session:
         recording = self.bench.require_recording()
         try:
             if recording.recorder is None:
-                await self._close_interrupted(recording)
+                await close_interrupted(self.bench)
             else:
                 await seal(self.bench)
         except RecordingError as error:
             recording.abandon()
             self.store.enter(StationState.FAULT, f"recording: {error}")
-
-    async def _close_interrupted(self, recording: SessionRecording) -> None:
-        """Nothing was added since the crash: what is whole becomes the recording."""
-        await recover_parts(self.bench, recording)
-        queue = self.bench.require_queue()
-        whole = recording.whole
-        await recording.save_state(queue, whole)
-        self.bench.recording = None
-        self.store.update(session=msgspec.structs.replace(self.store.status.session, recording=str(whole)))
-        self.store.enter(StationState.IDLE)
-        self.store.event(f"sealed: {whole}, {queue.done} of {len(queue.statuses)} poses")
 
     # -- the lease ---------------------------------------------------------------------------------------
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 from pathlib import Path
 from typing import Any
 
@@ -448,3 +449,27 @@ async def test_the_end_of_the_daemon_stops_then_seals(rig: Rig) -> None:
     await rig.session.close()
     assert rig.arm.log.index("stop") < rig.arm.log.index("close")
     assert len(open_recording(folder).views()) == 1
+
+
+async def test_the_log_is_in_the_recording_too(rig: Rig) -> None:
+    rig.arm.slow = True
+    await rig.give_go()
+    await rig.until(S.MOVING)
+    logging.getLogger("station.devices.ur").warning("a path of the stop failed")
+    rig.arm.slow = False
+    rig.arm.arrive.set()
+    await rig.until(S.IDLE)
+    logged = [event.detail for event in sealed(rig).events() if event.kind == "log"]
+    assert "station.devices.ur: a path of the stop failed" in logged
+    assert rig.session.store.status.camera.frames == POSES
+
+
+async def test_a_notice_of_the_arm_is_shown_while_it_moves(rig: Rig) -> None:
+    rig.arm.slow = True
+    rig.arm.notice = "speed slider at 5 %"
+    await rig.give_go()
+    await rig.until_true(lambda: rig.session.store.status.reason == "speed slider at 5 %")
+    rig.arm.slow = False
+    rig.arm.arrive.set()
+    await rig.until(S.IDLE)
+    assert rig.session.store.status.reason == ""

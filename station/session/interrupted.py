@@ -1,0 +1,41 @@
+"""A session that a crash cut: found again at the next start, closed or gone on with by a person."""
+
+from __future__ import annotations
+
+import msgspec
+
+from station.session.bench import Bench
+from station.session.folder import interrupted_session
+from station.session.queue import PoseQueue
+from station.session.recording import SessionRecording
+from station.session.run import recover_parts
+from station.status import StationState
+
+
+def find_interrupted(bench: Bench) -> None:
+    """Brings its poses back and stands in `stopped` until a person looked. Nothing moves."""
+    found = interrupted_session(bench.root)
+    if found is None:
+        return
+    folder, state = found
+    bench.queue = PoseQueue(state.plan, state.poses)
+    bench.recording = SessionRecording(bench.root, bench.cell, folder, state.parts)
+    reason = (
+        f"the daemon ended during session {folder.name}; its {bench.queue.done} poses are on the disk. "
+        "Look at the arm, acknowledge, then resume or finish."
+    )
+    bench.store.enter(StationState.STOPPED, reason)
+    bench.show_poses()
+    bench.store.event(reason, "warning")
+
+
+async def close_interrupted(bench: Bench) -> None:
+    """Nothing was added since the crash: what is whole becomes the recording. Raises RecordingError."""
+    recording, queue = bench.require_recording(), bench.require_queue()
+    await recover_parts(bench, recording)
+    whole = recording.whole
+    await recording.save_state(queue, whole)
+    bench.recording = None
+    bench.store.update(session=msgspec.structs.replace(bench.store.status.session, recording=str(whole)))
+    bench.store.enter(StationState.IDLE)
+    bench.store.event(f"sealed: {whole}, {queue.done} of {len(queue.statuses)} poses")

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import os
 import socket
 import stat
+import sys
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
@@ -207,3 +209,37 @@ async def test_a_dying_daemon_ends_requests_and_statuses(server: Served) -> None
     async with asyncio.timeout(2):
         assert len([s async for s in statuses]) <= 1
     await client.close()
+
+
+async def test_stop_gets_in_when_the_house_is_full(server: Served, handler: RecordingHandler) -> None:
+    _, path = server
+    clients = [await Client.connect(path) for _ in range(CLIENT_LIMIT)]
+    answers = await raw(path, b'{"id": 7, "verb": "stop"}\n')
+    assert answers[-1] == {"id": 7, "ok": True, "result": {}}
+    assert handler.order[-1] == "stop"
+    await raw(path, b'{"id": 8, "verb": "go"}\n')
+    assert "go" not in handler.order
+    for client in clients:
+        await client.close()
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can become somebody else")
+async def test_a_user_outside_the_group_is_refused(server: Served) -> None:
+    _, path = server
+    for folder in (path.parent, *path.parent.parents[:3]):
+        with contextlib.suppress(OSError):
+            folder.chmod(folder.stat().st_mode | 0o011)
+    program = (
+        "import os, socket, sys; os.setgroups([]); os.setgid(65534); os.setuid(65534)\n"
+        "socket.socket(socket.AF_UNIX).connect(sys.argv[1])"
+    )
+
+    async def knock() -> bytes:
+        stranger = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", program, str(path), stderr=asyncio.subprocess.PIPE
+        )
+        return (await stranger.communicate())[1]
+
+    assert b"PermissionError" in await knock()
+    path.chmod(0o666)
+    assert await knock() == b""  # it was the socket's mode that refused, not a folder's

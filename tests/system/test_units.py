@@ -77,3 +77,18 @@ def test_uninstall_removes_all_but_what_is_the_owners(scratch: Path) -> None:
     assert "mine.yaml" in own.read_text()
     make("uninstall", scratch)
     assert [p for p in scratch.rglob("*") if p.is_file()] == [own]
+
+
+def test_a_crash_loop_ends_and_a_hang_is_noticed(scratch: Path) -> None:
+    text = (scratch / "etc/systemd/system/station.service").read_text().splitlines()
+    wanted = "StartLimitIntervalSec=60 StartLimitBurst=5 Restart=on-failure WatchdogSec=10 Type=notify"
+    for line in wanted.split():
+        assert line in text
+
+
+def test_a_session_is_solved_in_its_own_folder(scratch: Path) -> None:
+    """Names of sessions have dashes, which systemd would unescape to slashes in %I."""
+    text = (scratch / "etc/systemd/system/calibrate@.service").read_text()
+    command = next(line for line in text.splitlines() if line.startswith("ExecStart="))
+    assert "%I" not in command
+    assert "--output /var/lib/station/sessions/%i/calibration.yaml" in command

@@ -18,6 +18,7 @@ from station.config import StationConfig
 from station.config_file import load_config
 from station.errors import ConfigError, LimitError, StationError
 from station.limits import PlanCheck, check_plan
+from station.plan.choose import Criterion
 from station.plan.files import import_list, load_plan, save_plan
 from station.plan.foxglove import save_scene
 from station.plan.model import Plan, plan_sha256
@@ -44,6 +45,9 @@ def plan_command(
     poses: Annotated[int, typer.Option(min=3, max=200, help="How many.")] = 25,
     seed: Annotated[int, typer.Option(help="The same seed gives the same plan.")] = 0,
     scene: Annotated[str, typer.Option(help="Simulated cell: paper or blog.")] = "paper",
+    d_optimal: Annotated[
+        bool, typer.Option("--d-optimal", help="Smallest error ellipsoid, not smallest error.")
+    ] = False,
     picture: Annotated[Path | None, typer.Option(help="Save a picture of the plan (png, svg, pdf).")] = None,
     foxglove: Annotated[Path | None, typer.Option(help="Save a scene for Foxglove (mcap).")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, nothing else.")] = False,
@@ -51,7 +55,8 @@ def plan_command(
     """Make a pose plan, or check one. Nothing moves."""
     try:
         cell, standing = _cell(config, scene, start)
-        plan = _plan(cell, standing, check, from_list, poses, seed, quiet=as_json)
+        criterion: Criterion = "D" if d_optimal else "A"
+        plan = _plan(cell, standing, check, from_list, poses, seed, criterion, quiet=as_json)
         outcome = check_plan(plan, standing, cell_geometry(cell))
         if output is not None and check is None:
             save_plan(plan, output)
@@ -104,6 +109,7 @@ def _plan(
     from_list: Path | None,
     poses: int,
     seed: int,
+    criterion: Criterion,
     quiet: bool,
 ) -> Plan:
     if check is not None and from_list is not None:
@@ -120,7 +126,9 @@ def _plan(
         def report(text: str, done: float) -> None:
             bar.update(task, description=text, completed=done)
 
-        return make_plan(cell, start_joints_rad=standing, seed=seed, count=poses, progress=report)
+        return make_plan(
+            cell, start_joints_rad=standing, seed=seed, count=poses, criterion=criterion, progress=report
+        )
 
 
 def _summary(plan: Plan, outcome: PlanCheck) -> dict[str, Any]:

@@ -53,6 +53,7 @@ def make_plan(
     start_joints_rad: Sequence[float] | None = None,
     seed: int = 0,
     count: int = 25,
+    criterion: Criterion = "A",
     progress: Progress = lambda text, done: None,
 ) -> Plan:
     """A plan of `count` poses for the configured cell. Deterministic by seed; takes seconds.
@@ -60,7 +61,7 @@ def make_plan(
     ConfigError when the configuration lacks what planning needs; LimitError when there is no such plan,
     saying which limit binds and what to change.
     """
-    options = PlanOptions(count=count, seed=seed, free_intrinsics=True)
+    options = PlanOptions(count=count, seed=seed, criterion=criterion)
     return plan_scene(scene_of(config), options, start_joints_rad, progress)
 
 

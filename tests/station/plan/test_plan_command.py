@@ -40,6 +40,15 @@ def test_a_plan_is_made_shown_and_saved(made):
     assert files["plan.png"].read_bytes()[:4] == b"\x89PNG"
 
 
+def test_the_other_criterion_makes_another_plan(tmp_path):
+    plans = []
+    for name, options in (("a", []), ("d", ["--d-optimal"])):
+        result = run("--poses", 6, "-o", tmp_path / name, *options)
+        assert result.exit_code == 0, result.output
+        plans.append(load_plan(tmp_path / name))
+    assert plans[0].poses != plans[1].poses
+
+
 def test_the_scene_file_opens_and_shows_the_arm_moving(made):
     with made[1]["plan.mcap"].open("rb") as stream:
         reader = make_reader(stream)

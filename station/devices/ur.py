@@ -69,23 +69,25 @@ class UrRobot(UrLink):
         """Spawns the control process, which loads its program. Only in answer to a go. Raises RobotError."""
         if self._child is not None:
             raise RobotError("control is already started")
+        self._stop_reason = ""
         await self.idle()  # a child that is still ending holds the registers
         await self.fresh()
         self.check()
         await self._may_start()
-        self._stop_reason = ""
+        if why := self._why_stopped():
+            raise RobotError(f"stopped before control started{why}")
         self._log_path.parent.mkdir(parents=True, exist_ok=True)
         child = self._child = ControlChild.spawn(self.config.host, self._log_path)
         try:
             tcp = await child.ready()
-            if self._stop_reason:
+            if self._why_stopped():
                 raise RobotError("stopped")
             if tcp is not None and self._tool is not None:
                 self._tool.agree((tcp[0], tcp[1], tcp[2], tcp[3], tcp[4], tcp[5]))
         except BaseException as error:
             await self.end_control()
-            if self._stop_reason and isinstance(error, RobotError):
-                raise RobotError(f"stopped while control was starting: {self._stop_reason}") from None
+            if (why := self._why_stopped()) and isinstance(error, RobotError):
+                raise RobotError(f"stopped while control was starting{why}") from None
             raise
         self._controls = True
 
@@ -203,14 +205,15 @@ class UrRobot(UrLink):
         """
         self._stop_reason = self._stop_reason or reason
         child, self._child, self._controls = self._child, None, False
-        waits: list[asyncio.Future[Any]] = []
+        reply: asyncio.Future[str] | None = None
         try:
             if child is not None:
                 child.stop()
-                waits.append(child.stop_acknowledged)
             if self.dashboard is not None and self.dashboard.alive:
-                waits.append(self.dashboard.send(STOP))
-            self._later(self._finish_stop(child, fallback=len(waits) < 2 or child is None))
+                reply = self.dashboard.send(STOP)
+            self._later(self._finish_stop(child, reply))
+            both = (reply, child.stop_acknowledged if child is not None else None)
+            waits: list[asyncio.Future[Any]] = [w for w in both if w is not None]
             if waits:
                 await asyncio.wait(waits, timeout=STOP_WAIT_S)
         except Exception:
@@ -221,10 +224,11 @@ class UrRobot(UrLink):
         while self._background:
             await asyncio.wait(self._background)
 
-    async def _finish_stop(self, child: ControlChild | None, fallback: bool) -> None:
-        """Behind the stop: the dashboard again by a new connection if need be, then the end of the child."""
+    async def _finish_stop(self, child: ControlChild | None, reply: asyncio.Future[str] | None) -> None:
+        """Behind the stop: the dashboard by a new connection if it did not answer, the end of the child."""
+        answered = reply is not None and await _came(reply)
         ending = [_end_after_stop(child)] if child is not None else []
-        if fallback or self.dashboard is None or not self.dashboard.alive:
+        if not answered:
             ending.append(self._dashboard_stop_anew())
         await asyncio.gather(*ending)
         if child is not None:
@@ -304,11 +308,15 @@ class UrRobot(UrLink):
         task.add_done_callback(self._background.discard)
 
 
+async def _came(reply: asyncio.Future[Any]) -> bool:
+    """The reply is there within a moment, and is no failure."""
+    await asyncio.wait([reply], timeout=STOP_WAIT_S)
+    return reply.done() and not reply.cancelled() and reply.exception() is None
+
+
 async def _end_after_stop(child: ControlChild) -> None:
     """Leaves a moment to pass the stop on, then ends the process."""
-    with contextlib.suppress(TimeoutError):
-        async with asyncio.timeout(STOP_WAIT_S):
-            await asyncio.shield(child.stop_acknowledged)
+    await _came(child.stop_acknowledged)
     child.kill()
     await child.reap()
 

@@ -100,6 +100,34 @@ async def test_stop_while_control_starts(cell: Make) -> None:
     assert not c.robot.control and c.robot.control_pid is None
 
 
+async def test_stop_before_the_control_process_exists(cell: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    c = await cell(control=False)
+    checks = c.robot._may_start
+
+    async def stop_comes_now() -> None:
+        await checks()
+        await c.robot.stop("changed my mind")
+
+    monkeypatch.setattr(c.robot, "_may_start", stop_comes_now)
+    with pytest.raises(RobotError, match="changed my mind"):
+        await c.robot.start_control()
+    assert c.robot.control_pid is None and c.asked("upload: rtde_control") == 0
+
+
+async def test_a_dashboard_connection_that_does_not_answer_is_replaced(
+    cell: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    c = await cell()
+    move = await c.cruising()
+    loop = asyncio.get_running_loop()
+    monkeypatch.setattr(c.robot.dashboard, "send", lambda command: loop.create_future())
+    os.kill(c.robot.control_pid, signal.SIGSTOP)
+    await c.robot.stop("operator")
+    await c.until(lambda: c.asked("dashboard: stop") >= 1, timeout_s=1.0)
+    with pytest.raises(RobotError):
+        await move
+
+
 async def test_a_new_go_right_after_a_stop(cell: Make) -> None:
     c = await cell()
     for _ in range(3):

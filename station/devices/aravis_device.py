@@ -19,6 +19,8 @@ if TYPE_CHECKING:
     from collections.abc import Iterator
 
 BUFFERS = 12
+STREAM_BUFFERS = 64
+"""Free-running: what a loaded computer may be late by, at 75 fps most of a second."""
 _LATCH_WAIT_S = 0.02
 _POP_S = 0.1
 """So often a waiting capture looks whether the camera was lost."""
@@ -81,7 +83,7 @@ class GenicamDevice:
         with self._explained("starting the camera"):
             self._stream = self._camera.create_stream(None, None)
             payload = self._camera.get_payload()
-            for _ in range(BUFFERS):
+            for _ in range(STREAM_BUFFERS if self._config.trigger == "free-running" else BUFFERS):
                 self._stream.push_buffer(self._aravis.Buffer.new_allocate(payload))
             self._camera.start_acquisition()
         self.check_settings()

@@ -14,7 +14,7 @@ from station.session.bench import Bench
 from station.session.capture import PoseFailedError, take_pose
 from station.session.queue import PoseQueue
 from station.session.recording import SessionRecording
-from station.session.run import unmark_busy
+from station.session.run import recover_parts, unmark_busy
 from station.status import StationState
 from station.stillness import NotStillError
 
@@ -39,6 +39,8 @@ class FreeDrive:
         if bench.queue is None:
             bench.queue = PoseQueue(Plan(bench.cell.config.robot.model, bench.cell.config.mount, ()))
         if bench.recording is None or bench.recording.recorder is None:
+            if bench.recording is not None:
+                await recover_parts(bench, bench.recording)
             recording = bench.recording or SessionRecording(bench.root, bench.cell)
             picture = await bench.cell.camera.capture() if bench.cell.config.camera.model is None else None
             await recording.open(bench.queue, picture)

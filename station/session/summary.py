@@ -23,6 +23,8 @@ def poses_to_drive(bench: Bench, purpose: str, index: int | None) -> tuple[int, 
     queue = bench.queue
     if queue is None:
         raise RefusedError("no plan is loaded: load or make one first")
+    if purpose in ("retake", "resume") and bench.recording is None:
+        raise RefusedError("no session is open: run the plan to begin one")
     if purpose == "retake":
         if index is None:
             raise RefusedError("say which pose to retake")

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -14,6 +16,7 @@ import pytest
 from station.cli import main
 from station.plan.files import load_plan
 from station.plan.model import plan_sha256
+from station.states import RUNNING
 from tests.system.conftest import short_folder
 
 pytestmark = pytest.mark.process
@@ -84,6 +87,21 @@ def test_a_session_from_the_shell(shell: Shell, tmp_path: Path) -> None:
     assert json.loads(shell("status", "--json").stdout)["state"] == "stopped"
     assert shell("acknowledge").returncode == 0
     assert shell("retake", "9").returncode == 1
+
+
+def test_ctrl_c_is_stop(shell: Shell, tmp_path: Path) -> None:
+    plan = tmp_path / "plan.yaml"
+    assert station("plan", "--poses", "8", "-o", str(plan), "--json").returncode == 0
+    command = [sys.executable, "-m", "station.cli", "capture", "--plan", str(plan), "--headless"]
+    capture = subprocess.Popen([*command, "--socket", str(shell.socket)], stdin=subprocess.DEVNULL)
+    give_up_s = time.monotonic() + 60
+    while json.loads(shell("status", "--json").stdout)["state"] not in RUNNING:
+        assert time.monotonic() < give_up_s
+    capture.send_signal(signal.SIGINT)
+    assert capture.wait(20) == 130
+    status = json.loads(shell("status", "--json").stdout)
+    assert status["state"] == "stopped"
+    assert "STOP by" in status["reason"]
 
 
 def test_the_demo_finds_the_truth(tmp_path: Path) -> None:

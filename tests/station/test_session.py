@@ -473,3 +473,12 @@ async def test_a_notice_of_the_arm_is_shown_while_it_moves(rig: Rig) -> None:
     rig.arm.arrive.set()
     await rig.until(S.IDLE)
     assert rig.session.store.status.reason == ""
+
+
+@pytest.mark.parametrize("purpose", ["resume", "retake"])
+async def test_a_sealed_session_is_not_added_to(rig: Rig, purpose: str) -> None:
+    await rig.give_go()
+    await rig.until_true(lambda: bool(rig.session.store.status.session.recording))
+    await rig.until(S.IDLE)
+    with pytest.raises(RefusedError, match="no session is open"):
+        await rig.session.prepare(1, purpose, 0)

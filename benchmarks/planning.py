@@ -39,6 +39,8 @@ NOISE = Noise(MID.corner_px, MID.robot_m, MID.robot_rad)
 MODERATE = ViewRange((0.38, 0.60), (0.0, np.deg2rad(30)), roll_rad=np.pi / 4, doubt=0.0)
 WIDE = ViewRange((0.34, 0.75), (0.0, np.deg2rad(50)), roll_rad=np.pi / 2, off_centre=0.8, doubt=0.0)
 RANDOM_ORDERS = 3
+VISITS = 6
+"""How often each set of poses is visited, with new noise."""
 
 
 @dataclass
@@ -46,7 +48,7 @@ class Tally:
     """What all cells add up to."""
 
     errors: dict[str, list[Array]] = field(default_factory=dict)
-    """Name → X errors (6,) of every cell"""
+    """Name → X errors (6,) of every visit"""
     predicted: list[float] = field(default_factory=list)
     achieved: list[float] = field(default_factory=list)
     asked: int = 0
@@ -98,8 +100,8 @@ def _compare_choices(cell: RandomCell, tally: Tally, rng: np.random.Generator, s
             (f"{name} planned 12", choose(each, 12, objective, rng)),
             (f"{name} random 25", rng.permutation(len(pool))[:25].tolist()),
         ):
-            error = _x_error(cell, pool.base_from_flange[places], rng)
-            tally.errors.setdefault(label, []).append(error)
+            visits = [_x_error(cell, pool.base_from_flange[places], rng) for _ in range(VISITS)]
+            tally.errors.setdefault(label, []).extend(visits)
 
 
 def _plan_and_check(cell: RandomCell, tally: Tally, rng: np.random.Generator, seed: int) -> None:
@@ -122,8 +124,8 @@ def _plan_and_check(cell: RandomCell, tally: Tally, rng: np.random.Generator, se
     tally.motion_random += [_random_time(scene, plan, cell, rng) for _ in range(RANDOM_ORDERS)]
     last = plan.poses[-1].predicted_sigma_m
     assert last is not None
-    tally.predicted.append(last)
-    tally.achieved.append(float(np.linalg.norm(_x_error(cell, flange, rng)[:3])))
+    tally.predicted += [last] * VISITS
+    tally.achieved += [float(np.linalg.norm(_x_error(cell, flange, rng)[:3])) for _ in range(VISITS)]
 
 
 def _check_path(start: Array, target: Array, cell: RandomCell, tally: Tally) -> None:
@@ -237,7 +239,8 @@ def report(tally: Tally) -> str:
         ["bootstrap and its plan: views without the whole board", str(tally.boot_unseen), ""],
     ]
     text = (
-        f"{tally.asked} random cells ({tally.drawn} drawn; the rest has no room by an independent check).\n\n"
+        f"{tally.asked} random cells ({tally.drawn} drawn; the rest has no room by an independent check), "
+        f"{len(mm['wide random 25'])} visits with new noise to each kind of pose set.\n\n"
     )
     text += table(["pool", "poses", "X error rms mm", "ratio", "goal"], rows) + "\n\n"
     text += table(["what", "measured", "goal"], facts)

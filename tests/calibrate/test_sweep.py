@@ -1,0 +1,68 @@
+"""A recorded sweep, with rendered pictures: the time offset is found end to end."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from calibrate.errors import BadViewsError, TooFewViewsError
+from calibrate.geometry import Array, inverse, rotation_log
+from calibrate.kinematics import MODELS, forward
+from calibrate.sweep import sweep_time_offset
+from recordings.messages import CameraModel, Picture, RobotState, SessionInfo, Stamps
+from recordings.reader import open_recording
+from recordings.writer import RecordingWriter
+from station.config import PAPER_BOARD
+from station.simulation.cell import make_cell
+from station.simulation.renderer import Light, render, scaled
+
+CELL = make_cell()
+LENS = scaled(CELL.camera, 0.375)
+LATENCY_S = 0.023
+"""From the start of exposure to the arrival of the first picture"""
+DEVICE_EPOCH_NS = 777_000_000_000
+
+
+def joints(t: Array) -> Array:
+    wave = np.sin(1.3 * t[:, None] + np.linspace(0, 2, 6)) * np.array([0.03, 0.03, 0.03, 0.05, 0.06, 0.30])
+    return np.asarray(CELL.start_joints_rad) + wave + 0.01 * np.sin(3.1 * t[:, None])
+
+
+def record(path: Path, pictures: int, lens: CameraModel = LENS) -> Path:
+    info = SessionInfo("sweep", "eye-in-hand", "simulated", PAPER_BOARD, lens)
+    rng = np.random.default_rng(4)
+    model = MODELS[CELL.robot_model]
+    start_ns = 10**12
+    with RecordingWriter(path, info) as writer:
+        for i, t in enumerate(np.arange(0, pictures / 10 + 1.0, 0.008)):
+            flange = forward(model, joints(np.array([t])))[0]
+            tcp = (*flange[:3, 3], *rotation_log(flange[:3, :3]))
+            stamps = Stamps(start_ns + round(t * 1e9), 10**18, controller_s=i * 0.008)
+            zeros = (0.0,) * 6
+            writer.robot_state(RobotState(stamps, zeros, zeros, zeros, tcp, 7, 1, 1, 2, 1, 1.0, 1.0))
+        for k, t in enumerate(0.5 + np.arange(pictures) / 10):
+            flange = forward(model, joints(np.array([t])))[0]
+            view = inverse(flange @ np.array(CELL.camera_mount)) @ np.array(CELL.board_place)
+            image = render(LENS, PAPER_BOARD, view, Light(pixel_noise=1.0, blur_px=0.6), rng)
+            stamps = Stamps(
+                start_ns + round((t + LATENCY_S) * 1e9), 10**18, device_ns=DEVICE_EPOCH_NS + round(t * 1e9)
+            )
+            writer.picture(Picture(image, stamps, k + 1, k))
+        return writer.finish()
+
+
+def test_the_latency_of_the_camera_is_found(tmp_path: Path) -> None:
+    found = sweep_time_offset(open_recording(record(tmp_path / "sweep.mcap", 60)))
+    assert found.offset_s == pytest.approx(-LATENCY_S, abs=max(4 * found.sigma_s, 1e-4))
+    assert found.sigma_s < 0.005 and found.pairs > 50
+
+
+def test_a_sweep_needs_a_lens_and_pictures(tmp_path: Path) -> None:
+    blind = msgspec.structs.replace(LENS, matrix=None, distortion=())
+    with pytest.raises(BadViewsError, match="calibrate from stops"):
+        sweep_time_offset(open_recording(record(tmp_path / "blind.mcap", 1, blind)))
+    with pytest.raises(TooFewViewsError, match="pictures with the board"):
+        sweep_time_offset(open_recording(record(tmp_path / "short.mcap", 3)))

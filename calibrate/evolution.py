@@ -52,16 +52,17 @@ def evolve(
     d = len(lower)
     x = lower + (upper - lower) * rng.random((s.population, d))
     partners = _partners(rng, s.generations, s.population)
-    crosses = rng.random((s.generations, s.population, d)) <= s.crossover
+    stays = rng.random((s.generations, s.population, d)) > s.crossover
     values = evaluate(x)
-    for (p1, p2, p3), cross in zip(partners, crosses, strict=True):
-        mutant = x[p2]
-        mutant -= x[p3]
-        mutant *= s.factor
-        mutant += x[p1]
-        np.maximum(mutant, lower, out=mutant)
-        np.minimum(mutant, upper, out=mutant)
-        trial = np.where(cross, mutant, x)
+    chosen = np.empty((3, s.population, d))
+    for partner, stay in zip(partners, stays, strict=True):
+        base, trial, minus = x.take(partner, axis=0, out=chosen, mode="clip")
+        trial -= minus
+        trial *= s.factor
+        trial += base
+        np.maximum(trial, lower, out=trial)
+        np.minimum(trial, upper, out=trial)
+        np.copyto(trial, x, where=stay)
         trial_values = evaluate(trial)
         better = trial_values <= values
         np.copyto(x, trial, where=better[:, None])
@@ -73,15 +74,18 @@ def evolve(
 def _partners(rng: np.random.Generator, generations: int, population: int) -> NDArray[np.intp]:
     """p1 ≠ p2 ≠ p3 ≠ i, uniform, (generations, 3, population): draws that step over what is taken."""
     shape = (generations, population)
-    taken = [np.broadcast_to(np.arange(population), shape)]
-    chosen = []
-    for k in range(1, 4):
-        pick = rng.integers(0, population - k, size=shape)
-        for held in taken:
-            pick = pick + (pick >= held)
-        chosen.append(pick)
-        taken = list(np.sort([*taken, pick], axis=0))
-    return np.stack(chosen, axis=1)
+    own = np.broadcast_to(np.arange(population), shape)
+    p1 = rng.integers(0, population - 1, size=shape)
+    p1 += p1 >= own
+    low, high = np.minimum(own, p1), np.maximum(own, p1)
+    p2 = rng.integers(0, population - 2, size=shape)
+    p2 += p2 >= low
+    p2 += p2 >= high
+    p3 = rng.integers(0, population - 3, size=shape)
+    lowest, highest = np.minimum(low, p2), np.maximum(high, p2)
+    for taken in (lowest, low + high + p2 - lowest - highest, highest):
+        p3 += p3 >= taken
+    return np.stack([p1, p2, p3], axis=1)
 
 
 def rotations_from_vectors(gamma: Array) -> Array:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from calibrate.commands import batch, board, check, install, solve
+from calibrate.commands import batch, board, check, install, solve, sweep
 
 app = typer.Typer(
     no_args_is_help=True,
@@ -12,5 +12,5 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     help="From a recording to a calibration that can be trusted, installed and undone.",
 )
-for family in (solve, install, check, board, batch):
+for family in (solve, install, check, board, batch, sweep):
     family.register(app)

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 
 import msgspec
 import numpy as np
 import pytest
+from typer.testing import CliRunner
 
+from calibrate.commands.app import app
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import Array, inverse, rotation_log
 from calibrate.kinematics import MODELS, forward
@@ -66,3 +69,12 @@ def test_a_sweep_needs_a_lens_and_pictures(tmp_path: Path) -> None:
         sweep_time_offset(open_recording(record(tmp_path / "blind.mcap", 1, blind)))
     with pytest.raises(TooFewViewsError, match="pictures with the board"):
         sweep_time_offset(open_recording(record(tmp_path / "short.mcap", 3)))
+
+
+def test_the_command_prints_offset_and_sigma(tmp_path: Path) -> None:
+    recording = record(tmp_path / "sweep.mcap", 40)
+    done = CliRunner().invoke(app, ["sweep", str(recording), "--json"])
+    assert done.exit_code == 0, done.output
+    answer = json.loads(done.stdout)
+    assert answer["offset_s"] == pytest.approx(-LATENCY_S, abs=max(4 * answer["sigma_s"], 1e-4))
+    assert "ms from its stamp" in CliRunner().invoke(app, ["sweep", str(recording)]).stdout

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from calibrate.calibration import write_atomically
 from calibrate.geometry import Array
 from calibrate.lens import project
 from calibrate.pipeline import SolvedRecording
+from calibrate.pnp import solve_pnp
 from calibrate.report import html, plots
 from calibrate.report.pictures import drawn_view
 from calibrate.solution import PeerResult
@@ -127,13 +129,15 @@ def _error(job: SolvedRecording) -> Iterator[str]:
 
 
 def _modelled_pixels(job: SolvedRecording) -> dict[int, tuple[Array, Array]]:
-    """Pose number → (found, modelled) pixels by the board's own pose in that picture."""
-    found = {}
+    """Pose number → (found, modelled) pixels by the board's own pose, through the final lens."""
     camera = job.solution.camera
-    for view in job.views:
-        if view.camera_from_board is not None:
-            found[view.index] = (view.pixels, project(camera, view.camera_from_board, view.board_points))
-    return found
+    # Solving began with poses through the first lens: they would shift every corner alike.
+    refitted = solve_pnp(replace(job.views, camera=camera))
+    return {
+        view.index: (view.pixels, project(camera, view.camera_from_board, view.board_points))
+        for view in refitted
+        if view.camera_from_board is not None
+    }
 
 
 def _residuals(job: SolvedRecording) -> Iterator[str]:

@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -35,15 +36,38 @@ def station(*args: str, timeout_s: float = 100.0, **environment: str) -> subproc
 
 
 class Shell:
-    def __init__(self, socket: Path, root: Path) -> None:
-        self.socket, self.root = socket, root
+    """The command line in this process, beside a daemon that is another."""
 
-    def __call__(self, *args: str) -> subprocess.CompletedProcess[str]:
-        return station(*args, "--socket", str(self.socket))
+    def __init__(
+        self, socket: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+    ) -> None:
+        self.socket, self._monkeypatch, self._capsys = socket, monkeypatch, capsys
+
+    def __call__(self, *args: str) -> tuple[int, str, str]:
+        """Exit code, standard output, standard error."""
+        self._monkeypatch.setattr(sys, "argv", ["station", *args])
+        self._capsys.readouterr()
+        with pytest.raises(SystemExit) as ended:
+            main()
+        said = self._capsys.readouterr()
+        code = ended.value.code
+        return code if isinstance(code, int) else 0, said.out, said.err
+
+    def ask(self, *args: str) -> tuple[int, str, str]:
+        return self(*args, "--socket", str(self.socket))
+
+    def state(self) -> dict[str, Any]:
+        state: dict[str, Any] = json.loads(self.ask("status", "--json")[1])
+        return state
 
 
 @pytest.fixture
-def shell(short_folder: Path, tmp_path: Path) -> Iterator[Shell]:
+def shell(
+    short_folder: Path,
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+) -> Iterator[Shell]:
     """Beside a simulated daemon, faster than real time."""
     socket = short_folder / "s"
     command = [sys.executable, "-m", "station.cli", "serve", "--simulate", "--end-with-stdin"]
@@ -53,7 +77,7 @@ def shell(short_folder: Path, tmp_path: Path) -> Iterator[Shell]:
     assert daemon.stdin is not None and daemon.stdout is not None
     try:
         assert json.loads(daemon.stdout.readline())["ready"]
-        yield Shell(socket, tmp_path)
+        yield Shell(socket, monkeypatch, capsys)
     finally:
         daemon.stdin.close()
         daemon.wait(15)
@@ -62,44 +86,43 @@ def shell(short_folder: Path, tmp_path: Path) -> Iterator[Shell]:
 
 def test_a_session_from_the_shell(shell: Shell, tmp_path: Path) -> None:
     plan = tmp_path / "plan.yaml"
-    made = station("plan", "--poses", "4", "-o", str(plan), "--json")
-    assert made.returncode == 0, made.stderr
+    assert shell("plan", "--poses", "4", "-o", str(plan), "--json")[0] == 0
 
-    wrong = shell("capture", "--plan", str(plan), "--headless", "--go", "ab" * 32)
-    assert wrong.returncode == 1
-    assert "is not the hash of this plan" in wrong.stderr and "nothing moved" in wrong.stderr
+    code, _, err = shell.ask("capture", "--plan", str(plan), "--headless", "--go", "ab" * 32)
+    assert code == 1
+    assert "is not the hash of this plan" in err and "nothing moved" in err
 
     sha = plan_sha256(load_plan(plan))
-    done = shell("capture", "--plan", str(plan), "--headless", "--go", sha[:12], "--json")
-    assert done.returncode in (0, 3), done.stderr
-    result = json.loads(done.stdout)
+    code, out, err = shell.ask("capture", "--plan", str(plan), "--headless", "--go", sha[:12], "--json")
+    assert code in (0, 3), err
+    result = json.loads(out)
     assert result["poses"]["planned"] == 4
     assert Path(result["recording"]).is_file()
 
-    status = json.loads(shell("status", "--json").stdout)
+    status = shell.state()
     assert status["state"] == "idle" and status["simulated"]
-    assert "SIMULATED" in shell("status").stdout
-    doctor = shell("doctor", "--json")
-    assert doctor.returncode == 0 and json.loads(doctor.stdout)["ok"]
-    refused = shell("pause")
-    assert refused.returncode == 1 and "no session is running" in refused.stderr
-    assert shell("stop").returncode == 0
-    assert json.loads(shell("status", "--json").stdout)["state"] == "stopped"
-    assert shell("acknowledge").returncode == 0
-    assert shell("retake", "9").returncode == 1
+    assert "SIMULATED" in shell.ask("status")[1]
+    code, out, _ = shell.ask("doctor", "--json")
+    assert code == 0 and json.loads(out)["ok"]
+    code, _, err = shell.ask("pause")
+    assert code == 1 and "no session is running" in err
+    assert shell.ask("stop")[0] == 0
+    assert shell.state()["state"] == "stopped"
+    assert shell.ask("acknowledge")[0] == 0
+    assert shell.ask("retake", "9")[0] == 1
 
 
 def test_ctrl_c_is_stop(shell: Shell, tmp_path: Path) -> None:
     plan = tmp_path / "plan.yaml"
-    assert station("plan", "--poses", "8", "-o", str(plan), "--json").returncode == 0
+    assert shell("plan", "--poses", "8", "-o", str(plan), "--json")[0] == 0
     command = [sys.executable, "-m", "station.cli", "capture", "--plan", str(plan), "--headless"]
     capture = subprocess.Popen([*command, "--socket", str(shell.socket)], stdin=subprocess.DEVNULL)
     give_up_s = time.monotonic() + 60
-    while json.loads(shell("status", "--json").stdout)["state"] not in RUNNING:
+    while shell.state()["state"] not in RUNNING:
         assert time.monotonic() < give_up_s
     capture.send_signal(signal.SIGINT)
     assert capture.wait(20) == 130
-    status = json.loads(shell("status", "--json").stdout)
+    status = shell.state()
     assert status["state"] == "stopped"
     assert "STOP by" in status["reason"]
 
@@ -136,11 +159,8 @@ def test_what_a_user_can_cause_has_words_and_a_code(
     monkeypatch: pytest.MonkeyPatch,
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    monkeypatch.setattr(sys, "argv", ["station", *args])
-    with pytest.raises(SystemExit) as ended:
-        main()
-    out, err = capsys.readouterr()
-    assert ended.value.code == code
+    ended, out, err = Shell(Path("/nowhere"), monkeypatch, capsys)(*args)
+    assert ended == code
     assert said in " ".join(err.replace("│", " ").split())
     assert out == ""
 

@@ -79,7 +79,8 @@ def test_an_impossible_size_is_refused() -> None:
 @given(types=st.lists(st.sampled_from(sorted(DATA_TYPES)), min_size=1, max_size=12), data=st.data())
 def test_recipes_round_trip(types: list[str], data: st.DataObject) -> None:
     strategies = {
-        "?": st.booleans(), "B": st.integers(0, 255), "I": st.integers(0, 2**32 - 1), "Q": st.integers(0, 2**64 - 1),
+        "?": st.booleans(), "B": st.integers(0, 255),
+        "I": st.integers(0, 2**32 - 1), "Q": st.integers(0, 2**64 - 1),
         "i": st.integers(-(2**31), 2**31 - 1), "d": st.floats(allow_nan=False),
     }  # fmt: skip
     values, elements = {}, []

@@ -80,7 +80,7 @@ def test_a_late_sample_of_an_ended_move_is_waited_for(watch: MoveWatch) -> None:
         ({"robot_mode": RobotMode.POWER_OFF}, RobotError, "power on and release the brakes on the pendant"),
         ({"robot_mode": 42}, RobotError, "robot is in mode 42"),
         ({"runtime_state": RuntimeState.PAUSED}, RobotError, "program was paused on the pendant"),
-        ({"runtime_state": RuntimeState.STOPPED}, RobotError, "program was stopped on the pendant, by the switch"),
+        ({"runtime_state": RuntimeState.STOPPED}, RobotError, "stopped on the pendant, by the switch"),
     ],
 )
 def test_what_the_state_says_ends_the_move_even_if_the_word_says_finished(

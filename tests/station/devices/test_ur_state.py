@@ -105,7 +105,7 @@ def test_frozen_data_are_no_samples(controller: Start, stream: Callable[..., Str
         assert s.reader.frozen > 10
 
 
-@pytest.mark.parametrize(("how", "words"), [("fin", "closed the connection"), ("rst", "reset the connection")])
+@pytest.mark.parametrize(("how", "words"), [("fin", "the robot closed"), ("rst", "the robot reset")])
 def test_the_end_of_a_link_is_told_at_once(
     controller: Start, stream: Callable[..., Stream], how: str, words: str
 ) -> None:

@@ -114,6 +114,8 @@ def _picture_quality(grey: Grey, pixels: Array) -> tuple[float, float]:
         region = grey[y0:y1, x0:x1]
     else:
         region = grey
-    laplacian = cv2.Laplacian(region, cv2.CV_32F)
-    variance = float(region.std()) ** 2 + 1e-6
-    return float(np.square(laplacian).mean()) / variance, float((region >= _SATURATED_GREY).mean())
+    laplacian = cv2.Laplacian(region, cv2.CV_16S)
+    energy = cv2.norm(laplacian, cv2.NORM_L2SQR) / region.size
+    _, spread = cv2.meanStdDev(region)
+    saturated = cv2.countNonZero(cv2.inRange(region, _SATURATED_GREY, 255)) / region.size
+    return energy / (float(spread[0, 0]) ** 2 + 1e-6), saturated

@@ -34,7 +34,7 @@ def in_this_process(
 
 @pytest.fixture
 def recordings(session_file: Path, tmp_path: Path) -> list[Path]:
-    return [Path(shutil.copy(session_file, tmp_path / f"cell-{k}.mcap")) for k in range(6)]
+    return [Path(shutil.copy(session_file, tmp_path / f"cell-{k}.mcap")) for k in range(4)]
 
 
 @pytest.mark.process

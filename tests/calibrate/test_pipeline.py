@@ -77,8 +77,12 @@ def test_another_board_or_lens_can_be_tried_on_the_old_pictures(real_session_fil
     given = solve_recording(real_session_file, JobOptions(camera=CAMERA))
     assert given.intrinsics is None
     assert given.calibration.provenance.options["camera"]["width"] == CAMERA.width
+
+
+def test_a_wrong_board_is_refused_with_what_was_seen(tmp_path: Path) -> None:
+    path = write_session(tmp_path / "s.mcap", Scene(views=4))
     with pytest.raises(TooFewViewsError, match="board 9×6 expected, 7×6 seen"):
-        solve_recording(real_session_file, JobOptions(board=BoardSpec(BoardKind.CHESSBOARD, 9, 6, 0.025)))
+        solve_recording(path, JobOptions(board=BoardSpec(BoardKind.CHESSBOARD, 9, 6, 0.025)))
 
 
 def test_a_lens_of_another_camera_is_refused(real_session_file: Path) -> None:

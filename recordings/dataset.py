@@ -4,20 +4,17 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any
 
 import msgspec
 import numpy as np
-import yaml
 
+from recordings import strict_yaml
 from recordings.errors import ImportFolderError
 from recordings.messages import BoardKind, BoardSpec, CameraModel, Mount, RobotIdentity
 from recordings.pictures import SIDE_LIMIT_PX
 
 DATASET_FILE = "dataset.yaml"
 POSES_FILE = "poses.csv"
-_YAML_LIMIT_BYTES = 256 * 1024
-_NEST_LIMIT = 20
 
 
 class Dataset(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -30,47 +27,14 @@ class Dataset(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     note: str = ""
 
 
-class _StrictLoader(yaml.SafeLoader):  # type: ignore[misc]  # yaml has no types
-    """Plain data only: no aliases, no tags of its own, no key twice, no deep nesting."""
-
-    depth = 0
-
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        if self.check_event(yaml.AliasEvent):
-            event = self.peek_event()
-            raise yaml.composer.ComposerError(None, None, "aliases (*) are not allowed", event.start_mark)
-        self.depth += 1
-        if self.depth > _NEST_LIMIT:
-            mark = self.peek_event().start_mark
-            raise yaml.composer.ComposerError(None, None, "it is nested too deeply", mark)
-        node = super().compose_node(parent, index)
-        self.depth -= 1
-        return node
-
-    def construct_mapping(self, node: Any, deep: bool = False) -> dict[Any, Any]:
-        seen = set()
-        for key_node, _ in node.value:
-            if key_node.value in seen:
-                text = f"'{key_node.value}' stands here twice"
-                raise yaml.constructor.ConstructorError(None, None, text, key_node.start_mark)
-            seen.add(key_node.value)
-        content: dict[Any, Any] = super().construct_mapping(node, deep)
-        return content
-
-
 def read_dataset(folder: Path) -> tuple[Dataset, bytes]:
     """(description, the file's bytes). Raises ImportFolderError with file, place and remedy."""
     path = folder / DATASET_FILE
-    content = read_small_file(path, _YAML_LIMIT_BYTES)
+    content = read_small_file(path, strict_yaml.LIMIT_BYTES)
     try:
-        plain = yaml.load(content, _StrictLoader)
-    except (yaml.YAMLError, UnicodeDecodeError, ValueError) as error:
-        raise ImportFolderError(f"{path} is not plain YAML: {_yaml_text(error)}") from error
-    try:
-        dataset = msgspec.convert(plain, Dataset)
-    except msgspec.ValidationError as error:
-        hint = " (numbers are written like 0.025, not 25e-3)" if "float" in str(error) else ""
-        raise ImportFolderError(f"{path}: {str(error).replace('`$.', '`')}{hint}. See {_HELP}") from error
+        dataset = strict_yaml.load(content, Dataset)
+    except strict_yaml.StrictYamlError as error:
+        raise ImportFolderError(f"{path}: {'; '.join(map(str, error.problems))} (see {_HELP})") from None
     problem = _board_problem(dataset.board) or _camera_problem(dataset.camera)
     if problem:
         raise ImportFolderError(f"{path}: {problem}. See {_HELP}")
@@ -78,12 +42,6 @@ def read_dataset(folder: Path) -> tuple[Dataset, bytes]:
 
 
 _HELP = "docs/recording-format.md, 'Bring your own pictures'"
-
-
-def _yaml_text(error: Exception) -> str:
-    mark = getattr(error, "problem_mark", None)
-    text = getattr(error, "problem", None) or str(error)
-    return f"line {mark.line + 1}: {text}" if mark else text
 
 
 def _board_problem(board: BoardSpec) -> str:

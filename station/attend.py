@@ -68,6 +68,7 @@ async def carry_out(
     summary = msgspec.convert(await client.request("prepare", purpose=purpose), GoSummary)
     if not confirm(summary):
         raise RefusedError("nothing moved: the go was not given")
+    await asyncio.sleep(0)  # Ctrl-C at the question strikes here, before the go is sent
     try:
         await client.request("go", token=summary.token, plan_sha256=summary.plan_sha256)
         status = await _watch(client, watch)

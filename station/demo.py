@@ -60,12 +60,14 @@ class DemoError(StationError):
 async def run_demo(options: DemoOptions, progress: SessionProgress) -> dict[str, Any]:
     """What `--json` prints, and `gates_passed`. Raises StationError."""
     options.out.mkdir(parents=True, exist_ok=True)
+    progress.say(f"starting a simulated {options.scene} cell, seed {options.seed}")
     outcome = await _capture(options, progress)
     if not outcome.recording:
         raise DemoError(f"no recording: {outcome.status.reason or outcome.status.state.value}")
     recording = Path(outcome.recording)
     folder = Path(outcome.status.session.folder)
     calibration, report = folder / CALIBRATION_FILE, folder / "report.html"
+    progress.say("solving the recording, in a process of its own")
     solved = await _solve(recording, calibration, report)
     translation_mm, rotation_deg = truth_error(recording, solved["result"]["matrix"])
     return {
@@ -91,6 +93,7 @@ async def _capture(options: DemoOptions, progress: SessionProgress) -> Outcome:
     ):
         await wait_until_idle(client)
         await client.request("lease", action="take")
+        progress.say(f"planning {options.poses} poses")
         await client.request("make_plan", poses=options.poses, seed=options.seed, timeout_s=120.0)
         with progress:
             return await carry_out(

@@ -12,7 +12,10 @@ from station.status import Event, StationStatus
 
 
 class SessionProgress:
-    """Context manager; call it with every status. Silent when `quiet`."""
+    """Context manager; call it with every status. Silent when `quiet`.
+
+    The bar appears with the first status, so that a question before the go has the terminal to itself.
+    """
 
     def __init__(self, console: Console, quiet: bool) -> None:
         self._quiet = quiet
@@ -28,8 +31,12 @@ class SessionProgress:
         self._last: Event | None = None
 
     def __enter__(self) -> SessionProgress:
-        self._bar.start()
         return self
+
+    def say(self, text: str) -> None:
+        """One line about what is going on outside a session."""
+        if not self._quiet:
+            self._bar.console.print(f"[dim]{escape(text)}[/]", highlight=False)
 
     def __exit__(
         self,
@@ -44,6 +51,7 @@ class SessionProgress:
             return
         session = status.session
         if self._task is None:
+            self._bar.start()
             self._task = self._bar.add_task("", total=len(session.poses))
         where = f"pose {session.current + 1} " if session.current is not None else ""
         self._bar.update(

@@ -63,10 +63,14 @@ def tui_command(
 def open_screen(socket: Path | None, replay: Path | None) -> None:
     if not sys.stdout.isatty() or not sys.stdin.isatty():
         raise StationError("the screen needs a terminal; without one use `station capture` or `station demo`")
-    from station.cli_serve import ensure_daemon
-    from station.tui.app import run
+    from station.tui.app import run, run_replay
 
-    run(ensure_daemon(socket or default_socket(), replay))
+    if replay is not None:
+        run_replay(replay)
+        return
+    from station.cli_serve import ensure_daemon
+
+    run(ensure_daemon(socket or default_socket()))
 
 
 def main() -> None:

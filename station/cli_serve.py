@@ -9,7 +9,6 @@ import logging
 import os
 import subprocess
 import sys
-import tempfile
 import time
 from pathlib import Path
 from typing import Annotated, get_args
@@ -113,28 +112,19 @@ def find_config() -> Path | None:
     return next((place for place in places if place.is_file()), None)
 
 
-def ensure_daemon(socket: Path, replay: Path | None = None) -> Path:
-    """The socket of a daemon that answers; starts one where none does. StationError when that fails.
-
-    A replay gets a daemon of its own, which ends with this process.
-    """
-    if replay is not None:
-        socket = Path(tempfile.mkdtemp(prefix="station-replay-")) / "control.sock"
-    elif _answers(socket):
+def ensure_daemon(socket: Path) -> Path:
+    """The socket of a daemon that answers; starts one where none does. StationError when that fails."""
+    if _answers(socket):
         return socket
     root = default_root()
-    if replay is not None:
-        root /= "replay"
-        what = ["--replay", str(replay), "--root", str(root), "--end-with-stdin"]
-    else:
-        config = find_config()
-        what = ["--simulate"] if config is None else ["--config", str(config)]
+    config = find_config()
+    what = ["--simulate"] if config is None else ["--config", str(config)]
     root.mkdir(parents=True, exist_ok=True)
     log = root / "daemon.log"
     with log.open("ab") as words:
         child = subprocess.Popen(
             [sys.executable, "-m", "station.cli", "serve", *what, "--socket", str(socket)],
-            stdin=subprocess.DEVNULL if replay is None else subprocess.PIPE,
+            stdin=subprocess.DEVNULL,
             stdout=subprocess.DEVNULL,
             stderr=words,
             start_new_session=True,

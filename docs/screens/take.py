@@ -1,6 +1,7 @@
 """Takes the pictures of the operator's screens from the running program: `python docs/screens/take.py`.
 
 Needs tmux. A simulated cell is captured, solved and looked at, in a real terminal of each size.
+Sizes may be named: `python docs/screens/take.py 160x48`.
 """
 
 from __future__ import annotations
@@ -19,17 +20,27 @@ from rich.text import Text
 
 HERE = Path(__file__).parent
 SIZES = ((80, 24), (160, 48))
+STATION = (sys.executable, "-m", "station.cli")
 
 
 class Terminal:
-    """A tmux server of its own, with one window that runs `station`."""
+    """A daemon with a simulated cell, and a tmux server of its own with one window that runs the screen."""
 
     def __init__(self, state: Path, width: int, height: int) -> None:
         self._size = (width, height)
         self._socket = f"screens-{os.getpid()}-{width}"
-        program = f"{sys.executable} -m station.cli"
-        places = f"XDG_STATE_HOME={state} XDG_RUNTIME_DIR={state}"
-        self._tmux("new-session", "-d", "-x", str(width), "-y", str(height), f"env {places} {program}")
+        control = state / "control.sock"
+        places = ("--socket", str(control), "--root", str(state / "root"))
+        self._daemon = subprocess.Popen(
+            [*STATION, "serve", "--simulate", "--end-with-stdin", *places],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=(state / "daemon.log").open("wb"),
+        )
+        assert self._daemon.stdout is not None
+        self._daemon.stdout.readline()  # it is ready
+        program = " ".join([*STATION, "tui", "--socket", str(control)])
+        self._tmux("new-session", "-d", "-x", str(width), "-y", str(height), program)
 
     def _tmux(self, *args: str) -> str:
         done = subprocess.run(["tmux", "-L", self._socket, *args], capture_output=True, text=True, check=True)
@@ -42,9 +53,9 @@ class Terminal:
 
     def wait_for(self, pattern: str, timeout_s: float = 120.0) -> None:
         deadline_s = time.monotonic() + timeout_s
-        while not re.search(pattern, self._tmux("capture-pane", "-p")):
+        while not re.search(pattern, self.shown()):
             if time.monotonic() > deadline_s:
-                raise TimeoutError(f"'{pattern}' never came:\n{self._tmux('capture-pane', '-p')}")
+                raise TimeoutError(f"'{pattern}' never came:\n{self.shown()}")
             time.sleep(0.3)
 
     def picture(self, name: str) -> None:
@@ -54,7 +65,23 @@ class Terminal:
         console.save_svg(str(HERE / f"{name}-{width}x{height}.svg"), title="station")
 
     def close(self) -> None:
-        self._tmux("kill-server")
+        subprocess.run(["tmux", "-L", self._socket, "kill-server"], check=False)
+        self._daemon.communicate(timeout=30)
+
+    def shown(self) -> str:
+        return self._tmux("capture-pane", "-p")
+
+    def go_on_until(self, pattern: str, timeout_s: float = 240.0) -> None:
+        """Gives a new go whenever a busy machine made the session pause."""
+        deadline_s = time.monotonic() + timeout_s
+        while not re.search(pattern, shown := self.shown()):
+            if time.monotonic() > deadline_s:
+                raise TimeoutError(f"'{pattern}' never came:\n{shown}")
+            if shown.lstrip().startswith("PAUSED"):
+                self.press("F5")
+                self.wait_for("The arm will move")
+                self.press("Tab", "Enter")
+            time.sleep(0.3)
 
 
 def take(width: int, height: int) -> None:
@@ -71,7 +98,7 @@ def take(width: int, height: int) -> None:
             terminal.wait_for("The arm will move")
             terminal.picture("go")
             terminal.press("Tab", "Enter")
-            terminal.wait_for(r"1\d/25")
+            terminal.go_on_until(r"1\d/25")
             terminal.picture("live")
             terminal.press("2")
             terminal.wait_for("done")
@@ -97,5 +124,6 @@ def take(width: int, height: int) -> None:
 
 
 if __name__ == "__main__":
-    for size in SIZES:
-        take(*size)
+    named = [tuple(map(int, size.split("x"))) for size in sys.argv[1:]]
+    for width, height in named or SIZES:
+        take(width, height)

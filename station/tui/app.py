@@ -7,6 +7,7 @@ makes the daemon decelerate the arm and pause.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Iterable
 from functools import partial
 from pathlib import Path
@@ -14,26 +15,27 @@ from typing import Any, ClassVar
 
 import msgspec
 from textual import work
-from textual.app import App, SystemCommand
+from textual.app import SystemCommand
 from textual.binding import Binding, BindingType
 from textual.message import Message
-from textual.reactive import reactive
 from textual.screen import Screen
 
 from station.client import Client
-from station.errors import RefusedError, StationError
-from station.protocol import Verb
-from station.status import GoSummary, StationState, StationStatus
+from station.errors import StationError
+from station.status import StationState, StationStatus
 from station.tui import offline
 from station.tui.checklist import ChecklistScreen
-from station.tui.confirm import Confirm, ConfirmGo
+from station.tui.commands import Commands
 from station.tui.link import Connect, Link
 from station.tui.live import LiveScreen
 from station.tui.log import LogScreen
 from station.tui.plan import PlanScreen
+from station.tui.replay import ReplayLink
+from station.tui.replay_screen import WATCHABLE, ReplayScreen
 from station.tui.result import ResultScreen
 from station.tui.screen import StationScreen
 from station.tui.sessions import SessionsScreen
+from station.tui.themes import THEMES, chosen_theme
 from station.tui.widgets.preview import Preview
 
 PREVIEW_PERIOD_S = 0.25
@@ -46,7 +48,7 @@ class StatusChanged(Message):
         self.status = status
 
 
-class StationApp(App[None]):
+class StationApp(Commands):
     """One app, several screens; the same keys everywhere."""
 
     TITLE = "Calibration station"
@@ -78,12 +80,14 @@ class StationApp(App[None]):
         Binding("f1", "show_help_panel", "Help", id="help", tooltip="Keys and help for what is on screen"),
         Binding("ctrl+q", "leave", "Quit", id="quit", tooltip="Close this screen; the daemon goes on"),
     ]
-    status: reactive[StationStatus | None] = reactive(None)
 
     def __init__(self, connect: Connect) -> None:
         super().__init__()
         self._connect = connect
-        self._link: Link | None = None
+        self._greeted = False
+        for theme in THEMES:
+            self.register_theme(theme)
+        self.theme = chosen_theme()
         self.result_path: str | None = None
         """The calibration file the result screen shows."""
 
@@ -98,34 +102,50 @@ class StationApp(App[None]):
         """Stays connected for as long as the screen lives."""
         while True:
             try:
-                self._link = await self._connect()
-                async for status in self._link.statuses():
+                self.link = await self._connect()
+                async for status in self.link.statuses():
                     self.post_message(StatusChanged(status))
-            except (OSError, StationError):
-                pass
-            self._link = None
+            except (OSError, StationError, msgspec.ValidationError):
+                pass  # Said on the bar; a daemon of another version is no daemon for this screen.
+            gone, self.link = self.link, None
+            if gone is not None:
+                await gone.close()
             self.post_message(StatusChanged(None))
             await asyncio.sleep(RECONNECT_S)
 
     @work(exclusive=True, group="preview", exit_on_error=False)
     async def fetch_previews(self) -> None:
+        """Only for a screen that shows them, and only as large as it can show."""
         while True:
             await asyncio.sleep(PREVIEW_PERIOD_S)
             screen = self.screen
-            if self._link is None or not isinstance(screen, LiveScreen):
+            link = screen.link if isinstance(screen, ReplayScreen) else self.link
+            if link is None or not isinstance(screen, LiveScreen):
                 continue
-            try:
-                answer = await self._link.request("preview", width=480, height=384)
-            except (OSError, StationError):
-                continue
-            if answer:
-                screen.query_one(Preview).show(answer)
+            for preview in screen.query(Preview):
+                width, height = preview.wanted_pixels()
+                with contextlib.suppress(OSError, StationError):
+                    if answer := await link.request("preview", width=width, height=height):
+                        preview.show(answer)
 
     def on_status_changed(self, message: StatusChanged) -> None:
         self.status = message.status
+        if message.status is not None and not self._greeted:
+            self._greeted = True
+            self.greet(message.status)
         for screen in self.screen_stack:
             if isinstance(screen, StationScreen) and screen.is_mounted:
                 screen.show(message.status)
+
+    @work(exit_on_error=False)
+    async def greet(self, status: StationStatus) -> None:
+        """Who starts for the first time, or without a robot, sees first what is missing."""
+        if status.playback:
+            return
+        missing = status.state is StationState.DISCONNECTED
+        unused = not status.session.poses and await self.ask("sessions") == []
+        if (missing or unused) and self.current_mode == self.DEFAULT_MODE:
+            await self.switch_mode("checklist")
 
     def get_system_commands(self, screen: Screen[Any]) -> Iterable[SystemCommand]:
         """Every key's action by name too; what moves the arm asks the same question from here."""
@@ -138,73 +158,20 @@ class StationApp(App[None]):
                 partial(self.call_later, self.run_action, action),
             )
 
-    # --- the operator → the daemon ---
+    # --- recordings and results ---
 
-    async def ask(self, verb: Verb, **args: Any) -> Any:
-        """The daemon's answer, or None after a notice that says why not."""
-        if self._link is None:
-            self.notify("No connection to the daemon: nothing was sent.", severity="error")
-            return None
+    @work(exclusive=True, group="job", exit_on_error=False)
+    async def watch_recording(self, folder: str) -> None:
+        state = None if self.status is None else self.status.state
+        if state is not None and state not in WATCHABLE:
+            self.notify(f"The cell is {state.value}: finish that first, then look at old recordings.")
+            return
         try:
-            return await self._link.request(verb, **args)
-        except RefusedError as refused:
-            self.notify(str(refused), severity="warning", timeout=10)
-        except (OSError, StationError) as gone:
-            self.notify(str(gone) or "The daemon is gone.", severity="error", timeout=10)
-        return None
-
-    @work(group="command", exit_on_error=False)
-    async def send(self, verb: Verb, **args: Any) -> None:
-        """A wish of one of the screens; control of the arm is taken with it."""
-        if await self.ask("lease", action="take") is not None:
-            await self.ask(verb, **args)
-
-    @work(group="stop", exit_on_error=False)
-    async def action_stop(self) -> None:
-        await self.ask("stop")
-
-    @work(exclusive=True, group="command", exit_on_error=False)
-    async def action_run(self) -> None:
-        """Prepare, ask the person, go: the only way from a key to a motion."""
-        if await self.ask("lease", action="take") is None:
+            link = await asyncio.to_thread(ReplayLink, Path(folder))
+        except StationError as problem:
+            self.notify(str(problem), severity="warning", timeout=10)
             return
-        resuming = self.status is not None and self.status.state is StationState.PAUSED
-        answer = await self.ask("prepare", purpose="resume" if resuming else "run")
-        if answer is None:
-            return
-        go = msgspec.convert(answer, GoSummary)
-        if await self.push_screen_wait(ConfirmGo(go)):
-            await self.ask("go", token=go.token)
-
-    @work(exclusive=True, group="command", exit_on_error=False)
-    async def action_pause(self) -> None:
-        await self.ask("pause")
-
-    @work(exclusive=True, group="command", exit_on_error=False)
-    async def action_finish(self) -> None:
-        captured = self.status.session.captured if self.status else 0
-        question = f"{captured} poses are captured. The recording is closed and can be solved."
-        if await self.push_screen_wait(Confirm("Finish this session?", question, yes="Finish")):
-            await self.ask("finish")
-
-    @work(exclusive=True, group="command", exit_on_error=False)
-    async def action_free_drive(self) -> None:
-        """The operator moves the arm with the pendant's free-drive button; the station only looks."""
-        if self.status is None:
-            return
-        on = self.status.state is not StationState.FREE_DRIVE
-        if await self.ask("lease", action="take") is not None:
-            await self.ask("free_drive", on=on)
-
-    @work(exclusive=True, group="command", exit_on_error=False)
-    async def action_record(self) -> None:
-        await self.ask("record")
-
-    @work(exclusive=True, group="command", exit_on_error=False)
-    async def action_acknowledge(self) -> None:
-        await self.ask("acknowledge")
-
-    # --- results ---
+        await self.push_screen(ReplayScreen(link))
 
     async def show_result(self, calibration: str) -> None:
         self.result_path = calibration
@@ -240,21 +207,21 @@ class StationApp(App[None]):
             self.result_path = None
             await self.switch_mode("sessions")
 
-    @work(exclusive=True, group="command", exit_on_error=False)
-    async def action_leave(self) -> None:
-        running = self.status is not None and self.status.state not in (
-            StationState.IDLE,
-            StationState.DISCONNECTED,
-        )
-        text = "A session is running. Without this screen the arm decelerates and the session pauses."
-        if not running or await self.push_screen_wait(Confirm("Close the screen?", text, yes="Close")):
-            self.exit()
-
 
 def run(socket: Path, who: str = "") -> None:
     """Opens the screen on the daemon that serves `socket` and returns when it is closed."""
 
     async def connect() -> Link:
         return await Client.connect(socket, who, interactive=True)
+
+    StationApp(connect).run()
+
+
+def run_replay(recording: Path) -> None:
+    """The live screen over a recording; no daemon is asked. StationError when it cannot be read."""
+    link = ReplayLink(recording)
+
+    async def connect() -> Link:
+        return link
 
     StationApp(connect).run()

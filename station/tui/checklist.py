@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any, ClassVar, cast
 
+from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 from textual import work
@@ -18,6 +19,10 @@ if TYPE_CHECKING:
     from station.tui.app import StationApp
 
 WORDS = {"ok": "ok", "warning": "WARN", "failed": "MISSING", "skipped": "-"}
+
+AGAIN_S = 5.0
+READY = "\nNothing is missing. 1 shows the cell, 2 then n makes a plan, F5 asks before the arm moves."
+NOT_READY = "\nSomething is missing: its remedy stands beside it. This list looks again every few seconds."
 
 
 def checklist_table(checks: list[dict[str, Any]]) -> Table:
@@ -40,6 +45,13 @@ class ChecklistScreen(StationScreen):
         Binding("r", "refresh_checks", "Check again", tooltip="Look at every item again")
     ]
 
+    def __init__(self) -> None:
+        super().__init__()
+        self._missing = True
+
+    def on_mount(self) -> None:
+        self.set_interval(AGAIN_S, self.look_again)
+
     def body(self) -> ComposeResult:
         with VerticalScroll(id="checklist-scroll"):
             yield Static("checking …", id="checklist")
@@ -51,5 +63,13 @@ class ChecklistScreen(StationScreen):
     @work(exclusive=True, exit_on_error=False)
     async def action_refresh_checks(self) -> None:
         answer = await cast("StationApp", self.app).ask("doctor")
-        if answer is not None:
-            self.query_one("#checklist", Static).update(checklist_table(answer))
+        if answer is None:
+            return
+        self._missing = any(check.get("state") == "failed" for check in answer)
+        words = NOT_READY if self._missing else READY
+        self.query_one("#checklist", Static).update(Group(checklist_table(answer), Text(words, style="bold")))
+
+    def look_again(self) -> None:
+        """What is missing is looked for again by itself; what is there is left in peace."""
+        if self._missing and self.is_current:
+            self.action_refresh_checks()

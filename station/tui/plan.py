@@ -97,7 +97,10 @@ class PlanScreen(StationScreen):
 
     def action_shift(self, by: int) -> None:
         status, line = self.station.status, self.table.cursor_row
-        if status is None or not 0 <= line + by < len(status.session.poses):
+        if self._selected() is None or status is None:
+            return
+        if not 0 <= line + by < len(status.session.poses):
+            self.notify(f"This pose is the {'first' if by < 0 else 'last'} already.")
             return
         order = [pose.index for pose in status.session.poses]
         order[line], order[line + by] = order[line + by], order[line]

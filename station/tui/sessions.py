@@ -87,7 +87,7 @@ class SessionsScreen(StationScreen):
 
     def action_watch(self) -> None:
         if (session := self._selected()) is not None:
-            self.station.send("open_replay", path=str(session["folder"]))
+            self.station.watch_recording(str(session["folder"]))
 
     def action_recover(self) -> None:
         if (session := self._selected()) is not None:

@@ -40,7 +40,12 @@ class FakeLink:
     def __init__(self) -> None:
         self.asked: list[tuple[str, dict[str, Any]]] = []
         self.refuse: dict[str, Exception] = {}
-        self.answers: dict[str, Any] = {"prepare": SUMMARY, "preview": _picture(), "lease": {"holder": "me"}}
+        self.answers: dict[str, Any] = {
+            "prepare": SUMMARY,
+            "preview": _picture(),
+            "lease": {"holder": "me"},
+            "sessions": [{"name": "s-0"}],
+        }
         self._statuses: asyncio.Queue[StationStatus | None] = asyncio.Queue()
         self.show(idle())
 
@@ -50,7 +55,7 @@ class FakeLink:
 
     @property
     def verbs(self) -> list[str]:
-        return [verb for verb, _ in self.asked if verb != "preview"]
+        return [verb for verb, _ in self.asked if verb not in ("preview", "sessions")]
 
     async def request(self, verb: str, **args: Any) -> Any:
         self.asked.append((verb, args))

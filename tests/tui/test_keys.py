@@ -8,6 +8,7 @@ from textual.widgets import Static
 from station.errors import RefusedError
 from station.status import StationState
 from station.tui.app import StationApp
+from station.tui.commands import PLAN_ANSWER_S
 from station.tui.confirm import ConfirmGo
 from tests.tui.conftest import FakeLink, idle
 
@@ -86,7 +87,7 @@ async def test_a_dead_daemon_is_said(link: FakeLink) -> None:
         await pilot.pause()
         link.show(None)
         await pilot.pause()
-        assert "no connection to the daemon" in text_of(pilot.app, "#bar")
+        assert "NO DAEMON" in text_of(pilot.app, "#bar")
 
 
 @pytest.mark.parametrize(
@@ -108,6 +109,7 @@ async def test_a_key_sends_its_wish_at_once(link: FakeLink, key: str, verbs: lis
 
 
 async def test_finish_asks_and_then_seals(link: FakeLink) -> None:
+    link.show(idle(StationState.PAUSED))
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await pilot.pause()
         await pilot.press("f7")
@@ -126,7 +128,7 @@ async def test_finish_asks_and_then_seals(link: FakeLink) -> None:
         ("d", ("drop", {"index": 2})),
         ("ctrl+up", ("reorder", {"order": [0, 2, 1, *range(3, 25)]})),
         ("ctrl+down", ("reorder", {"order": [0, 1, 3, 2, *range(4, 25)]})),
-        ("n", ("make_plan", {"poses": 25, "seed": 1})),
+        ("n", ("make_plan", {"poses": 25, "seed": 1, "timeout_s": PLAN_ANSWER_S})),
     ],
 )
 async def test_the_plan_screen_asks_for_changes_of_the_highlighted_pose(

@@ -10,35 +10,59 @@ from station.status import StationState, StationStatus
 from station.tui.words import STATE_WORDS, duration, size
 
 _ALARM = {StationState.STOPPED, StationState.FAULT, StationState.DISCONNECTED}
+STOP_KEY = "F12=STOP"
+LEVELS = 5
+NO_DAEMON = " NO DAEMON: trying again every second. To stop the arm use the pendant."
 
 
 class StatusBar(Static):
-    """First line: identity and health. Second line: why it stopped and what to do, when it did."""
+    """One line, as full as its width allows; the STOP key is the last thing to be left out: never."""
 
     status: reactive[StationStatus | None] = reactive(None)
 
     def watch_status(self, status: StationStatus | None) -> None:
-        if status is None:
-            self.set_class(True, "alarm")
-            self.update(Text("no connection to the daemon: trying again every second", no_wrap=True))
-            return
-        self.set_class(status.state in _ALARM, "alarm")
-        self.set_class(status.state is StationState.PAUSED, "warn")
-        self.update(Text(self.first_line(status), no_wrap=True, overflow="ellipsis"))
+        self.set_class(status is None or status.state in _ALARM, "alarm")
+        self.set_class(status is not None and status.state is StationState.PAUSED, "warn")
+        self.refresh()
 
-    @staticmethod
-    def first_line(status: StationStatus) -> str:
-        robot, session = status.robot, status.session
-        marks = [m for m, on in (("SIMULATED", status.simulated), ("PLAYBACK", status.playback)) if on]
-        who = " ".join([*marks, robot.model or "no robot"])
-        speed = f"{robot.speed_m_s:.2f}/{robot.speed_limit_m_s:.2f} m/s"
-        where = {True: "REMOTE", False: "LOCAL", None: ""}[robot.remote]
-        state = STATE_WORDS[status.state]
-        safety = robot.safety or "-"
-        count = f"{session.captured}/{len(session.poses)} {duration(session.elapsed_s)}"
-        disk = size(status.recorder.free_bytes)
-        parts = [f"{state} {who}", speed, " ".join(p for p in (safety, where) if p), count, disk, "F12=STOP"]
-        return " " + "│".join(parts)
+    def render(self) -> Text:
+        width = self.size.width
+        line = NO_DAEMON if self.status is None else bar_line(self.status, width)
+        return Text(line, no_wrap=True, overflow="ellipsis")
+
+
+def bar_line(status: StationStatus, width: int) -> str:
+    """The fullest line that fits `width` cells: less important parts go first, then names are cut."""
+    for level in range(LEVELS):
+        line = _line(_parts(status, level))
+        if len(line) + len(STOP_KEY) <= width:
+            return line.ljust(width - len(STOP_KEY)) + STOP_KEY
+    who, *rest = _parts(status, LEVELS - 1)
+    room = width - len(_line(rest)) - len(STOP_KEY) - 1
+    line = _line([who[: max(0, room - 1)] + "…", *rest])
+    return line[: max(0, width - len(STOP_KEY))] + STOP_KEY
+
+
+def _line(parts: list[str]) -> str:
+    return " " + "".join(part + "│" for part in parts)
+
+
+def _parts(status: StationStatus, level: int) -> list[str]:
+    """`level` 0 has everything; every level leaves something out."""
+    robot, session = status.robot, status.session
+    marks = [m for m, on in (("SIMULATED", status.simulated), ("PLAYBACK", status.playback)) if on]
+    limit = f"/{robot.speed_limit_m_s:.2f}" if level < 3 else ""
+    where = {True: "REMOTE", False: "LOCAL", None: ""}[robot.remote]
+    count = f"{session.captured}/{len(session.poses)}"
+    parts = [
+        " ".join([STATE_WORDS[status.state], *marks, robot.model or "no robot"]),
+        f"{robot.speed_m_s:.2f}{limit} m/s",
+        " ".join(p for p in (robot.safety or "-", where) if p),
+        count if level >= 1 else f"{count} {duration(session.elapsed_s)}",
+    ]
+    if level < 2 and status.recorder.free_bytes:
+        parts.append(size(status.recorder.free_bytes))
+    return parts if level < LEVELS - 1 else [parts[0], parts[2], parts[3]]
 
 
 class ReasonLine(Static):

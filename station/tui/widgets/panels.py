@@ -12,6 +12,8 @@ from textual.widgets import Static
 from station.status import StationStatus
 from station.tui.words import POSE_MARKS, degrees, mm
 
+CLOCKS_POOR_MS = 20.0
+"""The default of `capture.time_bound_s`: poses known worse than that are refused."""
 Lines = Callable[[StationStatus], list[str]]
 
 
@@ -47,9 +49,10 @@ def device_lines(status: StationStatus) -> list[str]:
         pulses, frames = status.trigger.pulses, status.trigger.frames
         lines.append(_line("trigger", f"{pulses} = {frames}", pulses == frames))
     recording = f"sync {recorder.sync_ms:.0f} ms" if recorder.recording else "not recording"
-    lines.append(_line("record", recording, None if not recorder.recording else not recorder.error))
-    if bounds.camera_bound_ms is not None:
-        lines.append(_line("clock", f"± {bounds.camera_bound_ms:.2f} ms", True))
+    lines.append(_line("record", recording, False if recorder.error else recorder.recording or None))
+    known_ms = [ms for ms in (bounds.camera_bound_ms, bounds.controller_bound_ms) if ms is not None]
+    if known_ms:
+        lines.append(_line("clocks", f"± {sum(known_ms):.1f} ms", sum(known_ms) < CLOCKS_POOR_MS))
     return lines
 
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import base64
+from functools import lru_cache
+from itertools import groupby
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from rich.color import Color
 from rich.segment import Segment
 from rich.style import Style
 from textual.geometry import Size
@@ -15,7 +18,10 @@ from textual.strip import Strip
 from textual.widget import Widget
 
 Grey = NDArray[np.uint8]
-CORNER_RGB = (0, 230, 0)
+LEVELS = 32
+"""Shades a terminal picture is drawn with: fewer styles to send, and no eye sees more in half blocks."""
+CORNER = Segment("+", Style(color=Color.from_rgb(0, 230, 0), bgcolor=Color.from_rgb(0, 0, 0), bold=True))
+"""A sign and not only a colour."""
 
 
 class Preview(Widget):
@@ -26,20 +32,27 @@ class Preview(Widget):
     def __init__(self, *, id: str | None = None) -> None:
         super().__init__(id=id)
         self._picture: Grey | None = None
+        self._sequence: object = None
         self._corners: NDArray[np.float64] = np.zeros((0, 2))
         self._rows: list[Strip] = []
         self._rows_size = Size(0, 0)
 
     def show(self, answer: dict[str, Any]) -> None:
         """A `preview` reply: jpeg_base64, and corners as fractions of width and height."""
+        if answer.get("sequence") is not None and answer["sequence"] == self._sequence:
+            return
         data = np.frombuffer(base64.b64decode(answer.get("jpeg_base64", "")), dtype=np.uint8)
         picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
         if picture is None:
             return
-        self._picture = np.asarray(picture, dtype=np.uint8)
+        self._picture, self._sequence = np.asarray(picture, dtype=np.uint8), answer.get("sequence")
         self._corners = np.array(answer.get("corners", []), dtype=float).reshape(-1, 2)
         self._rows_size = Size(0, 0)
         self.refresh()
+
+    def wanted_pixels(self) -> tuple[int, int]:
+        """Width and height of a picture that shows all that this widget can: a cell is one by two."""
+        return max(16, self.size.width), max(16, 2 * self.size.height)
 
     def render_line(self, y: int) -> Strip:
         if self._rows_size != self.size:
@@ -50,22 +63,29 @@ class Preview(Widget):
         if self._picture is None or size.width < 2 or size.height < 1:
             return [Strip([Segment("no picture yet".center(size.width))])] if size.width else []
         height, width = self._picture.shape
-        # A cell is one pixel wide and two high.
         scale = min(size.width / width, 2 * size.height / height)
         columns, rows = max(1, int(width * scale)), max(2, int(height * scale) // 2 * 2)
         small = cv2.resize(self._picture, (columns, rows), interpolation=cv2.INTER_AREA)
-        rgb = np.repeat(small[:, :, None], 3, axis=2)
+        shades = (small.astype(int) * LEVELS // 256).reshape(rows // 2, 2, columns)
+        cells = (shades[:, 0] * LEVELS + shades[:, 1]).tolist()
         for x, y in self._corners:
-            row, column = int(y * rows), int(x * columns)
-            if 0 <= row < rows and 0 <= column < columns:
-                rgb[row, column] = CORNER_RGB
+            row, column = int(y * rows) // 2, int(x * columns)
+            if 0 <= row < rows // 2 and 0 <= column < columns:
+                cells[row][column] = -1
         left = (size.width - columns) // 2
-        return [self._strip(rgb[r], rgb[r + 1], left, size.width) for r in range(0, rows, 2)]
+        return [_strip(line, left, size.width) for line in cells]
 
-    @staticmethod
-    def _strip(top: NDArray[Any], bottom: NDArray[Any], left: int, width: int) -> Strip:
-        cells = [Segment(" " * left)]
-        for a, b in zip(top, bottom, strict=True):
-            ink, paper = (f"rgb({p[0]},{p[1]},{p[2]})" for p in (a, b))
-            cells.append(Segment("▀", Style.parse(f"{ink} on {paper}")))
-        return Strip(cells).adjust_cell_length(width)
+
+def _strip(line: list[int], left: int, width: int) -> Strip:
+    """Neighbours alike become one run: less to send over ssh."""
+    runs = [Segment(" " * left)]
+    for cell, alike in groupby(line):
+        count = len(list(alike))
+        runs += [CORNER] * count if cell < 0 else [Segment("▀" * count, _style(cell))]
+    return Strip(runs).adjust_cell_length(width)
+
+
+@lru_cache(maxsize=LEVELS * LEVELS)
+def _style(cell: int) -> Style:
+    top, bottom = (round(shade * 255 / (LEVELS - 1)) for shade in divmod(cell, LEVELS))
+    return Style(color=Color.from_rgb(top, top, top), bgcolor=Color.from_rgb(bottom, bottom, bottom))

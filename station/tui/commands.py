@@ -1,0 +1,110 @@
+"""From the operator's keys to the daemon's verbs: what is asked first, what is said when it is refused."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+from textual import work
+from textual.app import App
+from textual.reactive import reactive
+
+from station.errors import RefusedError, StationError
+from station.protocol import Verb
+from station.states import refusal
+from station.status import GoSummary, StationState, StationStatus
+from station.tui.confirm import Confirm, ConfirmGo
+from station.tui.link import Link
+from station.tui.replay_screen import ReplayScreen
+
+PLAN_ANSWER_S = 200.0
+"""Planning takes the daemon some seconds on a quick computer, and minutes on a busy one."""
+
+
+class Commands(App[None]):
+    """Every wish goes through `ask`; the daemon decides, nothing is decided here."""
+
+    status: reactive[StationStatus | None] = reactive(None)
+    link: Link | None = None
+    """The connection while there is one."""
+
+    async def ask(self, verb: Verb, **args: Any) -> Any:
+        """The daemon's answer, or None after a notice that says why not."""
+        if verb != "stop" and any(isinstance(screen, ReplayScreen) for screen in self.screen_stack):
+            self.notify("This is the PLAYBACK of a recording: Escape leaves it. F12 still stops the arm.")
+            return None
+        if self.link is None:
+            self.notify("No connection to the daemon: nothing was sent.", severity="error")
+            return None
+        try:
+            return await self.link.request(verb, **args)
+        except RefusedError as refused:
+            self.notify(str(refused), severity="warning", timeout=10)
+        except (OSError, StationError) as gone:
+            self.notify(str(gone) or "The daemon is gone.", severity="error", timeout=10)
+        return None
+
+    @work(group="command", exit_on_error=False)
+    async def send(self, verb: Verb, **args: Any) -> None:
+        """A wish of one of the screens; control of the arm is taken with it."""
+        patience = {"timeout_s": PLAN_ANSWER_S} if verb == "make_plan" else {}
+        if await self.ask("lease", action="take") is not None:
+            await self.ask(verb, **patience, **args)
+
+    @work(group="stop", exit_on_error=False)
+    async def action_stop(self) -> None:
+        await self.ask("stop")
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_run(self) -> None:
+        """Prepare, ask the person, go: the only way from a key to a motion."""
+        if await self.ask("lease", action="take") is None:
+            return
+        resuming = self.status is not None and self.status.state is StationState.PAUSED
+        answer = await self.ask("prepare", purpose="resume" if resuming else "run")
+        if answer is None:
+            return
+        go = msgspec.convert(answer, GoSummary)
+        if await self.push_screen_wait(ConfirmGo(go)):
+            await self.ask("go", token=go.token)
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_pause(self) -> None:
+        await self.ask("pause")
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_finish(self) -> None:
+        if self.status is not None and (reason := refusal("finish", self.status.state)):
+            self.notify(reason, severity="warning")
+            return
+        captured = self.status.session.captured if self.status else 0
+        question = f"{captured} poses are captured. The recording is closed and can be solved."
+        if await self.push_screen_wait(Confirm("Finish this session?", question, yes="Finish")):
+            await self.ask("finish")
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_free_drive(self) -> None:
+        """The operator moves the arm with the pendant's free-drive button; the station only looks."""
+        if self.status is None:
+            return
+        on = self.status.state is not StationState.FREE_DRIVE
+        if await self.ask("lease", action="take") is not None:
+            await self.ask("free_drive", on=on)
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_record(self) -> None:
+        await self.ask("record")
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_acknowledge(self) -> None:
+        await self.ask("acknowledge")
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_leave(self) -> None:
+        running = self.status is not None and self.status.state not in (
+            StationState.IDLE,
+            StationState.DISCONNECTED,
+        )
+        text = "A session is running. Without this screen the arm decelerates and the session pauses."
+        if not running or await self.push_screen_wait(Confirm("Close the screen?", text, yes="Close")):
+            self.exit()

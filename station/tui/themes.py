@@ -1,0 +1,47 @@
+"""Two quiet themes, dark and light. `TEXTUAL_THEME` names another, such as `ansi-dark` for 16 colours."""
+
+from __future__ import annotations
+
+import os
+
+from textual.theme import BUILTIN_THEMES, Theme
+
+THEMES = (
+    Theme(
+        "station-dark",
+        primary="#2F5D8A",
+        secondary="#4A7A5C",
+        warning="#B8860B",
+        error="#B3261E",
+        success="#3C8C4A",
+        accent="#8AB4D8",
+        foreground="#E6E6E6",
+        background="#101418",
+        surface="#181D23",
+        panel="#20272F",
+        dark=True,
+    ),
+    Theme(
+        "station-light",
+        primary="#9CC3E6",
+        secondary="#9CCBAA",
+        warning="#F0C040",
+        error="#F2A29B",
+        success="#A5D6A7",
+        accent="#1F5C99",
+        foreground="#101418",
+        background="#FAFAF7",
+        surface="#F0F0EC",
+        panel="#E4E4DE",
+        dark=False,
+    ),
+)
+FEW_COLOURS = ("linux", "vt100", "vt220", "ansi")
+
+
+def chosen_theme() -> str:
+    """What the operator asked for; on a console with 16 colours those of the terminal itself."""
+    asked = os.environ.get("TEXTUAL_THEME", "")
+    if asked in BUILTIN_THEMES or asked in {theme.name for theme in THEMES}:
+        return asked
+    return "ansi-dark" if os.environ.get("TERM", "") in FEW_COLOURS else "station-dark"

@@ -1,0 +1,91 @@
+"""The bar as it reads at the usual widths: golden lines, and the STOP key in every one of them."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from station.status import RecorderStatus, RobotStatus, StationState, StationStatus
+from station.tui.widgets.bar import bar_line
+from tests.tui.conftest import FakeLink, idle
+from tests.tui.test_keys import app_on, text_of
+
+ROBOT = RobotStatus(
+    connected=True, model="UR10", safety="NORMAL", remote=True, speed_m_s=0.21, speed_limit_m_s=0.25
+)
+
+WIDE = (
+    " FREE-DRIVE SIMULATED PLAYBACK UR10e Series 5 (lab bench)│0.21/0.25 m/s│"
+    "AUTOMATIC MODE SAFEGUARD REMOTE│18/25│  F12=STOP"
+)
+
+
+def working(state: StationState = StationState.MOVING) -> StationStatus:
+    status = idle(state)
+    session = msgspec.structs.replace(status.session, captured=18, elapsed_s=362.0)
+    recorder = RecorderStatus(recording=True, free_bytes=212_000_000_000)
+    return msgspec.structs.replace(status, robot=ROBOT, session=session, recorder=recorder)
+
+
+def long_one() -> StationStatus:
+    status = working(StationState.FREE_DRIVE)
+    robot = msgspec.structs.replace(
+        ROBOT, model="UR10e Series 5 (lab bench)", safety="AUTOMATIC MODE SAFEGUARD"
+    )
+    return msgspec.structs.replace(status, playback=True, robot=robot)
+
+
+@pytest.mark.parametrize(
+    ("status", "width", "line"),
+    [
+        (working(), 80, " MOVING SIMULATED UR10│0.21/0.25 m/s│NORMAL REMOTE│18/25 6:02│212 GB│   F12=STOP"),
+        (
+            working(StationState.FREE_DRIVE),
+            80,
+            " FREE-DRIVE SIMULATED UR10│0.21/0.25 m/s│NORMAL REMOTE│18/25│212 GB│    F12=STOP",
+        ),
+        (
+            long_one(),
+            80,
+            " FREE-DRIVE SIMULATED PLAYBACK U…│AUTOMATIC MODE SAFEGUARD REMOTE│18/25│F12=STOP",
+        ),
+        (
+            long_one(),
+            120,
+            WIDE,
+        ),
+    ],
+)
+def test_golden_lines(status: StationStatus, width: int, line: str) -> None:
+    assert bar_line(status, width) == line
+
+
+@given(
+    width=st.integers(20, 200),
+    model=st.text(alphabet="UR10e x", max_size=60),
+    safety=st.sampled_from(["", "NORMAL", "PROTECTIVE STOP", "ROBOT EMERGENCY STOP"]),
+    state=st.sampled_from(list(StationState)),
+    both=st.booleans(),
+)
+def test_the_stop_key_is_at_the_right_edge_whatever_the_rest(
+    width: int, model: str, safety: str, state: StationState, both: bool
+) -> None:
+    robot = msgspec.structs.replace(ROBOT, model=model, safety=safety)
+    status = msgspec.structs.replace(working(state), playback=both, robot=robot)
+    line = bar_line(status, width)
+    assert len(line) <= width
+    assert line.endswith("F12=STOP")
+
+
+@pytest.mark.parametrize("size", [(80, 24), (120, 34)])
+async def test_on_the_screen_it_is_the_first_line(link: FakeLink, size: tuple[int, int]) -> None:
+    link.show(long_one())
+    async with app_on(link).run_test(size=size) as pilot:
+        await pilot.pause()
+        assert text_of(pilot.app, "#bar") == bar_line(long_one(), size[0])
+        assert pilot.app.screen.query_one("#bar").region.y == 0
+        await pilot.resize_terminal(60, 20)
+        await pilot.pause()
+        assert text_of(pilot.app, "#bar").endswith("F12=STOP")

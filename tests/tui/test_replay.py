@@ -1,0 +1,106 @@
+"""A recording in the live screen: it plays, it says PLAYBACK, and nothing can be commanded."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import pytest
+
+import recordings
+from station.errors import RefusedError, StationError
+from station.status import StationState
+from station.tui.app import StationApp
+from station.tui.replay import ReplayLink
+from station.tui.replay_screen import ReplayScreen
+from station.tui.timeline import END_TEXT, Timeline
+from station.tui.widgets.preview import Preview
+from tests.tui.conftest import FakeLink, idle
+from tests.tui.test_jobs import until
+from tests.tui.test_keys import app_on, text_of
+
+SAMPLE = Path(recordings.__file__).parent / "samples" / "paper-640.mcap"
+
+
+def replay_app(pace: float) -> StationApp:
+    link = ReplayLink(SAMPLE, pace)
+
+    async def connect() -> ReplayLink:
+        return link
+
+    return StationApp(connect)
+
+
+def test_the_arm_stands_where_it_stood_when_each_picture_was_taken() -> None:
+    timeline = Timeline(SAMPLE)
+    for view in timeline.views:
+        at_s = timeline._times_s[view.index]
+        status = timeline.status(at_s)
+        assert timeline.view_at(at_s) == view
+        assert status.robot.joints_rad == pytest.approx(view.joints_rad, abs=2e-3)
+        assert status.robot.base_from_flange is not None
+        for row, recorded in zip(status.robot.base_from_flange[:3], view.base_from_flange[:3], strict=True):
+            assert row == pytest.approx(recorded, abs=2e-3)
+    assert timeline.status(timeline.duration_s).reason == END_TEXT
+
+
+async def test_it_plays_to_its_end_with_pictures_and_marks(link: FakeLink) -> None:
+    async with replay_app(pace=1000.0).run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: "25/25" in text_of(pilot.app, "#bar"))
+        assert "PLAYBACK" in text_of(pilot.app, "#bar")
+        assert END_TEXT in text_of(pilot.app, "#reason")
+        preview = pilot.app.screen.query_one(Preview)
+        await until(pilot, lambda: preview._picture is not None and len(preview._corners) == 42)
+
+
+@pytest.mark.parametrize("verb", ["stop", "lease", "prepare", "go", "acknowledge", "finish", "retake"])
+async def test_nothing_can_be_commanded(verb: str) -> None:
+    with pytest.raises(RefusedError, match="PLAYBACK"):
+        await ReplayLink(SAMPLE).request(verb)  # type: ignore[arg-type]
+
+
+def test_a_missing_recording_is_said_before_the_screen_opens(tmp_path: Path) -> None:
+    with pytest.raises(StationError, match="cannot be replayed"):
+        ReplayLink(tmp_path / "none.mcap")
+
+
+@pytest.fixture
+def beside(link: FakeLink) -> FakeLink:
+    """A cell whose sessions screen lists the sample."""
+    link.answers["sessions"] = [
+        {"name": "s-0", "folder": str(SAMPLE), "recording": str(SAMPLE), "sealed": True}
+    ]
+    return link
+
+
+async def test_beside_a_cell_only_stop_goes_through(beside: FakeLink) -> None:
+    async with app_on(beside).run_test(size=(80, 24), notifications=True) as pilot:
+        await pilot.pause()
+        await pilot.press("4")
+        await pilot.pause()
+        await pilot.press("w")
+        await until(pilot, lambda: isinstance(pilot.app.screen, ReplayScreen))
+        await until(pilot, lambda: "PLAYBACK" in text_of(pilot.app, "#bar"))
+        await pilot.press("f5", "f6", "f3", "f2")
+        await pilot.pause()
+        assert beside.verbs == []
+        await pilot.press("f12")
+        await pilot.pause()
+        assert beside.verbs == ["stop"]
+        await pilot.press("escape")
+        await pilot.pause()
+        assert not isinstance(pilot.app.screen, ReplayScreen)
+        assert "PLAYBACK" not in text_of(pilot.app, "#bar")
+
+
+async def test_the_cells_own_work_ends_the_playback(beside: FakeLink) -> None:
+    async with app_on(beside).run_test(size=(80, 24)) as pilot:
+        await pilot.pause()
+        await pilot.press("4")
+        await pilot.pause()
+        await pilot.press("w")
+        await until(pilot, lambda: isinstance(pilot.app.screen, ReplayScreen))
+        beside.show(idle(StationState.STOPPED, "protective stop"))
+        await until(pilot, lambda: not isinstance(pilot.app.screen, ReplayScreen))
+        await asyncio.sleep(0)
+        assert "STOPPED" in text_of(pilot.app, "#bar")

@@ -1,0 +1,112 @@
+"""What is shown first, what is said when a key can do nothing, and how the screen looks on old terminals."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+
+from station.status import StationState
+from station.tui.app import StationApp
+from station.tui.checklist import ChecklistScreen
+from station.tui.live import LiveScreen
+from station.tui.themes import chosen_theme
+from tests.tui.conftest import FakeLink, idle
+from tests.tui.test_jobs import until
+from tests.tui.test_keys import app_on, text_of
+
+MISSING = [{"name": "robot", "state": "failed", "text": "no answer", "remedy": "switch it on"}]
+THERE = [{"name": "robot", "state": "ok", "text": "UR10"}]
+
+
+async def test_without_a_robot_the_checklist_comes_first(link: FakeLink) -> None:
+    link._statuses.get_nowait()
+    link.show(idle(StationState.DISCONNECTED))
+    link.answers["doctor"] = MISSING
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: isinstance(pilot.app.screen, ChecklistScreen))
+        await until(pilot, lambda: "switch&#160;it&#160;on" in pilot.app.export_screenshot())
+        assert "MISSING" in pilot.app.export_screenshot()
+
+
+async def test_before_the_first_session_too(link: FakeLink) -> None:
+    link._statuses.get_nowait()
+    fresh = idle()
+    link.show(msgspec.structs.replace(fresh, session=msgspec.structs.replace(fresh.session, poses=())))
+    link.answers |= {"doctor": THERE, "sessions": []}
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: isinstance(pilot.app.screen, ChecklistScreen))
+        await until(pilot, lambda: "F5&#160;asks" in pilot.app.export_screenshot())
+
+
+async def test_later_the_live_screen_comes_first(link: FakeLink) -> None:
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await pilot.pause()
+        await pilot.pause()
+        assert isinstance(pilot.app.screen, LiveScreen)
+
+
+@pytest.mark.parametrize(
+    ("screen", "keys", "words"),
+    [
+        ("1", ["f7"], "no session is running"),
+        ("1", ["f9"], "Nothing is sealed yet"),
+        ("2", ["r"], "No plan is loaded"),
+        ("2", ["ctrl+up"], "No plan is loaded"),
+        ("3", ["i"], "There is no result"),
+        ("3", ["e"], "There is no result"),
+        ("4", ["v"], "No session is recorded yet"),
+        ("4", ["w"], "No session is recorded yet"),
+    ],
+)
+async def test_a_key_that_can_do_nothing_says_why(
+    link: FakeLink, screen: str, keys: list[str], words: str
+) -> None:
+    link._statuses.get_nowait()
+    fresh = idle()
+    link.show(msgspec.structs.replace(fresh, session=msgspec.structs.replace(fresh.session, poses=())))
+    link.answers |= {"doctor": THERE, "sessions": []}
+    async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
+        await until(pilot, lambda: isinstance(pilot.app.screen, ChecklistScreen))
+        await pilot.press(screen)
+        await pilot.pause()
+        await pilot.press(*keys)
+        await pilot.pause()
+        assert any(words in said.message for said in pilot.app._notifications)
+        assert not {"go", "prepare", "finish"} & set(link.verbs)
+
+
+async def test_without_a_daemon_every_key_says_so(link: FakeLink) -> None:
+    link.show(None)
+    async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
+        await until(pilot, lambda: "NO DAEMON" in text_of(pilot.app, "#bar"))
+        await pilot.press("f12")
+        await pilot.pause()
+        assert any("nothing was sent" in said.message for said in pilot.app._notifications)
+
+
+def test_every_key_has_a_tooltip() -> None:
+    for owner in (StationApp, *StationApp.MODES.values()):
+        for binding in vars(owner).get("BINDINGS", ()):
+            assert binding.tooltip, (owner, binding)
+
+
+@pytest.mark.parametrize("theme", ["station-dark", "station-light", "ansi-dark"])
+async def test_the_state_is_a_word_in_every_theme(
+    link: FakeLink, theme: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TEXTUAL_THEME", theme)
+    link.show(idle(StationState.FAULT, "camera lost"))
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await pilot.pause()
+        assert pilot.app.theme == theme
+        assert text_of(pilot.app, "#bar").startswith(" FAULT")
+
+
+def test_a_console_with_16_colours_gets_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.delenv("TEXTUAL_THEME", raising=False)
+    monkeypatch.setenv("TERM", "linux")
+    assert chosen_theme() == "ansi-dark"
+    monkeypatch.setenv("TERM", "xterm-256color")
+    assert chosen_theme() == "station-dark"
+    monkeypatch.setenv("TEXTUAL_THEME", "no such theme")
+    assert chosen_theme() == "station-dark"

@@ -33,7 +33,7 @@ from calibrate.robust import solve_global
 from calibrate.views import ViewSet
 
 TRIALS = 200
-NOISE = Noise(0.2, 0.84e-3, np.radians(0.061))
+NOISE = Noise(0.2, 0.88e-3, np.radians(0.064))
 _FITTED = 19
 
 Method = Callable[[ViewSet, Pairs, int], Array]

@@ -7,6 +7,7 @@ id and sequence) and deleted. Frames are 1280×1024 mono8 in packets of 8996 byt
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import os
 import resource
@@ -26,6 +27,7 @@ import numpy as np
 from recordings.messages import CameraModel, Picture, RobotState, SessionInfo, Stamps
 from recordings.reader import open_recording
 from recordings.recorder import Recorder
+from station.cli_serve import PRIORITY
 from station.config import PAPER_BOARD, CameraConfig
 from station.devices.aravis import AravisCamera
 from station.devices.frames import frames_between
@@ -210,6 +212,8 @@ def process_cpu_s(pid: int) -> float:
 
 
 if __name__ == "__main__":
+    with contextlib.suppress(OSError):  # as `station serve` does, where it may
+        os.setpriority(os.PRIO_PROCESS, 0, PRIORITY)
     with tempfile.TemporaryDirectory() as folder, start_gige(numbered=True) as running:
         outcome = asyncio.run(stream(running, float(sys.argv[1]), float(sys.argv[2]), Path(folder)))
     print(json.dumps(asdict(outcome)))

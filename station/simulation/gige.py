@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import ctypes
 import json
+import socket
 import sys
 import tempfile
 import threading
@@ -29,6 +30,7 @@ from station.simulation.camera_process import CameraProcess
 from station.simulation.cell import CellTruth, make_cell, read_truth
 
 LIBRARY = "libaravis-0.8.so.0"
+CONTROL_PORT = 3956
 _LATCH_POLL_S = 0.001
 _FILL = ctypes.CFUNCTYPE(
     None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_uint32, ctypes.c_uint32
@@ -43,6 +45,7 @@ class GigeCamera:
     def __init__(self, source: Source, width: int, height: int, address: str, serial: str) -> None:
         self._source = source
         self._lib = _library()
+        _require_free(address)
         with tempfile.NamedTemporaryFile("w", suffix=".xml", encoding="utf-8") as description:
             description.write(genicam.genicam_xml())
             description.flush()
@@ -50,7 +53,7 @@ class GigeCamera:
                 address.encode(), serial.encode(), description.name.encode()
             )
         if not self._server or not self._lib.arv_gv_fake_camera_is_running(self._server):
-            raise CameraError(f"the GigE simulator cannot listen on {address}:3956; is another one running?")
+            raise CameraError(f"the GigE simulator did not start on {address}")
         self._camera = self._lib.arv_gv_fake_camera_get_fake_camera(self._server)
         self._describe(width, height, serial)
         self._lib.arv_fake_camera_set_trigger_frequency(self._camera, 1000.0)
@@ -121,6 +124,17 @@ class GigeCamera:
             data = encode(grey, names[pixel_format])
             ctypes.memmove(target, data, len(data))
         self._lib.arv_buffer_set_timestamp(buffer, device_ns)
+
+
+def _require_free(address: str) -> None:
+    """Aravis says that it runs even where it could not listen."""
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        try:
+            probe.bind((address, CONTROL_PORT))
+        except OSError as error:
+            raise CameraError(
+                f"the GigE simulator cannot listen on {address}:{CONTROL_PORT}: {error}; is one running?"
+            ) from error
 
 
 def _library() -> Any:

@@ -1,0 +1,72 @@
+"""The simulated GigE camera shows the simulated cell, and runs only where it disturbs nobody."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from xml.etree import ElementTree
+
+import pytest
+
+from calibrate.detect import detect
+from station.config import CameraConfig
+from station.devices.aravis import AravisCamera
+from station.errors import CameraError
+from station.simulation import genicam
+from station.simulation.cell import make_cell, write_truth
+from station.simulation.gige_launch import start_gige
+from station.simulation.launch import SimulatedController
+from station.simulation.netns import is_isolated, isolated_command
+
+
+def test_it_does_not_run_beside_other_networks() -> None:
+    if is_isolated():
+        pytest.skip("this machine has nothing but lo")
+    with pytest.raises(CameraError, match="nothing but lo"):
+        start_gige(numbered=True)
+
+
+@pytest.mark.gige
+@pytest.mark.process
+async def test_its_pictures_show_the_board_from_where_the_arm_stands(
+    lonely_network: None, controller: Callable[..., SimulatedController], tmp_path: Path
+) -> None:
+    cell = make_cell(seed=2)
+    write_truth(cell, tmp_path / "truth.json")
+    arm = controller(truth=tmp_path / "truth.json")
+    with start_gige(arm.host, truth=tmp_path / "truth.json", serial="SIM00002") as simulator:
+        camera = AravisCamera(CameraConfig(device="127.0.0.1", packet_size=8996))
+        await camera.open()
+        try:
+            picture = await camera.capture()
+            assert detect(picture.image, cell.board).found
+            simulator.inject("cover", 1.0)
+            assert (await camera.capture()).image.max() < 60
+        finally:
+            await camera.close()
+
+
+@pytest.mark.gige
+def test_a_second_camera_on_the_same_address_is_refused(lonely_network: None) -> None:
+    with start_gige(numbered=True), pytest.raises(CameraError, match="did not start"):
+        start_gige(numbered=True)
+
+
+def test_a_command_can_be_run_with_nothing_but_lo() -> None:
+    code = "from station.simulation.netns import is_isolated; print(is_isolated())"
+    done = subprocess.run(
+        isolated_command([sys.executable, "-c", code]), capture_output=True, text=True, timeout=30
+    )
+    if done.returncode != 0:
+        pytest.skip(f"no network namespaces here: {done.stderr.strip()}")
+    assert done.stdout.strip() == "True"
+
+
+def test_the_description_is_whole_and_every_reference_leads_somewhere() -> None:
+    root = ElementTree.fromstring(genicam.genicam_xml())
+    names = {node.get("Name") for node in root.iter() if node.get("Name")}
+    for tag in ("pFeature", "pValue", "pPort", "pMax", "pVariable"):
+        for node in root.iter(f"{{http://www.genicam.org/GenApi/Version_1_1}}{tag}"):
+            assert node.text in names, f"{tag} {node.text}"

@@ -18,7 +18,7 @@ from textual.strip import Strip
 from textual.widget import Widget
 
 Grey = NDArray[np.uint8]
-LEVELS = 32
+LEVELS = 20
 """Shades a terminal picture is drawn with: fewer styles to send, and no eye sees more in half blocks."""
 CORNER = Segment("+", Style(color=Color.from_rgb(0, 230, 0), bgcolor=Color.from_rgb(0, 0, 0), bold=True))
 """A sign and not only a colour."""

@@ -14,11 +14,12 @@ from station.analysis import Sighting, sight
 from station.devices.frames import mid_exposure
 from station.errors import CameraError, StaleStateError, StationError
 from station.session.bench import Bench, SeenView
+from station.session.patience import RestingCheck
 from station.status import PoseState, StationState
 from station.workers import WorkerError
 
-STATE_WAIT_S = 0.3
-"""The robot state of mid-exposure may come a little later than the picture."""
+STATE_WAIT_S = 1.0
+"""The robot state of mid-exposure may come later than the picture, on a busy computer by this much."""
 SIGHT_TIMEOUT_S = 20.0
 SATURATED_LIMIT = 0.05
 
@@ -33,7 +34,8 @@ async def take_pose(bench: Bench, index: int, attempt: int) -> None:
     PoseFailedError when this pose gave nothing; RobotError and RecordingError end the run.
     """
     _phase(bench, index, StationState.SETTLING, "settling")
-    still = await bench.stillness.settle(bench.cell.robot.check)
+    resting = RestingCheck(bench.cell.robot.check)
+    still = await bench.stillness.settle(resting)
     _phase(bench, index, StationState.CAPTURING, "capturing")
     picture = bench.require_recording().number(await _picture(bench, index))
     _show_frame(bench, picture)
@@ -41,7 +43,7 @@ async def take_pose(bench: Bench, index: int, attempt: int) -> None:
     clock = bench.cell.camera.clock
     mid_ns, camera_bound_s = mid_exposure(device_ns, arrival_ns, picture.exposure_us, clock)
     state = await _state_at(bench, mid_ns)
-    bench.cell.robot.check()
+    await resting.news()
     view = _view(bench, index, attempt, picture, state, still, camera_bound_s)
     _require_bound(bench, view)
     _phase(bench, index, StationState.WRITING, "writing")

@@ -15,6 +15,7 @@ from station.limits import MoveCheck, check_path, with_plan_speeds
 from station.session.bench import Bench
 from station.session.capture import PoseFailedError, take_pose
 from station.session.lease import Go
+from station.session.patience import RestingCheck
 from station.session.recording import SessionRecording
 from station.status import StationState
 from station.stillness import NotStillError
@@ -134,7 +135,7 @@ class Run:
         """From where the arm really is. LimitError when that way is not free."""
         bench = self._bench
         robot, queue = bench.cell.robot, bench.require_queue()
-        robot.check()
+        await RestingCheck(robot.check).news()
         here, target = robot.latest().joints_rad, queue.pose(index).joints_rad
         queue.mark(index, "moving")
         bench.store.enter(StationState.MOVING)

@@ -39,6 +39,7 @@ from station.tui.themes import THEMES, chosen_theme
 from station.tui.widgets.preview import Preview
 
 PREVIEW_PERIOD_S = 0.25
+STATUS_PERIOD_S = 0.15
 RECONNECT_S = 1.0
 
 
@@ -104,6 +105,7 @@ class StationApp(Commands):
             try:
                 self.link = await self._connect()
                 async for status in self.link.statuses():
+                    await self._pace(status)
                     self.post_message(StatusChanged(status))
             except (OSError, StationError, msgspec.ValidationError):
                 pass  # Said on the bar; a daemon of another version is no daemon for this screen.
@@ -112,6 +114,12 @@ class StationApp(Commands):
                 await gone.close()
             self.post_message(StatusChanged(None))
             await asyncio.sleep(RECONNECT_S)
+
+    async def _pace(self, status: StationStatus) -> None:
+        """A new state or reason is shown at once; numbers that only flicker, a few times a second."""
+        known = self.status
+        if known is not None and (known.state, known.reason) == (status.state, status.reason):
+            await asyncio.sleep(STATUS_PERIOD_S)
 
     @work(exclusive=True, group="preview", exit_on_error=False)
     async def fetch_previews(self) -> None:

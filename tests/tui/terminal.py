@@ -14,7 +14,7 @@ import sys
 import termios
 import threading
 import time
-from collections.abc import Callable
+from collections import deque
 from pathlib import Path
 
 KEYS = {
@@ -42,9 +42,15 @@ class Glass:
         self._cells = [[" "] * columns for _ in range(rows)]
         self._row = self._column = 0
         self._rest = ""
+        self._decoder = codecs.getincrementaldecoder("utf-8")("replace")
+        self._unread: deque[bytes] = deque()
 
-    def write(self, text: str) -> None:
-        text = self._rest + text
+    def write(self, data: bytes) -> None:
+        """Kept as it is until somebody looks: a program must not wait for its terminal."""
+        self._unread.append(data)
+
+    def _read(self, data: bytes) -> None:
+        text = self._rest + self._decoder.decode(data)
         unfinished = _UNFINISHED.search(text)
         self._rest = text[unfinished.start() :] if unfinished else ""
         for token in _TOKEN.finditer(text[: len(text) - len(self._rest)]):
@@ -67,6 +73,8 @@ class Glass:
 
     @property
     def text(self) -> str:
+        while self._unread:
+            self._read(self._unread.popleft())
         return "\n".join("".join(row).rstrip() for row in self._cells)
 
 
@@ -90,25 +98,25 @@ class ScreenProcess:
         self._reader.start()
 
     def _read(self) -> None:
-        decoder = codecs.getincrementaldecoder("utf-8")("replace")
         with contextlib.suppress(OSError):  # the other end is closed
             while data := os.read(self._master, 65536):
-                self.glass.write(decoder.decode(data))
+                self.glass.write(data)
 
     def press(self, *keys: str) -> None:
+        """One after the other, as a person would."""
         for key in keys:
-            os.write(self._master, KEYS.get(key, key).encode())
+            self.press_now(key)
             time.sleep(0.1)
 
-    def wait_for(
-        self, pattern: str, timeout_s: float = 60.0, meanwhile: Callable[[str], None] = lambda text: None
-    ) -> str:
-        """The glass when `pattern` is on it; `meanwhile` is given every other look."""
+    def press_now(self, key: str) -> None:
+        os.write(self._master, KEYS.get(key, key).encode())
+
+    def wait_for(self, pattern: str, timeout_s: float = 60.0) -> str:
+        """The glass when `pattern` is on it."""
         give_up_s = time.monotonic() + timeout_s
         while not re.search(pattern, text := self.glass.text):
             assert time.monotonic() < give_up_s, f"'{pattern}' never came:\n{text}"
             assert self.process.poll() is None, f"the screen ended:\n{text}"
-            meanwhile(text)
             time.sleep(0.05)
         return text
 

@@ -69,8 +69,11 @@ class ReasonLine(Static):
     """Why the station is not working, in a sentence, with what to do; hidden while all is well."""
 
     status: reactive[StationStatus | None] = reactive(None)
+    _reason = ""
 
     def watch_status(self, status: StationStatus | None) -> None:
         reason = "" if status is None else status.reason
-        self.display = bool(reason)
-        self.update(Text(" " + reason, overflow="fold"))
+        if reason != self._reason:
+            self._reason = reason
+            self.display = bool(reason)
+            self.update(Text(" " + reason, overflow="fold"))

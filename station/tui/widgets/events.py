@@ -28,9 +28,12 @@ class Events(Static):
     def __init__(self, *, id: str = "events") -> None:
         super().__init__(id=id, classes="panel")
         self.border_title = "Events"
+        self._shown: tuple[Event, ...] | None = None
 
     def watch_status(self, status: StationStatus | None) -> None:
         events = () if status is None else status.events
-        newest = [event_text(e) for e in reversed(events[-max(4, self.size.height) :])]
-        text = Text("\n", no_wrap=True, overflow="ellipsis").join(newest)
-        self.update(text)
+        newest = events[-max(4, self.size.height) :]
+        if newest != self._shown:
+            self._shown = newest
+            text = Text("\n", no_wrap=True, overflow="ellipsis")
+            self.update(text.join(event_text(event) for event in reversed(newest)), layout=False)

@@ -31,8 +31,10 @@ class Panel(Static):
     def watch_status(self, status: StationStatus | None) -> None:
         text = "" if status is None else "\n".join(self._lines(status))
         if text != self._shown:
+            # Laying the screen out again is dear, and only needed when the panel grows or shrinks.
+            grown = text.count("\n") != self._shown.count("\n") or not (text and self._shown)
             self._shown = text
-            self.update(Text(text, no_wrap=True, overflow="ellipsis"))
+            self.update(Text(text, no_wrap=True, overflow="ellipsis"), layout=grown)
 
 
 def _line(name: str, text: str, good: bool | None) -> str:

@@ -32,6 +32,7 @@ class PlanSketch(Static):
     def __init__(self, *, id: str) -> None:
         super().__init__(id=id, classes="panel")
         self.border_title = "Where the arm goes"
+        self._shown = ""
 
     def show(self, status: StationStatus | None, line: int) -> None:
         if status is None:
@@ -47,7 +48,9 @@ class PlanSketch(Static):
         above = scatter([(x, y, m) for (x, y, _), m in map(_place, stops)], width, height)
         side = scatter([(x, z, m) for (x, _, z), m in map(_place, stops)], width, height)
         lines = ["from above (x right, y up)", *above, "from the side (x right, z up)", *side]
-        self.update(Text("\n".join(lines), no_wrap=True))
+        if (text := "\n".join(lines)) != self._shown:
+            self._shown = text
+            self.update(Text(text, no_wrap=True), layout=False)
 
 
 def _place(stop: tuple[Matrix4, str]) -> tuple[tuple[float, float, float], str]:

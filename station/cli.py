@@ -5,6 +5,7 @@ Only what a command needs is loaded: STOP from a shell must not wait for a plann
 
 from __future__ import annotations
 
+import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -74,6 +75,8 @@ def open_screen(socket: Path | None, replay: Path | None) -> None:
 
 
 def main() -> None:
+    # Ctrl-C is STOP, also where a shell started this in the background with SIGINT ignored.
+    signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         command_line(sys.argv[1:])()
     except (StationError, RecordingError, CalibrationError) as problem:

@@ -11,6 +11,7 @@ import logging
 import os
 import socket
 import struct
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Protocol
@@ -56,12 +57,16 @@ class Handler(Protocol):
 class ControlServer:
     """Serves until `close`. `publish` sends every watcher what changed."""
 
-    def __init__(self, path: Path, handler: Handler) -> None:
+    def __init__(
+        self, path: Path, handler: Handler, newest: Callable[[], StationStatus] | None = None
+    ) -> None:
+        """`newest`: what a watcher that has just come is told; what was published may be a moment older."""
         self._path, self._handler = path, handler
+        self._status = StationStatus()
+        self._newest = newest or (lambda: self._status)
         self._server: asyncio.Server | None = None
         self._connections: set[_Connection] = set()
         self._next_client_id = 1
-        self._status = StationStatus()
         self._standing = 0
         """Clients beyond the limit that are listened to for a moment."""
 
@@ -124,7 +129,7 @@ class ControlServer:
         connection.hang_up()
 
     def _full_status(self) -> bytes:
-        plain: dict[str, Any] = msgspec.to_builtins(self._status)
+        plain: dict[str, Any] = msgspec.to_builtins(self._newest())
         return msgspec.json.encode(Notice(status=plain)) + b"\n"
 
 

@@ -44,7 +44,9 @@ class Daemon:
     def __init__(self, cell: Cell, root: Path, socket: Path) -> None:
         self._watchdog = Watchdog(self._healthy)
         self.session = Session(cell, root, ticked=self._watchdog.tick)
-        self._control = ControlServer(socket, SessionDispatcher(self.session))
+        self._control = ControlServer(
+            socket, SessionDispatcher(self.session), newest=lambda: self.session.store.status
+        )
         self._changed = asyncio.Event()
         self._ending = asyncio.Event()
         self._served_s = time.monotonic()

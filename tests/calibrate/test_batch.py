@@ -51,7 +51,7 @@ def test_a_killed_worker_loses_nothing_and_the_bits_are_those_of_one_process(
     pooled = run_batch(recordings, tmp_path / "pool", workers=2, progress=kill_one)
     assert killed, "no worker was found to kill"
     assert all(result.solved for result in pooled), [r.error for r in pooled]
-    alone = run_batch(recordings, tmp_path / "alone", solver=in_this_process)
+    alone = run_batch(recordings, tmp_path / "alone", workers=1)
     assert [r.content_sha256 for r in pooled] == [r.content_sha256 for r in alone]
     assert len({r.content_sha256 for r in alone}) == len(alone), "file names are part of the provenance"
 

@@ -54,7 +54,7 @@ class GenicamDevice:
         self._camera: Any = None
         self._stream: Any = None
         self._region = (0, 0, 0, 0)
-        self._latched_ns = 0
+        self._latched_ns: int | None = None
         self.lost = threading.Event()
         self.identity = CameraIdentity(driver="aravis")
 
@@ -167,6 +167,8 @@ class GenicamDevice:
             if not self._camera.is_feature_available(command):
                 continue
             with self._explained("reading the camera's clock"):
+                if self._latched_ns is None:  # what an earlier client latched is not the time of now
+                    self._latched_ns = self._to_ns(self._camera.get_integer(value))
                 asked_ns = time.monotonic_ns()
                 self._camera.execute_command(command)
                 device_ns = self._to_ns(self._camera.get_integer(value))

@@ -129,7 +129,9 @@ class ControlServer:
         connection.hang_up()
 
     def _full_status(self) -> bytes:
-        plain: dict[str, Any] = msgspec.to_builtins(self._newest())
+        # Published first, so that the next changes start from exactly what this watcher was told.
+        self.publish(self._newest())
+        plain: dict[str, Any] = msgspec.to_builtins(self._status)
         return msgspec.json.encode(Notice(status=plain)) + b"\n"
 
 
@@ -203,8 +205,8 @@ class _Connection:
             result = await self._handler.handle(self.peer, request.verb, request.args)
             self.reply(Reply(request.id, True, result))
             if request.verb == "watch" and not self.watching:
-                self.watching = True
                 self.send(self._full_status())
+                self.watching = True
         except (StationError, RecordingError) as error:
             self.reply(Reply(request.id, False, error=str(error)))
         except (msgspec.ValidationError, KeyError, TypeError, ValueError) as error:

@@ -18,12 +18,16 @@ from station.tui.words import POSE_MARKS
 if TYPE_CHECKING:
     from station.tui.app import StationApp
 
-COLUMNS = ("#", "pose", "state", "try", "corners", "gain", "why it is there / what happened")
+COLUMNS = ("#", "pose", "state", "try", "corners", "sigma then", "why it is there / what happened")
+
+SIGMA_SHOWN_MM = 100.0
 
 
 def row_of(pose: PoseStatus) -> tuple[str, ...]:
     """One line of the table, plain words and marks."""
-    gain = "" if pose.predicted_sigma_mm is None else f"{pose.predicted_sigma_mm:.2f} mm"
+    sigma_mm = pose.predicted_sigma_mm
+    # The first poses alone determine nothing: a number in metres would only puzzle.
+    gain = "-" if sigma_mm is None or sigma_mm > SIGMA_SHOWN_MM else f"{sigma_mm:.2f} mm"
     return (
         str(pose.index + 1),
         pose.name,
@@ -77,7 +81,7 @@ class PlanScreen(StationScreen):
         for line, row in enumerate(rows):
             for column, text in enumerate(row):
                 if self.table.get_cell_at((line, column)) != text:  # type: ignore[arg-type]
-                    self.table.update_cell_at((line, column), text)  # type: ignore[arg-type]
+                    self.table.update_cell_at((line, column), text, update_width=True)  # type: ignore[arg-type]
         self.query_one(PlanSketch).show(status, self.table.cursor_row)
 
     def on_data_table_row_highlighted(self, event: DataTable.RowHighlighted) -> None:

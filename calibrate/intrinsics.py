@@ -13,6 +13,7 @@ import numpy as np
 
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import Array
+from calibrate.projection import INTRINSICS
 from calibrate.views import ViewSet
 from recordings.messages import CameraModel
 
@@ -38,6 +39,11 @@ class Intrinsics:
     """Sentences: which parameters were held, and why."""
     dropped: dict[int, str] = field(default_factory=dict)
     """Pose number → why its corners were left out of the fit."""
+
+    @property
+    def held_names(self) -> tuple[str, ...]:
+        """Which of `projection.INTRINSICS` were held (plumb-bob)."""
+        return tuple(name for name in INTRINSICS if name not in self.sigma)
 
 
 @dataclass

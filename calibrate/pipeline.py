@@ -116,7 +116,7 @@ def _prepare(path: Path, options: JobOptions, progress: Progress | None, fewest:
     with clock.stage("intrinsics"):
         if views.camera.matrix is None:
             intrinsics = calibrate_intrinsics(views, options.lens_model)
-            views = replace(views, camera=intrinsics.camera)
+            views = replace(views, camera=intrinsics.camera, held_intrinsics=intrinsics.held_names)
     with clock.stage("board poses"):
         views = solve_pnp(views, loaded.board)
         _check_lens_fits(views)

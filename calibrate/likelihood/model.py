@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibrate.geometry import Array, perturb
-from calibrate.projection import intrinsics_vector, with_intrinsics_vector
+from calibrate.projection import INTRINSICS, intrinsics_vector, with_intrinsics_vector
 from calibrate.views import ViewSet
 from recordings.messages import CameraModel, Mount
 
@@ -31,6 +31,9 @@ class Observations:
     """(n, k) 1 for a corner, 0 for padding."""
     kinematics: Array | None = None
     """(n, 6, p) derivative of the flange pose by each θ, scaled to the prior's unit."""
+
+    held: tuple[int, ...] = ()
+    """Places in `projection.INTRINSICS` that stay as they are."""
 
     @property
     def has_pixels(self) -> bool:
@@ -71,4 +74,5 @@ def observe_views(views: ViewSet, kinematics: Array | None = None) -> Observatio
     for i, view in enumerate(views):
         k = len(view.pixels)
         points[i, :k], pixels[i, :k], present[i, :k] = view.board_points, view.pixels, 1.0
-    return Observations(views.mount, views.base_from_flange, points, pixels, present, kinematics)
+    held = tuple(INTRINSICS.index(name) for name in views.held_intrinsics if name in INTRINSICS)
+    return Observations(views.mount, views.base_from_flange, points, pixels, present, kinematics, held)

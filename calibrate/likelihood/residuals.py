@@ -63,6 +63,11 @@ def _add_corners(
         part = slice(start, start + step)
         _add_corner_chunk(normal, observed, state, weights, intrinsics_free, part)
     normal.count[CORNERS] = 2 * float(weights.sum())
+    if intrinsics_free and observed.held:
+        # One equation "no change" for each: it uses up the residual it adds, so the scales do not notice.
+        place = 12 + np.array(observed.held)
+        normal.U[CORNERS][place, place] = 1.0
+        normal.count[CORNERS] += len(observed.held)
 
 
 def _add_corner_chunk(
@@ -88,6 +93,7 @@ def _add_corner_chunk(
     normal.square[CORNERS] += float((residual**2).sum())
     if projected.by_intrinsics is not None:
         J_K = (projected.by_intrinsics * root[..., None]).reshape(n, -1, 9)
+        J_K[..., list(observed.held)] = 0.0
         normal.W[CORNERS, part, 12:21] = np.swapaxes(J_K, 1, 2) @ J
         flat = J_K.reshape(-1, 9)
         normal.U[CORNERS, 12:21, 12:21] += flat.T @ flat

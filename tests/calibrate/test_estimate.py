@@ -94,3 +94,17 @@ def test_a_lens_that_does_not_fit_the_pictures_is_told():
     board = cell.views.views[0].board_points
     views = view_set(cell.views.base_from_flange, board, pixels, wrong, "eye-in-hand")
     assert any("given intrinsics" in text for text in solve_views(views, QUICK).warnings)
+
+
+def test_what_the_pictures_leave_open_stays_as_it_is():
+    from dataclasses import replace
+
+    cell = make_cell(np.random.default_rng(5), 20, MID, refit_camera=True)
+    options = SolveOptions(holdout=False, intrinsics_from_same_pictures=True)
+    free = solve_views(cell.views, options)
+    held = solve_views(replace(cell.views, held_intrinsics=("k2", "k3")), options)
+    before, after = cell.views.camera.distortion, held.camera.distortion
+    assert (after[1], after[4]) == pytest.approx((before[1], before[4]), abs=1e-12)
+    assert after[0] != before[0]
+    assert held.sigma_translation_m <= free.sigma_translation_m
+    assert held.noise.corner_px == pytest.approx(free.noise.corner_px, rel=0.02)

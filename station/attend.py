@@ -71,9 +71,11 @@ async def carry_out(
     await asyncio.sleep(0)  # Ctrl-C at the question strikes here, before the go is sent
     try:
         await client.request("go", token=summary.token, plan_sha256=summary.plan_sha256)
+        client.outdate()  # it would show the session before, sealed and at rest
         status = await _watch(client, watch)
         if status.state is StationState.PAUSED and finish_with_loss and status.session.captured:
             await client.request("finish")
+            client.outdate()
             status = await _watch(client, watch)
     except asyncio.CancelledError:
         with contextlib.suppress(DaemonGoneError):

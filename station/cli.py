@@ -34,6 +34,7 @@ def command_line(arguments: Sequence[str]) -> typer.Typer:
 
 
 def _add_large_commands(app: typer.Typer) -> None:
+    from station.cli_bootstrap import bootstrap_command
     from station.cli_serve import serve_command
     from station.cli_session import capture_command, check_command, demo_command, resume_command
     from station.plan.cli import plan_command
@@ -44,6 +45,7 @@ def _add_large_commands(app: typer.Typer) -> None:
     app.command("capture")(capture_command)
     app.command("resume")(resume_command)
     app.command("check")(check_command)
+    app.command("bootstrap")(bootstrap_command)
     app.command("plan")(plan_command)
 
 

@@ -95,14 +95,17 @@ def capture_command(
 ) -> None:
     """One session: load the plan, check it, ask, go, watch, seal. Ctrl-C is STOP."""
     loaded = load_plan(plan)
-    _finish(asyncio.run(_session(socket, "run", headless, go, as_json, lambda c: _load(c, loaded))), as_json)
+    _finish(
+        asyncio.run(attended_session(socket, "run", headless, go, as_json, lambda c: load_into(c, loaded))),
+        as_json,
+    )
 
 
 def resume_command(
     headless: Headless = False, go: GoHash = "", socket: Socket = None, as_json: AsJson = False
 ) -> None:
     """Go on with a paused or interrupted session, from where the arm is. Ctrl-C is STOP."""
-    _finish(asyncio.run(_session(socket, "resume", headless, go, as_json, None)), as_json)
+    _finish(asyncio.run(attended_session(socket, "resume", headless, go, as_json, None)), as_json)
 
 
 def check_command(
@@ -112,14 +115,14 @@ def check_command(
     socket: Socket = None,
 ) -> None:
     """Does the installed calibration still hold? A few poses, then `calibrate check` on them."""
-    outcome = asyncio.run(_session(socket, "run", headless, go, False, lambda c: _make(c, poses)))
+    outcome = asyncio.run(attended_session(socket, "run", headless, go, False, lambda c: _make(c, poses)))
     if not outcome.recording:
         _finish(outcome, False)
     done = subprocess.run([sys.executable, "-m", "calibrate.cli", "check", outcome.recording])
     raise typer.Exit(done.returncode)
 
 
-async def _load(client: Client, plan: Plan) -> None:
+async def load_into(client: Client, plan: Plan) -> None:
     await client.request("load_plan", plan=msgspec.to_builtins(plan))
 
 
@@ -127,9 +130,10 @@ async def _make(client: Client, poses: int) -> None:
     await client.request("make_plan", poses=poses, seed=0, timeout_s=180.0)
 
 
-async def _session(
+async def attended_session(
     socket: Path | None, purpose: str, headless: bool, go: str, quiet: bool, before: Callable[..., Any] | None
 ) -> Outcome:
+    """One session as `purpose` says, with the go of the person or of the approved hash."""
     path = socket or default_socket()
     interactive = not headless and sys.stdin.isatty()
     async with await Client.connect(path, interactive=interactive) as client:

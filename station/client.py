@@ -56,6 +56,7 @@ class Client:
         self._next_id = 1
         self._waiting: dict[int, asyncio.Future[Reply]] = {}
         self._plain_status: dict[str, Any] | None = None
+        self._outdated = False
         self._fresh = asyncio.Event()
         self._gone = False
         self._task = asyncio.create_task(self._read(), name="client-read")
@@ -116,15 +117,20 @@ class Client:
     async def statuses(self) -> AsyncIterator[StationStatus]:
         """The status now and after every change (slow readers see the newest only)."""
         await self.request("watch")
-        if self._plain_status is not None:  # watched before: what is known is the start
-            self._fresh.set()
+        if self._plain_status is not None and not self._outdated:
+            self._fresh.set()  # watched before: what is known is the start
         while True:
             await self._fresh.wait()
             self._fresh.clear()
-            if self._plain_status is not None:
+            if self._plain_status is not None and not self._outdated:
                 yield msgspec.convert(self._plain_status, StationStatus)
             if self._gone:
                 return
+
+    def outdate(self) -> None:
+        """What is known is older than what was just asked: `statuses` begins with the next change."""
+        self._outdated = True
+        self._fresh.clear()
 
     async def close(self) -> None:
         self._task.cancel()
@@ -161,6 +167,7 @@ class Client:
             self._plain_status = message.status
         elif message.changes is not None and self._plain_status is not None:
             self._plain_status = self._plain_status | message.changes
+        self._outdated = False
         self._fresh.set()
 
     def _gone_error(self) -> DaemonGoneError:

@@ -82,7 +82,7 @@ def scene_of(config: StationConfig) -> Scene:
     if mount_guess is None or place_guess is None:
         missing = "camera_guess" if mount_guess is None else "board_guess"
         raise ConfigError(
-            f"planning needs {missing} in the configuration; or let `station plan bootstrap` find it"
+            f"planning needs {missing} in the configuration; or let `station bootstrap` find it"
         )
     X, Y = (pose_from_quaternion(g.translation_m, g.rotation_xyzw) for g in (mount_guess, place_guess))
     return Scene(

@@ -1,0 +1,138 @@
+"""`station bootstrap`: from a rough mount and a taught view to guesses that a plan can be made from."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import numpy as np
+import typer
+import yaml
+
+from calibrate.geometry import Array
+from calibrate.load import load_views
+from calibrate.pnp import solve_pnp
+from calibrate.views import ViewSet
+from recordings.files import write_atomically
+from recordings.messages import Vector6
+from recordings.reader import open_recording
+from station.attend import wait_until_idle
+from station.cli_session import Headless, Socket, attended_session, err, load_into, out
+from station.client import Client, default_socket
+from station.config import PoseGuess, StationConfig
+from station.config_file import load_config
+from station.errors import ConfigError, StationError
+from station.plan.bootstrap import Glimpse, believe, improved_config, next_move
+from station.plan.model import Plan, PlannedPose
+
+_STRAYED_RAD = 0.01
+"""Somebody moved the arm: the next move was checked from elsewhere."""
+
+
+class BootstrapError(StationError):
+    """A move or a picture of the bootstrap failed; nothing is left running."""
+
+
+def bootstrap_command(
+    config: Annotated[Path, typer.Option(help="The configuration that the daemon runs with.")],
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="Where the guesses go (YAML).")
+    ] = None,
+    headless: Headless = False,
+    socket: Socket = None,
+) -> None:
+    """Find mount and board by 3 to 5 small moves from a taught view; each is asked for. Ctrl-C is STOP."""
+    cell, _ = load_config(config)
+    if cell.camera.model is None or cell.camera.model.matrix is None:
+        raise ConfigError("bootstrap needs camera.model with width, height and a rough matrix")
+    believe(cell, [])  # says so when there is no camera_guess, before anything is asked
+    if output is not None and output.exists():
+        raise ConfigError(f"{output} exists: give another name for the guesses")
+    glimpses = _make_moves(cell, socket, headless)
+    found = improved_config(cell, glimpses)
+    assert found.camera_guess is not None and found.board_guess is not None
+    _show("camera", found.camera_guess)
+    _show("board", found.board_guess)
+    guesses = {"camera_guess": found.camera_guess, "board_guess": found.board_guess}
+    text = yaml.safe_dump(msgspec.to_builtins(guesses), sort_keys=False)
+    if output is None:
+        out.print(text, end="", markup=False)
+    else:
+        try:
+            write_atomically(output, text.encode())
+        except OSError as error:
+            raise ConfigError(f"cannot write {output}: {error.strerror}; the guesses are:\n{text}") from error
+        err.print(f"put the two entries of {output} into {config}, start the daemon anew, then plan")
+    if not believe(cell, glimpses).good:
+        err.print(
+            "[yellow]not sure enough for a good plan: teach another view and repeat with these guesses[/]"
+        )
+        raise typer.Exit(3)
+
+
+def _make_moves(cell: StationConfig, socket: Path | None, headless: bool) -> list[Glimpse]:
+    """The taught view and those after each move. Every one is a session of its own, with its own go."""
+    path = socket or default_socket()
+    taught = asyncio.run(_standing(path))
+    move: PlannedPose | None = PlannedPose("taught", taught, why="the view that was taught; no motion")
+    glimpses: list[Glimpse] = []
+    views: ViewSet | None = None
+    while move is not None:
+        before = glimpses[-1].joints_rad if glimpses else np.array(taught)
+        if np.abs(np.array(asyncio.run(_standing(path))) - before).max() > _STRAYED_RAD:
+            raise BootstrapError("the arm was moved meanwhile: teach the view again and start over")
+        err.print(f"[bold]{move.name}[/]: {move.why}")
+        joints, views = _take(cell, move, views, path, headless)
+        glimpses = [
+            Glimpse(q, C)
+            for q, C in zip(
+                [*(g.joints_rad for g in glimpses), joints],
+                solve_pnp(views, cell.board).camera_from_board,
+                strict=True,
+            )
+        ]
+        belief = believe(cell, glimpses)
+        err.print(f"mount known to {1000 * belief.sigma_m:.1f} mm, {np.rad2deg(belief.sigma_rad):.2f}°")
+        move = next_move(cell, glimpses)
+    return glimpses
+
+
+def _take(
+    cell: StationConfig, move: PlannedPose, before: ViewSet | None, socket: Path, headless: bool
+) -> tuple[Array, ViewSet]:
+    """One go, one picture: the joints (6,) where it was taken, and all views so far."""
+    plan = Plan(cell.robot.model, cell.mount, (move,), note="bootstrap")
+    outcome = asyncio.run(
+        attended_session(socket, "run", headless, "", False, lambda client: load_into(client, plan))
+    )
+    if not outcome.recording or not outcome.captured:
+        raise BootstrapError(
+            f"{move.name}: no picture was saved ({outcome.status.reason or outcome.status.state.value})"
+        )
+    recording = open_recording(Path(outcome.recording))
+    loaded = load_views(recording, cell.board, cell.camera.model, fewest=1).views
+    [view] = recording.views()
+    if view.joints_rad is None or view.name != move.name:
+        raise BootstrapError(f"{outcome.recording} is not the picture of {move.name}")
+    if before is None:
+        return np.array(view.joints_rad), loaded
+    # All views together decide which way round a symmetric board lies.
+    return np.array(view.joints_rad), replace(loaded, views=(*before.views, *loaded.views))
+
+
+async def _standing(socket: Path) -> Vector6:
+    """Joints where the arm stands."""
+    async with await Client.connect(socket) as client:
+        joints = (await wait_until_idle(client)).robot.joints_rad
+    if joints is None:
+        raise BootstrapError("the daemon does not know the arm's joints: `station doctor` says why")
+    return joints
+
+
+def _show(what: str, guess: PoseGuess) -> None:
+    x, y, z = (1000 * v for v in guess.translation_m)
+    sigma = f"± {1000 * guess.sigma_m:.1f} mm, {np.rad2deg(guess.sigma_rad):.2f}° (1 sigma per axis)"
+    err.print(f"{what:<7} {x:.1f}, {y:.1f}, {z:.1f} mm {sigma}")

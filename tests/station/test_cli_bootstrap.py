@@ -1,0 +1,86 @@
+"""`station bootstrap` against a simulated cell: a bad mount guess becomes one good enough to plan from."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import yaml
+
+from calibrate.geometry import difference, pose, pose_from_quaternion, rotation_exp
+from station.plan.planner import make_plan
+from station.simulation.placement import guess_of
+from station.simulation.scenes import build_cell, cell_config
+from tests.system.conftest import short_folder
+
+pytestmark = pytest.mark.process
+__all__ = ["short_folder"]
+SEED = 0
+TRUTH = build_cell("paper", SEED, "low", "eye-in-hand")
+
+
+@pytest.fixture
+def socket(short_folder: Path, tmp_path: Path) -> Iterator[Path]:
+    """Of a simulated daemon, faster than real time."""
+    command = [sys.executable, "-m", "station.cli", "serve", "--simulate", "--end-with-stdin"]
+    command += ["--seed", str(SEED), "--socket", str(short_folder / "s"), "--root", str(tmp_path / "root")]
+    with (tmp_path / "log").open("wb") as words:
+        daemon = subprocess.Popen(
+            [*command, "--time-scale", "4"], stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=words
+        )
+    assert daemon.stdin is not None and daemon.stdout is not None
+    try:
+        assert json.loads(daemon.stdout.readline())["ready"]
+        yield short_folder / "s"
+    finally:
+        daemon.stdin.close()
+        daemon.wait(15)
+        daemon.stdout.close()
+
+
+def test_a_mount_wrong_by_30_degrees_and_100_mm_is_found(socket: Path, tmp_path: Path) -> None:
+    X = np.array(TRUTH.camera_mount)
+    axis = np.array([0.6, -0.64, 0.48])
+    wrong = pose(rotation_exp(np.deg2rad(30) * axis) @ X[:3, :3], X[:3, 3] + 0.1 * axis[::-1])
+    bad = msgspec.structs.replace(
+        cell_config(TRUTH, "127.0.0.1"), camera_guess=guess_of(wrong, 0.06, 0.3), board_guess=None
+    )
+    config, guesses = tmp_path / "cell.yaml", tmp_path / "guesses.yaml"
+    config.write_text(yaml.safe_dump(msgspec.to_builtins(bad)))
+    command = [sys.executable, "-m", "station.cli", "bootstrap", "--config", str(config), "-o", str(guesses)]
+    done = subprocess.run(
+        [*command, "--headless", "--socket", str(socket)],
+        capture_output=True,
+        text=True,
+        timeout=120,
+        stdin=subprocess.DEVNULL,
+    )
+    assert done.returncode == 0, done.stderr
+    found = yaml.safe_load(guesses.read_text())
+    moves = done.stderr.count("bootstrap ")
+    assert 3 <= moves <= 5, done.stderr
+    for name, truth in (("camera_guess", TRUTH.camera_mount), ("board_guess", TRUTH.board_place)):
+        guess = found[name]
+        off = difference(
+            pose_from_quaternion(guess["translation_m"], guess["rotation_xyzw"]), np.array(truth)
+        )
+        assert np.linalg.norm(off[:3]) < 0.02, name
+        assert np.rad2deg(np.linalg.norm(off[3:])) < 2, name
+    improved = msgspec.convert({**msgspec.to_builtins(bad), **found}, type(bad))
+    assert len(make_plan(improved, start_joints_rad=TRUTH.start_joints_rad).poses) == 25
+
+
+def test_without_a_mount_guess_nothing_is_asked_of_the_arm(tmp_path: Path) -> None:
+    config = tmp_path / "cell.yaml"
+    blind = msgspec.structs.replace(cell_config(TRUTH, "127.0.0.1"), camera_guess=None, board_guess=None)
+    config.write_text(yaml.safe_dump(msgspec.to_builtins(blind)))
+    command = [sys.executable, "-m", "station.cli", "bootstrap", "--config", str(config)]
+    done = subprocess.run([*command, "--socket", str(tmp_path / "none")], capture_output=True, text=True)
+    assert done.returncode == 2
+    assert "needs camera_guess" in done.stderr

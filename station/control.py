@@ -212,6 +212,11 @@ class _Connection:
         except (msgspec.ValidationError, KeyError, TypeError, ValueError) as error:
             log.exception("%s from client %d", request.verb, self.peer.client_id)
             self.reply(Reply(request.id, False, error=f"{request.verb}: wrong arguments ({error})."))
+        except Exception as error:
+            log.exception("%s from client %d", request.verb, self.peer.client_id)
+            self.reply(
+                Reply(request.id, False, error=f"{request.verb}: internal error ({error!r}); see the log")
+            )
 
     def reply(self, reply: Reply) -> None:
         self.send(msgspec.json.encode(reply) + b"\n")

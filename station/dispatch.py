@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import pwd
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any, cast
 
 import msgspec
@@ -142,14 +142,19 @@ class SessionDispatcher:
 
     def stop_now(self, peer: Peer) -> Awaitable[None]:
         """STOP is on its way to the arm before anything else is looked at."""
-        return asyncio.create_task(self._session.stop(self._caller(peer).who))
+        return self._to_the_end(self._session.stop(self._caller(peer).who))
 
     def gone(self, peer: Peer) -> None:
         """The arm decelerates at once when this was the commander."""
         self._callers.pop(peer.client_id, None)
-        task = asyncio.create_task(self._session.lease_lost(peer.client_id))
+        self._to_the_end(self._session.lease_lost(peer.client_id))
+
+    def _to_the_end(self, work: Coroutine[Any, Any, None]) -> asyncio.Future[None]:
+        """A client that leaves takes its requests with it, but not these."""
+        task = asyncio.create_task(work)
         self._leaving.add(task)
         task.add_done_callback(self._leaving.discard)
+        return asyncio.shield(task)
 
     async def handle(self, peer: Peer, verb: str, args: dict[str, Any]) -> Any:
         """RefusedError for arguments that do not fit the verb."""
@@ -174,7 +179,7 @@ class SessionDispatcher:
         if args.action == "take":
             return self._session.take_lease(caller.client_id, caller.who)
         if args.action == "release":
-            return await self._session.release_lease(caller.client_id)
+            return await self._to_the_end(self._session.release_lease(caller.client_id))
         raise RefusedError(f"lease: take or release, not '{args.action}'")
 
     async def _acknowledge(self, caller: _Caller, args: _Args) -> None:
@@ -213,7 +218,7 @@ class SessionDispatcher:
         self._session.pause(caller.who)
 
     async def _finish(self, caller: _Caller, args: _Args) -> None:
-        await self._session.finish(caller.client_id)
+        await self._to_the_end(self._session.finish(caller.client_id))
 
     async def _retake(self, caller: _Caller, args: _Index) -> None:
         self._session.edit(caller.client_id, "retake", lambda queue: queue.retake(args.index))

@@ -231,7 +231,8 @@ def _margin_problems(gaps: Array, labels: Sequence[str], name: str) -> list[Prob
 def check_plan(plan: Plan, start_joints_rad: ArrayLike | None, geometry: CellGeometry) -> PlanCheck:
     """The whole plan from where the arm is now (None: from its first pose), move by move."""
     problems = list(_plan_problems(plan, geometry))
-    geometry = with_plan_speeds(geometry, plan)
+    if not any(problem.limit == "speed" for problem in problems):
+        geometry = with_plan_speeds(geometry, plan)
     before = start_joints_rad
     moves = []
     for number, pose in enumerate(plan.poses, start=1):
@@ -258,6 +259,8 @@ def _plan_problems(plan: Plan, geometry: CellGeometry) -> list[Problem]:
     problems = []
     if not plan.poses:
         problems.append(Problem("plan", "poses", "it has no poses"))
+    if not (plan.joint_speed_rad_s > 0 and plan.joint_acceleration_rad_s2 > 0):
+        problems.append(Problem("plan", "speed", "its joint speed and acceleration must be above zero"))
     if plan.robot != geometry.model.name:
         text = f"it was made for a {plan.robot}, the cell has a {geometry.model.name}; make a new plan"
         problems.append(Problem("plan", "robot", text))

@@ -43,6 +43,12 @@ class Workers:
         try:
             async with asyncio.timeout(timeout_s):
                 return await asyncio.wrap_future(pool.submit(function, *args))
+        except asyncio.CancelledError:
+            task = asyncio.current_task()
+            if task is not None and task.cancelling():
+                raise
+            # Not ours: the pool was replaced under a call that still waited in it.
+            raise WorkerError(f"the worker process was replaced before {function.__name__}") from None
         except (BrokenProcessPool, TimeoutError) as error:
             self._discard(pool)
             what = "took too long" if isinstance(error, TimeoutError) else "died"

@@ -7,6 +7,7 @@ restarted. That is why the heartbeat comes from nowhere else.
 from __future__ import annotations
 
 import asyncio
+import logging
 import time
 from collections import deque
 from collections.abc import Callable
@@ -21,6 +22,8 @@ from station.session.monitor import Monitor
 from station.states import RUNNING
 from station.status import StationState
 
+log = logging.getLogger(__name__)
+
 TICK_S = 0.02
 STATUS_TICKS = 5
 LOST_ROUNDS = 10
@@ -30,11 +33,19 @@ LAGS_KEPT = 3000
 
 
 class Guard:
-    def __init__(self, bench: Bench, jogged: Callable[[str], None], ticked: Callable[[], None]) -> None:
-        """`jogged`: the resting arm was moved by somebody, in words. `ticked`: after every round."""
+    def __init__(
+        self,
+        bench: Bench,
+        jogged: Callable[[str], None],
+        ticked: Callable[[], None],
+        lost: Callable[[], None],
+    ) -> None:
+        """`jogged`: the resting arm was moved by somebody, in words. `ticked`: after every round. `lost`: the
+        resting robot was silent for too long."""
         self._bench = bench
         self._monitor = Monitor(bench)
-        self._jogged, self._ticked = jogged, ticked
+        self._jogged, self._ticked, self._lost = jogged, ticked, lost
+        self._failure = ""
         self._rest_joints: Vector6 | None = None
         self._stale_rounds = 0
         self.lags_s: deque[float] = deque(maxlen=LAGS_KEPT)
@@ -55,10 +66,20 @@ class Guard:
         if self._bench.store.state in RUNNING:
             self._bench.cell.robot.heartbeat()
         if number % STATUS_TICKS == 0:
+            self._look()
+        self._ticked()
+
+    def _look(self) -> None:
+        """What fails here must not end the heartbeat; a person is told that the screen is not fresh."""
+        try:
             self._watch_link()
             self._watch_rest()
             self._monitor.refresh(self.lag_ms())
-        self._ticked()
+        except Exception as error:
+            if repr(error) != self._failure:
+                self._failure = repr(error)
+                log.exception("the status could not be refreshed")
+                self._bench.store.event(f"what the screen shows is not fresh: {error!r}", "error")
 
     def lag_ms(self) -> float:
         """Worst of the last second."""
@@ -72,6 +93,8 @@ class Guard:
             robot.latest()
         except StaleStateError as error:
             self._stale_rounds += 1
+            if self._stale_rounds == LOST_ROUNDS:
+                self._lost()
             if store.state is StationState.IDLE and self._stale_rounds >= LOST_ROUNDS:
                 store.enter(StationState.DISCONNECTED, str(error))
                 store.event(f"robot lost: {error}", "warning")

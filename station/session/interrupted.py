@@ -18,6 +18,13 @@ def find_interrupted(bench: Bench) -> None:
     if found is None:
         return
     folder, state = found
+    if state.source != bench.cell.source:
+        bench.store.event(
+            f"session {folder.name} of a {state.source} cell was cut and is not sealed; it cannot go on "
+            f"here, this cell is {bench.cell.source}: `recordings recover {folder}` saves it",
+            "warning",
+        )
+        return
     bench.queue = PoseQueue(state.plan, state.poses)
     bench.recording = SessionRecording(bench.root, bench.cell, folder, state.parts)
     reason = (
@@ -32,10 +39,12 @@ def find_interrupted(bench: Bench) -> None:
 async def close_interrupted(bench: Bench) -> None:
     """Nothing was added since the crash: what is whole becomes the recording. Raises RecordingError."""
     recording, queue = bench.require_recording(), bench.require_queue()
+    bench.store.enter(StationState.SEALING)
     await recover_parts(bench, recording)
     whole = recording.whole
     await recording.save_state(queue, whole)
     bench.recording = None
     bench.store.update(session=msgspec.structs.replace(bench.store.status.session, recording=str(whole)))
-    bench.store.enter(StationState.IDLE)
+    if bench.store.state is StationState.SEALING:  # a STOP meanwhile stays latched
+        bench.store.enter(StationState.IDLE)
     bench.store.event(f"sealed: {whole}, {queue.done} of {len(queue.statuses)} poses")

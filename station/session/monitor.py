@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shutil
 import time
+from pathlib import Path
 
 import msgspec
 
@@ -93,7 +94,7 @@ class Monitor:
         now_s = time.monotonic()
         if now_s - self._free_checked_s >= DISK_PERIOD_S:
             self._free_checked_s = now_s
-            self._free_bytes = shutil.disk_usage(self._bench.root).free // 100_000_000 * 100_000_000
+            self._free_bytes = _free_bytes(self._bench.root)
         recording = self._bench.recording
         recorder = recording.recorder if recording is not None else None
         if recording is None or recorder is None:
@@ -111,6 +112,14 @@ class Monitor:
     def _clock(self) -> ClockStatus:
         robot, camera = self._bench.cell.robot.clock(), self._bench.cell.camera.clock
         return ClockStatus(*_clock_facts(robot), *_clock_facts(camera))
+
+
+def _free_bytes(root: Path) -> int:
+    """In steps of 100 MB; 0 where the disk is gone."""
+    try:
+        return shutil.disk_usage(root).free // 100_000_000 * 100_000_000
+    except OSError:
+        return 0
 
 
 def _clock_facts(fit: ClockFit | None) -> tuple[float | None, float | None, float | None]:

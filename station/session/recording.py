@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import platform
+import threading
 import time
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -62,6 +63,7 @@ class SessionRecording:
         self.recorder: Recorder | None = None
         self._sequence = 0
         self._saving = asyncio.Lock()
+        self._closing: threading.Thread | None = None
 
     @property
     def unsealed_parts(self) -> bool:
@@ -206,10 +208,20 @@ class SessionRecording:
         return self.whole
 
     def abandon(self) -> None:
-        """After a write error: the `.part` file stays as it is, for `recordings recover`."""
+        """After a write error: the `.part` file stays as it is, for `recordings recover`.
+
+        In a thread: closing waits for the disk, and STOP must not wait for a disk that hangs.
+        """
         if self.recorder is not None:
-            self.recorder.close()
+            self._closing = threading.Thread(target=self.recorder.close, name="recorder close", daemon=True)
+            self._closing.start()
             self.recorder = None
+
+    async def released(self) -> None:
+        """Returns when nobody writes to an abandoned file any more."""
+        if self._closing is not None:
+            await asyncio.to_thread(self._closing.join)
+            self._closing = None
 
     def _require(self) -> Recorder:
         if self.recorder is None:

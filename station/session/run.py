@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 
 import msgspec
@@ -10,15 +11,17 @@ import numpy as np
 from recordings.errors import RecordingError
 from recordings.messages import Picture
 from recordings.recover import recover
-from station.errors import LimitError, RobotError, SafetyStopError, StationError, TriggerError
+from station.errors import LimitError, RefusedError, RobotError, SafetyStopError, StationError, TriggerError
 from station.limits import MoveCheck, check_path, with_plan_speeds
 from station.session.bench import Bench
 from station.session.capture import PoseFailedError, take_pose
-from station.session.lease import Go
+from station.session.lease import START_TOLERANCE_RAD, Go
 from station.session.patience import RestingCheck
 from station.session.recording import SessionRecording
 from station.status import StationState
 from station.stillness import NotStillError
+
+log = logging.getLogger(__name__)
 
 ARRIVED_RAD = 1e-4
 """Nearer to its target than this the arm need not move."""
@@ -44,8 +47,14 @@ class Run:
         except (RobotError, TriggerError) as error:
             self._halt(StationState.FAULT, str(error))
         except RecordingError as error:
-            self._bench.require_recording().abandon()
+            if self._bench.recording is not None:
+                self._bench.recording.abandon()
             self._halt(StationState.FAULT, f"recording: {error}. What was saved before is safe.")
+        except Exception as error:
+            # A defect of this program: the arm must stand, and the state must say so.
+            log.exception("the run failed")
+            await self._bench.cell.robot.stop("internal error")
+            self._halt(StationState.FAULT, f"internal error ({error!r}): the run was ended; see the log")
         finally:
             await self._bench.cell.robot.end_control()
 
@@ -64,6 +73,7 @@ class Run:
         resting = StationState.PAUSED if bench.recording is not None else StationState.IDLE
         try:
             await bench.cell.robot.start_control()
+            self._require_start()
             await self._open_recording()
         except SafetyStopError:
             raise
@@ -73,6 +83,15 @@ class Run:
                 bench.store.event(f"not started: {error}", "error")
             return False
         return True
+
+    def _require_start(self) -> None:
+        """Starting control takes a second or two. RefusedError when the arm was moved meanwhile."""
+        here = self._bench.cell.robot.latest().joints_rad
+        moved_rad = float(np.abs(np.subtract(here, self._go.start_joints_rad)).max())
+        if moved_rad > START_TOLERANCE_RAD:
+            raise RefusedError(
+                f"the arm moved by {np.rad2deg(moved_rad):.1f}° while control was started: prepare again"
+            )
 
     async def _open_recording(self) -> None:
         bench = self._bench
@@ -184,6 +203,7 @@ class Run:
 
 async def recover_parts(bench: Bench, recording: SessionRecording) -> None:
     """Of an interrupted session: what its crash left open is made whole before another part follows."""
+    await recording.released()
     if recording.unsealed_parts:
         for found in await bench.workers.call(recover, recording.folder):
             bench.store.event(f"recovered {found.path}: {found.poses} poses, {found.lost_bytes} bytes lost")

@@ -18,7 +18,7 @@ import msgspec
 from recordings.errors import RecordingError
 from station.analysis import plan_poses
 from station.cell import Cell
-from station.errors import RefusedError, RobotError
+from station.errors import RefusedError, RobotError, StationError
 from station.plan.model import Plan
 from station.plan.scene import cell_geometry
 from station.session.bench import Bench
@@ -60,7 +60,9 @@ class Session:
         self.bench = Bench(cell, geometry, self.store, Workers(), monitor, root)
         self.leases = LeaseDesk()
         self._goes = GoDesk(time.monotonic)
-        self.guard = Guard(self.bench, self._jogged, ticked)
+        self._voids = 0
+        """Counts what makes a go void: a check that was under way meanwhile offers none."""
+        self.guard = Guard(self.bench, self._jogged, ticked, self._void_go)
         self._keeper = Keeper(self.bench)
         self._estimator = Estimator(self.bench)
         self.previews = Previewer(self.bench)
@@ -92,6 +94,7 @@ class Session:
         self._goes.void()
         if self.store.state in RUNNING:
             await self._halt(StationState.STOPPED, "the station is ending")
+        await self._run_ended()
         if self.bench.recording is not None and self.bench.recording.recorder is not None:
             with contextlib.suppress(RecordingError):
                 path = await self.bench.recording.seal(self.bench.require_queue())
@@ -158,9 +161,13 @@ class Session:
             self.bench.queue = PoseQueue(self.bench.queue.plan)
             self.bench.show_poses()
         poses = poses_to_drive(self.bench, purpose, index)
+        self._void_go()
+        voids = self._voids
         summary = await summarise(self.bench, purpose, poses, self._notes)
         self._require("prepare")
         self.leases.require(client_id)
+        if self._voids != voids:
+            raise RefusedError("something changed while the way was checked: prepare again")
         assert summary.start_joints_rad is not None
         self._goes.offer(summary, client_id, summary.start_joints_rad, poses)
         self.store.update(go=summary)
@@ -206,7 +213,13 @@ class Session:
             return
         if self.bench.recording is None:
             raise RefusedError("nothing is recorded yet: there is nothing to finish")
+        await self._run_ended()  # after a halt it may still be writing what was taken
+        self._require("finish")
         await self._seal()
+
+    async def _run_ended(self) -> None:
+        if self._run is not None and not self._run.done():
+            await asyncio.wait({self._run}, timeout=END_RUN_S)
 
     async def _seal(self) -> None:
         recording = self.bench.require_recording()
@@ -215,9 +228,11 @@ class Session:
                 await close_interrupted(self.bench)
             else:
                 await seal(self.bench)
-        except RecordingError as error:
+        except (RecordingError, StationError) as error:
             recording.abandon()
-            self.store.enter(StationState.FAULT, f"recording: {error}")
+            self.store.event(f"not sealed: {error}", "error")
+            if self.store.state is not StationState.STOPPED:
+                self.store.enter(StationState.FAULT, f"recording: {error}")
 
     # -- the lease ---------------------------------------------------------------------------------------
 
@@ -235,14 +250,14 @@ class Session:
     def load_plan(self, client_id: int, plan: Plan) -> None:
         self.leases.require(client_id)
         self._require("load_plan")
-        if self.bench.recording is not None:
-            raise RefusedError("a session is open: finish it before another plan is loaded")
+        self._require_no_session()
         self._replace_plan(plan)
 
     async def make_plan(self, client_id: int, poses: int, seed: int) -> Plan:
         """Made in the worker. ConfigError and LimitError say what is missing or in the way."""
         self.leases.require(client_id)
         self._require("make_plan")
+        self._require_no_session()
         try:
             start = self.bench.cell.robot.latest().joints_rad
         except RobotError:
@@ -251,9 +266,15 @@ class Session:
         plan = await self.bench.workers.call(
             plan_poses, self.bench.cell.config, start, seed, poses, timeout_s=PLAN_TIMEOUT_S
         )
+        self.leases.require(client_id)
         self._require("make_plan")
+        self._require_no_session()
         self._replace_plan(plan)
         return plan
+
+    def _require_no_session(self) -> None:
+        if self.bench.recording is not None:
+            raise RefusedError("a session is open: finish it before another plan is loaded")
 
     def _replace_plan(self, plan: Plan) -> None:
         self._void_go()
@@ -284,6 +305,7 @@ class Session:
         self._require("free_drive")
         self._void_go()
         if on:
+            await self._run_ended()
             await self.free_drive.begin(auto)
         else:
             self.free_drive.end()
@@ -305,6 +327,7 @@ class Session:
             raise RefusedError(reason)
 
     def _void_go(self) -> None:
+        self._voids += 1
         self._goes.void()
         self.store.update(go=None)
 

@@ -15,6 +15,7 @@ from station.session.capture import PoseFailedError, take_pose
 from station.session.queue import PoseQueue
 from station.session.recording import SessionRecording
 from station.session.run import recover_parts, unmark_busy
+from station.states import TransitionError
 from station.status import StationState
 from station.stillness import NotStillError
 
@@ -86,6 +87,10 @@ class FreeDrive:
                 store.enter(StationState.FAULT, str(error))
                 store.event(str(error), "error", index)
             return index
+        except TransitionError:
+            if not bench.halting:
+                raise
+            unmark_busy(bench)  # STOP came in between: its state stays
         if not bench.halting:
             store.enter(StationState.FREE_DRIVE, "guide the arm by hand; the station does not move it")
         bench.show_poses(index)

@@ -281,3 +281,24 @@ async def test_an_error_nobody_foresaw_is_answered(rig: Rig, tmp_path: Path) -> 
             with pytest.raises(StationError):
                 await anna.request("go", token="made up")
     await control.close()
+
+
+async def test_stop_while_a_hand_guided_pose_is_taken_leaves_it_to_be_skipped(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await rig.session.switch_free_drive(1, True, False)
+    taken = asyncio.Event()
+    capture = rig.camera.capture
+
+    async def slow_capture(timeout_s: float = 5.0) -> Any:
+        await taken.wait()
+        return await capture(timeout_s)
+
+    monkeypatch.setattr(rig.camera, "capture", slow_capture)
+    recording = asyncio.ensure_future(rig.session.record(1))
+    await rig.until(S.CAPTURING)
+    await rig.session.stop("bert")
+    taken.set()
+    await recording
+    assert rig.state is S.STOPPED
+    assert rig.pose_states == ["planned"] * (POSES + 1)

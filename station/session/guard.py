@@ -29,6 +29,7 @@ STATUS_TICKS = 5
 LOST_ROUNDS = 10
 """A resting arm may be silent for this many status rounds (1 s); a moving one never."""
 JOGGED_RAD = 0.01
+RESTING_RAD_S = 0.01
 LAGS_KEPT = 3000
 
 
@@ -114,11 +115,13 @@ class Guard:
             self._rest_joints = None
             return
         try:
-            joints = bench.cell.robot.latest().joints_rad
+            state = bench.cell.robot.latest()
         except RobotError:
             return
+        joints = state.joints_rad
         if self._rest_joints is None:
-            self._rest_joints = joints
+            if max(map(abs, state.joint_speeds_rad_s)) < RESTING_RAD_S:  # not while a halt still brakes
+                self._rest_joints = joints
             return
         if np.abs(np.subtract(joints, self._rest_joints)).max() > JOGGED_RAD:
             self._jogged(displacement(bench, self._rest_joints, joints))

@@ -302,3 +302,25 @@ async def test_stop_while_a_hand_guided_pose_is_taken_leaves_it_to_be_skipped(
     await recording
     assert rig.state is S.STOPPED
     assert rig.pose_states == ["planned"] * (POSES + 1)
+
+
+async def test_an_arm_that_still_brakes_was_not_moved_by_anybody(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = rig.arm._state
+    speed = 0.3
+
+    def braking() -> Any:
+        return msgspec.structs.replace(state(), joint_speeds_rad_s=(speed, *(0.0,) * 5))
+
+    monkeypatch.setattr(rig.arm, "_state", braking)
+    rig.arm.slow = True
+    await rig.give_go()
+    await rig.until(S.MOVING)
+    await rig.session.lease_lost(1)
+    await asyncio.sleep(0.15)
+    first, *rest = rig.arm.joints
+    rig.arm.joints = (first + 0.05, *rest)  # type: ignore[assignment]
+    speed = 0.0
+    await asyncio.sleep(0.25)
+    assert not any("was moved" in event.text for event in rig.session.store.status.events)

@@ -43,7 +43,9 @@ class Keeper:
         while True:
             try:
                 await opening()
-            except StationError as error:
+            except Exception as error:
+                if not isinstance(error, StationError):
+                    log.exception("%s could not be opened", device)
                 if self.troubles.get(device) != str(error):
                     self.troubles[device] = str(error)
                     self._bench.store.event(f"{device}: {error}", "warning")

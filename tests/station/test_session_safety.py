@@ -16,7 +16,7 @@ from station.control import ControlServer
 from station.dispatch import SessionDispatcher
 from station.errors import LimitError, RefusedError, StationError
 from station.plan.model import Plan
-from station.session import guard, monitor
+from station.session import guard, keeper, monitor
 from station.session.recording import SessionRecording
 from station.status import StationState as S
 from station.workers import WorkerError, Workers
@@ -324,3 +324,19 @@ async def test_an_arm_that_still_brakes_was_not_moved_by_anybody(
     speed = 0.0
     await asyncio.sleep(0.25)
     assert not any("was moved" in event.text for event in rig.session.store.status.events)
+
+
+async def test_a_device_that_fails_in_an_unforeseen_way_is_named_and_tried_again(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tries = []
+
+    async def failing() -> None:
+        tries.append(1)
+        if len(tries) < 3:
+            raise OSError("no such bus")
+
+    monkeypatch.setattr(keeper, "RETRY_S", 0.01)
+    await rig.session._keeper._until_open("camera", failing)
+    assert len(tries) == 3
+    assert any("no such bus" in event.text for event in rig.session.store.status.events)

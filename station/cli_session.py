@@ -118,7 +118,10 @@ def check_command(
     outcome = asyncio.run(attended_session(socket, "run", headless, go, False, lambda c: _make(c, poses)))
     if not outcome.recording:
         _finish(outcome, False)
-    done = subprocess.run([sys.executable, "-m", "calibrate.cli", "check", outcome.recording])
+    # A session lies in ROOT/sessions/NAME: what is installed below that root is checked.
+    root = Path(outcome.status.session.folder).parents[1]
+    command = [sys.executable, "-m", "calibrate.cli", "check", outcome.recording, "--root", str(root)]
+    done = subprocess.run(command)
     raise typer.Exit(done.returncode)
 
 

@@ -20,6 +20,10 @@ from calibrate.intrinsics import calibrate_intrinsics
 from calibrate.pnp import solve_pnp
 from calibrate.views import ImageView, ViewSet
 from recordings.messages import BoardSpec, CameraModel, Mount
+from station.config import StationConfig
+from station.errors import StationError
+from station.plan.predict import advise
+from station.plan.scene import scene_of
 from station.status import EstimateStatus
 
 FEWEST_VIEWS = 4
@@ -57,6 +61,21 @@ def running_estimate(
         enough=sigma_m <= GOAL_M,
         advice="sure enough: you may finish" if sigma_m <= GOAL_M else "go on: every pose still helps",
     )
+
+
+def next_best(config: StationConfig, base_from_flange: Array, joints_now_rad: Sequence[float]) -> str:
+    """Which pose would help most and how many are missing, after those captured (n, 4, 4).
+
+    By forecast from the configured guesses; empty where these are missing or no pose would help.
+    """
+    try:
+        advice = advise(scene_of(config), base_from_flange, GOAL_M, joints_now_rad)
+    except StationError:
+        return ""
+    if advice.next_pose is None:
+        return ""
+    missing = f"about {advice.poses_missing} more" if advice.poses_missing else "many more poses"
+    return f"{missing} for {1000 * GOAL_M:.1f} mm; the next best: {advice.next_pose.why}"
 
 
 def image_coverage(camera: CameraModel, pixels: Sequence[Array]) -> tuple[tuple[int, ...], ...]:

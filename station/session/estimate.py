@@ -4,7 +4,10 @@ from __future__ import annotations
 
 import asyncio
 
-from station.estimation import running_estimate
+import msgspec
+import numpy as np
+
+from station.estimation import next_best, running_estimate
 from station.session.bench import Bench
 from station.status import EstimateStatus
 from station.workers import WorkerError
@@ -39,6 +42,11 @@ class Estimator:
                 estimate = await bench.workers.call(
                     running_estimate, config.mount, camera, known, config.board, seen, timeout_s=20.0
                 )
+                joints = bench.store.status.robot.joints_rad
+                if joints is not None and estimate.sigma_translation_mm is not None and not estimate.enough:
+                    flange = np.array([v[1] for v in seen])
+                    text = await bench.workers.call(next_best, config, flange, joints, timeout_s=20.0)
+                    estimate = msgspec.structs.replace(estimate, advice=text or estimate.advice)
             except WorkerError as error:
                 bench.store.event(f"no running estimate: {error}", "warning")
                 continue

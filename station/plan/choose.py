@@ -17,6 +17,9 @@ from station.plan.scene import Scene
 Criterion = Literal["A", "D"]
 LENS_PRIOR_SHARE = 0.05
 """The lens is known beforehand to about this share of its values; keeps few views from being hopeless."""
+_LEVER_SHARE = 0.3
+"""Of the working distance. Forecast on random cells: against 1, translation gains 5 to 10 % and rotation
+loses 5 %; below 0.3 rotation goes on losing and translation gains 2 % at most."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,7 +60,8 @@ def objective_for(scene: Scene, criterion: Criterion, free_intrinsics: bool) -> 
         f = float(camera_matrix(scene.camera)[0, 0])
         lens = [1 / (LENS_PRIOR_SHARE * f) ** 2] * 4 + [1.0] * (len(INTRINSICS) - 4)
     # A metre and three radians: no knowledge, only so that the first few views have a finite sigma.
-    return Objective(criterion, scene.working_distance_m, np.array([1.0, 1, 1, 0.1, 0.1, 0.1] * 2 + lens))
+    weak = np.array([1.0, 1, 1, 0.1, 0.1, 0.1] * 2 + lens)
+    return Objective(criterion, _LEVER_SHARE * scene.working_distance_m, weak)
 
 
 def choose(

@@ -28,7 +28,7 @@ from station.plan.view_range import ViewRange, view_range
 from station.plan.visibility import visible
 
 Progress = Callable[[str, float], None]
-POOL_SIZE = 320
+POOL_SIZE = 480
 _DRAWS = 48
 _TRIES = 12
 """Camera poses looked at per wanted member of the pool; most fall to the guess's uncertainty."""

@@ -6,6 +6,7 @@ Plain functions of plain data, so that they cross a process border; the daemon's
 from __future__ import annotations
 
 import contextlib
+import multiprocessing
 import os
 from dataclasses import dataclass
 from typing import Any
@@ -21,6 +22,7 @@ from recordings.messages import BoardSpec, CameraModel, Vector6
 from station.config import StationConfig
 from station.exposure import assess
 from station.limits import PlanCheck, check_plan
+from station.parent import die_with_parent
 from station.plan.model import Plan
 from station.plan.planner import make_plan
 from station.plan.scene import cell_geometry
@@ -42,6 +44,8 @@ class Sighting:
 
 def start_worker() -> None:
     """Capture and recording come first on a small machine; one thread leaves a core to them."""
+    if (parent := multiprocessing.parent_process()) is not None and parent.pid is not None:
+        die_with_parent(parent.pid)
     with contextlib.suppress(OSError):  # a service may be forbidden to
         os.nice(_NICENESS)
     cv2.setNumThreads(1)

@@ -14,7 +14,6 @@ Answers:  {"ready": true, "tcp": [6] | null} · {"refused": text} · {"beat": N,
 
 from __future__ import annotations
 
-import ctypes
 import json
 import math
 import os
@@ -24,18 +23,12 @@ import sys
 import time
 from typing import Any, NoReturn
 
+from station.parent import die_with_parent
+
 BEAT_FRESH_NS = 100_000_000
 WATCHDOG_HZ = 5.0
 """The controller stops the script after 1/5 s without a kick."""
 MESSAGE_LIMIT = 4096
-_PR_SET_PDEATHSIG = 1
-
-
-def die_with_parent(parent_pid: int) -> None:
-    """Has the kernel kill this process when the thread that started it ends."""
-    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
-    if os.getppid() != parent_pid:  # it died before the line above
-        os._exit(1)
 
 
 class ControlServer:

@@ -57,6 +57,12 @@ async def test_a_killed_operator_stops_the_arm(rig: SystemRig, short_plan: Plan)
     await anna.close()
 
 
+def children_of(pid: int) -> list[Path]:
+    """Their folders in /proc, which vanish with them."""
+    listed = Path(f"/proc/{pid}/task/{pid}/children").read_text().split()
+    return [Path("/proc") / child for child in listed]
+
+
 async def test_a_killed_daemon_stops_the_arm_and_the_next_one_waits_for_a_person(
     rig: SystemRig, short_plan: Plan
 ) -> None:
@@ -65,8 +71,13 @@ async def test_a_killed_daemon_stops_the_arm_and_the_next_one_waits_for_a_person
         await go(anna, short_plan)
         await status_when(anna, lambda s: s.session.captured == 1)
         await rig.moving()
+        children = children_of(first.process.pid)
+        assert len(children) >= 2, "worker and control process"
         first.process.kill()
         assert await rig.at_rest() < 1.5
+        async with asyncio.timeout(5):
+            while any(child.is_dir() for child in children):
+                await asyncio.sleep(0.05)
     second = await rig.daemon()
     async with await second.client() as anna:
         status = await status_when(anna, lambda s: s.state is S.STOPPED)

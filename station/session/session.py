@@ -157,6 +157,9 @@ class Session:
         """Checks the whole way from where the arm is and offers a one-use go for it."""
         self.leases.require(client_id)
         self._require("prepare")
+        if self._run is not None and not self._run.done():
+            # It is sealed and shown; its control process may take a moment more to end.
+            await asyncio.wait({self._run}, timeout=END_RUN_S)
         if purpose == "run" and self.bench.recording is None and self.bench.queue is not None:
             self.bench.queue = PoseQueue(self.bench.queue.plan)
             self.bench.show_poses()

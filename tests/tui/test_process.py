@@ -88,6 +88,10 @@ async def go(screen: ScreenProcess) -> None:
     await asyncio.to_thread(screen.press, "f5")
     await shows(screen, "The arm will move")
     await asyncio.to_thread(screen.press, "tab", "enter")
+    async with asyncio.timeout(60):
+        # Until the screen has heard of it: a second F5 would be refused.
+        while screen.glass.text.startswith((" PAUSED", " IDLE")):
+            await asyncio.sleep(0.05)
 
 
 def captured(text: str) -> int:
@@ -101,7 +105,6 @@ async def captured_at_least(screen: ScreenProcess, count: int, timeout_s: float 
         while captured(screen.glass.text) < count:
             if screen.glass.text.startswith(" PAUSED"):
                 await go(screen)
-                await shows(screen, r"^ (?!PAUSED)")
             await asyncio.sleep(0.05)
 
 

@@ -43,7 +43,7 @@ def test_a_plan_is_made_shown_and_saved(made):
 def test_the_other_criterion_makes_another_plan(tmp_path):
     plans = []
     for name, options in (("a", []), ("d", ["--d-optimal"])):
-        result = run("--poses", 6, "-o", tmp_path / name, *options)
+        result = run("--poses", 12, "-o", tmp_path / name, *options)
         assert result.exit_code == 0, result.output
         plans.append(load_plan(tmp_path / name))
     assert plans[0].poses != plans[1].poses

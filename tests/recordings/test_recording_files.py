@@ -114,7 +114,7 @@ def test_any_text_gives_a_safe_session_name(text: str) -> None:
 @given(st.text(max_size=50))
 def test_no_attachment_name_leaves_its_folder(text: str) -> None:
     if is_attachment_name(text):
-        assert os.path.normpath(f"/root/{text}") == f"/root/{text}"
+        assert os.path.normpath(f"/folder/{text}") == f"/folder/{text}"
 
 
 def test_a_missing_folder_says_so(tmp_path: Path) -> None:

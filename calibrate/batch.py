@@ -1,4 +1,7 @@
-"""Many recordings, solved again: a process pool, resumable, one result each, none stops the rest."""
+"""Many recordings, solved again: a process pool, resumable, one result each, none stops the rest.
+
+A Dask cluster instead of the pool: `cluster`.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +13,14 @@ import os
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from concurrent.futures.process import BrokenProcessPool
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import cv2
 import msgspec
 
-from calibrate.calibration import content_sha256, write_atomically, write_calibration
+from calibrate.calibration import content_sha256, encode_calibration, write_atomically
 from calibrate.errors import CalibrationError
 from calibrate.lines import append_line, read_lines
 from calibrate.pipeline import JobOptions, SolvedRecording, solve_recording
@@ -46,6 +49,7 @@ class BatchResult(msgspec.Struct, frozen=True, omit_defaults=True):
     mount: str = ""
     translation_m: tuple[float, ...] = ()
     rotation_xyzw: tuple[float, ...] = ()
+    covariance: tuple[tuple[float, ...], ...] = ()
     sigma_mm: float | None = None
     sigma_deg: float | None = None
     e_t_mm: float | None = None
@@ -59,9 +63,20 @@ class BatchResult(msgspec.Struct, frozen=True, omit_defaults=True):
     """Of the calibration: equal for equal results, whoever computed them."""
 
 
+@dataclass(frozen=True)
+class Solved:
+    """What comes back from a worker; workers write no file."""
+
+    result: BatchResult
+    content: bytes = b""
+    """Of the calibration file."""
+
+
 Progress = Callable[[int, int, BatchResult], None]
-Solver = Callable[[Sequence[tuple[str, str]], JobOptions, str], Iterator[BatchResult]]
-"""(recording, key) pairs, options, output folder → results as they come."""
+Task = tuple[str, str]
+"""Recording (absolute path) and key."""
+Solver = Callable[[Sequence[Task], JobOptions], Iterator[Solved]]
+"""Tasks and options → what was solved, as it comes, in any order; every task once."""
 
 
 def run_batch(
@@ -84,13 +99,16 @@ def run_batch(
         keys = [(str(path.resolve()), batch_key(path, options)) for path in recordings]
         todo = [(path, key) for path, key in dict.fromkeys(keys) if key not in done]
         solve = solver or _pool_solver(workers)
-        for count, result in enumerate(solve(todo, options, str(output)), 1):
+        for count, solved in enumerate(solve(todo, options), 1):
+            result = solved.result
+            if solved.content:
+                _write(output / result.calibration, solved.content)
             done[result.key] = result
             append_line(output / RESULTS, result)
             if progress:
                 progress(count, len(todo), result)
         results = [done[key] for _, key in keys]
-        write_atomically(output / "results.csv", lambda target: target.write(_csv(results)))
+        _write(output / "results.csv", _csv(results))
     except OSError as problem:
         raise BatchError(f"{output}: {problem.strerror or problem}.") from None
     return results
@@ -112,21 +130,23 @@ def read_results(output: Path) -> list[BatchResult]:
     return read_lines(output / RESULTS, BatchResult)
 
 
-def solve_one(recording: str, key: str, options: JobOptions, output: str) -> BatchResult:
+def _write(path: Path, content: bytes) -> None:
+    write_atomically(path, lambda target: target.write(content))
+
+
+def solve_one(recording: str, key: str, options: JobOptions) -> Solved:
     """What every worker does, here or on a cluster. Any failure is a result."""
     cv2.setNumThreads(1)
     path = Path(recording)
     try:
         job = solve_recording(path, replace(options, threads=1))
-        name = f"{path.stem}-{key[:8]}.calibration.yaml"
-        write_calibration(job.calibration, Path(output) / name)
+        content = encode_calibration(job.calibration)
     except (CalibrationError, RecordingError) as problem:
-        return BatchResult(recording, key, False, error=str(problem))
+        return Solved(BatchResult(recording, key, False, error=str(problem)))
     except Exception as problem:  # a defect in one recording must not stop the other 199
-        return BatchResult(
-            recording, key, False, error=f"internal error: {type(problem).__name__}: {problem}"
-        )
-    return _result(recording, key, job, name)
+        error = f"internal error: {type(problem).__name__}: {problem}"
+        return Solved(BatchResult(recording, key, False, error=error))
+    return Solved(_result(recording, key, job, f"{path.stem}-{key[:8]}.calibration.yaml"), content)
 
 
 def _result(recording: str, key: str, job: SolvedRecording, name: str) -> BatchResult:
@@ -145,6 +165,7 @@ def _result(recording: str, key: str, job: SolvedRecording, name: str) -> BatchR
         mount=calibration.mount,
         translation_m=calibration.result.translation_m,
         rotation_xyzw=calibration.result.rotation_xyzw,
+        covariance=calibration.covariance,
         sigma_mm=calibration.sigma.translation_mm,
         sigma_deg=calibration.sigma.rotation_deg,
         e_t_mm=None if quality.holdout is None else quality.holdout.e_t_m * 1000,
@@ -161,7 +182,7 @@ def _pool_solver(workers: int | None) -> Solver:
     """Processes of this machine. A killed worker costs a new pool, no recording."""
     count = workers or len(os.sched_getaffinity(0))
 
-    def solve(todo: Sequence[tuple[str, str]], options: JobOptions, output: str) -> Iterator[BatchResult]:
+    def solve(todo: Sequence[Task], options: JobOptions) -> Iterator[Solved]:
         attempts: dict[str, int] = {key: 0 for _, key in todo}
         waiting = list(todo)
         while waiting:
@@ -169,30 +190,29 @@ def _pool_solver(workers: int | None) -> Solver:
             suspects = [task for task in waiting if attempts[task[1]] > 0]
             tasks = [suspects[0]] if suspects else waiting
             finished: set[str] = set()
-            for result in _one_pool(tasks, options, output, count):
-                finished.add(result.key)
-                yield result
+            for solved in _one_pool(tasks, options, count):
+                finished.add(solved.result.key)
+                yield solved
             lost = [task for task in tasks if task[1] not in finished]
             for recording, key in lost:
                 attempts[key] += 1
                 if attempts[key] >= _ATTEMPTS:
                     finished.add(key)
-                    yield BatchResult(recording, key, False, error="its worker process was killed, twice")
+                    error = f"its worker process was killed, {_ATTEMPTS} times"
+                    yield Solved(BatchResult(recording, key, False, error=error))
             waiting = [task for task in waiting if task[1] not in finished]
 
     return solve
 
 
-def _one_pool(
-    tasks: Sequence[tuple[str, str]], options: JobOptions, output: str, count: int
-) -> Iterator[BatchResult]:
+def _one_pool(tasks: Sequence[Task], options: JobOptions, count: int) -> Iterator[Solved]:
     """Ends early when a worker dies; what was not yielded is lost."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["calibrate.batch"])
     with ProcessPoolExecutor(min(count, len(tasks)), mp_context=context) as pool:
-        pending: set[Future[BatchResult]] = {
-            pool.submit(solve_one, recording, key, options, output) for recording, key in tasks
+        pending: set[Future[Solved]] = {
+            pool.submit(solve_one, recording, key, options) for recording, key in tasks
         }
         while pending:
             finished, pending = wait(pending, return_when=FIRST_COMPLETED)
@@ -205,7 +225,7 @@ def _one_pool(
 
 def _csv(results: Iterable[BatchResult]) -> bytes:
     text = io.StringIO(newline="")
-    names = [name for name in BatchResult.__struct_fields__ if name != "key"]
+    names = [name for name in BatchResult.__struct_fields__ if name not in ("key", "covariance")]
     writer = csv.writer(text)
     writer.writerow(names)
     for result in results:

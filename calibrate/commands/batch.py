@@ -11,7 +11,8 @@ import msgspec
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from calibrate.batch import BatchResult, run_batch
+from calibrate.batch import BatchResult, Solver, run_batch
+from calibrate.cluster import Cluster, cluster_solver
 from calibrate.commands.output import AsJson, OutputError, err, out
 from calibrate.commands.solve import GatesFile, Profile, ProfileName, Seed
 from calibrate.gates import GateLimits, read_limits
@@ -31,6 +32,17 @@ def batch(
     profile: Profile = ProfileName.robust,
     seed: Seed = 0,
     gates: GatesFile = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            help="Solve on this Dask cluster, tcp://HOST:PORT or tls://HOST:PORT, not in processes here. Its "
+            "workers see the recordings under the same paths. Whoever reaches a tcp:// scheduler can run "
+            "code on it: use tls:// outside a closed network"
+        ),
+    ] = None,
+    tls_ca: Annotated[Path | None, typer.Option(help="The cluster's certificate authority, PEM")] = None,
+    tls_cert: Annotated[Path | None, typer.Option(help="Your certificate, PEM")] = None,
+    tls_key: Annotated[Path | None, typer.Option(help="Your private key, PEM")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Solve many recordings; resumable. Exit 3: done, but some recordings could not be solved."""
@@ -38,8 +50,9 @@ def batch(
         raise OutputError(f"{output} is a file; the results need a folder.")
     limits = GateLimits() if gates is None else read_limits(gates)
     options = JobOptions(profile=profile.value, seed=seed, limits=limits)
+    solver = _solver(scheduler, workers, tls_ca, tls_cert, tls_key)
     with ExitStack() as stack:
-        results = run_batch(recordings, output, options, workers, _progress(stack))
+        results = run_batch(recordings, output, options, workers, _progress(stack), solver)
     failed = [result for result in results if not result.solved]
     if as_json:
         for result in results:
@@ -54,6 +67,19 @@ def batch(
             err.print(f"{result.recording}: {result.error}")
     if failed:
         raise typer.Exit(DONE_WITH_LOSS)
+
+
+def _solver(
+    scheduler: str | None, workers: int | None, ca: Path | None, cert: Path | None, key: Path | None
+) -> Solver | None:
+    """None: the process pool."""
+    if scheduler is not None:
+        if workers is not None:
+            raise OutputError("--workers counts processes here; a cluster has as many as were started there.")
+        return cluster_solver(Cluster(scheduler, ca, cert, key))
+    if ca or cert or key:
+        raise OutputError("--tls-ca, --tls-cert and --tls-key belong to --scheduler tls://HOST:PORT.")
+    return None
 
 
 def _progress(stack: ExitStack) -> Callable[[int, int, BatchResult], None] | None:

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from calibrate.batch import BatchResult, batch_key, read_results, run_batch, solve_one
+from calibrate.batch import BatchResult, Solved, Task, batch_key, read_results, run_batch, solve_one
 from calibrate.pipeline import JobOptions
 
 
@@ -25,11 +25,9 @@ def worker_pids() -> list[int]:
     return [pid for pid, parent in parents.items() if parents.get(parent) == os.getpid()]
 
 
-def in_this_process(
-    todo: Sequence[tuple[str, str]], options: JobOptions, output: str
-) -> Iterator[BatchResult]:
+def in_this_process(todo: Sequence[Task], options: JobOptions) -> Iterator[Solved]:
     for recording, key in todo:
-        yield solve_one(recording, key, options, output)
+        yield solve_one(recording, key, options)
 
 
 @pytest.fixture
@@ -65,10 +63,8 @@ def test_a_broken_recording_is_a_result_and_the_rest_goes_on(recordings: list[Pa
 
 
 def test_it_goes_on_where_it_was_killed(recordings: list[Path], tmp_path: Path) -> None:
-    def two_then_dies(
-        todo: Sequence[tuple[str, str]], options: JobOptions, output: str
-    ) -> Iterator[BatchResult]:
-        yield from in_this_process(todo[:2], options, output)
+    def two_then_dies(todo: Sequence[Task], options: JobOptions) -> Iterator[Solved]:
+        yield from in_this_process(todo[:2], options)
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -78,9 +74,9 @@ def test_it_goes_on_where_it_was_killed(recordings: list[Path], tmp_path: Path) 
     assert len(read_results(tmp_path / "out")) == 2
     asked: list[str] = []
 
-    def counted(todo: Sequence[tuple[str, str]], options: JobOptions, output: str) -> Iterator[BatchResult]:
+    def counted(todo: Sequence[Task], options: JobOptions) -> Iterator[Solved]:
         asked.extend(recording for recording, _ in todo)
-        return in_this_process(todo, options, output)
+        return in_this_process(todo, options)
 
     results = run_batch(recordings[:4], tmp_path / "out", solver=counted)
     assert len(asked) == 2

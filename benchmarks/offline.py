@@ -12,6 +12,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from benchmarks.detection import Case, scene
 from calibrate.pipeline import JobOptions, solve_recording
 from recordings.messages import CameraIdentity, CameraModel, Picture, RobotIdentity, SessionInfo, Stamps, View
 from recordings.reader import open_recording
@@ -72,11 +73,9 @@ def make_recording(path: Path) -> Path:
         robot=RobotIdentity("UR10"),
         camera_identity=CameraIdentity("rendered", "bench"),
     )
-    from benchmarks.detection import _scene  # the same views as the detection's
-
     with RecordingWriter(path, info) as writer:
         for k in range(25):
-            _, seen = _scene(truth.board, (Light(), 25.0, 0.45, 0.0), k)
+            _, seen = scene(truth.board, Case(tilt_deg=25.0), k)
             stamps = Stamps(k * 10**9, 10**18 + k * 10**9)
             image = render(truth.camera, truth.board, seen, Light(), rng)
             writer.picture(Picture(image, stamps, frame_id=k, sequence=k))

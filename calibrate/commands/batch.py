@@ -12,11 +12,14 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from calibrate.batch import BatchResult, Solver, run_batch
+from calibrate.calibration import write_atomically
 from calibrate.cluster import Cluster, cluster_solver
 from calibrate.commands.output import AsJson, OutputError, err, out
 from calibrate.commands.solve import GatesFile, Profile, ProfileName, Seed
 from calibrate.gates import GateLimits, read_limits
 from calibrate.pipeline import JobOptions
+from calibrate.report.fleet import fleet_page
+from calibrate.trends import cells, trends_text
 
 DONE_WITH_LOSS = 3
 
@@ -45,7 +48,10 @@ def batch(
     tls_key: Annotated[Path | None, typer.Option(help="Your private key, PEM")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Solve many recordings; resumable. Exit 3: done, but some recordings could not be solved."""
+    """Solve many recordings; resumable. Exit 3: done, but some recordings could not be solved.
+
+    OUTPUT then holds a calibration each, results.jsonl, results.csv, and what moved: trends.html, trends.txt.
+    """
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output} is a file; the results need a folder.")
     limits = GateLimits() if gates is None else read_limits(gates)
@@ -53,6 +59,9 @@ def batch(
     solver = _solver(scheduler, workers, tls_ca, tls_cert, tls_key)
     with ExitStack() as stack:
         results = run_batch(recordings, output, options, workers, _progress(stack), solver)
+    found = cells(results)
+    _write(output / "trends.txt", trends_text(found))
+    _write(output / "trends.html", fleet_page(results, found))
     failed = [result for result in results if not result.solved]
     if as_json:
         for result in results:
@@ -61,8 +70,11 @@ def batch(
         good = sum(result.passed for result in results)
         out.print(
             f"{len(results)} recordings: {good} good, {len(results) - good - len(failed)} below a gate, "
-            f"{len(failed)} not solved. {output}/results.csv, results.jsonl"
+            f"{len(failed)} not solved. {output}/results.csv, results.jsonl, trends.html, trends.txt"
         )
+        for cell in found:
+            for finding in cell.findings:
+                out.print(f"{cell.name}: {finding}", soft_wrap=True)
         for result in failed:
             err.print(f"{result.recording}: {result.error}")
     if failed:
@@ -80,6 +92,10 @@ def _solver(
     if ca or cert or key:
         raise OutputError("--tls-ca, --tls-cert and --tls-key belong to --scheduler tls://HOST:PORT.")
     return None
+
+
+def _write(path: Path, text: str) -> None:
+    write_atomically(path, lambda target: target.write(text.encode()))
 
 
 def _progress(stack: ExitStack) -> Callable[[int, int, BatchResult], None] | None:

@@ -17,7 +17,7 @@ from calibrate.views import ViewSet
 from recordings.messages import CameraModel
 
 _BLUE, _RED, _GREY, _ORANGE = "#0969da", "#b42318", "#8c959f", "#bc4c00"
-_STYLE: Any = {
+STYLE: Any = {
     "svg.hashsalt": "report",
     "svg.fonttype": "none",
     "font.family": "sans-serif",
@@ -30,13 +30,13 @@ _STYLE: Any = {
 }
 
 
-def _figure(width: float, height: float, columns: int = 1) -> tuple[Figure, Any]:
+def new_figure(width: float, height: float, columns: int = 1) -> tuple[Figure, Any]:
     figure = Figure(figsize=(width, height), layout="constrained")
     axes = figure.subplots(1, columns)
     return figure, axes
 
 
-def _svg(figure: Figure) -> str:
+def svg_text(figure: Figure) -> str:
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
@@ -47,8 +47,8 @@ def residuals_by_view(
     residual_px: Mapping[int, float], robot_mm: Mapping[int, float], limit_px: float | None
 ) -> str:
     """Bars: rms of the corners, and the robot's miss, per pose."""
-    with matplotlib.rc_context(_STYLE):
-        figure, axes = _figure(10, 2.6, 2)
+    with matplotlib.rc_context(STYLE):
+        figure, axes = new_figure(10, 2.6, 2)
         for axis, values, unit in (
             (axes[0], residual_px, "corners, px rms"),
             (axes[1], robot_mm, "robot, mm"),
@@ -59,13 +59,13 @@ def residuals_by_view(
             axis.tick_params(axis="x", labelsize=7)
         if limit_px is not None and residual_px and max(residual_px.values()) > 0.3 * limit_px:
             axes[0].axhline(limit_px, color=_RED, linewidth=1)
-        return _svg(figure)
+        return svg_text(figure)
 
 
 def residual_scatter(misses: Array, pixels: Array, camera: CameraModel) -> str:
     """Where the corners miss: all misses (n, 2) px round zero, and over the picture as arrows."""
-    with matplotlib.rc_context(_STYLE):
-        figure, axes = _figure(10, 3.6, 2)
+    with matplotlib.rc_context(STYLE):
+        figure, axes = new_figure(10, 3.6, 2)
         reach = float(np.abs(misses).max(initial=1e-3)) * 1.05
         axes[0].scatter(misses[:, 0], misses[:, 1], s=3, color=_BLUE, alpha=0.5, linewidths=0)
         axes[0].set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel="x miss, px", ylabel="y miss, px")
@@ -86,13 +86,13 @@ def residual_scatter(misses: Array, pixels: Array, camera: CameraModel) -> str:
         )
         axes[1].set(xlim=(0, camera.width), ylim=(camera.height, 0), xlabel="x, px", ylabel="y, px")
         axes[1].set_aspect("equal")
-        return _svg(figure)
+        return svg_text(figure)
 
 
 def holdout_samples(methods: Sequence[tuple[str, Array, Array]]) -> str:
     """Error per held-out sample, translation (mm) and rotation; ours first. The paper's figures 4 and 5."""
-    with matplotlib.rc_context(_STYLE):
-        figure, axes = _figure(10, 3.0, 2)
+    with matplotlib.rc_context(STYLE):
+        figure, axes = new_figure(10, 3.0, 2)
         for place, (name, e_t_m, e_R) in enumerate(methods):
             look: dict[str, Any] = {"linewidth": 0.8, "marker": ".", "alpha": 0.7}
             if place == 0:
@@ -103,21 +103,21 @@ def holdout_samples(methods: Sequence[tuple[str, Array, Array]]) -> str:
         axes[0].set(xlabel="held-out sample", ylabel="translation error, mm", ylim=(0, None))
         axes[1].set(xlabel="held-out sample", ylabel="rotation error (spectral norm)", ylim=(0, None))
         figure.legend(loc="outside lower center", ncols=5, fontsize=7, frameon=False)
-        return _svg(figure)
+        return svg_text(figure)
 
 
 def error_shares(shares: Mapping[str, float]) -> str:
     """One bar: where the error of X comes from."""
     colours = (_BLUE, _ORANGE, "#1a7f37", "#8250df", _GREY)
-    with matplotlib.rc_context(_STYLE | {"axes.grid": False}):
-        figure, axis = _figure(10, 0.95)
+    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
+        figure, axis = new_figure(10, 0.95)
         left = 0.0
         for (name, share), colour in zip(shares.items(), colours, strict=False):
             axis.barh([0], [share], left=[left], color=colour, label=f"{name.replace('_', ' ')} {share:.0%}")
             left += share
         axis.set_axis_off()
         figure.legend(loc="outside lower center", ncols=5, fontsize=8, frameon=False)
-        return _svg(figure)
+        return svg_text(figure)
 
 
 def coverage_map(views: ViewSet) -> str:
@@ -128,8 +128,8 @@ def coverage_map(views: ViewSet) -> str:
         mask = np.zeros(seen.shape, np.uint8)
         cv2.fillConvexPoly(mask, cv2.convexHull((view.pixels / 8).astype(np.float32)).astype(np.int32), 1)
         seen += mask
-    with matplotlib.rc_context(_STYLE | {"axes.grid": False}):
-        figure, axes = _figure(10, 3.4, 2)
+    with matplotlib.rc_context(STYLE | {"axes.grid": False}):
+        figure, axes = new_figure(10, 3.4, 2)
         extent = (0, camera.width, camera.height, 0)
         shown = axes[0].imshow(seen, extent=extent, cmap="Blues", interpolation="nearest")
         figure.colorbar(shown, ax=axes[0], label="views")
@@ -137,7 +137,7 @@ def coverage_map(views: ViewSet) -> str:
             axes[0].plot(view.pixels[:, 0], view.pixels[:, 1], ".", markersize=1, color=_ORANGE)
         axes[0].set(xlim=(0, camera.width), ylim=(camera.height, 0), xlabel="x, px", ylabel="y, px")
         _distortion_curve(axes[1], camera)
-        return _svg(figure)
+        return svg_text(figure)
 
 
 def _distortion_curve(axis: Any, camera: CameraModel) -> None:

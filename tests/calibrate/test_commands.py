@@ -222,6 +222,8 @@ def test_batch_solves_the_rest_and_goes_on_where_it_was(session_file: Path, tmp_
     again = run("batch", *recordings, "-o", "out", "--json", cwd=tmp_path)
     assert again.returncode == 0
     assert (tmp_path / "out/results.jsonl").read_text().splitlines() == before
+    assert "No camera moved" in (tmp_path / "out/trends.txt").read_text()
+    assert "No camera moved" in (tmp_path / "out/trends.html").read_text()
     alone = run("solve", recordings[0], "-o", "alone.yaml", cwd=tmp_path)
     assert alone.returncode in (0, 4)
     pooled = read_calibration(tmp_path / "out" / rows[0]["calibration"])

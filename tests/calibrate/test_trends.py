@@ -1,0 +1,85 @@
+"""A cell's camera over time: a jump is named, noise is not."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calibrate.batch import BatchResult
+from calibrate.geometry import Array, Transform, perturb, pose, rotation_exp
+from calibrate.report.fleet import fleet_page
+from calibrate.trends import cells, trends_text
+
+SIGMA = np.array([0.1e-3] * 3 + [0.2e-3] * 3)
+X = pose(rotation_exp([0.3, -2.6, 0.9]), [0.05, -0.08, 0.11])
+DAY_NS = 86_400 * 10**9
+
+
+def session(number: int, shift_mm: float = 0.0, camera: str = "MER 17", seed: int = 0) -> BatchResult:
+    rng = np.random.default_rng([number, seed])
+    moved = perturb(X, rng.normal(size=6) * SIGMA)
+    return BatchResult(
+        recording=f"r{number}.mcap",
+        key=f"{camera}-{number}",
+        solved=True,
+        passed=True,
+        session=f"session-{number}",
+        robot="UR10 2020300001",
+        camera=camera,
+        recorded_wall_ns=1_700_000_000 * 10**9 + number * DAY_NS,
+        mount="eye-in-hand",
+        translation_m=tuple((moved[:3, 3] + [0.0, shift_mm * 1e-3, 0.0]).tolist()),
+        rotation_xyzw=quaternion(moved),
+        covariance=tuple(tuple(row) for row in np.diag(SIGMA**2).tolist()),
+        sigma_mm=0.17,
+        sigma_deg=0.02,
+        views=25,
+    )
+
+
+def quaternion(matrix: Array) -> tuple[float, ...]:
+    return tuple(Transform("flange", "camera", matrix).quaternion_xyzw.tolist())
+
+
+def test_a_jump_is_named_with_its_sessions_and_nothing_else_is() -> None:
+    results = [session(k, shift_mm=1.8 if k >= 3 else 0.0) for k in (5, 1, 3, 0, 2, 4)]
+    results += [session(k, camera="MER 18") for k in range(6)]
+    moved, quiet = cells(results)
+    assert [s.session for s in moved.sessions] == [f"session-{k}" for k in range(6)]
+    assert quiet.findings == []
+    (finding,) = moved.findings
+    assert "the camera moved 1." in finding and "on the flange" in finding
+    assert "between session-2 (2023-11-16" in finding and "and session-3 (2023-11-17" in finding
+    text = trends_text((moved, quiet))
+    assert text.startswith(f"{moved.name}: the camera moved")
+    assert next(line for line in text.splitlines() if "MOVED" in line).split()[2] == "session-3"
+
+
+def test_a_creep_that_no_step_shows_is_found_from_end_to_end() -> None:
+    (cell,) = cells([session(k, shift_mm=0.3 * k) for k in range(8)])
+    assert not any(move.real for move in cell.moves)
+    (finding,) = cell.findings
+    assert finding.startswith("slowly, no step stands out") and "between session-0" in finding
+
+
+def test_an_untouched_camera_raises_no_alarm_in_hundreds_of_comparisons() -> None:
+    quiet = [cells([session(k, seed=seed) for k in range(5)])[0] for seed in range(100)]
+    assert sum(bool(cell.findings) for cell in quiet) <= 1
+
+
+def test_the_page_is_whole_and_asks_the_network_for_nothing() -> None:
+    results = [session(k, shift_mm=1.8 if k >= 3 else 0.0) for k in range(6)]
+    results.append(BatchResult("<broken>.mcap", "b", False, error="cut & short"))
+    page = fleet_page(results, cells(results))
+    assert "1 moved" in page and page.count("<svg") == 1
+    assert "&lt;broken&gt;.mcap" in page and "cut &amp; short" in page
+    for word in ('src="http', 'href="http', "@import", "<script"):
+        assert word not in page
+    assert page == fleet_page(results, cells(results))
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_few_results_are_no_trouble(count: int) -> None:
+    results = [session(k) for k in range(count)]
+    assert "No camera moved" in trends_text(cells(results))
+    assert "No camera moved" in fleet_page(results, cells(results))

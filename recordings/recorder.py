@@ -2,7 +2,7 @@
 
 Pictures and robot states are dropped, and counted, when the disk cannot keep up; views, events and
 attachments never are. Data reach the operating system after every picture and at least every 0.1 s, the
-disk at every `sync` and at least every 0.5 s.
+disk at every `sync` and at least every 0.5 s; the regular ones run beside the writing, which goes on.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from recordings.errors import RecordingError
 from recordings.messages import CameraModel, CaptureEvent, Picture, RobotState, SessionInfo, View
 from recordings.writer import RecordingWriter
 
-QUEUE_LIMIT_BYTES = 128 * 1024 * 1024
+QUEUE_LIMIT_BYTES = 256 * 1024 * 1024
+"""At 150 fps of 1280×1024 bytes 1.3 s, which a disk may hesitate for."""
 QUEUE_LIMIT_MESSAGES = 20_000
 FLUSH_PERIOD_S = 0.1
 SYNC_PERIOD_S = 0.5
@@ -38,7 +39,7 @@ class _Item:
 class Recorder:
     """Thread-safe. The first write error is final: later calls raise it, futures fail with it.
 
-    `dropped`: pictures and states lost to a full queue. `last_sync_s`: how long the newest fdatasync took.
+    `dropped`: pictures and states lost to a full queue.
     """
 
     def __init__(
@@ -54,7 +55,6 @@ class Recorder:
         self._writer = RecordingWriter(path, info, lossless_png=lossless_png)
         self.part_path = self._writer.part_path
         self.dropped = 0
-        self.last_sync_s = 0.0
         self.error: RecordingError | None = None
         self._queue_limit_bytes = queue_limit_bytes
         self._clock = clock
@@ -73,6 +73,11 @@ class Recorder:
     def bytes_written(self) -> int:
         """Handed to the operating system so far."""
         return self._writer.bytes_written
+
+    @property
+    def last_sync_s(self) -> float:
+        """How long the newest fdatasync took."""
+        return self._writer.last_sync_s
 
     @property
     def queued_bytes(self) -> int:
@@ -188,8 +193,8 @@ class Recorder:
                 self._write(item)
             now_s = self._clock()
             if now_s - synced_s >= SYNC_PERIOD_S:
-                self._sync()
-                flushed_s = synced_s = self._clock()
+                self._writer.begin_sync()
+                flushed_s = synced_s = now_s
             elif now_s - flushed_s >= FLUSH_PERIOD_S:
                 self._writer.flush()
                 flushed_s = now_s
@@ -211,14 +216,9 @@ class Recorder:
         self._awaited = item.done
         item.write()
         if item.done is not None:
-            self._sync()
+            self._writer.sync()
             item.done.set_result(None)
         self._awaited = None
-
-    def _sync(self) -> None:
-        start_s = self._clock()
-        self._writer.sync()
-        self.last_sync_s = self._clock() - start_s
 
     def _fail(self, error: RecordingError) -> None:
         with self._wake:

@@ -17,6 +17,7 @@ from typing import Self
 import msgspec
 
 from recordings import viewing
+from recordings.background_sync import BackgroundSync
 from recordings.errors import RecordingError
 from recordings.files import (
     PART_SUFFIX,
@@ -61,6 +62,7 @@ class RecordingWriter:
         self._pictures: set[int] = set()
         self._attachments: set[str] = set()
         self._file = McapFile(self.part_path)
+        self._background = BackgroundSync(self._file.descriptor)
         with self._disk():
             self._file.start()
             content = with_crc({"format": FORMAT, "session": msgspec.json.encode(info).decode()})
@@ -153,12 +155,24 @@ class RecordingWriter:
         """Everything so far is on the disk when this returns: survives a power loss."""
         self.flush()
         with self._disk():
-            os.fdatasync(self._file.descriptor)
+            self._background.begin()
+            self._background.wait()
+
+    def begin_sync(self) -> None:
+        """Like `sync` but does not wait for the disk. Does nothing while one runs.
+
+        Its error is raised by the next `begin_sync`, `sync` or `finish`.
+        """
+        self.flush()
+        with self._disk():
+            if not self._background.busy:
+                self._background.begin()
 
     def finish(self) -> Path:
         """Seals the file, renames it, and returns its final path."""
         with self._disk():
             self._file.finish()
+            self._background.wait()
             os.fsync(self._file.descriptor)
             rename_new(self.part_path, self.path)
         self.close()
@@ -175,6 +189,11 @@ class RecordingWriter:
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
+
+    @property
+    def last_sync_s(self) -> float:
+        """How long the newest sync took."""
+        return self._background.last_s
 
     @property
     def bytes_written(self) -> int:

@@ -109,6 +109,55 @@ def test_data_reach_the_system_and_the_disk_without_being_asked(
     recorder.close()
 
 
+class SlowSync:
+    """A disk that takes its time for every fdatasync: until it is opened; then it may fail."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch, failure: OSError | None = None) -> None:
+        self.opened, self.reached = threading.Event(), threading.Event()
+        self._failures = [failure] if failure is not None else []
+        monkeypatch.setattr(os, "fdatasync", self._sync)
+
+    def _sync(self, _: int) -> None:
+        self.reached.set()
+        assert self.opened.wait(TIMEOUT_S)
+        if self._failures:
+            raise self._failures.pop()  # as the kernel does: it tells an error once
+
+
+def test_pictures_go_on_while_the_disk_syncs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    now_s = 0.0
+    disk = SlowSync(monkeypatch)
+    recorder = Recorder(tmp_path / "a.mcap", make_info(), clock=lambda: now_s)
+    now_s = recorder_module.SYNC_PERIOD_S * 1.01
+    assert disk.reached.wait(TIMEOUT_S)
+    size, sequence = recorder.part_path.stat().st_size, 0
+    for sequence in range(3):
+        now_s += recorder_module.SYNC_PERIOD_S * 1.01
+        recorder.picture(make_picture(sequence))
+    wait_until(lambda: recorder.part_path.stat().st_size > size + 3 * make_picture(0).image.nbytes)
+    recorder.view(make_view(2))
+    acknowledged = recorder.sync()
+    assert not acknowledged.done()
+    disk.opened.set()
+    acknowledged.result(TIMEOUT_S)
+    recorder.close()
+
+
+def test_nothing_is_acknowledged_after_a_regular_sync_failed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    now_s = 0.0
+    disk = SlowSync(monkeypatch, OSError(5, "Input/output error"))
+    recorder = Recorder(tmp_path / "a.mcap", make_info(), clock=lambda: now_s)
+    now_s = recorder_module.SYNC_PERIOD_S * 1.01
+    assert disk.reached.wait(TIMEOUT_S)
+    acknowledged = recorder.sync()  # its own fdatasync would succeed
+    disk.opened.set()
+    with pytest.raises(RecordingError, match="Input/output error"):
+        acknowledged.result(TIMEOUT_S)
+    assert recorder.error is not None
+
+
 def wait_until(condition: Callable[[], bool]) -> None:
     pause = threading.Event()
     for _ in range(int(TIMEOUT_S / 0.01)):

@@ -82,7 +82,7 @@ def run() -> str:
     return text + "\n\n" + _real() if DATASETS.is_dir() else text
 
 
-def scene(spec: BoardSpec, case: Case, seed: int) -> tuple[Any, Array]:
+def scene(spec: BoardSpec, case: Case, seed: int, camera: CameraModel = CAMERA) -> tuple[Any, Array]:
     """A picture, (h, w) uint8, and its camera_from_board: the board near the middle, turned at random."""
     rng = np.random.default_rng(seed)
     about, roll = rng.uniform(0, 2 * np.pi), rng.uniform(-0.7, 0.7)
@@ -90,7 +90,7 @@ def scene(spec: BoardSpec, case: Case, seed: int) -> tuple[Any, Array]:
     R = rotation_exp([tilt * np.cos(about), tilt * np.sin(about), 0]) @ rotation_exp([0, 0, roll])
     centre = (board_points(spec).min(axis=0) + board_points(spec).max(axis=0)) / 2
     seen = pose(R, np.array([*rng.uniform(-0.02, 0.02, 2), case.distance_m]) - R @ centre)
-    image = render(CAMERA, spec, seen, case.light, rng)
+    image = render(camera, spec, seen, case.light, rng)
     height, width = image.shape
     v, u = np.mgrid[-1 : 1 : height * 1j, -1 : 1 : width * 1j]
     left = (1 - case.uneven * (u + 1) / 2) * (1 - case.vignetting * (u**2 + v**2) / 2)

@@ -18,7 +18,7 @@ from recordings.messages import CameraIdentity, CameraModel, Picture, RobotIdent
 from recordings.reader import open_recording
 from recordings.writer import RecordingWriter
 from station.simulation.cell import CellTruth, make_cell
-from station.simulation.renderer import Light, render
+from station.simulation.renderer import scaled
 
 REPEATS = 5
 _PEAK = """
@@ -59,25 +59,27 @@ def run() -> str:
     return "\n".join(lines)
 
 
-def make_recording(path: Path) -> Path:
-    """The paper's scene from 25 random views that face the board; stored as the station stores pictures."""
+def make_recording(path: Path, views: int = 25, factor: float = 1.0, seed: int = 0) -> Path:
+    """The paper's scene from random views that face the board; stored as the station stores pictures.
+
+    factor: of the picture's sides.
+    """
     truth: CellTruth = make_cell("paper", 1, "low", "eye-in-hand")
-    rng = np.random.default_rng(0)
+    camera = scaled(truth.camera, factor)
     X, P = np.array(truth.camera_mount), np.array(truth.board_place)
     info = SessionInfo(
-        name="bench",
+        name=path.stem,
         mount="eye-in-hand",
         source="simulated",
         board=truth.board,
-        camera=CameraModel(truth.camera.width, truth.camera.height),
+        camera=CameraModel(camera.width, camera.height),
         robot=RobotIdentity("UR10"),
         camera_identity=CameraIdentity("rendered", "bench"),
     )
     with RecordingWriter(path, info) as writer:
-        for k in range(25):
-            _, seen = scene(truth.board, Case(tilt_deg=25.0), k)
+        for k in range(views):
+            image, seen = scene(truth.board, Case(tilt_deg=25.0), 1000 * seed + k, camera)
             stamps = Stamps(k * 10**9, 10**18 + k * 10**9)
-            image = render(truth.camera, truth.board, seen, Light(), rng)
             writer.picture(Picture(image, stamps, frame_id=k, sequence=k))
             flange = P @ np.linalg.inv(seen) @ np.linalg.inv(X)
             writer.view(View(k, f"pose-{k}", k, tuple(tuple(row) for row in flange.tolist()), stamps=stamps))

@@ -59,7 +59,10 @@ def tui_command(
     socket: Socket = None,
     replay: Annotated[Path | None, typer.Option(help="Show this recording in the live screen.")] = None,
 ) -> None:
-    """Open the operator's screen; starts a daemon if none runs (a simulated cell, if there is no config)."""
+    """Open the operator's screen; starts a daemon if none runs (a simulated cell, if there is no config).
+
+    With --socket it starts none: it waits for the one that serves there.
+    """
     open_screen(socket, replay)
 
 
@@ -73,7 +76,8 @@ def open_screen(socket: Path | None, replay: Path | None) -> None:
         return
     from station.cli_serve import ensure_daemon
 
-    run(ensure_daemon(socket or default_socket()))
+    # A socket that is named belongs to somebody: on a cell's console a second daemon would be a wrong one.
+    run(socket or ensure_daemon(default_socket()))
 
 
 def main() -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import os
 import sys
 from pathlib import Path
 
@@ -36,7 +37,7 @@ def main() -> None:
         source="simulated",
         attachments={"truth.json": Path(truth_file).read_bytes()},
     )
-    asyncio.run(serve_cell(cell, place, Path(socket), end_with_stdin=True))
+    asyncio.run(serve_cell(cell, place, Path(socket), end_with_stdin="INVOCATION_ID" not in os.environ))
 
 
 if __name__ == "__main__":

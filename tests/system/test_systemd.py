@@ -1,0 +1,189 @@
+"""The units under a running systemd: ready, watched, stopped in order, solved, and shown on a console."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import fcntl
+import os
+import pty
+import shutil
+import signal
+import struct
+import termios
+import time
+from collections.abc import AsyncIterator, Iterator
+from pathlib import Path
+
+import pytest
+
+import recordings
+from calibrate.calibration import read_calibration
+from recordings.reader import open_recording
+from station.client import Client
+from station.plan.model import Plan
+from station.status import StationState as S
+from tests.system.conftest import SystemRig, go, status_when
+from tests.system.machine import CHECKOUT, VENV, CannotBootError, Machine
+from tests.tui.terminal import KEYS, Glass
+
+pytestmark = [pytest.mark.process, pytest.mark.timeout(240)]
+SAMPLE = Path(recordings.__file__).parent / "samples" / "paper-640.mcap"
+SOCKET = "/run/station/control.sock"
+WATCHDOG_S = 4
+"""Shorter than the unit's 10 s, so that the test is."""
+
+
+class Console:
+    """A terminal that is the container's tty1: what stands on it, and its keys."""
+
+    def __init__(self) -> None:
+        self._master, self._slave = pty.openpty()
+        fcntl.ioctl(self._slave, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+        os.set_blocking(self._master, False)
+        self.name = os.ttyname(self._slave)
+        self._glass = Glass(80, 24)
+
+    def text(self) -> str:
+        # EIO: systemd hangs a console up before it hands it over.
+        with contextlib.suppress(OSError):
+            while data := os.read(self._master, 65536):
+                self._glass.write(data)
+        return self._glass.text
+
+    def press(self, key: str) -> None:
+        os.write(self._master, KEYS[key].encode())
+
+    def close(self) -> None:
+        os.close(self._master)
+        os.close(self._slave)
+
+
+@pytest.fixture(scope="module")
+def console() -> Iterator[Console]:
+    made = Console()
+    yield made
+    made.close()
+
+
+@pytest.fixture(scope="module")
+def machine(tmp_path_factory: pytest.TempPathFactory, console: Console) -> Iterator[Machine]:
+    try:
+        made = Machine(tmp_path_factory.mktemp("machine"), console.name)
+    except CannotBootError as why:
+        pytest.skip(str(why))
+    try:
+        made.run("systemd-sysusers")
+        made.run("systemd-tmpfiles", "--create", "/etc/tmpfiles.d/station.conf")
+        yield made
+    finally:
+        made.end()
+
+
+@pytest.fixture
+async def station(machine: Machine, rig: SystemRig) -> AsyncIterator[Machine]:
+    """station.service, started, in front of the rig's controller; its own unit but for the cell."""
+    shutil.copy(rig.folder / "truth.json", machine.root / "etc/station/truth.json")
+    cell = f"{rig.controller.host} /etc/station/truth.json /var/lib/station {SOCKET}"
+    machine.drop_in(
+        "station.service",
+        f"Environment=PYTHONPATH={CHECKOUT}",
+        "ExecStart=",
+        f"ExecStart={VENV}/bin/python -m tests.system.cell_daemon {cell}",
+        f"WatchdogSec={WATCHDOG_S}",
+    )
+    await asyncio.to_thread(machine.run, "systemctl", "start", "station")  # returns when it said READY=1
+    yield machine
+    await asyncio.to_thread(machine.run, "systemctl", "stop", "station")
+    for session in (machine.root / "var/lib/station/sessions").iterdir():
+        shutil.rmtree(session)
+
+
+async def client_of(machine: Machine) -> Client:
+    return await Client.connect(machine.path(SOCKET), interactive=True)
+
+
+async def test_stopping_the_service_stops_the_arm_seals_and_ends(
+    station: Machine, rig: SystemRig, short_plan: Plan
+) -> None:
+    assert station.show("station", "ActiveState") == "active"
+    assert station.path(SOCKET).stat().st_mode & 0o777 == 0o660
+    async with await client_of(station) as anna:
+        await go(anna, short_plan)
+        await status_when(anna, lambda s: s.session.captured >= 1)
+        assert "pose" in station.show("station", "StatusText")
+        await rig.moving()
+        begun_s = time.monotonic()
+        stopping = asyncio.create_task(asyncio.to_thread(station.run, "systemctl", "stop", "station"))
+        await rig.at_rest(1.5)
+        await stopping
+        assert time.monotonic() - begun_s < 8.0
+    assert station.show("station", "Result") == "success"
+    assert station.show("station", "ExecMainStatus") == "0"
+    assert not station.path(SOCKET).exists()
+    [folder] = (station.root / "var/lib/station/sessions").iterdir()
+    assert not list(folder.glob("*.part"))
+    assert len(open_recording(folder).views()) >= 1
+    await rig.stays_at_rest()
+
+
+async def test_the_screen_comes_up_on_a_console_and_its_stop_key_reaches_the_daemon(
+    station: Machine, rig: SystemRig, console: Console
+) -> None:
+    station.run("systemctl", "start", "station-tui@tty1")
+    await rig.until(lambda: "F12=STOP" in console.text(), 40)
+    async with await client_of(station) as anna:
+        await status_when(anna, lambda s: s.state is S.IDLE)
+        console.press("f12")
+        status = await status_when(anna, lambda s: s.state is S.STOPPED)
+        assert "STOP by station-screen on tty1" in status.reason
+    await rig.until(lambda: console.text().startswith(" STOPPED"))
+    screen = station.show("station-tui@tty1", "MainPID")
+    as_screen = (
+        f"nsenter -t {screen} -m setpriv --reuid station-screen --regid station-operator --clear-groups"
+    )
+    for place in ("sessions", "calibrations"):  # where solving and installing write
+        station.run(*as_screen.split(), "test", "-w", f"/var/lib/station/{place}")
+    station.run("systemctl", "stop", "station-tui@tty1")
+    assert station.show("station-tui@tty1", "Result") == "success"
+
+
+async def test_a_hung_daemon_is_killed_and_the_next_one_waits_for_a_person(
+    station: Machine, rig: SystemRig, short_plan: Plan
+) -> None:
+    pinged = station.show("station", "WatchdogTimestampMonotonic")
+    await rig.until(lambda: station.show("station", "WatchdogTimestampMonotonic") != pinged)
+    async with await client_of(station) as anna:
+        await go(anna, short_plan)
+        await status_when(anna, lambda s: s.session.captured >= 1)
+        await rig.moving()
+        first = station.show("station", "MainPID")
+        station.run("kill", f"-{signal.SIGSTOP.name}", first)
+        await rig.at_rest(1.5)
+    await rig.until(lambda: station.show("station", "NRestarts") == "1", WATCHDOG_S + 10)
+    await rig.until(lambda: station.show("station", "ActiveState") == "active", 30)
+    assert station.show("station", "MainPID") != first
+    async with await client_of(station) as anna:
+        status = await status_when(anna, lambda s: s.robot.connected)
+        assert status.state is S.STOPPED
+        assert "daemon ended during session" in status.reason
+        assert not status.robot.control
+        await rig.stays_at_rest(1.0)
+        await anna.request("lease", action="take")
+        await anna.request("acknowledge")
+        await anna.request("finish")
+        await status_when(anna, lambda s: bool(s.session.recording))
+
+
+def test_a_finished_session_is_solved_without_network_or_devices(machine: Machine) -> None:
+    folder = machine.root / "var/lib/station/sessions/s-0-paper"
+    folder.mkdir()
+    shutil.copy(SAMPLE, folder / "session.mcap")
+    machine.run("chown", "-R", "station:station-operator", "/var/lib/station/sessions")
+    machine.run("systemctl", "start", "calibrate@s-0-paper")
+    machine.until(lambda: machine.show("calibrate@s-0-paper", "ActiveState") in ("inactive", "failed"), 90)
+    assert machine.show("calibrate@s-0-paper", "Result") == "success", machine.journal()
+    calibration = read_calibration(folder / "calibration.yaml")
+    assert calibration.provenance.recording_sha256
+    assert (folder / "report.html").stat().st_size > 10_000
+    shutil.rmtree(folder)

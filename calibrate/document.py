@@ -168,6 +168,7 @@ def _quality(
         board_scale=None if scale is None else scale.scale,
         robot_systematics="" if solution.systematics is None else solution.systematics.text,
         warnings=[
+            *loaded.losses,
             *([ambiguity] if ambiguity else []),
             *(
                 f"view {i} left out of the lens: {why}"

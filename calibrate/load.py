@@ -16,6 +16,7 @@ from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import is_rigid
 from calibrate.solution import RejectedView
 from calibrate.views import ImageView, ViewSet
+from recordings.errors import BadPictureError
 from recordings.messages import BoardSpec, CameraModel, View
 from recordings.reader import Recording
 
@@ -33,8 +34,11 @@ class LoadedViews:
     board: BoardSpec
     pictures: int
     without_board: tuple[RejectedView, ...]
+    """Also those whose picture cannot be decoded."""
     detections: dict[int, Detection] = field(default_factory=dict)
     """Pose number → what was seen, also where nothing was."""
+    losses: tuple[str, ...] = ()
+    """What the recording once held and does not hold any more."""
 
 
 def load_views(
@@ -49,7 +53,8 @@ def load_views(
 
     `board` and `camera` replace the recorded ones (another size, known intrinsics). The result does not
     depend on the number of `threads`, as long as OpenCV itself uses one thread in each. Raises
-    BadViewsError for pictures or poses that cannot be, TooFewViewsError when fewer than `fewest` show it.
+    BadViewsError for pictures or poses that cannot be, TooFewViewsError when fewer than `fewest` show it. A
+    picture that cannot be decoded costs its own pose only.
     """
     info = recording.info
     spec = board or info.board
@@ -58,13 +63,17 @@ def load_views(
     missing: list[RejectedView] = []
     seen: dict[int, Detection] = {}
     for view, detection in _detect_all(recording, spec, model, progress, threads):
+        if isinstance(detection, BadPictureError):
+            missing.append(RejectedView(view.index, view.name, str(detection), "unreadable-picture"))
+            continue
         seen[view.index] = detection
         if detection.found:
             views.append(_image_view(view, detection, spec))
         else:
             missing.append(RejectedView(view.index, view.name, detection.reason, "corners"))
+    pictures = len(seen) + sum(view.kind == "unreadable-picture" for view in missing)
     if len(views) < fewest:
-        raise TooFewViewsError(_too_few_text(recording, len(views), len(seen), missing, fewest))
+        raise TooFewViewsError(_too_few_text(recording, len(views), pictures, missing, fewest))
     model = CameraModel(
         model.width or next(iter(seen.values())).width,
         model.height or next(iter(seen.values())).height,
@@ -73,7 +82,7 @@ def load_views(
         model.distortion_model,
     )
     found = ViewSet(info.mount, tuple(views), model, info.robot.model)
-    return LoadedViews(found, spec, len(seen), tuple(missing), seen)
+    return LoadedViews(found, spec, pictures, tuple(missing), seen, recording.losses)
 
 
 def _detect_all(
@@ -82,7 +91,7 @@ def _detect_all(
     camera: CameraModel,
     progress: Progress | None,
     threads: int | None,
-) -> Iterator[tuple[View, Detection]]:
+) -> Iterator[tuple[View, Detection | BadPictureError]]:
     """In the order of the views, with at most a few pictures in memory."""
     workers = threads or _available_cores()
     total = len(recording.views())
@@ -107,10 +116,14 @@ def _detect_all(
         pool.shutdown(cancel_futures=True)
 
 
-def _finished(waiting: deque[tuple[View, Future[Detection]]]) -> tuple[View, Detection]:
+def _finished(
+    waiting: deque[tuple[View, Future[Detection]]],
+) -> tuple[View, Detection | BadPictureError]:
     view, future = waiting.popleft()
     try:
         return view, future.result()
+    except BadPictureError as problem:
+        return view, problem
     except ValueError as problem:
         raise BadViewsError(f"view {view.index} ({view.name}): {problem}") from None
 

@@ -43,7 +43,15 @@ class RejectedView:
     name: str
     reason: str
     """One sentence for people."""
-    kind: Literal["turned-board", "wrong-pose", "wrong-square-size", "moved-board", "inconsistent", "corners"]
+    kind: Literal[
+        "turned-board",
+        "wrong-pose",
+        "wrong-square-size",
+        "moved-board",
+        "inconsistent",
+        "corners",
+        "unreadable-picture",
+    ]
 
 
 @dataclass(frozen=True, eq=False)

@@ -44,13 +44,15 @@ def _errors_for_people() -> Iterator[None]:
 
 @main.command()
 def info(recording: Path, json_: Json = False) -> None:
-    """What a recording holds: contents, rates, gaps, clock quality, size."""
+    """What a recording holds: contents, rates, gaps, clock quality, size; 3 when a part is missing."""
     with _errors_for_people():
-        facts = recording_info(open_recording(recording))
+        facts = recording_info(open_recording(recording, incomplete=True))
     if json_:
         print(json.dumps(facts))
     else:
         print_info(facts)
+    if facts["missing"]:
+        raise typer.Exit(3)
 
 
 @main.command("import")
@@ -108,7 +110,7 @@ def recover(
     else:
         for result in results:
             print_recovery(result)
-    raise typer.Exit(3 if any(result.rebuilt for result in results) else 0)
+    raise typer.Exit(3 if any(result.rebuilt or result.missing for result in results) else 0)
 
 
 @contextmanager

@@ -16,8 +16,16 @@ class UnsealedRecordingError(RecordingError):
     """The file was never finished or is cut; `recordings recover` can help."""
 
 
+class MissingPartError(RecordingError):
+    """The session has more parts than are here."""
+
+
 class CorruptRecordingError(RecordingError):
     """The file breaks a rule of the format; the message names the byte offset."""
+
+
+class BadPictureError(CorruptRecordingError):
+    """One picture cannot be decoded; the rest of the recording is proven and can be used without it."""
 
 
 class ImportFolderError(RecordingError):

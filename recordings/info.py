@@ -31,6 +31,8 @@ def recording_info(recording: Recording) -> dict[str, Any]:
         "source": info.source,
         "mount": info.mount,
         "parts": len(recording.parts),
+        "missing": list(recording.missing),
+        "losses": list(recording.losses),
         "size_bytes": sum(part.size_bytes for part in recording.parts),
         "sha256": recording.sha256,
         "created_wall_ns": info.created_wall_ns,

@@ -35,6 +35,10 @@ def _info_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     yield "session", f"{facts['name']}  {facts['source']}  {facts['mount']}  {created:%Y-%m-%d %H:%M} UTC"
     if facts["parts"] > 1:
         yield "parts", str(facts["parts"])
+    for missing in facts["missing"]:
+        yield "[red]MISSING[/red]", missing
+    for loss in facts["losses"]:
+        yield "[yellow]lost[/yellow]", loss
     yield "board", facts["board"]
     known = "intrinsics known" if camera["intrinsics"] else "intrinsics to be found"
     yield (
@@ -68,13 +72,9 @@ def _clock_text(clock: dict[str, float]) -> str:
 
 def print_recovery(result: Recovery) -> None:
     """What `recordings recover` did with one file."""
+    print(result.text)
     if not result.rebuilt:
-        print(f"{result.path}: whole, nothing was lost ({result.poses} poses)")
         return
-    print(
-        f"{result.path}: saved {result.poses} poses, {result.pictures} pictures and "
-        f"{result.robot_states} robot states; {result.lost_bytes} bytes were lost"
-    )
     for loss in result.losses[:_LOSSES_SHOWN]:
         print(f"  lost: {loss}")
     if len(result.losses) > _LOSSES_SHOWN:

@@ -15,12 +15,21 @@ from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
 from recordings.contents import MessageIndex
-from recordings.errors import CorruptRecordingError
+from recordings.errors import BadPictureError, CorruptRecordingError
 from recordings.files import is_attachment_name, is_session_name
+from recordings.manifest import PARTS_LIMIT
 from recordings.messages import CaptureEvent, Picture, RobotState, SessionInfo, View
 from recordings.pictures import PictureError, decode_picture, raw_array
 from recordings.scan import open_file, scan_file
-from recordings.schema import FORMAT, SESSION_RECORDS, PictureFacts, SchemaError, decode, schema_difference
+from recordings.schema import (
+    FORMAT,
+    RECOVERY_RECORD,
+    SESSION_RECORDS,
+    PictureFacts,
+    SchemaError,
+    decode,
+    schema_difference,
+)
 from recordings.topics import Topic, schema_bytes, schema_name
 
 VIEWS_LIMIT = 10_000
@@ -41,6 +50,7 @@ class RecordingPart:
             self._contents, self.sha256 = scan_file(self._descriptor, path)
             self._topics = self._check_channels()
             self.info = self._session_info()
+            self.lost_bytes = self._recovery_loss()
             self.attachments = self._checked_attachments()
             self.media_types = dict(self._contents.media_types)
             self._facts = self._index_pictures(Topic.PICTURE_FACTS)
@@ -78,7 +88,7 @@ class RecordingPart:
         return list(self._facts)
 
     def picture(self, sequence: int) -> Picture:
-        """Decoded; its array is read-only. KeyError when there is no such picture."""
+        """Decoded; its array is read-only. BadPictureError when it cannot be; KeyError when there is none."""
         facts = self._message(Topic.PICTURE_FACTS, self._facts[sequence], PictureFacts)
         compressed = sequence in self._compressed
         topic = Topic.COMPRESSED_IMAGE if compressed else Topic.RAW_IMAGE
@@ -89,7 +99,8 @@ class RecordingPart:
                 raise PictureError(f"is {facts.width}×{facts.height}, the camera {size[0]}×{size[1]}")
             image = self._decoded_image(topic, place, *size)
         except PictureError as error:
-            raise self.corrupt(topic, place, f"picture {sequence} {error}") from error
+            offset = self._topics[topic].offsets[place]
+            raise BadPictureError(f"{self.path} at byte {offset}: picture {sequence} {error}") from error
         image.flags.writeable = False
         return Picture(
             image=image,
@@ -188,9 +199,21 @@ class RecordingPart:
             info = msgspec.json.decode(record.get("session", ""), type=SessionInfo)
         except (msgspec.DecodeError, RecursionError) as error:
             raise self._file_error(f"its description does not fit this version: {error}") from error
-        if not is_session_name(info.name) or info.part < 1:
+        if not is_session_name(info.name) or not 1 <= info.part <= PARTS_LIMIT:
             raise self._file_error(f"its session name '{info.name[:60]}' or part {info.part} is not allowed")
         return info
+
+    @property
+    def recovered(self) -> bool:
+        """Its session did not end with it: the file was cut, and rebuilt."""
+        return RECOVERY_RECORD in self._contents.metadata
+
+    def _recovery_loss(self) -> int:
+        """Bytes that `recordings recover` could not save when it made this file."""
+        stated = self._contents.metadata.get(RECOVERY_RECORD, {}).get("lost_bytes", "0")
+        if not stated.isdecimal() or len(stated) > 18:
+            raise self._file_error(f"it says that '{stated[:20]}' bytes were lost")
+        return int(stated)
 
     def _checked_attachments(self) -> dict[str, bytes]:
         for name in self._contents.attachments:

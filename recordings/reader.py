@@ -7,21 +7,30 @@ from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 
-from recordings.errors import CorruptRecordingError, RecordingError, UnsealedRecordingError
-from recordings.files import EMPTY_SUFFIX, PART_SUFFIX
+from recordings.errors import MissingPartError, RecordingError, UnsealedRecordingError
+from recordings.files import PART_SUFFIX
 from recordings.messages import CaptureEvent, Picture, RobotState, SessionInfo, View
 from recordings.part import RecordingPart
-
-PARTS_LIMIT = 100
+from recordings.session_parts import parts_of_file, parts_of_folder
 
 
 class Recording:
     """A proven recording. Iterators raise CorruptRecordingError at a message wrong in itself."""
 
-    def __init__(self, path: Path, parts: list[RecordingPart]) -> None:
+    def __init__(
+        self,
+        path: Path,
+        parts: list[RecordingPart],
+        missing: tuple[str, ...] = (),
+        losses: tuple[str, ...] = (),
+    ) -> None:
         self.path = path
         self.parts = parts
         """In the order they were recorded."""
+        self.missing = missing
+        """A sentence for each part of the session that should be there and is not."""
+        self.losses = losses
+        """A sentence for everything that recovery could not save, or that nobody can rule out."""
         self._by_number = {part.info.part: part for part in parts}
 
     @property
@@ -79,60 +88,29 @@ class Recording:
         return {name: kind for part in self.parts for name, kind in part.media_types.items()}
 
 
-def open_recording(path: Path) -> Recording:
+def open_recording(path: Path, *, incomplete: bool = False) -> Recording:
     """Reads and proves the whole recording. At most 256 MiB of memory, whatever the file says.
 
     Raises UnsealedRecordingError for one that was never finished or is cut, CorruptRecordingError for one
-    that breaks a rule of the format, RecordingError when there is none.
+    that breaks a rule of the format, MissingPartError when parts of the session are not there (unless
+    `incomplete`: then `missing` names them), RecordingError when there is none.
     """
     path = Path(path)
-    if not path.is_dir():
-        unfinished = path if path.name.endswith(PART_SUFFIX) else path.with_name(path.name + PART_SUFFIX)
-        if unfinished.is_file() and (unfinished == path or not path.exists()):
-            raise UnsealedRecordingError(
-                f"{path} was never finished. Save what is whole: recordings recover {unfinished}"
-            )
-        return Recording(path, [RecordingPart(path)])
-    return Recording(path, _open_parts(path))
+    if path.is_dir():
+        found = parts_of_folder(path)
+        remedy = f"Copy it back beside the others; if it is lost for good: recordings recover {path}"
+    else:
+        _require_finished(path)
+        found = parts_of_file(path)
+        remedy = f"If the other parts are lost for good: recordings recover {path.parent}"
+    if found.missing and not incomplete:
+        raise MissingPartError(f"{'; '.join(found.missing)}. {remedy}")
+    return Recording(path, found.parts, found.missing, found.losses)
 
 
-def _open_parts(folder: Path) -> list[RecordingPart]:
-    names = sorted(entry.name for entry in folder.iterdir())
-    unsealed = [name for name in names if name.endswith(".mcap" + PART_SUFFIX)]
-    if unsealed:
+def _require_finished(path: Path) -> None:
+    unfinished = path if path.name.endswith(PART_SUFFIX) else path.with_name(path.name + PART_SUFFIX)
+    if unfinished.is_file() and (unfinished == path or not path.exists()):
         raise UnsealedRecordingError(
-            f"{folder / unsealed[0]} was never finished. Save what is whole: recordings recover {folder}"
+            f"{path} was never finished. Save what is whole: recordings recover {unfinished}"
         )
-    files = [name for name in names if name.endswith(".mcap")]
-    if not files:
-        raise RecordingError(f"{folder} holds no recording (*.mcap)")
-    if len(files) > PARTS_LIMIT:
-        raise RecordingError(
-            f"{folder} holds {len(files)} recordings: name one of them, or one session's folder"
-        )
-    parts = sorted((RecordingPart(folder / name) for name in files), key=lambda part: part.info.part)
-    _check_one_session(folder, parts, sum(f".part{EMPTY_SUFFIX}" in name for name in names))
-    return parts
-
-
-def _check_one_session(folder: Path, parts: list[RecordingPart], set_aside: int) -> None:
-    """The parts are of one session and none is missing, but for as many as recovery found empty."""
-    first = parts[0].info
-    for before, part in zip([None, *parts], parts, strict=False):
-        info = part.info
-        if (info.name, info.mount, info.board, info.source) != (
-            first.name,
-            first.mount,
-            first.board,
-            first.source,
-        ):
-            raise RecordingError(
-                f"{part.path} and {parts[0].path} are of different sessions: name one of them, not the folder"
-            )
-        if info.camera != first.camera or info.camera_identity.serial != first.camera_identity.serial:
-            raise RecordingError(f"{part.path} was recorded with another camera than {parts[0].path}")
-        set_aside -= info.part - 1 - (before.info.part if before else 0)
-        if set_aside < 0:
-            raise CorruptRecordingError(f"a part before {part.path} of session '{first.name}' is missing")
-        if before and before.info.part == info.part:
-            raise CorruptRecordingError(f"{before.path} and {part.path} are both part {info.part}")

@@ -11,13 +11,14 @@ import msgspec
 from recordings.contents import Contents
 from recordings.errors import CorruptRecordingError, RecordingError, UnsealedRecordingError
 from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, lock, rename_new, sync_folder
+from recordings.manifest import MANIFEST_FILE, give_up_parts, missing_parts, read_manifest
 from recordings.mcap_file import McapFile
-from recordings.messages import View
+from recordings.messages import SessionInfo, View
 from recordings.part import RecordingPart
 from recordings.records import MESSAGE_HEAD, RECORD_HEAD, Opcode, split_records, with_crc
 from recordings.salvage import CompressedError, Salvage, salvage
 from recordings.scan import open_file
-from recordings.schema import SESSION_RECORDS, SchemaError, decode
+from recordings.schema import RECOVERY_RECORD, SESSION_RECORDS, SchemaError, decode
 from recordings.topics import Topic
 
 DAMAGED_SUFFIX = ".damaged"
@@ -46,34 +47,78 @@ class Recovery:
     def rebuilt(self) -> bool:
         return self.kept_original is not None
 
+    @property
+    def missing(self) -> bool:
+        """A part of the session that is not there at all."""
+        return bool(self.losses) and not self.rebuilt
+
+    @property
+    def text(self) -> str:
+        """What became of the file, one line."""
+        if self.missing:
+            return f"{self.path}: {self.losses[0]}"
+        if not self.rebuilt:
+            return f"{self.path}: whole, nothing was lost ({self.poses} poses)"
+        return (
+            f"{self.path}: saved {self.poses} poses, {self.pictures} pictures and {self.robot_states} "
+            f"robot states; {self.lost_bytes} bytes were lost"
+        )
+
 
 def recover(source: Path, output: Path | None = None) -> list[Recovery]:
     """A file, or every file of a session folder. The result is read back strictly before it gets its name.
 
     Without `output` the recovered file takes the recording's name and the damaged one is kept beside it as
-    `.damaged`. Raises RecordingError when another process still writes it or nothing can be saved.
+    `.damaged`. Parts of the session that are not in its folder are given up: reported here, and named by
+    every later reader. Raises RecordingError when another process still writes it or nothing can be saved.
     """
     if source.is_dir():
         if output is not None:
             raise RecordingError("a session folder is recovered in place; leave out the output")
-        files = sorted(p for p in source.iterdir() if p.name.endswith((".mcap", ".mcap" + PART_SUFFIX)))
-        if not files:
-            raise RecordingError(f"{source} holds no recording (*.mcap, *.mcap.part)")
-        return [_recover_part(path) for path in files]
-    return [_recover_file(source, output)]
+        return _recover_session(source)
+    return [_recover_file(source, output)[0]]
 
 
-def _recover_part(source: Path) -> Recovery:
+def _recover_session(folder: Path) -> list[Recovery]:
+    try:
+        files = sorted(p for p in folder.iterdir() if p.name.endswith((".mcap", ".mcap" + PART_SUFFIX)))
+    except OSError as error:
+        raise RecordingError(f"cannot open {folder}: {error.strerror}") from error
+    if not files:
+        raise RecordingError(f"{folder} holds no recording (*.mcap, *.mcap.part)")
+    manifest = read_manifest(folder)
+    done = [_recover_part(path) for path in files]
+    present = {info.part: result.path.name for result, info in done if info is not None}
+    sessions = {info.name for _, info in done if info is not None}
+    results = [result for result, _ in done]
+    if len(sessions) != 1:  # nothing is left, or files of several sessions: nobody knows whose parts lack
+        return results
+    session = sessions.pop()
+    missing = missing_parts(folder, manifest, set(present))
+    if missing:
+        give_up_parts(folder, session, present, missing)
+    return [*results, *(_given_up(folder, part, name) for part, name in missing.items())]
+
+
+def _given_up(folder: Path, part: int, name: str) -> Recovery:
+    reason = (
+        f"part {part} of the session is not in the folder; noted as lost in {MANIFEST_FILE}. "
+        "Should it turn up, put it back here and it is read again"
+    )
+    return Recovery(folder / name, None, 0, 0, 0, 0, (reason,))
+
+
+def _recover_part(source: Path) -> tuple[Recovery, SessionInfo | None]:
     """Of a session: a part that was begun but holds nothing is set aside, the session goes on without it."""
     try:
         return _recover_file(source, None)
     except NothingToSaveError as error:
         aside = _free_name(source.with_name(source.name + EMPTY_SUFFIX))
         rename_new(source, aside)
-        return Recovery(source, aside, 0, 0, 0, aside.stat().st_size, (str(error),))
+        return Recovery(source, aside, 0, 0, 0, aside.stat().st_size, (str(error),)), None
 
 
-def _recover_file(source: Path, output: Path | None) -> Recovery:
+def _recover_file(source: Path, output: Path | None) -> tuple[Recovery, SessionInfo]:
     descriptor = open_file(source)
     try:
         lock(descriptor, source)
@@ -90,7 +135,7 @@ def _recover_file(source: Path, output: Path | None) -> Recovery:
         os.close(descriptor)
 
 
-def _nothing_lost(part: RecordingPart, source: Path, final: Path) -> Recovery:
+def _nothing_lost(part: RecordingPart, source: Path, final: Path) -> tuple[Recovery, SessionInfo]:
     """A file that is whole; at most its last rename was missing."""
     if source.name.endswith(PART_SUFFIX):
         rename_new(source, final)
@@ -101,8 +146,8 @@ def _nothing_lost(part: RecordingPart, source: Path, final: Path) -> Recovery:
 
 def _report(
     path: Path, part: RecordingPart, original: Path | None, lost_bytes: int, losses: tuple[str, ...]
-) -> Recovery:
-    return Recovery(
+) -> tuple[Recovery, SessionInfo]:
+    done = Recovery(
         path=path,
         kept_original=original,
         poses=len({view.index for view in part.views}),
@@ -111,9 +156,10 @@ def _report(
         lost_bytes=lost_bytes,
         losses=losses,
     )
+    return done, part.info
 
 
-def _rebuild(descriptor: int, source: Path, final: Path, in_place: bool) -> Recovery:
+def _rebuild(descriptor: int, source: Path, final: Path, in_place: bool) -> tuple[Recovery, SessionInfo]:
     try:
         found = salvage(descriptor)
     except CompressedError as error:
@@ -209,8 +255,10 @@ def _write(
     contents = found.contents
     for name in SESSION_RECORDS:
         file.metadata(name, session)
-    note = {"lost_bytes": str(found.lost_bytes), "losses": msgspec.json.encode(losses[:100]).decode()}
-    file.metadata("recovery", with_crc(note))
+    before = contents.metadata.get(RECOVERY_RECORD, {}).get("lost_bytes", "0")  # of an earlier recovery
+    lost_bytes = found.lost_bytes + (int(before) if before.isdecimal() else 0)
+    note = {"lost_bytes": str(lost_bytes), "losses": msgspec.json.encode(losses[:100]).decode()}
+    file.metadata(RECOVERY_RECORD, with_crc(note))
     for name, data in contents.attachments.items():
         file.attachment(name, contents.media_types[name], data, 0)
     numbers: dict[int, int] = {}

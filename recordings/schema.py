@@ -21,6 +21,8 @@ from recordings.messages import CaptureEvent, RobotState, Stamps, Stillness, Vie
 FORMAT = "station-recording/1"
 SESSION_RECORDS = ("session", "session-copy")
 """Metadata records with the SessionInfo: twice, because nothing can be saved from a file without it."""
+RECOVERY_RECORD = "recovery"
+"""Metadata record of a rebuilt file: what was lost."""
 PACKAGE = "station"
 _FILE = "station/recording.proto"
 _MATRIX_COLUMNS = 4

@@ -246,7 +246,9 @@ def _views(job: SolvedRecording) -> Iterator[str]:
     cells = []
     for view in job.recording.views()[:_PICTURES_LIMIT]:
         detection = job.loaded.detections.get(view.index)
-        found = detection.pixels if detection is not None else np.zeros((0, 2))
+        if detection is None:  # its picture cannot be decoded: the table above says so
+            continue
+        found = detection.pixels
         jpeg = drawn_view(
             job.recording.picture(view).image, found, modelled.get(view.index, (found, None))[1]
         )

@@ -15,6 +15,7 @@ import numpy as np
 
 from recordings.errors import RecordingError
 from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, require_free_space
+from recordings.manifest import enter_part, read_manifest
 from recordings.messages import CameraModel, CaptureEvent, Picture, RobotState, SessionInfo, Stamps, View
 from recordings.recorder import Recorder
 from station.cell import Cell
@@ -71,8 +72,10 @@ class SessionRecording:
         return any(self.folder.glob(f"*.mcap{PART_SUFFIX}"))
 
     def count_parts(self) -> None:
-        """The next part follows those that are whole, and those that recovery found empty."""
-        self.part = 1 + len([*self.folder.glob("*.mcap"), *self.folder.glob(f"*.mcap*{EMPTY_SUFFIX}")])
+        """The next part follows those that are whole, and those that are empty or lost. RecordingError."""
+        files = len([*self.folder.glob("*.mcap"), *self.folder.glob(f"*.mcap*{EMPTY_SUFFIX}")])
+        manifest = read_manifest(self.folder)
+        self.part = 1 + max([files, *(manifest.parts if manifest else [])])
 
     @property
     def whole(self) -> Path:
@@ -114,6 +117,11 @@ class SessionRecording:
         )
         path = part_path(self.folder, self.part)
         recorder = Recorder(path, info, lossless_png=config.capture.lossless_png)
+        try:
+            enter_part(self.folder, info.name, info.part, path.name)
+        except RecordingError:
+            recorder.close()
+            raise
         recorder.attach("plan.yaml", "application/yaml", msgspec.yaml.encode(plan))
         recorder.attach("config.yaml", "application/yaml", self._cell.config_yaml)
         recorder.attach("camera.json", "application/json", msgspec.json.encode(settings))

@@ -206,7 +206,7 @@ async def recover_parts(bench: Bench, recording: SessionRecording) -> None:
     await recording.released()
     if recording.unsealed_parts:
         for found in await bench.workers.call(recover, recording.folder):
-            bench.store.event(f"recovered {found.path}: {found.poses} poses, {found.lost_bytes} bytes lost")
+            bench.store.event(f"recovered {found.text}")
     recording.count_parts()
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recordings.errors import CorruptRecordingError, RecordingError
+from recordings.errors import CorruptRecordingError, MissingPartError, RecordingError
 from recordings.messages import CameraIdentity, CameraModel
 from recordings.reader import open_recording
 from recordings.recover import recover
@@ -56,17 +56,19 @@ def test_a_pose_taken_again_after_a_resume_supersedes_whatever_its_attempt(tmp_p
     assert [(v.part, v.attempt) for v in open_recording(tmp_path).views()] == [(2, 1)]
 
 
-def test_a_missing_part_is_noticed(tmp_path: Path) -> None:
+def test_a_gap_between_parts_is_noticed_without_a_list(tmp_path: Path) -> None:
     write_part(tmp_path / "session.mcap", [(0, 1)])
     write_part(tmp_path / "session-3.mcap", [(2, 1)], part=3)
-    with pytest.raises(CorruptRecordingError, match=r"a part before .*session-3\.mcap .* is missing"):
+    with pytest.raises(MissingPartError, match=r"lacks part 2 of session 'test-cell'.*recordings recover"):
         open_recording(tmp_path)
 
 
-def test_a_lone_second_part_in_a_folder_is_noticed(tmp_path: Path) -> None:
-    write_part(tmp_path / "session-2.mcap", [(0, 1)], part=2)
-    with pytest.raises(CorruptRecordingError, match="is missing"):
+def test_a_lone_second_part_is_noticed_as_folder_and_as_file(tmp_path: Path) -> None:
+    path = write_part(tmp_path / "session-2.mcap", [(0, 1)], part=2)
+    with pytest.raises(MissingPartError, match="lacks part 1"):
         open_recording(tmp_path)
+    with pytest.raises(MissingPartError, match=r"is part 2 of at least 2 .* give the session's folder"):
+        open_recording(path)
 
 
 def test_the_same_part_twice_is_noticed(tmp_path: Path) -> None:

@@ -11,6 +11,7 @@ from typer.testing import CliRunner, Result
 
 from recordings.cli import main
 from recordings.info import recording_info
+from recordings.manifest import enter_part
 from recordings.messages import Stamps
 from recordings.reader import open_recording
 from recordings.writer import RecordingWriter
@@ -121,6 +122,29 @@ def test_recover_json_lists_what_was_lost(tmp_path: Path) -> None:
     (report,) = json.loads(result.stdout)
     assert report["lost_bytes"] > 0
     assert report["losses"][0].startswith("bytes ")
+
+
+def test_a_missing_part_is_shown_by_info_and_given_up_by_recover(tmp_path: Path) -> None:
+    for part in (1, 2):
+        write_small(tmp_path / f"session-{part}.mcap", info=make_info(part=part))
+        enter_part(tmp_path, "test-cell", part, f"session-{part}.mcap")
+    (tmp_path / "session-2.mcap").unlink()
+    shown = run("info", tmp_path)
+    assert shown.exit_code == 3
+    assert "MISSING" in shown.output
+    assert "lacks part 2 (session-2.mcap)" in " ".join(shown.output.split())
+    assert "3 poses" in shown.output
+    assert json.loads(run("info", tmp_path, "--json").stdout)["missing"] != []
+    refused = run("excerpt", tmp_path, "-o", tmp_path / "b.mcap")
+    assert refused.exit_code == 1
+    assert f"recordings recover {tmp_path}" in refused.stderr
+    given_up = run("recover", tmp_path)
+    assert given_up.exit_code == 3
+    assert "session-2.mcap: part 2 of the session is not in the folder" in given_up.output
+    assert "damaged file is kept" not in given_up.output
+    afterwards = run("info", tmp_path)
+    assert afterwards.exit_code == 0
+    assert "part 2 of the session was lost" in afterwards.output
 
 
 def test_unknown_options_and_no_arguments_are_usage_errors() -> None:

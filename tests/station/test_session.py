@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from recordings.errors import RecordingError
+from recordings.errors import MissingPartError, RecordingError
 from recordings.reader import open_recording
 from station.errors import LimitError, RefusedError, RobotError, SafetyStopError
 from station.plan.model import Plan
@@ -394,6 +394,10 @@ async def test_a_session_cut_by_a_crash_waits_for_a_person_and_goes_on_in_a_new_
     recording = sealed(second)
     assert [view.index for view in recording.views()] == list(range(POSES))
     assert second.arm.log.count("move") == POSES - 1
+    assert recording.missing == ()
+    (recording.path / "session-2.mcap").unlink()
+    with pytest.raises(MissingPartError, match=r"lacks part 2 \(session-2\.mcap\)"):
+        open_recording(recording.path)
 
 
 def crash(rig: Rig) -> None:

@@ -1,0 +1,109 @@
+"""What a recording lacks: one picture costs its own pose, a lost part of the session is never passed over."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from calibrate.errors import TooFewViewsError
+from calibrate.load import load_views
+from calibrate.pipeline import solve_recording
+from calibrate.report.page import report_page
+from recordings.errors import CorruptRecordingError, MissingPartError
+from recordings.manifest import enter_part
+from recordings.pictures import encode_png
+from recordings.reader import Recording, open_recording
+from recordings.recover import recover
+from recordings.writer import RecordingWriter
+
+Damage = Callable[[bytes], bytes]
+
+
+def copied(
+    source: Recording, path: Path, poses: range, part: int = 1, damaged: dict[int, Damage] | None = None
+) -> Path:
+    """Some poses in a part of their own, as PNG; the bytes of some pictures changed on the way."""
+    with RecordingWriter(path, msgspec.structs.replace(source.info, part=part)) as writer:
+        for sequence, (view, picture) in enumerate(source.pictures()):
+            if sequence not in poses:
+                continue
+            encoded = (damaged or {}).get(sequence, bytes)(encode_png(picture.image))
+            writer.picture(picture, encoded=encoded)
+            writer.view(msgspec.structs.replace(view, part=1))
+        return writer.finish()
+
+
+@pytest.fixture
+def source(real_session_file: Path) -> Recording:
+    return open_recording(real_session_file)
+
+
+def larger(data: bytes) -> bytes:
+    """The header promises 30000×30000."""
+    return data[:16] + (30_000).to_bytes(4, "big") * 2 + data[24:]
+
+
+def test_a_picture_that_cannot_be_decoded_costs_its_own_pose_only(source: Recording, tmp_path: Path) -> None:
+    damaged: dict[int, Damage] = {
+        3: lambda data: data[: len(data) // 2],
+        7: lambda data: data[:5000] + bytes([data[5000] ^ 1]) + data[5001:],
+    }
+    path = copied(source, tmp_path / "a.mcap", range(14), damaged=damaged)
+    loaded = load_views(open_recording(path))
+    assert [view.index for view in loaded.views] == [n for n in range(14) if n not in (3, 7)]
+    assert [(view.index, view.kind) for view in loaded.without_board] == [
+        (3, "unreadable-picture"),
+        (7, "unreadable-picture"),
+    ]
+    assert "picture 3 the PNG is cut" in loaded.without_board[0].reason
+    assert "picture 7 the PNG is damaged (checksum" in loaded.without_board[1].reason
+    assert loaded.pictures == 14
+    job = solve_recording(path)
+    assert [rejected.index for rejected in job.calibration.views.rejected] == [3, 7]
+    assert "the PNG is cut" in report_page(job)
+
+
+def test_a_picture_of_impossible_size_is_refused_before_decoding(source: Recording, tmp_path: Path) -> None:
+    """Fault 36. The writer refuses such bytes, so the header is changed after it looked."""
+    path = copied(source, tmp_path / "a.mcap", range(3))
+    original = encode_png(next(source.pictures())[1].image)
+    recording = open_recording(path)
+    part = recording.parts[0]
+    stored = part._image_message
+
+    def lying(*place: object) -> object:
+        message = stored(*place)  # type: ignore[arg-type]
+        if message.data == original:
+            message.data = larger(message.data)
+        return message
+
+    part._image_message = lying  # type: ignore[method-assign]
+    with pytest.raises(TooFewViewsError, match=r"First reason, view 0 .* impossible size 30000×30000"):
+        load_views(recording)
+
+
+def test_a_damaged_container_is_refused_whole(source: Recording, tmp_path: Path) -> None:
+    path = copied(source, tmp_path / "a.mcap", range(6))
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data)
+    with pytest.raises(CorruptRecordingError, match=r"checksum .* recordings recover"):
+        solve_recording(path)
+
+
+def test_a_lost_part_is_never_passed_over(source: Recording, tmp_path: Path) -> None:
+    for part, poses in ((1, range(10)), (2, range(10, 14))):
+        copied(source, tmp_path / f"session-{part}.mcap", poses, part)
+        enter_part(tmp_path, source.info.name, part, f"session-{part}.mcap")
+    assert solve_recording(tmp_path).calibration.quality.warnings == []
+    (tmp_path / "session-2.mcap").unlink()
+    for path in (tmp_path, tmp_path / "session-1.mcap"):
+        with pytest.raises(MissingPartError, match=f"recordings recover {tmp_path}"):
+            solve_recording(path)
+    recover(tmp_path)
+    job = solve_recording(tmp_path)
+    assert job.calibration.quality.warnings == ["part 2 of the session was lost"]
+    assert len(job.calibration.views.used) == 10

@@ -104,6 +104,15 @@ class LimitsConfig(Section, frozen=True):
     board_clearance_m: float = 0.10
 
 
+class PointerConfig(Section, frozen=True):
+    """A rod or tool on the flange whose tip a person brings onto a corner (`station verify`); in `flange`."""
+
+    tip_m: Vector3
+    along: Vector3 = (0.0, 0.0, 1.0)
+    """Where it points to."""
+    radius_m: float = 0.01
+
+
 class StillnessConfig(Section, frozen=True):
     window_s: float = 0.3
     joint_speed_rad_s: float = 0.002
@@ -138,6 +147,8 @@ class StationConfig(Section, frozen=True):
     stillness: StillnessConfig = StillnessConfig()
     capture: CaptureConfig = CaptureConfig()
     working_distance_m: float = 0.5
+    pointer: PointerConfig | None = None
+    """None = the pendant's tool centre point, along its z axis."""
 
 
 PAPER_BOARD = BoardSpec(kind=BoardKind.CHESSBOARD, columns=7, rows=6, square_m=0.025)

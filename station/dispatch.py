@@ -16,6 +16,7 @@ from station.plan.model import Plan, PlannedPose
 from station.protocol import Verb
 from station.session.checklist import checklist
 from station.session.folder import list_sessions
+from station.session.hovering import HoverRequest
 from station.session.recording import software
 from station.session.session import Session
 from station.states import refusal
@@ -116,7 +117,7 @@ class SessionDispatcher:
         self._session = session
         self._callers: dict[int, _Caller] = {}
         self._leaving: set[asyncio.Task[None]] = set()
-        self._table: dict[Verb, tuple[type[_Args], Callable[[_Caller, Any], Awaitable[Any]]]] = {
+        self._table: dict[Verb, tuple[type[msgspec.Struct], Callable[[_Caller, Any], Awaitable[Any]]]] = {
             "hello": (_Hello, self._hello),
             "lease": (_Lease, self._lease),
             "acknowledge": (_Args, self._acknowledge),
@@ -124,6 +125,7 @@ class SessionDispatcher:
             "load_plan": (_LoadPlan, self._load_plan),
             "make_plan": (_MakePlan, self._make_plan),
             "prepare": (_Prepare, self._prepare),
+            "hover": (HoverRequest, self._hover),
             "go": (_Go, self._go),
             "pause": (_Args, self._pause),
             "finish": (_Args, self._finish),
@@ -173,7 +175,8 @@ class SessionDispatcher:
 
     async def _hello(self, caller: _Caller, args: _Hello) -> Any:
         caller.introduce(args.who, args.interactive)
-        return {"version": software()["calibration-station"], "pid": os.getpid()}
+        root = str(self._session.bench.root)
+        return {"version": software()["calibration-station"], "pid": os.getpid(), "root": root}
 
     async def _lease(self, caller: _Caller, args: _Lease) -> Any:
         if args.action == "take":
@@ -202,6 +205,11 @@ class SessionDispatcher:
 
     async def _prepare(self, caller: _Caller, args: _Prepare) -> Any:
         return await self._session.prepare(caller.client_id, args.purpose, args.index)
+
+    async def _hover(self, caller: _Caller, args: HoverRequest) -> Any:
+        if not (self._session.bench.cell.simulated or caller.interactive):
+            raise RefusedError("a real arm hovers over the board only with a person at the screen")
+        return await self._session.prepare_hover(caller.client_id, args)
 
     async def _go(self, caller: _Caller, args: _Go) -> None:
         cell, queue = self._session.bench.cell, self._session.bench.queue

@@ -6,7 +6,7 @@
                       └── acknowledge ── stopped, fault          paused <─────────────┘
 
 The only way into `moving` from rest is a go, through `checking`; the only ways out of `stopped` and `fault`
-are a person's acknowledgement and, from `fault`, STOP.
+are a person's acknowledgement and, from `fault`, STOP. A verification hover goes from `moving` to `idle`.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ TRANSITIONS: dict[S, frozenset[S]] = {
     S.DISCONNECTED: frozenset({S.IDLE, S.PAUSED}) | _STOPS,
     S.IDLE: frozenset({S.CHECKING, S.FREE_DRIVE, S.DISCONNECTED}) | _STOPS,
     S.CHECKING: frozenset({S.MOVING, S.IDLE, S.PAUSED}) | _STOPS,
-    S.MOVING: frozenset({S.SETTLING, S.PAUSED}) | _STOPS,
+    S.MOVING: frozenset({S.SETTLING, S.PAUSED, S.IDLE}) | _STOPS,
     S.SETTLING: frozenset({S.CAPTURING, S.MOVING, S.PAUSED, S.SEALING, S.FREE_DRIVE}) | _STOPS,
     S.CAPTURING: frozenset({S.WRITING, S.SETTLING, S.MOVING, S.PAUSED, S.SEALING, S.FREE_DRIVE}) | _STOPS,
     S.WRITING: frozenset({S.SETTLING, S.MOVING, S.PAUSED, S.SEALING, S.FREE_DRIVE}) | _STOPS,
@@ -46,6 +46,7 @@ VERB_STATES: dict[Verb, frozenset[S]] = {
     "load_plan": frozenset({S.IDLE, S.DISCONNECTED}),
     "make_plan": frozenset({S.IDLE, S.DISCONNECTED}),
     "prepare": _RESTING,
+    "hover": _RESTING,
     "go": _RESTING,
     "pause": RUNNING,
     "finish": RUNNING | {S.PAUSED, S.FREE_DRIVE},

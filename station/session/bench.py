@@ -2,19 +2,23 @@
 
 from __future__ import annotations
 
+import contextlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.geometry import Array
+from recordings.errors import RecordingError
+from recordings.messages import RobotState
 from station.cell import Cell
 from station.collision import CellGeometry
 from station.session.queue import PoseQueue
 from station.session.recording import SessionRecording
 from station.session.store import StatusStore
-from station.status import SessionStatus
+from station.status import Event, SessionStatus
 from station.stillness import StillnessMonitor
 from station.workers import Workers
 
@@ -57,6 +61,22 @@ class Bench:
     def require_recording(self) -> SessionRecording:
         assert self.recording is not None
         return self.recording
+
+    def record_state(self, state: RobotState) -> None:
+        """Every sample of the arm, while a recording is open; from the reader's thread."""
+        if (recording := self.recording) is not None:
+            recording.robot_state(state)
+
+    def record_event(self, event: Event) -> None:
+        if self.recording is not None:
+            with contextlib.suppress(RecordingError):
+                self.recording.event(event)
+
+    def forget_session(self) -> None:
+        """What is shown of the session before ends when the next one begins."""
+        self.seen.clear()
+        session = self.store.status.session
+        self.store.update(session=msgspec.structs.replace(session, name="", folder="", recording=""))
 
     def show_poses(self, current: int | None = None) -> None:
         """Brings the status up to date with the queue and the recording."""

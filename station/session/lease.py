@@ -10,6 +10,7 @@ import numpy as np
 
 from recordings.messages import Vector6
 from station.errors import RefusedError
+from station.plan.hover import Hover
 from station.status import GoSummary, Lease
 
 GO_LIFETIME_S = 120.0
@@ -59,6 +60,8 @@ class Go:
     start_joints_rad: Vector6
     poses: tuple[int, ...]
     """Pose numbers it covers, in order; more may not be driven to with it."""
+    hover: Hover | None = None
+    """A way over one corner of the board instead of poses of the plan."""
 
 
 class GoDesk:
@@ -76,9 +79,16 @@ class GoDesk:
     def new_token() -> str:
         return secrets.token_urlsafe(16)
 
-    def offer(self, summary: GoSummary, client_id: int, start: Vector6, poses: tuple[int, ...]) -> Go:
+    def offer(
+        self,
+        summary: GoSummary,
+        client_id: int,
+        start: Vector6,
+        poses: tuple[int, ...],
+        hover: Hover | None = None,
+    ) -> Go:
         """An older one is void."""
-        self._waiting = Go(summary, client_id, self._clock() + GO_LIFETIME_S, start, poses)
+        self._waiting = Go(summary, client_id, self._clock() + GO_LIFETIME_S, start, poses, hover)
         return self._waiting
 
     def void(self) -> bool:
@@ -95,7 +105,7 @@ class GoDesk:
             raise RefusedError(f"this go is older than {GO_LIFETIME_S:.0f} s: prepare again and confirm")
         if go.client_id != client_id:
             raise RefusedError("this go was asked for by another client: prepare again and confirm")
-        if go.summary.plan_sha256 != plan_sha256:
+        if go.hover is None and go.summary.plan_sha256 != plan_sha256:  # a hover carries its own plan
             raise RefusedError("the plan changed since this go was asked for: prepare again and confirm")
         moved_rad = float(np.abs(np.subtract(joints_rad, go.start_joints_rad)).max())
         if moved_rad > START_TOLERANCE_RAD:

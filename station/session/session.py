@@ -13,18 +13,18 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import msgspec
-
 from recordings.errors import RecordingError
 from station.analysis import plan_poses
 from station.cell import Cell
 from station.errors import RefusedError, RobotError, StationError
+from station.plan.hover import Hover
 from station.plan.model import Plan
 from station.plan.scene import cell_geometry
 from station.session.bench import Bench
 from station.session.estimate import Estimator
 from station.session.free_drive import FreeDrive
 from station.session.guard import Guard
+from station.session.hovering import HoverDesk, HoverRequest, HoverRun
 from station.session.interrupted import close_interrupted, find_interrupted
 from station.session.keeper import Keeper
 from station.session.lease import GoDesk, LeaseDesk
@@ -35,7 +35,7 @@ from station.session.run import Run, seal, unmark_busy
 from station.session.store import StatusStore
 from station.session.summary import poses_to_drive, summarise
 from station.states import RUNNING, refusal
-from station.status import GoSummary, Lease, StationState, StationStatus
+from station.status import GoSummary, HoverOffer, Lease, StationState, StationStatus
 from station.stillness import StillnessMonitor
 from station.workers import Workers
 
@@ -47,16 +47,12 @@ class Session:
     """Knows devices through `cell`, and nothing of sockets and screens."""
 
     def __init__(self, cell: Cell, root: Path, ticked: Callable[[], None] = lambda: None) -> None:
-        geometry = cell_geometry(cell.config)
+        config, playback = cell.config, cell.source == "playback"
+        geometry = cell_geometry(config)
         self.store = StatusStore(
-            StationStatus(
-                simulated=cell.simulated,
-                playback=cell.source == "playback",
-                cell=cell.config.name,
-                mount=cell.config.mount,
-            )
+            StationStatus(simulated=cell.simulated, playback=playback, cell=config.name, mount=config.mount)
         )
-        monitor = StillnessMonitor(geometry.model, cell.config.stillness)
+        monitor = StillnessMonitor(geometry.model, config.stillness)
         self.bench = Bench(cell, geometry, self.store, Workers(), monitor, root)
         self.leases = LeaseDesk()
         self._goes = GoDesk(time.monotonic)
@@ -67,13 +63,14 @@ class Session:
         self._estimator = Estimator(self.bench)
         self.previews = Previewer(self.bench)
         self.free_drive = FreeDrive(self.bench)
+        self._hovers = HoverDesk(self.bench)
         self._run: asyncio.Task[None] | None = None
         self._tasks: list[asyncio.Task[None]] = []
         self._saving: asyncio.Task[None] | None = None
         self._notes: tuple[str, ...] = ()
         cell.robot.subscribe(monitor.add)
-        cell.robot.subscribe(self._record_state)
-        self.store.on_event(self._record_event)
+        cell.robot.subscribe(self.bench.record_state)
+        self.store.on_event(self.bench.record_event)
         self.store.watch(self._estimator.poke)
         self._logbook = Logbook(lambda: self.bench.recording)
 
@@ -157,9 +154,7 @@ class Session:
         """Checks the whole way from where the arm is and offers a one-use go for it."""
         self.leases.require(client_id)
         self._require("prepare")
-        if self._run is not None and not self._run.done():
-            # It is sealed and shown; its control process may take a moment more to end.
-            await asyncio.wait({self._run}, timeout=END_RUN_S)
+        await self._run_ended()  # it is sealed and shown; its control process may take a moment more
         if purpose == "run" and self.bench.recording is None and self.bench.queue is not None:
             self.bench.queue = PoseQueue(self.bench.queue.plan)
             self.bench.show_poses()
@@ -167,14 +162,32 @@ class Session:
         self._void_go()
         voids = self._voids
         summary = await summarise(self.bench, purpose, poses, self._notes)
+        self._offer(client_id, voids, summary, poses)
+        return summary
+
+    async def prepare_hover(self, client_id: int, request: HoverRequest) -> HoverOffer:
+        """Offers a one-use go for a slow way to a place over a corner of the board."""
+        self.leases.require(client_id)
+        self._require("hover")
+        self._require_no_session()
+        await self._run_ended()
+        self._void_go()
+        voids = self._voids
+        hover, offer = await self._hovers.prepare(request)
+        self._offer(client_id, voids, offer.go, (), hover)
+        return offer
+
+    def _offer(
+        self, client_id: int, voids: int, go: GoSummary, poses: tuple[int, ...], hover: Hover | None = None
+    ) -> None:
+        """RefusedError when something happened while the way was checked."""
         self._require("prepare")
         self.leases.require(client_id)
         if self._voids != voids:
             raise RefusedError("something changed while the way was checked: prepare again")
-        assert summary.start_joints_rad is not None
-        self._goes.offer(summary, client_id, summary.start_joints_rad, poses)
-        self.store.update(go=summary)
-        return summary
+        assert go.start_joints_rad is not None
+        self._goes.offer(go, client_id, go.start_joints_rad, poses, hover)
+        self.store.update(go=go)
 
     def go(self, client_id: int, token: str) -> None:
         """The person's yes to exactly that summary. RefusedError when anything changed since."""
@@ -182,22 +195,21 @@ class Session:
         self._require("go")
         if self._run is not None and not self._run.done():
             raise RefusedError("the last run is still ending: try again in a moment")
-        queue = self.bench.require_queue()
         joints = self.bench.cell.robot.latest().joints_rad
+        queue = self.bench.queue
         try:
-            go = self._goes.redeem(token, client_id, queue.sha256, joints)
+            go = self._goes.redeem(token, client_id, queue.sha256 if queue else "", joints)
         finally:
             self.store.update(go=None)
         self._notes = ()
         self.bench.halting = False
         self.bench.pause_wanted, self.bench.finish_wanted = "", False
-        if self.bench.recording is None:
-            self.bench.seen.clear()
-            session = self.store.status.session
-            self.store.update(session=msgspec.structs.replace(session, name="", folder="", recording=""))
+        if self.bench.recording is None and go.hover is None:
+            self.bench.forget_session()
         self.store.enter(StationState.CHECKING)
         self.store.event(f"go by {self.leases.lease.holder}: {go.summary.purpose}")
-        self._run = asyncio.create_task(Run(self.bench, go).drive())
+        run = Run(self.bench, go) if go.hover is None else HoverRun(self.bench, go, go.hover)
+        self._run = asyncio.create_task(run.drive())
 
     def pause(self, who: str) -> None:
         """After this pose. Anyone may: it only ever makes the arm do less."""
@@ -277,14 +289,12 @@ class Session:
 
     def _require_no_session(self) -> None:
         if self.bench.recording is not None:
-            raise RefusedError("a session is open: finish it before another plan is loaded")
+            raise RefusedError("a session is open: finish it first")
 
     def _replace_plan(self, plan: Plan) -> None:
         self._void_go()
         self.bench.queue = PoseQueue(plan)
-        self.bench.seen.clear()
-        session = self.store.status.session
-        self.store.update(session=msgspec.structs.replace(session, name="", folder="", recording=""))
+        self.bench.forget_session()
         self.bench.show_poses()
         self.store.event(f"plan of {len(plan.poses)} poses loaded")
 
@@ -320,7 +330,6 @@ class Session:
 
     @property
     def troubles(self) -> dict[str, str]:
-        """Device → why it is not there."""
         return self._keeper.troubles
 
     # -- inside ------------------------------------------------------------------------------------------
@@ -339,12 +348,3 @@ class Session:
         self._notes = (f"the arm was moved by {how_far} since the pause",)
         self._void_go()
         self.store.event(text, "warning")
-
-    def _record_state(self, state: Any) -> None:
-        if (recording := self.bench.recording) is not None:
-            recording.robot_state(state)
-
-    def _record_event(self, event: Any) -> None:
-        if self.bench.recording is not None:
-            with contextlib.suppress(RecordingError):
-                self.bench.recording.event(event)

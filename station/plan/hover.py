@@ -1,0 +1,312 @@
+"""Where the flange must go so that the pointer stands over a corner of the board, and the way there.
+
+A check of a calibration that needs no mathematics to believe: the tip stands where the calibration says the
+corner is, a safe way above it; a person guides it down by hand and sees how far off it is. The station itself
+never brings anything nearer to the board than 50 mm.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+
+from calibrate.board import board_points
+from calibrate.board_now import locate_board, offset_covariance
+from calibrate.calibration import Calibration
+from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
+from calibrate.kinematics import RobotModel, forward, inverse_all, jacobian
+from calibrate.views import ImageView
+from recordings.messages import BoardSpec, Vector6
+from station.collision import CellGeometry, margins, plate
+from station.config import Capsule, PointerConfig, StationConfig
+from station.errors import LimitError
+from station.limits import PlanCheck, check_plan
+from station.plan.model import Plan, PlannedPose
+from station.plan.scene import board_extent, geometry_of
+
+CLEARANCE_M = 0.05
+"""Nothing that moves comes nearer to the board, on the way or at the end."""
+SPEED_M_S = 0.05
+APPROACH_M = 0.15
+"""The arm comes from here, along the board's normal, and leaves the same way."""
+_ACCELERATION_RAD_S2 = 0.3
+_PLATE_RODS = 41
+_PLATE_M = 0.005
+"""The board as the checks see it is at least this thick on both sides."""
+_CHECKED_M = 0.005
+"""Half of what the path check takes off every margin (limits.SPACING_M)."""
+_DOUBT_SIGMAS = 3.0
+_ROLLS = 24
+_SAME_POSTURE_RAD = 1.0
+"""Straight down turns no joint further than this; more means another posture of the arm."""
+_TRIED_WAYS = 60
+
+
+@dataclass(frozen=True, eq=False)
+class Hover:
+    """One way to one place over the board; what a go for it is bound to."""
+
+    plan: Plan
+    check: PlanCheck
+    geometry: CellGeometry
+    corner: int
+    standoff_m: float
+    base_from_board: Array
+    outward: Array
+    """(3,) unit normal in `board`, to the side that the camera sees."""
+
+    def tip_in_board_m(self, base_from_flange: Array, pointer: PointerConfig) -> Array:
+        """(3,) where the tip is when the flange is there."""
+        return board_from_tip(self.base_from_board, base_from_flange, pointer)
+
+
+def board_from_tip(base_from_board: Array, base_from_flange: Array, pointer: PointerConfig) -> Array:
+    """The tip (3,) in `board`, metres."""
+    tip = transform_points(base_from_flange, np.array(pointer.tip_m))
+    return transform_points(inverse(base_from_board), tip)
+
+
+def least_standoff_m(doubt_m: float) -> float:
+    """Smallest standoff of the tip; `doubt_m`: how far board and tip may be off, all told."""
+    return CLEARANCE_M + _PLATE_M + _CHECKED_M + doubt_m
+
+
+def outer_corners(board: BoardSpec) -> tuple[int, ...]:
+    """The four points nearest to the board's own corners: rows of `board_points`."""
+    points = board_points(board)[:, :2]
+    scores = points @ np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]).T
+    return tuple(dict.fromkeys(int(row) for row in scores.argmin(axis=0)))
+
+
+def hover_target(
+    base_from_board: Array,
+    corner_m: Array,
+    outward: Array,
+    standoff_m: float,
+    pointer: PointerConfig,
+    roll: float,
+) -> Array:
+    """base_from_flange (4, 4): the tip `standoff_m` above the corner, the pointer along the normal.
+
+    `corner_m`, `outward` (3,) in `board`; `roll` (rad) about the pointer is free.
+    """
+    down = -base_from_board[:3, :3] @ outward
+    along = np.array(pointer.along) / np.linalg.norm(pointer.along)
+    R = rotation_exp(roll * down) @ _turn(along, down)
+    tip = transform_points(base_from_board, corner_m + standoff_m * outward)
+    return pose(R, tip - R @ np.array(pointer.tip_m))
+
+
+def _turn(start: Array, end: Array) -> Array:
+    """A rotation (3, 3) that brings one unit vector onto another."""
+    axis, cosine = np.cross(start, end), float(start @ end)
+    sine = float(np.linalg.norm(axis))
+    if sine < 1e-9:
+        if cosine > 0:
+            return np.eye(3)
+        axis = np.linalg.svd(start[None])[2][2]  # any axis across serves for half a turn
+        return rotation_exp(np.pi * axis)
+    return rotation_exp(axis / sine * np.arctan2(sine, cosine))
+
+
+def plan_hover(
+    config: StationConfig,
+    X: Array,
+    base_from_board: Array,
+    outward: Array,
+    corner: int,
+    standoff_m: float,
+    doubt_m: float,
+    pointer: PointerConfig,
+    start_joints_rad: Vector6,
+) -> Hover:
+    """The shortest free way over a corner, from where the arm stands. LimitError says what is in the way.
+
+    X: flange_from_camera or base_from_camera of the calibration. Two moves: to a point `APPROACH_M` over the
+    corner, then straight down the normal to the standoff.
+    """
+    least_m = least_standoff_m(doubt_m)
+    if not standoff_m >= least_m:
+        raise LimitError(
+            f"{1000 * standoff_m:.0f} mm above the board is too near: {1000 * CLEARANCE_M:.0f} mm are kept "
+            f"whatever is uncertain, so the tip stays at least {np.ceil(1000 * least_m):.0f} mm away "
+            "(--standoff-mm); the rest is done by hand"
+        )
+    geometry = hover_geometry(config, X, base_from_board, doubt_m, pointer)
+    point = board_points(config.board)[corner]
+    refused: PlanCheck | None = None
+    ways = _ways(geometry.model, base_from_board, point, outward, standoff_m, pointer, start_joints_rad)
+    free = _free_ends(geometry, ways)
+    for high, low in free[:_TRIED_WAYS] or ways[:1]:
+        plan = _plan(config, geometry.model, corner, high, low)
+        check = check_plan(plan, start_joints_rad, geometry)
+        if not check.problems:
+            return Hover(plan, check, geometry, corner, standoff_m, base_from_board, outward)
+        refused = refused or check
+    where = f"corner {corner} with the tip {1000 * standoff_m:.0f} mm above it"
+    if refused is None:
+        raise LimitError(f"{where} is out of the arm's reach; choose another corner, or move the board")
+    problems = "\n".join(str(problem) for problem in refused.problems[:4])
+    raise LimitError(f"no way to {where} is free; nothing moved. The shortest one:\n{problems}")
+
+
+def hover_geometry(
+    config: StationConfig, X: Array, base_from_board: Array, doubt_m: float, pointer: PointerConfig
+) -> CellGeometry:
+    """The cell with the board where it was just seen, the pointer on the flange, and slow limits."""
+    low, high = board_extent(config.board)
+    if config.mount == "eye-in-hand":
+        cell = geometry_of(config, X, base_from_board, 0.0)
+        others: tuple[Capsule, ...] = ()
+    else:
+        cell = geometry_of(config, X, None, 0.0)
+        others = cell.obstacles
+    along = np.array(pointer.along) / np.linalg.norm(pointer.along)
+    end = np.array(pointer.tip_m) - pointer.radius_m * along
+    rod = Capsule("pointer", (0.0, 0.0, 0.0), _vector(end), pointer.radius_m)
+    limits = config.limits
+    slow = msgspec.structs.replace(
+        limits,
+        speed_m_s=min(limits.speed_m_s, SPEED_M_S),
+        joint_acceleration_rad_s2=min(limits.joint_acceleration_rad_s2, _ACCELERATION_RAD_S2),
+    )
+    return replace(
+        cell,
+        limits=slow,
+        solids=(*cell.solids, rod),
+        obstacles=(*plate("board", base_from_board, low, high, _PLATE_RODS), *others),
+        obstacle_clearance_m=CLEARANCE_M + doubt_m,
+        watched_m=(*cell.watched_m, pointer.tip_m),
+    )
+
+
+def _ways(
+    model: RobotModel,
+    base_from_board: Array,
+    point: Array,
+    outward: Array,
+    standoff_m: float,
+    pointer: PointerConfig,
+    start: Vector6,
+) -> list[tuple[Array, Array]]:
+    """Joints over the corner, high (6,) and low (6,): every roll and arm posture, the shortest turn first."""
+    found: list[tuple[float, Array, Array]] = []
+    high_m = max(standoff_m, APPROACH_M)
+    for roll in np.arange(_ROLLS) * 2 * np.pi / _ROLLS:
+        high = hover_target(base_from_board, point, outward, high_m, pointer, roll)
+        low = hover_target(base_from_board, point, outward, standoff_m, pointer, roll)
+        lows = list(_postures(model, low, start))
+        for joints in _postures(model, high, start):
+            below = min(lows, key=lambda low: float(np.abs(low - joints).max()), default=None)
+            if below is not None and np.abs(below - joints).max() < _SAME_POSTURE_RAD:
+                found.append((float(np.abs(joints - start).max()), joints, below))
+    found.sort(key=lambda way: way[0])
+    return [(joints, below) for _, joints, below in found]
+
+
+def _free_ends(geometry: CellGeometry, ways: list[tuple[Array, Array]]) -> list[tuple[Array, Array]]:
+    """Those ways whose two stops keep every clearance; the path between is not looked at."""
+    if not ways:
+        return []
+    gaps = margins(geometry, np.array(ways).reshape(-1, 6))[0].min(axis=1).reshape(-1, 2).min(axis=1)
+    return [way for way, gap in zip(ways, gaps, strict=True) if gap >= _CHECKED_M]
+
+
+def _postures(model: RobotModel, target: Array, near: Sequence[float]) -> Iterator[Array]:
+    """Every arm posture (6,) for a flange pose, whole turns chosen near `near`."""
+    for joints in inverse_all(model, target):
+        turned = joints + 2 * np.pi * np.round((np.array(near) - joints) / (2 * np.pi))
+        limit = model.joint_limit_rad
+        turned = np.where(turned > limit, turned - 2 * np.pi, turned)
+        turned = np.where(turned < -limit, turned + 2 * np.pi, turned)
+        exact = _refined(model, target, turned)
+        if exact is not None:
+            yield exact
+
+
+def _refined(model: RobotModel, target: Array, joints: Array) -> Array | None:
+    """Newton's method on the calibrated arm, which the analytic inverse does not know; None: no root."""
+    joints = joints.copy()
+    for _ in range(12):
+        miss = difference(target, forward(model, joints))
+        if np.abs(miss).max() < 1e-9:
+            return joints
+        step = np.linalg.lstsq(jacobian(model, joints), miss, rcond=1e-6)[0]
+        joints = joints + step * min(1.0, 0.3 / max(float(np.abs(step).max()), 1e-12))
+    return None
+
+
+def _plan(config: StationConfig, model: RobotModel, corner: int, high: Array, low: Array) -> Plan:
+    def stop(name: str, joints: Array, why: str) -> PlannedPose:
+        a, b, c, d, e, f = (float(angle) for angle in joints)
+        flange = tuple(tuple(float(x) for x in row) for row in forward(model, joints))
+        return PlannedPose(name, (a, b, c, d, e, f), base_from_flange=flange, why=why)
+
+    poses = (
+        stop("approach", high, f"high over corner {corner}"),
+        stop("hover", low, f"the tip over corner {corner}"),
+    )
+    limits = config.limits
+    return Plan(
+        config.robot.model,
+        config.mount,
+        poses,
+        joint_speed_rad_s=limits.joint_speed_rad_s,
+        joint_acceleration_rad_s2=_ACCELERATION_RAD_S2,
+        note="verification hover",
+    )
+
+
+def _vector(point: Array) -> tuple[float, float, float]:
+    return float(point[0]), float(point[1]), float(point[2])
+
+
+@dataclass(frozen=True, eq=False)
+class HoverQuestion:
+    """What is asked for: plain data that crosses into the worker."""
+
+    corner: int
+    standoff_m: float
+    pointer: PointerConfig
+    joints_rad: Vector6
+    """Where the arm stands."""
+    model_miss_m: float
+    """How far the arm's own flange position is from the configured kinematics, there."""
+
+
+@dataclass(frozen=True, eq=False)
+class HoverAnswer:
+    hover: Hover
+    offset_covariance: Array
+    """(3, 3) of tip minus corner in `board`, m²."""
+    board_moved_m: float
+
+
+def answer_hover(
+    config: StationConfig, calibration: Calibration, view: ImageView, question: HoverQuestion
+) -> HoverAnswer:
+    """From one picture of the board to a checked way. LimitError, BadViewsError."""
+    now = locate_board(calibration, view, config.board)
+    points = board_points(config.board)
+    tip = np.array(question.pointer.tip_m)
+    covariance = offset_covariance(calibration, view, now, points[question.corner], tip)
+    worst = max(
+        float(np.linalg.eigvalsh(offset_covariance(calibration, view, now, points[k], tip))[-1])
+        for k in outer_corners(config.board)
+    )
+    doubt_m = _DOUBT_SIGMAS * float(np.sqrt(worst)) + question.model_miss_m
+    hover = plan_hover(
+        config,
+        calibration.transform.matrix,
+        now.base_from_board,
+        now.outward,
+        question.corner,
+        question.standoff_m,
+        doubt_m,
+        question.pointer,
+        question.joints_rad,
+    )
+    return HoverAnswer(hover, covariance, now.moved_m)

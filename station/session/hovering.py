@@ -1,0 +1,252 @@
+"""The verification hover: the pointer's tip over a corner of the board, slowly, well above it, a go each.
+
+Nothing is recorded and nothing is touched: contact is made by a person's hand only.
+"""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from calibrate.board import board_points
+from calibrate.calibration import Calibration, read_calibration
+from calibrate.errors import CalibrationError
+from calibrate.geometry import pose_from_rotvec
+from calibrate.install import load_installed
+from calibrate.kinematics import forward
+from calibrate.views import ImageView
+from recordings.messages import Vector6
+from station.analysis import sight
+from station.config import PointerConfig
+from station.errors import LimitError, RefusedError
+from station.limits import check_path
+from station.plan.hover import Hover, HoverAnswer, HoverQuestion, answer_hover, least_standoff_m
+from station.plan.model import plan_sha256
+from station.session.bench import Bench
+from station.session.capture import flange_pose, matrix4
+from station.session.guard import displacement
+from station.session.lease import Go, GoDesk
+from station.session.patience import RestingCheck
+from station.session.run import Run
+from station.status import GoSummary, HoverOffer, StationState
+
+VIEW_LIFETIME_S = 900.0
+"""From close above the board a camera on the flange sees nothing: one picture serves several corners."""
+_SIGHT_S, _PLAN_S = 20.0, 60.0
+
+
+class HoverRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    calibration: str = ""
+    """A calibration file; empty = what is installed below the daemon's root."""
+    corner: int = 0
+    standoff_m: float = 0.08
+    pointer_m: float | None = None
+    """Length of a pointer along the flange's z axis; None = the configured one, or the pendant's tool."""
+    new_picture: bool = True
+    """False: the board as it was last seen for this calibration."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Look:
+    """The board as last seen."""
+
+    view: ImageView
+    place: str
+    """Which calibration it was seen by."""
+    at_s: float
+
+
+class HoverDesk:
+    """Finds ways over corners; remembers the last picture of the board."""
+
+    def __init__(self, bench: Bench) -> None:
+        self._bench = bench
+        self._look: _Look | None = None
+
+    async def prepare(self, request: HoverRequest) -> tuple[Hover, HoverOffer]:
+        """RefusedError, LimitError, RobotError and CameraError say what is in the way. Nothing moves."""
+        bench = self._bench
+        robot, config = bench.cell.robot, bench.cell.config
+        calibration = self._calibration(request)
+        pointer, words = self._pointer(request)
+        if not 0 <= request.corner < len(board_points(config.board)):
+            raise RefusedError(
+                f"the board has corners 0 to {len(board_points(config.board)) - 1}, not {request.corner}"
+            )
+        if not request.standoff_m >= least_standoff_m(0.0):
+            raise LimitError(
+                f"the tip must stay at least {1000 * least_standoff_m(0.0):.0f} mm above the board, not "
+                f"{1000 * request.standoff_m:.0f} mm: nearer, it is guided by hand only"
+            )
+        robot.check()
+        await bench.stillness.settle(RestingCheck(robot.check))
+        look = await self._seen(request, calibration)
+        start = robot.latest().joints_rad
+        question = HoverQuestion(request.corner, request.standoff_m, pointer, start, self._model_miss_m())
+        try:
+            answer = await bench.workers.call(
+                answer_hover, config, calibration, look.view, question, timeout_s=_PLAN_S
+            )
+        except CalibrationError as error:
+            raise RefusedError(str(error)) from error
+        summary = self._summary(answer, start, look, words)
+        return answer.hover, _offer(answer, summary, bench, pointer, words)
+
+    def _calibration(self, request: HoverRequest) -> Calibration:
+        """Of this very cell, and good: a wrong one would put the board somewhere else."""
+        cell = self._bench.cell
+        try:
+            if request.calibration:
+                found = read_calibration(Path(request.calibration))
+            else:
+                found = load_installed(self._bench.root, allow_simulated=cell.simulated)
+        except CalibrationError as error:
+            raise RefusedError(str(error)) from error
+        robot, camera = cell.robot.identity, cell.camera.identity
+        if found.mount != cell.config.mount or found.source != cell.source:
+            raise RefusedError(
+                f"the calibration is {found.source}, {found.mount}; this cell is {cell.source}, "
+                f"{cell.config.mount}"
+            )
+        if (found.robot.serial, found.camera.serial) != (robot.serial, camera.serial):
+            raise RefusedError(
+                f"the calibration is of robot {found.robot.serial} and camera {found.camera.serial}, this "
+                f"cell has {robot.serial} and {camera.serial}"
+            )
+        if found.quality.failed:
+            names = ", ".join(gate.name for gate in found.quality.failed)
+            raise RefusedError(f"the calibration failed its gates ({names}): nothing is driven by it")
+        return found
+
+    def _pointer(self, request: HoverRequest) -> tuple[PointerConfig, str]:
+        """The pointer and its words: as asked for, as configured, or the tool set on the pendant."""
+        configured = self._bench.cell.config.pointer
+        if request.pointer_m is not None:
+            if not 0.01 <= request.pointer_m <= 1.0:
+                raise RefusedError(f"a pointer is 10 to 1000 mm long, not {1000 * request.pointer_m:g} mm")
+            pointer = PointerConfig((0.0, 0.0, request.pointer_m))
+            return pointer, f"pointer {1000 * request.pointer_m:.1f} mm along the flange's z axis"
+        if configured is not None:
+            return configured, f"configured pointer, tip at {_mm(configured.tip_m)} mm in the flange"
+        tcp = self._bench.cell.robot.identity.tcp_offset
+        tip, along = tcp[:3], pose_from_rotvec(tcp[:3], tcp[3:])[:3, 2]
+        if np.linalg.norm(tip) < 0.01:
+            raise RefusedError(
+                "the station knows no pointer: give its length (--pointer-mm), or `pointer` in the "
+                "configuration, or set the tool centre point on the pendant"
+            )
+        x, y, z = (float(v) for v in along)
+        return PointerConfig(tip, (x, y, z)), f"the pendant's tool, tip at {_mm(tip)} mm in the flange"
+
+    async def _seen(self, request: HoverRequest, calibration: Calibration) -> _Look:
+        bench, place = self._bench, calibration.provenance.recording_sha256
+        if not request.new_picture:
+            look = self._look
+            if look is None or look.place != place or time.monotonic() - look.at_s > VIEW_LIFETIME_S:
+                raise RefusedError("the board was not looked at lately: bring it into the picture first")
+            return look
+        picture = await bench.cell.camera.capture()
+        state = bench.cell.robot.latest()
+        board = bench.cell.config.board
+        sighting = await bench.workers.call(
+            sight, picture.image, board, calibration.intrinsics.model, timeout_s=_SIGHT_S
+        )
+        if not sighting.status.found:
+            reason = sighting.status.reason or "no board in the picture"
+            raise RefusedError(f"{reason}: jog the arm or lay the board so that the camera sees it whole")
+        flange = flange_pose(state, bench.cell.robot.identity.tcp_offset)
+        points = board_points(board)[sighting.indices]
+        view = ImageView(0, "verification", flange, points, sighting.pixels)
+        self._look = _Look(view, place, time.monotonic())
+        return self._look
+
+    def _model_miss_m(self) -> float:
+        bench, state = self._bench, self._bench.cell.robot.latest()
+        told = flange_pose(state, bench.cell.robot.identity.tcp_offset)
+        modelled = forward(bench.geometry.model, state.joints_rad)
+        return float(np.linalg.norm(told[:3, 3] - modelled[:3, 3]))
+
+    def _summary(self, answer: HoverAnswer, start: Vector6, look: _Look, words: str) -> GoSummary:
+        bench, hover = self._bench, answer.hover
+        check, poses = hover.check, hover.plan.poses
+        warnings = [words]
+        age_s = time.monotonic() - look.at_s
+        if age_s > 5:
+            warnings.append(f"the board was seen {age_s:.0f} s ago: it must not have been moved since")
+        if answer.board_moved_m > 0.01:
+            warnings.append(
+                f"the board lies {1000 * answer.board_moved_m:.0f} mm from where it was calibrated"
+            )
+        if bench.cell.simulated:
+            warnings.append("SIMULATED cell: nothing real moves")
+        x, y = 1000 * board_points(bench.cell.config.board)[hover.corner][:2]
+        return GoSummary(
+            token=GoDesk.new_token(),
+            purpose=f"put the tip {1000 * hover.standoff_m:.0f} mm above corner {hover.corner} "
+            f"(x {x:.0f}, y {y:.0f} mm on the board)",
+            plan_sha256=plan_sha256(hover.plan),
+            poses=len(poses),
+            path_m=round(check.path_m, 3),
+            largest_step_rad=round(check.largest_step_rad, 4),
+            top_speed_m_s=round(check.top_speed_m_s, 3),
+            duration_s=round(check.duration_s, 1),
+            first_move=f"{displacement(bench, start, poses[0].joints_rad)}, high over the corner",
+            warnings=tuple(warnings),
+            start_joints_rad=start,
+        )
+
+
+def _mm(point: tuple[float, float, float]) -> str:
+    return ", ".join(f"{1000 * v:.1f}" for v in point)
+
+
+def _offer(
+    answer: HoverAnswer, summary: GoSummary, bench: Bench, pointer: PointerConfig, words: str
+) -> HoverOffer:
+    hover, sigma = answer.hover, np.sqrt(np.diag(answer.offset_covariance))
+    x, y = (float(v) for v in board_points(bench.cell.config.board)[hover.corner][:2])
+    return HoverOffer(
+        go=summary,
+        corner=hover.corner,
+        corner_m=(x, y),
+        standoff_m=hover.standoff_m,
+        tip_m=pointer.tip_m,
+        base_from_board=matrix4(hover.base_from_board),
+        sigma_m=(float(sigma[0]), float(sigma[1])),
+        board_moved_m=answer.board_moved_m,
+        pointer=words,
+    )
+
+
+class HoverRun(Run):
+    """Carries out one go for a hover: two moves, no picture, nothing recorded."""
+
+    def __init__(self, bench: Bench, go: Go, hover: Hover) -> None:
+        self._bench, self._go, self._hover = bench, go, hover
+        self._geometry, self._failures = hover.geometry, 0
+
+    async def _open_recording(self) -> None:
+        return None
+
+    async def _poses(self) -> None:
+        bench, robot = self._bench, self._bench.cell.robot
+        for planned in self._hover.plan.poses:
+            await RestingCheck(robot.check).news()
+            bench.store.enter(StationState.MOVING)
+            check = check_path(self._geometry, robot.latest().joints_rad, planned.joints_rad, planned.name)
+            if check.problems:
+                bench.store.enter(StationState.IDLE, "; ".join(map(str, check.problems)))
+                return
+            await self._drive_checked(planned.joints_rad, check)
+            if bench.halting:
+                return
+        reason = (
+            f"the tip stands {1000 * self._hover.standoff_m:.0f} mm above corner {self._hover.corner}: "
+            "guide it down by hand only"
+        )
+        bench.store.event(reason)
+        bench.store.enter(StationState.IDLE, reason)

@@ -1,0 +1,179 @@
+"""A verification hover through the session: one use, one place, stopped like any other motion."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from calibrate.calibration import write_calibration
+from calibrate.geometry import Array
+from calibrate.kinematics import MODELS, forward
+from station.analysis import Sighting
+from station.errors import LimitError, RefusedError, RobotError
+from station.plan.hover import SPEED_M_S, board_from_tip
+from station.session.hovering import HoverRequest
+from station.status import DetectionStatus, HoverOffer
+from station.status import StationState as S
+from tests.station.hover_cell import POINTER, calibration_of, seen_from
+from tests.station.session_rig import TRUTH, NewRig, Rig
+
+BOARD = np.array(TRUTH.board_place)
+
+
+def request(path: Path, corner: int = 0, **more: object) -> HoverRequest:
+    return msgspec.convert(
+        {"calibration": str(path), "corner": corner, "pointer_m": POINTER.tip_m[2], **more}, HoverRequest
+    )
+
+
+@pytest.fixture
+async def hover_rig(new_rig: NewRig) -> Rig:
+    rig = await new_rig(with_plan=False)
+    await rig.until(S.IDLE)
+    rig.session.take_lease(1, "anna")
+    view = seen_from(TRUTH, forward(MODELS["UR10"], TRUTH.start_joints_rad), BOARD)
+    status = DetectionStatus(found=True, corners=len(view.pixels), expected=len(view.pixels))
+    rig.worker.sees = Sighting(status, np.arange(len(view.pixels)), view.pixels)
+    return rig
+
+
+@pytest.fixture
+def calibration(hover_rig: Rig, tmp_path: Path) -> Path:
+    path = tmp_path / "cell.yaml"
+    write_calibration(calibration_of(TRUTH, hover_rig.arm.identity, hover_rig.camera.identity), path)
+    return path
+
+
+def tip_of(rig: Rig) -> Array:
+    return board_from_tip(BOARD, forward(MODELS["UR10"], rig.arm.joints), POINTER)
+
+
+async def test_a_go_brings_the_tip_over_the_corner_and_is_used_up(hover_rig: Rig, calibration: Path) -> None:
+    rig = hover_rig
+    offer: HoverOffer = await rig.session.prepare_hover(1, request(calibration))
+    assert 0 < offer.go.top_speed_m_s <= SPEED_M_S
+    assert "80 mm above corner 0" in offer.go.purpose
+    assert "start control" not in rig.arm.log
+    rig.session.go(1, offer.go.token)
+    with pytest.raises(RefusedError):
+        rig.session.go(1, offer.go.token)
+    await rig.until(S.IDLE)
+    assert rig.states == [S.IDLE, S.CHECKING, S.MOVING, S.IDLE]
+    assert tip_of(rig) == pytest.approx([0, 0, -0.08], abs=1e-6)
+    assert "by hand only" in rig.session.store.status.reason
+    assert rig.session.bench.recording is None
+    await rig.until_true(lambda: rig.arm.log[-1] == "end control")
+    assert rig.arm.log.count("move") == 2
+    with pytest.raises(RefusedError, match="not valid"):
+        rig.session.go(1, offer.go.token)
+    # The next corner: its own go, from the same picture.
+    rig.worker.sees = None  # type: ignore[assignment]
+    offer = await rig.session.prepare_hover(1, request(calibration, 41, new_picture=False))
+    rig.session.go(1, offer.go.token)
+    await rig.until(S.CHECKING)
+    await rig.until(S.IDLE)
+    assert tip_of(rig) == pytest.approx([0.15, 0.125, -0.08], abs=1e-6)
+
+
+async def test_stop_in_mid_hover_latches(hover_rig: Rig, calibration: Path) -> None:
+    rig = hover_rig
+    rig.arm.slow = True
+    offer = await rig.session.prepare_hover(1, request(calibration))
+    rig.session.go(1, offer.go.token)
+    await rig.until(S.MOVING)
+    await rig.session.stop("bert")
+    assert rig.state is S.STOPPED
+    assert "stop" in rig.arm.log
+    await rig.until_true(lambda: rig.arm.log[-1] == "end control")
+    assert rig.arm.log.count("move") == 1
+    with pytest.raises(RefusedError, match="acknowledge"):
+        await rig.session.prepare_hover(1, request(calibration))
+    rig.session.acknowledge("anna")
+    assert rig.state is S.IDLE
+
+
+async def test_a_lost_lease_stops_it_and_voids_the_next_go(hover_rig: Rig, calibration: Path) -> None:
+    rig = hover_rig
+    waiting = await rig.session.prepare_hover(1, request(calibration))
+    await rig.session.lease_lost(1)
+    rig.session.take_lease(1, "anna")
+    with pytest.raises(RefusedError, match="not valid"):
+        rig.session.go(1, waiting.go.token)
+    rig.arm.slow = True
+    offer = await rig.session.prepare_hover(1, request(calibration))
+    rig.session.go(1, offer.go.token)
+    await rig.until(S.MOVING)
+    await rig.session.lease_lost(1)
+    assert rig.state is S.PAUSED
+    assert "connection" in rig.session.store.status.reason
+    assert "stop" in rig.arm.log
+
+
+async def test_a_robot_fault_in_mid_hover_is_a_fault(hover_rig: Rig, calibration: Path) -> None:
+    rig = hover_rig
+    offer = await rig.session.prepare_hover(1, request(calibration))
+    rig.session.go(1, offer.go.token)
+    await rig.until(S.CHECKING)
+    rig.arm.trouble = RobotError("the script died")
+    await rig.until(S.FAULT)
+    assert "script died" in rig.session.store.status.reason
+
+
+async def test_a_moved_arm_voids_the_go(hover_rig: Rig, calibration: Path) -> None:
+    rig = hover_rig
+    offer = await rig.session.prepare_hover(1, request(calibration))
+    a, *rest = rig.arm.joints
+    rig.arm.joints = (a + 0.02, *rest)  # type: ignore[assignment]
+    rig.arm.rest()
+    with pytest.raises(RefusedError, match="arm moved"):
+        rig.session.go(1, offer.go.token)
+    assert "start control" not in rig.arm.log
+
+
+@pytest.mark.parametrize("standoff_m", [0.0, 0.049, 0.055, -1.0])
+async def test_nearer_than_50_mm_is_never_offered(
+    hover_rig: Rig, calibration: Path, standoff_m: float
+) -> None:
+    with pytest.raises(LimitError, match="by hand only"):
+        await hover_rig.session.prepare_hover(1, request(calibration, standoff_m=standoff_m))
+    assert hover_rig.session.store.status.go is None
+
+
+async def test_what_is_not_fit_to_drive_by_is_refused(
+    hover_rig: Rig, calibration: Path, tmp_path: Path
+) -> None:
+    rig = hover_rig
+    identity, camera = rig.arm.identity, rig.camera.identity
+    other = calibration_of(TRUTH, msgspec.structs.replace(identity, serial="OTHER"), camera)
+    write_calibration(other, tmp_path / "other.yaml")
+    with pytest.raises(RefusedError, match="OTHER"):
+        await rig.session.prepare_hover(1, request(tmp_path / "other.yaml"))
+    with pytest.raises(RefusedError, match="nothing is installed"):
+        await rig.session.prepare_hover(1, HoverRequest())
+    with pytest.raises(RefusedError, match="knows no pointer"):
+        await rig.session.prepare_hover(1, HoverRequest(str(calibration)))
+    with pytest.raises(RefusedError, match="corners 0 to 41"):
+        await rig.session.prepare_hover(1, request(calibration, 42))
+    with pytest.raises(RefusedError, match="not looked at lately"):
+        await rig.session.prepare_hover(1, request(calibration, new_picture=False))
+    with pytest.raises(RefusedError, match=r"take the lease|held by"):
+        await rig.session.prepare_hover(2, request(calibration))
+    rig.worker.sees = Sighting(DetectionStatus(reason="too dark"), np.arange(0), np.zeros((0, 2)))
+    with pytest.raises(RefusedError, match="too dark"):
+        await rig.session.prepare_hover(1, request(calibration))
+    assert "start control" not in rig.arm.log
+
+
+async def test_not_within_an_open_session(rig: Rig, tmp_path: Path) -> None:
+    rig.arm.slow = True
+    await rig.give_go()
+    await rig.until(S.MOVING)
+    with pytest.raises(RefusedError, match="hover is not possible now"):
+        await rig.session.prepare_hover(1, HoverRequest())
+    await rig.session.stop("anna")
+    rig.session.acknowledge("anna")
+    with pytest.raises(RefusedError, match="finish it first"):
+        await rig.session.prepare_hover(1, HoverRequest())

@@ -10,7 +10,9 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from calibrate.geometry import rotation_angle
@@ -22,6 +24,13 @@ from station.errors import StationError
 POLL_S = 0.02
 LEAST_SAMPLES = 8
 KEPT_SAMPLES = 4096
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the pictures say: how far they move, px; None where that cannot be measured."""
+
+    motion_px: float | None
 
 
 class NotStillError(StationError):
@@ -102,23 +111,39 @@ class StillnessMonitor:
     async def settle(
         self,
         alive: Callable[[], object],
-        image_motion: Callable[[], float | None] | None = None,
+        look: Callable[[int], Look | None] = lambda since_ns: Look(None),
         now_s: Callable[[], float] = time.monotonic,
     ) -> Stillness:
         """Returns as soon as everything is at rest. `alive` raises when the robot is lost (`robot.latest`).
 
+        `look`: at pictures exposed since this host time, when the joints came to rest; None = not yet.
         NotStillError after the configured time-out, with what still moved.
         """
         give_up_s = now_s() + self._limits.timeout_s
+        resting_since_ns: int | None = None
         while True:
             alive()
-            found = self.measure(image_motion() if image_motion is not None else None)
+            found = self.measure()
             unrest = self.unrest(found) if found is not None else "too few robot states"
-            if found is not None and not unrest:
-                return found
+            if found is None or unrest:
+                resting_since_ns = None
+            else:
+                resting_since_ns = resting_since_ns or self._window_begin_ns(found)
+                seen = look(resting_since_ns)
+                if seen is None:
+                    unrest = "the joints rest, the picture's motion is not known yet"
+                else:
+                    found = msgspec.structs.replace(found, image_motion_px=seen.motion_px)
+                    unrest = self.unrest(found)
+                    if not unrest:
+                        return found
             if now_s() >= give_up_s:
                 raise NotStillError(
                     f"not at rest within {self._limits.timeout_s:g} s: {unrest}. Look for what shakes "
-                    "the arm, or take this pose again later"
+                    "the arm or the camera, or take this pose again later"
                 )
             await asyncio.sleep(POLL_S)
+
+    def _window_begin_ns(self, found: Stillness) -> int:
+        """Host monotonic time."""
+        return self._states[-1].stamps.host_monotonic_ns - round(found.window_s * 1e9)

@@ -22,6 +22,7 @@ from station.errors import CameraError
 T = TypeVar("T")
 _CLOCK_READINGS = 8
 _STREAM_POP_S = 0.1
+_GLIMPSE_S = 1.0
 
 
 class AravisCamera:
@@ -60,21 +61,29 @@ class AravisCamera:
 
     async def capture(self, timeout_s: float = 5.0) -> Picture:
         async with self._busy:
-            exposure_us, gain_db = await self._run(self._prepare)
-            pulse = None
-            if self._config.trigger == "hardware":
-                assert self._trigger is not None
-                pulse = (await self._trigger.fire()).count
-            try:
-                picture = await self._run(partial(self._take, timeout_s))
-            except CameraError:
-                self.counter.lost(pulse)
-                raise
-            sequence = self.counter.accept(picture.frame_id, pulse)
-            self._newest = msgspec.structs.replace(
-                picture, sequence=sequence, exposure_us=exposure_us, gain_db=gain_db, trigger_count=pulse
-            )
+            self._newest = await self._one(timeout_s, sequenced=True)
             return self._newest
+
+    async def glimpse(self) -> Picture | None:
+        """Triggered as every picture is, by the box too."""
+        async with self._busy:
+            return await self._one(_GLIMPSE_S, sequenced=False)
+
+    async def _one(self, timeout_s: float, *, sequenced: bool) -> Picture:
+        exposure_us, gain_db = await self._run(self._prepare)
+        pulse = None
+        if self._config.trigger == "hardware":
+            assert self._trigger is not None
+            pulse = (await self._trigger.fire()).count
+        try:
+            picture = await self._run(partial(self._take, timeout_s))
+        except CameraError:
+            self.counter.lost(pulse)
+            raise
+        sequence = self.counter.accept(picture.frame_id, pulse, sequenced=sequenced)
+        return msgspec.structs.replace(
+            picture, sequence=sequence, exposure_us=exposure_us, gain_db=gain_db, trigger_count=pulse
+        )
 
     async def preview(self) -> Picture | None:
         """A fresh picture where the camera is idle and can be triggered by software, else the newest one."""
@@ -82,13 +91,10 @@ class AravisCamera:
             return self._newest
         async with self._busy:
             try:
-                await self._run(self._prepare)
-                picture = await self._run(partial(self._take, 1.0))
-                self.counter.accept(picture.frame_id, sequenced=False)
+                return await self._one(_GLIMPSE_S, sequenced=False)
             except CameraError:
                 self.counter.restart()
                 return None
-        return picture
 
     async def stream(self, callback: Callable[[Picture], None], stop: threading.Event) -> None:
         """Free-running: every frame, in order, from the worker's thread, until `stop` is set."""

@@ -82,6 +82,12 @@ class Camera(Protocol):
     async def settings(self) -> dict[str, Any]:
         """As the camera reports them now, for the recording; JSON types only. Raises CameraError."""
 
+    async def glimpse(self) -> Picture | None:
+        """A picture exposed after this call, of any size, that takes no number and is never recorded.
+
+        None where there is no such thing (played pictures). Raises CameraError within about a second.
+        """
+
     async def preview(self) -> Picture | None:
         """A recent picture for the screen; None when there is none. Never recorded."""
 

@@ -103,6 +103,10 @@ class PlaybackCamera:
     async def settings(self) -> dict[str, Any]:
         return {"device": self._config.device, "pace": self._config.playback_pace}
 
+    async def glimpse(self) -> Picture | None:
+        """None: a played picture was taken once, how it moved then cannot be seen in it."""
+        return None
+
     async def preview(self) -> Picture | None:
         """The newest picture; with a robot, what it looks at now."""
         if self._robot is not None and self._source is not None:

@@ -15,6 +15,7 @@ from station.devices.frames import mid_exposure
 from station.errors import CameraError, StaleStateError, StationError
 from station.session.bench import Bench, SeenView
 from station.session.patience import RestingCheck
+from station.session.picture_watch import PictureWatch
 from station.status import PoseState, StationState
 from station.workers import WorkerError
 
@@ -35,7 +36,8 @@ async def take_pose(bench: Bench, index: int, attempt: int) -> None:
     """
     _phase(bench, index, StationState.SETTLING, "settling")
     resting = RestingCheck(bench.cell.robot.check)
-    still = await bench.stillness.settle(resting)
+    async with PictureWatch(bench, index) as watch:
+        still = await bench.stillness.settle(resting, watch.look)
     _phase(bench, index, StationState.CAPTURING, "capturing")
     picture = bench.require_recording().number(await _picture(bench, index))
     _show_frame(bench, picture)

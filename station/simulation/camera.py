@@ -109,13 +109,17 @@ class RenderedCamera:
             "gain_db": self._gain_db,
         }
 
-    async def preview(self) -> Picture | None:
+    async def glimpse(self) -> Picture | None:
         """At half the size, rendered anew."""
+        picture = await self._ask({"cmd": "preview"}, 2.0)
+        assert isinstance(picture, Picture)
+        return picture
+
+    async def preview(self) -> Picture | None:
         try:
-            picture = await self._ask({"cmd": "preview"}, 2.0)
+            return await self.glimpse()
         except CameraError:
             return None
-        return picture if isinstance(picture, Picture) else None
 
     async def inject(self, fault: str, value: Any = None) -> None:
         """Arms a fault of `camera_faults`; 'unplugged' ends the process."""

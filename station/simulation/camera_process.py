@@ -110,7 +110,10 @@ class CameraProcess:
     def picture(self, start_ns: int, camera: CameraModel) -> NDArray[np.uint8]:
         """Exposed from the host time `start_ns` on; returns after the exposure."""
         exposure_us = self.faults.exposure_us or self.exposure_us
-        base_from_flange = self._flange_at(start_ns + round(exposure_us * 500))
+        middle_ns = start_ns + round(exposure_us * 500)
+        camera_from_board = self.faults.bracket(middle_ns) @ self.camera_from_board(
+            self._flange_at(middle_ns)
+        )
         light = Light(
             exposure_us=exposure_us,
             gain_db=self.gain_db,
@@ -119,7 +122,7 @@ class CameraProcess:
             blur_px=self.truth.blur_px * camera.width / self.truth.camera.width,
         )
         board = self.faults.board or self.truth.board
-        picture = render(camera, board, self.camera_from_board(base_from_flange), light, self._rng)
+        picture = render(camera, board, camera_from_board, light, self._rng)
         self.faults.cover(picture)
         return picture
 

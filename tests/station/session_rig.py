@@ -26,6 +26,7 @@ from station.status import DetectionStatus, StationState
 
 TRUTH = make_cell()
 POSES = 4
+GLIMPSED = np.random.default_rng(1).integers(0, 255, (64, 80), dtype=np.uint8)
 RUNNING, NORMAL, STOPPED = 7, 1, 1
 
 
@@ -146,6 +147,10 @@ class CameraInMemory:
         self.clock = None
         self.fail: list[str] = []
         self.taken = 0
+        self.jumps = 0
+        self.blind = False
+        self.glimpses = 0
+        self.glimpse_fails: list[str] = []
 
     async def open(self) -> CameraIdentity:
         return self.identity
@@ -165,6 +170,16 @@ class CameraInMemory:
 
     async def settings(self) -> dict[str, object]:
         return {"exposure_us": 1000.0}
+
+    async def glimpse(self) -> Picture | None:
+        """A small picture that jumps by `jumps` rows between two looks."""
+        self.glimpses += 1
+        if self.blind:
+            return None
+        if self.glimpse_fails:
+            raise CameraError(self.glimpse_fails.pop(0))
+        image = np.roll(GLIMPSED, self.jumps * (self.glimpses % 2), axis=0)
+        return Picture(image, Stamps(), 0, 0)
 
     async def preview(self) -> Picture | None:
         return await self.capture()

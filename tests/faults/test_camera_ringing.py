@@ -1,0 +1,48 @@
+"""A camera bracket that rings on while the joints rest: the picture shows it."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import pytest
+
+from station.picture_motion import picture_motion
+from station.simulation.camera import RenderedCamera
+from station.simulation.cell import make_cell, write_truth
+from station.simulation.launch import SimulatedController
+
+pytestmark = pytest.mark.process
+CELL = make_cell()
+
+
+@pytest.fixture
+async def camera(
+    controller: Callable[..., SimulatedController], tmp_path: Path
+) -> AsyncIterator[RenderedCamera]:
+    write_truth(CELL, tmp_path / "truth.json")
+    rendered = RenderedCamera(CELL, controller(truth=tmp_path / "truth.json").host)
+    await rendered.open()
+    yield rendered
+    await rendered.close()
+
+
+async def motion_px(camera: RenderedCamera) -> float:
+    looks = [await camera.glimpse() for _ in range(3)]
+    found = picture_motion([look.image for look in looks if look is not None], CELL.camera.width)
+    assert found is not None
+    return found
+
+
+async def test_a_resting_camera_shows_no_motion_and_a_ringing_one_does(camera: RenderedCamera) -> None:
+    assert await motion_px(camera) < 0.25
+    await camera.inject("ringing", {"amplitude_rad": 0.004, "frequency_hz": 6.3})
+    assert max([await motion_px(camera) for _ in range(3)]) > 1.0
+    await camera.inject("ringing")
+    assert await motion_px(camera) < 0.25
+
+
+async def test_glimpses_take_no_number_and_use_up_no_trigger(camera: RenderedCamera) -> None:
+    first = await camera.capture()
+    await camera.glimpse()
+    assert (await camera.capture()).frame_id in (first.frame_id + 1, 1)

@@ -1,0 +1,120 @@
+"""The picture has a say in what rests: a pose whose camera still rings is not captured."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from recordings.reader import open_recording
+from station.picture_motion import board_box, picture_motion
+from station.plan.model import ExpectedView
+from station.session.picture_watch import GLIMPSE_TRIES
+from station.status import StationState as S
+from tests.station.session_rig import POSES, Rig
+
+SCENE = cv2.GaussianBlur(np.random.default_rng(4).normal(128, 150, (600, 760)), (0, 0), 1.5)
+
+
+def seen(right_px: float = 0.0, noise: float = 0.0, seed: int = 0) -> np.ndarray:
+    """A window of one scene, 640 × 480, shifted and noisy."""
+    shift = np.array([[1.0, 0.0, -60.0 + right_px], [0.0, 1.0, -60.0]])
+    picture = cv2.warpAffine(SCENE, shift, (640, 480), flags=cv2.INTER_CUBIC)
+    noisy = picture + np.random.default_rng(seed).normal(0, noise, picture.shape) if noise else picture
+    return np.clip(noisy, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("shift_px", [0.0, 0.3, 1.0, 7.5, 40.0])
+def test_the_shift_between_noisy_pictures_is_measured(shift_px: float) -> None:
+    pictures = [seen(0.0, 7.0, 1), seen(0.0, 7.0, 2), seen(shift_px, 7.0, 3)]
+    motion_px = picture_motion(pictures)
+    assert motion_px == pytest.approx(shift_px, abs=0.3 if shift_px else 0.05)
+    assert picture_motion(pictures, full_width=1280) == pytest.approx(2 * (motion_px or 0))
+
+
+def test_a_ringing_that_fits_one_gap_shows_in_the_other() -> None:
+    assert picture_motion([seen(3.0), seen(0.0), seen(0.0)]) == pytest.approx(3.0, abs=0.15)
+    assert picture_motion([seen(0.0), seen(3.0), seen(0.0)]) == pytest.approx(3.0, abs=0.15)
+
+
+@pytest.mark.parametrize("kind", ["colour", "16 bit"])
+def test_every_kind_of_picture_is_understood(kind: str) -> None:
+    pair = [seen(0.0), seen(5.0)]
+    if kind == "colour":
+        pair = [cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR) for picture in pair]
+    else:
+        pair = [picture.astype(np.uint16) << 8 for picture in pair]
+    assert picture_motion(pair) == pytest.approx(5.0, abs=0.15)
+
+
+def test_a_flat_picture_says_nothing() -> None:
+    noise = np.random.default_rng(5).normal(90, 2, (2, 480, 640)).clip(0, 255).astype(np.uint8)
+    assert picture_motion(list(noise)) is None
+
+
+def test_a_board_that_swings_before_a_resting_wall_is_seen_where_it_should_be() -> None:
+    pair = [seen(), seen()]
+    for x, picture in zip((200, 206), pair, strict=True):
+        picture[160:280, x : x + 160] = 255 - seen()[160:280, 200:360] // 2
+    box = board_box(ExpectedView(0.8, 0.0, 0.0, (280.0, 220.0), 120 * 160 / (640 * 480)), 640, 480)
+    assert picture_motion(pair, 640, box) == pytest.approx(6.0, abs=0.8)
+
+
+async def recorded(rig: Rig) -> list[float | None]:
+    """Image motion of every pose of a whole session."""
+    await rig.give_go()
+    await rig.until(S.IDLE, S.PAUSED, S.FAULT)
+    views = open_recording(Path(rig.session.store.status.session.recording)).views()
+    return [view.stillness.image_motion_px for view in views if view.stillness is not None]
+
+
+async def test_every_pose_is_recorded_with_its_pictures_motion(rig: Rig) -> None:
+    assert await recorded(rig) == [0.0] * POSES
+    assert rig.camera.glimpses == 3 * POSES
+
+
+async def test_a_moving_picture_is_not_captured_although_the_joints_rest(rig: Rig) -> None:
+    rig.camera.jumps = 3
+    await rig.give_go()
+    await rig.until(S.PAUSED)
+    assert rig.camera.taken == 0 and "done" not in rig.pose_states
+    reason = rig.session.store.status.session.poses[0].reason
+    assert "the picture moves by 46.96 px (limit 0.30)" in reason
+
+
+async def test_it_is_captured_as_soon_as_the_picture_rests(rig: Rig) -> None:
+    rig.camera.jumps = 3
+    await rig.give_go()
+    await rig.until_true(lambda: rig.camera.glimpses > 3)
+    assert rig.camera.taken == 0
+    rig.camera.jumps = 0
+    await rig.until(S.IDLE)
+    assert rig.pose_states == ["done"] * POSES
+
+
+@pytest.mark.parametrize("why", ["played", "failing"])
+async def test_what_cannot_be_looked_at_is_recorded_as_not_measured(rig: Rig, why: str) -> None:
+    rig.camera.blind = why == "played"
+    if why == "failing":
+        rig.camera.glimpse_fails = ["no frame"] * GLIMPSE_TRIES * POSES
+    assert await recorded(rig) == [None] * POSES
+    told = [e.text for e in rig.session.store.status.events if "motion is not measured" in e.text]
+    assert len(told) == (POSES if why == "failing" else 0)
+
+
+async def test_one_bad_glimpse_is_looked_at_again(rig: Rig) -> None:
+    rig.camera.glimpse_fails = ["incomplete"]
+    assert await recorded(rig) == [0.0] * POSES
+
+
+async def test_stop_leaves_the_camera_free(rig: Rig) -> None:
+    rig.camera.jumps = 3
+    await rig.give_go()
+    await rig.until(S.SETTLING)
+    await rig.session.stop("bert")
+    seen_before = rig.camera.glimpses
+    await asyncio.sleep(0.1)
+    assert rig.camera.glimpses == seen_before and rig.state is S.STOPPED

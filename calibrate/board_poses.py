@@ -9,7 +9,7 @@ import numpy as np
 from calibrate.geometry import Array, perturb
 from calibrate.likelihood.model import Observations, State
 from calibrate.likelihood.normal import CORNERS
-from calibrate.likelihood.residuals import corner_residuals, linearise
+from calibrate.likelihood.residuals import corner_residuals, linearise_corners
 
 _STEPS = 10
 _LIMIT_SIGMA = 4.0
@@ -36,7 +36,7 @@ def refine_board_poses(observed: Observations, state: State) -> BoardPoses:
         distance = np.nan_to_num(np.linalg.norm(corner_residuals(observed, state), axis=-1), nan=1e6)
         limit = _LIMIT_SIGMA * np.maximum(_typical(distance, observed.present), 0.01)[:, None]
         weights = np.where(distance > limit, (limit / np.maximum(distance, limit)) ** 2, 1.0)
-        normal = linearise(observed, state, weights, intrinsics_free=False)
+        normal = linearise_corners(observed, state, weights)
         inverse = np.linalg.inv(normal.V[CORNERS] + 1e-9 * np.eye(6))
         delta = np.einsum("nij,nj->ni", inverse, normal.h[CORNERS])
         length = np.linalg.norm(delta, axis=1, keepdims=True)

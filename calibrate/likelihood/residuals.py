@@ -52,6 +52,13 @@ def linearise(observed: Observations, state: State, weights: Array, intrinsics_f
     return normal
 
 
+def linearise_corners(observed: Observations, state: State, weights: Array) -> Normal:
+    """The same of the corners alone, lens held: what the board poses follow from without the robot."""
+    normal = Normal.empty(len(state.C), 12)
+    _add_corners(normal, observed, state, weights * observed.present, intrinsics_free=False)
+    return normal
+
+
 def _add_corners(
     normal: Normal, observed: Observations, state: State, weights: Array, intrinsics_free: bool
 ) -> None:

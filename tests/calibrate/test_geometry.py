@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
 
 from calibrate import geometry as g
 
@@ -84,3 +85,17 @@ def test_interpolation_ends_where_it_should() -> None:
     np.testing.assert_allclose(g.interpolate(a, b, 0.0), a, atol=1e-12)
     np.testing.assert_allclose(g.interpolate(a, b, 1.0), b, atol=1e-12)
     np.testing.assert_allclose(g.rotation_log(g.interpolate(a, b, 0.5)[:3, :3]), [0, 0, 0.6], atol=1e-12)
+
+
+def test_logarithms_are_scipys_near_and_far_and_a_mirror_is_refused() -> None:
+    rng = np.random.default_rng(3)
+    for angle in (0.0, 1e-12, 1e-6, 0.3, 2.9, np.pi - 1e-9):
+        axes = rng.normal(size=(200, 3))
+        vectors = axes / np.linalg.norm(axes, axis=1, keepdims=True) * angle
+        R = Rotation.from_rotvec(vectors).as_matrix()
+        np.testing.assert_allclose(g.rotation_exp(vectors), R, atol=2e-15)
+        np.testing.assert_allclose(g.rotation_log(R), vectors, atol=2e-15)
+    almost = R + rng.normal(size=R.shape) * 1e-5
+    np.testing.assert_allclose(g.rotation_log(almost), Rotation.from_matrix(almost).as_rotvec(), atol=1e-13)
+    with pytest.raises(ValueError, match="determinant is not positive"):
+        g.rotation_log(-R)

@@ -17,7 +17,7 @@ import numpy as np
 
 from calibrate.board import board_points
 from calibrate.geometry import Array, inverse, pose, rotation_exp
-from calibrate.kinematics import MODELS, inverse_all, link_frames
+from calibrate.kinematics import MODELS, inverse_all, inverse_many, link_frames
 from recordings.messages import CameraModel
 from station.config import (
     PAPER_BOARD,
@@ -122,10 +122,8 @@ def _taught(X: Array, Y: Array, rng: np.random.Generator) -> Array | None:
 
 def _free_views(X: Array, Y: Array, start: Array, rng: np.random.Generator) -> int:
     """How many of the tried views some arm posture near the taught one can take."""
-    shown = [C for C in _views(rng, _TRIED, (0.38, 0.60), np.deg2rad(35)) if shows_board(C)]
-    solutions = [inverse_all(ARM, Y @ inverse(X @ C)) for C in shown]
-    view = np.repeat(np.arange(len(shown)), [len(q) for q in solutions])
-    q = np.concatenate([np.zeros((0, 6)), *solutions])
+    shown = np.array([C for C in _views(rng, _TRIED, (0.38, 0.60), np.deg2rad(35)) if shows_board(C)])
+    view, q = inverse_many(ARM, Y @ inverse(X @ shown))
     q = start + (q - start + np.pi) % (2 * np.pi) - np.pi
     near = (np.sign(q[:, [2, 4]]) == np.sign(start[[2, 4]])).all(axis=1) & (
         np.abs(q - start).max(axis=1) < 2.0

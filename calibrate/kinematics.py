@@ -10,9 +10,9 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from calibrate.geometry import Array, inverse
+from calibrate.geometry import Array
 
 _ALPHA = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
 JOINT_NAMES = ("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3")
@@ -118,65 +118,61 @@ def singularity_measure(model: RobotModel, joints_rad: ArrayLike) -> Array:
 def inverse_all(model: RobotModel, base_from_flange: Array) -> Array:
     """All analytic solutions of the nominal table, (n, 6) with n ≤ 8, each joint in (-π, π].
 
-    Source: K. Hawkins, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms" (2013).
     At a wrist singularity (sin q5 = 0) there are infinitely many; only those with wrist 3 = 0 are given, and
     there may be none near the limit of the reach. Unreachable poses give (0, 6).
+    """
+    return inverse_many(model, np.asarray(base_from_flange, dtype=float)[None])[1]
+
+
+def inverse_many(model: RobotModel, base_from_flange: Array) -> tuple[NDArray[np.intp], Array]:
+    """`inverse_all` of many poses (n, 4, 4): the pose that each solution belongs to (m,), and joints (m, 6).
+
+    Source: K. Hawkins, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms" (2013).
     """
     a2, a3 = model.a_m[1], model.a_m[2]
     d1, _, _, d4, d5, d6 = model.d_m
     T = np.asarray(base_from_flange, dtype=float)
-    solutions = []
-    wrist = T[:3, 3] - d6 * T[:3, 2]
-    radius = np.hypot(wrist[0], wrist[1])
-    if radius < abs(d4):
-        return np.zeros((0, 6))
-    for s1 in (1.0, -1.0):
-        q1 = np.arctan2(wrist[1], wrist[0]) + s1 * np.arccos(d4 / radius) + np.pi / 2
-        # Sideways axis of the arm in the flange: (sin q5 cos q6, -sin q5 sin q6, cos q5). Its two small
-        # entries keep full precision near the wrist singularity, where arccos(cos q5) has none.
-        side = T[0, :3] * np.sin(q1) - T[1, :3] * np.cos(q1)
-        for s5 in (1.0, -1.0):
-            sin_q5 = s5 * np.hypot(side[0], side[1])
-            q5 = np.arctan2(sin_q5, side[2])
-            q6 = np.arctan2(-side[1] / sin_q5, side[0] / sin_q5) if abs(sin_q5) > 1e-9 else 0.0
-            solutions += _arm_plane(T, a2, a3, d1, d4, d5, d6, q1, q5, q6)
-    if not solutions:
-        return np.zeros((0, 6))
-    return np.asarray((np.array(solutions) + np.pi) % (2 * np.pi) - np.pi)
-
-
-def _arm_plane(
-    T: Array,
-    a2: float,
-    a3: float,
-    d1: float,
-    d4: float,
-    d5: float,
-    d6: float,
-    q1: float,
-    q5: float,
-    q6: float,
-) -> list[list[float]]:
-    """Shoulder, elbow and wrist 1: a planar two-link arm, elbow up and down."""
-
-    def step(q: float, d: float, alpha: float) -> Array:
-        ct, st, ca, sa = np.cos(q), np.sin(q), np.cos(alpha), np.sin(alpha)
-        return np.array(
-            [[ct, -st * ca, st * sa, 0], [st, ct * ca, -ct * sa, 0], [0, sa, ca, d], [0, 0, 0, 1.0]]
-        )
-
-    T14 = inverse(step(q1, d1, np.pi / 2)) @ T @ inverse(step(q5, d5, -np.pi / 2) @ step(q6, d6, 0.0))
-    x, y = T14[0, 3], T14[1, 3]
+    wrist = T[:, :3, 3] - d6 * T[:, :3, 2]
+    radius = np.hypot(wrist[:, 0], wrist[:, 1])
+    reachable = np.flatnonzero(radius >= abs(d4))
+    T, wrist, radius = T[reachable], wrist[reachable], radius[reachable]
+    # Branches: shoulder side, wrist flip, elbow; each array is (poses, 2, 2, 2) or spreads to it.
+    s1, s5, s3 = (np.array([1.0, -1.0]).reshape(shape) for shape in ((2, 1, 1), (2, 1), (2,)))
+    one = (slice(None), None, None, None)
+    q1 = np.arctan2(wrist[:, 1], wrist[:, 0])[one] + s1 * np.arccos(d4 / radius)[one] + np.pi / 2
+    # Sideways axis of the arm in the flange: (sin q5 cos q6, -sin q5 sin q6, cos q5). Its two small
+    # entries keep full precision near the wrist singularity, where arccos(cos q5) has none.
+    side = [T[:, 0, i][one] * np.sin(q1) - T[:, 1, i][one] * np.cos(q1) for i in range(3)]
+    sin_q5 = s5 * np.hypot(side[0], side[1])
+    q5 = np.arctan2(sin_q5, side[2])
+    straight = np.abs(sin_q5) <= 1e-9
+    safe = np.where(straight, 1.0, sin_q5)
+    q6 = np.where(straight, 0.0, np.arctan2(-side[1] / safe, side[0] / safe))
+    x, y, tilt = _in_arm_plane(T[one], q1, q5, q6, d1, d5, d6)
+    # Shoulder, elbow and wrist 1: a planar two-link arm, elbow up and down.
     c3 = (x * x + y * y - a2 * a2 - a3 * a3) / (2 * a2 * a3)
-    if abs(c3) > 1 + 1e-9:
-        return []
-    found = []
-    for s3 in (1.0, -1.0):
-        q3 = s3 * np.arccos(np.clip(c3, -1, 1))
-        q2 = np.arctan2(y, x) - np.arctan2(a3 * np.sin(q3), a2 + a3 * np.cos(q3))
-        q4 = np.arctan2(T14[1, 0], T14[0, 0]) - q2 - q3
-        found.append([q1, q2, q3, q4, q5, q6])
-    return found
+    q3 = s3 * np.arccos(np.clip(c3, -1, 1))
+    q2 = np.arctan2(y, x) - np.arctan2(a3 * np.sin(q3), a2 + a3 * np.cos(q3))
+    joints = np.stack(np.broadcast_arrays(q1, q2, q3, tilt - q2 - q3, q5, q6), axis=-1).reshape(-1, 6)
+    possible = np.flatnonzero(np.broadcast_to(np.abs(c3) <= 1 + 1e-9, q2.shape))
+    return reachable[possible // 8], (joints[possible] + np.pi) % (2 * np.pi) - np.pi
+
+
+def _in_arm_plane(
+    T: Array, q1: Array, q5: Array, q6: Array, d1: float, d5: float, d6: float
+) -> tuple[Array, Array, Array]:
+    """Where wrist 1 stands in the plane of upper arm and forearm: x, y (m) and q2 + q3 + q4 (rad)."""
+    c1, n1 = np.cos(q1), np.sin(q1)
+    c5, n5, c6, n6 = np.cos(q5), np.sin(q5), np.cos(q6), np.sin(q6)
+    # Origin and x axis of frame 4, in the flange and then in base.
+    origin = (d5 * n6, d5 * c6, -d6)
+    x_axis = (c5 * c6, -c5 * n6, -n5)
+    in_base = [[sum(T[..., row, i] * v[i] for i in range(3)) for row in range(3)] for v in (origin, x_axis)]
+    p = [in_base[0][row] + T[..., row, 3] for row in range(3)]
+    x = c1 * p[0] + n1 * p[1]
+    y = p[2] - d1
+    tilt = np.arctan2(in_base[1][2], c1 * in_base[1][0] + n1 * in_base[1][1])
+    return np.asarray(x), np.asarray(y), np.asarray(tilt)
 
 
 def inverse_nearest(model: RobotModel, base_from_flange: Array, near_rad: ArrayLike) -> Array | None:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from calibrate.board import board_points
 from calibrate.geometry import Array, pose, rotation_exp
-from calibrate.kinematics import inverse_all, singularity_measure
+from calibrate.kinematics import inverse_many, singularity_measure
 from calibrate.projection import camera_matrix
 from station.collision import margins
 from station.limits import joint_bounds
@@ -85,7 +85,6 @@ def find_candidates(
     count: int,
     rng: np.random.Generator,
     near_joints_rad: Array | None,
-    draws: list[tuple[Array, Array]],
     tries: int | None = None,
 ) -> Pool:
     """All arm branches of camera poses that pass view, reach, joints and clearance.
@@ -94,7 +93,7 @@ def find_candidates(
     """
     views = camera_views(scene, view, tries or count, rng)
     flange = scene.base_from_flange(views)
-    seen = seen_for_certain(scene, flange, view, draws)
+    seen = seen_for_certain(scene, flange, view)
     lost = Counter({NOT_IN_PICTURE: int((~seen).sum())})
     views, flange = views[seen][:count], flange[seen][:count]
     rows, joints = _all_branches(scene, flange, near_joints_rad)
@@ -144,9 +143,7 @@ def _limit_of(label: str, scene: Scene) -> str:
 def _all_branches(scene: Scene, flange: Array, near: Array | None) -> tuple[NDArray[np.intp], Array]:
     """Inverse kinematics of all poses: row in `flange` (m,), and joints (m, 6)."""
     low, high = joint_bounds(scene.geometry)
-    solutions = [inverse_all(scene.geometry.model, target) for target in flange]
-    rows = np.repeat(np.arange(len(flange)), [len(found) for found in solutions])
-    q = np.concatenate([np.zeros((0, 6)), *solutions])
+    rows, q = inverse_many(scene.geometry.model, flange)
     branches = branch_of(scene, q)
     for branch in np.unique(branches):
         here = branches == branch

@@ -29,7 +29,6 @@ from station.plan.visibility import visible
 
 Progress = Callable[[str, float], None]
 POOL_SIZE = 480
-_DRAWS = 48
 _TRIES = 12
 """Camera poses looked at per wanted member of the pool; most fall to the guess's uncertainty."""
 
@@ -85,12 +84,10 @@ def _relaxed(view: ViewRange, start_roll_rad: float | None) -> list[tuple[ViewRa
     """The wanted range, then ever less particular ones, each with what is to be said about it."""
     rolls = [0.0, np.pi / 2, -np.pi / 2, np.pi] if start_roll_rad is None else [start_roll_rad, 0.0]
     views = [(replace(view, roll_centre_rad=roll), "") for roll in rolls]
-    doubtful = replace(views[0][0], doubt=1.0, visible_share=0.9, off_centre=0.2)
-    rolled = replace(doubtful, roll_rad=np.pi, visible_share=0.7, border_px=6.0)
+    doubtful = replace(views[0][0], doubt=2.0, off_centre=0.2)
+    rolled = replace(doubtful, roll_rad=np.pi, doubt=1.0, border_px=6.0)
     near, far = view.distance_m
-    wide = replace(
-        rolled, free_sight=False, visible_share=0.3, off_centre=0.1, distance_m=(0.85 * near, 1.3 * far)
-    )
+    wide = replace(rolled, free_sight=False, doubt=0.5, off_centre=0.1, distance_m=(0.85 * near, 1.3 * far))
     return [
         *views,
         (doubtful, "the guess is rough: some pictures may cut the board"),
@@ -115,8 +112,7 @@ def candidate_pool(
     """Candidates of the best branch. LimitError with the reason when the widest range has too few."""
     best: tuple[Pool, Pool, str] | None = None
     for view, note in _relaxed(options.view or view_range(scene), _start_roll(scene, start)):
-        draws = scene.drawn(_DRAWS, view.doubt, rng)
-        found = find_candidates(scene, view, 2 * options.pool, rng, start, draws, _TRIES * options.pool)
+        found = find_candidates(scene, view, 2 * options.pool, rng, start, _TRIES * options.pool)
         group = best_group(scene, found, start, options.pool, 3 * options.count)
         if best is None or len(group) > len(best[0]):
             best = group, found, note

@@ -21,7 +21,6 @@ from station.plan.view_range import ViewRange, view_range
 
 _FURTHER_POSES = 60
 _TRIES = 12
-_DRAWS = 16
 
 
 @dataclass(frozen=True)
@@ -87,8 +86,7 @@ def advise(
     rng = np.random.default_rng(options.seed)
     start = np.asarray(joints_now_rad, dtype=float)
     view = options.view or view_range(scene)
-    draws = scene.drawn(_DRAWS, view.doubt, rng)
-    pool = find_candidates(scene, view, options.pool, rng, start, draws)
+    pool = find_candidates(scene, view, options.pool, rng, start)
     if len(pool) == 0:
         return Advice(now, False, f"{state}; no further pose is reachable with the board in view")
     gains = informations(scene, pool.base_from_flange, options.noise, options.free_intrinsics)

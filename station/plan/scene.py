@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import msgspec
 import numpy as np
 
 from calibrate.board import board_points
-from calibrate.geometry import Array, inverse, pose, pose_from_quaternion, rotation_exp, transform_points
+from calibrate.geometry import Array, inverse, pose_from_quaternion, transform_points
 from calibrate.kinematics import MODELS, DhDeltas, RobotModel
 from recordings.messages import BoardSpec, CameraModel, Mount
 from station.collision import CellGeometry, plate
@@ -15,6 +16,10 @@ from station.config import Capsule, PoseGuess, StationConfig
 from station.errors import ConfigError
 
 _CAMERA_BODY_M, _CAMERA_RADIUS_M = 0.05, 0.035
+_DOUBT = 3.0
+"""What hangs on a guess is thickened by so many sigmas: nothing else keeps a wrong mount off the arm."""
+_MOST_DOUBT_M = 0.03
+"""A camera thicker than this could not stand beside any wrist; bootstrap is for guesses that are worse."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,18 +55,6 @@ class Scene:
         """Board points (k, 3) in `camera`, (n, k, 3)."""
         return transform_points(self.camera_from_board(base_from_flange), points)
 
-    def drawn(self, draws: int, doubt: float, rng: np.random.Generator) -> list[tuple[Array, Array]]:
-        """Other (X, Y) that the guess allows, `doubt` times its sigmas away; none without doubt."""
-        if doubt * max(*self.x_sigma, *self.y_sigma) == 0:
-            return []
-
-        def disturbed(matrix: Array, sigma: tuple[float, float]) -> Array:
-            # A guess is wrong about where the thing is and how it is turned, each about itself.
-            turned = matrix[:3, :3] @ rotation_exp(doubt * rng.normal(0, sigma[1], 3))
-            return pose(turned, matrix[:3, 3] + doubt * rng.normal(0, sigma[0], 3))
-
-        return [(disturbed(self.X, self.x_sigma), disturbed(self.Y, self.y_sigma)) for _ in range(draws)]
-
 
 def board_extent(board: BoardSpec) -> tuple[Array, Array]:
     """Corners (2,) of the printed area in the board's plane, one square beyond the outermost points."""
@@ -91,7 +84,7 @@ def scene_of(config: StationConfig) -> Scene:
         config.board,
         X,
         Y,
-        geometry_of(config, X, Y, 2 * place_guess.sigma_m),
+        cell_geometry(config),
         _sigmas(mount_guess),
         _sigmas(place_guess),
         config.working_distance_m,
@@ -103,13 +96,11 @@ def _sigmas(guess: PoseGuess) -> tuple[float, float]:
 
 
 def cell_geometry(config: StationConfig) -> CellGeometry:
-    """Geometry for checks before motion; uses the guesses where there are any."""
-    X, Y = (
-        None if g is None else pose_from_quaternion(g.translation_m, g.rotation_xyzw)
-        for g in (config.camera_guess, config.board_guess)
-    )
-    doubt_m = 2 * config.board_guess.sigma_m if config.board_guess else 0.0
-    return geometry_of(config, X, Y, doubt_m)
+    """Geometry for checks before motion; uses the guesses where there are any, and their sigmas."""
+    guesses = config.camera_guess, config.board_guess
+    X, Y = (None if g is None else pose_from_quaternion(g.translation_m, g.rotation_xyzw) for g in guesses)
+    camera_m, board_m = (0.0 if g is None else g.sigma_m for g in guesses)
+    return geometry_of(config, X, Y, camera_m, board_m)
 
 
 def arm_model(config: StationConfig) -> RobotModel:
@@ -120,8 +111,18 @@ def arm_model(config: StationConfig) -> RobotModel:
     return model
 
 
-def geometry_of(config: StationConfig, X: Array | None, Y: Array | None, doubt_m: float) -> CellGeometry:
-    """Solids and obstacles of a cell; board clearance grows by `doubt_m`, what its place is not known to."""
+def geometry_of(
+    config: StationConfig,
+    X: Array | None,
+    Y: Array | None,
+    camera_doubt_m: float = 0.0,
+    board_doubt_m: float = 0.0,
+) -> CellGeometry:
+    """Solids and obstacles of a cell, for a camera and a board that may be off by so much (one sigma).
+
+    What is on the flange gets thicker by three sigmas, 30 mm at most; clearance to what stands in the cell
+    grows by two. Solids that the configuration draws on the flange are taken as they are.
+    """
     low, high = board_extent(config.board)
     limits = config.limits
     solids = limits.solids
@@ -131,25 +132,33 @@ def geometry_of(config: StationConfig, X: Array | None, Y: Array | None, doubt_m
     if config.mount == "eye-in-hand":
         if X is not None:
             watched = (_point(X[:3, 3]),)
-            solids = solids or (camera_body("camera", X),)
+            solids = solids or (camera_body("camera", X, _thicker_m(camera_doubt_m)),)
         if Y is not None:
             obstacles = plate("board", Y, low, high)
-            clearance = limits.board_clearance_m + doubt_m
+            clearance = limits.board_clearance_m + 2 * board_doubt_m
     else:
         if Y is not None:
-            solids += plate("board", Y, low, high)
+            thicker_m = _thicker_m(board_doubt_m)
+            solids += tuple(
+                msgspec.structs.replace(rod, radius_m=rod.radius_m + thicker_m)
+                for rod in plate("board", Y, low, high)
+            )
             corners = np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
             watched = tuple(_point(p) for p in transform_points(Y, corners))
         if X is not None:
             obstacles = (camera_body("camera", X),)
-            clearance = limits.clearance_m + doubt_m
+            clearance = limits.clearance_m + 2 * camera_doubt_m
     return CellGeometry(arm_model(config), limits, solids, obstacles, clearance, watched)
 
 
-def camera_body(name: str, parent_from_camera: Array) -> Capsule:
+def _thicker_m(sigma_m: float) -> float:
+    return min(_DOUBT * sigma_m, _MOST_DOUBT_M)
+
+
+def camera_body(name: str, parent_from_camera: Array, thicker_m: float = 0.0) -> Capsule:
     """A camera as it stands behind its optical centre."""
     ends = transform_points(parent_from_camera, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -_CAMERA_BODY_M]]))
-    return Capsule(name, _point(ends[0]), _point(ends[1]), _CAMERA_RADIUS_M)
+    return Capsule(name, _point(ends[0]), _point(ends[1]), _CAMERA_RADIUS_M + thicker_m)
 
 
 def _point(p: Array) -> tuple[float, float, float]:

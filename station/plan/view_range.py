@@ -23,10 +23,9 @@ class ViewRange:
     off_centre: float = 0.35
     """Share of half the picture that the board's centre may be away from the picture's centre."""
     border_px: float = 12.0
-    doubt: float = 1.6
-    """The guess is taken to be wrong by so many times its sigmas."""
-    visible_share: float = 1.0
-    """Share of such wrong guesses for which the whole board must still be in the picture."""
+    doubt: float = 3.5
+    """So many standard deviations of its pixels, as the guesses' sigmas make them, every corner of the board
+    keeps from the picture's edge beyond `border_px`."""
     smallest_singular: float = 0.03
     free_sight: bool = True
     """No part of the arm between camera and board."""

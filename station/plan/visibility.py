@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,19 +37,36 @@ def lens_radius(camera: CameraModel) -> float:
     return float(radii[falling[0]] if len(falling) else radii[-1])
 
 
-def seen_for_certain(
-    scene: Scene, base_from_flange: Array, view: ViewRange, draws: list[tuple[Array, Array]]
-) -> NDArray[np.bool_]:
-    """(n,) whether guess and the wanted share of the drawn guesses show the whole board."""
+def seen_for_certain(scene: Scene, base_from_flange: Array, view: ViewRange) -> NDArray[np.bool_]:
+    """(n,) whether the whole board is in the picture, and stays so when the guesses are wrong.
+
+    Every point of the outline keeps `border_px` and `doubt` standard deviations of its pixel from the edge.
+    """
     rim = outline(scene.board)
-    left = np.flatnonzero(visible(scene.camera, scene.seen(base_from_flange, rim), view.border_px))
-    misses = np.zeros(len(left))
-    allowed = (1 - view.visible_share) * len(draws) + 1e-9
-    for X, Y in draws:
-        drawn = replace(scene, X=X, Y=Y)
-        misses += ~visible(scene.camera, drawn.seen(base_from_flange[left], rim), view.border_px)
-        left, misses = left[misses <= allowed], misses[misses <= allowed]
-    return np.isin(np.arange(len(base_from_flange)), left)
+    good = visible(scene.camera, scene.seen(base_from_flange, rim), view.border_px)
+    left = np.flatnonzero(good)
+    pixels, sigma_px = uncertain_pixels(scene, base_from_flange[left], rim)
+    border = view.border_px + view.doubt * sigma_px
+    size = np.array([scene.camera.width, scene.camera.height]) - 1
+    good[left] = ((pixels >= border) & (pixels <= size - border)).all(axis=(1, 2))
+    return good
+
+
+def uncertain_pixels(scene: Scene, base_from_flange: Array, points: Array) -> tuple[Array, Array]:
+    """Board points (k, 3) in n pictures: pixels and their standard deviations, (n, k, 2) each.
+
+    First order. An error of the camera's place or of the board's moves a point alike in all directions; a
+    turn of the camera moves it about the camera, a turn of the board about the board's origin.
+    """
+    seen = scene.seen(base_from_flange, points)
+    lever = seen - scene.seen(base_from_flange, np.zeros((1, 3)))
+    variance = (scene.x_sigma[0] ** 2 + scene.y_sigma[0] ** 2) * np.eye(3)
+    for arm, sigma_rad in ((seen, scene.x_sigma[1]), (lever, scene.y_sigma[1])):
+        across = (arm**2).sum(axis=-1)[..., None, None] * np.eye(3) - arm[..., :, None] * arm[..., None, :]
+        variance = variance + sigma_rad**2 * across
+    projected = project(scene.camera, seen)
+    J = projected.by_point
+    return projected.pixels, np.sqrt(np.einsum("nkij,nkjl,nkil->nki", J, variance, J))
 
 
 def outline(board: BoardSpec) -> Array:

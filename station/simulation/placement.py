@@ -5,6 +5,7 @@ A place counts when enough of the planner's own candidate poses are reachable an
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -142,8 +143,9 @@ def _random_turn(rng: np.random.Generator) -> Array:
 
 
 def _exact_scene(mount: Mount, camera: CameraModel, board: BoardSpec, X: Array, Y: Array) -> Scene:
-    # 20 mm of doubt about the board, as in the configuration that is handed out, keep clearances equal.
-    guesses = guess_of(X, 0.02, 0.0), guess_of(Y, 0.02, 0.0)
+    # 20 mm of doubt about what stands in the cell: room for the guesses that the configuration hands out.
+    camera_sigma_m, board_sigma_m = (0.0, 0.02) if mount == "eye-in-hand" else (0.02, 0.0)
+    guesses = guess_of(X, camera_sigma_m, 0.0), guess_of(Y, board_sigma_m, 0.0)
     return scene_of(cell_description(mount, camera, board, *guesses))
 
 
@@ -175,7 +177,7 @@ def _sees(scene: Scene, joints_rad: Array) -> bool:
 
 def _roomy(scene: Scene, start: Array, rng: np.random.Generator) -> bool:
     """Whether enough varied views are reachable without changing the arm branch."""
-    found = find_candidates(scene, view_range(scene), _TRIED_VIEWS, rng, start, [])
+    found = find_candidates(scene, replace(view_range(scene), doubt=0.0), _TRIED_VIEWS, rng, start)
     if len(found) == 0:
         return False
     near = np.abs(found.joints_rad - start).max(axis=1) < 2.6

@@ -124,7 +124,7 @@ def test_the_choice_beats_random_poses_of_the_same_pool():
     _, config = cell()
     scene = scene_of(config)
     rng = np.random.default_rng(0)
-    pool = find_candidates(scene, view_range(scene), 200, rng, None, [])
+    pool = find_candidates(scene, replace(view_range(scene), doubt=0.0), 200, rng, None)
     each = informations(scene, pool.base_from_flange, Noise(), True)
     for criterion in ("A", "D"):
         objective = objective_for(scene, criterion, True)
@@ -137,7 +137,7 @@ def test_kept_poses_stay_chosen():
     _, config = cell()
     scene = scene_of(config)
     rng = np.random.default_rng(0)
-    pool = find_candidates(scene, view_range(scene), 100, rng, None, [])
+    pool = find_candidates(scene, replace(view_range(scene), doubt=0.0), 100, rng, None)
     each = informations(scene, pool.base_from_flange, Noise(), True)
     chosen = choose(each, 8, objective_for(scene, "A", True), rng, keep=(3, 5))
     assert chosen[:2] == [3, 5]

@@ -1,0 +1,74 @@
+"""What a guess is not known to is kept clear: around camera and board, and at the picture's edge."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import msgspec
+import numpy as np
+import pytest
+
+from calibrate.geometry import perturb
+from calibrate.kinematics import forward
+from station.collision import margins
+from station.plan.scene import cell_geometry, scene_of
+from station.plan.visibility import outline, uncertain_pixels
+from station.simulation.placement import guess_of
+from station.simulation.scenes import build_cell, cell_config
+
+
+def config_of(mount="eye-in-hand", sigma_m=0.005):
+    truth = build_cell("paper", 0, "low", mount)
+    X, Y = np.array(truth.camera_mount), np.array(truth.board_place)
+    config = msgspec.structs.replace(
+        cell_config(truth),
+        camera_guess=guess_of(X, sigma_m, 0.03),
+        board_guess=guess_of(Y, sigma_m, 0.03),
+    )
+    return truth, config, X, Y
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_what_hangs_on_a_guess_stays_clear_of_the_arm_when_the_guess_is_three_sigmas_wrong(mount):
+    _, config, X, Y = config_of(mount)
+    doubted = cell_geometry(config)
+    joints = np.random.default_rng(1).uniform(-2.5, 2.5, (300, 6))
+    name = "camera" if mount == "eye-in-hand" else "board"
+    gaps, labels = margins(doubted, joints)
+    columns = [i for i, label in enumerate(labels) if label.endswith(f"against {name}")]
+    for way in np.vstack([np.eye(3), -np.eye(3)]):
+        shift = np.concatenate([0.015 * way, np.zeros(3)])
+        there = guess_of(perturb(X if name == "camera" else Y, shift), 0.0, 0.0)
+        moved = msgspec.structs.replace(config, **{f"{name}_guess": there})
+        true_gaps, same = margins(cell_geometry(moved), joints)
+        assert same == labels
+        assert (gaps[:, columns] <= true_gaps[:, columns] + 1e-9).all()
+
+
+def test_the_camera_is_not_thickened_without_bound():
+    [rough], [hopeless] = (cell_geometry(config_of(sigma_m=s)[1]).solids for s in (0.02, 0.2))
+    assert rough.radius_m == hopeless.radius_m <= 0.07
+
+
+def test_solids_of_the_configuration_are_taken_as_they_are():
+    _, config, _, _ = config_of()
+    drawn = cell_geometry(msgspec.structs.replace(config, camera_guess=guess_of(np.eye(4), 0.0, 0.0))).solids
+    limits = msgspec.structs.replace(config.limits, solids=drawn)
+    assert cell_geometry(msgspec.structs.replace(config, limits=limits)).solids == drawn
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_the_pixels_spread_as_drawn_guesses_say(mount):
+    truth, config, X, Y = config_of(mount)
+    scene = scene_of(config)
+    flange = forward(scene.geometry.model, truth.start_joints_rad)[None]
+    rim = outline(scene.board)
+    pixels, sigma_px = uncertain_pixels(scene, flange, rim)
+    rng = np.random.default_rng(0)
+    drawn = []
+    for _ in range(2000):
+        dX, dY = rng.normal(size=(2, 6)) * np.repeat([0.005, 0.03], 3)
+        wrong = replace(scene, X=perturb(X, dX), Y=perturb(Y, dY))
+        drawn.append(uncertain_pixels(wrong, flange, rim)[0][0])
+    assert np.mean(drawn, axis=0) == pytest.approx(pixels[0], abs=6)
+    assert np.std(drawn, axis=0) == pytest.approx(sigma_px[0], rel=0.1)

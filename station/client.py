@@ -25,6 +25,10 @@ class DaemonGoneError(StationError):
     """No daemon answers on the socket, or it went away."""
 
 
+class NoAnswerError(StationError):
+    """The daemon holds the connection and says nothing: it hangs, or its computer is far too busy."""
+
+
 def who_am_i() -> str:
     """'anna on tty1': what others read as the holder of the lease."""
     try:
@@ -85,11 +89,16 @@ class Client:
         except (OSError, TimeoutError) as error:
             raise DaemonGoneError(f"{path}: the daemon does not answer ({error or 'timeout'}).") from None
         client = cls(path, reader, writer)
-        await client.request("hello", who=who or who_am_i(), interactive=interactive)
+        try:
+            who = who or who_am_i()
+            await client.request("hello", who=who, interactive=interactive, timeout_s=timeout_s)
+        except StationError:
+            await client.close()
+            raise
         return client
 
     async def request(self, verb: Verb, *, timeout_s: float = ANSWER_S, **args: Any) -> Any:
-        """The daemon's result as plain data. RefusedError with its reason; DaemonGoneError."""
+        """The daemon's result as plain data. RefusedError with its reason; DaemonGoneError; NoAnswerError."""
         if self._gone:
             raise self._gone_error()
         request = Request(self._next_id, verb, args)
@@ -105,7 +114,10 @@ class Client:
             async with asyncio.timeout(timeout_s):
                 reply = await answer
         except TimeoutError:
-            raise StationError(f"{verb}: no answer from the daemon within {timeout_s:.0f} s.") from None
+            raise NoAnswerError(
+                f"{verb}: no answer from the daemon within {timeout_s:.0f} s. If the arm moves use the "
+                "emergency stop; `systemctl status station` or the daemon's log says more."
+            ) from None
         except OSError:
             raise self._gone_error() from None
         finally:

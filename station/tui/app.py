@@ -27,7 +27,7 @@ from station.status import StationState, StationStatus
 from station.tui import offline
 from station.tui.checklist import ChecklistScreen
 from station.tui.commands import Commands
-from station.tui.link import Connect, Link
+from station.tui.link import Connect, Link, listen
 from station.tui.live import LiveScreen
 from station.tui.log import LogScreen
 from station.tui.plan import PlanScreen
@@ -43,6 +43,11 @@ PREVIEW_PERIOD_S = 0.25
 STATUS_PERIOD_S = 0.15
 SETTLED_S = 2.0
 RECONNECT_S = 1.0
+GONE = "The daemon ended: the arm decelerates by itself. This screen goes on as soon as one serves again."
+SILENT = (
+    "The station does not answer: the daemon hangs, or its computer is far too busy. What stands below is "
+    "old. The arm's own watchdog stops it; if it moves all the same, use the emergency stop on the pendant."
+)
 
 
 def freeze_startup() -> None:
@@ -52,9 +57,11 @@ def freeze_startup() -> None:
 
 
 class StatusChanged(Message):
-    def __init__(self, status: StationStatus | None) -> None:
+    """None: there is no daemon, and `why`."""
+
+    def __init__(self, status: StationStatus | None, why: str = "") -> None:
         super().__init__()
-        self.status = status
+        self.status, self.why = status, why
 
 
 class StationApp(Commands):
@@ -111,18 +118,35 @@ class StationApp(Commands):
     async def follow(self) -> None:
         """Stays connected for as long as the screen lives."""
         while True:
+            why = GONE
             try:
                 self.link = await self._connect()
+                self.run_worker(listen(self.link, self.hear), group="listen", exclusive=True)
                 async for status in self.link.statuses():
                     await self._pace(status)
                     self.post_message(StatusChanged(status))
-            except (OSError, StationError, msgspec.ValidationError):
-                pass  # Said on the bar; a daemon of another version is no daemon for this screen.
+            except (OSError, StationError) as problem:
+                why = str(problem)
+            except msgspec.ValidationError as problem:
+                why = f"The daemon is of another version than this screen ({problem}): restart the older one."
             gone, self.link = self.link, None
             if gone is not None:
                 await gone.close()
-            self.post_message(StatusChanged(None))
+            self.post_message(StatusChanged(None, why))
             await asyncio.sleep(RECONNECT_S)
+
+    def hear(self, silent_s: float | None) -> None:
+        """For how long the daemon has not answered; None: it does."""
+        if silent_s is None and self.silent_s is None:
+            return
+        self.silent_s = silent_s
+        self._tell_trouble("" if silent_s is None else SILENT)
+
+    def _tell_trouble(self, trouble: str) -> None:
+        self.trouble = trouble
+        for screen in self.screen_stack:
+            if isinstance(screen, StationScreen) and screen.is_mounted:
+                screen.doubt(trouble, self.silent_s)
 
     async def _pace(self, status: StationStatus) -> None:
         """A new state or reason is shown at once; numbers that only flicker, a few times a second."""
@@ -147,12 +171,16 @@ class StationApp(Commands):
 
     def on_status_changed(self, message: StatusChanged) -> None:
         self.status = message.status
+        if message.status is None:
+            self.silent_s = None
         if message.status is not None and not self._greeted:
             self._greeted = True
             self.greet(message.status)
         for screen in self.screen_stack:
             if isinstance(screen, StationScreen) and screen.is_mounted:
                 screen.show(message.status)
+        if self.silent_s is None and self.trouble != message.why:
+            self._tell_trouble(message.why)
 
     @work(exit_on_error=False)
     async def greet(self, status: StationStatus) -> None:

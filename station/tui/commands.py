@@ -17,6 +17,7 @@ from station.tui.confirm import Confirm, ConfirmGo
 from station.tui.link import Link
 from station.tui.replay_screen import ReplayScreen
 
+STOP_UNHEARD = "STOP was sent, but the station does not answer: use the EMERGENCY STOP on the pendant."
 PLAN_ANSWER_S = 200.0
 """Planning takes the daemon some seconds on a quick computer, and minutes on a busy one."""
 
@@ -27,6 +28,10 @@ class Commands(App[None]):
     status: reactive[StationStatus | None] = reactive(None)
     link: Link | None = None
     """The connection while there is one."""
+    silent_s: float | None = None
+    """For how long the daemon has not answered; None while it does."""
+    trouble = ""
+    """Why what is shown is not how it is: no daemon, or one that does not answer."""
 
     async def ask(self, verb: Verb, **args: Any) -> Any:
         """The daemon's answer, or None after a notice that says why not."""
@@ -36,6 +41,11 @@ class Commands(App[None]):
         if self.link is None:
             self.notify("No connection to the daemon: nothing was sent.", severity="error")
             return None
+        if self.silent_s is not None:
+            if verb != "stop":
+                self.notify("The station does not answer: nothing was sent.", severity="error")
+                return None
+            self.notify(STOP_UNHEARD, severity="error", timeout=10)
         try:
             return await self.link.request(verb, **args)
         except RefusedError as refused:

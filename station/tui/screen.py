@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING, cast
+
 from textual.app import ComposeResult
 from textual.screen import Screen
 from textual.widgets import Footer
 
 from station.status import StationStatus
 from station.tui.widgets.bar import ReasonLine, StatusBar
+
+if TYPE_CHECKING:
+    from station.tui.commands import Commands
 
 
 class StationScreen(Screen[None]):
@@ -24,7 +29,9 @@ class StationScreen(Screen[None]):
         yield Footer()
 
     def on_screen_resume(self) -> None:
-        self.show(self.app.status)  # type: ignore[attr-defined]
+        app = cast("Commands", self.app)
+        self.show(app.status)
+        self.doubt(app.trouble, app.silent_s)
 
     def body(self) -> ComposeResult:
         yield from ()
@@ -33,3 +40,13 @@ class StationScreen(Screen[None]):
         """Hands the newest status to every part that shows some of it."""
         for part in self.query("StatusBar, ReasonLine, Panel, Events"):
             part.status = status  # type: ignore[attr-defined]
+
+    def doubt(self, trouble: str, silent_s: float | None) -> None:
+        """Why what stands here is old (empty: it is not), and for how long the daemon has not answered."""
+        self.set_class(bool(trouble), "-old")
+        for bar in self.query(StatusBar):
+            bar.silent_s = silent_s
+        for line in self.query(ReasonLine):
+            line.trouble = trouble
+        for part in self.query("Panel, Preview"):
+            part.old = bool(trouble)  # type: ignore[attr-defined]

@@ -46,6 +46,8 @@ class FakeLink:
             "lease": {"holder": "me"},
             "sessions": [{"name": "s-0"}],
         }
+        self.silent = asyncio.Event()
+        """While set nothing is answered, as by a daemon that hangs."""
         self._statuses: asyncio.Queue[StationStatus | None] = asyncio.Queue()
         self.show(idle())
 
@@ -55,10 +57,12 @@ class FakeLink:
 
     @property
     def verbs(self) -> list[str]:
-        return [verb for verb, _ in self.asked if verb not in ("preview", "sessions")]
+        return [verb for verb, _ in self.asked if verb not in ("preview", "sessions", "watch")]
 
     async def request(self, verb: str, **args: Any) -> Any:
         self.asked.append((verb, args))
+        while self.silent.is_set():
+            await asyncio.sleep(0.01)
         if verb in self.refuse:
             raise self.refuse[verb]
         return self.answers.get(verb, {})

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import re
+import signal
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 
@@ -148,7 +149,7 @@ async def test_run_stop_resume_finish_solve_install(desk_with: MakeDesk) -> None
     assert len(recording.views()) >= ENOUGH
 
 
-async def test_neither_end_of_the_line_takes_the_session_with_it(
+async def test_a_lost_screen_a_hung_and_a_killed_daemon_leave_the_session_whole(
     desk_with: MakeDesk, short_plan: Plan
 ) -> None:
     desk = await desk_with(1.0)
@@ -167,6 +168,20 @@ async def test_neither_end_of_the_line_takes_the_session_with_it(
     await shows(second, "connection of .* was lost")
     await shows(second, r"\+ ")
     assert captured(second.glass.text) >= 1
+
+    await go(second)
+    await desk.rig.moving()
+    desk.rig.daemons[-1].process.send_signal(signal.SIGSTOP)
+    await desk.rig.at_rest()
+    await shows(second, "^ NO ANSWER for .* EMERGENCY STOP")
+    await shows(second, "The station does not answer")
+    second.press("f12")
+    await shows(second, "STOP was sent, but")
+    desk.rig.daemons[-1].process.send_signal(signal.SIGCONT)
+    await shows(second, "^ STOPPED|^ FAULT")
+    await desk.rig.stays_at_rest()
+    second.press("f8")
+    await shows(second, "^ PAUSED")
 
     await go(second)
     await desk.rig.moving()

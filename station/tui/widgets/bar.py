@@ -14,20 +14,31 @@ STOP_KEY = "F12=STOP"
 LEVELS = 5
 NO_DAEMON = " NO DAEMON: trying again every second. To stop the arm use the pendant."
 
+NO_ANSWER = " NO ANSWER for {:.0f} s: state UNKNOWN. To stop the arm: EMERGENCY STOP."
+
 
 class StatusBar(Static):
     """One line, as full as its width allows; the STOP key is the last thing to be left out: never."""
 
     status: reactive[StationStatus | None] = reactive(None)
+    silent_s: reactive[float | None] = reactive(None)
 
-    def watch_status(self, status: StationStatus | None) -> None:
-        self.set_class(status is None or status.state in _ALARM, "alarm")
-        self.set_class(status is not None and status.state is StationState.PAUSED, "warn")
+    def watch_status(self) -> None:
+        status, silent = self.status, self.silent_s is not None
+        self.set_class(silent or status is None or status.state in _ALARM, "alarm")
+        self.set_class(status is not None and status.state is StationState.PAUSED and not silent, "warn")
         self.refresh()
 
+    def watch_silent_s(self) -> None:
+        self.watch_status()
+
     def render(self) -> Text:
-        width = self.size.width
-        line = NO_DAEMON if self.status is None else bar_line(self.status, width)
+        if self.silent_s is not None:
+            line = NO_ANSWER.format(self.silent_s)
+        elif self.status is None:
+            line = NO_DAEMON
+        else:
+            line = bar_line(self.status, self.size.width)
         return Text(line, no_wrap=True, overflow="ellipsis")
 
 
@@ -69,10 +80,15 @@ class ReasonLine(Static):
     """Why the station is not working, in a sentence, with what to do; hidden while all is well."""
 
     status: reactive[StationStatus | None] = reactive(None)
+    trouble: reactive[str] = reactive("")
+    """Stands before what the daemon said last."""
     _reason = ""
 
-    def watch_status(self, status: StationStatus | None) -> None:
-        reason = "" if status is None else status.reason
+    def watch_trouble(self) -> None:
+        self.watch_status()
+
+    def watch_status(self) -> None:
+        reason = self.trouble or ("" if self.status is None else self.status.reason)
         if reason != self._reason:
             self._reason = reason
             self.display = bool(reason)

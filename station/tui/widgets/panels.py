@@ -21,12 +21,17 @@ class Panel(Static):
     """A titled box that redraws only when its own lines change."""
 
     status: reactive[StationStatus | None] = reactive(None)
+    old: reactive[bool] = reactive(False)
+    """No longer how it is; said in the title too."""
 
     def __init__(self, title: str, lines: Lines, *, id: str) -> None:
         super().__init__(id=id, classes="panel")
-        self.border_title = title
+        self.border_title = self._title = title
         self._lines = lines
         self._shown = ""
+
+    def watch_old(self, old: bool) -> None:
+        self.border_title = f"{self._title}: OLD" if old else self._title
 
     def watch_status(self, status: StationStatus | None) -> None:
         text = "" if status is None else "\n".join(self._lines(status))

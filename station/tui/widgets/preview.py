@@ -14,6 +14,7 @@ from rich.color import Color
 from rich.segment import Segment
 from rich.style import Style
 from textual.geometry import Size
+from textual.reactive import reactive
 from textual.strip import Strip
 from textual.widget import Widget
 
@@ -23,11 +24,16 @@ LEVELS = 20
 CORNER = Segment("+", Style(color=Color.from_rgb(0, 230, 0), bgcolor=Color.from_rgb(0, 0, 0), bold=True))
 """A sign and not only a colour."""
 
+OLD = "OLD PICTURE"
+
 
 class Preview(Widget):
     """Shows the last picture it was given; scales with its own size, keeps the aspect ratio."""
 
     DEFAULT_CSS = "Preview { width: 1fr; height: 1fr; }"
+
+    old: reactive[bool] = reactive(False)
+    """The camera may see something else by now; written across the picture."""
 
     def __init__(self, *, id: str | None = None) -> None:
         super().__init__(id=id)
@@ -57,6 +63,8 @@ class Preview(Widget):
     def render_line(self, y: int) -> Strip:
         if self._rows_size != self.size:
             self._rows, self._rows_size = self._draw(self.size), self.size
+        if self.old and self._picture is not None and y == self.size.height // 2:
+            return Strip([Segment(OLD.center(self.size.width), Style(reverse=True, bold=True))])
         return self._rows[y] if y < len(self._rows) else Strip.blank(self.size.width)
 
     def _draw(self, size: Size) -> list[Strip]:

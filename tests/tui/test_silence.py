@@ -1,0 +1,65 @@
+"""A daemon that hangs keeps its socket open and says nothing: the screen must not look alive."""
+
+from __future__ import annotations
+
+import pytest
+
+from station.status import StationState
+from station.tui import link as link_module
+from station.tui.commands import STOP_UNHEARD
+from station.tui.widgets.preview import OLD, Preview
+from tests.tui.conftest import FakeLink, idle
+from tests.tui.test_jobs import until
+from tests.tui.test_keys import app_on, text_of
+
+
+@pytest.fixture(autouse=True)
+def short_patience(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(link_module, "LISTEN_S", 0.02)
+    monkeypatch.setattr(link_module, "SILENT_S", 0.1)
+
+
+async def test_a_daemon_that_does_not_answer_is_announced_and_what_it_said_is_old(link: FakeLink) -> None:
+    link.show(idle(StationState.MOVING))
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: "MOVING" in text_of(pilot.app, "#bar"))
+        preview = pilot.app.screen.query_one(Preview)
+        await until(pilot, lambda: preview._picture is not None)
+        link.silent.set()
+        await until(pilot, lambda: "NO ANSWER" in text_of(pilot.app, "#bar"))
+        await pilot.pause()
+        assert "MOVING" not in text_of(pilot.app, "#bar")
+        assert "EMERGENCY STOP" in text_of(pilot.app, "#bar")
+        assert "does not answer" in text_of(pilot.app, "#reason")
+        assert str(pilot.app.screen.query_one("#devices").border_title) == "Devices: OLD"
+        assert OLD in preview.render_line(preview.size.height // 2).text
+        await pilot.press("2")  # every screen says it
+        await until(pilot, lambda: "NO ANSWER" in text_of(pilot.app, "#bar"))
+        await pilot.press("1")
+        link.silent.clear()
+        await until(pilot, lambda: "MOVING" in text_of(pilot.app, "#bar"))
+        assert not pilot.app.screen.query_one("#reason").display
+        assert OLD not in preview.render_line(preview.size.height // 2).text
+
+
+async def test_meanwhile_only_stop_is_sent_and_the_emergency_stop_is_named(link: FakeLink) -> None:
+    async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
+        await pilot.pause()
+        link.silent.set()
+        await until(pilot, lambda: "NO ANSWER" in text_of(pilot.app, "#bar"))
+        await pilot.press("f5", "f6")
+        await pilot.pause()
+        assert link.verbs == []
+        await pilot.press("f12")
+        await pilot.pause()
+        assert link.verbs == ["stop"]
+        assert any(said.message == STOP_UNHEARD for said in pilot.app._notifications)
+        link.silent.clear()
+
+
+async def test_why_there_is_no_daemon_is_said(link: FakeLink) -> None:
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await pilot.pause()
+        link.show(None)
+        await until(pilot, lambda: "NO DAEMON" in text_of(pilot.app, "#bar"))
+        assert "The daemon ended" in text_of(pilot.app, "#reason")

@@ -1,7 +1,8 @@
 """How fast frames travel: simulated GigE camera → Aravis → recorder → disk, with 500 Hz robot states beside.
 
-Files of ten seconds are each verified in a process of low priority (every picture to the bit, every frame
-id and sequence) and deleted. Frames are 1280×1024 mono8 in packets of 8996 bytes over loopback.
+The camera counts what it sent: frames it did not get to send are its own, every other one that is missing is
+lost. Files of ten seconds are each verified in a process of low priority (every picture to the bit, frame
+ids, numbers, count of robot states) and deleted. Frames are 1280×1024 mono8 in packets of 8996 bytes.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import tempfile
 import threading
 import time
 from collections.abc import Callable
-from concurrent.futures import Future, ProcessPoolExecutor, wait
+from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -39,38 +40,65 @@ from station.simulation.netns import isolated_command
 FILE_S = 10.0
 STATE_HZ = 500.0
 SHARE = float(os.environ.get("BENCH_SHARE", "1"))
+LAST_FRAMES_S = 1.0
+"""Frames that are still on their way when the camera stops."""
 
 
 @dataclass
 class Outcome:
-    fps: float
+    asked_fps: float
     seconds: float
-    frames: int
+    sent: int
+    """Frames, from the first one received on"""
     lost: int
-    """Gaps in the frame ids"""
+    """Sent, but not received whole"""
+    reordered: int
     dropped: int
     """By the recorder, pictures and states"""
-    wrong: int
-    """Recorded pictures that differ from what was sent, or are missing or out of order in the file"""
     verified: int
+    """Pictures in the files"""
+    wrong: int
+    """Of them: other than what was sent under that number, or out of place"""
     states: int
-    client_cores: float
+    """Sent; each is in a file"""
+    states_lost: int
+    station_cores: float
     """CPU time of camera, recorder and states per second"""
-    server_cores: float
+    simulator_cores: float
+    verifier_cores: float
     memory_mib: float
+    unbuffered: int
+    incomplete: int
+    slowest_sync_ms: float
+
+    @property
+    def clean(self) -> bool:
+        bad = self.lost, self.reordered, self.dropped, self.wrong, self.states_lost
+        return not any(bad) and self.verified == self.sent
+
+
+HEADER = (
+    "asked fps|s|frames sent|fps|lost|reordered|dropped|verified|wrong|states|states lost"
+    "|CPU station|CPU simulator|CPU verifier|memory|slowest sync"
+)
+
+
+def row(outcome: Outcome) -> str:
+    """Of the table under `HEADER`."""
+    o, fps = outcome, outcome.sent / outcome.seconds
+    cells = (
+        f"{o.asked_fps:g}|{o.seconds:.0f}|{o.sent}|{fps:.1f}|{o.lost}|{o.reordered}|{o.dropped}"
+        f"|{o.verified}|{o.wrong}|{o.states}|{o.states_lost}|{o.station_cores:.2f} cores"
+        f"|{o.simulator_cores:.2f} cores|{o.verifier_cores:.2f} cores|{o.memory_mib:.0f} MiB"
+        f"|{o.slowest_sync_ms:.0f} ms"
+    )
+    return f"| {cells.replace('|', ' | ')} |"
 
 
 def run() -> str:
-    rows = [measure(75.0, 60 * SHARE), measure(150.0, 120 * SHARE)]
-    header = "asked fps|s|frames|fps|lost|dropped|verified|wrong|states|CPU client|CPU simulator|memory"
-    lines = [f"| {header.replace('|', ' | ')} |", "|" + "---|" * 12]
-    for asked, r in zip((75, 150), rows, strict=True):
-        lines.append(
-            f"| {asked} | {r.seconds:.0f} | {r.frames} | {r.fps:.1f} | {r.lost} | {r.dropped} | {r.verified} "
-            f"| {r.wrong} | {r.states} | {r.client_cores:.2f} cores | {r.server_cores:.2f} cores "
-            f"| {r.memory_mib:.0f} MiB |"
-        )
-    return "\n".join(lines)
+    rows = [row(measure(75.0, 60 * SHARE)), row(measure(150.0, 120 * SHARE))]
+    header = f"| {HEADER.replace('|', ' | ')} |"
+    return "\n".join([header, "|" + "---|" * (HEADER.count("|") + 1), *rows])
 
 
 def measure(fps: float, seconds: float) -> Outcome:
@@ -86,75 +114,86 @@ class Rotation:
     """Recorders of ten seconds each; finished files are verified and deleted."""
 
     def __init__(self, folder: Path, frames_per_file: int) -> None:
-        self._folder = folder
-        self._frames_per_file = frames_per_file
-        self._recorder: Recorder | None = None
-        self._verifier = ProcessPoolExecutor(1, initializer=os.nice, initargs=(19,))
-        self._sealed: list[tuple[Recorder, Future[Path]]] = []
-        self._results: list[Future[tuple[int, int]]] = []
+        self._folder, self._frames_per_file = folder, frames_per_file
         self._lock = threading.Lock()
-        self.states = 0
+        self._recorder = self._open(0)
+        self._opener = ThreadPoolExecutor(1)
+        self._opening = self._opener.submit(self._open, 1)
+        self._verifier = ProcessPoolExecutor(1, initializer=os.nice, initargs=(19,))
+        self._verifier.submit(int).result()  # forked before there is much to share
+        self._finished: list[Future[tuple[int, int, int]]] = []
+        self.first_number = self._last_number = -1
+        self.received = self.reordered = self.dropped = self.states = 0
+        self.slowest_sync_s = 0.0
 
     def picture(self, picture: Picture) -> None:
-        if picture.sequence % self._frames_per_file == 0:
-            self._next(picture.sequence // self._frames_per_file)
-        assert self._recorder is not None
+        if self.received and self.received % self._frames_per_file == 0:
+            self._next()
+        number = number_of(picture)
+        if not self.received:
+            self.first_number = number
+        self.reordered += number <= self._last_number
+        self._last_number = number
+        self.received += 1
         self._recorder.picture(picture)
 
     def state(self, state: RobotState) -> None:
         with self._lock:
-            if self._recorder is not None:
-                self.states += self._recorder.robot_state(state)
+            self.states += 1
+            self._recorder.robot_state(state)
+        self.slowest_sync_s = max(self.slowest_sync_s, self._recorder.last_sync_s)
 
     def finish(self) -> tuple[int, int, int]:
-        """Drops, pictures verified, and how many of them were wrong."""
-        self._next(None)
-        wait(finished for _, finished in self._sealed)
-        while len(self._results) < len(self._sealed):
-            time.sleep(0.01)  # callbacks come a moment after their future
-        results = [result.result() for result in self._results]
+        """Pictures verified, how many of them were wrong, robot states in the files."""
+        self._seal(self._recorder)
+        self._seal(self._opening.result())
+        self._opener.shutdown()  # the opener also hands sealed files to the verifier
+        results = [verified.result() for verified in self._finished]
         self._verifier.shutdown()
-        return (
-            sum(recorder.dropped for recorder, _ in self._sealed),
-            sum(good for good, _ in results),
-            sum(bad for _, bad in results),
-        )
+        return sum(r[0] for r in results), sum(r[1] for r in results), sum(r[2] for r in results)
 
-    def _next(self, number: int | None) -> None:
+    def _next(self) -> None:
         with self._lock:
-            before = self._recorder
-            self._recorder = None if number is None else self._open(number)
-        if before is not None:
-            finished = before.finish()
-            self._sealed.append((before, finished))
-            finished.add_done_callback(self._verify)
+            full, self._recorder = self._recorder, self._opening.result()
+        self._seal(full)
+        number = self.received // self._frames_per_file + 1
+        self._opening = self._opener.submit(self._open, number)
 
     def _open(self, number: int) -> Recorder:
-        path = self._folder / f"{number}.mcap"
         info = SessionInfo("bench", "eye-in-hand", "simulated", PAPER_BOARD, CameraModel(1280, 1024))
-        return Recorder(path, info)
+        return Recorder(self._folder / f"{number}.mcap", info)
 
-    def _verify(self, sealed: Future[Path]) -> None:
-        self._results.append(self._verifier.submit(verify, sealed.result()))
+    def _seal(self, recorder: Recorder) -> None:
+        sealed = recorder.finish()
+
+        def hand_over() -> None:
+            path = sealed.result()
+            self.dropped += recorder.dropped
+            self._finished.append(self._verifier.submit(verify, path))
+
+        self._opener.submit(hand_over)
 
 
-def verify(path: Path) -> tuple[int, int]:
-    """Pictures in the file and how many are not what the simulator sent; deletes the file."""
+def number_of(picture: Picture) -> int:
+    return int.from_bytes(picture.image.reshape(-1)[:8].tobytes(), "little")
+
+
+def verify(path: Path) -> tuple[int, int, int]:
+    """Pictures in the file, how many are not what the simulator sent, robot states; deletes the file."""
     part = open_recording(path).parts[0]
     sequences = part.picture_sequences()
-    wrong = (sequences[-1] - sequences[0] + 1) - len(sequences)
+    wrong = 0
     previous: tuple[int, int] | None = None
     for sequence in sequences:
         picture = part.picture(sequence)
-        number = int.from_bytes(picture.image.reshape(-1)[:8].tobytes(), "little")
+        number = number_of(picture)
         same = np.array_equal(picture.image, numbered_picture(number, 1280, 1024))
-        follows = previous is None or (
-            frames_between(previous[0], picture.frame_id) == 1 and number == previous[1] + 1
-        )
+        follows = previous is None or frames_between(previous[0], picture.frame_id) == number - previous[1]
         wrong += not (same and follows)
         previous = picture.frame_id, number
+    states = sum(1 for _ in part.robot_states())
     path.unlink()
-    return len(sequences), wrong
+    return len(sequences), wrong, states
 
 
 def publish_states(callback: Callable[[RobotState], None], stop: threading.Event) -> None:
@@ -170,34 +209,45 @@ def publish_states(callback: Callable[[RobotState], None], stop: threading.Event
 
 
 async def stream(server: SimulatedGige, fps: float, seconds: float, folder: Path) -> Outcome:
-    server.inject("register", [genicam.FRAME_PERIOD, round(1e6 / fps)])
+    server.inject("register", [genicam.FRAME_PERIOD, int(1e6 / fps)])
+    rotation = Rotation(folder, round(FILE_S * fps))
     camera = AravisCamera(CameraConfig(device="127.0.0.1", trigger="free-running", packet_size=8996))
     await camera.open()
-    rotation = Rotation(folder, round(FILE_S * fps))
     stop = threading.Event()
     states = threading.Thread(target=publish_states, args=(rotation.state, stop))
     states.start()
     before, server_before, start_s = cpu_s(), process_cpu_s(server.process.pid), time.monotonic()
-    asyncio.get_running_loop().call_later(seconds, stop.set)
-    await camera.stream(rotation.picture, stop)
+    streaming = asyncio.ensure_future(camera.stream(rotation.picture, stop))
+    await asyncio.sleep(seconds)
+    server.inject("register", [genicam.ACQUISITION, 0])
     took_s = time.monotonic() - start_s
-    client, served = cpu_s() - before, process_cpu_s(server.process.pid) - server_before
+    used_s, served_s = cpu_s() - before, process_cpu_s(server.process.pid) - server_before
+    await asyncio.sleep(LAST_FRAMES_S)
+    stop.set()
+    await streaming
     states.join()
     memory_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    sent, counts = server.sent() - rotation.first_number, camera.stream_counts()
     await camera.close()
-    dropped, verified, wrong = await asyncio.to_thread(rotation.finish)
+    verified, wrong, states_read = await asyncio.to_thread(rotation.finish)
     return Outcome(
-        fps=camera.counter.frames / took_s,
+        asked_fps=fps,
         seconds=took_s,
-        frames=camera.counter.frames,
-        lost=camera.counter.missing,
-        dropped=dropped,
-        wrong=wrong,
+        sent=sent,
+        lost=sent - rotation.received,
+        reordered=rotation.reordered,
+        dropped=rotation.dropped,
         verified=verified,
+        wrong=wrong,
         states=rotation.states,
-        client_cores=client / took_s,
-        server_cores=served / took_s,
+        states_lost=rotation.states - states_read,
+        station_cores=used_s / took_s,
+        simulator_cores=served_s / took_s,
+        verifier_cores=resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime / took_s,
         memory_mib=memory_mib,
+        unbuffered=counts.unbuffered,
+        incomplete=counts.incomplete,
+        slowest_sync_ms=1e3 * rotation.slowest_sync_s,
     )
 
 

@@ -16,7 +16,7 @@ from station.clocks import ClockFit
 from station.config import CameraConfig
 from station.devices.aravis_device import GenicamDevice
 from station.devices.base import Trigger
-from station.devices.frames import DeviceClock, FrameCounter
+from station.devices.frames import DeviceClock, FrameCounter, StreamCounts
 from station.errors import CameraError
 
 T = TypeVar("T")
@@ -48,6 +48,11 @@ class AravisCamera:
     @property
     def clock(self) -> ClockFit | None:
         return self._clock.fit
+
+    def stream_counts(self) -> StreamCounts:
+        """Since the camera was opened (again). At once, from any thread."""
+        device = self._device
+        return StreamCounts() if device is None else device.counts()
 
     async def open(self) -> CameraIdentity:
         async with self._busy:

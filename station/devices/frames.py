@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections import deque
 from typing import NamedTuple
 
+import msgspec
+
 from station.clocks import DRIFT_SPAN_S, UNFITTED_DRIFT, ClockFit
 from station.errors import CameraError
 
@@ -12,6 +14,19 @@ LAST_FRAME_ID = 65_535
 """GigE Vision block ids run from 1 to this and start over at 1; 0 means "no frame"."""
 UNKNOWN_READOUT_S = 0.05
 READINGS_KEPT = 200
+
+
+class StreamCounts(msgspec.Struct, frozen=True):
+    """What the network did to a camera's frames since it was opened."""
+
+    complete: int = 0
+    incomplete: int = 0
+    """Frames that arrived with holes"""
+    unbuffered: int = 0
+    """Frames that found no free buffer: the program was too slow"""
+    missing_packets: int = 0
+    resend_requests: int = 0
+    resent_packets: int = 0
 
 
 def next_frame_id(frame_id: int) -> int:

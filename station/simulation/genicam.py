@@ -12,7 +12,7 @@ VENDOR, MODEL = "Daheng Imaging", "MER-131-75GM"
 VENDOR_ADDRESS, MODEL_ADDRESS, VERSION_ADDRESS, INFO_ADDRESS, SERIAL_ADDRESS = 0x48, 0x68, 0x88, 0xA8, 0xD8
 SENSOR_HEIGHT, SENSOR_WIDTH = 0x118, 0x11C
 WIDTH, HEIGHT, GAIN, EXPOSURE = 0x100, 0x104, 0x110, 0x120
-PIXEL_FORMAT, FRAME_PERIOD = 0x128, 0x138
+ACQUISITION, PIXEL_FORMAT, FRAME_PERIOD = 0x124, 0x128, 0x138
 TIMESTAMP_LATCH, TIMESTAMP_VALUE, EXPOSURE_AUTO, GAIN_AUTO = 0xA000, 0xA008, 0xA010, 0xA014
 TRIGGER_SOURCE, FIRST_FREE = 0xA018, 0xA01C
 TRIGGER_PULSE, FAKE_TRIGGER_SOURCE = 0x30C, 0x304
@@ -58,8 +58,8 @@ def genicam_xml() -> str:
         _integer("Height", HEIGHT, "<Min>2</Min><pMax>SensorHeight</pMax><Inc>2</Inc>"),
         _enumeration("PixelFormat", PIXEL_FORMAT, PIXEL_FORMATS),
         _enumeration("AcquisitionMode", 0x12C, {"Continuous": 1, "SingleFrame": 2, "MultiFrame": 3}),
-        _command("AcquisitionStart", 0x124, 1),
-        _command("AcquisitionStop", 0x124, 0),
+        _command("AcquisitionStart", ACQUISITION, 1),
+        _command("AcquisitionStop", ACQUISITION, 0),
         _float("AcquisitionFrameRate", FRAME_PERIOD, "1000000 / FROM", "1000000 / TO", 0.1, 1000.0, "Hz"),
         _float("ExposureTime", EXPOSURE, "FROM", "TO", 20.0, 1_000_000.0, "us"),
         _enumeration("ExposureAuto", EXPOSURE_AUTO, {"Off": 0, "Continuous": 1, "Once": 2}),

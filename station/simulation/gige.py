@@ -7,8 +7,10 @@ camera, with `packet-loss` (share of packets) besides. It ends with its input.
 
 from __future__ import annotations
 
+import contextlib
 import ctypes
 import json
+import os
 import socket
 import sys
 import tempfile
@@ -203,6 +205,12 @@ def numbered_picture(number: int, width: int, height: int) -> NDArray[np.uint8]:
     return picture
 
 
+def _be_hardware() -> None:
+    """Keeps its pace whatever this computer does besides, where that is permitted: a camera would, too."""
+    with contextlib.suppress(OSError):
+        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(1))
+
+
 def main(
     controller_host: Annotated[str, typer.Option(help="Whose arm the camera looks at.")] = "",
     truth: Annotated[Path | None, typer.Option(help="File of the simulated cell.")] = None,
@@ -212,6 +220,8 @@ def main(
 ) -> None:
     """Serves until standard input ends; prints one JSON line when it listens."""
     cv2.setNumThreads(1)
+    if numbered:
+        _be_hardware()
     cell: CellTruth = make_cell() if truth is None else read_truth(truth)
     rendered = CameraProcess(cell, controller_host, cell.exposure_us, cell.gain_db)
     if not numbered:
@@ -235,13 +245,15 @@ def main(
             camera.set_packet_loss(float(request["value"]))
         elif request["name"] == "number":
             numbers.next_number = int(request["value"])
+        elif request["name"] == "sent":
+            pass  # every answer says it
         elif request["name"] == "pulse":
             camera.set_register(genicam.TRIGGER_PULSE, 1)
         elif request["name"] == "register":
             camera.set_register(*request["value"])
         else:
             rendered.faults.inject(request["name"], request.get("value"))
-        print(json.dumps({"done": request["name"]}), flush=True)
+        print(json.dumps({"done": request["name"], "number": numbers.next_number}), flush=True)
 
 
 if __name__ == "__main__":

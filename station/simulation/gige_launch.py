@@ -22,11 +22,20 @@ class SimulatedGige:
 
     def inject(self, fault: str, value: Any = None) -> None:
         """A fault of `camera_faults`, or `packet-loss` with a share of packets; then it is in force."""
+        self._ask(fault, value)
+
+    def sent(self) -> int:
+        """Numbered pictures that went out so far, plus the number of the first."""
+        return int(self._ask("sent")["number"])
+
+    def _ask(self, name: str, value: Any = None) -> dict[str, Any]:
         assert self.process.stdin is not None and self.process.stdout is not None
-        self.process.stdin.write(json.dumps({"name": fault, "value": value}) + "\n")
+        self.process.stdin.write(json.dumps({"name": name, "value": value}) + "\n")
         self.process.stdin.flush()
-        if not self.process.stdout.readline():
-            raise CameraError(f"the GigE simulator ended on the fault '{fault}'")
+        answer = self.process.stdout.readline()
+        if not answer:
+            raise CameraError(f"the GigE simulator ended on the fault '{name}'")
+        return dict(json.loads(answer))
 
     def stop(self) -> None:
         """Idempotent."""

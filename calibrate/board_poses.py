@@ -52,4 +52,6 @@ def refine_board_poses(observed: Observations, state: State) -> BoardPoses:
 
 def _typical(distance: Array, present: Array) -> Array:
     """Median per view over its own corners (n,)."""
+    if present.all():
+        return np.asarray(np.median(distance, axis=1))
     return np.asarray(np.nanmedian(np.where(present > 0, distance, np.nan), axis=1))

@@ -33,8 +33,6 @@ class Estimate:
     """(4,) corner px, robot m, robot rad, kinematic scale."""
     joint_covariance: Array
     """(12 + p, 12 + p) of X, Y and the kinematic errors."""
-    shares: dict[str, float]
-    """Share of X's variance (translation weighed by its size, see `_shares`) by source, sums to 1."""
     weights: Array
     """(n, k) of the corners."""
     normal: Normal
@@ -46,6 +44,11 @@ class Estimate:
     def covariance(self) -> Array:
         """(6, 6) of X."""
         return self.joint_covariance[:6, :6]
+
+    @property
+    def shares(self) -> dict[str, float]:
+        """Share of X's variance by source (mean over directions), sums to 1."""
+        return _shares(self.normal, self.normal.solve(self.sigma**-2), self.sigma, self.intrinsics_free)
 
     @property
     def threshold(self) -> float:
@@ -116,7 +119,6 @@ def estimate(
         state=state,
         sigma=sigma,
         joint_covariance=_without_intrinsics(solved.covariance, intrinsics_free),
-        shares=_shares(normal, solved, sigma, intrinsics_free),
         weights=weights,
         normal=normal,
         steps=steps,

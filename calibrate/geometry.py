@@ -123,7 +123,7 @@ def rotation_exp(vector: ArrayLike) -> Array:
     a, b = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2 * np.pi)) ** 2  # sin x/x, (1 - cos x)/x²
     R = b * (v[..., :, None] * v[..., None, :]) + a * skew(v)
     R[..., [0, 1, 2], [0, 1, 2]] += np.cos(angle[..., 0])
-    return R
+    return np.asarray(R)
 
 
 def rotation_log(R: ArrayLike) -> Array:

@@ -6,6 +6,7 @@ equidistant (fisheye) k1 … k4. Pixel (0, 0) is the centre of the top left pixe
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import msgspec
@@ -16,6 +17,8 @@ from recordings.messages import CameraModel
 
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 """What the last stage can refine, in this order."""
+_Bent = tuple[Array, Array, Callable[[], Array]]
+"""Distorted x, y of rays (x, y, 1), and on demand their derivatives by x and y (..., 2, 2)."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,20 +34,37 @@ class Projected:
 def project(camera: CameraModel, points: Array, with_intrinsics: bool = False) -> Projected:
     """Points (..., 3) in `camera`, metres. Points at or behind the camera give non-finite pixels."""
     K = camera_matrix(camera)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        w = 1.0 / points[..., 2]
-    x, y = points[..., 0] * w, points[..., 1] * w
-    if camera.distortion_model == "equidistant":
-        xd, yd, D = _equidistant(x, y, camera.distortion)
-    else:
-        xd, yd, D = _brown(x, y, camera.distortion)
-    skewed = K[0, 1]
-    pixels = np.stack([K[0, 0] * xd + skewed * yd + K[0, 2], K[1, 1] * yd + K[1, 2]], axis=-1)
+    x, y, w = _rays(points)
+    xd, yd, derivatives = _bend(camera, x, y)
+    by_x = K[:2, :2] @ derivatives()
     J = np.empty((*points.shape[:-1], 2, 3))
-    by_x = K[:2, :2] @ D
     J[..., :2] = by_x * w[..., None, None]
     J[..., 2] = -(by_x[..., 0] * (x * w)[..., None] + by_x[..., 1] * (y * w)[..., None])
+    pixels = _pixels(K, xd, yd)
     return Projected(pixels, J, _by_intrinsics(K, x, y, xd, yd) if with_intrinsics else None)
+
+
+def project_pixels(camera: CameraModel, points: Array) -> Array:
+    """The pixels of `project`, to the bit, without the derivatives."""
+    x, y, _ = _rays(points)
+    xd, yd, _ = _bend(camera, x, y)
+    return _pixels(camera_matrix(camera), xd, yd)
+
+
+def _rays(points: Array) -> tuple[Array, Array, Array]:
+    """x/z, y/z and 1/z."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        w = 1.0 / points[..., 2]
+    return points[..., 0] * w, points[..., 1] * w, w
+
+
+def _bend(camera: CameraModel, x: Array, y: Array) -> _Bent:
+    bend = _equidistant if camera.distortion_model == "equidistant" else _brown
+    return bend(x, y, camera.distortion)
+
+
+def _pixels(K: Array, xd: Array, yd: Array) -> Array:
+    return np.stack([K[0, 0] * xd + K[0, 1] * yd + K[0, 2], K[1, 1] * yd + K[1, 2]], axis=-1)
 
 
 def camera_matrix(camera: CameraModel) -> Array:
@@ -70,24 +90,28 @@ def with_intrinsics_vector(camera: CameraModel, vector: Array) -> CameraModel:
     return msgspec.structs.replace(camera, matrix=matrix, distortion=tuple(distortion))
 
 
-def _brown(x: Array, y: Array, coefficients: tuple[float, ...]) -> tuple[Array, Array, Array]:
-    """Radial (rational) and tangential distortion: xd, yd, ∂(xd, yd)/∂(x, y) (..., 2, 2)."""
+def _brown(x: Array, y: Array, coefficients: tuple[float, ...]) -> _Bent:
+    """Radial (rational) and tangential distortion."""
     k1, k2, p1, p2, k3, k4, k5, k6 = (*coefficients, *(0.0,) * 8)[:8]
     r2 = x * x + y * y
     top = 1 + r2 * (k1 + r2 * (k2 + r2 * k3))
     bottom = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
     radial = top / bottom
-    slope = (k1 + r2 * (2 * k2 + 3 * k3 * r2) - radial * (k4 + r2 * (2 * k5 + 3 * k6 * r2))) / bottom
     xd = x * radial + 2 * p1 * x * y + p2 * (r2 + 2 * x * x)
     yd = y * radial + p1 * (r2 + 2 * y * y) + 2 * p2 * x * y
-    D = np.empty((*x.shape, 2, 2))
-    D[..., 0, 0] = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
-    D[..., 0, 1] = D[..., 1, 0] = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
-    D[..., 1, 1] = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
-    return xd, yd, D
+
+    def derivatives() -> Array:
+        slope = (k1 + r2 * (2 * k2 + 3 * k3 * r2) - radial * (k4 + r2 * (2 * k5 + 3 * k6 * r2))) / bottom
+        D = np.empty((*x.shape, 2, 2))
+        D[..., 0, 0] = radial + 2 * x * x * slope + 2 * p1 * y + 6 * p2 * x
+        D[..., 0, 1] = D[..., 1, 0] = 2 * x * y * slope + 2 * p1 * x + 2 * p2 * y
+        D[..., 1, 1] = radial + 2 * y * y * slope + 6 * p1 * y + 2 * p2 * x
+        return D
+
+    return xd, yd, derivatives
 
 
-def _equidistant(x: Array, y: Array, coefficients: tuple[float, ...]) -> tuple[Array, Array, Array]:
+def _equidistant(x: Array, y: Array, coefficients: tuple[float, ...]) -> _Bent:
     """Kannala-Brandt: θd = θ (1 + k1 θ² + … + k4 θ⁸), scaled along the ray's direction."""
     k1, k2, k3, k4 = (*coefficients, *(0.0,) * 4)[:4]
     r = np.sqrt(x * x + y * y)
@@ -95,14 +119,18 @@ def _equidistant(x: Array, y: Array, coefficients: tuple[float, ...]) -> tuple[A
     theta = np.arctan(safe)
     t2 = theta * theta
     bent = theta * (1 + t2 * (k1 + t2 * (k2 + t2 * (k3 + t2 * k4))))
-    slope = (1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))) / (1 + safe * safe)
     scale = bent / safe
-    along = (slope - scale) / (safe * safe)
-    D = np.empty((*x.shape, 2, 2))
-    D[..., 0, 0] = scale + along * x * x
-    D[..., 0, 1] = D[..., 1, 0] = along * x * y
-    D[..., 1, 1] = scale + along * y * y
-    return x * scale, y * scale, D
+
+    def derivatives() -> Array:
+        slope = (1 + t2 * (3 * k1 + t2 * (5 * k2 + t2 * (7 * k3 + t2 * 9 * k4)))) / (1 + safe * safe)
+        along = (slope - scale) / (safe * safe)
+        D = np.empty((*x.shape, 2, 2))
+        D[..., 0, 0] = scale + along * x * x
+        D[..., 0, 1] = D[..., 1, 0] = along * x * y
+        D[..., 1, 1] = scale + along * y * y
+        return D
+
+    return x * scale, y * scale, derivatives
 
 
 def _by_intrinsics(K: Array, x: Array, y: Array, xd: Array, yd: Array) -> Array:

@@ -9,7 +9,7 @@ import numpy as np
 from calibrate.geometry import Array, difference, inverse, skew
 from calibrate.likelihood.model import Observations, State
 from calibrate.likelihood.normal import CORNERS, PRIOR, ROBOT_ROTATION, ROBOT_TRANSLATION, Normal
-from calibrate.projection import project
+from calibrate.projection import project, project_pixels
 
 _CHUNK_POINTS = 40_000
 """Corners linearised at once: bounds memory for thousands of views."""
@@ -21,7 +21,7 @@ def corner_residuals(observed: Observations, state: State) -> Array:
         return np.zeros_like(observed.pixels)
     p = observed.points @ np.swapaxes(state.C[:, :3, :3], 1, 2) + state.C[:, None, :3, 3]
     p = np.where(observed.present[..., None] > 0, p, [0.0, 0.0, 1.0])
-    return np.where(observed.present[..., None] > 0, observed.pixels - project(state.camera, p).pixels, 0.0)
+    return np.where(observed.present[..., None] > 0, observed.pixels - project_pixels(state.camera, p), 0.0)
 
 
 def modelled_flange(observed: Observations, state: State) -> Array:

@@ -135,6 +135,9 @@ class Recorder:
                 self._finished.set_running_or_notify_cancel()
                 if self.error is not None:
                     self._finished.set_exception(self.error)
+                elif self._closing:
+                    text = f"{self.part_path} was closed unsealed: `recordings recover` makes it whole"
+                    self._finished.set_exception(RecordingError(text))
                 self._wake.notify()
             return self._finished
 
@@ -198,7 +201,7 @@ class Recorder:
             elif now_s - flushed_s >= FLUSH_PERIOD_S:
                 self._writer.flush()
                 flushed_s = now_s
-        if self._finished is not None:
+        if self._finished is not None and not self._finished.done():
             self._finished.set_result(self._writer.finish())
 
     def _next(self) -> _Item | None:

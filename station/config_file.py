@@ -11,8 +11,8 @@ from calibrate.kinematics import MODELS
 from recordings import strict_yaml
 from station.config import PoseGuess, StationConfig
 from station.errors import ConfigError
+from station.limits import SPEED_CAP_M_S
 
-SPEED_CAP_M_S = 0.25
 LARGEST_SQUARE_M, LARGEST_REACH_M = 0.5, 5.0
 """Beyond these somebody wrote millimetres."""
 

@@ -27,6 +27,7 @@ SPACING_M = 0.01
 """No modelled point moves further between two checked samples; margins are reduced by half of it."""
 _LONGEST_TURN_RAD = 4 * np.pi
 """From one end of a joint's range to the other; whatever turns further is out of range."""
+_LEAVING_SLACK_M = 0.001
 _FLANGE_TOLERANCE_M, _FLANGE_TOLERANCE_RAD = 0.002, 0.005
 
 
@@ -204,10 +205,13 @@ def _joint_problems(geometry: CellGeometry, start: Array, target: Array, name: s
 def leaving(gaps: Array) -> Array:
     """Margins (..., samples, c) along paths, where an arm that already stands too close may move away.
 
-    A margin that starts negative counts as zero for as long as it only grows.
+    A margin that starts negative counts as zero for as long as it only grows, and grows fast enough to be
+    gone at the end of the way: sliding along a wall is no retreat.
     """
     growing = np.diff(gaps, axis=-2, prepend=gaps[..., :1, :]) > -1e-4
-    excused = np.cumprod(growing & (gaps < 0), axis=-2).astype(bool)
+    left = 1.0 - np.linspace(0.0, 1.0, gaps.shape[-2])[:, None]
+    fast = gaps >= gaps[..., :1, :] * left - _LEAVING_SLACK_M
+    excused = np.cumprod(growing & fast & (gaps < 0), axis=-2).astype(bool)
     excused[..., -1, :] = False
     return np.where(excused, 0.0, gaps)
 

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import threading
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
 from multiprocessing import get_context
+from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
 
 from station.analysis import start_worker, warm_up
@@ -16,6 +18,7 @@ from station.errors import StationError
 log = logging.getLogger(__name__)
 
 R = TypeVar("R")
+REAP_S = 5.0
 
 
 class WorkerError(StationError):
@@ -67,4 +70,10 @@ class Workers:
         pool.shutdown(wait=False, cancel_futures=True)
         for process in processes:
             process.kill()
-            process.join(1.0)
+        # In a thread: the loop that beats the arm's heart waits for no process to end.
+        threading.Thread(target=_reap, args=(processes,), name="worker reaper", daemon=True).start()
+
+
+def _reap(processes: list[BaseProcess]) -> None:
+    for process in processes:
+        process.join(REAP_S)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import time
 
 import msgspec
 import numpy as np
 
 from calibrate.geometry import Array, inverse, pose_from_rotvec
+from recordings.errors import RecordingError
 from recordings.messages import Matrix4, Picture, RobotState, Stamps, Stillness, Vector6, View
 from station.analysis import Sighting, sight
 from station.devices.frames import mid_exposure
@@ -40,7 +42,7 @@ async def take_pose(bench: Bench, index: int, attempt: int) -> None:
         still = await bench.stillness.settle(resting, watch.look)
     _phase(bench, index, StationState.CAPTURING, "capturing")
     picture = bench.require_recording().number(await _picture(bench, index))
-    _show_frame(bench, picture)
+    show_frame(bench, picture)
     device_ns, arrival_ns = picture.stamps.device_ns, picture.stamps.host_monotonic_ns
     clock = bench.cell.camera.clock
     mid_ns, camera_bound_s = mid_exposure(device_ns, arrival_ns, picture.exposure_us, clock)
@@ -53,8 +55,12 @@ async def take_pose(bench: Bench, index: int, attempt: int) -> None:
     try:
         await asyncio.shield(writing)
     except asyncio.CancelledError:
-        # STOP halts the arm, never the disk: what was taken is kept.
-        await asyncio.gather(writing, return_exceptions=True)
+        # STOP halts the arm, never the disk, however often it comes: what was taken is kept.
+        while not writing.done():
+            with contextlib.suppress(asyncio.CancelledError):
+                await asyncio.wait({writing})
+        if isinstance(failed := writing.exception(), RecordingError):
+            raise failed from None
         raise
 
 
@@ -80,7 +86,7 @@ async def _picture(bench: Bench, index: int) -> Picture:
     raise PoseFailedError(f"no good picture in {tries} tries: {last}")
 
 
-def _show_frame(bench: Bench, picture: Picture) -> None:
+def show_frame(bench: Bench, picture: Picture) -> None:
     height, width = picture.image.shape[:2]
     shown = msgspec.structs.replace(
         bench.store.status.camera,

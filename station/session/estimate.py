@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 
 import msgspec
 import numpy as np
@@ -11,6 +12,8 @@ from station.estimation import next_best, running_estimate
 from station.session.bench import Bench
 from station.status import EstimateStatus
 from station.workers import WorkerError
+
+log = logging.getLogger(__name__)
 
 
 class Estimator:
@@ -47,7 +50,9 @@ class Estimator:
                     flange = np.array([v[1] for v in seen])
                     text = await bench.workers.call(next_best, config, flange, joints, timeout_s=20.0)
                     estimate = msgspec.structs.replace(estimate, advice=text or estimate.advice)
-            except WorkerError as error:
+            except Exception as error:  # this task looks on; it must outlive every picture and every defect
+                if not isinstance(error, WorkerError):
+                    log.exception("the running estimate failed")
                 bench.store.event(f"no running estimate: {error}", "warning")
                 continue
             bench.store.update(estimate=estimate)

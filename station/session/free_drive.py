@@ -14,7 +14,7 @@ from station.session.bench import Bench
 from station.session.capture import PoseFailedError, take_pose
 from station.session.queue import PoseQueue
 from station.session.recording import SessionRecording
-from station.session.run import recover_parts, unmark_busy
+from station.session.run import disk_failed, recover_parts, unmark_busy
 from station.states import TransitionError
 from station.status import StationState
 from station.stillness import NotStillError
@@ -35,6 +35,7 @@ class FreeDrive:
 
     async def begin(self, auto: bool) -> None:
         """Opens the recording if none is open. `auto`: a picture whenever the arm rests anew."""
+        self._end_watch()
         bench = self._bench
         bench.cell.robot.check()
         if bench.queue is None:
@@ -55,11 +56,24 @@ class FreeDrive:
 
     def end(self) -> None:
         """To paused; the recording stays open."""
+        self._end_watch()
+        if self._bench.store.state is StationState.FREE_DRIVE:
+            self._bench.store.enter(StationState.PAUSED, "free drive ended: go on, or finish")
+
+    @property
+    def taking(self) -> bool:
+        """A picture is under way."""
+        return self._taking.locked()
+
+    async def last_picture(self) -> None:
+        """Returns when the picture under way is taken; no further one is begun by itself."""
+        async with self._taking:
+            self._end_watch()
+
+    def _end_watch(self) -> None:
         if self._watcher is not None:
             self._watcher.cancel()
             self._watcher = None
-        if self._bench.store.state is StationState.FREE_DRIVE:
-            self._bench.store.enter(StationState.PAUSED, "free drive ended: go on, or finish")
 
     async def record(self) -> int:
         """One picture here and now; its pose number. RefusedError when one is being taken already."""
@@ -81,7 +95,10 @@ class FreeDrive:
         except (PoseFailedError, NotStillError) as error:
             queue.mark(index, "failed", str(error))
             store.event(str(error), "warning", index)
-        except (RobotError, RecordingError) as error:
+        except RecordingError as error:
+            disk_failed(bench, error)
+            return index
+        except RobotError as error:
             unmark_busy(bench)
             if not bench.halting:
                 store.enter(StationState.FAULT, str(error))
@@ -94,6 +111,9 @@ class FreeDrive:
         if not bench.halting:
             store.enter(StationState.FREE_DRIVE, "guide the arm by hand; the station does not move it")
         bench.show_poses(index)
+        if bench.pause_wanted:
+            bench.pause_wanted = ""
+            self.end()
         return index
 
     async def _watch(self) -> None:

@@ -12,7 +12,7 @@ from recordings.messages import RobotState
 from station.clocks import ClockFit
 from station.devices.ur_condition import mode_word, program_word, safety_word
 from station.errors import RobotError
-from station.limits import point_speed_m_s
+from station.limits import SPEED_CAP_M_S, point_speed_m_s
 from station.session.bench import Bench
 from station.session.capture import flange_pose, matrix4
 from station.status import CameraStatus, ClockStatus, RecorderStatus, RobotStatus, StationState
@@ -47,7 +47,7 @@ class Monitor:
     def _robot(self) -> RobotStatus:
         bench, robot = self._bench, self._bench.cell.robot
         identity, config = robot.identity, bench.cell.config
-        limit = min(config.limits.speed_m_s, 0.25)
+        limit = min(config.limits.speed_m_s, SPEED_CAP_M_S)
         base = RobotStatus(
             model=identity.model,
             serial=identity.serial,

@@ -43,18 +43,19 @@ class Run:
             if await self._begin():
                 await self._poses()
         except SafetyStopError as error:
-            self._halt(StationState.STOPPED, str(error))
+            self._halt(StationState.STOPPED, str(error))  # the controller itself holds the arm
         except (RobotError, TriggerError) as error:
+            await self._bench.cell.robot.stop(str(error))
             self._halt(StationState.FAULT, str(error))
         except RecordingError as error:
-            if self._bench.recording is not None:
-                self._bench.recording.abandon()
-            self._halt(StationState.FAULT, f"recording: {error}. What was saved before is safe.")
+            await self._bench.cell.robot.stop("the disk failed")
+            disk_failed(self._bench, error)
         except Exception as error:
             # A defect of this program: the arm must stand, and the state must say so.
             log.exception("the run failed")
-            await self._bench.cell.robot.stop("internal error")
-            self._halt(StationState.FAULT, f"internal error ({error!r}): the run was ended; see the log")
+            reason = f"internal error ({error!r}): the run was ended; see the log"
+            await self._bench.cell.robot.stop(reason)
+            self._halt(StationState.FAULT, reason)
         finally:
             await self._bench.cell.robot.end_control()
 
@@ -183,6 +184,9 @@ class Run:
         """Where the session stands when its go is used up."""
         bench = self._bench
         queue = bench.require_queue()
+        await bench.cell.robot.end_control()  # before sealing: heartbeats end with the run
+        if bench.halting:
+            return
         if bench.finish_wanted or (not queue.open and not queue.failed):
             await seal(bench)
             return
@@ -223,6 +227,19 @@ async def seal(bench: Bench) -> None:
     bench.store.event(f"sealed: {path}, {queue.done} of {len(queue.statuses)} poses")
     if bench.store.state is StationState.SEALING:
         bench.store.enter(StationState.IDLE)
+
+
+def disk_failed(bench: Bench, error: RecordingError) -> None:
+    """The `.part` file is left for recovery; told in every state, and a STOP meanwhile stays latched."""
+    if bench.recording is not None:
+        bench.recording.abandon()
+    reason = f"recording: {error}. What was saved before is safe."
+    if bench.halting:
+        bench.store.update(reason=f"{bench.store.status.reason} — {reason}")
+    else:
+        bench.store.enter(StationState.FAULT, reason)
+    bench.store.event(reason, "error", bench.store.status.session.current)
+    unmark_busy(bench)
 
 
 def unmark_busy(bench: Bench) -> None:

@@ -222,13 +222,13 @@ class Session:
         self.leases.require(client_id)
         self._require("finish")
         self._void_go()
-        if self.store.state in RUNNING:
+        if self.store.state in RUNNING and not self.free_drive.taking:
             self.bench.finish_wanted = True
             self.store.event("finish after this pose")
             return
         if self.bench.recording is None:
             raise RefusedError("nothing is recorded yet: there is nothing to finish")
-        await self._run_ended()  # after a halt it may still be writing what was taken
+        await asyncio.gather(self._run_ended(), self.free_drive.last_picture())
         self._require("finish")
         await self._seal()
 

@@ -10,6 +10,7 @@ from station.limits import PlanCheck
 from station.session.bench import Bench
 from station.session.guard import displacement
 from station.session.lease import GoDesk
+from station.session.patience import RestingCheck
 from station.status import GoSummary, StationState
 
 POSE_OVERHEAD_S = 0.8
@@ -42,7 +43,7 @@ async def summarise(bench: Bench, purpose: str, poses: tuple[int, ...], notes: t
     """Checks the whole way in the worker. LimitError lists what is wrong with it, RobotError with the arm."""
     robot, queue = bench.cell.robot, bench.queue
     assert queue is not None
-    robot.check()
+    await RestingCheck(robot.check).news()
     start = robot.latest().joints_rad
     plan = queue.plan
     part = msgspec.structs.replace(plan, poses=tuple(queue.pose(index) for index in poses))
@@ -74,6 +75,8 @@ def _problem_text(check: PlanCheck) -> str:
 def _purpose_words(bench: Bench, purpose: str, poses: tuple[int, ...]) -> str:
     if purpose == "retake":
         return f"retake pose {poses[0] + 1}"
+    if bench.queue is not None and bench.queue.plan.motion == "sweep":
+        return f"sweep: {len(poses)} slow swings without a stop, the camera running"
     if bench.recording is None:
         return "run plan"
     return f"go on with session {bench.recording.name}"

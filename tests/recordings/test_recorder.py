@@ -303,6 +303,13 @@ def test_closing_leaves_the_part_file_for_recovery(tmp_path: Path) -> None:
         recorder.event(event())
 
 
+def test_finishing_what_was_closed_is_refused_at_once(tmp_path: Path) -> None:
+    recorder = Recorder(tmp_path / "a.mcap", make_info())
+    recorder.close()
+    with pytest.raises(RecordingError, match="closed unsealed"):
+        recorder.finish().result(TIMEOUT_S)
+
+
 def test_lossless_png_is_smaller_and_the_same(tmp_path: Path) -> None:
     smooth = make_picture(0)
     smooth.image[:] = 7

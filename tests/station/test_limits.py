@@ -134,6 +134,12 @@ def test_leaving_excuses_only_an_unbroken_retreat_that_ends_outside():
     assert leaving(np.array([[-0.03], [-0.02], [-0.01]])).min() < 0
 
 
+def test_sliding_along_a_wall_is_no_retreat():
+    slide = np.array([[-0.03]] * 9 + [[0.02]])
+    assert leaving(slide).min() < 0
+    assert leaving(slide + np.linspace(0, 0.005, 10)[:, None]).min() < 0
+
+
 def test_check_plan_names_pose_robot_and_edited_flange():
     good = check_plan(plan_of(REST + 0.1, REST), REST, FREE)
     assert good.problems == ()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import getpass
 import os
 from collections.abc import AsyncIterator
@@ -12,7 +13,7 @@ from typing import Any
 import msgspec
 
 from station.errors import RefusedError, StationError
-from station.protocol import LINE_LIMIT_BYTES, Reply, Request, Verb
+from station.protocol import LINE_LIMIT_BYTES, PIECE_BYTES, REQUEST_LIMIT_BYTES, Reply, Request, Verb
 from station.status import StationStatus
 
 CONNECT_S = 5.0
@@ -63,6 +64,8 @@ class Client:
         self._outdated = False
         self._fresh = asyncio.Event()
         self._gone = False
+        self._one_at_a_time = asyncio.Lock()
+        """Pieces of two long requests must not mix."""
         self._task = asyncio.create_task(self._read(), name="client-read")
 
     @classmethod
@@ -102,10 +105,10 @@ class Client:
         if self._gone:
             raise self._gone_error()
         request = Request(self._next_id, verb, args)
+        self._next_id += 1
         line = msgspec.json.encode(request) + b"\n"
         if len(line) > LINE_LIMIT_BYTES:
-            raise RefusedError(f"{verb}: {len(line)} bytes are more than the daemon takes at once.")
-        self._next_id += 1
+            return await self._request_in_pieces(verb, line, timeout_s)
         answer: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
         self._waiting[request.id] = answer
         try:
@@ -125,6 +128,18 @@ class Client:
         if not reply.ok:
             raise RefusedError(reply.error)
         return reply.result
+
+    async def _request_in_pieces(self, verb: Verb, whole: bytes, timeout_s: float) -> Any:
+        if len(whole) > REQUEST_LIMIT_BYTES:
+            raise RefusedError(
+                f"{verb}: {len(whole) / 1e6:.1f} MB are more than the daemon takes "
+                f"({REQUEST_LIMIT_BYTES / 1e6:.1f} MB): make a plan of fewer poses, or shorten its notes."
+            )
+        async with self._one_at_a_time:
+            for start in range(0, len(whole), PIECE_BYTES):
+                piece = base64.b64encode(whole[start : start + PIECE_BYTES]).decode()
+                await self.request("part", base64=piece)
+            return await self.request("whole", timeout_s=timeout_s)
 
     async def statuses(self) -> AsyncIterator[StationStatus]:
         """The status now and after every change (slow readers see the newest only)."""

@@ -6,6 +6,7 @@ A client that is slow, hostile or stuck costs a bounded amount of memory and is 
 from __future__ import annotations
 
 import asyncio
+import base64
 import contextlib
 import logging
 import os
@@ -20,7 +21,7 @@ import msgspec
 
 from recordings.errors import RecordingError
 from station.errors import StationError
-from station.protocol import CLIENT_LIMIT, LINE_LIMIT_BYTES, Notice, Reply, Request
+from station.protocol import CLIENT_LIMIT, LINE_LIMIT_BYTES, REQUEST_LIMIT_BYTES, Notice, Reply, Request
 from station.status import StationStatus, changed_sections
 
 log = logging.getLogger(__name__)
@@ -152,6 +153,8 @@ class _Connection:
         self._reader, self._writer, self._handler = reader, writer, handler
         self._full_status = full_status
         self._tasks: set[asyncio.Task[None]] = set()
+        self._pieces = bytearray()
+        """Of a request that is longer than a line."""
 
     async def run(self) -> None:
         decoder = msgspec.json.Decoder(Request)
@@ -159,7 +162,7 @@ class _Connection:
             while line := await self._reader.readline():
                 try:
                     self._take(decoder.decode(line))
-                except (msgspec.DecodeError, RecursionError) as error:
+                except (ValueError, RecursionError) as error:  # msgspec's, base64's
                     self.reply(Reply(0, False, error=f"not a request: {error}"))
         except ValueError:  # readline: the line is longer than the limit
             self.drop(f"a line of more than {LINE_LIMIT_BYTES} bytes")
@@ -185,10 +188,26 @@ class _Connection:
             # First in line and in this very call: nothing queued may come before it.
             stopping = self._handler.stop_now(self.peer)
             self._spawn(self._answer_stop(request.id, stopping))
+        elif request.verb == "part":
+            self._take_piece(request)
+        elif request.verb == "whole":
+            whole, self._pieces = bytes(self._pieces), bytearray()
+            inner = msgspec.json.decode(whole, type=Request)
+            self._take(Request(request.id, inner.verb, inner.args))
         elif len(self._tasks) >= OPEN_REQUESTS_LIMIT:
             self.reply(Reply(request.id, False, error="too many requests at once: wait for the answers."))
         else:
             self._spawn(self._answer(request))
+
+    def _take_piece(self, request: Request) -> None:
+        piece = base64.b64decode(str(request.args.get("base64", "")), validate=True)
+        if len(self._pieces) + len(piece) > REQUEST_LIMIT_BYTES:
+            self._pieces.clear()
+            text = f"more than {REQUEST_LIMIT_BYTES} bytes in one request: nothing of it is kept."
+            self.reply(Reply(request.id, False, error=text))
+            return
+        self._pieces += piece
+        self.reply(Reply(request.id, True, {}))
 
     def _spawn(self, work: Any) -> None:
         task = asyncio.create_task(work)

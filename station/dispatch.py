@@ -19,7 +19,6 @@ from station.session.folder import list_sessions
 from station.session.hovering import HoverRequest
 from station.session.recording import software
 from station.session.session import Session
-from station.states import refusal
 
 
 class _Args(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -74,10 +73,6 @@ class _FreeDrive(_Args, frozen=True):
 class _Preview(_Args, frozen=True):
     width: int = 480
     height: int = 384
-
-
-class _Path(_Args, frozen=True):
-    path: str
 
 
 PLAN_POSES = (4, 200)
@@ -139,7 +134,6 @@ class SessionDispatcher:
             "preview": (_Preview, self._preview),
             "doctor": (_Args, self._doctor),
             "sessions": (_Args, self._sessions),
-            "open_replay": (_Path, self._open_replay),
         }
 
     def stop_now(self, peer: Peer) -> Awaitable[None]:
@@ -257,8 +251,3 @@ class SessionDispatcher:
 
     async def _sessions(self, caller: _Caller, args: _Args) -> Any:
         return list_sessions(self._session.bench.root)
-
-    async def _open_replay(self, caller: _Caller, args: _Path) -> Any:
-        if reason := refusal("open_replay", self._session.store.state):
-            raise RefusedError(reason)
-        raise RefusedError("replay is a daemon of its own: station tui --replay " + args.path)

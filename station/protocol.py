@@ -4,7 +4,7 @@ client → daemon   {"id": 1, "verb": "go", "args": {…}}
 daemon → client   {"id": 1, "ok": true, "result": {…}}      or   {"id": 1, "ok": false, "error": "…"}
                   {"status": {…}}      full, right after `watch`
                   {"changes": {…}}     changed top-level sections of the status
-`stop` needs no lease and is handled before anything that is queued.
+`stop` needs no lease and is handled before anything that is queued, pieces of a long request included.
 """
 
 from __future__ import annotations
@@ -14,6 +14,9 @@ from typing import Any, Literal
 import msgspec
 
 LINE_LIMIT_BYTES = 64 * 1024
+REQUEST_LIMIT_BYTES = 2 * 1024 * 1024
+"""Of a request in pieces: a plan of some thousand poses. A connection costs the daemon no more than that."""
+PIECE_BYTES = 32 * 1024
 CLIENT_LIMIT = 16
 
 Verb = Literal[
@@ -40,7 +43,8 @@ Verb = Literal[
     "preview",  # {width, height} → {jpeg_base64, width, height, corners, sequence}
     "doctor",  # → [{name, state, text, remedy}]
     "sessions",  # → [{name, folder, views, sealed, …}]
-    "open_replay",  # {path}
+    "part",  # {base64} the next piece of a request that is longer than a line
+    "whole",  # → what the request in the pieces answers
 ]
 
 

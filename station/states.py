@@ -39,6 +39,8 @@ _ANY = frozenset(S)
 VERB_STATES: dict[Verb, frozenset[S]] = {
     "hello": _ANY,
     "watch": _ANY,
+    "part": _ANY,
+    "whole": _ANY,
     "lease": _ANY,
     "stop": _ANY,
     "acknowledge": _STOPS,
@@ -60,7 +62,6 @@ VERB_STATES: dict[Verb, frozenset[S]] = {
     "preview": _ANY,
     "doctor": _ANY,
     "sessions": _ANY,
-    "open_replay": frozenset({S.IDLE, S.DISCONNECTED}),
 }
 
 _REMEDIES: dict[S, str] = {

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import base64
 import contextlib
 import json
 import os
@@ -18,7 +19,7 @@ import pytest
 from station.client import Client, DaemonGoneError
 from station.control import ControlServer, Peer
 from station.errors import RefusedError, StationError
-from station.protocol import CLIENT_LIMIT, LINE_LIMIT_BYTES
+from station.protocol import CLIENT_LIMIT, LINE_LIMIT_BYTES, PIECE_BYTES, REQUEST_LIMIT_BYTES
 from station.status import StationState, StationStatus
 
 
@@ -143,6 +144,34 @@ async def test_an_endless_line_costs_no_memory(server: Served) -> None:
             await asyncio.wait_for(writer.drain(), 5)
             sent += 65536
     assert sent < 10_000_000
+
+
+async def test_a_long_request_goes_in_pieces_and_stop_passes_between_them(
+    server: Served, handler: RecordingHandler
+) -> None:
+    _, path = server
+    long = {"note": "ü" * 200_000, "index": 7}
+    async with await Client.connect(path) as client, await Client.connect(path) as other:
+        twice = await asyncio.gather(client.request("skip", **long), client.request("skip", **long))
+        assert twice == [{"index": 7}, {"index": 7}]
+        await client.request("part", base64=base64.b64encode(b'{"id": 1, "verb"').decode())
+        await other.request("stop")
+        await client.request("stop")
+        assert handler.order.count("stop") == 2
+        with pytest.raises(RefusedError, match=r"MB are more than the daemon takes.*fewer poses"):
+            await client.request("skip", note="x" * REQUEST_LIMIT_BYTES)
+
+
+async def test_pieces_without_end_or_sense_are_answered_in_words(server: Served) -> None:
+    _, path = server
+    piece = base64.b64encode(bytes(PIECE_BYTES)).decode()
+    lines = [json.dumps({"id": i, "verb": "part", "args": {"base64": piece}}).encode() for i in range(70)]
+    answers = await raw(path, b"\n".join(lines) + b"\n")
+    assert sum(not answer["ok"] for answer in answers) == 1
+    assert "nothing of it is kept" in next(answer["error"] for answer in answers if not answer["ok"])
+    nonsense = (b'{"id": 1, "verb": "part", "args": {"base64": "%"}}\n', b'{"id": 2, "verb": "whole"}\n')
+    for answer in await raw(path, *nonsense):
+        assert "not a request" in answer["error"]
 
 
 async def test_a_client_that_does_not_read_is_dropped(server: Served, handler: RecordingHandler) -> None:

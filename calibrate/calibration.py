@@ -159,6 +159,25 @@ class Override(msgspec.Struct, frozen=True):
     overridden: list[str]
 
 
+class Touch(msgspec.Struct, frozen=True, omit_defaults=True):
+    """The tip was brought down by hand where the calibration says that a corner is."""
+
+    corner: int
+    """Row of `board.board_points`."""
+    corner_mm: tuple[float, float]
+    """x, y on the board."""
+    offset_mm: tuple[float, float]
+    """Tip minus true corner along the board's x and y, when the tip is lowered straight down."""
+    sigma_mm: tuple[float, float]
+    """1 sigma of it that calibration, picture and robot predict."""
+    found: Literal["told by a person", "read from the arm"]
+    who: str
+    wall: str
+    pointer: str = ""
+    standoff_mm: float = 0.0
+    note: str = ""
+
+
 class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):
     format: Literal["handeye-calibration/1"]
     created: str
@@ -178,8 +197,8 @@ class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):
     quality: Quality
     provenance: Provenance
     override: Override | None = None
-    verification: list[dict[str, Any]] = []
-    """Contact checks after installing: corner, offset in mm, who."""
+    verification: list[Touch] = []
+    """Checks by hand, oldest first; see `verification`."""
 
     @property
     def transform(self) -> Transform:

@@ -45,11 +45,11 @@ class Generation:
 
 class LogEntry(msgspec.Struct, frozen=True, omit_defaults=True):
     wall: str
-    action: Literal["install", "rollback"]
+    action: Literal["install", "rollback", "verify"]
     generation: int
     who: str
     change: str = ""
-    """Against what was installed before."""
+    """Against what was installed before; for "verify" what was found."""
     reason: str = ""
 
 

@@ -36,6 +36,7 @@ from calibrate.generations import (
     write_new,
 )
 from calibrate.geometry import Transform, difference
+from calibrate.verification import objections as by_hand
 from recordings.messages import Source
 
 Cell = Literal["real", "imported", "simulated"]
@@ -90,6 +91,7 @@ def install(
     with locked(folder):
         before = _installed_before(root)
         objections = _objections(calibration, before, robot_serial, camera_serial)
+        objections += by_hand(calibration)
         _refuse_foreign_source(calibration, before, cell, path)
         failed = [f"gate {gate.name}: {gate.text}" for gate in calibration.quality.failed]
         if (failed or objections) and not override.strip():

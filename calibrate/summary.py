@@ -11,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from calibrate.board import describe_board
 from calibrate.calibration import Calibration
 from calibrate.geometry import difference
+from calibrate.verification import agrees, touch_text
 
 _STAMPS = {
     "simulated": "SIMULATED: made without a robot or a camera",
@@ -46,6 +47,9 @@ def summary(calibration: Calibration) -> RenderableType:
     if source_stamp(calibration):
         parts.append(Text(source_stamp(calibration), style="bold yellow"))
     parts += [_result_table(calibration), _gate_table(calibration)]
+    for touch in calibration.verification:
+        style = "green" if agrees(touch) else "bold red"
+        parts.append(Text(f"checked by hand, {touch.wall}, {touch.who}: {touch_text(touch)}", style=style))
     parts += [Text(f"! {warning}", style="yellow") for warning in calibration.quality.warnings]
     for view in calibration.views.rejected:
         parts.append(Text(f"- view {view.index} ({view.name}) left out: {view.reason}"))

@@ -72,11 +72,11 @@ async def carry_out(
     try:
         await client.request("go", token=summary.token, plan_sha256=summary.plan_sha256)
         client.outdate()  # it would show the session before, sealed and at rest
-        status = await _watch(client, watch)
+        status = await watch_until_rest(client, watch)
         if status.state is StationState.PAUSED and finish_with_loss and status.session.captured:
             await client.request("finish")
             client.outdate()
-            status = await _watch(client, watch)
+            status = await watch_until_rest(client, watch)
     except asyncio.CancelledError:
         with contextlib.suppress(DaemonGoneError):
             await client.request("stop")
@@ -84,7 +84,7 @@ async def carry_out(
     return Outcome(status)
 
 
-async def _watch(client: Client, watch: Watcher) -> StationStatus:
+async def watch_until_rest(client: Client, watch: Watcher) -> StationStatus:
     """The status in which the session rests."""
     async for status in client.statuses():
         watch(status)

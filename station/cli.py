@@ -37,6 +37,7 @@ def _add_large_commands(app: typer.Typer) -> None:
     from station.cli_bootstrap import bootstrap_command
     from station.cli_serve import serve_command
     from station.cli_session import capture_command, check_command, demo_command, resume_command
+    from station.cli_verify import verify_command
     from station.plan.cli import plan_command
 
     app.command("tui")(tui_command)
@@ -45,6 +46,7 @@ def _add_large_commands(app: typer.Typer) -> None:
     app.command("capture")(capture_command)
     app.command("resume")(resume_command)
     app.command("check")(check_command)
+    app.command("verify")(verify_command)
     app.command("bootstrap")(bootstrap_command)
     app.command("plan")(plan_command)
 

@@ -9,6 +9,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,9 +22,10 @@ from station.attend import Confirm, Outcome, carry_out, wait_until_idle
 from station.cli_serve import require_choices
 from station.client import Client, default_socket
 from station.demo import DemoOptions, run_demo
-from station.errors import RefusedError, StationError
+from station.errors import ConfigError, RefusedError, StationError
 from station.plan.files import load_plan
 from station.plan.model import Plan
+from station.plan.sweep import sweep_plan
 from station.progress import SessionProgress
 from station.session.folder import default_root
 from station.simulation.netns import is_isolated, isolated_command
@@ -87,18 +89,30 @@ def _show_demo(result: dict[str, Any], duration_s: float) -> None:
 
 
 def capture_command(
-    plan: Annotated[Path, typer.Option(help="The pose plan.")],
+    plan: Annotated[Path | None, typer.Option(help="The pose plan.")] = None,
+    sweep: Annotated[
+        bool, typer.Option("--sweep", help="Swing slowly about where the arm stands, camera running.")
+    ] = False,
     headless: Headless = False,
     go: GoHash = "",
     socket: Socket = None,
     as_json: AsJson = False,
 ) -> None:
-    """One session: load the plan, check it, ask, go, watch, seal. Ctrl-C is STOP."""
-    loaded = load_plan(plan)
-    _finish(
-        asyncio.run(attended_session(socket, "run", headless, go, as_json, lambda c: load_into(c, loaded))),
-        as_json,
-    )
+    """One session: load the plan, check it, ask, go, watch, seal. Ctrl-C is STOP.
+
+    With --sweep no poses are taken: the arm swings slowly where it stands, with the board in view, and
+    `calibrate sweep RECORDING` tells the time between camera and robot.
+    """
+    if (plan is None) != sweep:
+        raise ConfigError("say what to do, one of: --plan FILE (poses), --sweep (the clocks)")
+    if plan is None:
+        before = load_sweep
+    else:
+        before = partial(load_into, plan=load_plan(plan))
+    outcome = asyncio.run(attended_session(socket, "run", headless, go, as_json, before))
+    if sweep and outcome.recording and not as_json:
+        out.print(f"next: calibrate sweep {outcome.recording}")
+    _finish(outcome, as_json)
 
 
 def resume_command(
@@ -127,6 +141,14 @@ def check_command(
 
 async def load_into(client: Client, plan: Plan) -> None:
     await client.request("load_plan", plan=msgspec.to_builtins(plan))
+
+
+async def load_sweep(client: Client) -> None:
+    """A sweep about where the arm stands now."""
+    status = await wait_until_idle(client)
+    if status.robot.joints_rad is None:
+        raise RefusedError("the robot's joints are not known: `station doctor` says why")
+    await load_into(client, sweep_plan(status.robot.model, status.mount, status.robot.joints_rad))
 
 
 async def _make(client: Client, poses: int) -> None:
@@ -170,7 +192,7 @@ def _confirmation(go: str, interactive: bool, simulated: bool) -> Confirm:
                 )
             return True
         if interactive:
-            return _ask_person(summary)
+            return ask_person(summary)
         if simulated:
             return True
         raise RefusedError(f"nobody is here to confirm: approve the plan with --go {summary.plan_sha256}")
@@ -178,7 +200,7 @@ def _confirmation(go: str, interactive: bool, simulated: bool) -> Confirm:
     return confirm
 
 
-def _ask_person(summary: GoSummary) -> bool:
+def ask_person(summary: GoSummary) -> bool:
     err.print(f"\n[bold]The arm will move[/]: {summary.purpose}, {summary.poses} poses")
     err.print(f"first {summary.first_move}; {summary.path_m:.2f} m, up to {summary.top_speed_m_s:.2f} m/s")
     err.print(f"about {summary.duration_s:.0f} s, plan {summary.plan_sha256[:12]}")

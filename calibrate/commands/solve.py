@@ -11,12 +11,13 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from calibrate.calibration import write_calibration
+from calibrate.calibration import Touch, write_calibration
 from calibrate.commands.files import read_board, read_camera
 from calibrate.commands.install import Root, history_rows
 from calibrate.commands.output import AsJson, check_target, detection_progress, out, print_json
 from calibrate.errors import CalibrationError
 from calibrate.gates import GateLimits, read_limits
+from calibrate.install import load_installed
 from calibrate.pipeline import JobOptions, SolvedRecording, prepare_views, solve_recording, solver_options
 from calibrate.summary import summary
 
@@ -186,7 +187,17 @@ def _write_report(job: SolvedRecording, target: Path, options: JobOptions, root:
         peers = compare_all(job.views, solver_options(options, job))
     except CalibrationError:  # the report stands without the comparison
         peers = []
-    write_report(job, target, peers, history_rows(root))
+    write_report(job, target, peers, history_rows(root), _touches(job, root))
+
+
+def _touches(job: SolvedRecording, root: Path | None) -> list[Touch]:
+    """What was found by hand with the installed calibration, when it is of this recording."""
+    try:
+        installed = load_installed(root, allow_simulated=True)
+    except CalibrationError:
+        return []
+    same = installed.provenance.recording_sha256 == job.calibration.provenance.recording_sha256
+    return installed.verification if same else []
 
 
 def compare(

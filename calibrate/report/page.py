@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from calibrate.board import describe_board
-from calibrate.calibration import write_atomically
+from calibrate.calibration import Touch, write_atomically
 from calibrate.geometry import Array
 from calibrate.lens import project
 from calibrate.pipeline import SolvedRecording
@@ -18,6 +18,7 @@ from calibrate.report import html, plots
 from calibrate.report.pictures import drawn_view
 from calibrate.solution import PeerResult
 from calibrate.summary import pose_text, source_stamp, verdict
+from calibrate.verification import agrees, touch_text
 
 _PICTURES_LIMIT = 60
 
@@ -27,14 +28,19 @@ def write_report(
     path: Path,
     peers: Sequence[PeerResult] = (),
     history: Sequence[Sequence[str]] = (),
+    touches: Sequence[Touch] = (),
 ) -> None:
-    """Writes the page atomically. `history`: rows (generation, when, what, change) of what was installed."""
-    content = report_page(job, peers, history).encode()
+    """Writes the page atomically. `history`: rows (generation, when, what, change) of what was installed;
+    `touches`: what was found by hand since."""
+    content = report_page(job, peers, history, touches).encode()
     write_atomically(path, lambda file: file.write(content))
 
 
 def report_page(
-    job: SolvedRecording, peers: Sequence[PeerResult] = (), history: Sequence[Sequence[str]] = ()
+    job: SolvedRecording,
+    peers: Sequence[PeerResult] = (),
+    history: Sequence[Sequence[str]] = (),
+    touches: Sequence[Touch] = (),
 ) -> str:
     name = job.recording.info.name
     return html.page(
@@ -42,6 +48,7 @@ def report_page(
         [
             *_verdict(job),
             *_result(job),
+            *_touches(touches),
             *_gates(job),
             *_error(job),
             *_residuals(job),
@@ -110,6 +117,15 @@ def _gates(job: SolvedRecording) -> Iterator[str]:
     yield html.table(
         ("", "gate", "found"), [("✓" if gate.passed else "✗", gate.name, gate.text) for gate in job.gates]
     )
+
+
+def _touches(touches: Sequence[Touch]) -> Iterator[str]:
+    if touches:
+        yield html.heading("Checked by hand")
+        yield html.table(
+            ("", "where the tip stood beside the corner, against what was predicted", "when", "by whom"),
+            [("✓" if agrees(t) else "✗", touch_text(t), t.wall, f"{t.who}, {t.found}") for t in touches],
+        )
 
 
 def _error(job: SolvedRecording) -> Iterator[str]:

@@ -5,6 +5,7 @@ Nothing is recorded and nothing is touched: contact is made by a person's hand o
 
 from __future__ import annotations
 
+import contextlib
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -33,6 +34,7 @@ from station.session.lease import Go, GoDesk
 from station.session.patience import RestingCheck
 from station.session.run import Run
 from station.status import GoSummary, HoverOffer, StationState
+from station.stillness import NotStillError
 
 VIEW_LIFETIME_S = 900.0
 """From close above the board a camera on the flange sees nothing: one picture serves several corners."""
@@ -244,6 +246,10 @@ class HoverRun(Run):
             await self._drive_checked(planned.joints_rad, check)
             if bench.halting:
                 return
+        with contextlib.suppress(NotStillError):  # what is read next is the place where it rests
+            await bench.stillness.settle(RestingCheck(robot.check))
+        if bench.halting:
+            return
         reason = (
             f"the tip stands {1000 * self._hover.standoff_m:.0f} mm above corner {self._hover.corner}: "
             "guide it down by hand only"

@@ -1,0 +1,88 @@
+"""What hands found is kept in the file, survives installing, and is said."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import pytest
+from rich.console import Console
+
+from calibrate.calibration import CalibrationFileError, Touch, read_calibration, write_calibration
+from calibrate.generations import InstallError, generations, read_log
+from calibrate.install import install, load_installed, rollback
+from calibrate.pipeline import SolvedRecording
+from calibrate.report.page import report_page
+from calibrate.summary import summary
+from calibrate.verification import agrees, note_in_file, note_installed, touch_text
+
+GOOD = Touch(
+    0, (0.0, 0.0), (0.3, -0.2), (0.15, 0.15), "told by a person", "anna", "2026-11-21T12:00:00+00:00"
+)
+BAD = msgspec.structs.replace(GOOD, corner=41, corner_mm=(150.0, 125.0), offset_mm=(2.1, -0.4))
+
+
+@pytest.fixture
+def file(solved_real: SolvedRecording, tmp_path: Path) -> Path:
+    path = tmp_path / "cell.yaml"
+    write_calibration(solved_real.calibration, path)
+    return path
+
+
+def test_an_offset_is_judged_by_prediction_and_hand_together() -> None:
+    assert agrees(GOOD)
+    assert not agrees(BAD)
+    assert "0.36 mm off" in touch_text(GOOD)
+    assert "MORE than the calibration claims" in touch_text(BAD)
+    vague = msgspec.structs.replace(BAD, sigma_mm=(1.0, 1.0))
+    assert agrees(vague)
+
+
+def test_entries_go_into_a_file_and_stay_when_it_is_installed(file: Path, tmp_path: Path) -> None:
+    before = read_calibration(file)
+    note_in_file(file, [GOOD])
+    note_in_file(file, [GOOD])
+    after = read_calibration(file)
+    assert after.verification == [GOOD, GOOD]
+    assert msgspec.structs.replace(after, verification=[]) == before
+    install(file, tmp_path / "s")
+    assert load_installed(tmp_path / "s").verification == [GOOD, GOOD]
+
+
+def test_entries_for_the_installed_one_make_a_new_generation(file: Path, tmp_path: Path) -> None:
+    root = tmp_path / "s"
+    with pytest.raises(InstallError, match="nothing was noted"):
+        note_installed(root, [GOOD])
+    install(file, root)
+    note_installed(root, [GOOD])
+    assert load_installed(root).verification == [GOOD]
+    assert [g.number for g in generations(root)] == [1, 2]
+    assert read_log(root)[-1].action == "verify"
+    rollback(root)
+    assert load_installed(root).verification == []
+
+
+def test_hands_that_disagree_keep_it_from_being_installed(file: Path, tmp_path: Path) -> None:
+    note_in_file(file, [GOOD, BAD])
+    with pytest.raises(InstallError, match=r"Checked by hand, it is off at corner 41: 2\.14 mm"):
+        install(file, tmp_path / "s")
+    made = install(file, tmp_path / "s", override="the board was bent there")
+    assert made.calibration is not None and made.calibration.override is not None
+
+
+def test_an_edited_entry_is_noticed(file: Path) -> None:
+    note_in_file(file, [BAD])
+    file.write_text(file.read_text().replace("2.1", "0.1"))
+    with pytest.raises(CalibrationFileError, match="does not fit its hash"):
+        read_calibration(file)
+
+
+def test_they_are_shown_in_the_terminal_and_in_the_report(solved_real: SolvedRecording) -> None:
+    calibration = msgspec.structs.replace(solved_real.calibration, verification=[GOOD, BAD])
+    console = Console(record=True, width=150)
+    console.print(summary(calibration))
+    text = console.export_text()
+    assert "checked by hand" in text and "MORE than" in text
+    page = report_page(solved_real, touches=[GOOD, BAD])
+    assert "Checked by hand" in page and "corner 41" in page
+    assert "Checked by hand" not in report_page(solved_real)

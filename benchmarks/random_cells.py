@@ -36,7 +36,8 @@ CAMERA = CameraModel(
 )
 POINTS = board_points(PAPER_BOARD)
 GUESS_M, GUESS_RAD = 0.005, 0.03
-_TABLE_CLEARANCE_M, _BOARD_CLEARANCE_M = 0.03, 0.10
+CLEARANCES_M = np.array([0.03, 0.10])
+"""From table and board, as the configuration's defaults want them"""
 _NEEDED, _TRIED = 60, 1500
 
 
@@ -141,18 +142,21 @@ def shows_board(C: Array, camera: CameraModel = CAMERA) -> bool:
     return bool((pixels > 2).all() and (pixels < [camera.width - 3, camera.height - 3]).all())
 
 
-def is_free(joints: Array, X: Array, Y: Array, spare_m: float = 0.0, clearance: float = 1.0) -> Array:
-    """(n, 6) → (n,): spheres of arm and camera clear of themselves, the table and the board's plate.
+def is_free(joints: Array, X: Array, Y: Array, spare_m: float = 0.0) -> Array:
+    """(n, 6) → (n,): spheres of arm and camera clear of themselves, the table and the board's plate."""
+    cell, itself = gaps(joints, X, Y)
+    return np.asarray(np.minimum((cell - CLEARANCES_M).min(axis=1), itself) >= spare_m)
 
-    `clearance`: share of the wanted clearances from table and board that must be kept.
-    """
+
+def gaps(joints: Array, X: Array, Y: Array) -> tuple[Array, Array]:
+    """(n, 6) → metres from table and from board (n, 2), and from the arm to itself and the camera (n,)."""
     centres, radii, body = _spheres(joints, X)
     moving = body >= 2
-    table = (centres[:, moving, 2] - radii[moving] - clearance * _TABLE_CLEARANCE_M).min(axis=1)
+    table = (centres[:, moving, 2] - radii[moving]).min(axis=1)
     local = (centres[:, moving] - Y[:3, 3]) @ Y[:3, :3]
     low, high = plate_points().min(axis=0), plate_points().max(axis=0)
     far = np.linalg.norm(local - np.clip(local, low, high), axis=-1) - radii[moving]
-    board = far.min(axis=1) - clearance * _BOARD_CLEARANCE_M
+    board = far.min(axis=1)
     gap = np.linalg.norm(centres[:, :, None] - centres[:, None], axis=-1) - radii[:, None] - radii
     apart = body[None, :] - body[:, None] >= np.where(
         body[:, None] == 3, 3, np.where(body[:, None] == 1, 2, 2)
@@ -160,7 +164,7 @@ def is_free(joints: Array, X: Array, Y: Array, spare_m: float = 0.0, clearance: 
     apart &= ~((body[:, None] == 4) & (body[None, :] == 6)) & ~((body[:, None] == 1) & (body[None, :] < 3))
     apart &= ~((body[:, None] == 0) & (body[None, :] == 2)) & ~(body[:, None] >= 5)
     itself = np.where(apart, gap, np.inf).min(axis=(1, 2))
-    return np.asarray(np.minimum(np.minimum(table, board), itself) >= spare_m)
+    return np.stack([table, board], axis=1), itself
 
 
 def _spheres(joints: Array, X: Array) -> tuple[Array, Array, Array]:

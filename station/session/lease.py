@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -60,6 +60,8 @@ class Go:
     start_joints_rad: Vector6
     poses: tuple[int, ...]
     """Pose numbers it covers, in order; more may not be driven to with it."""
+    again: bool = False
+    """Nobody is there to be asked: poses that do not come to rest are tried once more at the end."""
     hover: Hover | None = None
     """A way over one corner of the board instead of poses of the plan."""
 
@@ -88,7 +90,7 @@ class GoDesk:
         hover: Hover | None = None,
     ) -> Go:
         """An older one is void."""
-        self._waiting = Go(summary, client_id, self._clock() + GO_LIFETIME_S, start, poses, hover)
+        self._waiting = Go(summary, client_id, self._clock() + GO_LIFETIME_S, start, poses, hover=hover)
         return self._waiting
 
     def void(self) -> bool:
@@ -96,7 +98,14 @@ class GoDesk:
         was, self._waiting = self._waiting, None
         return was is not None
 
-    def redeem(self, token: str, client_id: int, plan_sha256: str, joints_rad: Sequence[float]) -> Go:
+    def redeem(
+        self,
+        token: str,
+        client_id: int,
+        plan_sha256: str,
+        joints_rad: Sequence[float],
+        again: bool = False,
+    ) -> Go:
         """The go, once. RefusedError says what changed since the person was asked; the go is void then."""
         go, self._waiting = self._waiting, None
         if go is None or not secrets.compare_digest(go.summary.token.encode(), token.encode()):
@@ -113,4 +122,4 @@ class GoDesk:
                 f"the arm moved by {np.rad2deg(moved_rad):.1f}° since this go was asked for: "
                 "prepare again and confirm"
             )
-        return go
+        return replace(go, again=again)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 import time
+from collections.abc import Sequence
 
 import msgspec
 import numpy as np
@@ -36,6 +37,9 @@ class Run:
         self._go = go
         self._geometry = with_plan_speeds(bench.geometry, bench.require_queue().plan)
         self._failures = 0
+        self._unsettled: list[int] = []
+        """Poses where something still moved."""
+        self._tried_again = False
 
     async def drive(self) -> None:
         """From checking to paused, stopped, fault or idle; raises only when cancelled."""
@@ -122,7 +126,7 @@ class Run:
         started_s, taken = time.monotonic(), 0
         todo = [index for index in self._go.poses if queue.status(index).state == "planned"]
         while not bench.halting:
-            todo = [index for index in todo if index in queue.open]
+            todo = [index for index in todo if index in queue.open] or self._once_more()
             if self._wants_rest() or not todo or self._failures >= FAILURES_IN_A_ROW:
                 break
             index = todo.pop(0)
@@ -132,6 +136,21 @@ class Run:
             self._show_times(started_s, taken, len(todo))
         if not bench.halting:
             await self._rest()
+
+    def _once_more(self) -> list[int]:
+        """Poses that did not come to rest, once, under the same go, where nobody can be asked.
+
+        The same places that the go covers; every way is checked anew from where the arm stands.
+        """
+        queue = self._bench.require_queue()
+        found = [index for index in self._unsettled if queue.status(index).state == "failed"]
+        if not self._go.again or self._tried_again or self._wants_rest() or not found:
+            return []
+        self._tried_again, self._unsettled, self._failures = True, [], 0
+        for index in found:
+            queue.mark(index, "planned", "did not come to rest: tried once more")
+        self._bench.store.event(f"once more, by the same go: {_numbers(found)}, which did not come to rest")
+        return found
 
     def _wants_rest(self) -> bool:
         return bool(self._bench.pause_wanted) or self._bench.finish_wanted
@@ -146,6 +165,8 @@ class Run:
             self._failures = 0
         except (PoseFailedError, NotStillError, LimitError) as error:
             self._failures += 1
+            if isinstance(error, NotStillError):
+                self._unsettled.append(index)
             queue.mark(index, "failed", str(error))
             bench.store.event(str(error), "warning", index)
             await bench.require_recording().save_state(queue)
@@ -196,13 +217,22 @@ class Run:
             reason = f"{self._failures} poses in a row failed: look at the reasons, then go on or finish"
         elif queue.open:
             reason = f"{len(queue.open)} poses are left: give a new go to go on"
+        elif unsettled := [index for index in self._unsettled if index in queue.failed]:
+            reason = (
+                f"{_numbers(unsettled)} did not come to rest ({queue.status(unsettled[0]).reason}): "
+                "take again (retake) or leave out (skip), or finish"
+            )
         else:
-            failed = ", ".join(str(index + 1) for index in queue.failed)
-            reason = f"poses {failed} failed: retake or skip them, or finish"
+            reason = f"{_numbers(queue.failed)} failed: retake or skip them, or finish"
         bench.pause_wanted = ""
         bench.store.enter(StationState.PAUSED, reason)
         bench.store.event(reason)
         bench.show_poses()
+
+
+def _numbers(indices: Sequence[int]) -> str:
+    """'pose 4', 'poses 4, 7', as people count."""
+    return f"pose{'s' * (len(indices) > 1)} " + ", ".join(str(index + 1) for index in indices)
 
 
 async def recover_parts(bench: Bench, recording: SessionRecording) -> None:

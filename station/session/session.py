@@ -189,8 +189,8 @@ class Session:
         self._goes.offer(go, client_id, go.start_joints_rad, poses, hover)
         self.store.update(go=go)
 
-    def go(self, client_id: int, token: str) -> None:
-        """The person's yes to exactly that summary. RefusedError when anything changed since."""
+    def go(self, client_id: int, token: str, again: bool = False) -> None:
+        """The person's yes to exactly that summary; `again`: see Go. RefusedError when anything changed."""
         self.leases.require(client_id)
         self._require("go")
         if self._run is not None and not self._run.done():
@@ -198,7 +198,7 @@ class Session:
         joints = self.bench.cell.robot.latest().joints_rad
         queue = self.bench.queue
         try:
-            go = self._goes.redeem(token, client_id, queue.sha256 if queue else "", joints)
+            go = self._goes.redeem(token, client_id, queue.sha256 if queue else "", joints, again)
         finally:
             self.store.update(go=None)
         self._notes = ()

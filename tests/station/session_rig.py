@@ -212,7 +212,7 @@ class WorkerInThisProcess:
 def memory_config() -> StationConfig:
     config = cell_config(TRUTH, "127.0.0.1")
     capture = msgspec.structs.replace(config.capture, free_space_bytes=1, time_bound_s=1.0)
-    stillness = msgspec.structs.replace(config.stillness, timeout_s=0.3)
+    stillness = msgspec.structs.replace(config.stillness, timeout_s=0.8)
     return msgspec.structs.replace(config, capture=capture, stillness=stillness)
 
 

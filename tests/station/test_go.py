@@ -27,7 +27,7 @@ def offered(desk: GoDesk, client_id: int = 1) -> Go:
 def test_a_go_is_for_one_use() -> None:
     desk = GoDesk(Clock())
     go = offered(desk)
-    assert desk.redeem(go.summary.token, 1, PLAN, HERE) is go
+    assert desk.redeem(go.summary.token, 1, PLAN, HERE) == go
     with pytest.raises(RefusedError, match="not valid"):
         desk.redeem(go.summary.token, 1, PLAN, HERE)
 

@@ -263,7 +263,7 @@ async def test_a_bad_picture_is_taken_again_and_then_the_pose_fails_alone(rig: R
     await rig.give_go()
     await rig.until(S.PAUSED)
     assert rig.pose_states == ["failed", "done", "done", "done"]
-    assert "poses 1 failed" in rig.session.store.status.reason
+    assert "pose 1 failed" in rig.session.store.status.reason
     await rig.session.finish(1)
     assert [view.index for view in sealed(rig).views()] == [1, 2, 3]
 

@@ -44,10 +44,10 @@ def _attempts(grey: Grey, size: tuple[int, int], thorough: bool) -> Iterator[Arr
     if not thorough:
         yield _scaled(grey, min(1.0, _PREVIEW_SIDE_PX / largest), lambda small: _classic(small, size))
         return
+    if largest > _LARGE_SIDE_PX:
+        yield _scaled(grey, 0.5, lambda small: _classic(small, size))  # a third of the time
     yield _classic(grey, size)
     yield _sector(grey, size, 0)
-    if largest > _LARGE_SIDE_PX:
-        yield _scaled(grey, 0.5, lambda small: _classic(small, size))
     equalised: Any = cv2.createCLAHE(clipLimit=4.0, tileGridSize=(8, 8)).apply(grey)
     yield _classic(equalised, size)
     yield _sector(equalised, size, cv2.CALIB_CB_EXHAUSTIVE)

@@ -15,7 +15,10 @@ Grey = NDArray[np.uint8]
 _WINDOW_SHARE = 0.35
 """Half window of the refinement over the local spacing: as much edge as possible, no other corner."""
 _IRREGULAR_SHARE = 0.3
-_REFINEMENT_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-3)
+_REFINEMENT_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 5e-3)
+_SMOOTHING_PX = 1.0
+_SMOOTH_FROM_PX = 9.5
+"""Below this spacing the smoothing would mix a corner with its neighbours."""
 
 
 def to_grey(image: NDArray[Any]) -> Grey:
@@ -72,14 +75,21 @@ def refine(grey: Grey, corners: Array, spacing_px: Array, largest_half_window: i
     """Saddle points to sub-pixel accuracy; each corner with a window that fits its own spacing.
 
     corners: (n, 2); spacing_px: (n,). A corner that runs away by more than 0.4 spacings keeps its place.
+    The grey values are smoothed first: noise in the flat parts of a window pulls a corner to where the search
+    began, and a saddle stays where it is under any symmetric smoothing.
     """
     half = np.clip(np.floor(spacing_px * _WINDOW_SHARE), 2, largest_half_window).astype(int)
+    low = np.maximum(np.floor(corners.min(axis=0)).astype(int) - 2 * largest_half_window, 0)
+    high = np.maximum(np.ceil(corners.max(axis=0)).astype(int) + 2 * largest_half_window, low + 1)
+    region: Any = grey[low[1] : high[1], low[0] : high[0]].astype(np.float32)
+    if float(np.median(spacing_px)) >= _SMOOTH_FROM_PX:
+        region = cv2.GaussianBlur(region, (0, 0), _SMOOTHING_PX)
     refined = corners.copy()
     for size in np.unique(half):
         chosen = half == size
-        points = np.ascontiguousarray(corners[chosen].reshape(-1, 1, 2), dtype=np.float32)
-        cv2.cornerSubPix(grey, points, (int(size), int(size)), (-1, -1), _REFINEMENT_STEPS)
-        refined[chosen] = points.reshape(-1, 2)
+        points = np.ascontiguousarray((corners[chosen] - low).reshape(-1, 1, 2), dtype=np.float32)
+        cv2.cornerSubPix(region, points, (int(size), int(size)), (-1, -1), _REFINEMENT_STEPS)
+        refined[chosen] = points.reshape(-1, 2) + low
     ran = np.linalg.norm(refined - corners, axis=1) > 0.4 * spacing_px
     refined[ran] = corners[ran]
     return refined

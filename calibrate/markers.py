@@ -76,17 +76,27 @@ def _snap_to_corners(
         return _NOTHING
     # No edge of a marker may come into the window: they run beside the corner, not through it.
     margin_share = 0.5 * (1.0 - (spec.marker_m or 0.0) / spec.square_m)
-    corners = refine(grey, predicted[chosen], min(0.8, 2.8 * margin_share) * spacing[chosen])
-    good = is_saddle(grey, corners, min(0.25, 1.2 * margin_share) * spacing[chosen])
+    across, down = (
+        _apply(H, points[chosen] + half) - _apply(H, points[chosen] - half)
+        for half in np.eye(2) * spec.square_m / 2
+    )
+    # A tilt about the diagonal brings the markers' corners nearer than any neighbour.
+    diagonals = [np.linalg.norm(d, axis=1) / np.sqrt(2) for d in (across + down, across - down)]
+    room = np.minimum.reduce([spacing[chosen], *diagonals])
+    corners = refine(grey, predicted[chosen], min(0.8, 2.8 * margin_share) * room)
+    radius = (np.clip(min(0.25, 1.2 * margin_share) * room, 2.0, 12.0) / room)[:, None]
+    good = is_saddle(grey, corners, radius * across, radius * down)
     return chosen[good], corners[good]
 
 
-def is_saddle(grey: Grey, corners: Array, radius_px: Array) -> NDArray[np.bool_]:
-    """A chessboard corner: round it bright and dark alternate twice, opposite sides alike."""
+def is_saddle(grey: Grey, corners: Array, across: Array, down: Array) -> NDArray[np.bool_]:
+    """A chessboard corner: round it bright and dark alternate twice, opposite sides alike.
+
+    corners, across, down: (n, 2); the ring is a circle on the board, and these its half axes in the picture.
+    """
     angles = np.arange(16) * (2 * np.pi / 16)
-    radius = np.clip(radius_px, 2.0, 12.0)[:, None]
-    circle = np.stack([np.cos(angles), np.sin(angles)], axis=-1)
-    ring = sample(grey, corners[:, None] + radius[..., None] * circle)
+    circle = np.cos(angles)[:, None] * across[:, None] + np.sin(angles)[:, None] * down[:, None]
+    ring = sample(grey, corners[:, None] + circle)
     ring -= ring.mean(axis=1, keepdims=True)
     spectrum = np.abs(np.fft.rfft(ring, axis=1)) ** 2
     share = spectrum[:, 2] / np.maximum(spectrum[:, 1:].sum(axis=1), 1e-9)

@@ -109,8 +109,9 @@ def _compare_choices(cell: RandomCell, result: CellResult, rng: np.random.Genera
 def _squares(errors: Array, X: Array) -> tuple[float, float, float]:
     """Mean squared errors of X (visits, 6): translation, rotation, and of a point ahead of the camera."""
     ahead = errors[:, :3] + np.cross(errors[:, 3:], AHEAD_M * X[:3, 2])
-    mm, deg, point = (float((e**2).sum(axis=1).mean()) for e in (errors[:, :3], errors[:, 3:], ahead))
-    return 1e6 * mm, np.rad2deg(1) ** 2 * deg, 1e6 * point
+    scaled = (1e3 * errors[:, :3], np.rad2deg(errors[:, 3:]), 1e3 * ahead)
+    mm, deg, point = (float((e**2).sum(axis=1).mean()) for e in scaled)
+    return mm, deg, point
 
 
 def _plan_and_check(cell: RandomCell, result: CellResult, rng: np.random.Generator, seed: int) -> None:

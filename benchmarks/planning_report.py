@@ -39,8 +39,8 @@ def report(cells: list[CellResult]) -> str:
     text = (
         f"{len(cells)} random cells ({seen}), 5 visits with new noise per cell to each kind of pose set; "
         "random poses drawn anew for each visit. Root mean square errors of X; ± is over the cells. Point: "
-        "the place in `flange` of a point that the camera sees 0.5 m ahead, where translation and rotation count "
-        "as they do in use.\n\n"
+        "the place in `flange` of a point that the camera sees 0.5 m ahead, where translation and rotation "
+        "count as they do in use.\n\n"
     )
     heads = ["pool", "poses", "translation, mm", "ratio", "goal"]
     heads += ["rotation, °", "ratio", "point, mm", "ratio"]

@@ -129,6 +129,8 @@ class CaptureConfig(Section, frozen=True):
     this is 0.04 mm at one metre."""
     free_space_bytes: int = 2_000_000_000
     retries: int = 2
+    goal_m: float = 0.0005
+    """The session is good enough when the expected error of X (1 sigma of its translation) is below this."""
 
 
 class StationConfig(Section, frozen=True):

@@ -28,7 +28,6 @@ from station.status import EstimateStatus
 
 FEWEST_VIEWS = 4
 FEWEST_FOR_LENS = 6
-GOAL_M = 0.0005
 COVERAGE_ROWS, COVERAGE_COLUMNS = 4, 6
 _WEAK_PRIOR = (1.0, 1.0, 1.0, 0.1, 0.1, 0.1)
 _LENS_PRIOR_SHARE = 0.05
@@ -38,11 +37,16 @@ Seen = tuple[int, Array, NDArray[np.intp], Array]
 
 
 def running_estimate(
-    mount: Mount, camera: CameraModel, lens_is_known: bool, board: BoardSpec, seen: Sequence[Seen]
+    mount: Mount,
+    camera: CameraModel,
+    lens_is_known: bool,
+    board: BoardSpec,
+    seen: Sequence[Seen],
+    goal_m: float,
 ) -> EstimateStatus:
     """Few views or degenerate motion give an answer without numbers and with advice."""
     coverage = image_coverage(camera, [pixels for _, _, _, pixels in seen])
-    blank = EstimateStatus(len(seen), goal_mm=1000 * GOAL_M, image_coverage=coverage)
+    blank = EstimateStatus(len(seen), goal_mm=1000 * goal_m, image_coverage=coverage)
     if len(seen) < FEWEST_VIEWS:
         return msgspec.structs.replace(blank, advice="too few views yet")
     try:
@@ -58,24 +62,28 @@ def running_estimate(
         translation_mm=(round(x, 2), round(y, 2), round(z, 2)),
         sigma_translation_mm=round(1000 * sigma_m, 3),
         sigma_rotation_deg=round(math.degrees(sigma_rad), 4),
-        enough=sigma_m <= GOAL_M,
-        advice="sure enough: you may finish" if sigma_m <= GOAL_M else "go on: every pose still helps",
+        enough=sigma_m <= goal_m,
+        advice=f"enough for {1000 * goal_m:.2g} mm: you may finish"
+        if sigma_m <= goal_m
+        else "go on: every pose still helps",
     )
 
 
 def next_best(config: StationConfig, base_from_flange: Array, joints_now_rad: Sequence[float]) -> str:
     """Which pose would help most and how many are missing, after those captured (n, 4, 4).
 
-    By forecast from the configured guesses; empty where these are missing or no pose would help.
+    The goal is `capture.goal_m`. By forecast from the configured guesses; empty where these are missing or
+    no pose would help.
     """
+    goal_m = config.capture.goal_m
     try:
-        advice = advise(scene_of(config), base_from_flange, GOAL_M, joints_now_rad)
+        advice = advise(scene_of(config), base_from_flange, goal_m, joints_now_rad)
     except StationError:
         return ""
     if advice.next_pose is None:
         return ""
     missing = f"about {advice.poses_missing} more" if advice.poses_missing else "many more poses"
-    return f"{missing} for {1000 * GOAL_M:.1f} mm; the next best: {advice.next_pose.why}"
+    return f"{missing} for {1000 * goal_m:.2g} mm; the next best: {advice.next_pose.why}"
 
 
 def image_coverage(camera: CameraModel, pixels: Sequence[Array]) -> tuple[tuple[int, ...], ...]:

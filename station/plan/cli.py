@@ -71,9 +71,8 @@ def plan_command(
     if as_json:
         typer.echo(json.dumps(_summary(plan, outcome)))
     else:
-        _show(
-            plan, outcome, sketch(shown, plan) if shown is not None else "", output if check is None else None
-        )
+        drawn = sketch(shown, plan) if shown is not None else ""
+        _show(plan, outcome, drawn, output if check is None else None, cell.capture.goal_m)
     if outcome.problems:
         raise typer.Exit(LimitError.exit_code)
 
@@ -148,7 +147,21 @@ def _summary(plan: Plan, outcome: PlanCheck) -> dict[str, Any]:
     }
 
 
-def _show(plan: Plan, outcome: PlanCheck, picture: str, output: Path | None) -> None:
+def _goal_text(plan: Plan, goal_m: float) -> str:
+    """When the goal of accuracy should be reached; empty for plans that expect nothing."""
+    sigmas = [pose.predicted_sigma_m for pose in plan.poses]
+    if not sigmas or sigmas[-1] is None:
+        return ""
+    reached = (n for n, sigma in enumerate(sigmas, start=1) if sigma is not None and sigma <= goal_m)
+    number = next(reached, None)
+    goal = f"goal of {1000 * goal_m:.2g} mm (capture.goal_m)"
+    if number is not None:
+        return f"enough for the {goal} after pose {number}, if corners and arm are as good as assumed"
+    more = int(np.ceil(len(sigmas) * (sigmas[-1] / goal_m) ** 2))
+    return f"not enough for the {goal}: about {more} poses would be (--poses), or a better camera or arm"
+
+
+def _show(plan: Plan, outcome: PlanCheck, picture: str, output: Path | None, goal_m: float) -> None:
     console = Console(highlight=False, soft_wrap=True)
     table = Table(box=None, pad_edge=False)
     for heading in ("pose", "move s", "turn °", "margin mm", "σ mm"):
@@ -172,6 +185,8 @@ def _show(plan: Plan, outcome: PlanCheck, picture: str, output: Path | None) -> 
         f"{len(plan.poses)} poses, {outcome.duration_s:.0f} s of motion over {outcome.path_m:.1f} m, "
         f"at most {outcome.top_speed_m_s:.2f} m/s and {np.rad2deg(outcome.largest_step_rad):.0f}° in one move"
     )
+    if expected := _goal_text(plan, goal_m):
+        console.print(expected)
     if plan.note:
         console.print(f"note: {plan.note}")
     for problem in outcome.problems:

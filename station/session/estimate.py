@@ -43,7 +43,14 @@ class Estimator:
             known = bench.cell.camera_model is not None
             try:
                 estimate = await bench.workers.call(
-                    running_estimate, config.mount, camera, known, config.board, seen, timeout_s=20.0
+                    running_estimate,
+                    config.mount,
+                    camera,
+                    known,
+                    config.board,
+                    seen,
+                    config.capture.goal_m,
+                    timeout_s=20.0,
                 )
                 joints = bench.store.status.robot.joints_rad
                 if joints is not None and estimate.sigma_translation_mm is not None and not estimate.enough:

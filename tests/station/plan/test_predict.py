@@ -10,6 +10,7 @@ import pytest
 
 from calibrate.information import Noise
 from calibrate.kinematics import forward
+from station.config import CaptureConfig
 from station.estimation import next_best
 from station.limits import check_path
 from station.plan.planner import make_plan
@@ -79,5 +80,7 @@ def test_the_session_names_the_next_best_pose_until_it_is_enough():
     text = next_best(config, flange[:5], plan.poses[4].joints_rad)
     assert "more for 0.5 mm" in text and "next best" in text and "tilt" in text
     assert next_best(config, flange, plan.poses[-1].joints_rad) == ""
+    strict = msgspec.structs.replace(config, capture=CaptureConfig(goal_m=1e-4))
+    assert "for 0.1 mm" in next_best(strict, flange, plan.poses[-1].joints_rad)
     unknown = msgspec.structs.replace(config, board_guess=None)
     assert next_best(unknown, flange[:5], plan.poses[4].joints_rad) == ""

@@ -23,7 +23,7 @@ from calibrate.solution import Solution
 from calibrate.solve import SolveOptions, solve_views
 from calibrate.views import ViewSet
 
-TRIALS = 150
+TRIALS = 300
 SIZES_MM = (0.0, 0.25, 0.5)
 _MODEL = MODELS["UR10"]
 _HOME = (0.0, -1.5, 1.5, -1.5, -1.5, 0.0)

@@ -21,6 +21,13 @@ from calibrate.views import ViewSet
 
 _ROUNDS = 5
 _FEWEST = 4
+_FEWEST_IN_CORE = 6
+_TRIMMED = 0.6
+_FEWEST_TRIMMED = 8
+_UNDOUBTED, _NEAR = 0.999, 0.99
+"""Shares of good views that lie within, by the scale of the middle one."""
+_FEW = 0.1
+"""A smaller share of bad views does not widen the scales enough to hide in them."""
 MAX_ROBOT_M = 0.03
 MAX_ROBOT_RAD = np.radians(3.0)
 """Beyond this per axis it is not noise: no X is returned."""
@@ -90,22 +97,59 @@ def fit_views(
 def _settle(
     everything: Observations, views: ViewSet, places: Places, result: Estimate, reject: bool
 ) -> Settled:
-    """Estimate and verdict in turns until the accepted views stay the same; at most 5 rounds."""
-    seen: list[tuple[int, ...]] = []
-    C = views.camera_from_board
-    while True:
-        state = result.state
-        boards = refine_board_poses(everything, replace(state, C=C))
-        verdict = judge_views(everything, result, boards, places)
-        seen.append(tuple(places.tolist()))
-        good = verdict.good if reject else places
-        if len(seen) >= _ROUNDS or tuple(good.tolist()) in seen:
-            return Settled(places, _part(everything, places), result, verdict, boards)
+    """The core judges every view once; then those accepted judge each other until none has to leave.
+
+    Where more than a few are left out nobody is let in any more: every bad view let in widens the scales and
+    makes the next one look better.
+    """
+    if not reject:
+        return _judged(everything, views, places, result)
+    settled = _core(everything, views, places, result)
+    for round_ in range(_ROUNDS):
+        good = settled.verdict.good
+        if round_ and len(good) < (1 - _FEW) * len(views):
+            good = np.intersect1d(good, settled.places)
         if len(good) < _FEWEST:
             raise disagreement(f"Only {len(good)} of {len(views)} views agree; {_FEWEST} are needed.")
-        places = good
-        start = replace(state, C=boards.C[places])
-        result = estimate(_part(everything, places), start, result.intrinsics_free, result.sigma)
+        if np.array_equal(good, settled.places):
+            break
+        settled = _again(everything, views, settled, good)
+    return settled
+
+
+def _judged(everything: Observations, views: ViewSet, places: Places, result: Estimate) -> Settled:
+    boards = refine_board_poses(everything, replace(result.state, C=views.camera_from_board))
+    verdict = judge_views(everything, result, boards, places)
+    return Settled(places, _part(everything, places), result, verdict, boards)
+
+
+def _core(everything: Observations, views: ViewSet, group: Places, result: Estimate) -> Settled:
+    """The views of the group that agree best, and the estimate by them alone; bounded rounds.
+
+    Many bad views together widen the noise scales until each of them seems likely. So where the group is in
+    doubt the best 60 % of it are sought first (as in least trimmed squares: Rousseeuw 1984), then those
+    near them by the scale of the middle view. Whoever is left out is judged later by the others.
+    """
+    settled = _judged(everything, views, group, result)
+    if len(settled.verdict.near_middle(group, _UNDOUBTED)) == len(group):
+        return settled
+    fewest = int(np.ceil(_TRIMMED * len(group)))
+    if fewest >= _FEWEST_TRIMMED:
+        for _ in range(_ROUNDS):
+            core = settled.verdict.best(group, fewest)
+            if np.array_equal(core, settled.places):
+                break
+            settled = _again(everything, views, settled, core)
+    core = settled.verdict.near_middle(group, _NEAR)
+    return _again(everything, views, settled, core) if len(core) >= _FEWEST_IN_CORE else settled
+
+
+def _again(everything: Observations, views: ViewSet, settled: Settled, places: Places) -> Settled:
+    """Estimated by other views."""
+    before = settled.estimate
+    start = replace(before.state, C=settled.boards.C[places])
+    result = estimate(_part(everything, places), start, before.intrinsics_free, before.sigma)
+    return _judged(everything, views, places, result)
 
 
 def _part(everything: Observations, places: Places) -> Observations:

@@ -147,7 +147,9 @@ def _optimum_gates(solution: Solution, limits: GateLimits) -> Iterator[Gate]:
             proof.distance_sigma,
             limits.agreement_sigma,
             f"Certified optimum and installed X are {proof.distance_sigma:.1f} sigmas apart",
-            "Two sound methods disagree: look for views that do not belong, or a wrong lens.",
+            "The robot's orientations contradict its positions: see the warning below."
+            if solution.frames_finding
+            else "Two sound methods disagree: look for views that do not belong, or a wrong lens.",
         )
 
 

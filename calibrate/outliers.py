@@ -21,7 +21,7 @@ from calibrate.pairs import Places, mount_poses
 from calibrate.solution import RejectedView
 from calibrate.views import ImageView, ViewSet
 
-_FALSE_ALARM = 2e-4
+_FALSE_ALARM = 5e-4
 """Probability that a good view is rejected (more with few views, by the limit below)."""
 _LARGEST_SIGMAS = 6.0
 """No view that is farther out than this is kept, however few there are."""
@@ -50,6 +50,17 @@ class Judgement:
     def good(self) -> Places:
         return np.flatnonzero((self.distance2 <= self.limit) & ~self.blurred)
 
+    def near_middle(self, group: Places, share: float) -> Places:
+        """Those of the group that lie where a share of good views would, by the scale of the middle one."""
+        distance2 = self.distance2[group]
+        wider = float(np.median(distance2)) / float(stats.chi2.median(6))
+        near = distance2 <= wider * float(stats.chi2.ppf(share, 6))
+        return np.asarray(group[near & ~self.blurred[group]])
+
+    def best(self, group: Places, count: int) -> Places:
+        """The nearest of the group."""
+        return np.sort(group[np.argsort(self.distance2[group], kind="stable")[:count]])
+
 
 def judge_views(observed: Observations, result: Estimate, boards: BoardPoses, fitted: Places) -> Judgement:
     """`observed` and `boards` speak of all views, `result` rests on the `fitted` ones.
@@ -66,7 +77,9 @@ def judge_views(observed: Observations, result: Estimate, boards: BoardPoses, fi
     J = np.concatenate(parts, axis=2)[others]
     covariance[others] += J @ result.joint_covariance @ np.swapaxes(J, 1, 2)
     distance2 = np.einsum("ni,ni->n", miss, np.linalg.solve(covariance, miss[..., None])[..., 0])
-    chance = float(6 * stats.f.ppf(1 - _FALSE_ALARM, 6, max(3 * len(fitted) - 6, 3)))
+    # Two scales, each from 3N - 6 residuals: simulated, the tail is that of F with half as many again.
+    freedom = 1.5 * max(3 * len(fitted) - 6, 3)
+    chance = float(6 * stats.f.ppf(1 - _FALSE_ALARM, 6, freedom))
     limit = min(chance, _LARGEST_SIGMAS**2)
     typical = float(np.median(boards.typical_px))
     blurred = boards.typical_px > max(_BLURRED * typical, _BLURRED_PX)

@@ -12,12 +12,14 @@ from calibrate.assess import (
     median_distance_m,
     observe,
     point_error_m,
+    require_motion,
     score_holdout,
 )
 from calibrate.board_poses import refine_board_poses
 from calibrate.consensus import pose_arrays
-from calibrate.estimate import Estimate
+from calibrate.estimate import Estimate, estimate, first_state
 from calibrate.fit import Fit, Settled, fit_views
+from calibrate.frame_check import check_frames
 from calibrate.frames import board_frames, camera_frames
 from calibrate.geometry import Transform
 from calibrate.lens_check import check_lens
@@ -49,7 +51,9 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
     apart = distance_in_sigmas(start.X, state.X, pair_covariance(start.objective, pairs, start.X))
     lens_finding = "" if free else check_lens(settled.observed, result)
     watch.lap("lens check")
-    holdout = _holdout(fit, options, free) if options.holdout else None
+    # A fitted kinematic table accounts for such a turn itself.
+    frames_finding = "" if len(state.theta) else check_frames(settled.observed, replace(state, C=C[places]))
+    holdout = _holdout(fit, free) if options.holdout else None
     watch.lap("hold-out")
     indices = [view.index for view in fit.views]
     return Solution(
@@ -77,22 +81,31 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
         board_spread_rad=spread_rad,
         residual_px={indices[i]: float(settled.boards.rms_px[i]) for i in places},
         residual_robot=_robot_misses(settled, indices),
-        warnings=_warnings(fit, options, result, lens_finding),
+        frames_finding=frames_finding,
+        warnings=_warnings(fit, options, result, (lens_finding, frames_finding)),
         stage_ms=watch.stage_ms,
         solve_ms=watch.total_ms,
         seed=options.seed,
     )
 
 
-def _holdout(fit: Fit, options: SolveOptions, intrinsics_free: bool) -> HoldoutScore | None:
-    """Fit on all but the last 6 kept views, lens included; score all pairs inside those 6."""
+def _holdout(fit: Fit, intrinsics_free: bool) -> HoldoutScore | None:
+    """Fit on all but the last 6 kept views, lens included; score all pairs inside those 6.
+
+    That fit starts at the X of all views: a start decides how long the way to its own optimum is, not where
+    the optimum lies.
+    """
     kept = fit.views.select(fit.settled.places.tolist())
     fitted = len(kept) - HELD_OUT
     if fitted < 5:
         return None
     first = kept.select(list(range(fitted)))
     last = kept.select(list(range(fitted, len(kept))))
-    partial = fit_views(first, options.seed, intrinsics_free, False, Stopwatch()).settled.estimate.state
+    H, C = pose_arrays(first)
+    require_motion(all_pairs(H, C))
+    observed = observe_views(first)
+    start = first_state(observed, fit.settled.estimate.state.X, C, H, first.camera)
+    partial = estimate(observed, start, intrinsics_free).state
     H, C = pose_arrays(last)
     boards = refine_board_poses(observe_views(last), replace(partial, C=C))
     pairs = all_pairs(H, boards.C)
@@ -117,8 +130,10 @@ def _robot_misses(settled: Settled, indices: list[int]) -> dict[int, tuple[float
     }
 
 
-def _warnings(fit: Fit, options: SolveOptions, result: Estimate, lens_finding: str) -> tuple[str, ...]:
-    warnings = [lens_finding] if lens_finding else []
+def _warnings(
+    fit: Fit, options: SolveOptions, result: Estimate, findings: tuple[str, ...]
+) -> tuple[str, ...]:
+    warnings = [finding for finding in findings if finding]
     if options.intrinsics_from_same_pictures and not result.intrinsics_free:
         warnings.append(
             "The intrinsics came from the same pictures but could not be refined with X (only the plumb_bob "

@@ -200,6 +200,8 @@ class Solution:
     """Pose number → (metres, radians) between the recorded and the modelled flange."""
     on_box: tuple[str, ...] = ()
     """Paper profile: components of X that lie on the box of equation 22."""
+    frames_finding: str = ""
+    """The robot's orientations and positions contradict each other (see `frame_check`); "" if they do not."""
     warnings: tuple[str, ...] = ()
     stage_ms: dict[str, float] = field(default_factory=dict)
     solve_ms: float = 0.0

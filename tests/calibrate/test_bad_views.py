@@ -137,6 +137,21 @@ def test_swapped_poses_cost_no_more_than_their_views(share):
     assert np.mean(ours) < 1.1 * np.mean(oracle)
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_forty_percent_of_moderate_errors_do_not_hide_each_other(seed):
+    """6 … 10 robot sigmas in every component: together they widen the scales until each seems likely."""
+    rng = np.random.default_rng(100 + seed)
+    c = make_cell(rng, 25, MID)
+    bad = set(rng.choice(25, 10, replace=False).tolist())
+    sizes = rng.uniform(6, 10, (25, 6)) * rng.choice([-1, 1], (25, 6))
+    sigma = np.repeat([MID.robot_m, MID.robot_rad], 3)
+    flange = c.views.base_from_flange
+    for i in bad:
+        flange[i] = perturb(flange[i], sizes[i] * sigma)
+    solution = solve_views(with_flange(c.views, flange), QUICK)
+    assert set(solution.used) == set(range(25)) - bad
+
+
 def test_screening_finds_the_good_group_without_any_X():
     c = cell(2, 25)
     flange = c.views.base_from_flange.copy()

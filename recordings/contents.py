@@ -6,10 +6,10 @@ says. The strict reader and recovery both gather into this.
 
 from __future__ import annotations
 
-import zlib
 from array import array
 from dataclasses import dataclass, field
 
+from recordings import checksum
 from recordings.records import (
     MESSAGE_HEAD,
     BadRecordError,
@@ -103,7 +103,7 @@ class Contents:
         if self._attachment_bytes > ATTACHMENTS_LIMIT_BYTES:
             raise BadRecordError("the attachments are larger than any recording needs")
         record = parse_attachment(content)
-        if zlib.crc32(content[: record.crc_covers]) != record.crc:
+        if checksum.crc32(content[: record.crc_covers]) != record.crc:
             raise BadRecordError(f"the checksum of attachment '{record.name[:40]}' does not fit")
         if record.name in self.attachments:
             raise BadRecordError(f"attachment '{record.name[:40]}' stands twice in the file")

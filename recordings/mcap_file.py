@@ -9,11 +9,10 @@ from __future__ import annotations
 
 import os
 import struct
-import zlib
 from collections.abc import Sequence
 from pathlib import Path
 
-from recordings.checksum import joined_crc
+from recordings import checksum
 from recordings.files import create_exclusively
 from recordings.records import FOOTER, MAGIC, MESSAGE_HEAD, RECORD_HEAD, Opcode, Statistics
 
@@ -70,23 +69,19 @@ class McapFile:
 
     def message(self, channel: int, pieces: Sequence[Piece], time_ns: int, sequence: int) -> None:
         """A message whose content comes in pieces; ends the chunk when it is full."""
-        length = MESSAGE_HEAD.size + sum(len(piece) for piece in pieces)
+        length = MESSAGE_HEAD.size + sum(map(len, pieces))
         self._chunk.note(channel, time_ns)
-        self._chunk.add(RECORD_HEAD.pack(Opcode.MESSAGE, length))
-        self._chunk.add(MESSAGE_HEAD.pack(channel, sequence & 0xFFFFFFFF, time_ns, time_ns))
+        head = RECORD_HEAD.pack(Opcode.MESSAGE, length)
+        self._chunk.add(head + MESSAGE_HEAD.pack(channel, sequence & 0xFFFFFFFF, time_ns, time_ns))
         for piece in pieces:
             self._chunk.add(piece)
-        self._counts["messages"] += 1
-        self._per_channel[channel] = self._per_channel.get(channel, 0) + 1
-        first, last = self._span_ns or (time_ns, time_ns)
-        self._span_ns = (min(first, time_ns), max(last, time_ns))
         if self._chunk.size_bytes > CHUNK_BYTES:
             self.end_chunk()
 
     def attachment(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
         content = struct.pack("<QQ", time_ns, time_ns) + _text(name) + _text(media_type)
         content += struct.pack("<Q", len(data)) + data
-        record = _record(Opcode.ATTACHMENT, content + struct.pack("<I", zlib.crc32(content)))
+        record = _record(Opcode.ATTACHMENT, content + struct.pack("<I", checksum.crc32(content)))
         self.end_chunk()
         place = struct.pack("<QQQQQ", self.size_bytes, len(record), time_ns, time_ns, len(data))
         self._put([record])
@@ -108,19 +103,21 @@ class McapFile:
             return
         start, crc = self.size_bytes, chunk.crc()
         head = chunk.head(crc)
-        file_crc = joined_crc(zlib.crc32(head, self._crc), crc, chunk.size_bytes)
-        self._put([head, *chunk.pieces], file_crc)
-        index_start = self.size_bytes
-        offsets = b""
-        records: list[bytes] = []
+        index_start = start + len(head) + chunk.size_bytes
+        places, index = b"", b""
         for channel, entries in chunk.entries.items():
-            offsets += struct.pack("<HQ", channel, index_start + sum(len(record) for record in records))
+            self._per_channel[channel] = self._per_channel.get(channel, 0) + len(entries)
+            places += struct.pack("<HQ", channel, index_start + len(index))
             packed = b"".join(struct.pack("<QQ", *entry) for entry in entries)
-            records.append(_record(Opcode.MESSAGE_INDEX, struct.pack("<H", channel) + _sized(packed)))
-        self._put(records)
+            index += _record(Opcode.MESSAGE_INDEX, struct.pack("<H", channel) + _sized(packed))
+        file_crc = checksum.joined_crc(checksum.crc32(head, self._crc), crc, chunk.size_bytes)
+        self._put([head, *chunk.pieces, index], checksum.crc32(index, file_crc))
         first, last = chunk.span_ns
-        content = struct.pack("<QQQQ", first, last, start, index_start - start) + _sized(offsets)
-        content += struct.pack("<Q", self.size_bytes - index_start) + _text("")
+        if chunk.entries:
+            earliest, latest = self._span_ns or (first, last)
+            self._span_ns = (min(earliest, first), max(latest, last))
+        content = struct.pack("<QQQQ", first, last, start, index_start - start) + _sized(places)
+        content += struct.pack("<Q", len(index)) + _text("")
         content += struct.pack("<QQ", chunk.size_bytes, chunk.size_bytes)
         self._indexes.append(_record(Opcode.CHUNK_INDEX, content))
         self._counts["chunks"] += 1
@@ -139,7 +136,7 @@ class McapFile:
             ]
         )
         footer = RECORD_HEAD.pack(Opcode.FOOTER, FOOTER.size) + struct.pack("<QQ", start, 0)
-        crc = zlib.crc32(footer, zlib.crc32(summary))
+        crc = checksum.crc32(footer, checksum.crc32(summary))
         self._put([summary, footer, struct.pack("<I", crc), MAGIC])
 
     def close(self) -> None:
@@ -149,7 +146,7 @@ class McapFile:
             os.close(self.descriptor)
 
     def _statistics(self) -> bytes:
-        c = self._counts
+        c = self._counts | {"messages": sum(self._per_channel.values())}
         fixed = struct.pack("<QHIIII", *(c[name] for name in Statistics._fields[:6]))
         pairs = b"".join(struct.pack("<HQ", *pair) for pair in self._per_channel.items())
         return _record(
@@ -162,7 +159,7 @@ class McapFile:
         if crc is None:
             crc = self._crc
             for piece in rest:
-                crc = zlib.crc32(piece, crc)
+                crc = checksum.crc32(piece, crc)
         self._crc = crc
         while rest:
             done = os.writev(self.descriptor, rest)
@@ -203,7 +200,7 @@ class _Chunk:
     def crc(self) -> int:
         crc = 0
         for piece in self.pieces:
-            crc = zlib.crc32(piece, crc)
+            crc = checksum.crc32(piece, crc)
         return crc
 
     def head(self, crc: int) -> bytes:

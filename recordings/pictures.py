@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import re
 import struct
-import zlib
 from dataclasses import dataclass
 from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
+from recordings import checksum
 
 PICTURE_LIMIT_BYTES = 36 * 1024 * 1024
 """Decoded size above which no picture is read or written: bounds the reader's memory."""
@@ -106,7 +107,7 @@ def _check_png_chunks(data: bytes) -> None:
         end = position + 8 + length
         if end + 4 > len(data):
             break
-        if zlib.crc32(memoryview(data)[position + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
+        if checksum.crc32(memoryview(data)[position + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
             raise PictureError(f"the PNG is damaged (checksum of the block at byte {position})")
         if data[position + 4 : position + 8] == b"IEND":
             return

@@ -7,10 +7,11 @@ returns short data, skips padding or passes over a record it does not know.
 from __future__ import annotations
 
 import struct
-import zlib
 from collections.abc import Iterator
 from enum import IntEnum
 from typing import NamedTuple
+
+from recordings import checksum
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")
@@ -243,4 +244,4 @@ def require_crc(content: dict[str, str]) -> None:
 
 
 def _map_crc(content: dict[str, str]) -> str:
-    return f"{zlib.crc32(repr(sorted(content.items())).encode()):08x}"
+    return f"{checksum.crc32(repr(sorted(content.items())).encode()):08x}"

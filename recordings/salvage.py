@@ -9,11 +9,11 @@ from __future__ import annotations
 import os
 import re
 import struct
-import zlib
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 
+from recordings import checksum
 from recordings.contents import Contents
 from recordings.records import (
     FOOTER,
@@ -193,7 +193,7 @@ class _Walk:
         if not 0 < start <= end or end - start > SUMMARY_LIMIT_BYTES:
             return
         summary = self._read(start, end - start)
-        if zlib.crc32(tail[: FOOTER_BYTES - 4], zlib.crc32(summary)) != crc or offsets_start > end:
+        if checksum.crc32(tail[: FOOTER_BYTES - 4], checksum.crc32(summary)) != crc or offsets_start > end:
             return
         with suppress(BadRecordError):
             for _, opcode, content in split_records(memoryview(summary)):
@@ -207,6 +207,6 @@ def _proven_records(content: memoryview) -> tuple[memoryview, int]:
     if head.compression in COMPRESSIONS:
         raise CompressedError
     records = content[head.data_offset :]
-    if head.uncompressed_size != len(records) or zlib.crc32(records) != head.crc:
+    if head.uncompressed_size != len(records) or checksum.crc32(records) != head.crc:
         raise BadRecordError("the chunk's checksum does not fit its content")
     return records, head.data_offset

@@ -9,9 +9,9 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
-import zlib
 from pathlib import Path
 
+from recordings import checksum
 from recordings.contents import Contents
 from recordings.errors import CorruptRecordingError, RecordingError, UnsealedRecordingError
 from recordings.pictures import PICTURE_LIMIT_BYTES
@@ -175,7 +175,7 @@ class _Scan:
         records = content[head.data_offset :]
         if head.uncompressed_size != len(records):
             raise BadRecordError(f"a chunk says it has {head.uncompressed_size} bytes, it has {len(records)}")
-        if zlib.crc32(records) != head.crc:
+        if checksum.crc32(records) != head.crc:
             raise BadRecordError("the chunk's checksum does not fit its content")
         base = start + head.data_offset
         for offset, opcode, inner in split_records(records):
@@ -203,10 +203,10 @@ class _Scan:
             block = memoryview(self._read(offset, min(_BLOCK_BYTES, self._size - offset)))
             sha256.update(block)
             if offset < data_end:
-                data_crc = zlib.crc32(block[: data_end - offset], data_crc)
+                data_crc = checksum.crc32(block[: data_end - offset], data_crc)
             if offset + len(block) > summary_start:
                 part = block[max(0, summary_start - offset) : max(0, summary_end - offset)]
-                end_crc = zlib.crc32(part, end_crc)
+                end_crc = checksum.crc32(part, end_crc)
         if data_crc != stored_crc:
             raise self._corrupt(data_end, "the checksum of the data section does not fit its content")
         if end_crc != summary_crc:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from enum import Enum
+from enum import StrEnum
 from typing import Any
 
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
@@ -17,7 +17,7 @@ from recordings.messages import CaptureEvent, RobotState, View
 from recordings.schema import PictureFacts, message_class
 
 
-class Topic(Enum):
+class Topic(StrEnum):
     ROBOT_STATE = "/robot/state"
     PICTURE_FACTS = "/camera/frame"
     RAW_IMAGE = "/camera/image"

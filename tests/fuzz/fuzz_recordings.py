@@ -13,29 +13,29 @@ from __future__ import annotations
 import os
 import resource
 import sys
-import zlib
 from contextlib import suppress
 from pathlib import Path
 
 import atheris
 import cv2
 
-zlib.crc32 = lambda data, value=0: 0  # type: ignore[assignment]
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 with atheris.instrument_imports(include=["recordings"]):
+    from recordings import checksum
     from recordings.errors import RecordingError
     from recordings.reader import open_recording
     from recordings.recover import recover
     from recordings.writer import RecordingWriter
 
-from tests.recordings.small_recording import (  # noqa: E402  # after instrumentation
+from tests.recordings.small_recording import (  # after instrumentation
     make_info,
     make_picture,
     make_view,
     write_small,
 )
 
+checksum.crc32 = lambda data, value=0: 0
 SCRATCH = Path("/dev/shm") / f"fuzz-recordings-{os.getpid()}"
 MEMORY_LIMIT_BYTES = 256 * 1024 * 1024
 

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import zlib
 from pathlib import Path
 
@@ -13,8 +15,27 @@ from mcap.reader import make_reader
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 
+from recordings import checksum
 from recordings.checksum import joined_crc
 from recordings.mcap_file import CHUNK_BYTES, McapFile
+
+
+@given(st.binary(max_size=3000), st.integers(0, 2**32 - 1))
+def test_the_fast_checksum_is_zlibs(data: bytes, value: int) -> None:
+    assert checksum.crc32(data, value) == zlib.crc32(data, value)
+    assert checksum.crc32(memoryview(data)[1:]) == zlib.crc32(data[1:])
+
+
+def test_the_fast_checksum_is_the_one_in_use() -> None:
+    assert checksum.crc32 is not zlib.crc32, "zlib-ng is not installed: recording takes twice the processor"
+
+
+def test_it_records_without_zlib_ng_too() -> None:
+    code = (
+        "import sys, zlib; sys.modules['zlib_ng'] = None\n"
+        "from recordings import checksum; assert checksum.crc32 is zlib.crc32"
+    )
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[2])
 
 
 @given(st.binary(max_size=400), st.binary(max_size=400))

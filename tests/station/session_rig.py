@@ -15,6 +15,7 @@ from calibrate.board import board_points
 from calibrate.geometry import rotation_log
 from calibrate.kinematics import MODELS, forward
 from recordings.messages import CameraIdentity, Picture, RobotIdentity, RobotState, Stamps
+from recordings.reader import Recording, open_recording
 from station.analysis import Sighting, sight
 from station.cell import Cell
 from station.config import StationConfig
@@ -256,6 +257,11 @@ class Rig:
     @property
     def pose_states(self) -> list[str]:
         return [pose.state for pose in self.session.store.status.session.poses]
+
+
+def sealed(rig: Rig) -> Recording:
+    """What the session wrote."""
+    return open_recording(Path(rig.session.store.status.session.recording))
 
 
 NewRig = Callable[..., Awaitable[Rig]]

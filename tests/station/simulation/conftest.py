@@ -231,3 +231,11 @@ class Bench:
 @pytest.fixture
 def bench() -> Callable[..., Bench]:
     return Bench
+
+
+@pytest.fixture
+def script(bench: Callable[..., Bench]) -> Bench:
+    """A UR10 whose control script runs."""
+    made = bench()
+    made.start_script()
+    return made

@@ -1,0 +1,79 @@
+"""The dashboard's words, and a bare line on a script port."""
+
+from __future__ import annotations
+
+import socket
+import time
+
+import pytest
+
+from station.simulation.controller.dashboard import GREETING, LOCAL_REFUSAL
+
+pytestmark = pytest.mark.process
+
+
+def dashboard(host: str, *commands: str) -> list[str]:
+    """Greeting and one reply per command."""
+    with socket.create_connection((host, 29999), 3) as link, link.makefile("rw", newline="\n") as lines:
+        replies = [lines.readline().strip()]
+        for command in commands:
+            lines.write(command + "\n")
+            lines.flush()
+            replies.append(lines.readline().strip())
+    return replies
+
+
+def test_replies_of_the_dashboard(controller) -> None:
+    questions = {
+        "PolyscopeVersion": "3.15.8.106339",
+        "get serial number": "20263000001",
+        "get robot model": "UR10",
+        "robotmode": "Robotmode: RUNNING",
+        "safetymode": "Safetymode: NORMAL",
+        "safetystatus": "Safetystatus: NORMAL",
+        "programState": "STOPPED <unnamed>",
+        "running": "Program running: false",
+        "get loaded program": "No program loaded",
+        "stop": "Stopped",
+        "play": "Failed to execute: play",
+        "load job.urp": "File not found: job.urp",
+        "addToLog hello there": "Added log message",
+        "popup look": "showing popup",
+        "close popup": "closing popup",
+        "unlock protective stop": "Protective stop releasing",
+        "dance": "could not understand: dance",
+        "is in remote control": "could not understand: is in remote control",
+        "quit": "Disconnected",
+    }
+    assert dashboard(controller("UR10").host, *questions) == [GREETING, *questions.values()]
+
+
+def test_e_series_in_local_control_refuses_changes_and_answers_questions(controller) -> None:
+    running = controller("UR10e", options=("--local", "--serial", "20195500001"))
+    replies = dashboard(
+        running.host,
+        "is in remote control",
+        "get serial number",
+        "PolyscopeVersion",
+        "stop",
+        "power off",
+        "robotmode",
+    )
+    assert replies[1:3] == ["false", "20195500001"] and "5.11.1.108318" in replies[3]
+    assert replies[4:6] == [LOCAL_REFUSAL] * 2 and replies[6] == "Robotmode: RUNNING"
+
+
+def test_a_bare_line_on_a_script_port_replaces_the_program(controller, admin) -> None:
+    running = controller("UR10")
+    ask = admin(running)
+    ask.ask("foreign", name="job.urp")
+    with socket.create_connection((running.host, 30001), 3) as link:
+        link.sendall(b"textmsg(1)\n")
+        deadline = time.monotonic() + 2
+        while "upload: textmsg(1)" not in ask.ask("log")["counts"]:
+            assert time.monotonic() < deadline
+            time.sleep(0.01)
+    deadline = time.monotonic() + 2
+    while ask.ask("state")["program"] == "job.urp":
+        assert time.monotonic() < deadline
+        time.sleep(0.01)

@@ -1,0 +1,302 @@
+"""What goes wrong, as the unmodified ur_rtde wheel sees it: safety stops, other masters, broken links."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import pytest
+
+from station.simulation.admin import AdminClient
+from station.simulation.launch import SimulatedController
+
+pytestmark = pytest.mark.process
+Start = Callable[..., SimulatedController]
+Wheel = Callable[..., dict[str, Any]]
+
+
+def test_protective_stop_needs_five_seconds_an_unlock_and_a_new_script(
+    controller: Start, wheel: Wheel
+) -> None:
+    result = wheel(
+        controller("UR10"),
+        """
+        receive = rtde_receive.RTDEReceiveInterface(host)
+        control = rtde_control.RTDEControlInterface(host)
+        dashboard = dashboard_client.DashboardClient(host)
+        dashboard.connect()
+        control.moveJ(FAR, 0.5, 1.0, True)
+        time.sleep(0.4)
+        admin.ask("pstop")
+        time.sleep(0.05)
+        result["state"] = [receive.getSafetyMode(), receive.getRobotMode(), receive.isProtectiveStopped(),
+                           receive.isEmergencyStopped(), receive.getRuntimeState()]
+        result["speed"] = fastest(receive.getActualQd())
+        result["move"] = control.moveJ(NEAR, 0.5, 1.0)
+        result["word"] = control.getAsyncOperationProgress()
+        try:
+            dashboard.unlockProtectiveStop()
+        except RuntimeError as error:
+            result["early"] = str(error)
+        result["admin early"] = admin.ask("unlock")["unlocked"]
+        result["safetymode"] = dashboard.safetymode()
+        time.sleep(5.0)
+        dashboard.unlockProtectiveStop()
+        time.sleep(0.05)
+        result["after"] = [receive.getSafetyMode(), control.isProgramRunning()]
+        control.reuploadScript()
+        until(control.isProgramRunning)
+        result["moves again"] = control.moveJ(NEAR, 2.0, 4.0)
+        """,
+    )
+    assert result["state"] == [3, 7, True, False, 4]
+    assert result["speed"] == 0.0 and result["move"] is False and result["word"] == 0
+    assert "5s" in result["early"] and result["admin early"] is False
+    assert "PROTECTIVE_STOP" in result["safetymode"]
+    assert result["after"] == [1, False] and result["moves again"] is True
+
+
+@pytest.mark.parametrize(("model", "mode"), [("UR10", 3), ("UR10e", 5)])
+def test_emergency_stop_and_recovery(controller: Start, wheel: Wheel, model: str, mode: int) -> None:
+    result = wheel(
+        controller(model),
+        """
+        receive = rtde_receive.RTDEReceiveInterface(host)
+        control = rtde_control.RTDEControlInterface(host)
+        control.moveJ(FAR, 0.5, 1.0, True)
+        time.sleep(0.3)
+        admin.ask("estop")
+        time.sleep(0.05)
+        result["state"] = [receive.getSafetyMode(), receive.getRobotMode(), receive.isEmergencyStopped(),
+                           control.isProgramRunning()]
+        result["speed"] = fastest(receive.getActualQd())
+        result["move"] = control.moveJ(NEAR, 0.5, 1.0)
+        admin.ask("estop", on=False)
+        time.sleep(0.05)
+        result["released"] = [receive.getSafetyMode(), receive.getRobotMode()]
+        admin.ask("run")
+        control.reuploadScript()
+        until(control.isProgramRunning)
+        result["moves again"] = control.moveJ(NEAR, 2.0, 4.0)
+        """,
+    )
+    assert result["state"] == [7, mode, True, False]
+    assert result["speed"] == 0.0 and result["move"] is False
+    assert result["released"] == [1, 3] and result["moves again"] is True
+
+
+def test_a_safeguard_stop_pauses_until_play(controller: Start, wheel: Wheel) -> None:
+    result = wheel(
+        controller("UR10"),
+        """
+        receive = rtde_receive.RTDEReceiveInterface(host)
+        control = rtde_control.RTDEControlInterface(host)
+        control.moveJ(NEAR, 0.3, 1.0, True)
+        time.sleep(0.2)
+        admin.ask("safeguard")
+        time.sleep(0.4)
+        result["held"] = [receive.getSafetyMode(), receive.getRuntimeState(), fastest(receive.getActualQd())]
+        admin.ask("safeguard", on=False)
+        time.sleep(0.1)
+        result["cleared"] = [receive.getSafetyMode(), receive.getRuntimeState(), admin.ask("state")["moving"]]
+        result["play"] = admin.ask("play")["playing"]
+        until(lambda: near(receive.getActualQ(), NEAR))
+        """,
+    )
+    assert result["held"][:2] == [5, 4] and result["held"][2] < 1e-4
+    assert result["cleared"] == [1, 4, True] and result["play"] is True
+
+
+def test_power_off_and_program_stop_from_the_pendant(controller: Start, wheel: Wheel) -> None:
+    result = wheel(
+        controller("UR10"),
+        """
+        receive = rtde_receive.RTDEReceiveInterface(host)
+        control = rtde_control.RTDEControlInterface(host)
+        control.moveJ(FAR, 0.5, 1.0, True)
+        time.sleep(0.3)
+        admin.ask("stop_program")
+        time.sleep(0.3)
+        result["stopped"] = [receive.getRuntimeState(), fastest(receive.getActualQd())]
+        began = time.monotonic()
+        result["move"] = control.moveJ(NEAR, 0.5, 1.0)
+        result["at once"] = time.monotonic() - began
+        control.reuploadScript()
+        until(control.isProgramRunning)
+        result["again"] = control.moveJ(HOME, 2.0, 4.0)
+        admin.ask("power_off")
+        time.sleep(0.05)
+        result["off"] = [receive.getRobotMode(), receive.getRuntimeState(), receive.getRobotStatus()]
+        """,
+    )
+    assert result["stopped"][0] == 1 and result["stopped"][1] < 1e-4
+    assert result["move"] is False and result["at once"] < 1.0 and result["again"] is True
+    assert result["off"] == [3, 1, 0]
+
+
+def test_the_watchdog_stops_a_silent_client(controller: Start, wheel: Wheel) -> None:
+    result = wheel(
+        controller("UR10"),
+        """
+        receive = rtde_receive.RTDEReceiveInterface(host)
+        control = rtde_control.RTDEControlInterface(host)
+        result["set"] = control.setWatchdog(10.0)
+        control.moveJ(FAR, 0.3, 1.0, True)
+        for _ in range(20):
+            control.kickWatchdog()
+            time.sleep(0.03)
+        result["kicked"] = [control.isProgramRunning(), fastest(receive.getActualQd())]
+        silent = time.monotonic()
+        until(lambda: not control.isProgramRunning())
+        result["noticed"] = time.monotonic() - silent
+        time.sleep(0.3)
+        result["speed"] = fastest(receive.getActualQd())
+        """,
+    )
+    assert result["set"] and result["kicked"][0] and result["kicked"][1] > 0.2
+    assert result["noticed"] < 0.25 and result["speed"] < 1e-4
+
+
+def test_local_control_refuses_the_wheel(controller: Start, wheel: Wheel) -> None:
+    running = controller("UR10e", options=("--local",))
+    result = wheel(
+        running,
+        """
+        try:
+            rtde_control.RTDEControlInterface(host)
+        except RuntimeError as error:
+            result["refused"] = str(error)
+        dashboard = dashboard_client.DashboardClient(host)
+        dashboard.connect()
+        result["remote"] = dashboard.isInRemoteControl()
+        try:
+            dashboard.stop()
+        except RuntimeError as error:
+            result["stop"] = str(error)
+        admin.ask("remote", on=True)
+        try:
+            dashboard.stop()
+        except RuntimeError as error:
+            result["same connection"] = str(error)
+        dashboard.disconnect()
+        dashboard.connect()
+        dashboard.stop()
+        control = rtde_control.RTDEControlInterface(host)
+        result["running"] = control.isProgramRunning()
+        admin.ask("remote", on=False)
+        time.sleep(0.05)
+        result["local again"] = control.isProgramRunning()
+        """,
+    )
+    assert "remote control" in result["refused"].lower()
+    assert result["remote"] is False and "Remote Control" in result["stop"]
+    assert "Remote Control" in result["same connection"]
+    assert result["running"] is True and result["local again"] is False
+
+
+def test_a_killed_client_leaves_the_arm_moving_and_the_registers_free(
+    controller: Start, wheel: Wheel, admin: Callable[[SimulatedController], AdminClient]
+) -> None:
+    """Why a driver needs the watchdog: without it the program runs on alone."""
+    running = controller("UR10")
+    wheel(
+        running,
+        "rtde_control.RTDEControlInterface(host).moveJ(FAR, 1.0, 2.0, True)\nos.kill(os.getpid(), 9)",
+        ends=False,
+    )
+    ask = admin(running)
+    state = ask.ask("state")
+    assert state["moving"] and state["runtime_state"] == "PLAYING" and state["claims"] == []
+    deadline = time.monotonic() + 5
+    while ask.ask("state")["moving"]:
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
+    assert ask.ask("state")["target_joints_rad"][0] == pytest.approx(1.2)
+
+
+def test_a_second_client_and_a_foreign_program(controller: Start, wheel: Wheel) -> None:
+    result = wheel(
+        controller("UR10"),
+        """
+        admin.ask("foreign", name="palletising.urp")
+        until(lambda: admin.ask("state")["program"] == "palletising.urp")
+        dashboard = dashboard_client.DashboardClient(host)
+        dashboard.connect()
+        result["program"] = [dashboard.programState(), dashboard.running()]
+        began = time.monotonic()
+        control = rtde_control.RTDEControlInterface(host)
+        result["took"] = time.monotonic() - began
+        result["replaced"] = admin.ask("state")["program"]
+        try:
+            rtde_control.RTDEControlInterface(host)
+        except RuntimeError as error:
+            result["second"] = str(error)
+        result["first"] = control.isSteady()
+        """,
+    )
+    assert "PLAYING palletising.urp" in result["program"][0] and result["program"][1] is True
+    assert result["took"] > 4.0 and result["replaced"] == "rtde_control"
+    assert "in use" in result["second"] and result["first"] is True
+
+
+def test_registers_owned_by_a_field_bus(controller: Start, wheel: Wheel) -> None:
+    result = wheel(
+        controller("UR10"),
+        """
+        admin.ask("in_use", inputs=["input_int_register_0"])
+        try:
+            rtde_control.RTDEControlInterface(host)
+        except RuntimeError as error:
+            result["refused"] = str(error)
+        Control = rtde_control.RTDEControlInterface
+        control = Control(host, 125.0, Control.FLAG_UPLOAD_SCRIPT | Control.FLAG_UPPER_RANGE_REGISTERS)
+        result["upper"] = [control.isSteady(), control.moveJ(NEAR, 2.0, 4.0)]
+        """,
+    )
+    assert "in use" in result["refused"] and result["upper"] == [True, True]
+
+
+@pytest.mark.parametrize("how", ["fin", "rst"])
+def test_dropped_links(controller: Start, wheel: Wheel, how: str) -> None:
+    result = wheel(
+        controller("UR10"),
+        f"""
+        receive = rtde_receive.RTDEReceiveInterface(host)
+        result["cut"] = admin.ask("drop", how="{how}", ports=["rtde"])["cut"]
+        until(lambda: not receive.isConnected())
+        result["last"] = receive.getActualQ()
+        result["again"] = receive.reconnect()
+        time.sleep(0.1)
+        first = receive.getTimestamp()
+        time.sleep(0.1)
+        result["alive"] = receive.getTimestamp() > first
+        """,
+    )
+    assert result["cut"] == 1 and len(result["last"]) == 6 and result["again"] and result["alive"]
+
+
+def test_frozen_stalled_and_lost_data(controller: Start, wheel: Wheel) -> None:
+    result = wheel(
+        controller("UR10"),
+        """
+        receive = rtde_receive.RTDEReceiveInterface(host)
+        def advance():
+            first = receive.getTimestamp()
+            time.sleep(0.15)
+            return receive.getTimestamp() - first
+        result["live"] = advance()
+        admin.ask("freeze")
+        time.sleep(0.02)
+        result["frozen"] = advance()
+        admin.ask("freeze", on=False)
+        result["thawed"] = advance()
+        admin.ask("stall")
+        time.sleep(0.02)
+        result["stalled"] = [advance(), receive.isConnected()]
+        time.sleep(2.8)
+        result["noticed"] = receive.isConnected()
+        """,
+    )
+    assert result["live"] == pytest.approx(0.15, abs=0.05) and result["frozen"] == 0.0
+    assert result["thawed"] > 0.1 and result["stalled"] == [0.0, True] and result["noticed"] is False

@@ -1,0 +1,40 @@
+"""The operator guides the arm by hand, the station only records."""
+
+from __future__ import annotations
+
+import asyncio
+
+from station.status import StationState as S
+from tests.station.session_rig import NewRig, sealed
+
+
+async def test_a_free_hand_records_without_control(new_rig: NewRig) -> None:
+    rig = await new_rig(with_plan=False)
+    await rig.until(S.IDLE)
+    rig.session.take_lease(1, "anna")
+    await rig.session.switch_free_drive(1, True, auto=False)
+    assert rig.state is S.FREE_DRIVE
+    for turn in (0.0, 0.2):
+        rig.arm.joints = (*rig.arm.joints[:5], rig.arm.joints[5] + turn)
+        rig.arm.rest()
+        await rig.session.record(1)
+    await rig.session.switch_free_drive(1, False, auto=False)
+    await rig.session.finish(1)
+    assert [view.name for view in sealed(rig).views()] == ["hand-01", "hand-02"]
+    assert "start control" not in rig.arm.log
+
+
+async def test_auto_record_takes_a_new_place_once(new_rig: NewRig) -> None:
+    rig = await new_rig(with_plan=False)
+    await rig.until(S.IDLE)
+    rig.session.take_lease(1, "anna")
+    rig.arm.rest()
+    await rig.session.switch_free_drive(1, True, auto=True)
+    await rig.until_true(lambda: rig.session.store.status.session.captured == 1)
+    await asyncio.sleep(0.3)
+    assert rig.session.store.status.session.captured == 1
+    rig.arm.joints = (*rig.arm.joints[:5], rig.arm.joints[5] + 0.2)
+    rig.arm.rest()
+    await rig.until_true(lambda: rig.session.store.status.session.captured == 2)
+    await rig.session.stop("anna")
+    assert rig.state is S.STOPPED

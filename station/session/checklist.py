@@ -9,6 +9,7 @@ import msgspec
 
 from calibrate.board import BoardError, check_board, describe_board
 from station.devices.ur_condition import mode_word, not_powered, safety_stop, safety_word
+from station.devices.ur_probe import probe
 from station.errors import CameraError, RobotError
 from station.session.bench import Bench
 from station.status import StationState
@@ -27,7 +28,7 @@ class Check(msgspec.Struct, frozen=True):
 async def checklist(bench: Bench, troubles: dict[str, str]) -> list[Check]:
     """In the order in which a person would go through them."""
     return [
-        *_robot_checks(bench, troubles),
+        *await _robot_checks(bench, troubles),
         await _camera_check(bench, troubles),
         _trigger_check(bench, troubles),
         _board_check(bench),
@@ -36,13 +37,12 @@ async def checklist(bench: Bench, troubles: dict[str, str]) -> list[Check]:
     ]
 
 
-def _robot_checks(bench: Bench, troubles: dict[str, str]) -> list[Check]:
+async def _robot_checks(bench: Bench, troubles: dict[str, str]) -> list[Check]:
     robot, host = bench.cell.robot, bench.cell.config.robot.host
     try:
         state = robot.latest()
     except RobotError as error:
-        remedy = "check power, network cable and robot.host in the configuration"
-        return [Check("robot", "failed", troubles.get("robot", str(error)), remedy)]
+        return [Check("robot", "failed", troubles.get("robot", str(error)), await _from_outside(host))]
     identity = robot.identity
     checks = [Check("robot", "ok", f"{identity.model} {identity.serial} at {host}, {mode_word(state)}")]
     trouble = safety_stop(state) or not_powered(state)
@@ -57,6 +57,16 @@ def _robot_checks(bench: Bench, troubles: dict[str, str]) -> list[Check]:
         words = "remote" if robot.remote else "this controller has no remote switch"
         checks.append(Check("remote control", "ok", words))
     return checks
+
+
+async def _from_outside(host: str) -> str:
+    """What each port of a robot that gives no state answers, as the remedy."""
+    if not host:
+        return "give robot.host in the configuration"
+    found = await probe(host)
+    who = f"{found.model} {found.serial} answers at {host}" if found.model else f"nothing known at {host}"
+    remedy = "check power, network cable and robot.host in the configuration"
+    return "; ".join([who, *found.problems, *([remedy] if not found.model else [])])
 
 
 async def _camera_check(bench: Bench, troubles: dict[str, str]) -> Check:

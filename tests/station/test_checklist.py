@@ -1,0 +1,39 @@
+"""`station doctor`: what is missing is named with what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import msgspec
+import pytest
+
+from station.session.checklist import Check, checklist
+from station.simulation.launch import SimulatedController
+from tests.station.session_rig import Rig
+
+
+async def robot_check(rig: Rig, host: str) -> Check:
+    cell = rig.session.bench.cell
+    config = msgspec.structs.replace(cell.config, robot=msgspec.structs.replace(cell.config.robot, host=host))
+    object.__setattr__(cell, "config", config)
+    return (await checklist(rig.session.bench, {}))[0]
+
+
+async def test_a_robot_that_is_there_is_ok(rig: Rig) -> None:
+    assert (await robot_check(rig, "127.0.0.1")).state == "ok"
+
+
+@pytest.mark.parametrize(("host", "words"), [("", "give robot.host"), ("127.77.1.9", "127.77.1.9:30004")])
+async def test_a_robot_without_state_is_asked_port_by_port(rig: Rig, host: str, words: str) -> None:
+    rig.arm.stale = True
+    found = await robot_check(rig, host)
+    assert found.state == "failed" and words in found.remedy
+
+
+@pytest.mark.process
+async def test_a_robot_that_only_lacks_its_stream_is_told_by_name(
+    rig: Rig, controller: Callable[..., SimulatedController]
+) -> None:
+    rig.arm.stale = True
+    running = controller("UR10e")
+    assert f"UR10e 20263000001 answers at {running.host}" in (await robot_check(rig, running.host)).remedy

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from calibrate.geometry import Array
@@ -48,13 +50,18 @@ def _best_of_branch(scene: Scene, branch: Pool, start: Array | None) -> Pool:
     return max(groups, key=len)
 
 
-def _hubs(joints: Array, start: Array | None) -> Array:
-    """The start, and members far from one another (farthest-point sampling), most central first."""
-    spread = np.abs(joints[:, None] - joints[None]).max(axis=2)
-    hubs = [int(np.argmin(spread.mean(axis=1)))]
-    while len(hubs) < min(_HUBS, len(joints)):
-        hubs.append(int(np.argmax(spread[:, hubs].min(axis=1))))
-    return joints[hubs] if start is None else np.vstack([start, joints[hubs]])
+def _hubs(joints: Array, start: Array | None) -> Iterator[Array]:
+    """The start, the member nearest to the middle, then members far from these (farthest-point sampling)."""
+    if start is not None:
+        yield start
+    if len(joints) == 0:
+        return
+    hub = int(np.abs(joints - np.median(joints, axis=0)).max(axis=1).argmin())
+    away = np.full(len(joints), np.inf)
+    for _ in range(min(_HUBS, len(joints))):
+        yield joints[hub]
+        away = np.minimum(away, np.abs(joints - joints[hub]).max(axis=1))
+        hub = int(away.argmax())
 
 
 def _moves(scene: Scene, hub: Array, members: Array, reach_rad: float = _REACH_RAD) -> Array:

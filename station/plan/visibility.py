@@ -7,11 +7,15 @@ from numpy.typing import NDArray
 
 from calibrate.board import board_points
 from calibrate.geometry import Array, transform_points
+from calibrate.kinematics import forward
 from calibrate.projection import camera_matrix, project
 from recordings.messages import BoardSpec, CameraModel
 from station.collision import ARM_BODIES, body_segments, segment_distance
 from station.plan.scene import Scene
 from station.plan.view_range import ViewRange
+
+_ON_THE_WAY = 7
+"""Pictures looked at along a move."""
 
 
 def visible(camera: CameraModel, points: Array, border_px: float) -> NDArray[np.bool_]:
@@ -67,6 +71,15 @@ def uncertain_pixels(scene: Scene, base_from_flange: Array, points: Array) -> tu
     projected = project(scene.camera, seen)
     J = projected.by_point
     return projected.pixels, np.sqrt(np.einsum("nkij,nkjl,nkil->nki", J, variance, J))
+
+
+def blind_share(scene: Scene, joints_from: Array, joints_to: Array) -> Array:
+    """(n,) share of the way, 0…1, that joint moves (n, 6) → (n, 6) do not show the whole board."""
+    steps = np.linspace(0, 1, _ON_THE_WAY + 2)[1:-1]
+    paths = joints_from[:, None] + steps[:, None] * (joints_to - joints_from)[:, None]
+    flange = forward(scene.geometry.model, paths.reshape(-1, 6))
+    seen = visible(scene.camera, scene.seen(flange, outline(scene.board)), 0.0)
+    return np.asarray(1.0 - seen.reshape(len(joints_from), _ON_THE_WAY).mean(axis=1))
 
 
 def outline(board: BoardSpec) -> Array:

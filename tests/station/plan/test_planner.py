@@ -23,12 +23,13 @@ from calibrate.information import Noise
 from calibrate.kinematics import MODELS, forward
 from station.errors import ConfigError, LimitError
 from station.limits import SPEED_CAP_M_S, check_plan
+from station.plan import planner
 from station.plan.candidates import branch_of, find_candidates
 from station.plan.choose import choose, informations, objective_for
 from station.plan.planner import PlanOptions, make_plan, plan_scene
 from station.plan.scene import cell_geometry, scene_of
 from station.plan.view_range import ViewRange, view_range
-from station.plan.visibility import lens_radius, visible
+from station.plan.visibility import blind_share, lens_radius, visible
 from station.simulation.scenes import build_cell, cell_config
 
 CELLS = [
@@ -91,6 +92,27 @@ def test_poses_are_varied_and_say_why_they_are_there():
     sigmas = [pose.predicted_sigma_m for pose in plan.poses]
     assert all(b <= a * (1 + 1e-9) for a, b in pairwise(sigmas))
     assert sigmas[-1] < 0.0005
+
+
+def test_the_board_stays_in_the_picture_along_the_way():
+    _, config = cell()
+    scene = scene_of(config)
+    joints = np.array([pose.joints_rad for pose in planned().poses])
+    assert blind_share(scene, joints[:-1], joints[1:]).max() < 0.3
+    away = joints[:1] + np.array([0, 0, 0, 0, 1.2, 0])
+    assert blind_share(scene, joints[:1], away)[0] > 0.5
+    assert blind_share(scene, joints[:1], joints[:1])[0] == 0.0
+
+
+def test_an_order_takes_the_way_that_keeps_the_board_in_the_picture(monkeypatch):
+    """Of two equally long ways round, the one that sees the board."""
+    _, config = cell()
+    times = np.array([[0, 1, 1.01], [1, 0, 1], [1.01, 1, 0.0]])
+    monkeypatch.setattr(planner, "time_matrix", lambda *_: times)
+    monkeypatch.setattr(planner, "blind_share", lambda *_: np.array([1.0, 0.0, 0.0]))
+    order, unfree = planner._ordered(scene_of(config), np.zeros((3, 6)), None, 0)
+    assert unfree == []
+    assert {0, 1} not in ({*order[:2]}, {*order[1:]})
 
 
 def test_all_poses_stand_in_one_arm_branch():

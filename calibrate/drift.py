@@ -93,21 +93,22 @@ def judge_shift(views: ViewSet, installed: Array, covariance: Array, noise: Nois
     """The test itself. installed: (4, 4) X; covariance: (6, 6) of it."""
     if len(views) < FEWEST_VIEWS:
         raise TooFewViewsError(f"{len(views)} views are too few for a check: {FEWEST_VIEWS} to 5 are needed.")
-    flanges = views.base_from_flange if views.mount == "eye-in-hand" else inverse(views.base_from_flange)
+    flanges, in_hand = views.base_from_flange, views.mount == "eye-in-hand"
     seen = views.camera_from_board
     pnp = np.array(
         [pnp_covariance(v.board_points, views.camera, c) for v, c in zip(views, seen, strict=True)]
     )
     pnp *= noise.corner_px**2
     robot = np.diag([noise.robot_m**2] * 3 + [noise.robot_rad**2] * 3)
-    X, P = installed.copy(), flanges[0] @ installed @ seen[0]
+    X = installed.copy()
+    P = (flanges[0] if in_hand else inverse(flanges[0])) @ installed @ seen[0]
     for _ in range(_ITERATIONS):
-        information, gradient, misfit = _normal_equations(flanges, seen, X, P, robot, pnp)
+        information, gradient, misfit = _normal_equations(flanges, in_hand, seen, X, P, robot, pnp)
         fitted_all = _inverse(information)
         step = -fitted_all @ gradient
         fitted = fitted_all[:6, :6]
         X, P = perturb(X, step[:6]), perturb(P, step[6:])
-    _, _, misfit = _normal_equations(flanges, seen, X, P, robot, pnp)
+    _, _, misfit = _normal_equations(flanges, in_hand, seen, X, P, robot, pnp)
     shift = difference(X, installed)
     total = fitted + covariance
     weight: Any = np.linalg.inv(total)
@@ -147,16 +148,18 @@ def _power(weight: Array, size: float, threshold: float, nu: float) -> float:
 
 
 def _normal_equations(
-    flanges: Array, seen: Array, X: Array, P: Array, robot: Array, pnp: Array
+    flanges: Array, in_hand: bool, seen: Array, X: Array, P: Array, robot: Array, pnp: Array
 ) -> tuple[Array, Array, float]:
     """(12, 12) information of [δX, δP], (12,) gradient, and the misfit r'Wr.
 
-    flanges: base_from_flange, or its inverse for eye-to-hand (there P is flange_from_board).
+    flanges: base_from_flange; for eye-to-hand P is flange_from_board. `robot` (6, 6) is the covariance of the
+    deltas of base_from_flange for both: the robot turns its flange about the flange.
     """
     steps = _STEP * np.eye(6)[:, None]
 
     def miss(F: Array, X: Array, P: Array) -> Array:
-        return difference(seen, inverse(F @ X) @ P)
+        H = F if in_hand else inverse(F)
+        return difference(seen, inverse(H @ X) @ P)
 
     def slope(moved: Array, r: Array) -> Array:
         """(6, n, 6) misses after each step → (n, 6, 6) Jacobians."""

@@ -48,6 +48,10 @@ _CELL_OF: dict[Source, Cell] = {
 }
 
 
+WORSE_TIMES = 1.5
+"""More than the estimates of two good sessions differ by chance."""
+
+
 class InstallGateError(GateFailedError, InstallError):
     """A gate failed and nobody took responsibility."""
 
@@ -94,6 +98,7 @@ def install(
         objections += by_hand(calibration)
         _refuse_foreign_source(calibration, before, cell, path)
         failed = [f"gate {gate.name}: {gate.text}" for gate in calibration.quality.failed]
+        failed += _worse(calibration, before)
         if (failed or objections) and not override.strip():
             kind = InstallGateError if failed and not objections else InstallError
             raise kind(
@@ -176,6 +181,27 @@ def _refuse_foreign_source(
             f"{path} ({calibration.source}) does not follow a {before.source} calibration in the same place. "
             "Use another --root."
         )
+
+
+def _worse(calibration: Calibration, before: Calibration | None) -> list[str]:
+    """That it is much less certain than what it would replace; unless that failed its own gates."""
+    if before is None or before.quality.failed:
+        return []
+    new, old = calibration.quality, before.quality
+    same_place = new.working_distance_m == old.working_distance_m
+    if same_place and new.predicted_error_mm is not None and old.predicted_error_mm is not None:
+        ours, theirs = new.predicted_error_mm, old.predicted_error_mm
+        what = f"a point at {1000 * (new.working_distance_m or 0):.0f} mm is expected to be off by"
+    else:
+        ours, theirs = calibration.sigma.translation_mm, before.sigma.translation_mm
+        what = "the camera's position is uncertain by"
+    if not ours > WORSE_TIMES * theirs:
+        return []
+    text = (
+        f"gate no worse: {what} {ours:.2f} mm (1σ), by the installed calibration {theirs:.2f} mm. Capture "
+        "more or better poses, or keep the installed one; `calibrate check` says whether that still holds."
+    )
+    return [text]
 
 
 def _objections(

@@ -11,6 +11,7 @@ import numpy as np
 import typer
 from rich.table import Table
 
+from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, bounded
 from calibrate.calibration import Touch, write_calibration
 from calibrate.commands.files import read_board, read_camera
 from calibrate.commands.install import Root, history_rows
@@ -52,6 +53,9 @@ LensKind = Annotated[LensName, typer.Option("--lens", help="Model of a lens that
 GatesFile = Annotated[Path | None, typer.Option("--gates", help="YAML of other limits")]
 Threads = Annotated[int | None, typer.Option(help="For finding boards; the result does not depend on it")]
 Distance = Annotated[float | None, typer.Option("--working-distance-mm", help="Where the error is stated")]
+
+TimeLimit = Annotated[float, typer.Option(help="The solve ends with an error after so long; 0: no limit")]
+MemoryLimit = Annotated[int, typer.Option(help="… when this process needs so much; 0: no limit")]
 
 
 def register(app: typer.Typer) -> None:
@@ -103,6 +107,8 @@ def solve(
     threads: Threads = None,
     working_distance_mm: Distance = None,
     report: Annotated[Path | None, typer.Option(help="Also write the report (HTML)")] = None,
+    time_limit_s: TimeLimit = TIME_LIMIT_S,
+    memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
 ) -> None:
     """Solve a recording and write the calibration file. Exit 4: written, but a gate failed."""
     options = job_options(
@@ -110,7 +116,7 @@ def solve(
     )
     target = output or Path(f"{recording.name.removesuffix('.mcap')}.calibration.yaml")
     check_target(target)
-    with detection_progress() as progress:
+    with bounded(time_limit_s, memory_limit_mib), detection_progress() as progress:
         job = solve_recording(recording, options, progress)
     write_calibration(job.calibration, target)
     if report is not None:
@@ -167,13 +173,15 @@ def report_file(
     threads: Threads = None,
     working_distance_mm: Distance = None,
     root: Root = None,
+    time_limit_s: TimeLimit = TIME_LIMIT_S,
+    memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
 ) -> None:
     """Solve a recording again and write its report: one HTML file. With the history of what is installed."""
     options = job_options(
         profile, seed, board, square_mm, camera, find_intrinsics, lens, gates, threads, working_distance_mm
     )
     target = output or Path(f"{recording.name.removesuffix('.mcap')}.report.html")
-    with detection_progress() as progress:
+    with bounded(time_limit_s, memory_limit_mib), detection_progress() as progress:
         job = solve_recording(recording, options, progress)
     _write_report(job, target, options, root)
     out.print(f"written: {target}")
@@ -217,9 +225,9 @@ def compare(
     options = job_options(
         ProfileName.robust, seed, board, square_mm, camera, find_intrinsics, lens, None, threads, None
     )
-    with detection_progress() as progress:
+    with bounded(), detection_progress() as progress:
         prepared = prepare_views(recording, options, progress)
-    results = compare_all(prepared.views, solver_options(options, prepared))
+        results = compare_all(prepared.views, solver_options(options, prepared))
     if as_json:
         print_json(
             {

@@ -72,6 +72,22 @@ def test_the_promise_in_400_trials_each(mount: Mount) -> None:
     assert sum(not c.passed for c in checks(400, 0, float(np.radians(0.1)), 13, mount)) >= 380
 
 
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_where_the_robots_base_has_its_origin_changes_nothing(mount: Mount) -> None:
+    """A robot's error turns the flange about the flange, however far away the base is."""
+    views = few_views(np.random.default_rng(15), X_TRUE, mount=mount)
+    away = pose(np.eye(3), [0.0, 2.0, -3.0])
+    moved = replace(
+        views,
+        views=tuple(replace(v, base_from_flange=away @ v.base_from_flange) for v in views),
+    )
+    X = away @ X_TRUE if mount == "eye-to-hand" else X_TRUE
+    here = judge_shift(views, X_TRUE, INSTALLED_COVARIANCE, NOISE)
+    there = judge_shift(moved, X, INSTALLED_COVARIANCE, NOISE)
+    assert there.statistic == pytest.approx(here.statistic, rel=1e-3)
+    np.testing.assert_allclose(there.covariance, here.covariance, rtol=1e-3, atol=1e-12)
+
+
 def test_the_shift_is_named_and_the_stated_power_is_a_lower_bound() -> None:
     found = checks(40, 2e-3, 0, 4)
     assert np.median([c.shift_mm for c in found]) == pytest.approx(2.0, abs=0.3)

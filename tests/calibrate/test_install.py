@@ -260,3 +260,34 @@ def test_consumers_get_frames_in_the_name(make_file, tmp_path: Path) -> None:  #
     assert (calibration.transform.parent, calibration.transform.child) == ("flange", "camera")
     assert calibration.intrinsics.model.width == 480
     assert (tmp_path / "calibrations/current").readlink().parts[0] == "gen"
+
+
+def test_a_much_less_certain_one_replaces_no_better_one_without_a_reason(  # type: ignore[no-untyped-def]
+    make_file, solved_real: SolvedRecording, tmp_path: Path
+) -> None:
+    quality = solved_real.calibration.quality
+    assert quality.predicted_error_mm is not None
+    worse = msgspec.structs.replace(quality, predicted_error_mm=2.0 * quality.predicted_error_mm)
+    hardly = msgspec.structs.replace(quality, predicted_error_mm=1.3 * quality.predicted_error_mm)
+    root = tmp_path / "s"
+    install(make_file(quality=worse), root)  # nothing to compare with
+    install(make_file(), root)
+    install(make_file(quality=hardly), root)
+    with pytest.raises(InstallGateError, match=r"gate no worse: a point at \d+ mm is expected to be off by"):
+        install(make_file(quality=worse), root)
+    assert len(generations(root)) == 3
+    made = install(make_file(quality=worse), root, override="the old lens is broken")
+    assert made.calibration is not None and made.calibration.override is not None
+    assert "no worse" in made.calibration.override.overridden[0]
+    rollback(root)
+    assert load_installed(root).quality == hardly
+
+
+def test_without_a_predicted_error_the_sigmas_are_compared(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    root = tmp_path / "s"
+    install(make_file(), root)
+    sigma = load_installed(root).sigma
+    quality = msgspec.structs.replace(load_installed(root).quality, predicted_error_mm=None)
+    vague = msgspec.structs.replace(sigma, translation_mm=3 * sigma.translation_mm)
+    with pytest.raises(InstallGateError, match="camera's position is uncertain"):
+        install(make_file(quality=quality, sigma=vague), root)

@@ -1,0 +1,100 @@
+"""A solve that hangs, eats the memory or is killed leaves what was there before (fault table, row 45)."""
+
+from __future__ import annotations
+
+import resource
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from calibrate.bounds import SolveLimitError, bounded
+from calibrate.calibration import read_calibration, write_calibration
+from calibrate.errors import CalibrationError
+from calibrate.pipeline import SolvedRecording
+
+PROGRAM = (sys.executable, "-m", "calibrate.cli", "solve")
+
+
+@pytest.fixture
+def old_file(solved_real: SolvedRecording, tmp_path: Path) -> Path:
+    path = tmp_path / "cell.yaml"
+    write_calibration(solved_real.calibration, path)
+    return path
+
+
+def test_what_takes_too_long_is_ended_with_a_name() -> None:
+    begun_s = time.monotonic()
+    with pytest.raises(SolveLimitError, match=r"longer than 0\.1 s; nothing was written"), bounded(0.1, 0):
+        while time.monotonic() - begun_s < 10:
+            pass
+    assert time.monotonic() - begun_s < 5
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+
+
+def test_a_handler_that_swallows_the_first_alarm_meets_the_next() -> None:
+    with pytest.raises(SolveLimitError), bounded(0.05, 0):
+        try:
+            while True:
+                pass
+        except CalibrationError:
+            pass
+        while True:
+            pass
+
+
+@pytest.mark.parametrize("eater", ["numpy", "opencv"])
+def test_what_needs_too_much_memory_is_ended_with_a_name(eater: str) -> None:
+    before = resource.getrlimit(resource.RLIMIT_DATA)
+    with pytest.raises(SolveLimitError, match="more than 6000 MiB"), bounded(0, 6000):
+        if eater == "numpy":
+            np.ones((1000, 1000, 1000))
+        else:
+            cv2.resize(np.zeros((64, 64), np.uint8), (100_000, 80_000))
+    assert resource.getrlimit(resource.RLIMIT_DATA) == before
+
+
+def test_other_errors_pass_unchanged() -> None:
+    with pytest.raises(cv2.error, match="resize"), bounded():
+        cv2.resize(np.zeros((0, 0), np.uint8), (1, 1))
+    with bounded(60, 4096):
+        assert signal.getitimer(signal.ITIMER_REAL)[0] > 0
+
+
+@pytest.mark.parametrize(
+    ("option", "value", "said"),
+    [
+        ("--time-limit-s", "0.05", "longer than 0.05 s"),
+        ("--memory-limit-mib", "1", "more than 1 MiB"),
+    ],
+)
+def test_the_command_ends_with_1_and_the_old_file_stays(
+    real_session_file: Path, old_file: Path, option: str, value: str, said: str
+) -> None:
+    content = old_file.read_bytes()
+    done = subprocess.run(
+        [*PROGRAM, str(real_session_file), "-o", str(old_file), option, value], capture_output=True, text=True
+    )
+    assert done.returncode == 1
+    assert said in " ".join(done.stderr.split())
+    assert "Traceback" not in done.stderr
+    assert old_file.read_bytes() == content
+
+
+def test_killed_at_any_moment_it_leaves_a_whole_file(real_session_file: Path, old_file: Path) -> None:
+    whole = read_calibration(old_file)
+    for after_s in (0.3, 0.8, 1.5, 2.5):
+        child = subprocess.Popen(
+            [*PROGRAM, str(real_session_file), "-o", str(old_file)],
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        time.sleep(after_s)
+        child.kill()
+        child.wait()
+        assert read_calibration(old_file).result == whole.result

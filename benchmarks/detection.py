@@ -79,6 +79,7 @@ def run() -> str:
         f"Rendered 1280×1024, {count} pictures each: boards found (at least 80 % of the corners), share of "
         "all corners, and their rms distance from the truth.\n\n" + table(head, rows)
     )
+    text += "\n\n" + _circles(max(3, count // 5))
     return text + "\n\n" + _real() if DATASETS.is_dir() else text
 
 
@@ -147,6 +148,28 @@ def _charuco(image: Any, spec: BoardSpec) -> tuple[Any, Any] | None:
     board.setLegacyPattern(spec.legacy)
     corners, ids, _, _ = cv2.aruco.CharucoDetector(board).detectBoard(image)
     return None if ids is None else (ids.ravel(), corners.reshape(-1, 2))
+
+
+def _circles(count: int) -> str:
+    """Centres of circles, not of ellipses."""
+    boards = (
+        BoardSpec(BoardKind.CIRCLES, 7, 5, 0.03),
+        BoardSpec(BoardKind.ASYMMETRIC_CIRCLES, 4, 11, 0.015),
+    )
+    rows = []
+    for tilt_deg in (20, 45, 60):
+        case = Case(tilt_deg=tilt_deg, distance_m=0.5)
+        cells = [cell for spec in boards for cell in _cells((_ours, _circles_grid), spec, case, count)]
+        rows.append([f"{tilt_deg}°", *cells])
+    head = ("tilt", "circles 7×5, ours", "findCirclesGrid", "asymmetric 4×11, ours", "findCirclesGrid")
+    return f"Circle grids, {count} pictures each.\n\n" + table(head, rows)
+
+
+def _circles_grid(image: Any, spec: BoardSpec) -> tuple[Any, Any] | None:
+    asymmetric = spec.kind is BoardKind.ASYMMETRIC_CIRCLES
+    kind = cv2.CALIB_CB_ASYMMETRIC_GRID if asymmetric else cv2.CALIB_CB_SYMMETRIC_GRID
+    found, centres = cv2.findCirclesGrid(image, (spec.columns, spec.rows), flags=kind)
+    return (np.arange(len(centres)), centres.reshape(-1, 2)) if found else None
 
 
 def _real() -> str:

@@ -24,7 +24,7 @@ BOARDS = [
     BoardSpec(BoardKind.ASYMMETRIC_CIRCLES, 4, 11, 0.013),
     BoardSpec(BoardKind.APRIL_GRID, 4, 3, 0.036, 0.0108),
 ]
-EXACT_LIMIT_PX = {BoardKind.APRIL_GRID: 0.25, BoardKind.ASYMMETRIC_CIRCLES: 0.12}
+EXACT_LIMIT_PX = {BoardKind.APRIL_GRID: 0.25, BoardKind.ASYMMETRIC_CIRCLES: 0.05}
 
 
 def picture(spec: BoardSpec, seed: int, **light: float) -> tuple[np.ndarray, np.ndarray]:
@@ -144,3 +144,33 @@ def test_strong_tilt_blur_and_low_light(tilt_deg: float) -> None:
     assert found.found
     truth = project(CAMERA, seen, board_points(PAPER_BOARD))
     assert np.sqrt(np.square(found.pixels - truth).sum(axis=1).mean()) < 0.4
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [BoardSpec(BoardKind.CIRCLES, 7, 5, 0.022), BoardSpec(BoardKind.ASYMMETRIC_CIRCLES, 4, 11, 0.011)],
+    ids=lambda s: s.kind.value,
+)
+def test_a_tilted_circle_is_its_own_centre_not_its_ellipses(spec: BoardSpec) -> None:
+    """The ellipses' centres miss by 0.1 px here, and OpenCV guesses circles that it does not find."""
+    misses: list[float] = []
+    for seed in range(3):
+        seen = looking(spec, np.random.default_rng(seed), tilt=(0.9, 0.95), distance_m=0.34)
+        image = render(CAMERA, spec, seen, Light(pixel_noise=1.5), np.random.default_rng(seed))
+        found = detect(image, spec)
+        assert found.found
+        truth = project(CAMERA, seen, board_points(spec))
+        both = [np.linalg.norm(found.pixels - t, axis=1) for t in (truth, truth[::-1])]
+        misses += min(both, key=np.median).tolist()
+    assert max(misses) < 0.2
+    assert np.sqrt(np.square(misses).mean()) < 0.05
+
+
+def test_charuco_is_found_whole_at_sixty_degrees() -> None:
+    for seed in range(3):
+        seen = looking(CHARUCO, np.random.default_rng(seed), tilt=(1.04, 1.05), distance_m=0.3)
+        image = render(CAMERA, CHARUCO, seen, Light(pixel_noise=1.5), np.random.default_rng(seed))
+        found = detect(image, CHARUCO)
+        truth = project(CAMERA, seen, board_points(CHARUCO)[found.indices])
+        assert found.corners >= 0.9 * found.expected
+        assert np.sqrt(np.square(found.pixels - truth).sum(axis=1).mean()) < 0.3

@@ -26,10 +26,12 @@ from recordings.recover import recover as recover_recording
 main = typer.Typer(
     name="recordings",
     help="Look into, make, convert and rescue recordings.",
+    epilog="Exit codes: 0 good, 1 failed, 2 wrong usage, 3 done with loss.",
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
 )
+Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session's folder", show_default=False)]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 
 
@@ -43,8 +45,8 @@ def _errors_for_people() -> Iterator[None]:
 
 
 @main.command()
-def info(recording: Path, json_: Json = False) -> None:
-    """What a recording holds: contents, rates, gaps, clock quality, size; 3 when a part is missing."""
+def info(recording: Rec, json_: Json = False) -> None:
+    """What a recording holds: contents, rates, gaps, clock quality, size. Ends with 3 when a part lacks."""
     with _errors_for_people():
         facts = recording_info(open_recording(recording, incomplete=True))
     if json_:
@@ -57,7 +59,9 @@ def info(recording: Path, json_: Json = False) -> None:
 
 @main.command("import")
 def import_(
-    folder: Path,
+    folder: Annotated[
+        Path, typer.Argument(help="Holds dataset.yaml, poses.csv and the pictures", show_default=False)
+    ],
     output: Annotated[Path, typer.Option("-o", "--output", help="The recording to write (.mcap).")],
     json_: Json = False,
 ) -> None:
@@ -73,9 +77,12 @@ def import_(
 
 @main.command()
 def export(
-    recording: Path,
+    recording: Rec,
     output: Annotated[Path, typer.Option("-o", "--output", help="The folder to write; it must not exist.")],
-    to: Annotated[Target, typer.Option("--to", help="folder: for `import`; csv: tables; ros2: a bag.")],
+    to: Annotated[
+        Target,
+        typer.Option("--to", help="folder: pictures and poses, for `import`; csv: tables; ros2: a bag."),
+    ],
     json_: Json = False,
 ) -> None:
     """A recording as a folder of pictures and poses, as CSV tables, or as a ROS 2 bag."""
@@ -86,7 +93,7 @@ def export(
 
 @main.command()
 def excerpt(
-    recording: Path,
+    recording: Rec,
     output: Annotated[Path, typer.Option("-o", "--output", help="The smaller recording (.mcap) to write.")],
     json_: Json = False,
 ) -> None:
@@ -98,8 +105,13 @@ def excerpt(
 
 @main.command()
 def recover(
-    recording: Path,
-    output: Annotated[Path | None, typer.Option("-o", "--output", help="Default: repaired in place.")] = None,
+    recording: Annotated[
+        Path, typer.Argument(help="A recording (.mcap, .mcap.part) or a session's folder", show_default=False)
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help="Default: in place, and the damaged file is kept beside it."),
+    ] = None,
     json_: Json = False,
 ) -> None:
     """Rebuild an unfinished, cut or damaged recording (or a session's folder); ends with 3 when it had to."""
@@ -110,6 +122,8 @@ def recover(
     else:
         for result in results:
             print_recovery(result)
+        if output is not None and not results[0].rebuilt:
+            print(f"{output} was not written: there was nothing to repair")
     raise typer.Exit(3 if any(result.rebuilt or result.missing for result in results) else 0)
 
 

@@ -50,6 +50,8 @@ def _new_folder(output: Path) -> Iterator[Path]:
     """Appears under its name when it is complete."""
     if output.exists() or output.is_symlink():
         raise RecordingError(f"{output} exists already; choose another name")
+    if not output.absolute().parent.is_dir():
+        raise RecordingError(f"the folder {output.absolute().parent} does not exist; create it first")
     temporary = output.with_name(output.name + ".part")
     try:
         temporary.mkdir()

@@ -56,6 +56,8 @@ def _info_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
             plural = "s" if count > 1 else ""
             gaps = f"{count} gap{plural}, largest {states['largest_gap_s'] * 1e3:.0f} ms"
         yield "robot states", f"{states['count']} at {rate}, {gaps}"
+    if pictures := facts["pictures"]:
+        yield "pictures", _pictures_text(pictures)
     for name, clock in facts["clocks"].items():
         if clock:
             yield f"{name} clock", _clock_text(clock)
@@ -63,6 +65,16 @@ def _info_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "attached", ", ".join(f"{name} ({size} B)" for name, size in facts["attachments"].items())
     if facts["note"]:
         yield "note", facts["note"]
+
+
+def _pictures_text(pictures: dict[str, Any]) -> str:
+    settings = [f"{value:g} µs" for value in pictures["exposure_us"]]
+    settings += [f"{value:g} dB" for value in pictures["gain_db"]]
+    jumps = pictures["frame_id_jumps"]
+    order = "no frame id missing"
+    if jumps:  # between triggered pictures a camera may go on counting
+        order = f"frame ids jump {jumps} time{'s' * (jumps > 1)}"
+    return ", ".join([str(pictures["count"]), *pictures["pixel_formats"], *settings, order])
 
 
 def _clock_text(clock: dict[str, float]) -> str:

@@ -170,7 +170,7 @@ def _rebuild(descriptor: int, source: Path, final: Path, in_place: bool) -> tupl
     if session is None:
         raise NothingToSaveError(
             f"nothing can be saved from {source}: the description of the session itself is lost "
-            f"({os.fstat(descriptor).st_size} bytes)"
+            f"({os.fstat(descriptor).st_size} bytes). The file is unchanged; look for another copy"
         )
     dropped, reasons = _orphans(descriptor, found.contents)
     losses = (*(f"bytes {start} to {end}: {why}" for start, end, why in found.lost), *reasons)

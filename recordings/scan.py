@@ -116,7 +116,11 @@ class _Scan:
         if self._size < len(MAGIC) or self._read(0, len(MAGIC)) != MAGIC:
             if self._size and MAGIC.startswith(self._read(0, min(self._size, len(MAGIC)))):
                 raise self._unsealed(f"only {self._size} bytes")
-            raise self._corrupt(0, "this is not an MCAP file" if self._size else "the file is empty")
+            if not self._size:
+                raise CorruptRecordingError(
+                    f"{self._path} is empty: it was never written, or its copy failed. Copy it again"
+                )
+            raise self._corrupt(0, "it does not begin like an MCAP file, perhaps another one was meant")
         tail = FOOTER_BYTES + len(MAGIC)
         if self._size < 2 * len(MAGIC) + FOOTER_BYTES + DATA_END_BYTES:
             raise self._unsealed(f"only {self._size} bytes")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 
 import msgspec
@@ -69,6 +70,7 @@ def test_info_for_people_says_the_same(tmp_path: Path) -> None:
         "chessboard 7×6, 25 mm",
         "4 poses, 1 retaken",
         "990 at 500.0 Hz, 1 gap, largest 22 ms",
+        "5, Mono8, 10000 µs, 1.5 dB, frame ids jump 1 time",
         "drift +40.0 ppm",
     ):
         assert words in text, f"'{words}' is missing in: {text}"
@@ -92,6 +94,46 @@ def test_a_missing_file_is_one_sentence_and_1(tmp_path: Path, command: str) -> N
     result = run(command, tmp_path / "none.mcap")
     assert result.exit_code == 1
     assert result.stderr == f"error: cannot open {tmp_path}/none.mcap: No such file or directory\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "command", "words"),
+    [
+        (b"", "info", "is empty: it was never written, or its copy failed. Copy it again"),
+        (b"hello", "info", "does not begin like an MCAP file, perhaps another one was meant"),
+        (b"hello", "recover", "nothing can be saved from .* The file is unchanged; look for another copy"),
+        (b"\x89MCAP0", "info", "was not finished or is cut (only 6 bytes)"),
+    ],
+)
+def test_a_file_that_is_none_is_named_as_such(
+    tmp_path: Path, content: bytes, command: str, words: str
+) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(content)
+    result = run(command, path)
+    assert result.exit_code == 1
+    assert re.search(words.replace("(", "\\(").replace(")", "\\)"), result.stderr), result.stderr
+    assert path.read_bytes() == content
+
+
+def test_a_recording_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "a.mcap", make_info()):
+        result = run("recover", tmp_path / "a.mcap.part")
+        assert result.exit_code == 1
+        assert "is in use by another process; wait until it has finished" in result.stderr
+        assert "never finished" in run("info", tmp_path / "a.mcap").stderr
+
+
+def test_an_export_into_a_folder_that_is_not_there_says_so(small: Path, tmp_path: Path) -> None:
+    result = run("export", small, "--to", "csv", "-o", tmp_path / "none" / "out")
+    assert result.exit_code == 1
+    assert f"the folder {tmp_path}/none does not exist; create it first" in result.stderr
+
+
+def test_recover_of_a_whole_file_says_that_no_output_was_made(small: Path, tmp_path: Path) -> None:
+    result = run("recover", small, "-o", tmp_path / "b.mcap")
+    assert result.exit_code == 0
+    assert "b.mcap was not written: there was nothing to repair" in "".join(result.output)
 
 
 def test_a_device_or_a_pipe_is_no_recording() -> None:

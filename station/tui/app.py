@@ -27,12 +27,13 @@ from station.status import StationState, StationStatus
 from station.tui import offline
 from station.tui.checklist import ChecklistScreen
 from station.tui.commands import Commands
+from station.tui.help import Help
 from station.tui.link import Connect, Link, listen
 from station.tui.live import LiveScreen
 from station.tui.log import LogScreen
 from station.tui.plan import PlanScreen
 from station.tui.replay import ReplayLink
-from station.tui.replay_screen import WATCHABLE, ReplayScreen
+from station.tui.replay_screen import WATCHABLE, Player, ReplayScreen
 from station.tui.result import ResultScreen
 from station.tui.screen import StationScreen
 from station.tui.sessions import SessionsScreen
@@ -54,6 +55,17 @@ def freeze_startup() -> None:
     """What was loaded stays loaded: looking through it again and again would make STOP wait (~100 ms)."""
     gc.collect()
     gc.freeze()
+
+
+SCREENS = Binding.Group("Screens", compact=True)
+SCREEN_TOOLTIPS = {
+    "live": "The running capture",
+    "plan": "All poses, their state and reasons",
+    "result": "May it be trusted?",
+    "sessions": "Past recordings",
+    "log": "Everything that was said",
+    "checklist": "Is everything there?",
+}
 
 
 class StatusChanged(Message):
@@ -80,21 +92,21 @@ class StationApp(Commands):
     DEFAULT_MODE = "live"
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("f12", "stop", "STOP", priority=True, id="stop", tooltip="Stop the arm now; from any screen"),
+        Binding("f1", "help", "Help", id="help", tooltip="What this screen is for, and all its keys"),
         Binding("f5", "run", "Run", id="run", tooltip="Check the plan, show what would move, and ask"),
         Binding("f6", "pause", "Pause", id="pause", tooltip="Stop after this pose; nothing is lost"),
         Binding("f7", "finish", "Finish", id="finish", tooltip="Seal the recording with what is there"),
         Binding("f8", "acknowledge", "Ack", id="acknowledge", tooltip="I looked: leave STOPPED or FAULT"),
+        *(
+            Binding(key, f"switch_mode('{mode}')", mode.title(), id=mode, group=SCREENS, tooltip=tooltip)
+            for key, (mode, tooltip) in zip("123456", SCREEN_TOOLTIPS.items(), strict=True)
+        ),
         Binding("f9", "solve_newest", "Solve", id="solve", tooltip="Solve the session just recorded"),
         Binding("f3", "free_drive", "Hand", id="free-drive", tooltip="Free-drive: move the arm by hand"),
         Binding("f2", "record", "Take", id="record", tooltip="Take a picture here (free-drive)"),
-        Binding("1", "switch_mode('live')", "Live", id="live", tooltip="The running capture"),
-        Binding("2", "switch_mode('plan')", "Plan", id="plan", tooltip="All poses, their state and reasons"),
-        Binding("3", "switch_mode('result')", "Result", id="result", tooltip="May it be trusted?"),
-        Binding("4", "switch_mode('sessions')", "Sessions", id="sessions", tooltip="Past recordings"),
-        Binding("5", "switch_mode('log')", "Log", id="log", tooltip="Everything that was said"),
-        Binding("6", "switch_mode('checklist')", "Check", id="checklist", tooltip="Is everything there?"),
-        Binding("f1", "show_help_panel", "Help", id="help", tooltip="Keys and help for what is on screen"),
-        Binding("ctrl+q", "leave", "Quit", id="quit", tooltip="Close this screen; the daemon goes on"),
+        Binding(
+            "ctrl+q", "leave", "Quit", show=False, id="quit", tooltip="Close this screen; the daemon goes on"
+        ),
     ]
 
     def __init__(self, connect: Connect) -> None:
@@ -192,6 +204,15 @@ class StationApp(Commands):
         if (missing or unused) and self.current_mode == self.DEFAULT_MODE:
             await self.switch_mode("checklist")
 
+    def action_help(self) -> None:
+        """Own bindings in a window that fits a console; Textual's panel halves the screen."""
+        screen = self.screen
+        if isinstance(screen, StationScreen):
+            own = vars(type(screen)).get("BINDINGS", [])
+            ours = [kind for kind in type(self).__mro__ if kind.__module__.startswith("station.")]
+            common = [binding for kind in ours for binding in vars(kind).get("BINDINGS", [])]
+            self.push_screen(Help(screen.HELP or "", [*own, *common]))
+
     def get_system_commands(self, screen: Screen[Any]) -> Iterable[SystemCommand]:
         """Every key's action by name too; what moves the arm asks the same question from here."""
         yield from super().get_system_commands(screen)
@@ -253,6 +274,19 @@ class StationApp(Commands):
             await self.switch_mode("sessions")
 
 
+class ReplayApp(Player, StationApp):
+    """The same screens over a recording alone."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [*Player.BINDINGS]
+
+    def __init__(self, link: ReplayLink) -> None:
+        async def connect() -> Link:
+            return link
+
+        super().__init__(connect)
+        self.player = link
+
+
 def run(socket: Path, who: str = "") -> None:
     """Opens the screen on the daemon that serves `socket` and returns when it is closed."""
 
@@ -266,7 +300,4 @@ def run_replay(recording: Path) -> None:
     """The live screen over a recording; no daemon is asked. StationError when it cannot be read."""
     link = ReplayLink(recording)
 
-    async def connect() -> Link:
-        return link
-
-    StationApp(connect).run()
+    ReplayApp(link).run()

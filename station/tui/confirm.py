@@ -32,6 +32,7 @@ class Confirm(ModalScreen[bool]):
             with Horizontal(id="confirm-buttons"):
                 yield Button(self._no, id="no")
                 yield Button(self._yes, id="yes", variant="warning")
+            yield Label("Tab marks the other answer, Enter gives it; Escape: no", id="confirm-keys")
 
     def on_mount(self) -> None:
         self.query_one("#no", Button).focus()

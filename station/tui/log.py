@@ -27,6 +27,8 @@ class LogScreen(StationScreen):
         super().show(status)
         events = () if status is None else status.events
         start = events.index(self._last) + 1 if self._last in events else 0
+        if status is not None and status.playback and start == 0:  # it went back
+            self.query_one("#log", RichLog).clear()
         for event in events[start:]:
             self.query_one("#log", RichLog).write(event_text(event))
             self._last = event

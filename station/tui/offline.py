@@ -56,13 +56,15 @@ async def solve(app: StationApp, recording: str, folder: str) -> str | None:
     output, report = (str(Path(folder) / name) for name in (CALIBRATION_FILE, "report.html"))
     to = ("-o", output, "--report", report)
     code = await app.push_screen_wait(
-        JobScreen(f"Solving {recording}", "calibrate.cli", "solve", recording, *to)
+        JobScreen(f"Solving {Path(folder).name}", "calibrate.cli", "solve", recording, *to)
     )
     return output if code in (0, 4) else None
 
 
 async def recover(app: StationApp, folder: str) -> None:
-    await app.push_screen_wait(JobScreen(f"Recovering {folder}", "recordings.cli", "recover", folder))
+    await app.push_screen_wait(
+        JobScreen(f"Recovering {Path(folder).name}", "recordings.cli", "recover", folder)
+    )
 
 
 async def install(app: StationApp, path: str) -> None:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, ClassVar, cast
 
+from rich.text import Text
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
-from textual.containers import Horizontal
-from textual.widgets import DataTable
+from textual.containers import Horizontal, Vertical
+from textual.widgets import DataTable, Static
 
 from station.protocol import Verb
 from station.status import PoseStatus, StationStatus
@@ -18,8 +19,9 @@ from station.tui.words import POSE_MARKS
 if TYPE_CHECKING:
     from station.tui.app import StationApp
 
-COLUMNS = ("#", "pose", "state", "try", "corners", "sigma then", "why it is there / what happened")
-
+COLUMNS = ("#", "pose", "state", "then ±", "why it is there / what happened", "try", "corners")
+NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves); a adds the arm's posture."
+MOVE = Binding.Group("Move", compact=True)
 SIGMA_SHOWN_MM = 100.0
 
 
@@ -32,11 +34,18 @@ def row_of(pose: PoseStatus) -> tuple[str, ...]:
         str(pose.index + 1),
         pose.name,
         f"{POSE_MARKS[pose.state]} {pose.state}",
-        str(pose.attempt or ""),
-        "" if pose.corners is None else str(pose.corners),
         gain,
         pose.reason or pose.why,
+        str(pose.attempt or ""),
+        "" if pose.corners is None else str(pose.corners),
     )
+
+
+def detail_of(pose: PoseStatus) -> str:
+    """What the table has no room for."""
+    seen = "" if pose.corners is None else f" {pose.corners} corners in try {pose.attempt}."
+    why = f" {pose.why}." if pose.why and pose.reason else ""
+    return f"{pose.name}: {pose.reason or pose.why}.{why}{seen}"
 
 
 class PlanScreen(StationScreen):
@@ -47,15 +56,21 @@ class PlanScreen(StationScreen):
         Binding("r", "pose('retake')", "Retake", tooltip="Take this pose again at the next run"),
         Binding("s", "pose('skip')", "Skip", tooltip="Leave this pose out"),
         Binding("d", "pose('drop')", "Drop", tooltip="Remove this pose from the plan"),
-        Binding("a", "add", "Add here", tooltip="Add the arm's present posture as a pose"),
-        Binding("n", "make", "New plan", tooltip="Plan 25 poses from the configured guesses (seconds)"),
-        Binding("ctrl+up", "shift(-1)", "Up", tooltip="Visit this pose earlier"),
-        Binding("ctrl+down", "shift(1)", "Down", tooltip="Visit this pose later"),
+        Binding("a", "add", "Add", tooltip="Add the arm's present posture as a pose"),
+        Binding("n", "make", "New", tooltip="Plan 25 poses from the configured guesses (seconds)"),
+        Binding("ctrl+up", "shift(-1)", "Move", group=MOVE, tooltip="Visit this pose earlier"),
+        Binding("ctrl+down", "shift(1)", "Move", group=MOVE, tooltip="Visit this pose later"),
     ]
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._detail = NO_PLAN
 
     def body(self) -> ComposeResult:
         with Horizontal(id="plan"):
-            yield DataTable(id="plan-table", cursor_type="row", zebra_stripes=True)
+            with Vertical(id="plan-left"):
+                yield DataTable(id="plan-table", cursor_type="row", zebra_stripes=True)
+                yield Static(NO_PLAN, id="plan-detail")
             yield PlanSketch(id="plan-sketch")
 
     def on_mount(self) -> None:
@@ -82,10 +97,19 @@ class PlanScreen(StationScreen):
             for column, text in enumerate(row):
                 if self.table.get_cell_at((line, column)) != text:  # type: ignore[arg-type]
                     self.table.update_cell_at((line, column), text, update_width=True)  # type: ignore[arg-type]
-        self.query_one(PlanSketch).show(status, self.table.cursor_row)
+        self._explain(status, self.table.cursor_row)
 
     def on_data_table_row_highlighted(self, event: DataTable.RowHighlighted) -> None:
-        self.query_one(PlanSketch).show(self.station.status, event.cursor_row)
+        self._explain(self.station.status, event.cursor_row)
+
+    def _explain(self, status: StationStatus | None, line: int) -> None:
+        """The highlighted pose in words and in the sketch."""
+        self.query_one(PlanSketch).show(status, line)
+        poses = () if status is None else status.session.poses
+        text = detail_of(poses[line]) if line < len(poses) else NO_PLAN
+        if text != self._detail:
+            self._detail = text
+            self.query_one("#plan-detail", Static).update(Text(text))
 
     def _selected(self) -> int | None:
         status = self.station.status

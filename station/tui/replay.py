@@ -19,9 +19,11 @@ from recordings.messages import View
 from station.errors import RefusedError, StationError
 from station.protocol import Verb
 from station.status import DetectionStatus, StationStatus
-from station.tui.timeline import Timeline
+from station.tui.timeline import END_TEXT, Timeline
+from station.tui.words import duration
 
 STEP_S = 0.1
+KEYS_TEXT = "space pauses, left/right: picture, PgUp/PgDn: 10 s, Home: start"
 JPEG_QUALITY = 80
 
 
@@ -37,6 +39,8 @@ class ReplayLink:
         except RecordingError as error:
             raise StationError(f"{path} cannot be replayed: {error}") from error
         self._path, self._pace = path, pace
+        self._at_s = 0.0
+        self.paused = False
         self._status = self._timeline.status(0.0)
         self._seen = DetectionStatus()
         self._shown: View | None = None
@@ -55,15 +59,41 @@ class ReplayLink:
 
     async def statuses(self) -> AsyncIterator[StationStatus]:
         """Until the end, which stays on the screen."""
-        started_s = time.monotonic()
+        seen_s = time.monotonic()
         while not self._closed:
-            at_s = min((time.monotonic() - started_s) * self._pace, self._timeline.duration_s)
-            self._status = await asyncio.to_thread(self._timeline.status, at_s)
-            yield msgspec.structs.replace(self._status, detection=self._seen)
+            now_s = time.monotonic()
+            if not self.paused:
+                self.seek((now_s - seen_s) * self._pace)
+            seen_s = now_s
+            self._status = await asyncio.to_thread(self._timeline.status, self._at_s)
+            yield msgspec.structs.replace(self._status, detection=self._seen, reason=self._where())
             await asyncio.sleep(STEP_S)
 
     async def close(self) -> None:
         self._closed = True
+
+    def toggle(self) -> None:
+        """Pause or go on; from the end once more from the start."""
+        if self.ended:
+            self._at_s, self.paused = 0.0, False
+        else:
+            self.paused = not self.paused
+
+    def seek(self, by_s: float) -> None:
+        self._at_s = min(max(0.0, self._at_s + by_s), self._timeline.duration_s)
+
+    def step(self, by: int) -> None:
+        """To the next picture (1) or the one before (-1), and stay there."""
+        self.paused = True
+        self._at_s = self._timeline.picture_s(self._at_s, by)
+
+    @property
+    def ended(self) -> bool:
+        return self._at_s >= self._timeline.duration_s
+
+    def _where(self) -> str:
+        how = END_TEXT if self.ended else "paused" if self.paused else "playing"
+        return f"{duration(self._at_s)} of {duration(self._timeline.duration_s)} {how} │ {KEYS_TEXT}"
 
     async def _preview(self, width: int, height: int) -> dict[str, Any] | None:
         timeline = self._timeline

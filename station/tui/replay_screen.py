@@ -8,26 +8,53 @@ from textual import work
 from textual.binding import Binding, BindingType
 
 from station.status import StationState, StationStatus
-from station.tui.link import Link
 from station.tui.live import LiveScreen
+from station.tui.replay import ReplayLink
 
 WATCHABLE = (StationState.IDLE, StationState.DISCONNECTED)
 """A cell at rest: nobody looks at an old recording while the arm works or waits for an answer."""
 
 
-class ReplayScreen(LiveScreen):
+JUMP_S = 10.0
+
+
+class Player:
+    """The keys of a playback; for a screen of its own beside a cell, and for a whole app without one."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("space", "play", "Play/Pause", tooltip="Stop the playback here, or go on"),
+        Binding("left", "step(-1)", "Picture back", tooltip="To the picture before this one"),
+        Binding("right", "step(1)", "Picture on", tooltip="To the next picture"),
+        Binding("pageup", f"seek({-JUMP_S})", "10 s back", show=False, tooltip="Ten seconds back"),
+        Binding("pagedown", f"seek({JUMP_S})", "10 s on", show=False, tooltip="Ten seconds on"),
+        Binding("home", f"seek({-1e9})", "Start", show=False, tooltip="To the start of the recording"),
+    ]
+    player: ReplayLink
+
+    def action_play(self) -> None:
+        self.player.toggle()
+
+    def action_step(self, by: int) -> None:
+        self.player.step(by)
+
+    def action_seek(self, by_s: float) -> None:
+        self.player.seek(by_s)
+
+
+class ReplayScreen(Player, LiveScreen):
     """Shows `link`'s statuses in place of the daemon's. STOP still goes to the daemon."""
 
     HELP = (
         "PLAYBACK of a recording. Nothing can be commanded; F12 still stops this cell's arm. Escape leaves."
     )
     BINDINGS: ClassVar[list[BindingType]] = [
+        *Player.BINDINGS,
         Binding("escape", "close", "Back", tooltip="Leave the playback"),
     ]
 
-    def __init__(self, link: Link) -> None:
+    def __init__(self, link: ReplayLink) -> None:
         super().__init__()
-        self.link = link
+        self.link = self.player = link
         self._played: StationStatus | None = None
 
     def on_mount(self) -> None:

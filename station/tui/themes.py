@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
+from dataclasses import replace
 
 from textual.theme import BUILTIN_THEMES, Theme
 
-THEMES = (
+THEMES: tuple[Theme, ...] = (
     Theme(
         "station-dark",
         primary="#2F5D8A",
@@ -35,6 +36,11 @@ THEMES = (
         panel="#E4E4DE",
         dark=False,
     ),
+)
+_ANSI = BUILTIN_THEMES["ansi-dark"]
+"""A console's dark blue cannot be read on black, and bold black is grey there."""
+THEMES += (
+    replace(_ANSI, accent="ansi_cyan", variables=_ANSI.variables | {"block-cursor-text-style": "none"}),
 )
 FEW_COLOURS = ("linux", "vt100", "vt220", "ansi")
 

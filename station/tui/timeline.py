@@ -34,16 +34,14 @@ _POSE_STATES: dict[StationState, PoseState] = {
 
 
 class Timeline:
-    """Moves forward only. Raises RecordingError for a recording that cannot be read."""
+    """Forward is quick; back reads the arm's way anew. RecordingError for what cannot be read."""
 
     def __init__(self, path: Path) -> None:
         self.recording = open_recording(path)
         self.views = sorted(self.recording.views(), key=lambda view: view.stamps.host_monotonic_ns)
         self._times_s = _times_s(self.views)
         self._start_ns = self.views[0].stamps.host_monotonic_ns if self.views else 0
-        self._states = self.recording.robot_states()
-        self._robot: RobotState | None = None
-        self._ahead: RobotState | None = next(self._states, None)
+        self._rewind()
         self._events = sorted(self.recording.events(), key=lambda event: event.stamps.host_monotonic_ns)
         if self._ahead is not None:  # the way to the first pose is part of it
             lead_s = max(0.0, (self._start_ns - self._ahead.stamps.host_monotonic_ns) / 1e9)
@@ -54,13 +52,26 @@ class Timeline:
     def duration_s(self) -> float:
         return (self._times_s[-1] if self._times_s else 0.0) + WITHOUT_CLOCK_S
 
+    def _rewind(self) -> None:
+        self._states = self.recording.robot_states()
+        self._robot: RobotState | None = None
+        self._ahead: RobotState | None = next(self._states, None)
+
+    def picture_s(self, at_s: float, by: int) -> float:
+        """When the next picture (`by` 1) or the one before (-1) was taken, seen from `at_s`."""
+        done = sum(time_s <= at_s for time_s in self._times_s)
+        if by > 0:
+            return self._times_s[done] if done < len(self._times_s) else self.duration_s
+        # In the midst of a picture's time, back is the picture before it.
+        return self._times_s[done - 2] if done > 1 else 0.0
+
     def view_at(self, at_s: float) -> View | None:
         """The newest view taken by then."""
         done = sum(time_s <= at_s for time_s in self._times_s)
         return self.views[done - 1] if done else None
 
     def status(self, at_s: float) -> StationStatus:
-        """`at_s`: since the recording's start; never less than the time before."""
+        """`at_s`: since the recording's start."""
         robot = self._robot_at(at_s)
         done = sum(time_s <= at_s for time_s in self._times_s)
         info = self.recording.info
@@ -97,6 +108,8 @@ class Timeline:
 
     def _robot_at(self, at_s: float) -> RobotState | None:
         at_ns = self._start_ns + round(at_s * 1e9)
+        if self._robot is not None and self._robot.stamps.host_monotonic_ns > at_ns:
+            self._rewind()
         while self._ahead is not None and self._ahead.stamps.host_monotonic_ns <= at_ns:
             self._robot, self._ahead = self._ahead, next(self._states, None)
         return self._robot

@@ -10,7 +10,7 @@ import pytest
 import recordings
 from station.errors import RefusedError, StationError
 from station.status import StationState
-from station.tui.app import StationApp
+from station.tui.app import ReplayApp
 from station.tui.replay import ReplayLink
 from station.tui.replay_screen import ReplayScreen
 from station.tui.timeline import END_TEXT, Timeline
@@ -22,13 +22,8 @@ from tests.tui.test_keys import app_on, text_of
 SAMPLE = Path(recordings.__file__).parent / "samples" / "paper-640.mcap"
 
 
-def replay_app(pace: float) -> StationApp:
-    link = ReplayLink(SAMPLE, pace)
-
-    async def connect() -> ReplayLink:
-        return link
-
-    return StationApp(connect)
+def replay_app(pace: float) -> ReplayApp:
+    return ReplayApp(ReplayLink(SAMPLE, pace))
 
 
 def test_the_arm_stands_where_it_stood_when_each_picture_was_taken() -> None:
@@ -51,6 +46,35 @@ async def test_it_plays_to_its_end_with_pictures_and_marks(link: FakeLink) -> No
         assert END_TEXT in text_of(pilot.app, "#reason")
         preview = pilot.app.screen.query_one(Preview)
         await until(pilot, lambda: preview._picture is not None and len(preview._corners) == 42)
+
+
+async def test_it_pauses_steps_jumps_and_starts_again() -> None:
+    app = replay_app(pace=0.0)  # only the keys move it
+    async with app.run_test(size=(80, 24)) as pilot:
+
+        async def shows(pictures: int, text: str) -> None:
+            await until(pilot, lambda: f"│{pictures}/25" in text_of(pilot.app, "#bar"))
+            await until(pilot, lambda: text in text_of(pilot.app, "#reason"))
+
+        await shows(0, "playing")
+        await pilot.press("right", "right", "right")
+        await shows(3, "paused")
+        third = app.status
+        await pilot.press("left")
+        await shows(2, "paused")
+        await pilot.press("right")
+        await until(pilot, lambda: app.status is not None and app.status.robot == third.robot)  # type: ignore[union-attr]
+        await pilot.press("space")
+        await shows(3, "playing")
+        await pilot.press("pagedown")
+        await until(pilot, lambda: app.status is not None and app.status.session.elapsed_s > 10.0)
+        await pilot.press("pageup", "home")
+        await shows(0, "0:00 of")
+        for _ in range(26):
+            await pilot.press("right")
+        await shows(25, END_TEXT)
+        await pilot.press("space")
+        await shows(0, "playing")
 
 
 @pytest.mark.parametrize("verb", ["stop", "lease", "prepare", "go", "acknowledge", "finish", "retake"])

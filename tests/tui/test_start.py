@@ -8,8 +8,11 @@ import pytest
 from station.status import StationState
 from station.tui.app import StationApp
 from station.tui.checklist import ChecklistScreen
+from station.tui.help import Help
 from station.tui.live import LiveScreen
+from station.tui.plan import NO_PLAN, PlanScreen
 from station.tui.themes import chosen_theme
+from station.tui.widgets.preview import Preview
 from tests.tui.conftest import FakeLink, idle
 from tests.tui.test_jobs import until
 from tests.tui.test_keys import app_on, text_of
@@ -82,6 +85,49 @@ async def test_without_a_daemon_every_key_says_so(link: FakeLink) -> None:
         await pilot.press("f12")
         await pilot.pause()
         assert any("nothing was sent" in said.message for said in pilot.app._notifications)
+
+
+async def test_help_names_every_key_of_the_screen_and_stop_works_in_it(link: FakeLink) -> None:
+    async with app_on(link).run_test(size=(80, 60)) as pilot:
+        await pilot.pause()
+        await pilot.press("2", "f1")
+        await until(pilot, lambda: isinstance(pilot.app.screen, Help))
+        shown = pilot.app.export_screenshot().replace("&#160;", " ")
+        for words in ("F5 ", "Retake: Take this pose again", "Ctrl-q", "4 ", "Nothing here moves the arm"):
+            assert words in shown, words
+        await pilot.press("f12")
+        await until(pilot, lambda: link.verbs == ["stop"])
+        await pilot.press("escape")
+        await until(pilot, lambda: isinstance(pilot.app.screen, PlanScreen))
+
+
+async def test_the_highlighted_pose_is_told_in_full(link: FakeLink) -> None:
+    link._statuses.get_nowait()
+    status = idle()
+    poses = list(status.session.poses)
+    reason = "no board in the picture: " + "look at the light " * 4
+    poses[1] = msgspec.structs.replace(poses[1], state="failed", reason=reason, attempt=2)
+    session = msgspec.structs.replace(status.session, poses=tuple(poses))
+    link.show(msgspec.structs.replace(status, session=session))
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await pilot.pause()
+        await pilot.press("2", "down")
+        await until(pilot, lambda: reason in text_of(pilot.app, "#plan-detail"))
+        link.show(msgspec.structs.replace(status, session=msgspec.structs.replace(session, poses=())))
+        await until(pilot, lambda: text_of(pilot.app, "#plan-detail") == NO_PLAN)
+
+
+@pytest.mark.parametrize(("theme", "marks"), [("ansi-dark", "░▒▓█"), ("station-dark", "▀")])
+async def test_the_picture_needs_no_grey_background_on_a_console(
+    link: FakeLink, theme: str, marks: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("TEXTUAL_THEME", theme)
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        preview = pilot.app.screen.query_one(Preview)
+        await until(pilot, lambda: preview._picture is not None)
+        text = "".join(preview.render_line(y).text for y in range(preview.size.height))
+        assert set(text) - {" ", "+"} <= set(marks)
+        assert "+" in text
 
 
 def test_every_key_has_a_tooltip() -> None:

@@ -12,6 +12,12 @@ from station.tui.words import STATE_WORDS, duration, size
 _ALARM = {StationState.STOPPED, StationState.FAULT, StationState.DISCONNECTED}
 STOP_KEY = "F12=STOP"
 LEVELS = 5
+_NEXT = {
+    StationState.STOPPED: " │ F8: I looked",
+    StationState.FAULT: " │ F8: I looked",
+    StationState.PAUSED: " │ F5 goes on, F7 finishes",
+}
+"""Which key is next. The daemon's own sentence is for shells too."""
 NO_DAEMON = " NO DAEMON: trying again every second. To stop the arm use the pendant."
 
 NO_ANSWER = " NO ANSWER for {:.0f} s: state UNKNOWN. To stop the arm: EMERGENCY STOP."
@@ -88,7 +94,11 @@ class ReasonLine(Static):
         self.watch_status()
 
     def watch_status(self) -> None:
-        reason = self.trouble or ("" if self.status is None else self.status.reason)
+        # A playback has no trouble: the line only says where it is.
+        self.set_class(self.status is not None and self.status.playback and not self.trouble, "note")
+        reason = self.trouble
+        if not reason and self.status is not None and self.status.reason:
+            reason = self.status.reason + _NEXT.get(self.status.state, "")
         if reason != self._reason:
             self._reason = reason
             self.display = bool(reason)

@@ -25,6 +25,8 @@ CORNER = Segment("+", Style(color=Color.from_rgb(0, 230, 0), bgcolor=Color.from_
 """A sign and not only a colour."""
 
 OLD = "OLD PICTURE"
+FEW_SHADES = " ░▒▓█"
+"""For a console with 16 colours, whose backgrounds have no greys: one shade a cell."""
 
 
 class Preview(Widget):
@@ -75,21 +77,28 @@ class Preview(Widget):
         columns, rows = max(1, int(width * scale)), max(2, int(height * scale) // 2 * 2)
         small = cv2.resize(self._picture, (columns, rows), interpolation=cv2.INTER_AREA)
         shades = (small.astype(int) * LEVELS // 256).reshape(rows // 2, 2, columns)
-        cells = (shades[:, 0] * LEVELS + shades[:, 1]).tolist()
+        few = self.app.current_theme.ansi
+        shades_of_a_cell = shades[:, 0] + shades[:, 1] if few else shades[:, 0] * LEVELS + shades[:, 1]
+        cells = shades_of_a_cell.tolist()
         for x, y in self._corners:
             row, column = int(y * rows) // 2, int(x * columns)
             if 0 <= row < rows // 2 and 0 <= column < columns:
                 cells[row][column] = -1
         left = (size.width - columns) // 2
-        return [_strip(line, left, size.width) for line in cells]
+        return [_strip(line, left, size.width, few) for line in cells]
 
 
-def _strip(line: list[int], left: int, width: int) -> Strip:
+def _strip(line: list[int], left: int, width: int, few: bool) -> Strip:
     """Neighbours alike become one run: less to send over ssh."""
     runs = [Segment(" " * left)]
     for cell, alike in groupby(line):
         count = len(list(alike))
-        runs += [CORNER] * count if cell < 0 else [Segment("▀" * count, _style(cell))]
+        if cell < 0:
+            runs += [CORNER] * count
+        elif few:
+            runs.append(Segment(FEW_SHADES[cell * len(FEW_SHADES) // (2 * LEVELS - 1)] * count))
+        else:
+            runs.append(Segment("▀" * count, _style(cell)))
     return Strip(runs).adjust_cell_length(width)
 
 

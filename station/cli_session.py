@@ -29,7 +29,7 @@ from station.plan.sweep import sweep_plan
 from station.progress import SessionProgress
 from station.session.folder import default_root
 from station.simulation.netns import is_isolated, isolated_command
-from station.status import GoSummary
+from station.status import GoSummary, StationStatus
 
 out = Console(highlight=False, soft_wrap=True)
 err = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -166,18 +166,19 @@ async def attended_session(
         await client.request("lease", action="take")
         if before is not None:
             await before(client)
-        simulated = await _is_simulated(client)
+        standing = await _status(client)
         progress = SessionProgress(err, quiet=headless or quiet)
-        confirm = _confirmation(go, interactive, simulated)
+        progress.skip(standing)
+        confirm = _confirmation(go, interactive, standing.simulated)
         with progress:
             return await carry_out(
                 client, purpose, confirm=confirm, watch=progress, finish_with_loss=headless
             )
 
 
-async def _is_simulated(client: Client) -> bool:
+async def _status(client: Client) -> StationStatus:
     async for status in client.statuses():
-        return status.simulated
+        return status
     raise StationError("the daemon ended")
 
 
@@ -201,7 +202,8 @@ def _confirmation(go: str, interactive: bool, simulated: bool) -> Confirm:
 
 
 def ask_person(summary: GoSummary) -> bool:
-    err.print(f"\n[bold]The arm will move[/]: {summary.purpose}, {summary.poses} poses")
+    many = "1 pose" if summary.poses == 1 else f"{summary.poses} poses"
+    err.print(f"\n[bold]The arm will move[/]: {summary.purpose}, {many}")
     err.print(f"first {summary.first_move}; {summary.path_m:.2f} m, up to {summary.top_speed_m_s:.2f} m/s")
     err.print(f"about {summary.duration_s:.0f} s, plan {summary.plan_sha256[:12]}")
     for warning in summary.warnings:

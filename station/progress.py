@@ -46,6 +46,11 @@ class SessionProgress:
     ) -> None:
         self._bar.stop()
 
+    def skip(self, status: StationStatus) -> None:
+        """What this status tells happened before: it is not said again."""
+        if status.events:
+            self._last = status.events[-1]
+
     def __call__(self, status: StationStatus) -> None:
         if self._quiet:
             return

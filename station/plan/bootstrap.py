@@ -80,6 +80,10 @@ class Belief:
         return float(np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:]).max()))
 
     @property
+    def sigma_deg(self) -> float:
+        return float(np.rad2deg(self.sigma_rad))
+
+    @property
     def good(self) -> bool:
         return self.sigma_m <= GOOD_M and self.sigma_rad <= GOOD_RAD
 
@@ -120,10 +124,22 @@ def next_move(config: StationConfig, glimpses: Sequence[Glimpse]) -> PlannedPose
         joints = inverse_nearest(arm_model(config), target, here)
         if joints is not None and all(_is_free(cell, here, joints) for cell in cells):
             return _described(config, glimpses[0], belief, moves, joints)
-    raise LimitError(
-        f"No bootstrap move is safe for every camera mount within the guess ({1000 * belief.sigma_m:.0f} mm, "
-        f"{np.rad2deg(belief.sigma_rad):.0f}°). Teach a view with the board in the middle of the picture and "
-        "more room around the arm, or measure the mount better (camera_guess)."
+    raise LimitError(_no_move(belief, len(targets)))
+
+
+def _no_move(belief: Belief, in_view: int) -> str:
+    """Why, and what to do: `in_view` targets keep the board in the picture, none of them is free to reach."""
+    mount = f"camera mount within the guess ({1000 * belief.sigma_m:.0f} mm, {belief.sigma_deg:.0f}°)"
+    if in_view == 0:
+        return (
+            f"No small move keeps the board in the picture, and the camera no nearer, for every {mount}. "
+            "Teach a view with the board in the middle of the picture and filling less of it, or measure the "
+            "mount better (camera_guess)."
+        )
+    return (
+        f"{in_view} small moves keep the board in the picture, but none is free for every {mount}: the arm's "
+        "reach, its joints or what stands around it are in the way. Teach a view with more room around the "
+        "arm, or measure the mount better (camera_guess)."
     )
 
 

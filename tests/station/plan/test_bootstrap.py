@@ -8,7 +8,7 @@ import pytest
 
 from calibrate.geometry import difference, inverse, pose, rotation_exp, transform_points
 from calibrate.kinematics import MODELS, forward
-from station.errors import ConfigError
+from station.errors import ConfigError, LimitError
 from station.plan.bootstrap import MOVES_MAX, MOVES_MIN, Glimpse, believe, improved_config, next_move
 from station.plan.planner import make_plan
 from station.plan.visibility import outline, visible
@@ -96,3 +96,26 @@ def test_without_any_mount_guess_it_asks_for_one():
     config = msgspec.structs.replace(cell.config, camera_guess=None)
     with pytest.raises(ConfigError, match="camera_guess"):
         next_move(config, [cell.glimpse(cell.truth.start_joints_rad)])
+
+
+@pytest.mark.parametrize(
+    ("change", "told"),
+    [
+        ("far out of the middle", "No small move keeps the board in the picture"),
+        ("no joint may turn", "none is free .* Teach a view with more room"),
+    ],
+)
+def test_when_no_move_is_safe_it_says_what_is_in_the_way(change, told):
+    cell = Cell(1)
+    start = np.array(cell.truth.start_joints_rad)
+    config = cell.config
+    glimpse = cell.glimpse(start)
+    if change == "no joint may turn":
+        limits = msgspec.structs.replace(config.limits, joint_step_rad=1e-4)
+        config = msgspec.structs.replace(config, limits=limits)
+    else:
+        C = glimpse.camera_from_board.copy()
+        C[0, 3] += 0.5
+        glimpse = Glimpse(start, C)
+    with pytest.raises(LimitError, match=told):
+        next_move(config, [glimpse])

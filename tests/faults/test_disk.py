@@ -1,0 +1,129 @@
+"""Faults 27, 29, 37 and 39, of disk and files, as a session meets them; the rest is in tests/recordings."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import textwrap
+import time
+from pathlib import Path
+
+import pytest
+
+from recordings import manifest
+from recordings.errors import RecordingError
+from recordings.manifest import enter_part, read_manifest
+from recordings.recover import recover
+from station.session.folder import list_sessions, new_session_folder
+from tests.recordings.small_recording import write_small
+
+ROOT = Path(__file__).parents[2]
+
+UNTIL_IT_IS_FULL = textwrap.dedent(
+    """
+    import itertools, sys
+    from pathlib import Path
+    from recordings.errors import RecordingError
+    from recordings.reader import open_recording
+    from recordings.recorder import Recorder
+    from recordings.recover import recover
+    from tests.recordings.small_recording import make_info, make_picture, make_state, make_view
+
+    disk, elsewhere = Path(sys.argv[1]), Path(sys.argv[2])
+    recorder = Recorder(disk / "a.mcap", make_info())
+    acknowledged = 0
+    try:
+        for index in itertools.count():
+            recorder.robot_state(make_state(index))
+            if not recorder.picture(make_picture(index)):
+                raise recorder.error
+            recorder.view(make_view(index))
+            recorder.sync().result()
+            acknowledged += 1
+    except RecordingError as error:
+        print(error)
+    recorder.close()
+    recover(disk / "a.mcap.part", elsewhere / "a.mcap")
+    print(acknowledged, len(open_recording(elsewhere / "a.mcap").views()))
+    """
+)
+
+
+def test_27_a_killed_session_is_listed_as_unsealed_until_it_is_recovered(tmp_path: Path) -> None:
+    folder = new_session_folder(tmp_path, "cell")
+    data = write_small(folder / "whole.mcap").read_bytes()
+    (folder / "whole.mcap").unlink()
+    (folder / "session.mcap.part").write_bytes(data[: len(data) // 2])
+    (listed,) = list_sessions(tmp_path)
+    assert not listed["sealed"]
+    recover(folder)
+    (listed,) = list_sessions(tmp_path)
+    assert listed["sealed"]
+    assert listed["recording"] == str(folder / "session.mcap")
+
+
+@pytest.mark.process
+def test_29_a_disk_that_is_really_full_loses_nothing_acknowledged(tmp_path: Path) -> None:
+    """A file system of 300 kB of its own (in a user's mount namespace), not just a limit on the file."""
+    disk = tmp_path / "disk"
+    disk.mkdir()
+    inside = f'mount -t tmpfs -o size=300k none "{disk}" && exec "$@"'
+    command = ["unshare", "--map-root-user", "--mount", "sh", "-c", inside, "sh"]
+    if subprocess.run([*command, "true"], capture_output=True).returncode:
+        pytest.skip("no mount namespaces here")
+    done = subprocess.run(
+        [*command, sys.executable, "-c", UNTIL_IT_IS_FULL, str(disk), str(tmp_path)],
+        capture_output=True,
+        text=True,
+        cwd=ROOT,
+        env={**os.environ, "PYTHONPATH": str(ROOT)},
+        timeout=60,
+    )
+    assert done.returncode == 0, done.stderr
+    said, counts = done.stdout.splitlines()
+    acknowledged, saved = map(int, counts.split())
+    assert "No space left on device" in said
+    assert "Free space or replace the disk, then: recordings recover" in said
+    assert 10 < acknowledged <= saved <= acknowledged + 1
+
+
+def test_29_a_list_of_parts_that_cannot_be_written_keeps_the_old_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    enter_part(tmp_path, "cell", 1, "session.mcap")
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(manifest, "write_atomically", full)
+    with pytest.raises(RecordingError, match=r"cannot write .*parts\.json: No space left on device"):
+        enter_part(tmp_path, "cell", 2, "session-2.mcap")
+    listed = read_manifest(tmp_path)
+    assert listed is not None
+    assert listed.parts == {1: "session.mcap"}
+
+
+@pytest.mark.parametrize("cell", ["../../etc/x", "/etc/x", "a\0b", "x" * 300, "", "ZELLE 7"])
+def test_37_no_cells_name_leaves_the_sessions_folder(tmp_path: Path, cell: str) -> None:
+    folder = new_session_folder(tmp_path, cell)
+    assert folder.parent == tmp_path / "sessions"
+    assert folder.resolve() == folder
+    assert len(folder.name) <= 40
+
+
+def test_39_two_sessions_in_one_second_and_a_clock_set_back(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(time, "strftime", lambda _: "20260131-101500")
+    folders = [new_session_folder(tmp_path, "cell") for _ in range(3)]
+    assert [folder.name for folder in folders] == [
+        "20260131-101500-cell",
+        "20260131-101500-cell-2",
+        "20260131-101500-cell-3",
+    ]
+    path = write_small(folders[0] / "session.mcap")
+    before = path.read_bytes()
+    with pytest.raises(RecordingError, match="exists already"):
+        write_small(path)
+    assert path.read_bytes() == before

@@ -1,14 +1,18 @@
 """A sweep: the arm moved slowly while the camera ran freely. What was the time between the two?
 
-Pictures are placed by the camera's own clock, with the host's time of the first picture as its origin; the
-offset that is found therefore holds the exposure, readout and transport of that picture.
+Robot states and pictures are placed by the controller's and the camera's own clocks, each tied to the host's
+by its quickest messages: a busy computer delays arrivals, and never advances one. The offset that is found
+therefore holds the exposure, readout and transport of the quickest picture.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
+from dataclasses import replace
 
 import numpy as np
+from scipy.optimize import linprog
 
 from calibrate.board import board_points
 from calibrate.detect import detect
@@ -19,6 +23,9 @@ from calibrate.time_offset import FEWEST_PICTURES, LIMIT_S, TimeOffset, estimate
 from calibrate.views import ImageView
 from recordings.messages import CameraModel, Picture
 from recordings.reader import Recording
+
+UNSEEN_DELAY_S = 1e-4
+"""1 sigma of the controller's shortest delay: no arrival shows it, so it stays in the offset."""
 
 
 def sweep_time_offset(
@@ -42,27 +49,43 @@ def sweep_time_offset(
             f"few for a time offset; {FEWEST_PICTURES} pictures are needed"
         )
     times, poses = (np.array(column) for column in zip(*seen, strict=True))
-    return estimate_time_offset(robot_s, flange, times, poses, limit_s)
+    found = estimate_time_offset(robot_s, flange, times, poses, limit_s)
+    return replace(found, sigma_s=math.hypot(found.sigma_s, UNSEEN_DELAY_S))
 
 
 def _robot(recording: Recording) -> tuple[Array, Array]:
     """Host times (n,) s and base_from_tcp (n, 4, 4): any frame on the flange turns as the flange does."""
     states = list(recording.robot_states())
-    times = np.array([s.stamps.host_monotonic_ns for s in states]) / 1e9
+    arrivals = np.array([s.stamps.host_monotonic_ns for s in states]) / 1e9
+    times = on_host(np.array([s.stamps.controller_s for s in states]), arrivals)
     tcp = np.array([s.tcp_pose for s in states]).reshape(-1, 6)
-    # Arrivals may coincide when the host was late; the first of them is the one on time.
+    # Arrivals may coincide where there is no controller clock; the first of them is the one on time.
     fresh = np.diff(times, prepend=-np.inf) > 0
     return times[fresh], pose_from_rotvec(tcp[fresh, :3], tcp[fresh, 3:])
+
+
+def on_host(device_s: Array, arrivals_s: Array) -> Array:
+    """Host times of device times, both (n,) s: the nearest straight line that lies under all arrivals.
+
+    A linear program in offset and drift. The arrivals themselves where the device has no clock.
+    """
+    if len(device_s) < 2 or np.ptp(device_s) == 0:
+        return arrivals_s
+    since_s = device_s - device_s[0]
+    gap_s = arrivals_s - arrivals_s[0] - since_s
+    under = np.column_stack([np.ones_like(since_s), since_s])
+    line = linprog(-under.mean(axis=0), under, gap_s, bounds=(None, None), method="highs").x
+    return np.asarray(arrivals_s[0] + since_s + under @ line)
 
 
 def _seen(recording: Recording, camera: CameraModel) -> Iterator[tuple[float, Array]]:
     """Time of the start of exposure and camera_from_board of each picture that shows the board."""
     board = recording.info.board
-    origin: tuple[int, int] | None = None
-    for picture in _pictures(recording):
-        stamps = picture.stamps
-        if origin is None:
-            origin = stamps.host_monotonic_ns, stamps.device_ns
+    stamps = [facts.stamps for part in recording.parts for facts in part.picture_facts()]
+    taken_s = on_host(
+        np.array([s.device_ns for s in stamps]) / 1e9, np.array([s.host_monotonic_ns for s in stamps]) / 1e9
+    )
+    for picture, time_s in zip(_pictures(recording), taken_s, strict=True):
         found = detect(picture.image, board, thorough=False)
         if not found.found:
             continue
@@ -73,8 +96,7 @@ def _seen(recording: Recording, camera: CameraModel) -> Iterator[tuple[float, Ar
             board_points(board)[found.indices],
             found.pixels,
         )
-        taken_s = (origin[0] + stamps.device_ns - origin[1]) / 1e9
-        yield taken_s, candidate_poses(view, camera, None)[0].camera_from_board
+        yield float(time_s), candidate_poses(view, camera, None)[0].camera_from_board
 
 
 def _pictures(recording: Recording) -> Iterator[Picture]:

@@ -44,6 +44,8 @@ class Plan(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_field
     joint_acceleration_rad_s2: float = 1.0
     seed: int | None = None
     note: str = ""
+    motion: Literal["stops", "sweep"] = "stops"
+    """sweep: the arm swings through the poses without a stop for a picture, while the camera runs."""
 
 
 def plan_sha256(plan: Plan) -> str:

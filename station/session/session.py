@@ -24,14 +24,15 @@ from station.session.bench import Bench
 from station.session.estimate import Estimator
 from station.session.free_drive import FreeDrive
 from station.session.guard import Guard
-from station.session.hovering import HoverDesk, HoverRequest, HoverRun
+from station.session.hovering import HoverDesk, HoverRequest
 from station.session.interrupted import close_interrupted, find_interrupted
 from station.session.keeper import Keeper
 from station.session.lease import GoDesk, LeaseDesk
 from station.session.logbook import Logbook
 from station.session.preview import Previewer
 from station.session.queue import PoseQueue
-from station.session.run import Run, seal, unmark_busy
+from station.session.run import seal, unmark_busy
+from station.session.runs import run_for
 from station.session.store import StatusStore
 from station.session.summary import poses_to_drive, summarise
 from station.states import RUNNING, refusal
@@ -208,8 +209,7 @@ class Session:
             self.bench.forget_session()
         self.store.enter(StationState.CHECKING)
         self.store.event(f"go by {self.leases.lease.holder}: {go.summary.purpose}")
-        run = Run(self.bench, go) if go.hover is None else HoverRun(self.bench, go, go.hover)
-        self._run = asyncio.create_task(run.drive())
+        self._run = asyncio.create_task(run_for(self.bench, go).drive())
 
     def pause(self, who: str) -> None:
         """After this pose. Anyone may: it only ever makes the arm do less."""

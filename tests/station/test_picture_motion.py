@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable
 from pathlib import Path
 
 import cv2
@@ -10,11 +11,17 @@ import numpy as np
 import pytest
 
 from recordings.reader import open_recording
+from station.config import StillnessConfig
 from station.picture_motion import board_box, picture_motion
 from station.plan.model import ExpectedView
-from station.session.picture_watch import GLIMPSE_TRIES
+from station.session.picture_watch import GLIMPSE_TRIES, PictureWatch
+from station.session.queue import PoseQueue
+from station.simulation.camera import RenderedCamera
+from station.simulation.cell import write_truth
+from station.simulation.launch import SimulatedController
 from station.status import StationState as S
-from tests.station.session_rig import POSES, Rig
+from station.stillness import StillnessMonitor
+from tests.station.session_rig import POSES, TRUTH, Rig
 
 SCENE = cv2.GaussianBlur(np.random.default_rng(4).normal(128, 150, (600, 760)), (0, 0), 1.5)
 
@@ -118,3 +125,31 @@ async def test_stop_leaves_the_camera_free(rig: Rig) -> None:
     seen_before = rig.camera.glimpses
     await asyncio.sleep(0.1)
     assert rig.camera.glimpses == seen_before and rig.state is S.STOPPED
+
+
+@pytest.mark.process
+async def test_a_ringing_bracket_is_waited_for(
+    rig: Rig, controller: Callable[..., SimulatedController], tmp_path: Path
+) -> None:
+    write_truth(TRUTH, tmp_path / "truth.json")
+    rendered = RenderedCamera(TRUTH, controller(truth=tmp_path / "truth.json").host)
+    await rendered.open()
+    bench = rig.session.bench
+    bench.queue = PoseQueue(bench.require_queue().plan)
+    bench.stillness = StillnessMonitor(bench.geometry.model, StillnessConfig(timeout_s=20.0))
+    rig.arm.subscribe(bench.stillness.add)
+    rig.arm.rest()
+    object.__setattr__(bench.cell, "camera", rendered)
+    await rendered.inject("ringing", {"amplitude_rad": 0.01, "frequency_hz": 6.3})
+    async with PictureWatch(bench, 0) as watch:
+        settling = asyncio.ensure_future(bench.stillness.settle(lambda: None, watch.look))
+        look = None
+        while look is None:
+            await asyncio.sleep(0.02)
+            look = watch.look(0)
+        assert look.motion_px is not None and look.motion_px > 0.5 and not settling.done()
+        await rendered.inject("ringing")
+        motion_px = (await settling).image_motion_px
+        assert motion_px is not None and motion_px < 0.3
+    assert await rendered.capture()  # the camera is free
+    await rendered.close()

@@ -125,6 +125,8 @@ class Quality(msgspec.Struct, frozen=True, omit_defaults=True):
     board_spread_deg: float | None = None
     predicted_error_mm: float | None = None
     working_distance_m: float | None = None
+    projection_sigma_px: dict[str, float] = {}
+    """centre, corner, worst: 1σ by which a lens found here may show a fixed direction wrongly; else empty."""
     noise: dict[str, float] = {}
     """corner_px, robot_mm, robot_deg"""
     error_shares: dict[str, float] = {}

@@ -28,6 +28,7 @@ from calibrate.calibration import (
 )
 from calibrate.gates import Gate
 from calibrate.intrinsics import Intrinsics
+from calibrate.lens_uncertainty import LensUncertainty
 from calibrate.load import LoadedViews
 from calibrate.pnp import view_rms_px
 from calibrate.scale import ScaleCheck
@@ -50,6 +51,7 @@ def make_calibration(
     scale: ScaleCheck | None,
     gates: tuple[Gate, ...],
     options: JobOptions,
+    lens_known: LensUncertainty | None = None,
 ) -> Calibration:
     info = recording.info
     return Calibration(
@@ -74,7 +76,7 @@ def make_calibration(
             ),
             turned=list(solution.turned),
         ),
-        quality=_quality(solution, scale, gates, loaded, intrinsics),
+        quality=_quality(solution, scale, gates, loaded, intrinsics, lens_known),
         provenance=Provenance(
             recording=recording.path.name,
             recording_sha256=recording.sha256,
@@ -135,6 +137,7 @@ def _quality(
     gates: tuple[Gate, ...],
     loaded: LoadedViews,
     intrinsics: Intrinsics | None,
+    lens_known: LensUncertainty | None,
 ) -> Quality:
     proof, noise = solution.certificate, solution.noise
     ambiguity = ambiguity_text(loaded.board)
@@ -154,6 +157,7 @@ def _quality(
         board_spread_deg=_scaled(solution.board_spread_rad, float(np.degrees(1.0))),
         predicted_error_mm=_scaled(solution.predicted_error_m, 1e3),
         working_distance_m=solution.working_distance_m,
+        projection_sigma_px={} if lens_known is None else lens_known.figures,
         noise={}
         if noise is None
         else {

@@ -18,6 +18,7 @@ from calibrate.document import make_calibration
 from calibrate.errors import BadViewsError
 from calibrate.gates import Evidence, Gate, GateLimits, judge
 from calibrate.intrinsics import Intrinsics, LensModel, calibrate_intrinsics
+from calibrate.lens_uncertainty import LensUncertainty, lens_uncertainty
 from calibrate.load import FEWEST_VIEWS, LoadedViews, Progress, load_views
 from calibrate.pnp import solve_pnp, view_rms_px
 from calibrate.scale import ScaleCheck, check_scale
@@ -67,6 +68,8 @@ class SolvedRecording(PreparedViews):
     solution: Solution
     scale: ScaleCheck | None
     coverage: float
+    lens_known: LensUncertainty | None
+    """None where the lens was given, or is of a kind that is not judged."""
     gates: tuple[Gate, ...]
     calibration: Calibration
 
@@ -150,6 +153,7 @@ def solve_recording(
                 used, solution.matrix[:3, :3], loaded.board, options.limits.board_scale or 0.01
             )
         coverage = picture_coverage(used)
+        known = _lens_known(used, prepared.intrinsics, solution)
         evidence = Evidence(
             scale,
             coverage if prepared.intrinsics is not None else None,
@@ -157,7 +161,7 @@ def solve_recording(
         )
         gates = judge(solution, evidence, options.limits)
         calibration = make_calibration(
-            recording, loaded, views, prepared.intrinsics, solution, scale, gates, options
+            recording, loaded, views, prepared.intrinsics, solution, scale, gates, options, known
         )
     return SolvedRecording(
         recording,
@@ -168,9 +172,17 @@ def solve_recording(
         solution,
         scale,
         coverage,
+        known,
         gates,
         calibration,
     )
+
+
+def _lens_known(used: ViewSet, intrinsics: Intrinsics | None, solution: Solution) -> LensUncertainty | None:
+    if intrinsics is None or not solution.kept:
+        return None
+    corner_px = intrinsics.rms_px / 2**0.5 if solution.noise is None else solution.noise.corner_px
+    return lens_uncertainty(replace(used, views=solution.kept), solution.camera, corner_px)
 
 
 def _board(options: JobOptions, recorded: BoardSpec) -> BoardSpec:

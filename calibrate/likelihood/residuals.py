@@ -52,10 +52,12 @@ def linearise(observed: Observations, state: State, weights: Array, intrinsics_f
     return normal
 
 
-def linearise_corners(observed: Observations, state: State, weights: Array) -> Normal:
-    """The same of the corners alone, lens held: what the board poses follow from without the robot."""
-    normal = Normal.empty(len(state.C), 12)
-    _add_corners(normal, observed, state, weights * observed.present, intrinsics_free=False)
+def linearise_corners(
+    observed: Observations, state: State, weights: Array, intrinsics_free: bool = False
+) -> Normal:
+    """The same of the corners alone: what board poses and lens follow from without the robot."""
+    normal = Normal.empty(len(state.C), 12 + 9 * intrinsics_free)
+    _add_corners(normal, observed, state, weights * observed.present, intrinsics_free)
     return normal
 
 

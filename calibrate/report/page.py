@@ -15,6 +15,7 @@ from calibrate.lens import project
 from calibrate.pipeline import SolvedRecording
 from calibrate.pnp import solve_pnp
 from calibrate.report import html, plots
+from calibrate.report.lens_plots import uncertainty_map
 from calibrate.report.pictures import drawn_view
 from calibrate.solution import PeerResult
 from calibrate.summary import pose_text, source_stamp, verdict
@@ -69,8 +70,8 @@ def _verdict(job: SolvedRecording) -> Iterator[str]:
     yield f"<h1>Calibration of {html.escape(job.recording.info.name)}</h1>"
     if stamp := source_stamp(calibration):
         yield f'<div class="stamp">{html.escape(stamp)}. It is not installed on a real cell.</div>'
-    expected = ""
-    if quality.predicted_error_mm is not None and quality.working_distance_m is not None:
+    expected = " ".join(gate.text for gate in quality.failed)
+    if good and quality.predicted_error_mm is not None and quality.working_distance_m is not None:
         expected = (
             f"A point {quality.working_distance_m * 1000:.0f} mm in front of the camera should be right "
             f"to {quality.predicted_error_mm:.2f} mm (1σ)."
@@ -186,12 +187,13 @@ def _holdout(job: SolvedRecording, peers: Sequence[PeerResult]) -> Iterator[str]
     methods += [
         (peer.name, peer.samples_e_t_m, peer.samples_e_R)
         for peer in peers
-        if peer.samples_e_t_m is not None and peer.samples_e_R is not None
+        if peer.name != "ours" and peer.samples_e_t_m is not None and peer.samples_e_R is not None
     ]
     yield html.figure(
         plots.holdout_samples(methods),
         f"Mean e_t {score.e_t_m * 1000:.4f} mm, e_R {score.e_R:.6f} over {len(score.pairs)} samples. These "
-        "numbers are dominated by the noise of the held-out views: good methods cannot be ranked by them.",
+        "numbers are dominated by the noise of the held-out views: good methods cannot be ranked by them. "
+        "Curves of methods far worse than most leave the picture.",
     )
     yield html.paragraph(score.note, "note")
 
@@ -239,6 +241,14 @@ def _lens(job: SolvedRecording) -> Iterator[str]:
         plots.coverage_map(job.views),
         f"Left: where corners were seen ({job.coverage:.0%} of the picture). Right: what the lens bends.",
     )
+    if job.lens_known is not None:
+        px = job.lens_known.figures
+        yield html.figure(
+            uncertainty_map(job.lens_known, job.views),
+            f"By how much the lens may show a direction wrongly (1σ): {px['centre']:.3f} px at the centre, "
+            f"{px['corner']:.3f} px in the worst corner, {px['worst']:.3f} px at worst. Blue: the corners "
+            "that fixed it. Where it is large, show the board there too.",
+        )
 
 
 def _distortion_names(model: str) -> tuple[str, ...]:
@@ -269,7 +279,8 @@ def _views(job: SolvedRecording) -> Iterator[str]:
             job.recording.picture(view).image, found, modelled.get(view.index, (found, None))[1]
         )
         px = job.solution.residual_px.get(view.index)
-        caption = f"{view.index}: {view.name}" + (f", {px:.2f} px" if px is not None else "")
+        name = "" if view.name == str(view.index) else f": {view.name}"
+        caption = f"pose {view.index}{name}" + (f", {px:.2f} px" if px is not None else "")
         if view.index in rejected:
             caption += f": {rejected[view.index]}"
         mark = "out" if view.index in rejected else "in"

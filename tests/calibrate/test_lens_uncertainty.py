@@ -1,0 +1,71 @@
+"""The stated uncertainty of the lens is the scatter that repeated calibrations show."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from benchmarks.scene import Noise, make_cell, zhang
+from calibrate.geometry import Array, rotation_exp
+from calibrate.lens import undistort
+from calibrate.lens_uncertainty import lens_uncertainty
+from calibrate.projection import camera_matrix, project_pixels
+from recordings.messages import CameraModel
+
+PLACES = np.array([[640.0, 512.0], [0.0, 0.0], [1279.0, 0.0], [1279.0, 1023.0], [320.0, 768.0]])
+
+
+def rays(camera: CameraModel, pixels: Array) -> Array:
+    plain = np.concatenate([undistort(camera, pixels), np.ones((len(pixels), 1))], axis=1)
+    return np.asarray(plain @ np.linalg.inv(camera_matrix(camera)).T)
+
+
+def shift_after_best_turn(true: CameraModel, found: CameraModel, seen: Array, places: Array) -> Array:
+    """(n, 2) px by which `found` shows directions elsewhere, the camera turned so that corners agree."""
+    turn = np.zeros(3)
+    where = rays(true, seen)
+    for _ in range(3):
+        shown = project_pixels(found, where @ rotation_exp(turn).T)
+        J = np.stack(
+            [
+                (project_pixels(found, where @ rotation_exp(turn + step).T) - shown) / 1e-6
+                for step in 1e-6 * np.eye(3)
+            ],
+            axis=-1,
+        )
+        turn = turn + np.linalg.lstsq(J.reshape(-1, 3), (seen - shown).ravel(), rcond=None)[0]
+    return np.asarray(project_pixels(found, rays(true, places) @ rotation_exp(turn).T) - places)
+
+
+def test_it_is_the_scatter_of_repeated_calibrations() -> None:
+    noise = 0.2
+    cell = make_cell(np.random.default_rng(4), 15, Noise(noise, 0.0, 0.0))
+    board = cell.views.views[0].board_points
+    exact = np.array([project_pixels(cell.camera, board @ C[:3, :3].T + C[:3, 3]) for C in cell.C])
+    rng = np.random.default_rng(5)
+    shifts = []
+    for _ in range(40):
+        found = zhang(board, exact + rng.normal(size=exact.shape) * noise, cell.camera)
+        shifts.append(shift_after_best_turn(cell.camera, found, exact.reshape(-1, 2), PLACES))
+    scatter = np.sqrt(np.square(shifts).sum(axis=-1).mean(axis=0))
+    stated = lens_uncertainty(cell.views, cell.camera, noise)
+    assert stated is not None
+    columns = np.linspace(0, 1279, stated.sigma_px.shape[1])
+    lines = np.linspace(0, 1023, stated.sigma_px.shape[0])
+    for place, measured in zip(PLACES, scatter, strict=True):
+        said = stated.sigma_px[np.abs(lines - place[1]).argmin(), np.abs(columns - place[0]).argmin()]
+        assert 0.7 < said / measured < 1.4, (place, said, measured)
+    figures = stated.figures
+    assert figures["centre"] < figures["corner"] <= figures["worst"]
+
+
+def test_what_is_held_is_exact_and_other_lenses_are_not_judged() -> None:
+    cell = make_cell(np.random.default_rng(4), 10)
+    free = lens_uncertainty(cell.views, cell.camera, 0.1)
+    held = lens_uncertainty(replace(cell.views, held_intrinsics=("k3", "p1", "p2")), cell.camera, 0.1)
+    assert free is not None and held is not None
+    assert held.figures["corner"] < free.figures["corner"]
+    assert (held.covariance[[6, 7, 8]] == 0).all()
+    fisheye = CameraModel(1280, 1024, cell.camera.matrix, (0.0,) * 4, "equidistant")
+    assert lens_uncertainty(cell.views, fisheye, 0.1) is None

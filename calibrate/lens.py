@@ -1,4 +1,4 @@
-"""Projection and its inverse for the three lens models, all by OpenCV."""
+"""Pictures of a board, and pixels with the lens taken out."""
 
 from __future__ import annotations
 
@@ -8,22 +8,11 @@ import cv2
 import numpy as np
 
 from calibrate.errors import BadViewsError
-from calibrate.geometry import Array, rotation_log
+from calibrate.geometry import Array, transform_points
+from calibrate.projection import camera_matrix, project_pixels
 from recordings.messages import CameraModel
 
 _UNDISTORT_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-10)
-
-
-def camera_matrix(camera: CameraModel) -> Array:
-    """(3, 3); BadViewsError where it is missing or not a camera matrix."""
-    if camera.matrix is None:
-        raise BadViewsError("the camera's intrinsics are not known yet: calibrate them first")
-    K = np.array(camera.matrix, dtype=float)
-    if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
-        raise BadViewsError(
-            f"the camera matrix {camera.matrix} is not one: 3 × 3, finite, positive focal lengths are needed"
-        )
-    return K
 
 
 def distortion(camera: CameraModel) -> Array:
@@ -37,14 +26,7 @@ def distortion(camera: CameraModel) -> Array:
 
 def project(camera: CameraModel, camera_from_board: Array, points: Array) -> Array:
     """Points (n, 3) of `board` → pixels (n, 2)."""
-    K, D = camera_matrix(camera), distortion(camera)
-    rvec, tvec = rotation_log(camera_from_board[:3, :3]), camera_from_board[:3, 3]
-    points = np.ascontiguousarray(points, dtype=float).reshape(-1, 1, 3)
-    if camera.distortion_model == "equidistant":
-        pixels, _ = cv2.fisheye.projectPoints(points, rvec, tvec, K, D)
-    else:
-        pixels, _ = cv2.projectPoints(points, rvec, tvec, K, D)
-    return np.asarray(pixels, dtype=float).reshape(-1, 2)
+    return project_pixels(camera, transform_points(camera_from_board, np.asarray(points, dtype=float)))
 
 
 def undistort(camera: CameraModel, pixels: Array) -> Array:

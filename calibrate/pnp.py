@@ -10,8 +10,9 @@ import numpy as np
 from calibrate.board import board_from_turned, looks_same_turns
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, inverse, pose, rotation_exp, transform_points
-from calibrate.lens import camera_matrix, project, undistort
+from calibrate.lens import project, undistort
 from calibrate.orientation import choose_candidates
+from calibrate.projection import camera_matrix
 from calibrate.views import ImageView, ViewSet
 from recordings.messages import BoardSpec, CameraModel
 

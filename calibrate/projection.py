@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import msgspec
 import numpy as np
 
+from calibrate.errors import BadViewsError
 from calibrate.geometry import Array
 from recordings.messages import CameraModel
 
@@ -68,10 +69,15 @@ def _pixels(K: Array, xd: Array, yd: Array) -> Array:
 
 
 def camera_matrix(camera: CameraModel) -> Array:
-    """K (3, 3); ValueError where intrinsics are not known yet."""
+    """K (3, 3); BadViewsError where it is missing or not a camera matrix."""
     if camera.matrix is None:
-        raise ValueError("the camera has no matrix yet")
-    return np.array(camera.matrix, dtype=float)
+        raise BadViewsError("the camera's intrinsics are not known yet: calibrate them first")
+    K = np.array(camera.matrix, dtype=float)
+    if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
+        raise BadViewsError(
+            f"the camera matrix {camera.matrix} is not one: 3 × 3, finite, positive focal lengths are needed"
+        )
+    return K
 
 
 def intrinsics_vector(camera: CameraModel) -> Array:

@@ -12,7 +12,8 @@ import yaml
 from calibrate.board import check_board
 from calibrate.calibration import FORMAT, read_calibration
 from calibrate.errors import CalibrationError
-from calibrate.lens import camera_matrix, distortion
+from calibrate.lens import distortion
+from calibrate.projection import camera_matrix
 from recordings.messages import BoardSpec, CameraModel
 
 _LIMIT_BYTES = 256 * 1024

@@ -9,7 +9,8 @@ import yaml
 
 from calibrate.calibration import Calibration
 from calibrate.formats.frames import FrameNames, comment
-from calibrate.lens import camera_matrix, distortion
+from calibrate.lens import distortion
+from calibrate.projection import camera_matrix
 
 
 def text(calibration: Calibration, frames: FrameNames) -> str:

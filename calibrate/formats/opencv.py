@@ -7,7 +7,8 @@ import numpy as np
 
 from calibrate.calibration import Calibration
 from calibrate.formats.frames import FrameNames, comment
-from calibrate.lens import camera_matrix, distortion
+from calibrate.lens import distortion
+from calibrate.projection import camera_matrix
 
 
 def text(calibration: Calibration, frames: FrameNames) -> str:

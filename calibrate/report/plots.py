@@ -12,11 +12,13 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from calibrate.geometry import Array
-from calibrate.lens import camera_matrix, undistort
+from calibrate.lens import undistort
+from calibrate.projection import camera_matrix
 from calibrate.views import ViewSet
 from recordings.messages import CameraModel
 
 _BLUE, _RED, _GREY, _ORANGE = "#0969da", "#b42318", "#8c959f", "#bc4c00"
+_FAR_WORSE = 3.0
 STYLE: Any = {
     "svg.hashsalt": "report",
     "svg.fonttype": "none",
@@ -93,17 +95,26 @@ def holdout_samples(methods: Sequence[tuple[str, Array, Array]]) -> str:
     """Error per held-out sample, translation (mm) and rotation; ours first. The paper's figures 4 and 5."""
     with matplotlib.rc_context(STYLE):
         figure, axes = new_figure(10, 3.0, 2)
+        colours = matplotlib.colormaps["tab20"].colors  # type: ignore[attr-defined]
         for place, (name, e_t_m, e_R) in enumerate(methods):
             look: dict[str, Any] = {"linewidth": 0.8, "marker": ".", "alpha": 0.7}
+            look["color"] = colours[place % len(colours)]
             if place == 0:
                 look = {"linewidth": 2, "marker": "o", "color": _RED, "zorder": 5}
             samples = np.arange(1, len(e_t_m) + 1)
             axes[0].plot(samples, e_t_m * 1000, label=name, **look)
             axes[1].plot(samples, e_R, **look)
-        axes[0].set(xlabel="held-out sample", ylabel="translation error, mm", ylim=(0, None))
-        axes[1].set(xlabel="held-out sample", ylabel="rotation error (spectral norm)", ylim=(0, None))
+        tops = (_top([1000 * e_t for _, e_t, _ in methods]), _top([e_R for _, _, e_R in methods]))
+        axes[0].set(xlabel="held-out sample", ylabel="translation error, mm", ylim=(0, tops[0]))
+        axes[1].set(xlabel="held-out sample", ylabel="rotation error e_R", ylim=(0, tops[1]))
         figure.legend(loc="outside lower center", ncols=5, fontsize=7, frameon=False)
         return svg_text(figure)
+
+
+def _top(curves: Sequence[Array]) -> float:
+    """So high that all are seen but those several times worse than most: one would flatten all others."""
+    peaks = np.array([float(np.max(curve)) for curve in curves])
+    return 1.05 * float(peaks[peaks <= _FAR_WORSE * np.median(peaks)].max())
 
 
 def error_shares(shares: Mapping[str, float]) -> str:

@@ -105,5 +105,5 @@ def _draw_error(axes: Any, plan: Plan) -> None:
         axes.semilogy(range(1, len(sigmas) + 1), sigmas, "o-", ms=3)
         # The first two views say nothing about X; their bars would hide the rest.
         axes.set_ylim(0.7 * sigmas[-1], 1.5 * sigmas[min(2, len(sigmas) - 1)])
-        axes.annotate(f"{sigmas[-1]:.2f} mm", (len(sigmas), 1.1 * sigmas[-1]), ha="right", va="bottom")
+        axes.annotate(f"{sigmas[-1]:.2f} mm", (len(sigmas), 1.4 * sigmas[-1]), ha="right", va="bottom")
     axes.grid(True, which="both", alpha=0.3)

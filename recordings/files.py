@@ -59,6 +59,19 @@ def lock(descriptor: int, path: Path) -> None:
         raise RecordingError(f"{path} is in use by another process; wait until it has finished") from error
 
 
+def discard_leftover(path: Path) -> None:
+    """Removes what a killed process left half-written. RecordingError when a living one still writes it."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_CLOEXEC | os.O_NONBLOCK)
+    except OSError:  # nothing there, or nothing of ours: the exclusive creation will tell
+        return
+    try:
+        lock(descriptor, path)
+        path.unlink()
+    finally:
+        os.close(descriptor)
+
+
 def sync_folder(folder: Path) -> None:
     """Makes a creation or rename inside the folder survive a power loss."""
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)

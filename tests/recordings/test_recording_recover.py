@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from pathlib import Path
 
@@ -9,6 +10,7 @@ import numpy as np
 import pytest
 
 from recordings.errors import RecordingError
+from recordings.files import create_exclusively
 from recordings.messages import CameraModel
 from recordings.reader import open_recording
 from recordings.recover import recover
@@ -109,15 +111,6 @@ def test_a_folder_is_recovered_file_by_file(tmp_path: Path) -> None:
     assert [(v.index, v.part) for v in open_recording(tmp_path).views()] == [(0, 2), (1, 2), (2, 1)]
 
 
-def test_a_leftover_of_an_earlier_attempt_is_not_trodden_on(tmp_path: Path) -> None:
-    part = write_unfinished(tmp_path / "a.mcap")
-    (tmp_path / "a.mcap.recovering").write_text("left over")
-    with pytest.raises(RecordingError, match="exists already"):
-        recover(part)
-    assert part.exists()
-    assert (tmp_path / "a.mcap.recovering").read_text() == "left over"
-
-
 def test_what_an_earlier_recovery_kept_is_kept(tmp_path: Path) -> None:
     for _ in range(3):
         path = tmp_path / "a.mcap"
@@ -154,3 +147,23 @@ def test_after_a_destroyed_record_head_the_search_finds_the_next_whole_chunk(tmp
     path.write_bytes(data)
     recover(path)
     assert {0, 2, 3} <= {view.index for view in open_recording(path).views()}
+
+
+def test_what_a_killed_recovery_left_is_no_obstacle(small: Path) -> None:
+    data = small.read_bytes()
+    small.write_bytes(data[:-9000])
+    leftover = small.with_name("small.mcap.recovering")
+    leftover.write_bytes(b"half")
+    (result,) = recover(small)
+    assert result.poses == 3
+    assert not leftover.exists()
+
+
+def test_a_recovery_that_still_runs_is_not_disturbed(small: Path) -> None:
+    data = small.read_bytes()
+    small.write_bytes(data[:-9000])
+    other = create_exclusively(small.with_name("small.mcap.recovering"))
+    with pytest.raises(RecordingError, match=r"recovering is in use by another process"):
+        recover(small)
+    os.close(other)
+    assert small.read_bytes() == data[:-9000]

@@ -134,6 +134,26 @@ def test_the_reference_library_reads_the_file_with_published_schemas(small: Path
     assert list(by_topic["/robot/state"].joints_rad) == pytest.approx(make_state(8).joints_rad)
 
 
+def test_large_pictures_go_out_uncopied_and_are_identical_for_other_readers_too(tmp_path: Path) -> None:
+    """Above 32 kB the pixels never pass through protobuf; turned and cut arrays are laid out first."""
+    full = np.random.default_rng(3).integers(0, 256, (1024, 1280), np.uint8)
+    images = [full, full[::-1], np.ascontiguousarray(full.T).T, np.random.default_rng(4).permutation(full)]
+    with RecordingWriter(tmp_path / "a.mcap", make_info(camera=CameraModel(1280, 1024))) as writer:
+        for sequence, image in enumerate(images):
+            writer.robot_state(make_state(sequence))
+            writer.picture(make_picture(sequence, image))
+        path = writer.finish()
+    part = open_recording(path).parts[0]
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        theirs = [body for *_, body in reader.iter_decoded_messages(topics=["/camera/image"])]
+    assert len(theirs) == len(images)
+    for sequence, (image, body) in enumerate(zip(images, theirs, strict=True)):
+        np.testing.assert_array_equal(part.picture(sequence).image, image)
+        assert (body.encoding, body.width, body.height, body.step) == ("mono8", 1280, 1024, 1280)
+        np.testing.assert_array_equal(np.frombuffer(body.data, np.uint8).reshape(1024, 1280), image)
+
+
 def test_a_view_never_points_at_nothing(tmp_path: Path) -> None:
     with (
         RecordingWriter(tmp_path / "a.mcap", make_info()) as writer,

@@ -131,7 +131,7 @@ def _core(everything: Observations, views: ViewSet, group: Places, result: Estim
     near them by the scale of the middle view. Whoever is left out is judged later by the others.
     """
     settled = _judged(everything, views, group, result)
-    if len(settled.verdict.near_middle(group, _UNDOUBTED)) == len(group):
+    if not _in_doubt(settled.verdict, group):
         return settled
     fewest = int(np.ceil(_TRIMMED * len(group)))
     if fewest >= _FEWEST_TRIMMED:
@@ -142,6 +142,12 @@ def _core(everything: Observations, views: ViewSet, group: Places, result: Estim
             settled = _again(everything, views, settled, core)
     core = settled.verdict.near_middle(group, _NEAR)
     return _again(everything, views, settled, core) if len(core) >= _FEWEST_IN_CORE else settled
+
+
+def _in_doubt(verdict: Judgement, group: Places) -> bool:
+    """One view far out, or several farther out than so many good views would be."""
+    far = len(group) - len(verdict.near_middle(group, _NEAR))
+    return far > 1 + 0.02 * len(group) or len(verdict.near_middle(group, _UNDOUBTED)) < len(group)
 
 
 def _again(everything: Observations, views: ViewSet, settled: Settled, places: Places) -> Settled:

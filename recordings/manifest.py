@@ -6,12 +6,14 @@ beside them. A part is entered when its file is there and before anything in it 
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import msgspec
 
 from recordings.errors import CorruptRecordingError, RecordingError
 from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, write_atomically
+from recordings.scan import open_file
 
 MANIFEST_FILE = "parts.json"
 PARTS_LIMIT = 100
@@ -36,16 +38,18 @@ class Manifest(
 def read_manifest(folder: Path) -> Manifest | None:
     """None where there is none: a folder of an older version, or single files. Raises RecordingError."""
     path = folder / MANIFEST_FILE
-    try:
-        with path.open("rb") as file:
-            content = file.read(_LIMIT_BYTES + 1)
-    except FileNotFoundError:
+    if not os.path.lexists(path):
         return None
+    descriptor = open_file(path)
+    try:
+        content = os.pread(descriptor, _LIMIT_BYTES, 0)
     except OSError as error:
         raise RecordingError(f"cannot read {path}: {error.strerror}") from error
+    finally:
+        os.close(descriptor)
     try:
         manifest = msgspec.json.decode(content, type=Manifest)
-    except (msgspec.DecodeError, RecursionError) as error:
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise _damaged(path, str(error)) from error
     if not manifest.parts or not 1 <= min(manifest.parts) <= max(manifest.parts) <= PARTS_LIMIT:
         raise _damaged(path, f"its parts are not numbered 1 to at most {PARTS_LIMIT}")

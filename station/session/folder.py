@@ -77,7 +77,7 @@ def read_state(folder: Path) -> SessionState | None:
     """None where it is missing or not ours."""
     try:
         return msgspec.json.decode((folder / STATE_FILE).read_bytes(), type=SessionState)
-    except (OSError, msgspec.DecodeError):
+    except (OSError, msgspec.DecodeError, UnicodeDecodeError):
         return None
 
 

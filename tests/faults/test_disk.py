@@ -63,6 +63,14 @@ def test_27_a_killed_session_is_listed_as_unsealed_until_it_is_recovered(tmp_pat
     assert listed["recording"] == str(folder / "session.mcap")
 
 
+def test_27_a_damaged_state_file_hides_no_recording(tmp_path: Path) -> None:
+    folder = new_session_folder(tmp_path, "cell")
+    write_small(folder / "session.mcap")
+    (folder / "session.json").write_bytes(b'{"name": "\xff"}')
+    (listed,) = list_sessions(tmp_path)
+    assert listed["sealed"]
+
+
 @pytest.mark.process
 def test_29_a_disk_that_is_really_full_loses_nothing_acknowledged(tmp_path: Path) -> None:
     """A file system of 300 kB of its own (in a user's mount namespace), not just a limit on the file."""

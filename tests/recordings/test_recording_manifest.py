@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+import os
+from contextlib import suppress
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import msgspec
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from recordings.errors import CorruptRecordingError, MissingPartError, RecordingError
 from recordings.excerpt import write_excerpt
@@ -141,6 +146,24 @@ def test_a_damaged_list_is_refused(session: Path, content: bytes) -> None:
     for read in (lambda: open_recording(session), lambda: recover(session)):
         with pytest.raises(CorruptRecordingError, match=r"parts\.json is damaged .*delete it"):
             read()
+
+
+@given(st.binary(max_size=300), st.integers(0, 130))
+def test_any_edit_of_a_list_is_a_list_or_is_refused(piece: bytes, at: int) -> None:
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        enter_part(folder, "test-cell", 1, "session.mcap")
+        content = (folder / MANIFEST_FILE).read_bytes()
+        (folder / MANIFEST_FILE).write_bytes(content[:at] + piece + content[at + len(piece) :])
+        with suppress(CorruptRecordingError):
+            assert isinstance(read_manifest(folder), Manifest)
+
+
+def test_a_list_that_is_no_file_does_not_hang_its_reader(session: Path) -> None:
+    (session / MANIFEST_FILE).unlink()
+    os.mkfifo(session / MANIFEST_FILE)
+    with pytest.raises(RecordingError, match=r"parts\.json is not a file"):
+        open_recording(session)
 
 
 def test_a_folder_belongs_to_one_session(session: Path) -> None:

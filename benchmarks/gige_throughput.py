@@ -227,7 +227,7 @@ async def stream(server: SimulatedGige, fps: float, seconds: float, folder: Path
     await streaming
     states.join()
     memory_mib = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    sent, counts = server.sent() - rotation.first_number, camera.stream_counts()
+    sent, counts = server.sent() - rotation.first_number, camera.counts().stream
     await camera.close()
     verified, wrong, states_read = await asyncio.to_thread(rotation.finish)
     return Outcome(

@@ -54,8 +54,22 @@ def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
     if status.lease.holder:
         words.append(f"commanded by {status.lease.holder}")
     out.print(", ".join(words))
+    out.print(camera_words(status))
     if session.recording:
         out.print(f"recording {session.recording}")
+
+
+def camera_words(status: StationStatus) -> str:
+    """What camera and trigger box did, in one line."""
+    camera, trigger = status.camera, status.trigger
+    if not camera.connected:
+        return "camera not connected"
+    words = [f"{camera.model} {camera.fps:.1f} fps", f"{camera.dropped} frames dropped"]
+    if camera.lost_packets or camera.resent_packets:
+        words.append(f"{camera.lost_packets} packets lost, {camera.resent_packets} sent again")
+    if trigger.present:
+        words.append(f"trigger {trigger.pulses} pulses, {trigger.frames} frames")
+    return ", ".join(words)
 
 
 @app.command("stop")

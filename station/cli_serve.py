@@ -39,6 +39,9 @@ def serve_command(
     noise: Annotated[str, typer.Option(help="Simulated: low, mid or high.")] = "low",
     mount: Annotated[str, typer.Option(help="Simulated: eye-in-hand or eye-to-hand.")] = "eye-in-hand",
     gige: Annotated[bool, typer.Option("--gige", hidden=True)] = False,
+    hardware_trigger: Annotated[
+        bool, typer.Option("--hardware-trigger", help="Simulated: a trigger box fires the camera.")
+    ] = False,
     time_scale: Annotated[float, typer.Option(hidden=True)] = 1.0,
     end_with_stdin: Annotated[bool, typer.Option("--end-with-stdin", hidden=True)] = False,
 ) -> None:
@@ -62,7 +65,15 @@ def serve_command(
     # Simulation is loaded only where it is wanted.
     from station.simulation.launch_cell import SimulationOptions, simulated_cell
 
-    options = SimulationOptions(scene, seed, noise, mount, time_scale, gige)  # type: ignore[arg-type]
+    options = SimulationOptions(
+        scene,  # type: ignore[arg-type]
+        seed,
+        noise,  # type: ignore[arg-type]
+        mount,  # type: ignore[arg-type]
+        time_scale,
+        gige,
+        hardware_trigger,
+    )
     cell = simulated_cell(options, place / "simulation")
     asyncio.run(serve_cell(cell, place, socket or default_socket(), end_with_stdin))
 

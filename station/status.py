@@ -79,7 +79,10 @@ class CameraStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     height: int = 0
     frames: int = 0
     dropped: int = 0
+    """Frames that were due and did not come whole"""
     fps: float = 0.0
+    lost_packets: int = 0
+    resent_packets: int = 0
     exposure_us: float = 0.0
     gain_db: float = 0.0
 

@@ -16,7 +16,7 @@ from station.clocks import ClockFit
 from station.config import CameraConfig
 from station.devices.aravis_device import GenicamDevice
 from station.devices.base import Trigger
-from station.devices.frames import DeviceClock, FrameCounter, StreamCounts
+from station.devices.frames import CameraCounts, DeviceClock, FrameCounter, StreamCounts
 from station.errors import CameraError
 
 T = TypeVar("T")
@@ -49,10 +49,10 @@ class AravisCamera:
     def clock(self) -> ClockFit | None:
         return self._clock.fit
 
-    def stream_counts(self) -> StreamCounts:
-        """Since the camera was opened (again). At once, from any thread."""
+    def counts(self) -> CameraCounts:
+        """The network's since the camera was opened (again)."""
         device = self._device
-        return StreamCounts() if device is None else device.counts()
+        return self.counter.counts(StreamCounts() if device is None else device.counts())
 
     async def open(self) -> CameraIdentity:
         async with self._busy:

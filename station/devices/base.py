@@ -9,6 +9,7 @@ import msgspec
 
 from recordings.messages import CameraIdentity, Picture, RobotIdentity, RobotState
 from station.clocks import ClockFit
+from station.devices.frames import CameraCounts
 
 
 class Robot(Protocol):
@@ -79,6 +80,9 @@ class Camera(Protocol):
     def clock(self) -> ClockFit | None:
         """The camera's clock against the host's; None while not known. For `frames.mid_exposure`."""
 
+    def counts(self) -> CameraCounts:
+        """Since it was made. At once, from any thread."""
+
     async def settings(self) -> dict[str, Any]:
         """As the camera reports them now, for the recording; JSON types only. Raises CameraError."""
 
@@ -103,6 +107,10 @@ class TriggerPulse(msgspec.Struct, frozen=True):
 class Trigger(Protocol):
     async def open(self) -> str:
         """Identity text. Raises TriggerError."""
+
+    @property
+    def pulses(self) -> int:
+        """Counted by the box since it was opened, whoever caused them."""
 
     async def fire(self) -> TriggerPulse: ...
 

@@ -29,6 +29,18 @@ class StreamCounts(msgspec.Struct, frozen=True):
     resent_packets: int = 0
 
 
+class CameraCounts(msgspec.Struct, frozen=True):
+    """What became of a camera's frames, for the status."""
+
+    frames: int = 0
+    """Came, glimpses and previews included"""
+    missing: int = 0
+    """Triggered or numbered by the camera, but never came whole"""
+    paired: int = 0
+    """Came for a pulse of the trigger box"""
+    stream: StreamCounts = StreamCounts()
+
+
 def next_frame_id(frame_id: int) -> int:
     return frame_id % LAST_FRAME_ID + 1
 
@@ -50,6 +62,10 @@ class FrameCounter:
         """Accepted; the newest one's sequence number is one less."""
         self.missing = 0
         self.unexpected = 0
+        self.seen = 0
+        """Accepted, previews included."""
+        self.paired = 0
+        """Of them, those that a pulse of the trigger box was counted for."""
         self._last_id: int | None = None
         self._last_pulse: int | None = None
 
@@ -85,6 +101,8 @@ class FrameCounter:
                 "take this pose again"
             )
         self.frames += sequenced
+        self.seen += 1
+        self.paired += pulse_count is not None
         return self.frames - 1
 
     def follow(self, frame_id: int) -> int:
@@ -93,7 +111,11 @@ class FrameCounter:
             self.missing += max(0, frames_between(self._last_id, frame_id) - 1)
         self._last_id = frame_id
         self.frames += 1
+        self.seen += 1
         return self.frames - 1
+
+    def counts(self, stream: StreamCounts | None = None) -> CameraCounts:
+        return CameraCounts(self.seen, self.missing, self.paired, stream or StreamCounts())
 
     def lost(self, pulse_count: int | None = None) -> None:
         """A trigger, with this count of the trigger box, had no frame."""

@@ -21,7 +21,7 @@ from recordings.messages import CameraIdentity, Picture, RobotIdentity, RobotSta
 from recordings.reader import Recording, open_recording
 from station.clocks import ClockFit
 from station.config import CameraConfig
-from station.devices.frames import next_frame_id
+from station.devices.frames import CameraCounts, next_frame_id
 from station.devices.playback_source import Played, Source, open_source
 from station.errors import CameraError, RobotError, StaleStateError
 from station.plan.model import Plan, PlannedPose
@@ -67,6 +67,9 @@ class PlaybackCamera:
     @property
     def clock(self) -> ClockFit | None:
         return _HOST_CLOCK
+
+    def counts(self) -> CameraCounts:
+        return CameraCounts(frames=self._taken)
 
     async def open(self) -> CameraIdentity:
         self._source = await asyncio.to_thread(open_source, Path(self._config.device))

@@ -37,13 +37,18 @@ class SerialTrigger:
         self._lines = LineReader()
         self._boot_id = ""
         self._opened = False
-        self._count = 0
+        self._count = self._first_count = 0
         """Pulses, unwrapped: the box's own count starts over at 2^32."""
 
     @property
     def bad_lines(self) -> int:
         """Garbage seen on the line so far."""
         return self._lines.bad_lines
+
+    @property
+    def pulses(self) -> int:
+        """Since it was opened, whoever caused them."""
+        return self._count - self._first_count
 
     async def open(self) -> str:
         return await self._run(self._connect)
@@ -80,7 +85,7 @@ class SerialTrigger:
                 "and is this user in the group dialout?"
             ) from error
         self._lines = LineReader()
-        self._count = 0
+        self._count = self._first_count = 0
         if self._config.mode != "box":
             return f"{self._config.mode.upper()} of {self._config.port}"
         try:
@@ -110,7 +115,7 @@ class SerialTrigger:
                 f"protocol {PROTOCOL}; check trigger.port"
             )
         self._boot_id, count, _ = self._status()
-        self._count = count
+        self._count = self._first_count = count
         return f"{product} {serial}"
 
     def _set_light(self, level: float) -> None:

@@ -15,9 +15,10 @@ from station.errors import RobotError
 from station.limits import SPEED_CAP_M_S, point_speed_m_s
 from station.session.bench import Bench
 from station.session.capture import flange_pose, matrix4
-from station.status import CameraStatus, ClockStatus, RecorderStatus, RobotStatus, StationState
+from station.status import CameraStatus, ClockStatus, RecorderStatus, RobotStatus, StationState, TriggerStatus
 
 DISK_PERIOD_S = 2.0
+FPS_PERIOD_S = 2.0
 
 
 class Monitor:
@@ -27,6 +28,8 @@ class Monitor:
         self._free_checked_s = -DISK_PERIOD_S
         self._controller: tuple[float, float] | None = None
         self._states_seen = 0
+        self._frames = (0.0, 0)
+        """When, and how many until then"""
         bench.cell.robot.subscribe(self._count)
 
     def _count(self, state: RobotState) -> None:
@@ -39,6 +42,8 @@ class Monitor:
             store.update(reason=notice)  # 'speed slider at 5 %': no fault, but a person wants to know
         store.update(
             robot=self._robot(),
+            camera=self._camera(),
+            trigger=self._trigger(),
             recorder=self._recorder(),
             clock=self._clock(),
             loop_lag_ms=round(lag_ms, 1),
@@ -89,6 +94,28 @@ class Monitor:
             rate = seen / (now_s - last[0]) if last is not None else 0.0
             self._controller = (now_s, round(rate))
         return self._controller[1]
+
+    def _camera(self) -> CameraStatus:
+        counts, now_s = self._bench.cell.camera.counts(), time.monotonic()
+        shown = self._bench.store.status.camera
+        fps, (then_s, frames) = shown.fps, self._frames
+        if now_s - then_s >= FPS_PERIOD_S:
+            fps = round((counts.frames - frames) / (now_s - then_s), 1) if then_s else 0.0
+            self._frames = now_s, counts.frames
+        return msgspec.structs.replace(
+            shown,
+            fps=fps,
+            dropped=counts.missing,
+            lost_packets=counts.stream.missing_packets,
+            resent_packets=counts.stream.resent_packets,
+        )
+
+    def _trigger(self) -> TriggerStatus:
+        shown, box = self._bench.store.status.trigger, self._bench.cell.trigger
+        if box is None or not shown.present:
+            return shown
+        paired = self._bench.cell.camera.counts().paired
+        return msgspec.structs.replace(shown, pulses=box.pulses, frames=paired)
 
     def _recorder(self) -> RecorderStatus:
         now_s = time.monotonic()

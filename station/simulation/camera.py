@@ -15,7 +15,8 @@ import numpy as np
 from recordings.messages import CameraIdentity, Picture, Stamps
 from station.clocks import ClockFit
 from station.config import CameraConfig
-from station.devices.frames import DeviceClock, FrameCounter
+from station.devices.base import Trigger
+from station.devices.frames import CameraCounts, DeviceClock, FrameCounter
 from station.errors import CameraError
 from station.simulation.cell import CellTruth
 
@@ -27,8 +28,17 @@ _PIPE_LIMIT = 4 * 2**20
 class RenderedCamera:
     """`station.devices.base.Camera` of a simulated cell. `controller_host`: whose arm it looks at."""
 
-    def __init__(self, truth: CellTruth, controller_host: str, config: CameraConfig | None = None) -> None:
+    def __init__(
+        self,
+        truth: CellTruth,
+        controller_host: str,
+        config: CameraConfig | None = None,
+        trigger: Trigger | None = None,
+    ) -> None:
+        """`trigger`: the box that fires it, whose pulses reach `pulse`; None: triggered by software."""
         self._truth = truth
+        self._trigger = trigger
+        self._loop: asyncio.AbstractEventLoop | None = None
         self._host = controller_host
         self._exposure_us = truth.exposure_us if config is None else config.exposure_us
         self._gain_db = truth.gain_db if config is None else config.gain_db
@@ -53,8 +63,17 @@ class RenderedCamera:
     def clock(self) -> ClockFit | None:
         return self._device_clock.fit
 
+    def counts(self) -> CameraCounts:
+        return self.counter.counts()
+
+    def pulse(self) -> None:
+        """An edge on the trigger line; from any thread. Nobody sees it while the camera is not open."""
+        if self._loop is not None and self._process is not None:
+            self._loop.call_soon_threadsafe(self._write, {"cmd": "trigger"})
+
     async def open(self) -> CameraIdentity:
         """Starts the process and reads its clock a few times."""
+        self._loop = asyncio.get_running_loop()
         self._process = await asyncio.create_subprocess_exec(
             *(sys.executable, "-m", "station.simulation.camera_process"),
             stdin=asyncio.subprocess.PIPE,
@@ -87,19 +106,23 @@ class RenderedCamera:
             await self._read_clock()
             if not self._frames.empty():
                 raise self.counter.surplus(self._drain())
-            self._write({"cmd": "trigger"})
+            pulse = None
+            if self._trigger is None:
+                self._write({"cmd": "trigger"})
+            else:
+                pulse = (await self._trigger.fire()).count
             try:
                 frame = await asyncio.wait_for(self._frames.get(), timeout_s)
             except TimeoutError:
-                self.counter.lost()
+                self.counter.lost(pulse)
                 raise CameraError(
                     f"the camera sent no picture within {timeout_s:g} s of its trigger; take this pose again"
                 ) from None
             if isinstance(frame, CameraError):
                 raise frame
-            sequence = self.counter.accept(frame.frame_id)
+            sequence = self.counter.accept(frame.frame_id, pulse)
             self._check_settings(frame)
-            return msgspec.structs.replace(frame, sequence=sequence)
+            return msgspec.structs.replace(frame, sequence=sequence, trigger_count=pulse)
 
     async def settings(self) -> dict[str, Any]:
         return {

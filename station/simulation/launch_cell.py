@@ -5,16 +5,20 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import msgspec
 
 from recordings.messages import Mount
 from station.cell import Cell
-from station.config import StationConfig
-from station.devices.base import Camera
+from station.config import StationConfig, TriggerConfig
+from station.devices.base import Camera, Trigger
 from station.errors import StationError
 from station.simulation.cell import CellTruth, NoiseLevel, SceneName, make_cell, write_truth
 from station.simulation.launch import start_controller
+
+if TYPE_CHECKING:
+    from station.simulation.trigger import SimulatedTriggerBox
 
 GIGE_PACKET_BYTES = 8996
 
@@ -29,6 +33,8 @@ class SimulationOptions:
     """Above 1 only in tests: real time is what is demonstrated."""
     gige: bool = False
     """The camera over GigE Vision, in a network namespace with only `lo`."""
+    hardware_trigger: bool = False
+    """A trigger box on a pseudo terminal fires the camera."""
     free_space_bytes: int = 200_000_000
     """A demonstration must run on a small disk."""
 
@@ -49,12 +55,15 @@ def simulated_cell(options: SimulationOptions, folder: Path) -> Cell:
     capture = msgspec.structs.replace(config.capture, free_space_bytes=options.free_space_bytes)
     config = msgspec.structs.replace(config, capture=capture)
     try:
-        config, camera, camera_ended = _camera(options, config, truth, truth_file)
+        wires = _Wires(options.hardware_trigger)
+        config = wires.configured(config)
+        config, camera, camera_ended = _camera(options, config, truth, truth_file, wires)
     except StationError:
         controller.stop()
         raise
 
     def ended() -> None:
+        wires.end()
         camera_ended()
         controller.stop()
 
@@ -63,19 +72,52 @@ def simulated_cell(options: SimulationOptions, folder: Path) -> Cell:
         robot=UrRobot(config.robot, folder, folder),
         camera=camera,
         source="simulated",
+        trigger=wires.trigger,
         attachments={"truth.json": truth_file.read_bytes()},
         ended=ended,
     )
 
 
+class _Wires:
+    """The trigger box, its serial line and the wire from its output to the camera; or none of it."""
+
+    def __init__(self, wanted: bool) -> None:
+        self.camera: Callable[[], None] = lambda: None
+        """The far end of the wire"""
+        self._box: SimulatedTriggerBox | None = None
+        self.trigger: Trigger | None = None
+        if wanted:
+            from station.devices.serial_trigger import SerialTrigger
+            from station.simulation.trigger import SimulatedTriggerBox
+
+            self._box = SimulatedTriggerBox(on_pulse=lambda: self.camera())
+            self.trigger = SerialTrigger(TriggerConfig(self._box.port))
+
+    def configured(self, config: StationConfig) -> StationConfig:
+        if self._box is None:
+            return config
+        camera = msgspec.structs.replace(config.camera, trigger="hardware")
+        return msgspec.structs.replace(config, camera=camera, trigger=TriggerConfig(self._box.port))
+
+    def end(self) -> None:
+        if self._box is not None:
+            self._box.unplug()
+
+
 def _camera(
-    options: SimulationOptions, config: StationConfig, truth: CellTruth, truth_file: Path
+    options: SimulationOptions,
+    config: StationConfig,
+    truth: CellTruth,
+    truth_file: Path,
+    wires: _Wires,
 ) -> tuple[StationConfig, Camera, Callable[[], None]]:
     """The configuration with the camera it is about, and what ends its processes."""
     if not options.gige:
         from station.simulation.camera import RenderedCamera
 
-        return config, RenderedCamera(truth, config.robot.host, config.camera), lambda: None
+        rendered = RenderedCamera(truth, config.robot.host, config.camera, wires.trigger)
+        wires.camera = rendered.pulse
+        return config, rendered, lambda: None
     from station.devices.aravis import AravisCamera
     from station.simulation.gige_launch import start_gige
 
@@ -85,4 +127,5 @@ def _camera(
         config.camera, driver="aravis", device="127.0.0.1", packet_size=GIGE_PACKET_BYTES
     )
     config = msgspec.structs.replace(config, camera=over_gige)
-    return config, AravisCamera(over_gige), simulator.stop
+    wires.camera = lambda: simulator.inject("pulse")
+    return config, AravisCamera(over_gige, wires.trigger), simulator.stop

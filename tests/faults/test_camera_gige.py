@@ -40,7 +40,7 @@ async def test_18_an_incomplete_frame_is_refused_and_the_next_one_good(server: S
         server.inject("packet-loss", 0.03)
         with pytest.raises(CameraError, match="came incomplete"):
             await camera.capture(timeout_s=2.0)
-        counts = camera.stream_counts()
+        counts = camera.counts().stream
         assert counts.missing_packets > 0 and counts.incomplete >= 1 and counts.complete == 2
     finally:
         await camera.close()

@@ -19,6 +19,7 @@ from recordings.reader import Recording, open_recording
 from station.analysis import Sighting, sight
 from station.cell import Cell
 from station.config import StationConfig
+from station.devices.frames import CameraCounts
 from station.errors import CameraError, RobotError, StaleStateError
 from station.session import Session
 from station.simulation.cell import make_cell
@@ -155,6 +156,9 @@ class CameraInMemory:
 
     async def open(self) -> CameraIdentity:
         return self.identity
+
+    def counts(self) -> CameraCounts:
+        return CameraCounts(frames=self.taken + self.glimpses)
 
     async def capture(self, timeout_s: float = 5.0) -> Picture:
         if self.fail:

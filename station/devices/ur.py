@@ -21,7 +21,7 @@ from station.devices.ur_child import ControlChild
 from station.devices.ur_condition import foreign_program, not_powered, program_not_running, safety_stop
 from station.devices.ur_dashboard import STOP, Dashboard
 from station.devices.ur_heart import Heart
-from station.devices.ur_link import UrLink
+from station.devices.ur_link import UrLink, link_lost_words
 from station.devices.ur_moves import STALE_S, MoveWatch
 from station.errors import RobotError, SafetyStopError, StaleStateError
 
@@ -50,7 +50,7 @@ class UrRobot(UrLink):
         self._child: ControlChild | None = None
         self._controls = False
         self._moving = False
-        self._stop_reason = ""
+        self._stop_reason = self._link_loss = ""
         self._heart = Heart()
         self._background: set[asyncio.Task[Any]] = set()
 
@@ -132,7 +132,7 @@ class UrRobot(UrLink):
             raise RobotError(f"control is not started{self._why_stopped()}: a person's go starts it")
         if self._moving:
             raise RobotError("a move is already under way")
-        self._moving = True
+        self._moving, self._link_loss = True, ""
         try:
             await self.fresh()
             self.check()
@@ -161,15 +161,19 @@ class UrRobot(UrLink):
 
     def _explain(self, error: BaseException, child: ControlChild) -> BaseException:
         """The cause behind a symptom: STOP first, then safety, the link, our own heartbeat, the child."""
-        reader = self.reader
-        if not isinstance(error, RobotError) or reader is None or reader.newest is None:
+        if not isinstance(error, RobotError):
             return error
         if self._stop_reason:
             return RobotError(f"stopped: {self._stop_reason}")
-        state = reader.newest.state
-        stop = safety_stop(state) or not_powered(state)
+        reader = self.reader
+        state = reader.newest.state if reader is not None and reader.newest is not None else None
+        stop = safety_stop(state) or not_powered(state) if state is not None else None
         if stop is not None:
             return stop
+        if self._link_loss:  # the link may be on its way back already
+            return StaleStateError(link_lost_words(self._link_loss))
+        if reader is None or state is None:
+            return error
         if reader.ended is not None or isinstance(error, StaleStateError):
             return StaleStateError(self._stale_words(self.age_s()))
         if state.runtime_state != RuntimeState.STOPPED:
@@ -263,6 +267,7 @@ class UrRobot(UrLink):
 
     def on_link_lost(self, why: str) -> None:
         """ur_rtde would now reconnect by itself and load its program again: its process ends first."""
+        self._link_loss = why
         if self._child is not None and not self._moving:
             self._later(self.stop(f"connection to the robot lost ({why})"))
         if self._child is not None:

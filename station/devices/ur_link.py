@@ -53,6 +53,7 @@ class UrLink:
         self.dashboard: Dashboard | None = None
         self.lost = 0
         """Connections that ended by themselves."""
+        self._ended_reader: StateReader | None = None
         self._lock_dir = lock_dir
         self._lock: RobotLock | None = None
         self._identity = RobotIdentity(model=config.model)
@@ -220,7 +221,7 @@ class UrLink:
         reader = self.reader
         assert reader is not None
         if reader.ended is not None:
-            return f"connection to the robot lost ({reader.ended}): check cable and controller"
+            return link_lost_words(reader.ended)
         if reader.stands_still:
             return f"the controller's clock stands still since {age_s * 1000:.0f} ms: restart the controller"
         return f"no news from the robot for {age_s * 1000:.0f} ms: check cable and network"
@@ -249,7 +250,9 @@ class UrLink:
     # -- supervision ------------------------------------------------------------------------------------
 
     def _reader_ended(self, reader: StateReader, why: str) -> None:
-        if reader is self.reader and self._supervisor is not None:
+        """Once for each reader: its own word may come after the supervision saw it."""
+        if reader is self.reader and reader is not self._ended_reader and self._supervisor is not None:
+            self._ended_reader = reader
             self.lost += 1
             log.warning("robot state of %s: %s", self.config.host, why)
             self.on_link_lost(why)
@@ -264,6 +267,8 @@ class UrLink:
             reader = self.reader
             try:
                 if reader is None or reader.ended is not None:
+                    if reader is not None and reader.ended is not None:
+                        self._reader_ended(reader, reader.ended)
                     await self._close_link()
                     await self._open()
                 await self.supervise_more()
@@ -293,6 +298,10 @@ class UrLink:
         if self.remote is not None:
             with contextlib.suppress(DashboardError):
                 self.remote = await self.dashboard.remote()
+
+
+def link_lost_words(why: str) -> str:
+    return f"connection to the robot lost ({why}): check cable and controller"
 
 
 def _call(loop: asyncio.AbstractEventLoop, function: Callable[..., None], *arguments: object) -> None:

@@ -75,6 +75,16 @@ async def test_link_cut(cell: Make, fault_times: Keep, how: str, ports: list[str
     await c.stays_at_rest(1.0)
 
 
+async def test_a_lost_link_is_named_although_it_may_be_back_already(
+    cell: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("station.devices.ur.POLL_S", 1.0)  # a computer that looks again only then
+    c = await cell()
+    outcome = await c.strike(lambda: c.admin.ask("drop", how="rst"))
+    assert "connection to the robot lost" in str(outcome.error)
+    await c.stays_at_rest()
+
+
 @pytest.mark.parametrize(
     ("fault", "words"),
     [

@@ -19,7 +19,7 @@ from station.simulation.placement import guess_of
 from station.simulation.scenes import build_cell, cell_config
 from tests.system.conftest import short_folder
 
-pytestmark = pytest.mark.process
+pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
 __all__ = ["short_folder"]
 SEED = 0
 TRUTH = build_cell("paper", SEED, "low", "eye-in-hand")
@@ -40,7 +40,7 @@ def socket(short_folder: Path, tmp_path: Path) -> Iterator[Path]:
         yield short_folder / "s"
     finally:
         daemon.stdin.close()
-        daemon.wait(15)
+        daemon.wait(60)
         daemon.stdout.close()
 
 
@@ -58,7 +58,7 @@ def test_a_mount_wrong_by_30_degrees_and_100_mm_is_found(socket: Path, tmp_path:
         [*command, "--headless", "--socket", str(socket)],
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=240,
         stdin=subprocess.DEVNULL,
     )
     assert done.returncode == 0, done.stderr

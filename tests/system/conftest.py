@@ -12,7 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Callable, Iterator
 from pathlib import Path
 
 import msgspec
@@ -121,9 +121,9 @@ class SystemRig:
         return made
 
     def speed_rad_s(self) -> float:
-        return max(map(abs, self.admin.ask("state")["joint_speeds_rad_s"]))
+        return float(max(map(abs, self.admin.ask("state")["joint_speeds_rad_s"])))
 
-    async def until(self, condition: Callable[[], bool], timeout_s: float = 20.0) -> float:
+    async def until(self, condition: Callable[[], bool], timeout_s: float = 60.0) -> float:
         """Seconds until it holds."""
         begun_s = time.monotonic()
         while not condition():
@@ -150,7 +150,7 @@ class SystemRig:
 
 
 async def status_when(
-    client: Client, condition: Callable[[StationStatus], bool], timeout_s: float = 40.0
+    client: Client, condition: Callable[[StationStatus], bool], timeout_s: float = 90.0
 ) -> StationStatus:
     """The first status for which it holds."""
     async with asyncio.timeout(timeout_s):
@@ -169,9 +169,6 @@ async def go(client: Client, plan: Plan | None, purpose: str = "run") -> None:
         await client.request("load_plan", plan=msgspec.to_builtins(plan))
     summary = await client.request("prepare", purpose=purpose)
     await client.request("go", token=summary["token"])
-
-
-MakeRig = Callable[[], Awaitable[SystemRig]]
 
 
 @pytest.fixture

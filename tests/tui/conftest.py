@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import asyncio
 import base64
-from collections.abc import AsyncIterator
+import time
+from collections.abc import AsyncIterator, Callable
 from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from textual.pilot import Pilot
 
 from station.status import (
     CameraStatus,
@@ -32,6 +34,17 @@ SUMMARY = GoSummary(
     duration_s=95.0,
     first_move="84 mm and 22° to pose 1",
 )
+
+
+UNTIL_S = 40.0
+
+
+async def until(pilot: Pilot[None], condition: Callable[[], object]) -> None:
+    """What the screen comes to, however busy the computer is."""
+    give_up_s = time.monotonic() + UNTIL_S
+    while not condition():
+        assert time.monotonic() < give_up_s, "it did not come to that"
+        await pilot.pause(0.02)
 
 
 class FakeLink:

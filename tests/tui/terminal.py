@@ -111,7 +111,7 @@ class ScreenProcess:
     def press_now(self, key: str) -> None:
         os.write(self._master, KEYS.get(key, key).encode())
 
-    def wait_for(self, pattern: str, timeout_s: float = 60.0) -> str:
+    def wait_for(self, pattern: str, timeout_s: float = 120.0) -> str:
         """The glass when `pattern` is on it."""
         give_up_s = time.monotonic() + timeout_s
         while not re.search(pattern, text := self.glass.text):

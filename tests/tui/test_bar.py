@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from station.status import RecorderStatus, RobotStatus, StationState, StationStatus
 from station.tui.widgets.bar import bar_line
-from tests.tui.conftest import FakeLink, idle
+from tests.tui.conftest import FakeLink, idle, until
 from tests.tui.test_keys import app_on, text_of
 
 ROBOT = RobotStatus(
@@ -83,8 +83,7 @@ def test_the_stop_key_is_at_the_right_edge_whatever_the_rest(
 async def test_on_the_screen_it_is_the_first_line(link: FakeLink, size: tuple[int, int]) -> None:
     link.show(long_one())
     async with app_on(link).run_test(size=size) as pilot:
-        await pilot.pause()
-        assert text_of(pilot.app, "#bar") == bar_line(long_one(), size[0])
+        await until(pilot, lambda: text_of(pilot.app, "#bar") == bar_line(long_one(), size[0]))
         assert pilot.app.screen.query_one("#bar").region.y == 0
         await pilot.resize_terminal(60, 20)
         await pilot.pause()

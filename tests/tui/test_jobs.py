@@ -10,7 +10,7 @@ from textual.widgets import Button, RichLog
 
 from station.tui.app import StationApp
 from station.tui.jobs import JobScreen
-from tests.tui.conftest import FakeLink
+from tests.tui.conftest import FakeLink, until
 from tests.tui.test_keys import app_on
 
 
@@ -25,14 +25,6 @@ async def run_job(app: StationApp, *args: str) -> list[int | None]:
     codes: list[int | None] = []
     await app.push_screen(JobScreen("Working", "some_job", *args), codes.append)
     return codes
-
-
-async def until(pilot: object, condition: object) -> None:
-    for _ in range(200):
-        if condition():  # type: ignore[operator]
-            return
-        await pilot.pause(0.05)  # type: ignore[attr-defined]
-    raise AssertionError("it did not come to that")
 
 
 async def test_its_exit_code_comes_back(link: FakeLink, job: Path) -> None:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import pytest
+from textual.app import App
 from textual.widgets import Static
 
 from station.errors import RefusedError
 from station.status import StationState
 from station.tui.app import StationApp
 from station.tui.commands import PLAN_ANSWER_S
-from station.tui.confirm import ConfirmGo
-from tests.tui.conftest import FakeLink, idle
+from station.tui.confirm import Confirm, ConfirmGo
+from tests.tui.conftest import FakeLink, idle, until
 
 
 def app_on(link: FakeLink) -> StationApp:
@@ -20,74 +21,69 @@ def app_on(link: FakeLink) -> StationApp:
     return StationApp(connect)
 
 
-def text_of(app: StationApp, selector: str) -> str:
+def text_of(app: App[None], selector: str) -> str:
     return str(app.screen.query_one(selector, Static).render())
 
 
 async def test_run_asks_first_and_go_carries_the_token(link: FakeLink) -> None:
     async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await pilot.pause()
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
         await pilot.press("f5")
-        await pilot.pause()
-        assert isinstance(pilot.app.screen, ConfirmGo)
+        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmGo))
         assert "go" not in link.verbs
         body = str(pilot.app.screen.query_one("#confirm-body", Static).render())
         assert "84 mm and 22° to pose 1" in body
         assert "0.22 m/s" in body
         await pilot.click("#yes")
-        await pilot.pause()
-        assert link.asked[-1] == ("go", {"token": "t-1"}) or ("go", {"token": "t-1"}) in link.asked
+        await until(pilot, lambda: ("go", {"token": "t-1"}) in link.asked)
 
 
 @pytest.mark.parametrize("answer", ["escape", "enter"])
 async def test_the_harmless_answer_is_the_easy_one(link: FakeLink, answer: str) -> None:
     async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await pilot.pause()
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
         await pilot.press("f5")
-        await pilot.pause()
+        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmGo))
         await pilot.press(answer)
+        await until(pilot, lambda: not isinstance(pilot.app.screen, ConfirmGo))
         await pilot.pause()
         assert "go" not in link.verbs
 
 
 async def test_stop_works_inside_the_question_too(link: FakeLink) -> None:
     async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await pilot.pause()
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
         await pilot.press("f5")
-        await pilot.pause()
+        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmGo))
         await pilot.press("f12")
-        await pilot.pause()
-        assert "stop" in link.verbs
+        await until(pilot, lambda: "stop" in link.verbs)
 
 
 async def test_a_refusal_is_said_and_nothing_moves(link: FakeLink) -> None:
     link.refuse["lease"] = RefusedError("held by anna on tty1")
     async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
-        await pilot.pause()
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
         await pilot.press("f5")
-        await pilot.pause()
+        await until(pilot, lambda: any("held by anna" in n.message for n in pilot.app._notifications))
         assert link.verbs == ["lease"]
-        assert any("held by anna" in n.message for n in pilot.app._notifications)
 
 
 async def test_the_bar_says_state_robot_and_stop_key(link: FakeLink) -> None:
     async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await pilot.pause()
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
         bar = text_of(pilot.app, "#bar")
         for word in ("SIMULATED", "UR10", "NORMAL", "REMOTE", "0/25", "F12=STOP"):
             assert word in bar
         link.show(idle(StationState.STOPPED, "protective stop C157 at pose 18; inspect, then F8"))
-        await pilot.pause()
-        assert "STOPPED" in text_of(pilot.app, "#bar")
+        await until(pilot, lambda: "STOPPED" in text_of(pilot.app, "#bar"))
         assert "protective stop C157" in text_of(pilot.app, "#reason")
 
 
 async def test_a_dead_daemon_is_said(link: FakeLink) -> None:
     async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await pilot.pause()
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
         link.show(None)
-        await pilot.pause()
-        assert "NO DAEMON" in text_of(pilot.app, "#bar")
+        await until(pilot, lambda: "NO DAEMON" in text_of(pilot.app, "#bar"))
 
 
 @pytest.mark.parametrize(
@@ -102,22 +98,20 @@ async def test_a_dead_daemon_is_said(link: FakeLink) -> None:
 )
 async def test_a_key_sends_its_wish_at_once(link: FakeLink, key: str, verbs: list[str]) -> None:
     async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await pilot.pause()
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
         await pilot.press(key)
-        await pilot.pause()
-        assert link.verbs == verbs
+        await until(pilot, lambda: link.verbs == verbs)
 
 
 async def test_finish_asks_and_then_seals(link: FakeLink) -> None:
     link.show(idle(StationState.PAUSED))
     async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await pilot.pause()
+        await until(pilot, lambda: "PAUSED" in text_of(pilot.app, "#bar"))
         await pilot.press("f7")
-        await pilot.pause()
+        await until(pilot, lambda: isinstance(pilot.app.screen, Confirm))
         assert link.verbs == []
         await pilot.click("#yes")
-        await pilot.pause()
-        assert link.verbs == ["finish"]
+        await until(pilot, lambda: link.verbs == ["finish"])
 
 
 @pytest.mark.parametrize(
@@ -135,44 +129,42 @@ async def test_the_plan_screen_asks_for_changes_of_the_highlighted_pose(
     link: FakeLink, key: str, request_: tuple[str, dict[str, object]]
 ) -> None:
     async with app_on(link).run_test(size=(120, 34)) as pilot:
-        await pilot.pause()
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
         await pilot.press("2")
         await pilot.pause()
         await pilot.press("down", "down", key)
-        await pilot.pause()
-        assert request_ in link.asked
+        await until(pilot, lambda: request_ in link.asked)
 
 
 async def test_every_screen_opens_and_stop_works_on_each(link: FakeLink) -> None:
     link.answers["sessions"] = []
     link.answers["doctor"] = [{"name": "camera", "state": "failed", "text": "none", "remedy": "plug it in"}]
     async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await pilot.pause()
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
         for stops, key in enumerate("123456", start=1):
             await pilot.press(key)
             await pilot.pause()
             await pilot.press("f12")
-            await pilot.pause()
-            assert link.verbs.count("stop") == stops, key
-        assert "plug&#160;it&#160;in" in pilot.app.export_screenshot()
+            await until(pilot, lambda stops=stops: link.verbs.count("stop") == stops)  # type: ignore[misc]
+        await until(pilot, lambda: "plug&#160;it&#160;in" in pilot.app.export_screenshot())
 
 
 async def test_stop_works_in_the_command_palette(link: FakeLink) -> None:
     async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await pilot.pause()
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
         await pilot.press("ctrl+p")
         await pilot.pause()
         await pilot.press("x", "f12")
-        await pilot.pause()
-        assert link.verbs == ["stop"]
+        await until(pilot, lambda: link.verbs == ["stop"])
 
 
 async def test_quitting_asks_while_a_session_runs(link: FakeLink) -> None:
     link.show(idle(StationState.MOVING))
     async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await pilot.pause()
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+        await until(pilot, lambda: "MOVING" in text_of(pilot.app, "#bar"))
         await pilot.press("ctrl+q")
-        await pilot.pause()
+        await until(pilot, lambda: isinstance(pilot.app.screen, Confirm))
         assert "decelerates" in str(pilot.app.screen.query_one("#confirm-body", Static).render())
 
 

@@ -23,7 +23,7 @@ from tests.tui.terminal import ScreenProcess
 
 __all__ = ["short_folder", "short_plan"]
 
-pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
+pytestmark = [pytest.mark.process, pytest.mark.timeout(600)]
 POSES = 14
 ENOUGH = 9
 """Views that the gates ask for, and one more."""
@@ -80,7 +80,7 @@ async def desk_with(
         await asyncio.to_thread(desk.end)
 
 
-async def shows(screen: ScreenProcess, pattern: str, timeout_s: float = 60.0) -> str:
+async def shows(screen: ScreenProcess, pattern: str, timeout_s: float = 120.0) -> str:
     return await asyncio.to_thread(screen.wait_for, pattern, timeout_s)
 
 
@@ -89,7 +89,7 @@ async def go(screen: ScreenProcess) -> None:
     await asyncio.to_thread(screen.press, "f5")
     await shows(screen, "The arm will move")
     await asyncio.to_thread(screen.press, "tab", "enter")
-    async with asyncio.timeout(60):
+    async with asyncio.timeout(120):
         # Until the screen has heard of it: a second F5 would be refused.
         while screen.glass.text.startswith((" PAUSED", " IDLE")):
             await asyncio.sleep(0.05)
@@ -100,7 +100,7 @@ def captured(text: str) -> int:
     return int(found.group(1)) if found else 0
 
 
-async def captured_at_least(screen: ScreenProcess, count: int, timeout_s: float = 150.0) -> None:
+async def captured_at_least(screen: ScreenProcess, count: int, timeout_s: float = 250.0) -> None:
     """On a busy machine poses may fail and the session pause: a person would give a new go."""
     async with asyncio.timeout(timeout_s):
         while captured(screen.glass.text) < count:

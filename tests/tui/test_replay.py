@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import asyncio
 from pathlib import Path
 
 import pytest
+from textual.widgets import DataTable
 
 import recordings
 from station.errors import RefusedError, StationError
@@ -15,8 +15,7 @@ from station.tui.replay import ReplayLink
 from station.tui.replay_screen import ReplayScreen
 from station.tui.timeline import END_TEXT, Timeline
 from station.tui.widgets.preview import Preview
-from tests.tui.conftest import FakeLink, idle
-from tests.tui.test_jobs import until
+from tests.tui.conftest import FakeLink, idle, until
 from tests.tui.test_keys import app_on, text_of
 
 SAMPLE = Path(recordings.__file__).parent / "samples" / "paper-640.mcap"
@@ -101,7 +100,7 @@ async def test_beside_a_cell_only_stop_goes_through(beside: FakeLink) -> None:
     async with app_on(beside).run_test(size=(80, 24), notifications=True) as pilot:
         await pilot.pause()
         await pilot.press("4")
-        await pilot.pause()
+        await until(pilot, lambda: pilot.app.screen.query_one(DataTable).row_count == 1)
         await pilot.press("w")
         await until(pilot, lambda: isinstance(pilot.app.screen, ReplayScreen))
         await until(pilot, lambda: "PLAYBACK" in text_of(pilot.app, "#bar"))
@@ -109,22 +108,19 @@ async def test_beside_a_cell_only_stop_goes_through(beside: FakeLink) -> None:
         await pilot.pause()
         assert beside.verbs == []
         await pilot.press("f12")
-        await pilot.pause()
-        assert beside.verbs == ["stop"]
+        await until(pilot, lambda: beside.verbs == ["stop"])
         await pilot.press("escape")
-        await pilot.pause()
-        assert not isinstance(pilot.app.screen, ReplayScreen)
-        assert "PLAYBACK" not in text_of(pilot.app, "#bar")
+        await until(pilot, lambda: not isinstance(pilot.app.screen, ReplayScreen))
+        await until(pilot, lambda: "PLAYBACK" not in text_of(pilot.app, "#bar"))
 
 
 async def test_the_cells_own_work_ends_the_playback(beside: FakeLink) -> None:
     async with app_on(beside).run_test(size=(80, 24)) as pilot:
         await pilot.pause()
         await pilot.press("4")
-        await pilot.pause()
+        await until(pilot, lambda: pilot.app.screen.query_one(DataTable).row_count == 1)
         await pilot.press("w")
         await until(pilot, lambda: isinstance(pilot.app.screen, ReplayScreen))
         beside.show(idle(StationState.STOPPED, "protective stop"))
         await until(pilot, lambda: not isinstance(pilot.app.screen, ReplayScreen))
-        await asyncio.sleep(0)
-        assert "STOPPED" in text_of(pilot.app, "#bar")
+        await until(pilot, lambda: "STOPPED" in text_of(pilot.app, "#bar"))

@@ -8,8 +8,7 @@ from station.status import StationState
 from station.tui import link as link_module
 from station.tui.commands import STOP_UNHEARD
 from station.tui.widgets.preview import OLD, Preview
-from tests.tui.conftest import FakeLink, idle
-from tests.tui.test_jobs import until
+from tests.tui.conftest import FakeLink, idle, until
 from tests.tui.test_keys import app_on, text_of
 
 

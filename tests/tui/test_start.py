@@ -13,8 +13,7 @@ from station.tui.live import LiveScreen
 from station.tui.plan import NO_PLAN, PlanScreen
 from station.tui.themes import chosen_theme
 from station.tui.widgets.preview import Preview
-from tests.tui.conftest import FakeLink, idle
-from tests.tui.test_jobs import until
+from tests.tui.conftest import FakeLink, idle, until
 from tests.tui.test_keys import app_on, text_of
 
 MISSING = [{"name": "robot", "state": "failed", "text": "no answer", "remedy": "switch it on"}]
@@ -73,8 +72,7 @@ async def test_a_key_that_can_do_nothing_says_why(
         await pilot.press(screen)
         await pilot.pause()
         await pilot.press(*keys)
-        await pilot.pause()
-        assert any(words in said.message for said in pilot.app._notifications)
+        await until(pilot, lambda: any(words in said.message for said in pilot.app._notifications))
         assert not {"go", "prepare", "finish"} & set(link.verbs)
 
 
@@ -83,8 +81,7 @@ async def test_without_a_daemon_every_key_says_so(link: FakeLink) -> None:
     async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
         await until(pilot, lambda: "NO DAEMON" in text_of(pilot.app, "#bar"))
         await pilot.press("f12")
-        await pilot.pause()
-        assert any("nothing was sent" in said.message for said in pilot.app._notifications)
+        await until(pilot, lambda: any("nothing was sent" in n.message for n in pilot.app._notifications))
 
 
 async def test_help_names_every_key_of_the_screen_and_stop_works_in_it(link: FakeLink) -> None:

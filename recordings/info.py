@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,8 @@ from recordings.schema import PictureFacts
 from recordings.topics import Topic
 
 _NS = 1e9
+_SHORTEST_SPAN_S = 0.01
+"""Messages that all came at once have no rate."""
 _FRAME_ID_WRAP = 65535
 """GigE Vision frame ids go 1 … 65535 and start at 1 again."""
 
@@ -20,8 +23,8 @@ _FRAME_ID_WRAP = 65535
 def recording_info(recording: Recording) -> dict[str, Any]:
     """Everything `recordings info` says, one JSON-ready object. Times in seconds, sizes in bytes."""
     info = recording.info
-    states = list(recording.robot_states())
-    facts = [fact for part in recording.parts for fact in part.picture_facts()]
+    states = [list(part.robot_states()) for part in recording.parts]
+    facts = [list(part.picture_facts()) for part in recording.parts]
     longest = max(recording.parts, key=lambda part: len(part.messages(Topic.ROBOT_STATE)))
     attempts = sum(len(part.views) for part in recording.parts)
     views = recording.views()
@@ -70,25 +73,31 @@ def _count(recording: Recording, topic: Topic) -> int:
 def _topic(recording: Recording, topic: Topic) -> dict[str, Any]:
     indexes = [part.messages(topic) for part in recording.parts]
     span_s = sum((max(i.times_ns) - min(i.times_ns)) / _NS for i in indexes if len(i))
+    intervals = sum(len(i) - 1 for i in indexes if len(i))
     return {
         "topic": topic.value,
         "messages": sum(len(i) for i in indexes),
         "bytes": sum(sum(i.lengths) for i in indexes),
         "span_s": span_s,
+        "rate_hz": intervals / span_s if span_s > _SHORTEST_SPAN_S else None,
     }
 
 
-def _robot_stream(states: list[RobotState]) -> dict[str, Any] | None:
-    """Rate and gaps by the controller's own clock, so that the network's delay does not count."""
-    if len(states) < 2:
+def _robot_stream(parts: list[list[RobotState]]) -> dict[str, Any] | None:
+    """Rate and gaps by the controller's own clock, so that the network's delay does not count.
+
+    The time between two parts is no gap.
+    """
+    count = sum(len(states) for states in parts)
+    steps = np.concatenate([np.diff([state.stamps.controller_s for state in states]) for states in parts])
+    if not len(steps):
         return None
-    steps = np.diff([state.stamps.controller_s for state in states])
     period = float(np.median(steps))
     if period <= 0:
-        return {"count": len(states), "rate_hz": None, "gaps": 0, "largest_gap_s": 0.0, "backward": 0}
+        return {"count": count, "rate_hz": None, "gaps": 0, "largest_gap_s": 0.0, "backward": 0}
     gaps = steps[steps > 1.5 * period]
     return {
-        "count": len(states),
+        "count": count,
         "rate_hz": 1 / period,
         "gaps": len(gaps),
         "largest_gap_s": float(gaps.max()) if len(gaps) else 0.0,
@@ -96,10 +105,11 @@ def _robot_stream(states: list[RobotState]) -> dict[str, Any] | None:
     }
 
 
-def _picture_stream(facts: list[PictureFacts]) -> dict[str, Any] | None:
+def _picture_stream(parts: list[list[PictureFacts]]) -> dict[str, Any] | None:
+    facts = list(chain.from_iterable(parts))
     if not facts:
         return None
-    steps = np.diff([fact.frame_id for fact in facts])
+    steps = np.concatenate([np.diff([fact.frame_id for fact in part]) for part in parts])
     wrapped = np.where(steps < 0, steps + _FRAME_ID_WRAP, steps)
     return {
         "count": len(facts),

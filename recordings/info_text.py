@@ -23,7 +23,7 @@ def print_info(facts: dict[str, Any]) -> None:
     console.print(table)
     topics = Table("topic", "messages", "rate", "size", box=None, padding=(0, 2, 0, 0), header_style="dim")
     for topic in facts["topics"]:
-        rate = f"{(topic['messages'] - 1) / topic['span_s']:.1f} Hz" if topic["span_s"] > 0 else "-"
+        rate = f"{topic['rate_hz']:.1f} Hz" if topic["rate_hz"] else "-"
         topics.add_row(topic["topic"], str(topic["messages"]), rate, f"{topic['bytes'] / 1e6:.2f} MB")
     console.print(topics)
 
@@ -31,7 +31,8 @@ def print_info(facts: dict[str, Any]) -> None:
 def _info_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     created = datetime.fromtimestamp(facts["created_wall_ns"] / 1e9, UTC)
     camera, robot, views = facts["camera"], facts["robot"], facts["views"]
-    yield "recording", f"{facts['path']}  {facts['size_bytes'] / 1e6:.1f} MB  sealed, all checksums good"
+    whole = "INCOMPLETE, what is here is sealed" if facts["missing"] else "sealed"
+    yield "recording", f"{facts['path']}  {facts['size_bytes'] / 1e6:.1f} MB  {whole}, all checksums good"
     yield "session", f"{facts['name']}  {facts['source']}  {facts['mount']}  {created:%Y-%m-%d %H:%M} UTC"
     if facts["parts"] > 1:
         yield "parts", str(facts["parts"])

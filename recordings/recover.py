@@ -6,6 +6,8 @@ import os
 from dataclasses import dataclass
 from pathlib import Path
 
+import msgspec
+
 from recordings.errors import CorruptRecordingError, RecordingError, UnsealedRecordingError
 from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, discard_leftover, lock, rename_new
 from recordings.manifest import MANIFEST_FILE, give_up_parts, missing_parts, read_manifest
@@ -82,7 +84,8 @@ def _recover_session(folder: Path) -> list[Recovery]:
     if len(sessions) != 1:  # nothing is left, or files of several sessions: nobody knows whose parts lack
         return results
     session = sessions.pop()
-    missing = missing_parts(folder, manifest, set(present))
+    again = manifest and msgspec.structs.replace(manifest, given_up=[])  # said every time, not only the first
+    missing = missing_parts(folder, again, set(present))
     if missing:
         give_up_parts(folder, session, present, missing)
     return [*results, *(_given_up(folder, part, name) for part, name in missing.items())]

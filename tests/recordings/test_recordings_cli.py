@@ -13,7 +13,7 @@ from typer.testing import CliRunner, Result
 from recordings.cli import main
 from recordings.info import recording_info
 from recordings.manifest import enter_part
-from recordings.messages import Stamps
+from recordings.messages import CaptureEvent, Stamps
 from recordings.reader import open_recording
 from recordings.writer import RecordingWriter
 from tests.recordings.small_recording import (
@@ -184,9 +184,28 @@ def test_a_missing_part_is_shown_by_info_and_given_up_by_recover(tmp_path: Path)
     assert given_up.exit_code == 3
     assert "session-2.mcap: part 2 of the session is not in the folder" in given_up.output
     assert "damaged file is kept" not in given_up.output
+    assert "part 2 of the session is not in the folder" in run("recover", tmp_path).output
     afterwards = run("info", tmp_path)
     assert afterwards.exit_code == 0
     assert "part 2 of the session was lost" in afterwards.output
+
+
+def test_the_time_between_two_parts_is_no_gap_and_no_lost_frame(tmp_path: Path) -> None:
+    for part in (1, 2):
+        with RecordingWriter(tmp_path / f"session-{part}.mcap", make_info(part=part)) as writer:
+            for count in range(5):
+                stamps = Stamps(1, START_NS + count * 2_000_000, 1000 * part + count * 0.002)
+                writer.robot_state(msgspec.structs.replace(make_state(0), stamps=stamps))
+                writer.picture(msgspec.structs.replace(make_picture(count), frame_id=50 * part + count))
+            writer.event(CaptureEvent(Stamps(1, START_NS), "started"))
+            writer.event(CaptureEvent(Stamps(1, START_NS + 1), "finished"))
+            writer.finish()
+    info = recording_info(open_recording(tmp_path))
+    assert (info["robot_states"]["count"], info["robot_states"]["gaps"]) == (10, 0)
+    assert (info["pictures"]["count"], info["pictures"]["frame_id_jumps"]) == (10, 0)
+    rates = {topic["topic"]: topic["rate_hz"] for topic in info["topics"]}
+    assert rates["/camera/frame"] == pytest.approx(2.0)
+    assert rates["/session/event"] is None
 
 
 def test_unknown_options_and_no_arguments_are_usage_errors() -> None:

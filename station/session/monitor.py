@@ -19,6 +19,8 @@ from station.status import CameraStatus, ClockStatus, RecorderStatus, RobotStatu
 
 DISK_PERIOD_S = 2.0
 FPS_PERIOD_S = 2.0
+WALL_STEP_S = 0.5
+"""Less is a clock that is being disciplined, or a moment between two readings on a busy computer."""
 
 
 class Monitor:
@@ -30,6 +32,7 @@ class Monitor:
         self._states_seen = 0
         self._frames = (0.0, 0)
         """When, and how many until then"""
+        self._wall_ahead_ns = _wall_ahead_ns()
         bench.cell.robot.subscribe(self._count)
 
     def _count(self, state: RobotState) -> None:
@@ -37,6 +40,7 @@ class Monitor:
         self._states_seen += 1
 
     def refresh(self, lag_ms: float) -> None:
+        self._watch_wall_clock()
         store, notice = self._bench.store, self._bench.cell.robot.notice
         if store.state is StationState.MOVING:
             store.update(reason=notice)  # 'speed slider at 5 %': no fault, but a person wants to know
@@ -48,6 +52,16 @@ class Monitor:
             clock=self._clock(),
             loop_lag_ms=round(lag_ms, 1),
         )
+
+    def _watch_wall_clock(self) -> None:
+        """Nothing is placed by it, but a person who compares times with another computer wants to know."""
+        ahead_ns = _wall_ahead_ns()
+        step_s, self._wall_ahead_ns = (ahead_ns - self._wall_ahead_ns) / 1e9, ahead_ns
+        if abs(step_s) >= WALL_STEP_S:
+            text = (
+                f"this computer's clock was set by {step_s:+.1f} s; pictures and poses are placed by other clocks"
+            )
+            self._bench.store.event(text, "warning")
 
     def _robot(self) -> RobotStatus:
         bench, robot = self._bench, self._bench.cell.robot
@@ -139,6 +153,10 @@ class Monitor:
     def _clock(self) -> ClockStatus:
         robot, camera = self._bench.cell.robot.clock(), self._bench.cell.camera.clock
         return ClockStatus(*_clock_facts(robot), *_clock_facts(camera))
+
+
+def _wall_ahead_ns() -> int:
+    return time.time_ns() - time.monotonic_ns()
 
 
 def _free_bytes(root: Path) -> int:

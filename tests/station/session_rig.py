@@ -19,6 +19,7 @@ from recordings.reader import Recording, open_recording
 from station.analysis import Sighting, sight
 from station.cell import Cell
 from station.config import StationConfig
+from station.devices.base import Robot
 from station.devices.frames import CameraCounts
 from station.errors import CameraError, RobotError, StaleStateError
 from station.session import Session
@@ -224,9 +225,11 @@ def memory_config() -> StationConfig:
 class Rig:
     """A started session and its devices. Client 1 is the operator, 2 somebody else."""
 
-    def __init__(self, root: Path, source: Any = "simulated") -> None:
+    def __init__(self, root: Path, source: Any = "simulated", robot: Robot | None = None) -> None:
+        """`robot`: in place of the arm in memory."""
         self.arm, self.camera, self.worker = ArmInMemory(), CameraInMemory(), WorkerInThisProcess()
-        cell = Cell(memory_config(), self.arm, self.camera, source, attachments={"truth.json": b"{}"})
+        robot = robot or self.arm
+        cell = Cell(memory_config(), robot, self.camera, source, attachments={"truth.json": b"{}"})
         self.session = Session(cell, root)
         self.session.bench.workers = self.worker  # type: ignore[assignment]
         self.states: list[StationState] = []

@@ -1,0 +1,82 @@
+"""A whole session before the real driver and library: an arm jogged while paused, a pose out of reach."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from station.config import RobotConfig
+from station.devices.ur import UrRobot
+from station.errors import LimitError, RefusedError
+from station.plan.model import Plan, PlannedPose
+from station.simulation.admin import AdminClient
+from station.simulation.launch import SimulatedController
+from station.status import StationState as S
+from tests.station.session_rig import TRUTH, Rig
+
+pytestmark = pytest.mark.process
+HOME = np.array(TRUTH.start_joints_rad)
+PLAN = Plan(
+    "UR10",
+    "eye-in-hand",
+    tuple(PlannedPose(f"p{n}", tuple((HOME + 0.02 * n).tolist())) for n in range(1, 5)),
+)
+
+
+@pytest.fixture
+async def cell(
+    controller: Callable[..., SimulatedController], tmp_path: Path
+) -> AsyncIterator[tuple[Rig, AdminClient]]:
+    """A session in `idle` with the plan loaded, and the controller's back door."""
+    running = await asyncio.to_thread(controller, "UR10")
+    admin = running.admin()
+    admin.ask("jog", joints_rad=HOME.tolist())
+    while np.abs(np.array(admin.ask("state")["joints_rad"]) - HOME).max() > 1e-6:
+        await asyncio.sleep(0.02)
+    robot = UrRobot(RobotConfig("UR10", running.host), tmp_path / "log", tmp_path / "lock")
+    rig = Rig(tmp_path / "root", robot=robot)
+    await rig.start()
+    await rig.until(S.IDLE)
+    rig.session.take_lease(1, "anna")
+    rig.session.load_plan(1, PLAN)
+    yield rig, admin
+    await rig.session.close()
+    admin.close()
+
+
+async def test_07_an_arm_jogged_while_paused_voids_the_go(cell: tuple[Rig, AdminClient]) -> None:
+    rig, admin = cell
+    await rig.give_go()
+    await rig.until(S.MOVING)
+    rig.session.pause("anna")
+    await rig.until(S.PAUSED)
+    await rig.until_true(lambda: rig.session._run is not None and rig.session._run.done())
+    summary = await rig.session.prepare(1, "resume")
+    await asyncio.sleep(0.3)  # it was seen at rest
+    state = np.array(admin.ask("state")["joints_rad"])
+    begun_s = time.monotonic()
+    admin.ask("jog", joints_rad=(state + 0.1).tolist())
+    await rig.until_true(lambda: any("was moved by" in e.text for e in rig.session.store.status.events))
+    assert time.monotonic() - begun_s < 1.0
+    uploads = admin.ask("log")["counts"]["upload: rtde_control"]
+    with pytest.raises(RefusedError, match="prepare again"):
+        rig.session.go(1, summary.token)
+    await asyncio.sleep(1.0)
+    assert admin.ask("log")["counts"]["upload: rtde_control"] == uploads and rig.state is S.PAUSED
+    assert np.abs(np.array(admin.ask("state")["joints_rad"]) - state - 0.1).max() < 1e-3
+
+
+async def test_an_unreachable_pose_is_refused_before_anything_is_sent(cell: tuple[Rig, AdminClient]) -> None:
+    rig, admin = cell
+    far = tuple((HOME + np.array([0, 0, 7.0, 0, 0, 0])).tolist())
+    rig.session.load_plan(1, msgspec.structs.replace(PLAN, poses=(*PLAN.poses, PlannedPose("far", far))))
+    with pytest.raises(LimitError, match=r"pose 5 \(far\): elbow would"):
+        await rig.session.prepare(1, "run")
+    assert admin.ask("log")["counts"].get("upload: rtde_control", 0) == 0
+    assert np.abs(np.array(admin.ask("state")["joints_rad"]) - HOME).max() < 1e-3

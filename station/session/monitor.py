@@ -58,9 +58,7 @@ class Monitor:
         ahead_ns = _wall_ahead_ns()
         step_s, self._wall_ahead_ns = (ahead_ns - self._wall_ahead_ns) / 1e9, ahead_ns
         if abs(step_s) >= WALL_STEP_S:
-            text = (
-                f"this computer's clock was set by {step_s:+.1f} s; pictures and poses are placed by other clocks"
-            )
+            text = f"the wall clock was set by {step_s:+.1f} s; pictures and poses are placed by other clocks"
             self._bench.store.event(text, "warning")
 
     def _robot(self) -> RobotStatus:

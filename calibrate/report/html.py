@@ -23,11 +23,17 @@ td, th { border-bottom: 1px solid var(--line);
 th { color: var(--soft); font-weight: 600; }
 td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
 .pass { color: var(--good); font-weight: 700; } .fail { color: var(--bad); font-weight: 700; }
+td:first-child { white-space: nowrap; }
 .note { color: var(--soft); } .warning { color: var(--warn); } code { font-size: 13px; }
 figure { margin: 8px 0; } figure svg { max-width: 100%; height: auto; } figcaption { color: var(--soft); }
 .views { display: grid; grid-template-columns: repeat(auto-fill, minmax(240px, 1fr)); gap: 12px; }
 .views img { width: 100%; border-radius: 4px; border: 1px solid var(--line); }
 .views .out img { border: 3px solid var(--bad); } .big { font-size: 20px; font-weight: 600; }
+pre { overflow-x: auto; }
+@media (max-width: 700px) { body { padding: 16px; } .verdict strong { font-size: 20px; }
+  /* a plot shrunk to a phone cannot be read: it is swiped instead */
+  figure { overflow-x: auto; } figure svg { max-width: none; width: 720px; }
+  table { display: block; overflow-x: auto; } }
 @media print { body { max-width: none; } h2 { break-after: avoid; } figure, tr { break-inside: avoid; } }
 """
 

@@ -182,11 +182,14 @@ class PlaybackRobot:
         return Plan(self.identity.model, self._recording.info.mount, poses, note="playback")
 
     def picture(self) -> Picture:
-        """Of the view the arm stands at; CameraError between two."""
+        """Of the view the arm stands at; CameraError between two, or when it cannot be decoded."""
         view, moving = self._standing()
         if moving:
             raise CameraError("playback has pictures only from where the recorded arm stood")
-        return self._recording.picture(view)
+        try:
+            return self._recording.picture(view)
+        except RecordingError as error:
+            raise CameraError(str(error)) from error
 
     async def connect(self) -> RobotIdentity:
         if self._thread is None:

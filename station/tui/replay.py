@@ -105,8 +105,12 @@ class ReplayLink:
             self._shown = view
         return self._answer
 
-    def _look(self, view: View, width: int, height: int) -> dict[str, Any]:
-        image = self._timeline.recording.picture(view).image
+    def _look(self, view: View, width: int, height: int) -> dict[str, Any] | None:
+        try:
+            image = self._timeline.recording.picture(view).image
+        except RecordingError as error:
+            self._seen = DetectionStatus(reason=str(error))
+            return None
         seen = detect(image, self._timeline.recording.info.board, thorough=False)
         self._seen = _detection_status(seen)
         if image.dtype != np.uint8:

@@ -8,6 +8,8 @@ import pytest
 from textual.widgets import DataTable
 
 import recordings
+from recordings.pictures import encode_png
+from recordings.writer import RecordingWriter
 from station.errors import RefusedError, StationError
 from station.status import StationState
 from station.tui.app import ReplayApp
@@ -15,6 +17,7 @@ from station.tui.replay import ReplayLink
 from station.tui.replay_screen import ReplayScreen
 from station.tui.timeline import END_TEXT, Timeline
 from station.tui.widgets.preview import Preview
+from tests.recordings.small_recording import make_info, make_picture, make_view
 from tests.tui.conftest import FakeLink, idle, until
 from tests.tui.test_keys import app_on, text_of
 
@@ -36,6 +39,16 @@ def test_the_arm_stands_where_it_stood_when_each_picture_was_taken() -> None:
         for row, recorded in zip(status.robot.base_from_flange[:3], view.base_from_flange[:3], strict=True):
             assert row == pytest.approx(recorded, abs=2e-3)
     assert timeline.status(timeline.duration_s).reason == END_TEXT
+
+
+def test_a_picture_that_cannot_be_decoded_is_said_in_its_place(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        writer.picture(make_picture(0), encode_png(make_picture(0).image)[:-20])
+        writer.view(make_view(0))
+        writer.finish()
+    link = ReplayLink(tmp_path / "a.mcap", 0.0)
+    assert link._look(make_view(0), 80, 24) is None
+    assert "picture 0 the PNG is cut" in link._seen.reason
 
 
 async def test_it_plays_to_its_end_with_pictures_and_marks(link: FakeLink) -> None:

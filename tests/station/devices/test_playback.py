@@ -21,6 +21,7 @@ from recordings.messages import (
     Stamps,
     View,
 )
+from recordings.pictures import encode_png
 from recordings.writer import RecordingWriter
 from station.config import PAPER_BOARD, CameraConfig
 from station.devices.playback import PlaybackCamera, PlaybackRobot
@@ -51,7 +52,8 @@ def recording(tmp_path: Path) -> Path:
     return record(tmp_path / "session.mcap", joints=True)
 
 
-def record(path: Path, *, joints: bool) -> Path:
+def record(path: Path, *, joints: bool, cut: int | None = None) -> Path:
+    """`cut`: this picture's file lacks its end."""
     info = SessionInfo(
         name="session",
         mount="eye-in-hand",
@@ -64,7 +66,8 @@ def record(path: Path, *, joints: bool) -> Path:
     writer = RecordingWriter(path, info)
     for i, start in enumerate(STARTS):
         stamps = Stamps(host_monotonic_ns=10**9 + i * 200_000_000, host_wall_ns=10**18, device_ns=5)
-        writer.picture(Picture(image(i), stamps, frame_id=i + 1, sequence=i))
+        encoded = encode_png(image(i))[:-20] if i == cut else None
+        writer.picture(Picture(image(i), stamps, frame_id=i + 1, sequence=i), encoded)
         flange = forward(MODELS["UR10"], start)
         matrix = tuple(tuple(float(x) for x in row) for row in flange)
         writer.view(View(i, f"pose {i}", i, matrix, joints_rad=start if joints else None, stamps=stamps))
@@ -157,6 +160,20 @@ async def test_robot_and_camera_stand_where_the_recorded_ones_stood(recording: P
         expected = forward(MODELS["UR10"], STARTS[number]) @ pose_from_rotvec(TCP[:3], TCP[3:])
         assert np.abs(difference(base_from_tcp, expected)).max() < 1e-9
         assert np.array_equal((await camera.capture()).image, image(number))
+    await robot.close()
+
+
+async def test_a_recorded_picture_that_cannot_be_decoded_is_the_cameras_error(tmp_path: Path) -> None:
+    robot = PlaybackRobot(record(tmp_path / "a.mcap", joints=True, cut=1))
+    camera = PlaybackCamera(config(tmp_path / "a.mcap"), robot)
+    await robot.connect()
+    await camera.open()
+    await robot.start_control()
+    await robot.move(STARTS[1], 0.6, 1.0)
+    with pytest.raises(CameraError, match="picture 1 the PNG is cut"):
+        await camera.capture()
+    await robot.move(STARTS[2], 0.6, 1.0)
+    assert np.array_equal((await camera.capture()).image, image(2))
     await robot.close()
 
 

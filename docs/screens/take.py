@@ -1,12 +1,13 @@
 """Takes the pictures of the operator's screens from the running program: `python docs/screens/take.py`.
 
-Needs tmux. A simulated cell is captured, solved and looked at, in a real terminal of each size.
+Needs tmux. A simulated cell is captured, solved and looked at, in real terminals of each size at once.
 Sizes may be named: `python docs/screens/take.py 160x48`.
 """
 
 from __future__ import annotations
 
 import io
+import itertools
 import os
 import re
 import subprocess
@@ -20,25 +21,39 @@ from rich.text import Text
 
 HERE = Path(__file__).parent
 SIZES = ((80, 24), (160, 48))
+PATIENCE_S = 400.0
 STATION = (sys.executable, "-m", "station.cli")
 
 
-class Terminal:
-    """A daemon with a simulated cell, and a tmux server of its own with one window that runs the screen."""
+class Daemon:
+    """A simulated cell, served for as long as the pictures are taken."""
 
-    def __init__(self, state: Path, width: int, height: int) -> None:
-        self._size = (width, height)
-        self._socket = f"screens-{os.getpid()}-{width}"
-        control = state / "control.sock"
-        places = ("--socket", str(control), "--root", str(state / "root"))
-        self._daemon = subprocess.Popen(
+    def __init__(self, state: Path) -> None:
+        self.control = state / "control.sock"
+        places = ("--socket", str(self.control), "--root", str(state / "root"))
+        self._process = subprocess.Popen(
             [*STATION, "serve", "--simulate", "--end-with-stdin", *places],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=(state / "daemon.log").open("wb"),
         )
-        assert self._daemon.stdout is not None
-        self._daemon.stdout.readline()  # it is ready
+        assert self._process.stdout is not None
+        self._process.stdout.readline()  # it is ready
+
+    def close(self) -> None:
+        try:
+            self._process.communicate(timeout=60)
+        except subprocess.TimeoutExpired:
+            self._process.kill()
+            self._process.wait()
+
+
+class Terminal:
+    """A tmux server of its own with one window that runs the screen."""
+
+    def __init__(self, control: Path, width: int, height: int) -> None:
+        self._size = (width, height)
+        self._socket = f"screens-{os.getpid()}-{width}"
         program = " ".join([*STATION, "tui", "--socket", str(control)])
         self._tmux("new-session", "-d", "-x", str(width), "-y", str(height), program)
 
@@ -51,8 +66,8 @@ class Terminal:
             self._tmux("send-keys", key)
             time.sleep(0.5)
 
-    def wait_for(self, pattern: str, timeout_s: float = 120.0) -> None:
-        deadline_s = time.monotonic() + timeout_s
+    def wait_for(self, pattern: str) -> None:
+        deadline_s = time.monotonic() + PATIENCE_S
         while not re.search(pattern, self.shown()):
             if time.monotonic() > deadline_s:
                 raise TimeoutError(f"'{pattern}' never came:\n{self.shown()}")
@@ -65,65 +80,77 @@ class Terminal:
         console.save_svg(str(HERE / f"{name}-{width}x{height}.svg"), title="station")
 
     def close(self) -> None:
-        subprocess.run(["tmux", "-L", self._socket, "kill-server"], check=False)
-        self._daemon.communicate(timeout=30)
+        subprocess.run(["tmux", "-L", self._socket, "kill-server"], check=False, stderr=subprocess.DEVNULL)
 
     def shown(self) -> str:
         return self._tmux("capture-pane", "-p")
 
-    def go_on_until(self, pattern: str, timeout_s: float = 240.0) -> None:
+    def go_on_until(self, pattern: str) -> None:
         """Gives a new go whenever a busy machine made the session pause."""
-        deadline_s = time.monotonic() + timeout_s
+        deadline_s = time.monotonic() + PATIENCE_S
         while not re.search(pattern, shown := self.shown()):
             if time.monotonic() > deadline_s:
                 raise TimeoutError(f"'{pattern}' never came:\n{shown}")
-            if shown.lstrip().startswith("PAUSED"):
+            if shown.lstrip().startswith("FAULT"):
+                self.press("F8")
+            elif shown.lstrip().startswith("PAUSED"):
                 self.press("F5")
                 self.wait_for("The arm will move")
                 self.press("Tab", "Enter")
             time.sleep(0.3)
 
 
-def take(width: int, height: int) -> None:
+def both(terminals: list[Terminal], name: str, keys: tuple[str, ...], pattern: str) -> None:
+    """The same keys in every terminal, and a picture of each once `pattern` is there."""
+    for terminal in terminals:
+        terminal.press(*keys)
+    for terminal in terminals:
+        terminal.wait_for(pattern)
+        terminal.picture(name)
+
+
+def take(terminals: list[Terminal]) -> None:
+    """One capture, driven from the first terminal, watched from all."""
+    first = terminals[0]
+    for terminal in terminals:
+        terminal.wait_for("IDLE")
+    both(terminals, "checklist", ("6",), "missing")
+    first.press("2", "n")
+    first.wait_for("p19 ")
+    both([first], "go", ("1", "F5"), "The arm will move")
+    first.press("Tab", "Enter")
+    first.go_on_until(r"1\d/25")
+    both(terminals, "live", ("1",), "Detection")
+    both(terminals, "plan", ("2",), "why it is there")
+    first.press("F12")
+    both(terminals, "stopped", ("1",), "STOPPED(?s:.*)Detection")
+    first.press("F8")
+    first.wait_for("PAUSED")
+    first.press("F7", "Tab", "Enter")
+    first.wait_for("IDLE")
+    both(terminals, "sessions", ("4",), "sealed")
+    both([first], "result", ("F9",), "READY TO INSTALL|GATE")
+    for terminal in terminals[1:]:
+        both([terminal], "result", ("1", "4", "v"), "READY TO INSTALL|GATE")
+    both(terminals, "log", ("5",), "saved")
+    both(terminals, "help", ("1", "F1"), "Stop the arm now")
+    for before, terminal in itertools.pairwise(terminals):
+        before.close()  # only one holds control
+        both([terminal], "go", ("Escape", "F5"), "The arm will move")
+
+
+def main() -> None:
+    sizes = [tuple(map(int, size.split("x"))) for size in sys.argv[1:]] or SIZES
     with tempfile.TemporaryDirectory() as folder:
-        terminal = Terminal(Path(folder), width, height)
+        daemon = Daemon(Path(folder))
+        terminals = [Terminal(daemon.control, width, height) for width, height in sizes]
         try:
-            terminal.wait_for("IDLE")
-            terminal.press("6")
-            terminal.wait_for("missing")
-            terminal.picture("checklist")
-            terminal.press("2", "n")
-            terminal.wait_for("p25|p20")
-            terminal.press("1", "F5")
-            terminal.wait_for("The arm will move")
-            terminal.picture("go")
-            terminal.press("Tab", "Enter")
-            terminal.go_on_until(r"1\d/25")
-            terminal.picture("live")
-            terminal.press("2")
-            terminal.wait_for("why it is there")
-            terminal.picture("plan")
-            terminal.press("F12", "1")
-            terminal.wait_for("STOPPED")
-            terminal.picture("stopped")
-            terminal.press("F8")
-            terminal.wait_for("PAUSED")
-            terminal.press("F7", "Tab", "Enter")
-            terminal.wait_for("IDLE")
-            terminal.press("4")
-            terminal.wait_for("session +source")
-            terminal.picture("sessions")
-            terminal.press("F9")
-            terminal.wait_for("READY TO INSTALL|GATE")
-            terminal.picture("result")
-            terminal.press("5")
-            time.sleep(1)
-            terminal.picture("log")
+            take(terminals)
         finally:
-            terminal.close()
+            for terminal in terminals:
+                terminal.close()
+            daemon.close()
 
 
 if __name__ == "__main__":
-    named = [tuple(map(int, size.split("x"))) for size in sys.argv[1:]]
-    for width, height in named or SIZES:
-        take(width, height)
+    main()

@@ -14,8 +14,8 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from calibrate.batch import BatchResult, Solver, run_batch
 from calibrate.calibration import write_atomically
 from calibrate.cluster import Cluster, cluster_solver
+from calibrate.commands.job import GatesFile, Profile, ProfileName, Seed
 from calibrate.commands.output import AsJson, OutputError, err, out
-from calibrate.commands.solve import GatesFile, Profile, ProfileName, Seed
 from calibrate.gates import GateLimits, read_limits
 from calibrate.pipeline import JobOptions
 from calibrate.report.fleet import fleet_page

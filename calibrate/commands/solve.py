@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from enum import StrEnum
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,46 +12,20 @@ from rich.table import Table
 
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, bounded
 from calibrate.calibration import Touch, write_calibration
-from calibrate.commands.files import read_board, read_camera
 from calibrate.commands.install import Root, history_rows
+from calibrate.commands.job import job_options, picture_options, takes
 from calibrate.commands.output import AsJson, check_target, detection_progress, out, print_json
 from calibrate.errors import CalibrationError
-from calibrate.gates import GateLimits, read_limits
+from calibrate.frames import camera_frames
+from calibrate.geometry import rotation_log
 from calibrate.install import load_installed
 from calibrate.pipeline import JobOptions, SolvedRecording, prepare_views, solve_recording, solver_options
+from calibrate.solution import PeerResult
 from calibrate.summary import summary
 
 Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session folder", show_default=False)]
 GATE_FAILED = 4
 
-
-class ProfileName(StrEnum):
-    robust = "robust"
-    paper = "paper"
-
-
-class LensName(StrEnum):
-    plumb_bob = "plumb_bob"
-    rational = "rational_polynomial"
-    fisheye = "equidistant"
-
-
-Profile = Annotated[
-    ProfileName, typer.Option(help="robust: the station's; paper: the published method, exactly")
-]
-Seed = Annotated[int, typer.Option(help="Of every random draw")]
-BoardFile = Annotated[
-    Path | None, typer.Option("--board", help="YAML of another board than the recorded one")
-]
-SquareMm = Annotated[float | None, typer.Option("--square-mm", help="Another square size")]
-CameraFile = Annotated[
-    Path | None, typer.Option("--camera", help="Known lens: camera_info YAML or a calibration file")
-]
-Find = Annotated[bool, typer.Option("--find-intrinsics", help="Find the lens even where it is recorded")]
-LensKind = Annotated[LensName, typer.Option("--lens", help="Model of a lens that has to be found")]
-GatesFile = Annotated[Path | None, typer.Option("--gates", help="YAML of other limits")]
-Threads = Annotated[int | None, typer.Option(help="For finding boards; the result does not depend on it")]
-Distance = Annotated[float | None, typer.Option("--working-distance-mm", help="Where the error is stated")]
 
 TimeLimit = Annotated[float, typer.Option(help="The solve ends with an error after so long; 0: no limit")]
 MemoryLimit = Annotated[int, typer.Option(help="… when this process needs so much; 0: no limit")]
@@ -64,56 +37,19 @@ def register(app: typer.Typer) -> None:
     app.command("report")(report_file)
 
 
-def job_options(
-    profile: ProfileName,
-    seed: int,
-    board: Path | None,
-    square_mm: float | None,
-    camera: Path | None,
-    find_intrinsics: bool,
-    lens: LensName,
-    gates: Path | None,
-    threads: int | None,
-    working_distance_mm: float | None,
-) -> JobOptions:
-    return JobOptions(
-        profile=profile.value,
-        seed=seed,
-        board=None if board is None else read_board(board),
-        square_m=None if square_mm is None else square_mm / 1000,
-        camera=None if camera is None else read_camera(camera),
-        lens_model=lens.value,
-        find_intrinsics=find_intrinsics,
-        limits=GateLimits() if gates is None else read_limits(gates),
-        working_distance_m=None if working_distance_mm is None else working_distance_mm / 1000,
-        threads=threads,
-    )
-
-
+@takes(job_options)
 def solve(
     recording: Rec,
+    options: JobOptions,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Default: NAME.calibration.yaml in this folder")
     ] = None,
-    profile: Profile = ProfileName.robust,
     as_json: AsJson = False,
-    seed: Seed = 0,
-    board: BoardFile = None,
-    square_mm: SquareMm = None,
-    camera: CameraFile = None,
-    find_intrinsics: Find = False,
-    lens: LensKind = LensName.plumb_bob,
-    gates: GatesFile = None,
-    threads: Threads = None,
-    working_distance_mm: Distance = None,
     report: Annotated[Path | None, typer.Option(help="Also write the report (HTML)")] = None,
     time_limit_s: TimeLimit = TIME_LIMIT_S,
     memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
 ) -> None:
     """Solve a recording and write the calibration file. Exit 4: written, but a gate failed."""
-    options = job_options(
-        profile, seed, board, square_mm, camera, find_intrinsics, lens, gates, threads, working_distance_mm
-    )
     target = output or Path(f"{recording.name.removesuffix('.mcap')}.calibration.yaml")
     check_target(target)
     with bounded(time_limit_s, memory_limit_mib), detection_progress() as progress:
@@ -157,29 +93,18 @@ def solve_json(job: SolvedRecording) -> dict[str, Any]:
     }
 
 
+@takes(job_options)
 def report_file(
     recording: Rec,
+    options: JobOptions,
     output: Annotated[
         Path | None, typer.Option("-o", "--output", help="Default: NAME.report.html in this folder")
     ] = None,
-    profile: Profile = ProfileName.robust,
-    seed: Seed = 0,
-    board: BoardFile = None,
-    square_mm: SquareMm = None,
-    camera: CameraFile = None,
-    find_intrinsics: Find = False,
-    lens: LensKind = LensName.plumb_bob,
-    gates: GatesFile = None,
-    threads: Threads = None,
-    working_distance_mm: Distance = None,
     root: Root = None,
     time_limit_s: TimeLimit = TIME_LIMIT_S,
     memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
 ) -> None:
     """Solve a recording again and write its report: one HTML file. With the history of what is installed."""
-    options = job_options(
-        profile, seed, board, square_mm, camera, find_intrinsics, lens, gates, threads, working_distance_mm
-    )
     target = output or Path(f"{recording.name.removesuffix('.mcap')}.report.html")
     with bounded(time_limit_s, memory_limit_mib), detection_progress() as progress:
         job = solve_recording(recording, options, progress)
@@ -208,23 +133,15 @@ def _touches(job: SolvedRecording, root: Path | None) -> list[Touch]:
     return installed.verification if same else []
 
 
+@takes(picture_options)
 def compare(
     recording: Rec,
+    options: JobOptions,
     as_json: AsJson = False,
-    seed: Seed = 0,
-    board: BoardFile = None,
-    square_mm: SquareMm = None,
-    camera: CameraFile = None,
-    find_intrinsics: Find = False,
-    lens: LensKind = LensName.plumb_bob,
-    threads: Threads = None,
 ) -> None:
     """Every method side by side on the same views."""
     from calibrate.peers import compare_all
 
-    options = job_options(
-        ProfileName.robust, seed, board, square_mm, camera, find_intrinsics, lens, None, threads, None
-    )
     with bounded(), detection_progress() as progress:
         prepared = prepare_views(recording, options, progress)
         results = compare_all(prepared.views, solver_options(options, prepared))
@@ -251,6 +168,20 @@ def compare(
             peer.note,
         )
     out.print(table)
+    out.print(f"\nX, {' from '.join(camera_frames(prepared.views.mount))}:")
+    out.print(_table_of_X(results))
+
+
+def _table_of_X(results: list[PeerResult]) -> Table:
+    """Translation, and rotation as axis times angle."""
+    table = Table("method", "x mm", "y mm", "z mm", "rx °", "ry °", "rz °", box=None)
+    for peer in results:
+        if peer.matrix is None:
+            table.add_row(peer.name, "-")
+            continue
+        turn = [f"{v:.4f}" for v in np.degrees(rotation_log(peer.matrix[:3, :3]))] if peer.rigid else ["-"]
+        table.add_row(peer.name, *(f"{1e3 * v:.3f}" for v in peer.matrix[:3, 3]), *turn)
+    return table
 
 
 def peer_plain(peer: Any) -> dict[str, Any]:

@@ -1,0 +1,107 @@
+"""The options that every command which solves shares, written once."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import replace
+from enum import StrEnum
+from functools import wraps
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from calibrate.commands.files import read_board, read_camera
+from calibrate.gates import GateLimits, read_limits
+from calibrate.pipeline import JobOptions
+
+
+class ProfileName(StrEnum):
+    robust = "robust"
+    paper = "paper"
+
+
+class LensName(StrEnum):
+    plumb_bob = "plumb_bob"
+    rational = "rational_polynomial"
+    fisheye = "equidistant"
+
+
+Profile = Annotated[
+    ProfileName, typer.Option(help="robust: the station's; paper: the published method, exactly")
+]
+Seed = Annotated[int, typer.Option(help="Of every random draw")]
+BoardFile = Annotated[
+    Path | None, typer.Option("--board", help="YAML of another board than the recorded one")
+]
+SquareMm = Annotated[float | None, typer.Option("--square-mm", help="Another square size")]
+CameraFile = Annotated[
+    Path | None, typer.Option("--camera", help="Known lens: camera_info YAML or a calibration file")
+]
+Find = Annotated[bool, typer.Option("--find-intrinsics", help="Find the lens even where it is recorded")]
+LensKind = Annotated[LensName, typer.Option("--lens", help="Model of a lens that has to be found")]
+GatesFile = Annotated[Path | None, typer.Option("--gates", help="YAML of other limits")]
+Threads = Annotated[int | None, typer.Option(help="For finding boards; the result does not depend on it")]
+Distance = Annotated[float | None, typer.Option("--working-distance-mm", help="Where the error is stated")]
+
+
+def takes(build: Callable[..., JobOptions]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """The command offers `build`'s options instead of its parameter `options`, and gets what they make."""
+    offered = inspect.signature(build, eval_str=True).parameters
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        own = inspect.signature(command, eval_str=True)
+        rest = [p for name, p in own.parameters.items() if name != "options"]
+        needed = [p for p in rest if p.default is p.empty]
+        optional = [p for p in rest if p.default is not p.empty]
+
+        @wraps(command)
+        def run(**given: Any) -> Any:
+            chosen = {name: given.pop(name) for name in offered if name in given}
+            return command(options=build(**chosen), **given)
+
+        run.__signature__ = own.replace(  # type: ignore[attr-defined]
+            parameters=[*needed, *offered.values(), *optional]
+        )
+        run.__annotations__ = {p.name: p.annotation for p in [*rest, *offered.values()]}
+        return run
+
+    return decorate
+
+
+def picture_options(
+    seed: Seed = 0,
+    board: BoardFile = None,
+    square_mm: SquareMm = None,
+    camera: CameraFile = None,
+    find_intrinsics: Find = False,
+    lens: LensKind = LensName.plumb_bob,
+    threads: Threads = None,
+) -> JobOptions:
+    """How pictures are read."""
+    return JobOptions(
+        seed=seed,
+        board=None if board is None else read_board(board),
+        square_m=None if square_mm is None else square_mm / 1000,
+        camera=None if camera is None else read_camera(camera),
+        lens_model=lens.value,
+        find_intrinsics=find_intrinsics,
+        threads=threads,
+    )
+
+
+@takes(picture_options)
+def job_options(
+    options: JobOptions,
+    profile: Profile = ProfileName.robust,
+    gates: GatesFile = None,
+    working_distance_mm: Distance = None,
+) -> JobOptions:
+    """And how they are solved and judged."""
+    return replace(
+        options,
+        profile=profile.value,
+        limits=GateLimits() if gates is None else read_limits(gates),
+        working_distance_m=None if working_distance_mm is None else working_distance_mm / 1000,
+    )

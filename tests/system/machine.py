@@ -144,6 +144,9 @@ class Machine:
             except subprocess.TimeoutExpired:
                 self._nspawn.kill()
                 self._nspawn.wait()
-        for group in sorted(self._group.rglob("*/"), reverse=True):
-            group.rmdir()
-        self._group.rmdir()
+        for place in (self._group, *self._group.parents[1].glob(f"*/{self._group.name}")):
+            # On an older layout nspawn makes the group in systemd's own hierarchy too.
+            for group in sorted(place.rglob("*/"), reverse=True):
+                group.rmdir()
+            if place.is_dir():
+                place.rmdir()

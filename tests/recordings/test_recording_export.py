@@ -91,7 +91,7 @@ def test_nothing_is_overwritten_and_nothing_left_behind(small: Path, tmp_path: P
     taken.mkdir()
     with pytest.raises(RecordingError, match="exists already"):
         export_recording(open_recording(small), taken, Target.CSV)
-    with pytest.raises(RecordingError, match="cannot write"):
+    with pytest.raises(RecordingError, match="does not exist; create it first"):
         export_recording(open_recording(small), tmp_path / "no" / "out", Target.CSV)
     assert list(taken.iterdir()) == []
     assert not (tmp_path / "no").exists()

@@ -198,7 +198,7 @@ def impossible(name):
     [
         ("board out of reach", ["No pose", "reach", "2.2", "1.30 m", "board_guess"]),
         ("board turned over", ["No pose", "the table", "z axis"]),
-        ("box too small", ["of the wanted 25", "workspace box", "workspace_max_m"]),
+        ("box too small", ["possible. What binds is the workspace box", "workspace_max_m"]),
         ("few reachable", ["of the wanted 25", "joint range", "joints_min_rad"]),
         ("guess too rough", ["not wholly in the picture", "camera_guess"]),
     ],

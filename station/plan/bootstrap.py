@@ -8,7 +8,8 @@ nothing comes too close. After each picture the belief is updated; when it is go
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import product
 
 import msgspec
 import numpy as np
@@ -45,7 +46,8 @@ GOOD_M, GOOD_RAD = 0.006, 0.02
 _PLACE_M, _PLACE_RAD = 0.002, 0.003
 """How far the board's place may be off as seen through one picture and the arm; generous."""
 _LEVER_M = 0.5
-_SAMPLES = 40
+_SAMPLES, _FEWEST, _DRAWS = 40, 20, 400
+"""Possible mounts that a move is checked for; with fewer there is no move; so many are drawn to find them."""
 _ANGLES_RAD = tuple(np.deg2rad([2.0, 4.0, 7.0, 11.0, 16.0, 22.0]))
 _BACK_M = (0.0, 0.02, 0.05, 0.10)
 _BORDER_PX = 15.0
@@ -108,23 +110,35 @@ def believe(config: StationConfig, glimpses: Sequence[Glimpse]) -> Belief:
 def next_move(config: StationConfig, glimpses: Sequence[Glimpse]) -> PlannedPose | None:
     """The next small move from the last glimpse, or None when the belief is good enough or five are made.
 
-    LimitError when no move is safe for every mount that is still possible. Each move needs its own go.
+    LimitError when no move is safe for every mount that is still possible, or when hardly any mount within
+    the guess fits with where the arm stands. Each move needs its own go.
     """
     moves = len(glimpses) - 1
     belief = believe(config, glimpses)
     if moves >= MOVES_MAX or (moves >= MOVES_MIN and belief.good):
         return None
-    samples = _samples(belief, np.random.default_rng(moves))
+    samples, cells = _possible(config, glimpses, belief, np.random.default_rng(moves))
+    if len(cells) < _FEWEST:
+        raise LimitError(_not_here(belief, len(cells)))
     targets = _targets(config, glimpses[0], belief)
     targets = targets[_stays_in_view(config, glimpses[0], samples, targets)]
     gain = [_spread(_after(config, glimpses, belief, target)) for target in targets]
     here = glimpses[-1].joints_rad
-    cells = _possible_cells(config, glimpses, samples) or [geometry_of(config, None, None, 0.0)]
     for target in targets[np.argsort(gain, kind="stable")]:
         joints = inverse_nearest(arm_model(config), target, here)
         if joints is not None and all(_is_free(cell, here, joints) for cell in cells):
             return _described(config, glimpses[0], belief, moves, joints)
     raise LimitError(_no_move(belief, len(targets)))
+
+
+def _not_here(belief: Belief, possible: int) -> str:
+    """Why, and what to do, when the guess does not go with the arm's posture."""
+    return (
+        f"Of {_DRAWS} camera mounts within the guess ({1000 * belief.sigma_m:.0f} mm, "
+        f"{belief.sigma_deg:.0f}°) only {possible} fit with where the arm stands: with the others camera or "
+        "board would touch the arm or what is around it. No move can be checked. Correct camera_guess, its "
+        "sigmas or the board's size, or teach a view with more room around the arm."
+    )
 
 
 def _no_move(belief: Belief, in_view: int) -> str:
@@ -187,16 +201,50 @@ def _misfit(place: Array, reference: Array) -> Array:
     return np.asarray(difference(place, reference) / np.repeat([_PLACE_M, _PLACE_RAD], 3))
 
 
-def _samples(belief: Belief, rng: np.random.Generator) -> Array:
-    """Mounts (n, 4, 4) that are still possible, the likeliest first."""
-    draws = rng.multivariate_normal(np.zeros(6), belief.covariance, _SAMPLES, method="eigh")
+def _possible(
+    config: StationConfig, glimpses: Sequence[Glimpse], belief: Belief, rng: np.random.Generator
+) -> tuple[Array, list[CellGeometry]]:
+    """Mounts (n, 4, 4) that are still possible, n at most 40, and the cells with them.
+
+    Impossible is a mount with which camera or board would be in the arm's way where it has stood.
+    """
+    taught, stood = glimpses[0], np.array([g.joints_rad for g in glimpses])
+    E = forward(arm_model(config), taught.joints_rad)
+    without = margins(geometry_of(config, None, None), stood)[1]
+    draws = rng.multivariate_normal(np.zeros(6), belief.covariance, _DRAWS, method="eigh")
     draws[0] = 0.0
-    return perturb(belief.X, draws)
+    mounts: list[Array] = []
+    cells: list[CellGeometry] = []
+    for X in perturb(belief.X, draws):
+        place = _board_place(config.mount, E, X, taught.camera_from_board)
+        cell = as_taught(geometry_of(config, X, place), taught.joints_rad)
+        gaps, labels = margins(cell, stood)
+        new = [column for column, label in enumerate(labels) if label not in without]
+        if gaps[:, new].min(initial=np.inf) >= SPACING_M / 2:
+            mounts.append(X)
+            cells.append(cell)
+        if len(cells) == _SAMPLES:
+            break
+    return np.array(mounts).reshape(-1, 4, 4), cells
+
+
+def as_taught(cell: CellGeometry, taught_rad: Array) -> CellGeometry:
+    """The cell; where the taught view (6,) is nearer to the obstacle than wanted, half of that is kept.
+
+    Such a mount is possible, since a person jogged the arm there, so it must be kept clear of too.
+    """
+    [name] = {obstacle.name for obstacle in cell.obstacles}
+    gaps, labels = margins(cell, taught_rad)
+    near_m = min(gap for gap, label in zip(gaps[0], labels, strict=True) if label.endswith(f" the {name}"))
+    if near_m >= SPACING_M / 2:
+        return cell
+    return replace(cell, obstacle_clearance_m=max(0.0, (near_m + cell.obstacle_clearance_m) / 2))
 
 
 def _targets(config: StationConfig, taught: Glimpse, belief: Belief) -> Array:
-    """Flange poses (n, 4, 4) around the taught one: small turns about board or camera, and away."""
-    E = forward(arm_model(config), taught.joints_rad)
+    """Flange poses (n, 4, 4) around the taught one: small turns about board, camera or wrists, and away."""
+    model = arm_model(config)
+    E = forward(model, taught.joints_rad)
     C = taught.camera_from_board
     points = board_points(config.board)
     base_from_camera = E @ belief.X if config.mount == "eye-in-hand" else belief.X
@@ -207,15 +255,24 @@ def _targets(config: StationConfig, taught: Glimpse, belief: Belief) -> Array:
     if config.mount == "eye-to-hand":
         away = -away  # there the board is what moves
     pivots = [centre] if config.mount == "eye-to-hand" else [centre, base_from_camera[:3, 3]]
-    return np.array(
-        [
-            _moved(E, rotation_exp(np.asarray(axis) * angle), pivot, back * away)
-            for axis in _axes(base_from_board)
-            for angle in _ANGLES_RAD
-            for back in _BACK_M
-            for pivot in pivots
-        ]
-    )
+    turned = [
+        _turned(E, rotation_exp(axis * angle), pivot)
+        for axis in _axes(base_from_board)
+        for angle in _ANGLES_RAD
+        for pivot in pivots
+    ]
+    turned += list(forward(model, taught.joints_rad + _wrist_turns()))
+    shifts = np.outer(_BACK_M, away)
+    shifted = np.repeat(np.array(turned), len(shifts), axis=0)
+    shifted[:, :3, 3] += np.tile(shifts, (len(turned), 1))
+    return shifted
+
+
+def _wrist_turns() -> Array:
+    """Joint steps (m, 6) of the last three joints: the big links stay where they are known to be free."""
+    ways = np.array([way for way in product((-1.0, 0.0, 1.0), repeat=3) if any(way)])
+    steps = np.multiply.outer(np.array(_ANGLES_RAD), ways).reshape(-1, 3)
+    return np.hstack([np.zeros((len(steps), 3)), steps])
 
 
 def _axes(base_from_board: Array) -> Array:
@@ -225,8 +282,8 @@ def _axes(base_from_board: Array) -> Array:
     return np.asarray(np.vstack([flat, [0, 0, 1], [0, 0, -1]]) @ base_from_board[:3, :3].T)
 
 
-def _moved(E: Array, turn: Array, pivot: Array, shift: Array) -> Array:
-    return pose(turn @ E[:3, :3], turn @ (E[:3, 3] - pivot) + pivot + shift)
+def _turned(E: Array, turn: Array, pivot: Array) -> Array:
+    return pose(turn @ E[:3, :3], turn @ (E[:3, 3] - pivot) + pivot)
 
 
 def _seen_from(config: StationConfig, taught: Glimpse, X: Array, targets: Array) -> Array:
@@ -252,19 +309,6 @@ def _stays_in_view(
         good &= visible(camera, points, _BORDER_PX)
         good &= np.linalg.norm(points, axis=-1).min(axis=1) >= nearest_m - _NEARER_M
     return good
-
-
-def _possible_cells(config: StationConfig, glimpses: Sequence[Glimpse], samples: Array) -> list[CellGeometry]:
-    """Cells with the possible mounts, but none in which the arm could not have stood where it did."""
-    taught, stood = glimpses[0], np.array([g.joints_rad for g in glimpses])
-    E = forward(arm_model(config), taught.joints_rad)
-    cells = []
-    for X in samples:
-        Y = _board_place(config.mount, E, X, taught.camera_from_board)
-        cell = geometry_of(config, X, Y, 0.0)
-        if margins(cell, stood)[0].min() >= SPACING_M / 2:
-            cells.append(cell)
-    return cells
 
 
 def _is_free(cell: CellGeometry, here: Array, joints: Array) -> bool:

@@ -1,0 +1,77 @@
+"""Bootstrap with little room around the arm: which mounts are possible, and moves that suit them all."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibrate.geometry import inverse, pose, rotation_exp
+from calibrate.kinematics import MODELS, forward, link_frames
+from recordings.messages import CameraModel
+from station.collision import margins
+from station.config import PAPER_BOARD, CameraConfig, LimitsConfig, Plane, RobotConfig, StationConfig
+from station.errors import LimitError
+from station.limits import check_path
+from station.plan.bootstrap import Glimpse, as_taught, next_move
+from station.plan.scene import geometry_of
+from station.simulation.placement import guess_of
+
+ARM = MODELS["UR10"]
+TAUGHT = np.array([-0.364, -2.365, -0.459, 0.876, -0.866, -1.122])
+X = pose(rotation_exp([-0.261, 0.808, 2.537]), [0.014, -0.078, 0.076])
+Y = pose(rotation_exp([-2.482, 1.616, 0.196]), [0.604, -0.537, 0.234])
+WRONG = pose(rotation_exp([0.152, 0.643, 2.156]), [0.089, -0.084, 0.142])
+"""X turned by 30° and shifted by 100 mm."""
+GLIMPSE = Glimpse(TAUGHT, inverse(forward(ARM, TAUGHT) @ X) @ Y)
+LENS = CameraModel(1280, 1024, ((1667.0, 0.0, 639.5), (0.0, 1667.0, 511.5), (0.0, 0.0, 1.0)), (-0.09, 0.11))
+
+
+def config(mount=WRONG, sigma_m=0.06, sigma_rad=0.3, board_clearance_m=0.10):
+    return StationConfig(
+        robot=RobotConfig(model="UR10"),
+        camera=CameraConfig(driver="rendered", model=LENS),
+        board=PAPER_BOARD,
+        camera_guess=guess_of(mount, sigma_m, sigma_rad),
+        limits=LimitsConfig(
+            planes=(Plane("table", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),), board_clearance_m=board_clearance_m
+        ),
+    )
+
+
+def test_a_wrist_turns_where_the_big_links_have_no_room():
+    """With some of the possible mounts the forearm nearly touches camera or board: it must not move."""
+    move = next_move(config(), [GLIMPSE])
+    assert move is not None
+    assert move.joints_rad[:3] == pytest.approx(TAUGHT[:3], abs=1e-6)
+    true_cell = geometry_of(config(), X, Y)
+    assert check_path(true_cell, TAUGHT, move.joints_rad, "move").problems == ()
+
+
+def test_a_board_nearer_than_wanted_is_possible():
+    """A person jogged the arm there; mounts that explain it are checked for, not left out."""
+    assert next_move(config(X, 0.005, 0.03, board_clearance_m=0.5), [GLIMPSE]) is not None
+
+
+def test_where_the_taught_view_is_nearer_than_wanted_half_of_that_distance_is_kept():
+    bare = replace(geometry_of(config(), X, Y), obstacle_clearance_m=0.0)
+    gaps, labels = margins(bare, TAUGHT)
+    nearest_m = min(gap for gap, label in zip(gaps[0], labels, strict=True) if label.endswith(" the board"))
+    wants_more = as_taught(replace(bare, obstacle_clearance_m=nearest_m + 0.2), TAUGHT)
+    wants_less = as_taught(replace(bare, obstacle_clearance_m=nearest_m - 0.05), TAUGHT)
+    assert wants_more.obstacle_clearance_m == pytest.approx(nearest_m / 2)
+    assert wants_less.obstacle_clearance_m == nearest_m - 0.05
+
+
+def test_no_move_when_no_mount_goes_with_where_the_arm_stands():
+    """Unchecked for camera and board it may not go: here the guess puts the camera into the forearm."""
+    E = forward(ARM, TAUGHT)
+    inside = inverse(E) @ pose(E[:3, :3] @ X[:3, :3], _middle_of_forearm())
+    with pytest.raises(LimitError, match=r"only 0 fit with where the arm stands.* Correct camera_guess"):
+        next_move(config(inside, 0.002, 0.01), [GLIMPSE])
+
+
+def _middle_of_forearm():
+    frames = link_frames(ARM, TAUGHT[None])[0]
+    return (frames[2, :3, 3] + frames[3, :3, 3]) / 2 + 0.049 * frames[2, :3, 2]

@@ -37,7 +37,7 @@ from station.limits import SPACING_M
 from station.plan.describe import planned_pose
 from station.plan.model import PlannedPose
 from station.plan.order import move_times
-from station.plan.scene import Scene, arm_model, geometry_of
+from station.plan.scene import Scene, arm_model, cell_geometry, geometry_of
 from station.plan.visibility import outline, visible
 
 MOVES_MIN, MOVES_MAX = 3, 5
@@ -123,10 +123,12 @@ def next_move(config: StationConfig, glimpses: Sequence[Glimpse]) -> PlannedPose
     targets = _targets(config, glimpses[0], belief)
     targets = targets[_stays_in_view(config, glimpses[0], samples, targets)]
     gain = [_spread(_after(config, glimpses, belief, target)) for target in targets]
-    here = glimpses[-1].joints_rad
-    for target in targets[np.argsort(gain, kind="stable")]:
-        joints = inverse_nearest(arm_model(config), target, here)
-        if joints is not None and all(_is_free(cell, here, joints) for cell in cells):
+    here, configured = glimpses[-1].joints_rad, cell_geometry(config)
+    found = [inverse_nearest(arm_model(config), targets[i], here) for i in np.argsort(gain, kind="stable")]
+    reached = [joints for joints in found if joints is not None]
+    # The daemon checks by the configured guess: what it would refuse is tried last.
+    for joints in sorted(reached, key=lambda joints: not _is_free(configured, here, joints)):
+        if all(_is_free(cell, here, joints) for cell in cells):
             return _described(config, glimpses[0], belief, moves, joints)
     raise LimitError(_no_move(belief, len(targets)))
 

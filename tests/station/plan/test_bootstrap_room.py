@@ -15,7 +15,7 @@ from station.config import PAPER_BOARD, CameraConfig, LimitsConfig, Plane, Robot
 from station.errors import LimitError
 from station.limits import check_path
 from station.plan.bootstrap import Glimpse, as_taught, next_move
-from station.plan.scene import geometry_of
+from station.plan.scene import cell_geometry, geometry_of
 from station.simulation.placement import guess_of
 
 ARM = MODELS["UR10"]
@@ -62,6 +62,16 @@ def test_where_the_taught_view_is_nearer_than_wanted_half_of_that_distance_is_ke
     wants_less = as_taught(replace(bare, obstacle_clearance_m=nearest_m - 0.05), TAUGHT)
     assert wants_more.obstacle_clearance_m == pytest.approx(nearest_m / 2)
     assert wants_less.obstacle_clearance_m == nearest_m - 0.05
+
+
+def test_a_move_that_the_daemon_would_refuse_is_not_preferred():
+    """The daemon checks by the configured guess, whose thicker camera here comes close to wrist 1."""
+    shift = 0.16 * np.array([-0.637, 0.765, -0.088])
+    turn = rotation_exp(np.deg2rad(10) * np.array([0.509, -0.500, 0.701]))
+    guessed = config(pose(turn @ X[:3, :3], X[:3, 3] + shift), 0.06, 0.15)
+    move = next_move(guessed, [GLIMPSE])
+    assert move is not None
+    assert check_path(cell_geometry(guessed), TAUGHT, move.joints_rad, "move").problems == ()
 
 
 def test_no_move_when_no_mount_goes_with_where_the_arm_stands():

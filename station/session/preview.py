@@ -62,7 +62,7 @@ class Previewer:
         try:
             exposure = (picture.exposure_us, picture.gain_db) if picture.exposure_us else None
             sighting = await bench.workers.call(
-                sight, picture.image, config.board, None, False, exposure, timeout_s=5.0
+                sight, picture.image, config.board, config.camera.model, False, exposure, timeout_s=5.0
             )
         except WorkerError:
             sighting = None

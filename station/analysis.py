@@ -70,7 +70,9 @@ def sight(
     found = detect(image, board, thorough)
     distance_m = tilt_rad = None
     if found.found and camera is not None and camera.matrix is not None:
-        distance_m, tilt_rad = _distance_and_tilt(found.pixels, board_points(board)[found.indices], camera)
+        full = camera.width / image.shape[1]  # previews may be smaller than the camera's pictures
+        pixels = (found.pixels + 0.5) * full - 0.5
+        distance_m, tilt_rad = _distance_and_tilt(pixels, board_points(board)[found.indices], camera)
     advice = ""
     if exposure is not None:
         advice = "; ".join(assess(image, found.pixels if found.found else None, *exposure).warnings)

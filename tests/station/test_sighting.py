@@ -1,13 +1,14 @@
-"""Previews carry the exposure assistant's advice to the screen."""
+"""What previews tell the screen: the exposure assistant's advice, distance and tilt."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 
 from station.analysis import sight
 from station.config import PAPER_BOARD
 from station.simulation.placement import seen_from
-from station.simulation.renderer import Light, render
+from station.simulation.renderer import Light, render, scaled
 from station.simulation.scenes import build_cell
 from station.status import StationStatus
 from station.tui.widgets.panels import detection_lines
@@ -23,3 +24,12 @@ def test_a_picture_too_bright_says_what_to_set_on_the_screen() -> None:
         shown = "\n".join(detection_lines(StationStatus(detection=status)))
         assert words in shown
     assert sight(picture, PAPER_BOARD, None, False).status.advice == ""
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.5])
+def test_the_distance_is_the_same_in_a_preview_of_half_the_size(factor: float) -> None:
+    camera = build_cell("paper", 0, "low", "eye-in-hand").camera
+    view = seen_from(PAPER_BOARD, 0.5)
+    picture = render(scaled(camera, factor), PAPER_BOARD, view, Light(), np.random.default_rng(0))
+    status = sight(picture, PAPER_BOARD, camera, False).status
+    assert status.distance_m == pytest.approx(0.5, abs=0.005)

@@ -55,7 +55,9 @@ class Terminal:
         self._size = (width, height)
         self._socket = f"screens-{os.getpid()}-{width}"
         program = " ".join([*STATION, "tui", "--socket", str(control)])
-        self._tmux("new-session", "-d", "-x", str(width), "-y", str(height), program)
+        # 24-bit colours, as today's terminals have them
+        colours = ("-e", "COLORTERM=truecolor")
+        self._tmux("new-session", "-d", *colours, "-x", str(width), "-y", str(height), program)
 
     def _tmux(self, *args: str) -> str:
         done = subprocess.run(["tmux", "-L", self._socket, *args], capture_output=True, text=True, check=True)
@@ -76,7 +78,7 @@ class Terminal:
     def picture(self, name: str) -> None:
         width, height = self._size
         console = Console(record=True, width=width, height=height, file=io.StringIO())
-        console.print(Text.from_ansi(self._tmux("capture-pane", "-e", "-p").rstrip("\n")), end="")
+        console.print(Text.from_ansi(self._tmux("capture-pane", "-e", "-N", "-p").rstrip("\n")), end="")
         console.save_svg(str(HERE / f"{name}-{width}x{height}.svg"), title="station")
 
     def close(self) -> None:

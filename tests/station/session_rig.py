@@ -261,6 +261,15 @@ class Rig:
         summary = await self.session.prepare(1, purpose)
         self.session.go(1, summary.token)
 
+    async def go_until_the_second_move(self) -> None:
+        """One pose is on the disk; the slow arm is on its way to the next."""
+        self.arm.slow = True
+        await self.give_go()
+        await self.until(StationState.MOVING)
+        self.arm.arrive.set()
+        await self.until(StationState.WRITING)
+        await self.until(StationState.MOVING)
+
     @property
     def pose_states(self) -> list[str]:
         return [pose.state for pose in self.session.store.status.session.poses]

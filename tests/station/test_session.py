@@ -249,12 +249,7 @@ async def test_a_refused_control_leaves_everything_as_it_was(rig: Rig, tmp_path:
 
 
 async def test_the_end_of_the_daemon_stops_then_seals(rig: Rig) -> None:
-    rig.arm.slow = True
-    await rig.give_go()
-    await rig.until(S.MOVING)
-    rig.arm.arrive.set()
-    await rig.until(S.WRITING)
-    await rig.until(S.MOVING)
+    await rig.go_until_the_second_move()
     folder = Path(rig.session.store.status.session.folder)
     await rig.session.close()
     assert rig.arm.log.index("stop") < rig.arm.log.index("close")

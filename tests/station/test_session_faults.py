@@ -65,12 +65,7 @@ async def test_a_protective_stop_stops_and_sends_nothing(rig: Rig) -> None:
 
 
 async def test_a_tcp_changed_on_the_pendant_is_a_fault(rig: Rig) -> None:
-    rig.arm.slow = True
-    await rig.give_go()
-    await rig.until(S.MOVING)
-    rig.arm.arrive.set()
-    await rig.until(S.WRITING)
-    await rig.until(S.MOVING)
+    await rig.go_until_the_second_move()
     rig.arm.slow = False
     rig.arm.trouble = RobotError("TCP mix-up: the TCP offset on the pendant was changed")
     rig.arm.arrive.set()

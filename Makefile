@@ -29,7 +29,7 @@ demo-gige: $(READY)  ## the same, with the camera over real GigE Vision inside a
 	@$(BIN)/station demo --gige
 
 test: $(READY)  ## all tests
-	$(BIN)/python -m pytest -n 2 --dist loadfile
+	$(BIN)/python -m pytest -n 2 --dist worksteal
 
 check: $(READY)  ## ruff, mypy strict, import contracts
 	$(BIN)/ruff check .

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import subprocess
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -24,6 +26,16 @@ MAY_BE_SENT = {
     "script: setWatchdog", "script: getTCPOffset", "script: stopScript",
 }  # fmt: skip
 """Everything a station ever says to a controller; a change here is a change of the safety rules."""
+
+
+@pytest.hookimpl(optionalhook=True)
+def pytest_testnodedown(node: Any, error: object) -> None:
+    """A test process that died says by which signal; xdist itself says only that it is gone."""
+    if error is not None:
+        process = node.gateway._io.popen
+        with contextlib.suppress(subprocess.TimeoutExpired):
+            process.wait(5)
+        print(f"\n[{node.gateway.id}] ended with {process.returncode} (negative: killed by that signal)")
 
 
 @pytest.fixture

@@ -9,7 +9,6 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import math
 import time
 from collections.abc import Coroutine, Sequence
 from pathlib import Path
@@ -22,7 +21,7 @@ from station.devices.ur_condition import foreign_program, not_powered, program_n
 from station.devices.ur_dashboard import STOP, Dashboard
 from station.devices.ur_heart import Heart
 from station.devices.ur_link import UrLink, link_lost_words
-from station.devices.ur_moves import STALE_S, MoveWatch
+from station.devices.ur_moves import STALE_S, MoveWatch, check_goal
 from station.errors import RobotError, SafetyStopError, StaleStateError
 
 log = logging.getLogger(__name__)
@@ -34,8 +33,6 @@ WATCHDOG_S = 0.15
 PROGRAM_START_NS = 200_000_000
 LEFTOVER_WAIT_NS = 2_000_000_000
 CLOSE_WAIT_S = 0.5
-JOINT_SPEED_LIMIT_RAD_S = 1.05
-JOINT_ACCELERATION_LIMIT_RAD_S2 = 1.5
 LOCAL_CONTROL = "the robot is in local control: switch the pendant to Remote (top right), then give a new go"
 
 
@@ -66,7 +63,10 @@ class UrRobot(UrLink):
     # -- control ----------------------------------------------------------------------------------------
 
     async def start_control(self) -> None:
-        """Spawns the control process, which loads its program. Only in answer to a go. Raises RobotError."""
+        """Spawns the control process, which loads its program; returns when that heard a first heartbeat.
+
+        Only in answer to a go. Raises RobotError.
+        """
         if self._child is not None:
             raise RobotError("control is already started")
         self._stop_reason = ""
@@ -84,12 +84,20 @@ class UrRobot(UrLink):
                 raise RobotError("stopped")
             if tcp is not None and self._tool is not None:
                 self._tool.agree((tcp[0], tcp[1], tcp[2], tcp[3], tcp[4], tcp[5]))
+            await self._heard(child)
         except BaseException as error:
             await self.end_control()
             if (why := self._why_stopped()) and isinstance(error, RobotError):
                 raise RobotError(f"stopped while control was starting{why}") from None
             raise
         self._controls = True
+
+    async def _heard(self, child: ControlChild) -> None:
+        """Raises what kept the program from taking the first heartbeat."""
+        try:
+            await child.heard()
+        except RobotError as error:
+            raise await self._ask_remote(self._program_trouble() or error) from None
 
     async def _may_start(self) -> None:
         """Raises RobotError, with the remedy, while starting control would disturb somebody or must fail."""
@@ -126,7 +134,7 @@ class UrRobot(UrLink):
         Raises RobotError, SafetyStopError, StaleStateError. Paths are checked by the planner; here only the
         caps on speed, acceleration and joint range are kept.
         """
-        _check_numbers(joints_rad, speed_rad_s, acceleration_rad_s2, self.model.joint_limit_rad)
+        check_goal(joints_rad, speed_rad_s, acceleration_rad_s2, self.model.joint_limit_rad)
         child = self._child
         if child is None or not self._controls:
             raise RobotError(f"control is not started{self._why_stopped()}: a person's go starts it")
@@ -281,17 +289,20 @@ class UrRobot(UrLink):
             return
         try:
             child.check()
-            state = self.newest().state
-            trouble = safety_stop(state) or not_powered(state) or program_not_running(state)
-            if self.age_s() > STALE_S:
-                trouble = StaleStateError(self._stale_words(self.age_s()))
-            if self.remote is False:
-                trouble = RobotError(LOCAL_CONTROL)
-            if trouble is not None:
+            if (trouble := self._program_trouble()) is not None:
                 raise trouble
         except RobotError as error:
             await self.stop(str(error))
             raise
+
+    def _program_trouble(self) -> RobotError | None:
+        """What state stream and dashboard say against the control program. StaleStateError without both."""
+        state = self.newest().state
+        if self.age_s() > STALE_S:
+            return StaleStateError(self._stale_words(self.age_s()))
+        if self.remote is False:
+            return RobotError(LOCAL_CONTROL)
+        return safety_stop(state) or not_powered(state) or program_not_running(state)
 
     async def close(self) -> None:
         """Stops what moves, ends control and every connection."""
@@ -324,18 +335,3 @@ async def _end_after_stop(child: ControlChild) -> None:
     await _came(child.stop_acknowledged)
     child.kill()
     await child.reap()
-
-
-def _check_numbers(
-    joints_rad: Sequence[float], speed_rad_s: float, acceleration_rad_s2: float, limit_rad: float
-) -> None:
-    """Raises RobotError: ur_rtde sends NaN and wrong lengths to the controller as they are."""
-    if len(joints_rad) != 6 or not all(math.isfinite(q) and abs(q) <= limit_rad for q in joints_rad):
-        raise RobotError(f"not six joint angles within ± {limit_rad:.2f} rad: {list(joints_rad)}")
-    if not 0 < speed_rad_s <= JOINT_SPEED_LIMIT_RAD_S:
-        raise RobotError(f"joint speed {speed_rad_s} rad/s is not within 0…{JOINT_SPEED_LIMIT_RAD_S}")
-    if not 0 < acceleration_rad_s2 <= JOINT_ACCELERATION_LIMIT_RAD_S2:
-        raise RobotError(
-            f"joint acceleration {acceleration_rad_s2} rad/s² is not within "
-            f"0…{JOINT_ACCELERATION_LIMIT_RAD_S2}"
-        )

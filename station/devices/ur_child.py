@@ -18,6 +18,7 @@ from typing import Any
 from station.errors import RobotError
 
 CONNECT_S = 8.0
+HEARD_S = 1.0
 ACKNOWLEDGE_S = 1.0
 END_S = 1.0
 LOG_LIMIT_BYTES = 1_000_000
@@ -34,6 +35,8 @@ class ControlChild:
         self._log_path = log_path
         self._loop = asyncio.get_running_loop()
         self._ready: asyncio.Future[dict[str, Any]] = self._loop.create_future()
+        self._heard = asyncio.Event()
+        """A heartbeat kicked the watchdog, or none ever will."""
         self._moves: dict[int, asyncio.Future[dict[str, Any]]] = {}
         self._number = 0
         self._beat_ns = 0
@@ -87,6 +90,19 @@ class ControlChild:
             await self.reap()
             raise RobotError(_refusal(str(answer["refused"])) + self.epitaph())
         return tuple(answer["tcp"]) if answer.get("tcp") else None
+
+    async def heard(self, timeout_s: float = HEARD_S) -> None:
+        """Waits for the first heartbeat that kicked the watchdog: before it no move is taken. RobotError."""
+        try:
+            async with asyncio.timeout(timeout_s):
+                await self._heard.wait()
+        except TimeoutError:
+            self.check(patience_s=timeout_s / 2)
+            raise RobotError(
+                f"no heartbeat of the session reached the control process within {timeout_s:g} s: look for "
+                f"what loads this computer; see {self._log_path}"
+            ) from None
+        self.check()
 
     # -- requests ---------------------------------------------------------------------------------------
 
@@ -192,6 +208,8 @@ class ControlChild:
         if "beat" in answer:
             self._answered_ns = max(self._answered_ns, int(answer["beat"]))
             self.kicks_refused = bool(answer["lost"])
+            if answer["kicked"] or answer["lost"]:
+                self._heard.set()
         elif "id" in answer:
             waiter = self._moves.get(answer["id"])
             if waiter is not None and not waiter.done():
@@ -207,6 +225,7 @@ class ControlChild:
             self._loop.remove_reader(self._channel)
             self._channel.close()
         self.gone.set()
+        self._heard.set()
         died = {"ok": False, "error": "the control process died", "refused": "the control process died"}
         for waiter in (*self._moves.values(), self._ready):
             if not waiter.done():

@@ -8,7 +8,8 @@ Requests: {"do": "beat", "ns": N}   N = host monotonic time of the session loop;
           {"do": "move", "id": I, "joints": [6], "speed": rad/s, "acceleration": rad/s²}
           {"do": "stop", "deceleration": …}
           {"do": "end"}
-Answers:  {"ready": true, "tcp": [6] | null} · {"refused": text} · {"beat": N, "lost": bool}
+Answers:  {"ready": true, "tcp": [6] | null} · {"refused": text}
+          {"beat": N, "kicked": bool, "lost": bool}   kicked: the beat was fresh and the script took the kick
           {"id": I, "ok": bool, "error": text} · {"stopped": true}
 """
 
@@ -64,11 +65,12 @@ class ControlServer:
 
     def _beat(self, beat_ns: int) -> None:
         """A beat that waited too long kicks nothing. A script that took no kick is never kicked again."""
-        self._beat_ns = beat_ns
+        self._beat_ns, kicked = beat_ns, False
         if self._fresh() and not self._script_lost:
             armed = self._armed or self._arm()
-            self._script_lost = not (armed and self._control.kickWatchdog())
-        self.answer({"beat": beat_ns, "lost": self._script_lost})
+            kicked = bool(armed and self._control.kickWatchdog())
+            self._script_lost = not kicked
+        self.answer({"beat": beat_ns, "kicked": kicked, "lost": self._script_lost})
 
     def _arm(self) -> bool:
         """From now on the script lives only as long as it is kicked."""

@@ -8,6 +8,7 @@ or a lost link the word freezes, so the state decides first.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
@@ -22,6 +23,23 @@ NO_PROGRESS_S = 3.0
 SLIDER_ZERO_S = 10.0
 """An arm that waits longer for its slider gives up: nobody should be surprised by it."""
 SLIDER_STILL = 0.005
+JOINT_SPEED_LIMIT_RAD_S = 1.05
+JOINT_ACCELERATION_LIMIT_RAD_S2 = 1.5
+
+
+def check_goal(
+    joints_rad: Sequence[float], speed_rad_s: float, acceleration_rad_s2: float, limit_rad: float
+) -> None:
+    """Raises RobotError: ur_rtde sends NaN and wrong lengths to the controller as they are."""
+    if len(joints_rad) != 6 or not all(math.isfinite(q) and abs(q) <= limit_rad for q in joints_rad):
+        raise RobotError(f"not six joint angles within ± {limit_rad:.2f} rad: {list(joints_rad)}")
+    if not 0 < speed_rad_s <= JOINT_SPEED_LIMIT_RAD_S:
+        raise RobotError(f"joint speed {speed_rad_s} rad/s is not within 0…{JOINT_SPEED_LIMIT_RAD_S}")
+    if not 0 < acceleration_rad_s2 <= JOINT_ACCELERATION_LIMIT_RAD_S2:
+        raise RobotError(
+            f"joint acceleration {acceleration_rad_s2} rad/s² is not within "
+            f"0…{JOINT_ACCELERATION_LIMIT_RAD_S2}"
+        )
 
 
 def operation_count(word: int) -> int:

@@ -178,16 +178,14 @@ async def test_tcp_changed_on_the_pendant(cell: Make) -> None:
     await c.stays_at_rest()
 
 
-async def test_a_tool_on_the_pendant_is_reported_and_not_mixed_in(controller: Start, tmp_path: Path) -> None:
-    running = await asyncio.to_thread(controller)
-    with running.admin() as admin:
-        admin.ask("tcp", pose=[0.01, -0.02, 0.15, 0.0, 0.0, 0.5])
-        await asyncio.sleep(0.1)
-        robot = robot_at(running.host, tmp_path)
-        identity = await robot.connect()
-        assert identity.tcp_offset == pytest.approx((0.01, -0.02, 0.15, 0.0, 0.0, 0.5), abs=1e-6)
-        await robot.start_control()  # reads the offset from the controller and compares
-        await robot.close()
+async def test_a_tool_on_the_pendant_is_reported_and_not_mixed_in(cell: Make) -> None:
+    c = await cell(control=False)
+    await c.robot.close()
+    c.admin.ask("tcp", pose=[0.01, -0.02, 0.15, 0.0, 0.0, 0.5])
+    await asyncio.sleep(0.1)
+    identity = await c.robot.connect()
+    assert identity.tcp_offset == pytest.approx((0.01, -0.02, 0.15, 0.0, 0.0, 0.5), abs=1e-6)
+    await c.robot.start_control()  # reads the offset from the controller and compares
 
 
 @pytest.mark.parametrize(

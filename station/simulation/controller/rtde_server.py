@@ -91,7 +91,7 @@ class RtdeConnection(Connection):
                 else:
                     raise RtdeError(f"packet type {kind}")
         except (RtdeError, struct.error) as error:
-            self._robot.journal.note("rtde", "bad packet", error=str(error))
+            self._robot.journal.note("controller", "bad RTDE packet", error=str(error))
             self.transport.close()
 
     def closed(self) -> None:

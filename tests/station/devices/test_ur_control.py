@@ -98,19 +98,20 @@ def test_a_fresh_beat_arms_the_watchdog_once_and_kicks_it_each_time(child: Conve
     answers = child.say(beat(), beat(), beat())
     assert child.library.calls[0] == ("setWatchdog", (WATCHDOG_HZ,))
     assert child.library.names == ["setWatchdog", *["kickWatchdog"] * 3, "stopScript"]
-    assert [a["lost"] for a in answers] == [False] * 3
+    assert [(a["kicked"], a["lost"]) for a in answers] == [(True, False)] * 3
 
 
 def test_a_beat_that_waited_too_long_kicks_nothing(child: Conversation) -> None:
-    child.say(beat(age_ns=BEAT_FRESH_NS + 1_000_000))
+    answers = child.say(beat(age_ns=BEAT_FRESH_NS + 1_000_000))
     assert child.library.names == ["stopScript"]
+    assert not answers[0]["kicked"] and not answers[0]["lost"]
 
 
 def test_a_script_that_took_no_kick_is_never_kicked_again(child: Conversation) -> None:
     child.library.deaf = {"kickWatchdog"}
     answers = child.say(beat(), beat(), move())
     assert child.library.names.count("kickWatchdog") == 1
-    assert [a.get("lost") for a in answers[:2]] == [True, True]
+    assert [(a["kicked"], a["lost"]) for a in answers[:2]] == [(False, True)] * 2
     assert not answers[2]["ok"] and "moveJ" not in child.library.names
 
 

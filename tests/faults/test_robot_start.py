@@ -1,0 +1,183 @@
+"""Control has started when a heartbeat was heard. Whatever comes in between ends it, with its cause."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import signal
+import time
+from collections.abc import AsyncIterator, Awaitable, Callable
+from contextlib import suppress
+from typing import Any
+
+import pytest
+
+from station.devices.ur import LEFTOVER_WAIT_NS, UrRobot
+from station.devices.ur_child import END_S, HEARD_S
+from station.errors import RobotError, SafetyStopError
+
+pytestmark = pytest.mark.process
+
+Make = Callable[..., Awaitable[Any]]
+Start = Callable[..., Awaitable[tuple[Any, asyncio.Task[None]]]]
+SOON_S = HEARD_S + END_S + LEFTOVER_WAIT_NS / 1e9 + 1.0
+"""The wait, the end of a child that hangs, news of what it left behind, and this computer's share."""
+
+
+@pytest.fixture
+async def unheard(cell: Make) -> AsyncIterator[Start]:
+    """`await unheard("UR10")`: control starts, its program runs, and no heartbeat has come yet."""
+
+    async def start(model: str = "UR10") -> tuple[Any, asyncio.Task[None]]:
+        c = await cell(model, control=False)
+        c.beating = False
+        starting = asyncio.create_task(c.robot.start_control())
+        await c.until(lambda: c.admin.ask("state")["runtime_state"] == "PLAYING")
+        await asyncio.sleep(0.3)  # the process says it is ready
+        assert not starting.done() and not c.robot.control
+        return c, starting
+
+    yield start
+
+
+async def ends(starting: asyncio.Task[None]) -> tuple[RobotError, float]:
+    """Why, and after how many seconds."""
+    begun = time.monotonic()
+    with pytest.raises(RobotError) as caught:
+        async with asyncio.timeout(SOON_S):
+            await starting
+    return caught.value, time.monotonic() - begun
+
+
+async def gone(c: Any) -> None:
+    """Nothing of control is left, nothing moved, and a new go works."""
+    await c.robot.idle()
+    assert not c.robot.control and c.robot.control_pid is None
+    await c.stays_at_rest()
+    assert c.asked("script: moveJ") == 0
+
+
+def is_well(robot: UrRobot) -> bool:
+    """The link is back, the dashboard's too."""
+    with suppress(RobotError):
+        robot.check()
+        return robot.connected
+    return False
+
+
+async def test_a_move_right_after_the_start_is_taken(cell: Make) -> None:
+    c = await cell(control=False)
+    for _ in range(3):
+        await c.robot.start_control()
+        goal = c.joints_rad()
+        goal[5] += 0.02
+        await c.robot.move(goal, 0.5, 1.0)
+        await c.robot.end_control()
+
+
+async def test_a_heart_that_does_not_beat_ends_the_start(unheard: Start) -> None:
+    c, starting = await unheard()
+    error, _ = await ends(starting)
+    assert "no heartbeat of the session" in str(error)
+    await gone(c)
+    c.beating = True
+    await c.robot.start_control()
+
+
+async def test_a_heart_that_beats_late_is_in_time(unheard: Start) -> None:
+    c, starting = await unheard()
+    c.beating = True
+    await starting
+    assert c.robot.control
+
+
+async def test_stop_while_no_heartbeat_was_heard(unheard: Start) -> None:
+    c, starting = await unheard()
+    begun = time.monotonic()
+    await c.robot.stop("changed my mind")
+    assert time.monotonic() - begun < 0.1
+    error, seconds = await ends(starting)
+    assert "stopped while control was starting (changed my mind)" in str(error)
+    assert seconds < 0.5
+    await gone(c)
+
+
+@pytest.mark.parametrize("beating", [True, False])
+async def test_a_protective_stop_while_no_heartbeat_was_heard(unheard: Start, beating: bool) -> None:
+    c, starting = await unheard()
+    c.admin.ask("pstop")
+    await asyncio.sleep(0.05)
+    c.beating = beating
+    error, _ = await ends(starting)
+    assert isinstance(error, SafetyStopError) and "protective stop" in str(error)
+    await gone(c)
+
+
+@pytest.mark.parametrize(
+    ("kill", "words"), [(signal.SIGSEGV, "control process died"), (signal.SIGSTOP, "control process hangs")]
+)
+async def test_a_control_process_that_fails_before_the_first_heartbeat(
+    unheard: Start, kill: signal.Signals, words: str
+) -> None:
+    c, starting = await unheard()
+    os.kill(c.robot.control_pid, kill)
+    c.beating = True
+    error, _ = await ends(starting)
+    assert words in str(error)
+    await gone(c)
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ({"cmd": "drop", "how": "rst"}, "connection to the robot lost"),
+        ({"cmd": "black_hole"}, "no news from the robot"),
+        ({"cmd": "restart", "down_s": 0.5, "running": True}, "connection to the robot lost"),
+    ],
+    ids=["link cut", "cable pulled", "controller restarts"],
+)
+async def test_a_link_that_fails_before_the_first_heartbeat(
+    unheard: Start, fault: dict[str, Any], words: str
+) -> None:
+    c, starting = await unheard()
+    c.admin.ask(**fault)
+    c.beating = True
+    error, _ = await ends(starting)
+    assert words in str(error)
+    if fault["cmd"] == "black_hole":
+        # Nobody could tell the controller: its program waits, moves nothing, and is not silently replaced.
+        await c.robot.idle()
+        c.admin.ask("black_hole", on=False)
+        await c.until(lambda: is_well(c.robot), timeout_s=15.0)
+        with pytest.raises(RobotError, match=r"is playing.*Stop it"):
+            await c.robot.start_control()
+        await c.robot.stop("operator")
+    await c.until(lambda: c.admin.ask("state")["program"] is None)
+    await gone(c)
+
+
+@pytest.mark.parametrize(
+    ("fault", "words"),
+    [
+        ({"cmd": "stop_program"}, "control program was stopped on the pendant"),
+        ({"cmd": "remote", "on": False}, "switch the pendant to Remote"),
+    ],
+)
+async def test_the_pendant_before_the_first_heartbeat(
+    unheard: Start, fault: dict[str, Any], words: str
+) -> None:
+    c, starting = await unheard("UR10e")
+    c.admin.ask(**fault)
+    await asyncio.sleep(0.05)
+    c.beating = True
+    error, _ = await ends(starting)
+    assert words in str(error)
+    await gone(c)
+
+
+async def test_a_cancelled_start_leaves_nothing(unheard: Start) -> None:
+    c, starting = await unheard()
+    starting.cancel()
+    with pytest.raises(asyncio.CancelledError):
+        await starting
+    await gone(c)

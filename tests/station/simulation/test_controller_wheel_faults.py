@@ -15,19 +15,23 @@ pytestmark = pytest.mark.process
 Start = Callable[..., SimulatedController]
 Wheel = Callable[..., dict[str, Any]]
 
+IN_MOTION = """
+        receive = rtde_receive.RTDEReceiveInterface(host)
+        control = rtde_control.RTDEControlInterface(host)
+        control.moveJ(FAR, 0.5, 1.0, True)
+        time.sleep(0.3)
+"""
+
 
 def test_protective_stop_needs_five_seconds_an_unlock_and_a_new_script(
     controller: Start, wheel: Wheel
 ) -> None:
     result = wheel(
         controller("UR10"),
-        """
-        receive = rtde_receive.RTDEReceiveInterface(host)
-        control = rtde_control.RTDEControlInterface(host)
+        IN_MOTION
+        + """
         dashboard = dashboard_client.DashboardClient(host)
         dashboard.connect()
-        control.moveJ(FAR, 0.5, 1.0, True)
-        time.sleep(0.4)
         admin.ask("pstop")
         time.sleep(0.05)
         result["state"] = [receive.getSafetyMode(), receive.getRobotMode(), receive.isProtectiveStopped(),
@@ -61,11 +65,8 @@ def test_protective_stop_needs_five_seconds_an_unlock_and_a_new_script(
 def test_emergency_stop_and_recovery(controller: Start, wheel: Wheel, model: str, mode: int) -> None:
     result = wheel(
         controller(model),
-        """
-        receive = rtde_receive.RTDEReceiveInterface(host)
-        control = rtde_control.RTDEControlInterface(host)
-        control.moveJ(FAR, 0.5, 1.0, True)
-        time.sleep(0.3)
+        IN_MOTION
+        + """
         admin.ask("estop")
         time.sleep(0.05)
         result["state"] = [receive.getSafetyMode(), receive.getRobotMode(), receive.isEmergencyStopped(),
@@ -89,11 +90,8 @@ def test_emergency_stop_and_recovery(controller: Start, wheel: Wheel, model: str
 def test_a_safeguard_stop_pauses_until_play(controller: Start, wheel: Wheel) -> None:
     result = wheel(
         controller("UR10"),
-        """
-        receive = rtde_receive.RTDEReceiveInterface(host)
-        control = rtde_control.RTDEControlInterface(host)
-        control.moveJ(NEAR, 0.3, 1.0, True)
-        time.sleep(0.2)
+        IN_MOTION
+        + """
         admin.ask("safeguard")
         time.sleep(0.4)
         result["held"] = [receive.getSafetyMode(), receive.getRuntimeState(), fastest(receive.getActualQd())]
@@ -101,7 +99,7 @@ def test_a_safeguard_stop_pauses_until_play(controller: Start, wheel: Wheel) -> 
         time.sleep(0.1)
         result["cleared"] = [receive.getSafetyMode(), receive.getRuntimeState(), admin.ask("state")["moving"]]
         result["play"] = admin.ask("play")["playing"]
-        until(lambda: near(receive.getActualQ(), NEAR))
+        until(lambda: near(receive.getActualQ(), FAR))
         """,
     )
     assert result["held"][:2] == [5, 4] and result["held"][2] < 1e-4
@@ -111,11 +109,8 @@ def test_a_safeguard_stop_pauses_until_play(controller: Start, wheel: Wheel) -> 
 def test_power_off_and_program_stop_from_the_pendant(controller: Start, wheel: Wheel) -> None:
     result = wheel(
         controller("UR10"),
-        """
-        receive = rtde_receive.RTDEReceiveInterface(host)
-        control = rtde_control.RTDEControlInterface(host)
-        control.moveJ(FAR, 0.5, 1.0, True)
-        time.sleep(0.3)
+        IN_MOTION
+        + """
         admin.ask("stop_program")
         time.sleep(0.3)
         result["stopped"] = [receive.getRuntimeState(), fastest(receive.getActualQd())]

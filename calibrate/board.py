@@ -120,6 +120,22 @@ def board_from_turned(spec: BoardSpec, quarters: int) -> Array:
     return pose(R, centre - R @ centre)
 
 
+def fixes_a_plane(points: Array) -> bool:
+    """Do these points of a board (n, 3) tell its plane in a picture? Not where all but one lie in a line."""
+    xy = points[:, :2] - points[:, :2].mean(axis=0)
+    xy = xy / max(float(np.abs(xy).max()), 1e-12)
+    x, y, one = xy[:, 0], xy[:, 1], np.ones(len(xy))
+    zero = np.zeros_like(one)
+    by_homography = np.concatenate(
+        [
+            np.stack([x, y, one, zero, zero, zero, -x * x, -x * y, -x], axis=1),
+            np.stack([zero, zero, zero, x, y, one, -x * y, -y * y, -y], axis=1),
+        ]
+    )
+    singular = np.linalg.svd(by_homography, compute_uv=False)
+    return len(singular) > 7 and bool(singular[7] > 1e-6 * singular[0])
+
+
 def ambiguity_text(spec: BoardSpec) -> str:
     """One sentence for people when the board can be mistaken for itself turned; empty otherwise."""
     turns = looks_same_turns(spec)

@@ -9,7 +9,15 @@ import cv2
 import numpy as np
 
 from calibrate.board import looks_same_turns
-from calibrate.corners import Grey, is_regular, local_spacing, refine, right_handed, square_contrast
+from calibrate.corners import (
+    Grey,
+    is_regular,
+    local_spacing,
+    refine,
+    right_handed,
+    square_contrast,
+    square_means,
+)
 from calibrate.geometry import Array
 from recordings.messages import BoardSpec
 
@@ -78,9 +86,9 @@ def _orient(grey: Grey, grid: Array, spec: BoardSpec) -> Array:
     if len(looks_same_turns(spec)) == len(turns):
         return grid
     # Among the turns that the colours allow, the first corner nearest the picture's top left.
-    candidates = [np.rot90(grid, turn) for turn in turns]
-    dark_first = [c for c in candidates if square_contrast(grey, c) > 0] or candidates
-    return min(dark_first, key=lambda c: float(c[0, 0].sum()))
+    means, grey_level = square_means(grey, grid), float(cv2.mean(grey)[0])
+    dark_first = [t for t in turns if square_contrast(np.rot90(means, t), grey_level) > 0] or turns
+    return min((np.rot90(grid, t) for t in dark_first), key=lambda c: float(c[0, 0].sum()))
 
 
 def seen_size(grey: Grey) -> tuple[int, int] | None:

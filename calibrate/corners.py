@@ -17,6 +17,9 @@ _WINDOW_SHARE = 0.35
 _IRREGULAR_SHARE = 0.3
 _REFINEMENT_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 5e-3)
 _SMOOTHING_PX = 1.0
+_PATCH_MARGIN_PX, _PATCH_REACH_PX, _MOST_PATCHES = 8, 2.0, 8
+"""Around a window: 4 for the smoothing, 1 for the gradient, 2 for the way to the saddle; one that is farther
+away gets a new patch."""
 _SMOOTH_FROM_PX = 9.5
 """Below this spacing the smoothing would mix a corner with its neighbours."""
 
@@ -79,20 +82,42 @@ def refine(grey: Grey, corners: Array, spacing_px: Array, largest_half_window: i
     began, and a saddle stays where it is under any symmetric smoothing.
     """
     half = np.clip(np.floor(spacing_px * _WINDOW_SHARE), 2, largest_half_window).astype(int)
-    low = np.maximum(np.floor(corners.min(axis=0)).astype(int) - 2 * largest_half_window, 0)
-    high = np.maximum(np.ceil(corners.max(axis=0)).astype(int) + 2 * largest_half_window, low + 1)
-    region: Any = grey[low[1] : high[1], low[0] : high[0]].astype(np.float32)
-    if float(np.median(spacing_px)) >= _SMOOTH_FROM_PX:
-        region = cv2.GaussianBlur(region, (0, 0), _SMOOTHING_PX)
-    refined = corners.copy()
+    smooth = float(np.median(spacing_px)) >= _SMOOTH_FROM_PX
+    refined, last = corners.copy(), np.array([grey.shape[1] - 1, grey.shape[0] - 1])
     for size in np.unique(half):
-        chosen = half == size
-        points = np.ascontiguousarray((corners[chosen] - low).reshape(-1, 1, 2), dtype=np.float32)
-        cv2.cornerSubPix(region, points, (int(size), int(size)), (-1, -1), _REFINEMENT_STEPS)
-        refined[chosen] = points.reshape(-1, 2) + low
+        chosen = np.flatnonzero(half == size)
+        for _ in range(_MOST_PATCHES):
+            before = refined[chosen]
+            refined[chosen] = _saddles(grey, before, int(size), smooth)
+            after = refined[chosen]
+            far = np.abs(after - before).max(axis=1) > _PATCH_REACH_PX
+            chosen = chosen[far & (after >= 0).all(axis=1) & (after <= last).all(axis=1)]
+            if not len(chosen):
+                break
     ran = np.linalg.norm(refined - corners, axis=1) > 0.4 * spacing_px
     refined[ran] = corners[ran]
     return refined
+
+
+def _saddles(grey: Grey, corners: Array, half: int, smooth: bool) -> Array:
+    """The saddles near `corners` (n, 2). Only what lies around them is smoothed: a column of patches."""
+    side = 2 * (half + _PATCH_MARGIN_PX) + 1
+    first = np.round(corners).astype(int) - side // 2
+    beyond = max(0, -int(first.min()), int((first + side - [grey.shape[1], grey.shape[0]]).max()))
+    if beyond:
+        around: Any = cv2.copyMakeBorder(grey, *(beyond,) * 4, cv2.BORDER_REPLICATE)
+        grey = around
+    patches = np.lib.stride_tricks.sliding_window_view(grey, (side, side))[
+        first[:, 1] + beyond, first[:, 0] + beyond
+    ]
+    column: Any = patches.reshape(-1, side).astype(np.float32)
+    if smooth:
+        column = cv2.GaussianBlur(column, (0, 0), _SMOOTHING_PX)
+    shift = first.astype(float)
+    shift[:, 1] -= side * np.arange(len(first))
+    points = np.ascontiguousarray((corners - shift).reshape(-1, 1, 2), dtype=np.float32)
+    cv2.cornerSubPix(column, points, (half, half), (-1, -1), _REFINEMENT_STEPS)
+    return np.asarray(points.reshape(-1, 2) + shift)
 
 
 def sample(grey: Grey, pixels: Array) -> Array:
@@ -108,15 +133,22 @@ def sample(grey: Grey, pixels: Array) -> Array:
     return np.asarray(values, dtype=np.float64)
 
 
-def square_contrast(grey: Grey, grid: Array) -> float:
+def square_means(grey: Grey, grid: Array) -> Array:
+    """Grey values (rows - 1, columns - 1) in the middle of the squares between corners (rows, columns, 2)."""
+    centres = np.round((grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4).astype(int)
+    around = np.arange(-1, 2)
+    rows = np.clip(centres[..., 1, None] + around, 0, grey.shape[0] - 1)
+    columns = np.clip(centres[..., 0, None] + around, 0, grey.shape[1] - 1)
+    return np.asarray(grey[rows[..., :, None], columns[..., None, :]].mean(axis=(-2, -1)))
+
+
+def square_contrast(means: Array, mean_grey: float) -> float:
     """Brightness of the squares at odd places minus that at even ones, over the spread; > 0: first is dark.
 
-    grid: (rows, columns, 2). Value in about -1 … 1; near 0 the colours decide nothing.
+    means: those of `square_means`. Value in about -1 … 1; near 0 the colours decide nothing. A single
+    square is compared with the picture's `mean_grey`.
     """
-    centres = (grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4
-    samples = sample(grey, centres)
-    odd = np.indices(samples.shape).sum(axis=0) % 2 == 1
+    odd = np.indices(means.shape).sum(axis=0) % 2 == 1
     if odd.all() or not odd.any():
-        return 0.0 if samples.size == 0 else float(np.sign(grey.mean() - samples.mean()))
-    spread = samples.std() + 1e-9
-    return float((samples[odd].mean() - samples[~odd].mean()) / (2 * spread))
+        return 0.0 if means.size == 0 else float(np.sign(mean_grey - means.mean()))
+    return float((means[odd].mean() - means[~odd].mean()) / (2 * (means.std() + 1e-9)))

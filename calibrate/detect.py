@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board import board_points, check_board, describe_board
+from calibrate.board import board_points, check_board, describe_board, fixes_a_plane
 from calibrate.chessboard import find_chessboard, seen_size
 from calibrate.circles import find_circles
 from calibrate.corners import Grey, to_grey
@@ -38,9 +38,10 @@ class Detection:
     width: int
     height: int
     sharpness: float
-    """Mean squared Laplacian over the variance of the grey values, on the board (whole picture if none)."""
+    """Mean squared Laplacian over the variance of the grey values, on the board (whole picture if none); NaN
+    when not asked for."""
     saturated: float
-    """Share of pixels at the upper end of the scale there, 0 … 1."""
+    """Share of pixels at the upper end of the scale there, 0 … 1; NaN when not asked for."""
     coverage: float
     """Share of the picture inside the outline of the points, 0 … 1."""
 
@@ -49,12 +50,14 @@ class Detection:
         return len(self.indices)
 
 
-def detect(image: NDArray[Any], spec: BoardSpec, thorough: bool = True) -> Detection:
+def detect(
+    image: NDArray[Any], spec: BoardSpec, thorough: bool = True, with_quality: bool = True
+) -> Detection:
     """Finds the board to sub-pixel accuracy.
 
     image: (h, w) uint8 or uint16, or (h, w, 3) BGR. `thorough=False` leaves out the slow attempts and the
-    search for the reason (previews). Raises BoardError for an impossible board; a picture without a board is
-    an answer, not an error.
+    search for the reason (previews), `with_quality=False` the sharpness and the saturation. Raises BoardError
+    for an impossible board; a picture without a board is an answer, not an error.
     """
     check_board(spec)
     grey = to_grey(image)
@@ -62,11 +65,12 @@ def detect(image: NDArray[Any], spec: BoardSpec, thorough: bool = True) -> Detec
     indices, pixels = _find(grey, spec, thorough)
     height, width = grey.shape
     fewest = min(FEWEST_POINTS, expected)
-    found = len(indices) >= fewest
+    whole = len(indices) == expected
+    found = whole or (len(indices) >= fewest and fixes_a_plane(board_points(spec)[indices]))
     reason = "" if found else _reason(grey, spec, len(indices), fewest, thorough)
     if not found:
         indices, pixels = indices[:0], pixels[:0]
-    sharpness, saturated = _picture_quality(grey, pixels)
+    sharpness, saturated = _picture_quality(grey, pixels) if with_quality else (np.nan, np.nan)
     area = cv2.contourArea(cv2.convexHull(pixels.astype(np.float32))) if found else 0.0
     return Detection(
         found, reason, indices, pixels, expected, width, height, sharpness, saturated, area / (width * height)
@@ -88,6 +92,8 @@ def _find(grey: Grey, spec: BoardSpec, thorough: bool) -> tuple[NDArray[np.intp]
 
 
 def _reason(grey: Grey, spec: BoardSpec, count: int, fewest: int, thorough: bool) -> str:
+    if count >= fewest:
+        return f"the {count} corners of the board that are seen lie in a line: they fix no pose"
     if count:
         return f"only {count} corners of the board are seen, {fewest} are needed"
     level = float(grey.mean())

@@ -5,6 +5,7 @@ from __future__ import annotations
 import platform
 import sys
 from datetime import UTC, datetime
+from functools import cache
 from importlib import metadata
 from typing import TYPE_CHECKING, Any
 
@@ -92,6 +93,11 @@ def make_calibration(
 
 
 def software_versions() -> dict[str, str]:
+    return dict(_software_versions())
+
+
+@cache
+def _software_versions() -> dict[str, str]:
     found = {"python": platform.python_version(), "machine": f"{sys.platform} {platform.machine()}"}
     for name in _PACKAGES:
         try:

@@ -1,10 +1,12 @@
 """The lens, found from the session's own pictures (Zhang), holding what the pictures cannot tell.
 
-Z. Zhang, "A flexible new technique for camera calibration" (2000), by OpenCV.
+Z. Zhang, "A flexible new technique for camera calibration" (2000). Plumb-bob: `lens_fit`; other lenses by
+OpenCV.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -13,7 +15,8 @@ import numpy as np
 
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import Array
-from calibrate.projection import INTRINSICS
+from calibrate.lens_fit import LensFit, first_fit, refit
+from calibrate.projection import INTRINSICS, camera_matrix, intrinsics_vector
 from calibrate.views import ViewSet
 from recordings.messages import CameraModel
 
@@ -24,6 +27,8 @@ _SIGNIFICANT_SIGMAS = 2.0
 _LARGEST_BEND_PX = 1.0
 _LARGEST_CENTRE_SIGMA_SHARE = 0.03
 _STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-9)
+_POWERS = {"k1": 3, "k2": 5, "p1": 2, "p2": 2, "k3": 7}
+"""Of the distance from the middle, by which a coefficient bends."""
 _NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6")
 
 
@@ -48,7 +53,6 @@ class Intrinsics:
 
 @dataclass
 class _Fit:
-    flags: int
     rms_px: float
     K: Array
     D: Array
@@ -69,7 +73,12 @@ def calibrate_intrinsics(views: ViewSet, model: LensModel = "plumb_bob") -> Intr
     dropped: dict[int, str] = {}
     used = views
     for _ in range(3):
-        fit, held = _fit_model(used, model)
+        try:
+            fit, held = _FITS[model](used)
+        except cv2.error as problem:
+            raise BadViewsError(
+                f"The lens cannot be found from these corners ({problem.err}). Check the board's size."
+            ) from None
         limit = max(4 * float(np.median(fit.per_view)), 0.5)
         good = [k for k in range(len(used)) if fit.per_view[k] <= limit]
         if len(good) == len(used) or len(good) < FEWEST_VIEWS:
@@ -103,41 +112,80 @@ def calibrate_intrinsics(views: ViewSet, model: LensModel = "plumb_bob") -> Intr
     )
 
 
-def _fit_model(views: ViewSet, model: LensModel) -> tuple[_Fit, tuple[str, ...]]:
-    if model == "equidistant":
-        return _fit_fisheye(views), ()
-    flags = cv2.CALIB_RATIONAL_MODEL if model == "rational_polynomial" else 0
-    fit = _fit(views, flags)
+def _fit_plumb_bob(views: ViewSet) -> tuple[_Fit, tuple[str, ...]]:
+    """Holding one after the other what the pictures do not determine."""
+    fit = first_fit(views)
     held: list[str] = []
-    while (more := _undetermined(fit, views.camera)) is not None:
-        flag, text = more
+    while (more := _undetermined(fit)) is not None:
+        names, text = more
         held.append(text)
-        fit = _fit(views, fit.flags | flag)
-    return fit, tuple(held)
+        fit = refit(views, fit, (*fit.held, *names))
+    D = np.array(fit.camera.distortion)
+    return _Fit(fit.rms_px, camera_matrix(fit.camera), D, fit.sigma, fit.view_rms_px), tuple(held)
 
 
-def _fit(views: ViewSet, flags: int) -> _Fit:
+def _undetermined(fit: LensFit) -> tuple[tuple[str, ...], str] | None:
+    """The next parameters to hold, and a sentence; None when all are determined."""
+    value = dict(zip(INTRINSICS, intrinsics_vector(fit.camera).tolist(), strict=True))
+    sigma = dict(zip(INTRINSICS, fit.sigma.tolist(), strict=True))
+    size = np.array([fit.camera.width, fit.camera.height])
+    centre = np.array([value["cx"], value["cy"]])
+    corner = float(np.linalg.norm(np.maximum(centre, size - centre))) / value["fx"]
+
+    def unknown(name: str) -> bool:
+        """Not told from zero, and left free it could bend the picture's corner by more than a pixel.
+
+        A value that would throw the corner out of the picture comes from a singular fit, whatever its sigma.
+        """
+        lever_px = value["fx"] * corner ** _POWERS[name]
+        if lever_px * abs(value[name]) > size.max():
+            return True
+        vague = abs(value[name]) < _SIGNIFICANT_SIGMAS * sigma[name]
+        return bool(vague and lever_px * sigma[name] > _LARGEST_BEND_PX)
+
+    if (text := _centre_unknown(fit.sigma, size)) and "cx" not in fit.held:
+        return ("cx", "cy"), text
+    if "k3" not in fit.held and unknown("k3"):
+        return ("k3",), f"k3 held at 0: found {value['k3']:.3g} ± {sigma['k3']:.2g}"
+    if "p1" not in fit.held and unknown("p1") and unknown("p2"):
+        p1, p2 = (f"{value[name]:.2g} ± {sigma[name]:.1g}" for name in ("p1", "p2"))
+        return ("p1", "p2"), f"p1, p2 held at 0: found {p1}, {p2}"
+    for name, before in (("k2", "k3"), ("k1", "k2")):
+        if before in fit.held and name not in fit.held and unknown(name):
+            return (name,), f"{name} held at 0: found {value[name]:.3g} ± {sigma[name]:.2g}"
+    return None
+
+
+def _centre_unknown(sigma: Array, size: Array) -> str:
+    """A sentence when the views do not fix the principal point, else ""."""
+    sigma_px = float(max(sigma[2], sigma[3]))
+    if not sigma_px > _LARGEST_CENTRE_SIGMA_SHARE * size.max():
+        return ""
+    return f"principal point held at the centre: the views know it only to {sigma_px:.0f} px"
+
+
+def _fit_rational(views: ViewSet) -> tuple[_Fit, tuple[str, ...]]:
+    fit = _opencv_rational(views, 0)
+    text = _centre_unknown(fit.sigma, np.array([views.camera.width, views.camera.height]))
+    return (_opencv_rational(views, cv2.CALIB_FIX_PRINCIPAL_POINT), (text,)) if text else (fit, ())
+
+
+def _opencv_rational(views: ViewSet, flags: int) -> _Fit:
     object_points = [v.board_points.astype(np.float32) for v in views]
     pixels = [v.pixels.astype(np.float32) for v in views]
     size = (views.camera.width, views.camera.height)
+    flags |= cv2.CALIB_RATIONAL_MODEL | cv2.CALIB_USE_LU
     before = cv2.getNumThreads()
     # OpenCV's threads sum in the order they finish: the last bits would differ from run to run.
     cv2.setNumThreads(1)
     try:
         unknown: Any = None
         rms, K, D, _, _, sigma, _, per_view = cv2.calibrateCameraExtended(
-            object_points, pixels, size, unknown, unknown, flags=flags | cv2.CALIB_USE_LU, criteria=_STEPS
+            object_points, pixels, size, unknown, unknown, flags=flags, criteria=_STEPS
         )
-    except cv2.error as problem:
-        raise BadViewsError(
-            f"The lens cannot be found from these corners ({problem.err}). Check the board's size."
-        ) from None
     finally:
         cv2.setNumThreads(before)
-    count = 8 if flags & cv2.CALIB_RATIONAL_MODEL else 5
-    return _Fit(
-        flags, float(rms), _floats(K), _floats(D)[:count], _floats(sigma)[: 4 + count], _floats(per_view)
-    )
+    return _Fit(float(rms), _floats(K), _floats(D)[:8], _floats(sigma)[:12], _floats(per_view))
 
 
 def _floats(values: Any) -> Array:
@@ -145,48 +193,7 @@ def _floats(values: Any) -> Array:
     return found if found.shape == (3, 3) else found.ravel()
 
 
-def _undetermined(fit: _Fit, camera: CameraModel) -> tuple[int, str] | None:
-    """The next parameter to hold: (OpenCV's flag, sentence), or None when all are determined."""
-    k1, k2, p1, p2, k3 = fit.D[:5]
-    s = fit.sigma
-    rational = bool(fit.flags & cv2.CALIB_RATIONAL_MODEL)
-    centre, focal = fit.K[:2, 2], float(fit.K[0, 0])
-    corner = float(np.linalg.norm(np.maximum(centre, [camera.width, camera.height] - centre))) / focal
-
-    def unknown(power: int, value: float, sigma: float) -> bool:
-        """Not told from zero, and left free it could bend the picture's corner by more than a pixel.
-
-        A value that would throw the corner out of the picture comes from a singular fit, whatever its sigma.
-        """
-        bend_px, doubt_px = focal * abs(value) * corner**power, focal * sigma * corner**power
-        if bend_px > max(camera.width, camera.height):
-            return True
-        return abs(value) < _SIGNIFICANT_SIGMAS * sigma and doubt_px > _LARGEST_BEND_PX
-
-    if not fit.flags & cv2.CALIB_FIX_PRINCIPAL_POINT and max(s[2], s[3]) > (
-        _LARGEST_CENTRE_SIGMA_SHARE * max(camera.width, camera.height)
-    ):
-        return (
-            cv2.CALIB_FIX_PRINCIPAL_POINT,
-            f"principal point held at the centre: the views know it only to {max(s[2], s[3]):.0f} px",
-        )
-    if rational:
-        return None
-    if not fit.flags & cv2.CALIB_FIX_K3 and unknown(7, k3, s[8]):
-        return cv2.CALIB_FIX_K3, f"k3 held at 0: found {k3:.3g} ± {s[8]:.2g}"
-    if not fit.flags & cv2.CALIB_ZERO_TANGENT_DIST and unknown(2, p1, s[6]) and unknown(2, p2, s[7]):
-        return (
-            cv2.CALIB_ZERO_TANGENT_DIST,
-            f"p1, p2 held at 0: found {p1:.2g} ± {s[6]:.1g}, {p2:.2g} ± {s[7]:.1g}",
-        )
-    if fit.flags & cv2.CALIB_FIX_K3 and not fit.flags & cv2.CALIB_FIX_K2 and unknown(5, k2, s[5]):
-        return cv2.CALIB_FIX_K2, f"k2 held at 0: found {k2:.3g} ± {s[5]:.2g}"
-    if fit.flags & cv2.CALIB_FIX_K2 and not fit.flags & cv2.CALIB_FIX_K1 and unknown(3, k1, s[4]):
-        return cv2.CALIB_FIX_K1, f"k1 held at 0: found {k1:.3g} ± {s[4]:.2g}"
-    return None
-
-
-def _fit_fisheye(views: ViewSet) -> _Fit:
+def _fit_fisheye(views: ViewSet) -> tuple[_Fit, tuple[str, ...]]:
     object_points = [v.board_points.reshape(-1, 1, 3) for v in views]
     pixels = [v.pixels.reshape(-1, 1, 2) for v in views]
     flags = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW
@@ -203,4 +210,11 @@ def _fit_fisheye(views: ViewSet) -> _Fit:
     for points, seen, rvec, tvec in zip(object_points, pixels, rvecs, tvecs, strict=True):
         shown, _ = cv2.fisheye.projectPoints(points, rvec, tvec, K, D)
         per_view.append(np.sqrt(np.square(shown.reshape(-1, 2) - seen.reshape(-1, 2)).sum(axis=1).mean()))
-    return _Fit(0, float(rms), _floats(K), _floats(D), np.zeros(8), np.array(per_view))
+    return _Fit(float(rms), _floats(K), _floats(D), np.zeros(8), np.array(per_view)), ()
+
+
+_FITS: dict[LensModel, Callable[[ViewSet], tuple[_Fit, tuple[str, ...]]]] = {
+    "plumb_bob": _fit_plumb_bob,
+    "rational_polynomial": _fit_rational,
+    "equidistant": _fit_fisheye,
+}

@@ -11,11 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibrate.board_poses import refine_board_poses
 from calibrate.geometry import Array, skew
 from calibrate.lens import undistort
+from calibrate.lens_fit import reduced
 from calibrate.likelihood.model import State, observe_views
-from calibrate.likelihood.normal import CORNERS
 from calibrate.likelihood.residuals import linearise_corners
 from calibrate.projection import camera_matrix, project
 from calibrate.views import ViewSet
@@ -66,15 +65,12 @@ def lens_uncertainty(views: ViewSet, camera: CameraModel, corner_px: float) -> L
 
 
 def _intrinsics_covariance(views: ViewSet, camera: CameraModel, corner_px: float) -> Array | None:
-    """(9, 9), the board poses marginalised."""
+    """(9, 9), the board poses marginalised; at the poses as they are, which PnP found by the same corners."""
     observed = observe_views(replace(views, camera=camera))
     state = State(np.eye(4), np.eye(4), views.camera_from_board, camera, np.zeros(0))
-    state = replace(state, C=refine_board_poses(observed, state).C)
     normal = linearise_corners(observed, state, observed.present, intrinsics_free=True)
     lens = np.setdiff1d(np.arange(9), observed.held)
-    W = normal.W[CORNERS][:, 12 + lens]
-    information = normal.U[CORNERS][np.ix_(12 + lens, 12 + lens)]
-    information = information - np.einsum("nai,nij,nbj->ab", W, np.linalg.inv(normal.V[CORNERS]), W)
+    information, _ = reduced(normal, lens)
     scale = 1 / np.sqrt(np.maximum(np.diag(information), 1e-300))
     values, vectors = np.linalg.eigh(information * np.outer(scale, scale))
     if not values[0] > 1e-12:

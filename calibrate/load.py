@@ -131,7 +131,7 @@ def _finished(
 def _decode_and_detect(recording: Recording, view: View, spec: BoardSpec, camera: CameraModel) -> Detection:
     picture = recording.picture(view)
     _check_size(view, picture.image.shape[1], picture.image.shape[0], camera)
-    return detect(picture.image, spec)
+    return detect(picture.image, spec, with_quality=False)
 
 
 def _available_cores() -> int:

@@ -6,15 +6,26 @@ from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from calibrate.board import board_from_turned, looks_same_turns
 from calibrate.errors import BadViewsError
-from calibrate.geometry import Array, inverse, pose, rotation_exp, transform_points
+from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
 from calibrate.lens import project, undistort
+from calibrate.likelihood.model import Observations, State, observe_views
+from calibrate.likelihood.normal import CORNERS
+from calibrate.likelihood.residuals import corner_residuals, linearise_corners
 from calibrate.orientation import choose_candidates
 from calibrate.projection import camera_matrix
 from calibrate.views import ImageView, ViewSet
 from recordings.messages import BoardSpec, CameraModel
+
+_STEPS = 20
+_SETTLED = 1e-6
+"""Relative gain after which the next step, by far smaller, is not worth taking: a hundredth of a sigma."""
+_JUDGED_AFTER = 4
+"""Steps after which a tilt that is far from credible is not followed any further: it has no minimum there."""
+_DAMPING, _LARGEST_DAMPING = 1e-6, 1e6
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,7 +44,7 @@ def solve_pnp(views: ViewSet, board: BoardSpec | None = None) -> ViewSet:
     given) and, for a small board far away, towards which side it is tilted. All views together decide, by
     their agreement with the robot's motion. Raises BadViewsError when a view has no pose at all.
     """
-    candidates = [candidate_poses(view, views.camera, board) for view in views]
+    candidates = _candidates(views, board)
     if all(len(c) == 1 for c in candidates):
         chosen = [0] * len(candidates)
     else:
@@ -53,37 +64,112 @@ def solve_pnp(views: ViewSet, board: BoardSpec | None = None) -> ViewSet:
 
 def candidate_poses(view: ImageView, camera: CameraModel, board: BoardSpec | None) -> list[Candidate]:
     """Poses that explain the picture equally well, best first, each in every turn that looks the same."""
-    tilts = _planar_poses(view, camera)
-    turns = looks_same_turns(board) if board is not None else (0,)
+    return _candidates(ViewSet("eye-in-hand", (view,), camera), board)[0]
+
+
+def _candidates(views: ViewSet, board: BoardSpec | None) -> list[list[Candidate]]:
+    turned = [(0, np.eye(4))]
+    if board is not None:
+        turned = [(turn, board_from_turned(board, turn)) for turn in looks_same_turns(board)]
+    return [
+        [Candidate(tilt @ matrix, turn) for turn, matrix in turned for tilt in tilts]
+        for tilts in _planar_poses(views)
+    ]
+
+
+def _planar_poses(views: ViewSet) -> list[list[Array]]:
+    """T. Collins, A. Bartoli: "Infinitesimal plane-based pose estimation" (2014), then least squares."""
+    starts = [_tilts(view, views.camera) for view in views]
+    owner = np.repeat(np.arange(len(views)), [len(each) for each in starts])
+    poses, rms_px = _least_squares(views, owner, np.concatenate(starts))
+    in_front = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(rms_px) & (poses[:, 2, 3] > 0)
     found = []
-    for turn in turns:
-        turned = board_from_turned(board, turn) if board is not None and turn else np.eye(4)
-        found += [Candidate(tilt @ turned, turn) for tilt in tilts]
+    for i, view in enumerate(views):
+        own = np.flatnonzero(in_front & (owner == i))
+        if not len(own):
+            raise BadViewsError(
+                f"view {view.name}: the corners do not fix a board pose in front of the camera"
+            )
+        own = own[np.argsort(rms_px[own], kind="stable")]
+        limit_px = _credible_px(rms_px[own[0]])
+        found.append([poses[k] for k in own if rms_px[k] <= limit_px])
     return found
 
 
-def _planar_poses(view: ImageView, camera: CameraModel) -> list[Array]:
-    """T. Collins, A. Bartoli: "Infinitesimal plane-based pose estimation" (2014), then least squares."""
+def _credible_px(best_px: Array) -> Array:
+    """The largest rms of a pose that explains a picture as well as the best one does."""
+    return np.maximum(1.5 * best_px, best_px + 0.05)
+
+
+def _tilts(view: ImageView, camera: CameraModel) -> Array:
+    """(1 or 2, 4, 4)"""
     K = camera_matrix(camera)
     points = np.ascontiguousarray(view.board_points)
     pixels = np.ascontiguousarray(undistort(camera, view.pixels))
     try:
-        count, rvecs, tvecs, _ = cv2.solvePnPGeneric(points, pixels, K, None, flags=cv2.SOLVEPNP_IPPE)
+        count, turns, shifts, _ = cv2.solvePnPGeneric(points, pixels, K, None, flags=cv2.SOLVEPNP_IPPE)
     except cv2.error as problem:
         raise BadViewsError(
             f"view {view.name}: the corners do not fix a board pose ({problem.err})"
         ) from None
-    scored = []
-    for rvec, tvec in zip(rvecs[:count], tvecs[:count], strict=True):
-        rvec, tvec = cv2.solvePnPRefineLM(points, pixels, K, None, rvec, tvec)
-        matrix = pose(rotation_exp(rvec.ravel()), tvec.ravel())
-        if np.isfinite(matrix).all() and matrix[2, 3] > 0:
-            scored.append((view_rms_px(view, camera, matrix), matrix))
-    if not scored:
-        raise BadViewsError(f"view {view.name}: the corners do not fix a board pose in front of the camera")
-    scored.sort(key=lambda each: each[0])
-    best = scored[0][0]
-    return [matrix for rms, matrix in scored if rms <= max(1.5 * best, best + 0.05)]
+    return pose(
+        rotation_exp(np.reshape(turns, (-1, 3))[:count]), np.reshape(shifts, (-1, 3))[:count]
+    ).reshape(-1, 4, 4)
+
+
+def _least_squares(views: ViewSet, owner: NDArray[np.intp], poses: Array) -> tuple[Array, Array]:
+    """Poses (m, 4, 4) of views `owner` (m,), each by itself to its own minimum; and rms distances (m,), px.
+
+    Levenberg-Marquardt on all of them at once.
+    """
+    everything = observe_views(views)
+    poses, damping = poses.copy(), np.full(len(poses), _DAMPING)
+    square = _squares(everything, views.camera, owner, poses)
+    going = np.flatnonzero(np.isfinite(square))
+    count = everything.present[owner].sum(axis=1)
+    for step in range(_STEPS):
+        if step == _JUDGED_AFTER:
+            best = np.full(len(views), np.inf)
+            np.fmin.at(best, owner, square)
+            limit = 2 * _credible_px(np.sqrt(best[owner] / count))
+            going = going[np.sqrt(square / count)[going] <= limit[going]]
+        if not len(going):
+            break
+        observed = _rows(everything, owner[going])
+        state = _state(views.camera, poses[going])
+        normal = linearise_corners(observed, state, observed.present)
+        V = normal.V[CORNERS]
+        np.einsum("nii->ni", V)[:] *= 1 + damping[going, None]
+        V += 1e-9 * np.eye(6)
+        trial = perturb(poses[going], np.linalg.solve(V, normal.h[CORNERS][..., None])[..., 0])
+        ahead = _squares(everything, views.camera, owner[going], trial)
+        before = square[going]
+        better = ahead <= before
+        poses[going[better]], square[going[better]] = trial[better], ahead[better]
+        damping[going] = np.where(better, np.maximum(damping[going] / 10, _DAMPING), damping[going] * 30)
+        settled = better & (before - ahead <= _SETTLED * before)
+        going = going[~settled & (damping[going] < _LARGEST_DAMPING)]
+    return poses, np.sqrt(square / count)
+
+
+def _squares(everything: Observations, camera: CameraModel, owner: NDArray[np.intp], poses: Array) -> Array:
+    """(m,) sums of squared distances, px²."""
+    misses = corner_residuals(_rows(everything, owner), _state(camera, poses))
+    return np.asarray((misses**2).sum(axis=(1, 2)))
+
+
+def _rows(observed: Observations, rows: NDArray[np.intp]) -> Observations:
+    return replace(
+        observed,
+        flange=observed.flange[rows],
+        points=observed.points[rows],
+        pixels=observed.pixels[rows],
+        present=observed.present[rows],
+    )
+
+
+def _state(camera: CameraModel, poses: Array) -> State:
+    return State(np.eye(4), np.eye(4), poses, camera, np.zeros(0))
 
 
 def view_rms_px(view: ImageView, camera: CameraModel, camera_from_board: Array) -> float:

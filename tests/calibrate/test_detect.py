@@ -7,7 +7,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.board import BoardError, ambiguity_text, board_from_turned, board_points, looks_same_turns
+from calibrate.board import (
+    BoardError,
+    ambiguity_text,
+    board_from_turned,
+    board_points,
+    fixes_a_plane,
+    looks_same_turns,
+)
 from calibrate.detect import detect
 from calibrate.geometry import pose, rotation_exp
 from calibrate.lens import project
@@ -89,6 +96,24 @@ def test_partial_charuco_is_used_and_its_points_keep_their_identity() -> None:
     assert 6 <= found.corners < found.expected
     truth = project(CAMERA, seen, board_points(CHARUCO)[found.indices])
     assert np.linalg.norm(found.pixels - truth, axis=1).max() < 0.6
+
+
+def test_corners_in_a_line_are_refused_and_not_handed_to_the_solver() -> None:
+    """One such view would make every pose and lens fit of the recording fail."""
+    image, seen = picture(CHARUCO, 6)
+    points = board_points(CHARUCO)
+    size_m = CHARUCO.square_m
+    rows = np.array([[-1.0, -1.0], [7.0, -1.0], [7.0, 0.6], [-1.0, 0.6]]) * size_m
+    outline = project(CAMERA, seen, np.column_stack([rows, np.zeros(4)]))
+    band = cv2.fillConvexPoly(np.zeros_like(image), outline.round().astype(np.int32), 1)
+    found = detect(np.where(band > 0, image, 90).astype(np.uint8), CHARUCO)
+    assert not found.found
+    assert "lie in a line" in found.reason
+    assert found.corners == 0
+    row = points[:, 1] == points[0, 1]
+    assert not fixes_a_plane(points[row])
+    assert not fixes_a_plane(np.concatenate([points[row], points[~row][:1]]))
+    assert fixes_a_plane(np.concatenate([points[row], points[~row][:2]]))
 
 
 def test_sixteen_bits_and_colour_give_the_corners_of_eight_bits() -> None:

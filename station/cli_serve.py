@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import logging
 import os
@@ -19,12 +18,11 @@ from recordings.messages import Mount
 from station.cell import Cell
 from station.client import DaemonGoneError, ask, default_socket
 from station.errors import ConfigError, StationError
+from station.priority import DAEMON_NICENESS, go_before_others
 from station.session.folder import default_root
 from station.simulation.cell import NoiseLevel, SceneName
 
 START_WAIT_S = 30.0
-PRIORITY = -5
-"""The arm's watchdog hangs on the daemon's loop and the control process: they go before other programs."""
 _RANGES = {"scene": SceneName, "noise": NoiseLevel, "mount": Mount}
 
 
@@ -42,6 +40,8 @@ def serve_command(
     hardware_trigger: Annotated[
         bool, typer.Option("--hardware-trigger", help="Simulated: a trigger box fires the camera.")
     ] = False,
+    frame_rate_hz: Annotated[float, typer.Option(hidden=True)] = 0.0,
+    robot: Annotated[str, typer.Option(hidden=True)] = "UR10",
     time_scale: Annotated[float, typer.Option(hidden=True)] = 1.0,
     end_with_stdin: Annotated[bool, typer.Option("--end-with-stdin", hidden=True)] = False,
 ) -> None:
@@ -73,6 +73,8 @@ def serve_command(
         time_scale,
         gige,
         hardware_trigger,
+        frame_rate_hz,
+        robot,
     )
     cell = simulated_cell(options, place / "simulation")
     asyncio.run(serve_cell(cell, place, socket or default_socket(), end_with_stdin))
@@ -96,8 +98,7 @@ def _real_cell(config: Path, root: Path) -> Cell:
 async def serve_cell(cell: Cell, root: Path, socket: Path, end_with_stdin: bool) -> None:
     from station.daemon import Daemon
 
-    with contextlib.suppress(OSError):  # who may not goes on as before; the unit file asks for it too
-        os.setpriority(os.PRIO_PROCESS, 0, PRIORITY)
+    go_before_others(DAEMON_NICENESS)
     try:
         daemon = Daemon(cell, root, socket)
         if end_with_stdin:

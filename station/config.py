@@ -47,6 +47,8 @@ class CameraConfig(Section, frozen=True):
     """aravis: serial, IP address or name. playback: a folder, video or recording."""
     trigger: Literal["software", "hardware", "free-running"] = "software"
     pixel_format: str = "Mono8"
+    frame_rate_hz: float | None = None
+    """free-running: None = the camera's own"""
     exposure_us: float = 10_000.0
     gain_db: float = 0.0
     region: tuple[int, int, int, int] | None = None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import threading
+import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
@@ -23,6 +24,8 @@ T = TypeVar("T")
 _CLOCK_READINGS = 8
 _STREAM_POP_S = 0.1
 _GLIMPSE_S = 1.0
+_STREAM_CHECK_S = 1.0
+"""So often clock and settings are read while frames come by themselves."""
 
 
 class AravisCamera:
@@ -101,6 +104,10 @@ class AravisCamera:
                 self.counter.restart()
                 return None
 
+    @property
+    def free_running(self) -> bool:
+        return self._config.trigger == "free-running"
+
     async def stream(self, callback: Callable[[Picture], None], stop: threading.Event) -> None:
         """Free-running: every frame, in order, from the worker's thread, until `stop` is set."""
         async with self._busy:
@@ -139,19 +146,20 @@ class AravisCamera:
 
     def _prepare(self) -> tuple[float, float]:
         device = self._live()
-        if self._config.trigger != "free-running" and (extra := device.drain()):
+        if not self.free_running and (extra := device.drain()):
             raise self.counter.surplus(extra)
         device.latch(self._clock)
         return device.check_settings()
 
     def _take(self, timeout_s: float) -> Picture:
         device = self._live()
-        if self._config.trigger == "free-running":
-            device.drain()  # they began before they were asked for
+        if self.free_running:
             self.counter.restart()
-        elif self._config.trigger == "software":
-            device.trigger()
-        picture = device.frame(timeout_s)
+            picture = device.fresh_frame(timeout_s)
+        else:
+            if self._config.trigger == "software":
+                device.trigger()
+            picture = device.frame(timeout_s)
         if picture is None:
             raise CameraError(
                 f"the camera sent no picture within {timeout_s:g} s of its trigger; take this pose again "
@@ -163,7 +171,10 @@ class AravisCamera:
         device = self._live()
         self.counter.restart()
         device.drain()
+        exposure_us, gain_db, checked_s = 0.0, 0.0, -_STREAM_CHECK_S
         while not stop.is_set():
+            if time.monotonic() - checked_s >= _STREAM_CHECK_S:
+                (exposure_us, gain_db), checked_s = self._prepare(), time.monotonic()
             try:
                 picture = device.frame(_STREAM_POP_S)
             except CameraError:
@@ -172,4 +183,7 @@ class AravisCamera:
                 continue  # incomplete: the next frame's id shows the gap, and the counter counts it
             if picture is not None:
                 sequence = self.counter.follow(picture.frame_id)
-                callback(msgspec.structs.replace(picture, sequence=sequence))
+                self._newest = msgspec.structs.replace(
+                    picture, sequence=sequence, exposure_us=exposure_us, gain_db=gain_db
+                )
+                callback(self._newest)

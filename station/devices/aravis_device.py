@@ -25,6 +25,8 @@ STREAM_BUFFERS = 128
 """Free-running: what a loaded computer may be late by, at 150 fps most of a second."""
 FRAME_RETENTION_S = 0.5
 """So long a frame may wait for its last packets before it is given up as incomplete."""
+SOCKET_BUFFER_BYTES = 32 * 2**20
+"""Of packets that wait in the kernel; it gives what net.core.rmem_max permits."""
 _STREAM_PRIORITY = -15
 """Of Aravis's receiving thread: the kernel keeps a fifth of a second of packets, then frames are lost."""
 _LATCH_WAIT_S = 0.02
@@ -92,6 +94,9 @@ class GenicamDevice:
             _hurry(_threads() - before)
             if self._camera.is_gv_device():
                 self._stream.set_property("frame-retention", round(FRAME_RETENTION_S * 1e6))
+                # By itself Aravis asks for the size of one picture, whatever the system would permit.
+                self._stream.set_property("socket-buffer", self._aravis.GvStreamSocketBuffer.FIXED)
+                self._stream.set_property("socket-buffer-size", SOCKET_BUFFER_BYTES)
             payload = self._camera.get_payload()
             for _ in range(STREAM_BUFFERS if self._config.trigger == "free-running" else BUFFERS):
                 self._stream.push_buffer(self._aravis.Buffer.new_allocate(payload))
@@ -132,7 +137,10 @@ class GenicamDevice:
             else:
                 camera.gv_set_packet_size(config.packet_size)
         camera.set_acquisition_mode(self._aravis.AcquisitionMode.CONTINUOUS)
-        if config.trigger != "free-running":
+        if config.trigger == "free-running":
+            if config.frame_rate_hz is not None:
+                camera.set_frame_rate(config.frame_rate_hz)
+        else:
             camera.set_trigger("Software" if config.trigger == "software" else "Line0")
 
     def settings(self) -> dict[str, Any]:
@@ -237,6 +245,18 @@ class GenicamDevice:
             return self._picture(buffer)
         finally:
             self._stream.push_buffer(buffer)
+
+    def fresh_frame(self, timeout_s: float) -> Picture | None:
+        """Free-running: the next complete one of those that were not there when it was asked for."""
+        self.drain()
+        end_s = time.monotonic() + timeout_s
+        while (left_s := end_s - time.monotonic()) > 0:
+            try:
+                return self.frame(left_s)
+            except CameraError:
+                if self.lost.is_set():
+                    raise
+        return None
 
     def _picture(self, buffer: Any) -> Picture:
         if buffer.get_status() != self._aravis.BufferStatus.SUCCESS:

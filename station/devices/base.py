@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import msgspec
 
@@ -96,6 +97,18 @@ class Camera(Protocol):
         """A recent picture for the screen; None when there is none. Never recorded."""
 
     async def close(self) -> None: ...
+
+
+@runtime_checkable
+class StreamingCamera(Protocol):
+    """A camera that can also send pictures at its own pace."""
+
+    @property
+    def free_running(self) -> bool:
+        """It does so; else every picture is triggered."""
+
+    async def stream(self, callback: Callable[[Picture], None], stop: threading.Event) -> None:
+        """Every frame, in order, from a thread of its own, until `stop` is set. Raises CameraError."""
 
 
 class TriggerPulse(msgspec.Struct, frozen=True):

@@ -25,6 +25,7 @@ import time
 from typing import Any, NoReturn
 
 from station.parent import die_with_parent
+from station.priority import DAEMON_NICENESS, go_before_others
 
 BEAT_FRESH_NS = 100_000_000
 WATCHDOG_HZ = 5.0
@@ -96,6 +97,7 @@ class ControlServer:
 def main(host: str, descriptor: int, parent_pid: int) -> NoReturn:
     """`descriptor`: the inherited socket. Leaves by os._exit: the library's destructors can hang or abort."""
     die_with_parent(parent_pid)
+    go_before_others(DAEMON_NICENESS)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = socket.socket(fileno=descriptor)
     from rtde_control import RTDEControlInterface

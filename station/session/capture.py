@@ -41,7 +41,7 @@ async def take_pose(bench: Bench, index: int, attempt: int) -> None:
     async with PictureWatch(bench, index) as watch:
         still = await bench.stillness.settle(resting, watch.look)
     _phase(bench, index, StationState.CAPTURING, "capturing")
-    picture = bench.require_recording().number(await _picture(bench, index))
+    picture = bench.require_recording().number(await take_picture(bench, index))
     show_frame(bench, picture)
     device_ns, arrival_ns = picture.stamps.device_ns, picture.stamps.host_monotonic_ns
     clock = bench.cell.camera.clock
@@ -70,8 +70,8 @@ def _phase(bench: Bench, index: int, state: StationState, pose_state: PoseState)
     bench.show_poses(index)
 
 
-async def _picture(bench: Bench, index: int) -> Picture:
-    """PoseFailedError once the configured retries are used up."""
+async def take_picture(bench: Bench, index: int | None = None) -> Picture:
+    """Of a pose, or of none. PoseFailedError once the configured retries are used up."""
     tries = 1 + bench.cell.config.capture.retries
     camera = bench.cell.camera
     for number in range(1, tries + 1):

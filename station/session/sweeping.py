@@ -3,17 +3,23 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 
+from recordings.messages import Picture
 from station.analysis import sight
+from station.devices.base import StreamingCamera
 from station.errors import CameraError, LimitError
 from station.session.bench import Bench
-from station.session.capture import SIGHT_TIMEOUT_S, show_frame
+from station.session.capture import SIGHT_TIMEOUT_S, show_frame, take_picture
 from station.session.lease import Go
+from station.session.recording import SessionRecording
 from station.session.run import FAILURES_IN_A_ROW, Run
 from station.status import StationState
 
 BREATH_S = 0.02
 """Between two pictures, for whatever else the loop has to do: the arm's heartbeat first of all."""
+SHOW_PERIOD_S = 0.1
+"""So often a streaming camera's newest picture is told of."""
 
 
 class SweepRun(Run):
@@ -21,12 +27,12 @@ class SweepRun(Run):
 
     def __init__(self, bench: Bench, go: Go) -> None:
         super().__init__(bench, go)
-        self._pictures, self._ended = 0, False
+        self._pictures, self._ended = 0, threading.Event()
 
     async def _open_recording(self) -> None:
-        """CameraError without the board in view: a sweep that sees none is worth nothing."""
+        """StationError without the board in view: a sweep that sees none is worth nothing."""
         bench, config = self._bench, self._bench.cell.config
-        picture = await bench.cell.camera.capture()
+        picture = await take_picture(bench)
         seen = await bench.workers.call(
             sight, picture.image, config.board, config.camera.model, timeout_s=SIGHT_TIMEOUT_S
         )
@@ -44,7 +50,7 @@ class SweepRun(Run):
                 try:
                     await self._swings()
                 finally:
-                    self._ended = True  # a camera may swallow being cancelled, just when its picture comes
+                    self._ended.set()  # a camera may swallow being cancelled, just when its picture comes
         except ExceptionGroup as failed:
             raise failed.exceptions[0] from None  # of two the first one tells the cause
         if not self._bench.halting:
@@ -72,23 +78,51 @@ class SweepRun(Run):
 
     async def _take_pictures(self) -> None:
         """Until the arm rests, or until the camera failed several times in a row."""
-        bench, failures = self._bench, 0
-        while not self._ended:
+        camera, recording, failures = self._bench.cell.camera, self._bench.require_recording(), 0
+        streaming = camera if isinstance(camera, StreamingCamera) and camera.free_running else None
+        while not self._ended.is_set():
             if failures == FAILURES_IN_A_ROW:
                 self._give_up("the camera fails again and again: the sweep ends with this swing")
                 return
+            before = self._pictures
             try:
-                picture = await bench.cell.camera.capture()
+                if streaming is not None:
+                    await self._stream(streaming, recording)
+                else:
+                    show_frame(self._bench, self._keep(recording, await camera.capture()))
+                    await asyncio.sleep(BREATH_S)
             except CameraError as error:
-                failures += 1
-                bench.store.event(f"picture: {error}", "warning")
-                continue
-            failures = 0
-            numbered = bench.require_recording().number(picture)
-            bench.require_recording().picture(numbered)
-            self._pictures += 1
-            show_frame(bench, numbered)
-            await asyncio.sleep(BREATH_S)
+                failures = 1 if self._pictures > before else failures + 1
+                self._bench.store.event(f"picture: {error}", "warning")
+            else:
+                failures = 0
+
+    def _keep(self, recording: SessionRecording, picture: Picture) -> Picture:
+        """Numbered and handed to the recorder; RecordingError when that cannot keep up."""
+        numbered = recording.number(picture)
+        recording.picture(numbered)
+        self._pictures += 1
+        return numbered
+
+    async def _stream(self, camera: StreamingCamera, recording: SessionRecording) -> None:
+        """Every frame, straight from the camera's thread; what is shown of them comes from the loop."""
+        newest: list[Picture] = []
+
+        def keep(picture: Picture) -> None:
+            if not self._ended.is_set():  # the arm stopped while it was on its way
+                newest[:] = [self._keep(recording, picture)]
+
+        async def show() -> None:
+            while True:
+                await asyncio.sleep(SHOW_PERIOD_S)
+                if newest:
+                    show_frame(self._bench, newest[0])
+
+        showing = asyncio.create_task(show())
+        try:
+            await camera.stream(keep, self._ended)
+        finally:
+            showing.cancel()
 
     def _give_up(self, reason: str) -> None:
         """The arm rests after this swing; a person decides."""

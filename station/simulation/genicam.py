@@ -60,7 +60,16 @@ def genicam_xml() -> str:
         _enumeration("AcquisitionMode", 0x12C, {"Continuous": 1, "SingleFrame": 2, "MultiFrame": 3}),
         _command("AcquisitionStart", ACQUISITION, 1),
         _command("AcquisitionStop", ACQUISITION, 0),
-        _float("AcquisitionFrameRate", FRAME_PERIOD, "1000000 / FROM", "1000000 / TO", 0.1, 1000.0, "Hz"),
+        # Range checks ask for the converted smallest register, 0.
+        _float(
+            "AcquisitionFrameRate",
+            FRAME_PERIOD,
+            "1000000 / FROM",
+            "1000000 / (TO + (TO = 0))",
+            0.1,
+            1000.0,
+            "Hz",
+        ),
         _float("ExposureTime", EXPOSURE, "FROM", "TO", 20.0, 1_000_000.0, "us"),
         _enumeration("ExposureAuto", EXPOSURE_AUTO, {"Off": 0, "Continuous": 1, "Once": 2}),
         _float("Gain", GAIN, f"FROM * {GAIN_STEPS_PER_DB}", f"TO / {GAIN_STEPS_PER_DB}.0", 0.0, 24.0, "dB"),

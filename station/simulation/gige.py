@@ -25,11 +25,13 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
+from calibrate.kinematics import MODELS, forward
 from station.devices.pixels import encode
 from station.errors import CameraError, RobotError
 from station.simulation import genicam
 from station.simulation.camera_process import CameraProcess
 from station.simulation.cell import CellTruth, make_cell, read_truth
+from station.simulation.renderer import render
 
 LIBRARY = "libaravis-0.8.so.0"
 CONTROL_PORT = 3956
@@ -181,28 +183,43 @@ def rendered_source(camera: CameraProcess) -> Source:
 class NumberedSource:
     """For throughput: frame n is `numbered_picture(n)`, at next to no cost. `clock`: the device's, ns."""
 
-    def __init__(self, clock: Callable[[], int]) -> None:
+    def __init__(self, clock: Callable[[], int], still: NDArray[np.uint8] | None = None) -> None:
         self.next_number = 0
         self._clock = clock
+        self._still = still
 
     def __call__(
         self, width: int, height: int, exposure_us: float, gain_db: float
     ) -> tuple[NDArray[np.uint8], int]:
         self.next_number += 1
-        return numbered_picture(self.next_number - 1, width, height), self._clock()
+        return numbered_picture(self.next_number - 1, width, height, self._still), self._clock()
 
 
 _noise: dict[tuple[int, int], NDArray[np.uint8]] = {}
 
 
-def numbered_picture(number: int, width: int, height: int) -> NDArray[np.uint8]:
-    """Noise that moves with the number, and the number itself in the first eight bytes."""
+def numbered_picture(
+    number: int, width: int, height: int, still: NDArray[np.uint8] | None = None
+) -> NDArray[np.uint8]:
+    """Noise that moves with the number, and the number itself in the first eight bytes.
+
+    `still`: (height, width), shown below the noise, which then has three bits.
+    """
     if (width, height) not in _noise:
         _noise[width, height] = np.random.default_rng(0).integers(0, 256, (height + 64, width), np.uint8)
     shift = number % 64
     picture = _noise[width, height][shift : shift + height].copy()
+    if still is not None:
+        picture = (still[:height, :width] & np.uint8(0xF8)) | (picture >> np.uint8(5))
     picture.reshape(-1)[:8] = np.frombuffer(number.to_bytes(8, "little"), np.uint8)
     return picture
+
+
+def still_picture(truth: CellTruth) -> NDArray[np.uint8]:
+    """What the camera sees from where the arm starts, without noise: the same bits every time."""
+    camera = CameraProcess(truth, "", truth.exposure_us, truth.gain_db)
+    flange = forward(MODELS[truth.robot_model], truth.start_joints_rad)
+    return render(truth.camera, truth.board, camera.camera_from_board(flange))
 
 
 def _be_hardware() -> None:
@@ -216,7 +233,9 @@ def main(
     truth: Annotated[Path | None, typer.Option(help="File of the simulated cell.")] = None,
     address: Annotated[str, typer.Option(help="Loopback address of the camera.")] = "127.0.0.1",
     serial: Annotated[str, typer.Option(help="As the camera reports it.")] = "SIM00000",
-    numbered: Annotated[bool, typer.Option(help="Numbered test pictures instead of the cell.")] = False,
+    numbered: Annotated[
+        bool, typer.Option(help="Numbered test pictures, over what the start shows if there is a truth.")
+    ] = False,
 ) -> None:
     """Serves until standard input ends; prints one JSON line when it listens."""
     cv2.setNumThreads(1)
@@ -230,7 +249,7 @@ def main(
     def clock() -> int:
         return rendered.device_ns(time.monotonic_ns())
 
-    numbers = NumberedSource(clock)
+    numbers = NumberedSource(clock, None if truth is None or not numbered else still_picture(cell))
     source = numbers if numbered else rendered_source(rendered)
     try:
         camera = GigeCamera(source, cell.camera.width, cell.camera.height, address, serial)

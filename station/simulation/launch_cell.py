@@ -13,7 +13,7 @@ from recordings.messages import Mount
 from station.cell import Cell
 from station.config import StationConfig, TriggerConfig
 from station.devices.base import Camera, Trigger
-from station.errors import StationError
+from station.errors import ConfigError, StationError
 from station.simulation.cell import CellTruth, NoiseLevel, SceneName, make_cell, write_truth
 from station.simulation.launch import start_controller
 
@@ -35,17 +35,25 @@ class SimulationOptions:
     """The camera over GigE Vision, in a network namespace with only `lo`."""
     hardware_trigger: bool = False
     """A trigger box on a pseudo terminal fires the camera."""
+    frame_rate_hz: float = 0.0
+    """With `gige`: free-running at this rate. Drawing takes longer than a frame, so its pictures are numbered
+    ones of the board as the camera sees it from where the arm starts."""
+    robot: str = "UR10"
+    """Another arm at the same place; its own start shows the board for seed 0."""
     free_space_bytes: int = 200_000_000
     """A demonstration must run on a small disk."""
 
 
 def simulated_cell(options: SimulationOptions, folder: Path) -> Cell:
-    """Starts the controller; blocking (a second). `folder` takes the truth and logs. Raises RobotError."""
+    """Starts the controller; blocking (a second). `folder` takes the truth and logs. Raises StationError."""
     from station.devices.ur import UrRobot
     from station.simulation.scenes import cell_config
 
+    if options.frame_rate_hz and (options.hardware_trigger or not options.gige):
+        raise ConfigError("a simulated camera runs freely only over GigE, and without a trigger box")
     folder.mkdir(parents=True, exist_ok=True)
     truth = make_cell(options.scene, options.seed, options.noise, options.mount)
+    truth = msgspec.structs.replace(truth, robot_model=options.robot)
     truth_file = folder / "truth.json"
     write_truth(truth, truth_file)
     controller = start_controller(
@@ -53,7 +61,8 @@ def simulated_cell(options: SimulationOptions, folder: Path) -> Cell:
     )
     config = cell_config(truth, controller.host)
     capture = msgspec.structs.replace(config.capture, free_space_bytes=options.free_space_bytes)
-    config = msgspec.structs.replace(config, capture=capture)
+    robot = msgspec.structs.replace(config.robot, model=options.robot)
+    config = msgspec.structs.replace(config, capture=capture, robot=robot)
     try:
         wires = _Wires(options.hardware_trigger)
         config = wires.configured(config)
@@ -121,11 +130,17 @@ def _camera(
     from station.devices.aravis import AravisCamera
     from station.simulation.gige_launch import start_gige
 
-    simulator = start_gige(config.robot.host, truth=truth_file, serial=f"SIM{options.seed:05d}")
+    free = options.frame_rate_hz > 0
+    serial = f"SIM{options.seed:05d}"
+    simulator = start_gige(config.robot.host, truth=truth_file, serial=serial, numbered=free)
     # The simulator has no test packets to negotiate the packet size with; loopback carries the largest.
     over_gige = msgspec.structs.replace(
         config.camera, driver="aravis", device="127.0.0.1", packet_size=GIGE_PACKET_BYTES
     )
+    if free:
+        over_gige = msgspec.structs.replace(
+            over_gige, trigger="free-running", frame_rate_hz=options.frame_rate_hz
+        )
     config = msgspec.structs.replace(config, camera=over_gige)
     wires.camera = lambda: simulator.inject("pulse")
     return config, AravisCamera(over_gige, wires.trigger), simulator.stop

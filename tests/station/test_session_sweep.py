@@ -3,17 +3,21 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
+import threading
+from collections.abc import Callable
 
 import numpy as np
 import pytest
 
+from recordings.messages import Picture
 from recordings.reader import Recording
 from station.analysis import Sighting
-from station.errors import RefusedError
+from station.errors import CameraError, RefusedError
 from station.plan.sweep import SWINGS, sweep_plan
 from station.status import DetectionStatus
 from station.status import StationState as S
-from tests.station.session_rig import TRUTH, Rig, sealed
+from tests.station.session_rig import TRUTH, CameraInMemory, Rig, sealed
 
 
 @pytest.fixture
@@ -76,13 +80,94 @@ async def test_a_camera_that_fails_again_and_again_ends_it_after_the_swing(sweep
 
 async def test_a_full_disk_stops_the_arm_at_once(sweeping: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     sweeping.arm.slow = True
-    await sweeping.give_go()
-    await sweeping.until_true(lambda: sweeping.camera.taken > 3)
+    await stops_on_a_full_disk(sweeping, monkeypatch)
+
+
+async def stops_on_a_full_disk(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    await rig.give_go()
+    await rig.until_true(lambda: rig.camera.taken > 3)
 
     def full(*_: object) -> int:
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr("recordings.mcap_file.os.writev", full)
-    await sweeping.until(S.FAULT)
-    assert "No space left" in sweeping.session.store.status.reason
-    await sweeping.until_true(lambda: "stop" in sweeping.arm.log)
+    await rig.until(S.FAULT)
+    assert "No space left" in rig.session.store.status.reason
+    await rig.until_true(lambda: "stop" in rig.arm.log)
+
+
+class StreamingInMemory(CameraInMemory):
+    """Sends frames from a thread of its own, faster than a loop that is busy could ask for them."""
+
+    free_running = True
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.streams = 0
+
+    async def stream(self, callback: Callable[[Picture], None], stop: threading.Event) -> None:
+        self.streams += 1
+        await asyncio.to_thread(self._send, callback, stop)
+
+    def _send(self, callback: Callable[[Picture], None], stop: threading.Event) -> None:
+        while not stop.is_set():
+            if self.fail:
+                raise CameraError(self.fail.pop(0))
+            callback(asyncio.run(self.capture()))
+            stop.wait(0.002)
+        callback(asyncio.run(self.capture()))  # one that was on its way
+
+
+@pytest.fixture
+async def streaming(rig: Rig) -> Rig:
+    rig.camera = StreamingInMemory()
+    cell = dataclasses.replace(rig.session.bench.cell, camera=rig.camera)
+    rig.session.bench.cell = cell
+    rig.arm.slow = True
+    rig.session.load_plan(1, sweep_plan("UR10", "eye-in-hand", TRUTH.start_joints_rad))
+    return rig
+
+
+async def test_every_frame_of_a_streaming_camera_is_recorded(streaming: Rig) -> None:
+    await streaming.give_go()
+    for number in range(SWINGS):
+        await streaming.until_true(lambda n=number: streaming.arm.log.count("move") == n + 1)
+        before = streaming.camera.taken
+        await streaming.until_true(lambda before=before: streaming.camera.taken > before + 2)
+        streaming.arm.arrive.set()
+    await streaming.until(S.IDLE)
+    assert streaming.camera.streams == 1
+    part = sealed(streaming).parts[0]
+    ids = [facts.frame_id for facts in part.picture_facts()]
+    assert ids == list(range(2, 2 + len(ids))), "all that follow the first look at the board"
+    assert len(ids) == streaming.camera.taken - 2 > 2 * SWINGS, "but for that look and the one that came late"
+
+
+async def test_stop_ends_a_stream(streaming: Rig) -> None:
+    await streaming.give_go()
+    await streaming.until_true(lambda: streaming.camera.taken > 3)
+    await streaming.session.stop("anna")
+    taken = streaming.camera.taken
+    assert streaming.session.store.state is S.STOPPED
+    await asyncio.sleep(0.1)
+    assert streaming.camera.taken <= taken + 1 and streaming.arm.log.count("move") == 1
+
+
+async def test_a_stream_that_breaks_is_begun_again_and_given_up_in_the_end(streaming: Rig) -> None:
+    await streaming.give_go()
+    await streaming.until_true(lambda: streaming.camera.taken > 3)
+    streaming.camera.fail = ["gone"]
+    before = streaming.camera.taken
+    await streaming.until_true(lambda: streaming.camera.taken > before + 3)
+    assert streaming.camera.streams == 2
+    streaming.camera.fail = ["gone"] * 3
+    await streaming.until_true(lambda: not streaming.camera.fail)
+    streaming.arm.arrive.set()
+    await streaming.until(S.PAUSED)
+    assert streaming.arm.log.count("move") == 1
+
+
+async def test_a_full_disk_stops_a_stream_and_the_arm(
+    streaming: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await stops_on_a_full_disk(streaming, monkeypatch)

@@ -191,9 +191,11 @@ def test_hardware_trigger_needs_a_box() -> None:
 
 
 async def test_free_running_frames_come_in_order_and_complete(server: SimulatedGige) -> None:
-    server.inject("register", [genicam.FRAME_PERIOD, 13_333])  # 75 fps
+    config = CameraConfig(
+        device="127.0.0.1", trigger="free-running", frame_rate_hz=75.0, packet_size=8996, gain_db=2.0
+    )
     pictures: list[Picture] = []
-    async with Opened(CameraConfig(device="127.0.0.1", trigger="free-running", packet_size=8996)) as camera:
+    async with Opened(config) as camera:
         stop = threading.Event()
 
         def keep(picture: Picture) -> None:
@@ -208,6 +210,9 @@ async def test_free_running_frames_come_in_order_and_complete(server: SimulatedG
     numbers = [number_of(p) for p in pictures]
     assert numbers == list(range(numbers[0], numbers[0] + 60))
     assert [p.sequence for p in pictures] == list(range(60))
+    assert {p.gain_db for p in pictures} == {2.0}
+    seconds = (pictures[-1].stamps.device_ns - pictures[0].stamps.device_ns) / 1e9
+    assert 40 < 59 / seconds < 80, "75 a second; less where the simulator is held up"
 
 
 async def test_without_pygobject_the_operator_is_told_what_to_install(

@@ -22,10 +22,18 @@ from typing import Literal
 
 import msgspec
 
-from calibrate.calibration import Calibration, CalibrationFileError, fsync_folder, read_calibration
+from calibrate.calibration import (
+    Calibration,
+    CalibrationFileError,
+    decode_calibration,
+    encode_calibration,
+    fsync_folder,
+    read_calibration,
+)
 from calibrate.errors import CalibrationError
 from calibrate.lines import append_line, read_lines
 
+Action = Literal["install", "rollback", "verify"]
 _NAME = re.compile(r"(\d{4,})-[0-9a-f]{8}\.yaml")
 
 
@@ -45,7 +53,7 @@ class Generation:
 
 class LogEntry(msgspec.Struct, frozen=True, omit_defaults=True):
     wall: str
-    action: Literal["install", "rollback", "verify"]
+    action: Action
     generation: int
     who: str
     change: str = ""
@@ -66,7 +74,7 @@ def state_root(root: Path | None = None) -> Path:
 def generations(root: Path | None = None) -> list[Generation]:
     """Everything ever installed, oldest first; damaged files are listed with their problem."""
     folder = calibrations_folder(root)
-    current = current_name(folder)
+    current = _current_name(folder)
     found = []
     for path in sorted((folder / "gen").glob("*.yaml")):
         match = _NAME.fullmatch(path.name)
@@ -86,7 +94,34 @@ def read_log(root: Path | None = None) -> list[LogEntry]:
     return read_lines(calibrations_folder(root) / "log.jsonl", LogEntry)
 
 
-def content_name(content: bytes) -> str:
+def add_generation(
+    root: Path | None, calibration: Calibration, action: Action, change: str, reason: str = ""
+) -> Generation:
+    """A new generation with this content becomes the current one and is logged. Inside `locked` only.
+
+    It is on the disk, whole, and read back before anything points to it. InstallError, CalibrationFileError.
+    """
+    folder = calibrations_folder(root)
+    content = encode_calibration(calibration)
+    number = _next_number(folder)
+    path = folder / "gen" / f"{number:04d}-{_content_name(content)}.yaml"
+    _write_new(path, content)
+    decode_calibration(path.read_bytes(), str(path))
+    make_current(root, Generation(number, path, True, calibration), action, change, reason)
+    return Generation(number, path, True, calibration)
+
+
+def make_current(
+    root: Path | None, generation: Generation, action: Action, change: str, reason: str = ""
+) -> None:
+    """Switches to it, and writes that down. Inside `locked` only."""
+    folder = calibrations_folder(root)
+    _switch(folder, generation.path.name, generation.path.read_bytes())
+    entry = LogEntry(_now_text(), action, generation.number, who(), change, reason)
+    append_line(folder / "log.jsonl", entry)
+
+
+def _content_name(content: bytes) -> str:
     """First 8 hex digits of the content's own hash, as written in the file."""
     found = re.search(rb"^sha256: '?([0-9a-f]{8})", content, re.MULTILINE)
     if found is None:
@@ -98,19 +133,19 @@ def calibrations_folder(root: Path | None) -> Path:
     return state_root(root) / "calibrations"
 
 
-def current_name(folder: Path) -> str:
+def _current_name(folder: Path) -> str:
     try:
         return (folder / "current").readlink().name
     except OSError:
         return ""
 
 
-def next_number(folder: Path) -> int:
+def _next_number(folder: Path) -> int:
     numbers = [int(m[1]) for p in (folder / "gen").iterdir() if (m := _NAME.fullmatch(p.name))]
     return max(numbers, default=0) + 1
 
 
-def write_new(path: Path, content: bytes) -> None:
+def _write_new(path: Path, content: bytes) -> None:
     """A generation appears under its name only when it is whole and on the disk."""
     temporary = path.with_suffix(".tmp")
     descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o640)
@@ -122,7 +157,7 @@ def write_new(path: Path, content: bytes) -> None:
     fsync_folder(path.parent)
 
 
-def switch(folder: Path, name: str, content: bytes) -> None:
+def _switch(folder: Path, name: str, content: bytes) -> None:
     """`current` → gen/name by one rename, then read back through it."""
     temporary = folder / "current.new"
     temporary.unlink(missing_ok=True)
@@ -131,10 +166,6 @@ def switch(folder: Path, name: str, content: bytes) -> None:
     fsync_folder(folder)
     if (folder / "current").read_bytes() != content:
         raise InstallError(f"{folder / 'current'} does not read back what was installed; check the disk.")
-
-
-def append_log(folder: Path, entry: LogEntry) -> None:
-    append_line(folder / "log.jsonl", entry)
 
 
 @contextmanager
@@ -161,7 +192,7 @@ def no_generation(folder: Path, number: int, known: list[Generation]) -> Generat
     raise InstallError(f"{folder}: there is no generation {number}; there are: {have}.")
 
 
-def now_text() -> str:
+def _now_text() -> str:
     return datetime.now(UTC).isoformat(timespec="seconds")
 
 

@@ -11,29 +11,18 @@ from typing import Literal
 import msgspec
 import numpy as np
 
-from calibrate.calibration import (
-    Calibration,
-    Override,
-    decode_calibration,
-    encode_calibration,
-    read_calibration,
-)
+from calibrate.calibration import Calibration, Override, read_calibration
 from calibrate.errors import GateFailedError
 from calibrate.generations import (
     Generation,
     InstallError,
-    LogEntry,
-    append_log,
+    add_generation,
     calibrations_folder,
-    content_name,
     generations,
     locked,
-    next_number,
+    make_current,
     no_generation,
-    now_text,
-    switch,
     who,
-    write_new,
 )
 from calibrate.geometry import Transform, difference
 from calibrate.verification import objections as by_hand
@@ -91,8 +80,7 @@ def install(
     configuration, when known. Raises InstallError (also as exit code 4 for a gate) or CalibrationFileError.
     """
     calibration = read_calibration(path)
-    folder = calibrations_folder(root)
-    with locked(folder):
+    with locked(calibrations_folder(root)):
         before = _installed_before(root)
         objections = _objections(calibration, before, robot_serial, camera_serial)
         objections += by_hand(calibration)
@@ -108,15 +96,8 @@ def install(
         if failed or objections:
             taken = Override(override.strip(), who(), [*objections, *failed])
             calibration = msgspec.structs.replace(calibration, override=taken)
-        content = encode_calibration(calibration)
-        number = next_number(folder)
-        name = f"{number:04d}-{content_name(content)}.yaml"
-        write_new(folder / "gen" / name, content)
-        decode_calibration((folder / "gen" / name).read_bytes(), str(folder / "gen" / name))
-        switch(folder, name, content)
         change = change_text(before, calibration)
-        append_log(folder, LogEntry(now_text(), "install", number, who(), change, override.strip()))
-    return Generation(number, folder / "gen" / name, True, calibration)
+        return add_generation(root, calibration, "install", change, override.strip())
 
 
 def rollback(root: Path | None = None, to: int | None = None, reason: str = "") -> Generation:
@@ -134,10 +115,8 @@ def rollback(root: Path | None = None, to: int | None = None, reason: str = "") 
             target = next((g for g in known if g.number == to), None) or no_generation(folder, to, known)
         if target.calibration is None:
             raise InstallError(f"generation {target.number} is damaged and cannot be used: {target.problem}")
-        switch(folder, target.path.name, target.path.read_bytes())
         before = None if current is None else current.calibration
-        change = change_text(before, target.calibration)
-        append_log(folder, LogEntry(now_text(), "rollback", target.number, who(), change, reason))
+        make_current(root, target, "rollback", change_text(before, target.calibration), reason)
     return Generation(target.number, target.path, True, target.calibration)
 
 

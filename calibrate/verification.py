@@ -13,28 +13,14 @@ import msgspec
 import numpy as np
 from scipy import stats
 
-from calibrate.calibration import (
-    Calibration,
-    Touch,
-    decode_calibration,
-    encode_calibration,
-    read_calibration,
-    write_calibration,
-)
+from calibrate.calibration import Calibration, Touch, read_calibration, write_calibration
 from calibrate.generations import (
     Generation,
     InstallError,
-    LogEntry,
-    append_log,
+    add_generation,
     calibrations_folder,
-    content_name,
     generations,
     locked,
-    next_number,
-    now_text,
-    switch,
-    who,
-    write_new,
 )
 
 HAND_MM = 0.3
@@ -85,15 +71,8 @@ def note_installed(root: Path | None, touches: Sequence[Touch]) -> Generation:
         if current is None or current.calibration is None:
             raise InstallError(f"{folder}: no whole calibration is installed; nothing was noted.")
         calibration = _with_touches(current.calibration, touches)
-        content = encode_calibration(calibration)
-        number = next_number(folder)
-        path = folder / "gen" / f"{number:04d}-{content_name(content)}.yaml"
-        write_new(path, content)
-        decode_calibration(path.read_bytes(), str(path))
-        switch(folder, path.name, content)
-        text = "; ".join(touch_text(touch) for touch in touches)
-        append_log(folder, LogEntry(now_text(), "verify", number, who(), text))
-    return Generation(number, path, True, calibration)
+        found = "; ".join(touch_text(touch) for touch in touches)
+        return add_generation(root, calibration, "verify", found)
 
 
 def _with_touches(calibration: Calibration, touches: Sequence[Touch]) -> Calibration:

@@ -16,6 +16,7 @@ from calibrate.calibration import (
     Calibration,
     CalibrationFileError,
     FramePose,
+    Touch,
     read_calibration,
     write_calibration,
 )
@@ -172,70 +173,61 @@ from pathlib import Path
 from calibrate.install import install
 install(Path(sys.argv[1]), Path(sys.argv[2]))
 """
+NOTE = """
+import sys
+from pathlib import Path
+from calibrate.calibration import read_calibration
+from calibrate.verification import note_installed
+note_installed(Path(sys.argv[2]), read_calibration(Path(sys.argv[1])).verification)
+"""
+TOUCH = Touch(
+    0, (0.0, 0.0), (0.3, -0.2), (0.15, 0.15), "told by a person", "anna", "2026-11-21T12:00:00+00:00"
+)
 _SYSCALLS = "openat,write,fsync,rename,renameat,renameat2,symlink,symlinkat,unlink,unlinkat,mkdir,close,flock"
 
 
 @pytest.mark.process
 @pytest.mark.skipif(shutil.which("strace") is None, reason="strace is not installed")
+@pytest.mark.parametrize("program", [INSTALL, NOTE], ids=["install", "note what hands found"])
 @pytest.mark.parametrize("points", [9, pytest.param(1000, marks=pytest.mark.soak)])
-def test_a_kill_at_any_system_call_leaves_old_or_new(make_file, tmp_path: Path, points: int) -> None:  # type: ignore[no-untyped-def]
+def test_a_kill_at_any_system_call_leaves_old_or_new(  # type: ignore[no-untyped-def]
+    make_file, tmp_path: Path, program: str, points: int
+) -> None:
     """Fault 46: SIGKILL on entry to file system calls between the first and the last touch of the root."""
-    old, new = make_file(), make_file(0.001)
+    old, new = make_file(), make_file(0.001 if program is INSTALL else 0.0, verification=[TOUCH])
     template = tmp_path / "template"
     install(old, template)
-    results = {name: read_calibration(path).result for name, path in (("old", old), ("new", new))}
-    calls = _touching_calls(new, template, tmp_path)
+    results = {name: read_calibration(path) for name, path in (("old", old), ("new", new))}
+    calls = _touching_calls(program, new, template, tmp_path)
     assert len(calls) >= 12
     calls = [calls[k] for k in np.unique(np.linspace(0, len(calls) - 1, points).astype(int))]
     seen = []
     for name, place in calls:
         root = tmp_path / "kill"
         shutil.copytree(template, root, symlinks=True)
-        inject = f"inject={name}:signal=KILL:when={place}"
-        command = [
-            "strace",
-            "-f",
-            "-qq",
-            "-o",
-            "/dev/null",
-            "-e",
-            inject,
-            sys.executable,
-            "-c",
-            INSTALL,
-            str(new),
-            str(root),
-        ]
-        done = subprocess.run(command, capture_output=True, timeout=60, check=False)
-        assert done.returncode != 0, f"{name} {place} was not reached"
-        found = load_installed(root).result
+        inject = ("-o", "/dev/null", "-e", f"inject={name}:signal=KILL:when={place}")
+        assert _traced(program, new, root, *inject) != 0, f"{name} {place} was not reached"
+        found = load_installed(root)
         assert found in results.values(), (name, place)
         seen.append("new" if found == results["new"] else "old")
         assert all(not g.problem for g in generations(root)), (name, place)
         install(new, root)  # what a person does next works
-        assert load_installed(root).result == results["new"]
+        assert load_installed(root) == results["new"]
         shutil.rmtree(root)
     assert seen == sorted(seen, reverse=True), "it went back"
     assert {"old", "new"} == set(seen)
 
 
-def _touching_calls(new: Path, template: Path, tmp_path: Path) -> list[tuple[str, int]]:
+def _traced(program: str, new: Path, root: Path, *options: str) -> int:
+    command = ["strace", "-f", "-qq", *options, sys.executable, "-c", program, str(new), str(root)]
+    return subprocess.run(command, capture_output=True, timeout=60, check=False).returncode
+
+
+def _touching_calls(program: str, new: Path, template: Path, tmp_path: Path) -> list[tuple[str, int]]:
     """(system call, its how-manieth) for every call of an undisturbed run after it first touches the root."""
     root, trace = tmp_path / "traced", tmp_path / "trace"
     shutil.copytree(template, root, symlinks=True)
-    command = [
-        "strace",
-        "-f",
-        "-qq",
-        "-o",
-        str(trace),
-        "-e",
-        f"trace={_SYSCALLS}",
-        sys.executable,
-        "-c",
-        INSTALL,
-    ]
-    subprocess.run([*command, str(new), str(root)], check=True, timeout=60)
+    assert _traced(program, new, root, "-o", str(trace), "-e", f"trace={_SYSCALLS}") == 0
     counts: dict[str, int] = {}
     found: list[tuple[str, int]] = []
     begun = False

@@ -38,6 +38,7 @@ from station.tui.result import ResultScreen
 from station.tui.screen import StationScreen
 from station.tui.sessions import SessionsScreen
 from station.tui.themes import THEMES, chosen_theme
+from station.tui.widgets.graphics import Graphics, detect
 from station.tui.widgets.preview import Preview
 
 PREVIEW_PERIOD_S = 0.25
@@ -90,8 +91,10 @@ class StationApp(Commands):
         "checklist": ChecklistScreen,
     }
     DEFAULT_MODE = "live"
+    graphics: Graphics | None = None
+    """How the terminal draws pictures; None: half blocks only."""
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("f12", "stop", "STOP", priority=True, id="stop", tooltip="Stop the arm now; from any screen"),
+        Binding("f12", "stop", "STOP", show=False, priority=True, id="stop", tooltip="Stop the arm now"),
         Binding("f1", "help", "Help", id="help", tooltip="What this screen is for, and all its keys"),
         Binding("f5", "run", "Run", id="run", tooltip="Check the plan, show what would move, and ask"),
         Binding("f6", "pause", "Pause", id="pause", tooltip="Stop after this pose; nothing is lost"),
@@ -179,7 +182,7 @@ class StationApp(Commands):
                 width, height = preview.wanted_pixels()
                 with contextlib.suppress(OSError, StationError):
                     if answer := await link.request("preview", width=width, height=height):
-                        preview.show(answer)
+                        await preview.show(answer)
 
     def on_status_changed(self, message: StatusChanged) -> None:
         self.status = message.status
@@ -203,6 +206,15 @@ class StationApp(Commands):
         unused = not status.session.poses and await self.ask("sessions") == []
         if (missing or unused) and self.current_mode == self.DEFAULT_MODE:
             await self.switch_mode("checklist")
+
+    def common_actions(self) -> list[str]:
+        """What has a key on every screen; a playback adds its own."""
+        return [binding.action for binding in StationApp.BINDINGS if isinstance(binding, Binding)]
+
+    def get_key_display(self, binding: Binding) -> str:
+        """F5 as it is printed on the key, and as every text here calls it."""
+        shown = super().get_key_display(binding)
+        return shown.upper() if shown[0] == "f" and shown[1:].isdigit() else shown
 
     def action_help(self) -> None:
         """Own bindings in a window that fits a console; Textual's panel halves the screen."""
@@ -293,11 +305,13 @@ def run(socket: Path, who: str = "") -> None:
     async def connect() -> Link:
         return await Client.connect(socket, who, interactive=True)
 
-    StationApp(connect).run()
+    app = StationApp(connect)
+    app.graphics = detect()
+    app.run()
 
 
 def run_replay(recording: Path) -> None:
     """The live screen over a recording; no daemon is asked. StationError when it cannot be read."""
-    link = ReplayLink(recording)
-
-    ReplayApp(link).run()
+    app = ReplayApp(ReplayLink(recording))
+    app.graphics = detect()
+    app.run()

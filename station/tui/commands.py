@@ -18,8 +18,6 @@ from station.tui.link import Link
 from station.tui.replay_screen import ReplayScreen
 
 STOP_UNHEARD = "STOP was sent, but the station does not answer: use the EMERGENCY STOP on the pendant."
-PLAN_ANSWER_S = 200.0
-"""Planning takes the daemon some seconds on a quick computer, and minutes on a busy one."""
 
 
 class Commands(App[None]):
@@ -57,9 +55,13 @@ class Commands(App[None]):
     @work(group="command", exit_on_error=False)
     async def send(self, verb: Verb, **args: Any) -> None:
         """A wish of one of the screens; control of the arm is taken with it."""
-        patience = {"timeout_s": PLAN_ANSWER_S} if verb == "make_plan" else {}
-        if await self.ask("lease", action="take") is not None:
-            await self.ask(verb, **patience, **args)
+        await self.ask_with_control(verb, **args)
+
+    async def ask_with_control(self, verb: Verb, **args: Any) -> Any:
+        """As `ask`, for what only the holder of the lease may."""
+        if await self.ask("lease", action="take") is None:
+            return None
+        return await self.ask(verb, **args)
 
     @work(group="stop", exit_on_error=False)
     async def action_stop(self) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, ClassVar, cast
 
 from rich.text import Text
+from textual import work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
@@ -19,8 +20,10 @@ from station.tui.words import POSE_MARKS
 if TYPE_CHECKING:
     from station.tui.app import StationApp
 
-COLUMNS = ("#", "pose", "state", "then ±", "why it is there / what happened", "try", "corners")
+COLUMNS = ("#", "pose", "state", "± then", "why it is there / what happened", "try", "corners")
 NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves); a adds the arm's posture."
+PLANNING = "Planning 25 poses … (seconds; minutes on a busy computer). Nothing moves."
+PLAN_ANSWER_S = 200.0
 MOVE = Binding.Group("Move", compact=True)
 SIGMA_SHOWN_MM = 100.0
 
@@ -60,11 +63,14 @@ class PlanScreen(StationScreen):
         Binding("n", "make", "New", tooltip="Plan 25 poses from the configured guesses (seconds)"),
         Binding("ctrl+up", "shift(-1)", "Move", group=MOVE, tooltip="Visit this pose earlier"),
         Binding("ctrl+down", "shift(1)", "Move", group=MOVE, tooltip="Visit this pose later"),
+        Binding("home", "to_row(0)", "First", show=False, priority=True, tooltip="The first pose"),
+        Binding("end", "to_row(-1)", "Last", show=False, priority=True, tooltip="The last pose"),
     ]
 
     def __init__(self) -> None:
         super().__init__()
         self._detail = NO_PLAN
+        self._planning = False
 
     def body(self) -> ComposeResult:
         with Horizontal(id="plan"):
@@ -106,7 +112,7 @@ class PlanScreen(StationScreen):
         """The highlighted pose in words and in the sketch."""
         self.query_one(PlanSketch).show(status, line)
         poses = () if status is None else status.session.poses
-        text = detail_of(poses[line]) if line < len(poses) else NO_PLAN
+        text = PLANNING if self._planning else detail_of(poses[line]) if line < len(poses) else NO_PLAN
         if text != self._detail:
             self._detail = text
             self.query_one("#plan-detail", Static).update(Text(text))
@@ -135,6 +141,9 @@ class PlanScreen(StationScreen):
         self.station.send("reorder", order=order)
         self.table.move_cursor(row=line + by)
 
+    def action_to_row(self, row: int) -> None:
+        self.table.move_cursor(row=row % max(1, self.table.row_count))
+
     def action_add(self) -> None:
         status = self.station.status
         if status is None or status.robot.joints_rad is None:
@@ -144,6 +153,16 @@ class PlanScreen(StationScreen):
         pose = {"name": name, "joints_rad": status.robot.joints_rad, "why": "added on the screen"}
         self.station.send("add", pose=pose)
 
-    def action_make(self) -> None:
-        self.notify("Planning: some seconds …")
-        self.station.send("make_plan", poses=25, seed=1)
+    @work(exit_on_error=False)
+    async def action_make(self) -> None:
+        """Says that it is at work for as long as it is."""
+        if self._planning:
+            self.notify("A plan is being made already.")
+            return
+        self._planning = True
+        self._explain(self.station.status, self.table.cursor_row)
+        try:
+            await self.station.ask_with_control("make_plan", timeout_s=PLAN_ANSWER_S, poses=25, seed=1)
+        finally:
+            self._planning = False
+            self._explain(self.station.status, self.table.cursor_row)

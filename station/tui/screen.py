@@ -6,13 +6,13 @@ from typing import TYPE_CHECKING, cast
 
 from textual.app import ComposeResult
 from textual.screen import Screen
-from textual.widgets import Footer
 
 from station.status import StationStatus
 from station.tui.widgets.bar import ReasonLine, StatusBar
+from station.tui.widgets.keys import Keys
 
 if TYPE_CHECKING:
-    from station.tui.commands import Commands
+    from station.tui.app import StationApp
 
 
 class StationScreen(Screen[None]):
@@ -26,10 +26,10 @@ class StationScreen(Screen[None]):
         yield StatusBar(id="bar")
         yield ReasonLine(id="reason")
         yield from self.body()
-        yield Footer(show_command_palette=False)
+        yield Keys(cast("StationApp", self.app).common_actions())
 
     def on_screen_resume(self) -> None:
-        app = cast("Commands", self.app)
+        app = cast("StationApp", self.app)
         self.show(app.status)
         self.doubt(app.trouble, app.silent_s)
 

@@ -42,6 +42,7 @@ _ANSI = BUILTIN_THEMES["ansi-dark"]
 THEMES += (
     replace(_ANSI, accent="ansi_cyan", variables=_ANSI.variables | {"block-cursor-text-style": "none"}),
 )
+ANSI_THEMES = tuple(name for name, theme in BUILTIN_THEMES.items() if theme.ansi)
 FEW_COLOURS = ("linux", "vt100", "vt220", "ansi")
 
 

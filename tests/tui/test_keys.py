@@ -9,8 +9,8 @@ from textual.widgets import Static
 from station.errors import RefusedError
 from station.status import StationState
 from station.tui.app import StationApp
-from station.tui.commands import PLAN_ANSWER_S
 from station.tui.confirm import Confirm, ConfirmGo
+from station.tui.plan import PLAN_ANSWER_S
 from tests.tui.conftest import FakeLink, idle, until
 
 

@@ -1,11 +1,13 @@
-"""The camera's picture in half blocks, with the found corners drawn on it. Works on any terminal."""
+"""The camera's picture and its found corners: half blocks on any terminal, sharp where it can draw them."""
 
 from __future__ import annotations
 
+import asyncio
 import base64
+import time
 from functools import lru_cache
 from itertools import groupby
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 import cv2
 import numpy as np
@@ -13,10 +15,15 @@ from numpy.typing import NDArray
 from rich.color import Color
 from rich.segment import Segment
 from rich.style import Style
-from textual.geometry import Size
+from textual.geometry import Region, Size
 from textual.reactive import reactive
 from textual.strip import Strip
 from textual.widget import Widget
+
+from station.tui.widgets.graphics import SHARE, Graphics, SharpPicture
+
+if TYPE_CHECKING:
+    from station.tui.app import StationApp
 
 Grey = NDArray[np.uint8]
 LEVELS = 20
@@ -30,7 +37,10 @@ FEW_SHADES = " ░▒▓█"
 
 
 class Preview(Widget):
-    """Shows the last picture it was given; scales with its own size, keeps the aspect ratio."""
+    """Shows the last picture it was given; scales with its own size, keeps the aspect ratio.
+
+    Half blocks are drawn whenever something may stand over the picture: a terminal's own graphics hide text.
+    """
 
     DEFAULT_CSS = "Preview { width: 1fr; height: 1fr; }"
 
@@ -44,10 +54,14 @@ class Preview(Widget):
         self._corners: NDArray[np.float64] = np.zeros((0, 2))
         self._rows: list[Strip] = []
         self._rows_size = Size(0, 0)
+        self._sharp: SharpPicture | None = None
+        self._next_s = 0.0
+        """Not before: drawing takes no more than its share of the computer."""
 
-    def show(self, answer: dict[str, Any]) -> None:
+    async def show(self, answer: dict[str, Any]) -> None:
         """A `preview` reply: jpeg_base64, and corners as fractions of width and height."""
-        if answer.get("sequence") is not None and answer["sequence"] == self._sequence:
+        same = answer.get("sequence") is not None and answer["sequence"] == self._sequence
+        if same or time.monotonic() < self._next_s:
             return
         data = np.frombuffer(base64.b64decode(answer.get("jpeg_base64", "")), dtype=np.uint8)
         picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
@@ -56,22 +70,45 @@ class Preview(Widget):
         self._picture, self._sequence = np.asarray(picture, dtype=np.uint8), answer.get("sequence")
         self._corners = np.array(answer.get("corners", []), dtype=float).reshape(-1, 2)
         self._rows_size = Size(0, 0)
+        await self._sharpen(self.size)
         self.refresh()
+
+    async def _sharpen(self, size: Size) -> None:
+        graphics, self._sharp = self._graphics(), None
+        if graphics is None or self._picture is None:
+            return
+        self._sharp = await asyncio.to_thread(graphics.draw, self._picture, self._corners, size)
+        self._next_s = time.monotonic() + self._sharp.spent_s / SHARE
+
+    def _graphics(self) -> Graphics | None:
+        """How this terminal draws pictures; None while half blocks are due."""
+        graphics = cast("StationApp", self.app).graphics
+        if graphics is None or self.old or not self.screen.is_active or not graphics.ready():
+            return None
+        return None if any(part.display for part in self.screen.query("Toast, Tooltip")) else graphics
 
     def wanted_pixels(self) -> tuple[int, int]:
         """Width and height of a picture that shows all that this widget can: a cell is one by two."""
+        if (graphics := self._graphics()) is not None:
+            return graphics.pixels(self.size)
         return max(16, self.size.width), max(16, 2 * self.size.height)
+
+    def render_lines(self, crop: Region) -> list[Strip]:
+        if self._sharp is not None and crop.size == self._sharp.size == self.size and self._graphics():
+            return self._sharp.strips(*self.region.offset, self.rich_style)
+        return super().render_lines(crop)
 
     def render_line(self, y: int) -> Strip:
         if self._rows_size != self.size:
             self._rows, self._rows_size = self._draw(self.size), self.size
         if self.old and self._picture is not None and y == self.size.height // 2:
             return Strip([Segment(OLD.center(self.size.width), Style(reverse=True, bold=True))])
-        return self._rows[y] if y < len(self._rows) else Strip.blank(self.size.width)
+        return self._rows[y] if y < len(self._rows) else Strip.blank(self.size.width, self.rich_style)
 
     def _draw(self, size: Size) -> list[Strip]:
         if self._picture is None or size.width < 2 or size.height < 1:
-            return [Strip([Segment("no picture yet".center(size.width))])] if size.width else []
+            words = Segment("no picture yet".center(size.width), self.rich_style)
+            return [Strip([words])] if size.width else []
         height, width = self._picture.shape
         scale = min(size.width / width, 2 * size.height / height)
         columns, rows = max(1, int(width * scale)), max(2, int(height * scale) // 2 * 2)
@@ -85,12 +122,16 @@ class Preview(Widget):
             if 0 <= row < rows // 2 and 0 <= column < columns:
                 cells[row][column] = -1
         left = (size.width - columns) // 2
-        return [_strip(line, left, size.width, few) for line in cells]
+        sides = (
+            Segment(" " * left, self.rich_style),
+            Segment(" " * (size.width - columns - left), self.rich_style),
+        )
+        return [Strip([sides[0], *_runs(line, few), sides[1]], size.width) for line in cells]
 
 
-def _strip(line: list[int], left: int, width: int, few: bool) -> Strip:
+def _runs(line: list[int], few: bool) -> list[Segment]:
     """Neighbours alike become one run: less to send over ssh."""
-    runs = [Segment(" " * left)]
+    runs: list[Segment] = []
     for cell, alike in groupby(line):
         count = len(list(alike))
         if cell < 0:
@@ -99,7 +140,7 @@ def _strip(line: list[int], left: int, width: int, few: bool) -> Strip:
             runs.append(Segment(FEW_SHADES[cell * len(FEW_SHADES) // (2 * LEVELS - 1)] * count))
         else:
             runs.append(Segment("▀" * count, _style(cell)))
-    return Strip(runs).adjust_cell_length(width)
+    return runs
 
 
 @lru_cache(maxsize=LEVELS * LEVELS)

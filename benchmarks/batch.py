@@ -12,6 +12,7 @@ from pathlib import Path
 from benchmarks.offline import make_recording
 from benchmarks.trials import trials
 from calibrate.batch import BatchResult, Progress, Solved, Solver, Task, run_batch, solve_one
+from calibrate.bounds import Limits
 from calibrate.pipeline import JobOptions
 
 _PARTS = 4
@@ -67,7 +68,7 @@ def _recordings(folder: Path, count: int) -> list[Path]:
 
 def _in_this_process(todo: Sequence[Task], options: JobOptions) -> Iterator[Solved]:
     for recording, key in todo:
-        yield solve_one(recording, key, options)
+        yield solve_one(recording, key, options, Limits())
 
 
 def _timed(
@@ -91,13 +92,13 @@ class _Kill:
 
     def __call__(self, done: int, total: int, result: BatchResult) -> None:
         if done == self.after and not self.pids:
-            self.pids = _grandchildren()[:1]
+            self.pids = worker_pids()[:1]
             for pid in self.pids:
                 os.kill(pid, signal.SIGKILL)
 
 
-def _grandchildren() -> list[int]:
-    """The pool's workers: the fork server, a child of this process, started them."""
+def worker_pids() -> list[int]:
+    """Of the pool: the fork server, a child of this process, started them."""
     parents: dict[int, int] = {}
     for stat in Path("/proc").glob("[0-9]*/stat"):
         try:

@@ -20,6 +20,7 @@ from typing import Any
 import cv2
 import msgspec
 
+from calibrate.bounds import Limits, bounded
 from calibrate.calibration import content_sha256, encode_calibration, write_atomically
 from calibrate.errors import CalibrationError
 from calibrate.lines import append_line, read_lines
@@ -86,11 +87,13 @@ def run_batch(
     workers: int | None = None,
     progress: Progress | None = None,
     solver: Solver | None = None,
+    limits: Limits | None = None,
 ) -> list[BatchResult]:
     """Solves what is not solved yet; returns all results in the order of `recordings`.
 
     Each result is a calibration file and a line of `results.jsonl` in `output`, written at once, so that a
-    batch that was killed goes on where it stopped. Raises BatchError when `output` cannot be written.
+    batch that was killed goes on where it stopped. `workers` and `limits` (of each solve) are those of the
+    pool; a `solver` has its own. Raises BatchError when `output` cannot be written.
     """
     options = options or JobOptions()
     try:
@@ -98,7 +101,7 @@ def run_batch(
         done = {result.key: result for result in read_results(output) if result.solved}
         keys = [(str(path.resolve()), batch_key(path, options)) for path in recordings]
         todo = [(path, key) for path, key in dict.fromkeys(keys) if key not in done]
-        solve = solver or _pool_solver(workers)
+        solve = solver or _pool_solver(workers, limits or Limits())
         for count, solved in enumerate(solve(todo, options), 1):
             result = solved.result
             if solved.content:
@@ -134,12 +137,13 @@ def _write(path: Path, content: bytes) -> None:
     write_atomically(path, lambda target: target.write(content))
 
 
-def solve_one(recording: str, key: str, options: JobOptions) -> Solved:
+def solve_one(recording: str, key: str, options: JobOptions, limits: Limits) -> Solved:
     """What every worker does, here or on a cluster. Any failure is a result."""
     cv2.setNumThreads(1)
     path = Path(recording)
     try:
-        job = solve_recording(path, replace(options, threads=1))
+        with bounded(limits.time_s, limits.memory_mib):
+            job = solve_recording(path, replace(options, threads=1))
         content = encode_calibration(job.calibration)
     except (CalibrationError, RecordingError) as problem:
         return Solved(BatchResult(recording, key, False, error=str(problem)))
@@ -178,7 +182,7 @@ def _result(recording: str, key: str, job: SolvedRecording, name: str) -> BatchR
     )
 
 
-def _pool_solver(workers: int | None) -> Solver:
+def _pool_solver(workers: int | None, limits: Limits) -> Solver:
     """Processes of this machine. A killed worker costs a new pool, no recording."""
     count = workers or len(os.sched_getaffinity(0))
 
@@ -190,7 +194,7 @@ def _pool_solver(workers: int | None) -> Solver:
             suspects = [task for task in waiting if attempts[task[1]] > 0]
             tasks = [suspects[0]] if suspects else waiting
             finished: set[str] = set()
-            for solved in _one_pool(tasks, options, count):
+            for solved in _one_pool(tasks, options, limits, count):
                 finished.add(solved.result.key)
                 yield solved
             lost = [task for task in tasks if task[1] not in finished]
@@ -205,14 +209,14 @@ def _pool_solver(workers: int | None) -> Solver:
     return solve
 
 
-def _one_pool(tasks: Sequence[Task], options: JobOptions, count: int) -> Iterator[Solved]:
+def _one_pool(tasks: Sequence[Task], options: JobOptions, limits: Limits, count: int) -> Iterator[Solved]:
     """Ends early when a worker dies; what was not yielded is lost."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["calibrate.batch"])
     with ProcessPoolExecutor(min(count, len(tasks)), mp_context=context) as pool:
         pending: set[Future[Solved]] = {
-            pool.submit(solve_one, recording, key, options) for recording, key in tasks
+            pool.submit(solve_one, recording, key, options, limits) for recording, key in tasks
         }
         while pending:
             finished, pending = wait(pending, return_when=FIRST_COMPLETED)

@@ -10,10 +10,9 @@ import resource
 import signal
 import sys
 import threading
-from collections.abc import Iterator
-from contextlib import contextmanager
-from types import FrameType
-from typing import NoReturn
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from types import FrameType, TracebackType
 
 import cv2
 
@@ -29,74 +28,82 @@ class SolveLimitError(CalibrationError):
     """A solve took more time or memory than it may; nothing was written."""
 
 
-@contextmanager
-def bounded(time_limit_s: float = TIME_LIMIT_S, memory_limit_mib: int = MEMORY_LIMIT_MIB) -> Iterator[None]:
+@dataclass(frozen=True)
+class Limits:
+    """Of one solve; 0 = no limit."""
+
+    time_s: float = TIME_LIMIT_S
+    memory_mib: int = MEMORY_LIMIT_MIB
+
+
+def bounded(
+    time_limit_s: float = TIME_LIMIT_S, memory_limit_mib: int = MEMORY_LIMIT_MIB
+) -> AbstractContextManager[None]:
     """Within the block SolveLimitError is raised once it has taken so long, or so much memory; 0 = no limit.
 
     Memory is that of this whole process (its data, not the files it maps). Outside the main thread, where no
-    signal can be had, only memory is limited.
+    signal can be had and others share the memory, nothing is limited.
     """
-    try:
-        with _time(time_limit_s), _memory(memory_limit_mib):
-            yield
-    except (MemoryError, RuntimeError, cv2.error) as problem:
-        if not _is_out_of_memory(problem):
-            raise
-        raise SolveLimitError(
-            f"The solve needs more than {memory_limit_mib} MiB of memory; nothing was written. Does the "
-            "recording hold far more or far larger pictures than you think (recordings info)? More is "
-            "allowed with --memory-limit-mib."
-        ) from None
+    if threading.current_thread() is not threading.main_thread():
+        return nullcontext()
+    return _Bounded(Limits(time_limit_s, memory_limit_mib))
 
 
-def _is_out_of_memory(problem: Exception) -> bool:
+class _Bounded(AbstractContextManager[None]):
+    """A class, not a generator: an alarm at any moment must find out whether the block has ended already."""
+
+    def __init__(self, limits: Limits) -> None:
+        self._limits = limits
+        self._text = (
+            f"The solve took longer than {limits.time_s:g} s; nothing was written. Other work on this "
+            "computer, or a recording far larger than usual? More is allowed with --time-limit-s."
+        )
+
+    def __enter__(self) -> None:
+        if self._limits.time_s > 0:
+            self._handler_before = signal.signal(signal.SIGALRM, self._late)
+            self._last = threading.Timer(self._limits.time_s + _GRACE_S, self._too_late)
+            self._last.daemon = True
+            self._last.start()
+            # again, should something swallow the first
+            signal.setitimer(signal.ITIMER_REAL, self._limits.time_s, 1.0)
+        soft, hard = self._memory_before = resource.getrlimit(resource.RLIMIT_DATA)
+        if self._limits.memory_mib > 0:
+            limit = self._limits.memory_mib * 2**20
+            limit = limit if soft == resource.RLIM_INFINITY else min(limit, soft)
+            resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
+
+    def __exit__(
+        self, kind: type[BaseException] | None, problem: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._limits.time_s > 0:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.signal(signal.SIGALRM, self._handler_before)
+            self._last.cancel()
+        resource.setrlimit(resource.RLIMIT_DATA, self._memory_before)
+        if problem is not None and _is_out_of_memory(problem):
+            raise SolveLimitError(
+                f"The solve needs more than {self._limits.memory_mib} MiB of memory; nothing was written. "
+                "Does the recording hold far more or far larger pictures than you think (recordings info)? "
+                "More is allowed with --memory-limit-mib."
+            ) from None
+
+    def _late(self, signal_number: int, frame: FrameType | None) -> None:
+        """Raising in the middle of `__exit__` would leave the thread alive that ends the process."""
+        while frame is not None:
+            if frame.f_code in (_Bounded.__enter__.__code__, _Bounded.__exit__.__code__):
+                return
+            frame = frame.f_back
+        raise SolveLimitError(self._text)
+
+    def _too_late(self) -> None:
+        print(f"calibrate: {self._text}", file=sys.stderr, flush=True)
+        os._exit(SolveLimitError.exit_code)
+
+
+def _is_out_of_memory(problem: BaseException) -> bool:
     """A thread's stack is memory, too."""
     if isinstance(problem, cv2.error):
         return bool(problem.code == cv2.Error.StsNoMem)
-    return isinstance(problem, MemoryError) or "start new thread" in str(problem)
-
-
-@contextmanager
-def _memory(limit_mib: int) -> Iterator[None]:
-    soft, hard = resource.getrlimit(resource.RLIMIT_DATA)
-    if limit_mib <= 0:
-        yield
-        return
-    limit = limit_mib * 2**20
-    if soft != resource.RLIM_INFINITY:
-        limit = min(limit, soft)
-    resource.setrlimit(resource.RLIMIT_DATA, (limit, hard))
-    try:
-        yield
-    finally:
-        resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
-
-
-@contextmanager
-def _time(limit_s: float) -> Iterator[None]:
-    if limit_s <= 0 or threading.current_thread() is not threading.main_thread():
-        yield
-        return
-    text = (
-        f"The solve took longer than {limit_s:g} s; nothing was written. Other work on this computer, or a "
-        "recording far larger than usual? More is allowed with --time-limit-s."
-    )
-
-    def late(signal_number: int, frame: FrameType | None) -> NoReturn:
-        raise SolveLimitError(text)
-
-    def too_late() -> None:
-        print(f"calibrate: {text}", file=sys.stderr, flush=True)
-        os._exit(SolveLimitError.exit_code)
-
-    before = signal.signal(signal.SIGALRM, late)
-    last = threading.Timer(limit_s + _GRACE_S, too_late)
-    last.daemon = True
-    last.start()
-    signal.setitimer(signal.ITIMER_REAL, limit_s, 1.0)  # again, should something swallow the first
-    try:
-        yield
-    finally:
-        signal.setitimer(signal.ITIMER_REAL, 0.0)
-        signal.signal(signal.SIGALRM, before)
-        last.cancel()
+    thread = isinstance(problem, RuntimeError) and "start new thread" in str(problem)
+    return thread or isinstance(problem, MemoryError)

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from calibrate.batch import BatchError, BatchResult, Solved, Solver, Task, solve_one
+from calibrate.bounds import Limits
 from calibrate.document import software_versions
 from calibrate.pipeline import JobOptions
 
@@ -71,7 +72,7 @@ def _solve(dask: Any, cluster: Cluster, todo: Sequence[Task], options: JobOption
     with _connect(dask, cluster) as client:
         _require_same_software(client, cluster.address)
         futures = {
-            client.submit(solve_one, recording, key, options, pure=False): (recording, key)
+            client.submit(solve_one, recording, key, options, Limits(), pure=False): (recording, key)
             for recording, key in todo
         }
         for future in dask.as_completed(futures):

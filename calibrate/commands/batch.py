@@ -12,9 +12,10 @@ import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from calibrate.batch import BatchResult, Solver, run_batch
+from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
 from calibrate.calibration import write_atomically
 from calibrate.cluster import Cluster, cluster_solver
-from calibrate.commands.job import GatesFile, Profile, ProfileName, Seed
+from calibrate.commands.job import GatesFile, MemoryLimit, Profile, ProfileName, Seed, TimeLimit
 from calibrate.commands.output import AsJson, OutputError, err, out
 from calibrate.gates import GateLimits, read_limits
 from calibrate.pipeline import JobOptions
@@ -46,19 +47,30 @@ def batch(
     tls_ca: Annotated[Path | None, typer.Option(help="The cluster's certificate authority, PEM")] = None,
     tls_cert: Annotated[Path | None, typer.Option(help="Your certificate, PEM")] = None,
     tls_key: Annotated[Path | None, typer.Option(help="Your private key, PEM")] = None,
+    time_limit_s: TimeLimit = TIME_LIMIT_S,
+    memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
     as_json: AsJson = False,
 ) -> None:
     """Solve many recordings; resumable. Exit 3: done, but some recordings could not be solved.
 
     OUTPUT then holds a calibration each, results.jsonl, results.csv, and what moved: trends.html, trends.txt.
+    The limits are those of one solve in a process here; on a cluster the workers' own hold.
     """
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output} is a file; the results need a folder.")
-    limits = GateLimits() if gates is None else read_limits(gates)
-    options = JobOptions(profile=profile.value, seed=seed, limits=limits)
+    gate_limits = GateLimits() if gates is None else read_limits(gates)
+    options = JobOptions(profile=profile.value, seed=seed, limits=gate_limits)
     solver = _solver(scheduler, workers, tls_ca, tls_cert, tls_key)
     with ExitStack() as stack:
-        results = run_batch(recordings, output, options, workers, _progress(stack), solver)
+        results = run_batch(
+            recordings,
+            output,
+            options,
+            workers,
+            _progress(stack),
+            solver,
+            Limits(time_limit_s, memory_limit_mib),
+        )
     found = cells(results)
     _write(output / "trends.txt", trends_text(found))
     _write(output / "trends.html", fleet_page(results, found))

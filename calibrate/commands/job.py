@@ -45,6 +45,9 @@ GatesFile = Annotated[Path | None, typer.Option("--gates", help="YAML of other l
 Threads = Annotated[int | None, typer.Option(help="For finding boards; the result does not depend on it")]
 Distance = Annotated[float | None, typer.Option("--working-distance-mm", help="Where the error is stated")]
 
+TimeLimit = Annotated[float, typer.Option(help="A solve ends with an error after so long; 0: no limit")]
+MemoryLimit = Annotated[int, typer.Option(help="… when its process needs so much; 0: no limit")]
+
 
 def takes(build: Callable[..., JobOptions]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """The command offers `build`'s options instead of its parameter `options`, and gets what they make."""

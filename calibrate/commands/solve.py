@@ -13,7 +13,7 @@ from rich.table import Table
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, bounded
 from calibrate.calibration import Touch, write_calibration
 from calibrate.commands.install import Root, history_rows
-from calibrate.commands.job import job_options, picture_options, takes
+from calibrate.commands.job import MemoryLimit, TimeLimit, job_options, picture_options, takes
 from calibrate.commands.output import AsJson, check_target, detection_progress, out, print_json
 from calibrate.errors import CalibrationError
 from calibrate.frames import camera_frames
@@ -25,10 +25,6 @@ from calibrate.summary import summary
 
 Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session folder", show_default=False)]
 GATE_FAILED = 4
-
-
-TimeLimit = Annotated[float, typer.Option(help="The solve ends with an error after so long; 0: no limit")]
-MemoryLimit = Annotated[int, typer.Option(help="… when this process needs so much; 0: no limit")]
 
 
 def register(app: typer.Typer) -> None:

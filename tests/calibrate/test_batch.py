@@ -10,24 +10,15 @@ from pathlib import Path
 
 import pytest
 
+from benchmarks.batch import worker_pids
 from calibrate.batch import BatchResult, Solved, Task, batch_key, read_results, run_batch, solve_one
+from calibrate.bounds import Limits
 from calibrate.pipeline import JobOptions
-
-
-def worker_pids() -> list[int]:
-    """Processes that the fork server of this process started."""
-    parents = {}
-    for stat in Path("/proc").glob("[0-9]*/stat"):
-        try:
-            parents[int(stat.parent.name)] = int(stat.read_text().rpartition(")")[2].split()[1])
-        except OSError:
-            continue
-    return [pid for pid, parent in parents.items() if parents.get(parent) == os.getpid()]
 
 
 def in_this_process(todo: Sequence[Task], options: JobOptions) -> Iterator[Solved]:
     for recording, key in todo:
-        yield solve_one(recording, key, options)
+        yield solve_one(recording, key, options, Limits())
 
 
 @pytest.fixture
@@ -60,6 +51,20 @@ def test_a_broken_recording_is_a_result_and_the_rest_goes_on(recordings: list[Pa
     assert [result.solved for result in results] == [False, True, False]
     assert "recordings recover" in results[0].error
     assert results[2].recording.endswith("none.mcap")
+
+
+@pytest.mark.process
+@pytest.mark.parametrize(
+    ("limits", "said"),
+    [(Limits(time_s=0.02), "longer than 0.02 s"), (Limits(memory_mib=1), "more than 1 MiB of memory")],
+)
+def test_a_solve_beyond_its_limits_costs_itself_only(
+    recordings: list[Path], tmp_path: Path, limits: Limits, said: str
+) -> None:
+    """And is tried again next time, when more may be allowed."""
+    beyond = run_batch(recordings[:2], tmp_path / "out", workers=1, limits=limits)
+    assert all(said in result.error for result in beyond), [result.error for result in beyond]
+    assert all(result.solved for result in run_batch(recordings[:2], tmp_path / "out", workers=1))
 
 
 def test_it_goes_on_where_it_was_killed(recordings: list[Path], tmp_path: Path) -> None:

@@ -8,14 +8,16 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
+import time
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import pytest
 
-from calibrate.batch import BatchError, BatchResult, run_batch
+from calibrate.batch import BatchError, BatchResult, Solved, Task, read_results, run_batch
 from calibrate.cluster import Cluster, ClusterError, cluster_solver
+from calibrate.pipeline import JobOptions
 from tests.calibrate.test_batch import in_this_process
 
 needs_distributed = pytest.mark.skipif(
@@ -46,7 +48,7 @@ def listening_inodes(pid: int) -> set[str]:
 
 @contextmanager
 def dask_cluster(folder: Path, workers: int, tls: list[str] | None = None) -> Iterator[tuple[str, list[int]]]:
-    """(address, pids of the workers); ended with everything it started."""
+    """(address, pids of the scheduler and the workers); ended with everything it started."""
     dask = str(Path(sys.executable).parent / "dask")
     address = f"{'tls' if tls else 'tcp'}://127.0.0.1:{free_port()}"
     common = [*(tls or []), "--no-dashboard"]
@@ -61,9 +63,9 @@ def dask_cluster(folder: Path, workers: int, tls: list[str] | None = None) -> It
             stack.callback(process.kill)
             return process
 
-        start("scheduler", *place, *common)
+        scheduler = start("scheduler", *place, *common).pid
         alone = ["--no-nanny", "--nthreads", "1", "--host", "127.0.0.1", "--local-directory", str(folder)]
-        yield address, [start("worker", address, *alone, *common).pid for _ in range(workers)]
+        yield address, [scheduler, *(start("worker", address, *alone, *common).pid for _ in range(workers))]
 
 
 @pytest.fixture
@@ -83,7 +85,7 @@ def test_a_killed_worker_loses_nothing_and_the_bits_are_the_pools(
 
         def kill_one(done: int, total: int, result: BatchResult) -> None:
             if done == 1:
-                os.kill(pids[0], signal.SIGKILL)
+                os.kill(pids[1], signal.SIGKILL)
             opened.update(listening_inodes(os.getpid()) - before)
 
         solver = cluster_solver(Cluster(address))
@@ -93,6 +95,34 @@ def test_a_killed_worker_loses_nothing_and_the_bits_are_the_pools(
     assert not opened, "the client listens on a port of its own"
     for result in spread:
         assert (tmp_path / "dask" / result.calibration).is_file()
+
+
+@needs_distributed
+@pytest.mark.process
+def test_a_lost_scheduler_is_said_and_finished_results_are_kept(
+    recordings: list[Path], tmp_path: Path
+) -> None:
+    with dask_cluster(tmp_path, workers=1) as (address, pids):
+
+        def kill_scheduler(done: int, total: int, result: BatchResult) -> None:
+            os.kill(pids[0], signal.SIGKILL)
+
+        begun_s = time.monotonic()
+        with pytest.raises(BatchError, match=r"connection to tcp://.* is lost.*run the same command again"):
+            solver = cluster_solver(Cluster(address))
+            run_batch(recordings, tmp_path / "out", progress=kill_scheduler, solver=solver)
+        assert time.monotonic() - begun_s < 60
+    kept = [result.recording for result in read_results(tmp_path / "out") if result.solved]
+    assert kept
+    asked: list[str] = []
+
+    def counted(todo: Sequence[Task], options: JobOptions) -> Iterator[Solved]:
+        asked.extend(recording for recording, _ in todo)
+        return in_this_process(todo, options)
+
+    results = run_batch(recordings, tmp_path / "out", solver=counted)
+    assert all(result.solved for result in results)
+    assert not set(asked) & set(kept)
 
 
 @needs_distributed

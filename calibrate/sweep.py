@@ -21,6 +21,7 @@ from calibrate.geometry import Array, pose_from_rotvec
 from calibrate.pnp import candidate_poses
 from calibrate.time_offset import FEWEST_PICTURES, LIMIT_S, TimeOffset, estimate_time_offset
 from calibrate.views import ImageView
+from recordings.errors import BadPictureError
 from recordings.messages import CameraModel, Picture
 from recordings.reader import Recording
 
@@ -33,6 +34,7 @@ def sweep_time_offset(
 ) -> TimeOffset:
     """Of every picture in the recording, whether it belongs to a stop of the arm or not.
 
+    A picture that cannot be decoded is left out, and told of in `lost`.
     `camera`: the lens, needed where the recording does not know it. Raises CalibrationError.
     """
     camera = camera or recording.info.camera
@@ -42,7 +44,8 @@ def sweep_time_offset(
             "first, and give that calibration's intrinsics"
         )
     robot_s, flange = _robot(recording)
-    seen = list(_seen(recording, camera))
+    lost: list[str] = []
+    seen = list(_seen(recording, camera, lost))
     if len(robot_s) < 2 or len(seen) < FEWEST_PICTURES:
         raise TooFewViewsError(
             f"{recording.path}: {len(seen)} pictures with the board and {len(robot_s)} robot states are too "
@@ -50,7 +53,7 @@ def sweep_time_offset(
         )
     times, poses = (np.array(column) for column in zip(*seen, strict=True))
     found = estimate_time_offset(robot_s, flange, times, poses, limit_s)
-    return replace(found, sigma_s=math.hypot(found.sigma_s, UNSEEN_DELAY_S))
+    return replace(found, sigma_s=math.hypot(found.sigma_s, UNSEEN_DELAY_S), lost=tuple(lost))
 
 
 def _robot(recording: Recording) -> tuple[Array, Array]:
@@ -78,14 +81,20 @@ def on_host(device_s: Array, arrivals_s: Array) -> Array:
     return np.asarray(arrivals_s[0] + since_s + under @ line)
 
 
-def _seen(recording: Recording, camera: CameraModel) -> Iterator[tuple[float, Array]]:
-    """Time of the start of exposure and camera_from_board of each picture that shows the board."""
+def _seen(recording: Recording, camera: CameraModel, lost: list[str]) -> Iterator[tuple[float, Array]]:
+    """Time of the start of exposure and camera_from_board of each picture that shows the board.
+
+    `lost` takes what is said of pictures that cannot be decoded.
+    """
     board = recording.info.board
     stamps = [facts.stamps for part in recording.parts for facts in part.picture_facts()]
     taken_s = on_host(
         np.array([s.device_ns for s in stamps]) / 1e9, np.array([s.host_monotonic_ns for s in stamps]) / 1e9
     )
     for picture, time_s in zip(_pictures(recording), taken_s, strict=True):
+        if isinstance(picture, BadPictureError):
+            lost.append(str(picture))
+            continue
         found = detect(picture.image, board, thorough=False)
         if not found.found:
             continue
@@ -99,7 +108,10 @@ def _seen(recording: Recording, camera: CameraModel) -> Iterator[tuple[float, Ar
         yield float(time_s), candidate_poses(view, camera, None)[0].camera_from_board
 
 
-def _pictures(recording: Recording) -> Iterator[Picture]:
+def _pictures(recording: Recording) -> Iterator[Picture | BadPictureError]:
     for part in recording.parts:
         for sequence in part.picture_sequences():
-            yield part.picture(sequence)
+            try:
+                yield part.picture(sequence)
+            except BadPictureError as problem:
+                yield problem

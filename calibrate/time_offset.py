@@ -31,6 +31,8 @@ class TimeOffset:
     rms_rad: float
     """Of the angles that were compared."""
     pairs: int
+    lost: tuple[str, ...] = ()
+    """Pictures that could not be used, each in words"""
 
 
 def estimate_time_offset(

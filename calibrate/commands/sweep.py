@@ -7,9 +7,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
+from rich.markup import escape
 
 from calibrate.calibration import read_calibration
-from calibrate.commands.output import AsJson, out, print_json
+from calibrate.commands.output import AsJson, err, out, print_json
 from calibrate.sweep import sweep_time_offset
 from recordings.reader import open_recording
 
@@ -28,6 +29,8 @@ def sweep(
     """Estimate the time offset between camera and robot, with its sigma."""
     lens = None if calibration_file is None else read_calibration(calibration_file).intrinsics.model
     found = sweep_time_offset(open_recording(recording), lens)
+    for problem in found.lost:
+        err.print(f"[yellow]left out[/]: {escape(problem)}")
     if as_json:
         print_json(
             {
@@ -35,6 +38,7 @@ def sweep(
                 "sigma_s": found.sigma_s,
                 "rms_deg": math.degrees(found.rms_rad),
                 "pairs": found.pairs,
+                "lost": found.lost,
             }
         )
         return

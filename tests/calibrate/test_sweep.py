@@ -16,6 +16,7 @@ from calibrate.geometry import Array, inverse, rotation_log
 from calibrate.kinematics import MODELS, forward
 from calibrate.sweep import sweep_time_offset
 from recordings.messages import CameraModel, Picture, RobotState, SessionInfo, Stamps
+from recordings.pictures import encode_png
 from recordings.reader import open_recording
 from recordings.writer import RecordingWriter
 from station.config import PAPER_BOARD
@@ -34,7 +35,8 @@ def joints(t: Array) -> Array:
     return np.asarray(CELL.start_joints_rad) + wave + 0.01 * np.sin(3.1 * t[:, None])
 
 
-def record(path: Path, pictures: int, lens: CameraModel = LENS) -> Path:
+def record(path: Path, pictures: int, lens: CameraModel = LENS, broken: int | None = None) -> Path:
+    """`broken`: the picture that is a PNG cut short."""
     info = SessionInfo("sweep", "eye-in-hand", "simulated", PAPER_BOARD, lens)
     rng = np.random.default_rng(4)
     model = MODELS[CELL.robot_model]
@@ -53,7 +55,8 @@ def record(path: Path, pictures: int, lens: CameraModel = LENS) -> Path:
             stamps = Stamps(
                 start_ns + round((t + LATENCY_S) * 1e9), 10**18, device_ns=DEVICE_EPOCH_NS + round(t * 1e9)
             )
-            writer.picture(Picture(image, stamps, k + 1, k))
+            cut = encode_png(image)[:-2000] if k == broken else None
+            writer.picture(Picture(image, stamps, k + 1, k), cut)
         return writer.finish()
 
 
@@ -78,3 +81,13 @@ def test_the_command_prints_offset_and_sigma(tmp_path: Path) -> None:
     answer = json.loads(done.stdout)
     assert answer["offset_s"] == pytest.approx(-LATENCY_S, abs=max(4 * answer["sigma_s"], 1e-4))
     assert "ms from its stamp" in CliRunner().invoke(app, ["sweep", str(recording)]).stdout
+
+
+def test_a_picture_that_cannot_be_decoded_costs_itself_only(tmp_path: Path) -> None:
+    recording = record(tmp_path / "sweep.mcap", 40, broken=17)
+    done = CliRunner().invoke(app, ["sweep", str(recording), "--json"])
+    assert done.exit_code == 0, done.output
+    assert "left out" in done.stderr and "picture 17 the PNG is cut" in " ".join(done.stderr.split())
+    answer = json.loads(done.stdout)
+    assert answer["offset_s"] == pytest.approx(-LATENCY_S, abs=max(4 * answer["sigma_s"], 1e-4))
+    assert len(answer["lost"]) == 1

@@ -90,7 +90,7 @@ class Recorder:
         return self._thread.is_alive()
 
     def robot_state(self, state: RobotState) -> bool:
-        """False when it was dropped."""
+        """False when it was dropped, or came after the end."""
         return self._offer(lambda: self._writer.robot_state(state), _STATE_BYTES)
 
     def picture(self, picture: Picture) -> bool:
@@ -154,7 +154,9 @@ class Recorder:
                 self._queued_bytes + size_bytes > self._queue_limit_bytes
                 or len(self._queue) >= QUEUE_LIMIT_MESSAGES
             )
-            if full or self.error is not None or self._ended:
+            if self._ended:
+                return False
+            if full or self.error is not None:
                 self.dropped += 1
                 return False
             self._append(_Item(write, size_bytes))

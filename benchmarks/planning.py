@@ -35,11 +35,13 @@ from calibrate.information import Noise
 from calibrate.kinematics import forward
 from calibrate.likelihood.model import Observations, State
 from calibrate.projection import project
+from station.analysis import check_run
 from station.errors import LimitError
 from station.limits import allowed_speed, check_plan, sample_path
-from station.plan.bootstrap import Glimpse, improved_config, next_move
+from station.plan.belief import Glimpse, improved_config
+from station.plan.bootstrap import next_move
 from station.plan.choose import choose, informations, objective_for
-from station.plan.model import Plan
+from station.plan.model import Plan, PlannedPose
 from station.plan.planner import PlanOptions, candidate_pool, plan_scene
 from station.plan.scene import Scene, scene_of
 from station.plan.view_range import ViewRange
@@ -85,7 +87,7 @@ def measure(seed: int) -> CellResult:
     rng = np.random.default_rng([32, seed])
     _compare_choices(cell, result, rng, seed)
     _plan_and_check(cell, result, rng, seed)
-    _bootstrap(cell, result, rng, seed)
+    _bootstrap(cell, result, np.random.default_rng([33, seed]), seed)
     return result
 
 
@@ -187,9 +189,19 @@ def _bootstrap(cell: RandomCell, result: CellResult, rng: np.random.Generator, s
         seen = perturb(C, rng.normal(size=6) * np.repeat([4e-4, 8e-4], 3))
         return Glimpse(np.array(joints), seen)
 
-    glimpses = [glimpse(cell.start.tolist())]
+    def require_passing(pose: PlannedPose) -> None:
+        """LimitError where the daemon, which knows the wrong guess only, would refuse."""
+        start = tuple(glimpses[-1].joints_rad) if glimpses else pose.joints_rad
+        problems = check_run(config, Plan(ARM.name, "eye-in-hand", (pose,)), start).problems
+        if problems:
+            raise LimitError(f"the daemon would refuse: {problems[0]}")
+
+    glimpses: list[Glimpse] = []
     try:
+        require_passing(PlannedPose("taught", tuple(cell.start)))
+        glimpses.append(glimpse(cell.start.tolist()))
         while (move := next_move(config, glimpses)) is not None:
+            require_passing(move)
             _check_path(glimpses[-1].joints_rad, np.array(move.joints_rad), cell, result)
             glimpses.append(glimpse(move.joints_rad))
         scene = scene_of(improved_config(config, glimpses))

@@ -25,7 +25,7 @@ from station.limits import PlanCheck, check_plan
 from station.parent import die_with_parent
 from station.plan.model import Plan
 from station.plan.planner import make_plan
-from station.plan.scene import cell_geometry
+from station.plan.standing import geometry_from
 from station.status import DetectionStatus
 
 _NICENESS = 5
@@ -109,7 +109,7 @@ def _distance_and_tilt(
 
 def check_run(config: StationConfig, plan: Plan, start_joints_rad: Vector6) -> PlanCheck:
     """The whole way, from where the arm is."""
-    return check_plan(plan, start_joints_rad, cell_geometry(config))
+    return check_plan(plan, start_joints_rad, geometry_from(config, start_joints_rad))
 
 
 def plan_poses(config: StationConfig, start_joints_rad: Vector6 | None, seed: int, count: int) -> Plan:

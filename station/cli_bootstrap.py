@@ -25,7 +25,8 @@ from station.client import Client, default_socket
 from station.config import PoseGuess, StationConfig
 from station.config_file import load_config
 from station.errors import ConfigError, StationError
-from station.plan.bootstrap import Glimpse, believe, improved_config, next_move
+from station.plan.belief import Glimpse, believe, improved_config
+from station.plan.bootstrap import next_move
 from station.plan.model import Plan, PlannedPose
 
 _STRAYED_RAD = 0.01

@@ -89,6 +89,14 @@ def body_segments(geometry: CellGeometry, joints_rad: Array) -> tuple[Array, Arr
     return np.stack(starts, axis=1), np.stack(ends, axis=1), np.array(radii)
 
 
+def gap_to_arm(geometry: CellGeometry, joints_rad: Array, starts: Array, ends: Array) -> Array:
+    """(n,) distance from the arm in one posture (6,) to segments on its flange, (n, 3) each in `base`."""
+    first, last, radii = body_segments(geometry, joints_rad[None])
+    bodies = list(_SELF_BODIES_FOR_TOOL)
+    gap = segment_distance(first[:, bodies], last[:, bodies], starts[:, None], ends[:, None])
+    return np.asarray((gap - radii[bodies]).min(axis=1))
+
+
 def moving_points(geometry: CellGeometry, joints_rad: Array) -> Array:
     """(n, 6) → points (n, k, 3) in `base` whose speed counts: ends of every body beyond the shoulder."""
     starts, ends, _ = body_segments(geometry, joints_rad)

@@ -8,103 +8,37 @@ nothing comes too close. After each picture the belief is updated; when it is go
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import product
 
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from calibrate.board import board_points
-from calibrate.geometry import (
-    Array,
-    difference,
-    inverse,
-    perturb,
-    pose,
-    pose_from_quaternion,
-    quaternion_from_matrix,
-    rotation_exp,
-    transform_points,
-)
-from calibrate.kinematics import forward, inverse_nearest
-from recordings.messages import Mount
+from calibrate.geometry import Array, perturb, pose, rotation_exp, transform_points
+from calibrate.kinematics import RobotModel, forward, inverse_nearest
 from station.collision import CellGeometry, margins
-from station.config import PoseGuess, StationConfig
-from station.errors import ConfigError, LimitError
+from station.config import StationConfig
+from station.errors import LimitError
 from station.limits import SPACING_M
+from station.plan.belief import Belief, Glimpse, believe, board_place, expected_after, seen_from, spread_of
 from station.plan.describe import planned_pose
 from station.plan.model import PlannedPose
 from station.plan.order import move_times
-from station.plan.scene import Scene, arm_model, cell_geometry, geometry_of
+from station.plan.scene import Scene, arm_model, geometry_of
+from station.plan.standing import geometry_from
 from station.plan.visibility import outline, visible
 
 MOVES_MIN, MOVES_MAX = 3, 5
-GOOD_M, GOOD_RAD = 0.006, 0.02
-"""A belief this sharp (1 sigma per axis) is enough to plan from."""
-_PLACE_M, _PLACE_RAD = 0.002, 0.003
-"""How far the board's place may be off as seen through one picture and the arm; generous."""
-_LEVER_M = 0.5
 _SAMPLES, _FEWEST, _DRAWS = 40, 20, 400
 """Possible mounts that a move is checked for; with fewer there is no move; so many are drawn to find them."""
 _ANGLES_RAD = tuple(np.deg2rad([2.0, 4.0, 7.0, 11.0, 16.0, 22.0]))
+_OTHERS, _OTHERS_MOST_RAD = 4000, 0.25
 _BACK_M = (0.0, 0.02, 0.05, 0.10)
 _BORDER_PX = 15.0
 _NEARER_M = 0.001
 """What counts as not nearer."""
-
-
-@dataclass(frozen=True, eq=False)
-class Glimpse:
-    """One picture of the bootstrap; the first is the taught one."""
-
-    joints_rad: Array
-    camera_from_board: Array
-    """By PnP, (4, 4)."""
-
-
-@dataclass(frozen=True, eq=False)
-class Belief:
-    """What is known of the mount X."""
-
-    X: Array
-    covariance: Array
-    """(6, 6) of `geometry.perturb`'s delta."""
-
-    @property
-    def sigma_m(self) -> float:
-        """Largest over all directions."""
-        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3]).max()))
-
-    @property
-    def sigma_rad(self) -> float:
-        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:]).max()))
-
-    @property
-    def sigma_deg(self) -> float:
-        return float(np.rad2deg(self.sigma_rad))
-
-    @property
-    def good(self) -> bool:
-        return self.sigma_m <= GOOD_M and self.sigma_rad <= GOOD_RAD
-
-
-def believe(config: StationConfig, glimpses: Sequence[Glimpse]) -> Belief:
-    """The mount that guess and pictures make most likely. ConfigError without `camera_guess`."""
-    guess, prior = _prior(config)
-    model = arm_model(config)
-    seen = [(forward(model, g.joints_rad), g.camera_from_board) for g in glimpses]
-
-    def residuals(delta: Array) -> Array:
-        X = perturb(guess, delta)
-        places = [_board_place(config.mount, E, X, C) for E, C in seen]
-        return np.concatenate([delta / prior, *(_misfit(place, places[0]) for place in places[1:])])
-
-    if len(glimpses) < 2:
-        return Belief(guess, np.diag(prior**2))
-    fit = least_squares(residuals, np.zeros(6), x_scale=prior)
-    return Belief(perturb(guess, fit.x), np.linalg.inv(fit.jac.T @ fit.jac))
 
 
 def next_move(config: StationConfig, glimpses: Sequence[Glimpse]) -> PlannedPose | None:
@@ -113,24 +47,43 @@ def next_move(config: StationConfig, glimpses: Sequence[Glimpse]) -> PlannedPose
     LimitError when no move is safe for every mount that is still possible, or when hardly any mount within
     the guess fits with where the arm stands. Each move needs its own go.
     """
-    moves = len(glimpses) - 1
+    model, moves = arm_model(config), len(glimpses) - 1
     belief = believe(config, glimpses)
     if moves >= MOVES_MAX or (moves >= MOVES_MIN and belief.good):
         return None
-    samples, cells = _possible(config, glimpses, belief, np.random.default_rng(moves))
+    rng = np.random.default_rng(moves)
+    samples, cells = _possible(config, glimpses, belief, rng)
     if len(cells) < _FEWEST:
         raise LimitError(_not_here(belief, len(cells)))
-    targets = _targets(config, glimpses[0], belief)
-    targets = targets[_stays_in_view(config, glimpses[0], samples, targets)]
-    gain = [_spread(_after(config, glimpses, belief, target)) for target in targets]
-    here, configured = glimpses[-1].joints_rad, cell_geometry(config)
-    found = [inverse_nearest(arm_model(config), targets[i], here) for i in np.argsort(gain, kind="stable")]
-    reached = [joints for joints in found if joints is not None]
-    # The daemon checks by the configured guess: what it would refuse is tried last.
-    for joints in sorted(reached, key=lambda joints: not _is_free(configured, here, joints)):
-        if all(_is_free(cell, here, joints) for cell in cells):
-            return _described(config, glimpses[0], belief, moves, joints)
-    raise LimitError(_no_move(belief, len(targets)))
+    here = glimpses[-1].joints_rad
+    allowed = geometry_from(config, here)  # what the daemon would refuse is no move
+    in_view = 0
+    for targets in (_targets(config, glimpses[0], belief), _any_direction(model, here, rng)):
+        targets = targets[_stays_in_view(config, glimpses[0], samples, targets)]
+        in_view += len(targets)
+        passed = _passing(allowed, here, targets)
+        gain = [spread_of(expected_after(config, glimpses, belief, forward(model, q))) for q in passed]
+        for place in np.argsort(gain, kind="stable"):
+            if _free_in_all(cells, here, passed[place]):
+                return _described(config, glimpses[0], belief, moves, passed[place])
+    raise LimitError(_no_move(belief, in_view))
+
+
+def _passing(cell: CellGeometry, here: Array, targets: Array) -> Array:
+    """Joints (k, 6) of the flange poses (n, 4, 4) that a free direct move from `here` leads to."""
+    found = [inverse_nearest(cell.model, target, here) for target in targets]
+    joints = np.array([q for q in found if q is not None]).reshape(-1, 6)
+    times = move_times(cell, np.broadcast_to(here, joints.shape), joints)
+    return joints[np.isfinite(times)]
+
+
+def _free_in_all(cells: list[CellGeometry], here: Array, joints: Array) -> bool:
+    """Whether the move is free in each of them. The cell that says no comes first next time: it is tight."""
+    for place, cell in enumerate(cells):
+        if not np.isfinite(move_times(cell, here[None], joints[None])[0]):
+            cells.insert(0, cells.pop(place))
+            return False
+    return True
 
 
 def _not_here(belief: Belief, possible: int) -> str:
@@ -159,50 +112,6 @@ def _no_move(belief: Belief, in_view: int) -> str:
     )
 
 
-def improved_config(config: StationConfig, glimpses: Sequence[Glimpse]) -> StationConfig:
-    """The configuration with mount and board place as the glimpses show them: what the plan is made from."""
-    belief = believe(config, glimpses)
-    taught = glimpses[0]
-    place = _board_place(
-        config.mount, forward(arm_model(config), taught.joints_rad), belief.X, taught.camera_from_board
-    )
-    # The board's place inherits the mount's doubt over the taught distance.
-    distance_m = float(np.linalg.norm(taught.camera_from_board[:3, 3]))
-    sigma_m = float(np.hypot(belief.sigma_m, distance_m * belief.sigma_rad))
-    return msgspec.structs.replace(
-        config,
-        camera_guess=_guess(belief.X, belief.sigma_m, belief.sigma_rad),
-        board_guess=_guess(place, sigma_m, belief.sigma_rad),
-    )
-
-
-def _prior(config: StationConfig) -> tuple[Array, Array]:
-    """The configured mount (4, 4) and its sigmas (6,)."""
-    guess = config.camera_guess
-    if guess is None:
-        raise ConfigError("bootstrap needs camera_guess: a rough mount, good to about 30° and 100 mm")
-    X = pose_from_quaternion(guess.translation_m, guess.rotation_xyzw)
-    return X, np.repeat([guess.sigma_m, guess.sigma_rad], 3)
-
-
-def _guess(matrix: Array, sigma_m: float, sigma_rad: float) -> PoseGuess:
-    x, y, z = (float(v) for v in matrix[:3, 3])
-    qx, qy, qz, qw = (float(v) for v in quaternion_from_matrix(matrix[:3, :3]))
-    return PoseGuess((x, y, z), (qx, qy, qz, qw), sigma_m, sigma_rad)
-
-
-def _board_place(mount: Mount, base_from_flange: Array, X: Array, camera_from_board: Array) -> Array:
-    """base_from_board (eye-in-hand) or flange_from_board (eye-to-hand)."""
-    if mount == "eye-in-hand":
-        return np.asarray(base_from_flange @ X @ camera_from_board)
-    return np.asarray(inverse(base_from_flange) @ X @ camera_from_board)
-
-
-def _misfit(place: Array, reference: Array) -> Array:
-    """The same board seen twice should stand in one place; the difference in sigmas (6,)."""
-    return np.asarray(difference(place, reference) / np.repeat([_PLACE_M, _PLACE_RAD], 3))
-
-
 def _possible(
     config: StationConfig, glimpses: Sequence[Glimpse], belief: Belief, rng: np.random.Generator
 ) -> tuple[Array, list[CellGeometry]]:
@@ -218,7 +127,7 @@ def _possible(
     mounts: list[Array] = []
     cells: list[CellGeometry] = []
     for X in perturb(belief.X, draws):
-        place = _board_place(config.mount, E, X, taught.camera_from_board)
+        place = board_place(config.mount, E, X, taught.camera_from_board)
         cell = as_taught(geometry_of(config, X, place), taught.joints_rad)
         gaps, labels = margins(cell, stood)
         new = [column for column, label in enumerate(labels) if label not in without]
@@ -277,6 +186,13 @@ def _wrist_turns() -> Array:
     return np.hstack([np.zeros((len(steps), 3)), steps])
 
 
+def _any_direction(model: RobotModel, here: Array, rng: np.random.Generator) -> Array:
+    """Flange poses (n, 4, 4) after small steps of all joints, for where the orderly moves have no room."""
+    ways = rng.normal(size=(_OTHERS, 6))
+    sizes = rng.uniform(_ANGLES_RAD[0], _OTHERS_MOST_RAD, (_OTHERS, 1))
+    return np.asarray(forward(model, here + sizes * ways / np.linalg.norm(ways, axis=1, keepdims=True)))
+
+
 def _axes(base_from_board: Array) -> Array:
     """Axes (m, 3) in `base`: eight around the board's plane, and its normal both ways."""
     around = np.arange(8) * np.pi / 4
@@ -286,15 +202,6 @@ def _axes(base_from_board: Array) -> Array:
 
 def _turned(E: Array, turn: Array, pivot: Array) -> Array:
     return pose(turn @ E[:3, :3], turn @ (E[:3, 3] - pivot) + pivot)
-
-
-def _seen_from(config: StationConfig, taught: Glimpse, X: Array, targets: Array) -> Array:
-    """camera_from_board (n, 4, 4) at the targets, if the mount is X."""
-    E = forward(arm_model(config), taught.joints_rad)
-    Y = _board_place(config.mount, E, X, taught.camera_from_board)
-    if config.mount == "eye-in-hand":
-        return np.asarray(inverse(targets @ X) @ Y)
-    return np.asarray(inverse(X) @ targets @ Y)
 
 
 def _stays_in_view(
@@ -307,40 +214,17 @@ def _stays_in_view(
     nearest_m = float(np.linalg.norm(transform_points(taught.camera_from_board, rim), axis=-1).min())
     good = np.ones(len(targets), dtype=bool)
     for X in samples:
-        points = transform_points(_seen_from(config, taught, X, targets), rim)
+        points = transform_points(seen_from(config, taught, X, targets), rim)
         good &= visible(camera, points, _BORDER_PX)
         good &= np.linalg.norm(points, axis=-1).min(axis=1) >= nearest_m - _NEARER_M
     return good
-
-
-def _is_free(cell: CellGeometry, here: Array, joints: Array) -> bool:
-    return bool(np.isfinite(move_times(cell, here[None], joints[None]))[0])
-
-
-def _after(config: StationConfig, glimpses: Sequence[Glimpse], belief: Belief, target: Array) -> Array:
-    """Covariance (6, 6) of X expected after one more glimpse from `target`."""
-    taught = glimpses[0]
-    E = forward(arm_model(config), taught.joints_rad)
-    C = _seen_from(config, taught, belief.X, target[None])[0]
-    step = 1e-5
-    columns = []
-    for delta in np.eye(6) * step:
-        X = perturb(belief.X, delta)
-        place = _board_place(config.mount, E, X, taught.camera_from_board)
-        columns.append(_misfit(_board_place(config.mount, target, X, C), place) / step)
-    J = np.stack(columns, axis=1)
-    return np.asarray(np.linalg.inv(np.linalg.inv(belief.covariance) + J.T @ J))
-
-
-def _spread(covariance: Array) -> float:
-    return float(np.trace(covariance[:3, :3]) + _LEVER_M**2 * np.trace(covariance[3:, 3:]))
 
 
 def _described(
     config: StationConfig, taught: Glimpse, belief: Belief, moves: int, joints: Array
 ) -> PlannedPose:
     E = forward(arm_model(config), taught.joints_rad)
-    place = _board_place(config.mount, E, belief.X, taught.camera_from_board)
+    place = board_place(config.mount, E, belief.X, taught.camera_from_board)
     camera = config.camera.model
     assert camera is not None
     scene = Scene(

@@ -20,6 +20,7 @@ from station.plan.visibility import seen_for_certain, sees_past_the_arm
 
 NOT_IN_PICTURE = "the board is not wholly in the picture"
 OUT_OF_REACH = "the arm's reach"
+ARM_IN_SIGHT = "the arm itself, between camera and board"
 _PATH_RESERVE_M = 0.01
 """Poses stand this far from every limit, so that moves between neighbours have room."""
 
@@ -117,11 +118,8 @@ def _checks(
         "singular postures": np.asarray(
             singularity_measure(scene.geometry.model, joints) >= view.smallest_singular
         ),
+        ARM_IN_SIGHT: sees_past_the_arm(scene, joints, base_from_flange),
     }
-    if view.free_sight:
-        checks["the arm itself, between camera and board"] = sees_past_the_arm(
-            scene, joints, base_from_flange
-        )
     gaps, labels = margins(scene.geometry, joints)
     for label, gap in zip(labels, gaps.T, strict=True):
         name = _limit_of(label, scene)

@@ -7,14 +7,14 @@ import numpy as np
 from calibrate.board import board_points
 from calibrate.geometry import Array, transform_points
 from station.collision import margins
-from station.plan.candidates import NOT_IN_PICTURE, OUT_OF_REACH, Pool
+from station.plan.candidates import ARM_IN_SIGHT, NOT_IN_PICTURE, OUT_OF_REACH, Pool
 from station.plan.scene import Scene
 
 _REMEDIES = {
     NOT_IN_PICTURE: "measure camera_guess and board_guess better, use a smaller board or a wider lens",
     "the joint range": "widen limits.joints_min_rad and joints_max_rad, or turn the board",
     "singular postures": "move the board sideways, so that the arm need not stretch or fold",
-    "the arm itself, between camera and board": "turn the board to face the camera, or mount the camera so "
+    ARM_IN_SIGHT: "turn the board to face the camera, or mount the camera so "
     "that it looks away from the arm (is camera_guess right?)",
     "the workspace box": "widen limits.workspace_min_m and workspace_max_m, or move the board to its middle",
     "the arm touching itself or its tool": "check limits.solids, or move the board further from the base",
@@ -22,9 +22,16 @@ _REMEDIES = {
     "the camera": "work further from the camera, or measure camera_guess better (its sigma counts)",
 }
 
+_BACKWARDS = -0.3
+"""Cosine between the flange's axis and the line of sight of a camera that looks back at the arm."""
+_KEYHOLE = 10
+"""Hidden views for each free one, from which on the free ones hang on the guess's last millimetres."""
+
 
 def explain_shortage(scene: Scene, wanted: int, group: Pool, found: Pool, start: Array | None) -> str:
     """One paragraph for a person: `group` is what is usable, `found` all that passes pose by pose."""
+    if looks_back(scene, found):
+        return _looks_back_text(scene, found.alone[ARM_IN_SIGHT])
     if start is not None and len(found) >= wanted and len(group) < wanted:
         return _start_is_cut_off(scene, wanted, len(group), len(found), start)
     sentences = [
@@ -50,6 +57,23 @@ def _remedy(limit: str) -> str:
         limit,
         f"move the board away from {limit}, or correct limits.planes (or is board_guess turned over? The "
         "board's z axis points into the board)",
+    )
+
+
+def looks_back(scene: Scene, found: Pool) -> bool:
+    """Whether the guessed camera looks back at the arm, which hides the board from nearly everywhere."""
+    hidden = found.alone[ARM_IN_SIGHT]
+    backwards = scene.mount == "eye-in-hand" and scene.X[2, 2] < _BACKWARDS
+    return bool(backwards and hidden > _KEYHOLE * len(found))
+
+
+def _looks_back_text(scene: Scene, hidden: int) -> str:
+    angle_deg = np.rad2deg(np.arccos(np.clip(scene.X[2, 2], -1.0, 1.0)))
+    return (
+        "The camera looks away from the board, back at the arm: by camera_guess its line of sight (z axis) "
+        f"is {angle_deg:.0f}° away from where the flange points, and in {hidden} postures the arm itself "
+        "would stand between camera and board. The z axis points out of the lens: if it is turned over, "
+        "turn camera_guess by 180° about its x or y axis."
     )
 
 

@@ -19,7 +19,7 @@ from station.limits import check_plan
 from station.plan.candidates import Pool, find_candidates
 from station.plan.choose import Criterion, Objective, choose, informations, objective_for, sigma_of
 from station.plan.describe import expected_view, planned_pose
-from station.plan.explain import explain_shortage
+from station.plan.explain import explain_shortage, looks_back
 from station.plan.groups import best_group
 from station.plan.model import Plan
 from station.plan.order import BLOCKED, move_times, short_order, time_matrix
@@ -90,12 +90,12 @@ def _relaxed(view: ViewRange, start_roll_rad: float | None) -> list[tuple[ViewRa
     doubtful = replace(views[0][0], doubt=2.0, off_centre=0.2)
     rolled = replace(doubtful, roll_rad=np.pi, doubt=1.0, border_px=6.0)
     near, far = view.distance_m
-    wide = replace(rolled, free_sight=False, doubt=0.5, off_centre=0.1, distance_m=(0.85 * near, 1.3 * far))
+    wide = replace(rolled, doubt=0.5, off_centre=0.1, distance_m=(0.85 * near, 1.3 * far))
     return [
         *views,
         (doubtful, "the guess is rough: some pictures may cut the board"),
         (rolled, "poses of any roll had to be used, and some pictures may cut the board"),
-        (wide, "unusual distances had to be used; pictures may cut or hide parts of the board"),
+        (wide, "unusual distances had to be used; pictures may cut the board"),
     ]
 
 
@@ -123,7 +123,7 @@ def candidate_pool(
             break
     assert best is not None
     group, found, note = best
-    if len(group) < options.count:
+    if len(group) < options.count or looks_back(scene, found):
         raise LimitError(explain_shortage(scene, options.count, group, found, start))
     return group, [note] if note else []
 

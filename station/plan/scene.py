@@ -132,7 +132,7 @@ def geometry_of(
     if config.mount == "eye-in-hand":
         if X is not None:
             watched = (_point(X[:3, 3]),)
-            solids = solids or (camera_body("camera", X, _thicker_m(camera_doubt_m)),)
+            solids = solids or (camera_body("camera", X, camera_radius_m(camera_doubt_m)),)
         if Y is not None:
             obstacles = plate("board", Y, low, high)
             clearance = limits.board_clearance_m + 2 * board_doubt_m
@@ -155,10 +155,25 @@ def _thicker_m(sigma_m: float) -> float:
     return min(_DOUBT * sigma_m, _MOST_DOUBT_M)
 
 
-def camera_body(name: str, parent_from_camera: Array, thicker_m: float = 0.0) -> Capsule:
+def covers_its_doubt(guess: PoseGuess) -> bool:
+    """Whether what hangs on the flange gets as much thicker as it may be off."""
+    return _DOUBT * guess.sigma_m <= _MOST_DOUBT_M
+
+
+def camera_radius_m(sigma_m: float) -> float:
+    """Of a camera on the flange whose place is known to `sigma_m`."""
+    return _CAMERA_RADIUS_M + _thicker_m(sigma_m)
+
+
+def camera_ends(parent_from_camera: Array) -> Array:
+    """(..., 4, 4) → (..., 2, 3): the camera's body, from the optical centre back."""
+    return transform_points(parent_from_camera, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -_CAMERA_BODY_M]]))
+
+
+def camera_body(name: str, parent_from_camera: Array, radius_m: float = _CAMERA_RADIUS_M) -> Capsule:
     """A camera as it stands behind its optical centre."""
-    ends = transform_points(parent_from_camera, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -_CAMERA_BODY_M]]))
-    return Capsule(name, _point(ends[0]), _point(ends[1]), _CAMERA_RADIUS_M + thicker_m)
+    ends = camera_ends(parent_from_camera)
+    return Capsule(name, _point(ends[0]), _point(ends[1]), radius_m)
 
 
 def _point(p: Array) -> tuple[float, float, float]:

@@ -27,8 +27,6 @@ class ViewRange:
     """So many standard deviations of its pixels, as the guesses' sigmas make them, every corner of the board
     keeps from the picture's edge beyond `border_px`."""
     smallest_singular: float = 0.03
-    free_sight: bool = True
-    """No part of the arm between camera and board."""
 
 
 _NEAR_FILL, _FAR_FILL = 0.64, 0.40

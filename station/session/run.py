@@ -14,6 +14,7 @@ from recordings.messages import Picture
 from recordings.recover import recover
 from station.errors import LimitError, RefusedError, RobotError, SafetyStopError, StationError, TriggerError
 from station.limits import MoveCheck, check_path, with_plan_speeds
+from station.plan.standing import geometry_from
 from station.session.bench import Bench
 from station.session.capture import PoseFailedError, take_pose
 from station.session.lease import START_TOLERANCE_RAD, Go
@@ -35,7 +36,8 @@ class Run:
     def __init__(self, bench: Bench, go: Go) -> None:
         self._bench = bench
         self._go = go
-        self._geometry = with_plan_speeds(bench.geometry, bench.require_queue().plan)
+        geometry = geometry_from(bench.cell.config, go.start_joints_rad)
+        self._geometry = with_plan_speeds(geometry, bench.require_queue().plan)
         self._failures = 0
         self._unsettled: list[int] = []
         """Poses where something still moved."""

@@ -9,7 +9,8 @@ import pytest
 from calibrate.geometry import difference, inverse, pose, rotation_exp, transform_points
 from calibrate.kinematics import MODELS, forward
 from station.errors import ConfigError, LimitError
-from station.plan.bootstrap import MOVES_MAX, MOVES_MIN, Glimpse, believe, improved_config, next_move
+from station.plan.belief import Glimpse, believe, improved_config
+from station.plan.bootstrap import MOVES_MAX, MOVES_MIN, next_move
 from station.plan.planner import make_plan
 from station.plan.visibility import outline, visible
 from station.simulation.placement import guess_of

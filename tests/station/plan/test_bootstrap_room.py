@@ -14,7 +14,8 @@ from station.collision import margins
 from station.config import PAPER_BOARD, CameraConfig, LimitsConfig, Plane, RobotConfig, StationConfig
 from station.errors import LimitError
 from station.limits import check_path
-from station.plan.bootstrap import Glimpse, as_taught, next_move
+from station.plan.belief import Glimpse
+from station.plan.bootstrap import as_taught, next_move
 from station.plan.scene import cell_geometry, geometry_of
 from station.simulation.placement import guess_of
 

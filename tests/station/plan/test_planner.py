@@ -189,6 +189,7 @@ def impossible(name):
             config,
             limits=moved(limits, joints_min_rad=tuple(start - 0.12), joints_max_rad=tuple(start + 0.12)),
         ),
+        "camera turned over": moved(config, camera_guess=turned(config.camera_guess, [0, np.pi, 0])),
         "guess too rough": moved(config, camera_guess=moved(config.camera_guess, sigma_rad=0.6)),
     }[name], truth.start_joints_rad
 
@@ -200,6 +201,10 @@ def impossible(name):
         ("board turned over", ["No pose", "the table", "z axis"]),
         ("box too small", ["possible. What binds is the workspace box", "workspace_max_m"]),
         ("few reachable", ["of the wanted 25", "joint range", "joints_min_rad"]),
+        (
+            "camera turned over",
+            ["looks away from the board", "180°", "camera_guess", "about its x or y axis"],
+        ),
         ("guess too rough", ["not wholly in the picture", "camera_guess"]),
     ],
 )

@@ -1,0 +1,156 @@
+"""What a few pictures of the board say about a badly known camera mount, and how sure that is."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+from scipy.optimize import least_squares
+
+from calibrate.geometry import (
+    Array,
+    difference,
+    inverse,
+    perturb,
+    pose_from_quaternion,
+    quaternion_from_matrix,
+)
+from calibrate.kinematics import forward
+from recordings.messages import Mount
+from station.config import PoseGuess, StationConfig
+from station.errors import ConfigError
+from station.plan.scene import arm_model
+
+GOOD_M, GOOD_RAD = 0.006, 0.02
+"""A belief this sharp (1 sigma per axis) is enough to plan from."""
+_PLACE_M, _PLACE_RAD = 0.002, 0.003
+"""How far the board's place may be off as seen through one picture and the arm; generous."""
+_LEVER_M = 0.5
+
+
+@dataclass(frozen=True, eq=False)
+class Glimpse:
+    """One picture of the bootstrap; the first is the taught one."""
+
+    joints_rad: Array
+    camera_from_board: Array
+    """By PnP, (4, 4)."""
+
+
+@dataclass(frozen=True, eq=False)
+class Belief:
+    """What is known of the mount X."""
+
+    X: Array
+    covariance: Array
+    """(6, 6) of `geometry.perturb`'s delta."""
+
+    @property
+    def sigma_m(self) -> float:
+        """Largest over all directions."""
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[:3, :3]).max()))
+
+    @property
+    def sigma_rad(self) -> float:
+        return float(np.sqrt(np.linalg.eigvalsh(self.covariance[3:, 3:]).max()))
+
+    @property
+    def sigma_deg(self) -> float:
+        return float(np.rad2deg(self.sigma_rad))
+
+    @property
+    def good(self) -> bool:
+        return self.sigma_m <= GOOD_M and self.sigma_rad <= GOOD_RAD
+
+
+def believe(config: StationConfig, glimpses: Sequence[Glimpse]) -> Belief:
+    """The mount that guess and pictures make most likely. ConfigError without `camera_guess`."""
+    guess, prior = _prior(config)
+    model = arm_model(config)
+    seen = [(forward(model, g.joints_rad), g.camera_from_board) for g in glimpses]
+
+    def residuals(delta: Array) -> Array:
+        X = perturb(guess, delta)
+        places = [board_place(config.mount, E, X, C) for E, C in seen]
+        return np.concatenate([delta / prior, *(_misfit(place, places[0]) for place in places[1:])])
+
+    if len(glimpses) < 2:
+        return Belief(guess, np.diag(prior**2))
+    fit = least_squares(residuals, np.zeros(6), x_scale=prior)
+    return Belief(perturb(guess, fit.x), np.linalg.inv(fit.jac.T @ fit.jac))
+
+
+def improved_config(config: StationConfig, glimpses: Sequence[Glimpse]) -> StationConfig:
+    """The configuration with mount and board place as the glimpses show them: what the plan is made from."""
+    belief = believe(config, glimpses)
+    taught = glimpses[0]
+    place = board_place(
+        config.mount, forward(arm_model(config), taught.joints_rad), belief.X, taught.camera_from_board
+    )
+    # The board's place inherits the mount's doubt over the taught distance.
+    distance_m = float(np.linalg.norm(taught.camera_from_board[:3, 3]))
+    sigma_m = float(np.hypot(belief.sigma_m, distance_m * belief.sigma_rad))
+    return msgspec.structs.replace(
+        config,
+        camera_guess=_guess(belief.X, belief.sigma_m, belief.sigma_rad),
+        board_guess=_guess(place, sigma_m, belief.sigma_rad),
+    )
+
+
+def expected_after(
+    config: StationConfig, glimpses: Sequence[Glimpse], belief: Belief, target: Array
+) -> Array:
+    """Covariance (6, 6) of X expected after one more glimpse from `target`."""
+    taught = glimpses[0]
+    E = forward(arm_model(config), taught.joints_rad)
+    C = seen_from(config, taught, belief.X, target[None])[0]
+    step = 1e-5
+    columns = []
+    for delta in np.eye(6) * step:
+        X = perturb(belief.X, delta)
+        place = board_place(config.mount, E, X, taught.camera_from_board)
+        columns.append(_misfit(board_place(config.mount, target, X, C), place) / step)
+    J = np.stack(columns, axis=1)
+    return np.asarray(np.linalg.inv(np.linalg.inv(belief.covariance) + J.T @ J))
+
+
+def spread_of(covariance: Array) -> float:
+    return float(np.trace(covariance[:3, :3]) + _LEVER_M**2 * np.trace(covariance[3:, 3:]))
+
+
+def board_place(mount: Mount, base_from_flange: Array, X: Array, camera_from_board: Array) -> Array:
+    """base_from_board (eye-in-hand) or flange_from_board (eye-to-hand)."""
+    if mount == "eye-in-hand":
+        return np.asarray(base_from_flange @ X @ camera_from_board)
+    return np.asarray(inverse(base_from_flange) @ X @ camera_from_board)
+
+
+def seen_from(config: StationConfig, taught: Glimpse, X: Array, targets: Array) -> Array:
+    """camera_from_board (n, 4, 4) at the targets, if the mount is X."""
+    E = forward(arm_model(config), taught.joints_rad)
+    Y = board_place(config.mount, E, X, taught.camera_from_board)
+    if config.mount == "eye-in-hand":
+        return np.asarray(inverse(targets @ X) @ Y)
+    return np.asarray(inverse(X) @ targets @ Y)
+
+
+def _prior(config: StationConfig) -> tuple[Array, Array]:
+    """The configured mount (4, 4) and its sigmas (6,)."""
+    guess = config.camera_guess
+    if guess is None:
+        raise ConfigError("bootstrap needs camera_guess: a rough mount, good to about 30° and 100 mm")
+    X = pose_from_quaternion(guess.translation_m, guess.rotation_xyzw)
+    return X, np.repeat([guess.sigma_m, guess.sigma_rad], 3)
+
+
+def _guess(matrix: Array, sigma_m: float, sigma_rad: float) -> PoseGuess:
+    x, y, z = (float(v) for v in matrix[:3, 3])
+    qx, qy, qz, qw = (float(v) for v in quaternion_from_matrix(matrix[:3, :3]))
+    return PoseGuess((x, y, z), (qx, qy, qz, qw), sigma_m, sigma_rad)
+
+
+def _misfit(place: Array, reference: Array) -> Array:
+    """The same board seen twice should stand in one place; the difference in sigmas (6,)."""
+    return np.asarray(difference(place, reference) / np.repeat([_PLACE_M, _PLACE_RAD], 3))

@@ -1,0 +1,57 @@
+"""A rough guess that puts the camera into the arm is wrong: checks take the nearest mount that has room."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calibrate.geometry import inverse, pose
+from calibrate.kinematics import forward, link_frames
+from station.analysis import check_run
+from station.collision import margins
+from station.plan.bootstrap import next_move
+from station.plan.model import Plan
+from station.plan.scene import cell_geometry
+from station.plan.standing import geometry_from
+from tests.station.plan.test_bootstrap_room import ARM, GLIMPSE, TAUGHT, WRONG, X, config
+
+FLANGE = forward(ARM, TAUGHT)
+
+
+def beside_the_forearm(beside_m):
+    """A mount that puts the camera so far beside the middle of the forearm."""
+    frames = link_frames(ARM, TAUGHT[None])[0]
+    middle = (frames[2, :3, 3] + frames[3, :3, 3]) / 2 + 0.049 * frames[2, :3, 2]
+    return inverse(FLANGE) @ pose(FLANGE[:3, :3] @ X[:3, :3], middle + [0.0, 0.0, beside_m])
+
+
+def room_m(cell):
+    gaps, labels = margins(cell, TAUGHT)
+    return min(gap for gap, label in zip(gaps[0], labels, strict=True) if label.endswith("against camera"))
+
+
+def test_a_rough_guess_inside_the_arm_gives_way_to_a_mount_that_has_room():
+    guessed = config(beside_the_forearm(0.1), 0.06, 0.3)
+    assert room_m(cell_geometry(guessed)) < -0.01
+    cell = geometry_from(guessed, TAUGHT)
+    assert room_m(cell) >= 0.01
+    assert [s.radius_m for s in cell.solids] == [s.radius_m for s in cell_geometry(guessed).solids]
+    assert cell.watched_m != cell_geometry(guessed).watched_m
+
+
+@pytest.mark.parametrize(
+    ("mount", "sigma_m"), [(beside_the_forearm(0.1), 0.01), (WRONG, 0.06), (beside_the_forearm(0.0), 0.02)]
+)
+def test_a_sharp_guess_one_with_room_and_one_far_inside_stay(mount, sigma_m):
+    guessed = config(mount, sigma_m, 0.1)
+    assert geometry_from(guessed, TAUGHT).solids == cell_geometry(guessed).solids
+
+
+def test_bootstrap_moves_away_from_a_guess_inside_the_arm_as_the_daemon_allows():
+    shift = 0.2 * np.array([-0.637, 0.765, -0.088])
+    guessed = config(pose(X[:3, :3], X[:3, 3] + shift), 0.06, 0.15)
+    assert room_m(cell_geometry(guessed)) < 0
+    move = next_move(guessed, [GLIMPSE])
+    assert move is not None
+    plan = Plan("UR10", "eye-in-hand", (move,))
+    assert check_run(guessed, plan, tuple(TAUGHT)).problems == ()

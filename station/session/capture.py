@@ -79,6 +79,9 @@ async def take_picture(bench: Bench, index: int | None = None) -> Picture:
             if number == tries > 1:  # the last try, with a camera that was opened anew
                 await camera.close()
                 await camera.open()
+            if number > 1:  # some cameras lose the first frame after a pause, and waiting for it was one
+                with contextlib.suppress(CameraError):
+                    await camera.glimpse()
             return await camera.capture()
         except CameraError as error:
             last = error

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from typing import Any
 
 import cv2
 import numpy as np
@@ -11,6 +10,7 @@ import numpy as np
 from calibrate.board import looks_same_turns
 from calibrate.corners import (
     Grey,
+    equalise,
     is_regular,
     local_spacing,
     refine,
@@ -56,7 +56,7 @@ def _attempts(grey: Grey, size: tuple[int, int], thorough: bool) -> Iterator[Arr
         yield _scaled(grey, 0.5, lambda small: _classic(small, size))  # a third of the time
     yield _classic(grey, size)
     yield _sector(grey, size, 0)
-    equalised: Any = cv2.createCLAHE(clipLimit=4.0, tileGridSize=(8, 8)).apply(grey)
+    equalised = equalise(grey)
     yield _classic(equalised, size)
     yield _sector(equalised, size, cv2.CALIB_CB_EXHAUSTIVE)
     if largest <= _SMALL_SIDE_PX:

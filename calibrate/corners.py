@@ -36,6 +36,11 @@ def to_grey(image: NDArray[Any]) -> Grey:
     return np.ascontiguousarray(image)
 
 
+def equalise(grey: Grey) -> Grey:
+    """The same picture with contrast everywhere; for finding, not for measuring."""
+    return np.asarray(cv2.createCLAHE(clipLimit=4.0, tileGridSize=(8, 8)).apply(grey))
+
+
 def local_spacing(grid: Array) -> Array:
     """(rows, columns, 2) pixels → (rows, columns): distance to the nearest neighbour in row or column."""
     across = np.linalg.norm(np.diff(grid, axis=1), axis=-1)

@@ -79,7 +79,7 @@ def detect(
 
 def _find(grey: Grey, spec: BoardSpec, thorough: bool) -> tuple[NDArray[np.intp], Array]:
     if spec.kind is BoardKind.CHARUCO:
-        return find_charuco(grey, spec)
+        return find_charuco(grey, spec, thorough)
     if spec.kind is BoardKind.APRIL_GRID:
         return find_april_grid(grey, spec)
     if spec.kind is BoardKind.CHESSBOARD:

@@ -10,10 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.board import APRIL_DICTIONARY, board_points, dictionary_id
-from calibrate.corners import Grey, local_spacing, refine, sample
+from calibrate.corners import Grey, equalise, local_spacing, refine, sample
 from calibrate.geometry import Array
 from recordings.messages import BoardSpec
 
+_FEW_MARKERS = 0.7
+"""Of those of the board."""
 Indices = NDArray[np.intp]
 _NOTHING = (np.zeros(0, dtype=np.intp), np.zeros((0, 2)))
 
@@ -27,23 +29,30 @@ def charuco_board(spec: BoardSpec) -> Any:
     return board
 
 
-def find_charuco(grey: Grey, spec: BoardSpec) -> tuple[Indices, Array]:
-    """Point indices (k,) and pixels (k, 2) of the chessboard corners that were found."""
+def find_charuco(grey: Grey, spec: BoardSpec, thorough: bool = True) -> tuple[Indices, Array]:
+    """Point indices (k,) and pixels (k, 2) of the chessboard corners that were found.
+
+    `thorough`: where few markers are seen, the dark parts of the picture are brightened.
+    """
     board = charuco_board(spec)
-    markers, marker_ids, _ = _marker_detector(spec.dictionary or "", 1).detectMarkers(grey)
-    if marker_ids is None or len(marker_ids) < 2:
-        return _NOTHING
-    # OpenCV's sub-pixel step needs both markers of a corner; ours takes every corner the plane predicts.
     plane_of = dict(zip(board.getIds().ravel().tolist(), board.getObjPoints(), strict=True))
-    seen = [
-        (plane_of[i], m) for i, m in zip(marker_ids.ravel().tolist(), markers, strict=True) if i in plane_of
-    ]
+    seen = _markers(grey, spec, plane_of)
+    if thorough and len(seen) < _FEW_MARKERS * len(plane_of):
+        seen = max(seen, _markers(equalise(grey), spec, plane_of), key=len)
     if len(seen) < 2:
         return _NOTHING
+    # OpenCV's sub-pixel step needs both markers of a corner; ours takes every corner the plane predicts.
     plane = np.concatenate([corners[:, :2] for corners, _ in seen]).astype(float)
     pixels = np.concatenate([marker.reshape(4, 2) for _, marker in seen]).astype(float)
     points = board_points(spec)[:, :2] + spec.square_m  # OpenCV counts from the outer edge
     return _snap_to_corners(grey, spec, plane, pixels, points)
+
+
+def _markers(grey: Grey, spec: BoardSpec, plane_of: dict[int, Any]) -> list[tuple[Any, Any]]:
+    """Corners on the board and in the picture of every marker of the board that is seen."""
+    markers, ids, _ = _marker_detector(spec.dictionary or "", 1).detectMarkers(grey)
+    found = [] if ids is None else ids.ravel().tolist()
+    return [(plane_of[i], marker) for i, marker in zip(found, markers, strict=False) if i in plane_of]
 
 
 def _snap_to_corners(

@@ -98,6 +98,15 @@ def test_partial_charuco_is_used_and_its_points_keep_their_identity() -> None:
     assert np.linalg.norm(found.pixels - truth, axis=1).max() < 0.6
 
 
+def test_a_dark_charuco_board_is_found_whole() -> None:
+    for seed in range(3):
+        image, seen = picture(CHARUCO, seed, illumination=0.08)
+        found = detect(image, CHARUCO)
+        assert found.corners >= 0.9 * found.expected
+        truth = project(CAMERA, seen, board_points(CHARUCO)[found.indices])
+        assert np.sqrt(np.square(found.pixels - truth).sum(axis=1).mean()) < 0.3
+
+
 def test_corners_in_a_line_are_refused_and_not_handed_to_the_solver() -> None:
     """One such view would make every pose and lens fit of the recording fail."""
     image, seen = picture(CHARUCO, 6)

@@ -1,0 +1,42 @@
+"""A whole session whose pictures come over GigE Vision, each fired by the trigger box on its serial line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from recordings.reader import open_recording
+from station.attend import carry_out, wait_until_idle
+from station.client import Client
+from station.demo import simulated_daemon
+from station.devices.frames import frames_between
+from station.plan.planner import make_plan
+from station.simulation.cell import make_cell
+from station.simulation.scenes import cell_config
+
+POSES = 3
+
+
+@pytest.mark.gige
+@pytest.mark.process
+async def test_every_pose_has_the_picture_of_its_own_pulse(lonely_network: None, tmp_path: Path) -> None:
+    truth = make_cell()
+    plan = make_plan(cell_config(truth), start_joints_rad=truth.start_joints_rad, seed=0, count=POSES)
+    async with (
+        simulated_daemon(tmp_path, ["--gige", "--hardware-trigger"]) as socket,
+        await Client.connect(socket) as client,
+    ):
+        await wait_until_idle(client)
+        await client.request("lease", action="take")
+        await client.request("load_plan", plan=msgspec.to_builtins(plan))
+        ended = await carry_out(client, "run", confirm=lambda summary: True, watch=lambda status: None)
+    assert ended.captured == POSES, ended.status.reason
+    box = ended.status.trigger
+    assert box.identity == "calibration-trigger SIM1" and box.pulses == box.frames > POSES, "glimpses too"
+    pictures = [picture for _, picture in open_recording(Path(ended.recording)).pictures()]
+    ids, counts = [p.frame_id for p in pictures], [p.trigger_count or 0 for p in pictures]
+    assert counts[0] > 0 and counts == sorted(set(counts))
+    # One frame for one pulse, glimpses included: ids and counts go on together.
+    assert [frames_between(ids[0], i) for i in ids] == [count - counts[0] for count in counts]

@@ -4,17 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import os
+import random
 import signal
 import time
 from collections.abc import Iterator
 
+import numpy as np
 import pytest
 
 from station.config import CameraConfig
 from station.devices.aravis import AravisCamera
 from station.errors import CameraError
 from station.simulation import genicam
+from station.simulation.gige import numbered_picture
 from station.simulation.gige_launch import SimulatedGige, start_gige
+from tests.faults.lossy_wire import LossyWire
 
 pytestmark = pytest.mark.gige
 CONFIG = CameraConfig(device="127.0.0.1", packet_size=8996)
@@ -44,6 +48,27 @@ async def test_18_an_incomplete_frame_is_refused_and_the_next_one_good(server: S
         assert counts.missing_packets > 0 and counts.incomplete >= 1 and counts.complete == 2
     finally:
         await camera.close()
+
+
+async def test_18_lost_packets_are_sent_again_and_counted(server: SimulatedGige) -> None:
+    camera, chance = AravisCamera(CameraConfig(device="127.0.0.2", packet_size=8996)), random.Random(0)
+    with LossyWire() as wire:
+        await camera.open()
+        try:
+            await camera.capture()
+            wire.loses = lambda packet: chance.random() < 0.02
+            pictures = [await camera.capture() for _ in range(20)]
+            counts = camera.counts().stream
+        finally:
+            await camera.close()
+    numbers = [int.from_bytes(p.image.reshape(-1)[:8].tobytes(), "little") for p in pictures]
+    assert numbers == list(range(1, 21))
+    assert all(
+        np.array_equal(p.image, numbered_picture(n, 1280, 1024))
+        for n, p in zip(numbers, pictures, strict=True)
+    )
+    assert wire.lost > 20 and counts.incomplete == counts.missing_packets == 0
+    assert wire.lost <= counts.resent_packets <= wire.sent_again
 
 
 async def test_19_frames_nobody_asked_for_are_noticed(server: SimulatedGige) -> None:

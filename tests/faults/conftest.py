@@ -18,6 +18,8 @@ from station.config import RobotConfig
 from station.devices.ur import UrRobot
 from station.errors import RobotError
 from station.simulation.admin import AdminClient
+from station.simulation.camera import RenderedCamera
+from station.simulation.cell import make_cell, write_truth
 from station.simulation.launch import SimulatedController
 
 AT_REST_RAD_S = 1e-3
@@ -162,3 +164,16 @@ def fault_times(request: pytest.FixtureRequest) -> Callable[[Outcome], None]:
                 lines.write(json.dumps(row) + "\n")
 
     return keep
+
+
+@pytest.fixture
+async def camera(
+    controller: Callable[..., SimulatedController], tmp_path: Path
+) -> AsyncIterator[RenderedCamera]:
+    """Opened, before the published cell's arm."""
+    cell = make_cell()
+    write_truth(cell, tmp_path / "truth.json")
+    rendered = RenderedCamera(cell, controller(truth=tmp_path / "truth.json").host)
+    await rendered.open()
+    yield rendered
+    await rendered.close()

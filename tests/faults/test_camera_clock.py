@@ -4,40 +4,30 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
 
 from station.devices.frames import DeviceClock, mid_exposure
 from station.simulation.camera import RenderedCamera
-from station.simulation.cell import make_cell, write_truth
-from station.simulation.launch import SimulatedController
 
 
 @pytest.mark.process
 async def test_24_an_ntp_step_of_an_hour_moves_no_mid_exposure(
-    controller: Callable[..., SimulatedController], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    camera: RenderedCamera, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    cell = make_cell()
-    write_truth(cell, tmp_path / "truth.json")
-    camera = RenderedCamera(cell, controller(truth=tmp_path / "truth.json").host)
-    await camera.open()
-    try:
-        before = await camera.capture()
-        true_time_ns = time.time_ns
-        monkeypatch.setattr(time, "time_ns", lambda: true_time_ns() + 3600 * 10**9)
-        asked_ns = time.monotonic_ns()
-        after = await camera.capture()
-        stamps = after.stamps
-        middle_ns, bound_s = mid_exposure(
-            stamps.device_ns, stamps.host_monotonic_ns, after.exposure_us, camera.clock
-        )
-        assert asked_ns - bound_s * 1e9 < middle_ns < time.monotonic_ns()
-        stepped_s = (stamps.host_wall_ns - before.stamps.host_wall_ns) / 1e9
-        assert 3600 < stepped_s < 3630, "the wall clock is recorded as it was"
-    finally:
-        await camera.close()
+    before = await camera.capture()
+    true_time_ns = time.time_ns
+    monkeypatch.setattr(time, "time_ns", lambda: true_time_ns() + 3600 * 10**9)
+    asked_ns = time.monotonic_ns()
+    after = await camera.capture()
+    stamps = after.stamps
+    middle_ns, bound_s = mid_exposure(
+        stamps.device_ns, stamps.host_monotonic_ns, after.exposure_us, camera.clock
+    )
+    assert asked_ns - bound_s * 1e9 < middle_ns < time.monotonic_ns()
+    stepped_s = (stamps.host_wall_ns - before.stamps.host_wall_ns) / 1e9
+    assert 3600 < stepped_s < 3630, "the wall clock is recorded as it was"
 
 
 def simulated_readings(

@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable
-from pathlib import Path
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,20 +9,6 @@ from hypothesis import strategies as st
 from station.devices.frames import LAST_FRAME_ID, FrameCounter, next_frame_id
 from station.errors import CameraError
 from station.simulation.camera import RenderedCamera
-from station.simulation.cell import make_cell, write_truth
-from station.simulation.launch import SimulatedController
-
-
-@pytest.fixture
-async def camera(
-    controller: Callable[..., SimulatedController], tmp_path: Path
-) -> AsyncIterator[RenderedCamera]:
-    cell = make_cell()
-    write_truth(cell, tmp_path / "truth.json")
-    rendered = RenderedCamera(cell, controller(truth=tmp_path / "truth.json").host)
-    await rendered.open()
-    yield rendered
-    await rendered.close()
 
 
 @pytest.mark.process

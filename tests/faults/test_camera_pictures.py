@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable
-from pathlib import Path
 from typing import Any
 
 import msgspec
@@ -15,22 +13,8 @@ from station.config import PAPER_BOARD
 from station.errors import CameraError
 from station.exposure import assess
 from station.simulation.camera import RenderedCamera
-from station.simulation.cell import make_cell, write_truth
-from station.simulation.launch import SimulatedController
 
 pytestmark = pytest.mark.process
-
-
-@pytest.fixture
-async def camera(
-    controller: Callable[..., SimulatedController], tmp_path: Path
-) -> AsyncIterator[RenderedCamera]:
-    cell = make_cell()
-    write_truth(cell, tmp_path / "truth.json")
-    rendered = RenderedCamera(cell, controller(truth=tmp_path / "truth.json").host)
-    await rendered.open()
-    yield rendered
-    await rendered.close()
 
 
 async def test_23_a_camera_that_changes_its_exposure_is_refused(camera: RenderedCamera) -> None:

@@ -2,34 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator, Callable
-from pathlib import Path
-
 import pytest
 
 from station.picture_motion import picture_motion
 from station.simulation.camera import RenderedCamera
-from station.simulation.cell import make_cell, write_truth
-from station.simulation.launch import SimulatedController
+from station.simulation.cell import make_cell
 
 pytestmark = pytest.mark.process
-CELL = make_cell()
-
-
-@pytest.fixture
-async def camera(
-    controller: Callable[..., SimulatedController], tmp_path: Path
-) -> AsyncIterator[RenderedCamera]:
-    write_truth(CELL, tmp_path / "truth.json")
-    rendered = RenderedCamera(CELL, controller(truth=tmp_path / "truth.json").host)
-    await rendered.open()
-    yield rendered
-    await rendered.close()
 
 
 async def motion_px(camera: RenderedCamera) -> float:
     looks = [await camera.glimpse() for _ in range(3)]
-    found = picture_motion([look.image for look in looks if look is not None], CELL.camera.width)
+    found = picture_motion([look.image for look in looks if look is not None], make_cell().camera.width)
     assert found is not None
     return found
 

@@ -26,17 +26,22 @@ async def sweeping(rig: Rig) -> Rig:
     return rig
 
 
+async def swing_to_the_end(rig: Rig) -> None:
+    """At least three pictures a swing of the slow arm."""
+    for number in range(SWINGS):
+        await rig.until_true(lambda n=number: rig.arm.log.count("move") == n + 1)
+        before = rig.camera.taken
+        await rig.until_true(lambda before=before: rig.camera.taken > before + 2)
+        rig.arm.arrive.set()
+    await rig.until(S.IDLE)
+
+
 async def test_it_swings_takes_pictures_and_comes_back(sweeping: Rig) -> None:
     sweeping.arm.slow = True
     summary = await sweeping.session.prepare(1, "run")
     assert "sweep: 8 slow swings" in summary.purpose and sweeping.arm.log == []
     sweeping.session.go(1, summary.token)
-    for number in range(SWINGS):
-        await sweeping.until_true(lambda n=number: sweeping.arm.log.count("move") == n + 1)
-        before = sweeping.camera.taken
-        await sweeping.until_true(lambda before=before: sweeping.camera.taken > before + 2)
-        sweeping.arm.arrive.set()
-    await sweeping.until(S.IDLE)
+    await swing_to_the_end(sweeping)
     assert sweeping.arm.joints == pytest.approx(TRUTH.start_joints_rad)
     assert sweeping.pose_states == ["done"] * SWINGS
     recording: Recording = sealed(sweeping)
@@ -130,12 +135,7 @@ async def streaming(rig: Rig) -> Rig:
 
 async def test_every_frame_of_a_streaming_camera_is_recorded(streaming: Rig) -> None:
     await streaming.give_go()
-    for number in range(SWINGS):
-        await streaming.until_true(lambda n=number: streaming.arm.log.count("move") == n + 1)
-        before = streaming.camera.taken
-        await streaming.until_true(lambda before=before: streaming.camera.taken > before + 2)
-        streaming.arm.arrive.set()
-    await streaming.until(S.IDLE)
+    await swing_to_the_end(streaming)
     assert streaming.camera.streams == 1
     part = sealed(streaming).parts[0]
     ids = [facts.frame_id for facts in part.picture_facts()]

@@ -7,6 +7,7 @@ from datetime import UTC, datetime
 
 import matplotlib
 import numpy as np
+from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
 from calibrate.batch import BatchResult
 from calibrate.geometry import difference
@@ -14,6 +15,8 @@ from calibrate.report import html
 from calibrate.report.plots import STYLE, new_figure, svg_text
 from calibrate.trends import HEAD, Cell, place, rows
 
+_FINDINGS_LISTED = 3
+"""Of one cell, above all sections."""
 _COLOURS = ("#0969da", "#1a7f37", "#bc4c00")
 
 
@@ -33,13 +36,19 @@ def fleet_page(results: Sequence[BatchResult], cells: Sequence[Cell]) -> str:
 
 
 def _findings(cells: Sequence[Cell]) -> Iterator[str]:
-    found = [f"{cell.name}: {finding}." for cell in cells for finding in cell.findings]
-    if not found:
+    moved = [cell for cell in cells if cell.findings]
+    if not moved:
         text = "No camera moved by more than chance explains."
         yield f'<div class="verdict good"><strong>{text}</strong></div>'
         return
+    found = []
+    for cell in moved:
+        found += [f"{cell.name}: {finding}." for finding in cell.findings[:_FINDINGS_LISTED]]
+        if (more := len(cell.findings) - _FINDINGS_LISTED) > 0:
+            found.append(f"{cell.name}: and {more} more, in its table below.")
     items = "<br>".join(html.escape(text) for text in found)
-    yield f'<div class="verdict bad"><strong>{len(found)} moved</strong>{items}</div>'
+    title = f"{len(moved)} of {len(cells)} cameras moved"
+    yield f'<div class="verdict bad"><strong>{title}</strong>{items}</div>'
 
 
 def _section(cell: Cell) -> Iterator[str]:
@@ -79,8 +88,11 @@ def place_over_time(cell: Cell) -> str:
                 if move.real:
                     axis.axvline(across[place_of + 1], color="#b42318", linewidth=1, alpha=0.6)
             axis.set_ylabel(f"{'shift' if start == 0 else 'turn'}, {unit}")
-            axis.tick_params(axis="x", labelsize=7, labelrotation=20)
-            if not known:
+            if known:
+                dates = AutoDateLocator(maxticks=7)  # type: ignore[no-untyped-call]
+                axis.xaxis.set_major_locator(dates)
+                axis.xaxis.set_major_formatter(ConciseDateFormatter(dates))  # type: ignore[no-untyped-call]
+            else:
                 axis.set_xlabel("session")
         axes[0].legend(fontsize=7, frameon=False, ncols=3)
         return svg_text(figure)

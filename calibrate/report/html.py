@@ -17,9 +17,9 @@ h1 { font-size: 22px; margin: 0 0 4px; } h2 { font-size: 17px; margin: 32px 0 8p
 .good { background: var(--good); } .bad { background: var(--bad); }
 .stamp { border: 3px solid var(--warn); border-radius: 8px; color: var(--warn); font-weight: 700;
   padding: 8px 16px; margin: 16px 0; }
-table { border-collapse: collapse; width: 100%; }
+table { border-collapse: collapse; max-width: 100%; }
 td, th { border-bottom: 1px solid var(--line);
-  padding: 4px 10px 4px 0; text-align: left; vertical-align: top; }
+  padding: 4px 16px 4px 0; text-align: left; vertical-align: top; }
 th { color: var(--soft); font-weight: 600; }
 td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
 .pass { color: var(--good); font-weight: 700; } .fail { color: var(--bad); font-weight: 700; }

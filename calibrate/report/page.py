@@ -210,12 +210,13 @@ def _methods(peers: Sequence[PeerResult]) -> Iterator[str]:
             html.number(peer.board_spread_m, 3, 1e3),
             html.number(peer.board_spread_rad, 4, float(np.degrees(1))),
             html.number(peer.distance_sigma, 1),
+            html.number(peer.time_ms, 0),
             peer.note,
         )
         for peer in peers
     ]
-    head = ("method", "e_t, mm", "e_R", "board spread, mm", "board spread, °", "σ from ours", "")
-    yield html.table(head, rows, (1, 2, 3, 4, 5))
+    head = ("method", "e_t, mm", "e_R", "board spread, mm", "board spread, °", "σ from ours", "ms", "")
+    yield html.table(head, rows, (1, 2, 3, 4, 5, 6))
 
 
 def _lens(job: SolvedRecording) -> Iterator[str]:
@@ -282,9 +283,14 @@ def _views(job: SolvedRecording) -> Iterator[str]:
         name = "" if view.name == str(view.index) else f": {view.name}"
         caption = f"pose {view.index}{name}" + (f", {px:.2f} px" if px is not None else "")
         if view.index in rejected:
-            caption += f": {rejected[view.index]}"
+            caption += ", left out"
         mark = "out" if view.index in rejected else "in"
         cells.append(f'<div class="{mark}">{html.figure(html.picture(jpeg, caption), caption)}</div>')
+    yield html.paragraph(
+        "Orange: the corners found, the first one in red. Blue rings: where the board's pose and the "
+        "lens put them.",
+        "note",
+    )
     yield '<div class="views">' + "\n".join(cells) + "</div>"
     if len(job.recording.views()) > _PICTURES_LIMIT:
         yield html.paragraph(f"The first {_PICTURES_LIMIT} are shown.", "note")

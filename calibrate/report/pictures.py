@@ -22,10 +22,10 @@ def drawn_view(image: Any, found: Array, modelled: Array | None) -> bytes:
     canvas = cv2.cvtColor(np.clip(small * (245.0 / top), 0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)
     if modelled is not None:
         for x, y in _places(modelled, scale):
-            cv2.circle(canvas, (x, y), 5, (218, 105, 9), 1, cv2.LINE_AA)
+            cv2.circle(canvas, (x, y), 7, (218, 105, 9), 2, cv2.LINE_AA)
     for k, (x, y) in enumerate(_places(found, scale)):
         colour = (0, 0, 255) if k == 0 else (0, 140, 255)
-        cv2.drawMarker(canvas, (x, y), colour, cv2.MARKER_CROSS, 7 if k else 13, 1)
+        cv2.drawMarker(canvas, (x, y), colour, cv2.MARKER_CROSS, 8 if k else 18, 2)
     _, jpeg = cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, 70])
     return jpeg.tobytes()
 

@@ -10,6 +10,7 @@ import cv2
 import matplotlib
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
 
 from calibrate.geometry import Array
 from calibrate.lens import undistort
@@ -75,7 +76,7 @@ def residual_scatter(misses: Array, pixels: Array, camera: CameraModel) -> str:
         sigma = float(np.sqrt(np.square(misses).mean()))
         angle = np.linspace(0, 2 * np.pi, 100)
         for k in (1, 2, 3):
-            axes[0].plot(k * sigma * np.cos(angle), k * sigma * np.sin(angle), color=_GREY, linewidth=0.7)
+            axes[0].plot(k * sigma * np.cos(angle), k * sigma * np.sin(angle), color=_RED, linewidth=1)
         keep = np.linspace(0, len(pixels) - 1, min(len(pixels), 1500)).astype(int)
         axes[1].quiver(
             pixels[keep, 0],
@@ -143,7 +144,7 @@ def coverage_map(views: ViewSet) -> str:
         figure, axes = new_figure(10, 3.4, 2)
         extent = (0, camera.width, camera.height, 0)
         shown = axes[0].imshow(seen, extent=extent, cmap="Blues", interpolation="nearest")
-        figure.colorbar(shown, ax=axes[0], label="views")
+        figure.colorbar(shown, ax=axes[0], label="views", ticks=MaxNLocator(integer=True))
         for view in views:
             axes[0].plot(view.pixels[:, 0], view.pixels[:, 1], ".", markersize=1, color=_ORANGE)
         axes[0].set(xlim=(0, camera.width), ylim=(camera.height, 0), xlabel="x, px", ylabel="y, px")

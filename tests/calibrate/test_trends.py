@@ -71,7 +71,7 @@ def test_the_page_is_whole_and_asks_the_network_for_nothing() -> None:
     results = [session(k, shift_mm=1.8 if k >= 3 else 0.0) for k in range(6)]
     results.append(BatchResult("<broken>.mcap", "b", False, error="cut & short"))
     page = fleet_page(results, cells(results))
-    assert "1 moved" in page and page.count("<svg") == 1
+    assert "1 of 1 cameras moved" in page and page.count("<svg") == 1
     assert "&lt;broken&gt;.mcap" in page and "cut &amp; short" in page
     for word in ('src="http', 'href="http', "@import", "<script"):
         assert word not in page
@@ -83,3 +83,11 @@ def test_few_results_are_no_trouble(count: int) -> None:
     results = [session(k) for k in range(count)]
     assert "No camera moved" in trends_text(cells(results))
     assert "No camera moved" in fleet_page(results, cells(results))
+
+
+def test_a_camera_that_moves_all_the_time_does_not_hide_the_others() -> None:
+    restless = [session(k, shift_mm=1.8 * k) for k in range(8)]
+    page = fleet_page(restless, cells(restless))
+    verdict = page[page.index("verdict") : page.index("<h2>")]
+    assert verdict.count("the camera moved") == 3
+    assert "and 4 more" in verdict

@@ -265,6 +265,11 @@ class GenicamDevice:
                 "were lost; check cable, network card and packet size, and take this pose again"
             )
         width, height = buffer.get_image_width(), buffer.get_image_height()
+        if (width, height) != self._region[2:]:
+            raise CameraError(
+                f"frame {buffer.get_frame_id()} came as {width}×{height}, set were {self._region[2]}×"
+                f"{self._region[3]}: another program changes the camera's settings; take this pose again"
+            )
         wall_ns = buffer.get_system_timestamp()
         image = decode(buffer.get_data(), width, height, self._config.pixel_format)
         return Picture(

@@ -6,12 +6,14 @@ import asyncio
 import os
 import random
 import signal
+import threading
 import time
 from collections.abc import Iterator
 
 import numpy as np
 import pytest
 
+from recordings.messages import Picture
 from station.config import CameraConfig
 from station.devices.aravis import AravisCamera
 from station.errors import CameraError
@@ -101,6 +103,29 @@ async def test_23_settings_changed_behind_our_back_are_refused(server: Simulated
             server.inject("register", [register, before])
         await camera.capture()
     finally:
+        await camera.close()
+
+
+async def test_23_a_stream_ends_when_settings_are_changed_and_passes_no_picture_of_them(
+    server: SimulatedGige,
+) -> None:
+    camera = AravisCamera(
+        CameraConfig(device="127.0.0.1", packet_size=8996, trigger="free-running", frame_rate_hz=20.0)
+    )
+    sizes: list[tuple[int, ...]] = []
+
+    def keep(picture: Picture) -> None:
+        sizes.append(picture.image.shape)
+        if len(sizes) == 5:
+            server.inject("register", [genicam.WIDTH, 640])
+
+    await camera.open()
+    try:
+        with pytest.raises(CameraError, match="640"):
+            await asyncio.wait_for(camera.stream(keep, threading.Event()), 20)
+        assert len(sizes) >= 5 and set(sizes) == {(1024, 1280)}
+    finally:
+        server.inject("register", [genicam.WIDTH, 1280])
         await camera.close()
 
 

@@ -104,7 +104,7 @@ def _compare_choices(cell: RandomCell, result: CellResult, rng: np.random.Genera
             (f"{name} planned 12", [choose(each, 12, objective, rng)] * VISITS),
             (f"{name} random 25", [rng.permutation(len(pool))[:25].tolist() for _ in range(VISITS)]),
         ):
-            visits = [_x_error(cell, pool.base_from_flange[places], rng) for places in sets]
+            visits = [x_error(cell, pool.base_from_flange[places], rng) for places in sets]
             result.squares[label] = _squares(np.array(visits), cell.X)
 
 
@@ -137,7 +137,7 @@ def _plan_and_check(cell: RandomCell, result: CellResult, rng: np.random.Generat
     result.motion_random_s = float(np.mean(times))
     last = plan.poses[-1].predicted_sigma_m
     assert last is not None
-    errors = np.array([_x_error(cell, flange, rng) for _ in range(2 * VISITS)])
+    errors = np.array([x_error(cell, flange, rng) for _ in range(2 * VISITS)])
     result.achieved = [float(e) / last for e in np.linalg.norm(errors[:, :3], axis=1)]
 
 
@@ -158,7 +158,7 @@ def _random_time(scene: Scene, plan: Plan, cell: RandomCell, rng: np.random.Gene
     return sum(allowed_speed(scene.geometry, sample_path(scene.geometry, a, b, 0.02))[2] for a, b in moves)
 
 
-def _x_error(cell: RandomCell, flange: Array, rng: np.random.Generator) -> Array:
+def x_error(cell: RandomCell, flange: Array, rng: np.random.Generator) -> Array:
     """Error (6,) of the estimate from one noisy visit to these flange poses (n, 4, 4)."""
     n, k = len(flange), len(POINTS)
     there = perturb(flange, rng.normal(size=(n, 6)) * np.repeat([NOISE.robot_m, NOISE.robot_rad], 3))

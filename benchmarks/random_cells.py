@@ -197,18 +197,18 @@ def _spheres(joints: Array, X: Array) -> tuple[Array, Array, Array]:
     return np.stack(centres, axis=1), np.array(radii), np.array(body)
 
 
-def _config(X: Array, Y: Array, rng: np.random.Generator) -> StationConfig:
-    def roughly(T: Array) -> PoseGuess:
-        wrong = pose(
-            T[:3, :3] @ rotation_exp(rng.normal(0, GUESS_RAD, 3)), T[:3, 3] + rng.normal(0, GUESS_M, 3)
-        )
-        return guess_of(wrong, GUESS_M, GUESS_RAD)
+def roughly(T: Array, rng: np.random.Generator, sigma_m: float, sigma_rad: float) -> PoseGuess:
+    """A guess of T (4, 4) that is wrong by its sigmas."""
+    wrong = pose(T[:3, :3] @ rotation_exp(rng.normal(0, sigma_rad, 3)), T[:3, 3] + rng.normal(0, sigma_m, 3))
+    return guess_of(wrong, sigma_m, sigma_rad)
 
+
+def _config(X: Array, Y: Array, rng: np.random.Generator) -> StationConfig:
     return StationConfig(
         robot=RobotConfig(model="UR10"),
         camera=CameraConfig(driver="rendered", model=CAMERA),
         board=PAPER_BOARD,
-        camera_guess=roughly(X),
-        board_guess=roughly(Y),
+        camera_guess=roughly(X, rng, GUESS_M, GUESS_RAD),
+        board_guess=roughly(Y, rng, GUESS_M, GUESS_RAD),
         limits=LimitsConfig(planes=(Plane("table", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),)),
     )

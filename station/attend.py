@@ -16,6 +16,8 @@ from station.status import GoSummary, StationState, StationStatus
 Watcher = Callable[[StationStatus], None]
 Confirm = Callable[[GoSummary], bool]
 CONNECT_WAIT_S = 30.0
+PREPARE_S = 180.0
+"""Poses may be planned anew for it."""
 _RESTING = (StationState.PAUSED, StationState.STOPPED, StationState.FAULT, StationState.DISCONNECTED)
 
 
@@ -65,7 +67,7 @@ async def carry_out(
 
     RefusedError when the daemon or the person says no. Being cancelled sends STOP.
     """
-    summary = msgspec.convert(await client.request("prepare", purpose=purpose), GoSummary)
+    summary = msgspec.convert(await client.request("prepare", purpose=purpose, timeout_s=PREPARE_S), GoSummary)
     if not confirm(summary):
         raise RefusedError("nothing moved: the go was not given")
     await asyncio.sleep(0)  # Ctrl-C at the question strikes here, before the go is sent

@@ -36,7 +36,13 @@ def command_line(arguments: Sequence[str]) -> typer.Typer:
 def _add_large_commands(app: typer.Typer) -> None:
     from station.cli_bootstrap import bootstrap_command
     from station.cli_serve import serve_command
-    from station.cli_session import capture_command, check_command, demo_command, resume_command
+    from station.cli_session import (
+        capture_command,
+        check_command,
+        demo_command,
+        improve_command,
+        resume_command,
+    )
     from station.cli_verify import verify_command
     from station.plan.cli import plan_command
 
@@ -45,6 +51,7 @@ def _add_large_commands(app: typer.Typer) -> None:
     app.command("demo")(demo_command)
     app.command("capture")(capture_command)
     app.command("resume")(resume_command)
+    app.command("improve")(improve_command)
     app.command("check")(check_command)
     app.command("verify")(verify_command)
     app.command("bootstrap")(bootstrap_command)

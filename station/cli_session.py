@@ -122,6 +122,14 @@ def resume_command(
     _finish(asyncio.run(attended_session(socket, "resume", headless, go, as_json, None)), as_json)
 
 
+def improve_command(headless: Headless = False, socket: Socket = None, as_json: AsJson = False) -> None:
+    """Plan the poses that are left of a paused session anew, from what its pictures show; then go on.
+
+    Says what would change and asks; without a yes the session stays as it is. Ctrl-C is STOP.
+    """
+    _finish(asyncio.run(attended_session(socket, "improve", headless, "", as_json, None)), as_json)
+
+
 def check_command(
     poses: Annotated[int, typer.Option(min=4, max=50)] = CHECK_POSES,
     headless: Headless = False,

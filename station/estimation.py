@@ -50,12 +50,11 @@ def running_estimate(
     if len(seen) < FEWEST_VIEWS:
         return msgspec.structs.replace(blank, advice="too few views yet")
     try:
-        views = _views(mount, camera, lens_is_known, board, seen)
-        X, Y = _quick_solution(views)
+        views, X, Y = solve_quickly(mount, camera, lens_is_known, board, seen)
     except (CalibrationError, cv2.error, np.linalg.LinAlgError):
         return msgspec.structs.replace(blank, advice="the motion says too little yet")
     free_lens = not lens_is_known
-    sigma_m, sigma_rad = _sigma(views, board, X, Y, free_lens)
+    sigma_m, sigma_rad = quick_sigma(views, board, X, Y, free_lens)
     x, y, z = (float(v) for v in 1000 * X[:3, 3])
     return msgspec.structs.replace(
         blank,
@@ -98,6 +97,17 @@ def image_coverage(camera: CameraModel, pixels: Sequence[Array]) -> tuple[tuple[
     return tuple(tuple(int(n) for n in row) for row in counts)
 
 
+def solve_quickly(
+    mount: Mount, camera: CameraModel, lens_is_known: bool, board: BoardSpec, seen: Sequence[Seen]
+) -> tuple[ViewSet, Array, Array]:
+    """Views with the lens they were read by, X and Y.
+
+    CalibrationError, cv2.error or LinAlgError when the views are degenerate.
+    """
+    views = _views(mount, camera, lens_is_known, board, seen)
+    return views, *_quick_solution(views)
+
+
 def _views(
     mount: Mount, camera: CameraModel, lens_is_known: bool, board: BoardSpec, seen: Sequence[Seen]
 ) -> ViewSet:
@@ -129,7 +139,7 @@ def _quick_solution(views: ViewSet) -> tuple[Array, Array]:
     return X, np.asarray(gripper[0] @ X @ board[0])
 
 
-def _sigma(views: ViewSet, board: BoardSpec, X: Array, Y: Array, free_lens: bool) -> tuple[float, float]:
+def quick_sigma(views: ViewSet, board: BoardSpec, X: Array, Y: Array, free_lens: bool) -> tuple[float, float]:
     """1σ of X: translation (m) and rotation (rad), roots of the summed variances."""
     information = view_information(
         views.mount, views.camera, views.base_from_flange, X, Y, board_points(board), Noise(), free_lens

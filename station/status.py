@@ -143,6 +143,8 @@ class EstimateStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     goal_mm: float | None = None
     enough: bool = False
     advice: str = ""
+    improve: str = ""
+    """Why and how the poses that are left should be planned anew; empty = no need."""
     image_coverage: tuple[tuple[int, ...], ...] = ()
     """Corners seen so far in each part of the picture, rows from the top."""
 

@@ -94,8 +94,8 @@ def improved_config(config: StationConfig, glimpses: Sequence[Glimpse]) -> Stati
     sigma_m = float(np.hypot(belief.sigma_m, distance_m * belief.sigma_rad))
     return msgspec.structs.replace(
         config,
-        camera_guess=_guess(belief.X, belief.sigma_m, belief.sigma_rad),
-        board_guess=_guess(place, sigma_m, belief.sigma_rad),
+        camera_guess=guess_from(belief.X, belief.sigma_m, belief.sigma_rad),
+        board_guess=guess_from(place, sigma_m, belief.sigma_rad),
     )
 
 
@@ -145,7 +145,8 @@ def _prior(config: StationConfig) -> tuple[Array, Array]:
     return X, np.repeat([guess.sigma_m, guess.sigma_rad], 3)
 
 
-def _guess(matrix: Array, sigma_m: float, sigma_rad: float) -> PoseGuess:
+def guess_from(matrix: Array, sigma_m: float, sigma_rad: float) -> PoseGuess:
+    """A transform (4, 4) as the configuration writes it."""
     x, y, z = (float(v) for v in matrix[:3, 3])
     qx, qy, qz, qw = (float(v) for v in quaternion_from_matrix(matrix[:3, :3]))
     return PoseGuess((x, y, z), (qx, qy, qz, qw), sigma_m, sigma_rad)

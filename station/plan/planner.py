@@ -72,13 +72,14 @@ def plan_scene(
     options: PlanOptions,
     start_joints_rad: Sequence[float] | None = None,
     progress: Progress = lambda text, done: None,
+    captured: Array | None = None,
 ) -> Plan:
-    """The same, for a scene that is already known."""
+    """The same, for a scene that is already known; `captured`: flange poses (n, 4, 4) that were taken."""
     rng = np.random.default_rng(options.seed)
     start = None if start_joints_rad is None else np.asarray(start_joints_rad, dtype=float)
     progress("looking for poses", 0.0)
     pool, notes = candidate_pool(scene, options, start, rng)
-    plan = _choose_and_order(scene, options, pool, start, rng, progress)
+    plan = _choose_and_order(scene, options, pool, start, rng, progress, captured)
     progress("done", 1.0)
     return msgspec.structs.replace(plan, note="; ".join(notes))
 
@@ -135,17 +136,22 @@ def _choose_and_order(
     start: Array | None,
     rng: np.random.Generator,
     progress: Progress,
+    captured: Array | None,
 ) -> Plan:
     """The checked plan. Poses that no free way leads to leave the pool, and the choice is made again."""
     objective = objective_for(scene, options.criterion, options.free_intrinsics)
     information = informations(scene, pool.base_from_flange, options.noise, options.free_intrinsics)
+    known: Array | None = None
+    if captured is not None:
+        known = informations(scene, captured, options.noise, options.free_intrinsics).sum(axis=0)
     left = np.arange(len(pool))
     picked: list[int] = []
     while len(left) >= options.count:
         # The first choice is polished; when poses without a free way leave, only their places are filled.
         kept = tuple(int(k) for k in np.flatnonzero(np.isin(left, picked)))
-        chosen = choose(
+        chosen = _chosen(
             information[left],
+            known,
             options.count,
             objective,
             rng,
@@ -158,7 +164,7 @@ def _choose_and_order(
         order, blocked = _ordered(scene, pool.joints_rad[places], start, options.seed)
         if not blocked:
             places = places[order]
-            plan = _describe(scene, options, pool.joints_rad[places], information[places], objective)
+            plan = _describe(scene, options, pool.joints_rad[places], information[places], objective, known)
             progress("checking", 0.95)
             blocked = _failing(plan, start, scene)
             if not blocked:
@@ -166,6 +172,24 @@ def _choose_and_order(
         gone = places[blocked]
         left, picked = np.setdiff1d(left, gone), [p for p in places if p not in gone]
     raise LimitError(explain_shortage(scene, options.count, pool.take(left), pool, start))
+
+
+def _chosen(
+    pool: Array,
+    known: Array | None,
+    count: int,
+    objective: Objective,
+    rng: np.random.Generator,
+    keep: tuple[int, ...],
+    sweeps: int,
+    progress: Callable[[float], None],
+) -> list[int]:
+    """`choose`, beside what is `known` (p, p): that counts as one more member, which stays in."""
+    if known is None:
+        return choose(pool, count, objective, rng, keep, sweeps, progress)
+    stays = (0, *(place + 1 for place in keep))
+    chosen = choose(np.concatenate([known[None], pool]), count + 1, objective, rng, stays, sweeps, progress)
+    return [place - 1 for place in chosen[1:]]
 
 
 def _ordered(scene: Scene, joints: Array, start: Array | None, seed: int) -> tuple[list[int], list[int]]:
@@ -193,9 +217,16 @@ def _failing(plan: Plan, start: Array | None, scene: Scene) -> list[int]:
     return failing
 
 
-def _describe(scene: Scene, options: PlanOptions, joints: Array, gained: Array, objective: Objective) -> Plan:
+def _describe(
+    scene: Scene,
+    options: PlanOptions,
+    joints: Array,
+    gained: Array,
+    objective: Objective,
+    before: Array | None,
+) -> Plan:
     flange = forward(scene.geometry.model, joints)
-    known = gained.cumsum(axis=0)
+    known = gained.cumsum(axis=0) + (0.0 if before is None else before)
     poses = tuple(
         planned_pose(scene, number, joints[number], flange[number], sigma_of(known[number], objective)[0])
         for number in range(len(joints))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+from collections.abc import Callable
 
 import msgspec
 import numpy as np
@@ -17,8 +18,9 @@ log = logging.getLogger(__name__)
 
 
 class Estimator:
-    def __init__(self, bench: Bench) -> None:
-        self._bench = bench
+    def __init__(self, bench: Bench, hint: Callable[[EstimateStatus], str] = lambda estimate: "") -> None:
+        """`hint`: what else to tell a person about an estimate."""
+        self._bench, self._hint = bench, hint
         self._known: tuple[int, ...] = ()
         self._woken = asyncio.Event()
 
@@ -62,4 +64,7 @@ class Estimator:
                     log.exception("the running estimate failed")
                 bench.store.event(f"no running estimate: {error}", "warning")
                 continue
-            bench.store.update(estimate=estimate)
+            hint = self._hint(estimate)
+            if hint and not bench.store.status.estimate.improve:
+                bench.store.event(hint)
+            bench.store.update(estimate=msgspec.structs.replace(estimate, improve=hint))

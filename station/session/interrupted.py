@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import msgspec
 
+from recordings.errors import RecordingError
+from station.errors import StationError
 from station.session.bench import Bench
 from station.session.folder import interrupted_session
 from station.session.queue import PoseQueue
 from station.session.recording import SessionRecording
-from station.session.run import recover_parts
+from station.session.run import recover_parts, seal
 from station.status import StationState
 
 
@@ -34,6 +36,21 @@ def find_interrupted(bench: Bench) -> None:
     bench.store.enter(StationState.STOPPED, reason)
     bench.show_poses()
     bench.store.event(reason, "warning")
+
+
+async def close_or_seal(bench: Bench) -> None:
+    """A person finishes: of an open recording the end is written, an interrupted one is made whole."""
+    recording = bench.require_recording()
+    try:
+        if recording.recorder is None:
+            await close_interrupted(bench)
+        else:
+            await seal(bench)
+    except (RecordingError, StationError) as error:
+        recording.abandon()
+        bench.store.event(f"not sealed: {error}", "error")
+        if bench.store.state is not StationState.STOPPED:
+            bench.store.enter(StationState.FAULT, f"recording: {error}")
 
 
 async def close_interrupted(bench: Bench) -> None:

@@ -11,6 +11,7 @@ import numpy as np
 from recordings.messages import Vector6
 from station.errors import RefusedError
 from station.plan.hover import Hover
+from station.session.queue import Replanned
 from station.status import GoSummary, Lease
 
 GO_LIFETIME_S = 120.0
@@ -62,6 +63,8 @@ class Go:
     """Pose numbers it covers, in order; more may not be driven to with it."""
     again: bool = False
     """Nobody is there to be asked: poses that do not come to rest are tried once more at the end."""
+    replanned: Replanned | None = None
+    """Poses that take the place of the session's with this go."""
     hover: Hover | None = None
     """A way over one corner of the board instead of poses of the plan."""
 
@@ -88,9 +91,11 @@ class GoDesk:
         start: Vector6,
         poses: tuple[int, ...],
         hover: Hover | None = None,
+        replanned: Replanned | None = None,
     ) -> Go:
         """An older one is void."""
-        self._waiting = Go(summary, client_id, self._clock() + GO_LIFETIME_S, start, poses, hover=hover)
+        expires_s = self._clock() + GO_LIFETIME_S
+        self._waiting = Go(summary, client_id, expires_s, start, poses, hover=hover, replanned=replanned)
         return self._waiting
 
     def void(self) -> bool:
@@ -114,7 +119,8 @@ class GoDesk:
             raise RefusedError(f"this go is older than {GO_LIFETIME_S:.0f} s: prepare again and confirm")
         if go.client_id != client_id:
             raise RefusedError("this go was asked for by another client: prepare again and confirm")
-        if go.hover is None and go.summary.plan_sha256 != plan_sha256:  # a hover carries its own plan
+        asked_for = go.replanned.before_sha256 if go.replanned else go.summary.plan_sha256
+        if go.hover is None and asked_for != plan_sha256:  # a hover carries its own plan
             raise RefusedError("the plan changed since this go was asked for: prepare again and confirm")
         moved_rad = float(np.abs(np.subtract(joints_rad, go.start_joints_rad)).max())
         if moved_rad > START_TOLERANCE_RAD:

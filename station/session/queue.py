@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import msgspec
 
@@ -13,6 +14,17 @@ from station.status import PoseState, PoseStatus
 OPEN: frozenset[PoseState] = frozenset({"planned"})
 BUSY: frozenset[PoseState] = frozenset({"moving", "settling", "capturing", "writing"})
 POSE_LIMIT = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class Replanned:
+    """Poses that wait for a person's yes to take the place of the session's."""
+
+    queue: PoseQueue
+    before_sha256: str
+    """Of the poses that they were made for."""
+    changes: tuple[str, ...]
+    """What is better, in words."""
 
 
 class PoseQueue:
@@ -48,6 +60,11 @@ class PoseQueue:
         return tuple(i for i in self._poses if self._status[i].state in OPEN)
 
     @property
+    def fresh(self) -> tuple[int, ...]:
+        """Poses that are open and were never tried, in order."""
+        return tuple(i for i in self.open if not self._status[i].attempt)
+
+    @property
     def done(self) -> int:
         return sum(s.state == "done" for s in self._status.values())
 
@@ -70,6 +87,15 @@ class PoseQueue:
     def note(self, index: int, *, corners: int | None = None, coverage: float | None = None) -> None:
         """What the picture showed."""
         self._status[index] = msgspec.structs.replace(self.status(index), corners=corners, coverage=coverage)
+
+    def with_fresh(self, poses: Sequence[PlannedPose]) -> PoseQueue:
+        """A copy with these, at most as many, in place of the fresh ones, by the same numbers, at the end."""
+        fresh = self.fresh
+        taken = [(i, pose) for i, pose in self._poses.items() if i not in fresh]
+        placed = [(i, _named(pose, i)) for i, pose in zip(fresh, poses, strict=False)]
+        plan = msgspec.structs.replace(self._plan, poses=tuple(pose for _, pose in (*taken, *placed)))
+        known = [*(self._status[i] for i, _ in taken), *(_fresh(i, pose) for i, pose in placed)]
+        return PoseQueue(plan, known)
 
     def start_attempt(self, index: int) -> int:
         """The number of this attempt, from 1; later ones supersede earlier ones in the recording."""
@@ -116,6 +142,11 @@ class PoseQueue:
         if len(self._poses) == 1:
             raise RefusedError("the last pose cannot be dropped: finish the session instead")
         del self._poses[index], self._status[index]
+
+
+def _named(pose: PlannedPose, index: int) -> PlannedPose:
+    """Told apart from the pose that had this number before."""
+    return msgspec.structs.replace(pose, name=f"p{index + 1:02d} anew")
 
 
 def _fresh(index: int, pose: PlannedPose) -> PoseStatus:

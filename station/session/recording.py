@@ -63,6 +63,7 @@ class SessionRecording:
         self.folder = folder or new_session_folder(root, cell.config.name)
         self.recorder: Recorder | None = None
         self._sequence = 0
+        self._plans = 1
         self._saving = asyncio.Lock()
         self._closing: threading.Thread | None = None
 
@@ -156,6 +157,11 @@ class SessionRecording:
         numbered = msgspec.structs.replace(picture, sequence=self._sequence, image=_own(picture.image))
         self._sequence += 1
         return numbered
+
+    def attach_plan(self, plan: Plan) -> None:
+        """The plan as it was changed on the way, beside the one it began with. Raises RecordingError."""
+        self._plans += 1
+        self._require().attach(f"plan-{self._plans}.yaml", "application/yaml", msgspec.yaml.encode(plan))
 
     def picture(self, picture: Picture) -> None:
         """Hands it to the writer. Raises RecordingError when the disk cannot keep up or has failed."""

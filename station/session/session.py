@@ -16,7 +16,7 @@ from typing import Any
 from recordings.errors import RecordingError
 from station.analysis import plan_poses
 from station.cell import Cell
-from station.errors import RefusedError, RobotError, StationError
+from station.errors import RefusedError, RobotError
 from station.plan.hover import Hover
 from station.plan.model import Plan
 from station.plan.scene import cell_geometry
@@ -25,13 +25,14 @@ from station.session.estimate import Estimator
 from station.session.free_drive import FreeDrive
 from station.session.guard import Guard
 from station.session.hovering import HoverDesk, HoverRequest
-from station.session.interrupted import close_interrupted, find_interrupted
+from station.session.improving import ImproveDesk
+from station.session.interrupted import close_or_seal, find_interrupted
 from station.session.keeper import Keeper
 from station.session.lease import GoDesk, LeaseDesk
 from station.session.logbook import Logbook
 from station.session.preview import Previewer
-from station.session.queue import PoseQueue
-from station.session.run import seal, unmark_busy
+from station.session.queue import PoseQueue, Replanned
+from station.session.run import unmark_busy
 from station.session.runs import run_for
 from station.session.store import StatusStore
 from station.session.summary import poses_to_drive, summarise
@@ -61,7 +62,8 @@ class Session:
         """Counts what makes a go void: a check that was under way meanwhile offers none."""
         self.guard = Guard(self.bench, self._jogged, ticked, self._void_go)
         self._keeper = Keeper(self.bench)
-        self._estimator = Estimator(self.bench)
+        self._improver = ImproveDesk(self.bench)
+        self._estimator = Estimator(self.bench, self._improver.hint)
         self.previews = Previewer(self.bench)
         self.free_drive = FreeDrive(self.bench)
         self._hovers = HoverDesk(self.bench)
@@ -159,11 +161,13 @@ class Session:
         if purpose == "run" and self.bench.recording is None and self.bench.queue is not None:
             self.bench.queue = PoseQueue(self.bench.queue.plan)
             self.bench.show_poses()
-        poses = poses_to_drive(self.bench, purpose, index)
         self._void_go()
         voids = self._voids
-        summary = await summarise(self.bench, purpose, poses, self._notes)
-        self._offer(client_id, voids, summary, poses)
+        found = await self._improver.prepare() if purpose == "improve" else None
+        poses = found.queue.open if found else poses_to_drive(self.bench, purpose, index)
+        queue, notes = (found.queue, found.changes) if found else (self.bench.require_queue(), ())
+        summary = await summarise(self.bench, purpose, queue, poses, (*notes, *self._notes))
+        self._offer(client_id, voids, summary, poses, replanned=found)
         return summary
 
     async def prepare_hover(self, client_id: int, request: HoverRequest) -> HoverOffer:
@@ -179,7 +183,13 @@ class Session:
         return offer
 
     def _offer(
-        self, client_id: int, voids: int, go: GoSummary, poses: tuple[int, ...], hover: Hover | None = None
+        self,
+        client_id: int,
+        voids: int,
+        go: GoSummary,
+        poses: tuple[int, ...],
+        hover: Hover | None = None,
+        replanned: Replanned | None = None,
     ) -> None:
         """RefusedError when something happened while the way was checked."""
         self._require("prepare")
@@ -187,7 +197,7 @@ class Session:
         if self._voids != voids:
             raise RefusedError("something changed while the way was checked: prepare again")
         assert go.start_joints_rad is not None
-        self._goes.offer(go, client_id, go.start_joints_rad, poses, hover)
+        self._goes.offer(go, client_id, go.start_joints_rad, poses, hover, replanned)
         self.store.update(go=go)
 
     def go(self, client_id: int, token: str, again: bool = False) -> None:
@@ -203,6 +213,8 @@ class Session:
         finally:
             self.store.update(go=None)
         self._notes = ()
+        if go.replanned is not None:
+            self._improver.adopt(go.replanned)
         self.bench.halting = False
         self.bench.pause_wanted, self.bench.finish_wanted = "", False
         if self.bench.recording is None and go.hover is None:
@@ -230,24 +242,11 @@ class Session:
             raise RefusedError("nothing is recorded yet: there is nothing to finish")
         await asyncio.gather(self._run_ended(), self.free_drive.last_picture())
         self._require("finish")
-        await self._seal()
+        await close_or_seal(self.bench)
 
     async def _run_ended(self) -> None:
         if self._run is not None and not self._run.done():
             await asyncio.wait({self._run}, timeout=END_RUN_S)
-
-    async def _seal(self) -> None:
-        recording = self.bench.require_recording()
-        try:
-            if recording.recorder is None:
-                await close_interrupted(self.bench)
-            else:
-                await seal(self.bench)
-        except (RecordingError, StationError) as error:
-            recording.abandon()
-            self.store.event(f"not sealed: {error}", "error")
-            if self.store.state is not StationState.STOPPED:
-                self.store.enter(StationState.FAULT, f"recording: {error}")
 
     # -- the lease ---------------------------------------------------------------------------------------
 

@@ -11,6 +11,7 @@ from station.session.bench import Bench
 from station.session.guard import displacement
 from station.session.lease import GoDesk
 from station.session.patience import RestingCheck
+from station.session.queue import PoseQueue
 from station.status import GoSummary, StationState
 
 POSE_OVERHEAD_S = 0.8
@@ -33,16 +34,17 @@ def poses_to_drive(bench: Bench, purpose: str, index: int | None) -> tuple[int, 
             queue.retake(index)
         return (index,)
     if purpose not in ("run", "resume"):
-        raise RefusedError(f"unknown purpose '{purpose}'; known are run, resume, retake")
+        raise RefusedError(f"unknown purpose '{purpose}'; known are run, resume, retake, improve")
     if not queue.open:
         raise RefusedError("no pose is left to take: retake some, or finish")
     return queue.open
 
 
-async def summarise(bench: Bench, purpose: str, poses: tuple[int, ...], notes: tuple[str, ...]) -> GoSummary:
+async def summarise(
+    bench: Bench, purpose: str, queue: PoseQueue, poses: tuple[int, ...], notes: tuple[str, ...]
+) -> GoSummary:
     """Checks the whole way in the worker. LimitError lists what is wrong with it, RobotError with the arm."""
-    robot, queue = bench.cell.robot, bench.queue
-    assert queue is not None
+    robot = bench.cell.robot
     await RestingCheck(robot.check).news()
     start = robot.latest().joints_rad
     plan = queue.plan
@@ -79,6 +81,8 @@ def _purpose_words(bench: Bench, purpose: str, poses: tuple[int, ...]) -> str:
         return f"sweep: {len(poses)} slow swings without a stop, the camera running"
     if bench.recording is None:
         return "run plan"
+    if purpose == "improve":
+        return f"go on with session {bench.recording.name}, the poses that are left planned anew"
     return f"go on with session {bench.recording.name}"
 
 

@@ -119,6 +119,21 @@ async def test_without_a_person_a_real_arm_needs_the_plans_hash(
     await served.control.close()
 
 
+async def test_without_a_person_a_real_arm_s_plan_is_not_changed_on_the_way(
+    new_rig: NewRig, tmp_path: Path
+) -> None:
+    real = await new_rig(with_plan=False, source="real")
+    await real.until(StationState.IDLE)
+    served = Served(real, tmp_path / "r")
+    await served.control.start()
+    for interactive, told in ((False, "only with a person at the screen"), (True, "no session is open")):
+        async with await served.client(interactive=interactive) as client:
+            await client.request("lease", action="take")
+            with pytest.raises(RefusedError, match=told):
+                await client.request("prepare", purpose="improve")
+    await served.control.close()
+
+
 async def test_leaving_voids_the_go(served: Served, small_plan: Plan) -> None:
     async with await served.client() as anna:
         await anna.request("lease", action="take")

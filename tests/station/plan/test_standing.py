@@ -22,7 +22,7 @@ def beside_the_forearm(beside_m):
     """A mount that puts the camera so far beside the middle of the forearm."""
     frames = link_frames(ARM, TAUGHT[None])[0]
     middle = (frames[2, :3, 3] + frames[3, :3, 3]) / 2 + 0.049 * frames[2, :3, 2]
-    return inverse(FLANGE) @ pose(FLANGE[:3, :3] @ X[:3, :3], middle + [0.0, 0.0, beside_m])
+    return inverse(FLANGE) @ pose(FLANGE[:3, :3] @ X[:3, :3], middle + np.array([0.0, 0.0, beside_m]))
 
 
 def room_m(cell):

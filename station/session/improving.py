@@ -1,0 +1,102 @@
+"""The plan gets better while it is carried out: poses that are left, planned anew, offered to a person."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+
+import msgspec
+
+from recordings.errors import RecordingError
+from station.errors import RefusedError
+from station.estimation import Seen
+from station.improvement import FEWEST_LEFT, FEWEST_VIEWS, Improvement, improve
+from station.session.bench import Bench
+from station.session.patience import RestingCheck
+from station.session.queue import Replanned
+from station.status import EstimateStatus
+
+_SHARPER = 4.0
+"""So many times sharper the mount must be known than when the plan was made, to speak of it."""
+_PLAN_S = 120.0
+
+
+class ImproveDesk:
+    """Says when it would be worth it, and makes the offer."""
+
+    def __init__(self, bench: Bench) -> None:
+        self._bench = bench
+        self._improved = ""
+        """The session whose plan was improved already: once is told, more may be asked for."""
+
+    def hint(self, estimate: EstimateStatus) -> str:
+        """What to tell a person when it would be worth it; empty = nothing."""
+        queue, config = self._bench.queue, self._bench.cell.config
+        sigma_mm, guess = estimate.sigma_translation_mm, config.camera_guess
+        if queue is None or sigma_mm is None or guess is None:
+            return ""
+        times = 1000 * guess.sigma_m / sigma_mm
+        if estimate.views < FEWEST_VIEWS or len(queue.fresh) < FEWEST_LEFT or times < _SHARPER:
+            return ""
+        if self._bench.recording is None or self._bench.recording.name == self._improved:
+            return ""
+        return (
+            f"the mount is known {times:.0f} times better than the guess the poses were planned from: pause, "
+            f"then `station improve` plans the {len(queue.fresh)} that are left anew"
+        )
+
+    async def prepare(self) -> Replanned:
+        """The poses with those left planned anew. Nothing moves, and nothing is changed yet.
+
+        RefusedError when it is too early, too late or not worth it; LimitError when no such poses exist.
+        """
+        bench = self._bench
+        queue, robot = bench.queue, bench.cell.robot
+        if bench.recording is None or queue is None:
+            raise RefusedError("no session is open: the plan is improved from its first pictures")
+        if queue.plan.motion != "stops":
+            raise RefusedError("a sweep has no poses to improve")
+        fresh = queue.fresh
+        if len(fresh) < FEWEST_LEFT:
+            raise RefusedError(f"{len(fresh)} poses are left: too few to plan them anew")
+        await RestingCheck(robot.check).news()
+        before = [queue.pose(index) for index in queue.open if index not in fresh]
+        start = before[-1].joints_rad if before else robot.latest().joints_rad
+        left = msgspec.structs.replace(queue.plan, poses=tuple(queue.pose(index) for index in fresh))
+        seen: list[Seen] = [(v.index, v.base_from_flange, v.indices, v.pixels) for v in bench.seen.values()]
+        known = bench.cell.camera_model is not None
+        config = bench.cell.config
+        found = await bench.workers.call(improve, config, known, seen, left, start, timeout_s=_PLAN_S)
+        if not is_worth_it(found):
+            raise RefusedError(f"nothing to gain, go on with the plan as it is ({'; '.join(changes(found))})")
+        return Replanned(queue.with_fresh(found.plan.poses), queue.sha256, changes(found))
+
+    def adopt(self, found: Replanned) -> None:
+        """A person said yes: these are the poses now, and the recording says so."""
+        bench, recording = self._bench, self._bench.require_recording()
+        bench.queue, self._improved = found.queue, recording.name
+        bench.show_poses()
+        bench.store.event("; ".join(found.changes))
+        with contextlib.suppress(RecordingError):  # a disk that fails is told by the next picture
+            recording.attach_plan(found.queue.plan)
+
+
+def is_worth_it(found: Improvement) -> bool:
+    """Fewer cut boards, a smaller expected error or a better covered picture."""
+    before, after = found.before, found.after
+    if after.cut != before.cut:
+        return after.cut < before.cut
+    return after.sigma_m < 0.97 * before.sigma_m or after.margin_px < before.margin_px - 30
+
+
+def changes(found: Improvement) -> tuple[str, ...]:
+    """What a person is told, before → after."""
+    before, after = found.before, found.after
+    cut = (f"poses that would cut the board: {before.cut} → {after.cut}",) if before.cut or after.cut else ()
+    known = f"{1000 * found.sigma_m:.1f} mm and {math.degrees(found.sigma_rad):.2f}°"
+    return (
+        f"planned anew: {len(found.plan.poses)} poses, from a mount known to {known}",
+        f"expected error at the end: {1000 * before.sigma_m:.2f} → {1000 * after.sigma_m:.2f} mm",
+        f"empty strip along the picture's edges: {before.margin_px:.0f} → {after.margin_px:.0f} px",
+        *cut,
+    )

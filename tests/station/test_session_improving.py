@@ -1,0 +1,129 @@
+"""The poses that are left, planned anew: offered to a person, changed by nothing but that person's go."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from calibrate.board import board_points
+from calibrate.geometry import inverse, transform_points
+from calibrate.kinematics import MODELS, forward
+from calibrate.projection import project
+from station.analysis import Sighting, sight
+from station.errors import RefusedError
+from station.limits import check_plan
+from station.plan.model import Plan
+from station.plan.planner import make_plan
+from station.plan.scene import cell_geometry
+from station.session.queue import PoseQueue
+from station.status import StationState as S
+from tests.station.session_rig import TRUTH, NewRig, Rig, WorkerInThisProcess, memory_config, sealed
+
+POSES, BEFORE = 12, 7
+
+
+class WorkerThatSees(WorkerInThisProcess):
+    """Finds the board where the true camera would show it."""
+
+    def __init__(self, rig: Rig) -> None:
+        super().__init__()
+        self.rig, self.noise = rig, np.random.default_rng(5)
+
+    async def call(self, function: Callable[..., Any], *args: Any, timeout_s: float = 60.0) -> Any:
+        if function is not sight:
+            return await super().call(function, *args, timeout_s=timeout_s)
+        flange = forward(MODELS["UR10"], self.rig.arm.joints)
+        board = inverse(flange @ np.array(TRUTH.camera_mount)) @ np.array(TRUTH.board_place)
+        points = board_points(TRUTH.board)
+        pixels = project(TRUTH.camera, transform_points(board, points)).pixels
+        return Sighting(
+            self.sees.status, np.arange(len(points)), pixels + self.noise.normal(0, 0.1, pixels.shape)
+        )
+
+
+@pytest.fixture(scope="module")
+def plan() -> Plan:
+    return make_plan(memory_config(), start_joints_rad=TRUTH.start_joints_rad, seed=3, count=POSES)
+
+
+@pytest.fixture
+async def half_way(new_rig: NewRig, plan: Plan) -> Rig:
+    """Paused after some poses."""
+    rig = await new_rig()
+    rig.session.bench.workers = WorkerThatSees(rig)  # type: ignore[assignment]
+    rig.session.load_plan(1, plan)
+    ended = rig.session.store.watch(lambda: _pause_after(rig, BEFORE))
+    await rig.give_go()
+    await rig.until(S.PAUSED)
+    ended()
+    return rig
+
+
+def _pause_after(rig: Rig, poses: int) -> None:
+    if rig.session.store.status.session.captured == poses:
+        rig.session.bench.pause_wanted = "anna"
+
+
+def queue_of(rig: Rig) -> PoseQueue:
+    return rig.session.bench.require_queue()
+
+
+async def test_the_remaining_poses_are_planned_anew_only_by_a_go(half_way: Rig, plan: Plan) -> None:
+    rig = half_way
+    await rig.until_true(lambda: "station improve" in rig.session.store.status.estimate.improve)
+    before, moves = queue_of(rig).sha256, rig.arm.log.count("move")
+    summary = await rig.session.prepare(1, "improve")
+    assert summary.poses == POSES - BEFORE
+    assert any("expected error at the end" in line for line in summary.warnings)
+    assert queue_of(rig).sha256 == before != summary.plan_sha256
+    old = await rig.session.prepare(1, "resume")
+    assert old.plan_sha256 == before
+    with pytest.raises(RefusedError, match="not valid"):
+        rig.session.go(1, summary.token)  # the later question made it void
+    assert rig.arm.log.count("move") == moves
+
+    summary = await rig.session.prepare(1, "improve")
+    rig.session.go(1, summary.token)
+    assert queue_of(rig).sha256 == summary.plan_sha256
+    await rig.until(S.IDLE)
+    recording = sealed(rig)
+    assert [view.index for view in recording.views()] == list(range(POSES))
+    driven = msgspec.yaml.decode(recording.attachments()["plan-2.yaml"], type=Plan)
+    assert driven.poses[:BEFORE] == plan.poses[:BEFORE]
+    assert not {p.joints_rad for p in driven.poses[BEFORE:]} & {p.joints_rad for p in plan.poses}
+    rest = msgspec.structs.replace(driven, poses=driven.poses[BEFORE:])
+    assert check_plan(rest, plan.poses[BEFORE - 1].joints_rad, cell_geometry(memory_config())).problems == ()
+
+
+async def test_it_is_void_when_the_poses_change_meanwhile(half_way: Rig) -> None:
+    summary = await half_way.session.prepare(1, "improve")
+    half_way.session.edit(1, "skip", lambda queue: queue.skip(BEFORE + 1))
+    with pytest.raises(RefusedError, match="not valid"):
+        half_way.session.go(1, summary.token)
+    assert "p09" in [status.name for status in queue_of(half_way).statuses]
+
+
+async def test_too_early_is_told(rig: Rig) -> None:
+    with pytest.raises(RefusedError, match="no session is open"):
+        await rig.session.prepare(1, "improve")
+
+
+def test_poses_that_were_tried_keep_their_places_and_are_not_replaced(plan: Plan) -> None:
+    queue = PoseQueue(plan)
+    queue.start_attempt(0)
+    queue.mark(0, "done")
+    queue.start_attempt(3)
+    queue.retake(3)
+    queue.skip(5)
+    anew = [msgspec.structs.replace(pose, why="anew") for pose in plan.poses[: len(queue.fresh)]]
+    found = queue.with_fresh(anew)
+    assert found.status(0).state == "done" and found.pose(0) == plan.poses[0]
+    assert found.status(3).attempt == 1 and found.pose(3) == plan.poses[3]
+    assert found.status(5).state == "skipped"
+    assert found.open == (3, *queue.fresh)
+    assert {found.pose(index).why for index in queue.fresh} == {"anew"}
+    assert queue.pose(1) == plan.poses[1]

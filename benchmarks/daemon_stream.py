@@ -37,7 +37,7 @@ from station.status import StationState, StationStatus
 
 SESSION_S = 60.0
 STATE_PERIOD_S = 0.002
-NICENESS = -10
+NICENESS = -19
 """Where that is permitted: what else this computer does is not the question."""
 WAITING = 2
 """Sessions that may wait for their verification"""

@@ -4,21 +4,18 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
-import getpass
 import json
 import sys
 from dataclasses import dataclass
-from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
-import numpy as np
 import typer
 
 from calibrate.calibration import Calibration, Touch, read_calibration
 from calibrate.errors import CalibrationError
-from calibrate.geometry import Array, inverse, transform_points
+from calibrate.geometry import Array
 from calibrate.install import load_installed
 from calibrate.verification import note_in_file, note_installed, touch_text
 from station.attend import wait_until_idle, watch_until_rest
@@ -27,48 +24,7 @@ from station.client import Client, DaemonGoneError, default_socket
 from station.errors import RefusedError, StationError
 from station.plan.hover import outer_corners
 from station.status import HoverOffer, StationState, StationStatus
-
-_ARRIVED_M = 0.005
-"""Further than this from where it was sent the tip is not over its corner."""
-_TOUCHING_M, _BESIDE_M = 0.01, 0.05
-"""A tip is on the board, and at a corner, within these."""
-
-
-@dataclass(frozen=True, eq=False)
-class Hovering:
-    """The arm stands over a corner."""
-
-    offer: HoverOffer
-    tip_m: Array
-    """(3,) in `board`, by the arm's own position."""
-
-    @property
-    def beside_mm(self) -> Array:
-        """(2,) how far the tip stands beside the place it was sent to."""
-        return np.asarray(1000 * (self.tip_m[:2] - self.offer.corner_m))
-
-
-def tip_on_board_m(offer: HoverOffer, base_from_flange: Any) -> Array:
-    """(3,) in `board`."""
-    tip = transform_points(np.array(base_from_flange), np.array(offer.tip_m))
-    return transform_points(inverse(np.array(offer.base_from_board)), tip)
-
-
-def told_offset_mm(hovering: Hovering, told_mm: Array) -> Array:
-    """What a person saw when the tip came down straight, less what the arm itself knows it was beside."""
-    return np.asarray(told_mm - hovering.beside_mm)
-
-
-def read_offset_mm(offer: HoverOffer, touching_m: Array) -> Array:
-    """With the tip on the true corner: the other way round, the tip sent there would miss it by as much."""
-    if abs(touching_m[2]) > _TOUCHING_M:
-        raise RefusedError(
-            f"the tip is {1000 * abs(touching_m[2]):.0f} mm off the board: bring it onto the corner"
-        )
-    offset = np.array(offer.corner_m) - touching_m[:2]
-    if np.linalg.norm(offset) > _BESIDE_M:
-        raise RefusedError(f"the tip is {1000 * np.linalg.norm(offset):.0f} mm from corner {offer.corner}")
-    return np.asarray(1000 * offset)
+from station.touching import Hovering, read_offset_mm, tip_on_board_m, told_offset_mm, touch_of, two_numbers
 
 
 def verify_command(
@@ -191,11 +147,7 @@ class _Visit:
             raise
         if status.state is not StationState.IDLE or status.robot.base_from_flange is None:
             raise StationError(f"the hover ended {status.state.value}: {status.reason}")
-        tip = tip_on_board_m(offer, status.robot.base_from_flange)
-        beside = np.abs([*(tip[:2] - offer.corner_m), abs(tip[2]) - offer.standoff_m])
-        if beside.max() > _ARRIVED_M:
-            raise StationError(f"the tip did not come over corner {offer.corner}: {status.reason}")
-        return Hovering(offer, tip)
+        return Hovering.arrived(offer, status.robot.base_from_flange, status.reason)
 
     async def _ask_offset(self, hovering: Hovering) -> bool:
         offer = hovering.offer
@@ -216,13 +168,13 @@ class _Visit:
                 return said == "s"
             try:
                 if said:
-                    offset, found = told_offset_mm(hovering, _two_numbers(said)), "told by a person"
+                    offset, found = told_offset_mm(hovering, two_numbers(said)), "told by a person"
                 else:
                     offset, found = read_offset_mm(offer, await self._tip_now(offer)), "read from the arm"
             except RefusedError as problem:
                 err.print(f"[yellow]{problem}[/]")
                 continue
-            self._touches.append(touch := _touch(hovering, offset, found))
+            self._touches.append(touch := touch_of(hovering, offset, found))
             err.print(touch_text(touch))
             return True
 
@@ -247,34 +199,6 @@ class _Visit:
             err.print(f"[red]not written[/]: {problem}")
             for touch in self._touches:
                 err.print(f"  {touch_text(touch)}")
-
-
-def _two_numbers(said: str) -> Array:
-    try:
-        numbers = np.array([float(part) for part in said.replace(";", ",").split(",")])
-    except ValueError:
-        numbers = np.zeros(0)
-    if numbers.shape != (2,) or not np.isfinite(numbers).all() or np.abs(numbers).max() > 1000 * _BESIDE_M:
-        raise RefusedError(
-            f"two numbers in mm, at most {1000 * _BESIDE_M:.0f}, are needed: for example 0.2,-0.1"
-        )
-    return numbers
-
-
-def _touch(hovering: Hovering, offset_mm: Array, found: Any) -> Touch:
-    offer = hovering.offer
-    x, y = offer.corner_m
-    return Touch(
-        corner=offer.corner,
-        corner_mm=(1000 * x, 1000 * y),
-        offset_mm=(round(float(offset_mm[0]), 3), round(float(offset_mm[1]), 3)),
-        sigma_mm=(round(1000 * offer.sigma_m[0], 3), round(1000 * offer.sigma_m[1], 3)),
-        found=found,
-        who=getpass.getuser(),
-        wall=datetime.now(UTC).isoformat(timespec="seconds"),
-        pointer=offer.pointer,
-        standoff_mm=1000 * offer.standoff_m,
-    )
 
 
 def _row(hovering: Hovering) -> dict[str, Any]:

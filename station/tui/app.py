@@ -38,6 +38,7 @@ from station.tui.result import ResultScreen
 from station.tui.screen import StationScreen
 from station.tui.sessions import SessionsScreen
 from station.tui.themes import THEMES, chosen_theme
+from station.tui.verify import verify
 from station.tui.widgets.graphics import Graphics, detect
 from station.tui.widgets.preview import Preview
 
@@ -58,6 +59,7 @@ def freeze_startup() -> None:
     gc.freeze()
 
 
+LOOKED = "I looked: leave STOPPED or FAULT"
 SCREENS = Binding.Group("Screens", compact=True)
 SCREEN_TOOLTIPS = {
     "live": "The running capture",
@@ -99,7 +101,7 @@ class StationApp(Commands):
         Binding("f5", "run", "Run", id="run", tooltip="Check the plan, show what would move, and ask"),
         Binding("f6", "pause", "Pause", id="pause", tooltip="Stop after this pose; nothing is lost"),
         Binding("f7", "finish", "Finish", id="finish", tooltip="Seal the recording with what is there"),
-        Binding("f8", "acknowledge", "Ack", id="acknowledge", tooltip="I looked: leave STOPPED or FAULT"),
+        Binding("f8", "acknowledge", "Ack", priority=True, id="acknowledge", tooltip=LOOKED),
         *(
             Binding(key, f"switch_mode('{mode}')", mode.title(), id=mode, group=SCREENS, tooltip=tooltip)
             for key, (mode, tooltip) in zip("123456", SCREEN_TOOLTIPS.items(), strict=True)
@@ -254,6 +256,8 @@ class StationApp(Commands):
     async def show_result(self, calibration: str) -> None:
         self.result_path = calibration
         await self.switch_mode("result")
+        if isinstance(self.screen, ResultScreen):
+            self.screen.load()
 
     @work(exclusive=True, group="job", exit_on_error=False)
     async def solve(self, recording: str, folder: str) -> None:
@@ -274,6 +278,19 @@ class StationApp(Commands):
     @work(exclusive=True, group="job", exit_on_error=False)
     async def install(self, calibration: str) -> None:
         await offline.install(self, calibration)
+
+    @work(exclusive=True, group="job", exit_on_error=False)
+    async def roll_back(self, calibration: str) -> None:
+        await offline.roll_back(self, calibration)
+
+    @work(exclusive=True, group="job", exit_on_error=False)
+    async def check(self, recording: str, folder: str) -> None:
+        await offline.check(self, recording, folder)
+
+    @work(exclusive=True, group="job", exit_on_error=False)
+    async def verify(self, calibration: str) -> None:
+        if await verify(self, calibration):
+            await self.show_result(calibration)
 
     @work(exclusive=True, group="job", exit_on_error=False)
     async def export(self, calibration: str) -> None:

@@ -18,14 +18,19 @@ TERMINATE_S = 5.0
 
 
 class JobScreen(ModalScreen[int]):
-    """Runs `python -m MODULE ARGS…` and returns its exit code; Escape or Cancel ends it (-1)."""
+    """Runs `python -m MODULE ARGS…` and returns its exit code; Escape or Cancel ends it (-1).
+
+    What it said stays until it is read, unless the code is one of `close_on`.
+    """
 
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("escape", "cancel", "Cancel", tooltip="End this work; nothing half-written stays")
     ]
 
-    def __init__(self, title: str, module: str, *args: str) -> None:
+    def __init__(self, title: str, module: str, *args: str, close_on: tuple[int, ...] = (0, 4)) -> None:
         super().__init__()
+        self._close_on = close_on
+        self.said: list[str] = []
         self._title, self._command = title, (sys.executable, "-m", module, *args)
         self._process: asyncio.subprocess.Process | None = None
         self._exit_code: int | None = None
@@ -52,11 +57,12 @@ class JobScreen(ModalScreen[int]):
         assert self._process.stdout is not None
         lines = self.query_one("#job-lines", RichLog)
         async for line in self._process.stdout:
-            lines.write(line.decode(errors="replace").rstrip())
+            self.said.append(line.decode(errors="replace").rstrip())
+            lines.write(self.said[-1])
         self._exit_code = await self._process.wait()
         if self._cancelled:
             self.dismiss(-1)
-        elif self._exit_code in (0, 4):
+        elif self._exit_code in self._close_on:
             self.dismiss(self._exit_code)
         else:  # The person reads why before it goes away.
             self.query_one("#job-cancel", Button).label = "Close"

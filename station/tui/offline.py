@@ -9,11 +9,12 @@ from textual.app import ComposeResult
 from textual.binding import Binding
 from textual.containers import Vertical
 from textual.screen import ModalScreen
-from textual.widgets import Label, OptionList
+from textual.widgets import Input, Label, OptionList, Static
 
 from calibrate.calibration import Calibration
 from calibrate.errors import CalibrationError
 from calibrate.formats import FORMATS
+from calibrate.generations import Generation, generations
 from calibrate.install import load_installed
 from station.tui.confirm import Confirm
 from station.tui.jobs import JobScreen
@@ -21,6 +22,10 @@ from station.tui.jobs import JobScreen
 if TYPE_CHECKING:
     from station.tui.app import StationApp
 
+OVERRIDE = "--override"
+PERSON = "If a person takes responsibility"
+"""Before it the command says why it refuses, after it how a person overrules that."""
+NOTHING_INSTALLED = "Nothing was installed."
 CALIBRATION_FILE = "calibration.yaml"
 
 
@@ -36,6 +41,30 @@ class ChooseFormat(ModalScreen[str | None]):
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
         self.dismiss(str(event.option.prompt))
+
+
+class Reason(ModalScreen[str]):
+    """Why a person installs a calibration all the same; empty: not."""
+
+    BINDINGS = [Binding("escape", "dismiss('')", "Cancel", tooltip="Install nothing")]  # noqa: RUF012
+
+    def __init__(self, refusal: str) -> None:
+        super().__init__()
+        self._refusal = refusal
+
+    def compose(self) -> ComposeResult:
+        with Vertical(id="verify"):
+            yield Label("It is not installed", id="verify-title")
+            yield Static(self._refusal, markup=False)
+            yield Input(id="reason", placeholder="your reason, if you take responsibility")
+            yield Label(
+                "Your name and the reason go into the file. Enter installs, Escape not.",
+                id="verify-keys",
+            )
+
+    def on_input_submitted(self, event: Input.Submitted) -> None:
+        if event.value.strip():
+            self.dismiss(event.value.strip())
 
 
 def state_root(calibration: str) -> Path:
@@ -69,16 +98,65 @@ async def recover(app: StationApp, folder: str) -> None:
 
 async def install(app: StationApp, path: str) -> None:
     """Asks, then installs below the daemon's root. A simulated result only on a simulated cell's root."""
-    body = f"{path}\nbecomes what every consumer of this cell reads. `calibrate rollback` undoes it."
+    body = f"{path}\nbecomes what every consumer of this cell reads. Key b on this screen undoes it."
     if not await app.push_screen_wait(Confirm("Install this calibration?", body, yes="Install")):
         return
     cell = "simulated" if app.status is not None and app.status.simulated else "real"
     where = ("--root", str(state_root(path)), "--cell", cell)
-    code = await app.push_screen_wait(JobScreen("Installing", "calibrate.cli", "install", path, *where))
+    refusal = await _install(app, path, *where)
+    if refusal and OVERRIDE in refusal:
+        reason = await app.push_screen_wait(
+            Reason(refusal.partition(PERSON)[0].strip().removeprefix("calibrate: "))
+        )
+        refusal = await _install(app, path, *where, OVERRIDE, reason) if reason else NOTHING_INSTALLED
+    if refusal:
+        app.notify(refusal, title="Not installed", severity="error", timeout=20)
+
+
+async def _install(app: StationApp, path: str, *options: str) -> str:
+    """Why not; empty when it is installed."""
+    job = JobScreen("Installing", "calibrate.cli", "install", path, *options, close_on=(0, 1, 4))
+    code = await app.push_screen_wait(job)
     if code == 0:
-        app.notify("Installed. `calibrate rollback` goes back to the one before.")
-    elif code == 4:
-        app.notify("A gate failed: nothing was installed. `calibrate install --override REASON` takes over.")
+        app.notify("Installed. Key b on this screen goes back to the one before.")
+        return ""
+    return " ".join(job.said) or NOTHING_INSTALLED
+
+
+async def roll_back(app: StationApp, path: str) -> None:
+    """Asks, naming both, then switches back to the generation before the installed one."""
+    root = state_root(path)
+    known = generations(root)
+    current = next((g for g in known if g.current), None)
+    older = [g for g in known if current is not None and g.number < current.number and not g.problem]
+    if current is None or not older:
+        there = "nothing is" if current is None else "only one was ever"
+        app.notify(f"There is no older calibration to go back to: {there} installed.")
+        return
+    body = f"Now: {_named(current)}\nBefore: {_named(older[-1])}\nConsumers then read the one before."
+    if not await app.push_screen_wait(Confirm("Go back to the calibration before?", body, yes="Go back")):
+        return
+    if (
+        await app.push_screen_wait(JobScreen("Going back", "calibrate.cli", "rollback", "--root", str(root)))
+        == 0
+    ):
+        app.notify("The calibration before is installed again.")
+
+
+def _named(generation: Generation) -> str:
+    calibration = generation.calibration
+    if calibration is None:
+        return f"generation {generation.number}"
+    taken = calibration.override
+    reason = "" if taken is None else f" with the reason “{taken.reason}”"
+    return f"generation {generation.number}, solved {calibration.created[:16]}{reason}"
+
+
+async def check(app: StationApp, recording: str, folder: str) -> None:
+    """Does the installed calibration still hold on this recording? Its answer stays until it is read."""
+    where = ("--root", str(Path(folder).resolve().parents[1]))
+    title = f"Does the installed calibration hold on {Path(folder).name}?"
+    await app.push_screen_wait(JobScreen(title, "calibrate.cli", "check", recording, *where, close_on=()))
 
 
 async def export(app: StationApp, path: str) -> None:

@@ -15,25 +15,40 @@ from textual.widgets import Static
 from calibrate.calibration import Calibration, read_calibration
 from calibrate.errors import CalibrationError
 from calibrate.geometry import difference
+from calibrate.verification import agrees, touch_text
 from station.tui.offline import installed_beside
 from station.tui.screen import StationScreen
 
 if TYPE_CHECKING:
     from station.tui.app import StationApp
 
+NO_RESULT = "No result yet. F9 solves the session just captured; on screen 4, v shows older ones."
 BAR_CELLS = 24
 
 
 def verdict_text(calibration: Calibration) -> Text:
     """The checklist: what passed, what failed and what to do about it."""
-    failed = calibration.quality.failed
+    gates = sorted(calibration.quality.gates, key=lambda gate: gate.passed)  # the failed ones first
+    touches = sorted(calibration.verification, key=agrees)
+    against = [
+        _many(len(calibration.quality.failed), "GATE") + " FAILED",
+        _many(sum(not agrees(touch) for touch in touches), "CORNER") + " OFF BY HAND",
+    ]
+    against = [words for words in against if not words.startswith("0 ")]
     stamp = "" if calibration.source == "real" else f"{calibration.source.upper()}: never for a real cell\n"
-    head = "READY TO INSTALL\n" if not failed else f"{len(failed)} GATE(S) FAILED: will not install\n"
-    text = Text(stamp, style="bold").append(head, style="bold reverse" if failed else "bold")
-    for gate in calibration.quality.gates:
-        text.append(f"\n[{'ok' if gate.passed else 'FAIL'}] ", style="" if gate.passed else "bold reverse")
-        text.append(f"{gate.name}: {gate.text}")
+    head = ", ".join(against) + ": installs only with a reason" if against else "READY TO INSTALL"
+    text = Text(stamp, style="bold").append(f"{head}\n", style="bold reverse" if against else "bold")
+    for passed, words in (
+        *((agrees(touch), f"by hand: {touch_text(touch)}") for touch in touches),
+        *((gate.passed, f"{gate.name}: {gate.text}") for gate in gates),
+    ):
+        text.append(f"\n[{'ok' if passed else 'FAIL'}] ", style="" if passed else "bold reverse")
+        text.append(words)
     return text
+
+
+def _many(count: int, what: str) -> str:
+    return f"{count} {what}{'S' * (count != 1)}"
 
 
 def answer_text(calibration: Calibration) -> Text:
@@ -86,6 +101,8 @@ class ResultScreen(StationScreen):
     HELP = "The newest result, or the one picked on the sessions screen. Installing can be undone."
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("i", "install", "Install", tooltip="Make this the cell's calibration; rollback undoes it"),
+        Binding("b", "roll_back", "Back", tooltip="Back to the calibration that was installed before"),
+        Binding("h", "verify", "By hand", tooltip="Check it by hand: the tip over corners of the board"),
         Binding("e", "export", "Export", tooltip="Write it for ROS, OpenCV, URDF … beside the recording"),
         Binding("x", "discard", "Discard", tooltip="Delete this result; the recording stays"),
     ]
@@ -97,11 +114,14 @@ class ResultScreen(StationScreen):
     def body(self) -> ComposeResult:
         with Horizontal(id="result"):
             with VerticalScroll(id="result-left"):
-                yield Static("No result yet: capture a session, then F9 solves it.", id="verdict")
+                yield Static(NO_RESULT, id="verdict")
             with VerticalScroll(id="result-right"):
                 yield Static(id="answer")
                 yield Static(id="change")
                 yield Static(id="residuals")
+
+    def on_mount(self) -> None:
+        self.query_one("#result-left").focus()
 
     @property
     def station(self) -> StationApp:
@@ -135,6 +155,14 @@ class ResultScreen(StationScreen):
     def action_install(self) -> None:
         if (path := self._path()) is not None:
             self.station.install(path)
+
+    def action_roll_back(self) -> None:
+        if (path := self._path()) is not None:
+            self.station.roll_back(path)
+
+    def action_verify(self) -> None:
+        if (path := self._path()) is not None:
+            self.station.verify(path)
 
     def action_export(self) -> None:
         if (path := self._path()) is not None:

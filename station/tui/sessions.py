@@ -24,6 +24,7 @@ class SessionsScreen(StationScreen):
         Binding("f9", "solve", "Solve", tooltip="Solve this recording again, outside the daemon"),
         Binding("v", "result", "Result", tooltip="Show this session's calibration"),
         Binding("w", "watch", "Watch", tooltip="Play this recording in the live screen"),
+        Binding("k", "check", "Check", tooltip="Does the installed calibration still hold on this one?"),
         Binding("c", "recover", "Recover", tooltip="Rebuild an unfinished recording"),
     ]
 
@@ -84,6 +85,10 @@ class SessionsScreen(StationScreen):
                 self.notify("Not solved yet: F9 solves it.")
                 return
             await self.station.show_result(str(session["calibration"]))
+
+    def action_check(self) -> None:
+        if (session := self._selected()) is not None:
+            self.station.check(str(session["recording"]), str(session["folder"]))
 
     def action_watch(self) -> None:
         if (session := self._selected()) is not None:

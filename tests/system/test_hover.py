@@ -15,13 +15,13 @@ from calibrate.geometry import Array
 from calibrate.kinematics import MODELS, forward
 from calibrate.verification import agrees, note_in_file
 from recordings.messages import CameraIdentity, RobotIdentity
-from station.cli_verify import read_offset_mm, tip_on_board_m
 from station.client import Client
 from station.limits import point_speed_m_s
 from station.plan.hover import SPEED_M_S, board_from_tip, hover_geometry
 from station.simulation.scenes import cell_config
 from station.status import HoverOffer, StationStatus
 from station.status import StationState as S
+from station.touching import read_offset_mm, tip_on_board_m
 from tests.station.hover_cell import POINTER, SIGMA_M, SIGMA_RAD, calibration_of
 from tests.system.conftest import TRUTH, SystemRig, status_when
 

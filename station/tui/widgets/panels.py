@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+import textwrap
 from collections.abc import Callable
 
 from rich.text import Text
@@ -14,6 +15,8 @@ from station.tui.words import POSE_MARKS, degrees, mm
 
 CLOCKS_POOR_MS = 20.0
 """The default of `capture.time_bound_s`: poses known worse than that are refused."""
+NARROW = 29
+"""Letters in a line of the right column on the narrowest screen."""
 Lines = Callable[[StationStatus], list[str]]
 
 
@@ -92,7 +95,8 @@ def progress_lines(status: StationStatus) -> list[str]:
     session = status.session
     if session.current is None or session.current >= len(session.poses):
         done = sum(p.state == "done" for p in session.poses)
-        return [f"{done} of {len(session.poses)} poses captured" if session.poses else "no plan loaded"]
+        counted = f"{done} of {len(session.poses)} poses captured" if session.poses else "no plan loaded"
+        return [counted + (", sealed: F9 solves it" if session.recording else "")]
     pose = session.poses[session.current]
     steps = ("moving", "settling", "capturing", "writing")
     at = steps.index(pose.state) if pose.state in steps else (4 if pose.state == "done" else -1)
@@ -124,11 +128,11 @@ def coverage_lines(status: StationStatus) -> list[str]:
 def estimate_lines(status: StationStatus) -> list[str]:
     estimate = status.estimate
     if estimate.sigma_translation_mm is None or estimate.translation_mm is None:
-        return [f"{estimate.views} views: too few yet"]
+        return [f"{estimate.views} view{'s' * (estimate.views != 1)}: too few yet"]
     x, y, z = estimate.translation_mm
     rotation = "" if estimate.sigma_rotation_deg is None else f"  {estimate.sigma_rotation_deg:.3f}°"
     return [
         f"{x:7.1f} {y:7.1f} {z:7.1f} mm",
         f"± {estimate.sigma_translation_mm:.2f} mm{rotation}",
-        "enough" if estimate.enough else estimate.advice or "not final",
+        *textwrap.wrap(estimate.advice or ("enough" if estimate.enough else "not final"), NARROW),
     ]

@@ -1,0 +1,122 @@
+"""Installing, overruling with a reason, and going back, from the result screen."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import msgspec
+import pytest
+from textual.pilot import Pilot
+from textual.widgets import Input, Static
+
+from calibrate.calibration import Touch, write_calibration
+from calibrate.install import InstallError, install
+from recordings.messages import CameraIdentity, RobotIdentity
+from station.tui import offline
+from station.tui.confirm import Confirm
+from station.tui.jobs import JobScreen
+from station.tui.offline import OVERRIDE, PERSON, Reason
+from tests.station.hover_cell import calibration_of
+from tests.station.session_rig import TRUTH
+from tests.tui.conftest import FakeLink, until
+from tests.tui.test_keys import app_on, text_of
+
+GOOD = calibration_of(
+    TRUTH, RobotIdentity(serial="1", model="UR10"), CameraIdentity(serial="2", model="camera")
+)
+OFF = Touch(0, (0.0, 0.0), (9.0, 0.0), (0.1, 0.1), "told by a person", "anna", "2026-01-01T00:00:00+00:00")
+DOUBTED = msgspec.structs.replace(GOOD, verification=[OFF])
+JOB = """
+import json, pathlib, sys
+with (pathlib.Path(__file__).parent / "asked").open("a") as asked:
+    asked.write(json.dumps(sys.argv[1:]) + "\\n")
+if sys.argv[1] == "install" and "--override" not in sys.argv:
+    sys.exit("It is not installed. corner 0 is off. If a person takes responsibility: … --override REASON")
+"""
+
+
+@pytest.fixture
+def asked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """What the jobs were asked for, a line each; they refuse to install without a reason."""
+    (tmp_path / "some_job.py").write_text(JOB)
+    monkeypatch.setenv("PYTHONPATH", str(tmp_path))
+    monkeypatch.setattr(
+        offline, "JobScreen", lambda title, module, *args, **more: JobScreen(title, "some_job", *args, **more)
+    )
+    return tmp_path / "asked"
+
+
+@pytest.fixture
+def calibration(tmp_path: Path) -> Path:
+    path = tmp_path / "sessions" / "s-1" / "calibration.yaml"
+    path.parent.mkdir(parents=True)
+    write_calibration(DOUBTED, path)
+    return path
+
+
+async def press_on_result(pilot: Pilot[None], calibration: Path, *keys: str) -> None:
+    await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    pilot.app.result_path = str(calibration)  # type: ignore[attr-defined]
+    await pilot.press("3")
+    await until(pilot, lambda: "1 CORNER OFF BY HAND" in text_of(pilot.app, "#verdict"))
+    await pilot.press(*keys)
+
+
+def said(pilot: Pilot[None]) -> str:
+    return " ".join(notice.message for notice in pilot.app._notifications)
+
+
+async def test_who_overrules_gives_a_reason(link: FakeLink, asked: Path, calibration: Path) -> None:
+    async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
+        await press_on_result(pilot, calibration, "i")
+        await until(pilot, lambda: isinstance(pilot.app.screen, Confirm))
+        await pilot.press("tab", "enter")
+        await until(pilot, lambda: isinstance(pilot.app.screen, Reason))
+        shown = " ".join(str(part.render()) for part in pilot.app.screen.query(Static))
+        assert "corner 0 is off" in shown
+        assert OVERRIDE not in shown  # that is the shell's word
+        await pilot.press("enter")  # without a reason nothing happens
+        assert isinstance(pilot.app.screen, Reason)
+        pilot.app.screen.query_one(Input).value = "measured with the tape"
+        await pilot.press("enter")
+        await until(pilot, lambda: "Installed" in said(pilot))
+    calls = [json.loads(line) for line in asked.read_text().splitlines()]
+    assert OVERRIDE not in calls[0]
+    assert calls[1][-2:] == [OVERRIDE, "measured with the tape"]
+
+
+async def test_who_does_not_installs_nothing(link: FakeLink, asked: Path, calibration: Path) -> None:
+    async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
+        await press_on_result(pilot, calibration, "i")
+        await until(pilot, lambda: isinstance(pilot.app.screen, Confirm))
+        await pilot.press("tab", "enter")
+        await until(pilot, lambda: isinstance(pilot.app.screen, Reason))
+        await pilot.press("escape")
+        await until(pilot, lambda: "Nothing was installed" in said(pilot))
+    assert len(asked.read_text().splitlines()) == 1
+
+
+def test_the_command_says_when_a_person_may_overrule(calibration: Path, tmp_path: Path) -> None:
+    with pytest.raises(InstallError) as refused:
+        install(calibration, tmp_path, cell="simulated")
+    assert PERSON in str(refused.value)
+    assert OVERRIDE in str(refused.value)
+
+
+async def test_going_back_names_both_and_asks(link: FakeLink, asked: Path, calibration: Path) -> None:
+    async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
+        await press_on_result(pilot, calibration, "b")
+        await until(pilot, lambda: "no older calibration" in said(pilot))
+        for path in (calibration.with_name("a.yaml"), calibration.with_name("b.yaml")):
+            write_calibration(GOOD, path)
+            install(path, calibration.parents[2], cell="simulated")
+        await pilot.press("b")
+        await until(pilot, lambda: isinstance(pilot.app.screen, Confirm))
+        body = str(pilot.app.screen.query_one("#confirm-body", Static).render())
+        assert "Now: generation 2" in body
+        assert "Before: generation 1" in body
+        await pilot.press("tab", "enter")
+        await until(pilot, lambda: "installed again" in said(pilot))
+    (call,) = [json.loads(line) for line in asked.read_text().splitlines()]
+    assert call == ["rollback", "--root", str(calibration.parents[2])]

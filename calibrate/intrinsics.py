@@ -75,9 +75,10 @@ def calibrate_intrinsics(views: ViewSet, model: LensModel = "plumb_bob") -> Intr
     for _ in range(3):
         try:
             fit, held = _FITS[model](used)
-        except cv2.error as problem:
+        except (cv2.error, np.linalg.LinAlgError) as problem:
+            reason = problem.err if isinstance(problem, cv2.error) else problem
             raise BadViewsError(
-                f"The lens cannot be found from these corners ({problem.err}). Check the board's size."
+                f"The lens cannot be found from these corners ({reason}). Check the board's size."
             ) from None
         limit = max(4 * float(np.median(fit.per_view)), 0.5)
         good = [k for k in range(len(used)) if fit.per_view[k] <= limit]
@@ -90,7 +91,7 @@ def calibrate_intrinsics(views: ViewSet, model: LensModel = "plumb_bob") -> Intr
             )
         used = used.select(good)
     size = (views.camera.width, views.camera.height)
-    if not (0.2 * max(size) < fit.K[0, 0] < 100 * max(size)) or fit.rms_px > 0.01 * max(size):
+    if not (0.2 * max(size) < fit.K[0, 0] < 100 * max(size) and fit.rms_px <= 0.01 * max(size)):
         raise BadViewsError(
             f"No lens explains the corners (focal length {fit.K[0, 0]:.0f} px, rms {fit.rms_px:.1f} px). "
             "Check the board's columns and rows, or give the camera's matrix. Pictures that all face the "

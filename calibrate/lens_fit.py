@@ -87,7 +87,15 @@ def _first_poses(views: ViewSet, K: Array) -> Array:
 
 
 def _fit(views: ViewSet, camera: CameraModel, poses: Array, held: tuple[str, ...]) -> LensFit:
-    """Levenberg-Marquardt: K. Levenberg (1944), D. Marquardt (1963)."""
+    """Levenberg-Marquardt: K. Levenberg (1944), D. Marquardt (1963).
+
+    Steps that lead to absurd lenses overflow, and are not taken.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):
+        return _fitted(views, camera, poses, held)
+
+
+def _fitted(views: ViewSet, camera: CameraModel, poses: Array, held: tuple[str, ...]) -> LensFit:
     observed = observe_views(replace(views, camera=camera, held_intrinsics=held))
     free = np.setdiff1d(np.arange(len(INTRINSICS)), observed.held)
     state = State(np.eye(4), np.eye(4), poses, camera, np.zeros(0))

@@ -108,3 +108,13 @@ def test_too_few_and_impossible_views_are_refused() -> None:
     noise = views_of(CAMERA, around(6), 120.0)
     with pytest.raises(BadViewsError, match=r"columns and rows|board's size"):
         calibrate_intrinsics(noise)
+
+
+@pytest.mark.filterwarnings("error")
+def test_corners_that_are_none_are_refused_in_a_sentence() -> None:
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        views = views_of(CAMERA, around(6, seed))
+        anywhere = tuple(replace(v, pixels=rng.uniform(0, 480, v.pixels.shape)) for v in views)
+        with pytest.raises(BadViewsError, match="corners"):
+            calibrate_intrinsics(replace(views, views=anywhere))

@@ -143,7 +143,10 @@ class UrRobot(UrLink):
         self._moving, self._link_loss = True, ""
         try:
             await self.fresh()
+            await child.heard()
             self.check()
+            if self._child is not child:
+                raise RobotError("stopped")  # while we waited
             sample = self.newest()
             watch = MoveWatch(joints_rad, sample.operation, time.monotonic())
             await child.move(joints_rad, speed_rad_s, acceleration_rad_s2)

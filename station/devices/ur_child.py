@@ -19,6 +19,8 @@ from station.errors import RobotError
 
 CONNECT_S = 8.0
 HEARD_S = 1.0
+HEARD_NS = 50_000_000
+"""Younger heartbeats leave a move time to get to the process, which takes none after 100 ms."""
 ACKNOWLEDGE_S = 1.0
 END_S = 1.0
 LOG_LIMIT_BYTES = 1_000_000
@@ -35,8 +37,9 @@ class ControlChild:
         self._log_path = log_path
         self._loop = asyncio.get_running_loop()
         self._ready: asyncio.Future[dict[str, Any]] = self._loop.create_future()
-        self._heard = asyncio.Event()
-        """A heartbeat kicked the watchdog, or none ever will."""
+        self._kicked_ns = 0
+        """Of the newest heartbeat that kicked the watchdog."""
+        self._news = asyncio.Event()
         self._moves: dict[int, asyncio.Future[dict[str, Any]]] = {}
         self._number = 0
         self._beat_ns = 0
@@ -92,10 +95,14 @@ class ControlChild:
         return tuple(answer["tcp"]) if answer.get("tcp") else None
 
     async def heard(self, timeout_s: float = HEARD_S) -> None:
-        """Waits for the first heartbeat that kicked the watchdog: before it no move is taken. RobotError."""
+        """Waits for a fresh heartbeat that kicked the watchdog: without, no move is taken. RobotError."""
         try:
             async with asyncio.timeout(timeout_s):
-                await self._heard.wait()
+                while time.monotonic_ns() - self._kicked_ns > HEARD_NS:
+                    if self.gone.is_set() or self.kicks_refused:
+                        break
+                    self._news.clear()
+                    await self._news.wait()
         except TimeoutError:
             self.check(patience_s=timeout_s / 2)
             raise RobotError(
@@ -208,8 +215,9 @@ class ControlChild:
         if "beat" in answer:
             self._answered_ns = max(self._answered_ns, int(answer["beat"]))
             self.kicks_refused = bool(answer["lost"])
-            if answer["kicked"] or answer["lost"]:
-                self._heard.set()
+            if answer["kicked"]:
+                self._kicked_ns = int(answer["beat"])
+            self._news.set()
         elif "id" in answer:
             waiter = self._moves.get(answer["id"])
             if waiter is not None and not waiter.done():
@@ -225,7 +233,7 @@ class ControlChild:
             self._loop.remove_reader(self._channel)
             self._channel.close()
         self.gone.set()
-        self._heard.set()
+        self._news.set()
         died = {"ok": False, "error": "the control process died", "refused": "the control process died"}
         for waiter in (*self._moves.values(), self._ready):
             if not waiter.done():

@@ -40,6 +40,7 @@ class ControlServer:
         self._beat_ns = 0
         self._armed = False
         self._script_lost = False
+        self._stopped = False
 
     def serve(self) -> None:
         """Until the parent says `end` or closes the socket."""
@@ -52,6 +53,7 @@ class ControlServer:
                 error = self._move(request)
                 self.answer({"id": request["id"], "ok": not error, "error": error})
             elif verb == "stop":
+                self._stopped = True
                 self._control.stopJ(float(request["deceleration"]), True)
                 self.answer({"stopped": True})
             elif verb == "end":
@@ -82,6 +84,8 @@ class ControlServer:
         joints = [float(q) for q in request["joints"]]
         if len(joints) != 6 or not all(map(math.isfinite, joints)):
             return f"six finite joint angles are needed, not {joints}"
+        if self._stopped:
+            return "a stop was asked for"
         if not self._fresh():
             return "the session's heartbeat is missing"
         # Before every move: a connection that dropped unseen would have loaded the script anew, unwatched.

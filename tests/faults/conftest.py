@@ -70,16 +70,21 @@ class Cell:
     def asked(self, what: str) -> int:
         return int(self.admin.ask("log")["counts"].get(what, 0))
 
-    def far_move(self) -> asyncio.Task[None]:
-        """A move of several seconds, under way."""
+    def far_goal(self) -> list[float]:
         goal = self.joints_rad()
         goal[0] += FAR_RAD
-        return asyncio.create_task(self.robot.move(goal, 0.5, 1.0))
+        return goal
+
+    def far_move(self) -> asyncio.Task[None]:
+        """A move of several seconds, under way."""
+        return asyncio.create_task(self.robot.move(self.far_goal(), 0.5, 1.0))
 
     async def cruising(self) -> asyncio.Task[None]:
         """The task of a move that has reached its full speed."""
         move = self.far_move()
-        await self.until(lambda: self.speed_rad_s() > 0.4)
+        await self.until(lambda: move.done() or self.speed_rad_s() > 0.4)
+        if move.done():
+            await move  # why it ended
         return move
 
     async def until(self, condition: Callable[[], bool], timeout_s: float = 5.0) -> float:

@@ -75,6 +75,33 @@ async def test_a_move_right_after_the_start_is_taken(cell: Make) -> None:
         await c.robot.end_control()
 
 
+async def test_a_move_waits_for_a_session_that_was_busy_for_a_moment(cell: Make) -> None:
+    c = await cell()
+    goal = c.joints_rad()
+    goal[5] += 0.02
+    c.beating = False
+    await asyncio.sleep(0.12)  # too old for a move, too young for the watchdog
+    asyncio.get_running_loop().call_later(0.03, setattr, c, "beating", True)
+    await c.robot.move(goal, 0.5, 1.0)
+
+
+async def test_a_stop_before_the_move_was_sent(cell: Make, monkeypatch: pytest.MonkeyPatch) -> None:
+    c = await cell()
+    goal, heard = c.far_goal(), c.robot._child.heard
+    stops: list[asyncio.Task[None]] = []
+
+    async def stop_comes_now() -> None:
+        await heard()
+        stops.append(asyncio.create_task(c.robot.stop("changed my mind")))
+        await asyncio.sleep(0)
+
+    monkeypatch.setattr(c.robot._child, "heard", stop_comes_now)
+    with pytest.raises(RobotError, match="changed my mind"):
+        await c.robot.move(goal, 0.5, 1.0)
+    await stops[0]
+    await gone(c)
+
+
 async def test_a_heart_that_does_not_beat_ends_the_start(unheard: Start) -> None:
     c, starting = await unheard()
     error, _ = await ends(starting)

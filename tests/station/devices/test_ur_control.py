@@ -149,6 +149,12 @@ def test_stop_is_asynchronous(child: Conversation) -> None:
     assert child.library.calls[0] == ("stopJ", (True,))
 
 
+def test_nothing_moves_after_a_stop(child: Conversation) -> None:
+    answers = child.say(beat(), {"do": "stop", "deceleration": 2.0}, beat(), move())
+    assert answers[-1] == {"id": 7, "ok": False, "error": "a stop was asked for"}
+    assert "moveJ" not in child.library.names
+
+
 # -- the parent's side, with the real library -----------------------------------------------------------
 
 

@@ -39,7 +39,7 @@ class JobScreen(ModalScreen[int]):
     def compose(self) -> ComposeResult:
         with Vertical(id="job"):
             yield Label(self._title, id="job-title")
-            yield RichLog(id="job-lines", wrap=True, max_lines=500)
+            yield RichLog(id="job-lines", wrap=True, max_lines=500, min_width=0)
             yield Button("Cancel", id="job-cancel")
 
     def on_mount(self) -> None:
@@ -47,15 +47,16 @@ class JobScreen(ModalScreen[int]):
 
     @work(exclusive=True, exit_on_error=False)
     async def run_job(self) -> None:
+        lines = self.query_one("#job-lines", RichLog)
+        width = str(max(40, lines.size.width))  # its own line breaks are then ours
         self._process = await asyncio.create_subprocess_exec(
             *self._command,
             stdin=asyncio.subprocess.DEVNULL,
             stdout=asyncio.subprocess.PIPE,
             stderr=asyncio.subprocess.STDOUT,
-            env=os.environ | {"CALIBRATE_PROGRESS": "lines", "PYTHONUNBUFFERED": "1"},
+            env=os.environ | {"CALIBRATE_PROGRESS": "lines", "PYTHONUNBUFFERED": "1", "COLUMNS": width},
         )
         assert self._process.stdout is not None
-        lines = self.query_one("#job-lines", RichLog)
         async for line in self._process.stdout:
             self.said.append(line.decode(errors="replace").rstrip())
             lines.write(self.said[-1])

@@ -71,6 +71,7 @@ class PlanScreen(StationScreen):
         super().__init__()
         self._detail = NO_PLAN
         self._planning = False
+        self._rows: list[tuple[str, ...]] = []
 
     def body(self) -> ComposeResult:
         with Horizontal(id="plan"):
@@ -96,13 +97,17 @@ class PlanScreen(StationScreen):
         poses = () if status is None else status.session.poses
         rows = [row_of(pose) for pose in poses]
         if len(rows) != self.table.row_count:
+            at = self.table.cursor_row
             self.table.clear()
             for row in rows:
                 self.table.add_row(*row)
-        for line, row in enumerate(rows):
-            for column, text in enumerate(row):
-                if self.table.get_cell_at((line, column)) != text:  # type: ignore[arg-type]
-                    self.table.update_cell_at((line, column), text, update_width=True)  # type: ignore[arg-type]
+            self.table.move_cursor(row=at)  # a dropped pose leaves the next one marked
+        else:
+            for line, (row, before) in enumerate(zip(rows, self._rows, strict=True)):
+                for column, text in enumerate(row):
+                    if before[column] != text:
+                        self.table.update_cell_at((line, column), text, update_width=True)  # type: ignore[arg-type]
+        self._rows = rows
         self._explain(status, self.table.cursor_row)
 
     def on_data_table_row_highlighted(self, event: DataTable.RowHighlighted) -> None:

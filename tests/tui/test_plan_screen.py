@@ -6,9 +6,12 @@ import asyncio
 from typing import Any
 
 import msgspec
+import pytest
+from textual.widgets import DataTable
 
 from station.status import PoseStatus
 from station.tui.plan import PLANNING
+from station.tui.widgets.panels import pose_map_lines
 from tests.tui.conftest import FakeLink, idle, until
 from tests.tui.test_keys import app_on, text_of
 
@@ -50,3 +53,37 @@ async def test_the_end_of_two_hundred_poses_is_told_as_the_start_is(link: FakeLi
         await until(pilot, lambda: "place 200" in text_of(pilot.app, "#plan-detail"))
         await pilot.press("d")
         await until(pilot, lambda: ("drop", {"index": 199}) in link.asked)
+        fewer = msgspec.structs.replace(status.session, poses=poses[:-1])
+        link.show(msgspec.structs.replace(status, session=fewer))
+        await until(pilot, lambda: "place 199" in text_of(pilot.app, "#plan-detail"))
+
+
+@pytest.mark.parametrize(
+    ("count", "current", "first", "last"), [(25, None, "", ""), (200, 0, "1", "116"), (200, 199, "88", "200")]
+)
+def test_the_map_of_poses_leaves_room_for_the_rest(
+    count: int, current: int | None, first: str, last: str
+) -> None:
+    status = idle()
+    poses = tuple(PoseStatus(index=i, name=f"p{i}") for i in range(count))
+    session = msgspec.structs.replace(status.session, poses=poses, current=current)
+    *rows, words = pose_map_lines(msgspec.structs.replace(status, session=session))
+    assert len(rows) <= 4
+    assert max(map(len, [*rows, words])) <= 29
+    assert words == (f"{first} to {last} of {count}" if first else "+ done - skipped x failed")
+
+
+async def test_a_pose_that_changes_is_told_where_it_stands(link: FakeLink) -> None:
+    status = idle()
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+        await pilot.press("2")
+        poses = list(status.session.poses)
+        poses[7] = msgspec.structs.replace(poses[7], state="failed", reason="too dark")
+        session = msgspec.structs.replace(status.session, poses=tuple(poses))
+        link.show(msgspec.structs.replace(status, session=session))
+        table = pilot.app.screen.query_one(DataTable)
+        await until(
+            pilot, lambda: table.row_count == 25 and table.get_row_at(7)[2:5:2] == ["x failed", "too dark"]
+        )
+        assert table.get_row_at(6)[2] == "· planned"

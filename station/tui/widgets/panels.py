@@ -17,6 +17,8 @@ CLOCKS_POOR_MS = 20.0
 """The default of `capture.time_bound_s`: poses known worse than that are refused."""
 NARROW = 29
 """Letters in a line of the right column on the narrowest screen."""
+MAP_ROWS = 4
+SPACED = 13 * MAP_ROWS
 Lines = Callable[[StationStatus], list[str]]
 
 
@@ -106,9 +108,20 @@ def progress_lines(status: StationStatus) -> list[str]:
 
 
 def pose_map_lines(status: StationStatus) -> list[str]:
+    """A mark a pose; of a long plan the rows around the pose that is being taken."""
     marks = "".join(POSE_MARKS[p.state] for p in status.session.poses)
-    rows = [" ".join(marks[i : i + 13]) for i in range(0, len(marks), 13)]
-    return [*rows, "+ done - skipped x failed"] if marks else ["no plan: 2, then n makes one"]
+    if not marks:
+        return ["no plan: 2, then n makes one"]
+    if len(marks) <= SPACED:
+        rows, first = [" ".join(marks[i : i + 13]) for i in range(0, len(marks), 13)], 0
+    else:
+        rows = [marks[i : i + NARROW] for i in range(0, len(marks), NARROW)]
+        first = max(0, min((status.session.current or 0) // NARROW - 1, len(rows) - MAP_ROWS))
+    shown = rows[first : first + MAP_ROWS]
+    if len(shown) < len(rows):
+        last = min(len(marks), (first + MAP_ROWS) * NARROW)
+        return [*shown, f"{first * NARROW + 1} to {last} of {len(marks)}"]
+    return [*shown, "+ done - skipped x failed"]
 
 
 _SHADES = " ░▒▓█"

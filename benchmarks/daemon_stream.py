@@ -183,10 +183,10 @@ async def stream(fps: float, seconds: float, root: Path) -> Outcome:
         await client.request("lease", action="take")
         await client.request("load_plan", plan=msgspec.to_builtins(long_sweep(idle, min(seconds, SESSION_S))))
         daemon = daemon_of_this_process()
-        put_before_others(daemon, NICENESS)
         usage = DaemonUsage(daemon)
 
         def look(status: StationStatus) -> None:
+            put_before_others(daemon, NICENESS)  # each go starts a control process
             usage.sample()
             outcome.dropped = max(outcome.dropped, status.recorder.drops)
             if status.state is StationState.MOVING:

@@ -7,6 +7,7 @@ moved since). If nothing changed, δX is normal with covariance S = S_fit + S_in
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from dataclasses import dataclass
 from typing import Any
 
@@ -22,6 +23,11 @@ from recordings.messages import CameraModel
 
 FEWEST_VIEWS = 3
 FALSE_ALARM = 0.05
+POWER = 0.95
+"""How surely a check should notice `SHIFT_M` and `TURN_RAD` before nobody needs to take more views."""
+SHIFT_M, TURN_RAD = 0.5e-3, float(np.radians(0.1))
+_MOST_VIEWS = 30
+"""Whoever needs more for a check should calibrate."""
 _STEP = 1e-6
 _ITERATIONS = 4
 _SMALLEST_EIGENVALUE = 1e-9
@@ -41,9 +47,16 @@ class DriftCheck:
     """Probability to notice a shift of 0.5 mm in the direction that is hardest to see."""
     power_rotation: float
     """… a turn of 0.1°."""
+    views_needed: int | None
+    """About how many views like these give both a probability of 95 %; None where not even 30 do."""
     disagreement: float
     """Misfit after the best shift, per degree of freedom: about 1 when the noise is as it was."""
     views: int
+
+    @property
+    def power(self) -> float:
+        """The lower of the two."""
+        return min(self.power_translation, self.power_rotation)
 
     @property
     def shift_mm(self) -> float:
@@ -111,10 +124,11 @@ def judge_shift(views: ViewSet, installed: Array, covariance: Array, noise: Nois
     _, _, misfit = _normal_equations(flanges, in_hand, seen, X, P, robot, pnp)
     shift = difference(X, installed)
     total = fitted + covariance
-    weight: Any = np.linalg.inv(total)
-    statistic = float(shift @ weight @ shift)
+    statistic = float(shift @ np.linalg.solve(total, shift))
     nu = noise.degrees_of_freedom
     threshold = float(6 * stats.f.ppf(1 - FALSE_ALARM, 6, nu))
+    power_translation, power_rotation = powers(total, nu)
+    enough = min(power_translation, power_rotation) >= POWER
     return DriftCheck(
         passed=statistic <= threshold,
         shift=shift,
@@ -122,8 +136,9 @@ def judge_shift(views: ViewSet, installed: Array, covariance: Array, noise: Nois
         statistic=statistic,
         threshold=threshold,
         p_value=float(stats.f.sf(statistic / 6, 6, nu)),
-        power_translation=_power(weight[:3, :3], 0.5e-3, threshold, nu),
-        power_rotation=_power(weight[3:, 3:], float(np.radians(0.1)), threshold, nu),
+        power_translation=power_translation,
+        power_rotation=power_rotation,
+        views_needed=len(views) if enough else _views_needed(fitted, covariance, len(views), nu),
         disagreement=float(misfit / max(6 * len(views) - 12, 1)),
         views=len(views),
     )
@@ -142,9 +157,25 @@ def _inverse(information: Array) -> Array:
     return np.asarray(root @ root.T)
 
 
-def _power(weight: Array, size: float, threshold: float, nu: float) -> float:
-    noncentrality = size**2 * float(np.linalg.eigvalsh(weight)[0])
-    return float(stats.ncf.sf(threshold / 6, 6, nu, noncentrality))
+def powers(covariance: Array, nu: float) -> tuple[float, float]:
+    """Of a check whose shift has this covariance (6, 6): for 0.5 mm and 0.1°, each the worst direction."""
+    weight: Any = np.linalg.inv(covariance)
+    threshold = stats.f.ppf(1 - FALSE_ALARM, 6, nu)
+
+    def power(block: Array, size: float) -> float:
+        noncentrality = size**2 * float(np.linalg.eigvalsh(block)[0])
+        if noncentrality < 1e-6:  # where SciPy's ncf is not to be trusted
+            return FALSE_ALARM
+        return float(stats.ncf.sf(threshold, 6, nu, noncentrality))
+
+    return power(weight[:3, :3], SHIFT_M), power(weight[3:, 3:], TURN_RAD)
+
+
+def _views_needed(fitted: Array, installed: Array, views: int, nu: float) -> int | None:
+    """If further views tell as much as these did on average."""
+    counts = range(views, max(views, _MOST_VIEWS) + 1)
+    place = bisect_left(counts, POWER, key=lambda n: min(powers(fitted * views / n + installed, nu)))
+    return counts[place] if place < len(counts) else None
 
 
 def _normal_equations(

@@ -134,7 +134,13 @@ def install_file(
     ] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Make a calibration the installed one. Exit 4: a gate failed; nothing was changed."""
+    """Make a calibration the installed one. What was installed stays: `calibrate rollback` goes back.
+
+    Programs read one path that never changes: ROOT/calibrations/current. Refused are a failed gate, another
+    robot or camera than the cell's, and whatever does not come from this kind of cell.
+
+    Exit codes: 0 installed, 4 a gate failed, 1 refused for another reason; then nothing was changed.
+    """
     robot_serial, camera_serial = ("", "") if cell_config is None else read_cell_serials(cell_config)
     made = install(
         file,
@@ -153,7 +159,7 @@ def roll_back(
     reason: Annotated[str, typer.Option(help="Goes into the log")] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Go back to an older installed calibration."""
+    """Go back to an older installed calibration: the one before, or a generation of `calibrate list`."""
     _switched(rollback(root, to, reason), root, as_json)
 
 
@@ -169,13 +175,13 @@ def _switched(generation: Generation, root: Path | None, as_json: bool) -> None:
 
 
 def list_installed(root: Root = None, as_json: AsJson = False) -> None:
-    """Every calibration that was installed here."""
+    """Every calibration that was installed here, oldest first; → marks the current one."""
     known = generations(root)
     if as_json:
         print_json([_plain(generation) for generation in known])
         return
     if not known:
-        err.print(f"nothing is installed in {state_root(root)}")
+        err.print(f"nothing is installed in {state_root(root)}. Run: calibrate install FILE")
         return
     table = Table("", "generation", "solved", "result", "verdict", box=None)
     for generation in known:

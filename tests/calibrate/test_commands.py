@@ -110,6 +110,7 @@ def test_solve_install_check_diff_rollback(real_session_file: Path, real_file: P
     holds = run("check", real_session_file, "--json", cwd=tmp_path)
     assert holds.returncode == 0, holds.stdout + holds.stderr
     assert json.loads(holds.stdout)["passed"] is True
+    assert json.loads(holds.stdout)["own_views"] is True and "it proves nothing" in holds.stderr
     installed = run("install", second, "--json", cwd=tmp_path)
     assert json.loads(installed.stdout)["generation"] == 2
     drifted = run("check", real_session_file, cwd=tmp_path)

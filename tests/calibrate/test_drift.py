@@ -11,10 +11,12 @@ from scipy import stats
 
 from calibrate.board import board_points
 from calibrate.checks import CheckEntry, append_check, read_checks, trend_text
-from calibrate.drift import DriftCheck, Noise, judge_shift, pnp_covariance
+from calibrate.commands.check import check_text
+from calibrate.drift import POWER, DriftCheck, Noise, judge_shift, pnp_covariance, powers
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp
 from calibrate.lens import project
+from calibrate.pipeline import SolvedRecording
 from calibrate.pnp import solve_pnp
 from calibrate.views import ImageView, ViewSet
 from recordings.messages import CameraModel, Mount
@@ -94,6 +96,39 @@ def test_the_shift_is_named_and_the_stated_power_is_a_lower_bound() -> None:
     stated = np.mean([c.power_translation for c in checks(20, 0, 0, 5)])
     noticed = np.mean([not c.passed for c in checks(40, 0.5e-3, 0, 6)])
     assert 0.5 < stated <= noticed + 0.05
+
+
+MID = Noise(corner_px=0.15, robot_m=0.0001, robot_rad=float(np.radians(0.01)), degrees_of_freedom=69)
+
+
+def test_it_says_how_many_views_would_do() -> None:
+    rng = np.random.default_rng(17)
+    weak = judge_shift(few_views(rng, X_TRUE, 5), X_TRUE, 4 * INSTALLED_COVARIANCE, MID)
+    assert weak.power < POWER and weak.views_needed is not None and weak.views_needed > 5
+    views = few_views(rng, X_TRUE, weak.views_needed + 4)
+    enough = judge_shift(views, X_TRUE, 4 * INSTALLED_COVARIANCE, MID)
+    assert enough.power >= POWER and enough.views_needed == len(views)
+    hopeless = judge_shift(few_views(rng, X_TRUE, 5), X_TRUE, 100 * INSTALLED_COVARIANCE, MID)
+    assert hopeless.views_needed is None
+
+
+def test_what_a_weak_check_says(solved_real: SolvedRecording) -> None:
+    check = checks(1, 0, 0, 5)[0]
+    strong = replace(check, passed=True, power_translation=0.97, power_rotation=0.99)
+    weak = replace(strong, power_translation=0.6, views_needed=8)
+    assert check_text(strong, solved_real.calibration).startswith("HOLDS: flange_from_camera fits 5")
+    text = check_text(weak, solved_real.calibration)
+    assert text.startswith("HOLDS, as far as these views can tell") and "Take 3 more" in text
+    assert "calibrate again" in check_text(replace(weak, views_needed=None), solved_real.calibration)
+    moved = check_text(replace(weak, passed=False), solved_real.calibration)
+    assert "DOES NOT HOLD" in moved and "more" not in moved
+
+
+@pytest.mark.parametrize("rounding", [-1e-9, 0.0, 1e-9])
+def test_views_that_say_nothing_have_no_power(rounding: float) -> None:
+    blind = np.diag([1e12] * 6)
+    blind[0, 1] = blind[1, 0] = 1e12 * (1 - 1e-8 + rounding)
+    assert powers(blind, 69) == pytest.approx((0.05, 0.05), abs=1e-3)
 
 
 def test_noisier_views_are_said_to_disagree() -> None:

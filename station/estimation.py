@@ -81,7 +81,7 @@ def next_best(config: StationConfig, base_from_flange: Array, joints_now_rad: Se
         return ""
     if advice.next_pose is None:
         return ""
-    missing = f"about {advice.poses_missing} more" if advice.poses_missing else "many more poses"
+    missing = f"at best {advice.poses_missing} more" if advice.poses_missing else "many more poses"
     return f"{missing} for {1000 * goal_m:.2g} mm; the next best: {advice.next_pose.why}"
 
 

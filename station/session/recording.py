@@ -159,9 +159,12 @@ class SessionRecording:
         return numbered
 
     def attach_plan(self, plan: Plan) -> None:
-        """The plan as it was changed on the way, beside the one it began with. Raises RecordingError."""
+        """The plan as it was changed on the way, beside the one it began with. Raises RecordingError.
+
+        JSON: writing YAML would hold the loop up for longer than STOP may wait.
+        """
         self._plans += 1
-        self._require().attach(f"plan-{self._plans}.yaml", "application/yaml", msgspec.yaml.encode(plan))
+        self._require().attach(f"plan-{self._plans}.json", "application/json", msgspec.json.encode(plan))
 
     def picture(self, picture: Picture) -> None:
         """Hands it to the writer. Raises RecordingError when the disk cannot keep up or has failed."""

@@ -92,7 +92,7 @@ async def test_the_remaining_poses_are_planned_anew_only_by_a_go(half_way: Rig, 
     await rig.until(S.IDLE)
     recording = sealed(rig)
     assert [view.index for view in recording.views()] == list(range(POSES))
-    driven = msgspec.yaml.decode(recording.attachments()["plan-2.yaml"], type=Plan)
+    driven = msgspec.json.decode(recording.attachments()["plan-2.json"], type=Plan)
     assert driven.poses[:BEFORE] == plan.poses[:BEFORE]
     assert not {p.joints_rad for p in driven.poses[BEFORE:]} & {p.joints_rad for p in plan.poses}
     rest = msgspec.structs.replace(driven, poses=driven.poses[BEFORE:])

@@ -16,6 +16,9 @@ from recordings.messages import BoardSpec
 
 _FEW_MARKERS = 0.7
 """Of those of the board."""
+_NEAR_SHARE, _FAR_MOVES = 0.025, 4.0
+"""A corner ran away where the refinement moves it farther from the prediction than this share of the spacing
+and than so many times the middle one."""
 Indices = NDArray[np.intp]
 _NOTHING = (np.zeros(0, dtype=np.intp), np.zeros((0, 2)))
 
@@ -95,6 +98,9 @@ def _snap_to_corners(
     corners = refine(grey, predicted[chosen], min(0.8, 2.8 * margin_share) * room)
     radius = (np.clip(min(0.25, 1.2 * margin_share) * room, 2.0, 12.0) / room)[:, None]
     good = is_saddle(grey, corners, radius * across, radius * down)
+    moved = np.linalg.norm(corners - predicted[chosen], axis=1)
+    if good.any():
+        good &= moved <= np.maximum(_NEAR_SHARE * room, _FAR_MOVES * np.median(moved[good]))
     return chosen[good], corners[good]
 
 

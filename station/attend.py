@@ -67,7 +67,8 @@ async def carry_out(
 
     RefusedError when the daemon or the person says no. Being cancelled sends STOP.
     """
-    summary = msgspec.convert(await client.request("prepare", purpose=purpose, timeout_s=PREPARE_S), GoSummary)
+    answer = await client.request("prepare", purpose=purpose, timeout_s=PREPARE_S)
+    summary = msgspec.convert(answer, GoSummary)
     if not confirm(summary):
         raise RefusedError("nothing moved: the go was not given")
     await asyncio.sleep(0)  # Ctrl-C at the question strikes here, before the go is sent

@@ -118,7 +118,7 @@ def take(terminals: list[Terminal]) -> None:
         terminal.wait_for("IDLE")
     both(terminals, "checklist", ("6",), "missing")
     first.press("2", "n")
-    first.wait_for("p19 ")
+    first.wait_for("p10 ")
     both([first], "go", ("1", "F5"), "The arm will move")
     first.press("Tab", "Enter")
     first.go_on_until(r"1\d/25")

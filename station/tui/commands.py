@@ -20,6 +20,10 @@ from station.tui.replay_screen import ReplayScreen
 STOP_UNHEARD = "STOP was sent, but the station does not answer: use the EMERGENCY STOP on the pendant."
 
 
+PLAN_ANSWER_S = 200.0
+"""Planning takes the daemon some seconds on a quick computer, and minutes on a busy one."""
+
+
 class Commands(App[None]):
     """Every wish goes through `ask`; the daemon decides, nothing is decided here."""
 
@@ -69,11 +73,18 @@ class Commands(App[None]):
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_run(self) -> None:
-        """Prepare, ask the person, go: the only way from a key to a motion."""
-        if await self.ask("lease", action="take") is None:
-            return
         resuming = self.status is not None and self.status.state is StationState.PAUSED
-        answer = await self.ask("prepare", purpose="resume" if resuming else "run")
+        await self._go_for("resume" if resuming else "run")
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_improve(self) -> None:
+        """The poses that are left, planned anew from the pictures so far; taken up by its go alone."""
+        self.notify("Planning the poses that are left anew …", timeout=3)
+        await self._go_for("improve", timeout_s=PLAN_ANSWER_S)
+
+    async def _go_for(self, purpose: str, **patience: float) -> None:
+        """Prepare, ask the person, go: how the keys of a session move the arm."""
+        answer = await self.ask_with_control("prepare", purpose=purpose, **patience)
         if answer is None:
             return
         go = msgspec.convert(answer, GoSummary)

@@ -27,5 +27,5 @@ class LiveScreen(StationScreen):
                 yield panels.Panel("Poses", panels.pose_map_lines, id="poses")
                 yield panels.Panel("Image coverage", panels.coverage_lines, id="coverage")
                 yield panels.Panel("Estimate (not final)", panels.estimate_lines, id="estimate")
-                yield panels.Panel("Robot", panels.robot_lines, id="robot")
+                yield panels.Panel("Robot (mm, °)", panels.robot_lines, id="robot")
         yield Events()

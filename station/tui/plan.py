@@ -13,6 +13,7 @@ from textual.widgets import DataTable, Static
 
 from station.protocol import Verb
 from station.status import PoseStatus, StationStatus
+from station.tui.commands import PLAN_ANSWER_S
 from station.tui.screen import StationScreen
 from station.tui.widgets.sketch import PlanSketch
 from station.tui.words import POSE_MARKS
@@ -23,7 +24,6 @@ if TYPE_CHECKING:
 COLUMNS = ("#", "pose", "state", "± then", "why it is there / what happened", "try", "corners")
 NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves); a adds the arm's posture."
 PLANNING = "Planning 25 poses … (seconds; minutes on a busy computer). Nothing moves."
-PLAN_ANSWER_S = 200.0
 MOVE = Binding.Group("Move", compact=True)
 SIGMA_SHOWN_MM = 100.0
 
@@ -61,6 +61,7 @@ class PlanScreen(StationScreen):
         Binding("d", "pose('drop')", "Drop", tooltip="Remove this pose from the plan"),
         Binding("a", "add", "Add", tooltip="Add the arm's present posture as a pose"),
         Binding("n", "make", "New", tooltip="Plan 25 poses from the configured guesses (seconds)"),
+        Binding("p", "app.improve", "Improve", tooltip="Plan what is left anew from the pictures so far"),
         Binding("ctrl+up", "shift(-1)", "Move", group=MOVE, tooltip="Visit this pose earlier"),
         Binding("ctrl+down", "shift(1)", "Move", group=MOVE, tooltip="Visit this pose later"),
         Binding("home", "to_row(0)", "First", show=False, priority=True, tooltip="The first pose"),

@@ -9,8 +9,8 @@ from textual.widgets import Static
 from station.errors import RefusedError
 from station.status import StationState
 from station.tui.app import StationApp
+from station.tui.commands import PLAN_ANSWER_S
 from station.tui.confirm import Confirm, ConfirmGo
-from station.tui.plan import PLAN_ANSWER_S
 from tests.tui.conftest import FakeLink, idle, until
 
 
@@ -134,6 +134,17 @@ async def test_the_plan_screen_asks_for_changes_of_the_highlighted_pose(
         await pilot.pause()
         await pilot.press("down", "down", key)
         await until(pilot, lambda: request_ in link.asked)
+
+
+async def test_improving_the_plan_asks_as_every_motion_does(link: FakeLink) -> None:
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+        await pilot.press("2", "p")
+        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmGo))
+        assert ("prepare", {"purpose": "improve", "timeout_s": PLAN_ANSWER_S}) in link.asked
+        assert "go" not in link.verbs
+        await pilot.click("#yes")
+        await until(pilot, lambda: ("go", {"token": "t-1"}) in link.asked)
 
 
 async def test_every_screen_opens_and_stop_works_on_each(link: FakeLink) -> None:

@@ -85,11 +85,11 @@ def robot_lines(status: StationStatus) -> list[str]:
     if robot.joints_rad is None or robot.base_from_flange is None:
         return ["no robot state"]
     x, y, z = (row[3] * 1000 for row in robot.base_from_flange[:3])
-    joints = [f"{math.degrees(q):8.1f}" for q in robot.joints_rad]
+    joints = [f"{math.degrees(q):7.1f}" for q in robot.joints_rad]
     return [
-        f"flange {x:8.1f} {y:8.1f} {z:8.1f} mm",
-        f"joints {' '.join(joints[:3])} °",
-        f"       {' '.join(joints[3:])} °",
+        f"flange {x:7.1f}{y:7.1f}{z:7.1f}",
+        f"joints {''.join(joints[:3])}",
+        f"       {''.join(joints[3:])}",
     ]
 
 
@@ -147,5 +147,6 @@ def estimate_lines(status: StationStatus) -> list[str]:
     return [
         f"{x:7.1f} {y:7.1f} {z:7.1f} mm",
         f"± {estimate.sigma_translation_mm:.2f} mm{rotation}",
+        *(["p on screen 2 plans the rest"] if estimate.improve else []),
         *textwrap.wrap(estimate.advice or ("enough" if estimate.enough else "not final"), NARROW),
     ]

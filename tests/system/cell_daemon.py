@@ -1,7 +1,7 @@
 """The real daemon in front of a simulated controller that outlives it: python -m tests.system.cell_daemon …
 
 `station serve --simulate` owns its controller, which ends with it; here a test can look at the arm of a
-daemon that was killed.
+daemon that was killed. CELL_TOLD: another truth, that the configuration is made from.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ def main() -> None:
     host, truth_file, root, socket = sys.argv[1:5]
     logging.basicConfig(level=logging.INFO, stream=sys.stderr)
     truth = read_truth(Path(truth_file))
-    config = cell_config(truth, host)
+    config = cell_config(read_truth(Path(os.environ.get("CELL_TOLD", truth_file))), host)
     capture = msgspec.structs.replace(config.capture, free_space_bytes=1)
     config = msgspec.structs.replace(config, capture=capture)
     place = Path(root)

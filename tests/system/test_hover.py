@@ -11,13 +11,15 @@ import pytest
 
 from calibrate.board import board_points
 from calibrate.calibration import Touch, read_calibration, write_calibration
-from calibrate.geometry import Array
+from calibrate.geometry import Array, inverse, pose
 from calibrate.kinematics import MODELS, forward
 from calibrate.verification import agrees, note_in_file
-from recordings.messages import CameraIdentity, RobotIdentity
+from recordings.messages import CameraIdentity, Matrix4, RobotIdentity
 from station.client import Client
 from station.limits import point_speed_m_s
 from station.plan.hover import SPEED_M_S, board_from_tip, hover_geometry
+from station.simulation.cell import CellTruth, write_truth
+from station.simulation.placement import board_centre
 from station.simulation.scenes import cell_config
 from station.status import HoverOffer, StationStatus
 from station.status import StationState as S
@@ -27,8 +29,34 @@ from tests.system.conftest import TRUTH, SystemRig, status_when
 
 pytestmark = pytest.mark.process
 BOARD = np.array(TRUTH.board_place)
-GEOMETRY = hover_geometry(cell_config(TRUTH), np.array(TRUTH.camera_mount), BOARD, 0.0, POINTER)
 ERROR = np.array([SIGMA_M, -SIGMA_M, 0.5 * SIGMA_M, SIGMA_RAD, 0.5 * SIGMA_RAD, -SIGMA_RAD])
+
+
+def matrix4(matrix: Array) -> Matrix4:
+    return tuple(tuple(float(v) for v in row) for row in matrix)
+
+
+def camera_beside() -> tuple[CellTruth, CellTruth]:
+    """A camera beside the cell that sees the board where it lies, off the flange: as told, and as rendered.
+
+    The simulation hangs every board of such a cell on the flange. So a long arm on the flange carries the
+    camera that is rendered: in the one picture that is taken, at the start, both are at the same place.
+    """
+    middle = BOARD[:3, :3] @ board_centre(TRUTH.board) + BOARD[:3, 3]
+    outward = np.append(middle[:2] / np.linalg.norm(middle[:2]), 0.0)
+    eye = middle - 0.7 * BOARD[:3, 2] + 0.5 * outward
+    z = (middle - eye) / np.linalg.norm(middle - eye)
+    x = BOARD[:3, 0] - (BOARD[:3, 0] @ z) * z
+    x /= np.linalg.norm(x)
+    camera = pose(np.stack([x, np.cross(z, x), z], axis=1), eye)
+    start = forward(MODELS["UR10"], np.array(TRUTH.start_joints_rad))
+    told = msgspec.structs.replace(
+        TRUTH,
+        mount="eye-to-hand",
+        camera_mount=matrix4(camera),
+        board_place=matrix4(pose(np.eye(3), [0, 0, 0.1])),
+    )
+    return told, msgspec.structs.replace(TRUTH, camera_mount=matrix4(inverse(start) @ camera))
 
 
 async def ready(client: Client) -> StationStatus:
@@ -37,11 +65,11 @@ async def ready(client: Client) -> StationStatus:
     return status
 
 
-def write_file(folder: Path, status: StationStatus, error: Array) -> Path:
+def write_file(folder: Path, status: StationStatus, error: Array, truth: CellTruth = TRUTH) -> Path:
     robot = RobotIdentity(model=status.robot.model, serial=status.robot.serial)
     camera = CameraIdentity(model=status.camera.model, serial=status.camera.serial, driver="rendered")
     path = folder / "cell.yaml"
-    write_calibration(calibration_of(TRUTH, robot, camera, error), path)
+    write_calibration(calibration_of(truth, robot, camera, error), path)
     return path
 
 
@@ -57,12 +85,13 @@ async def offered(client: Client, path: Path, corner: int, new_picture: bool = T
     return msgspec.convert(answer, HoverOffer)
 
 
-async def fastest_m_s(rig: SystemRig, until_rest: asyncio.Event) -> float:
+async def fastest_m_s(rig: SystemRig, told: CellTruth, until_rest: asyncio.Event) -> float:
     """By the controller's own joint speeds, at any modelled point."""
+    geometry = hover_geometry(cell_config(told), np.array(told.camera_mount), BOARD, 0.0, POINTER)
     fastest = 0.0
     while not until_rest.is_set():
         state = rig.admin.ask("state")
-        fastest = max(fastest, point_speed_m_s(GEOMETRY, state["joints_rad"], state["joint_speeds_rad_s"]))
+        fastest = max(fastest, point_speed_m_s(geometry, state["joints_rad"], state["joint_speeds_rad_s"]))
         await asyncio.sleep(0.01)
     return fastest
 
@@ -72,17 +101,24 @@ def true_tip(rig: SystemRig) -> Array:
     return board_from_tip(BOARD, np.array(rig.admin.ask("truth")["base_from_flange"]), POINTER)
 
 
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 async def test_the_tip_truly_stands_over_the_corner_slowly_and_the_offset_is_kept(
-    rig: SystemRig, tmp_path: Path
+    rig: SystemRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mount: str
 ) -> None:
+    told = TRUTH
+    if mount == "eye-to-hand":
+        told, rendered = camera_beside()
+        write_truth(rendered, rig.folder / "truth.json")
+        write_truth(told, rig.folder / "told.json")
+        monkeypatch.setenv("CELL_TOLD", str(rig.folder / "told.json"))
     daemon = await rig.daemon()
     async with await daemon.client() as anna:
         status = await ready(anna)
-        path = write_file(tmp_path, status, ERROR)
+        path = write_file(tmp_path, status, ERROR, told)
         for first, corner in ((True, 0), (False, 41)):
             offer = await offered(anna, path, corner, first)
             arrived = asyncio.Event()
-            watch = asyncio.create_task(fastest_m_s(rig, arrived))
+            watch = asyncio.create_task(fastest_m_s(rig, told, arrived))
             await anna.request("go", token=offer.go.token)
             anna.outdate()
             done = await status_when(anna, lambda s: s.state in (S.IDLE, S.FAULT, S.STOPPED))

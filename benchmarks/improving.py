@@ -16,6 +16,7 @@ import numpy as np
 from benchmarks.planning import NOISE, x_error
 from benchmarks.random_cells import ARM, CAMERA, POINTS, RandomCell, random_cell, roughly, shows_board
 from benchmarks.trials import percentiles, table, trials
+from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, perturb, transform_points
 from calibrate.kinematics import forward
 from calibrate.projection import project
@@ -47,11 +48,12 @@ def run() -> str:
     for guess in GUESSES:
         found, refused = [], []
         for seed in range(trials(CELLS)):
+            name = f"cell {seed}, {1000 * guess[0]:.0f} mm"
             try:
                 found.append(measure(seed, *guess))
-            except StationError as error:
-                refused.append(f"cell {seed}, {1000 * guess[0]:.0f} mm: {error}")
-            print(f"cell {seed}", flush=True)
+            except (StationError, CalibrationError) as error:
+                refused.append(f"{name}: {error}")
+            print(name, found[-1:], refused[-1:], flush=True)
         rows += _rows(guess, found)
         notes += refused
     heads = ["guess", "cells", "plan", "translation, mm", "ratio", "rotation, °", "ratio"]
@@ -61,7 +63,7 @@ def run() -> str:
 
 
 def measure(seed: int, guess_m: float, guess_rad: float) -> Result:
-    """StationError when there is no first plan or no improvement."""
+    """StationError without a first plan or an improvement, CalibrationError when too many boards are cut."""
     cell, _ = random_cell(seed)
     rng = np.random.default_rng([40, seed])
     guesses = {

@@ -11,6 +11,7 @@ from calibrate.consensus import Consensus, disagreement, find_consensus, pose_ar
 from calibrate.estimate import Estimate, estimate, first_state
 from calibrate.likelihood.kinematics import UNIT, kinematic_derivatives
 from calibrate.likelihood.model import Observations, observe_views
+from calibrate.mixture import find_good_views
 from calibrate.outliers import Judgement, explain, judge_views
 from calibrate.pairs import Pairs, Places, all_pairs
 from calibrate.robust import GlobalResult, solve_global
@@ -21,9 +22,8 @@ from calibrate.views import ViewSet
 
 _ROUNDS = 5
 _FEWEST = 4
-_FEWEST_IN_CORE = 6
-_TRIMMED = 0.6
-_FEWEST_TRIMMED = 8
+_FEWEST_GOOD = 6
+"""The mixture is believed only if it leaves that many."""
 _UNDOUBTED, _NEAR = 0.999, 0.99
 """Shares of good views that lie within, by the scale of the middle one."""
 _FEW = 0.1
@@ -97,17 +97,25 @@ def fit_views(
 def _settle(
     everything: Observations, views: ViewSet, places: Places, result: Estimate, reject: bool
 ) -> Settled:
-    """The core judges every view once; then those accepted judge each other until none has to leave.
+    """The group judges every view; in doubt a mixture first; then those kept judge each other.
 
-    Where more than a few are left out nobody is let in any more: every bad view let in widens the scales and
-    makes the next one look better.
+    Many bad views widen the scales until each of them seems likely, and so does every one let in again: where
+    more than a few of the group are left out, views only have to leave. Without doubt nothing is sought:
+    among the systematic errors of a worn arm some views always agree better than all of them.
     """
+    settled = _judged(everything, views, places, result)
     if not reject:
-        return _judged(everything, views, places, result)
-    settled = _core(everything, views, places, result)
+        return settled
+    closed = False
+    if _in_doubt(settled.verdict, places):
+        good = find_good_views(settled.verdict.linear, places, ~settled.verdict.blurred)
+        believed = len(good) >= _FEWEST_GOOD
+        closed = believed and len(np.intersect1d(good, places)) < (1 - _FEW) * len(places)
+        if believed and not np.array_equal(good, places):
+            settled = _again(everything, views, settled, good)
     for round_ in range(_ROUNDS):
         good = settled.verdict.good
-        if round_ and len(good) < (1 - _FEW) * len(views):
+        if closed or (round_ and len(good) < (1 - _FEW) * len(views)):
             good = np.intersect1d(good, settled.places)
         if len(good) < _FEWEST:
             raise disagreement(f"Only {len(good)} of {len(views)} views agree; {_FEWEST} are needed.")
@@ -117,37 +125,26 @@ def _settle(
     return settled
 
 
-def _judged(everything: Observations, views: ViewSet, places: Places, result: Estimate) -> Settled:
-    boards = refine_board_poses(everything, replace(result.state, C=views.camera_from_board))
-    verdict = judge_views(everything, result, boards, places)
-    return Settled(places, _part(everything, places), result, verdict, boards)
-
-
-def _core(everything: Observations, views: ViewSet, group: Places, result: Estimate) -> Settled:
-    """The views of the group that agree best, and the estimate by them alone; bounded rounds.
-
-    Many bad views together widen the noise scales until each of them seems likely. So where the group is in
-    doubt the best 60 % of it are sought first (as in least trimmed squares: Rousseeuw 1984), then those
-    near them by the scale of the middle view. Whoever is left out is judged later by the others.
-    """
-    settled = _judged(everything, views, group, result)
-    if not _in_doubt(settled.verdict, group):
-        return settled
-    fewest = int(np.ceil(_TRIMMED * len(group)))
-    if fewest >= _FEWEST_TRIMMED:
-        for _ in range(_ROUNDS):
-            core = settled.verdict.best(group, fewest)
-            if np.array_equal(core, settled.places):
-                break
-            settled = _again(everything, views, settled, core)
-    core = settled.verdict.near_middle(group, _NEAR)
-    return _again(everything, views, settled, core) if len(core) >= _FEWEST_IN_CORE else settled
-
-
 def _in_doubt(verdict: Judgement, group: Places) -> bool:
     """One view far out, or several farther out than so many good views would be."""
     far = len(group) - len(verdict.near_middle(group, _NEAR))
     return far > 1 + 0.02 * len(group) or len(verdict.near_middle(group, _UNDOUBTED)) < len(group)
+
+
+def _judged(
+    everything: Observations,
+    views: ViewSet,
+    places: Places,
+    result: Estimate,
+    before: BoardPoses | None = None,
+) -> Settled:
+    """Board poses are sought from those before, which another lens hardly moves and nothing else does."""
+    C = views.camera_from_board if before is None else before.C
+    boards = before
+    if boards is None or result.intrinsics_free:
+        boards = refine_board_poses(everything, replace(result.state, C=C))
+    verdict = judge_views(everything, result, boards, places)
+    return Settled(places, _part(everything, places), result, verdict, boards)
 
 
 def _again(everything: Observations, views: ViewSet, settled: Settled, places: Places) -> Settled:
@@ -155,7 +152,7 @@ def _again(everything: Observations, views: ViewSet, settled: Settled, places: P
     before = settled.estimate
     start = replace(before.state, C=settled.boards.C[places])
     result = estimate(_part(everything, places), start, before.intrinsics_free, before.sigma)
-    return _judged(everything, views, places, result)
+    return _judged(everything, views, places, result, settled.boards)
 
 
 def _part(everything: Observations, places: Places) -> Observations:

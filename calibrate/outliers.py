@@ -17,6 +17,7 @@ from calibrate.estimate import Estimate
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
 from calibrate.likelihood.model import Observations, State
 from calibrate.likelihood.residuals import modelled_flange, robot_derivatives, robot_residuals
+from calibrate.mixture import LinearMisses
 from calibrate.pairs import Places, mount_poses
 from calibrate.solution import RejectedView
 from calibrate.views import ImageView, ViewSet
@@ -38,13 +39,17 @@ class Judgement:
 
     distance2: Array
     """(n,) squared sigmas, 6 degrees of freedom."""
-    miss: Array
-    """(n, 6) modelled against recorded flange."""
+    linear: LinearMisses
     modelled: Array
     """(n, 4, 4)"""
     limit: float
     blurred: NDArray[np.bool_]
     """(n,)"""
+
+    @property
+    def miss(self) -> Array:
+        """(n, 6) modelled against recorded flange."""
+        return self.linear.miss
 
     @property
     def good(self) -> Places:
@@ -57,10 +62,6 @@ class Judgement:
         near = distance2 <= wider * float(stats.chi2.ppf(share, 6))
         return np.asarray(group[near & ~self.blurred[group]])
 
-    def best(self, group: Places, count: int) -> Places:
-        """The nearest of the group."""
-        return np.sort(group[np.argsort(self.distance2[group], kind="stable")[:count]])
-
 
 def judge_views(observed: Observations, result: Estimate, boards: BoardPoses, fitted: Places) -> Judgement:
     """`observed` and `boards` speak of all views, `result` rests on the `fitted` ones.
@@ -68,14 +69,12 @@ def judge_views(observed: Observations, result: Estimate, boards: BoardPoses, fi
     For the others the uncertainty of X, Y and the kinematic errors counts too.
     """
     state = replace(result.state, C=boards.C)
-    miss = robot_residuals(observed, state)
-    by_X, by_Y, by_C = robot_derivatives(observed, state)
-    covariance = result.sigma[0] ** 2 * by_C @ boards.covariance @ np.swapaxes(by_C, 1, 2)
-    covariance += np.diag(np.repeat(result.sigma[1:3] ** 2, 3))
-    parts = [by_X, by_Y] if observed.kinematics is None else [by_X, by_Y, -observed.kinematics]
-    others = np.setdiff1d(np.arange(len(miss)), fitted)
-    J = np.concatenate(parts, axis=2)[others]
+    linear = _linear_misses(observed, state, result, boards)
+    covariance = linear.by_corners + np.diag(np.repeat(linear.sigma**2, 3))
+    others = np.setdiff1d(np.arange(len(covariance)), fitted)
+    J = linear.by_global[others]
     covariance[others] += J @ result.joint_covariance @ np.swapaxes(J, 1, 2)
+    miss = linear.miss
     distance2 = np.einsum("ni,ni->n", miss, np.linalg.solve(covariance, miss[..., None])[..., 0])
     # Two scales, each from 3N - 6 residuals: simulated, the tail is that of F with half as many again.
     freedom = 1.5 * max(3 * len(fitted) - 6, 3)
@@ -83,7 +82,23 @@ def judge_views(observed: Observations, result: Estimate, boards: BoardPoses, fi
     limit = min(chance, _LARGEST_SIGMAS**2)
     typical = float(np.median(boards.typical_px))
     blurred = boards.typical_px > max(_BLURRED * typical, _BLURRED_PX)
-    return Judgement(distance2, miss, modelled_flange(observed, state), limit, blurred)
+    return Judgement(distance2, linear, modelled_flange(observed, state), limit, blurred)
+
+
+def _linear_misses(
+    observed: Observations, state: State, result: Estimate, boards: BoardPoses
+) -> LinearMisses:
+    by_X, by_Y, by_C = robot_derivatives(observed, state)
+    parts = [by_X, by_Y] if observed.kinematics is None else [by_X, by_Y, -observed.kinematics]
+    prior = np.concatenate([np.zeros(12), np.full(len(state.theta), result.sigma[3] ** -2)])
+    return LinearMisses(
+        miss=robot_residuals(observed, state),
+        by_global=np.concatenate(parts, axis=2),
+        by_corners=result.sigma[0] ** 2 * by_C @ boards.covariance @ np.swapaxes(by_C, 1, 2),
+        prior=prior,
+        pull=prior * np.concatenate([np.zeros(12), state.theta]),
+        sigma=result.sigma[1:3],
+    )
 
 
 def board_turns(view: ImageView) -> list[Array]:

@@ -6,6 +6,7 @@ Sizes may be named: `python docs/screens/take.py 160x48`.
 
 from __future__ import annotations
 
+import contextlib
 import io
 import itertools
 import os
@@ -22,6 +23,7 @@ from rich.text import Text
 HERE = Path(__file__).parent
 SIZES = ((80, 24), (160, 48))
 PATIENCE_S = 400.0
+QUESTION_S = 20.0
 STATION = (sys.executable, "-m", "station.cli")
 
 
@@ -68,8 +70,8 @@ class Terminal:
             self._tmux("send-keys", key)
             time.sleep(0.5)
 
-    def wait_for(self, pattern: str) -> None:
-        deadline_s = time.monotonic() + PATIENCE_S
+    def wait_for(self, pattern: str, patience_s: float = PATIENCE_S) -> None:
+        deadline_s = time.monotonic() + patience_s
         while not re.search(pattern, self.shown()):
             if time.monotonic() > deadline_s:
                 raise TimeoutError(f"'{pattern}' never came:\n{self.shown()}")
@@ -97,8 +99,9 @@ class Terminal:
                 self.press("F8")
             elif shown.lstrip().startswith("PAUSED"):
                 self.press("F5")
-                self.wait_for("The arm will move")
-                self.press("Tab", "Enter")
+                with contextlib.suppress(TimeoutError):  # it may have gone on meanwhile
+                    self.wait_for("The arm will move", QUESTION_S)
+                    self.press("Tab", "Enter")
             time.sleep(0.3)
 
 
@@ -121,7 +124,7 @@ def take(terminals: list[Terminal]) -> None:
     first.wait_for("p10 ")
     both([first], "go", ("1", "F5"), "The arm will move")
     first.press("Tab", "Enter")
-    first.go_on_until(r"1\d/25")
+    first.go_on_until(r"(1\d|2[0-4])/25")
     both(terminals, "live", ("1",), "Detection")
     both(terminals, "plan", ("2",), "why it is there")
     first.press("F12")

@@ -18,6 +18,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
+from calibrate.install import load_installed
 from station.attend import Confirm, Outcome, carry_out, wait_until_idle
 from station.cli_serve import require_choices
 from station.client import Client, default_socket
@@ -143,6 +144,7 @@ def check_command(
 
     Exit codes: 0 it holds, 4 it does not, 1 no recording or nothing installed, 2 usage.
     """
+    asyncio.run(_require_installed(socket or default_socket()))  # or the arm would move for nothing
     outcome = asyncio.run(attended_session(socket, "run", headless, go, False, lambda c: _make(c, poses)))
     if not outcome.recording:
         _finish(outcome, False)
@@ -151,6 +153,12 @@ def check_command(
     command = [sys.executable, "-m", "calibrate.cli", "check", outcome.recording, "--root", str(root)]
     done = subprocess.run(command)
     raise typer.Exit(done.returncode)
+
+
+async def _require_installed(socket: Path) -> None:
+    async with await Client.connect(socket) as client:
+        root = Path((await client.request("hello"))["root"])
+    load_installed(root, allow_simulated=True)
 
 
 async def load_into(client: Client, plan: Plan) -> None:

@@ -1,0 +1,25 @@
+"""`station check` with the real daemon."""
+
+from __future__ import annotations
+
+import asyncio
+import sys
+
+import pytest
+
+from station.status import StationState as S
+from tests.system.conftest import SystemRig, status_when
+
+pytestmark = pytest.mark.process
+
+
+async def test_nothing_moves_where_no_calibration_is_installed(rig: SystemRig) -> None:
+    daemon = await rig.daemon()
+    async with await daemon.client() as client:
+        await status_when(client, lambda s: s.state is S.IDLE and s.camera.connected)
+    command = [sys.executable, "-m", "station.cli", "check", "--headless", "--socket", str(daemon.socket)]
+    check = await asyncio.create_subprocess_exec(*command, stderr=asyncio.subprocess.PIPE)
+    _, words = await asyncio.wait_for(check.communicate(), 60)
+    assert check.returncode == 1
+    assert "nothing is installed. Run: calibrate install FILE" in words.decode()
+    assert "upload: rtde_control" not in rig.admin.ask("log")["counts"]

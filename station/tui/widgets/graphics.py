@@ -30,6 +30,8 @@ SWITCH = "STATION_PICTURES"
 """`blocks`: never; `sharp`: over ssh too, where STOP's key and every picture share one line."""
 SHARE = 0.04
 """Of one core at most, for drawing pictures: the dearer one is, the seldomer they come."""
+PERIOD_S = 0.5
+"""Between two pictures at least: the terminal has to draw them too."""
 GREYS = 16
 """Time and bytes of a sixel picture grow with its shades: 46 kB for 400×320 in 16, 186 kB in 256."""
 ANSWER_S = 1.0

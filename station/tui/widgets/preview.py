@@ -20,7 +20,7 @@ from textual.reactive import reactive
 from textual.strip import Strip
 from textual.widget import Widget
 
-from station.tui.widgets.graphics import SHARE, Graphics, SharpPicture
+from station.tui.widgets.graphics import PERIOD_S, SHARE, Graphics, SharpPicture
 
 if TYPE_CHECKING:
     from station.tui.app import StationApp
@@ -78,7 +78,7 @@ class Preview(Widget):
         if graphics is None or self._picture is None:
             return
         self._sharp = await asyncio.to_thread(graphics.draw, self._picture, self._corners, size)
-        self._next_s = time.monotonic() + self._sharp.spent_s / SHARE
+        self._next_s = time.monotonic() + max(PERIOD_S, self._sharp.spent_s / SHARE)
 
     def _graphics(self) -> Graphics | None:
         """How this terminal draws pictures; None while half blocks are due."""

@@ -27,7 +27,7 @@ PLAN_ANSWER_S = 200.0
 class Commands(App[None]):
     """Every wish goes through `ask`; the daemon decides, nothing is decided here."""
 
-    status: reactive[StationStatus | None] = reactive(None)
+    status: reactive[StationStatus | None] = reactive(None, repaint=False)
     link: Link | None = None
     """The connection while there is one."""
     silent_s: float | None = None

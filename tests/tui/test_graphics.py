@@ -12,9 +12,12 @@ import termios
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 import pytest
+from textual._compositor import Compositor
 from textual._xterm_parser import XTermParser
 from textual.geometry import Region, Size
 from textual.pilot import Pilot
@@ -24,8 +27,8 @@ from station.tui.confirm import ConfirmGo
 from station.tui.widgets import graphics as graphics_module
 from station.tui.widgets.graphics import SWITCH, Graphics, SharpPicture, detect
 from station.tui.widgets.preview import Preview
-from tests.tui.conftest import FakeLink, until
-from tests.tui.test_keys import app_on
+from tests.tui.conftest import FakeLink, idle, until
+from tests.tui.test_keys import app_on, text_of
 
 CELL = (8, 17)
 VT340 = b"\x1b[?63;1;2;4;6;9;15;22c"
@@ -208,3 +211,26 @@ def test_without_the_extra_nothing_is_missed(
     asked = answer(terminal, VT340)
     assert detect() is None
     asked.join()
+
+
+async def test_a_status_repaints_only_what_it_changes(
+    link: FakeLink, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    link.answers["preview"]["sequence"] = 1
+    updates: list[str] = []
+    render = Compositor.render_update
+
+    def noted(self: Compositor, *args: Any, **more: Any) -> Any:
+        update = render(self, *args, **more)
+        updates.append(type(update).__name__)
+        return update
+
+    async with app_on(link).run_test(size=(160, 48)) as pilot:
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+        await pilot.pause(1.0)
+        monkeypatch.setattr(Compositor, "render_update", noted)
+        status = idle()
+        link.show(msgspec.structs.replace(status, robot=msgspec.structs.replace(status.robot, age_ms=7.0)))
+        await until(pilot, lambda: updates)
+        await pilot.pause(0.3)
+        assert "LayoutUpdate" not in updates

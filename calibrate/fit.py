@@ -100,22 +100,19 @@ def _settle(
     """The group judges every view; in doubt a mixture first; then those kept judge each other.
 
     Many bad views widen the scales until each of them seems likely, and so does every one let in again: where
-    more than a few of the group are left out, views only have to leave. Without doubt nothing is sought:
-    among the systematic errors of a worn arm some views always agree better than all of them.
+    more than a few are left out, views only have to leave once all were judged. Without doubt nothing is
+    sought: among the systematic errors of a worn arm some views always agree better than all of them.
     """
     settled = _judged(everything, views, places, result)
     if not reject:
         return settled
-    closed = False
     if _in_doubt(settled.verdict, places):
         good = find_good_views(settled.verdict.linear, places, ~settled.verdict.blurred)
-        believed = len(good) >= _FEWEST_GOOD
-        closed = believed and len(np.intersect1d(good, places)) < (1 - _FEW) * len(places)
-        if believed and not np.array_equal(good, places):
+        if len(good) >= _FEWEST_GOOD and not np.array_equal(good, places):
             settled = _again(everything, views, settled, good)
     for round_ in range(_ROUNDS):
         good = settled.verdict.good
-        if closed or (round_ and len(good) < (1 - _FEW) * len(views)):
+        if round_ and len(good) < (1 - _FEW) * len(views):
             good = np.intersect1d(good, settled.places)
         if len(good) < _FEWEST:
             raise disagreement(f"Only {len(good)} of {len(views)} views agree; {_FEWEST} are needed.")

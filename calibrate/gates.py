@@ -131,13 +131,13 @@ def _motion_gates(solution: Solution, limits: GateLimits) -> Iterator[Gate]:
 def _optimum_gates(solution: Solution, limits: GateLimits) -> Iterator[Gate]:
     proof = solution.certificate
     if limits.certificate:
-        gap = f"relative gap {proof.relative_gap:.1e}"
+        gap = f"relative gap {proof.relative_gap:.1e}" if proof.relative_gap > 1e-15 else "no gap at all"
         yield Gate(
             "certificate",
             proof.certified,
             proof.relative_gap,
             proof.tolerance,
-            f"The optimum of {proof.problem or 'the quadratic objective'} is proven global ({gap})"
+            f"The optimum of the {proof.problem or 'quadratic objective'} is proven global ({gap})"
             if proof.certified
             else f"The optimum is not proven ({gap}). Add views, or look for wrong ones.",
         )

@@ -141,6 +141,12 @@ def _installed_before(root: Path | None) -> Calibration | None:
     return (current or known)[-1].calibration if known else None
 
 
+def install_line(source: Source, path: Path) -> str:
+    """The command that installs a file of this source: only what a real cell captured goes there unasked."""
+    kind = _CELL_OF[source]
+    return f"calibrate install {'' if kind == 'real' else f'--cell {kind} --root FOLDER '}{path}"
+
+
 def _refuse_foreign_source(
     calibration: Calibration, before: Calibration | None, cell: Cell, path: Path
 ) -> None:
@@ -153,7 +159,7 @@ def _refuse_foreign_source(
         }[cell]
         raise InstallError(
             f"{path} is {calibration.source} and is not installed on a {cell} cell. {hint} "
-            f"Files from elsewhere have their own place: calibrate install --cell {kind} --root FOLDER {path}"
+            f"Files from elsewhere have their own place: {install_line(calibration.source, path)}"
         )
     if before is not None and _CELL_OF[before.source] != kind:
         raise InstallError(

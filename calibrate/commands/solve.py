@@ -18,7 +18,7 @@ from calibrate.commands.output import AsJson, check_target, detection_progress, 
 from calibrate.errors import CalibrationError
 from calibrate.frames import camera_frames
 from calibrate.geometry import rotation_log
-from calibrate.install import load_installed
+from calibrate.install import install_line, load_installed
 from calibrate.pipeline import JobOptions, SolvedRecording, prepare_views, solve_recording, solver_options
 from calibrate.solution import PeerResult
 from calibrate.summary import summary
@@ -59,7 +59,7 @@ def solve(
         out.print(summary(job.calibration))
         out.print(f"written: {target}" + ("" if report is None else f"  report: {report}"))
         if job.passed:
-            out.print(f"next: calibrate install {target}")
+            out.print(f"next: {install_line(job.calibration.source, target)}")
     if not job.passed:
         raise typer.Exit(GATE_FAILED)
 

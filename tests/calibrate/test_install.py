@@ -23,7 +23,7 @@ from calibrate.calibration import (
 from calibrate.gates import Gate
 from calibrate.generations import InstallError, generations, read_log
 from calibrate.geometry import Transform, perturb
-from calibrate.install import InstallGateError, install, load_installed, rollback
+from calibrate.install import InstallGateError, install, install_line, load_installed, rollback
 from calibrate.pipeline import SolvedRecording
 
 
@@ -43,6 +43,13 @@ def make_file(solved_real: SolvedRecording, tmp_path: Path):  # type: ignore[no-
         return path
 
     return make
+
+
+def test_the_next_step_of_a_solve_is_one_that_works() -> None:
+    assert install_line("real", Path("c.yaml")) == "calibrate install c.yaml"
+    assert install_line("playback", Path("c.yaml")) == (
+        "calibrate install --cell simulated --root FOLDER c.yaml"
+    )
 
 
 def test_install_list_rollback(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]

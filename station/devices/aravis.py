@@ -139,7 +139,7 @@ class AravisCamera:
         """The device; opened again, by its serial, after it was lost."""
         if self._device is None:
             raise CameraError("the camera is not open")
-        if self._device.lost.is_set():
+        if self._device.lost:
             self._device.close()
             self._open()
         return self._device
@@ -178,7 +178,7 @@ class AravisCamera:
             try:
                 picture = device.frame(_STREAM_POP_S)
             except CameraError:
-                if device.lost.is_set():
+                if device.lost:
                     raise
                 continue  # incomplete: the next frame's id shows the gap, and the counter counts it
             if picture is not None:

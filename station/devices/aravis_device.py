@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import threading
 import time
 import warnings
 from contextlib import contextmanager, suppress
@@ -63,8 +62,21 @@ class GenicamDevice:
         self._stream: Any = None
         self._region = (0, 0, 0, 0)
         self._latched_ns: int | None = None
-        self.lost = threading.Event()
+        self._controls = False
+        self._lost = False
         self.identity = CameraIdentity(driver="aravis")
+
+    @property
+    def lost(self) -> bool:
+        """Gone without our doing, as far as is known by now. From any thread.
+
+        Polled: while a handler of Aravis's `control-lost` runs, a thread of Aravis holds the device. When that
+        becomes the last reference, the thread waits for its own end, and GLib ends the process.
+        """
+        camera = self._camera
+        if self._controls and camera is not None and not camera.get_device().is_controller():
+            self._lost = True
+        return self._lost
 
     def open(self, serial: str = "") -> CameraIdentity:
         """Finds, sets up and starts the camera. `serial`: only this very one."""
@@ -79,7 +91,7 @@ class GenicamDevice:
     def _open(self, wanted: str) -> None:
         with self._explained("opening the camera"):
             self._camera = self._aravis.Camera.new(_find(self._aravis, wanted))
-            self._camera.get_device().connect("control-lost", lambda _: self.lost.set())
+            self._controls = self._camera.is_gv_device() and self._camera.get_device().is_controller()
             self.identity = CameraIdentity(
                 vendor=self._camera.get_vendor_name() or "",
                 model=self._camera.get_model_name() or "unknown",
@@ -105,8 +117,9 @@ class GenicamDevice:
 
     def close(self) -> None:
         """Takes seconds when the camera is gone; never raises."""
-        camera, self._camera, self._stream = self._camera, None, None
-        if camera is None or self.lost.is_set():
+        lost, camera = self.lost, self._camera
+        self._camera = self._stream = None
+        if camera is None or lost:
             return
         try:
             camera.stop_acquisition()
@@ -114,7 +127,7 @@ class GenicamDevice:
                 # Others may hold a reference still, in a traceback for instance: let go of the camera now.
                 camera.get_device().leave_control()
         except self._glib.Error:
-            self.lost.set()
+            self._lost = True
 
     def _set_up(self) -> None:
         camera, config = self._camera, self._config
@@ -235,7 +248,7 @@ class GenicamDevice:
         end_s = time.monotonic() + timeout_s
         buffer = None
         while buffer is None:
-            if self.lost.is_set():
+            if self.lost:
                 raise CameraError(f"{self._name} is gone (cable, power?); it is opened again when it is back")
             left_s = end_s - time.monotonic()
             if left_s <= 0:
@@ -254,7 +267,7 @@ class GenicamDevice:
             try:
                 return self.frame(left_s)
             except CameraError:
-                if self.lost.is_set():
+                if self.lost:
                     raise
         return None
 
@@ -292,13 +305,13 @@ class GenicamDevice:
 
     @contextmanager
     def _explained(self, doing: str) -> Iterator[None]:
-        if self.lost.is_set():
+        if self.lost:
             raise CameraError(f"{self._name} is gone (cable, power?); it is opened again when it is back")
         try:
             yield
         except self._glib.Error as error:
-            if error.matches(self._aravis.device_error_quark(), self._aravis.DeviceError.TIMEOUT):
-                self.lost.set()
+            gone = (self._aravis.DeviceError.TIMEOUT, self._aravis.DeviceError.NOT_CONNECTED)
+            self._lost |= any(error.matches(self._aravis.device_error_quark(), code) for code in gone)
             raise CameraError(f"{doing} failed: {error.message}") from error
 
 

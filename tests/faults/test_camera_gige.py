@@ -6,6 +6,8 @@ import asyncio
 import os
 import random
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -155,6 +157,35 @@ async def test_an_unplugged_camera_is_gone_and_comes_back_by_its_serial(server: 
             assert camera.identity.serial == "KJ0042"
     finally:
         await camera.close()
+
+
+_LOST_AND_FORGOTTEN = """
+import gc, sys, time
+from station.config import CameraConfig
+from station.devices.aravis_device import GenicamDevice
+from station.simulation.gige_launch import start_gige
+
+with start_gige(numbered=True, serial="KJ0042") as server:
+    device = GenicamDevice(CameraConfig(device="127.0.0.1", packet_size=8996))
+    device.open()
+    device._stream = None
+    gc.collect()
+    server.process.kill()
+    sys.setswitchinterval(100)  # a handler called in Aravis's thread has to wait for the loop below
+    until_s = time.monotonic() + 10.0  # Aravis gives up the camera in 4 to 7 s
+    while time.monotonic() < until_s:
+        pass
+    assert device.lost
+    device._camera = None  # the last reference of ours
+time.sleep(1)
+print("alive")
+"""
+
+
+def test_a_camera_let_go_while_its_loss_is_told_does_not_end_the_process(lonely_network: None) -> None:
+    command = [sys.executable, "-c", _LOST_AND_FORGOTTEN]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+    assert done.stdout == "alive\n", f"{done.returncode}: {done.stderr}"
 
 
 async def test_a_frozen_camera_is_noticed_and_used_again_after_it_thaws(server: SimulatedGige) -> None:

@@ -70,8 +70,8 @@ class GenicamDevice:
     def lost(self) -> bool:
         """Gone without our doing, as far as is known by now. From any thread.
 
-        Polled: while a handler of Aravis's `control-lost` runs, a thread of Aravis holds the device. When that
-        becomes the last reference, the thread waits for its own end, and GLib ends the process.
+        Polled: while a handler of Aravis's `control-lost` runs, a thread of Aravis holds the device. When
+        that becomes the last reference, the thread waits for its own end, and GLib ends the process.
         """
         camera = self._camera
         if self._controls and camera is not None and not camera.get_device().is_controller():

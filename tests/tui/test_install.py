@@ -63,16 +63,20 @@ async def press_on_result(pilot: Pilot[None], calibration: Path, *keys: str) -> 
     await pilot.press(*keys)
 
 
+async def install_until_a_reason_is_asked_for(pilot: Pilot[None], calibration: Path) -> None:
+    await press_on_result(pilot, calibration, "i")
+    await until(pilot, lambda: isinstance(pilot.app.screen, Confirm))
+    await pilot.press("tab", "enter")
+    await until(pilot, lambda: isinstance(pilot.app.screen, Reason))
+
+
 def said(pilot: Pilot[None]) -> str:
     return " ".join(notice.message for notice in pilot.app._notifications)
 
 
 async def test_who_overrules_gives_a_reason(link: FakeLink, asked: Path, calibration: Path) -> None:
     async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
-        await press_on_result(pilot, calibration, "i")
-        await until(pilot, lambda: isinstance(pilot.app.screen, Confirm))
-        await pilot.press("tab", "enter")
-        await until(pilot, lambda: isinstance(pilot.app.screen, Reason))
+        await install_until_a_reason_is_asked_for(pilot, calibration)
         shown = " ".join(str(part.render()) for part in pilot.app.screen.query(Static))
         assert "corner 0 is off" in shown
         assert OVERRIDE not in shown  # that is the shell's word
@@ -88,10 +92,7 @@ async def test_who_overrules_gives_a_reason(link: FakeLink, asked: Path, calibra
 
 async def test_who_does_not_installs_nothing(link: FakeLink, asked: Path, calibration: Path) -> None:
     async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
-        await press_on_result(pilot, calibration, "i")
-        await until(pilot, lambda: isinstance(pilot.app.screen, Confirm))
-        await pilot.press("tab", "enter")
-        await until(pilot, lambda: isinstance(pilot.app.screen, Reason))
+        await install_until_a_reason_is_asked_for(pilot, calibration)
         await pilot.press("escape")
         await until(pilot, lambda: "Nothing was installed" in said(pilot))
     assert len(asked.read_text().splitlines()) == 1

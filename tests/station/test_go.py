@@ -5,7 +5,9 @@ from __future__ import annotations
 import pytest
 
 from station.errors import RefusedError
+from station.plan.model import Plan
 from station.session.lease import GO_LIFETIME_S, START_TOLERANCE_RAD, Go, GoDesk, LeaseDesk
+from station.session.queue import PoseQueue, Replanned
 from station.status import GoSummary
 
 HERE = (0.0, -1.5, 1.5, -1.5, -1.5, 0.0)
@@ -19,9 +21,9 @@ class Clock:
         return self.now_s
 
 
-def offered(desk: GoDesk, client_id: int = 1) -> Go:
+def offered(desk: GoDesk, client_id: int = 1, replanned: Replanned | None = None) -> Go:
     summary = GoSummary(desk.new_token(), "run plan", PLAN, 4, 1.0, 0.5, 0.2, 30.0, "84 mm and 22° to pose 1")
-    return desk.offer(summary, client_id, HERE, (0, 1, 2, 3))
+    return desk.offer(summary, client_id, HERE, (0, 1, 2, 3), replanned=replanned)
 
 
 def test_a_go_is_for_one_use() -> None:
@@ -58,6 +60,17 @@ def test_a_go_is_bound_to_what_was_shown_and_a_wrong_try_voids_it(
         )
     with pytest.raises(RefusedError):
         desk.redeem(token, 1, PLAN, HERE)
+
+
+def test_improved_poses_go_only_into_the_plan_they_were_made_for() -> None:
+    desk, before = GoDesk(Clock()), "ef" * 32
+    better = Replanned(PoseQueue(Plan(robot="UR10", mount="eye-in-hand", poses=())), before, ())
+    for plan in (PLAN, "cd" * 32):
+        token = offered(desk, replanned=better).summary.token
+        with pytest.raises(RefusedError, match="plan changed"):
+            desk.redeem(token, 1, plan, HERE)
+    go = offered(desk, replanned=better)
+    assert desk.redeem(go.summary.token, 1, before, HERE) == go
 
 
 def test_a_newer_go_replaces_the_older_and_void_ends_both() -> None:

@@ -203,13 +203,13 @@ class UrRobot(UrLink):
 
     async def _ask_remote(self, error: BaseException) -> BaseException:
         """A program that just stopped may have been stopped by the switch to local control."""
-        if isinstance(error, RobotError) and self.remote and self.dashboard is not None:
+        if not isinstance(error, RobotError) or isinstance(error, SafetyStopError):
+            return error
+        if self.remote and self.dashboard is not None:
             with contextlib.suppress(RobotError, TimeoutError):
                 async with asyncio.timeout(0.3):
                     self.remote = await self.dashboard.remote()
-            if self.remote is False and not isinstance(error, SafetyStopError):
-                return RobotError(LOCAL_CONTROL)
-        return error
+        return RobotError(LOCAL_CONTROL) if self.remote is False else error
 
     # -- stopping ---------------------------------------------------------------------------------------
 

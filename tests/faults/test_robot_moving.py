@@ -55,6 +55,17 @@ async def test_something_on_the_pendant(
     await c.stays_at_rest()
 
 
+async def test_the_switch_to_local_is_named_although_the_supervision_saw_it_first(cell: Make) -> None:
+    c = await cell("UR10e")
+
+    def go_local() -> None:
+        c.admin.ask(cmd="remote", on=False)
+        c.robot.remote = False
+
+    outcome = await c.strike(go_local)
+    assert "switch the pendant to Remote" in str(outcome.error)
+
+
 async def test_a_program_paused_on_the_pendant_does_not_go_on_when_play_is_pressed(cell: Make) -> None:
     c = await cell()
     await c.strike(lambda: c.admin.ask("pause"))

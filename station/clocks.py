@@ -14,6 +14,10 @@ import time
 from collections import deque
 from dataclasses import dataclass
 
+import numpy as np
+
+from calibrate.geometry import Array
+
 BINS = 300
 LEAST_BINS = 5
 STRETCHES = 10
@@ -23,6 +27,9 @@ DRIFT_SPAN_S = 5.0
 DRIFT_LIMIT = 500e-6
 """Quartz clocks are far better; a steeper edge comes from too few arrivals."""
 UNFITTED_DRIFT = 100e-6
+REFIT_SHARE = 0.05
+"""A fit stays the newest one until the span has grown by so much of it, or REFIT_S has passed."""
+REFIT_S = 1.0
 
 
 def monotonic_from_wall_ns(wall_ns: int) -> int:
@@ -90,7 +97,6 @@ class ClockEstimator:
         self._newest_s = 0.0
         self._samples = 0
         self._fit: ClockFit | None = None
-        self._fitted_bin_s = 0.0
         self._lock = threading.Lock()
 
     def add(self, device_s: float, host_monotonic_ns: int) -> None:
@@ -127,62 +133,71 @@ class ClockEstimator:
         self._bin_s *= 2
 
     def fit(self) -> ClockFit | None:
-        """The newest estimate; None before there is enough to say anything."""
+        """The newest estimate; None before there is enough to say anything.
+
+        Whoever adds arrivals waits for copying only, never for the estimate.
+        """
         with self._lock:
-            if len(self._bins) < LEAST_BINS:
-                return None
-            if self._fit is None or self._fitted_bin_s != self._bin_start_s:
-                self._fit = self._estimate(list(self._bins))
-                self._fitted_bin_s = self._bin_start_s
-            return self._fit
+            if len(self._bins) < LEAST_BINS or self._is_fresh(self._fit):
+                return self._fit
+            points, newest_s, samples = np.array(self._bins), self._newest_s, self._samples
+        fit = _estimate(points, newest_s, samples, self.latency_s)
+        with self._lock:
+            if self._bins and self._samples >= samples:  # not forgotten meanwhile
+                self._fit = fit
+        return fit
 
-    def _estimate(self, points: list[tuple[float, float]]) -> ClockFit:
-        span_s = points[-1][0] - points[0][0]
-        if span_s < DRIFT_SPAN_S:
-            drift, (at_s, gap_ns) = 0.0, min(points, key=lambda p: p[1])
-        else:
-            drift, (at_s, gap_ns) = _supporting_line(points)
-        offset_ns = gap_ns + drift * (self._newest_s - at_s) * 1e9
-        above = [(d, g - offset_ns - drift * (d - self._newest_s) * 1e9) for d, g in points]
-        residual_s = _worst_best(above, points[0][0], span_s) / 1e9
-        uncertainty = UNFITTED_DRIFT if span_s < DRIFT_SPAN_S else min(UNFITTED_DRIFT, residual_s / span_s)
-        return ClockFit(
-            reference_s=self._newest_s,
-            offset_ns=offset_ns,
-            drift=drift,
-            residual_s=residual_s,
-            drift_uncertainty=uncertainty,
-            latency_s=self.latency_s,
-            samples=self._samples,
-            span_s=span_s,
-        )
+    def _is_fresh(self, fit: ClockFit | None) -> bool:
+        return fit is not None and self._newest_s - fit.reference_s < min(REFIT_S, REFIT_SHARE * fit.span_s)
 
 
-def _supporting_line(points: list[tuple[float, float]]) -> tuple[float, tuple[float, float]]:
-    """Slope (seconds per second) and one point of the lower hull's edge above the middle of the points."""
-    hull: list[tuple[float, float]] = []
-    for p in points:
-        while len(hull) >= 2 and _turns_right(hull[-2], hull[-1], p):
+def _estimate(points: Array, newest_s: float, samples: int, latency_s: float) -> ClockFit:
+    """points: (n, 2), device time [s] and smallest host − device [ns] of each bin, oldest first."""
+    device_s, gaps_ns = points.T
+    span_s = float(device_s[-1] - device_s[0])
+    drift, support = 0.0, int(gaps_ns.argmin())
+    if span_s >= DRIFT_SPAN_S:
+        drift, support = _supporting_line(points)
+    line_ns = gaps_ns[support] + drift * (device_s - device_s[support]) * 1e9
+    residual_s = _worst_best(gaps_ns - line_ns, device_s) / 1e9
+    return ClockFit(
+        reference_s=newest_s,
+        offset_ns=float(gaps_ns[support] + drift * (newest_s - device_s[support]) * 1e9),
+        drift=drift,
+        residual_s=residual_s,
+        drift_uncertainty=(
+            UNFITTED_DRIFT if span_s < DRIFT_SPAN_S else min(UNFITTED_DRIFT, residual_s / span_s)
+        ),
+        latency_s=latency_s,
+        samples=samples,
+        span_s=span_s,
+    )
+
+
+def _supporting_line(points: Array) -> tuple[float, int]:
+    """Slope (seconds per second) and a point (its row) of the lower hull's edge above the points' middle."""
+    hull: list[int] = []
+    rows = points.tolist()  # Python's floats: the chain is a loop
+    for i, row in enumerate(rows):
+        while len(hull) >= 2 and _turns_right(rows[hull[-2]], rows[hull[-1]], row):
             hull.pop()
-        hull.append(p)
-    middle_s = sum(d for d, _ in points) / len(points)
-    right = next(i for i, (d, _) in enumerate(hull) if d >= middle_s or i == len(hull) - 1)
-    (d0, g0), (d1, g1) = hull[max(right, 1) - 1], hull[max(right, 1)]
+        hull.append(i)
+    right = max(1, int(np.searchsorted(points[hull, 0], points[:, 0].mean())))
+    (d0, g0), (d1, g1) = rows[hull[right - 1]], rows[hull[right]]
     drift = (g1 - g0) / (d1 - d0) / 1e9
     if abs(drift) <= DRIFT_LIMIT:
-        return drift, (d0, g0)
-    return 0.0, min(points, key=lambda p: p[1])
+        return drift, hull[right - 1]
+    return 0.0, int(points[:, 1].argmin())
 
 
-def _worst_best(points: list[tuple[float, float]], begin_s: float, span_s: float) -> float:
+def _worst_best(above_ns: Array, device_s: Array) -> float:
     """The largest among the smallest values of each stretch of time: how well the line is held everywhere."""
-    best: dict[int, float] = {}
-    for d, value in points:
-        stretch = min(STRETCHES - 1, int(STRETCHES * (d - begin_s) / span_s)) if span_s > 0 else 0
-        best[stretch] = min(value, best.get(stretch, value))
-    return max(best.values())
+    begin_s, end_s = device_s[0], device_s[-1]
+    edges_s = np.linspace(begin_s, end_s, STRETCHES, endpoint=False)
+    starts = np.unique(np.searchsorted(device_s, edges_s))
+    return float(np.minimum.reduceat(above_ns, starts).max())
 
 
-def _turns_right(a: tuple[float, float], b: tuple[float, float], c: tuple[float, float]) -> bool:
+def _turns_right(a: list[float], b: list[float], c: list[float]) -> bool:
     """b lies on or above the line a–c, so that it is not part of the lower hull."""
     return (b[1] - a[1]) * (c[0] - a[0]) >= (c[1] - a[1]) * (b[0] - a[0])

@@ -75,6 +75,16 @@ def test_a_few_late_arrivals_change_nothing() -> None:
     assert fit(disturbed).to_host_ns(9.0) == pytest.approx(fit(clean).to_host_ns(9.0), abs=1000)
 
 
+def test_an_estimate_is_made_anew_when_a_second_has_passed() -> None:
+    clock = ClockEstimator()
+    _, last = feed(clock, 60, 125, drift_ppm=20.0, delay_s=0.001, seed=7)
+    before = fit(clock)
+    clock.add(last + 0.5, host_ns(last + 0.5, 20.0))
+    assert fit(clock) is before
+    clock.add(last + 1.1, host_ns(last + 1.1, 20.0))
+    assert fit(clock).reference_s == pytest.approx(last + 1.1)
+
+
 def test_there_and_back() -> None:
     clock = ClockEstimator()
     feed(clock, 20, 125, drift_ppm=-80, delay_s=0.001, seed=2)

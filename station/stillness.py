@@ -108,6 +108,15 @@ class StillnessMonitor:
             )
         return ", ".join(parts)
 
+    @property
+    def at_rest(self) -> bool:
+        """By the joints alone; asked often, so an arm in motion costs next to nothing."""
+        states = self._states.copy()
+        if not states or max(map(abs, states[-1].joint_speeds_rad_s)) > self._limits.joint_speed_rad_s:
+            return False
+        found = self.measure()
+        return found is not None and not self.unrest(found)
+
     async def settle(
         self,
         alive: Callable[[], object],

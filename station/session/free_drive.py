@@ -127,8 +127,7 @@ class FreeDrive:
                     self._bench.store.event(str(error), "warning")
 
     def _at_rest_elsewhere(self) -> bool:
-        still = self._bench.stillness.measure()
-        if still is None or self._bench.stillness.unrest(still):
+        if not self._bench.stillness.at_rest:
             return False
         joints = self._bench.cell.robot.latest().joints_rad
         last = self._last_place

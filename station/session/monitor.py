@@ -79,7 +79,6 @@ class Monitor:
             state = robot.latest()
         except RobotError:
             return base
-        still = bench.stillness.measure()
         return msgspec.structs.replace(
             base,
             connected=True,
@@ -91,7 +90,7 @@ class Monitor:
             slider=round(state.target_speed_fraction, 3),
             joints_rad=state.joints_rad,
             base_from_flange=matrix4(flange_pose(state, identity.tcp_offset)),
-            still=still is not None and not bench.stillness.unrest(still),
+            still=bench.stillness.at_rest,
         )
 
     def _speed_m_s(self, state: RobotState) -> float:

@@ -56,6 +56,7 @@ def test_a_resting_arm_is_still() -> None:
     shake(m, 0.5, 0.0)
     found = m.measure()
     assert found is not None and m.unrest(found) == ""
+    assert m.at_rest
     assert found.window_s == pytest.approx(0.3, abs=0.01)
     assert found.position_scatter_m < 1e-12 and found.max_joint_speed_rad_s == 0.0
 
@@ -69,6 +70,9 @@ def test_a_shaking_arm_is_measured() -> None:
     radius_m = math.hypot(0.5723 + 0.1157, 0.612)  # of the flange about the shoulder, roughly
     assert found.position_scatter_m == pytest.approx(0.001 * radius_m, rel=0.5)
     assert "shoulder moves at 2.8" in m.unrest(found) and "scatters by" in m.unrest(found)
+    assert not m.at_rest
+    m.add(state(1.0))
+    assert not m.at_rest  # it rests now, but not for long enough
 
 
 def test_a_slow_creep_is_no_rest_although_no_speed_is_reported() -> None:
@@ -77,6 +81,7 @@ def test_a_slow_creep_is_no_rest_although_no_speed_is_reported() -> None:
         m.add(state(i * 0.008, joint_rad=0.001 * i * 0.008))
     found = m.measure()
     assert found is not None and "scatters" in m.unrest(found)
+    assert not m.at_rest
 
 
 def test_the_picture_has_a_say() -> None:

@@ -1,8 +1,9 @@
 """From one taught view of the board to a first camera mount and board place, by a few small safe moves.
 
 The mount is known only to about 30° and 100 mm. Each move is chosen so that for every mount the views so
-far allow, the board stays in the picture, the camera comes no nearer to the board than it was taught, and
-nothing comes too close. After each picture the belief is updated; when it is good enough the plan is made.
+far allow, the board is in the picture at its end, the camera comes no nearer to the board than it was
+taught, on the way too, and nothing comes too close. After each picture the belief is updated; when it is good
+enough the plan is made.
 """
 
 from __future__ import annotations
@@ -21,7 +22,7 @@ from calibrate.kinematics import RobotModel, forward, inverse_nearest
 from station.collision import CellGeometry, margins
 from station.config import StationConfig
 from station.errors import LimitError
-from station.limits import SPACING_M
+from station.limits import SPACING_M, joint_bounds
 from station.plan.belief import Belief, Glimpse, believe, board_place, expected_after, seen_from, spread_of
 from station.plan.describe import planned_pose
 from station.plan.model import PlannedPose
@@ -39,6 +40,10 @@ _BACK_M = (0.0, 0.02, 0.05, 0.10)
 _BORDER_PX = 15.0
 _NEARER_M = 0.001
 """What counts as not nearer."""
+_ON_THE_WAY = 17
+"""Places along a move where that is looked at; in between the way bends by tenths of a millimetre."""
+_MOST_TURN_RAD = 1.0
+"""No joint turns further in one move: another posture of the arm is no small move."""
 
 
 def next_move(config: StationConfig, glimpses: Sequence[Glimpse]) -> PlannedPose | None:
@@ -64,15 +69,19 @@ def next_move(config: StationConfig, glimpses: Sequence[Glimpse]) -> PlannedPose
         passed = _passing(allowed, here, targets)
         gain = [spread_of(expected_after(config, glimpses, belief, forward(model, q))) for q in passed]
         for place in np.argsort(gain, kind="stable"):
-            if _free_in_all(cells, here, passed[place]):
+            way_is_free = _free_in_all(cells, here, passed[place])
+            if way_is_free and _keeps_away(config, glimpses[0], samples, here, passed[place]):
                 return _described(config, glimpses[0], belief, moves, passed[place])
     raise LimitError(_no_move(belief, in_view))
 
 
 def _passing(cell: CellGeometry, here: Array, targets: Array) -> Array:
-    """Joints (k, 6) of the flange poses (n, 4, 4) that a free direct move from `here` leads to."""
+    """Joints (k, 6) of the flange poses (n, 4, 4) that a short and free direct move from `here` leads to."""
     found = [inverse_nearest(cell.model, target, here) for target in targets]
     joints = np.array([q for q in found if q is not None]).reshape(-1, 6)
+    low, high = joint_bounds(cell)
+    near = np.abs(joints - here) <= _MOST_TURN_RAD
+    joints = joints[(near & (joints >= low) & (joints <= high)).all(axis=1)]
     times = move_times(cell, np.broadcast_to(here, joints.shape), joints)
     return joints[np.isfinite(times)]
 
@@ -107,8 +116,8 @@ def _no_move(belief: Belief, in_view: int) -> str:
         )
     return (
         f"{in_view} small moves keep the board in the picture, but none is free for every {mount}: the arm's "
-        "reach, its joints or what stands around it are in the way. Teach a view with more room around the "
-        "arm, or measure the mount better (camera_guess)."
+        "reach, its joints or what stands around it are in the way, or the camera would come nearer on the "
+        "way. Teach a view with more room around the arm, or measure the mount better (camera_guess)."
     )
 
 
@@ -211,13 +220,31 @@ def _stays_in_view(
     camera = config.camera.model
     assert camera is not None
     rim = outline(config.board)
-    nearest_m = float(np.linalg.norm(transform_points(taught.camera_from_board, rim), axis=-1).min())
+    nearest_m = float(_away_m(config, taught.camera_from_board))
     good = np.ones(len(targets), dtype=bool)
     for X in samples:
-        points = transform_points(seen_from(config, taught, X, targets), rim)
-        good &= visible(camera, points, _BORDER_PX)
-        good &= np.linalg.norm(points, axis=-1).min(axis=1) >= nearest_m - _NEARER_M
+        seen = seen_from(config, taught, X, targets)
+        good &= visible(camera, transform_points(seen, rim), _BORDER_PX)
+        good &= _away_m(config, seen) >= nearest_m - _NEARER_M
     return good
+
+
+def _keeps_away(config: StationConfig, taught: Glimpse, samples: Array, here: Array, joints: Array) -> bool:
+    """Whether for every possible mount the camera comes no nearer on the way than it was taught, or is."""
+    way = forward(arm_model(config), here + np.linspace(0, 1, _ON_THE_WAY)[:, None] * (joints - here))
+    taught_m = float(_away_m(config, taught.camera_from_board))
+    for X in samples:
+        away_m = _away_m(config, seen_from(config, taught, X, way))
+        if away_m.min() < min(taught_m, float(away_m[0])) - _NEARER_M:
+            return False
+    return True
+
+
+def _away_m(config: StationConfig, camera_from_board: Array) -> Array:
+    """(...) distance from the camera to the nearest point of the board's outline, for poses (..., 4, 4)."""
+    return np.asarray(
+        np.linalg.norm(transform_points(camera_from_board, outline(config.board)), axis=-1).min(axis=-1)
+    )
 
 
 def _described(

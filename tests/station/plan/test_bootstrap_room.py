@@ -4,19 +4,23 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 import pytest
 
-from calibrate.geometry import inverse, pose, rotation_exp
-from calibrate.kinematics import MODELS, forward, link_frames
+from calibrate.board import board_points
+from calibrate.geometry import inverse, pose, rotation_exp, transform_points
+from calibrate.kinematics import MODELS, forward, inverse_nearest, link_frames
 from recordings.messages import CameraModel
 from station.collision import margins
 from station.config import PAPER_BOARD, CameraConfig, LimitsConfig, Plane, RobotConfig, StationConfig
 from station.errors import LimitError
 from station.limits import check_path
+from station.plan import bootstrap
 from station.plan.belief import Glimpse
 from station.plan.bootstrap import as_taught, next_move
 from station.plan.scene import cell_geometry, geometry_of
+from station.plan.visibility import outline
 from station.simulation.placement import guess_of
 
 ARM = MODELS["UR10"]
@@ -73,6 +77,47 @@ def test_a_move_that_the_daemon_would_refuse_is_not_preferred():
     move = next_move(guessed, [GLIMPSE])
     assert move is not None
     assert check_path(cell_geometry(guessed), TAUGHT, move.joints_rad, "move").problems == ()
+
+
+def test_the_configured_joint_range_is_kept():
+    """The daemon would refuse what is beyond it."""
+    cell = config(X, 0.005, 0.03)
+    move = next_move(cell, [GLIMPSE])
+    assert move is not None
+    turned = np.subtract(move.joints_rad, TAUGHT)
+    joint = int(np.abs(turned).argmax())
+    low, high = np.full(6, -2 * np.pi), np.full(6, 2 * np.pi)
+    (high if turned[joint] > 0 else low)[joint] = TAUGHT[joint] + turned[joint] / 2
+    limits = msgspec.structs.replace(cell.limits, joints_min_rad=tuple(low), joints_max_rad=tuple(high))
+    move = next_move(msgspec.structs.replace(cell, limits=limits), [GLIMPSE])
+    assert move is not None
+    assert (low <= move.joints_rad).all() and (move.joints_rad <= high).all()
+
+
+def test_no_joint_turns_far():
+    """Here the most telling view is reached by another posture of the arm, its base turned by 147°."""
+    move = next_move(config(X, 0.005, 0.03), [GLIMPSE])
+    assert move is not None
+    assert np.abs(np.subtract(move.joints_rad, TAUGHT)).max() <= np.deg2rad(60)
+
+
+def test_the_camera_comes_no_nearer_on_the_way_either(monkeypatch):
+    """A turn about the board ends further away than it began, but the arm cuts the corner."""
+    E = forward(ARM, TAUGHT)
+    centre = transform_points(Y, board_points(PAPER_BOARD).mean(axis=0))
+    back = (E @ X)[:3, 3] - centre
+    turn = rotation_exp(np.deg2rad(-20) * Y[:3, 0])
+    there = pose(turn @ E[:3, :3], turn @ (E[:3, 3] - centre) + centre + 0.03 * back / np.linalg.norm(back))
+    joints = inverse_nearest(ARM, there, TAUGHT)
+    assert joints is not None
+    way = forward(ARM, TAUGHT + np.linspace(0, 1, 40)[:, None] * (joints - TAUGHT)) @ X
+    rim = transform_points(Y, outline(PAPER_BOARD))
+    away_m = np.linalg.norm(way[:, None, :3, 3] - rim, axis=-1).min(axis=1)
+    assert away_m[-1] > away_m[0] > away_m.min() + 0.004
+    monkeypatch.setattr(bootstrap, "_targets", lambda *_: there[None])
+    monkeypatch.setattr(bootstrap, "_any_direction", lambda *_: there[None])
+    with pytest.raises(LimitError, match="nearer on the way"):
+        next_move(config(X, 0.001, 0.005), [GLIMPSE])
 
 
 def test_no_move_when_no_mount_goes_with_where_the_arm_stands():

@@ -1,10 +1,18 @@
-"""fdatasync beside the writer: what comes meanwhile still reaches the operating system."""
+"""fdatasync beside the writer: what comes meanwhile still reaches the operating system.
+
+What is on the disk leaves the computer's memory again, but for the newest part: a stream of gigabytes would
+fill it with pages that nobody reads, and a computer that has to find free memory halts everything for tenths
+of a second, the arm's heartbeat too.
+"""
 
 from __future__ import annotations
 
 import os
 import threading
 import time
+
+KEPT_IN_MEMORY_BYTES = 256 * 2**20
+"""Of one file: a session of single pictures stays for the solve that follows."""
 
 
 class BackgroundSync:
@@ -38,6 +46,9 @@ class BackgroundSync:
         start_s = time.monotonic()
         try:
             os.fdatasync(self._descriptor)
+            surplus = os.fstat(self._descriptor).st_size - KEPT_IN_MEMORY_BYTES
+            if surplus > 0:  # a length of 0 would mean all of it
+                os.posix_fadvise(self._descriptor, 0, surplus, os.POSIX_FADV_DONTNEED)
         except OSError as error:
             self._error = error
         self.last_s = time.monotonic() - start_s

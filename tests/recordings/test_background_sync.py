@@ -1,0 +1,44 @@
+"""A stream does not fill the computer's memory."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+from pathlib import Path
+
+import pytest
+
+from recordings import background_sync
+from recordings.background_sync import BackgroundSync
+
+MIB = 2**20
+
+
+def in_memory_bytes(path: Path) -> int:
+    """Of the file, as the kernel tells."""
+    command = ["fincore", "--bytes", "--noheadings", "--output", "RES", str(path)]
+    return int(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
+
+
+@pytest.mark.skipif(shutil.which("fincore") is None, reason="fincore (util-linux) is not installed")
+def test_what_is_on_the_disk_leaves_the_memory_but_for_the_newest_part(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(background_sync, "KEPT_IN_MEMORY_BYTES", MIB)
+    path = tmp_path / "stream"
+    with path.open("wb", buffering=0) as file:
+        sync = BackgroundSync(file.fileno())
+        for _ in range(4):
+            file.write(os.urandom(2 * MIB))
+            sync.begin()
+        sync.wait()
+    if in_memory_bytes(path) == 8 * MIB and _keeps_everything(path):
+        pytest.skip("this file system keeps its files in memory")
+    assert MIB <= in_memory_bytes(path) <= 2 * MIB
+
+
+def _keeps_everything(path: Path) -> bool:
+    with path.open("rb") as file:
+        os.posix_fadvise(file.fileno(), 0, 0, os.POSIX_FADV_DONTNEED)
+    return in_memory_bytes(path) > 0

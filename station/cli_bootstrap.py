@@ -31,6 +31,8 @@ from station.plan.model import Plan, PlannedPose
 
 _STRAYED_RAD = 0.01
 """Somebody moved the arm: the next move was checked from elsewhere."""
+_JOINT_SPEED_RAD_S, _JOINT_ACCELERATION_RAD_S2 = 0.2, 0.5
+"""Slow: speed is capped at the modelled camera, and the true one may be 100 mm from there."""
 
 
 class BootstrapError(StationError):
@@ -45,7 +47,13 @@ def bootstrap_command(
     headless: Headless = False,
     socket: Socket = None,
 ) -> None:
-    """Find mount and board by 3 to 5 small moves from a taught view; each is asked for. Ctrl-C is STOP."""
+    """Find mount and board by 3 to 5 small moves from a taught view; each is asked for. Ctrl-C is STOP.
+
+    First jog the arm to where the camera sees the whole board in the middle of its picture: that is the
+    taught view. The configuration holds `camera_guess`, good to about 30° and 100 mm, and `camera.model`.
+
+    Exit codes: 0 the guesses are good enough for a plan, 3 they are not yet, 1 refused or failed.
+    """
     cell, _ = load_config(config)
     if cell.camera.model is None or cell.camera.model.matrix is None:
         raise ConfigError("bootstrap needs camera.model with width, height and a rough matrix")
@@ -78,7 +86,7 @@ def _make_moves(cell: StationConfig, socket: Path | None, headless: bool) -> lis
     """The taught view and those after each move. Every one is a session of its own, with its own go."""
     path = socket or default_socket()
     taught = asyncio.run(_standing(path))
-    move: PlannedPose | None = PlannedPose("taught", taught, why="the view that was taught; no motion")
+    move: PlannedPose | None = PlannedPose("taught", taught, why="a picture where the arm stands")
     glimpses: list[Glimpse] = []
     views: ViewSet | None = None
     while move is not None:
@@ -105,13 +113,15 @@ def _take(
     cell: StationConfig, move: PlannedPose, before: ViewSet | None, socket: Path, headless: bool
 ) -> tuple[Array, ViewSet]:
     """One go, one picture: the joints (6,) where it was taken, and all views so far."""
-    plan = Plan(cell.robot.model, cell.mount, (move,), note="bootstrap")
+    plan = slow_plan(cell, move)
     outcome = asyncio.run(
         attended_session(socket, "run", headless, "", False, lambda client: load_into(client, plan))
     )
     if not outcome.recording or not outcome.captured:
+        reason = (outcome.status.reason or outcome.status.state.value).rstrip(".")
         raise BootstrapError(
-            f"{move.name}: no picture was saved ({outcome.status.reason or outcome.status.state.value})"
+            f"{move.name}: no picture was saved ({reason}). When that is mended, `station finish` closes "
+            "what is open; then start over from a view with the whole board"
         )
     recording = open_recording(Path(outcome.recording))
     loaded = load_views(recording, cell.board, cell.camera.model, fewest=1).views
@@ -122,6 +132,18 @@ def _take(
         return np.array(view.joints_rad), loaded
     # All views together decide which way round a symmetric board lies.
     return np.array(view.joints_rad), replace(loaded, views=(*before.views, *loaded.views))
+
+
+def slow_plan(cell: StationConfig, move: PlannedPose) -> Plan:
+    """One move of the bootstrap as a plan."""
+    return Plan(
+        cell.robot.model,
+        cell.mount,
+        (move,),
+        joint_speed_rad_s=_JOINT_SPEED_RAD_S,
+        joint_acceleration_rad_s2=_JOINT_ACCELERATION_RAD_S2,
+        note="bootstrap",
+    )
 
 
 async def _standing(socket: Path) -> Vector6:

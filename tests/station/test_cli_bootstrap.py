@@ -14,6 +14,9 @@ import pytest
 import yaml
 
 from calibrate.geometry import difference, pose, pose_from_quaternion, rotation_exp
+from station.analysis import check_run
+from station.cli_bootstrap import slow_plan
+from station.plan.model import Plan, PlannedPose
 from station.plan.planner import make_plan
 from station.simulation.placement import guess_of
 from station.simulation.scenes import build_cell, cell_config
@@ -74,6 +77,18 @@ def test_a_mount_wrong_by_30_degrees_and_100_mm_is_found(socket: Path, tmp_path:
         assert np.rad2deg(np.linalg.norm(off[3:])) < 2, name
     improved = msgspec.convert({**msgspec.to_builtins(bad), **found}, type(bad))
     assert len(make_plan(improved, start_joints_rad=TRUTH.start_joints_rad).poses) == 25
+
+
+def test_its_moves_are_slower_than_those_of_a_plan() -> None:
+    """The speed limit holds for the modelled camera; the true one may be 100 mm from there."""
+    config = cell_config(TRUTH, "127.0.0.1")
+    a, *others = TRUTH.start_joints_rad
+    move = PlannedPose("bootstrap 1", (a + 0.3, *others))
+    usual = check_run(config, Plan(config.robot.model, config.mount, (move,)), TRUTH.start_joints_rad)
+    slow = check_run(config, slow_plan(config, move), TRUTH.start_joints_rad)
+    assert not slow.problems
+    assert slow.moves[0].joint_speed_rad_s <= 0.2 < usual.moves[0].joint_speed_rad_s
+    assert slow.top_speed_m_s < 0.7 * usual.top_speed_m_s
 
 
 def test_without_a_mount_guess_nothing_is_asked_of_the_arm(tmp_path: Path) -> None:

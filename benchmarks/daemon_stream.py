@@ -3,7 +3,8 @@
 The real daemon, without a screen, in a network namespace with only `lo`: a simulated UR10e swings under a go
 given over the control socket, a free-running camera sends 1280×1024 mono8 in packets of 8996 bytes. A minute
 makes a session. Each sealed session is verified by a process of low priority (every picture to the bit,
-numbers, frame ids, the controller's time stamps of all states) and deleted, while the next one is recorded.
+numbers, frame ids, the controller's time stamps of all states) and deleted: from the third minute on while
+the next ones are recorded, the last two afterwards.
 """
 
 from __future__ import annotations
@@ -14,14 +15,14 @@ import os
 import subprocess
 import sys
 import tempfile
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import Future, ProcessPoolExecutor
 from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
-from benchmarks.processes import DaemonUsage, daemon_of_this_process, put_before_others
+from benchmarks.processes import DaemonUsage, daemon_of_this_process, put_before_others, step_behind_others
 from recordings.part import RecordingPart
 from recordings.reader import open_recording
 from station.attend import carry_out, wait_until_idle
@@ -40,7 +41,7 @@ STATE_PERIOD_S = 0.002
 NICENESS = -19
 """Where that is permitted: what else this computer does is not the question."""
 WAITING = 2
-"""Sessions that may wait for their verification"""
+"""Sessions on the disk that wait for their verification"""
 SHARE = float(os.environ.get("BENCH_SHARE", "1"))
 
 
@@ -173,11 +174,12 @@ def long_sweep(status: StationStatus, seconds: float) -> Plan:
 
 
 async def stream(fps: float, seconds: float, root: Path) -> Outcome:
-    verifier = ProcessPoolExecutor(1, initializer=os.nice, initargs=(19,))
+    verifier = ProcessPoolExecutor(1, initializer=step_behind_others)
     verifier.submit(int).result()  # forked before there is much to share
     arguments = ["--gige", "--frame-rate-hz", str(fps), "--robot", "UR10e"]
     outcome = Outcome(fps, 0, Checked(), 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    verified = []
+    waiting: list[Path] = []
+    verified: list[Future[Checked]] = []
     async with simulated_daemon(root, arguments) as socket, await Client.connect(socket) as client:
         idle = await wait_until_idle(client)
         await client.request("lease", action="take")
@@ -198,13 +200,15 @@ async def stream(fps: float, seconds: float, root: Path) -> Outcome:
             if ended.exit_code != 0:
                 raise RuntimeError(f"{ended.status.state.value}: {ended.status.reason}")
             outcome.sessions += 1
-            verified.append(verifier.submit(verify, Path(ended.recording)))
-            if len(verified) > WAITING:  # the disk has an end
-                await asyncio.wrap_future(verified[-1 - WAITING])
+            waiting.append(Path(ended.recording))
+            if len(waiting) > WAITING:
+                if verified:  # the disk has an end
+                    await asyncio.wrap_future(verified[-1])
+                verified.append(verifier.submit(verify, waiting.pop(0)))
         outcome.station_cores = usage.cores(simulators=False)
         outcome.simulator_cores = usage.cores(simulators=True)
         outcome.memory_mib, outcome.load = usage.memory_mib(), os.getloadavg()[1]
-    for done in verified:
+    for done in (*verified, *(verifier.submit(verify, path) for path in waiting)):
         outcome.checked += await asyncio.wrap_future(done)
     verifier.shutdown()
     return outcome

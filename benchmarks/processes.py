@@ -61,6 +61,14 @@ def put_before_others(daemon: int, niceness: int) -> None:
             Path(f"/proc/{pid}/autogroup").write_text(str(niceness))
 
 
+def step_behind_others() -> None:
+    """This process, as a session of its own: Linux weighs sessions first, then processes inside of them."""
+    os.setsid()
+    os.nice(19)
+    with contextlib.suppress(OSError):
+        Path("/proc/self/autogroup").write_text("19")
+
+
 def _family(pid: int) -> Iterator[int]:
     """The process and all that descend from it."""
     yield pid

@@ -37,6 +37,7 @@ def _add_large_commands(app: typer.Typer) -> None:
     from station.cli_bootstrap import bootstrap_command
     from station.cli_serve import serve_command
     from station.cli_session import (
+        best_command,
         capture_command,
         check_command,
         demo_command,
@@ -52,6 +53,7 @@ def _add_large_commands(app: typer.Typer) -> None:
     app.command("capture")(capture_command)
     app.command("resume")(resume_command)
     app.command("improve")(improve_command)
+    app.command("best")(best_command)
     app.command("check")(check_command)
     app.command("verify")(verify_command)
     app.command("bootstrap")(bootstrap_command)

@@ -18,11 +18,11 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from calibrate.install import load_installed
 from station.attend import Confirm, Outcome, carry_out, wait_until_idle
 from station.cli_serve import require_choices
 from station.client import Client, default_socket
 from station.demo import DemoOptions, run_demo
+from station.drift_check import PLAN_ANSWER_S, POSES, SEED, check_arguments, require_installed
 from station.errors import ConfigError, RefusedError, StationError
 from station.plan.files import load_plan
 from station.plan.model import Plan
@@ -39,7 +39,6 @@ Socket = Annotated[Path | None, typer.Option(help="The daemon's control socket."
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout and nothing else.")]
 Headless = Annotated[bool, typer.Option("--headless", help="Nobody is asked; no progress bar.")]
 GoHash = Annotated[str, typer.Option("--go", help="Hash of the plan that a person approved.")]
-CHECK_POSES = 6
 
 
 def demo_command(
@@ -131,8 +130,23 @@ def improve_command(headless: Headless = False, socket: Socket = None, as_json: 
     _finish(asyncio.run(attended_session(socket, "improve", headless, "", as_json, None)), as_json)
 
 
+def best_command(headless: Headless = False, socket: Socket = None) -> None:
+    """Add the pose that would help most to a paused session, and take it.
+
+    Says where it is and what it brings, and asks; the way is checked as for any pose. Then the session is
+    paused as before, or sealed when nothing else was left. Ctrl-C is STOP.
+
+    Exit codes: 0 it was taken, 1 it was not.
+    """
+    outcome = asyncio.run(attended_session(socket, "best", headless, "", False, None))
+    added = max(outcome.status.session.poses, key=lambda pose: pose.index)
+    out.print(f"pose {added.index + 1}: {added.state}{f', {added.reason}' if added.reason else ''}")
+    err.print(f"[bold]{outcome.status.state.value}[/]: {outcome.status.reason or outcome.recording}")
+    raise typer.Exit(0 if added.state == "done" else 1)
+
+
 def check_command(
-    poses: Annotated[int, typer.Option(min=4, max=50)] = CHECK_POSES,
+    poses: Annotated[int, typer.Option(min=4, max=50)] = POSES,
     headless: Headless = False,
     go: GoHash = "",
     socket: Socket = None,
@@ -145,20 +159,18 @@ def check_command(
     Exit codes: 0 it holds, 4 it does not, 1 no recording or nothing installed, 2 usage.
     """
     asyncio.run(_require_installed(socket or default_socket()))  # or the arm would move for nothing
-    outcome = asyncio.run(attended_session(socket, "run", headless, go, False, lambda c: _make(c, poses)))
+    outcome = asyncio.run(attended_session(socket, "check", headless, go, False, lambda c: _make(c, poses)))
     if not outcome.recording:
         _finish(outcome, False)
-    # A session lies in ROOT/sessions/NAME: what is installed below that root is checked.
-    root = Path(outcome.status.session.folder).parents[1]
-    command = [sys.executable, "-m", "calibrate.cli", "check", outcome.recording, "--root", str(root)]
-    done = subprocess.run(command)
+    what = check_arguments(outcome.recording, outcome.status.session.folder)
+    done = subprocess.run([sys.executable, "-m", "calibrate.cli", *what])
     raise typer.Exit(done.returncode)
 
 
 async def _require_installed(socket: Path) -> None:
     async with await Client.connect(socket) as client:
-        root = Path((await client.request("hello"))["root"])
-    load_installed(root, allow_simulated=True)
+        assert client.root is not None
+        require_installed(client.root)
 
 
 async def load_into(client: Client, plan: Plan) -> None:
@@ -174,7 +186,7 @@ async def load_sweep(client: Client) -> None:
 
 
 async def _make(client: Client, poses: int) -> None:
-    await client.request("make_plan", poses=poses, seed=0, timeout_s=180.0)
+    await client.request("make_plan", poses=poses, seed=SEED, timeout_s=PLAN_ANSWER_S)
 
 
 async def attended_session(
@@ -228,6 +240,8 @@ def ask_person(summary: GoSummary) -> bool:
     err.print(f"\n[bold]The arm will move[/]: {summary.purpose}, {many}")
     err.print(f"first {summary.first_move}; {summary.path_m:.2f} m, up to {summary.top_speed_m_s:.2f} m/s")
     err.print(f"about {summary.duration_s:.0f} s, plan {summary.plan_sha256[:12]}")
+    for change in summary.changes:
+        err.print(change)
     for warning in summary.warnings:
         err.print(f"[yellow]{warning}[/]")
     err.print("The emergency stop on the pendant is the safety device. Ctrl-C stops too.")

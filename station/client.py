@@ -64,6 +64,8 @@ class Client:
         self._outdated = False
         self._fresh = asyncio.Event()
         self._gone = False
+        self.root: Path | None = None
+        """Below which the daemon keeps sessions and what is installed."""
         self._one_at_a_time = asyncio.Lock()
         """Pieces of two long requests must not mix."""
         self._task = asyncio.create_task(self._read(), name="client-read")
@@ -94,10 +96,12 @@ class Client:
         client = cls(path, reader, writer)
         try:
             who = who or who_am_i()
-            await client.request("hello", who=who, interactive=interactive, timeout_s=timeout_s)
+            hello = await client.request("hello", who=who, interactive=interactive, timeout_s=timeout_s)
         except StationError:
             await client.close()
             raise
+        if root := hello.get("root"):
+            client.root = Path(root)
         return client
 
     async def request(self, verb: Verb, *, timeout_s: float = ANSWER_S, **args: Any) -> Any:

@@ -198,7 +198,9 @@ class SessionDispatcher:
         return {"poses": len(plan.poses), "sha256": self._session.bench.require_queue().sha256}
 
     async def _prepare(self, caller: _Caller, args: _Prepare) -> Any:
-        if args.purpose == "improve" and not (self._session.bench.cell.simulated or caller.interactive):
+        if args.purpose in ("improve", "best") and not (
+            self._session.bench.cell.simulated or caller.interactive
+        ):
             raise RefusedError("a real arm's plan is changed on the way only with a person at the screen")
         return await self._session.prepare(caller.client_id, args.purpose, args.index)
 

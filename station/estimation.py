@@ -22,7 +22,7 @@ from calibrate.views import ImageView, ViewSet
 from recordings.messages import BoardSpec, CameraModel, Mount
 from station.config import StationConfig
 from station.errors import StationError
-from station.plan.predict import advise
+from station.plan.predict import Advice, AdviceOptions, advise
 from station.plan.scene import scene_of
 from station.status import EstimateStatus
 
@@ -68,12 +68,25 @@ def running_estimate(
     )
 
 
-def next_best(config: StationConfig, base_from_flange: Array, joints_now_rad: Sequence[float]) -> str:
-    """Which pose would help most and how many are missing, after those captured (n, 4, 4).
+def next_best(
+    config: StationConfig,
+    base_from_flange: Array,
+    joints_now_rad: Sequence[float],
+    onward_rad: Sequence[float] | None,
+) -> Advice:
+    """Which pose would help most after those captured (n, 4, 4), whether or not these are enough.
 
-    The goal is `capture.goal_m`. By forecast from the configured guesses; empty where these are missing or
-    no pose would help.
+    Free to reach from here, and from it the pose that is next (`onward_rad`). By forecast from the configured
+    guesses; ConfigError where these are missing.
     """
+    return advise(
+        scene_of(config), base_from_flange, 0.0, joints_now_rad, AdviceOptions(onward_rad=onward_rad)
+    )
+
+
+def next_best_text(config: StationConfig, base_from_flange: Array, joints_now_rad: Sequence[float]) -> str:
+    """Which pose would help most and how many are missing for `capture.goal_m`; empty when none is, or none
+    helps, or the guesses are missing."""
     goal_m = config.capture.goal_m
     try:
         advice = advise(scene_of(config), base_from_flange, goal_m, joints_now_rad)

@@ -182,7 +182,7 @@ class GoSummary(msgspec.Struct, frozen=True, omit_defaults=True):
 
     token: str
     purpose: str
-    """'run plan', 'resume', 'retake pose 7', 'bootstrap move 2' …"""
+    """'run plan', 'retake pose 7', 'drift check of the installed calibration' …"""
     plan_sha256: str
     poses: int
     path_m: float
@@ -192,6 +192,8 @@ class GoSummary(msgspec.Struct, frozen=True, omit_defaults=True):
     duration_s: float
     first_move: str
     """'84 mm and 22° to pose 1'"""
+    changes: tuple[str, ...] = ()
+    """What this go would change in the plan, and what that brings."""
     warnings: tuple[str, ...] = ()
     start_joints_rad: Vector6 | None = None
 

@@ -18,7 +18,8 @@ from calibrate.calibration import CalibrationFileError, read_calibration
 from calibrate.errors import CalibrationError
 from calibrate.load import Progress as LoadProgress
 
-out = Console(highlight=False, width=None if sys.stdout.isatty() else 150)
+_told_width = sys.stdout.isatty() or "COLUMNS" in os.environ
+out = Console(highlight=False, width=None if _told_width else 150)
 err = Console(stderr=True, highlight=False)
 
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout and nothing else")]

@@ -50,6 +50,8 @@ class AdviceOptions:
     """None = by the lens and the board's size."""
     pool: int = 150
     seed: int = 0
+    onward_rad: Sequence[float] | None = None
+    """Joints of the pose after it: the way on to it must be free too."""
 
 
 def forecast(scene: Scene, plan: Plan, noise: Noise, free_intrinsics: bool = True) -> list[Forecast]:
@@ -92,10 +94,11 @@ def advise(
     gains = informations(scene, pool.base_from_flange, options.noise, options.free_intrinsics)
     scores = objective(known + gains)
     ranked = np.argsort(scores, kind="stable")[:_TRIES]
+    stops = [start] if options.onward_rad is None else [start, np.asarray(options.onward_rad, dtype=float)]
     free = (
         int(place)
         for place in ranked
-        if not check_path(scene.geometry, start, pool.joints_rad[place]).problems
+        if not any(check_path(scene.geometry, stop, pool.joints_rad[place]).problems for stop in stops)
     )
     best = next(free, None)
     if best is None:

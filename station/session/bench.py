@@ -76,7 +76,10 @@ class Bench:
         """What is shown of the session before ends when the next one begins."""
         self.seen.clear()
         session = self.store.status.session
-        self.store.update(session=msgspec.structs.replace(session, name="", folder="", recording=""))
+        fresh = msgspec.structs.replace(
+            session, name="", folder="", recording="", elapsed_s=0.0, remaining_s=None
+        )
+        self.store.update(session=fresh)
 
     def show_poses(self, current: int | None = None) -> None:
         """Brings the status up to date with the queue and the recording."""

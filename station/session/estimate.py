@@ -9,7 +9,7 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 
-from station.estimation import next_best, running_estimate
+from station.estimation import next_best_text, running_estimate
 from station.session.bench import Bench
 from station.status import EstimateStatus
 from station.workers import WorkerError
@@ -57,7 +57,7 @@ class Estimator:
                 joints = bench.store.status.robot.joints_rad
                 if joints is not None and estimate.sigma_translation_mm is not None and not estimate.enough:
                     flange = np.array([v[1] for v in seen])
-                    text = await bench.workers.call(next_best, config, flange, joints, timeout_s=20.0)
+                    text = await bench.workers.call(next_best_text, config, flange, joints, timeout_s=20.0)
                     estimate = msgspec.structs.replace(estimate, advice=text or estimate.advice)
             except Exception as error:  # this task looks on; it must outlive every picture and every defect
                 if not isinstance(error, WorkerError):

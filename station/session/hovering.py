@@ -23,13 +23,13 @@ from calibrate.views import ImageView
 from recordings.messages import Vector6
 from station.analysis import sight
 from station.config import PointerConfig
-from station.errors import LimitError, RefusedError
+from station.errors import LimitError, RefusedError, RobotError
 from station.limits import check_path
 from station.plan.hover import Hover, HoverAnswer, HoverQuestion, answer_hover, least_standoff_m
 from station.plan.model import plan_sha256
 from station.session.bench import Bench
 from station.session.capture import flange_pose, matrix4
-from station.session.guard import displacement
+from station.session.guard import JOGGED_RAD, displacement
 from station.session.lease import Go, GoDesk
 from station.session.patience import RestingCheck
 from station.session.run import Run
@@ -256,3 +256,21 @@ class HoverRun(Run):
         )
         bench.store.event(reason)
         bench.store.enter(StationState.IDLE, reason)
+        unsay_when_moved(bench, reason)
+
+
+def unsay_when_moved(bench: Bench, reason: str) -> None:
+    """The sentence is true for as long as the arm rests where it is."""
+    store, robot = bench.store, bench.cell.robot
+    there = robot.latest().joints_rad
+
+    def look() -> None:
+        moved = False
+        with contextlib.suppress(RobotError):
+            moved = np.abs(np.subtract(robot.latest().joints_rad, there)).max() > JOGGED_RAD
+        if moved or store.status.reason != reason:
+            end()
+        if moved and store.status.reason == reason:
+            store.update(reason="")
+
+    end = store.watch(look)

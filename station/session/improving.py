@@ -1,4 +1,7 @@
-"""The plan gets better while it is carried out: poses that are left, planned anew, offered to a person."""
+"""The plan gets better while it is carried out: poses that are left, planned anew, or one that helps most.
+
+Both are offered to a person and become the session's by that person's go only.
+"""
 
 from __future__ import annotations
 
@@ -6,14 +9,16 @@ import contextlib
 import math
 
 import msgspec
+import numpy as np
 
 from recordings.errors import RecordingError
 from station.errors import RefusedError
-from station.estimation import Seen
+from station.estimation import Seen, next_best
 from station.improvement import FEWEST_LEFT, FEWEST_VIEWS, Improvement, improve
+from station.plan.predict import Advice
 from station.session.bench import Bench
 from station.session.patience import RestingCheck
-from station.session.queue import Replanned
+from station.session.queue import PoseQueue, Replanned
 from station.status import EstimateStatus
 
 _SHARPER = 4.0
@@ -42,24 +47,31 @@ class ImproveDesk:
             return ""
         return (
             f"the mount is known {times:.0f} times better than the guess the poses were planned from: pause, "
-            f"then `station improve` plans the {len(queue.fresh)} that are left anew"
+            f"then `station improve` (p on the plan screen) plans the {len(queue.fresh)} that are left anew"
         )
 
-    async def prepare(self) -> Replanned:
-        """The poses with those left planned anew. Nothing moves, and nothing is changed yet.
+    async def replan(self, purpose: str) -> Replanned | None:
+        """The poses that this purpose would put in place of the session's; None when it changes none.
 
-        RefusedError when it is too early, too late or not worth it; LimitError when no such poses exist.
+        Nothing moves, and nothing is changed yet. RefusedError when it is too early, too late or not worth
+        it; LimitError when no such poses exist.
         """
+        if purpose not in ("improve", "best"):
+            return None
         bench = self._bench
-        queue, robot = bench.queue, bench.cell.robot
-        if bench.recording is None or queue is None:
+        if bench.recording is None or bench.queue is None:
             raise RefusedError("no session is open: the plan is improved from its first pictures")
-        if queue.plan.motion != "stops":
+        if bench.queue.plan.motion != "stops":
             raise RefusedError("a sweep has no poses to improve")
+        await RestingCheck(bench.cell.robot.check).news()
+        return await (self._anew(bench.queue) if purpose == "improve" else self._one_more(bench.queue))
+
+    async def _anew(self, queue: PoseQueue) -> Replanned:
+        """The poses with those left planned anew."""
+        bench, robot = self._bench, self._bench.cell.robot
         fresh = queue.fresh
         if len(fresh) < FEWEST_LEFT:
             raise RefusedError(f"{len(fresh)} poses are left: too few to plan them anew")
-        await RestingCheck(robot.check).news()
         before = [queue.pose(index) for index in queue.open if index not in fresh]
         start = before[-1].joints_rad if before else robot.latest().joints_rad
         left = msgspec.structs.replace(queue.plan, poses=tuple(queue.pose(index) for index in fresh))
@@ -69,16 +81,45 @@ class ImproveDesk:
         found = await bench.workers.call(improve, config, known, seen, left, start, timeout_s=_PLAN_S)
         if not is_worth_it(found):
             raise RefusedError(f"nothing to gain, go on with the plan as it is ({'; '.join(changes(found))})")
-        return Replanned(queue.with_fresh(found.plan.poses), queue.sha256, changes(found))
+        better = queue.with_fresh(found.plan.poses)
+        return Replanned("improve", better, better.open, queue.sha256, changes(found))
+
+    async def _one_more(self, queue: PoseQueue) -> Replanned:
+        """The poses and the one that would help most after those captured."""
+        bench = self._bench
+        if not bench.seen:
+            raise RefusedError("no picture counts yet: what would help most is not known")
+        flange = np.array([view.base_from_flange for view in bench.seen.values()])
+        here = bench.cell.robot.latest().joints_rad
+        onward = queue.pose(queue.open[0]).joints_rad if queue.open else None
+        found = await bench.workers.call(
+            next_best, bench.cell.config, flange, here, onward, timeout_s=_PLAN_S
+        )
+        if found.next_pose is None:
+            raise RefusedError(found.text)
+        more, index = queue.with_more(found.next_pose)
+        return Replanned("best", more, (index,), queue.sha256, what_it_brings(found, index))
 
     def adopt(self, found: Replanned) -> None:
         """A person said yes: these are the poses now, and the recording says so."""
         bench, recording = self._bench, self._bench.require_recording()
-        bench.queue, self._improved = found.queue, recording.name
+        bench.queue = found.queue
+        if found.purpose == "improve":
+            self._improved = recording.name
         bench.show_poses()
         bench.store.event("; ".join(found.changes))
         with contextlib.suppress(RecordingError):  # a disk that fails is told by the next picture
             recording.attach_plan(found.queue.plan)
+
+
+def what_it_brings(found: Advice, index: int) -> tuple[str, ...]:
+    """What a person is told of one pose more."""
+    pose = found.next_pose
+    assert pose is not None and pose.predicted_sigma_m is not None
+    return (
+        f"added as pose {index + 1}: {pose.why}",
+        f"expected error: {1000 * found.now.sigma_m:.2f} → {1000 * pose.predicted_sigma_m:.2f} mm",
+    )
 
 
 def is_worth_it(found: Improvement) -> bool:

@@ -20,7 +20,10 @@ POSE_LIMIT = 2000
 class Replanned:
     """Poses that wait for a person's yes to take the place of the session's."""
 
+    purpose: str
     queue: PoseQueue
+    poses: tuple[int, ...]
+    """Those that the go covers, in order."""
     before_sha256: str
     """Of the poses that they were made for."""
     changes: tuple[str, ...]
@@ -92,10 +95,15 @@ class PoseQueue:
         """A copy with these, at most as many, in place of the fresh ones, by the same numbers, at the end."""
         fresh = self.fresh
         taken = [(i, pose) for i, pose in self._poses.items() if i not in fresh]
-        placed = [(i, _named(pose, i)) for i, pose in zip(fresh, poses, strict=False)]
+        placed = [(i, _named(pose, i, "anew")) for i, pose in zip(fresh, poses, strict=False)]
         plan = msgspec.structs.replace(self._plan, poses=tuple(pose for _, pose in (*taken, *placed)))
         known = [*(self._status[i] for i, _ in taken), *(_fresh(i, pose) for i, pose in placed)]
         return PoseQueue(plan, known)
+
+    def with_more(self, pose: PlannedPose) -> tuple[PoseQueue, int]:
+        """A copy with this pose too, at the end, and its number."""
+        more = PoseQueue(self.plan, self.statuses)
+        return more, more.add(_named(pose, more._next_index, "more"))
 
     def start_attempt(self, index: int) -> int:
         """The number of this attempt, from 1; later ones supersede earlier ones in the recording."""
@@ -144,9 +152,9 @@ class PoseQueue:
         del self._poses[index], self._status[index]
 
 
-def _named(pose: PlannedPose, index: int) -> PlannedPose:
-    """Told apart from the pose that had this number before."""
-    return msgspec.structs.replace(pose, name=f"p{index + 1:02d} anew")
+def _named(pose: PlannedPose, index: int, word: str) -> PlannedPose:
+    """Told apart from the poses of the first plan."""
+    return msgspec.structs.replace(pose, name=f"p{index + 1:02d} {word}")
 
 
 def _fresh(index: int, pose: PlannedPose) -> PoseStatus:

@@ -126,6 +126,7 @@ class Run:
         bench = self._bench
         queue = bench.require_queue()
         started_s, taken = time.monotonic(), 0
+        before_s = bench.store.status.session.elapsed_s
         todo = [index for index in self._go.poses if queue.status(index).state == "planned"]
         while not bench.halting:
             todo = [index for index in todo if index in queue.open] or self._once_more()
@@ -135,7 +136,7 @@ class Run:
             bench.require_recording().require_space()
             await self._pose(index)
             taken += 1
-            self._show_times(started_s, taken, len(todo))
+            self._show_times(before_s, time.monotonic() - started_s, taken, len(todo))
         if not bench.halting:
             await self._rest()
 
@@ -193,13 +194,12 @@ class Run:
     async def _drive_checked(self, target: tuple[float, ...], check: MoveCheck) -> None:
         await self._bench.cell.robot.move(target, check.joint_speed_rad_s, check.joint_acceleration_rad_s2)
 
-    def _show_times(self, started_s: float, taken: int, left: int) -> None:
-        """Elapsed and remaining, by the average so far."""
-        elapsed_s = time.monotonic() - started_s
+    def _show_times(self, before_s: float, run_s: float, taken: int, left: int) -> None:
+        """Elapsed, the session's runs before this one included; remaining, by this one's average."""
         session = self._bench.store.status.session
         self._bench.store.update(
             session=msgspec.structs.replace(
-                session, elapsed_s=round(elapsed_s, 1), remaining_s=round(elapsed_s / taken * left, 1)
+                session, elapsed_s=round(before_s + run_s, 1), remaining_s=round(run_s / taken * left, 1)
             )
         )
 

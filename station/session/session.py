@@ -163,10 +163,10 @@ class Session:
             self.bench.show_poses()
         self._void_go()
         voids = self._voids
-        found = await self._improver.prepare() if purpose == "improve" else None
-        poses = found.queue.open if found else poses_to_drive(self.bench, purpose, index)
-        queue, notes = (found.queue, found.changes) if found else (self.bench.require_queue(), ())
-        summary = await summarise(self.bench, purpose, queue, poses, (*notes, *self._notes))
+        found = await self._improver.replan(purpose)
+        poses = found.poses if found else poses_to_drive(self.bench, purpose, index)
+        queue, changes = (found.queue, found.changes) if found else (self.bench.require_queue(), ())
+        summary = await summarise(self.bench, purpose, queue, poses, self._notes, changes)
         self._offer(client_id, voids, summary, poses, replanned=found)
         return summary
 

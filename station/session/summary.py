@@ -33,15 +33,24 @@ def poses_to_drive(bench: Bench, purpose: str, index: int | None) -> tuple[int, 
         if queue.status(index).state != "planned":
             queue.retake(index)
         return (index,)
-    if purpose not in ("run", "resume"):
-        raise RefusedError(f"unknown purpose '{purpose}'; known are run, resume, retake, improve")
+    if purpose == "check" and bench.recording is not None:
+        raise RefusedError("a session is open: finish it first, then check")
+    if purpose not in ("run", "check", "resume"):
+        raise RefusedError(
+            f"unknown purpose '{purpose}'; known are run, check, resume, retake, improve, best"
+        )
     if not queue.open:
         raise RefusedError("no pose is left to take: retake some, or finish")
     return queue.open
 
 
 async def summarise(
-    bench: Bench, purpose: str, queue: PoseQueue, poses: tuple[int, ...], notes: tuple[str, ...]
+    bench: Bench,
+    purpose: str,
+    queue: PoseQueue,
+    poses: tuple[int, ...],
+    notes: tuple[str, ...],
+    changes: tuple[str, ...] = (),
 ) -> GoSummary:
     """Checks the whole way in the worker. LimitError lists what is wrong with it, RobotError with the arm."""
     robot = bench.cell.robot
@@ -62,6 +71,7 @@ async def summarise(
         top_speed_m_s=round(check.top_speed_m_s, 3),
         duration_s=round(check.duration_s + POSE_OVERHEAD_S * len(poses), 1),
         first_move=f"{displacement(bench, start, part.poses[0].joints_rad)} to pose {poses[0] + 1}",
+        changes=changes,
         warnings=(*notes, *_warnings(bench)),
         start_joints_rad=start,
     )
@@ -79,8 +89,12 @@ def _purpose_words(bench: Bench, purpose: str, poses: tuple[int, ...]) -> str:
         return f"retake pose {poses[0] + 1}"
     if bench.queue is not None and bench.queue.plan.motion == "sweep":
         return f"sweep: {len(poses)} slow swings without a stop, the camera running"
+    if purpose == "check":
+        return "drift check of the installed calibration"
     if bench.recording is None:
         return "run plan"
+    if purpose == "best":
+        return f"one pose more for session {bench.recording.name}"
     if purpose == "improve":
         return f"go on with session {bench.recording.name}, the poses that are left planned anew"
     return f"go on with session {bench.recording.name}"

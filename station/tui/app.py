@@ -27,6 +27,7 @@ from station.status import StationState, StationStatus
 from station.tui import offline
 from station.tui.checklist import ChecklistScreen
 from station.tui.commands import Commands
+from station.tui.drift import drift_check
 from station.tui.help import Help
 from station.tui.link import Connect, Link, listen
 from station.tui.live import LiveScreen
@@ -165,6 +166,12 @@ class StationApp(Commands):
             if isinstance(screen, StationScreen) and screen.is_mounted:
                 screen.doubt(trouble, self.silent_s)
 
+    def tell_busy(self, words: str) -> None:
+        super().tell_busy(words)
+        for screen in self.screen_stack:
+            if isinstance(screen, StationScreen) and screen.is_mounted:
+                screen.say_busy(words)
+
     async def _pace(self, status: StationStatus) -> None:
         """A new state or reason is shown at once; numbers that only flicker, a few times a second."""
         known = self.status
@@ -230,13 +237,14 @@ class StationApp(Commands):
     def get_system_commands(self, screen: Screen[Any]) -> Iterable[SystemCommand]:
         """Every key's action by name too; what moves the arm asks the same question from here."""
         yield from super().get_system_commands(screen)
-        for binding in (b for b in self.BINDINGS if isinstance(b, Binding)):
-            action = binding.action
-            yield SystemCommand(
-                f"{binding.description} ({binding.key})",
-                binding.tooltip,
-                partial(self.call_later, self.run_action, action),
-            )
+        own = vars(type(screen)).get("BINDINGS", []) if isinstance(screen, StationScreen) else []
+        for place, bindings in ((screen, own), (self, self.BINDINGS)):
+            for binding in (b for b in bindings if isinstance(b, Binding) and b.tooltip):
+                yield SystemCommand(
+                    f"{binding.description} ({binding.key})",
+                    binding.tooltip,
+                    partial(self.call_later, self.run_action, binding.action, place),
+                )
 
     # --- recordings and results ---
 
@@ -286,6 +294,10 @@ class StationApp(Commands):
     @work(exclusive=True, group="job", exit_on_error=False)
     async def check(self, recording: str, folder: str) -> None:
         await offline.check(self, recording, folder)
+
+    @work(exclusive=True, group="drift", exit_on_error=False)
+    async def drift_check(self) -> None:
+        await drift_check(self)
 
     @work(exclusive=True, group="job", exit_on_error=False)
     async def verify(self, calibration: str) -> None:

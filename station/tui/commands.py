@@ -34,6 +34,8 @@ class Commands(App[None]):
     """For how long the daemon has not answered; None while it does."""
     trouble = ""
     """Why what is shown is not how it is: no daemon, or one that does not answer."""
+    busy = ""
+    """What the daemon is at work on for this screen; empty: nothing that takes long."""
 
     async def ask(self, verb: Verb, **args: Any) -> Any:
         """The daemon's answer, or None after a notice that says why not."""
@@ -67,6 +69,23 @@ class Commands(App[None]):
             return None
         return await self.ask(verb, **args)
 
+    async def ask_long(self, words: str, verb: Verb, **args: Any) -> Any:
+        """As `ask_with_control`, for what takes seconds or, on a busy computer, minutes.
+
+        `words` stand on every screen for as long as it does.
+        """
+        if self.busy:
+            self.notify(f"One after the other: {self.busy}")
+            return None
+        self.tell_busy(words)
+        try:
+            return await self.ask_with_control(verb, timeout_s=PLAN_ANSWER_S, **args)
+        finally:
+            self.tell_busy("")
+
+    def tell_busy(self, words: str) -> None:
+        self.busy = words
+
     @work(group="stop", exit_on_error=False)
     async def action_stop(self) -> None:
         await self.ask("stop")
@@ -74,22 +93,27 @@ class Commands(App[None]):
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_run(self) -> None:
         resuming = self.status is not None and self.status.state is StationState.PAUSED
-        await self._go_for("resume" if resuming else "run")
+        await self.go_for("resume" if resuming else "run")
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_improve(self) -> None:
         """The poses that are left, planned anew from the pictures so far; taken up by its go alone."""
-        self.notify("Planning the poses that are left anew …", timeout=3)
-        await self._go_for("improve", timeout_s=PLAN_ANSWER_S)
+        await self.go_for("improve", "Planning the poses that are left anew … Nothing moves.")
 
-    async def _go_for(self, purpose: str, **patience: float) -> None:
-        """Prepare, ask the person, go: how the keys of a session move the arm."""
-        answer = await self.ask_with_control("prepare", purpose=purpose, **patience)
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_best(self) -> None:
+        """One pose more, the one that would help most; taken up by its go alone."""
+        await self.go_for("best", "Looking for the pose that would help most … Nothing moves.")
+
+    async def go_for(self, purpose: str, words: str = "Checking the way … Nothing moves.") -> bool:
+        """Prepare, ask the person, go: how the keys of a session move the arm. True: it was told to go."""
+        answer = await self.ask_long(words, "prepare", purpose=purpose)
         if answer is None:
-            return
+            return False
         go = msgspec.convert(answer, GoSummary)
-        if await self.push_screen_wait(ConfirmGo(go)):
-            await self.ask("go", token=go.token)
+        if not await self.push_screen_wait(ConfirmGo(go)):
+            return False
+        return await self.ask("go", token=go.token) is not None
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_pause(self) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from typing import ClassVar
 
 from textual.app import ComposeResult
@@ -12,6 +13,9 @@ from textual.widgets import Button, Label, Static
 
 from station.status import GoSummary
 from station.tui.words import degrees, duration
+
+WIDTH, INDENT = 70, 11
+"""Letters in a line of the question on the narrowest screen, and those before a fact."""
 
 
 class Confirm(ModalScreen[bool]):
@@ -44,21 +48,32 @@ class Confirm(ModalScreen[bool]):
         self.dismiss(yes)
 
 
+ASK = (
+    "\nThe emergency stop on the pendant is the safety device. F12 stops too."
+    "\nIs everybody out of the arm's reach?"
+)
+
+
 def go_text(go: GoSummary) -> str:
-    """The summary a person confirms, one fact a line."""
-    lines = [
-        f"What       {go.purpose}, {go.poses} pose{'s' if go.poses != 1 else ''}",
-        f"First      {go.first_move}",
-        f"How far    {go.path_m:.2f} m of flange path, largest joint turn {degrees(go.largest_step_rad, 0)}",
-        f"How fast   up to {go.top_speed_m_s:.2f} m/s at any point of arm, tool and camera",
-        f"How long   about {duration(go.duration_s)} min",
-        f"Plan       {go.plan_sha256[:12]}",
-        *(f"WARNING    {warning}" for warning in go.warnings),
-        "",
-        "The emergency stop on the pendant is the safety device. F12 stops too.",
-        "Is everybody out of the arm's reach?",
+    """The summary a person confirms, one fact a line; long ones go on below themselves."""
+    facts = [
+        ("What", f"{go.purpose}, {go.poses} pose{'s' if go.poses != 1 else ''}"),
+        *(("Change", change) for change in go.changes),
+        ("First", go.first_move),
+        (
+            "How far",
+            f"{go.path_m:.2f} m of flange path, largest joint turn {degrees(go.largest_step_rad, 0)}",
+        ),
+        ("How fast", f"up to {go.top_speed_m_s:.2f} m/s at any point of arm, tool and camera"),
+        ("How long", f"about {duration(go.duration_s)} min"),
+        ("Plan", go.plan_sha256[:12]),
+        *(("WARNING", warning) for warning in go.warnings),
     ]
-    return "\n".join(lines)
+    lines = (
+        textwrap.fill(text, WIDTH, initial_indent=f"{name:<{INDENT}}", subsequent_indent=" " * INDENT)
+        for name, text in facts
+    )
+    return "\n".join([*lines, ASK])
 
 
 class ConfirmGo(Confirm):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import time
 from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
 from typing import Any, Protocol
 
 from station.errors import RefusedError
@@ -14,6 +15,9 @@ from station.status import StationStatus
 
 class Link(Protocol):
     """What the screen needs of a connection; `station.client.Client` is one, tests bring another."""
+
+    root: Path | None
+    """Below which the daemon keeps sessions and what is installed."""
 
     async def request(self, verb: Verb, **args: Any) -> Any:
         """The daemon's result. RefusedError with the daemon's reason; StationError when it is gone."""

@@ -16,6 +16,7 @@ from calibrate.errors import CalibrationError
 from calibrate.formats import FORMATS
 from calibrate.generations import Generation, generations
 from calibrate.install import load_installed
+from station.drift_check import check_arguments
 from station.tui.confirm import Confirm
 from station.tui.jobs import JobScreen
 
@@ -154,9 +155,9 @@ def _named(generation: Generation) -> str:
 
 async def check(app: StationApp, recording: str, folder: str) -> None:
     """Does the installed calibration still hold on this recording? Its answer stays until it is read."""
-    where = ("--root", str(Path(folder).resolve().parents[1]))
     title = f"Does the installed calibration hold on {Path(folder).name}?"
-    await app.push_screen_wait(JobScreen(title, "calibrate.cli", "check", recording, *where, close_on=()))
+    what = check_arguments(recording, folder)
+    await app.push_screen_wait(JobScreen(title, "calibrate.cli", *what, close_on=()))
 
 
 async def export(app: StationApp, path: str) -> None:

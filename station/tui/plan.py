@@ -13,7 +13,6 @@ from textual.widgets import DataTable, Static
 
 from station.protocol import Verb
 from station.status import PoseStatus, StationStatus
-from station.tui.commands import PLAN_ANSWER_S
 from station.tui.screen import StationScreen
 from station.tui.widgets.sketch import PlanSketch
 from station.tui.words import POSE_MARKS
@@ -62,6 +61,7 @@ class PlanScreen(StationScreen):
         Binding("a", "add", "Add", tooltip="Add the arm's present posture as a pose"),
         Binding("n", "make", "New", tooltip="Plan 25 poses from the configured guesses (seconds)"),
         Binding("p", "app.improve", "Improve", tooltip="Plan what is left anew from the pictures so far"),
+        Binding("b", "app.best", "Best", tooltip="Add the pose that would help most, and take it (asks)"),
         Binding("ctrl+up", "shift(-1)", "Move", group=MOVE, tooltip="Visit this pose earlier"),
         Binding("ctrl+down", "shift(1)", "Move", group=MOVE, tooltip="Visit this pose later"),
         Binding("home", "to_row(0)", "First", show=False, priority=True, tooltip="The first pose"),
@@ -71,7 +71,6 @@ class PlanScreen(StationScreen):
     def __init__(self) -> None:
         super().__init__()
         self._detail = NO_PLAN
-        self._planning = False
         self._rows: list[tuple[str, ...]] = []
 
     def body(self) -> ComposeResult:
@@ -118,7 +117,7 @@ class PlanScreen(StationScreen):
         """The highlighted pose in words and in the sketch."""
         self.query_one(PlanSketch).show(status, line)
         poses = () if status is None else status.session.poses
-        text = PLANNING if self._planning else detail_of(poses[line]) if line < len(poses) else NO_PLAN
+        text = detail_of(poses[line]) if line < len(poses) else NO_PLAN
         if text != self._detail:
             self._detail = text
             self.query_one("#plan-detail", Static).update(Text(text))
@@ -161,14 +160,4 @@ class PlanScreen(StationScreen):
 
     @work(exit_on_error=False)
     async def action_make(self) -> None:
-        """Says that it is at work for as long as it is."""
-        if self._planning:
-            self.notify("A plan is being made already.")
-            return
-        self._planning = True
-        self._explain(self.station.status, self.table.cursor_row)
-        try:
-            await self.station.ask_with_control("make_plan", timeout_s=PLAN_ANSWER_S, poses=25, seed=1)
-        finally:
-            self._planning = False
-            self._explain(self.station.status, self.table.cursor_row)
+        await self.station.ask_long(PLANNING, "make_plan", poses=25, seed=1)

@@ -33,6 +33,8 @@ class ReplayLink:
     StationError for a recording that cannot be read.
     """
 
+    root: Path | None = None
+
     def __init__(self, path: Path, pace: float = 1.0) -> None:
         try:
             self._timeline = Timeline(path)

@@ -32,6 +32,7 @@ class StationScreen(Screen[None]):
         app = cast("StationApp", self.app)
         self.show(app.status)
         self.doubt(app.trouble, app.silent_s)
+        self.say_busy(app.busy)
 
     def body(self) -> ComposeResult:
         yield from ()
@@ -40,6 +41,11 @@ class StationScreen(Screen[None]):
         """Hands the newest status to every part that shows some of it."""
         for part in self.query("StatusBar, ReasonLine, Panel, Events"):
             part.status = status  # type: ignore[attr-defined]
+
+    def say_busy(self, words: str) -> None:
+        """What the daemon is at work on for this screen; empty: nothing."""
+        for line in self.query(ReasonLine):
+            line.busy = words
 
     def doubt(self, trouble: str, silent_s: float | None) -> None:
         """Why what stands here is old (empty: it is not), and for how long the daemon has not answered."""

@@ -25,6 +25,9 @@ class SessionsScreen(StationScreen):
         Binding("v", "result", "Result", tooltip="Show this session's calibration"),
         Binding("w", "watch", "Watch", tooltip="Play this recording in the live screen"),
         Binding("k", "check", "Check", tooltip="Does the installed calibration still hold on this one?"),
+        Binding(
+            "d", "drift", "Drift", tooltip="Take 6 pictures now: does the installed one still hold? (asks)"
+        ),
         Binding("c", "recover", "Recover", tooltip="Rebuild an unfinished recording"),
     ]
 
@@ -89,6 +92,9 @@ class SessionsScreen(StationScreen):
     def action_check(self) -> None:
         if (session := self._selected()) is not None:
             self.station.check(str(session["recording"]), str(session["folder"]))
+
+    def action_drift(self) -> None:
+        self.station.drift_check()
 
     def action_watch(self) -> None:
         if (session := self._selected()) is not None:

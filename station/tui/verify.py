@@ -29,7 +29,6 @@ if TYPE_CHECKING:
     from station.tui.app import StationApp
 
 STANDOFF_M = 0.08
-WAY_ANSWER_S = 90.0
 BEGUN_S = 5.0
 AT_WORK = (StationState.CHECKING, StationState.MOVING, StationState.SETTLING)
 ABOUT = (
@@ -185,7 +184,6 @@ async def verify(app: StationApp, path: str) -> bool:
     looked = False
     while (corner := await app.push_screen_wait(choice)) is not None:
         choice = ChooseCorner(board, found, choice.pointer_mm)
-        app.notify(f"Looking for a way over corner {corner} …", timeout=3)
         wish: dict[str, Any] = {
             "corner": corner,
             "standoff_m": STANDOFF_M,
@@ -193,7 +191,8 @@ async def verify(app: StationApp, path: str) -> bool:
         }
         if choice.pointer_mm:
             wish["pointer_m"] = float(choice.pointer_mm) / 1000
-        answer = await app.ask_with_control("hover", timeout_s=WAY_ANSWER_S, new_picture=not looked, **wish)
+        words = f"Looking for a way over corner {corner} … Nothing moves."
+        answer = await app.ask_long(words, "hover", new_picture=not looked, **wish)
         if answer is None:
             continue
         offer = msgspec.convert(answer, HoverOffer)

@@ -64,7 +64,7 @@ def test_a_go_is_bound_to_what_was_shown_and_a_wrong_try_voids_it(
 
 def test_improved_poses_go_only_into_the_plan_they_were_made_for() -> None:
     desk, before = GoDesk(Clock()), "ef" * 32
-    better = Replanned(PoseQueue(Plan(robot="UR10", mount="eye-in-hand", poses=())), before, ())
+    better = Replanned("improve", PoseQueue(Plan("UR10", "eye-in-hand", ())), (), before, ())
     for plan in (PLAN, "cd" * 32):
         token = offered(desk, replanned=better).summary.token
         with pytest.raises(RefusedError, match="plan changed"):

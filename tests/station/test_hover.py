@@ -78,6 +78,21 @@ async def test_a_go_brings_the_tip_over_the_corner_and_is_used_up(hover_rig: Rig
     assert tip_of(rig) == pytest.approx([0.15, 0.125, -0.08], abs=1e-6)
 
 
+async def test_what_is_said_of_the_tip_goes_when_the_arm_is_moved(hover_rig: Rig, calibration: Path) -> None:
+    rig = hover_rig
+    offer = await rig.session.prepare_hover(1, request(calibration))
+    rig.session.go(1, offer.go.token)
+    await rig.until(S.CHECKING)
+    await rig.until(S.IDLE)
+    rig.session.store.event("something else")
+    assert "by hand only" in rig.session.store.status.reason
+    a, *rest = rig.arm.joints
+    rig.arm.joints = (a + 0.02, *rest)  # type: ignore[assignment]
+    rig.arm.rest()
+    await rig.until_true(lambda: rig.session.store.status.reason == "")
+    assert rig.state is S.IDLE
+
+
 async def test_stop_in_mid_hover_latches(hover_rig: Rig, calibration: Path) -> None:
     rig = hover_rig
     rig.arm.slow = True

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import msgspec
@@ -14,9 +15,10 @@ from calibrate.geometry import inverse, transform_points
 from calibrate.kinematics import MODELS, forward
 from calibrate.projection import project
 from station.analysis import Sighting, sight
-from station.errors import RefusedError
+from station.errors import LimitError, RefusedError
+from station.estimation import next_best
 from station.limits import check_plan
-from station.plan.model import Plan
+from station.plan.model import Plan, PlannedPose
 from station.plan.planner import make_plan
 from station.plan.scene import cell_geometry
 from station.session.queue import PoseQueue
@@ -78,7 +80,7 @@ async def test_the_remaining_poses_are_planned_anew_only_by_a_go(half_way: Rig, 
     before, moves = queue_of(rig).sha256, rig.arm.log.count("move")
     summary = await rig.session.prepare(1, "improve")
     assert summary.poses == POSES - BEFORE
-    assert any("expected error at the end" in line for line in summary.warnings)
+    assert any("expected error at the end" in line for line in summary.changes)
     assert queue_of(rig).sha256 == before != summary.plan_sha256
     old = await rig.session.prepare(1, "resume")
     assert old.plan_sha256 == before
@@ -99,17 +101,48 @@ async def test_the_remaining_poses_are_planned_anew_only_by_a_go(half_way: Rig, 
     assert check_plan(rest, plan.poses[BEFORE - 1].joints_rad, cell_geometry(memory_config())).problems == ()
 
 
-async def test_it_is_void_when_the_poses_change_meanwhile(half_way: Rig) -> None:
-    summary = await half_way.session.prepare(1, "improve")
-    half_way.session.edit(1, "skip", lambda queue: queue.skip(BEFORE + 1))
-    with pytest.raises(RefusedError, match="not valid"):
-        half_way.session.go(1, summary.token)
-    assert "p09" in [status.name for status in queue_of(half_way).statuses]
-
-
-async def test_too_early_is_told(rig: Rig) -> None:
+@pytest.mark.parametrize("purpose", ["improve", "best"])
+async def test_too_early_is_told(rig: Rig, purpose: str) -> None:
     with pytest.raises(RefusedError, match="no session is open"):
-        await rig.session.prepare(1, "improve")
+        await rig.session.prepare(1, purpose)
+
+
+async def test_the_pose_that_helps_most_is_added_and_taken_by_its_own_go(half_way: Rig, plan: Plan) -> None:
+    rig = half_way
+    before, moves = queue_of(rig), rig.arm.log.count("move")
+    summary = await rig.session.prepare(1, "best")
+    assert summary.poses == 1
+    assert f"added as pose {POSES + 1}" in summary.changes[0] and "expected error" in summary.changes[1]
+    assert queue_of(rig) is before  # until a person says yes
+    elapsed_s = rig.session.store.status.session.elapsed_s
+    rig.session.go(1, summary.token)
+    await rig.until(S.PAUSED)
+    assert rig.arm.log.count("move") == moves + 1
+    added = queue_of(rig).status(POSES)
+    assert (added.name, added.state) == (f"p{POSES + 1} more", "done")
+    assert queue_of(rig).open == before.open
+    assert rig.session.store.status.session.elapsed_s > elapsed_s  # of the session, not of this run
+    driven = queue_of(rig).pose(POSES).joints_rad
+    assert min(np.abs(np.subtract(driven, pose.joints_rad)).max() for pose in plan.poses) > 0.01
+    await rig.give_go("resume")
+    await rig.until(S.IDLE)
+    assert len(sealed(rig).views()) == POSES + 1
+
+
+async def test_a_pose_that_helps_is_checked_like_any(half_way: Rig) -> None:
+    """Whatever the search thought of it."""
+    worker, before = half_way.session.bench.workers, queue_of(half_way)
+    folded = PlannedPose("p01", (0.0, -1.5, 3.0, 0.0, 0.0, 0.0), why="folded", predicted_sigma_m=1e-4)
+
+    class WorkerThatFolds(WorkerThatSees):
+        async def call(self, function: Callable[..., Any], *args: Any, timeout_s: float = 60.0) -> Any:
+            found = await worker.call(function, *args, timeout_s=timeout_s)
+            return replace(found, next_pose=folded) if function is next_best else found
+
+    half_way.session.bench.workers = WorkerThatFolds(half_way)  # type: ignore[assignment]
+    with pytest.raises(LimitError, match="refused, nothing moved"):
+        await half_way.session.prepare(1, "best")
+    assert queue_of(half_way) is before and half_way.session.store.status.go is None
 
 
 def test_poses_that_were_tried_keep_their_places_and_are_not_replaced(plan: Plan) -> None:

@@ -6,6 +6,7 @@ import asyncio
 import base64
 import time
 from collections.abc import AsyncIterator, Callable
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -49,6 +50,8 @@ async def until(pilot: Pilot[None], condition: Callable[[], object]) -> None:
 
 class FakeLink:
     """Answers like a daemon in a good mood; `refuse` maps verbs to errors."""
+
+    root: Path | None = None
 
     def __init__(self) -> None:
         self.asked: list[tuple[str, dict[str, Any]]] = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import pytest
 from textual.app import App
 from textual.widgets import Static
@@ -11,7 +12,7 @@ from station.status import StationState
 from station.tui.app import StationApp
 from station.tui.commands import PLAN_ANSWER_S
 from station.tui.confirm import Confirm, ConfirmGo
-from tests.tui.conftest import FakeLink, idle, until
+from tests.tui.conftest import SUMMARY, FakeLink, idle, until
 
 
 def app_on(link: FakeLink) -> StationApp:
@@ -136,13 +137,20 @@ async def test_the_plan_screen_asks_for_changes_of_the_highlighted_pose(
         await until(pilot, lambda: request_ in link.asked)
 
 
-async def test_improving_the_plan_asks_as_every_motion_does(link: FakeLink) -> None:
+@pytest.mark.parametrize(("key", "purpose"), [("p", "improve"), ("b", "best")])
+async def test_changing_the_plan_on_the_way_asks_as_every_motion_does(
+    link: FakeLink, key: str, purpose: str
+) -> None:
+    link.answers["prepare"] = msgspec.structs.replace(SUMMARY, changes=("0.61 → 0.52 mm " * 6,))
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
-        await pilot.press("2", "p")
+        await pilot.press("2", key)
         await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmGo))
-        assert ("prepare", {"purpose": "improve", "timeout_s": PLAN_ANSWER_S}) in link.asked
+        assert ("prepare", {"purpose": purpose, "timeout_s": PLAN_ANSWER_S}) in link.asked
         assert "go" not in link.verbs
+        facts = text_of(pilot.app, "#confirm-body").splitlines()
+        change = next(i for i, line in enumerate(facts) if line.startswith("Change"))
+        assert facts[change + 1].startswith(" " * 11 + "0")  # a long fact goes on below itself
         await pilot.click("#yes")
         await until(pilot, lambda: ("go", {"token": "t-1"}) in link.asked)
 
@@ -158,6 +166,17 @@ async def test_every_screen_opens_and_stop_works_on_each(link: FakeLink) -> None
             await pilot.press("f12")
             await until(pilot, lambda stops=stops: link.verbs.count("stop") == stops)  # type: ignore[misc]
         await until(pilot, lambda: "plug&#160;it&#160;in" in pilot.app.export_screenshot())
+
+
+async def test_the_palette_names_the_screen_s_own_keys_too(link: FakeLink) -> None:
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+        await pilot.press("2")
+        await pilot.pause()
+        named = {command.title: command for command in pilot.app.get_system_commands(pilot.app.screen)}
+        assert {"Retake (r)", "Best (b)", "Pause (f6)", "STOP (f12)"} <= set(named)
+        named["Skip (s)"].callback()
+        await until(pilot, lambda: ("skip", {"index": 0}) in link.asked)
 
 
 async def test_stop_works_in_the_command_palette(link: FakeLink) -> None:

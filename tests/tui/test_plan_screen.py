@@ -35,12 +35,12 @@ async def test_it_says_that_it_plans_for_as_long_as_it_does() -> None:
     async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
         await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
         await pilot.press("2", "n")
-        await until(pilot, lambda: text_of(pilot.app, "#plan-detail") == PLANNING)
+        await until(pilot, lambda: PLANNING in text_of(pilot.app, "#reason"))
         await pilot.press("n")
-        await until(pilot, lambda: any("already" in n.message for n in pilot.app._notifications))
+        await until(pilot, lambda: any("One after the other" in n.message for n in pilot.app._notifications))
         assert link.verbs.count("make_plan") == 1
         link.made.set()
-        await until(pilot, lambda: "p01" in text_of(pilot.app, "#plan-detail"))
+        await until(pilot, lambda: not text_of(pilot.app, "#reason").strip())
 
 
 async def test_the_end_of_two_hundred_poses_is_told_as_the_start_is(link: FakeLink) -> None:

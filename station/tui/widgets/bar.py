@@ -88,17 +88,24 @@ class ReasonLine(Static):
     status: reactive[StationStatus | None] = reactive(None)
     trouble: reactive[str] = reactive("")
     """Stands before what the daemon said last."""
+    busy: reactive[str] = reactive("")
+    """What takes long and was asked for here; below the reason, if there is one."""
     _reason = ""
 
     def watch_trouble(self) -> None:
         self.watch_status()
 
+    def watch_busy(self) -> None:
+        self.watch_status()
+
     def watch_status(self) -> None:
-        # A playback has no trouble: the line only says where it is.
-        self.set_class(self.status is not None and self.status.playback and not self.trouble, "note")
         reason = self.trouble
         if not reason and self.status is not None and self.status.reason:
             reason = self.status.reason + _NEXT.get(self.status.state, "")
+        # A playback has no trouble: the line only says where it is.
+        playing = self.status is not None and self.status.playback and not self.trouble
+        self.set_class(playing or not reason, "note")
+        reason = "\n ".join(words for words in (reason, self.busy) if words)
         if reason != self._reason:
             self._reason = reason
             self.display = bool(reason)

@@ -11,7 +11,7 @@ import pytest
 from calibrate.information import Noise
 from calibrate.kinematics import forward
 from station.config import CaptureConfig
-from station.estimation import next_best
+from station.estimation import next_best_text
 from station.limits import check_path
 from station.plan.planner import make_plan
 from station.plan.predict import AdviceOptions, advise, forecast, forecast_views
@@ -77,10 +77,10 @@ def test_a_goal_beyond_the_arm_is_not_promised():
 def test_the_session_names_the_next_best_pose_until_it_is_enough():
     config = cell_config(build_cell("paper", 0, "low", "eye-in-hand"))
     _, plan, flange = world()
-    text = next_best(config, flange[:5], plan.poses[4].joints_rad)
+    text = next_best_text(config, flange[:5], plan.poses[4].joints_rad)
     assert "more for 0.5 mm" in text and "next best" in text and "tilt" in text
-    assert next_best(config, flange, plan.poses[-1].joints_rad) == ""
+    assert next_best_text(config, flange, plan.poses[-1].joints_rad) == ""
     strict = msgspec.structs.replace(config, capture=CaptureConfig(goal_m=1e-4))
-    assert "for 0.1 mm" in next_best(strict, flange, plan.poses[-1].joints_rad)
+    assert "for 0.1 mm" in next_best_text(strict, flange, plan.poses[-1].joints_rad)
     unknown = msgspec.structs.replace(config, board_guess=None)
-    assert next_best(unknown, flange[:5], plan.poses[4].joints_rad) == ""
+    assert next_best_text(unknown, flange[:5], plan.poses[4].joints_rad) == ""

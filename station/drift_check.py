@@ -1,0 +1,22 @@
+"""The drift check, by the shell or the screen: a few poses, then `calibrate check` on their recording."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from calibrate.install import load_installed
+
+POSES = 6
+"""Notice a shift of 0.5 mm or 0.1° on a quiet cell."""
+SEED = 0
+PLAN_ANSWER_S = 200.0
+
+
+def require_installed(root: Path) -> None:
+    """CalibrationError when nothing is installed below the daemon's root: the arm would move for nothing."""
+    load_installed(root, allow_simulated=True)
+
+
+def check_arguments(recording: str, folder: str) -> tuple[str, ...]:
+    """Of `calibrate`. A session lies in ROOT/sessions/NAME: what is installed below that root is checked."""
+    return ("check", recording, "--root", str(Path(folder).resolve().parents[1]))

@@ -1,0 +1,58 @@
+"""The drift check from the screen: a few poses under a go of their own, then the verdict in words."""
+
+from __future__ import annotations
+
+import asyncio
+from typing import TYPE_CHECKING
+
+from calibrate.errors import CalibrationError
+from station.drift_check import POSES, SEED, require_installed
+from station.status import SessionStatus, StationState
+from station.tui import offline
+
+if TYPE_CHECKING:
+    from station.tui.app import StationApp
+
+LOOK_S = 0.2
+PLANNING_CHECK = f"Planning the {POSES} poses of the check … Nothing moves."
+CHANGED = (
+    "Another plan was loaded: the drift check has no verdict. Its pictures, if any, are on screen 4 (k)."
+)
+
+
+async def drift_check(app: StationApp) -> None:
+    """Plans, asks, goes, and judges what was recorded, also after pauses and new goes in between."""
+    if app.link is not None and app.link.root is not None:
+        try:
+            require_installed(app.link.root)
+        except CalibrationError as problem:
+            app.notify(f"No drift check: {problem}", severity="warning", timeout=10)
+            return
+    before = "" if app.status is None else app.status.session.recording
+    made = await app.ask_long(PLANNING_CHECK, "make_plan", poses=POSES, seed=SEED)
+    if made is None or not await app.go_for("check"):
+        return
+    await app.switch_mode("live")
+    session = await _sealed(app, made["sha256"], before)
+    if session is None:
+        app.notify(CHANGED, timeout=10)
+        return
+    await offline.check(app, session.recording, session.folder)
+
+
+async def _sealed(app: StationApp, plan_sha256: str, before: str) -> SessionStatus | None:
+    """The session of this plan once its recording is closed; None when another plan takes its place.
+
+    `before`: the recording that was shown until then; the same poses may have been driven before.
+    """
+    seen = False
+    while True:
+        if (status := app.status) is not None:
+            session = status.session
+            ours = session.plan_sha256 == plan_sha256
+            if seen and not ours:
+                return None
+            seen = seen or ours
+            if ours and session.recording not in ("", before) and status.state is StationState.IDLE:
+                return session
+        await asyncio.sleep(LOOK_S)

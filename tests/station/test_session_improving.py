@@ -101,6 +101,14 @@ async def test_the_remaining_poses_are_planned_anew_only_by_a_go(half_way: Rig, 
     assert check_plan(rest, plan.poses[BEFORE - 1].joints_rad, cell_geometry(memory_config())).problems == ()
 
 
+async def test_it_is_void_when_the_poses_change_meanwhile(half_way: Rig) -> None:
+    summary = await half_way.session.prepare(1, "improve")
+    half_way.session.edit(1, "skip", lambda queue: queue.skip(BEFORE + 1))
+    with pytest.raises(RefusedError, match="not valid"):
+        half_way.session.go(1, summary.token)
+    assert "p09" in [status.name for status in queue_of(half_way).statuses]
+
+
 @pytest.mark.parametrize("purpose", ["improve", "best"])
 async def test_too_early_is_told(rig: Rig, purpose: str) -> None:
     with pytest.raises(RefusedError, match="no session is open"):

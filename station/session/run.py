@@ -79,6 +79,9 @@ class Run:
         bench = self._bench
         resting = StationState.PAUSED if bench.recording is not None else StationState.IDLE
         try:
+            if bench.recording is not None:
+                # Nothing moves by poses that a restart would not find again.
+                await bench.recording.save_state(bench.require_queue())
             await bench.cell.robot.start_control()
             self._require_start()
             await self._open_recording()

@@ -275,6 +275,16 @@ class Rig:
         return [pose.state for pose in self.session.store.status.session.poses]
 
 
+def crash(rig: Rig) -> None:
+    """What SIGKILL leaves: no sealing, no goodbye, the file as the disk has it."""
+    for task in (*rig.session._tasks, rig.session._run):
+        if task is not None:
+            task.cancel()
+    assert rig.session.bench.recording is not None
+    rig.session.bench.recording.abandon()
+    rig.session.bench.recording = None
+
+
 def sealed(rig: Rig) -> Recording:
     """What the session wrote."""
     return open_recording(Path(rig.session.store.status.session.recording))

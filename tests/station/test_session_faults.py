@@ -12,7 +12,7 @@ from recordings.reader import open_recording
 from station.errors import RefusedError, RobotError, SafetyStopError
 from station.session.recording import SessionRecording
 from station.status import StationState as S
-from tests.station.session_rig import POSES, NewRig, Rig, sealed
+from tests.station.session_rig import POSES, NewRig, Rig, crash, sealed
 
 
 async def test_a_bad_picture_is_taken_again_and_then_the_pose_fails_alone(rig: Rig) -> None:
@@ -154,13 +154,3 @@ async def test_a_session_cut_by_a_crash_waits_for_a_person_and_goes_on_in_a_new_
     (recording.path / "session-2.mcap").unlink()
     with pytest.raises(MissingPartError, match=r"lacks part 2 \(session-2\.mcap\)"):
         open_recording(recording.path)
-
-
-def crash(rig: Rig) -> None:
-    """What SIGKILL leaves: no sealing, no goodbye, the file as the disk has it."""
-    for task in (*rig.session._tasks, rig.session._run):
-        if task is not None:
-            task.cancel()
-    assert rig.session.bench.recording is not None
-    rig.session.bench.recording.abandon()
-    rig.session.bench.recording = None

@@ -23,7 +23,7 @@ from station.plan.planner import make_plan
 from station.plan.scene import cell_geometry
 from station.session.queue import PoseQueue
 from station.status import StationState as S
-from tests.station.session_rig import TRUTH, NewRig, Rig, WorkerInThisProcess, memory_config, sealed
+from tests.station.session_rig import TRUTH, NewRig, Rig, WorkerInThisProcess, crash, memory_config, sealed
 
 POSES, BEFORE = 12, 7
 
@@ -99,6 +99,35 @@ async def test_the_remaining_poses_are_planned_anew_only_by_a_go(half_way: Rig, 
     assert not {p.joints_rad for p in driven.poses[BEFORE:]} & {p.joints_rad for p in plan.poses}
     rest = msgspec.structs.replace(driven, poses=driven.poses[BEFORE:])
     assert check_plan(rest, plan.poses[BEFORE - 1].joints_rad, cell_geometry(memory_config())).problems == ()
+
+
+async def test_a_crash_before_the_first_of_them_is_saved_finds_what_was_agreed_to(
+    half_way: Rig, new_rig: NewRig
+) -> None:
+    half_way.arm.slow = True
+    summary = await half_way.session.prepare(1, "improve")
+    half_way.session.go(1, summary.token)
+    await half_way.until(S.MOVING)
+    crash(half_way)
+    again = await new_rig(with_plan=False)
+    assert again.state is S.STOPPED
+    assert queue_of(again).sha256 == summary.plan_sha256
+    assert queue_of(again).done == BEFORE
+
+
+async def test_nothing_moves_by_poses_that_the_disk_did_not_take(
+    half_way: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    moves = half_way.arm.log.count("move")
+    summary = await half_way.session.prepare(1, "improve")
+    monkeypatch.setattr("station.session.recording.write_state", full)
+    half_way.session.go(1, summary.token)
+    await half_way.until_true(lambda: "No space left" in half_way.session.store.status.reason)
+    assert half_way.state is S.PAUSED
+    assert half_way.arm.log.count("move") == moves
 
 
 async def test_it_is_void_when_the_poses_change_meanwhile(half_way: Rig) -> None:

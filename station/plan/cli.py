@@ -19,7 +19,7 @@ from station.config_file import load_config
 from station.errors import ConfigError, LimitError, StationError
 from station.limits import PlanCheck, check_plan
 from station.plan.choose import Criterion
-from station.plan.files import import_list, load_plan, save_plan
+from station.plan.files import import_list, load_plan, save_plan, taught_plan
 from station.plan.foxglove import save_scene
 from station.plan.model import Plan, plan_sha256
 from station.plan.planner import make_plan
@@ -39,6 +39,9 @@ def plan_command(
     output: Annotated[Path | None, typer.Option("--output", "-o", help="Where plan.yaml goes.")] = None,
     check: Annotated[Path | None, typer.Option(help="Check this plan instead of making one.")] = None,
     from_list: Annotated[Path | None, typer.Option(help="CSV of joints or flange poses instead.")] = None,
+    taught: Annotated[
+        Path | None, typer.Option(help="Recording whose poses, guided by hand say, become the plan.")
+    ] = None,
     start: Annotated[
         str | None, typer.Option(help="Joints where the arm stands, degrees: 0,-90,90,…")
     ] = None,
@@ -56,7 +59,8 @@ def plan_command(
     try:
         cell, standing = _cell(config, scene, start)
         criterion: Criterion = "D" if d_optimal else "A"
-        plan = _plan(cell, standing, check, from_list, poses, seed, criterion, quiet=as_json)
+        plan = _given(cell, standing, check, from_list, taught)
+        plan = plan or _made(cell, standing, poses, seed, criterion, quiet=as_json)
         outcome = check_plan(plan, standing, cell_geometry(cell))
         if output is not None and check is None:
             save_plan(plan, output)
@@ -101,22 +105,31 @@ def _joints(text: str) -> list[float]:
     return [float(np.deg2rad(angle)) for angle in degrees]
 
 
-def _plan(
+def _given(
     cell: StationConfig,
     standing: list[float] | None,
     check: Path | None,
     from_list: Path | None,
+    taught: Path | None,
+) -> Plan | None:
+    """The plan that is there already; None when one is to be made."""
+    if sum(path is not None for path in (check, from_list, taught)) > 1:
+        raise ConfigError("--check, --from-list and --taught exclude each other; give one of them")
+    if check is not None:
+        return load_plan(check)
+    if from_list is not None:
+        return import_list(from_list, cell.robot.model, cell.mount, standing)
+    return None if taught is None else taught_plan(taught, cell.robot.model, cell.mount)
+
+
+def _made(
+    cell: StationConfig,
+    standing: list[float] | None,
     poses: int,
     seed: int,
     criterion: Criterion,
     quiet: bool,
 ) -> Plan:
-    if check is not None and from_list is not None:
-        raise ConfigError("--check and --from-list exclude each other; give one of them")
-    if check is not None:
-        return load_plan(check)
-    if from_list is not None:
-        return import_list(from_list, cell.robot.model, cell.mount, standing)
     with Progress(
         TextColumn("{task.description}"), BarColumn(), console=_errors, transient=True, disable=quiet
     ) as bar:

@@ -16,6 +16,7 @@ from calibrate.kinematics import MODELS, forward, inverse_nearest
 from recordings import strict_yaml
 from recordings.files import write_atomically
 from recordings.messages import Mount
+from recordings.reader import open_recording
 from station.errors import ConfigError
 from station.plan.model import Plan, PlannedPose
 
@@ -106,14 +107,27 @@ def _value_problems(plan: Plan) -> list[str]:
     return problems
 
 
-def taught_plan(robot: str, mount: Mount, joints_rad: Sequence[Sequence[float]], why: str = "taught") -> Plan:
-    """A plan from joints that a person taught (pendant, free-drive) in this order."""
-    if robot not in MODELS:
-        raise ConfigError(f"robot '{robot}' is unknown; known are {', '.join(MODELS)}")
-    poses = tuple(
-        _plain_pose(robot, f"p{n + 1:02d}", np.array(q, dtype=float), why) for n, q in enumerate(joints_rad)
-    )
-    return Plan(robot=robot, mount=mount, poses=poses)
+def taught_plan(path: Path, robot: str, mount: Mount) -> Plan:
+    """The poses of a recording's pictures, guided by hand or driven to, as a plan, in their order.
+
+    ConfigError when they are of another arm or mount or without joints; RecordingError when it is not whole.
+    """
+    recording = open_recording(path)
+    of = recording.info
+    if (of.robot.model, of.mount) != (robot, mount):
+        raise ConfigError(
+            f"{path} is of a {of.robot.model or 'nameless arm'}, {of.mount}; this cell has a {robot}, "
+            f"{mount}: its poses are no plan for it"
+        )
+    views = recording.views()
+    taught = [(view.name, view.joints_rad) for view in views if view.joints_rad is not None]
+    if not taught or len(taught) < len(views):
+        raise ConfigError(f"{path} holds {len(views)} poses, {len(taught)} of them with the arm's joints")
+    poses = tuple(_plain_pose(robot, name, np.array(joints), "as taught") for name, joints in taught)
+    plan = Plan(robot=robot, mount=mount, poses=poses, note=f"taught: the poses of {path.name}")
+    if problems := _value_problems(plan):
+        raise _report(str(path), problems)
+    return plan
 
 
 def _plain_pose(robot: str, name: str, joints: Array, why: str) -> PlannedPose:
@@ -130,7 +144,7 @@ def import_list(path: Path, robot: str, mount: Mount, near_joints_rad: Sequence[
     nearest to `near_joints_rad`, which is needed then). ConfigError names file, row and remedy.
     """
     try:
-        rows = list(csv.reader(_read(path).decode().splitlines()))
+        rows = list(csv.reader(_read(path).decode("utf-8-sig").splitlines()))
     except UnicodeDecodeError:
         raise ConfigError(f"{path} is not a text file; a list is CSV") from None
     if not rows:
@@ -142,7 +156,8 @@ def import_list(path: Path, robot: str, mount: Mount, near_joints_rad: Sequence[
     if columns not in (_JOINTS_DEG, _JOINTS_RAD, _POSE):
         raise ConfigError(
             f"{path}, row 1: the columns are {','.join(header)!r}; wanted is {','.join(_JOINTS_DEG)} or "
-            f"{','.join(_JOINTS_RAD)} or {','.join(_POSE)}, with `name` before them if you like"
+            f"{','.join(_JOINTS_RAD)} or {','.join(_POSE)}, with `name` before them if you like and commas "
+            "between them"
         )
     if columns == _POSE and near_joints_rad is None:
         raise ConfigError(

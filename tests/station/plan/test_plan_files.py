@@ -2,16 +2,21 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import msgspec
 import numpy as np
 import pytest
 
+import recordings
 from calibrate.geometry import quaternion_from_matrix
 from calibrate.kinematics import MODELS, forward
+from recordings.reader import open_recording
 from station.errors import ConfigError
 from station.plan.files import import_list, load_plan, parse_plan, save_plan, taught_plan
 from station.plan.model import ExpectedView, Plan, PlannedPose, plan_sha256
 
+SAMPLE = Path(recordings.__file__).parent / "samples" / "paper-640.mcap"
 Q = (0.1, -1.7, -1.6, -1.3, 1.5, 0.2)
 
 
@@ -111,6 +116,7 @@ def test_flange_poses_take_the_branch_of_the_arm(tmp_path):
     [
         ("", "empty"),
         ("a,b\n1,2\n", "columns"),
+        ("j1_deg;j2_deg;j3_deg;j4_deg;j5_deg;j6_deg\n1;2;3;4;5;6\n", "commas between them"),
         ("j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n1,2,3\n", "row 2"),
         ("j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n1,2,3,4,5,six\n", "row 2"),
         ("j1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n1,2,3,4,5,nan\n", "finite"),
@@ -124,9 +130,17 @@ def test_a_wrong_list_names_row_and_remedy(tmp_path, text, told):
         import_list(tmp_path / "list.csv", "UR10", "eye-in-hand", Q)
 
 
-def test_taught_poses_carry_their_flange_pose():
-    made = taught_plan("UR5e", "eye-to-hand", [Q, np.zeros(6)])
-    assert [pose.name for pose in made.poses] == ["p01", "p02"]
-    np.testing.assert_allclose(made.poses[0].base_from_flange, forward(MODELS["UR5e"], Q))
-    with pytest.raises(ConfigError, match="UR1000"):
-        taught_plan("UR1000", "eye-in-hand", [Q])
+def test_poses_that_were_guided_by_hand_become_a_plan():
+    made = taught_plan(SAMPLE, "UR10", "eye-in-hand")
+    views = open_recording(SAMPLE).views()
+    assert [pose.name for pose in made.poses] == [view.name for view in views]
+    assert [pose.joints_rad for pose in made.poses] == [view.joints_rad for view in views]
+    np.testing.assert_allclose(made.poses[0].base_from_flange, forward(MODELS["UR10"], views[0].joints_rad))
+    with pytest.raises(ConfigError, match="is of a UR10, eye-in-hand; this cell has a UR5e"):
+        taught_plan(SAMPLE, "UR5e", "eye-in-hand")
+
+
+def test_a_list_from_a_spreadsheet_begins_with_a_mark(tmp_path):
+    (tmp_path / "list.csv").write_text("\ufeffj1_deg,j2_deg,j3_deg,j4_deg,j5_deg,j6_deg\n1,2,3,4,5,6\n")
+    [pose] = import_list(tmp_path / "list.csv", "UR10", "eye-in-hand").poses
+    np.testing.assert_allclose(np.rad2deg(pose.joints_rad), [1, 2, 3, 4, 5, 6])

@@ -55,6 +55,7 @@ CASES = {
     "tilt 60°": Case(tilt_deg=60),
     "tilt 60°, far, uneven": Case(tilt_deg=60, distance_m=0.9, uneven=0.6),
     "far, 1.5 m": Case(tilt_deg=30, distance_m=1.5),
+    "far, 2.5 m": Case(tilt_deg=30, distance_m=2.5),
     "far, 3 m": Case(tilt_deg=30, distance_m=3.0),
 }
 Method = Callable[[Any, BoardSpec], tuple[Any, Any] | None]

@@ -16,6 +16,10 @@ from recordings.messages import BoardSpec
 
 _FEW_MARKERS = 0.7
 """Of those of the board."""
+_SMALL_MARKER_PX, _ENLARGED, _LARGEST_SIDE_PX = 20.0, 3.0, 6000
+"""Markers with shorter sides are read in an enlarged picture, unless that would be larger than this."""
+_SMALLEST_PERIMETER = 0.03
+"""Of a marker, over the longer side of the picture; OpenCV's own."""
 _NEAR_SHARE, _FAR_MOVES = 0.025, 4.0
 """A corner ran away where the refinement moves it farther from the prediction than this share of the spacing
 and than so many times the middle one."""
@@ -35,13 +39,17 @@ def charuco_board(spec: BoardSpec) -> Any:
 def find_charuco(grey: Grey, spec: BoardSpec, thorough: bool = True) -> tuple[Indices, Array]:
     """Point indices (k,) and pixels (k, 2) of the chessboard corners that were found.
 
-    `thorough`: where few markers are seen, the dark parts of the picture are brightened.
+    `thorough`: where few markers are seen, the dark parts of the picture are brightened; where those are
+    small or none, it is enlarged.
     """
     board = charuco_board(spec)
     plane_of = dict(zip(board.getIds().ravel().tolist(), board.getObjPoints(), strict=True))
     seen = _markers(grey, spec, plane_of)
-    if thorough and len(seen) < _FEW_MARKERS * len(plane_of):
+    few = _FEW_MARKERS * len(plane_of)
+    if thorough and len(seen) < few:
         seen = max(seen, _markers(equalise(grey), spec, plane_of), key=len)
+    if thorough and len(seen) < few and _small(seen) and _ENLARGED * max(grey.shape) <= _LARGEST_SIDE_PX:
+        seen = max(seen, _markers_enlarged(grey, spec, plane_of), key=len)
     if len(seen) < 2:
         return _NOTHING
     # OpenCV's sub-pixel step needs both markers of a corner; ours takes every corner the plane predicts.
@@ -51,11 +59,24 @@ def find_charuco(grey: Grey, spec: BoardSpec, thorough: bool = True) -> tuple[In
     return _snap_to_corners(grey, spec, plane, pixels, points)
 
 
-def _markers(grey: Grey, spec: BoardSpec, plane_of: dict[int, Any]) -> list[tuple[Any, Any]]:
+def _markers(
+    grey: Grey, spec: BoardSpec, plane_of: dict[int, Any], smallest: float = _SMALLEST_PERIMETER
+) -> list[tuple[Any, Any]]:
     """Corners on the board and in the picture of every marker of the board that is seen."""
-    markers, ids, _ = _marker_detector(spec.dictionary or "", 1).detectMarkers(grey)
+    markers, ids, _ = _marker_detector(spec.dictionary or "", 1, smallest).detectMarkers(grey)
     found = [] if ids is None else ids.ravel().tolist()
     return [(plane_of[i], marker) for i, marker in zip(found, markers, strict=False) if i in plane_of]
+
+
+def _markers_enlarged(grey: Grey, spec: BoardSpec, plane_of: dict[int, Any]) -> list[tuple[Any, Any]]:
+    large: Any = cv2.resize(grey, None, fx=_ENLARGED, fy=_ENLARGED, interpolation=cv2.INTER_CUBIC)
+    seen = _markers(large, spec, plane_of, _SMALLEST_PERIMETER / _ENLARGED)
+    return [(corners, (marker + 0.5) / _ENLARGED - 0.5) for corners, marker in seen]
+
+
+def _small(seen: list[tuple[Any, Any]]) -> bool:
+    sides = [np.linalg.norm(np.diff(marker.reshape(4, 2), axis=0), axis=1) for _, marker in seen]
+    return not sides or float(np.median(sides)) < _SMALL_MARKER_PX
 
 
 def _snap_to_corners(
@@ -124,8 +145,9 @@ def _apply(H: Array, points: Array) -> Array:
 
 
 @lru_cache(maxsize=8)
-def _marker_detector(dictionary: str, border_bits: int) -> Any:
+def _marker_detector(dictionary: str, border_bits: int, smallest: float = _SMALLEST_PERIMETER) -> Any:
     parameters = cv2.aruco.DetectorParameters()
+    parameters.minMarkerPerimeterRate = smallest
     parameters.markerBorderBits = border_bits
     parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
     return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(dictionary_id(dictionary)), parameters)

@@ -208,3 +208,14 @@ def test_charuco_is_found_whole_at_sixty_degrees() -> None:
         truth = project(CAMERA, seen, board_points(CHARUCO)[found.indices])
         assert found.corners >= 0.9 * found.expected
         assert np.sqrt(np.square(found.pixels - truth).sum(axis=1).mean()) < 0.3
+
+
+def test_a_far_charuco_board_is_read_enlarged() -> None:
+    """A bit of a marker is less than 2 px wide here."""
+    for seed in (1, 2):
+        seen = looking(CHARUCO, np.random.default_rng(seed), distance_m=0.85)
+        image = render(CAMERA, CHARUCO, seen, Light(pixel_noise=1.5), np.random.default_rng(seed))
+        found = detect(image, CHARUCO)
+        assert found.corners >= 0.8 * found.expected
+        truth = project(CAMERA, seen, board_points(CHARUCO)[found.indices])
+        assert np.linalg.norm(found.pixels - truth, axis=1).max() < 0.5

@@ -9,7 +9,7 @@ import numpy as np
 from calibrate.geometry import Array, perturb
 from calibrate.likelihood.model import Observations, State
 from calibrate.likelihood.normal import CORNERS
-from calibrate.likelihood.residuals import corner_residuals, linearise_corners
+from calibrate.likelihood.residuals import corner_distance, corner_residuals, linearise_corners
 
 _STEPS = 10
 _LIMIT_SIGMA = 4.0
@@ -33,7 +33,7 @@ def refine_board_poses(observed: Observations, state: State) -> BoardPoses:
         n = len(state.C)
         return BoardPoses(state.C, np.zeros((n, 6, 6)), np.zeros(n), np.zeros(n))
     for step in range(_STEPS):
-        distance = np.nan_to_num(np.linalg.norm(corner_residuals(observed, state), axis=-1), nan=1e6)
+        distance = np.nan_to_num(corner_distance(corner_residuals(observed, state)), nan=1e6)
         limit = _LIMIT_SIGMA * np.maximum(_typical(distance, observed.present), 0.01)[:, None]
         weights = np.where(distance > limit, (limit / np.maximum(distance, limit)) ** 2, 1.0)
         normal = linearise_corners(observed, state, weights)
@@ -44,7 +44,7 @@ def refine_board_poses(observed: Observations, state: State) -> BoardPoses:
         state = State(state.X, state.Y, perturb(state.C, delta), state.camera, state.theta)
         if step >= 1 and length.max() < 1e-9:
             break
-    distance = np.nan_to_num(np.linalg.norm(corner_residuals(observed, state), axis=-1), nan=1e6)
+    distance = np.nan_to_num(corner_distance(corner_residuals(observed, state)), nan=1e6)
     count = np.maximum(observed.present.sum(axis=1), 1.0)
     rms = np.sqrt((distance**2 * observed.present).sum(axis=1) / count)
     return BoardPoses(state.C, np.asarray(inverse), _typical(distance, observed.present), rms)

@@ -17,7 +17,13 @@ from calibrate.geometry import Array
 from calibrate.likelihood.model import Observations, State
 from calibrate.likelihood.noise import FLOOR, reml_scales
 from calibrate.likelihood.normal import PRIOR, Normal, Solved
-from calibrate.likelihood.residuals import corner_residuals, linearise, robot_residuals
+from calibrate.likelihood.residuals import (
+    Misses,
+    corner_residuals,
+    linearise,
+    misses,
+    robot_residuals,
+)
 from calibrate.projection import INTRINSICS
 from recordings.messages import CameraModel
 
@@ -92,22 +98,22 @@ def estimate(
     Raises BadViewsError where the views do not determine the parameters.
     """
     intrinsics_free = intrinsics_free and observed.has_pixels
-    state = start
+    state, missed = start, misses(observed, start)
     sigma = first_sigma(observed, state) if sigma is None else sigma
     steps, converged = 0, False
     try:
         while steps < MAX_STEPS and not converged:
             steps += 1
-            weights = corner_weights(observed, state, sigma[0])
+            weights = corner_weights(observed, missed, sigma[0])
             normal = linearise(observed, state, weights, intrinsics_free)
             previous = sigma
             if fit_scales:
                 sigma = reml_scales(normal, sigma, observed.has_pixels)
             solved = normal.solve(sigma**-2)
-            state = _step(observed, state, solved, sigma, intrinsics_free)
+            state, missed = _step(observed, state, missed, solved, sigma, intrinsics_free)
             steady = np.abs(np.log(sigma / previous)).max() < 1e-3
             converged = bool(steady and _in_sigmas(solved) < 1e-3)
-        weights = corner_weights(observed, state, sigma[0])
+        weights = corner_weights(observed, missed, sigma[0])
         normal = linearise(observed, state, weights, intrinsics_free)
         solved = normal.solve(sigma**-2)
     except np.linalg.LinAlgError as error:
@@ -127,29 +133,36 @@ def estimate(
     )
 
 
-def corner_weights(observed: Observations, state: State, sigma_px: float) -> Array:
+def corner_weights(observed: Observations, missed: Misses, sigma_px: float) -> Array:
     """(n, k): 1 up to the limit, then falling with the square of the distance; 0 for padding."""
-    distance = np.linalg.norm(corner_residuals(observed, state), axis=-1)
-    distance = np.nan_to_num(distance, nan=np.inf, posinf=np.inf)
+    distance = np.nan_to_num(missed.distance_px, nan=np.inf, posinf=np.inf)
     limit = _CORNER_LIMIT_SIGMA * sigma_px
     return np.where(distance > limit, (limit / np.maximum(distance, limit)) ** 2, 1.0) * observed.present
 
 
-def _step(observed: Observations, state: State, solved: Solved, sigma: Array, intrinsics_free: bool) -> State:
+def _step(
+    observed: Observations,
+    state: State,
+    missed: Misses,
+    solved: Solved,
+    sigma: Array,
+    intrinsics_free: bool,
+) -> tuple[State, Misses]:
     """The Gauss-Newton step, halved while the weighed sum of squares would rise."""
-    before = _cost(observed, state, sigma)
+    before = _cost(missed, state, sigma)
     for halving in range(6):
         factor = 0.5**halving
         trial = state.moved(factor * solved.step, factor * solved.by_view, intrinsics_free)
-        if _cost(observed, trial, sigma) <= before * (1 + 1e-9) + 1e-9:
-            return trial
-    return state
+        ahead = misses(observed, trial)
+        if _cost(ahead, trial, sigma) <= before * (1 + 1e-9) + 1e-9:
+            return trial, ahead
+    return state, missed
 
 
-def _cost(observed: Observations, state: State, sigma: Array) -> float:
+def _cost(missed: Misses, state: State, sigma: Array) -> float:
     """Robust sum: corners saturate like their weights do, (limit² (1 + 2 ln(d/limit)) beyond it)."""
-    e = robot_residuals(observed, state) / np.repeat(sigma[1:3], 3)
-    d = np.linalg.norm(corner_residuals(observed, state), axis=-1) / sigma[0]
+    e = missed.robot / np.repeat(sigma[1:3], 3)
+    d = missed.distance_px / sigma[0]
     d = np.where(np.isfinite(d), d, 1e6)
     over = np.maximum(d / _CORNER_LIMIT_SIGMA, 1.0)
     corners = np.minimum(d, _CORNER_LIMIT_SIGMA) ** 2 + 2 * _CORNER_LIMIT_SIGMA**2 * np.log(over)

@@ -8,6 +8,7 @@ carried by G's last entry alone and nothing cancels, unlike in a plain moment ma
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Literal
 
 import numpy as np
@@ -46,12 +47,12 @@ class Objective:
     def best_translation(self, R: Array) -> Array:
         """b (m, 3) that minimises f for given R (m, 3, 3); least norm from b0 where it is not unique."""
         z = np.concatenate([(R - self.R0).reshape(-1, 9), np.ones((len(R), 1))], axis=1)
-        return np.asarray(self.b0 - z @ (self._b_inverse() @ self.gram[9:12][:, _REST]).T)
+        return np.asarray(self.b0 - z @ (self._b_inverse @ self.gram[9:12][:, _REST]).T)
 
     def reduced(self) -> Array:
         """(10, 10) form in [vec(R - R0); 1] with the translation eliminated (Schur complement)."""
         cross = self.gram[_REST][:, 9:12]
-        reduced = self.gram[np.ix_(_REST, _REST)] - cross @ self._b_inverse() @ cross.T
+        reduced = self.gram[np.ix_(_REST, _REST)] - cross @ self._b_inverse @ cross.T
         return np.asarray((reduced + reduced.T) / 2)
 
     def translation_rank(self) -> int:
@@ -65,6 +66,7 @@ class Objective:
         J[:9, 3:] = (skew(_I3) @ X[:3, :3]).reshape(3, 9).T
         return np.asarray(J.T @ self.gram @ J)
 
+    @cached_property
     def _b_inverse(self) -> Array:
         return np.asarray(np.linalg.pinv(self.gram[9:12, 9:12], rcond=1e-10, hermitian=True))
 

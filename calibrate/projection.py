@@ -37,7 +37,9 @@ def project(camera: CameraModel, points: Array, with_intrinsics: bool = False) -
     K = camera_matrix(camera)
     x, y, w = _rays(points)
     xd, yd, derivatives = _bend(camera, x, y)
-    by_x = K[:2, :2] @ derivatives()
+    by_x = derivatives()
+    by_x[..., 0, :] = K[0, 0] * by_x[..., 0, :] + K[0, 1] * by_x[..., 1, :]
+    by_x[..., 1, :] *= K[1, 1]
     J = np.empty((*points.shape[:-1], 2, 3))
     J[..., :2] = by_x * w[..., None, None]
     J[..., 2] = -(by_x[..., 0] * (x * w)[..., None] + by_x[..., 1] * (y * w)[..., None])
@@ -141,11 +143,12 @@ def _equidistant(x: Array, y: Array, coefficients: tuple[float, ...]) -> _Bent:
 
 def _by_intrinsics(K: Array, x: Array, y: Array, xd: Array, yd: Array) -> Array:
     r2 = x * x + y * y
-    zero, one = np.zeros_like(x), np.ones_like(x)
-    u = [xd, zero, one, zero]
-    v = [zero, yd, zero, one]
+    J = np.zeros((*x.shape, 2, len(INTRINSICS)))
+    J[..., 0, 0], J[..., 0, 2] = xd, 1.0
+    J[..., 1, 1], J[..., 1, 3] = yd, 1.0
     by_k_x = [x * r2, x * r2 * r2, 2 * x * y, r2 + 2 * x * x, x * r2 * r2 * r2]
     by_k_y = [y * r2, y * r2 * r2, r2 + 2 * y * y, 2 * x * y, y * r2 * r2 * r2]
-    u += [K[0, 0] * a + K[0, 1] * b for a, b in zip(by_k_x, by_k_y, strict=True)]
-    v += [K[1, 1] * b for b in by_k_y]
-    return np.stack([np.stack(u, axis=-1), np.stack(v, axis=-1)], axis=-2)
+    for place, (a, b) in enumerate(zip(by_k_x, by_k_y, strict=True), start=4):
+        J[..., 0, place] = K[0, 0] * a + K[0, 1] * b
+        J[..., 1, place] = K[1, 1] * b
+    return J

@@ -21,7 +21,7 @@ import cv2
 import msgspec
 
 from calibrate.bounds import Limits, bounded
-from calibrate.calibration import content_sha256, encode_calibration, write_atomically
+from calibrate.calibration import content_sha256, encode_calibration, write_output
 from calibrate.errors import CalibrationError
 from calibrate.lines import append_line, read_lines
 from calibrate.pipeline import JobOptions, SolvedRecording, solve_recording
@@ -134,7 +134,7 @@ def read_results(output: Path) -> list[BatchResult]:
 
 
 def _write(path: Path, content: bytes) -> None:
-    write_atomically(path, lambda target: target.write(content))
+    write_output(path, content)
 
 
 def solve_one(recording: str, key: str, options: JobOptions, limits: Limits) -> Solved:

@@ -10,7 +10,6 @@ from __future__ import annotations
 import hashlib
 import os
 import secrets
-from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
@@ -21,6 +20,7 @@ import yaml
 from calibrate.errors import CalibrationError
 from calibrate.gates import Gate
 from calibrate.geometry import Transform, is_rigid, matrix_from_quaternion
+from recordings.files import sync_folder
 from recordings.messages import BoardSpec, CameraIdentity, CameraModel, Matrix4, Mount, RobotIdentity, Source
 
 FORMAT: Literal["handeye-calibration/1"] = "handeye-calibration/1"
@@ -296,28 +296,22 @@ def read_calibration(path: Path) -> Calibration:
 
 def write_calibration(calibration: Calibration, path: Path) -> None:
     """Atomically: temporary file, fsync, rename, fsync of the folder. Raises CalibrationFileError."""
-    content = encode_calibration(calibration)
-    write_atomically(path, lambda file: file.write(content))
+    write_output(path, encode_calibration(calibration))
 
 
-def write_atomically(path: Path, write: Callable[[Any], Any]) -> None:
-    """`write` gets a binary file; the name appears only when everything is on the disk."""
+def write_output(path: Path, content: bytes) -> None:
+    """A file for whoever asked for it, with their permissions for new files; old or new, never half.
+
+    Several processes may write it at once. Raises CalibrationFileError, and leaves nothing beside it then.
+    """
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     try:
         with temporary.open("xb") as file:
-            write(file)
+            file.write(content)
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
-        fsync_folder(path.parent)
+        sync_folder(path.parent)
     except OSError as problem:
         temporary.unlink(missing_ok=True)
         raise CalibrationFileError(f"{path} cannot be written: {problem.strerror or problem}.") from None
-
-
-def fsync_folder(folder: Path) -> None:
-    descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
-    try:
-        os.fsync(descriptor)
-    finally:
-        os.close(descriptor)

@@ -27,11 +27,11 @@ from calibrate.calibration import (
     CalibrationFileError,
     decode_calibration,
     encode_calibration,
-    fsync_folder,
     read_calibration,
 )
 from calibrate.errors import CalibrationError
 from calibrate.lines import append_line, read_lines
+from recordings.files import sync_folder, write_atomically
 
 Action = Literal["install", "rollback", "verify"]
 _NAME = re.compile(r"(\d{4,})-[0-9a-f]{8}\.yaml")
@@ -105,7 +105,7 @@ def add_generation(
     content = encode_calibration(calibration)
     number = _next_number(folder)
     path = folder / "gen" / f"{number:04d}-{_content_name(content)}.yaml"
-    _write_new(path, content)
+    write_atomically(path, content)
     decode_calibration(path.read_bytes(), str(path))
     make_current(root, Generation(number, path, True, calibration), action, change, reason)
     return Generation(number, path, True, calibration)
@@ -145,25 +145,13 @@ def _next_number(folder: Path) -> int:
     return max(numbers, default=0) + 1
 
 
-def _write_new(path: Path, content: bytes) -> None:
-    """A generation appears under its name only when it is whole and on the disk."""
-    temporary = path.with_suffix(".tmp")
-    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o640)
-    with os.fdopen(descriptor, "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.rename(path)
-    fsync_folder(path.parent)
-
-
 def _switch(folder: Path, name: str, content: bytes) -> None:
     """`current` → gen/name by one rename, then read back through it."""
     temporary = folder / "current.new"
     temporary.unlink(missing_ok=True)
     temporary.symlink_to(Path("gen") / name)
     temporary.replace(folder / "current")
-    fsync_folder(folder)
+    sync_folder(folder)
     if (folder / "current").read_bytes() != content:
         raise InstallError(f"{folder / 'current'} does not read back what was installed; check the disk.")
 

@@ -13,7 +13,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 from calibrate.batch import BatchResult, Solver, run_batch
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
-from calibrate.calibration import write_atomically
+from calibrate.calibration import write_output
 from calibrate.cluster import Cluster, cluster_solver
 from calibrate.commands.job import GatesFile, MemoryLimit, Profile, ProfileName, Seed, TimeLimit
 from calibrate.commands.output import AsJson, OutputError, err, out
@@ -107,7 +107,7 @@ def _solver(
 
 
 def _write(path: Path, text: str) -> None:
-    write_atomically(path, lambda target: target.write(text.encode()))
+    write_output(path, text.encode())
 
 
 def _progress(stack: ExitStack) -> Callable[[int, int, BatchResult], None] | None:

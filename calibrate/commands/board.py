@@ -9,7 +9,7 @@ import typer
 
 from calibrate.board import ambiguity_text, describe_board
 from calibrate.boardprint import PAPER_MM, board_sheet
-from calibrate.calibration import write_atomically
+from calibrate.calibration import write_output
 from calibrate.commands.files import read_board
 from calibrate.commands.output import OutputError, err, out
 from calibrate.vector import pdf, svg
@@ -52,7 +52,7 @@ def board(
         spec = read_board(board_file)
     sheet = board_sheet(spec, paper)
     content = pdf(sheet) if output.suffix.lower() == ".pdf" else svg(sheet).encode()
-    write_atomically(output, lambda file: file.write(content))
+    write_output(output, content)
     out.print(f"written: {output} ({describe_board(spec)}, {sheet.width_mm:.0f} × {sheet.height_mm:.0f} mm)")
     out.print(
         "print at 100 % (no fitting to the page), glue it on something flat, measure the bar and one square"

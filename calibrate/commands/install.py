@@ -11,7 +11,7 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from calibrate.calibration import Calibration, read_calibration, write_atomically
+from calibrate.calibration import Calibration, read_calibration, write_output
 from calibrate.commands.files import read_cell_serials
 from calibrate.commands.output import AsJson, OutputError, err, out, print_json
 from calibrate.formats import FORMATS, export
@@ -119,7 +119,7 @@ def export_file(
         return
     if not output.parent.is_dir():
         raise OutputError(f"{output}: the folder {output.parent} does not exist.")
-    write_atomically(output, lambda target: target.write(text.encode()))
+    write_output(output, text.encode())
 
 
 def install_file(

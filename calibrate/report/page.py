@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from calibrate.board import describe_board
-from calibrate.calibration import Touch, write_atomically
+from calibrate.calibration import Touch, write_output
 from calibrate.geometry import Array
 from calibrate.lens import project
 from calibrate.pipeline import SolvedRecording
@@ -34,7 +34,7 @@ def write_report(
     """Writes the page atomically. `history`: rows (generation, when, what, change) of what was installed;
     `touches`: what was found by hand since."""
     content = report_page(job, peers, history, touches).encode()
-    write_atomically(path, lambda file: file.write(content))
+    write_output(path, content)
 
 
 def report_page(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 
 import msgspec
@@ -14,8 +15,8 @@ from calibrate.calibration import (
     decode_calibration,
     encode_calibration,
     read_calibration,
-    write_atomically,
     write_calibration,
+    write_output,
 )
 from calibrate.geometry import FrameMismatchError, Transform
 from calibrate.pipeline import SolvedRecording
@@ -117,14 +118,17 @@ def test_frames_that_do_not_touch_are_refused(real_file: Path) -> None:
         camera_from_board @ flange_from_camera
 
 
-def test_a_failed_write_leaves_the_old_file_and_no_scraps(real_file: Path, tmp_path: Path) -> None:
+def test_a_failed_write_leaves_the_old_file_and_no_scraps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     path = tmp_path / "c.yaml"
     path.write_bytes(b"old")
 
-    def fail(file: object) -> None:
+    def fail(descriptor: int) -> None:
         raise OSError(28, "No space left on device")
 
+    monkeypatch.setattr(os, "fsync", fail)
     with pytest.raises(CalibrationFileError, match="No space left"):
-        write_atomically(path, fail)
+        write_output(path, b"new")
     assert path.read_bytes() == b"old"
     assert [p.name for p in tmp_path.iterdir()] == ["c.yaml"]

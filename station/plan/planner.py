@@ -23,7 +23,7 @@ from station.plan.explain import explain_shortage, looks_back
 from station.plan.groups import best_group
 from station.plan.model import Plan
 from station.plan.order import BLOCKED, move_times, short_order, time_matrix
-from station.plan.scene import Scene, scene_of
+from station.plan.scene import Scene, require_kept_clear, scene_of
 from station.plan.view_range import ViewRange, view_range
 from station.plan.visibility import blind_share, visible
 
@@ -63,6 +63,7 @@ def make_plan(
     ConfigError when the configuration lacks what planning needs; LimitError when there is no such plan,
     saying which limit binds and what to change.
     """
+    require_kept_clear(config)
     options = PlanOptions(count=count, seed=seed, criterion=criterion)
     return plan_scene(scene_of(config), options, start_joints_rad, progress)
 

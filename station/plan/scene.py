@@ -13,7 +13,7 @@ from calibrate.kinematics import MODELS, DhDeltas, RobotModel
 from recordings.messages import BoardSpec, CameraModel, Mount
 from station.collision import CellGeometry, plate
 from station.config import Capsule, PoseGuess, StationConfig
-from station.errors import ConfigError
+from station.errors import ConfigError, LimitError
 
 _CAMERA_BODY_M, _CAMERA_RADIUS_M = 0.05, 0.035
 _DOUBT = 3.0
@@ -153,6 +153,20 @@ def geometry_of(
 
 def _thicker_m(sigma_m: float) -> float:
     return min(_DOUBT * sigma_m, _MOST_DOUBT_M)
+
+
+def require_kept_clear(config: StationConfig) -> None:
+    """LimitError when what hangs on a guess may well be (1 sigma) where no check keeps clear of."""
+    name = "camera_guess" if config.mount == "eye-in-hand" else "board_guess"
+    guess: PoseGuess | None = getattr(config, name)
+    drawn = config.mount == "eye-in-hand" and config.limits.solids
+    if guess is None or drawn or guess.sigma_m <= _MOST_DOUBT_M:
+        return
+    raise LimitError(
+        f"{name} is known to {1000 * guess.sigma_m:.0f} mm only (sigma_m), and the checks keep clear of "
+        f"{1000 * _MOST_DOUBT_M:.0f} mm: moves of a plan might touch something. Let `station bootstrap` find "
+        "it, or measure it better"
+    )
 
 
 def covers_its_doubt(guess: PoseGuess) -> bool:

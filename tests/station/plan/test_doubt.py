@@ -11,6 +11,8 @@ import pytest
 from calibrate.geometry import perturb
 from calibrate.kinematics import forward
 from station.collision import margins
+from station.errors import LimitError
+from station.plan.planner import make_plan
 from station.plan.scene import cell_geometry, scene_of
 from station.plan.visibility import outline, uncertain_pixels
 from station.simulation.placement import guess_of
@@ -48,6 +50,16 @@ def test_what_hangs_on_a_guess_stays_clear_of_the_arm_when_the_guess_is_three_si
 def test_the_camera_is_not_thickened_without_bound():
     [rough], [hopeless] = (cell_geometry(config_of(sigma_m=s)[1]).solids for s in (0.02, 0.2))
     assert rough.radius_m == hopeless.radius_m <= 0.07
+
+
+@pytest.mark.parametrize(("mount", "name"), [("eye-in-hand", "camera"), ("eye-to-hand", "board")])
+def test_a_guess_that_is_not_kept_clear_of_makes_no_plan(mount, name):
+    """The camera may be anywhere within 60 mm, the checks keep clear of 30."""
+    truth, config, X, Y = config_of(mount)
+    rough = guess_of(X if name == "camera" else Y, 0.06, 0.3)
+    config = msgspec.structs.replace(config, **{f"{name}_guess": rough})
+    with pytest.raises(LimitError, match=f"{name}_guess is known to 60 mm only.*station bootstrap"):
+        make_plan(config, start_joints_rad=truth.start_joints_rad)
 
 
 def test_solids_of_the_configuration_are_taken_as_they_are():

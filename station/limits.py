@@ -218,15 +218,19 @@ def leaving(gaps: Array) -> Array:
 
 def _margin_problems(gaps: Array, labels: Sequence[str], name: str) -> list[Problem]:
     problems = []
-    for column in (int(c) for c in np.flatnonzero(gaps.min(axis=0) < 0)):
-        at = int(np.argmin(gaps[:, column]))
+    for label in dict.fromkeys(labels):
+        alike = [column for column, other in enumerate(labels) if other == label]  # a plate is several rods
+        gap = gaps[:, alike].min(axis=1)
+        at = int(np.argmin(gap))
+        if gap[at] >= 0:
+            continue
         where = "at the target" if at == len(gaps) - 1 else f"after {at / (len(gaps) - 1):.0%} of the way"
         problems.append(
             Problem(
                 name,
                 "clearance",
-                f"{labels[column]}, {-1000 * gaps[at, column]:.0f} mm too close {where}",
-                labels[column].split(" against ")[0],
+                f"{label}, {-1000 * gap[at]:.0f} mm too close {where}",
+                label.split(" against ")[0],
             )
         )
     return problems

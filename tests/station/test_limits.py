@@ -7,11 +7,12 @@ import numpy as np
 import pytest
 
 from calibrate.kinematics import MODELS, forward
-from station.collision import CellGeometry, margins, moving_points
+from station.collision import CellGeometry, margins, moving_points, plate
 from station.config import Capsule, LimitsConfig, Plane
 from station.limits import (
     JOINT_ACCELERATION_CAP_RAD_S2,
     JOINT_SPEED_CAP_RAD_S,
+    SPACING_M,
     SPEED_CAP_M_S,
     check_path,
     check_plan,
@@ -80,6 +81,18 @@ def test_an_obstacle_between_two_good_poses_is_found():
     assert problems
     assert all(p.pose == "pose 7" and p.limit == "clearance" for p in problems)
     assert any("wrist 3 against the post" in str(p) and "of the way" in str(p) for p in problems)
+
+
+def test_a_plate_of_several_rods_is_one_problem():
+    """A board on the flange, driven into the table."""
+    board = plate("board", np.eye(4), np.array([-0.1, -0.1]), np.array([0.1, 0.1]))
+    limits = LimitsConfig(planes=(Plane("table", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),))
+    cell = CellGeometry(MODELS["UR10"], limits, solids=board)
+    down = (0.0, -0.4, 1.4, -2.6, -1.57, 0.0)
+    gaps, labels = margins(cell, np.array([down]))
+    worst_m = min(gap for gap, label in zip(gaps[0], labels, strict=True) if label == "board against table")
+    [told] = [p.text for p in check_path(cell, down, down).problems if "board against table" in p.text]
+    assert told.startswith(f"board against table, {-1000 * (worst_m - SPACING_M / 2):.0f} mm too close")
 
 
 def test_samples_lie_as_dense_as_promised():

@@ -23,9 +23,11 @@ from station.plan.files import import_list, load_plan, save_plan, taught_plan
 from station.plan.foxglove import save_scene
 from station.plan.model import Plan, plan_sha256
 from station.plan.planner import make_plan
+from station.plan.predict import with_forecast
 from station.plan.preview import save_picture
-from station.plan.scene import cell_geometry, scene_of
+from station.plan.scene import Scene, cell_geometry, scene_of
 from station.plan.sketch import sketch
+from station.plan.standing import geometry_from
 
 _errors = Console(stderr=True)
 _NOTHING_KNOWN_M = 0.05
@@ -61,10 +63,14 @@ def plan_command(
         criterion: Criterion = "D" if d_optimal else "A"
         plan = _given(cell, standing, check, from_list, taught)
         plan = plan or _made(cell, standing, poses, seed, criterion, quiet=as_json)
-        outcome = check_plan(plan, standing, cell_geometry(cell))
-        if output is not None and check is None:
-            save_plan(plan, output)
-        shown = None if cell.camera_guess is None or cell.board_guess is None else scene_of(cell)
+        geometry = cell_geometry(cell) if standing is None else geometry_from(cell, standing)
+        outcome = check_plan(plan, standing, geometry)
+        shown = _scene(cell, needed=picture is not None or foxglove is not None)
+        told, cut = (plan, ()) if shown is None else with_forecast(shown, plan)
+        if check is None:
+            plan = told
+            if output is not None:
+                save_plan(plan, output)
         if shown is not None and picture is not None:
             save_picture(shown, plan, picture)
         if shown is not None and foxglove is not None:
@@ -73,10 +79,10 @@ def plan_command(
         _errors.print(f"[bold red]error:[/] {error}", soft_wrap=True, highlight=False)
         raise typer.Exit(error.exit_code) from None
     if as_json:
-        typer.echo(json.dumps(_summary(plan, outcome)))
+        typer.echo(json.dumps(_summary(plan, told, outcome)))
     else:
-        drawn = sketch(shown, plan) if shown is not None else ""
-        _show(plan, outcome, drawn, output if check is None else None, cell.capture.goal_m)
+        drawn = sketch(shown, told) if shown is not None else ""
+        _show(told, outcome, drawn, cut, output if check is None else None, cell.capture.goal_m)
     if outcome.problems:
         raise typer.Exit(LimitError.exit_code)
 
@@ -91,6 +97,16 @@ def _cell(config: Path | None, scene: str, start: str | None) -> tuple[StationCo
 
     truth = build_cell(scene, 0, "low", "eye-in-hand")  # type: ignore[arg-type]
     return cell_config(truth), standing or list(truth.start_joints_rad)
+
+
+def _scene(cell: StationConfig, needed: bool) -> Scene | None:
+    """What can be drawn and forecast. Checking needs none: None where the configuration says too little."""
+    try:
+        return scene_of(cell)
+    except ConfigError:
+        if needed:
+            raise
+        return None
 
 
 def _joints(text: str) -> list[float]:
@@ -143,8 +159,9 @@ def _made(
         )
 
 
-def _summary(plan: Plan, outcome: PlanCheck) -> dict[str, Any]:
-    last = plan.poses[-1].predicted_sigma_m if plan.poses else None
+def _summary(plan: Plan, told: Plan, outcome: PlanCheck) -> dict[str, Any]:
+    """`told`: the plan with its forecast."""
+    last = told.poses[-1].predicted_sigma_m
     return {
         "plan_sha256": plan_sha256(plan),
         "poses": len(plan.poses),
@@ -174,7 +191,9 @@ def _goal_text(plan: Plan, goal_m: float) -> str:
     return f"not enough for the {goal}: about {more} poses would be (--poses), or a better camera or arm"
 
 
-def _show(plan: Plan, outcome: PlanCheck, picture: str, output: Path | None, goal_m: float) -> None:
+def _show(
+    plan: Plan, outcome: PlanCheck, picture: str, cut: tuple[str, ...], output: Path | None, goal_m: float
+) -> None:
     console = Console(highlight=False, soft_wrap=True)
     table = Table(box=None, pad_edge=False)
     for heading in ("pose", "move s", "turn °", "margin mm", "σ mm"):
@@ -200,6 +219,8 @@ def _show(plan: Plan, outcome: PlanCheck, picture: str, output: Path | None, goa
     )
     if expected := _goal_text(plan, goal_m):
         console.print(expected)
+    if cut:
+        console.print(f"by the guesses these do not show the whole board: {', '.join(cut)}")
     if plan.note:
         console.print(f"note: {plan.note}")
     for problem in outcome.problems:

@@ -5,9 +5,11 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
+import msgspec
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
+from calibrate.board import board_points
 from calibrate.geometry import Array
 from calibrate.information import Noise
 from calibrate.kinematics import forward
@@ -18,6 +20,7 @@ from station.plan.describe import planned_pose
 from station.plan.model import Plan, PlannedPose
 from station.plan.scene import Scene
 from station.plan.view_range import ViewRange, view_range
+from station.plan.visibility import visible
 
 _FURTHER_POSES = 60
 _TRIES = 12
@@ -54,19 +57,36 @@ class AdviceOptions:
     """Joints of the pose after it: the way on to it must be free too."""
 
 
-def forecast(scene: Scene, plan: Plan, noise: Noise, free_intrinsics: bool = True) -> list[Forecast]:
-    """Expected sigma after each pose of the plan, first to last."""
+def with_forecast(scene: Scene, plan: Plan) -> tuple[Plan, tuple[str, ...]]:
+    """The plan, with the expected sigma after each pose if it says none; names of poses that cut the board."""
     flange = forward(scene.geometry.model, np.array([pose.joints_rad for pose in plan.poses]).reshape(-1, 6))
-    return forecast_views(scene, flange, noise, free_intrinsics)
+    cut = tuple(pose.name for pose, seen in zip(plan.poses, _whole(scene, flange), strict=True) if not seen)
+    if all(pose.predicted_sigma_m is not None for pose in plan.poses):
+        return plan, cut
+    expected = forecast_views(scene, flange, Noise())
+    poses = tuple(
+        msgspec.structs.replace(pose, predicted_sigma_m=after.sigma_m)
+        for pose, after in zip(plan.poses, expected, strict=True)
+    )
+    return msgspec.structs.replace(plan, poses=poses), cut
 
 
 def forecast_views(
     scene: Scene, base_from_flange: Array, noise: Noise, free_intrinsics: bool = True
 ) -> list[Forecast]:
-    """Expected sigma after each of the views taken from these flange poses (n, 4, 4)."""
+    """Expected sigma after each of the views taken from these flange poses (n, 4, 4).
+
+    A view that by the guess does not show the whole board brings nothing.
+    """
     objective = objective_for(scene, "A", free_intrinsics)
-    known = informations(scene, base_from_flange, noise, free_intrinsics).cumsum(axis=0)
-    return [Forecast(*sigma_of(information, objective)) for information in known]
+    gains = informations(scene, base_from_flange, noise, free_intrinsics)
+    gains[~_whole(scene, base_from_flange)] = 0.0
+    return [Forecast(*sigma_of(information, objective)) for information in gains.cumsum(axis=0)]
+
+
+def _whole(scene: Scene, base_from_flange: Array) -> NDArray[np.bool_]:
+    """(n,) whether every point of the board is in the picture, by the guess."""
+    return visible(scene.camera, scene.seen(base_from_flange, board_points(scene.board)), 0.0)
 
 
 def advise(

@@ -117,3 +117,17 @@ def test_a_list_from_elsewhere_is_checked_like_any_plan(tmp_path):
     result = run("--config", tmp_path / "cell.yaml", "--from-list", tmp_path / "list.csv", "-o", out)
     assert result.exit_code == 0, result.output
     assert [pose.why for pose in load_plan(out).poses] == ["from list.csv"] * 3
+    assert all(pose.predicted_sigma_m is not None for pose in load_plan(out).poses)
+    assert "not enough for the goal" in result.output
+
+
+def test_checking_needs_no_lens_but_a_picture_does(made, tmp_path):
+    truth = build_cell("paper", 0, "low", "eye-in-hand")
+    config = cell_config(truth, "127.0.0.1")
+    blind = msgspec.structs.replace(config, camera=msgspec.structs.replace(config.camera, model=None))
+    (tmp_path / "cell.yaml").write_bytes(msgspec.yaml.encode(blind))
+    check = ["--config", tmp_path / "cell.yaml", "--check", made[1]["plan.yaml"]]
+    assert run(*check).exit_code == 0, run(*check).output
+    refused = run(*check, "--picture", tmp_path / "plan.png")
+    assert refused.exit_code == 2
+    assert "rough lens" in refused.output.replace("\n", " ")

@@ -13,8 +13,9 @@ from calibrate.kinematics import forward
 from station.config import CaptureConfig
 from station.estimation import next_best_text
 from station.limits import check_path
+from station.plan.model import PlannedPose
 from station.plan.planner import make_plan
-from station.plan.predict import AdviceOptions, advise, forecast, forecast_views
+from station.plan.predict import AdviceOptions, advise, forecast_views, with_forecast
 from station.plan.scene import scene_of
 from station.simulation.scenes import build_cell, cell_config
 
@@ -30,9 +31,23 @@ def world():
 
 def test_the_forecast_is_what_the_plan_says_and_only_falls():
     scene, plan, _ = world()
-    steps = forecast(scene, plan, Noise())
-    assert [s.sigma_m for s in steps] == pytest.approx([p.predicted_sigma_m for p in plan.poses], rel=1e-4)
-    assert (np.diff([s.sigma_m for s in steps]) <= 1e-12).all()
+    assert with_forecast(scene, plan) == (plan, ())
+    silent = tuple(msgspec.structs.replace(pose, predicted_sigma_m=None) for pose in plan.poses)
+    told, cut = with_forecast(scene, msgspec.structs.replace(plan, poses=silent))
+    steps = [pose.predicted_sigma_m for pose in told.poses]
+    assert cut == ()
+    assert steps == pytest.approx([pose.predicted_sigma_m for pose in plan.poses], rel=1e-4)
+    assert (np.diff(steps) <= 1e-12).all()
+
+
+def test_a_pose_that_cuts_the_board_is_named_and_expected_to_bring_nothing():
+    scene, plan, _ = world()
+    a, b, c, d, e, f = plan.poses[8].joints_rad
+    away = PlannedPose("away", (a, b, c, d, e + 0.5, f))
+    poses = tuple(msgspec.structs.replace(pose, predicted_sigma_m=None) for pose in plan.poses[:9])
+    told, cut = with_forecast(scene, msgspec.structs.replace(plan, poses=(*poses, away)))
+    assert cut == ("away",)
+    assert told.poses[9].predicted_sigma_m == told.poses[8].predicted_sigma_m
 
 
 def test_a_known_lens_and_less_noise_make_it_better():

@@ -187,6 +187,8 @@ def _goal_text(plan: Plan, goal_m: float) -> str:
     goal = f"goal of {1000 * goal_m:.2g} mm (capture.goal_m)"
     if number is not None:
         return f"enough for the {goal} after pose {number}, if corners and arm are as good as assumed"
+    if sigmas[-1] >= _NOTHING_KNOWN_M:
+        return f"not enough for the {goal}: so few poses, or so much alike, say next to nothing of the mount"
     more = int(np.ceil(len(sigmas) * (sigmas[-1] / goal_m) ** 2))
     return f"not enough for the {goal}: about {more} poses would be (--poses), or a better camera or arm"
 

@@ -58,7 +58,10 @@ class AdviceOptions:
 
 
 def with_forecast(scene: Scene, plan: Plan) -> tuple[Plan, tuple[str, ...]]:
-    """The plan, with the expected sigma after each pose if it says none; names of poses that cut the board."""
+    """The plan, with the expected sigma after each pose if it says none; poses that cut the board.
+
+    By the scene's guess and the usual noise.
+    """
     flange = forward(scene.geometry.model, np.array([pose.joints_rad for pose in plan.poses]).reshape(-1, 6))
     cut = tuple(pose.name for pose, seen in zip(plan.poses, _whole(scene, flange), strict=True) if not seen)
     if all(pose.predicted_sigma_m is not None for pose in plan.poses):

@@ -86,8 +86,7 @@ class FreeDrive:
         bench = self._bench
         queue, store = bench.require_queue(), bench.store
         joints = bench.cell.robot.latest().joints_rad
-        number = len(queue.statuses) + 1
-        index = queue.add(PlannedPose(f"hand-{number:02d}", joints, why="guided by hand"))
+        index = queue.add(PlannedPose(f"hand-{queue.next_index + 1:02d}", joints, why="guided by hand"))
         attempt = queue.start_attempt(index)
         self._last_place = joints
         try:

@@ -68,6 +68,11 @@ class PoseQueue:
         return tuple(i for i in self.open if not self._status[i].attempt)
 
     @property
+    def next_index(self) -> int:
+        """The number that a further pose will have."""
+        return self._next_index
+
+    @property
     def done(self) -> int:
         return sum(s.state == "done" for s in self._status.values())
 
@@ -103,7 +108,7 @@ class PoseQueue:
     def with_more(self, pose: PlannedPose) -> tuple[PoseQueue, int]:
         """A copy with this pose too, at the end, and its number."""
         more = PoseQueue(self.plan, self.statuses)
-        return more, more.add(_named(pose, more._next_index, "more"))
+        return more, more.add(_named(pose, more.next_index, "more"))
 
     def start_attempt(self, index: int) -> int:
         """The number of this attempt, from 1; later ones supersede earlier ones in the recording."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 
 from station.status import StationState as S
-from tests.station.session_rig import NewRig, sealed
+from tests.station.session_rig import POSES, NewRig, Rig, sealed
 
 
 async def test_a_free_hand_records_without_control(new_rig: NewRig) -> None:
@@ -22,6 +22,17 @@ async def test_a_free_hand_records_without_control(new_rig: NewRig) -> None:
     await rig.session.finish(1)
     assert [view.name for view in sealed(rig).views()] == ["hand-01", "hand-02"]
     assert "start control" not in rig.arm.log
+
+
+async def test_a_dropped_pose_does_not_take_the_name_of_the_next_picture(rig: Rig) -> None:
+    await rig.session.switch_free_drive(1, True, auto=False)
+    await rig.session.record(1)
+    await rig.session.switch_free_drive(1, False, auto=False)
+    rig.session.edit(1, "drop", lambda queue: queue.drop(POSES - 1))
+    await rig.session.switch_free_drive(1, True, auto=False)
+    assert await rig.session.record(1) == POSES + 1
+    names = [pose.name for pose in rig.session.store.status.session.poses]
+    assert names[-2:] == [f"hand-{POSES + 1:02d}", f"hand-{POSES + 2:02d}"]
 
 
 async def test_auto_record_takes_a_new_place_once(new_rig: NewRig) -> None:

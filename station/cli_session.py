@@ -186,7 +186,7 @@ async def load_sweep(client: Client) -> None:
 
 
 async def _make(client: Client, poses: int) -> None:
-    await client.request("make_plan", poses=poses, seed=SEED, timeout_s=PLAN_ANSWER_S)
+    await client.request("make_plan", poses=poses, seed=SEED, lens_known=True, timeout_s=PLAN_ANSWER_S)
 
 
 async def attended_session(
@@ -205,8 +205,10 @@ async def attended_session(
         progress.skip(standing)
         confirm = _confirmation(go, interactive, standing.simulated)
         with progress:
+            # One pose more never ends a session that has others left.
+            to_the_end = headless and purpose != "best"
             return await carry_out(
-                client, purpose, confirm=confirm, watch=progress, finish_with_loss=headless
+                client, purpose, confirm=confirm, watch=progress, finish_with_loss=to_the_end
             )
 
 

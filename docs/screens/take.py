@@ -136,7 +136,9 @@ def take(terminals: list[Terminal]) -> None:
     both(terminals, "sessions", ("4",), "sealed")
     both([first], "result", ("F9",), "READY TO INSTALL|GATE")
     for terminal in terminals[1:]:
-        both([terminal], "result", ("1", "4", "v"), "READY TO INSTALL|GATE")
+        terminal.press("1", "4")
+        terminal.wait_for("yes")
+        both([terminal], "result", ("v",), "READY TO INSTALL|GATE")
     both(terminals, "log", ("5",), "saved")
     both(terminals, "help", ("1", "F1"), "Stop the arm now")
     for before, terminal in itertools.pairwise(terminals):

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import Any, ClassVar
 
 from rich.console import Group
 from rich.table import Table
@@ -14,9 +14,6 @@ from textual.containers import VerticalScroll
 from textual.widgets import Static
 
 from station.tui.screen import StationScreen
-
-if TYPE_CHECKING:
-    from station.tui.app import StationApp
 
 WORDS = {"ok": "ok", "warning": "WARN", "failed": "MISSING", "skipped": "-"}
 
@@ -62,7 +59,7 @@ class ChecklistScreen(StationScreen):
 
     @work(exclusive=True, exit_on_error=False)
     async def action_refresh_checks(self) -> None:
-        answer = await cast("StationApp", self.app).ask("doctor")
+        answer = await self.station.ask("doctor")
         if answer is None:
             return
         self._missing = any(check.get("state") == "failed" for check in answer)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, ClassVar, cast
+from typing import ClassVar, cast
 
 from rich.text import Text
 from textual import work
@@ -16,9 +16,6 @@ from station.status import PoseStatus, StationStatus
 from station.tui.screen import StationScreen
 from station.tui.widgets.sketch import PlanSketch
 from station.tui.words import POSE_MARKS
-
-if TYPE_CHECKING:
-    from station.tui.app import StationApp
 
 COLUMNS = ("#", "pose", "state", "± then", "why it is there / what happened", "try", "corners")
 NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves); a adds the arm's posture."
@@ -87,10 +84,6 @@ class PlanScreen(StationScreen):
     @property
     def table(self) -> DataTable[str]:
         return cast("DataTable[str]", self.query_one("#plan-table", DataTable))
-
-    @property
-    def station(self) -> StationApp:
-        return cast("StationApp", self.app)
 
     def show(self, status: StationStatus | None) -> None:
         super().show(status)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, ClassVar, cast
+from typing import ClassVar
 
 import numpy as np
 from rich.text import Text
@@ -18,9 +18,6 @@ from calibrate.geometry import difference
 from calibrate.verification import agrees, touch_text
 from station.tui.offline import installed_beside
 from station.tui.screen import StationScreen
-
-if TYPE_CHECKING:
-    from station.tui.app import StationApp
 
 NO_RESULT = "No result yet. F9 solves the session just captured; on screen 4, v shows older ones."
 BAR_CELLS = 24
@@ -122,10 +119,6 @@ class ResultScreen(StationScreen):
 
     def on_mount(self) -> None:
         self.query_one("#result-left").focus()
-
-    @property
-    def station(self) -> StationApp:
-        return cast("StationApp", self.app)
 
     def on_screen_resume(self) -> None:
         super().on_screen_resume()

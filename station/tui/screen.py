@@ -26,13 +26,16 @@ class StationScreen(Screen[None]):
         yield StatusBar(id="bar")
         yield ReasonLine(id="reason")
         yield from self.body()
-        yield Keys(cast("StationApp", self.app).common_actions())
+        yield Keys(self.station.common_actions())
+
+    @property
+    def station(self) -> StationApp:
+        return cast("StationApp", self.app)
 
     def on_screen_resume(self) -> None:
-        app = cast("StationApp", self.app)
-        self.show(app.status)
-        self.doubt(app.trouble, app.silent_s)
-        self.say_busy(app.busy)
+        self.show(self.station.status)
+        self.doubt(self.station.trouble, self.station.silent_s)
+        self.say_busy(self.station.busy)
 
     def body(self) -> ComposeResult:
         yield from ()

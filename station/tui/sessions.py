@@ -2,19 +2,18 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any, ClassVar, cast
+from typing import Any, ClassVar, cast
 
 from textual import work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.widgets import DataTable
 
+from station.drift_check import POSES
 from station.tui.screen import StationScreen
 from station.tui.words import size
 
-if TYPE_CHECKING:
-    from station.tui.app import StationApp
-
+DRIFT = f"Take {POSES} pictures in place of the loaded plan: does the installed one still hold? (asks)"
 COLUMNS = ("session", "source", "views", "size", "state", "calibration")
 
 
@@ -25,9 +24,7 @@ class SessionsScreen(StationScreen):
         Binding("v", "result", "Result", tooltip="Show this session's calibration"),
         Binding("w", "watch", "Watch", tooltip="Play this recording in the live screen"),
         Binding("k", "check", "Check", tooltip="Does the installed calibration still hold on this one?"),
-        Binding(
-            "d", "drift", "Drift", tooltip="Take 6 pictures now: does the installed one still hold? (asks)"
-        ),
+        Binding("d", "drift", "Drift", tooltip=DRIFT),
         Binding("c", "recover", "Recover", tooltip="Rebuild an unfinished recording"),
     ]
 
@@ -49,10 +46,6 @@ class SessionsScreen(StationScreen):
     @property
     def table(self) -> DataTable[str]:
         return cast("DataTable[str]", self.query_one("#sessions-table", DataTable))
-
-    @property
-    def station(self) -> StationApp:
-        return cast("StationApp", self.app)
 
     @work(exclusive=True, group="fetch", exit_on_error=False)
     async def fetch(self) -> None:

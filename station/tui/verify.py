@@ -179,30 +179,7 @@ async def verify(app: StationApp, path: str) -> bool:
     except CalibrationError as problem:
         app.notify(str(problem), severity="error")
         return False
-    found: dict[int, Touch] = {}
-    choice = ChooseCorner(board, found, "")
-    looked = False
-    while (corner := await app.push_screen_wait(choice)) is not None:
-        choice = ChooseCorner(board, found, choice.pointer_mm)
-        wish: dict[str, Any] = {
-            "corner": corner,
-            "standoff_m": STANDOFF_M,
-            "calibration": str(Path(path).resolve()),
-        }
-        if choice.pointer_mm:
-            wish["pointer_m"] = float(choice.pointer_mm) / 1000
-        words = f"Looking for a way over corner {corner} … Nothing moves."
-        answer = await app.ask_long(words, "hover", new_picture=not looked, **wish)
-        if answer is None:
-            continue
-        offer = msgspec.convert(answer, HoverOffer)
-        looked = True  # from above the board the camera sees nothing
-        if not await app.push_screen_wait(ConfirmGo(offer.go)):
-            continue
-        if await app.ask("go", token=offer.go.token, plan_sha256=offer.go.plan_sha256) is None:
-            continue
-        if (touch := await app.push_screen_wait(Touching(offer))) is not None:
-            found[corner] = touch
+    found = await _look_at_corners(app, path, board)
     if not found:
         return False
     try:
@@ -212,3 +189,34 @@ async def verify(app: StationApp, path: str) -> bool:
         return False
     app.notify(f"Written into {path}")
     return True
+
+
+async def _look_at_corners(app: StationApp, path: str, board: BoardSpec) -> dict[int, Touch]:
+    """What the hand found, by corner."""
+    found: dict[int, Touch] = {}
+    choice = ChooseCorner(board, found, "")
+    looked = False
+    while (corner := await app.push_screen_wait(choice)) is not None:
+        choice = ChooseCorner(board, found, choice.pointer_mm)
+        offer = await _way_over(app, path, corner, choice.pointer_mm, new_picture=not looked)
+        if offer is None:
+            continue
+        looked = True  # from above the board the camera sees nothing
+        if not await app.push_screen_wait(ConfirmGo(offer.go)):
+            continue
+        if await app.ask("go", token=offer.go.token, plan_sha256=offer.go.plan_sha256) is None:
+            continue
+        if (touch := await app.push_screen_wait(Touching(offer))) is not None:
+            found[corner] = touch
+    return found
+
+
+async def _way_over(
+    app: StationApp, path: str, corner: int, pointer_mm: str, new_picture: bool
+) -> HoverOffer | None:
+    wish: dict[str, Any] = {"corner": corner, "standoff_m": STANDOFF_M, "new_picture": new_picture}
+    if pointer_mm:
+        wish["pointer_m"] = float(pointer_mm) / 1000
+    words = f"Looking for a way over corner {corner} … Nothing moves."
+    answer = await app.ask_long(words, "hover", calibration=str(Path(path).resolve()), **wish)
+    return None if answer is None else msgspec.convert(answer, HoverOffer)

@@ -14,7 +14,9 @@ from typing import Any
 
 import pytest
 
+from station import cli_session
 from station.cli import main
+from station.errors import RefusedError
 from station.plan.files import load_plan
 from station.plan.model import plan_sha256
 from station.states import RUNNING
@@ -82,6 +84,20 @@ def shell(
         daemon.stdin.close()
         daemon.wait(15)
         daemon.stdout.close()
+
+
+def test_one_pose_more_leaves_the_session_open(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where nobody is there to say how it goes on, every other command seals what it got."""
+    asked: dict[str, bool] = {}
+
+    async def carry_out(_: object, purpose: str, *, finish_with_loss: bool, **more: object) -> None:
+        asked[purpose] = finish_with_loss
+        raise RefusedError("seen enough")
+
+    monkeypatch.setattr(cli_session, "carry_out", carry_out)
+    for command in ("best", "improve", "resume"):
+        assert "seen enough" in shell.ask(command, "--headless")[2]
+    assert asked == {"best": False, "improve": True, "resume": True}
 
 
 def test_a_session_from_the_shell(shell: Shell, tmp_path: Path) -> None:

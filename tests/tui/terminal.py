@@ -31,6 +31,10 @@ KEYS = {
 _TOKEN = re.compile(
     r"\x1b\[([0-9;?<>=]*)([A-Za-z~])|\x1b[P\]].*?(?:\x1b\\|\x07)|\x1b.|[\x00-\x1f]|[^\x00-\x1f\x1b]+"
 )
+CELL = (8, 17)
+"""Pixels of a letter, where pictures are drawn."""
+WHAT_ARE_YOU, SIXELS = b"\x1b[c", b"\x1b[?63;1;2;4;6;9;15;22c"
+"""The question for a terminal's attributes, and how a VT340 answers it."""
 _UNFINISHED = re.compile(r"\x1b(?:\[[0-9;?<>=]*|[P\]][^\x07]*)?$")
 
 
@@ -79,17 +83,22 @@ class Glass:
 
 
 class ScreenProcess:
-    """`station tui` in a terminal of its own."""
+    """`station tui` in a terminal of its own; `sixels`: one that says it draws them."""
 
-    def __init__(self, socket: Path, columns: int = 100, rows: int = 34) -> None:
+    def __init__(self, socket: Path, columns: int = 100, rows: int = 34, sixels: bool = False) -> None:
         self._master, slave = pty.openpty()
-        fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, 0, 0))
+        pixels = (columns * CELL[0], rows * CELL[1]) if sixels else (0, 0)
+        fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, *pixels))
+        self._sixels, self.pictures = sixels, 0
+        """`pictures`: how many came."""
         self.process = subprocess.Popen(
             [sys.executable, "-m", "station.cli", "tui", "--socket", str(socket)],
             stdin=slave,
             stdout=slave,
             stderr=slave,
-            env=os.environ | {"TERM": "xterm-256color", "COLUMNS": str(columns), "LINES": str(rows)},
+            env=os.environ
+            | {"TERM": "xterm-256color", "COLUMNS": str(columns), "LINES": str(rows)}
+            | ({"STATION_PICTURES": "sharp"} if sixels else {}),
             start_new_session=True,
         )
         os.close(slave)
@@ -101,6 +110,9 @@ class ScreenProcess:
         with contextlib.suppress(OSError):  # the other end is closed
             while data := os.read(self._master, 65536):
                 self.glass.write(data)
+                self.pictures += data.count(b"\x1bP")
+                if self._sixels and WHAT_ARE_YOU in data:
+                    os.write(self._master, SIXELS)
 
     def press(self, *keys: str) -> None:
         """One after the other, as a person would."""

@@ -138,5 +138,8 @@ async def test_planning_it_is_said_on_every_screen() -> None:
         await until(pilot, lambda: PLANNING_CHECK in text_of(app, "#reason"))
         await pilot.press("5")
         await until(pilot, lambda: app.current_mode == "log" and PLANNING_CHECK in text_of(app, "#reason"))
+        link.show(idle(StationState.PAUSED, "poses 3, 7 failed: retake or skip them, or finish"))
+        await until(pilot, lambda: "poses 3, 7 failed" in text_of(app, "#reason"))
+        assert text_of(app, "#reason").strip().startswith(PLANNING_CHECK)  # a long reason may be cut
         link.made.set()
         await until(pilot, lambda: not app.busy)

@@ -9,9 +9,9 @@ import msgspec
 import pytest
 from textual.widgets import DataTable
 
-from station.status import PoseStatus
+from station.status import EstimateStatus, PoseStatus
 from station.tui.plan import PLANNING
-from station.tui.widgets.panels import pose_map_lines
+from station.tui.widgets.panels import estimate_lines, pose_map_lines
 from tests.tui.conftest import FakeLink, idle, until
 from tests.tui.test_keys import app_on, text_of
 
@@ -71,6 +71,18 @@ def test_the_map_of_poses_leaves_room_for_the_rest(
     assert len(rows) <= 4
     assert max(map(len, [*rows, words])) <= 29
     assert words == (f"{first} to {last} of {count}" if first else "+ done - skipped x failed")
+
+
+def test_the_estimate_of_a_sealed_session_asks_for_no_more_poses() -> None:
+    found = EstimateStatus(
+        9, (1.0, 2.0, 3.0), 0.4, 0.05, advice="go on: every pose still helps", improve="6 times better"
+    )
+    status = msgspec.structs.replace(idle(), estimate=found)
+    assert "p on screen 2 plans the rest" in estimate_lines(status)
+    assert "go on" in " ".join(estimate_lines(status))
+    session = msgspec.structs.replace(status.session, recording="s.mcap")
+    lines = estimate_lines(msgspec.structs.replace(status, session=session))
+    assert lines[-1] == "F9 finds the final one" and len(lines) == 3
 
 
 async def test_a_pose_that_changes_is_told_where_it_stands(link: FakeLink) -> None:

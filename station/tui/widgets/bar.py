@@ -89,7 +89,7 @@ class ReasonLine(Static):
     trouble: reactive[str] = reactive("")
     """Stands before what the daemon said last."""
     busy: reactive[str] = reactive("")
-    """What takes long and was asked for here; below the reason, if there is one."""
+    """What takes long and was asked for here."""
     _reason = ""
 
     def watch_trouble(self) -> None:
@@ -99,13 +99,13 @@ class ReasonLine(Static):
         self.watch_status()
 
     def watch_status(self) -> None:
-        reason = self.trouble
-        if not reason and self.status is not None and self.status.reason:
-            reason = self.status.reason + _NEXT.get(self.status.state, "")
+        said = ""
+        if self.status is not None and self.status.reason and not self.trouble:
+            said = self.status.reason + _NEXT.get(self.status.state, "")
         # A playback has no trouble: the line only says where it is.
         playing = self.status is not None and self.status.playback and not self.trouble
-        self.set_class(playing or not reason, "note")
-        reason = "\n ".join(words for words in (reason, self.busy) if words)
+        self.set_class(playing or not (self.trouble or said), "note")
+        reason = "\n ".join(words for words in (self.trouble, self.busy, said) if words)
         if reason != self._reason:
             self._reason = reason
             self.display = bool(reason)

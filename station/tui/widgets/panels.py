@@ -143,10 +143,11 @@ def estimate_lines(status: StationStatus) -> list[str]:
     if estimate.sigma_translation_mm is None or estimate.translation_mm is None:
         return [f"{estimate.views} view{'s' * (estimate.views != 1)}: too few yet"]
     x, y, z = estimate.translation_mm
+    advice = "F9 finds the final one" if status.session.recording else estimate.advice
     rotation = "" if estimate.sigma_rotation_deg is None else f"  {estimate.sigma_rotation_deg:.3f}°"
     return [
         f"{x:7.1f} {y:7.1f} {z:7.1f} mm",
         f"± {estimate.sigma_translation_mm:.2f} mm{rotation}",
-        *(["p on screen 2 plans the rest"] if estimate.improve else []),
-        *textwrap.wrap(estimate.advice or ("enough" if estimate.enough else "not final"), NARROW),
+        *(["p on screen 2 plans the rest"] if estimate.improve and not status.session.recording else []),
+        *textwrap.wrap(advice or ("enough" if estimate.enough else "not final"), NARROW),
     ]

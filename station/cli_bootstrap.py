@@ -24,9 +24,9 @@ from station.cli_session import Headless, Socket, attended_session, err, load_in
 from station.client import Client, default_socket
 from station.config import PoseGuess, StationConfig
 from station.config_file import load_config
-from station.errors import ConfigError, StationError
+from station.errors import ConfigError, LimitError, StationError
 from station.plan.belief import Glimpse, believe, improved_config
-from station.plan.bootstrap import next_move
+from station.plan.bootstrap import MOVES_MAX, MOVES_MIN, next_move
 from station.plan.model import Plan, PlannedPose
 
 _STRAYED_RAD = 0.01
@@ -93,7 +93,8 @@ def _make_moves(cell: StationConfig, socket: Path | None, headless: bool) -> lis
         before = glimpses[-1].joints_rad if glimpses else np.array(taught)
         if np.abs(np.array(asyncio.run(_standing(path))) - before).max() > _STRAYED_RAD:
             raise BootstrapError("the arm was moved meanwhile: teach the view again and start over")
-        err.print(f"[bold]{move.name}[/]: {move.why}")
+        of = f" (of {MOVES_MIN} to {MOVES_MAX})" if glimpses else ""
+        err.print(f"[bold]{move.name}[/]{of}: {move.why}")
         joints, views = _take(cell, move, views, path, headless)
         glimpses = [
             Glimpse(q, C)
@@ -105,7 +106,13 @@ def _make_moves(cell: StationConfig, socket: Path | None, headless: bool) -> lis
         ]
         belief = believe(cell, glimpses)
         err.print(f"mount known to {1000 * belief.sigma_m:.1f} mm, {np.rad2deg(belief.sigma_rad):.2f}°")
-        move = next_move(cell, glimpses)
+        try:
+            move = next_move(cell, glimpses)
+        except LimitError as error:
+            if len(glimpses) == 1:
+                raise
+            err.print(f"[yellow]the moves end here:[/] {error}")
+            return glimpses
     return glimpses
 
 

@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
 
 import msgspec
 import numpy as np
@@ -14,8 +15,11 @@ import pytest
 import yaml
 
 from calibrate.geometry import difference, pose, pose_from_quaternion, rotation_exp
+from recordings.messages import Vector6
+from station import cli_bootstrap
 from station.analysis import check_run
 from station.cli_bootstrap import slow_plan
+from station.errors import LimitError
 from station.plan.model import Plan, PlannedPose
 from station.plan.planner import make_plan
 from station.simulation.placement import guess_of
@@ -77,6 +81,35 @@ def test_a_mount_wrong_by_30_degrees_and_100_mm_is_found(socket: Path, tmp_path:
         assert np.rad2deg(np.linalg.norm(off[3:])) < 2, name
     improved = msgspec.convert({**msgspec.to_builtins(bad), **found}, type(bad))
     assert len(make_plan(improved, start_joints_rad=TRUTH.start_joints_rad).poses) == 25
+
+
+def test_what_was_found_is_kept_when_no_further_move_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
+    config, start = cell_config(TRUTH, "127.0.0.1"), TRUTH.start_joints_rad
+    moves = [PlannedPose("bootstrap 1", start), LimitError("nothing is free")]
+
+    async def standing(_: Path) -> Vector6:
+        return start
+
+    def next_move(*_: object) -> PlannedPose:
+        move = moves.pop(0)
+        if isinstance(move, LimitError):
+            raise move
+        return move
+
+    def pictures(*_: object) -> SimpleNamespace:
+        return SimpleNamespace(camera_from_board=np.eye(4)[None].repeat(3 - len(moves), axis=0))
+
+    monkeypatch.setattr(cli_bootstrap, "_standing", standing)
+    monkeypatch.setattr(cli_bootstrap, "_take", lambda *_: (np.array(start), None))
+    monkeypatch.setattr(cli_bootstrap, "solve_pnp", pictures)
+    monkeypatch.setattr(cli_bootstrap, "next_move", next_move)
+    assert len(cli_bootstrap._make_moves(config, Path("socket"), headless=True)) == 2
+    with pytest.raises(LimitError, match="nothing is free"):
+        moves[:] = [LimitError("nothing is free")]
+        monkeypatch.setattr(
+            cli_bootstrap, "solve_pnp", lambda *_: SimpleNamespace(camera_from_board=np.eye(4)[None])
+        )
+        cli_bootstrap._make_moves(config, Path("socket"), headless=True)
 
 
 def test_its_moves_are_slower_than_those_of_a_plan() -> None:

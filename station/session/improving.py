@@ -63,6 +63,11 @@ class ImproveDesk:
             raise RefusedError("no session is open: the plan is improved from its first pictures")
         if bench.queue.plan.motion != "stops":
             raise RefusedError("a sweep has no poses to improve")
+        if not bench.seen and bench.queue.done:
+            raise RefusedError(
+                "what the pictures from before the daemon's restart show is not known to it: go on with the "
+                f"plan as it is (`station resume`), and ask again after {FEWEST_VIEWS} more"
+            )
         await RestingCheck(bench.cell.robot.check).news()
         return await (self._anew(bench.queue) if purpose == "improve" else self._one_more(bench.queue))
 

@@ -113,6 +113,10 @@ async def test_a_crash_before_the_first_of_them_is_saved_finds_what_was_agreed_t
     assert again.state is S.STOPPED
     assert queue_of(again).sha256 == summary.plan_sha256
     assert queue_of(again).done == BEFORE
+    again.session.take_lease(1, "anna")
+    again.session.acknowledge("anna")
+    with pytest.raises(RefusedError, match="before the daemon's restart"):
+        await again.session.prepare(1, "improve")
 
 
 async def test_nothing_moves_by_poses_that_the_disk_did_not_take(

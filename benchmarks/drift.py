@@ -2,7 +2,8 @@
 
 Views are corners with noise on corners and robot, 0.45 m from the paper's board; the installed X has an error
 of its own, drawn from its covariance. Shifts and turns have random directions. Poses are random, as of an arm
-moved by hand, or chosen by the planner's criterion out of 200 random ones, as `station check` does.
+moved by hand; chosen by the planner's criterion out of 200 random ones; or planned as `station check` does,
+by the whole planner with its limits and obstacles, on random cells whose guesses are wrong by their sigmas.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from benchmarks.random_cells import random_cell
 from benchmarks.trials import share_spread, table, trials
 from calibrate.board import board_points
 from calibrate.drift import SHIFT_M, TURN_RAD, DriftCheck, Noise, judge_shift
@@ -22,6 +24,7 @@ from calibrate.pnp import solve_pnp
 from calibrate.views import ImageView, ViewSet
 from recordings.messages import BoardKind, BoardSpec, CameraModel, Mount
 from station.plan.choose import Objective, choose
+from station.plan.planner import make_plan
 
 TRIALS = 400
 SETS, POOL = 20, 200
@@ -34,6 +37,16 @@ _PLACE = pose(rotation_exp([np.pi - 0.2, 0.1, 0.4]), [0.6, 0.1, 0.0])
 _MOUNT = pose(rotation_exp([0.1, -0.2, 1.5]), [0.06, -0.07, 0.05])
 _OBJECTIVE = Objective("A", 0.45, np.array([1.0, 1, 1, 0.1, 0.1, 0.1] * 2))
 """As the planner's own (`objective_for`), the lens known."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Set:
+    """Poses of one check."""
+
+    seen: list[Array]
+    """camera_from_board"""
+    X: Array
+    Y: Array
 
 
 @dataclass(frozen=True)
@@ -58,10 +71,11 @@ MID = _Level("mid", Noise(0.15, 1.0e-4, 1.7e-4, _DEGREES_OF_FREEDOM), 6.0e-5, 1.
 def run() -> str:
     count = trials(TRIALS)
     mounts: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
-    rows = [
-        _row(level, chosen, views, mount, count)
+    rows = [_row(MID, "planned", views, "eye-in-hand", count) for views in (3, 4, 5, 6)]
+    rows += [
+        _row(level, poses, views, mount, count)
         for level in (LOW, MID)
-        for chosen in (True, False)
+        for poses in ("chosen", "random")
         for views in (3, 5, 6, 10)
         for mount in mounts
     ]
@@ -89,14 +103,14 @@ def run() -> str:
     return text + "\n\n" + table([*header, "stated %"], rows)
 
 
-def _row(level: _Level, chosen: bool, views: int, mount: Mount, count: int) -> list[object]:
-    sets = _sets(level, chosen, views, mount, SETS if chosen else count)
+def _row(level: _Level, poses: str, views: int, mount: Mount, count: int) -> list[object]:
+    sets = _sets(level, poses, views, mount, count if poses == "random" else SETS)
     quiet = _checks(level, sets, mount, count, 0.0, 0.0, 1)
     shifted = _checks(level, sets, mount, count, SHIFT_M, 0.0, 2)
     turned = _checks(level, sets, mount, count, 0.0, TURN_RAD, 3)
     return [
         level.name,
-        "chosen" if chosen else "random",
+        poses,
         views,
         mount,
         _alarms(quiet),
@@ -111,17 +125,28 @@ def _alarms(checks: list[DriftCheck]) -> str:
     return f"{100 * np.mean([not c.passed for c in checks]):.1f}"
 
 
-def _sets(level: _Level, chosen: bool, views: int, mount: Mount, count: int) -> list[list[Array]]:
-    """So many times the camera_from_board of `views` poses."""
+def _sets(level: _Level, poses: str, views: int, mount: Mount, count: int) -> list[_Set]:
+    """So many times `views` poses."""
     rng = np.random.default_rng(views)
-    if not chosen:
-        return [[_seen(rng) for _ in range(views)] for _ in range(count)]
-    return [_choice(level, views, mount, rng) for _ in range(count)]
+    if poses == "planned":
+        return [_planned(views, seed) for seed in range(count)]
+    if poses == "random":
+        seen = [[_seen(rng) for _ in range(views)] for _ in range(count)]
+    else:
+        seen = [_choice(level, views, mount, rng) for _ in range(count)]
+    return [_Set(each, _MOUNT, _PLACE) for each in seen]
+
+
+def _planned(views: int, seed: int) -> _Set:
+    cell, _ = random_cell(seed)
+    plan = make_plan(cell.config, start_joints_rad=cell.start.tolist(), count=views, lens_known=True)
+    flanges = [np.array(each.base_from_flange) for each in plan.poses]
+    return _Set([cell.camera_from_board(flange) for flange in flanges], cell.X, cell.Y)
 
 
 def _choice(level: _Level, views: int, mount: Mount, rng: np.random.Generator) -> list[Array]:
     pool = [_seen(rng) for _ in range(POOL)]
-    flanges = np.array([_flange(seen, mount, _MOUNT) for seen in pool])
+    flanges = np.array([_flange(seen, mount, _MOUNT, _PLACE) for seen in pool])
     noise = PlanNoise(level.noise.corner_px, level.noise.robot_m, level.noise.robot_rad)
     points = board_points(_BOARD)
     information = view_information(mount, _CAMERA, flanges, _MOUNT, _PLACE, points, noise, False)
@@ -130,38 +155,39 @@ def _choice(level: _Level, views: int, mount: Mount, rng: np.random.Generator) -
 
 def _checks(
     level: _Level,
-    sets: list[list[Array]],
+    sets: list[_Set],
     mount: Mount,
     count: int,
     shift_m: float,
     turn_rad: float,
     seed: int,
 ) -> list[DriftCheck]:
-    rng = np.random.default_rng([seed, len(sets[0])])
+    rng = np.random.default_rng([seed, len(sets[0].seen)])
     root = np.linalg.cholesky(level.covariance)
     found = []
     for trial in range(count):
         way = rng.normal(size=(2, 3))
         way /= np.linalg.norm(way, axis=1, keepdims=True)
-        moved = perturb(_MOUNT, np.r_[way[0] * shift_m, way[1] * turn_rad])
-        installed = perturb(_MOUNT, root @ rng.normal(size=6))
-        new = _views(level.noise, sets[trial % len(sets)], mount, moved, rng)
+        poses = sets[trial % len(sets)]
+        moved = perturb(poses.X, np.r_[way[0] * shift_m, way[1] * turn_rad])
+        installed = perturb(poses.X, root @ rng.normal(size=6))
+        new = _views(level.noise, poses, mount, moved, rng)
         found.append(judge_shift(new, installed, level.covariance, level.noise))
     return found
 
 
-def _views(noise: Noise, poses: list[Array], mount: Mount, X: Array, rng: np.random.Generator) -> ViewSet:
+def _views(noise: Noise, poses: _Set, mount: Mount, X: Array, rng: np.random.Generator) -> ViewSet:
     """New views of a cell whose camera is truly at X."""
     points, found = board_points(_BOARD), []
-    for k, seen in enumerate(poses):
+    for k, seen in enumerate(poses.seen):
         error = np.r_[rng.normal(size=3) * noise.robot_m, rng.normal(size=3) * noise.robot_rad]
         pixels = project(_CAMERA, seen, points) + rng.normal(size=(len(points), 2)) * noise.corner_px
-        found.append(ImageView(k, str(k), perturb(_flange(seen, mount, X), error), points, pixels))
+        found.append(ImageView(k, str(k), perturb(_flange(seen, mount, X, poses.Y), error), points, pixels))
     return solve_pnp(ViewSet(mount, tuple(found), _CAMERA), _BOARD)
 
 
-def _flange(seen: Array, mount: Mount, X: Array) -> Array:
-    return _PLACE @ inverse(X @ seen) if mount == "eye-in-hand" else X @ seen @ inverse(_PLACE)
+def _flange(seen: Array, mount: Mount, X: Array, Y: Array) -> Array:
+    return Y @ inverse(X @ seen) if mount == "eye-in-hand" else X @ seen @ inverse(Y)
 
 
 def _seen(rng: np.random.Generator) -> Array:

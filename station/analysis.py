@@ -112,6 +112,8 @@ def check_run(config: StationConfig, plan: Plan, start_joints_rad: Vector6) -> P
     return check_plan(plan, start_joints_rad, geometry_from(config, start_joints_rad))
 
 
-def plan_poses(config: StationConfig, start_joints_rad: Vector6 | None, seed: int, count: int) -> Plan:
+def plan_poses(
+    config: StationConfig, start_joints_rad: Vector6 | None, seed: int, count: int, lens_known: bool
+) -> Plan:
     """ConfigError or LimitError with the remedy."""
-    return make_plan(config, start_joints_rad=start_joints_rad, seed=seed, count=count)
+    return make_plan(config, start_joints_rad=start_joints_rad, seed=seed, count=count, lens_known=lens_known)

@@ -41,6 +41,7 @@ class _LoadPlan(_Args, frozen=True):
 class _MakePlan(_Args, frozen=True):
     poses: int = 25
     seed: int = 0
+    lens_known: bool = False
 
 
 class _Prepare(_Args, frozen=True):
@@ -194,7 +195,7 @@ class SessionDispatcher:
         low, high = PLAN_POSES
         if not low <= args.poses <= high:
             raise RefusedError(f"a plan has {low} to {high} poses, not {args.poses}")
-        plan = await self._session.make_plan(caller.client_id, args.poses, args.seed)
+        plan = await self._session.make_plan(caller.client_id, args.poses, args.seed, args.lens_known)
         return {"poses": len(plan.poses), "sha256": self._session.bench.require_queue().sha256}
 
     async def _prepare(self, caller: _Caller, args: _Prepare) -> Any:

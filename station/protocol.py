@@ -27,7 +27,7 @@ Verb = Literal[
     "acknowledge",  # leave `stopped` or `fault` after a person looked
     "plan",  # → the loaded plan
     "load_plan",  # {plan: {…}} inline plan; checked, refused with all problems
-    "make_plan",  # {poses, seed} → made in a worker, then loaded
+    "make_plan",  # {poses, seed, lens_known} → made in a worker, then loaded
     "prepare",  # {purpose: run|check|resume|retake|improve|best, index?} → GoSummary; checks the whole way
     "hover",  # {calibration?, corner, standoff_m, …} → HoverOffer; a slow way over a corner of the board
     "go",  # {token} the person's confirmation of exactly that summary

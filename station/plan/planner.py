@@ -56,15 +56,17 @@ def make_plan(
     seed: int = 0,
     count: int = 25,
     criterion: Criterion = "A",
+    lens_known: bool = False,
     progress: Progress = lambda text, done: None,
 ) -> Plan:
     """A plan of `count` poses for the configured cell. Deterministic by seed; takes seconds.
 
+    `lens_known`: the pictures need not tell the lens too, as when an installed calibration is checked.
     ConfigError when the configuration lacks what planning needs; LimitError when there is no such plan,
     saying which limit binds and what to change.
     """
     require_kept_clear(config)
-    options = PlanOptions(count=count, seed=seed, criterion=criterion)
+    options = PlanOptions(count=count, seed=seed, criterion=criterion, free_intrinsics=not lens_known)
     return plan_scene(scene_of(config), options, start_joints_rad, progress)
 
 

@@ -267,7 +267,7 @@ class Session:
         self._require_no_session()
         self._replace_plan(plan)
 
-    async def make_plan(self, client_id: int, poses: int, seed: int) -> Plan:
+    async def make_plan(self, client_id: int, poses: int, seed: int, lens_known: bool = False) -> Plan:
         """Made in the worker. ConfigError and LimitError say what is missing or in the way."""
         self.leases.require(client_id)
         self._require("make_plan")
@@ -278,7 +278,7 @@ class Session:
             start = None
         self.store.event(f"planning {poses} poses")
         plan = await self.bench.workers.call(
-            plan_poses, self.bench.cell.config, start, seed, poses, timeout_s=PLAN_TIMEOUT_S
+            plan_poses, self.bench.cell.config, start, seed, poses, lens_known, timeout_s=PLAN_TIMEOUT_S
         )
         self.leases.require(client_id)
         self._require("make_plan")

@@ -29,7 +29,7 @@ async def drift_check(app: StationApp) -> None:
             app.notify(f"No drift check: {problem}", severity="warning", timeout=10)
             return
     before = "" if app.status is None else app.status.session.recording
-    made = await app.ask_long(PLANNING_CHECK, "make_plan", poses=POSES, seed=SEED)
+    made = await app.ask_long(PLANNING_CHECK, "make_plan", poses=POSES, seed=SEED, lens_known=True)
     if made is None or not await app.go_for("check"):
         return
     await app.switch_mode("live")

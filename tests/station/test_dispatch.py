@@ -56,6 +56,23 @@ async def test_a_capture_over_the_socket(served: Served, small_plan: Plan) -> No
         assert all(0 <= x <= 1 and 0 <= y <= 1 for x, y in preview["corners"])
 
 
+async def test_poses_of_a_check_are_planned_for_a_known_lens(
+    served: Served, small_plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[object] = []
+
+    async def call(function: object, *args: object, timeout_s: float) -> Plan:
+        asked.append(args[-1])
+        return small_plan
+
+    monkeypatch.setattr(served.rig.session.bench.workers, "call", call)
+    async with await served.client() as anna:
+        await anna.request("lease", action="take")
+        await anna.request("make_plan", poses=6, lens_known=True)
+        await anna.request("make_plan", poses=25)
+    assert asked == [True, False]
+
+
 async def test_the_second_operator_may_watch_pause_and_stop_only(served: Served, small_plan: Plan) -> None:
     async with await served.client() as anna, await served.client() as bert:
         await anna.request("lease", action="take")

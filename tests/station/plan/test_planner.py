@@ -27,6 +27,7 @@ from station.plan import planner
 from station.plan.candidates import branch_of, find_candidates
 from station.plan.choose import choose, informations, objective_for
 from station.plan.planner import PlanOptions, make_plan, plan_scene
+from station.plan.predict import forecast_views
 from station.plan.scene import cell_geometry, scene_of
 from station.plan.view_range import ViewRange, view_range
 from station.plan.visibility import blind_share, lens_radius, visible
@@ -271,3 +272,14 @@ def test_a_plan_without_a_start_and_with_few_poses():
     )
     assert len(plan.poses) == 4
     assert check_plan(plan, None, cell_geometry(config)).problems == ()
+
+
+def test_six_poses_for_a_known_lens_tell_more_of_where_the_camera_sits():
+    """As `station check` asks for them: the installed calibration knows the lens."""
+    truth, config = cell()
+    scene, sigmas_m = scene_of(config), []
+    for known in (False, True):
+        plan = make_plan(config, start_joints_rad=truth.start_joints_rad, count=6, lens_known=known)
+        flange = np.array([pose.base_from_flange for pose in plan.poses])
+        sigmas_m.append(forecast_views(scene, flange, Noise(), free_intrinsics=False)[-1].sigma_m)
+    assert sigmas_m[1] < 0.85 * sigmas_m[0]

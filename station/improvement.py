@@ -23,7 +23,6 @@ from calibrate.geometry import (
     pose_from_quaternion,
 )
 from calibrate.information import Noise
-from calibrate.kinematics import forward
 from calibrate.projection import project
 from station.config import PoseGuess, StationConfig
 from station.errors import LimitError, RefusedError
@@ -33,7 +32,7 @@ from station.plan.belief import guess_from
 from station.plan.choose import informations, objective_for, sigma_of
 from station.plan.model import Plan
 from station.plan.planner import PlanOptions, plan_scene
-from station.plan.scene import Scene, cell_geometry, scene_of
+from station.plan.scene import Scene, cell_geometry, flange_poses, scene_of
 from station.plan.standing import geometry_from
 from station.plan.visibility import outline, visible
 
@@ -138,7 +137,7 @@ def _require_agreement(guess: PoseGuess, X: Array) -> None:
 
 
 def _worth(scene: Scene, seen: Sequence[Seen], left: Plan, free_lens: bool) -> Worth:
-    flange = forward(scene.geometry.model, np.array([pose.joints_rad for pose in left.poses]))
+    flange = flange_poses(scene, left)
     captured = np.array([pose for _, pose, _, _ in seen])
     everything = informations(scene, np.concatenate([captured, flange]), Noise(), free_lens).sum(axis=0)
     sigma_m = sigma_of(everything, objective_for(scene, "A", free_lens))[0]

@@ -18,7 +18,7 @@ from station.plan.candidates import find_candidates
 from station.plan.choose import informations, objective_for, sigma_of
 from station.plan.describe import planned_pose
 from station.plan.model import Plan, PlannedPose
-from station.plan.scene import Scene
+from station.plan.scene import Scene, flange_poses
 from station.plan.view_range import ViewRange, view_range
 from station.plan.visibility import visible
 
@@ -62,7 +62,7 @@ def with_forecast(scene: Scene, plan: Plan) -> tuple[Plan, tuple[str, ...]]:
 
     By the scene's guess and the usual noise.
     """
-    flange = forward(scene.geometry.model, np.array([pose.joints_rad for pose in plan.poses]).reshape(-1, 6))
+    flange = flange_poses(scene, plan)
     cut = tuple(pose.name for pose, seen in zip(plan.poses, _whole(scene, flange), strict=True) if not seen)
     if all(pose.predicted_sigma_m is not None for pose in plan.poses):
         return plan, cut
@@ -115,29 +115,29 @@ def advise(
     if len(pool) == 0:
         return Advice(now, False, f"{state}; no further pose is reachable with the board in view")
     gains = informations(scene, pool.base_from_flange, options.noise, options.free_intrinsics)
-    scores = objective(known + gains)
-    ranked = np.argsort(scores, kind="stable")[:_TRIES]
     stops = [start] if options.onward_rad is None else [start, np.asarray(options.onward_rad, dtype=float)]
-    free = (
-        int(place)
-        for place in ranked
-        if not any(check_path(scene.geometry, stop, pool.joints_rad[place]).problems for stop in stops)
-    )
-    best = next(free, None)
+    best = _best_free(scene, stops, pool.joints_rad, objective(known + gains))
     if best is None:
         return Advice(
             now, False, f"{state}; no free way from here to a pose that helps: jog the arm and ask again"
         )
     missing = _missing(known, gains, goal_m=goal_m, scene=scene, free_intrinsics=options.free_intrinsics)
     after = sigma_of(known + gains[best], objective)[0]
-    pose = planned_pose(
-        scene, len(flange), pool.joints_rad[best], forward(scene.geometry.model, pool.joints_rad[best]), after
-    )
+    joints = pool.joints_rad[best]
+    pose = planned_pose(scene, len(flange), joints, forward(scene.geometry.model, joints), after)
     more = (
         f"about {missing} more" if missing else f"more than {_FURTHER_POSES} more, or a better camera or arm"
     )
     text = f"{state}; the goal of {1000 * goal_m:.2f} mm needs {more}. Next best: {pose.why}"
     return Advice(now, False, text, pose, missing)
+
+
+def _best_free(scene: Scene, stops: Sequence[Array], joints_rad: Array, scores: Array) -> int | None:
+    """Row of the joints (n, 6) with the lowest score whose ways to the stops (6,) are free; few are tried."""
+    for place in np.argsort(scores, kind="stable")[:_TRIES]:
+        if not any(check_path(scene.geometry, stop, joints_rad[place]).problems for stop in stops):
+            return int(place)
+    return None
 
 
 def _missing(known: Array, gains: Array, goal_m: float, scene: Scene, free_intrinsics: bool) -> int | None:

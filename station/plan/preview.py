@@ -14,8 +14,8 @@ from calibrate.projection import camera_matrix
 from station.collision import body_segments
 from station.errors import ConfigError
 from station.plan.model import Plan
-from station.plan.scene import Scene, board_extent
-from station.plan.sketch import expected_pixels, flange_poses
+from station.plan.scene import Scene, board_extent, flange_poses
+from station.plan.sketch import expected_pixels
 
 _FRUSTUM_M = 0.06
 _SHOWN_ARMS = 3

@@ -9,11 +9,12 @@ import numpy as np
 
 from calibrate.board import board_points
 from calibrate.geometry import Array, inverse, pose_from_quaternion, transform_points
-from calibrate.kinematics import MODELS, DhDeltas, RobotModel
+from calibrate.kinematics import MODELS, DhDeltas, RobotModel, forward
 from recordings.messages import BoardSpec, CameraModel, Mount
 from station.collision import CellGeometry, plate
 from station.config import Capsule, PoseGuess, StationConfig
 from station.errors import ConfigError, LimitError
+from station.plan.model import Plan
 
 _CAMERA_BODY_M, _CAMERA_RADIUS_M = 0.05, 0.035
 _DOUBT = 3.0
@@ -54,6 +55,12 @@ class Scene:
     def seen(self, base_from_flange: Array, points: Array) -> Array:
         """Board points (k, 3) in `camera`, (n, k, 3)."""
         return transform_points(self.camera_from_board(base_from_flange), points)
+
+
+def flange_poses(scene: Scene, plan: Plan) -> Array:
+    """(n, 4, 4) base_from_flange of the plan's joints."""
+    joints = np.array([pose.joints_rad for pose in plan.poses]).reshape(-1, 6)
+    return np.asarray(forward(scene.geometry.model, joints))
 
 
 def board_extent(board: BoardSpec) -> tuple[Array, Array]:

@@ -6,19 +6,12 @@ import numpy as np
 
 from calibrate.board import board_points
 from calibrate.geometry import Array, transform_points
-from calibrate.kinematics import forward
 from calibrate.projection import project
 from station.plan.model import Plan
-from station.plan.scene import Scene
+from station.plan.scene import Scene, flange_poses
 
 _SHADES = " ░▒▓█"
 _BARS = "▁▂▃▄▅▆▇█"
-
-
-def flange_poses(scene: Scene, plan: Plan) -> Array:
-    """(n, 4, 4) base_from_flange of the plan's joints."""
-    joints = np.array([pose.joints_rad for pose in plan.poses]).reshape(-1, 6)
-    return np.asarray(forward(scene.geometry.model, joints))
 
 
 def expected_pixels(scene: Scene, plan: Plan) -> Array:

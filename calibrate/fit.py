@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy import stats
 
 from calibrate.board_poses import BoardPoses, refine_board_poses
 from calibrate.consensus import Consensus, disagreement, find_consensus, pose_arrays
@@ -26,6 +27,10 @@ _FEWEST_GOOD = 6
 """The mixture is believed only if it leaves that many."""
 _UNDOUBTED, _NEAR = 0.999, 0.99
 """Shares of good views that lie within, by the scale of the middle one."""
+_LARGEST_CHANCE = 0.2
+"""That one number of all good views lies beyond."""
+_TAIL = 0.5
+"""Left out, and this share of them within the limit: the good views' own tail, not another kind."""
 _FEW = 0.1
 """A smaller share of bad views does not widen the scales enough to hide in them."""
 MAX_ROBOT_M = 0.03
@@ -78,10 +83,11 @@ def fit_views(
     H, C = pose_arrays(views)
     start = first_state(_part(everything, places), consensus.start.X, C[places], H[places], views.camera)
     plain = estimate(_part(everything, places), start, intrinsics_free)
-    settled = _settle(everything, views, places, plain, reject)
+    group = _judged(everything, views, places, plain)
+    settled = _settle(everything, views, group, reject)
     _require_plausible_noise(settled.estimate)
     watch.lap("maximum likelihood")
-    finding, settled = _with_kinematics(everything, views, settled, kinematic_prior, reject)
+    finding, settled = _with_kinematics(everything, views, group, settled, kinematic_prior, reject)
     watch.lap("robot systematics")
     places = settled.places
     bad = np.setdiff1d(np.arange(len(views)), places)
@@ -94,25 +100,21 @@ def fit_views(
     return Fit(consensus, views, settled, rejected, pairs, certified, finding)
 
 
-def _settle(
-    everything: Observations, views: ViewSet, places: Places, result: Estimate, reject: bool
-) -> Settled:
+def _settle(everything: Observations, views: ViewSet, group: Settled, reject: bool) -> Settled:
     """The group judges every view; in doubt a mixture first; then those kept judge each other.
 
     Many bad views widen the scales until each of them seems likely, and so does every one let in again: where
     more than a few are left out, views only have to leave once all were judged. Without doubt nothing is
     sought: among the systematic errors of a worn arm some views always agree better than all of them.
     """
-    settled = _judged(everything, views, places, result)
     if not reject:
-        return settled
-    if _in_doubt(settled.verdict, places):
-        good = find_good_views(settled.verdict.linear, places, ~settled.verdict.blurred)
-        if len(good) >= _FEWEST_GOOD and not np.array_equal(good, places):
-            settled = _again(everything, views, settled, good)
+        return group
+    settled, closed = group, False
+    if _in_doubt(group.verdict, group.places):
+        settled, closed = _separated(everything, views, group)
     for round_ in range(_ROUNDS):
         good = settled.verdict.good
-        if round_ and len(good) < (1 - _FEW) * len(views):
+        if closed or (round_ and len(good) < (1 - _FEW) * len(views)):
             good = np.intersect1d(good, settled.places)
         if len(good) < _FEWEST:
             raise disagreement(f"Only {len(good)} of {len(views)} views agree; {_FEWEST} are needed.")
@@ -122,10 +124,27 @@ def _settle(
     return settled
 
 
+def _separated(everything: Observations, views: ViewSet, group: Settled) -> tuple[Settled, bool]:
+    """By those that the mixture finds good, and whether the others are of another kind.
+
+    Of an arm that errs systematically it leaves out good views, too: then most of these lie within the limit,
+    and all that do may come back. Bad ones that chance brought within it are few among those left out.
+    """
+    good = find_good_views(group.verdict.linear, group.places, ~group.verdict.blurred)
+    if len(good) < _FEWEST_GOOD or np.array_equal(good, group.places):
+        return group, False
+    settled = _again(everything, views, group, good)
+    left_out = np.setdiff1d(group.places, good)
+    within = np.intersect1d(left_out, settled.verdict.good)
+    return settled, len(within) < _TAIL * len(left_out)
+
+
 def _in_doubt(verdict: Judgement, group: Places) -> bool:
-    """One view far out, or several farther out than so many good views would be."""
+    """One view far out, several farther out than so many good views would be, or one number far out."""
     far = len(group) - len(verdict.near_middle(group, _NEAR))
-    return far > 1 + 0.02 * len(group) or len(verdict.near_middle(group, _UNDOUBTED)) < len(group)
+    if far > 1 + 0.02 * len(group) or len(verdict.near_middle(group, _UNDOUBTED)) < len(group):
+        return True
+    return verdict.largest_number(group) > float(stats.norm.isf(_LARGEST_CHANCE / (12 * len(group))))
 
 
 def _judged(
@@ -164,22 +183,39 @@ def _part(everything: Observations, places: Places) -> Observations:
 
 
 def _with_kinematics(
-    everything: Observations, views: ViewSet, plain: Settled, prior: KinematicPrior, reject: bool
+    everything: Observations,
+    views: ViewSet,
+    group: Settled,
+    plain: Settled,
+    prior: KinematicPrior,
+    reject: bool,
 ) -> tuple[RobotSystematics | None, Settled]:
     """The finding, and the estimate that counts: with the kinematic model where it is due.
 
-    With the model, views are judged again: some looked wrong only because the arm is.
+    With the model, views are judged again: some looked wrong only because the arm is. Where many of the group
+    were left out and the others do not show it, the whole group is asked, and believed if that explains them.
     """
     derivatives = kinematic_derivatives(views) if len(plain.places) >= FEWEST_VIEWS else None
     if derivatives is None:
         return None, plain
-    fitted = fit_kinematics(plain.observed, plain.estimate, derivatives[plain.places])
-    if prior == "off" or not (fitted.finding.detected or prior == "on"):
-        return fitted.finding, plain
     with_table = replace(everything, kinematics=derivatives)
-    settled = _settle(with_table, views, plain.places, fitted.estimate, reject)
-    table_errors = tuple((UNIT * settled.estimate.state.theta).tolist())
-    return replace(fitted.finding, prior_applied=True, table_errors=table_errors), settled
+
+    def settle(start: Settled) -> tuple[RobotSystematics, Settled | None]:
+        fitted = fit_kinematics(start.observed, start.estimate, derivatives[start.places])
+        if prior == "off" or not (fitted.finding.detected or prior == "on"):
+            return fitted.finding, None
+        judged = _judged(with_table, views, start.places, fitted.estimate)
+        settled = _settle(with_table, views, judged, reject)
+        table_errors = tuple((UNIT * settled.estimate.state.theta).tolist())
+        return replace(fitted.finding, prior_applied=True, table_errors=table_errors), settled
+
+    finding, settled = settle(plain)
+    most = (1 - _FEW) * len(group.places)
+    if not finding.detected and len(plain.places) < most:
+        of_all, explained = settle(group)
+        if of_all.detected and explained is not None and len(explained.places) >= most:
+            return of_all, explained
+    return finding, settled or plain
 
 
 def _require_plausible_noise(result: Estimate) -> None:

@@ -53,6 +53,10 @@ class LinearMisses:
     sigma: Array
     """(2,) robot m, rad."""
 
+    def covariance(self, sigma: Array) -> Array:
+        """(n, 6, 6) of the misses, were the robot's scales (2,) these."""
+        return np.asarray(self.by_corners + np.diag(np.repeat(sigma**2, 3)))
+
 
 @dataclass(frozen=True, eq=False)
 class _Fitted:
@@ -75,7 +79,7 @@ def find_good_views(misses: LinearMisses, group: Places, usable: NDArray[np.bool
     """
     weights, fitted = _tightest(misses, group)
     sigma = _TIGHTER * fitted.sigma
-    fitted = _Fitted(fitted.left, _covariance(misses, sigma), fitted.doubt, sigma)
+    fitted = _Fitted(fitted.left, misses.covariance(sigma), fitted.doubt, sigma)
     share = _FIRST_SHARE
     for _ in range(_ROUNDS):
         before = weights
@@ -114,7 +118,7 @@ def _fit(misses: LinearMisses, weights: Array, sigma: Array, passes: int) -> _Fi
     J, n = misses.by_global, len(weights)
     flat = (J * weights[:, None, None]).reshape(6 * n, -1)
     for _ in range(passes):
-        P = np.linalg.inv(_covariance(misses, sigma))
+        P = np.linalg.inv(misses.covariance(sigma))
         PJ = P @ J
         inverse = np.linalg.inv(flat.T @ PJ.reshape(6 * n, -1) + np.diag(misses.prior))
         right = flat.T @ (P @ misses.miss[..., None]).reshape(-1) + misses.pull
@@ -125,11 +129,7 @@ def _fit(misses: LinearMisses, weights: Array, sigma: Array, passes: int) -> _Fi
         ratio = squares.reshape(2, 3).sum(axis=1) / np.maximum(freedoms.reshape(2, 3).sum(axis=1), 1e-30)
         sigma = np.maximum(sigma * np.sqrt(np.clip(ratio, 0.01, 100.0)), FLOOR[1:3])
     doubt = J @ inverse @ np.swapaxes(J, 1, 2)
-    return _Fitted(left, _covariance(misses, sigma), doubt, sigma)
-
-
-def _covariance(misses: LinearMisses, sigma: Array) -> Array:
-    return np.asarray(misses.by_corners + np.diag(np.repeat(sigma**2, 3)))
+    return _Fitted(left, misses.covariance(sigma), doubt, sigma)
 
 
 def _distance2(left: Array, precision: NDArray[np.floating[Any]]) -> Array:

@@ -62,6 +62,15 @@ class Judgement:
         near = distance2 <= wider * float(stats.chi2.ppf(share, 6))
         return np.asarray(group[near & ~self.blurred[group]])
 
+    def largest_number(self, group: Places) -> float:
+        """Of the group: the most that one number of a flange pose alone is off, in sigmas of that alone.
+
+        An error e of number k explains the miss d best at e = (P d)_k / P_kk, P the inverse covariance.
+        """
+        precision = np.linalg.inv(self.linear.covariance(self.linear.sigma)[group])
+        off = (precision @ self.miss[group, :, None])[..., 0]
+        return float(np.abs(off / np.sqrt(np.diagonal(precision, axis1=1, axis2=2))).max())
+
 
 def judge_views(observed: Observations, result: Estimate, boards: BoardPoses, fitted: Places) -> Judgement:
     """`observed` and `boards` speak of all views, `result` rests on the `fitted` ones.
@@ -70,7 +79,7 @@ def judge_views(observed: Observations, result: Estimate, boards: BoardPoses, fi
     """
     state = replace(result.state, C=boards.C)
     linear = _linear_misses(observed, state, result, boards)
-    covariance = linear.by_corners + np.diag(np.repeat(linear.sigma**2, 3))
+    covariance = linear.covariance(linear.sigma)
     others = np.setdiff1d(np.arange(len(covariance)), fitted)
     J = linear.by_global[others]
     covariance[others] += J @ result.joint_covariance @ np.swapaxes(J, 1, 2)

@@ -54,3 +54,11 @@ def test_without_joints_or_with_foreign_joints_nothing_is_claimed():
     ):
         assert kinematic_derivatives(changed) is None
         assert solve_views(changed, AUTO).systematics is None
+
+
+def test_a_worn_arm_is_not_taken_for_bad_views():
+    """19 of these views agree better than all 25, and among themselves do not show the arm's error."""
+    worn = worn_cell(np.random.default_rng(41), 0.25)
+    solution = solve_views(worn.views, AUTO)
+    assert solution.rejected == ()
+    assert solution.systematics.prior_applied

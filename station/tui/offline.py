@@ -57,7 +57,7 @@ class Reason(ModalScreen[str]):
         with Vertical(id="verify"):
             yield Label("It is not installed", id="verify-title")
             yield Static(self._refusal, markup=False)
-            yield Input(id="reason", placeholder="your reason, if you take responsibility")
+            yield Input(id="reason", placeholder="your reason, if you take responsibility", compact=True)
             yield Label(
                 "Your name and the reason go into the file. Enter installs, Escape not.",
                 id="verify-keys",

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import ClassVar, cast
+from typing import ClassVar
 
 from rich.text import Text
 from textual import work
@@ -14,6 +14,7 @@ from textual.widgets import DataTable, Static
 from station.protocol import Verb
 from station.status import PoseStatus, StationStatus
 from station.tui.screen import StationScreen
+from station.tui.widgets.rows import Rows
 from station.tui.widgets.sketch import PlanSketch
 from station.tui.words import POSE_MARKS
 
@@ -50,7 +51,10 @@ def detail_of(pose: PoseStatus) -> str:
 class PlanScreen(StationScreen):
     """The table is the plan as the daemon holds it; every change is asked of the daemon."""
 
-    HELP = "Poses in capture order. Nothing here moves the arm: F5 shows what would move and asks."
+    HELP = (
+        "Poses in capture order. Nothing moves without your yes: F5, p and b show what would move and ask. "
+        "Home and End go to the first and the last pose."
+    )
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("r", "pose('retake')", "Retake", tooltip="Take this pose again at the next run"),
         Binding("s", "pose('skip')", "Skip", tooltip="Leave this pose out"),
@@ -61,8 +65,6 @@ class PlanScreen(StationScreen):
         Binding("b", "app.best", "Best", tooltip="Add the pose that would help most, and take it (asks)"),
         Binding("ctrl+up", "shift(-1)", "Move", group=MOVE, tooltip="Visit this pose earlier"),
         Binding("ctrl+down", "shift(1)", "Move", group=MOVE, tooltip="Visit this pose later"),
-        Binding("home", "to_row(0)", "First", show=False, priority=True, tooltip="The first pose"),
-        Binding("end", "to_row(-1)", "Last", show=False, priority=True, tooltip="The last pose"),
     ]
 
     def __init__(self) -> None:
@@ -73,7 +75,7 @@ class PlanScreen(StationScreen):
     def body(self) -> ComposeResult:
         with Horizontal(id="plan"):
             with Vertical(id="plan-left"):
-                yield DataTable(id="plan-table", cursor_type="row", zebra_stripes=True)
+                yield Rows(id="plan-table")
                 yield Static(NO_PLAN, id="plan-detail")
             yield PlanSketch(id="plan-sketch")
 
@@ -82,8 +84,8 @@ class PlanScreen(StationScreen):
         self.table.focus()
 
     @property
-    def table(self) -> DataTable[str]:
-        return cast("DataTable[str]", self.query_one("#plan-table", DataTable))
+    def table(self) -> Rows:
+        return self.query_one(Rows)
 
     def show(self, status: StationStatus | None) -> None:
         super().show(status)
@@ -138,9 +140,6 @@ class PlanScreen(StationScreen):
         order[line], order[line + by] = order[line + by], order[line]
         self.station.send("reorder", order=order)
         self.table.move_cursor(row=line + by)
-
-    def action_to_row(self, row: int) -> None:
-        self.table.move_cursor(row=row % max(1, self.table.row_count))
 
     def action_add(self) -> None:
         status = self.station.status

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar, cast
+from typing import Any, ClassVar
 
 from textual import work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
-from textual.widgets import DataTable
 
 from station.drift_check import POSES
 from station.tui.screen import StationScreen
+from station.tui.widgets.rows import Rows
 from station.tui.words import size
 
 DRIFT = f"Take {POSES} pictures in place of the loaded plan: does the installed one still hold? (asks)"
@@ -18,7 +18,10 @@ COLUMNS = ("session", "source", "views", "size", "state", "calibration")
 
 
 class SessionsScreen(StationScreen):
-    HELP = "Past recordings. Solving runs in its own process; the daemon and a running capture go on."
+    HELP = (
+        "Past recordings. Solving runs in its own process; the daemon and a running capture go on. Home and "
+        "End go to the newest and the oldest."
+    )
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("f9", "solve", "Solve", tooltip="Solve this recording again, outside the daemon"),
         Binding("v", "result", "Result", tooltip="Show this session's calibration"),
@@ -33,7 +36,7 @@ class SessionsScreen(StationScreen):
         self._sessions: list[dict[str, Any]] = []
 
     def body(self) -> ComposeResult:
-        yield DataTable(id="sessions-table", cursor_type="row", zebra_stripes=True)
+        yield Rows(id="sessions-table")
 
     def on_mount(self) -> None:
         self.table.add_columns(*COLUMNS)
@@ -44,8 +47,8 @@ class SessionsScreen(StationScreen):
         self.fetch()
 
     @property
-    def table(self) -> DataTable[str]:
-        return cast("DataTable[str]", self.query_one("#sessions-table", DataTable))
+    def table(self) -> Rows:
+        return self.query_one(Rows)
 
     @work(exclusive=True, group="fetch", exit_on_error=False)
     async def fetch(self) -> None:

@@ -103,7 +103,7 @@ class Touching(ModalScreen[Touch | None]):
         with Vertical(id="verify"):
             yield Label(f"Corner {self._offer.corner}", id="verify-title")
             yield Static("The arm moves; F12 stops it.", id="verify-text", markup=False)
-            yield Input(id="verify-offset", placeholder="x,y in mm, or only Enter")
+            yield Input(id="verify-offset", placeholder="x,y in mm, or only Enter", compact=True)
             yield Label("", id="verify-problem", markup=False)
             yield Label("Escape leaves this corner out", id="verify-keys")
 

@@ -102,9 +102,9 @@ class ReasonLine(Static):
         said = ""
         if self.status is not None and self.status.reason and not self.trouble:
             said = self.status.reason + _NEXT.get(self.status.state, "")
-        # A playback has no trouble: the line only says where it is.
-        playing = self.status is not None and self.status.playback and not self.trouble
-        self.set_class(playing or not (self.trouble or said), "note")
+        # A playback has no trouble, and a cell at rest neither: the line only tells.
+        calm = self.status is None or self.status.playback or self.status.state is StationState.IDLE
+        self.set_class(calm and not self.trouble, "note")
         reason = "\n ".join(words for words in (self.trouble, self.busy, said) if words)
         if reason != self._reason:
             self._reason = reason

@@ -17,7 +17,7 @@ from calibrate.load import load_views
 from calibrate.pnp import solve_pnp
 from calibrate.views import ViewSet
 from recordings.files import write_atomically
-from recordings.messages import Vector6
+from recordings.messages import Mount, Vector6
 from recordings.reader import open_recording
 from station.attend import wait_until_idle
 from station.cli_session import Headless, Socket, attended_session, err, load_into, out
@@ -85,13 +85,13 @@ def bootstrap_command(
 def _make_moves(cell: StationConfig, socket: Path | None, headless: bool) -> list[Glimpse]:
     """The taught view and those after each move. Every one is a session of its own, with its own go."""
     path = socket or default_socket()
-    taught = asyncio.run(_standing(path))
+    taught = asyncio.run(_standing(path, cell.mount))
     move: PlannedPose | None = PlannedPose("taught", taught, why="a picture where the arm stands")
     glimpses: list[Glimpse] = []
     views: ViewSet | None = None
     while move is not None:
         before = glimpses[-1].joints_rad if glimpses else np.array(taught)
-        if np.abs(np.array(asyncio.run(_standing(path))) - before).max() > _STRAYED_RAD:
+        if np.abs(np.array(asyncio.run(_standing(path, cell.mount))) - before).max() > _STRAYED_RAD:
             raise BootstrapError("the arm was moved meanwhile: teach the view again and start over")
         of = f" (of {MOVES_MIN} to {MOVES_MAX})" if glimpses else ""
         err.print(f"[bold]{move.name}[/]{of}: {move.why}")
@@ -153,10 +153,15 @@ def slow_plan(cell: StationConfig, move: PlannedPose) -> Plan:
     )
 
 
-async def _standing(socket: Path) -> Vector6:
-    """Joints where the arm stands."""
+async def _standing(socket: Path, mount: Mount) -> Vector6:
+    """Joints where the arm stands. ConfigError when the daemon's cell is of the other mount."""
     async with await Client.connect(socket) as client:
-        joints = (await wait_until_idle(client)).robot.joints_rad
+        status = await wait_until_idle(client)
+    if status.mount != mount:
+        raise ConfigError(
+            f"the configuration says {mount}, the daemon's cell is {status.mount}: give the file it runs with"
+        )
+    joints = status.robot.joints_rad
     if joints is None:
         raise BootstrapError("the daemon does not know the arm's joints: `station doctor` says why")
     return joints

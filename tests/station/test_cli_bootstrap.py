@@ -87,7 +87,7 @@ def test_what_was_found_is_kept_when_no_further_move_is_free(monkeypatch: pytest
     config, start = cell_config(TRUTH, "127.0.0.1"), TRUTH.start_joints_rad
     moves = [PlannedPose("bootstrap 1", start), LimitError("nothing is free")]
 
-    async def standing(_: Path) -> Vector6:
+    async def standing(*_: object) -> Vector6:
         return start
 
     def next_move(*_: object) -> PlannedPose:
@@ -122,6 +122,16 @@ def test_its_moves_are_slower_than_those_of_a_plan() -> None:
     assert not slow.problems
     assert slow.moves[0].joint_speed_rad_s <= 0.2 < usual.moves[0].joint_speed_rad_s
     assert slow.top_speed_m_s < 0.7 * usual.top_speed_m_s
+
+
+def test_a_configuration_of_the_other_mount_is_refused(socket: Path, tmp_path: Path) -> None:
+    other = cell_config(build_cell("paper", SEED, "low", "eye-to-hand"), "127.0.0.1")
+    config = tmp_path / "cell.yaml"
+    config.write_text(yaml.safe_dump(msgspec.to_builtins(other)))
+    command = [sys.executable, "-m", "station.cli", "bootstrap", "--config", str(config), "--headless"]
+    done = subprocess.run([*command, "--socket", str(socket)], capture_output=True, text=True, timeout=120)
+    assert done.returncode == 2, done.stderr
+    assert "says eye-to-hand, the daemon's cell is eye-in-hand" in done.stderr
 
 
 def test_without_a_mount_guess_nothing_is_asked_of_the_arm(tmp_path: Path) -> None:

@@ -34,7 +34,7 @@ def verdict_text(calibration: Calibration) -> Text:
     against = [words for words in against if not words.startswith("0 ")]
     stamp = "" if calibration.source == "real" else f"{calibration.source.upper()}: never for a real cell\n"
     head = ", ".join(against) + ": installs only with a reason" if against else "READY TO INSTALL"
-    text = Text(stamp, style="bold").append(f"{head}\n", style="bold reverse" if against else "bold")
+    text = Text().append(stamp, "bold").append(f"{head}\n", "bold reverse" if against else "bold")
     for passed, words in (
         *((agrees(touch), f"by hand: {touch_text(touch)}") for touch in touches),
         *((gate.passed, f"{gate.name}: {gate.text}") for gate in gates),

@@ -17,6 +17,7 @@ from station.tui import offline
 from station.tui.confirm import Confirm
 from station.tui.jobs import JobScreen
 from station.tui.offline import OVERRIDE, PERSON, Reason
+from station.tui.result import verdict_text
 from tests.station.hover_cell import calibration_of
 from tests.station.session_rig import TRUTH
 from tests.tui.conftest import FakeLink, until
@@ -53,6 +54,13 @@ def calibration(tmp_path: Path) -> Path:
     path.parent.mkdir(parents=True)
     write_calibration(DOUBTED, path)
     return path
+
+
+def test_only_what_matters_most_is_bold() -> None:
+    text = verdict_text(DOUBTED)
+    assert not text.style
+    bold = [text.plain[span.start : span.end].strip() for span in text.spans if "bold" in str(span.style)]
+    assert bold == ["SIMULATED: never for a real cell", text.plain.splitlines()[1], "[FAIL]"]
 
 
 async def press_on_result(pilot: Pilot[None], calibration: Path, *keys: str) -> None:

@@ -6,9 +6,11 @@ import asyncio
 from typing import Any
 
 import msgspec
+import numpy as np
 import pytest
 from textual.widgets import DataTable
 
+from calibrate.geometry import pose as pose_of
 from station.status import EstimateStatus, PoseStatus
 from station.tui.plan import PLANNING
 from station.tui.widgets.panels import estimate_lines, pose_map_lines
@@ -83,6 +85,24 @@ def test_the_estimate_of_a_sealed_session_asks_for_no_more_poses() -> None:
     session = msgspec.structs.replace(status.session, recording="s.mcap")
     lines = estimate_lines(msgspec.structs.replace(status, session=session))
     assert lines[-1] == "F9 finds the final one" and len(lines) == 3
+
+
+async def test_the_sketch_fills_its_place_before_anything_new_is_told(link: FakeLink) -> None:
+    status = idle()
+    places = [
+        tuple(tuple(row) for row in pose_of(np.eye(3), np.array([x, x, x])).tolist()) for x in (0.3, 0.9)
+    ]
+    poses = tuple(
+        PoseStatus(index=i, name=f"p{i}", base_from_flange=place)  # type: ignore[arg-type]
+        for i, place in enumerate(places)
+    )
+    link.show(msgspec.structs.replace(status, session=msgspec.structs.replace(status.session, poses=poses)))
+    async with app_on(link).run_test(size=(160, 48)) as pilot:
+        await until(pilot, lambda: "/2" in text_of(pilot.app, "#bar"))
+        await pilot.press("2")
+        await until(
+            pilot, lambda: max(map(len, text_of(pilot.app, "#plan-sketch").splitlines()), default=0) > 30
+        )
 
 
 async def test_a_pose_that_changes_is_told_where_it_stands(link: FakeLink) -> None:

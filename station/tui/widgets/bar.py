@@ -13,8 +13,8 @@ _ALARM = {StationState.STOPPED, StationState.FAULT, StationState.DISCONNECTED}
 STOP_KEY = "F12=STOP"
 LEVELS = 5
 _NEXT = {
-    StationState.STOPPED: " │ F8: I looked",
-    StationState.FAULT: " │ F8: I looked",
+    StationState.STOPPED: " │ F8",
+    StationState.FAULT: " │ F8",
     StationState.PAUSED: " │ F5 goes on, F7 finishes",
 }
 """Which key is next. The daemon's own sentence is for shells too."""

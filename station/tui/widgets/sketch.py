@@ -33,8 +33,13 @@ class PlanSketch(Static):
         super().__init__(id=id, classes="panel")
         self.border_title = "Where the arm goes"
         self._shown = ""
+        self._last: tuple[StationStatus | None, int] = (None, 0)
+
+    def on_resize(self) -> None:
+        self.show(*self._last)
 
     def show(self, status: StationStatus | None, line: int) -> None:
+        self._last = (status, line)
         if status is None:
             return
         stops = [

@@ -8,6 +8,7 @@ enough the plan is made.
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
 from itertools import product
@@ -22,7 +23,7 @@ from calibrate.kinematics import RobotModel, forward, inverse_nearest
 from station.collision import CellGeometry, margins
 from station.config import StationConfig
 from station.errors import LimitError
-from station.limits import SPACING_M, joint_bounds
+from station.limits import SPACING_M, Problem, check_path, joint_bounds
 from station.plan.belief import Belief, Glimpse, believe, board_place, expected_after, seen_from, spread_of
 from station.plan.describe import planned_pose
 from station.plan.model import PlannedPose
@@ -38,6 +39,8 @@ _ANGLES_RAD = tuple(np.deg2rad([2.0, 4.0, 7.0, 11.0, 16.0, 22.0]))
 _OTHERS, _OTHERS_MOST_RAD = 4000, 0.25
 _BACK_M = (0.0, 0.02, 0.05, 0.10)
 _BORDER_PX = 15.0
+_ASKED = 20
+"""Refused moves that are asked what is in their way."""
 _NEARER_M = 0.001
 """What counts as not nearer."""
 _ON_THE_WAY = 17
@@ -62,17 +65,17 @@ def next_move(config: StationConfig, glimpses: Sequence[Glimpse]) -> PlannedPose
         raise LimitError(_not_here(belief, len(cells)))
     here = glimpses[-1].joints_rad
     allowed = geometry_from(config, here)  # what the daemon would refuse is no move
-    in_view = 0
+    in_view: list[Array] = []
     for targets in (_targets(config, glimpses[0], belief), _any_direction(model, here, rng)):
         targets = targets[_stays_in_view(config, glimpses[0], samples, targets)]
-        in_view += len(targets)
+        in_view += list(targets)
         passed = _passing(allowed, here, targets)
         gain = [spread_of(expected_after(config, glimpses, belief, forward(model, q))) for q in passed]
         for place in np.argsort(gain, kind="stable"):
             way_is_free = _free_in_all(cells, here, passed[place])
             if way_is_free and _keeps_away(config, glimpses[0], samples, here, passed[place]):
                 return _described(config, glimpses[0], belief, moves, passed[place])
-    raise LimitError(_no_move(belief, in_view))
+    raise LimitError(_no_move(belief, len(in_view), _in_the_way([allowed, *cells], here, in_view)))
 
 
 def _passing(cell: CellGeometry, here: Array, targets: Array) -> Array:
@@ -105,7 +108,28 @@ def _not_here(belief: Belief, possible: int) -> str:
     )
 
 
-def _no_move(belief: Belief, in_view: int) -> str:
+def _in_the_way(cells: Sequence[CellGeometry], here: Array, targets: Sequence[Array]) -> str:
+    """What the moves to these flange poses (4, 4) break most often; a sample of them is looked at."""
+    broken: Counter[str] = Counter()
+    for target in targets[:: 1 + len(targets) // _ASKED]:
+        joints = inverse_nearest(cells[0].model, target, here)
+        if joints is None:
+            broken["the arm's reach"] += 1
+        elif np.abs(joints - here).max() > _MOST_TURN_RAD:
+            broken["a joint that would have to turn far"] += 1
+        else:
+            checks = (check_path(cell, here, joints).problems for cell in cells)
+            problems = next((found for found in checks if found), ())
+            broken.update({_limit_of(problem) for problem in problems} or {"the camera coming nearer"})
+    return " and ".join(limit for limit, _ in broken.most_common(2))
+
+
+def _limit_of(problem: Problem) -> str:
+    """'forearm against table', 'the joint range'"""
+    return problem.text.split(",")[0] if problem.limit == "clearance" else f"the {problem.limit}"
+
+
+def _no_move(belief: Belief, in_view: int, in_the_way: str) -> str:
     """Why, and what to do: `in_view` targets keep the board in the picture, none of them is free to reach."""
     mount = f"camera mount within the guess ({1000 * belief.sigma_m:.0f} mm, {belief.sigma_deg:.0f}°)"
     if in_view == 0:
@@ -115,9 +139,9 @@ def _no_move(belief: Belief, in_view: int) -> str:
             "mount better (camera_guess)."
         )
     return (
-        f"{in_view} small moves keep the board in the picture, but none is free for every {mount}: the arm's "
-        "reach, its joints or what stands around it are in the way, or the camera would come nearer on the "
-        "way. Teach a view with more room around the arm, or measure the mount better (camera_guess)."
+        f"{in_view} small moves keep the board in the picture, but none is free for every {mount}; mostly "
+        f"in the way: {in_the_way}. Teach a view with more room around the arm, correct `limits`, or measure "
+        "the mount better (camera_guess)."
     )
 
 

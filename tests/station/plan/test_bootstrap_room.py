@@ -116,8 +116,25 @@ def test_the_camera_comes_no_nearer_on_the_way_either(monkeypatch):
     assert away_m[-1] > away_m[0] > away_m.min() + 0.004
     monkeypatch.setattr(bootstrap, "_targets", lambda *_: there[None])
     monkeypatch.setattr(bootstrap, "_any_direction", lambda *_: there[None])
-    with pytest.raises(LimitError, match="nearer on the way"):
+    with pytest.raises(LimitError, match="the camera coming nearer"):
         next_move(config(X, 0.001, 0.005), [GLIMPSE])
+
+
+@pytest.mark.parametrize(
+    ("limit", "told"), [("box", "outside the workspace box"), ("joints", "the joint range")]
+)
+def test_it_names_what_is_in_the_way_of_every_move(limit, told):
+    cell = config(X, 0.005, 0.03)
+    at, low, high = forward(ARM, TAUGHT)[:3, 3], tuple(TAUGHT - 0.005), tuple(TAUGHT + 0.005)
+    limits = msgspec.structs.replace(cell.limits, joints_min_rad=low, joints_max_rad=high)
+    if limit == "box":
+        camera = (forward(ARM, TAUGHT) @ X)[:3, 3]
+        low, high = np.minimum(at, camera) - 0.004, np.maximum(at, camera) + 0.004
+        limits = msgspec.structs.replace(
+            cell.limits, workspace_min_m=tuple(low.tolist()), workspace_max_m=tuple(high.tolist())
+        )
+    with pytest.raises(LimitError, match=rf"mostly in the way: .*{told}.* Teach a view"):
+        next_move(msgspec.structs.replace(cell, limits=limits), [GLIMPSE])
 
 
 def test_no_move_when_no_mount_goes_with_where_the_arm_stands():

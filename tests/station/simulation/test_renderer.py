@@ -76,6 +76,20 @@ def test_corners_lie_where_opencv_projects_them_without_bias() -> None:
     assert np.sqrt((error**2).mean()) < 0.03
 
 
+def test_rows_of_the_board_along_the_pixel_rows_are_as_exact_as_others() -> None:
+    """There all samples of an edge would pass at once, were they a square grid."""
+    errors = []
+    for k in range(3):
+        view = seen_from(
+            PAPER_BOARD, 0.45 + 0.013 * k, rotation_exp([0.34 * np.cos(k), 0.34 * np.sin(k), 0.0])
+        )
+        seen = detect(render(CAMERA, PAPER_BOARD, view, NO_NOISE), PAPER_BOARD)
+        assert seen.found
+        truth = projected(PAPER_BOARD, view)
+        errors.append(min((seen.pixels - t for t in (truth, truth[::-1])), key=np.linalg.norm))
+    assert np.sqrt((np.concatenate(errors) ** 2).mean()) < 0.03
+
+
 def test_a_point_on_a_hand_drawn_ray_is_where_the_pinhole_says() -> None:
     """No projection code at all: a bare pinhole, a board straight ahead, sides at integer pixels + ½."""
     camera = CameraModel(400, 400, ((400.0, 0.0, 199.5), (0.0, 400.0, 199.5), (0.0, 0.0, 1.0)))

@@ -58,6 +58,14 @@ def read_checks(root: Path | None = None) -> list[CheckEntry]:
     return read_lines(calibrations_folder(root) / "checks.jsonl", CheckEntry)
 
 
+def earlier_text(history: Sequence[CheckEntry], generation: int) -> str:
+    """How the checks of this generation went so far, else empty: one alarm alone may be chance."""
+    earlier = [entry.passed for entry in history if entry.generation == generation]
+    if not earlier:
+        return ""
+    return f"Earlier checks of generation {generation}: {len(earlier)}, it held in {sum(earlier)} of them."
+
+
 def trend_text(history: Sequence[CheckEntry], generation: int) -> str:
     """A warning when the checks of this generation wander with time, else empty.
 

@@ -62,7 +62,7 @@ def check_scale(
 
 def _text(scale: float, sigma: float, board: BoardSpec, allowed: float) -> str:
     configured, fits, doubt = board.square_m * 1e3, board.square_m * scale * 1e3, board.square_m * sigma * 1e3
-    text = f"Squares of {fits:.2f} ± {doubt:.2f} mm fit the robot's motion, {configured:g} mm are configured"
+    text = f"Squares of {fits:.3f} ± {doubt:.3f} mm fit the robot's motion, {configured:g} mm are configured"
     if abs(scale - 1) > max(allowed, SIGNIFICANT_SIGMAS * sigma):
         text += ". Measure the board, correct square_m and solve the same recording again with --square-mm."
     return text

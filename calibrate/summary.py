@@ -9,7 +9,7 @@ from rich.text import Text
 from scipy.spatial.transform import Rotation
 
 from calibrate.board import describe_board
-from calibrate.calibration import Calibration
+from calibrate.calibration import Calibration, Override
 from calibrate.geometry import difference
 from calibrate.verification import agrees, touch_text
 
@@ -33,6 +33,10 @@ def verdict(calibration: Calibration) -> tuple[bool, str]:
     return False, f"NOT GOOD ENOUGH: {names} ({len(failed)} of {len(calibration.quality.gates)} gates failed)"
 
 
+def override_text(override: Override) -> str:
+    return f"installed although refused, by {override.who}: {override.reason}"
+
+
 def pose_text(calibration: Calibration) -> str:
     """Position in mm, then roll, pitch, yaw about fixed axes in degrees."""
     x, y, z = (v * 1000 for v in calibration.result.translation_m)
@@ -46,6 +50,8 @@ def summary(calibration: Calibration) -> RenderableType:
     parts: list[RenderableType] = [Text(sentence, style="bold green" if good else "bold red")]
     if source_stamp(calibration):
         parts.append(Text(source_stamp(calibration), style="bold yellow"))
+    if calibration.override is not None:
+        parts.append(Text(override_text(calibration.override), style="bold yellow"))
     parts += [_result_table(calibration), _gate_table(calibration)]
     for touch in calibration.verification:
         style = "green" if agrees(touch) else "bold red"

@@ -146,7 +146,7 @@ def best_command(headless: Headless = False, socket: Socket = None) -> None:
 
 
 def check_command(
-    poses: Annotated[int, typer.Option(min=4, max=50)] = POSES,
+    poses: Annotated[int, typer.Option(min=4, max=50, help="How many to take")] = POSES,
     headless: Headless = False,
     go: GoHash = "",
     socket: Socket = None,

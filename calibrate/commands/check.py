@@ -9,15 +9,18 @@ from typing import Annotated
 import typer
 
 from calibrate.calibration import Calibration, read_calibration
-from calibrate.checks import CheckEntry, append_check, read_checks, trend_text
+from calibrate.checks import CheckEntry, append_check, earlier_text, read_checks, trend_text
 from calibrate.commands.install import Root
 from calibrate.commands.output import AsJson, OutputError, detection_progress, err, out, print_json
 from calibrate.drift import FEWEST_VIEWS, POWER, DriftCheck, check_drift
 from calibrate.generations import generations
 from calibrate.install import load_installed
 from calibrate.pipeline import JobOptions, prepare_views
+from recordings.messages import SessionInfo
 
 DRIFTED = 4
+_BY_CHANCE = 0.001
+"""A smaller p is not worth a second look."""
 
 
 def register(app: typer.Typer) -> None:
@@ -48,28 +51,44 @@ def check(
     with detection_progress() as progress:
         prepared = prepare_views(recording, options, progress, fewest=FEWEST_VIEWS)
     info = prepared.recording.info
-    if info.mount != calibration.mount:
-        raise OutputError(f"{recording} is {info.mount}, the calibration {calibration.mount}.")
-    if (info.source == "simulated") != (calibration.source == "simulated"):
-        raise OutputError(f"{recording} is {info.source}, the calibration {calibration.source}.")
+    _require_same_cell(recording, info, calibration)
     result = check_drift(prepared.views, calibration)
-    trend = ""
+    trend = before = ""
     own = prepared.recording.sha256 == calibration.provenance.recording_sha256
     if own:
         err.print(f"{recording} is what this calibration was made from: it proves nothing, take new views.")
     elif calibration_file is None:
         number = next((g.number for g in generations(root) if g.current), 0)
         wall_s = info.created_wall_ns / 1e9 or time.time()
-        append_check(CheckEntry.of(result, wall_s, number, recording.name), root)
+        before = earlier_text(read_checks(root), number)
+        append_check(CheckEntry.of(result, wall_s, number, info.name), root)
         trend = trend_text(read_checks(root), number)
     if as_json:
         print_json({**_plain(result, trend), "own_views": own})
     else:
         out.print(check_text(result, calibration), style="green" if result.passed else "bold red")
+        if before:
+            out.print(before)
         if trend:
             out.print(trend, style="yellow")
     if not result.passed:
         raise typer.Exit(DRIFTED)
+
+
+def _require_same_cell(recording: Path, info: SessionInfo, calibration: Calibration) -> None:
+    if info.mount != calibration.mount:
+        raise OutputError(f"{recording} is {info.mount}, the calibration {calibration.mount}.")
+    if (info.source == "simulated") != (calibration.source == "simulated"):
+        raise OutputError(f"{recording} is {info.source}, the calibration {calibration.source}.")
+    for name, seen, known in (
+        ("robot", info.robot.serial, calibration.robot.serial),
+        ("camera", info.camera_identity.serial, calibration.camera.serial),
+    ):
+        if seen and known and seen != known:
+            raise OutputError(
+                f"{recording} was taken with {name} {seen}, the calibration is of {name} {known}: that is no "
+                "drift. Calibrate the new one."
+            )
 
 
 def check_text(result: DriftCheck, calibration: Calibration) -> str:
@@ -81,7 +100,7 @@ def check_text(result: DriftCheck, calibration: Calibration) -> str:
     else:
         text = (
             f"DOES NOT HOLD: the camera seems to have moved by {result.shift_mm:.2f} mm and "
-            f"{result.shift_deg:.3f}° (p = {result.p_value:.1e}). Check its mount, and calibrate again."
+            f"{result.shift_deg:.3f}° (p = {result.p_value:.1e}). {_next_step(result)}"
         )
     text += (
         f" This check notices a shift of 0.5 mm in {result.power_translation:.0%} and a turn of 0.1° in "
@@ -95,6 +114,15 @@ def check_text(result: DriftCheck, calibration: Calibration) -> str:
             "board or robot are not what they were, or a view is bad."
         )
     return text
+
+
+def _next_step(result: DriftCheck) -> str:
+    if result.p_value < _BY_CHANCE:
+        return "Check its mount, and calibrate again."
+    return (
+        f"Of cameras that did not move, one check in {1 / result.p_value:.0f} looks like this: check once "
+        "more, and if it does not hold again, check the mount and calibrate again."
+    )
 
 
 def _more_text(result: DriftCheck, calibration: Calibration) -> str:

@@ -18,7 +18,7 @@ from calibrate.formats import FORMATS, export
 from calibrate.formats.frames import FrameNames
 from calibrate.generations import Generation, generations, read_log, state_root
 from calibrate.install import install, load_installed, rollback
-from calibrate.summary import pose_difference, pose_text, summary, verdict
+from calibrate.summary import override_text, pose_difference, pose_text, summary, verdict
 
 Root = Annotated[
     Path | None,
@@ -88,7 +88,7 @@ def diff(
         ("solved", lambda c: c.created),
         ("robot", lambda c: f"{c.robot.model} {c.robot.serial}"),
         ("camera", lambda c: f"{c.camera.model} {c.camera.serial}"),
-        ("recording", lambda c: c.provenance.recording),
+        ("session", lambda c: c.provenance.session),
     ]
     for name, say in rows:
         table.add_row(name, say(a), say(b))
@@ -191,9 +191,14 @@ def list_installed(root: Root = None, as_json: AsJson = False) -> None:
             str(generation.number),
             "" if calibration is None else calibration.created,
             generation.problem if calibration is None else pose_text(calibration),
-            "" if calibration is None else verdict(calibration)[1],
+            "" if calibration is None else _verdict_text(calibration),
         )
     out.print(table)
+
+
+def _verdict_text(calibration: Calibration) -> str:
+    text = verdict(calibration)[1]
+    return text if calibration.override is None else f"{text}; {override_text(calibration.override)}"
 
 
 def history_rows(root: Path | None) -> list[tuple[str, str, str, str]]:

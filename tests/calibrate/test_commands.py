@@ -92,6 +92,8 @@ def test_a_failed_gate_is_exit_4_and_the_file_is_written_and_will_not_install(
     assert run("install", "c.yaml", "--override", "trial", cwd=tmp_path).returncode == 0
     shown = run("show", "--json", cwd=tmp_path)
     assert json.loads(shown.stdout)["override"]["reason"] == "trial"
+    for command in ("show", "list"):
+        assert "installed although refused" in " ".join(run(command, cwd=tmp_path).stdout.split())
 
 
 def test_solve_install_check_diff_rollback(real_session_file: Path, real_file: Path, tmp_path: Path) -> None:
@@ -260,3 +262,11 @@ def test_a_lens_known_before_can_be_given(session_file: Path, real_file: Path, t
 def test_few_views_are_refused(tmp_path: Path) -> None:
     path = write_session(tmp_path / "few.mcap", Scene(views=3), known_lens=True)
     refused(run("solve", path, cwd=tmp_path), 1, "at least 4 views")
+
+
+def test_another_camera_is_no_drift(real_session_file: Path, real_file: Path, tmp_path: Path) -> None:
+    calibration = read_calibration(real_file)
+    other = msgspec.structs.replace(calibration.camera, serial="other")
+    write_calibration(msgspec.structs.replace(calibration, camera=other), tmp_path / "other.yaml")
+    done = run("check", real_session_file, "--calibration", "other.yaml", cwd=tmp_path)
+    refused(done, 2, "the calibration is of camera other", "Calibrate the new one")

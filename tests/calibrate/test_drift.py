@@ -5,12 +5,13 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from scipy import stats
 
 from calibrate.board import board_points
-from calibrate.checks import CheckEntry, append_check, read_checks, trend_text
+from calibrate.checks import CheckEntry, append_check, earlier_text, read_checks, trend_text
 from calibrate.commands.check import check_text
 from calibrate.drift import POWER, DriftCheck, Noise, judge_shift, pnp_covariance, powers
 from calibrate.errors import BadViewsError, TooFewViewsError
@@ -120,8 +121,10 @@ def test_what_a_weak_check_says(solved_real: SolvedRecording) -> None:
     text = check_text(weak, solved_real.calibration)
     assert text.startswith("HOLDS, as far as these views can tell") and "Take 3 more" in text
     assert "calibrate again" in check_text(replace(weak, views_needed=None), solved_real.calibration)
-    moved = check_text(replace(weak, passed=False), solved_real.calibration)
+    moved = check_text(replace(weak, passed=False, p_value=1e-6), solved_real.calibration)
     assert "DOES NOT HOLD" in moved and "more" not in moved
+    doubtful = check_text(replace(weak, passed=False, p_value=0.02), solved_real.calibration)
+    assert "one check in 50" in doubtful and "check once more" in doubtful
 
 
 @pytest.mark.parametrize("rounding", [-1e-9, 0.0, 1e-9])
@@ -177,6 +180,9 @@ def test_a_trend_is_warned_of_before_a_check_fails(tmp_path: Path) -> None:
     steady = [entry(day, 0.1) for day in range(8)]
     assert trend_text(steady, 1) == ""
     assert trend_text(steady[:3], 1) == ""
+    failed = msgspec.structs.replace(steady[0], passed=False)
+    assert "generation 1: 4, it held in 3" in earlier_text([*steady[:3], failed], 1)
+    assert earlier_text(steady, 2) == ""
 
 
 def test_a_cut_history_line_is_skipped(tmp_path: Path) -> None:

@@ -24,6 +24,7 @@ HERE = Path(__file__).parent
 SIZES = ((80, 24), (160, 48))
 PATIENCE_S = 400.0
 QUESTION_S = 20.0
+DRAWN_S = 1.5
 STATION = (sys.executable, "-m", "station.cli")
 
 
@@ -111,6 +112,7 @@ def both(terminals: list[Terminal], name: str, keys: tuple[str, ...], pattern: s
         terminal.press(*keys)
     for terminal in terminals:
         terminal.wait_for(pattern)
+        time.sleep(DRAWN_S)
         terminal.picture(name)
 
 

@@ -40,7 +40,7 @@ class PlanSketch(Static):
 
     def show(self, status: StationStatus | None, line: int) -> None:
         self._last = (status, line)
-        if status is None:
+        if status is None or not self.size:
             return
         stops = [
             (pose.base_from_flange, "@" if i == line else POSE_MARKS[pose.state])

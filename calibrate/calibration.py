@@ -280,8 +280,12 @@ def _check_result(calibration: Calibration, where: str) -> None:
         or np.abs(matrix[:3, 3] - np.array(result.translation_m)).max() > 1e-12
     ):
         raise CalibrationFileError(f"{where}: matrix, translation and quaternion do not agree.")
-    if np.array(calibration.covariance).shape != (6, 6):
-        raise CalibrationFileError(f"{where}: the covariance is not 6 × 6.")
+    covariance = np.array(calibration.covariance)
+    if covariance.shape != (6, 6) or not np.isfinite(covariance).all():
+        raise CalibrationFileError(f"{where}: the covariance is not 6 × 6 finite numbers.")
+    rounding = 1e-9 * float(np.abs(covariance).max())
+    if np.abs(covariance - covariance.T).max() > rounding or np.linalg.eigvalsh(covariance).min() < -rounding:
+        raise CalibrationFileError(f"{where}: the covariance is not symmetric and positive.")
 
 
 def read_calibration(path: Path) -> Calibration:

@@ -109,6 +109,19 @@ def test_a_result_that_contradicts_itself_is_refused_even_with_a_right_hash(
             decode_calibration(content, "x")
 
 
+@pytest.mark.parametrize(("row", "column", "value"), [(0, 0, -1e-6), (0, 1, 1e-6), (2, 2, float("inf"))])
+def test_a_covariance_that_is_none_is_refused_even_with_a_right_hash(
+    solved_real: SolvedRecording, row: int, column: int, value: float
+) -> None:
+    """Negative along a direction, not symmetric, not finite."""
+    good = solved_real.calibration
+    rows = [list(line) for line in good.covariance]
+    rows[row][column] = value
+    wrong = msgspec.structs.replace(good, covariance=tuple(tuple(line) for line in rows))
+    with pytest.raises(CalibrationFileError, match="covariance"):
+        decode_calibration(encode_calibration(wrong), "x")
+
+
 def test_frames_that_do_not_touch_are_refused(real_file: Path) -> None:
     """Fault 43: the loaded transform knows its frames."""
     flange_from_camera = read_calibration(real_file).transform

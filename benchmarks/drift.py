@@ -71,7 +71,7 @@ MID = _Level("mid", Noise(0.15, 1.0e-4, 1.7e-4, _DEGREES_OF_FREEDOM), 6.0e-5, 1.
 def run() -> str:
     count = trials(TRIALS)
     mounts: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
-    rows = [_row(MID, "planned", views, "eye-in-hand", count) for views in (3, 4, 5, 6)]
+    rows = [_row(MID, "planned", views, "eye-in-hand", count) for views in (3, 4, 5, 6, 8)]
     rows += [
         _row(level, poses, views, mount, count)
         for level in (LOW, MID)

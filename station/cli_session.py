@@ -153,8 +153,8 @@ def check_command(
 ) -> None:
     """Does the installed calibration still hold? A few poses, then `calibrate check` on them.
 
-    The board may lie elsewhere by now. Six poses notice a shift of 0.5 mm or 0.1° on a quiet cell; where they
-    do not, it says how many more would. Ctrl-C is STOP.
+    The board may lie elsewhere by now. Eight poses notice a shift of 0.5 mm or 0.1° on a usual cell, five on
+    a quiet one; where they do not, it says how many more would. Ctrl-C is STOP.
 
     Exit codes: 0 it holds, 4 it does not, 1 no recording or nothing installed, 2 usage.
     """

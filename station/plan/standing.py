@@ -32,7 +32,7 @@ def geometry_from(config: StationConfig, standing_rad: ArrayLike) -> CellGeometr
     mounts = perturb(pose_from_quaternion(guess.translation_m, guess.rotation_xyzw), nearest)
     room_m = _room_m(cell, np.asarray(standing_rad, dtype=float), mounts, camera_radius_m(guess.sigma_m))
     roomy = np.flatnonzero(room_m >= SPACING_M)
-    if room_m[0] >= 0 or len(roomy) == 0:
+    if room_m[0] >= SPACING_M / 2 or len(roomy) == 0:  # what the check of a path wants
         return cell
     Y = None if place is None else pose_from_quaternion(place.translation_m, place.rotation_xyzw)
     return geometry_of(config, mounts[roomy[0]], Y, guess.sigma_m, 0.0 if place is None else place.sigma_m)

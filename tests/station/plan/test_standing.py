@@ -39,6 +39,12 @@ def test_a_rough_guess_inside_the_arm_gives_way_to_a_mount_that_has_room():
     assert cell.watched_m != cell_geometry(guessed).watched_m
 
 
+def test_room_that_is_less_than_the_check_of_a_path_wants_is_none():
+    guesses = [config(beside_the_forearm(beside_m), 0.06, 0.3) for beside_m in np.arange(0.1, 0.4, 0.001)]
+    guessed = next(g for g in guesses if 0.002 < room_m(cell_geometry(g)) < 0.004)
+    assert room_m(geometry_from(guessed, TAUGHT)) >= 0.01
+
+
 @pytest.mark.parametrize(
     ("mount", "sigma_m"), [(beside_the_forearm(0.1), 0.01), (WRONG, 0.06), (beside_the_forearm(0.0), 0.02)]
 )

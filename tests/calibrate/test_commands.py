@@ -18,6 +18,7 @@ import pytest
 
 from calibrate.calibration import read_calibration, write_calibration
 from calibrate.cli import main
+from calibrate.commands import output
 from recordings.messages import CameraModel
 from tests.calibrate.sessions import Scene, write_session
 
@@ -36,6 +37,7 @@ def run(*arguments: object, cwd: Path) -> Done:
         patch.chdir(cwd)
         patch.setenv("XDG_STATE_HOME", str(cwd / "state"))
         patch.delenv("STATE_DIRECTORY", raising=False)
+        patch.setattr(output.out, "width", 150)  # whatever a test before it told
         patch.setattr(sys, "argv", ["calibrate", *map(str, arguments)])
         try:
             main()

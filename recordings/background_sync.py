@@ -1,8 +1,8 @@
 """fdatasync beside the writer: what comes meanwhile still reaches the operating system.
 
 What is on the disk leaves the computer's memory again, but for the newest part: a stream of gigabytes would
-fill it with pages that nobody reads, and a computer that has to find free memory halts everything for tenths
-of a second, the arm's heartbeat too.
+fill it with pages that nobody reads. Streams then ended after minutes, daemon or robot silent for tenths of a
+second (docs/decisions/0088).
 """
 
 from __future__ import annotations

@@ -141,9 +141,10 @@ def _available_cores() -> int:
 def _check_size(view: View, width: int, height: int, camera: CameraModel) -> None:
     if camera.width and (width, height) != (camera.width, camera.height):
         raise BadViewsError(
-            f"view {view.index} ({view.name}): the picture is {width}×{height}, the camera is "
-            f"{camera.width}×{camera.height}. All pictures of a recording must come from one camera with one "
-            "setting; check the region of interest, or the width and height in dataset.yaml."
+            f"view {view.index} ({view.name}): the picture is {width}×{height}, the camera or its lens is "
+            f"given for {camera.width}×{camera.height}. All pictures, and the lens, must be of one camera in "
+            "one setting: check the region of interest, the width and height in dataset.yaml, or whether "
+            "this lens (--camera, the calibration that is checked) belongs to these pictures."
         )
 
 

@@ -8,17 +8,22 @@ from typing import Annotated
 
 import typer
 
-from calibrate.calibration import Calibration, read_calibration
+from calibrate.calibration import Calibration, Provenance, read_calibration
 from calibrate.checks import CheckEntry, append_check, earlier_text, read_checks, trend_text
 from calibrate.commands.install import Root
-from calibrate.commands.output import AsJson, OutputError, detection_progress, err, out, print_json
+from calibrate.commands.output import AsJson, OutputError, detection_progress, out, print_json
 from calibrate.drift import FEWEST_VIEWS, POWER, DriftCheck, check_drift
+from calibrate.errors import BadViewsError
 from calibrate.generations import generations
 from calibrate.install import load_installed
 from calibrate.pipeline import JobOptions, prepare_views
 from recordings.messages import SessionInfo
 
 DRIFTED = 4
+OWN_VIEWS = (
+    "PROVES NOTHING: the calibration was made from {recording}, so it fits these views whatever the camera "
+    "did since. Take new ones: `station check`, or capture again."
+)
 _BY_CHANCE = 0.001
 """A smaller p is not worth a second look."""
 
@@ -28,7 +33,9 @@ def register(app: typer.Typer) -> None:
 
 
 def check(
-    recording: Annotated[Path, typer.Argument(help="3 to 5 views of a board, or a whole session")],
+    recording: Annotated[
+        Path, typer.Argument(help="3 and more new views of a board: a recording or a session")
+    ],
     calibration_file: Annotated[
         Path | None, typer.Option("--calibration", help="Instead of the installed one; nothing is noted")
     ] = None,
@@ -41,7 +48,8 @@ def check(
     Says how surely it would have noticed 0.5 mm or 0.1°, and how many more views would do. Every check of the
     installed calibration is noted; a trend over five and more is warned of. `station check` takes the views.
 
-    Exit codes: 0 it holds, 4 it does not, 1 the views or files cannot be used, 2 wrong options or kind.
+    Exit codes: 0 it holds, 4 it does not, 1 the views or files cannot be used (they are those the calibration
+    was made from, say), 2 wrong options or kind.
     """
     if calibration_file is None:
         calibration = load_installed(root, allow_simulated=True)
@@ -54,17 +62,18 @@ def check(
     _require_same_cell(recording, info, calibration)
     result = check_drift(prepared.views, calibration)
     trend = before = ""
-    own = prepared.recording.sha256 == calibration.provenance.recording_sha256
-    if own:
-        err.print(f"{recording} is what this calibration was made from: it proves nothing, take new views.")
-    elif calibration_file is None:
+    own = _is_origin(prepared.recording.sha256, info, calibration.provenance)
+    if calibration_file is None and not own:
         number = next((g.number for g in generations(root) if g.current), 0)
         wall_s = info.created_wall_ns / 1e9 or time.time()
         before = earlier_text(read_checks(root), number)
         append_check(CheckEntry.of(result, wall_s, number, info.name), root)
         trend = trend_text(read_checks(root), number)
+    proves_nothing = own and result.passed
     if as_json:
-        print_json({**_plain(result, trend), "own_views": own})
+        print_json({**_plain(result, trend), "passed": result.passed and not own, "own_views": own})
+    elif proves_nothing:
+        out.print(OWN_VIEWS.format(recording=recording), style="yellow")
     else:
         out.print(check_text(result, calibration), style="green" if result.passed else "bold red")
         if before:
@@ -73,6 +82,15 @@ def check(
             out.print(trend, style="yellow")
     if not result.passed:
         raise typer.Exit(DRIFTED)
+    if proves_nothing:
+        raise typer.Exit(BadViewsError.exit_code)
+
+
+def _is_origin(sha256: str, info: SessionInfo, provenance: Provenance) -> bool:
+    """Whether the calibration was made from this recording; an excerpt is of the same session."""
+    session = (info.name, info.created_wall_ns)
+    known = bool(info.created_wall_ns) and session == (provenance.session, provenance.recorded_wall_ns)
+    return known or sha256 == provenance.recording_sha256
 
 
 def _require_same_cell(recording: Path, info: SessionInfo, calibration: Calibration) -> None:

@@ -19,7 +19,9 @@ import pytest
 from calibrate.calibration import read_calibration, write_calibration
 from calibrate.cli import main
 from calibrate.commands import output
+from recordings.excerpt import write_excerpt
 from recordings.messages import CameraModel
+from recordings.reader import open_recording
 from tests.calibrate.sessions import Scene, write_session
 
 
@@ -111,10 +113,18 @@ def test_solve_install_check_diff_rollback(real_session_file: Path, real_file: P
     )
     write_calibration(msgspec.structs.replace(calibration, result=result), second)
     assert run("install", real_file, cwd=tmp_path).returncode == 0
-    holds = run("check", real_session_file, "--json", cwd=tmp_path)
+    own = run("check", real_session_file, cwd=tmp_path)
+    assert own.returncode == 1, own.stdout + own.stderr
+    assert own.stdout.startswith("PROVES NOTHING") and "HOLDS" not in own.stdout
+    answer = json.loads(run("check", real_session_file, "--json", cwd=tmp_path).stdout)
+    assert answer["own_views"] is True and answer["passed"] is False
+    excerpt = write_excerpt(open_recording(real_session_file), tmp_path / "excerpt.mcap")
+    assert run("check", excerpt, cwd=tmp_path).stdout.startswith("PROVES NOTHING")
+    later = Scene(views=6, seed=5)
+    new = write_session(tmp_path / "new.mcap", later, known_lens=True, source="real", name="later")
+    holds = run("check", new, "--json", cwd=tmp_path)
     assert holds.returncode == 0, holds.stdout + holds.stderr
-    assert json.loads(holds.stdout)["passed"] is True
-    assert json.loads(holds.stdout)["own_views"] is True and "it proves nothing" in holds.stderr
+    assert json.loads(holds.stdout)["passed"] is True and json.loads(holds.stdout)["own_views"] is False
     installed = run("install", second, "--json", cwd=tmp_path)
     assert json.loads(installed.stdout)["generation"] == 2
     drifted = run("check", real_session_file, cwd=tmp_path)

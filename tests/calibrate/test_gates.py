@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 
@@ -115,3 +117,13 @@ def test_wrong_limits_are_refused_with_the_file(tmp_path: Path, content: str) ->
         read_limits(path)
     with pytest.raises(GatesError, match=r"none\.yaml"):
         read_limits(tmp_path / "none.yaml")
+
+
+def test_the_documented_defaults_are_those_in_force() -> None:
+    text = Path("docs/calibration-file.md").read_text()
+    table = text[text.index("## Gates") : text.index("Installing asks one gate more")]
+    documented: dict[str, str] = {}
+    for row in re.findall(r"^\| (`[^|]+) \| ([^|]+) \|", table, re.MULTILINE):
+        documented |= zip(re.findall(r"`(\w+)`", row[0]), row[1].strip().split(", "), strict=True)
+    defaults = msgspec.structs.asdict(GateLimits())
+    assert documented == {name: f"{v}".lower() if v is True else f"{v:g}" for name, v in defaults.items()}

@@ -131,6 +131,8 @@ def ensure_daemon(socket: Path) -> Path:
     root = default_root()
     config = find_config()
     what = ["--simulate"] if config is None else ["--config", str(config)]
+    cell = "a SIMULATED cell (no configuration found)" if config is None else f"the cell of {config}"
+    print(f"no daemon serves {socket}: starting one for {cell} …", file=sys.stderr)
     root.mkdir(parents=True, exist_ok=True)
     log = root / "daemon.log"
     with log.open("ab") as words:

@@ -61,6 +61,7 @@ def freeze_startup() -> None:
 
 
 LOOKED = "I looked: leave STOPPED or FAULT"
+LET_GO = "Give up control, so that another screen may take it"
 SCREENS = Binding.Group("Screens", compact=True)
 SCREEN_TOOLTIPS = {
     "live": "The running capture",
@@ -110,6 +111,7 @@ class StationApp(Commands):
         Binding("f9", "solve_newest", "Solve", id="solve", tooltip="Solve the session just recorded"),
         Binding("f3", "free_drive", "Hand", id="free-drive", tooltip="Free-drive: move the arm by hand"),
         Binding("f2", "record", "Take", id="record", tooltip="Take a picture here (free-drive)"),
+        Binding("f4", "let_go", "Let go", show=False, id="let-go", tooltip=LET_GO),
         Binding(
             "ctrl+q", "leave", "Quit", show=False, id="quit", tooltip="Close this screen; the daemon goes on"
         ),

@@ -11,7 +11,7 @@ from textual.reactive import reactive
 
 from station.errors import RefusedError, StationError
 from station.protocol import Verb
-from station.states import refusal
+from station.states import RUNNING, refusal
 from station.status import GoSummary, StationState, StationStatus
 from station.tui.confirm import Confirm, ConfirmGo
 from station.tui.link import Link
@@ -20,6 +20,8 @@ from station.tui.replay_screen import ReplayScreen
 STOP_UNHEARD = "STOP was sent, but the station does not answer: use the EMERGENCY STOP on the pendant."
 
 
+WITHOUT = "It decelerates at once, and the session pauses."
+STAYS = "The daemon and its session stay as they are; `station` opens this screen again."
 PLAN_ANSWER_S = 200.0
 """Planning takes the daemon some seconds on a quick computer, and minutes on a busy one."""
 
@@ -34,6 +36,8 @@ class Commands(App[None]):
     """For how long the daemon has not answered; None while it does."""
     trouble = ""
     """Why what is shown is not how it is: no daemon, or one that does not answer."""
+    _own_id: int | None = None
+    """How the daemon knows this connection, once it held the lease."""
     busy = ""
     """What the daemon is at work on for this screen; empty: nothing that takes long."""
 
@@ -65,9 +69,18 @@ class Commands(App[None]):
 
     async def ask_with_control(self, verb: Verb, **args: Any) -> Any:
         """As `ask`, for what only the holder of the lease may."""
-        if await self.ask("lease", action="take") is None:
-            return None
-        return await self.ask(verb, **args)
+        return await self.ask(verb, **args) if await self.take_control() else None
+
+    async def take_control(self) -> bool:
+        lease = await self.ask("lease", action="take")
+        if lease is not None:
+            self._own_id = lease.get("client_id")
+        return lease is not None
+
+    def has_control(self) -> bool:
+        """This screen holds the lease, and no other."""
+        holder = None if self.status is None else self.status.lease.client_id
+        return holder is not None and holder == self._own_id
 
     async def ask_long(self, words: str, verb: Verb, **args: Any) -> Any:
         """As `ask_with_control`, for what takes seconds or, on a busy computer, minutes.
@@ -105,12 +118,18 @@ class Commands(App[None]):
         """One pose more, the one that would help most; taken up by its go alone."""
         await self.go_for("best", "Looking for the pose that would help most … Nothing moves.")
 
-    async def go_for(self, purpose: str, words: str = "Checking the way … Nothing moves.") -> bool:
-        """Prepare, ask the person, go: how the keys of a session move the arm. True: it was told to go."""
+    async def go_for(
+        self, purpose: str, words: str = "Checking the way … Nothing moves.", changes: tuple[str, ...] = ()
+    ) -> bool:
+        """Prepare, ask the person, go: how the keys of a session move the arm. True: it was told to go.
+
+        `changes`: what else a yes changes.
+        """
         answer = await self.ask_long(words, "prepare", purpose=purpose)
         if answer is None:
             return False
         go = msgspec.convert(answer, GoSummary)
+        go = msgspec.structs.replace(go, changes=(*changes, *go.changes))
         if not await self.push_screen_wait(ConfirmGo(go)):
             return False
         return await self.ask("go", token=go.token) is not None
@@ -135,8 +154,7 @@ class Commands(App[None]):
         if self.status is None:
             return
         on = self.status.state is not StationState.FREE_DRIVE
-        if await self.ask("lease", action="take") is not None:
-            await self.ask("free_drive", on=on)
+        await self.ask_with_control("free_drive", on=on)
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_record(self) -> None:
@@ -147,11 +165,25 @@ class Commands(App[None]):
         await self.ask("acknowledge")
 
     @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_let_go(self) -> None:
+        """Another screen or a command may take control then."""
+        if self.status is None or not self.has_control():
+            holder = "" if self.status is None else self.status.lease.holder
+            self.notify(f"This screen does not hold control: {holder or 'nobody'} does.")
+            return
+        if self.status.state in RUNNING and not await self.push_screen_wait(
+            Confirm("Let go of control?", f"The arm works. {WITHOUT}", yes="Let go")
+        ):
+            return
+        await self.ask("lease", action="release")
+        self.notify("Control was let go of: another screen or command may take it.")
+
+    @work(exclusive=True, group="command", exit_on_error=False)
     async def action_leave(self) -> None:
-        running = self.status is not None and self.status.state not in (
-            StationState.IDLE,
-            StationState.DISCONNECTED,
-        )
-        text = "A session is running. Without this screen the arm decelerates and the session pauses."
-        if not running or await self.push_screen_wait(Confirm("Close the screen?", text, yes="Close")):
-            self.exit()
+        state = None if self.status is None else self.status.state
+        if state not in (None, StationState.IDLE, StationState.DISCONNECTED):
+            held = state in RUNNING and self.has_control()
+            text = f"The arm works, commanded from here. {WITHOUT}" if held else STAYS
+            if not await self.push_screen_wait(Confirm("Close the screen?", text, yes="Close")):
+                return
+        self.exit()

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import asyncio
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from calibrate.errors import CalibrationError
 from station.drift_check import POSES, SEED, require_installed
@@ -15,6 +15,7 @@ if TYPE_CHECKING:
 
 LOOK_S = 0.2
 PLANNING_CHECK = f"Planning the {POSES} poses of the check … Nothing moves."
+INSTEAD = "takes the place of the loaded plan of {} poses, which was never run (a no keeps it)"
 CHANGED = (
     "Another plan was loaded: the drift check has no verdict. Its pictures, if any, are on screen 4 (k)."
 )
@@ -29,8 +30,14 @@ async def drift_check(app: StationApp) -> None:
             app.notify(f"No drift check: {problem}", severity="warning", timeout=10)
             return
     before = "" if app.status is None else app.status.session.recording
+    loaded = await _unused_plan(app)
     made = await app.ask_long(PLANNING_CHECK, "make_plan", poses=POSES, seed=SEED, lens_known=True)
-    if made is None or not await app.go_for("check"):
+    if made is None:
+        return
+    changes = () if loaded is None else (INSTEAD.format(len(loaded["poses"])),)
+    if not await app.go_for("check", changes=changes):
+        if loaded is not None:
+            await app.ask_with_control("load_plan", plan=loaded)
         return
     await app.switch_mode("live")
     session = await _sealed(app, made["sha256"], before)
@@ -38,6 +45,15 @@ async def drift_check(app: StationApp) -> None:
         app.notify(CHANGED, timeout=10)
         return
     await offline.check(app, session.recording, session.folder)
+
+
+async def _unused_plan(app: StationApp) -> dict[str, Any] | None:
+    """The loaded plan when none of its poses was ever tried: somebody may still want it."""
+    poses = () if app.status is None else app.status.session.poses
+    if not poses or any(pose.attempt for pose in poses):
+        return None
+    loaded = await app.ask("plan")
+    return loaded["plan"] if loaded else None
 
 
 async def _sealed(app: StationApp, plan_sha256: str, before: str) -> SessionStatus | None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import os
 import sys
+import time
 from typing import ClassVar
 
 from textual import work
@@ -13,6 +14,8 @@ from textual.binding import Binding, BindingType
 from textual.containers import Vertical
 from textual.screen import ModalScreen
 from textual.widgets import Button, Label, RichLog
+
+from station.tui.words import duration
 
 TERMINATE_S = 5.0
 
@@ -43,7 +46,15 @@ class JobScreen(ModalScreen[int]):
             yield Button("Cancel", id="job-cancel")
 
     def on_mount(self) -> None:
-        self.run_job()
+        self._begun_s = time.monotonic()
+        self.set_interval(1.0, self._say_how_long)
+        self.call_after_refresh(self.run_job)  # the width of its lines is known then
+
+    def _say_how_long(self) -> None:
+        """It may say nothing for a while; the seconds tell that it works."""
+        if self._exit_code is None:
+            spent = duration(time.monotonic() - self._begun_s)
+            self.query_one("#job-title", Label).update(f"{self._title} … {spent}")
 
     @work(exclusive=True, exit_on_error=False)
     async def run_job(self) -> None:
@@ -61,6 +72,7 @@ class JobScreen(ModalScreen[int]):
             self.said.append(line.decode(errors="replace").rstrip())
             lines.write(self.said[-1])
         self._exit_code = await self._process.wait()
+        self.query_one("#job-title", Label).update(self._title)
         if self._cancelled:
             self.dismiss(-1)
         elif self._exit_code in self._close_on:

@@ -9,12 +9,17 @@ from station.tui.screen import StationScreen
 from station.tui.widgets import panels
 from station.tui.widgets.events import Events
 from station.tui.widgets.preview import Preview
+from station.tui.words import POSE_MARKS
 
 
 class LiveScreen(StationScreen):
     """Camera, quality, progress on the left; devices, poses, estimate on the right; events below."""
 
-    HELP = "The running capture. F5 asks before the arm moves; F12 stops it at once, in every screen."
+    HELP = (
+        "The running capture. F5 asks before the arm moves; F12 stops it at once, in every screen. Poses: "
+        + " ".join(f"{mark} {state}" for state, mark in POSE_MARKS.items())
+        + "."
+    )
 
     def body(self) -> ComposeResult:
         with Horizontal(id="live"):
@@ -26,6 +31,6 @@ class LiveScreen(StationScreen):
                 yield panels.Panel("Devices", panels.device_lines, id="devices")
                 yield panels.Panel("Poses", panels.pose_map_lines, id="poses")
                 yield panels.Panel("Image coverage", panels.coverage_lines, id="coverage")
-                yield panels.Panel("Estimate (not final)", panels.estimate_lines, id="estimate")
+                yield panels.Panel("Estimate (not final)", panels.estimate_lines, id="estimate", wrap=True)
                 yield panels.Panel("Robot (mm, °)", panels.robot_lines, id="robot")
         yield Events()

@@ -53,7 +53,8 @@ class PlanScreen(StationScreen):
 
     HELP = (
         "Poses in capture order. Nothing moves without your yes: F5, p and b show what would move and ask. "
-        "Home and End go to the first and the last pose."
+        "Home and End go to the first and the last pose. ± then: the expected error after this pose, "
+        "as planned."
     )
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("r", "pose('retake')", "Retake", tooltip="Take this pose again at the next run"),
@@ -89,7 +90,9 @@ class PlanScreen(StationScreen):
 
     def show(self, status: StationStatus | None) -> None:
         super().show(status)
-        poses = () if status is None else status.session.poses
+        if status is None:
+            return  # what was known last stands there
+        poses = status.session.poses
         rows = [row_of(pose) for pose in poses]
         if len(rows) != self.table.row_count:
             at = self.table.cursor_row
@@ -146,7 +149,7 @@ class PlanScreen(StationScreen):
         if status is None or status.robot.joints_rad is None:
             self.notify("The arm's posture is not known: no robot state.", severity="warning")
             return
-        name = f"here-{len(status.session.poses) + 1}"
+        name = f"here-{max((pose.index for pose in status.session.poses), default=-1) + 2}"
         pose = {"name": name, "joints_rad": status.robot.joints_rad, "why": "added on the screen"}
         self.station.send("add", pose=pose)
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
 from typing import ClassVar
 
@@ -16,14 +17,16 @@ from calibrate.calibration import Calibration, read_calibration
 from calibrate.errors import CalibrationError
 from calibrate.geometry import difference
 from calibrate.verification import agrees, touch_text
-from station.tui.offline import installed_beside
+from station.tui.elsewhere import LOOK_S, Marks, marks
+from station.tui.offline import installed_beside, state_root
 from station.tui.screen import StationScreen
 
 NO_RESULT = "No result yet. F9 solves the session just captured; on screen 4, v shows older ones."
 BAR_CELLS = 24
+REASONED = {False: "installs only with a reason", True: "installed all the same"}
 
 
-def verdict_text(calibration: Calibration) -> Text:
+def verdict_text(calibration: Calibration, installed: bool = False) -> Text:
     """The checklist: what passed, what failed and what to do about it."""
     gates = sorted(calibration.quality.gates, key=lambda gate: gate.passed)  # the failed ones first
     touches = sorted(calibration.verification, key=agrees)
@@ -33,7 +36,8 @@ def verdict_text(calibration: Calibration) -> Text:
     ]
     against = [words for words in against if not words.startswith("0 ")]
     stamp = "" if calibration.source == "real" else f"{calibration.source.upper()}: never for a real cell\n"
-    head = ", ".join(against) + ": installs only with a reason" if against else "READY TO INSTALL"
+    ready = "INSTALLED" if installed else "READY TO INSTALL"
+    head = ", ".join(against) + f": {REASONED[installed]}" if against else ready
     text = Text().append(stamp, "bold").append(f"{head}\n", "bold reverse" if against else "bold")
     for passed, words in (
         *((agrees(touch), f"by hand: {touch_text(touch)}") for touch in touches),
@@ -81,10 +85,17 @@ def residual_text(calibration: Calibration) -> Text:
     return Text("\n".join(["reprojection per view", *lines, *rejected]))
 
 
+def is_same(one: Calibration, other: Calibration | None) -> bool:
+    """Of the same solve; a reason or a check by hand may have come to one of them."""
+    return other is not None and (one.created, one.provenance) == (other.created, other.provenance)
+
+
 def change_text(calibration: Calibration, installed: Calibration | None) -> Text:
     """What installing would change."""
     if installed is None:
         return Text("\nnothing is installed yet")
+    if is_same(calibration, installed):
+        return Text("\nthis one is installed")
     if installed.mount != calibration.mount:
         return Text(f"\ninstalled: {installed.mount}, this one: {calibration.mount}")
     delta = difference(calibration.transform.matrix, installed.transform.matrix)
@@ -107,6 +118,7 @@ class ResultScreen(StationScreen):
     def __init__(self) -> None:
         super().__init__()
         self._calibration: Calibration | None = None
+        self._marks: Marks = frozenset()
 
     def body(self) -> ComposeResult:
         with Horizontal(id="result"):
@@ -119,10 +131,20 @@ class ResultScreen(StationScreen):
 
     def on_mount(self) -> None:
         self.query_one("#result-left").focus()
+        self.set_interval(LOOK_S, self.look_again)
 
     def on_screen_resume(self) -> None:
         super().on_screen_resume()
         self.load()
+
+    async def look_again(self) -> None:
+        """Another screen or a shell may have installed, gone back or solved again."""
+        path = self.station.result_path
+        if path is None or not self.is_current:
+            return
+        before, self._marks = self._marks, await asyncio.to_thread(marks, state_root(path))
+        if self._marks != before:
+            self.load()
 
     def load(self) -> None:
         path = self.station.result_path
@@ -134,9 +156,11 @@ class ResultScreen(StationScreen):
             self._calibration = None
             self.query_one("#verdict", Static).update(Text(str(problem)))
             return
-        self.query_one("#verdict", Static).update(verdict_text(self._calibration))
+        installed = installed_beside(path)
+        same = is_same(self._calibration, installed)
+        self.query_one("#verdict", Static).update(verdict_text(self._calibration, same))
         self.query_one("#answer", Static).update(answer_text(self._calibration))
-        self.query_one("#change", Static).update(change_text(self._calibration, installed_beside(path)))
+        self.query_one("#change", Static).update(change_text(self._calibration, installed))
         self.query_one("#residuals", Static).update(residual_text(self._calibration))
 
     def _path(self) -> str | None:

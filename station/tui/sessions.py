@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from typing import Any, ClassVar
 
 from textual import work
@@ -9,12 +10,20 @@ from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 
 from station.drift_check import POSES
+from station.states import RUNNING
+from station.tui.elsewhere import LOOK_S, Marks, installed_session, marks
 from station.tui.screen import StationScreen
 from station.tui.widgets.rows import Rows
 from station.tui.words import size
 
 DRIFT = f"Take {POSES} pictures in place of the loaded plan: does the installed one still hold? (asks)"
 COLUMNS = ("session", "source", "views", "size", "state", "calibration")
+
+
+def calibration_word(session: dict[str, Any], installed: str) -> str:
+    if installed and session.get("name") == installed:
+        return "INSTALLED"
+    return "yes" if session.get("calibration") else "-"
 
 
 class SessionsScreen(StationScreen):
@@ -34,6 +43,7 @@ class SessionsScreen(StationScreen):
     def __init__(self) -> None:
         super().__init__()
         self._sessions: list[dict[str, Any]] = []
+        self._marks: Marks = frozenset()
 
     def body(self) -> ComposeResult:
         yield Rows(id="sessions-table")
@@ -41,10 +51,22 @@ class SessionsScreen(StationScreen):
     def on_mount(self) -> None:
         self.table.add_columns(*COLUMNS)
         self.table.focus()
+        self.set_interval(LOOK_S, self.look_again)
 
     def on_screen_resume(self) -> None:
         super().on_screen_resume()
         self.fetch()
+
+    async def look_again(self) -> None:
+        """Another screen or a shell may have solved or installed. A daemon at work is left in peace."""
+        link, status = self.station.link, self.station.status
+        if not self.is_current or link is None or link.root is None:
+            return
+        if status is None or status.state in RUNNING:
+            return
+        if (there := await asyncio.to_thread(marks, link.root)) != self._marks:
+            self._marks = there
+            self.fetch()
 
     @property
     def table(self) -> Rows:
@@ -52,7 +74,13 @@ class SessionsScreen(StationScreen):
 
     @work(exclusive=True, group="fetch", exit_on_error=False)
     async def fetch(self) -> None:
+        link = self.station.link
+        root = None if link is None else link.root
+        if root is not None:
+            self._marks = await asyncio.to_thread(marks, root)
         answer = await self.station.ask("sessions")
+        installed = "" if root is None else await asyncio.to_thread(installed_session, root)
+        at = self._sessions[self.table.cursor_row]["name"] if self._sessions else ""
         self._sessions = list(answer or [])
         self.table.clear()
         for session in self._sessions:
@@ -62,8 +90,10 @@ class SessionsScreen(StationScreen):
                 str(session.get("views", "")),
                 size(float(session.get("bytes", 0))),
                 "sealed" if session.get("sealed") else "UNSEALED",
-                "yes" if session.get("calibration") else "-",
+                calibration_word(session, installed),
             )
+        names = [session.get("name", "") for session in self._sessions]
+        self.table.move_cursor(row=names.index(at) if at in names else 0)
 
     def _selected(self) -> dict[str, Any] | None:
         if not self._sessions:

@@ -59,7 +59,7 @@ class FakeLink:
         self.answers: dict[str, Any] = {
             "prepare": SUMMARY,
             "preview": _picture(),
-            "lease": {"holder": "me"},
+            "lease": {"holder": "me", "client_id": 7},
             "sessions": [{"name": "s-0"}],
         }
         self.silent = asyncio.Event()

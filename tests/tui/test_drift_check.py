@@ -16,7 +16,7 @@ from station.status import StationState, StationStatus
 from station.tui import offline
 from station.tui.app import StationApp
 from station.tui.confirm import ConfirmGo
-from station.tui.drift import PLANNING_CHECK
+from station.tui.drift import INSTEAD, PLANNING_CHECK
 from station.tui.jobs import JobScreen
 from tests.tui.conftest import FakeLink, idle, until
 from tests.tui.test_install import GOOD
@@ -84,13 +84,34 @@ async def test_what_the_daemon_refuses_is_said(link: FakeLink, installed: Path) 
         assert "prepare" not in link.verbs and not app.busy
 
 
-async def test_a_no_leaves_the_arm_where_it_is(link: FakeLink, installed: Path) -> None:
+async def test_a_no_leaves_arm_and_plan_as_they_were(link: FakeLink, installed: Path) -> None:
+    link.answers["plan"] = {"plan": {"poses": [1, 2, 3]}, "sha256": "ab" * 32}
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await ask_for_it(pilot)
         await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmGo))
+        body = " ".join(text_of(pilot.app, "#confirm-body").split())
+        assert INSTEAD.format(3) in body
         await pilot.press("escape")
-        await pilot.pause()
+        await until(pilot, lambda: link.verbs[-1] == "load_plan")
+        assert ("load_plan", {"plan": {"poses": [1, 2, 3]}}) in link.asked
         assert "go" not in link.verbs
+
+
+async def test_a_plan_that_was_used_is_not_missed(link: FakeLink, installed: Path) -> None:
+    status = idle()
+    poses = (msgspec.structs.replace(status.session.poses[0], attempt=1), *status.session.poses[1:])
+    link.show(msgspec.structs.replace(status, session=msgspec.structs.replace(status.session, poses=poses)))
+    app = app_on(link)
+    async with app.run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: app.status is not None and app.status.session.poses == poses)
+        await ask_for_it(pilot)
+        await until(pilot, lambda: isinstance(app.screen, ConfirmGo))
+        assert "plan" not in link.verbs
+        assert "takes the place" not in text_of(app, "#confirm-body")
+        await pilot.press("escape")
+        await until(pilot, lambda: not isinstance(app.screen, ConfirmGo))
+        await pilot.pause()
+        assert "load_plan" not in link.verbs
 
 
 async def test_the_verdict_comes_when_the_recording_is_sealed(link: FakeLink, installed: Path) -> None:

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 import pytest
-from textual.widgets import Button, RichLog
+from textual.widgets import Button, Label, RichLog
 
 from station.tui.app import StationApp
 from station.tui.jobs import JobScreen
@@ -33,6 +33,31 @@ async def test_its_exit_code_comes_back(link: FakeLink, job: Path) -> None:
         codes = await run_job(pilot.app, "4")  # type: ignore[arg-type]
         await until(pilot, lambda: codes)
         assert codes == [4]
+
+
+async def test_its_lines_are_as_wide_as_the_window(link: FakeLink, job: Path) -> None:
+    job.write_text("import os; print('columns', os.environ['COLUMNS']); raise SystemExit(1)")
+    async with app_on(link).run_test(size=(100, 30)) as pilot:
+        await run_job(pilot.app)  # type: ignore[arg-type]
+        screen = pilot.app.screen
+        assert isinstance(screen, JobScreen)
+        await until(pilot, lambda: screen.said)
+        assert screen.said == [f"columns {screen.query_one(RichLog).size.width}"]
+        assert screen.query_one(RichLog).size.width > 80
+
+
+async def test_seconds_tell_that_it_works(link: FakeLink, job: Path) -> None:
+    job.write_text("import time; time.sleep(600)")
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await run_job(pilot.app)  # type: ignore[arg-type]
+        screen = pilot.app.screen
+        assert isinstance(screen, JobScreen)
+        await until(pilot, lambda: screen._process)
+        screen._begun_s -= 65.0
+        screen._say_how_long()
+        assert "Working … 1:05" in str(screen.query_one("#job-title", Label).render())
+        await pilot.press("escape")
+        await until(pilot, lambda: not isinstance(pilot.app.screen, JobScreen))
 
 
 async def test_a_failure_stays_on_the_screen_until_it_is_read(link: FakeLink, job: Path) -> None:

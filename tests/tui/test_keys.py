@@ -8,7 +8,7 @@ from textual.app import App
 from textual.widgets import Static
 
 from station.errors import RefusedError
-from station.status import StationState
+from station.status import Lease, StationState, StationStatus
 from station.tui.app import StationApp
 from station.tui.commands import PLAN_ANSWER_S
 from station.tui.confirm import Confirm, ConfirmGo
@@ -188,14 +188,57 @@ async def test_stop_works_in_the_command_palette(link: FakeLink) -> None:
         await until(pilot, lambda: link.verbs == ["stop"])
 
 
-async def test_quitting_asks_while_a_session_runs(link: FakeLink) -> None:
-    link.show(idle(StationState.MOVING))
+def commanded(state: StationState) -> StationStatus:
+    """By the screen that `FakeLink` tells it is client 7."""
+    return msgspec.structs.replace(idle(state), lease=Lease("anna on tty1", 7))
+
+
+@pytest.mark.parametrize("key", ["ctrl+q", "f4"])
+async def test_what_ends_control_asks_while_the_arm_works_by_it(link: FakeLink, key: str) -> None:
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+        await pilot.press("f3")  # takes control
+        await until(pilot, lambda: "free_drive" in link.verbs)
+        link.show(commanded(StationState.MOVING))
         await until(pilot, lambda: "MOVING" in text_of(pilot.app, "#bar"))
-        await pilot.press("ctrl+q")
+        await pilot.press(key)
         await until(pilot, lambda: isinstance(pilot.app.screen, Confirm))
         assert "decelerates" in str(pilot.app.screen.query_one("#confirm-body", Static).render())
+        await pilot.press("escape")
+        await pilot.pause()
+        assert ("lease", {"action": "release"}) not in link.asked
+
+
+@pytest.mark.parametrize("state", [StationState.MOVING, StationState.PAUSED])
+async def test_who_only_watches_is_told_that_closing_changes_nothing(
+    link: FakeLink, state: StationState
+) -> None:
+    link.show(commanded(state))
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: state.value.upper() in text_of(pilot.app, "#bar"))
+        await pilot.press("ctrl+q")
+        await until(pilot, lambda: isinstance(pilot.app.screen, Confirm))
+        assert "stay as they are" in str(pilot.app.screen.query_one("#confirm-body", Static).render())
+
+
+async def test_control_is_let_go_of_by_its_holder_alone(link: FakeLink) -> None:
+    link.show(commanded(StationState.PAUSED))
+    async with app_on(link).run_test(size=(160, 24), notifications=True) as pilot:
+        await until(pilot, lambda: "control: anna on tty1" in text_of(pilot.app, "#bar"))
+        await pilot.press("f4")
+        await until(pilot, lambda: any("anna on tty1 does" in n.message for n in pilot.app._notifications))
+        assert link.verbs == []
+        await pilot.press("f3")  # takes it, as if anna had let go
+        await until(pilot, lambda: "free_drive" in link.verbs)
+        await pilot.press("f4")
+        await until(pilot, lambda: ("lease", {"action": "release"}) in link.asked)
+
+
+async def test_after_looking_the_line_says_which_key_goes_on(link: FakeLink) -> None:
+    link.show(idle(StationState.PAUSED))  # acknowledged: the daemon has no more to say
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: "F5 goes on, F7 finishes" in text_of(pilot.app, "#reason"))
+        assert pilot.app.screen.query_one("#reason").display
 
 
 async def test_a_hundred_resizes_leave_a_working_screen(link: FakeLink) -> None:

@@ -12,8 +12,10 @@ from textual.widgets import DataTable
 
 from calibrate.geometry import pose as pose_of
 from station.status import EstimateStatus, PoseStatus
+from station.tui.live import LiveScreen
 from station.tui.plan import PLANNING
-from station.tui.widgets.panels import estimate_lines, pose_map_lines
+from station.tui.widgets.panels import estimate_lines, pose_map_lines, progress_lines
+from station.tui.words import POSE_MARKS
 from tests.tui.conftest import FakeLink, idle, until
 from tests.tui.test_keys import app_on, text_of
 
@@ -67,12 +69,63 @@ def test_the_map_of_poses_leaves_room_for_the_rest(
     count: int, current: int | None, first: str, last: str
 ) -> None:
     status = idle()
-    poses = tuple(PoseStatus(index=i, name=f"p{i}") for i in range(count))
+    first_one: PoseStatus = PoseStatus(index=0, name="p0", state="failed")
+    poses = (first_one, *(PoseStatus(index=i, name=f"p{i}") for i in range(1, count)))
     session = msgspec.structs.replace(status.session, poses=poses, current=current)
     *rows, words = pose_map_lines(msgspec.structs.replace(status, session=session))
     assert len(rows) <= 4
     assert max(map(len, [*rows, words])) <= 29
     assert words == (f"{first} to {last} of {count}" if first else "+ done - skipped x failed")
+
+
+def test_the_marks_are_explained_once_one_needs_it() -> None:
+    assert pose_map_lines(idle()) == ["· " * 12 + "·", "· " * 11 + "·"]
+    assert all(f"{mark} {state}" in LiveScreen.HELP for state, mark in POSE_MARKS.items())
+
+
+def test_the_time_that_is_left_stands_beside_the_steps() -> None:
+    status = idle()
+    poses = (msgspec.structs.replace(status.session.poses[0], state="settling"), *status.session.poses[1:])
+    session = msgspec.structs.replace(status.session, poses=poses, current=0, remaining_s=639.0)
+    steps = progress_lines(msgspec.structs.replace(status, session=session))[-1]
+    assert steps == "move ██ settle █▒ capture ░░ write ░░ 10:39 left"
+    assert len(steps) <= 48  # what 80 columns leave
+
+
+def test_a_plan_that_was_not_begun_says_which_key_is_next() -> None:
+    status = idle()
+    session = msgspec.structs.replace(status.session, name="")
+    assert "F5" in progress_lines(msgspec.structs.replace(status, session=session))[0]
+
+
+@pytest.mark.parametrize(("size", "lines"), [((80, 24), 3), ((100, 40), 3), ((160, 48), 2)])
+async def test_the_advice_uses_the_width_there_is(link: FakeLink, size: tuple[int, int], lines: int) -> None:
+    advice = "at best 1 more for 0.5 mm; the next best: 428 mm, tilt 31°, roll +1°, board left"
+    found = EstimateStatus(9, (1.0, 2.0, 3.0), 0.4, 0.05, advice=advice)
+    link.show(msgspec.structs.replace(idle(), estimate=found))
+    async with app_on(link).run_test(size=size) as pilot:
+        await until(pilot, lambda: "board left" in text_of(pilot.app, "#estimate"))
+        shown = text_of(pilot.app, "#estimate").splitlines()[2:]
+        assert " ".join(shown) == advice
+        assert len(shown) == lines
+        await pilot.resize_terminal(120, 40)
+        await until(pilot, lambda: len(text_of(pilot.app, "#estimate").splitlines()) == 4)
+
+
+async def test_a_pose_added_here_is_called_by_its_number(link: FakeLink) -> None:
+    status = idle()
+    status = msgspec.structs.replace(
+        status,
+        session=msgspec.structs.replace(status.session, poses=status.session.poses[3:]),  # some were dropped
+        robot=msgspec.structs.replace(status.robot, joints_rad=(0.0,) * 6),
+    )
+    link.show(status)
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: "/22" in text_of(pilot.app, "#bar"))
+        await pilot.press("2", "a")
+        await until(pilot, lambda: "add" in link.verbs)
+        (added,) = [args for verb, args in link.asked if verb == "add"]
+        assert added["pose"]["name"] == "here-26"
 
 
 def test_the_estimate_of_a_sealed_session_asks_for_no_more_poses() -> None:

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import msgspec
 import pytest
+from textual.widgets import DataTable
 
-from station.status import StationState
+from station.status import Event, StationState
 from station.tui import link as link_module
 from station.tui.commands import STOP_UNHEARD
 from station.tui.widgets.preview import OLD, Preview
@@ -62,3 +64,27 @@ async def test_why_there_is_no_daemon_is_said(link: FakeLink) -> None:
         link.show(None)
         await until(pilot, lambda: "NO DAEMON" in text_of(pilot.app, "#bar"))
         assert "The daemon ended" in text_of(pilot.app, "#reason")
+
+
+async def test_what_the_daemon_said_last_stays_and_is_marked_old(link: FakeLink) -> None:
+    said = Event(1, "warning", "pose 3 did not come to rest")
+    link.show(msgspec.structs.replace(idle(StationState.MOVING), events=(said,)))
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: "pose 3" in text_of(pilot.app, "#events"))
+        link.show(None)
+        await until(pilot, lambda: "NO DAEMON" in text_of(pilot.app, "#bar"))
+        assert "robot" in text_of(pilot.app, "#devices")
+        assert str(pilot.app.screen.query_one("#devices").border_title) == "Devices: OLD"
+        assert "pose 3" in text_of(pilot.app, "#events")
+
+
+async def test_the_plan_stays_in_sight_too(link: FakeLink) -> None:
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+        await pilot.press("2")
+        await until(pilot, lambda: pilot.app.screen.query(DataTable))
+        table = pilot.app.screen.query_one(DataTable)
+        await until(pilot, lambda: table.row_count == 25)
+        link.show(None)
+        await until(pilot, lambda: "NO DAEMON" in text_of(pilot.app, "#bar"))
+        assert table.row_count == 25

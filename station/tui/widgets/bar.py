@@ -11,11 +11,11 @@ from station.tui.words import STATE_WORDS, duration, size
 
 _ALARM = {StationState.STOPPED, StationState.FAULT, StationState.DISCONNECTED}
 STOP_KEY = "F12=STOP"
-LEVELS = 5
+LEVELS = 6
 _NEXT = {
-    StationState.STOPPED: " │ F8",
-    StationState.FAULT: " │ F8",
-    StationState.PAUSED: " │ F5 goes on, F7 finishes",
+    StationState.STOPPED: "F8",
+    StationState.FAULT: "F8",
+    StationState.PAUSED: "F5 goes on, F7 finishes",
 }
 """Which key is next. The daemon's own sentence is for shells too."""
 NO_DAEMON = " NO DAEMON: trying again every second. To stop the arm use the pendant."
@@ -68,17 +68,19 @@ def _parts(status: StationStatus, level: int) -> list[str]:
     """`level` 0 has everything; every level leaves something out."""
     robot, session = status.robot, status.session
     marks = [m for m, on in (("SIMULATED", status.simulated), ("PLAYBACK", status.playback)) if on]
-    limit = f"/{robot.speed_limit_m_s:.2f}" if level < 3 else ""
+    limit = f"/{robot.speed_limit_m_s:.2f}" if level < 4 else ""
     where = {True: "REMOTE", False: "LOCAL", None: ""}[robot.remote]
     count = f"{session.captured}/{len(session.poses)}"
     parts = [
         " ".join([STATE_WORDS[status.state], *marks, robot.model or "no robot"]),
         f"{robot.speed_m_s:.2f}{limit} m/s",
         " ".join(p for p in (robot.safety or "-", where) if p),
-        count if level >= 1 else f"{count} {duration(session.elapsed_s)}",
+        count if level >= 2 else f"{count} {duration(session.elapsed_s)}",
     ]
-    if level < 2 and status.recorder.free_bytes:
+    if level < 3 and status.recorder.free_bytes:
         parts.append(size(status.recorder.free_bytes))
+    if level < 1 and status.lease.holder:
+        parts.append(f"control: {status.lease.holder}")
     return parts if level < LEVELS - 1 else [parts[0], parts[2], parts[3]]
 
 
@@ -100,13 +102,14 @@ class ReasonLine(Static):
 
     def watch_status(self) -> None:
         said = ""
-        if self.status is not None and self.status.reason and not self.trouble:
-            said = self.status.reason + _NEXT.get(self.status.state, "")
+        if self.status is not None and not self.trouble:
+            reason, next_key = self.status.reason, _NEXT.get(self.status.state, "")
+            said = " │ ".join(words for words in (reason, next_key) if words)
         # A playback has no trouble, and a cell at rest neither: the line only tells.
         calm = self.status is None or self.status.playback or self.status.state is StationState.IDLE
         self.set_class(calm and not self.trouble, "note")
-        reason = "\n ".join(words for words in (self.trouble, self.busy, said) if words)
-        if reason != self._reason:
-            self._reason = reason
-            self.display = bool(reason)
-            self.update(Text(" " + reason, overflow="fold"))
+        told = "\n".join(words for words in (self.trouble, self.busy, said) if words)
+        if told != self._reason:
+            self._reason = told
+            self.display = bool(told)
+            self.update(Text(told, overflow="fold"))

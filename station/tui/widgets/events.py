@@ -31,7 +31,9 @@ class Events(Static):
         self._shown: tuple[Event, ...] | None = None
 
     def watch_status(self, status: StationStatus | None) -> None:
-        events = () if status is None else status.events
+        if status is None:
+            return  # what was said last stands there
+        events = status.events
         newest = events[-max(4, self.size.height) :]
         if newest != self._shown:
             self._shown = newest

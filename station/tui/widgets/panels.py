@@ -11,7 +11,7 @@ from textual.reactive import reactive
 from textual.widgets import Static
 
 from station.status import StationStatus
-from station.tui.words import POSE_MARKS, degrees, mm
+from station.tui.words import POSE_MARKS, degrees, duration, mm
 
 CLOCKS_POOR_MS = 20.0
 """The default of `capture.time_bound_s`: poses known worse than that are refused."""
@@ -29,17 +29,27 @@ class Panel(Static):
     old: reactive[bool] = reactive(False)
     """No longer how it is; said in the title too."""
 
-    def __init__(self, title: str, lines: Lines, *, id: str) -> None:
+    def __init__(self, title: str, lines: Lines, *, id: str, wrap: bool = False) -> None:
+        """`wrap`: what is longer than the panel is wide goes on below; else it is cut."""
         super().__init__(id=id, classes="panel")
         self.border_title = self._title = title
-        self._lines = lines
+        self._lines, self._wrap = lines, wrap
         self._shown = ""
+
+    def on_resize(self) -> None:
+        if self._wrap:
+            self.watch_status(self.status)
 
     def watch_old(self, old: bool) -> None:
         self.border_title = f"{self._title}: OLD" if old else self._title
 
     def watch_status(self, status: StationStatus | None) -> None:
-        text = "" if status is None else "\n".join(self._lines(status))
+        if status is None:
+            return  # what was known last stands there, marked old
+        lines = self._lines(status)
+        if self._wrap and (width := self.content_size.width):
+            lines = [part for line in lines for part in textwrap.wrap(line, width) or [""]]
+        text = "\n".join(lines)
         if text != self._shown:
             # Laying the screen out again is dear, and only needed when the panel grows or shrinks.
             grown = text.count("\n") != self._shown.count("\n") or not (text and self._shown)
@@ -75,7 +85,7 @@ def detection_lines(status: StationStatus) -> list[str]:
     tilt = "-" if seen.tilt_rad is None else degrees(seen.tilt_rad, 0)
     far = "-" if seen.distance_m is None else mm(seen.distance_m, 0)
     return [
-        f"board {seen.corners}/{seen.expected}  sharp {seen.sharpness:.1f}  sat {100 * seen.saturated:.1f} %",
+        f"board {seen.corners}/{seen.expected}  sharp {seen.sharpness:.2f}  sat {100 * seen.saturated:.1f} %",
         seen.advice or f"fills {100 * seen.coverage:.0f} %  tilt {tilt}  at {far}",
     ]
 
@@ -97,14 +107,17 @@ def progress_lines(status: StationStatus) -> list[str]:
     session = status.session
     if session.current is None or session.current >= len(session.poses):
         done = sum(p.state == "done" for p in session.poses)
+        if session.poses and not session.name:
+            return [f"{len(session.poses)} poses planned: F5 shows the way and asks"]
         counted = f"{done} of {len(session.poses)} poses captured" if session.poses else "no plan loaded"
         return [counted + (", sealed: F9 solves it" if session.recording else "")]
     pose = session.poses[session.current]
     steps = ("moving", "settling", "capturing", "writing")
     at = steps.index(pose.state) if pose.state in steps else (4 if pose.state == "done" else -1)
     words = ("move", "settle", "capture", "write")
-    marks = [f"{w} {'███' if i < at else '█▒░' if i == at else '░░░'}" for i, w in enumerate(words)]
-    return [f"{pose.name}: {pose.why}", " ".join(marks)]
+    marks = [f"{w} {'██' if i < at else '█▒' if i == at else '░░'}" for i, w in enumerate(words)]
+    left = "" if session.remaining_s is None else f" {duration(session.remaining_s)} left"
+    return [f"{pose.name}: {pose.why}", " ".join(marks) + left]
 
 
 def pose_map_lines(status: StationStatus) -> list[str]:
@@ -121,7 +134,8 @@ def pose_map_lines(status: StationStatus) -> list[str]:
     if len(shown) < len(rows):
         last = min(len(marks), (first + MAP_ROWS) * NARROW)
         return [*shown, f"{first * NARROW + 1} to {last} of {len(marks)}"]
-    return [*shown, "+ done - skipped x failed"]
+    left_out = {"skipped", "failed"} & {p.state for p in status.session.poses}
+    return [*shown, "+ done - skipped x failed"] if left_out else shown
 
 
 _SHADES = " ░▒▓█"
@@ -149,5 +163,5 @@ def estimate_lines(status: StationStatus) -> list[str]:
         f"{x:7.1f} {y:7.1f} {z:7.1f} mm",
         f"± {estimate.sigma_translation_mm:.2f} mm{rotation}",
         *(["p on screen 2 plans the rest"] if estimate.improve and not status.session.recording else []),
-        *textwrap.wrap(advice or ("enough" if estimate.enough else "not final"), NARROW),
+        advice or ("enough" if estimate.enough else "not final"),
     ]

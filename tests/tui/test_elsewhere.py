@@ -1,0 +1,81 @@
+"""What another screen or a shell solves, installs or takes back is seen without leaving the screen."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import pytest
+from textual.widgets import DataTable
+
+from calibrate.calibration import write_calibration
+from calibrate.install import install, rollback
+from station.tui import result, sessions
+from tests.tui.conftest import FakeLink, until
+from tests.tui.test_install import GOOD
+from tests.tui.test_keys import app_on, text_of
+
+
+@pytest.fixture
+def root(link: FakeLink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """Two solved sessions; the screens look twenty times a second."""
+    for name, created in (("s-1", "2026-01-01"), ("s-2", "2026-01-02")):
+        folder = tmp_path / "sessions" / name
+        folder.mkdir(parents=True)
+        provenance = msgspec.structs.replace(GOOD.provenance, session=name)
+        write_calibration(
+            msgspec.structs.replace(GOOD, created=created, provenance=provenance), folder / "calibration.yaml"
+        )
+    monkeypatch.setattr(sessions, "LOOK_S", 0.05)
+    monkeypatch.setattr(result, "LOOK_S", 0.05)
+    link.root = tmp_path
+    link.answers["sessions"] = [
+        {"name": name, "calibration": str(tmp_path / "sessions" / name / "calibration.yaml")}
+        for name in ("s-2", "s-1")
+    ]
+    return tmp_path
+
+
+def put(root: Path, session: str) -> None:
+    install(root / "sessions" / session / "calibration.yaml", root, cell="simulated")
+
+
+async def test_the_list_of_sessions_names_what_is_installed_now(link: FakeLink, root: Path) -> None:
+    app = app_on(link)
+    async with app.run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
+        await pilot.press("4")
+        await until(pilot, lambda: app.current_mode == "sessions")
+        table = app.screen.query_one(DataTable)
+
+        def states() -> list[str]:
+            return [table.get_row_at(line)[-1] for line in range(table.row_count)]
+
+        await until(pilot, lambda: states() == ["yes", "yes"])
+        await pilot.press("end")
+        put(root, "s-1")
+        await until(pilot, lambda: states() == ["yes", "INSTALLED"])
+        assert table.cursor_row == 1  # what was marked still is
+        put(root, "s-2")
+        await until(pilot, lambda: states() == ["INSTALLED", "yes"])
+        rollback(root)
+        await until(pilot, lambda: states() == ["yes", "INSTALLED"])
+        link.answers["sessions"] = [{"name": "s-3"}, *link.answers["sessions"]]
+        (root / "sessions" / "s-3").mkdir()
+        await until(pilot, lambda: states() == ["-", "yes", "INSTALLED"])
+        assert table.cursor_row == 2
+
+
+async def test_the_result_says_when_it_is_the_installed_one(link: FakeLink, root: Path) -> None:
+    app = app_on(link)
+    async with app.run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
+        await app.show_result(str(root / "sessions" / "s-1" / "calibration.yaml"))
+        await until(pilot, lambda: "READY TO INSTALL" in text_of(app, "#verdict"))
+        assert "nothing is installed" in text_of(app, "#change")
+        put(root, "s-1")
+        await until(pilot, lambda: "INSTALLED" in text_of(app, "#verdict").splitlines()[1])
+        assert "this one is installed" in text_of(app, "#change")
+        put(root, "s-2")
+        await until(pilot, lambda: "against the installed one" in text_of(app, "#change"))
+        assert "READY TO INSTALL" in text_of(app, "#verdict")

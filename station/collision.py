@@ -12,6 +12,7 @@ import numpy as np
 
 from calibrate.geometry import Array, transform_points
 from calibrate.kinematics import RobotModel, link_frames
+from recordings.messages import Mount
 from station.config import Capsule, LimitsConfig
 
 ARM_BODIES = ("base column", "shoulder", "upper arm", "forearm", "wrist 1", "wrist 2", "wrist 3")
@@ -49,6 +50,8 @@ class CellGeometry:
     obstacle_clearance_m: float = 0.10
     watched_m: tuple[tuple[float, float, float], ...] = ()
     """Further points in `flange` (camera centre, board corners) that speed and workspace limits hold for."""
+    mount: Mount | None = None
+    """What a plan must be made for; None: not known."""
     body_names: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:

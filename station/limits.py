@@ -25,6 +25,8 @@ _SPEED_RESERVE = 0.97
 """Between samples a point may be a little faster than at them."""
 SPACING_M = 0.01
 """No modelled point moves further between two checked samples; margins are reduced by half of it."""
+_PIECES = 48
+"""A move is first looked at in so many, to find how dense its samples must be."""
 _LONGEST_TURN_RAD = 4 * np.pi
 """From one end of a joint's range to the other; whatever turns further is out of range."""
 _LEAVING_SLACK_M = 0.001
@@ -113,10 +115,10 @@ def point_speed_m_s(geometry: CellGeometry, joints_rad: ArrayLike, joint_speeds_
 
 def sample_path(geometry: CellGeometry, from_rad: Array, to_rad: Array, spacing_m: float) -> Array:
     """Joints (m, 6) along the move, so dense that no modelled point moves more than `spacing_m` between."""
-    coarse = from_rad + np.linspace(0, 1, 9)[:, None] * (to_rad - from_rad)
+    coarse = from_rad + np.linspace(0, 1, _PIECES + 1)[:, None] * (to_rad - from_rad)
     steps = np.linalg.norm(np.diff(moving_points(geometry, coarse), axis=0), axis=-1)
-    # An arc is longer than its chord: 10 % covers the 1/8 of the largest turn that a step spans.
-    count = int(np.ceil(1.1 * 8 * steps.max() / spacing_m)) + 1
+    # An arc is longer than its chord, and speed changes along it: 10 % covers both in a piece this short.
+    count = int(np.ceil(1.1 * _PIECES * steps.max() / spacing_m)) + 1
     return np.asarray(from_rad + np.linspace(0, 1, max(count, 3))[:, None] * (to_rad - from_rad))
 
 
@@ -272,6 +274,9 @@ def _plan_problems(plan: Plan, geometry: CellGeometry) -> list[Problem]:
     if plan.robot != geometry.model.name:
         text = f"it was made for a {plan.robot}, the cell has a {geometry.model.name}; make a new plan"
         problems.append(Problem("plan", "robot", text))
+    if geometry.mount not in (None, plan.mount):
+        text = f"it was made for {plan.mount}, the cell is {geometry.mount}; make a new plan"
+        problems.append(Problem("plan", "mount", text))
     return problems
 
 

@@ -155,7 +155,8 @@ def geometry_of(
         if X is not None:
             obstacles = (camera_body("camera", X),)
             clearance = limits.clearance_m + 2 * camera_doubt_m
-    return CellGeometry(arm_model(config), limits, solids, obstacles, clearance, watched)
+    model = arm_model(config)
+    return CellGeometry(model, limits, solids, obstacles, clearance, watched, config.mount)
 
 
 def _thicker_m(sigma_m: float) -> float:

@@ -101,6 +101,24 @@ def test_samples_lie_as_dense_as_promised():
     assert travel.max() <= 0.01
 
 
+@pytest.mark.parametrize("turn", [1.0, LimitsConfig().joint_step_rad, 2 * np.pi])
+def test_samples_lie_as_dense_when_every_joint_turns_far(turn):
+    """Joints that turn against each other bend the way: a chord over an eighth of it is too short."""
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        start = rng.uniform(-6.2, 6.2, 6)
+        target = start + rng.choice([-1, 1], 6) * rng.uniform(0.3, 1.0, 6) * turn
+        travel = np.diff(moving_points(FREE, sample_path(FREE, start, target, SPACING_M)), axis=0)
+        assert np.linalg.norm(travel, axis=-1).max() <= SPACING_M
+
+
+def test_a_plan_for_the_other_mount_is_refused():
+    cell = CellGeometry(MODELS["UR10"], LimitsConfig(), mount="eye-to-hand")
+    [problem] = check_plan(plan_of(REST), REST, cell).problems
+    assert problem.limit == "mount"
+    assert "made for eye-in-hand, the cell is eye-to-hand; make a new plan" in str(problem)
+
+
 def test_joint_range_and_step_name_the_joint():
     limits = LimitsConfig(joints_max_rad=(6.28, 6.28, 6.28, 6.28, 6.28, 0.5), joint_step_rad=0.3)
     problems = check_path(

@@ -106,6 +106,14 @@ def test_wrong_use_is_a_sentence_and_exit_code_2(args, code, told):
     assert "Traceback" not in result.output
 
 
+def test_a_plan_of_the_other_mount_fails_the_check_with_1(made, tmp_path):
+    config = cell_config(build_cell("paper", 0, "low", "eye-to-hand"), "127.0.0.1")
+    (tmp_path / "cell.yaml").write_bytes(msgspec.yaml.encode(config))
+    result = run("--config", tmp_path / "cell.yaml", "--check", made[1]["plan.yaml"])
+    assert result.exit_code == 1
+    assert "it was made for eye-in-hand, the cell is eye-to-hand; make a new plan" in result.output
+
+
 def test_a_list_from_elsewhere_is_checked_like_any_plan(tmp_path):
     truth = build_cell("paper", 0, "low", "eye-in-hand")
     config = msgspec.structs.replace(cell_config(truth, "127.0.0.1"))

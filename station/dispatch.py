@@ -243,7 +243,7 @@ class SessionDispatcher:
         self._session.edit(caller.client_id, "drop", lambda queue: queue.drop(args.index))
 
     async def _free_drive(self, caller: _Caller, args: _FreeDrive) -> None:
-        await self._session.switch_free_drive(caller.client_id, args.on, args.auto)
+        await self._to_the_end(self._session.switch_free_drive(caller.client_id, args.on, args.auto))
 
     async def _record(self, caller: _Caller, args: _Args) -> Any:
         return {"index": await self._session.record(caller.client_id)}

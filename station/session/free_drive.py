@@ -3,22 +3,26 @@
 from __future__ import annotations
 
 import asyncio
+import logging
 
 import numpy as np
 
 from recordings.errors import RecordingError
 from recordings.messages import Vector6
-from station.errors import RefusedError, RobotError, StationError
+from station.errors import RefusedError, RobotError, StaleStateError, StationError, TriggerError
 from station.plan.model import Plan, PlannedPose
 from station.session.bench import Bench
 from station.session.capture import PoseFailedError, take_pose
 from station.session.queue import PoseQueue
 from station.session.recording import SessionRecording
 from station.session.run import disk_failed, recover_parts, unmark_busy
-from station.states import TransitionError
+from station.states import refusal
 from station.status import StationState
 from station.stillness import NotStillError
 
+log = logging.getLogger(__name__)
+
+_GUIDE = "guide the arm by hand; the station does not move it"
 NEW_PLACE_RAD = 0.1
 """Auto-record: some joint must have turned by this much since the last picture."""
 WATCH_PERIOD_S = 0.1
@@ -36,23 +40,39 @@ class FreeDrive:
     async def begin(self, auto: bool) -> None:
         """Opens the recording if none is open. `auto`: a picture whenever the arm rests anew."""
         self._end_watch()
-        bench = self._bench
+        bench, store = self._bench, self._bench.store
         bench.cell.robot.check()
-        if bench.queue is None:
-            bench.queue = PoseQueue(Plan(bench.cell.config.robot.model, bench.cell.config.mount, ()))
-        if bench.recording is None or bench.recording.recorder is None:
-            if bench.recording is not None:
-                await recover_parts(bench, bench.recording)
-            recording = bench.recording or SessionRecording(bench.root, bench.cell)
-            picture = await bench.cell.camera.capture() if bench.cell.config.camera.model is None else None
-            await recording.open(bench.queue, picture)
-            bench.recording = recording
+        resting = store.state
         bench.halting = False
-        bench.store.enter(StationState.FREE_DRIVE, "guide the arm by hand; the station does not move it")
+        # At once, and taking: while the disk works nobody is offered a go, and no picture is begun.
+        store.enter(StationState.FREE_DRIVE, "the recording is being opened")
+        async with self._taking:
+            try:
+                await self._open_recording()
+            except BaseException:
+                if store.state is StationState.FREE_DRIVE:
+                    store.enter(resting)
+                raise
+        if reason := refusal("record", store.state):
+            raise RefusedError(reason)  # STOP, or the end of free drive, came in between
+        store.enter(StationState.FREE_DRIVE, _GUIDE)
         bench.show_poses()
         self._last_place = None
         if auto:
             self._watcher = asyncio.create_task(self._watch())
+
+    async def _open_recording(self) -> None:
+        bench, before = self._bench, self._bench.recording
+        if bench.queue is None:
+            bench.queue = PoseQueue(Plan(bench.cell.config.robot.model, bench.cell.config.mount, ()))
+        if before is not None and before.recorder is not None:
+            return
+        if before is not None:
+            await recover_parts(bench, before)
+        recording = before or SessionRecording(bench.root, bench.cell)
+        picture = await bench.cell.camera.capture() if bench.cell.config.camera.model is None else None
+        await recording.open(bench.queue, picture)
+        bench.recording = recording
 
     def end(self) -> None:
         """To paused; the recording stays open."""
@@ -97,33 +117,40 @@ class FreeDrive:
         except RecordingError as error:
             disk_failed(bench, error)
             return index
-        except RobotError as error:
-            unmark_busy(bench)
-            if not bench.halting:
-                store.enter(StationState.FAULT, str(error))
-                store.event(str(error), "error", index)
+        except (RobotError, TriggerError) as error:
+            self._failed(str(error), index)
             return index
-        except TransitionError:
-            if not bench.halting:
-                raise
-            unmark_busy(bench)  # STOP came in between: its state stays
-        if not bench.halting:
-            store.enter(StationState.FREE_DRIVE, "guide the arm by hand; the station does not move it")
+        except Exception as error:
+            if not bench.halting:  # else STOP came in between: its state stays
+                log.exception("a picture failed")
+            self._failed(f"internal error ({error!r}); see the log", index)
+        if not bench.halting and store.state is not StationState.FAULT:
+            store.enter(StationState.FREE_DRIVE, _GUIDE)
         bench.show_poses(index)
         if bench.pause_wanted:
             bench.pause_wanted = ""
             self.end()
         return index
 
+    def _failed(self, reason: str, index: int) -> None:
+        unmark_busy(self._bench)
+        if not self._bench.halting:
+            self._bench.store.enter(StationState.FAULT, reason)
+            self._bench.store.event(reason, "error", index)
+
     async def _watch(self) -> None:
         """For as long as free drive lasts."""
         while self._bench.store.state not in (StationState.PAUSED, StationState.IDLE):
             await asyncio.sleep(WATCH_PERIOD_S)
-            if self._bench.store.state is StationState.FREE_DRIVE and self._at_rest_elsewhere():
-                try:
+            if self._bench.store.state is not StationState.FREE_DRIVE:
+                continue
+            try:
+                if self._at_rest_elsewhere():
                     await self.record()
-                except StationError as error:
-                    self._bench.store.event(str(error), "warning")
+            except StaleStateError:
+                continue  # a hiccup of the news; a picture waits for better ones
+            except StationError as error:
+                self._bench.store.event(str(error), "warning")
 
     def _at_rest_elsewhere(self) -> bool:
         if not self._bench.stillness.at_rest:

@@ -39,6 +39,8 @@ from station.stillness import NotStillError
 VIEW_LIFETIME_S = 900.0
 """From close above the board a camera on the flange sees nothing: one picture serves several corners."""
 _SIGHT_S, _PLAN_S = 20.0, 60.0
+_SAME_PLACE_RAD = 1e-3
+"""The arm stands where the picture was taken: a board seen from elsewhere lies elsewhere."""
 
 
 class HoverRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -151,8 +153,13 @@ class HoverDesk:
             if look is None or look.place != place or time.monotonic() - look.at_s > VIEW_LIFETIME_S:
                 raise RefusedError("the board was not looked at lately: bring it into the picture first")
             return look
+        self._look = None
+        before = bench.cell.robot.latest().joints_rad
         picture = await bench.cell.camera.capture()
+        await RestingCheck(bench.cell.robot.check).news()
         state = bench.cell.robot.latest()
+        if np.abs(np.subtract(state.joints_rad, before)).max() > _SAME_PLACE_RAD:
+            raise RefusedError("the arm was moved while the picture was taken: leave it at rest, then again")
         board = bench.cell.config.board
         sighting = await bench.workers.call(
             sight, picture.image, board, calibration.intrinsics.model, timeout_s=_SIGHT_S
@@ -246,8 +253,14 @@ class HoverRun(Run):
             await self._drive_checked(planned.joints_rad, check)
             if bench.halting:
                 return
+            if self._wants_rest() and planned is not self._hover.plan.poses[-1]:
+                reason = f"paused by {bench.pause_wanted}" if bench.pause_wanted else "ended"
+                bench.store.enter(StationState.IDLE, f"{reason} high over the corner: ask for the hover anew")
+                return
         with contextlib.suppress(NotStillError):  # what is read next is the place where it rests
             await bench.stillness.settle(RestingCheck(robot.check))
+        await RestingCheck(robot.check).news()
+        there = robot.latest().joints_rad
         if bench.halting:
             return
         reason = (
@@ -256,13 +269,12 @@ class HoverRun(Run):
         )
         bench.store.event(reason)
         bench.store.enter(StationState.IDLE, reason)
-        unsay_when_moved(bench, reason)
+        _unsay_when_moved(bench, reason, there)
 
 
-def unsay_when_moved(bench: Bench, reason: str) -> None:
-    """The sentence is true for as long as the arm rests where it is."""
+def _unsay_when_moved(bench: Bench, reason: str, there: Vector6) -> None:
+    """The sentence is true for as long as the arm rests there."""
     store, robot = bench.store, bench.cell.robot
-    there = robot.latest().joints_rad
 
     def look() -> None:
         moved = False

@@ -75,6 +75,8 @@ class GoDesk:
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
         self._waiting: Go | None = None
+        self.voids = 0
+        """How often a go was made void: a check that was under way meanwhile offers none."""
 
     @property
     def waiting(self) -> Go | None:
@@ -88,18 +90,20 @@ class GoDesk:
         self,
         summary: GoSummary,
         client_id: int,
-        start: Vector6,
         poses: tuple[int, ...],
         hover: Hover | None = None,
         replanned: Replanned | None = None,
     ) -> Go:
-        """An older one is void."""
+        """From where the summary begins. An older one is void."""
+        start = summary.start_joints_rad
+        assert start is not None
         expires_s = self._clock() + GO_LIFETIME_S
         self._waiting = Go(summary, client_id, expires_s, start, poses, hover=hover, replanned=replanned)
         return self._waiting
 
     def void(self) -> bool:
         """True when there was one."""
+        self.voids += 1
         was, self._waiting = self._waiting, None
         return was is not None
 

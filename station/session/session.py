@@ -17,7 +17,6 @@ from recordings.errors import RecordingError
 from station.analysis import plan_poses
 from station.cell import Cell
 from station.errors import RefusedError, RobotError
-from station.plan.hover import Hover
 from station.plan.model import Plan
 from station.plan.scene import cell_geometry
 from station.session.bench import Bench
@@ -31,7 +30,7 @@ from station.session.keeper import Keeper
 from station.session.lease import GoDesk, LeaseDesk
 from station.session.logbook import Logbook
 from station.session.preview import Previewer
-from station.session.queue import PoseQueue, Replanned
+from station.session.queue import PoseQueue
 from station.session.run import unmark_busy
 from station.session.runs import run_for
 from station.session.store import StatusStore
@@ -58,8 +57,6 @@ class Session:
         self.bench = Bench(cell, geometry, self.store, Workers(), monitor, root)
         self.leases = LeaseDesk()
         self._goes = GoDesk(time.monotonic)
-        self._voids = 0
-        """Counts what makes a go void: a check that was under way meanwhile offers none."""
         self.guard = Guard(self.bench, self._jogged, ticked, self._void_go)
         self._keeper = Keeper(self.bench)
         self._improver = ImproveDesk(self.bench)
@@ -94,7 +91,8 @@ class Session:
         self._goes.void()
         if self.store.state in RUNNING:
             await self._halt(StationState.STOPPED, "the station is ending")
-        await self._run_ended()
+        with contextlib.suppress(RefusedError):
+            await self._run_ended()
         if self.bench.recording is not None and self.bench.recording.recorder is not None:
             with contextlib.suppress(RecordingError):
                 path = await self.bench.recording.seal(self.bench.require_queue())
@@ -162,12 +160,14 @@ class Session:
             self.bench.queue = PoseQueue(self.bench.queue.plan)
             self.bench.show_poses()
         self._void_go()
-        voids = self._voids
+        voids = self._goes.voids
         found = await self._improver.replan(purpose)
         poses = found.poses if found else poses_to_drive(self.bench, purpose, index)
         queue, changes = (found.queue, found.changes) if found else (self.bench.require_queue(), ())
         summary = await summarise(self.bench, purpose, queue, poses, self._notes, changes)
-        self._offer(client_id, voids, summary, poses, replanned=found)
+        self._require_unchanged(client_id, voids)
+        self._goes.offer(summary, client_id, poses, replanned=found)
+        self.store.update(go=summary)
         return summary
 
     async def prepare_hover(self, client_id: int, request: HoverRequest) -> HoverOffer:
@@ -177,35 +177,27 @@ class Session:
         self._require_no_session()
         await self._run_ended()
         self._void_go()
-        voids = self._voids
+        voids = self._goes.voids
         hover, offer = await self._hovers.prepare(request)
-        self._offer(client_id, voids, offer.go, (), hover)
+        self._require_unchanged(client_id, voids)
+        self._goes.offer(offer.go, client_id, (), hover)
+        self.store.update(go=offer.go)
         return offer
 
-    def _offer(
-        self,
-        client_id: int,
-        voids: int,
-        go: GoSummary,
-        poses: tuple[int, ...],
-        hover: Hover | None = None,
-        replanned: Replanned | None = None,
-    ) -> None:
+    def _require_unchanged(self, client_id: int, voids: int) -> None:
         """RefusedError when something happened while the way was checked."""
         self._require("prepare")
         self.leases.require(client_id)
-        if self._voids != voids:
+        if self._goes.voids != voids:
             raise RefusedError("something changed while the way was checked: prepare again")
-        assert go.start_joints_rad is not None
-        self._goes.offer(go, client_id, go.start_joints_rad, poses, hover, replanned)
-        self.store.update(go=go)
 
     def go(self, client_id: int, token: str, again: bool = False) -> None:
         """The person's yes to exactly that summary; `again`: see Go. RefusedError when anything changed."""
         self.leases.require(client_id)
         self._require("go")
-        if self._run is not None and not self._run.done():
-            raise RefusedError("the last run is still ending: try again in a moment")
+        self._require_run_ended()
+        if self.free_drive.taking:
+            raise RefusedError("free drive is still ending: try again in a moment")
         joints = self.bench.cell.robot.latest().joints_rad
         queue = self.bench.queue
         try:
@@ -219,9 +211,10 @@ class Session:
         self.bench.pause_wanted, self.bench.finish_wanted = "", False
         if self.bench.recording is None and go.hover is None:
             self.bench.forget_session()
+        run = run_for(self.bench, go)
         self.store.enter(StationState.CHECKING)
         self.store.event(f"go by {self.leases.lease.holder}: {go.summary.purpose}")
-        self._run = asyncio.create_task(run_for(self.bench, go).drive())
+        self._run = asyncio.create_task(run.drive())
 
     def pause(self, who: str) -> None:
         """After this pose. Anyone may: it only ever makes the arm do less."""
@@ -245,8 +238,14 @@ class Session:
         await close_or_seal(self.bench)
 
     async def _run_ended(self) -> None:
+        """RefusedError when it does not: nothing new begins beside it."""
         if self._run is not None and not self._run.done():
             await asyncio.wait({self._run}, timeout=END_RUN_S)
+        self._require_run_ended()
+
+    def _require_run_ended(self) -> None:
+        if self._run is not None and not self._run.done():
+            raise RefusedError("the last run is still ending: try again in a moment")
 
     # -- the lease ---------------------------------------------------------------------------------------
 
@@ -338,7 +337,6 @@ class Session:
             raise RefusedError(reason)
 
     def _void_go(self) -> None:
-        self._voids += 1
         self._goes.void()
         self.store.update(go=None)
 

@@ -62,6 +62,8 @@ class SweepRun(Run):
         for index in self._go.poses:
             if bench.halting or self._wants_rest() or self._failures >= FAILURES_IN_A_ROW:
                 return
+            if index not in queue.open:
+                continue  # skipped or dropped since the go
             bench.require_recording().require_space()
             queue.start_attempt(index)
             try:

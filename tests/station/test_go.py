@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import msgspec
 import pytest
 
 from station.errors import RefusedError
@@ -23,7 +24,8 @@ class Clock:
 
 def offered(desk: GoDesk, client_id: int = 1, replanned: Replanned | None = None) -> Go:
     summary = GoSummary(desk.new_token(), "run plan", PLAN, 4, 1.0, 0.5, 0.2, 30.0, "84 mm and 22° to pose 1")
-    return desk.offer(summary, client_id, HERE, (0, 1, 2, 3), replanned=replanned)
+    summary = msgspec.structs.replace(summary, start_joints_rad=HERE)
+    return desk.offer(summary, client_id, (0, 1, 2, 3), replanned=replanned)
 
 
 def test_a_go_is_for_one_use() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 from pathlib import Path
 
 import msgspec
@@ -192,3 +193,73 @@ async def test_not_within_an_open_session(rig: Rig, tmp_path: Path) -> None:
     rig.session.acknowledge("anna")
     with pytest.raises(RefusedError, match="finish it first"):
         await rig.session.prepare_hover(1, HoverRequest())
+
+
+async def test_pause_keeps_the_tip_high(hover_rig: Rig, calibration: Path) -> None:
+    rig = hover_rig
+    rig.arm.slow = True
+    offer = await rig.session.prepare_hover(1, request(calibration))
+    rig.session.go(1, offer.go.token)
+    await rig.until(S.MOVING)
+    rig.session.pause("bert")
+    rig.arm.arrive.set()
+    await rig.until(S.IDLE)
+    assert "bert" in rig.session.store.status.reason
+    await rig.until_true(lambda: rig.arm.log[-1] == "end control")
+    assert rig.arm.log.count("move") == 1
+
+
+async def test_a_moment_without_news_at_the_end_is_no_fault(
+    hover_rig: Rig, calibration: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = hover_rig
+    offer = await rig.session.prepare_hover(1, request(calibration))
+    settle = rig.session.bench.stillness.settle
+
+    async def hiccup(*args: object) -> object:
+        try:
+            return await settle(*args)  # type: ignore[arg-type]
+        finally:
+            rig.arm.stale = True
+            asyncio.get_running_loop().call_later(0.05, setattr, rig.arm, "stale", False)
+
+    monkeypatch.setattr(rig.session.bench.stillness, "settle", hiccup)
+    rig.session.go(1, offer.go.token)
+    await rig.until(S.CHECKING)
+    await rig.until(S.IDLE, S.FAULT)
+    assert rig.state is S.IDLE, rig.session.store.status.reason
+    assert "by hand only" in rig.session.store.status.reason
+
+
+async def test_a_robot_lost_at_the_end_of_a_hover_is_a_fault(
+    hover_rig: Rig, calibration: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = hover_rig
+    offer = await rig.session.prepare_hover(1, request(calibration))
+
+    async def lost(*args: object) -> None:
+        rig.arm.stale = True
+
+    monkeypatch.setattr(rig.session.bench.stillness, "settle", lost)
+    monkeypatch.setattr("station.session.patience.REST_PATIENCE_S", 0.05)
+    rig.session.go(1, offer.go.token)
+    await rig.until(S.CHECKING)
+    await rig.until(S.IDLE, S.FAULT)
+    assert rig.state is S.FAULT and "no news" in rig.session.store.status.reason
+
+
+async def test_a_board_seen_while_the_arm_was_jogged_is_not_driven_by(
+    hover_rig: Rig, calibration: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig, capture = hover_rig, hover_rig.camera.capture
+
+    async def jogged(timeout_s: float = 5.0) -> object:
+        picture = await capture(timeout_s)
+        rig.arm.joints = (rig.arm.joints[0] + 0.01, *rig.arm.joints[1:])
+        return picture
+
+    monkeypatch.setattr(rig.camera, "capture", jogged)
+    with pytest.raises(RefusedError, match="moved while the picture was taken"):
+        await rig.session.prepare_hover(1, request(calibration))
+    with pytest.raises(RefusedError, match="not looked at lately"):
+        await rig.session.prepare_hover(1, request(calibration, new_picture=False))

@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 
+import pytest
+
+from station.errors import RefusedError, TriggerError
 from station.status import StationState as S
 from tests.station.session_rig import POSES, NewRig, Rig, sealed
 
@@ -49,3 +53,78 @@ async def test_auto_record_takes_a_new_place_once(new_rig: NewRig) -> None:
     await rig.until_true(lambda: rig.session.store.status.session.captured == 2)
     await rig.session.stop("anna")
     assert rig.state is S.STOPPED
+
+
+async def test_auto_record_outlives_a_moment_without_news(new_rig: NewRig) -> None:
+    rig = await new_rig(with_plan=False)
+    await rig.until(S.IDLE)
+    rig.session.take_lease(1, "anna")
+    rig.arm.rest()
+    await rig.session.switch_free_drive(1, True, auto=True)
+    await rig.until_true(lambda: rig.session.store.status.session.captured == 1)
+    rig.arm.stale = True
+    rig.arm.joints = (*rig.arm.joints[:5], rig.arm.joints[5] + 0.2)
+    await asyncio.sleep(0.25)  # two rounds of its watch
+    rig.arm.stale = False
+    rig.arm.rest()
+    await rig.until_true(lambda: rig.session.store.status.session.captured == 2)
+
+
+@pytest.mark.parametrize("broken", [TriggerError("the trigger box is gone"), ZeroDivisionError("a defect")])
+async def test_a_picture_that_ends_oddly_leaves_no_state_of_work(
+    new_rig: NewRig, monkeypatch: pytest.MonkeyPatch, broken: Exception
+) -> None:
+    rig = await new_rig(with_plan=False)
+    await rig.until(S.IDLE)
+    rig.session.take_lease(1, "anna")
+    rig.arm.rest()
+    await rig.session.switch_free_drive(1, True, auto=False)
+
+    async def capture(timeout_s: float = 5.0) -> None:
+        raise broken
+
+    monkeypatch.setattr(rig.camera, "capture", capture)
+    with contextlib.suppress(type(broken)):
+        await rig.session.record(1)
+    assert rig.state is S.FAULT
+    assert str(broken.args[0]) in rig.session.store.status.reason
+    assert rig.pose_states == ["planned"]
+
+
+async def test_stop_while_free_drive_begins_stays_latched(
+    new_rig: NewRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = await new_rig(with_plan=False)
+    await rig.until(S.IDLE)
+    rig.session.take_lease(1, "anna")
+    opened, settings = asyncio.Event(), rig.camera.settings
+
+    async def slow() -> dict[str, object]:
+        await opened.wait()
+        return await settings()
+
+    monkeypatch.setattr(rig.camera, "settings", slow)
+    beginning = asyncio.ensure_future(rig.session.switch_free_drive(1, True, auto=False))
+    await asyncio.sleep(0.02)
+    await rig.session.stop("bert")
+    opened.set()
+    with pytest.raises(RefusedError, match="STOP is latched"):
+        await beginning
+    assert rig.state is S.STOPPED and rig.session.bench.halting
+
+
+async def test_no_go_is_given_while_free_drive_begins(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened, settings = asyncio.Event(), rig.camera.settings
+
+    async def slow() -> dict[str, object]:
+        await opened.wait()
+        return await settings()
+
+    monkeypatch.setattr(rig.camera, "settings", slow)
+    beginning = asyncio.ensure_future(rig.session.switch_free_drive(1, True, auto=False))
+    await asyncio.sleep(0.02)
+    with pytest.raises(RefusedError, match="free drive"):
+        await rig.session.prepare(1, "run")
+    opened.set()
+    await beginning
+    assert rig.state is S.FREE_DRIVE

@@ -171,3 +171,20 @@ async def test_a_full_disk_stops_a_stream_and_the_arm(
     streaming: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     await stops_on_a_full_disk(streaming, monkeypatch)
+
+
+async def test_a_swing_that_a_person_leaves_out_or_drops_is_not_driven(sweeping: Rig) -> None:
+    rig = sweeping
+    rig.arm.slow = True
+    await rig.give_go()
+    await rig.until(S.MOVING)
+    rig.session.edit(1, "skip", lambda queue: queue.skip(1))
+    for index in range(2, SWINGS - 1):
+        rig.session.edit(1, "drop", lambda queue, index=index: queue.drop(index))
+    for number in (1, 2):
+        await rig.until_true(lambda n=number: rig.arm.log.count("move") == n)
+        rig.arm.arrive.set()
+    await rig.until(S.IDLE, S.FAULT)
+    assert rig.state is S.IDLE, rig.session.store.status.reason
+    assert rig.arm.log.count("move") == 2
+    assert rig.pose_states == ["done", "skipped", "done"]

@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import msgspec
 
 from station.client import Client, DaemonGoneError
-from station.errors import RefusedError
+from station.errors import RefusedError, StationError
 from station.status import GoSummary, StationState, StationStatus
 
 Watcher = Callable[[StationStatus], None]
 Confirm = Callable[[GoSummary], bool]
 CONNECT_WAIT_S = 30.0
+STOP_ANSWER_S = 3.0
 PREPARE_S = 180.0
 """Poses may be planned anew for it."""
 _RESTING = (StationState.PAUSED, StationState.STOPPED, StationState.FAULT, StationState.DISCONNECTED)
@@ -65,7 +67,7 @@ async def carry_out(
 ) -> Outcome:
     """Prepares, lets `confirm` decide, goes, and watches. `finish_with_loss`: seal although poses failed.
 
-    RefusedError when the daemon or the person says no. Being cancelled sends STOP.
+    RefusedError when the daemon or the person says no. Being cancelled (Ctrl-C) sends STOP and says so.
     """
     answer = await client.request("prepare", purpose=purpose, timeout_s=PREPARE_S)
     summary = msgspec.convert(answer, GoSummary)
@@ -81,10 +83,22 @@ async def carry_out(
             client.outdate()
             status = await watch_until_rest(client, watch)
     except asyncio.CancelledError:
-        with contextlib.suppress(DaemonGoneError):
-            await client.request("stop")
+        await stop_and_say(client)
         raise
     return Outcome(status)
+
+
+async def stop_and_say(client: Client) -> None:
+    """STOP for a person who pressed Ctrl-C, who reads on stderr what became of it."""
+    try:
+        await client.request("stop", timeout_s=STOP_ANSWER_S)
+        told = (
+            "STOP: the arm was stopped, nothing moves without a new go. Look at the cell, then `station "
+            "acknowledge`; `station resume` goes on with what is open, `station finish` closes it."
+        )
+    except StationError as problem:
+        told = f"STOP was not answered: {problem} If the arm still moves use the emergency stop."
+    print(f"\n{told}", file=sys.stderr)
 
 
 async def watch_until_rest(client: Client, watch: Watcher) -> StationStatus:

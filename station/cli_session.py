@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import json
 import os
+import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -247,7 +249,21 @@ def ask_person(summary: GoSummary) -> bool:
     for warning in summary.warnings:
         err.print(f"[yellow]{warning}[/]")
     err.print("The emergency stop on the pendant is the safety device. Ctrl-C stops too.")
-    return typer.confirm("Is everybody out of the arm's reach? Move?", default=False, err=True)
+    try:
+        with ctrl_c_at_once():
+            return typer.confirm("Is everybody out of the arm's reach? Move?", default=False, err=True)
+    except typer.Abort:
+        return False
+
+
+@contextlib.contextmanager
+def ctrl_c_at_once() -> Iterator[None]:
+    """At a question: the event loop, which waits for the answer too, would hear of Ctrl-C only after it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def _finish(outcome: Outcome, as_json: bool) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
 import sys
 from dataclasses import dataclass
@@ -18,9 +17,9 @@ from calibrate.errors import CalibrationError
 from calibrate.geometry import Array
 from calibrate.install import load_installed
 from calibrate.verification import note_in_file, note_installed, touch_text
-from station.attend import wait_until_idle, watch_until_rest
-from station.cli_session import AsJson, Socket, ask_person, err, out
-from station.client import Client, DaemonGoneError, default_socket
+from station.attend import stop_and_say, wait_until_idle, watch_until_rest
+from station.cli_session import AsJson, Socket, ask_person, ctrl_c_at_once, err, out
+from station.client import Client, default_socket
 from station.errors import RefusedError, StationError
 from station.plan.hover import outer_corners
 from station.status import HoverOffer, StationState, StationStatus
@@ -135,15 +134,14 @@ class _Visit:
         return await self._ask_offset(hovering)
 
     async def _hover(self, holder: Client, watcher: Client, offer: HoverOffer) -> Hovering:
-        """Being cancelled (Ctrl-C) sends STOP."""
+        """Being cancelled (Ctrl-C) sends STOP and says so."""
         await asyncio.sleep(0)  # Ctrl-C at the question strikes here, before the go is sent
         try:
             await holder.request("go", token=offer.go.token, plan_sha256=offer.go.plan_sha256)
             watcher.outdate()
             status = await watch_until_rest(watcher, lambda _: None)
         except asyncio.CancelledError:
-            with contextlib.suppress(DaemonGoneError):
-                await holder.request("stop")
+            await stop_and_say(holder)
             raise
         if status.state is not StationState.IDLE or status.robot.base_from_flange is None:
             raise StationError(f"the hover ended {status.state.value}: {status.reason}")
@@ -161,7 +159,8 @@ class _Visit:
         )
         while True:
             try:
-                said = str(typer.prompt("offset x,y", default="", show_default=False, err=True)).strip()
+                with ctrl_c_at_once():
+                    said = str(typer.prompt("offset x,y", default="", show_default=False, err=True)).strip()
             except typer.Abort:
                 return False
             if said in ("s", "q"):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
 import os
 import signal
@@ -13,13 +14,16 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import typer
 
-from station import cli_session
+from station import attend, cli_session
 from station.cli import main
+from station.client import NoAnswerError
 from station.errors import RefusedError
 from station.plan.files import load_plan
 from station.plan.model import plan_sha256
 from station.states import RUNNING
+from station.status import GoSummary
 from tests.system.conftest import short_folder
 
 pytestmark = pytest.mark.process
@@ -132,15 +136,48 @@ def test_ctrl_c_is_stop(shell: Shell, tmp_path: Path) -> None:
     plan = tmp_path / "plan.yaml"
     assert shell("plan", "--poses", "8", "-o", str(plan), "--json")[0] == 0
     command = [sys.executable, "-m", "station.cli", "capture", "--plan", str(plan), "--headless"]
-    capture = subprocess.Popen([*command, "--socket", str(shell.socket)], stdin=subprocess.DEVNULL)
+    capture = subprocess.Popen(
+        [*command, "--socket", str(shell.socket)], stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
     give_up_s = time.monotonic() + 60
     while shell.state()["state"] not in RUNNING:
         assert time.monotonic() < give_up_s
     capture.send_signal(signal.SIGINT)
-    assert capture.wait(20) == 130
+    said = capture.communicate(timeout=20)[1]
+    assert capture.returncode == 130
+    assert "STOP: the arm was stopped" in said and "station acknowledge" in said
     status = shell.state()
     assert status["state"] == "stopped"
     assert "STOP by" in status["reason"]
+
+
+async def test_ctrl_c_without_an_answer_says_what_to_do(capsys: pytest.CaptureFixture[str]) -> None:
+    class Hanging:
+        async def request(self, verb: str, *, timeout_s: float) -> None:
+            raise NoAnswerError(f"{verb}: no answer from the daemon within {timeout_s:.0f} s.")
+
+    await attend.stop_and_say(Hanging())  # type: ignore[arg-type]
+    said = capsys.readouterr().err
+    assert "STOP was not answered" in said and "use the emergency stop" in said
+
+
+def test_ctrl_c_at_the_question_is_a_no_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    def pressed(*_: object, **__: object) -> bool:
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise typer.Abort from None
+        return True
+
+    summary = GoSummary("t", "run plan", "ab" * 32, 4, 1.0, 0.5, 0.2, 30.0, "84 mm and 22° to pose 1")
+    monkeypatch.setattr(typer, "confirm", pressed)
+
+    async def ask() -> bool:  # below an event loop's own handler of Ctrl-C
+        return cli_session.ask_person(summary)
+
+    before = signal.getsignal(signal.SIGINT)
+    assert asyncio.run(ask()) is False
+    assert signal.getsignal(signal.SIGINT) is before
 
 
 def test_the_demo_finds_the_truth(tmp_path: Path) -> None:

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import asyncio
 import json
+import signal
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -19,11 +21,13 @@ from recordings.messages import Vector6
 from station import cli_bootstrap
 from station.analysis import check_run
 from station.cli_bootstrap import slow_plan
+from station.client import Client
 from station.errors import LimitError
 from station.plan.model import Plan, PlannedPose
 from station.plan.planner import make_plan
 from station.simulation.placement import guess_of
 from station.simulation.scenes import build_cell, cell_config
+from station.status import StationState, StationStatus
 from tests.system.conftest import short_folder
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
@@ -81,6 +85,32 @@ def test_a_mount_wrong_by_30_degrees_and_100_mm_is_found(socket: Path, tmp_path:
         assert np.rad2deg(np.linalg.norm(off[3:])) < 2, name
     improved = msgspec.convert({**msgspec.to_builtins(bad), **found}, type(bad))
     assert len(make_plan(improved, start_joints_rad=TRUTH.start_joints_rad).poses) == 25
+
+
+def test_ctrl_c_in_mid_move_stops_the_arm_and_says_so(socket: Path, tmp_path: Path) -> None:
+    config = tmp_path / "cell.yaml"
+    config.write_text(yaml.safe_dump(msgspec.to_builtins(cell_config(TRUTH, "127.0.0.1"))))
+    command = [sys.executable, "-m", "station.cli", "bootstrap", "--config", str(config), "--headless"]
+    bootstrap = subprocess.Popen([*command, "--socket", str(socket)], stderr=subprocess.PIPE, text=True)
+
+    async def strike() -> StationStatus:
+        """In the first real move; the status in which the arm is at rest."""
+        async with asyncio.timeout(60), await Client.connect(socket) as client:
+            async for status in client.statuses():
+                if status.state is StationState.MOVING and status.robot.speed_m_s > 0.01:
+                    bootstrap.send_signal(signal.SIGINT)
+                    break
+            async for status in client.statuses():
+                if status.state is StationState.STOPPED and status.robot.still:
+                    return status
+        raise AssertionError("the daemon ended")
+
+    status = asyncio.run(strike())
+    said = bootstrap.communicate(timeout=20)[1]
+    assert bootstrap.returncode == 130
+    assert "STOP: the arm was stopped" in said and "station acknowledge" in said
+    assert "STOP by" in status.reason and not status.robot.control
+    assert [pose.state for pose in status.session.poses] == ["planned"]
 
 
 def test_what_was_found_is_kept_when_no_further_move_is_free(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -30,6 +30,10 @@ POLL_S = 0.005
 STOP_WAIT_S = 0.05
 WATCHDOG_S = 0.15
 """A pause of the heartbeat that can have tripped the watchdog (1/5 s, and ticks)."""
+UNANSWERED_S = 0.1
+"""A heartbeat that the control process did not answer for so long kicked nothing any more."""
+OUTLIVED_S = 0.3
+"""A program that still plays so long after a pause began did not stop for it."""
 PROGRAM_START_NS = 200_000_000
 LEFTOVER_WAIT_NS = 2_000_000_000
 CLOSE_WAIT_S = 0.5
@@ -49,6 +53,8 @@ class UrRobot(UrLink):
         self._moving = False
         self._stop_reason = self._link_loss = ""
         self._heart = Heart()
+        self._played_s = 0.0
+        """When the control program was last seen playing, in a move."""
         self._background: set[asyncio.Task[Any]] = set()
 
     @property
@@ -148,7 +154,8 @@ class UrRobot(UrLink):
             if self._child is not child:
                 raise RobotError("stopped")  # while we waited
             sample = self.newest()
-            watch = MoveWatch(joints_rad, sample.operation, time.monotonic())
+            self._played_s = time.monotonic()
+            watch = MoveWatch(joints_rad, sample.operation, self._played_s)
             await child.move(joints_rad, speed_rad_s, acceleration_rad_s2)
             await self._follow(watch, child)
         except BaseException as error:
@@ -164,6 +171,8 @@ class UrRobot(UrLink):
             if self._stop_reason:
                 raise RobotError(f"stopped: {self._stop_reason}")
             sample = self.newest()
+            if sample.state.runtime_state == RuntimeState.PLAYING:
+                self._played_s = sample.state.stamps.host_monotonic_ns / 1e9
             if watch.step(sample.state, sample.operation, self.age_s(), time.monotonic()):
                 return
             child.check()
@@ -189,14 +198,14 @@ class UrRobot(UrLink):
             return StaleStateError(self._stale_words(self.age_s()))
         if state.runtime_state != RuntimeState.STOPPED:
             return error
-        pause_s = self._heart.worst_s()
+        pause_s = self._heart.worst_s(since_s=self._played_s - OUTLIVED_S)
         if pause_s > WATCHDOG_S:
             return RobotError(
                 f"the session was busy for {pause_s * 1000:.0f} ms and the watchdog stopped the arm. "
                 "Look for what loads this computer, then give a new go."
             )
         try:
-            child.check(patience_s=WATCHDOG_S)
+            child.check(patience_s=UNANSWERED_S)
         except RobotError as trouble:
             return trouble
         return error

@@ -4,22 +4,21 @@ from __future__ import annotations
 
 import time
 from collections import deque
+from collections.abc import Callable
 from itertools import pairwise
 
 KEPT = 64
-RECENT_S = 1.0
 
 
 class Heart:
-    def __init__(self) -> None:
+    def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._now_s = now_s
         self._beats_s: deque[float] = deque(maxlen=KEPT)
 
     def beat(self) -> None:
-        self._beats_s.append(time.monotonic())
+        self._beats_s.append(self._now_s())
 
-    def worst_s(self) -> float:
-        """Longest pause that ended, or goes on, within the last second; 0 when it never beat."""
-        now_s = time.monotonic()
-        beats_s = [*self._beats_s, now_s]
-        pauses = [b - a for a, b in pairwise(beats_s) if b > now_s - RECENT_S]
-        return max(pauses, default=0.0)
+    def worst_s(self, since_s: float) -> float:
+        """Longest pause that began after `since_s` (host monotonic), ended or not; 0 when there is none."""
+        beats_s = [*self._beats_s, self._now_s()]
+        return max((b - a for a, b in pairwise(beats_s) if a > since_s), default=0.0)

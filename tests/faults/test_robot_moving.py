@@ -13,8 +13,7 @@ from station.errors import RobotError, SafetyStopError, StaleStateError
 
 pytestmark = pytest.mark.process
 
-Make = Callable[..., Awaitable[Any]]
-Keep = Callable[[Any], None]
+Strike = Callable[..., Awaitable[Any]]
 
 
 @pytest.mark.parametrize(
@@ -22,10 +21,8 @@ Keep = Callable[[Any], None]
     [("pstop", "protective stop"), ("safeguard", "safeguard stop"), ("estop", "emergency stop")],
 )
 @pytest.mark.parametrize("model", ["UR10", "UR10e"])
-async def test_safety_stop(cell: Make, fault_times: Keep, model: str, fault: str, words: str) -> None:
-    c = await cell(model)
-    outcome = await c.strike(lambda: c.admin.ask(fault))
-    fault_times(outcome)
+async def test_safety_stop(strike: Strike, model: str, fault: str, words: str) -> None:
+    c, outcome = await strike(lambda c: c.admin.ask(fault), model)
     assert isinstance(outcome.error, SafetyStopError)
     assert words in str(outcome.error) and "new go" in str(outcome.error)
     assert outcome.noticed_s < 0.25 and outcome.stopped_s < 0.5
@@ -44,31 +41,24 @@ async def test_safety_stop(cell: Make, fault_times: Keep, model: str, fault: str
     ],
     ids=["program stopped", "program paused", "power off", "remote control lost"],
 )
-async def test_something_on_the_pendant(
-    cell: Make, fault_times: Keep, fault: dict[str, Any], words: str
-) -> None:
-    c = await cell("UR10e")
-    outcome = await c.strike(lambda: c.admin.ask(**fault))
-    fault_times(outcome)
+async def test_something_on_the_pendant(strike: Strike, fault: dict[str, Any], words: str) -> None:
+    c, outcome = await strike(lambda c: c.admin.ask(**fault), "UR10e")
     assert words in str(outcome.error)
     assert outcome.noticed_s < 0.25 and outcome.stopped_s < 0.6
     await c.stays_at_rest()
 
 
-async def test_the_switch_to_local_is_named_although_the_supervision_saw_it_first(cell: Make) -> None:
-    c = await cell("UR10e")
-
-    def go_local() -> None:
+async def test_the_switch_to_local_is_named_although_the_supervision_saw_it_first(strike: Strike) -> None:
+    def go_local(c: Any) -> None:
         c.admin.ask(cmd="remote", on=False)
         c.robot.remote = False
 
-    outcome = await c.strike(go_local)
+    _, outcome = await strike(go_local, "UR10e")
     assert "switch the pendant to Remote" in str(outcome.error)
 
 
-async def test_a_program_paused_on_the_pendant_does_not_go_on_when_play_is_pressed(cell: Make) -> None:
-    c = await cell()
-    await c.strike(lambda: c.admin.ask("pause"))
+async def test_a_program_paused_on_the_pendant_does_not_go_on_when_play_is_pressed(strike: Strike) -> None:
+    c, _ = await strike(lambda c: c.admin.ask("pause"))
     await c.until(lambda: c.admin.ask("state")["runtime_state"] == "STOPPED")
     c.admin.ask("play")
     await c.stays_at_rest()
@@ -76,10 +66,8 @@ async def test_a_program_paused_on_the_pendant_does_not_go_on_when_play_is_press
 
 @pytest.mark.parametrize("how", ["fin", "rst"])
 @pytest.mark.parametrize("ports", [None, ["rtde"]], ids=["every link", "rtde links"])
-async def test_link_cut(cell: Make, fault_times: Keep, how: str, ports: list[str] | None) -> None:
-    c = await cell()
-    outcome = await c.strike(lambda: c.admin.ask("drop", how=how, ports=ports))
-    fault_times(outcome)
+async def test_link_cut(strike: Strike, how: str, ports: list[str] | None) -> None:
+    c, outcome = await strike(lambda c: c.admin.ask("drop", how=how, ports=ports))
     assert "connection to the robot lost" in str(outcome.error)
     assert outcome.noticed_s < 0.5 and outcome.stopped_s < 1.0
     await c.until(lambda: c.admin.ask("state")["program"] is None)  # ur_rtde loads its program anew by itself
@@ -87,11 +75,10 @@ async def test_link_cut(cell: Make, fault_times: Keep, how: str, ports: list[str
 
 
 async def test_a_lost_link_is_named_although_it_may_be_back_already(
-    cell: Make, monkeypatch: pytest.MonkeyPatch
+    strike: Strike, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("station.devices.ur.POLL_S", 1.0)  # a computer that looks again only then
-    c = await cell()
-    outcome = await c.strike(lambda: c.admin.ask("drop", how="rst"))
+    c, outcome = await strike(lambda c: c.admin.ask("drop", how="rst"))
     assert "connection to the robot lost" in str(outcome.error)
     await c.stays_at_rest()
 
@@ -105,10 +92,8 @@ async def test_a_lost_link_is_named_although_it_may_be_back_already(
     ],
     ids=["silent link", "frozen data", "cable pulled"],
 )
-async def test_no_news(cell: Make, fault_times: Keep, fault: dict[str, Any], words: str) -> None:
-    c = await cell()
-    outcome = await c.strike(lambda: c.admin.ask(**fault))
-    fault_times(outcome)
+async def test_no_news(strike: Strike, fault: dict[str, Any], words: str) -> None:
+    c, outcome = await strike(lambda c: c.admin.ask(**fault))
     assert isinstance(outcome.error, StaleStateError)
     assert words in str(outcome.error)
     assert 0.2 < outcome.noticed_s < 0.6 and outcome.stopped_s < 1.2
@@ -116,10 +101,8 @@ async def test_no_news(cell: Make, fault_times: Keep, fault: dict[str, Any], wor
     await c.stays_at_rest()
 
 
-async def test_controller_restart(cell: Make, fault_times: Keep) -> None:
-    c = await cell()
-    outcome = await c.strike(lambda: c.admin.ask("restart", down_s=0.5, running=True))
-    fault_times(outcome)
+async def test_controller_restart(strike: Strike) -> None:
+    c, _ = await strike(lambda c: c.admin.ask("restart", down_s=0.5, running=True))
     await c.until(lambda: c.robot.age_s() < 0.1, timeout_s=6.0)
     await c.stays_at_rest()
 
@@ -129,26 +112,26 @@ async def test_controller_restart(cell: Make, fault_times: Keep) -> None:
     [(signal.SIGSEGV, "control process died"), (signal.SIGSTOP, "control process hangs")],
     ids=["child segfault", "child hung"],
 )
-async def test_control_process(cell: Make, fault_times: Keep, kill: signal.Signals, words: str) -> None:
-    c = await cell()
-    pid = c.robot.control_pid
-    outcome = await c.strike(lambda: os.kill(pid, kill))
-    fault_times(outcome)
+async def test_control_process(strike: Strike, kill: signal.Signals, words: str) -> None:
+    killed: list[int] = []
+
+    def strike_down(c: Any) -> None:
+        killed[:] = [c.robot.control_pid]
+        os.kill(killed[0], kill)
+
+    c, outcome = await strike(strike_down)
     assert words in str(outcome.error)
     assert outcome.stopped_s < 1.2
     await c.stays_at_rest()
     with pytest.raises(ProcessLookupError):
-        os.kill(pid, 0)
+        os.kill(killed[0], 0)
 
 
-async def test_a_session_loop_that_stalls_stops_the_arm(cell: Make, fault_times: Keep) -> None:
-    c = await cell()
-
-    def stall() -> None:
+async def test_a_session_loop_that_stalls_stops_the_arm(strike: Strike) -> None:
+    def stall(c: Any) -> None:
         c.beating = False
 
-    outcome = await c.strike(stall)
-    fault_times(outcome)
+    c, outcome = await strike(stall)
     assert "the session was busy for" in str(outcome.error)
     assert outcome.stopped_s < 1.0
     assert isinstance(outcome.error, RobotError)

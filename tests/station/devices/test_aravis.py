@@ -226,3 +226,49 @@ async def test_without_pygobject_the_operator_is_told_what_to_install(
 async def test_no_camera_at_all(lonely_network: None) -> None:
     with pytest.raises(CameraError, match="opening the camera failed"):
         await AravisCamera(CameraConfig(device="127.0.0.9")).open()
+
+
+class Unplugged:
+    """A USB camera that was pulled out, as Aravis tells of it: the next request says NOT_CONNECTED."""
+
+    def __init__(self, camera: Any, error: Exception) -> None:
+        self._camera, self._error = camera, error
+
+    def software_trigger(self) -> None:
+        raise self._error
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._camera, name)
+
+
+async def test_a_usb_camera_that_was_pulled_out_is_opened_again(server: SimulatedGige) -> None:
+    async with Opened() as camera:
+        first = await camera.capture()
+        device = camera._device
+        assert device is not None
+        aravis, glib = device._aravis, device._glib
+        code = aravis.DeviceError.NOT_CONNECTED
+        error = glib.Error.new_literal(aravis.device_error_quark(), "Not connected", code)
+        device._controls = False  # USB knows no control channel that could be asked
+        device._camera.get_device().leave_control()
+        device._camera = Unplugged(device._camera, error)
+        assert not device.lost
+        with pytest.raises(CameraError, match="triggering the camera failed: Not connected"):
+            await camera.capture()
+        assert device.lost
+        second = await camera.capture()
+        assert camera._device is not device
+    assert second.sequence == first.sequence + 1
+
+
+async def test_a_refused_setting_does_not_count_as_a_lost_camera(server: SimulatedGige) -> None:
+    async with Opened() as camera:
+        device = camera._device
+        assert device is not None
+        aravis, glib = device._aravis, device._glib
+        code = aravis.DeviceError.INVALID_PARAMETER
+        error = glib.Error.new_literal(aravis.device_error_quark(), "Invalid", code)
+        device._camera = Unplugged(device._camera, error)
+        with pytest.raises(CameraError, match="Invalid"):
+            await camera.capture()
+        assert not device.lost

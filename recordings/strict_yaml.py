@@ -12,8 +12,9 @@ import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
+from enum import Enum
 from types import NoneType, UnionType
-from typing import Any, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import msgspec
 import yaml
@@ -79,14 +80,17 @@ def _float(text: str) -> float:
     return float(text.replace(".inf", "inf").replace(".nan", "nan"))
 
 
-def load(content: bytes, kind: type[T]) -> T:
-    """The file's content as `kind`, a msgspec struct. Raises StrictYamlError with all problems and lines."""
+def load(content: bytes, kind: type[T], under: str = "") -> T:
+    """The file's content as `kind`, a msgspec struct. Raises StrictYamlError with all problems and lines.
+
+    `under`: where the file has this key, only what stands below it is read.
+    """
     if len(content) > LIMIT_BYTES:
         raise StrictYamlError([Problem(0, "", f"larger than {LIMIT_BYTES // 1024} kB")])
     try:
         loader = _Loader(content)
-        node = loader.get_single_node()
-        problems = list(_problems(node, kind, "")) if node else [Problem(0, "", "the file is empty")]
+        node, where = _below(loader.get_single_node(), under)
+        problems = list(_problems(node, kind, where)) if node else [Problem(0, "", "the file is empty")]
         if problems:
             raise StrictYamlError(problems)
         plain = loader.construct_document(node)
@@ -101,6 +105,15 @@ def load(content: bytes, kind: type[T]) -> T:
         return msgspec.convert(plain, kind)
     except msgspec.ValidationError as error:
         raise StrictYamlError([Problem(0, "", str(error))]) from None
+
+
+def _below(root: yaml.Node | None, key: str) -> tuple[yaml.Node | None, str]:
+    """(the value of `key` in the file's mapping, `key`); the file itself where it has none."""
+    if key and isinstance(root, yaml.MappingNode):
+        for name, value in root.value:
+            if name.value == key:
+                return value, key
+    return root, ""
 
 
 def _problems(node: yaml.Node, kind: Any, where: str) -> Iterator[Problem]:
@@ -157,10 +170,20 @@ def _leaf_problems(node: yaml.Node, kind: Any, where: str) -> Iterator[Problem]:
         msgspec.convert(value, kind)
     except msgspec.ValidationError as error:
         found = f" (found {node.value[:40]!r})" if isinstance(node, yaml.ScalarNode) else ""
-        yield Problem(line, where, f"{error}{found}")
+        words = [str(word) for option in _options(kind) for word in _words(option)]
+        yield Problem(
+            line, where, f"must be one of {', '.join(words)}{found}" if words else f"{error}{found}"
+        )
         return
     if isinstance(value, float) and not math.isfinite(value):
         yield Problem(line, where, "is not a finite number")
+
+
+def _words(kind: Any) -> tuple[Any, ...]:
+    """What may stand where a Literal or an Enum is asked for; else nothing."""
+    if get_origin(kind) is Literal:
+        return get_args(kind)
+    return tuple(k.value for k in kind) if isinstance(kind, type) and issubclass(kind, Enum) else ()
 
 
 def _options(kind: Any) -> tuple[Any, ...]:

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-import msgspec
 import numpy as np
 import yaml
 
@@ -14,9 +13,11 @@ from calibrate.calibration import FORMAT, read_calibration
 from calibrate.errors import CalibrationError
 from calibrate.lens import distortion
 from calibrate.projection import camera_matrix
+from recordings import strict_yaml
 from recordings.messages import BoardSpec, CameraModel
 
-_LIMIT_BYTES = 256 * 1024
+_LIMIT_BYTES = strict_yaml.LIMIT_BYTES
+T = TypeVar("T")
 
 
 class InputFileError(CalibrationError):
@@ -27,8 +28,7 @@ class InputFileError(CalibrationError):
 
 def read_board(path: Path) -> BoardSpec:
     """A board's fields, or any YAML with `board:` in it (dataset.yaml, a station's configuration)."""
-    plain = _read(path)
-    board: BoardSpec = _convert(path, plain.get("board", plain), BoardSpec)
+    board = _strictly(path, BoardSpec, "board")
     check_board(board)
     return board
 
@@ -41,7 +41,7 @@ def read_camera(path: Path) -> CameraModel:
     if "camera_matrix" in plain:
         camera = _camera_info(path, plain)
     else:
-        camera = _convert(path, plain.get("camera", plain), CameraModel)
+        camera = _strictly(path, CameraModel, "camera")
     camera_matrix(camera)
     distortion(camera)
     return camera
@@ -69,22 +69,27 @@ def _camera_info(path: Path, plain: dict[str, Any]) -> CameraModel:
         raise InputFileError(f"{path}: not a whole camera_info file ({problem!r}).") from None
 
 
-def _convert(path: Path, plain: object, kind: type[Any]) -> Any:
+def _strictly(path: Path, kind: type[T], under: str) -> T:
     try:
-        return msgspec.convert(plain, kind)
-    except msgspec.ValidationError as problem:
-        raise InputFileError(f"{path}: {problem}.") from None
+        return strict_yaml.load(_content(path), kind, under)
+    except strict_yaml.StrictYamlError as error:
+        raise InputFileError(f"{path}: {'; '.join(map(str, error.problems))}.") from None
+
+
+def _content(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            content = file.read(_LIMIT_BYTES + 1)
+    except OSError as problem:
+        raise InputFileError(f"{path}: {problem.strerror or problem}.") from None
+    if len(content) > _LIMIT_BYTES:
+        raise InputFileError(f"{path}: larger than {_LIMIT_BYTES} bytes.")
+    return content
 
 
 def _read(path: Path) -> dict[str, Any]:
     try:
-        with path.open("rb") as file:
-            content = file.read(_LIMIT_BYTES + 1)
-        if len(content) > _LIMIT_BYTES:
-            raise InputFileError(f"{path}: larger than {_LIMIT_BYTES} bytes.")
-        plain = yaml.safe_load(content)
-    except OSError as problem:
-        raise InputFileError(f"{path}: {problem.strerror or problem}.") from None
+        plain = yaml.safe_load(_content(path))
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as problem:
         raise InputFileError(f"{path}: not YAML ({problem}).") from None
     if not isinstance(plain, dict):

@@ -138,7 +138,10 @@ BAD: dict[str, tuple[Change, str]] = {
     "header of 30000×30000": (huge_header, r"line 3: .*impossible size 30000×30000"),
     "mixed sizes": (another_size, r"line 4: picture images/2.png is 40×30, dataset.yaml says 32×24"),
     "outside": (edit("poses.csv", "images/1.png", "../../secret.png"), r"line 3: .*outside the folder"),
-    "unknown mount": (edit("dataset.yaml", "eye-in-hand", "on-hand"), r"mount: Invalid enum value 'on-hand'"),
+    "unknown mount": (
+        edit("dataset.yaml", "eye-in-hand", "on-hand"),
+        r"mount: must be one of eye-in-hand, .*'on-hand'",
+    ),
     "unknown key": (
         edit("dataset.yaml", "note:", "nota:"),
         r"line 5: nota: unknown key; did you mean 'note'",
@@ -149,7 +152,7 @@ BAD: dict[str, tuple[Change, str]] = {
     ),
     "board kind": (
         edit("dataset.yaml", "kind: chessboard", "kind: chess"),
-        r"board.kind: Invalid enum value 'chess'",
+        r"board.kind: must be one of chessboard, .*'chess'",
     ),
     "board size": (edit("dataset.yaml", "columns: 7", "columns: 0"), r"0×6 columns×rows"),
     "square in mm": (edit("dataset.yaml", "0.025", "25"), r"square_m = 25.0 is not a length in metres"),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from enum import StrEnum
+from typing import Literal
 
 import msgspec
 import pytest
@@ -10,6 +12,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from recordings.strict_yaml import StrictYamlError, load
+
+
+class Colour(StrEnum):
+    RED = "red"
+    GREEN = "green"
 
 
 class Inner(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -78,3 +85,25 @@ def test_any_bytes_give_a_value_or_a_report(content: bytes) -> None:
         assert math.isfinite(load(content, Outer).inner.speed_m_s)
     except StrictYamlError as error:
         assert error.problems
+
+
+class Chosen(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    kind: Literal["a", "b"] = "a"
+    colour: Colour | None = None
+
+
+def test_a_choice_names_what_may_stand_there() -> None:
+    with pytest.raises(StrictYamlError) as caught:
+        load(b"kind: c\ncolour: blue", Chosen)
+    assert [str(p) for p in caught.value.problems] == [
+        "line 1: kind: must be one of a, b (found 'c')",
+        "line 2: colour: must be one of red, green (found 'blue')",
+    ]
+
+
+def test_a_part_of_a_larger_file_is_read_with_the_files_lines() -> None:
+    text = b"other: 1\nkind_of_thing:\n  kind: b\n"
+    assert load(text, Chosen, "kind_of_thing") == Chosen("b")
+    assert load(b"kind: b", Chosen, "kind_of_thing") == Chosen("b"), "a file of its own"
+    with pytest.raises(StrictYamlError, match=r"line 3: part\.kin: unknown key; did you mean 'kind'"):
+        load(b"x: 1\npart:\n  kin: b\n", Chosen, "part")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from itertools import pairwise
+from itertools import pairwise, zip_longest
 
 import numpy as np
 from scipy import stats
@@ -39,6 +39,13 @@ class Move:
         )
 
 
+_UNNAMED_ROBOT = ("", "unknown")
+NOT_FOLLOWED = (
+    "These recordings do not say of which robot they are, so nobody can tell whether one camera moved "
+    "between them. Name it in dataset.yaml (robot: NAME) and import again."
+)
+
+
 @dataclass(frozen=True)
 class Cell:
     """One robot with one camera in one mount, by their serial numbers."""
@@ -47,13 +54,15 @@ class Cell:
     sessions: tuple[BatchResult, ...]
     """Solved ones, oldest first."""
     moves: tuple[Move, ...]
-    """From each session to the next."""
+    """From each session to the next; none where the robot is not named."""
+    followed: bool = True
+    """False: the robot is not named, these may be sessions of many cells."""
 
     @property
     def findings(self) -> list[str]:
         """Jumps by name; a creep that no single step shows is found between the first and the last."""
         jumps = [move.sentence for move in self.moves if move.real]
-        if jumps or len(self.sessions) < 3:
+        if jumps or len(self.sessions) < 3 or not self.followed:
             return jumps
         whole = _move(self.sessions[0], self.sessions[-1])
         return [f"slowly, no step stands out: {whole.sentence}"] if whole.real else []
@@ -69,8 +78,9 @@ def cells(results: Iterable[BatchResult]) -> tuple[Cell, ...]:
     found = []
     for name in sorted(groups):
         sessions = sorted(groups[name], key=lambda r: (r.recorded_wall_ns, r.recording))
-        steps = pairwise(sessions)
-        found.append(Cell(name, tuple(sessions), tuple(_move(a, b) for a, b in steps)))
+        followed = sessions[0].robot not in _UNNAMED_ROBOT
+        steps = pairwise(sessions) if followed else ()
+        found.append(Cell(name, tuple(sessions), tuple(_move(a, b) for a, b in steps), followed))
     return tuple(found)
 
 
@@ -95,7 +105,13 @@ def trends_text(found: Sequence[Cell]) -> str:
     lines = [f"{cell.name}: {finding}" for cell in found for finding in cell.findings]
     lines = lines or ["No camera moved by more than chance explains."]
     for cell in found:
-        lines += ["", cell.name, _row(HEAD), *(_row(row) for row in rows(cell))]
+        lines += [
+            "",
+            cell.name,
+            *([] if cell.followed else [NOT_FOLLOWED]),
+            _row(HEAD),
+            *(_row(row) for row in rows(cell)),
+        ]
     return "\n".join(lines) + "\n"
 
 
@@ -108,7 +124,7 @@ HEAD = (
 def rows(cell: Cell) -> list[tuple[str, ...]]:
     """As HEAD; the last column holds MOVED and the gates that failed."""
     found: list[tuple[str, ...]] = []
-    for session, move in zip(cell.sessions, (None, *cell.moves), strict=True):
+    for session, move in zip_longest(cell.sessions, (None, *cell.moves)):
         x, y, z = (f"{v * 1000:.3f}" for v in session.translation_m)
         sigma = (f"{session.sigma_mm or 0:.3f}", f"{session.sigma_deg or 0:.4f}")
         step = ("", "", "")

@@ -13,7 +13,7 @@ from calibrate.batch import BatchResult
 from calibrate.geometry import difference
 from calibrate.report import html
 from calibrate.report.plots import STYLE, new_figure, svg_text
-from calibrate.trends import HEAD, Cell, place, rows
+from calibrate.trends import HEAD, NOT_FOLLOWED, Cell, place, rows
 
 _FINDINGS_LISTED = 3
 """Of one cell, above all sections."""
@@ -53,7 +53,9 @@ def _findings(cells: Sequence[Cell]) -> Iterator[str]:
 
 def _section(cell: Cell) -> Iterator[str]:
     yield html.heading(cell.name)
-    if len(cell.sessions) > 1:
+    if not cell.followed:
+        yield html.paragraph(NOT_FOLLOWED, "warning")
+    elif len(cell.sessions) > 1:
         yield html.figure(
             place_over_time(cell),
             "X against time, relative to the first session; bars: 1σ. A red line: the camera moved there.",

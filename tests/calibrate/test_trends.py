@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from msgspec.structs import replace
 
 from calibrate.batch import BatchResult
 from calibrate.geometry import Array, Transform, perturb, pose, rotation_exp
@@ -83,6 +84,18 @@ def test_few_results_are_no_trouble(count: int) -> None:
     results = [session(k) for k in range(count)]
     assert "No camera moved" in trends_text(cells(results))
     assert "No camera moved" in fleet_page(results, cells(results))
+
+
+def test_recordings_that_name_no_robot_are_listed_but_not_taken_for_one_cell() -> None:
+    """Imports of six strangers' data sets: no camera of anybody moved by half a metre."""
+    results = [replace(session(k, shift_mm=500.0 * k), robot="unknown", camera="unknown") for k in range(4)]
+    found = cells(results)
+    assert [cell.findings for cell in found] == [[]]
+    text, page = trends_text(found), fleet_page(results, found)
+    for shown in (text, page):
+        assert "MOVED" not in shown and "do not say of which robot" in shown
+        assert all(f"session-{k}" in shown for k in range(4))
+    assert "<svg" not in page
 
 
 def test_a_camera_that_moves_all_the_time_does_not_hide_the_others() -> None:

@@ -35,7 +35,7 @@ _CELL_OF: dict[Source, Cell] = {
     "simulated": "simulated",
     "playback": "simulated",
 }
-
+_ARTICLE: dict[Cell, str] = {"real": "a", "imported": "an", "simulated": "a"}
 
 WORSE_TIMES = 1.5
 """More than the estimates of two good sessions differ by chance."""
@@ -158,7 +158,7 @@ def _refuse_foreign_source(
             "simulated": "This root belongs to a simulated cell.",
         }[cell]
         raise InstallError(
-            f"{path} is {calibration.source} and is not installed on a {cell} cell. {hint} "
+            f"{path} is {calibration.source} and is not installed on {_ARTICLE[cell]} {cell} cell. {hint} "
             f"Files from elsewhere have their own place: {install_line(calibration.source, path)}"
         )
     if before is not None and _CELL_OF[before.source] != kind:

@@ -168,6 +168,8 @@ def _image_view(view: View, detection: Detection, spec: BoardSpec) -> ImageView:
 def _too_few_text(
     recording: Recording, found: int, total: int, missing: list[RejectedView], fewest: int
 ) -> str:
+    if total == 0:
+        return f"{recording.path} holds no picture with a robot pose: there is nothing to solve."
     text = (
         f"{recording.path}: the board is seen in {found} of {total} pictures; at least {fewest} views "
         "are needed."

@@ -41,7 +41,7 @@ def sweep_time_offset(
     if camera.matrix is None:
         raise BadViewsError(
             f"{recording.path} does not know its lens, and a sweep cannot find it: calibrate from stops "
-            "first, and give that calibration's intrinsics"
+            "first, and give that calibration (calibrate sweep --calibration FILE)"
         )
     robot_s, flange = _robot(recording)
     lost: list[str] = []

@@ -19,7 +19,6 @@ from calibrate.commands.job import GatesFile, MemoryLimit, Profile, ProfileName,
 from calibrate.commands.output import AsJson, OutputError, err, out
 from calibrate.gates import GateLimits, read_limits
 from calibrate.pipeline import JobOptions
-from calibrate.report.fleet import fleet_page
 from calibrate.trends import cells, trends_text
 
 DONE_WITH_LOSS = 3
@@ -32,7 +31,7 @@ def register(app: typer.Typer) -> None:
 def batch(
     recordings: Annotated[list[Path], typer.Argument(help="Recordings or session folders")],
     output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the results")] = Path("batch"),
-    workers: Annotated[int | None, typer.Option(help="Processes; default: one per core")] = None,
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core")] = None,
     profile: Profile = ProfileName.robust,
     seed: Seed = 0,
     gates: GatesFile = None,
@@ -56,6 +55,8 @@ def batch(
     OUTPUT then holds a calibration each, results.jsonl, results.csv, and what moved: trends.html, trends.txt.
     The limits are those of one solve in a process here; on a cluster the workers' own hold.
     """
+    from calibrate.report.fleet import fleet_page  # matplotlib is slow to load
+
     if output.exists() and not output.is_dir():
         raise OutputError(f"{output} is a file; the results need a folder.")
     gate_limits = GateLimits() if gates is None else read_limits(gates)
@@ -88,7 +89,8 @@ def batch(
             for finding in cell.findings:
                 out.print(f"{cell.name}: {finding}", soft_wrap=True)
         for result in failed:
-            err.print(f"{result.recording}: {result.error}")
+            named = result.error.startswith(result.recording)
+            err.print(result.error if named else f"{result.recording}: {result.error}", soft_wrap=True)
     if failed:
         raise typer.Exit(DONE_WITH_LOSS)
 

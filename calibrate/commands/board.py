@@ -11,7 +11,7 @@ from calibrate.board import ambiguity_text, describe_board
 from calibrate.boardprint import PAPER_MM, board_sheet
 from calibrate.calibration import write_output
 from calibrate.commands.files import read_board
-from calibrate.commands.output import OutputError, err, out
+from calibrate.commands.output import OutputError, check_folder, err, out
 from calibrate.vector import pdf, svg
 from recordings.messages import BoardKind, BoardSpec
 
@@ -40,8 +40,7 @@ def board(
     """Write a printable board (PDF or SVG, true scale). Without options: 8 × 7 squares of 25 mm."""
     if output.suffix.lower() not in (".pdf", ".svg"):
         raise OutputError(f"{output}: the name must end in .pdf or .svg.")
-    if not output.parent.is_dir():
-        raise OutputError(f"{output}: the folder {output.parent} does not exist.")
+    check_folder(output)
     marker_m = None if marker_mm is None else marker_mm / 1000
     if marker_m is None and kind in (BoardKind.CHARUCO, BoardKind.APRIL_GRID):
         marker_m = square_mm / 1000 * (0.75 if kind is BoardKind.CHARUCO else 0.3)

@@ -11,6 +11,7 @@ import typer
 from calibrate.calibration import Calibration, Provenance, read_calibration
 from calibrate.checks import CheckEntry, append_check, earlier_text, read_checks, trend_text
 from calibrate.commands.install import Root
+from calibrate.commands.job import Threads
 from calibrate.commands.output import AsJson, OutputError, detection_progress, out, print_json
 from calibrate.drift import FEWEST_VIEWS, POWER, DriftCheck, check_drift
 from calibrate.errors import BadViewsError
@@ -41,7 +42,7 @@ def check(
     ] = None,
     root: Root = None,
     as_json: AsJson = False,
-    threads: Annotated[int | None, typer.Option(help="For finding boards")] = None,
+    threads: Threads = None,
 ) -> None:
     """Does the installed calibration still hold? Tests it on new views, wherever the board lies by now.
 

@@ -11,9 +11,9 @@ import numpy as np
 import typer
 from rich.table import Table
 
-from calibrate.calibration import Calibration, read_calibration, write_output
+from calibrate.calibration import Calibration, Lens, read_calibration, write_output
 from calibrate.commands.files import read_cell_serials
-from calibrate.commands.output import AsJson, OutputError, err, out, print_json
+from calibrate.commands.output import AsJson, OutputError, check_folder, err, out, print_json
 from calibrate.formats import FORMATS, export
 from calibrate.formats.frames import FrameNames
 from calibrate.generations import Generation, generations, read_log, state_root
@@ -68,7 +68,7 @@ def diff(
     if a.mount != b.mount:
         raise OutputError(f"{first} is {a.mount}, the other is {b.mount}: there is nothing to compare.")
     millimetres, degrees, sigmas = pose_difference(a, b)
-    lens_px = float(np.abs(np.array(a.intrinsics.matrix) - np.array(b.intrinsics.matrix)).max())
+    lens_px = _lens_difference_px(a.intrinsics, b.intrinsics)
     if as_json:
         print_json(
             {
@@ -93,12 +93,24 @@ def diff(
     for name, say in rows:
         table.add_row(name, say(a), say(b))
     out.print(table)
+    lens = (
+        "the lenses are of pictures of different sizes"
+        if lens_px is None
+        else f"camera matrix differs by up to {lens_px:.2f} px"
+    )
     # Six numbers: 3.55 sigmas are exceeded by chance in 5 % of honest pairs (chi-square, 6 degrees).
     judged = "more than" if sigmas > 3.55 else "within"
     out.print(
         f"apart: {millimetres:.3f} mm, {degrees:.4f}°, {sigmas:.1f} sigmas ({judged} their uncertainty); "
-        f"camera matrix differs by up to {lens_px:.2f} px"
+        f"{lens}"
     )
+
+
+def _lens_difference_px(a: Lens, b: Lens) -> float | None:
+    """Largest difference between the camera matrices; None where their pixels are not the same."""
+    if (a.width, a.height) != (b.width, b.height):
+        return None
+    return float(np.abs(np.array(a.matrix) - np.array(b.matrix)).max())
 
 
 def export_file(
@@ -117,8 +129,7 @@ def export_file(
     if output is None:
         typer.echo(text, nl=False)
         return
-    if not output.parent.is_dir():
-        raise OutputError(f"{output}: the folder {output.parent} does not exist.")
+    check_folder(output)
     write_output(output, text.encode())
 
 
@@ -141,6 +152,10 @@ def install_file(
 
     Exit codes: 0 installed, 4 a gate failed, 1 refused for another reason; then nothing was changed.
     """
+    if root is None and cell is not CellKind.real:
+        raise OutputError(
+            f"What is {cell} never lies where a real cell's is: name its place with --root FOLDER."
+        )
     robot_serial, camera_serial = ("", "") if cell_config is None else read_cell_serials(cell_config)
     made = install(
         file,

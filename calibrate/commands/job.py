@@ -31,7 +31,7 @@ class LensName(StrEnum):
 Profile = Annotated[
     ProfileName, typer.Option(help="robust: the station's; paper: the published method, exactly")
 ]
-Seed = Annotated[int, typer.Option(help="Of every random draw")]
+Seed = Annotated[int, typer.Option(min=0, help="Of every random draw")]
 BoardFile = Annotated[
     Path | None, typer.Option("--board", help="YAML of another board than the recorded one")
 ]
@@ -42,11 +42,17 @@ CameraFile = Annotated[
 Find = Annotated[bool, typer.Option("--find-intrinsics", help="Find the lens even where it is recorded")]
 LensKind = Annotated[LensName, typer.Option("--lens", help="Model of a lens that has to be found")]
 GatesFile = Annotated[Path | None, typer.Option("--gates", help="YAML of other limits")]
-Threads = Annotated[int | None, typer.Option(help="For finding boards; the result does not depend on it")]
-Distance = Annotated[float | None, typer.Option("--working-distance-mm", help="Where the error is stated")]
+Threads = Annotated[
+    int | None, typer.Option(min=1, help="For finding boards; the result does not depend on it")
+]
+Distance = Annotated[
+    float | None, typer.Option("--working-distance-mm", min=1.0, help="Where the error is stated")
+]
 
-TimeLimit = Annotated[float, typer.Option(help="A solve ends with an error after so long; 0: no limit")]
-MemoryLimit = Annotated[int, typer.Option(help="… when its process needs so much; 0: no limit")]
+TimeLimit = Annotated[
+    float, typer.Option(min=0.0, help="A solve ends with an error after so long; 0: no limit")
+]
+MemoryLimit = Annotated[int, typer.Option(min=0, help="… when its process needs so much; 0: no limit")]
 
 
 def takes(build: Callable[..., JobOptions]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

@@ -31,10 +31,17 @@ class OutputError(CalibrationError):
     exit_code = 2
 
 
+def check_folder(target: Path) -> None:
+    """Before the work, not after it: a file can be written there."""
+    if not target.parent.is_dir():
+        raise OutputError(f"{target}: the folder {target.parent} does not exist. Create it, or name another.")
+    if target.is_dir():
+        raise OutputError(f"{target} is a folder; name a file in it.")
+
+
 def check_target(target: Path) -> None:
     """A calibration file may be replaced; anything else that stands there is left alone."""
-    if not target.parent.is_dir():
-        raise OutputError(f"{target}: the folder {target.parent} does not exist.")
+    check_folder(target)
     if target.exists():
         try:
             read_calibration(target)

@@ -14,7 +14,7 @@ from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, bounded
 from calibrate.calibration import Touch, write_calibration
 from calibrate.commands.install import Root, history_rows
 from calibrate.commands.job import MemoryLimit, TimeLimit, job_options, picture_options, takes
-from calibrate.commands.output import AsJson, check_target, detection_progress, out, print_json
+from calibrate.commands.output import AsJson, check_folder, check_target, detection_progress, out, print_json
 from calibrate.errors import CalibrationError
 from calibrate.frames import camera_frames
 from calibrate.geometry import rotation_log
@@ -48,6 +48,8 @@ def solve(
     """Solve a recording and write the calibration file. Exit 4: written, but a gate failed."""
     target = output or Path(f"{recording.name.removesuffix('.mcap')}.calibration.yaml")
     check_target(target)
+    if report is not None:
+        check_folder(report)
     with bounded(time_limit_s, memory_limit_mib), detection_progress() as progress:
         job = solve_recording(recording, options, progress)
     write_calibration(job.calibration, target)
@@ -102,6 +104,7 @@ def report_file(
 ) -> None:
     """Solve a recording again and write its report: one HTML file. With the history of what is installed."""
     target = output or Path(f"{recording.name.removesuffix('.mcap')}.report.html")
+    check_folder(target)
     with bounded(time_limit_s, memory_limit_mib), detection_progress() as progress:
         job = solve_recording(recording, options, progress)
     _write_report(job, target, options, root)

@@ -142,6 +142,8 @@ def test_solve_install_check_diff_rollback(real_session_file: Path, real_file: P
 def test_simulated_never_installs_on_a_real_cell(session_file: Path, tmp_path: Path) -> None:
     run("solve", session_file, "-o", "c.yaml", cwd=tmp_path)
     refused(run("install", "c.yaml", "--override", "x", cwd=tmp_path), 1, "is simulated and is not installed")
+    refused(run("install", "c.yaml", "--cell", "simulated", cwd=tmp_path), 2, "name its place with --root")
+    assert not list((tmp_path / "state").rglob("*.yaml")), "the real cell's place is untouched"
 
 
 @pytest.mark.process
@@ -185,12 +187,20 @@ def test_wrong_usage_is_exit_2_and_says_what_is_allowed(session_file: Path, tmp_
     refused(run("solve", session_file, "-o", "precious.yaml", cwd=tmp_path), 2, "precious.yaml", "-o")
     assert (tmp_path / "precious.yaml").read_text() == "not: a calibration\n"
     refused(run("solve", session_file, "-o", "no/such/c.yaml", cwd=tmp_path), 2, "no/such")
+    refused(run("solve", session_file, "--report", "no/such/r.html", cwd=tmp_path), 2, "no/such")
+    refused(run("report", session_file, "-o", "no/such/r.html", cwd=tmp_path), 2, "no/such")
+    assert not list(tmp_path.glob("*.calibration.yaml")), "said before the solve, not after it"
+    (tmp_path / "board.yaml").write_text("kind: chesboard\ncolums: 7\nrows: 6\nsquare_m: 0.025\n")
+    said = ("line 1: kind: must be one of chessboard", "line 2: colums: unknown key; did you mean 'columns'")
+    refused(run("solve", session_file, "--board", "board.yaml", cwd=tmp_path), 2, *said)
     (tmp_path / "gates.yaml").write_text("view: 20\n")
     refused(run("solve", session_file, "--gates", "gates.yaml", cwd=tmp_path), 2, "gates.yaml", "view")
     (tmp_path / "camera.yaml").write_text("image_width: 3\ncamera_matrix: {data: [1]}\n")
     refused(run("solve", session_file, "--camera", "camera.yaml", cwd=tmp_path), 2, "camera_info")
     refused(run("solve", session_file, "--square-mm", "-4", cwd=tmp_path), 2, "square_m")
     refused(run("solve", session_file, "--profile", "nix", cwd=tmp_path), 2, "robust")
+    for option in ("--threads", "--time-limit-s", "--memory-limit-mib", "--seed", "--working-distance-mm"):
+        refused(run("solve", session_file, option, "-3", cwd=tmp_path), 2, option)
     refused(run("solve", cwd=tmp_path), 2)
     refused(run("export", "c.yaml", "--to", "nix", cwd=tmp_path), 2, "urdf")
 
@@ -210,6 +220,16 @@ def test_mixed_picture_sizes_name_the_view(session_file: Path, tmp_path: Path) -
         "width: 640\nheight: 480\nmatrix: [[600, 0, 320], [0, 600, 240], [0, 0, 1]]\n"
     )
     refused(run("solve", session_file, "--camera", "camera.yaml", cwd=tmp_path), 1, "view 0", "640×480")
+
+
+def test_lenses_of_different_picture_sizes_are_not_compared(real_file: Path, tmp_path: Path) -> None:
+    calibration = read_calibration(real_file)
+    lens = msgspec.structs.replace(calibration.intrinsics, width=2 * calibration.intrinsics.width)
+    write_calibration(msgspec.structs.replace(calibration, intrinsics=lens), tmp_path / "wide.yaml")
+    said = run("diff", real_file, "wide.yaml", cwd=tmp_path).stdout
+    assert "pictures of different sizes" in said and "camera matrix differs" not in said
+    plain = json.loads(run("diff", real_file, "wide.yaml", "--json", cwd=tmp_path).stdout)
+    assert plain["lens_matrix_px"] is None
 
 
 def test_the_board_prints(tmp_path: Path) -> None:

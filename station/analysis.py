@@ -9,6 +9,7 @@ import contextlib
 import multiprocessing
 import os
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import cv2
@@ -18,7 +19,9 @@ from numpy.typing import NDArray
 from calibrate.board import board_points
 from calibrate.detect import detect
 from calibrate.geometry import Array
+from recordings.errors import RecordingError
 from recordings.messages import BoardSpec, CameraModel, Vector6
+from recordings.reader import open_recording
 from station.config import StationConfig
 from station.exposure import assess
 from station.limits import PlanCheck, check_plan
@@ -89,6 +92,22 @@ def sight(
         advice=advice,
     )
     return Sighting(status, found.indices, found.pixels)
+
+
+def seen_before(
+    path: Path, board: BoardSpec, camera: CameraModel | None
+) -> list[tuple[int, Array, Sighting]]:
+    """Pose number, base_from_flange (4, 4) and sighting of every picture of a recording that shows the board.
+
+    A picture that cannot be read shows none. RecordingError for a recording that cannot be.
+    """
+    recording = open_recording(path)
+    found = []
+    for view in recording.views():
+        with contextlib.suppress(RecordingError):
+            seen = sight(recording.picture(view).image, board, camera)
+            found.append((view.index, np.array(view.base_from_flange), seen))
+    return [entry for entry in found if entry[2].status.found]
 
 
 def _distance_and_tilt(

@@ -34,6 +34,8 @@ class SessionState(msgspec.Struct, frozen=True, omit_defaults=True):
     plan: Plan
     poses: tuple[PoseStatus, ...]
     parts: int = 1
+    elapsed_s: float = 0.0
+    """Of all its runs."""
     sealed: bool = False
     recording: str = ""
 

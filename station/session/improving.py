@@ -17,6 +17,7 @@ from station.estimation import Seen, next_best
 from station.improvement import FEWEST_LEFT, FEWEST_VIEWS, Improvement, improve
 from station.plan.predict import Advice
 from station.session.bench import Bench
+from station.session.interrupted import look_back
 from station.session.patience import RestingCheck
 from station.session.queue import PoseQueue, Replanned
 from station.status import EstimateStatus
@@ -53,19 +54,20 @@ class ImproveDesk:
     async def replan(self, purpose: str) -> Replanned | None:
         """The poses that this purpose would put in place of the session's; None when it changes none.
 
-        Nothing moves, and nothing is changed yet. RefusedError when it is too early, too late or not worth
-        it; LimitError when no such poses exist.
+        Nothing moves, and nothing is changed yet; what a restart forgot is read again first. RefusedError
+        when it is too early, too late or not worth it; LimitError when no such poses exist.
         """
+        bench = self._bench
+        await look_back(bench)
         if purpose not in ("improve", "best"):
             return None
-        bench = self._bench
         if bench.recording is None or bench.queue is None:
             raise RefusedError("no session is open: the plan is improved from its first pictures")
         if bench.queue.plan.motion != "stops":
             raise RefusedError("a sweep has no poses to improve")
         if not bench.seen and bench.queue.done:
             raise RefusedError(
-                "what the pictures from before the daemon's restart show is not known to it: go on with the "
+                "what the pictures from before the daemon's restart show could not be read: go on with the "
                 f"plan as it is (`station resume`), and ask again after {FEWEST_VIEWS} more"
             )
         await RestingCheck(bench.cell.robot.check).news()

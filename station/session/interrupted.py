@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import msgspec
+import numpy as np
 
 from recordings.errors import RecordingError
+from station.analysis import seen_before
 from station.errors import StationError
-from station.session.bench import Bench
+from station.session.bench import Bench, SeenView
 from station.session.folder import interrupted_session
 from station.session.queue import PoseQueue
 from station.session.recording import SessionRecording
 from station.session.run import recover_parts, seal
 from station.status import StationState
+from station.workers import WorkerError
+
+_LOOK_BACK_S = 120.0
 
 
 def find_interrupted(bench: Bench) -> None:
@@ -28,14 +33,37 @@ def find_interrupted(bench: Bench) -> None:
         )
         return
     bench.queue = PoseQueue(state.plan, state.poses)
-    bench.recording = SessionRecording(bench.root, bench.cell, folder, state.parts)
+    bench.recording = SessionRecording(bench.root, bench.cell, folder, state.parts, state.elapsed_s)
     reason = (
         f"the daemon ended during session {folder.name}; its {bench.queue.done} poses are on the disk. "
         "Look at the arm, acknowledge, then resume or finish."
     )
     bench.store.enter(StationState.STOPPED, reason)
     bench.show_poses()
+    session = bench.store.status.session
+    bench.store.update(session=msgspec.structs.replace(session, elapsed_s=state.elapsed_s))
     bench.store.event(reason, "warning")
+
+
+async def look_back(bench: Bench) -> None:
+    """What the pictures from before a restart show, for the estimate and the poses that would help most.
+
+    Read from the recording, which is made whole first; nothing when it is known already.
+    """
+    recording, queue = bench.recording, bench.queue
+    if recording is None or recording.recorder is not None or bench.seen or queue is None or not queue.done:
+        return
+    camera = bench.cell.config.camera.model
+    try:
+        await recover_parts(bench, recording)
+        found = await bench.workers.call(
+            seen_before, recording.whole, bench.cell.config.board, camera, timeout_s=_LOOK_BACK_S
+        )
+    except (RecordingError, WorkerError) as error:
+        bench.store.event(f"the estimate begins anew, without the pictures so far: {error}", "warning")
+        return
+    for index, flange, seen in found:
+        bench.seen[index] = SeenView(index, np.asarray(flange), seen.indices, seen.pixels)
 
 
 async def close_or_seal(bench: Bench) -> None:

@@ -56,8 +56,10 @@ def stamps_now(controller_s: float = 0.0) -> Stamps:
 class SessionRecording:
     """Open from a go to sealing. Pictures are numbered here, without gaps or repeats."""
 
-    def __init__(self, root: Path, cell: Cell, folder: Path | None = None, parts: int = 0) -> None:
-        """`folder`, `parts`: of an interrupted session; the new part follows those. Raises RecordingError."""
+    def __init__(
+        self, root: Path, cell: Cell, folder: Path | None = None, parts: int = 0, elapsed_s: float = 0.0
+    ) -> None:
+        """`folder`, `parts`, `elapsed_s`: of an interrupted session; its next part follows. StationError."""
         self._root, self._cell = root, cell
         self.part = parts + 1
         self.folder = folder or new_session_folder(root, cell.config.name)
@@ -66,6 +68,17 @@ class SessionRecording:
         self._plans = 1
         self._saving = asyncio.Lock()
         self._closing: threading.Thread | None = None
+        self.recovering = asyncio.Lock()
+        self._before_s, self._run_since_s = elapsed_s, 0.0
+
+    @property
+    def elapsed_s(self) -> float:
+        """What its runs took together, the present one included; pauses are none."""
+        return self._before_s + (time.monotonic() - self._run_since_s if self._run_since_s else 0.0)
+
+    def count_time(self, running: bool) -> None:
+        """A run begins, or it has ended."""
+        self._before_s, self._run_since_s = self.elapsed_s, time.monotonic() if running else 0.0
 
     @property
     def unsealed_parts(self) -> bool:
@@ -200,6 +213,7 @@ class SessionRecording:
             plan=queue.plan,
             poses=queue.statuses,
             parts=self.part,
+            elapsed_s=round(self.elapsed_s, 1),
             sealed=recording is not None,
             recording=str(recording or ""),
         )

@@ -126,10 +126,19 @@ class Run:
         bench.store.event(f"recording to {fresh.folder}, part {fresh.part}")
 
     async def _poses(self) -> None:
+        recording = self._bench.require_recording()
+        recording.count_time(running=True)
+        try:
+            await self._all_poses()
+        finally:
+            recording.count_time(running=False)
+        if not self._bench.halting:
+            await self._rest()
+
+    async def _all_poses(self) -> None:
         bench = self._bench
         queue = bench.require_queue()
         started_s, taken = time.monotonic(), 0
-        before_s = bench.store.status.session.elapsed_s
         todo = list(self._go.poses)
         while not bench.halting:
             todo = [index for index in todo if index in queue.open] or self._once_more()
@@ -139,9 +148,7 @@ class Run:
             bench.require_recording().require_space()
             await self._pose(index)
             taken += 1
-            self._show_times(before_s, time.monotonic() - started_s, taken, len(todo))
-        if not bench.halting:
-            await self._rest()
+            self._show_times((time.monotonic() - started_s) / taken * len(todo))
 
     def _once_more(self) -> list[int]:
         """Poses that did not come to rest, once, under the same go, where nobody can be asked.
@@ -197,14 +204,13 @@ class Run:
     async def _drive_checked(self, target: tuple[float, ...], check: MoveCheck) -> None:
         await self._bench.cell.robot.move(target, check.joint_speed_rad_s, check.joint_acceleration_rad_s2)
 
-    def _show_times(self, before_s: float, run_s: float, taken: int, left: int) -> None:
+    def _show_times(self, remaining_s: float) -> None:
         """Elapsed, the session's runs before this one included; remaining, by this one's average."""
-        session = self._bench.store.status.session
-        self._bench.store.update(
-            session=msgspec.structs.replace(
-                session, elapsed_s=round(before_s + run_s, 1), remaining_s=round(run_s / taken * left, 1)
-            )
+        elapsed_s = round(self._bench.require_recording().elapsed_s, 1)
+        session = msgspec.structs.replace(
+            self._bench.store.status.session, elapsed_s=elapsed_s, remaining_s=round(remaining_s, 1)
         )
+        self._bench.store.update(session=session)
 
     async def _rest(self) -> None:
         """Where the session stands when its go is used up."""
@@ -243,10 +249,11 @@ def _numbers(indices: Sequence[int]) -> str:
 async def recover_parts(bench: Bench, recording: SessionRecording) -> None:
     """Of an interrupted session: what its crash left open is made whole before another part follows."""
     await recording.released()
-    if recording.unsealed_parts:
-        for found in await bench.workers.call(recover, recording.folder):
-            bench.store.event(f"recovered {found.text}")
-    recording.count_parts()
+    async with recording.recovering:
+        if recording.unsealed_parts:
+            for found in await bench.workers.call(recover, recording.folder):
+                bench.store.event(f"recovered {found.text}")
+        recording.count_parts()
 
 
 async def seal(bench: Bench) -> None:

@@ -14,7 +14,8 @@ from calibrate.board import board_points
 from calibrate.geometry import inverse, transform_points
 from calibrate.kinematics import MODELS, forward
 from calibrate.projection import project
-from station.analysis import Sighting, sight
+from recordings.reader import open_recording
+from station.analysis import Sighting, seen_before, sight
 from station.errors import LimitError, RefusedError
 from station.estimation import next_best
 from station.limits import check_plan
@@ -117,6 +118,45 @@ async def test_a_crash_before_the_first_of_them_is_saved_finds_what_was_agreed_t
     again.session.acknowledge("anna")
     with pytest.raises(RefusedError, match="before the daemon's restart"):
         await again.session.prepare(1, "improve")
+
+
+class WorkerThatLooksBack(WorkerInThisProcess):
+    """Finds in the pictures on the disk what it found in them when they were taken."""
+
+    def __init__(self, rig: Rig) -> None:
+        super().__init__()
+        self.known = [
+            (view.index, view.base_from_flange, Sighting(self.sees.status, view.indices, view.pixels))
+            for view in rig.session.bench.seen.values()
+        ]
+
+    async def call(self, function: Callable[..., Any], *args: Any, timeout_s: float = 60.0) -> Any:
+        if function is not seen_before:
+            return await super().call(function, *args, timeout_s=timeout_s)
+        assert len(open_recording(args[0]).views()) == BEFORE  # it is whole by then
+        return self.known
+
+
+async def test_after_a_crash_the_pictures_before_it_count_in_the_estimate_and_the_offers(
+    half_way: Rig, new_rig: NewRig
+) -> None:
+    await half_way.until_true(lambda: half_way.session.store.status.estimate.views == BEFORE)
+    known = half_way.session.store.status
+    crash(half_way)
+    again = await new_rig(with_plan=False)
+    assert again.session.store.status.session.elapsed_s == pytest.approx(known.session.elapsed_s, abs=0.3)
+    assert known.session.elapsed_s > 0.1
+    again.session.bench.workers = WorkerThatLooksBack(half_way)  # type: ignore[assignment]
+    again.session.take_lease(1, "anna")
+    again.session.acknowledge("anna")
+    summary = await again.session.prepare(1, "best")
+    assert any("expected error" in change for change in summary.changes)
+    await again.until_true(lambda: again.session.store.status.estimate.views == BEFORE)
+    assert again.session.store.status.estimate.translation_mm == known.estimate.translation_mm
+    await again.give_go("resume")
+    await again.until(S.IDLE)
+    assert again.session.store.status.session.elapsed_s > known.session.elapsed_s
+    assert [view.index for view in sealed(again).views()] == list(range(POSES))
 
 
 async def test_nothing_moves_by_poses_that_the_disk_did_not_take(

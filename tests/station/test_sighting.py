@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
-from station.analysis import sight
+import recordings
+from recordings.reader import open_recording
+from station.analysis import seen_before, sight
 from station.config import PAPER_BOARD
 from station.simulation.placement import seen_from
 from station.simulation.renderer import Light, render, scaled
@@ -33,3 +37,13 @@ def test_the_distance_is_the_same_in_a_preview_of_half_the_size(factor: float) -
     picture = render(scaled(camera, factor), PAPER_BOARD, view, Light(), np.random.default_rng(0))
     status = sight(picture, PAPER_BOARD, camera, False).status
     assert status.distance_m == pytest.approx(0.5, abs=0.005)
+
+
+def test_the_pictures_of_a_recording_are_seen_again_with_their_poses() -> None:
+    path = Path(recordings.__file__).parent / "samples" / "paper-640.mcap"
+    recording = open_recording(path)
+    found = seen_before(path, recording.info.board, None)
+    assert [index for index, _, _ in found] == [view.index for view in recording.views()]
+    for (_, flange, seen), view in zip(found, recording.views(), strict=True):
+        assert np.array_equal(flange, view.base_from_flange)
+        assert seen.status.corners == len(seen.pixels) == 42

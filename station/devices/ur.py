@@ -155,7 +155,8 @@ class UrRobot(UrLink):
                 raise RobotError("stopped")  # while we waited
             sample = self.newest()
             self._played_s = time.monotonic()
-            watch = MoveWatch(joints_rad, sample.operation, self._played_s)
+            start = sample.state.joints_rad
+            watch = MoveWatch(start, joints_rad, sample.operation, self._played_s)
             await child.move(joints_rad, speed_rad_s, acceleration_rad_s2)
             await self._follow(watch, child)
         except BaseException as error:

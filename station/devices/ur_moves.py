@@ -12,12 +12,14 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from recordings.messages import RobotState
+from recordings.messages import RobotState, Vector6
 from station.devices.ur_condition import not_powered, program_not_running, safety_stop
 from station.errors import RobotError, StaleStateError
 
 STALE_S = 0.25
 ARRIVED_RAD = 0.01
+STRAYED_RAD = 0.05
+"""Further beside the straight way than any arm that follows it: 65 mm at 1.3 m."""
 PROGRESS_RAD = 5e-4
 NO_PROGRESS_S = 3.0
 SLIDER_ZERO_S = 10.0
@@ -50,8 +52,23 @@ def is_running(word: int) -> bool:
     return bool(word & 1 << 15)
 
 
+def beside(start_rad: Vector6, target_rad: Sequence[float], joints_rad: Vector6) -> tuple[int, float]:
+    """The joint that is furthest from the straight way, counted from 0, and by how much (rad).
+
+    A joint move is straight in joint space, all joints in step: that is what the check of its path assumes.
+    """
+    way = [b - a for a, b in zip(start_rad, target_rad, strict=True)]
+    gone = [q - a for a, q in zip(start_rad, joints_rad, strict=True)]
+    length = sum(w * w for w in way)
+    share = min(max(sum(g * w for g, w in zip(gone, way, strict=True)) / length, 0.0), 1.0) if length else 0.0
+    off = [abs(g - share * w) for g, w in zip(gone, way, strict=True)]
+    return off.index(max(off)), max(off)
+
+
 @dataclass
 class MoveWatch:
+    start_rad: Vector6
+    """Where the arm stood when the move was asked for."""
     target_rad: Sequence[float]
     operation_before: int
     """The word before the move was asked for."""
@@ -74,6 +91,12 @@ class MoveWatch:
         trouble = safety_stop(state) or not_powered(state) or program_not_running(state)
         if trouble is not None:
             raise trouble
+        joint, off_rad = beside(self.start_rad, self.target_rad, state.joints_rad)
+        if off_rad > STRAYED_RAD:
+            raise RobotError(
+                f"the arm left the way that was checked: joint {joint + 1} is {math.degrees(off_rad):.1f}° "
+                "beside it. Something else commands the arm, or pushes it; look at the cell"
+            )
         distances = [abs(q - t) for q, t in zip(state.joints_rad, self.target_rad, strict=True)]
         distance_rad = max(distances)
         if abs(distance_rad - self._distance_rad) > PROGRESS_RAD:

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 
+from station.devices.ur_child import ControlChild
 from station.errors import RobotError, SafetyStopError, StaleStateError
 
 pytestmark = pytest.mark.process
@@ -135,4 +136,21 @@ async def test_a_session_loop_that_stalls_stops_the_arm(strike: Strike) -> None:
     assert "the session was busy for" in str(outcome.error)
     assert outcome.stopped_s < 1.0
     assert isinstance(outcome.error, RobotError)
+    await c.stays_at_rest()
+
+
+async def test_an_arm_that_goes_another_way_than_the_checked_one_is_stopped(
+    cell: Callable[..., Awaitable[Any]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    c = await cell()
+    ask, before = ControlChild.move, c.joints_rad()
+
+    async def elsewhere(self: ControlChild, joints_rad: list[float], *speeds: float) -> None:
+        await ask(self, [joints_rad[0], joints_rad[1] - 0.6, *joints_rad[2:]], *speeds)
+
+    monkeypatch.setattr(ControlChild, "move", elsewhere)
+    with pytest.raises(RobotError, match="left the way that was checked: joint 2"):
+        await c.far_move()
+    await c.at_rest()
+    assert max(abs(a - b) for a, b in zip(c.joints_rad(), before, strict=True)) < 0.5
     await c.stays_at_rest()

@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from recordings.messages import RobotState, Stamps
+from recordings.messages import RobotState, Stamps, Vector6
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode, SafetyStatus
 from station.devices.ur_moves import MoveWatch
 from station.errors import RobotError, SafetyStopError, StaleStateError
@@ -34,12 +34,13 @@ STATE = RobotState(
 
 
 def state(joint_rad: float = 0.0, **changes: Any) -> RobotState:
-    return msgspec.structs.replace(STATE, joints_rad=(joint_rad, 0.0, 0.0, 0.0, 0.0, 0.0), **changes)
+    where = {"joints_rad": (joint_rad, 0.0, 0.0, 0.0, 0.0, 0.0)}
+    return msgspec.structs.replace(STATE, **(where | changes))
 
 
 @pytest.fixture
 def watch() -> MoveWatch:
-    return MoveWatch(GOAL, BEFORE, begun_s=0.0)
+    return MoveWatch(START, GOAL, BEFORE, begun_s=0.0)
 
 
 def test_a_move_that_was_just_accepted_still_looks_finished(watch: MoveWatch) -> None:
@@ -52,7 +53,7 @@ def test_arrived(watch: MoveWatch) -> None:
 
 
 def test_the_operation_count_wraps() -> None:
-    watch = MoveWatch(GOAL, 0x7F << 24, begun_s=0.0)
+    watch = MoveWatch(START, GOAL, 0x7F << 24, begun_s=0.0)
     assert watch.step(state(0.5), 0, 0.0, 1.0)
 
 
@@ -99,6 +100,28 @@ def test_old_news_end_the_move(watch: MoveWatch) -> None:
     assert not watch.step(state(0.1), RUNNING, 0.24, 1.0)
     with pytest.raises(StaleStateError, match="no news from the robot for 260 ms"):
         watch.step(state(0.1), RUNNING, 0.26, 1.0)
+
+
+def test_an_arm_that_leaves_the_checked_way_is_a_fault() -> None:
+    watch = MoveWatch(START, (0.5, 1.0, 0.0, 0.0, 0.0, -0.2), BEFORE, begun_s=0.0)
+    for share in (0.0, 0.3, 0.6):
+        on_its_way = (0.5 * share, share + 0.02, 0.0, -0.02, 0.0, -0.2 * share)
+        assert not watch.step(state(joints_rad=on_its_way), RUNNING, 0.0, share)
+    with pytest.raises(RobotError, match=r"left the way that was checked: joint 4 is 4\.\d° beside it"):
+        watch.step(state(joints_rad=(0.3, 0.6, 0.0, 0.08, 0.0, -0.12)), RUNNING, 0.0, 0.7)
+
+
+@pytest.mark.parametrize("joints", [(-0.06, 0.0, 0.0, 0.0, 0.0, 0.0), (0.56, 0.0, 0.0, 0.0, 0.0, 0.0)])
+def test_so_is_one_that_goes_the_other_way_or_on(watch: MoveWatch, joints: Vector6) -> None:
+    with pytest.raises(RobotError, match=r"joint 1 is 3\.4° beside it"):
+        watch.step(state(joints_rad=joints), RUNNING, 0.0, 1.0)
+
+
+def test_a_move_to_where_the_arm_stands_has_no_way_to_leave() -> None:
+    watch = MoveWatch(GOAL, GOAL, BEFORE, begun_s=0.0)
+    assert watch.step(state(0.5), ENDED, 0.0, 0.1)
+    with pytest.raises(RobotError, match="left the way"):
+        watch.step(state(0.6), RUNNING, 0.0, 0.1)
 
 
 def test_a_slow_arm_is_no_fault_however_long_it_takes(watch: MoveWatch) -> None:

@@ -29,7 +29,7 @@ from station.attend import carry_out, wait_until_idle
 from station.client import Client
 from station.demo import simulated_daemon
 from station.devices.frames import frames_between
-from station.plan.model import Plan
+from station.plan.model import Plan, PlannedPose
 from station.plan.sweep import sweep_plan
 from station.simulation.cell import CellTruth
 from station.simulation.gige import numbered_picture, still_picture
@@ -163,7 +163,8 @@ def long_sweep(status: StationStatus, seconds: float) -> Plan:
     """The sweep's swings over and over, for about so long."""
     assert status.robot.joints_rad is not None
     once = sweep_plan(status.robot.model, status.mount, status.robot.joints_rad)
-    poses, here, took_s = [], np.array(status.robot.joints_rad), 0.0
+    poses: list[PlannedPose] = []
+    here, took_s = np.array(status.robot.joints_rad), 0.0
     while took_s < seconds:
         pose = once.poses[len(poses) % len(once.poses)]
         way_rad = float(np.abs(np.array(pose.joints_rad) - here).max())

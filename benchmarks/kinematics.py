@@ -19,12 +19,13 @@ from calibrate.kinematics import MODELS, DhDeltas, forward, inverse_nearest
 from calibrate.likelihood.kinematics import UNIT, table_derivatives
 from calibrate.peer_methods import HAND_EYE, opencv_hand_eye
 from calibrate.projection import project
-from calibrate.solution import Solution
+from calibrate.solution import KinematicPrior, Solution
 from calibrate.solve import SolveOptions, solve_views
 from calibrate.views import ViewSet
 
 TRIALS = 300
 SIZES_MM = (0.0, 0.25, 0.5)
+_PRIORS: tuple[KinematicPrior, ...] = ("off", "auto")
 _MODEL = MODELS["UR10"]
 _HOME = (0.0, -1.5, 1.5, -1.5, -1.5, 0.0)
 
@@ -61,7 +62,7 @@ def _row(size_mm: float, count: int) -> list[str]:
     for k in range(count):
         worn = worn_cell(rng, size_mm)
         flange[k] = worn.flange_error_m
-        for j, prior in enumerate(("off", "auto")):
+        for j, prior in enumerate(_PRIORS):
             solution = solve_views(worn.views, SolveOptions(holdout=False, kinematic_prior=prior))
             delta = difference(solution.matrix, worn.X)
             square = delta @ np.linalg.solve(solution.covariance, delta)

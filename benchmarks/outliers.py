@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import stats
 
 from benchmarks.scene import MID, Cell, make_cell
@@ -22,6 +23,8 @@ TRIALS = 60
 _SHARES = (0.0, 0.08, 0.2, 0.4)
 _BEST_LIMIT = float(np.sqrt(stats.chi2.ppf(1 - 5e-4, 6)))
 """Sigmas; the solver's rate of false alarms with everything known."""
+Indices = NDArray[np.int64]
+
 _OPTIONS = SolveOptions(holdout=False)
 _ORACLE = replace(_OPTIONS, reject_outliers=False)
 
@@ -100,16 +103,17 @@ def _noise(cell: Cell, views: ViewSet) -> tuple[Array, Array]:
 def _true_distance(cell: Cell, views: ViewSet) -> Array:
     """(n,) sigmas."""
     miss, covariance = _noise(cell, views)
-    return np.sqrt(np.einsum("ni,ni->n", miss, np.linalg.solve(covariance, miss[..., None])[..., 0]))
+    weighted = np.linalg.solve(covariance, miss[..., None])[..., 0]
+    return np.asarray(np.sqrt(np.einsum("ni,ni->n", miss, weighted)))
 
 
-def _swap(cell: Cell, views: list[ImageView], bad: Array, rng: np.random.Generator) -> None:
+def _swap(cell: Cell, views: list[ImageView], bad: Indices, rng: np.random.Generator) -> None:
     flanges = [views[i].base_from_flange for i in np.roll(bad, 1)]
     for i, flange in zip(bad, flanges, strict=True):
         views[i] = replace(views[i], base_from_flange=flange)
 
 
-def _turn(cell: Cell, views: list[ImageView], bad: Array, rng: np.random.Generator) -> None:
+def _turn(cell: Cell, views: list[ImageView], bad: Indices, rng: np.random.Generator) -> None:
     for i in bad:
         points, seen = views[i].board_points, views[i].camera_from_board
         assert seen is not None
@@ -119,21 +123,21 @@ def _turn(cell: Cell, views: list[ImageView], bad: Array, rng: np.random.Generat
         )
 
 
-def _far(cell: Cell, views: list[ImageView], bad: Array, rng: np.random.Generator) -> None:
+def _far(cell: Cell, views: list[ImageView], bad: Indices, rng: np.random.Generator) -> None:
     _nudge(views, bad, rng.uniform(10, 60, (len(bad), 6)) * rng.choice([-1, 1], (len(bad), 6)))
 
 
-def _every(cell: Cell, views: list[ImageView], bad: Array, rng: np.random.Generator) -> None:
+def _every(cell: Cell, views: list[ImageView], bad: Indices, rng: np.random.Generator) -> None:
     _nudge(views, bad, rng.uniform(6, 10, (len(bad), 6)) * rng.choice([-1, 1], (len(bad), 6)))
 
 
-def _one(cell: Cell, views: list[ImageView], bad: Array, rng: np.random.Generator) -> None:
+def _one(cell: Cell, views: list[ImageView], bad: Indices, rng: np.random.Generator) -> None:
     sizes = np.zeros((len(bad), 6))
     sizes[np.arange(len(bad)), rng.integers(6, size=len(bad))] = rng.uniform(6, 10, len(bad))
     _nudge(views, bad, sizes)
 
 
-def _length(cell: Cell, views: list[ImageView], bad: Array, rng: np.random.Generator) -> None:
+def _length(cell: Cell, views: list[ImageView], bad: Indices, rng: np.random.Generator) -> None:
     _, covariance = _noise(cell, replace(cell.views, views=tuple(views)))
     for i in bad:
         direction = rng.normal(size=6)
@@ -142,7 +146,7 @@ def _length(cell: Cell, views: list[ImageView], bad: Array, rng: np.random.Gener
         views[i] = replace(views[i], base_from_flange=flange)
 
 
-def _nudge(views: list[ImageView], bad: Array, sizes: Array) -> None:
+def _nudge(views: list[ImageView], bad: Indices, sizes: Array) -> None:
     """`sizes` (n, 6) in robot sigmas."""
     sigma = np.repeat([MID.robot_m, MID.robot_rad], 3)
     for i, size in zip(bad, sizes, strict=True):

@@ -49,7 +49,8 @@ def run() -> str:
         first, held = cell.views.select(list(range(_FITTED))), pairs.select(slice(18, None))
         for name, method in _methods(cell).items():
             X = method(first, pairs.select(slice(0, 18)), seed)
-            scores.setdefault(name, []).append(tuple(float(e.mean()) for e in motion_errors(X, held)))
+            e_t, e_R = motion_errors(X, held)
+            scores.setdefault(name, []).append((float(e_t.mean()), float(e_R.mean())))
             delta = difference(orthonormalised(X), cell.X)
             errors.setdefault(name, []).append(
                 (float(np.linalg.norm(delta[:3])), float(np.linalg.norm(delta[3:])))
@@ -77,13 +78,13 @@ def _methods(cell: Cell) -> dict[str, Method]:
         "certified, all pairs": lambda views, pairs, seed: solve_global(_all(views), seed).X,
         "ours": lambda views, pairs, seed: _ours(views),
     }
-    for name, number in HAND_EYE.items():
-        methods[name] = lambda views, pairs, seed, number=number: opencv_hand_eye(*pose_arrays(views), number)
-    for name, number in ROBOT_WORLD.items():
-        methods[name] = lambda views, pairs, seed, number=number: opencv_robot_world(
-            *pose_arrays(views), number
-        )
+    methods |= {name: _opencv(opencv_hand_eye, number) for name, number in HAND_EYE.items()}
+    methods |= {name: _opencv(opencv_robot_world, number) for name, number in ROBOT_WORLD.items()}
     return methods
+
+
+def _opencv(method: Callable[[Array, Array, int], Array], number: int) -> Method:
+    return lambda views, pairs, seed: method(*pose_arrays(views), number)
 
 
 def _all(views: ViewSet) -> Pairs:

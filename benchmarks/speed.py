@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 from scipy import optimize
@@ -81,6 +82,14 @@ def _best_ms(work: Callable[[], object], repeats: int) -> float:
     return min(times)
 
 
+def _scipy(evaluate: Evaluate) -> object:
+    """The same evolution by scipy."""
+    return optimize.differential_evolution(
+        lambda x: evaluate(x.T), list(zip(-BOX, BOX, strict=True)), popsize=5, maxiter=100, mutation=0.5,
+        recombination=0.9, polish=False, tol=0, vectorized=True, updating="deferred", rng=0,
+    )  # fmt: skip
+
+
 def _runs() -> str:
     rows = []
     for n in (18, 300, 4950):
@@ -96,15 +105,8 @@ def _runs() -> str:
         setup = _best_ms(lambda: build_objective(fresh(), "log"), 15)
         numpy = _best_ms(lambda: de(over_pairs(fresh())), 3)
         loops = _best_ms(lambda: de(pair_loops(fresh())), 1)
-        bounds = list(zip(-BOX, BOX, strict=True))
         evaluate = paper_evaluate(build_objective(given, "log"))
-        scipy = _best_ms(
-            lambda bounds=bounds, evaluate=evaluate: optimize.differential_evolution(
-                lambda x: evaluate(x.T), bounds, popsize=5, maxiter=100, mutation=0.5, recombination=0.9,
-                polish=False, tol=0, vectorized=True, updating="deferred", rng=0,
-            ),
-            3,
-        )  # fmt: skip
+        scipy = _best_ms(partial(_scipy, evaluate), 3)
         rows.append([n, f"{ours:.1f}", f"{setup:.1f}", f"{numpy:.0f}", f"{loops:.0f}", f"{scipy:.1f}",
                      f"{numpy / ours:.0f} ×", f"{loops / ours:.0f} ×"])  # fmt: skip
     header = ["pairs", "ours, all", "of it set-up", "numpy over pairs", "loop over pairs",

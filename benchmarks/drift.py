@@ -3,7 +3,8 @@
 Views are corners with noise on corners and robot, 0.45 m from the paper's board; the installed X has an error
 of its own, drawn from its covariance. Shifts and turns have random directions. Poses are random, as of an arm
 moved by hand; chosen by the planner's criterion out of 200 random ones; or planned as `station check` does,
-by the whole planner with its limits and obstacles, on random cells whose guesses are wrong by their sigmas.
+by the whole planner with its limits and obstacles, on random cells whose guesses are wrong by their sigmas
+(camera on the flange: `random_cells`; beside the cell: the simulation's own cells).
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from calibrate.views import ImageView, ViewSet
 from recordings.messages import BoardKind, BoardSpec, CameraModel, Mount
 from station.plan.choose import Objective, choose
 from station.plan.planner import make_plan
+from station.simulation.scenes import build_cell, cell_config
 
 TRIALS = 400
 SETS, POOL = 20, 200
@@ -71,7 +73,7 @@ MID = _Level("mid", Noise(0.15, 1.0e-4, 1.7e-4, _DEGREES_OF_FREEDOM), 6.0e-5, 1.
 def run() -> str:
     count = trials(TRIALS)
     mounts: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
-    rows = [_row(MID, "planned", views, "eye-in-hand", count) for views in (3, 4, 5, 6, 8)]
+    rows = [_row(MID, "planned", views, mount, count) for mount in mounts for views in (3, 4, 5, 6, 8)]
     rows += [
         _row(level, poses, views, mount, count)
         for level in (LOW, MID)
@@ -129,7 +131,7 @@ def _sets(level: _Level, poses: str, views: int, mount: Mount, count: int) -> li
     """So many times `views` poses."""
     rng = np.random.default_rng(views)
     if poses == "planned":
-        return [_planned(views, seed) for seed in range(count)]
+        return [_planned(views, seed, mount) for seed in range(count)]
     if poses == "random":
         seen = [[_seen(rng) for _ in range(views)] for _ in range(count)]
     else:
@@ -137,11 +139,19 @@ def _sets(level: _Level, poses: str, views: int, mount: Mount, count: int) -> li
     return [_Set(each, _MOUNT, _PLACE) for each in seen]
 
 
-def _planned(views: int, seed: int) -> _Set:
-    cell, _ = random_cell(seed)
-    plan = make_plan(cell.config, start_joints_rad=cell.start.tolist(), count=views, lens_known=True)
+def _planned(views: int, seed: int, mount: Mount) -> _Set:
+    if mount == "eye-in-hand":
+        cell, _ = random_cell(seed)
+        config, start, X, Y = cell.config, cell.start, cell.X, cell.Y
+    else:
+        truth = build_cell("paper", 1 + seed, "mid", mount)  # seed 0 is the published place
+        config, start = cell_config(truth), np.array(truth.start_joints_rad)
+        X, Y = np.array(truth.camera_mount), np.array(truth.board_place)
+    plan = make_plan(config, start_joints_rad=start.tolist(), count=views, lens_known=True)
     flanges = [np.array(each.base_from_flange) for each in plan.poses]
-    return _Set([cell.camera_from_board(flange) for flange in flanges], cell.X, cell.Y)
+    in_hand = mount == "eye-in-hand"
+    seen = [inverse(E @ X) @ Y if in_hand else inverse(X) @ E @ Y for E in flanges]
+    return _Set(seen, X, Y)
 
 
 def _choice(level: _Level, views: int, mount: Mount, rng: np.random.Generator) -> list[Array]:

@@ -32,9 +32,12 @@ def parent_from_body(calibration: Calibration) -> Array:
 
 
 def comment(calibration: Calibration) -> str:
-    """One line on where this comes from, stamped where it must be."""
+    """One line on where this comes from, stamped where it must be.
+
+    One line whatever the file says: the rest of a name must not become a line of a launch file or a script.
+    """
     stamp = source_stamp(calibration)
-    origin = f"{calibration.provenance.session}, solved {calibration.created}"
+    origin = " ".join(f"{calibration.provenance.session}, solved {calibration.created}".split())
     return f"{stamp}. {origin}" if stamp else origin
 
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+import shlex
+
 from calibrate.calibration import Calibration
 from calibrate.formats.frames import FrameNames, comment, number
 
@@ -15,11 +18,12 @@ def arguments(calibration: Calibration, frames: FrameNames) -> list[str]:
 
 
 def command(calibration: Calibration, frames: FrameNames) -> str:
-    line = " ".join(["ros2 run tf2_ros static_transform_publisher", *arguments(calibration, frames)])
+    line = f"ros2 run tf2_ros static_transform_publisher {shlex.join(arguments(calibration, frames))}"
     return f"# {comment(calibration)}\n{line}\n"
 
 
 def launch_file(calibration: Calibration, frames: FrameNames) -> str:
+    node = re.sub(r"\W", "_", frames.camera, flags=re.ASCII)  # all that ROS allows in a node's name
     listed = ",\n".join(f"                {part!r}" for part in arguments(calibration, frames))
     return f'''# {comment(calibration)}
 from launch import LaunchDescription
@@ -31,7 +35,7 @@ def generate_launch_description():
         Node(
             package="tf2_ros",
             executable="static_transform_publisher",
-            name="{frames.camera}_publisher",
+            name="{node}_publisher",
             arguments=[
 {listed},
             ],

@@ -6,8 +6,11 @@ import argparse
 import json
 import re
 import shlex
+import sys
+import types
 import xml.etree.ElementTree as ElementTree
 from pathlib import Path
+from typing import Any
 
 import cv2
 import msgspec
@@ -62,13 +65,9 @@ def test_static_transform_publisher(calibration: Calibration) -> None:
     same(X, calibration)
 
 
-def test_launch_file_runs_and_publishes_the_same(
-    calibration: Calibration, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    import sys
-    import types
-
-    made: list[dict[str, object]] = []
+def launched(text: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """The one node that a launch file makes, as `ros2 launch` would be told of it."""
+    made: list[dict[str, Any]] = []
     actions = types.ModuleType("launch_ros.actions")
     actions.Node = lambda **options: made.append(options)  # type: ignore[attr-defined]
     launch = types.ModuleType("launch")
@@ -79,13 +78,40 @@ def test_launch_file_runs_and_publishes_the_same(
         ("launch_ros.actions", actions),
     ):
         monkeypatch.setitem(sys.modules, name, module)
-    space: dict[str, object] = {}
-    exec(export(calibration, "ros-launch"), space)
-    space["generate_launch_description"]()  # type: ignore[operator]
-    assert (made[0]["package"], made[0]["executable"]) == ("tf2_ros", "static_transform_publisher")
-    parent, _, X = static_transform(made[0]["arguments"])  # type: ignore[arg-type]
-    assert parent == parent_of(calibration)
+    space: dict[str, Any] = {}
+    exec(compile(text, "cell.launch.py", "exec"), space)
+    space["generate_launch_description"]()
+    (node,) = made
+    return node
+
+
+def test_launch_file_runs_and_publishes_the_same(
+    calibration: Calibration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = launched(export(calibration, "ros-launch"), monkeypatch)
+    assert (node["package"], node["executable"]) == ("tf2_ros", "static_transform_publisher")
+    parent, child, X = static_transform(node["arguments"])
+    assert (parent, child) == (parent_of(calibration), "camera_optical_frame")
     same(X, calibration)
+
+
+def test_frame_names_of_any_kind_stay_names(
+    calibration: Calibration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In Python and in a shell; a node's name may hold letters, digits and underscores only."""
+    odd = FrameNames(camera='cell 1/cam\'s "eye"')
+    node = launched(export(calibration, "ros-launch", odd), monkeypatch)
+    assert static_transform(node["arguments"])[1] == odd.camera
+    assert re.fullmatch(r"[A-Za-z]\w*", node["name"], re.ASCII)
+    line = export(calibration, "ros-static-transform", odd).splitlines()[-1]
+    assert static_transform(shlex.split(line)[4:])[1] == odd.camera
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_session_name_never_leaves_the_comment(calibration: Calibration, name: str) -> None:
+    evil = msgspec.structs.replace(calibration.provenance, session="x\nimport os\n")
+    text = export(msgspec.structs.replace(calibration, provenance=evil), name)
+    assert "import os" not in text.splitlines()
 
 
 def urdf_origin(joint: ElementTree.Element) -> Array:

@@ -100,10 +100,17 @@ def place(result: BatchResult) -> Array:
     return pose(matrix_from_quaternion(np.array(result.rotation_xyzw)), np.array(result.translation_m))
 
 
+def quiet_text(found: Sequence[Cell]) -> str:
+    """When nobody's camera moved: or that nothing could be compared."""
+    if found and not any(cell.followed for cell in found):
+        return "No camera was followed."
+    return "No camera moved by more than chance explains."
+
+
 def trends_text(found: Sequence[Cell]) -> str:
     """Plain text: findings first, then one table per cell."""
     lines = [f"{cell.name}: {finding}" for cell in found for finding in cell.findings]
-    lines = lines or ["No camera moved by more than chance explains."]
+    lines = lines or [quiet_text(found)]
     for cell in found:
         lines += [
             "",

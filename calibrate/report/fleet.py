@@ -13,7 +13,7 @@ from calibrate.batch import BatchResult
 from calibrate.geometry import difference
 from calibrate.report import html
 from calibrate.report.plots import STYLE, new_figure, svg_text
-from calibrate.trends import HEAD, NOT_FOLLOWED, Cell, place, rows
+from calibrate.trends import HEAD, NOT_FOLLOWED, Cell, place, quiet_text, rows
 
 _FINDINGS_LISTED = 3
 """Of one cell, above all sections."""
@@ -38,8 +38,8 @@ def fleet_page(results: Sequence[BatchResult], cells: Sequence[Cell]) -> str:
 def _findings(cells: Sequence[Cell]) -> Iterator[str]:
     moved = [cell for cell in cells if cell.findings]
     if not moved:
-        text = "No camera moved by more than chance explains."
-        yield f'<div class="verdict good"><strong>{text}</strong></div>'
+        kind = "verdict good" if not cells or any(cell.followed for cell in cells) else "stamp"
+        yield f'<div class="{kind}"><strong>{quiet_text(cells)}</strong></div>'
         return
     found = []
     for cell in moved:

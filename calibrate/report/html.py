@@ -7,7 +7,8 @@ from collections.abc import Iterable, Sequence
 from html import escape as escape  # for the sections, too
 
 STYLE = """
-:root { --good: #1a7f37; --bad: #b42318; --warn: #9a6700; --line: #d8dee4; --soft: #57606a; }
+:root { color-scheme: only light;
+  --good: #1a7f37; --bad: #b42318; --warn: #9a6700; --line: #d8dee4; --soft: #57606a; }
 * { box-sizing: border-box; }
 body { font: 15px/1.5 system-ui, "Segoe UI", "DejaVu Sans", sans-serif; color: #1f2328; margin: 0 auto;
   max-width: 1080px; padding: 24px; }
@@ -31,9 +32,10 @@ figure { margin: 8px 0; } figure svg { max-width: 100%; height: auto; } figcapti
 .views .out img { border: 3px solid var(--bad); } .big { font-size: 20px; font-weight: 600; }
 pre { overflow-x: auto; }
 @media (max-width: 700px) { body { padding: 16px; } .verdict strong { font-size: 20px; }
-  /* a plot shrunk to a phone cannot be read: it is swiped instead */
-  figure { overflow-x: auto; } figure svg { max-width: none; width: 720px; }
-  table { display: block; overflow-x: auto; } }
+  /* a plot of the page's whole width cannot be read on a phone's: it is swiped instead */
+  figure { overflow-x: auto; } figure svg[width="720pt"] { max-width: none; width: 720px; }
+  table { display: block; overflow-x: auto; } td:last-child:not(.n) { min-width: 11em; }
+  pre { font-size: 11px; } }
 @media print { body { max-width: none; } h2 { break-after: avoid; } figure, tr { break-inside: avoid; } }
 """
 

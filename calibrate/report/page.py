@@ -134,7 +134,8 @@ def _error(job: SolvedRecording) -> Iterator[str]:
     yield html.heading("Where the error comes from")
     if quality.error_shares:
         shares = {name: share for name, share in quality.error_shares.items() if share > 0.001}
-        yield html.figure(plots.error_shares(shares), "Shares of the variance of X by source.")
+        listed = ", ".join(f"{name.replace('_', ' ')} {share:.0%}" for name, share in shares.items())
+        yield html.figure(plots.error_shares(shares), f"Shares of the variance of X by source: {listed}.")
     noise = quality.noise
     if noise:
         yield html.paragraph(

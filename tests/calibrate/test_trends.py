@@ -94,6 +94,7 @@ def test_recordings_that_name_no_robot_are_listed_but_not_taken_for_one_cell() -
     text, page = trends_text(found), fleet_page(results, found)
     for shown in (text, page):
         assert "MOVED" not in shown and "do not say of which robot" in shown
+        assert "No camera was followed" in shown and "No camera moved" not in shown
         assert all(f"session-{k}" in shown for k in range(4))
     assert "<svg" not in page
 

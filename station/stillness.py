@@ -123,7 +123,7 @@ class StillnessMonitor:
         look: Callable[[int], Look | None] = lambda since_ns: Look(None),
         now_s: Callable[[], float] = time.monotonic,
     ) -> Stillness:
-        """Returns as soon as everything is at rest. `alive` raises when the robot is lost (`robot.latest`).
+        """Returns as soon as everything is at rest. `alive` raises when the robot is lost; False: old news.
 
         `look`: at pictures exposed since this host time, when the joints came to rest; None = not yet.
         NotStillError after the configured time-out, with what still moved.
@@ -131,9 +131,10 @@ class StillnessMonitor:
         give_up_s = now_s() + self._limits.timeout_s
         resting_since_ns: int | None = None
         while True:
-            alive()
-            found = self.measure()
+            old = alive() is False
+            found = self.measure() if not old else None
             unrest = self.unrest(found) if found is not None else "too few robot states"
+            unrest = "no fresh news of the robot" if old else unrest
             if found is None or unrest:
                 resting_since_ns = None
             else:

@@ -24,7 +24,6 @@ from recordings.messages import Vector6
 from station.analysis import sight
 from station.config import PointerConfig
 from station.errors import LimitError, RefusedError, RobotError
-from station.limits import check_path
 from station.plan.hover import Hover, HoverAnswer, HoverQuestion, answer_hover, least_standoff_m
 from station.plan.model import plan_sha256
 from station.session.bench import Bench
@@ -246,11 +245,11 @@ class HoverRun(Run):
         for planned in self._hover.plan.poses:
             await RestingCheck(robot.check).news()
             bench.store.enter(StationState.MOVING)
-            check = check_path(self._geometry, robot.latest().joints_rad, planned.joints_rad, planned.name)
-            if check.problems:
-                bench.store.enter(StationState.IDLE, "; ".join(map(str, check.problems)))
+            try:
+                await self._drive(robot.latest().joints_rad, planned.joints_rad, planned.name)
+            except LimitError as error:
+                bench.store.enter(StationState.IDLE, str(error))
                 return
-            await self._drive_checked(planned.joints_rad, check)
             if bench.halting:
                 return
             if self._wants_rest() and planned is not self._hover.plan.poses[-1]:

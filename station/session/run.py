@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import time
 from collections.abc import Sequence
@@ -10,10 +11,10 @@ import msgspec
 import numpy as np
 
 from recordings.errors import RecordingError
-from recordings.messages import Picture
+from recordings.messages import Picture, Vector6
 from recordings.recover import recover
 from station.errors import LimitError, RefusedError, RobotError, SafetyStopError, StationError, TriggerError
-from station.limits import MoveCheck, check_path, with_plan_speeds
+from station.limits import check_path, with_plan_speeds
 from station.plan.standing import geometry_from
 from station.session.bench import Bench
 from station.session.capture import PoseFailedError, take_pose
@@ -196,13 +197,20 @@ class Run:
         bench.show_poses(index)
         if np.abs(np.subtract(target, here)).max() < ARRIVED_RAD:
             return
-        check = check_path(self._geometry, here, target, f"pose {index + 1}")
+        await self._drive(here, target, f"pose {index + 1}")
+
+    async def _drive(self, here: Vector6, target: Vector6, name: str) -> None:
+        """LimitError when the way from `here`, where the arm stands, is not free."""
+        robot = self._bench.cell.robot
+        # In a thread: neither the heartbeat nor STOP waits for it.
+        check = await asyncio.to_thread(check_path, self._geometry, here, target, name)
         if check.problems:
             raise LimitError("; ".join(map(str, check.problems)))
-        await self._drive_checked(target, check)
-
-    async def _drive_checked(self, target: tuple[float, ...], check: MoveCheck) -> None:
-        await self._bench.cell.robot.move(target, check.joint_speed_rad_s, check.joint_acceleration_rad_s2)
+        await RestingCheck(robot.check).news()
+        moved_rad = float(np.abs(np.subtract(robot.latest().joints_rad, here)).max())
+        if moved_rad > START_TOLERANCE_RAD:
+            raise LimitError(f"the arm moved by {np.rad2deg(moved_rad):.1f}° while its way was checked")
+        await robot.move(target, check.joint_speed_rad_s, check.joint_acceleration_rad_s2)
 
     def _show_times(self, remaining_s: float) -> None:
         """Elapsed, the session's runs before this one included; remaining, by this one's average."""

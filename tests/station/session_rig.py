@@ -41,7 +41,7 @@ class ArmInMemory:
         self.joints = TRUTH.start_joints_rad
         self.log: list[str] = []
         self.control, self.notice, self.remote = False, "", None
-        self.slow = False
+        self.slow = self.under_way = False
         self.arrive = asyncio.Event()
         self.trouble: RobotError | None = None
         self.refuse_control: RobotError | None = None
@@ -110,6 +110,13 @@ class ArmInMemory:
 
     async def move(self, joints_rad: Sequence[float], speed_rad_s: float, acceleration_rad_s2: float) -> None:
         self.log.append("move")
+        self.under_way = True
+        try:
+            await self._move(joints_rad)
+        finally:
+            self.under_way = False
+
+    async def _move(self, joints_rad: Sequence[float]) -> None:
         self._stopped.clear()
         if self.slow:
             waits = [asyncio.ensure_future(e.wait()) for e in (self.arrive, self._stopped)]
@@ -248,9 +255,14 @@ class Rig:
         return self.session.store.state
 
     async def until(self, *states: StationState) -> None:
+        """A slow arm that is `moving` is under way: its way was checked."""
         async with asyncio.timeout(10):
-            while self.state not in states:
+            while self.state not in states or self._waits_for_its_check:
                 await asyncio.sleep(0.002)
+
+    @property
+    def _waits_for_its_check(self) -> bool:
+        return self.state is StationState.MOVING and self.arm.slow and not self.arm.under_way
 
     async def until_true(self, condition: Callable[[], bool]) -> None:
         async with asyncio.timeout(10):

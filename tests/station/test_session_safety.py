@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import socket
+import threading
 import time
 from pathlib import Path
 from typing import Any
@@ -388,6 +389,49 @@ async def test_finish_before_a_way_that_is_not_free_seals(rig: Rig, monkeypatch:
     await rig.give_go()
     await rig.until(S.IDLE, S.FAULT)
     assert rig.state is S.IDLE, rig.session.store.status.reason
+    assert "move" not in rig.arm.log
+
+
+class SlowCheck:
+    """Looks at a way until `go_on` is set."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.go_on, self.looks = threading.Event(), threading.Event()
+        self._check = run.check_path
+        monkeypatch.setattr(run, "check_path", self)
+
+    def __call__(self, *args: Any) -> Any:
+        self.looks.set()
+        assert self.go_on.wait(5.0)
+        return self._check(*args)
+
+
+async def test_neither_heartbeat_nor_stop_waits_for_the_check_of_a_way(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slow = SlowCheck(monkeypatch)
+    await rig.give_go()
+    await rig.until_true(slow.looks.is_set)
+    before = rig.arm.beats
+    await rig.until_true(lambda: rig.arm.beats > before + 3)
+    await rig.session.stop("bert")
+    slow.go_on.set()
+    await rig.until_true(lambda: rig.arm.log[-1:] == ["end control"])
+    assert rig.state is S.STOPPED and "move" not in rig.arm.log
+
+
+async def test_an_arm_that_moved_while_its_way_was_checked_is_not_driven(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slow = SlowCheck(monkeypatch)
+    await rig.give_go()
+    await rig.until_true(slow.looks.is_set)
+    first, *rest = rig.arm.joints
+    rig.arm.joints = (first + 0.02, *rest)  # type: ignore[assignment]
+    slow.go_on.set()
+    await rig.until_true(lambda: rig.pose_states[0] == "failed")
+    failed = rig.session.store.status.session.poses[0]
+    assert "moved by 1.1° while its way was checked" in failed.reason
     assert "move" not in rig.arm.log
 
 

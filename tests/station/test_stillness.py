@@ -136,6 +136,28 @@ async def test_an_arm_that_never_rests_is_given_up_with_the_reason() -> None:
         await m.settle(lambda: None, now_s=lambda: next(clock))
 
 
+async def test_old_news_of_an_arm_at_rest_are_no_rest() -> None:
+    m = monitor(timeout_s=5.0)
+    shake(m, 0.5, 0.0)
+    news = iter([False, False, True])
+    asked: list[bool] = []
+
+    def alive() -> bool:
+        asked.append(next(news))
+        return asked[-1]
+
+    await m.settle(alive)
+    assert asked == [False, False, True]
+
+
+async def test_news_that_stay_away_are_the_reason() -> None:
+    m = monitor(timeout_s=5.0)
+    shake(m, 0.5, 0.0)
+    clock = iter([0.0, 1.0, 5.1])
+    with pytest.raises(NotStillError, match="no fresh news of the robot"):
+        await m.settle(lambda: False, now_s=lambda: next(clock))
+
+
 async def test_a_lost_robot_ends_the_waiting() -> None:
     def dead() -> None:
         raise StaleStateError("no news")

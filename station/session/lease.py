@@ -29,7 +29,8 @@ class LeaseDesk:
         """Taking it again is fine. RefusedError names the present holder."""
         if self.lease.client_id not in (None, client_id):
             raise RefusedError(
-                f"control is held by {self.lease.holder}: ask them to let go, or press STOP if you must"
+                f"control is held by {self.lease.holder}: ask them to let go (F4 on their screen); "
+                "you may watch and STOP"
             )
         if self.lease.client_id is None:
             self.lease = Lease(holder=who, client_id=client_id, since_wall_ns=wall_ns)

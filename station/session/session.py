@@ -113,16 +113,15 @@ class Session:
             return
         await self._halt(StationState.STOPPED, f"STOP by {who}: look at the cell, then acknowledge")
 
-    async def lease_lost(self, client_id: int) -> None:
-        """The connection that commands is gone: decelerate at once; go on only with a new go."""
+    async def lease_lost(self, client_id: int, how: str = "the connection of {} was lost") -> None:
+        """Nobody commands any more: decelerate at once; go on only with a new go."""
         holder = self.leases.lease.holder
         if not self.leases.release(client_id):
             return
         self._void_go()
         self.store.update(lease=self.leases.lease)
         if self.store.state in RUNNING and self.store.state is not StationState.SEALING:
-            reason = f"the connection of {holder} was lost: give a new go to go on"
-            await self._halt(StationState.PAUSED, reason)
+            await self._halt(StationState.PAUSED, how.format(holder) + ": give a new go to go on")
 
     async def _halt(self, state: StationState, reason: str) -> None:
         bench, run = self.bench, self._run
@@ -256,7 +255,7 @@ class Session:
 
     async def release_lease(self, client_id: int) -> None:
         """Letting go during a run is losing it: the arm decelerates."""
-        await self.lease_lost(client_id)
+        await self.lease_lost(client_id, "{} let go of control")
 
     # -- the plan ----------------------------------------------------------------------------------------
 

@@ -44,7 +44,8 @@ from station.tui.widgets.graphics import Graphics, detect
 from station.tui.widgets.preview import Preview
 
 PREVIEW_PERIOD_S = 0.25
-STATUS_PERIOD_S = 0.15
+STATUS_PERIOD_S = 0.25
+"""Laying out what flickers is most of what this screen costs: four times a second are enough for eyes."""
 SETTLED_S = 2.0
 RECONNECT_S = 1.0
 GONE = "The daemon ended: the arm decelerates by itself. This screen goes on as soon as one serves again."
@@ -190,10 +191,8 @@ class StationApp(Commands):
             if link is None or not isinstance(screen, LiveScreen):
                 continue
             for preview in screen.query(Preview):
-                width, height = preview.wanted_pixels()
                 with contextlib.suppress(OSError, StationError):
-                    if answer := await link.request("preview", width=width, height=height):
-                        await preview.show(answer)
+                    await preview.fetch(link)
 
     def on_status_changed(self, message: StatusChanged) -> None:
         self.status = message.status

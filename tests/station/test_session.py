@@ -176,6 +176,19 @@ async def test_a_lost_commander_stops_the_arm_at_once(rig: Rig) -> None:
     assert len(sealed(rig).views()) == POSES
 
 
+async def test_who_lets_go_in_mid_move_stops_the_arm_and_is_named(rig: Rig) -> None:
+    rig.arm.slow = True
+    await rig.give_go()
+    await rig.until(S.MOVING)
+    with pytest.raises(RefusedError, match=r"held by anna.*F4 on their screen.*STOP"):
+        rig.session.take_lease(2, "bert")
+    await rig.session.release_lease(1)
+    assert rig.state is S.PAUSED
+    assert "stop" in rig.arm.log
+    assert rig.session.store.status.reason == "anna let go of control: give a new go to go on"
+    rig.session.take_lease(2, "bert")
+
+
 async def test_finish_seals_what_is_there(rig: Rig) -> None:
     rig.arm.slow = True
     await rig.give_go()

@@ -10,6 +10,7 @@ import struct
 import sys
 import termios
 import threading
+import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -234,3 +235,19 @@ async def test_a_status_repaints_only_what_it_changes(
         await until(pilot, lambda: updates)
         await pilot.pause(0.3)
         assert "LayoutUpdate" not in updates
+
+
+async def test_until_the_next_picture_is_due_only_the_smallest_is_asked_for(link: FakeLink) -> None:
+    async with app_on(link).run_test(size=(160, 48)) as pilot:
+        preview = pilot.app.screen.query_one(Preview)
+        await until(pilot, lambda: preview._picture is not None)
+        shown = preview._picture
+        preview._next_s = time.monotonic() + 3600.0
+        link.asked.clear()
+        await preview.fetch(link)  # what the daemon finds in it is still told by the status
+        assert link.asked[-1] == ("preview", {"width": 16, "height": 16})
+        assert preview._picture is shown
+        preview._next_s = 0.0
+        await preview.fetch(link)
+        assert link.asked[-1][1]["width"] > 16
+        assert preview._picture is not shown

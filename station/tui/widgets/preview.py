@@ -20,6 +20,7 @@ from textual.reactive import reactive
 from textual.strip import Strip
 from textual.widget import Widget
 
+from station.tui.link import Link
 from station.tui.widgets.graphics import PERIOD_S, SHARE, Graphics, SharpPicture
 
 if TYPE_CHECKING:
@@ -32,6 +33,8 @@ CORNER = Segment("+", Style(color=Color.from_rgb(0, 230, 0), bgcolor=Color.from_
 """A sign and not only a colour."""
 
 OLD = "OLD PICTURE"
+SMALLEST = (16, 16)
+"""Pixels of a picture that nobody will see."""
 FEW_SHADES = " ░▒▓█"
 """For a console with 16 colours, whose backgrounds have no greys: one shade a cell."""
 
@@ -58,10 +61,19 @@ class Preview(Widget):
         self._next_s = 0.0
         """Not before: drawing takes no more than its share of the computer."""
 
+    async def fetch(self, link: Link) -> None:
+        """Asks for a picture and shows it. What the daemon sees in it stands in the status, shown or not.
+
+        Until the next one may be drawn the smallest will do: a large one is dear to send and to read.
+        """
+        due = time.monotonic() >= self._next_s
+        width, height = self.wanted_pixels() if due else SMALLEST
+        if (answer := await link.request("preview", width=width, height=height)) and due:
+            await self.show(answer)
+
     async def show(self, answer: dict[str, Any]) -> None:
         """A `preview` reply: jpeg_base64, and corners as fractions of width and height."""
-        same = answer.get("sequence") is not None and answer["sequence"] == self._sequence
-        if same or time.monotonic() < self._next_s:
+        if answer.get("sequence") is not None and answer["sequence"] == self._sequence:
             return
         data = np.frombuffer(base64.b64decode(answer.get("jpeg_base64", "")), dtype=np.uint8)
         picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None

@@ -67,12 +67,6 @@ class Transform:
         """Points (..., 3) of `child` in metres → the same points in `parent`."""
         return transform_points(self.matrix, points)
 
-    @classmethod
-    def from_quaternion(
-        cls, parent: str, child: str, translation_m: ArrayLike, quaternion_xyzw: ArrayLike
-    ) -> Transform:
-        return cls(parent, child, pose_from_quaternion(translation_m, quaternion_xyzw))
-
 
 def pose(rotation: ArrayLike, translation_m: ArrayLike) -> Array:
     """(..., 3, 3) and (..., 3) → (..., 4, 4)."""

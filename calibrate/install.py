@@ -24,7 +24,7 @@ from calibrate.generations import (
     no_generation,
     who,
 )
-from calibrate.geometry import Transform, difference
+from calibrate.geometry import difference
 from calibrate.verification import objections as by_hand
 from recordings.messages import Source
 
@@ -127,11 +127,6 @@ def change_text(before: Calibration | None, after: Calibration) -> str:
     delta = difference(after.transform.matrix, before.transform.matrix)
     degrees = float(np.degrees(np.linalg.norm(delta[3:])))
     return f"{np.linalg.norm(delta[:3]) * 1000:.3f} mm, {degrees:.4f}° from the one before"
-
-
-def installed_transform(root: Path | None = None, allow_simulated: bool = False) -> Transform:
-    """`flange_from_camera` or `base_from_camera` of the installed calibration, verified."""
-    return load_installed(root, allow_simulated).transform
 
 
 def _installed_before(root: Path | None) -> Calibration | None:

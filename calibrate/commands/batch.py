@@ -19,7 +19,7 @@ from calibrate.commands.job import GatesFile, MemoryLimit, Profile, ProfileName,
 from calibrate.commands.output import AsJson, OutputError, err, out
 from calibrate.gates import GateLimits, read_limits
 from calibrate.pipeline import JobOptions
-from calibrate.trends import cells, trends_text
+from calibrate.trends import Cell, cells, trends_text
 
 DONE_WITH_LOSS = 3
 
@@ -75,24 +75,28 @@ def batch(
     found = cells(results)
     _write(output / "trends.txt", trends_text(found))
     _write(output / "trends.html", fleet_page(results, found))
-    failed = [result for result in results if not result.solved]
     if as_json:
         for result in results:
             typer.echo(msgspec.json.encode(result).decode())
     else:
-        good = sum(result.passed for result in results)
-        out.print(
-            f"{len(results)} recordings: {good} good, {len(results) - good - len(failed)} below a gate, "
-            f"{len(failed)} not solved. {output}/results.csv, results.jsonl, trends.html, trends.txt"
-        )
-        for cell in found:
-            for finding in cell.findings:
-                out.print(f"{cell.name}: {finding}", soft_wrap=True)
-        for result in failed:
-            named = result.error.startswith(result.recording)
-            err.print(result.error if named else f"{result.recording}: {result.error}", soft_wrap=True)
-    if failed:
+        _tell(results, found, output)
+    if not all(result.solved for result in results):
         raise typer.Exit(DONE_WITH_LOSS)
+
+
+def _tell(results: list[BatchResult], found: tuple[Cell, ...], output: Path) -> None:
+    good = sum(result.passed for result in results)
+    failed = [result for result in results if not result.solved]
+    out.print(
+        f"{len(results)} recordings: {good} good, {len(results) - good - len(failed)} below a gate, "
+        f"{len(failed)} not solved. {output}/results.csv, results.jsonl, trends.html, trends.txt"
+    )
+    for cell in found:
+        for finding in cell.findings:
+            out.print(f"{cell.name}: {finding}", soft_wrap=True)
+    for result in failed:
+        named = result.error.startswith(result.recording)
+        err.print(result.error if named else f"{result.recording}: {result.error}", soft_wrap=True)
 
 
 def _solver(

@@ -8,15 +8,14 @@ from typing import Annotated
 
 import typer
 
-from calibrate.calibration import Calibration, Provenance, read_calibration
+from calibrate.calibration import Calibration, Provenance
 from calibrate.checks import CheckEntry, append_check, earlier_text, read_checks, trend_text
-from calibrate.commands.install import Root
+from calibrate.commands.install import Root, named_or_installed
 from calibrate.commands.job import Threads
 from calibrate.commands.output import AsJson, OutputError, detection_progress, out, print_json
 from calibrate.drift import FEWEST_VIEWS, POWER, DriftCheck, check_drift
 from calibrate.errors import BadViewsError
 from calibrate.generations import generations
-from calibrate.install import load_installed
 from calibrate.pipeline import JobOptions, prepare_views
 from recordings.messages import SessionInfo
 
@@ -52,24 +51,15 @@ def check(
     Exit codes: 0 it holds, 4 it does not, 1 the views or files cannot be used (they are those the calibration
     was made from, say), 2 wrong options or kind.
     """
-    if calibration_file is None:
-        calibration = load_installed(root, allow_simulated=True)
-    else:
-        calibration = read_calibration(calibration_file)
+    calibration = named_or_installed(calibration_file, root)
     options = JobOptions(camera=calibration.intrinsics.model, threads=threads)
     with detection_progress() as progress:
         prepared = prepare_views(recording, options, progress, fewest=FEWEST_VIEWS)
     info = prepared.recording.info
     _require_same_cell(recording, info, calibration)
     result = check_drift(prepared.views, calibration)
-    trend = before = ""
     own = _is_origin(prepared.recording.sha256, info, calibration.provenance)
-    if calibration_file is None and not own:
-        number = next((g.number for g in generations(root) if g.current), 0)
-        wall_s = info.created_wall_ns / 1e9 or time.time()
-        before = earlier_text(read_checks(root), number)
-        append_check(CheckEntry.of(result, wall_s, number, info.name), root)
-        trend = trend_text(read_checks(root), number)
+    before, trend = ("", "") if own or calibration_file is not None else _note(result, info, root)
     proves_nothing = own and result.passed
     if as_json:
         print_json({**_plain(result, trend), "passed": result.passed and not own, "own_views": own})
@@ -85,6 +75,14 @@ def check(
         raise typer.Exit(DRIFTED)
     if proves_nothing:
         raise typer.Exit(BadViewsError.exit_code)
+
+
+def _note(result: DriftCheck, info: SessionInfo, root: Path | None) -> tuple[str, str]:
+    """Adds the check to those of the installed calibration: what to say of them before it, and with it."""
+    number = next((g.number for g in generations(root) if g.current), 0)
+    before = earlier_text(read_checks(root), number)
+    append_check(CheckEntry.of(result, info.created_wall_ns / 1e9 or time.time(), number, info.name), root)
+    return before, trend_text(read_checks(root), number)
 
 
 def _is_origin(sha256: str, info: SessionInfo, provenance: Provenance) -> bool:

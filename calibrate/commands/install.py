@@ -29,6 +29,9 @@ FormatName = StrEnum("FormatName", {name.replace("-", "_"): name for name in FOR
 Named = Annotated[Path | None, typer.Argument(help="A calibration file; default: the installed one")]
 
 
+_OTHER_PIXELS = "the lenses are of pictures of different sizes"
+
+
 class CellKind(StrEnum):
     real = "real"
     imported = "imported"
@@ -93,16 +96,11 @@ def diff(
     for name, say in rows:
         table.add_row(name, say(a), say(b))
     out.print(table)
-    lens = (
-        "the lenses are of pictures of different sizes"
-        if lens_px is None
-        else f"camera matrix differs by up to {lens_px:.2f} px"
-    )
     # Six numbers: 3.55 sigmas are exceeded by chance in 5 % of honest pairs (chi-square, 6 degrees).
     judged = "more than" if sigmas > 3.55 else "within"
     out.print(
         f"apart: {millimetres:.3f} mm, {degrees:.4f}°, {sigmas:.1f} sigmas ({judged} their uncertainty); "
-        f"{lens}"
+        + (_OTHER_PIXELS if lens_px is None else f"camera matrix differs by up to {lens_px:.2f} px")
     )
 
 

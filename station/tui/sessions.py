@@ -64,8 +64,7 @@ class SessionsScreen(StationScreen):
             return
         if status is None or status.state in RUNNING:
             return
-        if (there := await asyncio.to_thread(marks, link.root)) != self._marks:
-            self._marks = there
+        if await asyncio.to_thread(marks, link.root) != self._marks:
             self.fetch()
 
     @property
@@ -76,12 +75,15 @@ class SessionsScreen(StationScreen):
     async def fetch(self) -> None:
         link = self.station.link
         root = None if link is None else link.root
-        if root is not None:
+        if root is not None:  # noted first: a slow answer must not be asked for again and again
             self._marks = await asyncio.to_thread(marks, root)
         answer = await self.station.ask("sessions")
+        if answer is None:
+            self._marks = frozenset()
+            return  # why was said; what was known stays
         installed = "" if root is None else await asyncio.to_thread(installed_session, root)
         at = self._sessions[self.table.cursor_row]["name"] if self._sessions else ""
-        self._sessions = list(answer or [])
+        self._sessions = list(answer)
         self.table.clear()
         for session in self._sessions:
             self.table.add_row(

@@ -10,6 +10,7 @@ from textual.widgets import DataTable
 
 from calibrate.calibration import write_calibration
 from calibrate.install import install, rollback
+from station.errors import StationError
 from station.tui import result, sessions
 from tests.tui.conftest import FakeLink, until
 from tests.tui.test_install import GOOD
@@ -79,3 +80,22 @@ async def test_the_result_says_when_it_is_the_installed_one(link: FakeLink, root
         put(root, "s-2")
         await until(pilot, lambda: "against the installed one" in text_of(app, "#change"))
         assert "READY TO INSTALL" in text_of(app, "#verdict")
+
+
+async def test_a_list_that_did_not_come_is_asked_for_again_and_the_old_one_stays(
+    link: FakeLink, root: Path
+) -> None:
+    app = app_on(link)
+    async with app.run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
+        await pilot.press("4")
+        await until(pilot, lambda: app.current_mode == "sessions")
+        table = app.screen.query_one(DataTable)
+        await until(pilot, lambda: table.row_count == 2)
+        link.refuse["sessions"] = StationError("the daemon is gone")
+        (root / "sessions" / "s-3").mkdir()
+        await until(pilot, lambda: any("gone" in notice.message for notice in app._notifications))
+        assert table.row_count == 2
+        link.answers["sessions"] = [{"name": "s-3"}, *link.answers["sessions"]]
+        del link.refuse["sessions"]
+        await until(pilot, lambda: table.row_count == 3)

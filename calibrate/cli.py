@@ -7,7 +7,7 @@ import sys
 
 
 def main() -> None:
-    """Exit codes: 0 good, 1 failed, 2 usage or configuration, 4 a quality gate failed."""
+    """Exit codes: 0 good, 1 failed, 2 usage or configuration, 3 done with loss, 4 a gate failed."""
     # Before numpy is loaded: small matrices are faster on one thread, and the same to the bit on any machine
     # with the same processor, whatever its number of cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")

@@ -26,9 +26,9 @@ def board(
         Path | None,
         typer.Option("--board", help="YAML with a board: dataset.yaml, a station's configuration"),
     ] = None,
-    kind: Annotated[BoardKind, typer.Option(help="Of board")] = BoardKind.CHESSBOARD,
+    kind: Annotated[BoardKind, typer.Option(help="Of the pattern")] = BoardKind.CHESSBOARD,
     columns: Annotated[int, typer.Option(help="Inner corners; circles; tags; charuco: squares")] = 7,
-    rows: Annotated[int, typer.Option()] = 6,
+    rows: Annotated[int, typer.Option(help="As columns")] = 6,
     square_mm: Annotated[float, typer.Option(help="Square; circle distance; april-grid: tag")] = 25.0,
     marker_mm: Annotated[float | None, typer.Option(help="charuco: marker; april-grid: gap")] = None,
     dictionary: Annotated[str | None, typer.Option(help="Of markers, such as DICT_6X6_250")] = None,
@@ -37,7 +37,10 @@ def board(
         str | None, typer.Option(help=f"{', '.join(PAPER_MM)}; default: as large as needed")
     ] = None,
 ) -> None:
-    """Write a printable board (PDF or SVG, true scale). Without options: 8 × 7 squares of 25 mm."""
+    """Write a printable board (PDF or SVG, true scale). Without options: 8 × 7 squares of 25 mm.
+
+    With a bar to measure on the paper, and the lines for the station's configuration.
+    """
     if output.suffix.lower() not in (".pdf", ".svg"):
         raise OutputError(f"{output}: the name must end in .pdf or .svg.")
     check_folder(output)

@@ -134,7 +134,10 @@ def export_file(
 def install_file(
     file: Annotated[Path, typer.Argument(help="A calibration file")],
     root: Root = None,
-    cell: Annotated[CellKind, typer.Option(help="What kind of cell this root belongs to")] = CellKind.real,
+    cell: Annotated[
+        CellKind,
+        typer.Option(help="What kind of cell the root belongs to; all but real must name it: --root"),
+    ] = CellKind.real,
     cell_config: Annotated[
         Path | None, typer.Option(help="The station's configuration: its robot and camera are checked")
     ] = None,

@@ -24,7 +24,7 @@ from station.attend import Confirm, Outcome, carry_out, wait_until_idle
 from station.cli_serve import require_choices
 from station.client import Client, default_socket
 from station.demo import DemoOptions, run_demo
-from station.drift_check import PLAN_ANSWER_S, POSES, SEED, check_arguments, require_installed
+from station.drift_check import PLAN_ANSWER_S, POSES, SEED, check_arguments, never_run, require_installed
 from station.errors import ConfigError, RefusedError, StationError
 from station.plan.files import load_plan
 from station.plan.model import Plan
@@ -188,6 +188,8 @@ async def load_sweep(client: Client) -> None:
 
 
 async def _make(client: Client, poses: int) -> None:
+    if lost := never_run(await _status(client)):
+        err.print(f"the check takes the place of the loaded plan of {lost} poses, which was never run")
     await client.request("make_plan", poses=poses, seed=SEED, lens_known=True, timeout_s=PLAN_ANSWER_S)
 
 

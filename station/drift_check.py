@@ -5,11 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 
 from calibrate.install import load_installed
+from station.status import StationStatus
 
 POSES = 8
 """Notice a shift of 0.5 mm in 96 of 100 cases at mid noise, five in 88 (benchmarks/README.md)."""
 SEED = 0
 PLAN_ANSWER_S = 200.0
+
+
+def never_run(status: StationStatus) -> int:
+    """How many poses the loaded plan has when none was ever tried: somebody may still want it; else 0."""
+    poses = status.session.poses
+    return 0 if any(pose.attempt for pose in poses) else len(poses)
 
 
 def require_installed(root: Path) -> None:

@@ -6,7 +6,7 @@ import asyncio
 from typing import TYPE_CHECKING, Any
 
 from calibrate.errors import CalibrationError
-from station.drift_check import POSES, SEED, require_installed
+from station.drift_check import POSES, SEED, never_run, require_installed
 from station.status import SessionStatus, StationState
 from station.tui import offline
 
@@ -49,8 +49,7 @@ async def drift_check(app: StationApp) -> None:
 
 async def _unused_plan(app: StationApp) -> dict[str, Any] | None:
     """The loaded plan when none of its poses was ever tried: somebody may still want it."""
-    poses = () if app.status is None else app.status.session.poses
-    if not poses or any(pose.attempt for pose in poses):
+    if app.status is None or not never_run(app.status):
         return None
     loaded = await app.ask("plan")
     return loaded["plan"] if loaded else None

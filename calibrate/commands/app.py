@@ -13,8 +13,8 @@ app = typer.Typer(
     help="From a recording to a calibration that can be trusted, installed and undone.\n\n"
     "A round: calibrate solve REC -o cell.yaml --report cell.html, then calibrate install cell.yaml. Your "
     "own pictures become a recording by: recordings import FOLDER -o REC.",
-    epilog="Exit codes: 0 good, 1 failed, 2 wrong usage or configuration, 3 done with loss, 4 a gate failed or "
-    "a check did not hold.",
+    epilog="Exit codes: 0 good, 1 failed, 2 wrong usage or configuration, 3 done with loss, 4 a gate failed "
+    "or a check did not hold.",
 )
 for family in (solve, install, check, board, batch, sweep):
     family.register(app)

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from recordings.messages import CameraIdentity, Picture, Stamps
 from station.clocks import monotonic_from_wall_ns
 from station.config import CameraConfig
+from station.devices.aravis_settings import Region, apply_settings, read_settings, require_settings
 from station.devices.frames import DeviceClock, StreamCounts
 from station.devices.pixels import bits_per_pixel, decode
 from station.errors import CameraError
@@ -31,8 +32,6 @@ _STREAM_PRIORITY = -15
 _LATCH_WAIT_S = 0.02
 _POP_S = 0.1
 """So often a waiting capture looks whether the camera was lost."""
-_EXPOSURE_TOLERANCE = 0.02
-_GAIN_TOLERANCE_DB = 0.2
 _INSTALL = (
     "GenICam cameras need Debian's python3-gi and gir1.2-aravis-0.8 (apt install both, then make the venv "
     "again with --system-site-packages)"
@@ -60,7 +59,7 @@ class GenicamDevice:
         self._aravis, self._glib = _aravis()
         self._camera: Any = None
         self._stream: Any = None
-        self._region = (0, 0, 0, 0)
+        self._region: Region = (0, 0, 0, 0)
         self._latched_ns: int | None = None
         self._controls = False
         self._lost = False
@@ -99,7 +98,7 @@ class GenicamDevice:
                 driver="aravis",
             )
         with self._explained("setting up the camera"):
-            self._set_up()
+            self._region = apply_settings(self._aravis, self._camera, self._config)
         with self._explained("starting the camera"):
             before = _threads()
             self._stream = self._camera.create_stream(None, None)
@@ -129,65 +128,15 @@ class GenicamDevice:
         except self._glib.Error:
             self._lost = True
 
-    def _set_up(self) -> None:
-        camera, config = self._camera, self._config
-        camera.set_range_check_policy(self._aravis.RangeCheckPolicy.ENABLE)
-        camera.stop_acquisition()
-        camera.clear_triggers()
-        for automatic in ("ExposureAuto", "GainAuto"):
-            if camera.is_feature_available(automatic):
-                camera.set_string(automatic, "Off")
-        camera.set_pixel_format_from_string(config.pixel_format)
-        # Cameras keep the region of whoever used them last.
-        self._region = config.region or (0, 0, *camera.get_sensor_size())
-        camera.set_region(*self._region)
-        camera.set_exposure_time(config.exposure_us)
-        if camera.is_gain_available():
-            camera.set_gain(config.gain_db)
-        if camera.is_gv_device():
-            if config.packet_size is None:
-                camera.gv_auto_packet_size()
-            else:
-                camera.gv_set_packet_size(config.packet_size)
-        camera.set_acquisition_mode(self._aravis.AcquisitionMode.CONTINUOUS)
-        if config.trigger == "free-running":
-            if config.frame_rate_hz is not None:
-                camera.set_frame_rate(config.frame_rate_hz)
-        else:
-            camera.set_trigger("Software" if config.trigger == "software" else "Line0")
-
     def settings(self) -> dict[str, Any]:
         """Read back from the camera now, for the recording."""
-        camera = self._camera
         with self._explained("reading the camera's settings"):
-            region = camera.get_region()
-            return {
-                "pixel_format": camera.get_pixel_format_as_string(),
-                "region": [region.x, region.y, region.width, region.height],
-                "exposure_us": camera.get_exposure_time(),
-                "gain_db": camera.get_gain() if camera.is_gain_available() else 0.0,
-                "packet_size": camera.gv_get_packet_size() if camera.is_gv_device() else None,
-            }
+            return read_settings(self._camera)
 
     def check_settings(self) -> tuple[float, float]:
         """Exposure (µs) and gain (dB) as they are; CameraError when they are not what was asked for."""
         with self._explained("reading the camera's settings"):
-            exposure_us = float(self._camera.get_exposure_time())
-            gain_db = float(self._camera.get_gain()) if self._camera.is_gain_available() else 0.0
-            region = self._camera.get_region()
-        wanted = self._config
-        actual = (region.x, region.y, region.width, region.height)
-        if (
-            abs(exposure_us - wanted.exposure_us) > _EXPOSURE_TOLERANCE * wanted.exposure_us
-            or abs(gain_db - wanted.gain_db) > _GAIN_TOLERANCE_DB
-            or actual != self._region
-        ):
-            raise CameraError(
-                f"the camera stands at {exposure_us:g} µs, {gain_db:g} dB, region {actual}; set were "
-                f"{wanted.exposure_us:g} µs, {wanted.gain_db:g} dB, region {self._region}: the "
-                "camera cannot do that, or another program changes its settings"
-            )
-        return exposure_us, gain_db
+            return require_settings(self._camera, self._config, self._region)
 
     def latch(self, clock: DeviceClock) -> None:
         """One reading of the camera's clock, where it has one that can be latched."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import hashlib
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
@@ -17,7 +18,7 @@ from calibrate.load import load_views
 from calibrate.pnp import solve_pnp
 from calibrate.views import ViewSet
 from recordings.files import write_atomically
-from recordings.messages import Mount, Vector6
+from recordings.messages import Mount, SessionInfo, Vector6
 from recordings.reader import open_recording
 from station.attend import wait_until_idle
 from station.cli_session import Headless, Socket, attended_session, err, load_into, out
@@ -54,26 +55,28 @@ def bootstrap_command(
 
     Exit codes: 0 the guesses are good enough for a plan, 3 they are not yet, 1 refused or failed.
     """
-    cell, _ = load_config(config)
+    cell, text = load_config(config)
     if cell.camera.model is None or cell.camera.model.matrix is None:
         raise ConfigError("bootstrap needs camera.model with width, height and a rough matrix")
     believe(cell, [])  # says so when there is no camera_guess, before anything is asked
     if output is not None and output.exists():
         raise ConfigError(f"{output} exists: give another name for the guesses")
-    glimpses = _make_moves(cell, socket, headless)
+    glimpses = _make_moves(cell, socket, headless, hashlib.sha256(text).hexdigest())
     found = improved_config(cell, glimpses)
     assert found.camera_guess is not None and found.board_guess is not None
     _show("camera", found.camera_guess)
     _show("board", found.board_guess)
     guesses = {"camera_guess": found.camera_guess, "board_guess": found.board_guess}
-    text = yaml.safe_dump(msgspec.to_builtins(guesses), sort_keys=False)
+    entries = yaml.safe_dump(msgspec.to_builtins(guesses), sort_keys=False)
     if output is None:
-        out.print(text, end="", markup=False)
+        out.print(entries, end="", markup=False)
     else:
         try:
-            write_atomically(output, text.encode())
+            write_atomically(output, entries.encode())
         except OSError as error:
-            raise ConfigError(f"cannot write {output}: {error.strerror}; the guesses are:\n{text}") from error
+            raise ConfigError(
+                f"cannot write {output}: {error.strerror}; the guesses are:\n{entries}"
+            ) from error
         err.print(f"put the two entries of {output} into {config}, start the daemon anew, then plan")
     if not believe(cell, glimpses).good:
         err.print(
@@ -82,7 +85,9 @@ def bootstrap_command(
         raise typer.Exit(3)
 
 
-def _make_moves(cell: StationConfig, socket: Path | None, headless: bool) -> list[Glimpse]:
+def _make_moves(
+    cell: StationConfig, socket: Path | None, headless: bool, config_sha256: str = ""
+) -> list[Glimpse]:
     """The taught view and those after each move. Every one is a session of its own, with its own go."""
     path = socket or default_socket()
     taught = asyncio.run(_standing(path, cell.mount))
@@ -95,7 +100,7 @@ def _make_moves(cell: StationConfig, socket: Path | None, headless: bool) -> lis
             raise BootstrapError("the arm was moved meanwhile: teach the view again and start over")
         of = f" (of {MOVES_MIN} to {MOVES_MAX})" if glimpses else ""
         err.print(f"[bold]{move.name}[/]{of}: {move.why}")
-        joints, views = _take(cell, move, views, path, headless)
+        joints, views = _take(cell, move, views, path, headless, config_sha256)
         glimpses = [
             Glimpse(q, C)
             for q, C in zip(
@@ -117,7 +122,12 @@ def _make_moves(cell: StationConfig, socket: Path | None, headless: bool) -> lis
 
 
 def _take(
-    cell: StationConfig, move: PlannedPose, before: ViewSet | None, socket: Path, headless: bool
+    cell: StationConfig,
+    move: PlannedPose,
+    before: ViewSet | None,
+    socket: Path,
+    headless: bool,
+    config_sha256: str,
 ) -> tuple[Array, ViewSet]:
     """One go, one picture: the joints (6,) where it was taken, and all views so far."""
     plan = slow_plan(cell, move)
@@ -131,6 +141,7 @@ def _take(
             "what is open; then start over from a view with the whole board"
         )
     recording = open_recording(Path(outcome.recording))
+    require_same_cell(cell, config_sha256, recording.info)
     loaded = load_views(recording, cell.board, cell.camera.model, fewest=1).views
     [view] = recording.views()
     if view.joints_rad is None or view.name != move.name:
@@ -139,6 +150,22 @@ def _take(
         return np.array(view.joints_rad), loaded
     # All views together decide which way round a symmetric board lies.
     return np.array(view.joints_rad), replace(loaded, views=(*before.views, *loaded.views))
+
+
+def require_same_cell(cell: StationConfig, config_sha256: str, seen: SessionInfo) -> None:
+    """ConfigError when the daemon's cell is another one: moves are chosen by this file and checked by that.
+
+    `seen`: of the taught picture, before anything moved. A simulated daemon has no file to compare.
+    """
+    if seen.board != cell.board:
+        raise ConfigError(
+            "the daemon runs with another board than this configuration: give the file it runs with"
+        )
+    if seen.source == "real" and seen.config_sha256 != config_sha256:
+        raise ConfigError(
+            "the daemon runs with another configuration, or with this one as it was before: give the file it "
+            "runs with, or start the daemon anew"
+        )
 
 
 def slow_plan(cell: StationConfig, move: PlannedPose) -> Plan:

@@ -17,12 +17,12 @@ import pytest
 import yaml
 
 from calibrate.geometry import difference, pose, pose_from_quaternion, rotation_exp
-from recordings.messages import Vector6
+from recordings.messages import SessionInfo, Source, Vector6
 from station import cli_bootstrap
 from station.analysis import check_run
 from station.cli_bootstrap import slow_plan
 from station.client import Client
-from station.errors import LimitError
+from station.errors import ConfigError, LimitError
 from station.plan.model import Plan, PlannedPose
 from station.plan.planner import make_plan
 from station.simulation.placement import guess_of
@@ -111,6 +111,29 @@ def test_ctrl_c_in_mid_move_stops_the_arm_and_says_so(socket: Path, tmp_path: Pa
     assert "STOP: the arm was stopped" in said and "station acknowledge" in said
     assert "STOP by" in status.reason and not status.robot.control
     assert [pose.state for pose in status.session.poses] == ["planned"]
+
+
+@pytest.mark.parametrize(
+    ("source", "sha256", "square_m", "same"),
+    [
+        ("real", "ab", 0.025, True),
+        ("real", "cd", 0.025, False),
+        ("simulated", "cd", 0.025, True),
+        ("simulated", "cd", 0.030, False),
+    ],
+)
+def test_a_file_that_the_daemon_does_not_run_with_is_refused(
+    source: Source, sha256: str, square_m: float, same: bool
+) -> None:
+    """Its moves would be chosen for another cell than they are checked in."""
+    cell = cell_config(TRUTH, "127.0.0.1")
+    board = msgspec.structs.replace(cell.board, square_m=square_m)
+    info = SessionInfo("s", cell.mount, source, board, TRUTH.camera, config_sha256=sha256)
+    if same:
+        cli_bootstrap.require_same_cell(cell, "ab", info)
+        return
+    with pytest.raises(ConfigError, match="the daemon runs with another"):
+        cli_bootstrap.require_same_cell(cell, "ab", info)
 
 
 def test_what_was_found_is_kept_when_no_further_move_is_free(monkeypatch: pytest.MonkeyPatch) -> None:

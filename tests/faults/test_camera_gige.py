@@ -65,7 +65,7 @@ async def test_18_lost_packets_are_sent_again_and_counted(
         try:
             await camera.capture()
             wire.loses = lambda packet: chance.random() < 0.02
-            pictures = [await camera.capture() for _ in range(20)]
+            pictures = [await camera.capture(timeout_s=20.0) for _ in range(20)]
             counts = camera.counts().stream
         finally:
             await camera.close()
@@ -76,7 +76,9 @@ async def test_18_lost_packets_are_sent_again_and_counted(
         for n, p in zip(numbers, pictures, strict=True)
     )
     assert wire.lost > 20 and counts.incomplete == counts.missing_packets == 0
-    assert wire.lost <= counts.resent_packets <= wire.sent_again
+    assert wire.lost <= wire.sent_again
+    # A packet that was only late, and asked for meanwhile, counts as well.
+    assert wire.lost <= counts.resent_packets <= counts.resend_requests
 
 
 async def test_19_frames_nobody_asked_for_are_noticed(server: SimulatedGige) -> None:

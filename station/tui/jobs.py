@@ -59,7 +59,7 @@ class JobScreen(ModalScreen[int]):
     @work(exclusive=True, exit_on_error=False)
     async def run_job(self) -> None:
         lines = self.query_one("#job-lines", RichLog)
-        width = str(max(40, lines.size.width))  # its own line breaks are then ours
+        width = str(max(40, lines.scrollable_content_region.width))  # its own line breaks are then ours
         self._process = await asyncio.create_subprocess_exec(
             *self._command,
             stdin=asyncio.subprocess.DEVNULL,

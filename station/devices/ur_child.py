@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import json
+import logging
 import os
 import signal
 import socket
@@ -17,12 +18,15 @@ from typing import Any
 
 from station.errors import RobotError
 
+log = logging.getLogger(__name__)
+
 CONNECT_S = 8.0
 HEARD_S = 1.0
 HEARD_NS = 50_000_000
 """Younger heartbeats leave a move time to get to the process, which takes none after 100 ms."""
 ACKNOWLEDGE_S = 1.0
 END_S = 1.0
+REAP_S = 2.0
 LOG_LIMIT_BYTES = 1_000_000
 STOP_DECELERATION = 2.0
 """The script reads it as m/s² of the tool for an asynchronous stop (see docs/safety.md)."""
@@ -187,7 +191,12 @@ class ControlChild:
         self._close()
 
     async def reap(self) -> None:
+        """Waits for the killed process; not for one that hangs in the kernel."""
+        give_up_s = time.monotonic() + REAP_S
         while self._process.poll() is None:
+            if time.monotonic() > give_up_s:
+                log.error("the control process %d was killed and did not end", self.pid)
+                return
             await asyncio.sleep(0.005)
 
     def epitaph(self) -> str:

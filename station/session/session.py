@@ -138,7 +138,7 @@ class Session:
         unmark_busy(bench)
 
     def acknowledge(self, who: str) -> None:
-        """A person looked. RefusedError while the cause is still there."""
+        """A person looked. What still holds the arm is told when the next go is given."""
         self._require("acknowledge")
         try:
             self.bench.cell.robot.latest()

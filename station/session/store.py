@@ -38,9 +38,14 @@ class StatusStore:
         return self._status.state
 
     def watch(self, changed: Callable[[], None]) -> Callable[[], None]:
-        """`changed` is called after every change; returns what ends it."""
+        """`changed` is called after every change; returns what ends it, however often it is called."""
         self._watchers.append(changed)
-        return lambda: self._watchers.remove(changed)
+
+        def end() -> None:
+            if changed in self._watchers:
+                self._watchers.remove(changed)
+
+        return end
 
     def on_event(self, listener: Callable[[Event], None]) -> None:
         """The recording keeps what people are told."""

@@ -13,6 +13,7 @@ from typing import Any
 
 import pytest
 
+from station.devices import ur_child
 from station.devices.ur_child import ControlChild
 from station.devices.ur_control import BEAT_FRESH_NS, WATCHDOG_HZ, ControlServer
 from station.errors import RobotError
@@ -187,3 +188,29 @@ async def test_its_words_go_to_the_log_and_the_log_is_bounded(
     await child.end()
     assert (tmp_path / "control.log.1").stat().st_size == 1_000_001
     assert log.stat().st_size < 10_000
+
+
+class Undying:
+    """A process that the kernel does not let go."""
+
+    pid, kills = 0, 0
+
+    def kill(self) -> None:
+        self.kills += 1
+
+    def poll(self) -> None:
+        return None
+
+
+async def test_a_process_that_does_not_end_holds_nobody_up(
+    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    monkeypatch.setattr(ur_child, "REAP_S", 0.05)
+    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+    process: Any = Undying()
+    child = ControlChild(process, ours, tmp_path / "control.log")
+    async with asyncio.timeout(2.0):
+        await child.end(timeout_s=0.01)
+    theirs.close()
+    assert process.kills and child.gone.is_set()
+    assert "did not end" in caplog.text

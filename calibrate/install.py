@@ -5,6 +5,7 @@ How it lies on the disk is `generations`' business.
 
 from __future__ import annotations
 
+import shlex
 from pathlib import Path
 from typing import Literal
 
@@ -139,7 +140,8 @@ def _installed_before(root: Path | None) -> Calibration | None:
 def install_line(source: Source, path: Path) -> str:
     """The command that installs a file of this source: only what a real cell captured goes there unasked."""
     kind = _CELL_OF[source]
-    return f"calibrate install {'' if kind == 'real' else f'--cell {kind} --root FOLDER '}{path}"
+    place = "" if kind == "real" else f"--cell {kind} --root FOLDER "
+    return f"calibrate install {place}{shlex.quote(str(path))}"
 
 
 def _refuse_foreign_source(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shlex
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -72,7 +73,7 @@ def import_(
         print(json.dumps({"recording": str(done.path), "views": done.pictures, "bytes": done.size_bytes}))
     else:
         print(f"{done.path}: {done.pictures} views, {done.size_bytes / 1e6:.1f} MB")
-        print(f"next: calibrate solve {done.path}")
+        print(f"next: calibrate solve {shlex.quote(str(done.path))}")
 
 
 @main.command()

@@ -7,7 +7,8 @@ from datetime import UTC, datetime
 from typing import Any
 
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
+from rich.text import Text
 
 from recordings.recover import Recovery
 
@@ -16,8 +17,9 @@ _LOSSES_SHOWN = 20
 
 def print_info(facts: dict[str, Any]) -> None:
     """Prints what `recording_info` found as two small tables."""
-    console = Console()
-    table = Table(box=None, show_header=False, padding=(0, 2, 0, 0))
+    # no markup: brackets and colons of a name are the name's own
+    console = Console(markup=False, emoji=False)
+    table = Table("", Column("", overflow="fold"), box=None, show_header=False, padding=(0, 2, 0, 0))
     for name, value in _info_rows(facts):
         table.add_row(name, value)
     console.print(table)
@@ -28,7 +30,7 @@ def print_info(facts: dict[str, Any]) -> None:
     console.print(topics)
 
 
-def _info_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
+def _info_rows(facts: dict[str, Any]) -> Iterator[tuple[str | Text, str]]:
     created = datetime.fromtimestamp(facts["created_wall_ns"] / 1e9, UTC)
     camera, robot, views = facts["camera"], facts["robot"], facts["views"]
     whole = "INCOMPLETE, what is here is sealed" if facts["missing"] else "sealed"
@@ -37,9 +39,9 @@ def _info_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
     if facts["parts"] > 1:
         yield "parts", str(facts["parts"])
     for missing in facts["missing"]:
-        yield "[red]MISSING[/red]", missing
+        yield Text("MISSING", "red"), missing
     for loss in facts["losses"]:
-        yield "[yellow]lost[/yellow]", loss
+        yield Text("lost", "yellow"), loss
     yield "board", facts["board"]
     known = "intrinsics known" if camera["intrinsics"] else "intrinsics to be found"
     yield (

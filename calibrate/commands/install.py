@@ -9,7 +9,7 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 import typer
-from rich.table import Table
+from rich.table import Column, Table
 
 from calibrate.calibration import Calibration, Lens, read_calibration, write_output
 from calibrate.commands.files import read_cell_serials
@@ -82,7 +82,8 @@ def diff(
             }
         )
         return
-    table = Table("", str(first), str(second or "installed"), box=None)
+    names = (Column(str(name), overflow="fold") for name in (first, second or "installed"))
+    table = Table("", *names, box=None)
     rows: list[tuple[str, Any]] = [
         ("result", pose_text),
         ("1σ", lambda c: f"{c.sigma.translation_mm:.3f} mm  {c.sigma.rotation_deg:.4f}°"),
@@ -185,7 +186,7 @@ def _switched(generation: Generation, root: Path | None, as_json: bool) -> None:
         print_json({"generation": generation.number, "path": str(generation.path), "current": str(stable)})
         return
     log = read_log(root)
-    out.print(f"generation {generation.number} is installed: {stable}")
+    out.print(f"generation {generation.number} is installed: {stable}", soft_wrap=True)
     if log and log[-1].change:
         out.print(f"change: {log[-1].change}")
 

@@ -19,8 +19,9 @@ from calibrate.errors import CalibrationError
 from calibrate.load import Progress as LoadProgress
 
 _told_width = sys.stdout.isatty() or "COLUMNS" in os.environ
-out = Console(highlight=False, width=None if _told_width else 150)
-err = Console(stderr=True, highlight=False)
+# no markup: brackets and colons of a name are the name's own
+out = Console(highlight=False, markup=False, emoji=False, width=None if _told_width else 150)
+err = Console(stderr=True, highlight=False, markup=False, emoji=False)
 
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout and nothing else")]
 
@@ -61,7 +62,7 @@ def detection_progress() -> Iterator[LoadProgress | None]:
         TextColumn("finding the board"),
         BarColumn(),
         MofNCompleteColumn(),
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
     )
     with Progress(*columns, console=err, transient=True) as bar:
         task = bar.add_task("", total=None)

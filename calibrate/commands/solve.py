@@ -59,9 +59,9 @@ def solve(
         print_json(solve_json(job))
     else:
         out.print(summary(job.calibration))
-        out.print(f"written: {target}" + ("" if report is None else f"  report: {report}"))
+        out.print(f"written: {target}" + ("" if report is None else f"  report: {report}"), soft_wrap=True)
         if job.passed:
-            out.print(f"next: {install_line(job.calibration.source, target)}")
+            out.print(f"next: {install_line(job.calibration.source, target)}", soft_wrap=True)
     if not job.passed:
         raise typer.Exit(GATE_FAILED)
 
@@ -108,7 +108,7 @@ def report_file(
     with bounded(time_limit_s, memory_limit_mib), detection_progress() as progress:
         job = solve_recording(recording, options, progress)
     _write_report(job, target, options, root)
-    out.print(f"written: {target}")
+    out.print(f"written: {target}", soft_wrap=True)
 
 
 def _write_report(job: SolvedRecording, target: Path, options: JobOptions, root: Path | None = None) -> None:

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 from calibrate.calibration import read_calibration
 from calibrate.commands.output import AsJson, err, out, print_json
@@ -30,7 +29,7 @@ def sweep(
     lens = None if calibration_file is None else read_calibration(calibration_file).intrinsics.model
     found = sweep_time_offset(open_recording(recording), lens)
     for problem in found.lost:
-        err.print(f"[yellow]left out[/]: {escape(problem)}")
+        err.print(f"left out: {problem}", style="yellow")
     if as_json:
         print_json(
             {

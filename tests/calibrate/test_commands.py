@@ -232,6 +232,15 @@ def test_lenses_of_different_picture_sizes_are_not_compared(real_file: Path, tmp
     assert plain["lens_matrix_px"] is None
 
 
+def test_names_are_printed_as_they_are(real_file: Path, tmp_path: Path) -> None:
+    """Brackets and colons are no markup: the command that is offered next must work as it stands."""
+    name = "c[red]:bug:.yaml"
+    shutil.copy(real_file, tmp_path / name)
+    assert name in run("diff", name, real_file, cwd=tmp_path).stdout
+    board = run("board", "-o", "b[a]:bug:.pdf", cwd=tmp_path)
+    assert board.stdout.startswith("written: b[a]:bug:.pdf (")
+
+
 def test_the_board_prints(tmp_path: Path) -> None:
     done = run("board", "-o", "b.pdf", "--paper", "A4", cwd=tmp_path)
     assert done.returncode == 0

@@ -47,6 +47,7 @@ def make_file(solved_real: SolvedRecording, tmp_path: Path):  # type: ignore[no-
 
 def test_the_next_step_of_a_solve_is_one_that_works() -> None:
     assert install_line("real", Path("c.yaml")) == "calibrate install c.yaml"
+    assert install_line("real", Path("my c.yaml")) == "calibrate install 'my c.yaml'"
     assert install_line("playback", Path("c.yaml")) == (
         "calibrate install --cell simulated --root FOLDER c.yaml"
     )

@@ -116,6 +116,12 @@ def test_a_file_that_is_none_is_named_as_such(
     assert path.read_bytes() == content
 
 
+def test_a_name_is_printed_as_it_is(small: Path, tmp_path: Path) -> None:
+    path = tmp_path / "a[red]:bug:.mcap"
+    path.write_bytes(small.read_bytes())
+    assert path.name in "".join(run("info", path).output.split())
+
+
 def test_a_recording_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", make_info()):
         result = run("recover", tmp_path / "a.mcap.part")

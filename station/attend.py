@@ -93,8 +93,8 @@ async def stop_and_say(client: Client) -> None:
     try:
         await client.request("stop", timeout_s=STOP_ANSWER_S)
         told = (
-            "STOP: the arm was stopped, nothing moves without a new go. Look at the cell, then `station "
-            "acknowledge`; `station resume` goes on with what is open, `station finish` closes it."
+            "STOP: the arm was stopped, nothing moves without a new go. Look at the cell.\n"
+            "`station acknowledge`, then `station resume` goes on with it, `station finish` closes it."
         )
     except StationError as problem:
         told = f"STOP was not answered: {problem} If the arm still moves use the emergency stop."

@@ -255,6 +255,7 @@ def ask_person(summary: GoSummary) -> bool:
         with ctrl_c_at_once():
             return typer.confirm("Is everybody out of the arm's reach? Move?", default=False, err=True)
     except typer.Abort:
+        err.print()  # after the terminal's ^C
         return False
 
 

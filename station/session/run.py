@@ -18,6 +18,7 @@ from station.limits import check_path, with_plan_speeds
 from station.plan.standing import geometry_from
 from station.session.bench import Bench
 from station.session.capture import PoseFailedError, take_pose
+from station.session.guard import JOGGED_RAD
 from station.session.lease import START_TOLERANCE_RAD, Go
 from station.session.patience import RestingCheck
 from station.session.recording import SessionRecording
@@ -208,7 +209,7 @@ class Run:
             raise LimitError("; ".join(map(str, check.problems)))
         await RestingCheck(robot.check).news()
         moved_rad = float(np.abs(np.subtract(robot.latest().joints_rad, here)).max())
-        if moved_rad > START_TOLERANCE_RAD:
+        if moved_rad > JOGGED_RAD:  # after a swing it may settle by less than that
             raise LimitError(f"the arm moved by {np.rad2deg(moved_rad):.1f}° while its way was checked")
         await robot.move(target, check.joint_speed_rad_s, check.joint_acceleration_rad_s2)
 

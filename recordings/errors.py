@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import shlex
+from pathlib import Path
+
 
 class RecordingError(Exception):
     """Something is wrong with a recording, a folder or a disk. `str()` says what, where and what to do next.
@@ -30,3 +33,8 @@ class BadPictureError(CorruptRecordingError):
 
 class ImportFolderError(RecordingError):
     """A folder to import is wrong; the message names file, row and remedy."""
+
+
+def recover_line(path: Path) -> str:
+    """The command that saves what is whole, as a shell takes it."""
+    return f"recordings recover {shlex.quote(str(path))}"

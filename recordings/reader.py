@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 
-from recordings.errors import MissingPartError, RecordingError, UnsealedRecordingError
+from recordings.errors import MissingPartError, RecordingError, UnsealedRecordingError, recover_line
 from recordings.files import PART_SUFFIX
 from recordings.messages import CaptureEvent, Picture, RobotState, SessionInfo, View
 from recordings.part import RecordingPart
@@ -98,11 +98,11 @@ def open_recording(path: Path, *, incomplete: bool = False) -> Recording:
     path = Path(path)
     if path.is_dir():
         found = parts_of_folder(path)
-        remedy = f"Copy it back beside the others; if it is lost for good: recordings recover {path}"
+        remedy = f"Copy it back beside the others; if it is lost for good: {recover_line(path)}"
     else:
         _require_finished(path)
         found = parts_of_file(path)
-        remedy = f"If the other parts are lost for good: recordings recover {path.parent}"
+        remedy = f"If the other parts are lost for good: {recover_line(path.parent)}"
     if found.missing and not incomplete:
         raise MissingPartError(f"{'; '.join(found.missing)}. {remedy}")
     return Recording(path, found.parts, found.missing, found.losses)
@@ -112,5 +112,5 @@ def _require_finished(path: Path) -> None:
     unfinished = path if path.name.endswith(PART_SUFFIX) else path.with_name(path.name + PART_SUFFIX)
     if unfinished.is_file() and (unfinished == path or not path.exists()):
         raise UnsealedRecordingError(
-            f"{path} was never finished. Save what is whole: recordings recover {unfinished}"
+            f"{path} was never finished. Save what is whole: {recover_line(unfinished)}"
         )

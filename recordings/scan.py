@@ -13,7 +13,7 @@ from pathlib import Path
 
 from recordings import checksum
 from recordings.contents import Contents
-from recordings.errors import CorruptRecordingError, RecordingError, UnsealedRecordingError
+from recordings.errors import CorruptRecordingError, RecordingError, UnsealedRecordingError, recover_line
 from recordings.pictures import PICTURE_LIMIT_BYTES
 from recordings.records import (
     DATA_END_BYTES,
@@ -93,13 +93,13 @@ class _Scan:
     def _corrupt(self, offset: int, reason: str) -> CorruptRecordingError:
         return CorruptRecordingError(
             f"{self._path} is damaged at byte {offset}: {reason}. "
-            f"Use the original, or save what is whole: recordings recover {self._path}"
+            f"Use the original, or save what is whole: {recover_line(self._path)}"
         )
 
     def _unsealed(self, reason: str) -> UnsealedRecordingError:
         return UnsealedRecordingError(
             f"{self._path} was not finished or is cut ({reason}). "
-            f"Save what is whole: recordings recover {self._path}"
+            f"Save what is whole: {recover_line(self._path)}"
         )
 
     def _read(self, offset: int, length: int) -> bytes:

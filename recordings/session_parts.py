@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from recordings.errors import CorruptRecordingError, RecordingError, UnsealedRecordingError
+from recordings.errors import CorruptRecordingError, RecordingError, UnsealedRecordingError, recover_line
 from recordings.files import PART_SUFFIX
 from recordings.manifest import PARTS_LIMIT, Manifest, missing_parts, read_manifest
 from recordings.part import RecordingPart
@@ -46,7 +46,7 @@ def parts_of_folder(folder: Path) -> SessionParts:
     unsealed = [name for name in names if name.endswith(".mcap" + PART_SUFFIX)]
     if unsealed:
         raise UnsealedRecordingError(
-            f"{folder / unsealed[0]} was never finished. Save what is whole: recordings recover {folder}"
+            f"{folder / unsealed[0]} was never finished. Save what is whole: {recover_line(folder)}"
         )
     files = [name for name in names if name.endswith(".mcap")]
     manifest = read_manifest(folder)

@@ -18,7 +18,7 @@ import msgspec
 
 from recordings import viewing
 from recordings.background_sync import BackgroundSync
-from recordings.errors import RecordingError
+from recordings.errors import RecordingError, recover_line
 from recordings.files import (
     PART_SUFFIX,
     is_attachment_name,
@@ -227,7 +227,7 @@ class RecordingWriter:
             # A writer that failed once cannot be trusted again: what it holds in memory is thrown away.
             self.error = RecordingError(
                 f"writing {self.part_path} failed ({error.strerror}); everything synced before is safe. "
-                f"Free space or replace the disk, then: recordings recover {self.part_path}"
+                f"Free space or replace the disk, then: {recover_line(self.part_path)}"
             )
             self._file.close()
             raise self.error from error

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import re
+import shlex
 from pathlib import Path
 
 import msgspec
@@ -114,6 +115,13 @@ def test_a_file_that_is_none_is_named_as_such(
     assert result.exit_code == 1
     assert re.search(words.replace("(", "\\(").replace(")", "\\)"), result.stderr), result.stderr
     assert path.read_bytes() == content
+
+
+def test_the_command_that_is_offered_works_for_any_name(small: Path, tmp_path: Path) -> None:
+    path = tmp_path / "cut it.mcap"
+    path.write_bytes(small.read_bytes()[:-9000])
+    offered = run("info", path).stderr.strip().partition("recordings recover ")[2]
+    assert shlex.split(offered) == [str(path)]
 
 
 def test_a_name_is_printed_as_it_is(small: Path, tmp_path: Path) -> None:

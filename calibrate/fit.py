@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy import stats
 
 from calibrate.board_poses import BoardPoses, refine_board_poses
 from calibrate.consensus import Consensus, disagreement, find_consensus, pose_arrays
@@ -23,14 +22,6 @@ from calibrate.views import ViewSet
 
 _ROUNDS = 5
 _FEWEST = 4
-_FEWEST_GOOD = 6
-"""The mixture is believed only if it leaves that many."""
-_UNDOUBTED, _NEAR = 0.999, 0.99
-"""Shares of good views that lie within, by the scale of the middle one."""
-_LARGEST_CHANCE = 0.2
-"""That one number of all good views lies beyond."""
-_TAIL = 0.5
-"""Left out, and this share of them within the limit: the good views' own tail, not another kind."""
 _FEW = 0.1
 """A smaller share of bad views does not widen the scales enough to hide in them."""
 MAX_ROBOT_M = 0.03
@@ -101,17 +92,16 @@ def fit_views(
 
 
 def _settle(everything: Observations, views: ViewSet, group: Settled, reject: bool) -> Settled:
-    """The group judges every view; in doubt a mixture first; then those kept judge each other.
+    """Those that the mixture finds good judge each other; where it finds no bad ones, the group judges all.
 
     Many bad views widen the scales until each of them seems likely, and so does every one let in again: where
-    more than a few are left out, views only have to leave once all were judged. Without doubt nothing is
-    sought: among the systematic errors of a worn arm some views always agree better than all of them.
+    the mixture left some out, or the limit more than a few, views only have to leave.
     """
     if not reject:
         return group
-    settled, closed = group, False
-    if _in_doubt(group.verdict, group.places):
-        settled, closed = _separated(everything, views, group)
+    good = find_good_views(group.verdict.linear, group.places, ~group.verdict.blurred)
+    closed = not np.array_equal(good, group.places)
+    settled = _again(everything, views, group, good) if closed else group
     for round_ in range(_ROUNDS):
         good = settled.verdict.good
         if closed or (round_ and len(good) < (1 - _FEW) * len(views)):
@@ -122,29 +112,6 @@ def _settle(everything: Observations, views: ViewSet, group: Settled, reject: bo
             break
         settled = _again(everything, views, settled, good)
     return settled
-
-
-def _separated(everything: Observations, views: ViewSet, group: Settled) -> tuple[Settled, bool]:
-    """By those that the mixture finds good, and whether the others are of another kind.
-
-    Of an arm that errs systematically it leaves out good views, too: then most of these lie within the limit,
-    and all that do may come back. Bad ones that chance brought within it are few among those left out.
-    """
-    good = find_good_views(group.verdict.linear, group.places, ~group.verdict.blurred)
-    if len(good) < _FEWEST_GOOD or np.array_equal(good, group.places):
-        return group, False
-    settled = _again(everything, views, group, good)
-    left_out = np.setdiff1d(group.places, good)
-    within = np.intersect1d(left_out, settled.verdict.good)
-    return settled, len(within) < _TAIL * len(left_out)
-
-
-def _in_doubt(verdict: Judgement, group: Places) -> bool:
-    """One view far out, several farther out than so many good views would be, or one number far out."""
-    far = len(group) - len(verdict.near_middle(group, _NEAR))
-    if far > 1 + 0.02 * len(group) or len(verdict.near_middle(group, _UNDOUBTED)) < len(group):
-        return True
-    return verdict.largest_number(group) > float(stats.norm.isf(_LARGEST_CHANCE / (12 * len(group))))
 
 
 def _judged(

@@ -55,22 +55,6 @@ class Judgement:
     def good(self) -> Places:
         return np.flatnonzero((self.distance2 <= self.limit) & ~self.blurred)
 
-    def near_middle(self, group: Places, share: float) -> Places:
-        """Those of the group that lie where a share of good views would, by the scale of the middle one."""
-        distance2 = self.distance2[group]
-        wider = float(np.median(distance2)) / float(stats.chi2.median(6))
-        near = distance2 <= wider * float(stats.chi2.ppf(share, 6))
-        return np.asarray(group[near & ~self.blurred[group]])
-
-    def largest_number(self, group: Places) -> float:
-        """Of the group: the most that one number of a flange pose alone is off, in sigmas of that alone.
-
-        An error e of number k explains the miss d best at e = (P d)_k / P_kk, P the inverse covariance.
-        """
-        precision = np.linalg.inv(self.linear.covariance(self.linear.sigma)[group])
-        off = (precision @ self.miss[group, :, None])[..., 0]
-        return float(np.abs(off / np.sqrt(np.diagonal(precision, axis1=1, axis2=2))).max())
-
 
 def judge_views(observed: Observations, result: Estimate, boards: BoardPoses, fitted: Places) -> Judgement:
     """`observed` and `boards` speak of all views, `result` rests on the `fitted` ones.

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from calibrate import mixture
 from calibrate.errors import BadViewsError
 from calibrate.evolution_robust import solve_geman_mcclure
 from calibrate.geometry import inverse, perturb, pose, rotation_exp, transform_points
@@ -208,6 +209,22 @@ def test_forty_percent_of_errors_in_one_number_do_not_hide_each_other(seed):
     used, bad = used_and_bad(200 + seed, lambda rng: 9 * (np.arange(6) == rng.integers(6)))
     assert len(used & bad) <= 2
     assert len(used - bad) >= 13
+
+
+@pytest.mark.parametrize("seed", [401, 452])  # by the length of their misses, and each alone, none looks bad
+def test_many_small_errors_in_one_number_are_found_by_what_they_have_in_common(seed):
+    used, bad = used_and_bad(seed, lambda rng: 8 * (np.arange(6) == rng.integers(6)))
+    assert not used & bad
+    assert len(used - bad) == 15
+
+
+@pytest.mark.parametrize("seed", [521, 604, 632])
+def test_good_views_are_not_divided_because_some_agree_better(seed, monkeypatch):
+    """In these the mixture by itself leaves two of 15 good views out."""
+    found, weigh = [], mixture._weigh
+    monkeypatch.setattr(mixture, "_weigh", lambda *given: found.append(weigh(*given)) or found[-1])
+    assert len(solve_views(cell(seed, 15).views, QUICK).used) == 15
+    assert len(found[0]) == 13
 
 
 @pytest.mark.parametrize("seed", [0, 10, 14])

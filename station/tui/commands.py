@@ -146,7 +146,7 @@ class Commands(App[None]):
         captured = self.status.session.captured if self.status else 0
         question = f"{captured} poses are captured. The recording is closed and can be solved."
         if await self.push_screen_wait(Confirm("Finish this session?", question, yes="Finish")):
-            await self.ask("finish")
+            await self.ask_with_control("finish")
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_free_drive(self) -> None:
@@ -158,7 +158,7 @@ class Commands(App[None]):
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_record(self) -> None:
-        await self.ask("record")
+        await self.ask_with_control("record")
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_acknowledge(self) -> None:

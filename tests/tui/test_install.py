@@ -75,7 +75,8 @@ async def install_until_a_reason_is_asked_for(pilot: Pilot[None], calibration: P
     await press_on_result(pilot, calibration, "i")
     await until(pilot, lambda: isinstance(pilot.app.screen, Confirm))
     await pilot.press("tab", "enter")
-    await until(pilot, lambda: isinstance(pilot.app.screen, Reason))
+    # Shown is not yet composed, on a busy computer.
+    await until(pilot, lambda: isinstance(pilot.app.screen, Reason) and pilot.app.screen.query(Input))
 
 
 def said(pilot: Pilot[None]) -> str:

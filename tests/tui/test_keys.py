@@ -93,7 +93,7 @@ async def test_a_dead_daemon_is_said(link: FakeLink) -> None:
         ("f6", ["pause"]),
         ("f8", ["acknowledge"]),
         ("f3", ["lease", "free_drive"]),
-        ("f2", ["record"]),
+        ("f2", ["lease", "record"]),
         ("f12", ["stop"]),
     ],
 )
@@ -112,7 +112,7 @@ async def test_finish_asks_and_then_seals(link: FakeLink) -> None:
         await until(pilot, lambda: isinstance(pilot.app.screen, Confirm))
         assert link.verbs == []
         await pilot.click("#yes")
-        await until(pilot, lambda: link.verbs == ["finish"])
+        await until(pilot, lambda: link.verbs == ["lease", "finish"])
 
 
 @pytest.mark.parametrize(
@@ -202,7 +202,7 @@ async def test_what_ends_control_asks_while_the_arm_works_by_it(link: FakeLink, 
         link.show(commanded(StationState.MOVING))
         await until(pilot, lambda: "MOVING" in text_of(pilot.app, "#bar"))
         await pilot.press(key)
-        await until(pilot, lambda: isinstance(pilot.app.screen, Confirm))
+        await until(pilot, lambda: pilot.app.screen.query("#confirm-body"))
         assert "decelerates" in str(pilot.app.screen.query_one("#confirm-body", Static).render())
         await pilot.press("escape")
         await pilot.pause()
@@ -217,7 +217,7 @@ async def test_who_only_watches_is_told_that_closing_changes_nothing(
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: state.value.upper() in text_of(pilot.app, "#bar"))
         await pilot.press("ctrl+q")
-        await until(pilot, lambda: isinstance(pilot.app.screen, Confirm))
+        await until(pilot, lambda: pilot.app.screen.query("#confirm-body"))
         assert "stay as they are" in str(pilot.app.screen.query_one("#confirm-body", Static).render())
 
 

@@ -17,8 +17,14 @@ from typing import Any
 from station.config import RobotConfig
 from station.devices.rtde import RuntimeState
 from station.devices.ur_child import ControlChild
-from station.devices.ur_condition import foreign_program, not_powered, program_not_running, safety_stop
-from station.devices.ur_dashboard import STOP, Dashboard
+from station.devices.ur_condition import (
+    foreign_program,
+    not_powered,
+    program_ended,
+    program_not_running,
+    safety_stop,
+)
+from station.devices.ur_dashboard import STOP, Dashboard, came
 from station.devices.ur_heart import Heart
 from station.devices.ur_link import UrLink, link_lost_words
 from station.devices.ur_moves import STALE_S, MoveWatch, check_goal
@@ -155,8 +161,7 @@ class UrRobot(UrLink):
                 raise RobotError("stopped")  # while we waited
             sample = self.newest()
             self._played_s = time.monotonic()
-            start = sample.state.joints_rad
-            watch = MoveWatch(start, joints_rad, sample.operation, self._played_s)
+            watch = MoveWatch(sample.state.joints_rad, joints_rad, sample.operation, self._played_s)
             await child.move(joints_rad, speed_rad_s, acceleration_rad_s2)
             await self._follow(watch, child)
         except BaseException as error:
@@ -197,7 +202,8 @@ class UrRobot(UrLink):
             return error
         if reader.ended is not None or isinstance(error, StaleStateError):
             return StaleStateError(self._stale_words(self.age_s()))
-        if state.runtime_state != RuntimeState.STOPPED:
+        refused = child.kicks_refused and state.runtime_state == RuntimeState.PLAYING  # it tells no more yet
+        if state.runtime_state != RuntimeState.STOPPED and not refused:
             return error
         pause_s = self._heart.worst_s(since_s=self._played_s - OUTLIVED_S)
         if pause_s > WATCHDOG_S:
@@ -205,6 +211,8 @@ class UrRobot(UrLink):
                 f"the session was busy for {pause_s * 1000:.0f} ms and the watchdog stopped the arm. "
                 "Look for what loads this computer, then give a new go."
             )
+        if refused:
+            return program_ended(RuntimeState.STOPPED)
         try:
             child.check(patience_s=UNANSWERED_S)
         except RobotError as trouble:
@@ -251,8 +259,8 @@ class UrRobot(UrLink):
 
     async def _finish_stop(self, child: ControlChild | None, reply: asyncio.Future[str] | None) -> None:
         """Behind the stop: the dashboard by a new connection if it did not answer, the end of the child."""
-        answered = reply is not None and await _came(reply)
-        ending = [_end_after_stop(child)] if child is not None else []
+        answered = reply is not None and await came(reply, STOP_WAIT_S)
+        ending = [child.end_after_stop(STOP_WAIT_S)] if child is not None else []
         if not answered:
             ending.append(self._dashboard_stop_anew())
         await asyncio.gather(*ending)
@@ -335,16 +343,3 @@ class UrRobot(UrLink):
         task = asyncio.get_running_loop().create_task(work)
         self._background.add(task)
         task.add_done_callback(self._background.discard)
-
-
-async def _came(reply: asyncio.Future[Any]) -> bool:
-    """The reply is there within a moment, and is no failure."""
-    await asyncio.wait([reply], timeout=STOP_WAIT_S)
-    return reply.done() and not reply.cancelled() and reply.exception() is None
-
-
-async def _end_after_stop(child: ControlChild) -> None:
-    """Leaves a moment to pass the stop on, then ends the process."""
-    await _came(child.stop_acknowledged)
-    child.kill()
-    await child.reap()

@@ -184,6 +184,12 @@ class ControlChild:
         self.kill()
         await self.reap()
 
+    async def end_after_stop(self, moment_s: float) -> None:
+        """Leaves a moment to pass the stop on, then ends the process."""
+        await asyncio.wait([self.stop_acknowledged], timeout=moment_s)
+        self.kill()
+        await self.reap()
+
     def kill(self) -> None:
         """SIGKILL; immediate, from any state."""
         with contextlib.suppress(OSError):

@@ -82,11 +82,14 @@ def not_powered(state: RobotState) -> RobotError | None:
 
 def program_not_running(state: RobotState) -> RobotError | None:
     """Of our own control script, which must play as long as control lives."""
-    if state.runtime_state == RuntimeState.PLAYING:
-        return None
-    word = program_word(state)
+    return None if state.runtime_state == RuntimeState.PLAYING else program_ended(state.runtime_state)
+
+
+def program_ended(runtime_state: int) -> RobotError:
+    """Our own control script plays no more."""
+    word = _program_word(runtime_state)
     by = "on the pendant, by the switch to local control, or by its watchdog"
-    if state.runtime_state in (RuntimeState.PAUSED, RuntimeState.PAUSING):
+    if runtime_state in (RuntimeState.PAUSED, RuntimeState.PAUSING):
         by = "on the pendant"
     return RobotError(
         f"the control program was {word} {by}. Look at the cell, acknowledge here and give a new go."
@@ -104,7 +107,11 @@ def foreign_program(state: RobotState, name: str) -> RobotError | None:
 
 
 def program_word(state: RobotState) -> str:
-    return _PROGRAM_WORDS.get(state.runtime_state, f"in state {state.runtime_state}")
+    return _program_word(state.runtime_state)
+
+
+def _program_word(runtime_state: int) -> str:
+    return _PROGRAM_WORDS.get(runtime_state, f"in state {runtime_state}")
 
 
 def safety_word(state: RobotState) -> str:

@@ -117,3 +117,9 @@ class Dashboard:
         self._break("closed")
         self._task.cancel()
         await asyncio.gather(self._task, return_exceptions=True)
+
+
+async def came(reply: asyncio.Future[str], moment_s: float) -> bool:
+    """The reply is there within a moment, and is no failure."""
+    await asyncio.wait([reply], timeout=moment_s)
+    return reply.done() and not reply.cancelled() and reply.exception() is None

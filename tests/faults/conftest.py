@@ -90,12 +90,19 @@ class Cell:
         return asyncio.create_task(self.robot.move(self.far_goal(), 0.5, 1.0))
 
     async def cruising(self) -> asyncio.Task[None]:
-        """The task of a move that has reached its full speed."""
-        move = self.far_move()
-        await self.until(lambda: move.done() or self.speed_rad_s() > 0.4)
-        if move.done():
-            await move  # why it ended
-        return move
+        """The task of a move that has reached its full speed; begun anew where this computer was too late."""
+        for left in reversed(range(TRIES)):
+            move = self.far_move()
+            await self.until(lambda move=move: move.done() or self.speed_rad_s() > 0.4)
+            if not move.done():
+                return move
+            try:
+                await move
+            except RobotError:
+                if not left:
+                    raise
+            await self.robot.start_control()
+        raise AssertionError("the arm arrived, again and again, before it was at full speed")
 
     async def until(self, condition: Callable[[], bool], timeout_s: float = 5.0) -> float:
         """Seconds until it holds."""

@@ -49,6 +49,17 @@ async def test_something_on_the_pendant(strike: Strike, fault: dict[str, Any], w
     await c.stays_at_rest()
 
 
+async def test_a_refused_kick_is_told_as_the_stopped_program_that_it_means(strike: Strike) -> None:
+    """The control process may hear of it before the state stream tells."""
+
+    def refuse(c: Any) -> None:
+        c.robot._child.kicks_refused = True
+
+    c, outcome = await strike(refuse)
+    assert "control program was stopped on the pendant" in str(outcome.error)
+    await c.stays_at_rest()
+
+
 async def test_the_switch_to_local_is_named_although_the_supervision_saw_it_first(strike: Strike) -> None:
     def go_local(c: Any) -> None:
         c.admin.ask(cmd="remote", on=False)

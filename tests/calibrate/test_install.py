@@ -195,6 +195,7 @@ _SYSCALLS = "openat,write,fsync,rename,renameat,renameat2,symlink,symlinkat,unli
 
 
 @pytest.mark.process
+@pytest.mark.timeout(300)  # strace stops every system call of a dozen starts of Python
 @pytest.mark.skipif(shutil.which("strace") is None, reason="strace is not installed")
 @pytest.mark.parametrize("program", [INSTALL, NOTE], ids=["install", "note what hands found"])
 @pytest.mark.parametrize("points", [5, pytest.param(1000, marks=pytest.mark.soak)])

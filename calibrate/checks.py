@@ -79,6 +79,7 @@ def trend_text(history: Sequence[CheckEntry], generation: int) -> str:
     days = np.array([entry.wall_s for entry in entries]) / 86400
     if np.ptp(days) <= 0:
         return ""
+    span = float(np.ptp(days))
     days = days - days.mean()
     shifts = np.array([entry.shift for entry in entries])
     weights = np.linalg.inv(np.array([entry.covariance for entry in entries]))
@@ -90,9 +91,17 @@ def trend_text(history: Sequence[CheckEntry], generation: int) -> str:
     statistic = float(slope @ np.linalg.solve(covariance[6:, 6:], slope))
     if stats.chi2.sf(statistic, 6) > _TREND_P:
         return ""
-    millimetres = float(np.linalg.norm(slope[:3]) * 1e3 * 30)
-    degrees = float(np.degrees(np.linalg.norm(slope[3:])) * 30)
+    millimetres = float(np.linalg.norm(slope[:3]) * 1e3 * span)
+    degrees = float(np.degrees(np.linalg.norm(slope[3:])) * span)
+    again = "calibrate again before it fails" if entries[-1].passed else "then calibrate again"
     return (
-        f"The last {len(entries)} checks wander: about {millimetres:.2f} mm and {degrees:.3f}° a month. "
-        "Look for a loosening mount; calibrate again before it fails."
+        f"The last {len(entries)} checks wander: by about {millimetres:.2f} mm and {degrees:.3f}° "
+        f"{_within(span)}. Look for a loosening mount; {again}."
     )
+
+
+def _within(days: float) -> str:
+    """Only the time that was looked at: minutes say nothing about a month."""
+    if days >= 2:
+        return f"in {days:.0f} days"
+    return f"in {days * 24:.0f} hours" if days * 24 >= 2 else f"in {max(days * 1440, 1):.0f} min"

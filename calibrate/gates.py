@@ -31,7 +31,7 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """0: all turns about one axis, 1: about all axes alike."""
     certificate: bool | None = True
     agreement_sigma: float | None = 6.0
-    """Between the certified optimum of the quadratic objective and the installed X."""
+    """Between the certified optimum of the quadratic objective and the final X."""
     view_rms_px: float | None = 1.5
     """Worst view."""
     holdout_share: float | None = 0.01
@@ -146,7 +146,7 @@ def _optimum_gates(solution: Solution, limits: GateLimits) -> Iterator[Gate]:
             "agreement",
             proof.distance_sigma,
             limits.agreement_sigma,
-            f"Certified optimum and installed X are {proof.distance_sigma:.1f} sigmas apart",
+            f"Certified optimum and final X are {proof.distance_sigma:.1f} sigmas apart",
             "The robot's orientations contradict its positions: see the warning below."
             if solution.frames_finding
             else "Two sound methods disagree: look for views that do not belong, or a wrong lens.",

@@ -175,7 +175,9 @@ def entry(day: float, shift_mm: float, generation: int = 1) -> CheckEntry:
 def test_a_trend_is_warned_of_before_a_check_fails(tmp_path: Path) -> None:
     for day in range(8):
         append_check(entry(day, 0.05 * day), tmp_path)
-    assert "about 1.50 mm" in trend_text(read_checks(tmp_path), 1)
+    warning = trend_text(read_checks(tmp_path), 1)
+    assert "by about 0.35 mm and 0.000° in 7 days" in warning
+    assert "before it fails" in warning
     assert trend_text(read_checks(tmp_path), 2) == ""
     steady = [entry(day, 0.1) for day in range(8)]
     assert trend_text(steady, 1) == ""
@@ -183,6 +185,14 @@ def test_a_trend_is_warned_of_before_a_check_fails(tmp_path: Path) -> None:
     failed = msgspec.structs.replace(steady[0], passed=False)
     assert "generation 1: 4, it held in 3" in earlier_text([*steady[:3], failed], 1)
     assert earlier_text(steady, 2) == ""
+
+
+def test_a_trend_over_minutes_is_not_stretched_to_a_month() -> None:
+    minutes = [entry(k / 1440, 0.05 * k) for k in range(8)]
+    minutes[-1] = msgspec.structs.replace(minutes[-1], passed=False)
+    warning = trend_text(minutes, 1)
+    assert "0.35 mm and 0.000° in 7 min" in warning
+    assert "then calibrate again" in warning
 
 
 def test_a_cut_history_line_is_skipped(tmp_path: Path) -> None:

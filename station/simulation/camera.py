@@ -21,6 +21,7 @@ from station.errors import CameraError
 from station.simulation.cell import CellTruth
 
 START_TIMEOUT_S = 20.0
+_ANSWER_S = 5.0
 _CLOCK_READINGS = 8
 _PIPE_LIMIT = 4 * 2**20
 
@@ -134,7 +135,7 @@ class RenderedCamera:
 
     async def glimpse(self) -> Picture | None:
         """At half the size, rendered anew."""
-        picture = await self._ask({"cmd": "preview"}, 2.0)
+        picture = await self._ask({"cmd": "preview"}, _ANSWER_S)
         assert isinstance(picture, Picture)
         return picture
 
@@ -149,7 +150,7 @@ class RenderedCamera:
         if fault == "unplugged":
             self._write({"cmd": "fault", "name": fault})
             return
-        await self._ask({"cmd": "fault", "name": fault, "value": value}, 2.0)
+        await self._ask({"cmd": "fault", "name": fault, "value": value}, _ANSWER_S)
 
     async def close(self) -> None:
         process, self._process = self._process, None
@@ -183,7 +184,7 @@ class RenderedCamera:
 
     async def _read_clock(self) -> None:
         asked_ns = time.monotonic_ns()
-        answer = await self._ask_locked({"cmd": "clock"}, 2.0)
+        answer = await self._ask_locked({"cmd": "clock"}, _ANSWER_S)
         if isinstance(answer, dict):
             self._device_clock.reading(answer["device_ns"], asked_ns, time.monotonic_ns())
 

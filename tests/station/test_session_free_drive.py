@@ -91,12 +91,8 @@ async def test_a_picture_that_ends_oddly_leaves_no_state_of_work(
     assert rig.pose_states == ["planned"]
 
 
-async def test_stop_while_free_drive_begins_stays_latched(
-    new_rig: NewRig, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    rig = await new_rig(with_plan=False)
-    await rig.until(S.IDLE)
-    rig.session.take_lease(1, "anna")
+async def _begins(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> tuple[asyncio.Event, asyncio.Future[None]]:
+    """Free drive, for as long as its recording is not opened: until the event is set."""
     opened, settings = asyncio.Event(), rig.camera.settings
 
     async def slow() -> dict[str, object]:
@@ -106,6 +102,16 @@ async def test_stop_while_free_drive_begins_stays_latched(
     monkeypatch.setattr(rig.camera, "settings", slow)
     beginning = asyncio.ensure_future(rig.session.switch_free_drive(1, True, auto=False))
     await asyncio.sleep(0.02)
+    return opened, beginning
+
+
+async def test_stop_while_free_drive_begins_stays_latched(
+    new_rig: NewRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = await new_rig(with_plan=False)
+    await rig.until(S.IDLE)
+    rig.session.take_lease(1, "anna")
+    opened, beginning = await _begins(rig, monkeypatch)
     await rig.session.stop("bert")
     opened.set()
     with pytest.raises(RefusedError, match="STOP is latched"):
@@ -114,15 +120,7 @@ async def test_stop_while_free_drive_begins_stays_latched(
 
 
 async def test_no_go_is_given_while_free_drive_begins(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    opened, settings = asyncio.Event(), rig.camera.settings
-
-    async def slow() -> dict[str, object]:
-        await opened.wait()
-        return await settings()
-
-    monkeypatch.setattr(rig.camera, "settings", slow)
-    beginning = asyncio.ensure_future(rig.session.switch_free_drive(1, True, auto=False))
-    await asyncio.sleep(0.02)
+    opened, beginning = await _begins(rig, monkeypatch)
     with pytest.raises(RefusedError, match="free drive"):
         await rig.session.prepare(1, "run")
     opened.set()

@@ -24,8 +24,7 @@ from recordings.info_text import print_info, print_recovery
 from recordings.reader import open_recording
 from recordings.recover import recover as recover_recording
 
-main = typer.Typer(
-    name="recordings",
+app = typer.Typer(
     help="Look into, make, convert and rescue recordings.",
     epilog="Exit codes: 0 good, 1 failed, 2 wrong usage, 3 done with loss.",
     no_args_is_help=True,
@@ -36,20 +35,10 @@ Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session's fo
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 
 
-@contextmanager
-def _errors_for_people() -> Iterator[None]:
-    try:
-        yield
-    except RecordingError as error:
-        print(f"error: {error}", file=sys.stderr)
-        raise typer.Exit(error.exit_code) from error
-
-
-@main.command()
+@app.command()
 def info(recording: Rec, json_: Json = False) -> None:
     """What a recording holds: contents, rates, gaps, clock quality, size. Ends with 3 when a part lacks."""
-    with _errors_for_people():
-        facts = recording_info(open_recording(recording, incomplete=True))
+    facts = recording_info(open_recording(recording, incomplete=True))
     if json_:
         print(json.dumps(facts))
     else:
@@ -58,7 +47,7 @@ def info(recording: Rec, json_: Json = False) -> None:
         raise typer.Exit(3)
 
 
-@main.command("import")
+@app.command("import")
 def import_(
     folder: Annotated[
         Path, typer.Argument(help="Holds dataset.yaml, poses.csv and the pictures", show_default=False)
@@ -67,7 +56,7 @@ def import_(
     json_: Json = False,
 ) -> None:
     """Your own pictures and poses (dataset.yaml, poses.csv, pictures) to a recording."""
-    with _errors_for_people(), _progress("importing", not json_) as progress:
+    with _progress("importing", not json_) as progress:
         done = import_folder(folder, output, progress)
     if json_:
         print(json.dumps({"recording": str(done.path), "views": done.pictures, "bytes": done.size_bytes}))
@@ -76,7 +65,7 @@ def import_(
         print(f"next: calibrate solve {shlex.quote(str(done.path))}")
 
 
-@main.command()
+@app.command()
 def export(
     recording: Rec,
     output: Annotated[Path, typer.Option("-o", "--output", help="The folder to write; it must not exist.")],
@@ -87,24 +76,22 @@ def export(
     json_: Json = False,
 ) -> None:
     """A recording as a folder of pictures and poses, as CSV tables, or as a ROS 2 bag."""
-    with _errors_for_people():
-        written = export_recording(open_recording(recording), output, to)
+    written = export_recording(open_recording(recording), output, to)
     print(json.dumps({"output": str(written)}) if json_ else f"{written} written")
 
 
-@main.command()
+@app.command()
 def excerpt(
     recording: Rec,
     output: Annotated[Path, typer.Option("-o", "--output", help="The smaller recording (.mcap) to write.")],
     json_: Json = False,
 ) -> None:
     """A smaller recording that solves like the whole: lossless PNG, robot states only around the pictures."""
-    with _errors_for_people():
-        written = write_excerpt(open_recording(recording), output)
+    written = write_excerpt(open_recording(recording), output)
     print(json.dumps({"output": str(written)}) if json_ else f"{written} written")
 
 
-@main.command()
+@app.command()
 def recover(
     recording: Annotated[
         Path, typer.Argument(help="A recording (.mcap, .mcap.part) or a session's folder", show_default=False)
@@ -116,8 +103,7 @@ def recover(
     json_: Json = False,
 ) -> None:
     """Rebuild an unfinished, cut or damaged recording (or a session's folder); ends with 3 when it had to."""
-    with _errors_for_people():
-        results = recover_recording(recording, output)
+    results = recover_recording(recording, output)
     if json_:
         print(json.dumps([dataclasses.asdict(result) for result in results], default=str))
     else:
@@ -138,6 +124,15 @@ def _progress(text: str, shown: bool) -> Iterator[Callable[[int, int], None]]:
     with Progress(console=console, transient=True) as bar:
         task = bar.add_task(text)
         yield lambda done, total: bar.update(task, completed=done, total=total)
+
+
+def main() -> None:
+    """The entry point. Exit codes: 0 good, 1 failed, 2 usage, 3 done with loss."""
+    try:
+        app()
+    except RecordingError as problem:
+        print(f"recordings: {problem}", file=sys.stderr)
+        sys.exit(problem.exit_code)
 
 
 if __name__ == "__main__":

@@ -13,10 +13,9 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 
-from recordings.errors import RecordingError
 from station.config import StationConfig
 from station.config_file import load_config
-from station.errors import ConfigError, LimitError, StationError
+from station.errors import ConfigError, LimitError
 from station.limits import PlanCheck, check_plan
 from station.plan.choose import Criterion
 from station.plan.files import import_list, load_plan, save_plan, taught_plan
@@ -58,26 +57,22 @@ def plan_command(
     as_json: Annotated[bool, typer.Option("--json", help="One JSON object, nothing else.")] = False,
 ) -> None:
     """Make a pose plan, or check one. Nothing moves."""
-    try:
-        cell, standing = _cell(config, scene, start)
-        criterion: Criterion = "D" if d_optimal else "A"
-        plan = _given(cell, standing, check, from_list, taught)
-        plan = plan or _made(cell, standing, poses, seed, criterion, quiet=as_json)
-        geometry = cell_geometry(cell) if standing is None else geometry_from(cell, standing)
-        outcome = check_plan(plan, standing, geometry)
-        shown = _scene(cell, needed=picture is not None or foxglove is not None)
-        told, cut = (plan, ()) if shown is None else with_forecast(shown, plan)
-        if check is None:
-            plan = told
-            if output is not None:
-                save_plan(plan, output)
-        if shown is not None and picture is not None:
-            save_picture(shown, plan, picture)
-        if shown is not None and foxglove is not None:
-            save_scene(shown, plan, foxglove)
-    except (StationError, RecordingError) as error:
-        _errors.print(f"[bold red]error:[/] {error}", soft_wrap=True, highlight=False)
-        raise typer.Exit(error.exit_code) from None
+    cell, standing = _cell(config, scene, start)
+    criterion: Criterion = "D" if d_optimal else "A"
+    plan = _given(cell, standing, check, from_list, taught)
+    plan = plan or _made(cell, standing, poses, seed, criterion, quiet=as_json)
+    geometry = cell_geometry(cell) if standing is None else geometry_from(cell, standing)
+    outcome = check_plan(plan, standing, geometry)
+    shown = _scene(cell, needed=picture is not None or foxglove is not None)
+    told, cut = (plan, ()) if shown is None else with_forecast(shown, plan)
+    if check is None:
+        plan = told
+        if output is not None:
+            save_plan(plan, output)
+    if shown is not None and picture is not None:
+        save_picture(shown, plan, picture)
+    if shown is not None and foxglove is not None:
+        save_scene(shown, plan, foxglove)
     if as_json:
         typer.echo(json.dumps(_summary(plan, told, outcome)))
     else:

@@ -3,14 +3,12 @@
 from __future__ import annotations
 
 import csv
-import io
 import json
 import shutil
 import subprocess
 import sys
-from contextlib import redirect_stderr, redirect_stdout
-from dataclasses import dataclass
 from pathlib import Path
+from subprocess import CompletedProcess
 
 import msgspec
 import numpy as np
@@ -23,32 +21,19 @@ from recordings.excerpt import write_excerpt
 from recordings.messages import CameraModel
 from recordings.reader import open_recording
 from tests.calibrate.sessions import Scene, write_session
+from tests.command_line import call
 
 
-@dataclass
-class Done:
-    returncode: int
-    stdout: str
-    stderr: str
-
-
-def run(*arguments: object, cwd: Path) -> Done:
-    """The command in this process: the same entry point as the script's, without its start-up time."""
-    out, err, code = io.StringIO(), io.StringIO(), 0
-    with pytest.MonkeyPatch.context() as patch, redirect_stdout(out), redirect_stderr(err):
+def run(*arguments: object, cwd: Path) -> CompletedProcess[str]:
+    with pytest.MonkeyPatch.context() as patch:
         patch.chdir(cwd)
         patch.setenv("XDG_STATE_HOME", str(cwd / "state"))
         patch.delenv("STATE_DIRECTORY", raising=False)
         patch.setattr(output.out, "width", 150)  # whatever a test before it told
-        patch.setattr(sys, "argv", ["calibrate", *map(str, arguments)])
-        try:
-            main()
-        except SystemExit as end:
-            code = int(end.code or 0)
-    return Done(code, out.getvalue(), err.getvalue())
+        return call(main, *arguments)
 
 
-def refused(done: Done, code: int, *words: str) -> None:
+def refused(done: CompletedProcess[str], code: int, *words: str) -> None:
     assert done.returncode == code, done.stderr
     assert done.stdout == ""
     assert "Traceback" not in done.stderr

@@ -16,7 +16,6 @@ import pytest
 import yaml
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
-from typer.testing import CliRunner
 
 from recordings.cdr import definition_text, encode_cdr
 from recordings.cli import main
@@ -28,6 +27,7 @@ from recordings.messages import Stamps
 from recordings.reader import open_recording
 from recordings.viewing import quaternion_xyzw
 from recordings.writer import RecordingWriter
+from tests.command_line import call
 from tests.recordings.small_recording import (
     HEIGHT,
     START_NS,
@@ -127,8 +127,8 @@ def test_an_excerpt_keeps_the_views_and_the_states_around_them(tmp_path: Path) -
 
 @pytest.mark.parametrize("target", ["folder", "csv", "ros2"])
 def test_the_command_line_writes_each_target(small: Path, tmp_path: Path, target: str) -> None:
-    result = CliRunner().invoke(main, ["export", str(small), "--to", target, "-o", str(tmp_path / "out")])
-    assert result.exit_code == 0, result.output
+    result = call(main, "export", small, "--to", target, "-o", tmp_path / "out")
+    assert result.returncode == 0, result.stderr
     assert (tmp_path / "out").is_dir()
 
 

@@ -9,13 +9,13 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner
 
 from recordings.cli import main
 from recordings.errors import ImportFolderError, RecordingError
 from recordings.importer import import_folder
 from recordings.poses import matrix_from_quaternion
 from recordings.reader import open_recording
+from tests.command_line import call
 from tests.recordings.small_recording import BOARD, HEIGHT, WIDTH, make_image
 
 Change = Callable[[Path], object]
@@ -192,17 +192,17 @@ def test_a_bad_folder_says_what_where_and_what_to_do(folder: Path, tmp_path: Pat
 
 
 def test_the_command_line_ends_with_one_paragraph_and_no_traceback(folder: Path, tmp_path: Path) -> None:
-    result = CliRunner().invoke(main, ["import", str(folder / "nowhere"), "-o", str(tmp_path / "out.mcap")])
-    assert result.exit_code == 1
-    assert result.stderr.startswith("error: ")
+    result = call(main, "import", folder / "nowhere", "-o", tmp_path / "out.mcap")
+    assert result.returncode == 1
+    assert result.stderr.startswith("recordings: ")
     assert "is not a folder" in result.stderr
-    assert "Traceback" not in result.output
+    assert "Traceback" not in result.stderr
 
 
 def test_the_command_line_prints_one_json_object(folder: Path, tmp_path: Path) -> None:
     output = tmp_path / "out.mcap"
-    result = CliRunner().invoke(main, ["import", str(folder), "-o", str(output), "--json"])
-    assert result.exit_code == 0
+    result = call(main, "import", folder, "-o", output, "--json")
+    assert result.returncode == 0
     assert json.loads(result.stdout) == {"recording": str(output), "views": 3, "bytes": output.stat().st_size}
 
 

@@ -6,10 +6,10 @@ import json
 import re
 import shlex
 from pathlib import Path
+from subprocess import CompletedProcess
 
 import msgspec
 import pytest
-from typer.testing import CliRunner, Result
 
 from recordings.cli import main
 from recordings.info import recording_info
@@ -17,6 +17,7 @@ from recordings.manifest import enter_part
 from recordings.messages import CaptureEvent, Stamps
 from recordings.reader import open_recording
 from recordings.writer import RecordingWriter
+from tests.command_line import call
 from tests.recordings.small_recording import (
     START_NS,
     make_info,
@@ -27,8 +28,8 @@ from tests.recordings.small_recording import (
 )
 
 
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(main, [str(argument) for argument in arguments])
+def run(*arguments: object) -> CompletedProcess[str]:
+    return call(main, *arguments)
 
 
 def write_with_clocks(path: Path, drift_ppm: float, missing: range) -> Path:
@@ -64,8 +65,8 @@ def test_info_measures_rate_gaps_drift_and_lost_frames(tmp_path: Path) -> None:
 def test_info_for_people_says_the_same(tmp_path: Path) -> None:
     path = write_with_clocks(tmp_path / "a.mcap", drift_ppm=40, missing=range(500, 510))
     result = run("info", path)
-    assert result.exit_code == 0
-    text = " ".join(result.output.split())
+    assert result.returncode == 0
+    text = " ".join(result.stdout.split())
     for words in (
         "simulated eye-in-hand",
         "chessboard 7×6, 25 mm",
@@ -86,15 +87,15 @@ def test_info_of_an_empty_recording(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
         path = writer.finish()
     result = run("info", path)
-    assert result.exit_code == 0, result.output
+    assert result.returncode == 0, result.stderr
     assert recording_info(open_recording(path))["robot_states"] is None
 
 
 @pytest.mark.parametrize("command", ["info", "recover"])
 def test_a_missing_file_is_one_sentence_and_1(tmp_path: Path, command: str) -> None:
     result = run(command, tmp_path / "none.mcap")
-    assert result.exit_code == 1
-    assert result.stderr == f"error: cannot open {tmp_path}/none.mcap: No such file or directory\n"
+    assert result.returncode == 1
+    assert result.stderr == f"recordings: cannot open {tmp_path}/none.mcap: No such file or directory\n"
 
 
 @pytest.mark.parametrize(
@@ -112,7 +113,7 @@ def test_a_file_that_is_none_is_named_as_such(
     path = tmp_path / "a.mcap"
     path.write_bytes(content)
     result = run(command, path)
-    assert result.exit_code == 1
+    assert result.returncode == 1
     assert re.search(words.replace("(", "\\(").replace(")", "\\)"), result.stderr), result.stderr
     assert path.read_bytes() == content
 
@@ -127,45 +128,45 @@ def test_the_command_that_is_offered_works_for_any_name(small: Path, tmp_path: P
 def test_a_name_is_printed_as_it_is(small: Path, tmp_path: Path) -> None:
     path = tmp_path / "a[red]:bug:.mcap"
     path.write_bytes(small.read_bytes())
-    assert path.name in "".join(run("info", path).output.split())
+    assert path.name in "".join(run("info", path).stdout.split())
 
 
 def test_a_recording_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", make_info()):
         result = run("recover", tmp_path / "a.mcap.part")
-        assert result.exit_code == 1
+        assert result.returncode == 1
         assert "is in use by another process; wait until it has finished" in result.stderr
         assert "never finished" in run("info", tmp_path / "a.mcap").stderr
 
 
 def test_an_export_into_a_folder_that_is_not_there_says_so(small: Path, tmp_path: Path) -> None:
     result = run("export", small, "--to", "csv", "-o", tmp_path / "none" / "out")
-    assert result.exit_code == 1
+    assert result.returncode == 1
     assert f"the folder {tmp_path}/none does not exist; create it first" in result.stderr
 
 
 def test_recover_of_a_whole_file_says_that_no_output_was_made(small: Path, tmp_path: Path) -> None:
     result = run("recover", small, "-o", tmp_path / "b.mcap")
-    assert result.exit_code == 0
-    assert "b.mcap was not written: there was nothing to repair" in "".join(result.output)
+    assert result.returncode == 0
+    assert "b.mcap was not written: there was nothing to repair" in "".join(result.stdout)
 
 
 def test_a_device_or_a_pipe_is_no_recording() -> None:
-    assert run("info", "/dev/zero").exit_code == 1
+    assert run("info", "/dev/zero").returncode == 1
 
 
 def test_recover_ends_with_3_when_it_had_to_rebuild_and_with_0_when_not(tmp_path: Path) -> None:
     path = write_small(tmp_path / "a.mcap")
-    assert run("recover", path).exit_code == 0
+    assert run("recover", path).returncode == 0
     path.write_bytes(path.read_bytes()[:-9000])
     refused = run("info", path)
-    assert refused.exit_code == 1
+    assert refused.returncode == 1
     assert "recordings recover" in refused.stderr
     result = run("recover", path)
-    assert result.exit_code == 3
-    assert "saved 3 poses" in result.output
-    assert "a.mcap.damaged" in "".join(result.output.split())
-    assert run("info", path).exit_code == 0
+    assert result.returncode == 3
+    assert "saved 3 poses" in result.stdout
+    assert "a.mcap.damaged" in "".join(result.stdout.split())
+    assert run("info", path).returncode == 0
 
 
 def test_recover_json_lists_what_was_lost(tmp_path: Path) -> None:
@@ -174,7 +175,7 @@ def test_recover_json_lists_what_was_lost(tmp_path: Path) -> None:
     data[14_000] ^= 1
     path.write_bytes(data)
     result = run("recover", path, "--json")
-    assert result.exit_code == 3
+    assert result.returncode == 3
     (report,) = json.loads(result.stdout)
     assert report["lost_bytes"] > 0
     assert report["losses"][0].startswith("bytes ")
@@ -186,22 +187,22 @@ def test_a_missing_part_is_shown_by_info_and_given_up_by_recover(tmp_path: Path)
         enter_part(tmp_path, "test-cell", part, f"session-{part}.mcap")
     (tmp_path / "session-2.mcap").unlink()
     shown = run("info", tmp_path)
-    assert shown.exit_code == 3
-    assert "MISSING" in shown.output
-    assert "lacks part 2 (session-2.mcap)" in " ".join(shown.output.split())
-    assert "3 poses" in shown.output
+    assert shown.returncode == 3
+    assert "MISSING" in shown.stdout
+    assert "lacks part 2 (session-2.mcap)" in " ".join(shown.stdout.split())
+    assert "3 poses" in shown.stdout
     assert json.loads(run("info", tmp_path, "--json").stdout)["missing"] != []
     refused = run("excerpt", tmp_path, "-o", tmp_path / "b.mcap")
-    assert refused.exit_code == 1
+    assert refused.returncode == 1
     assert f"recordings recover {tmp_path}" in refused.stderr
     given_up = run("recover", tmp_path)
-    assert given_up.exit_code == 3
-    assert "session-2.mcap: part 2 of the session is not in the folder" in given_up.output
-    assert "damaged file is kept" not in given_up.output
-    assert "part 2 of the session is not in the folder" in run("recover", tmp_path).output
+    assert given_up.returncode == 3
+    assert "session-2.mcap: part 2 of the session is not in the folder" in given_up.stdout
+    assert "damaged file is kept" not in given_up.stdout
+    assert "part 2 of the session is not in the folder" in run("recover", tmp_path).stdout
     afterwards = run("info", tmp_path)
-    assert afterwards.exit_code == 0
-    assert "part 2 of the session was lost" in afterwards.output
+    assert afterwards.returncode == 0
+    assert "part 2 of the session was lost" in afterwards.stdout
 
 
 def test_the_time_between_two_parts_is_no_gap_and_no_lost_frame(tmp_path: Path) -> None:
@@ -223,5 +224,5 @@ def test_the_time_between_two_parts_is_no_gap_and_no_lost_frame(tmp_path: Path) 
 
 
 def test_unknown_options_and_no_arguments_are_usage_errors() -> None:
-    assert run("info").exit_code == 2
-    assert run("export", "a", "--to", "bag", "-o", "b").exit_code == 2
+    assert run("info").returncode == 2
+    assert run("export", "a", "--to", "bag", "-o", "b").returncode == 2

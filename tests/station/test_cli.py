@@ -24,6 +24,7 @@ from station.plan.files import load_plan
 from station.plan.model import plan_sha256
 from station.states import RUNNING
 from station.status import GoSummary
+from tests.command_line import call
 from tests.system.conftest import short_folder
 
 pytestmark = pytest.mark.process
@@ -44,20 +45,13 @@ def station(*args: str, timeout_s: float = 100.0, **environment: str) -> subproc
 class Shell:
     """The command line in this process, beside a daemon that is another."""
 
-    def __init__(
-        self, socket: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-    ) -> None:
-        self.socket, self._monkeypatch, self._capsys = socket, monkeypatch, capsys
+    def __init__(self, socket: Path) -> None:
+        self.socket = socket
 
     def __call__(self, *args: str) -> tuple[int, str, str]:
         """Exit code, standard output, standard error."""
-        self._monkeypatch.setattr(sys, "argv", ["station", *args])
-        self._capsys.readouterr()
-        with pytest.raises(SystemExit) as ended:
-            main()
-        said = self._capsys.readouterr()
-        code = ended.value.code
-        return code if isinstance(code, int) else 0, said.out, said.err
+        done = call(main, *args)
+        return done.returncode, done.stdout, done.stderr
 
     def ask(self, *args: str) -> tuple[int, str, str]:
         return self(*args, "--socket", str(self.socket))
@@ -68,12 +62,7 @@ class Shell:
 
 
 @pytest.fixture
-def shell(
-    short_folder: Path,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> Iterator[Shell]:
+def shell(short_folder: Path, tmp_path: Path) -> Iterator[Shell]:
     """Beside a simulated daemon, faster than real time."""
     socket = short_folder / "s"
     command = [sys.executable, "-m", "station.cli", "serve", "--simulate", "--end-with-stdin"]
@@ -83,7 +72,7 @@ def shell(
     assert daemon.stdin is not None and daemon.stdout is not None
     try:
         assert json.loads(daemon.stdout.readline())["ready"]
-        yield Shell(socket, monkeypatch, capsys)
+        yield Shell(socket)
     finally:
         daemon.stdin.close()
         daemon.wait(15)
@@ -205,17 +194,11 @@ def test_the_demo_finds_the_truth(tmp_path: Path) -> None:
         (("retake", "0"), 2, "greater than or equal to 1"),
     ],
 )
-def test_what_a_user_can_cause_has_words_and_a_code(
-    args: tuple[str, ...],
-    code: int,
-    said: str,
-    monkeypatch: pytest.MonkeyPatch,
-    capsys: pytest.CaptureFixture[str],
-) -> None:
-    ended, out, err = Shell(Path("/nowhere"), monkeypatch, capsys)(*args)
-    assert ended == code
-    assert said in " ".join(err.replace("│", " ").split())
-    assert out == ""
+def test_what_a_user_can_cause_has_words_and_a_code(args: tuple[str, ...], code: int, said: str) -> None:
+    done = call(main, *args)
+    assert done.returncode == code
+    assert said in " ".join(done.stderr.replace("│", " ").split())
+    assert done.stdout == ""
 
 
 def test_the_command_line_loads_no_screen_and_no_driver() -> None:

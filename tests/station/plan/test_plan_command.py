@@ -3,24 +3,19 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 
 import msgspec
 import numpy as np
 import pytest
-import typer
 from mcap.reader import make_reader
-from typer.testing import CliRunner
 
-from station.plan.cli import plan_command
+from station.cli import main
 from station.plan.files import load_plan, save_plan
 from station.simulation.scenes import build_cell, cell_config
+from tests.command_line import call
 
-app = typer.Typer()
-app.command()(plan_command)
-
-
-def run(*args):
-    return CliRunner().invoke(app, [str(a) for a in args])
+run = partial(call, main, "plan")
 
 
 @pytest.fixture(scope="module")
@@ -33,9 +28,9 @@ def made(tmp_path_factory):
 
 def test_a_plan_is_made_shown_and_saved(made):
     result, files = made
-    assert result.exit_code == 0, result.output
-    assert "12 poses" in result.output and "check: passed" in result.output
-    assert "board points in the picture" in result.output
+    assert result.returncode == 0, result.stderr
+    assert "12 poses" in result.stdout and "check: passed" in result.stdout
+    assert "board points in the picture" in result.stdout
     assert len(load_plan(files["plan.yaml"]).poses) == 12
     assert files["plan.png"].read_bytes()[:4] == b"\x89PNG"
 
@@ -44,7 +39,7 @@ def test_the_other_criterion_makes_another_plan(tmp_path):
     plans = []
     for name, options in (("a", []), ("d", ["--d-optimal"])):
         result = run("--poses", 12, "-o", tmp_path / name, *options)
-        assert result.exit_code == 0, result.output
+        assert result.returncode == 0, result.stderr
         plans.append(load_plan(tmp_path / name))
     assert plans[0].poses != plans[1].poses
 
@@ -62,7 +57,7 @@ def test_the_scene_file_opens_and_shows_the_arm_moving(made):
 def test_json_is_one_object_and_nothing_else(made):
     result = run("--check", made[1]["plan.yaml"], "--json")
     summary = json.loads(result.stdout)
-    assert result.exit_code == 0
+    assert result.returncode == 0
     assert summary["poses"] == 12
     assert summary["problems"] == []
     assert summary["top_speed_m_s"] <= 0.25
@@ -71,7 +66,7 @@ def test_json_is_one_object_and_nothing_else(made):
 
 def sum_of(made):
     return float(
-        next(line for line in made[0].output.splitlines() if "s of motion" in line).split(",")[1].split()[0]
+        next(line for line in made[0].stdout.splitlines() if "s of motion" in line).split(",")[1].split()[0]
     )
 
 
@@ -82,9 +77,9 @@ def test_an_edited_plan_that_hits_something_fails_the_check_with_1(made, tmp_pat
     poses = (*plan.poses[:3], bad, *plan.poses[4:])
     save_plan(msgspec.structs.replace(plan, poses=poses), tmp_path / "bad.yaml")
     result = run("--check", tmp_path / "bad.yaml")
-    assert result.exit_code == 1
-    assert "pose 4 (p04)" in result.output and "table" in result.output
-    assert "FAILED" in result.output
+    assert result.returncode == 1
+    assert "pose 4 (p04)" in result.stdout and "table" in result.stdout
+    assert "FAILED" in result.stdout
     summary = json.loads(run("--check", tmp_path / "bad.yaml", "--json").stdout)
     assert {problem["limit"] for problem in summary["problems"]} >= {"clearance"}
 
@@ -101,17 +96,17 @@ def test_an_edited_plan_that_hits_something_fails_the_check_with_1(made, tmp_pat
 )
 def test_wrong_use_is_a_sentence_and_exit_code_2(args, code, told):
     result = run(*args)
-    assert result.exit_code == code
-    assert told in result.output.replace("\n", " ")
-    assert "Traceback" not in result.output
+    assert result.returncode == code
+    assert told in result.stderr.replace("\n", " ")
+    assert "Traceback" not in result.stderr
 
 
 def test_a_plan_of_the_other_mount_fails_the_check_with_1(made, tmp_path):
     config = cell_config(build_cell("paper", 0, "low", "eye-to-hand"), "127.0.0.1")
     (tmp_path / "cell.yaml").write_bytes(msgspec.yaml.encode(config))
     result = run("--config", tmp_path / "cell.yaml", "--check", made[1]["plan.yaml"])
-    assert result.exit_code == 1
-    assert "it was made for eye-in-hand, the cell is eye-to-hand; make a new plan" in result.output
+    assert result.returncode == 1
+    assert "it was made for eye-in-hand, the cell is eye-to-hand; make a new plan" in result.stdout
 
 
 def test_a_list_from_elsewhere_is_checked_like_any_plan(tmp_path):
@@ -123,10 +118,10 @@ def test_a_list_from_elsewhere_is_checked_like_any_plan(tmp_path):
     (tmp_path / "list.csv").write_text("\n".join([header, *(",".join(map(str, row)) for row in rows)]))
     out = tmp_path / "plan.yaml"
     result = run("--config", tmp_path / "cell.yaml", "--from-list", tmp_path / "list.csv", "-o", out)
-    assert result.exit_code == 0, result.output
+    assert result.returncode == 0, result.stderr
     assert [pose.why for pose in load_plan(out).poses] == ["from list.csv"] * 3
     assert all(pose.predicted_sigma_m is not None for pose in load_plan(out).poses)
-    assert "not enough for the goal" in result.output
+    assert "not enough for the goal" in result.stdout
 
 
 def test_checking_needs_no_lens_but_a_picture_does(made, tmp_path):
@@ -135,7 +130,7 @@ def test_checking_needs_no_lens_but_a_picture_does(made, tmp_path):
     blind = msgspec.structs.replace(config, camera=msgspec.structs.replace(config.camera, model=None))
     (tmp_path / "cell.yaml").write_bytes(msgspec.yaml.encode(blind))
     check = ["--config", tmp_path / "cell.yaml", "--check", made[1]["plan.yaml"]]
-    assert run(*check).exit_code == 0, run(*check).output
+    assert run(*check).returncode == 0, run(*check).stderr
     refused = run(*check, "--picture", tmp_path / "plan.png")
-    assert refused.exit_code == 2
-    assert "rough lens" in refused.output.replace("\n", " ")
+    assert refused.returncode == 2
+    assert "rough lens" in refused.stderr.replace("\n", " ")

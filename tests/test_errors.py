@@ -1,0 +1,36 @@
+"""The errors of all commands: on stderr, first the name of the command, then what and what to do."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+import calibrate.cli
+import recordings.cli
+import station.cli
+from tests.command_line import call
+
+
+@pytest.mark.parametrize(
+    ("main", "arguments"),
+    [
+        (calibrate.cli.main, ("show", "none.yaml")),
+        (calibrate.cli.main, ("solve", "none.mcap")),
+        (recordings.cli.main, ("info", "none.mcap")),
+        (station.cli.main, ("status", "--socket", "none")),
+        (station.cli.main, ("doctor", "--config", "none.yaml")),
+        (station.cli.main, ("plan", "--check", "none.yaml")),
+        (station.cli.main, ("plan", "--taught", "none.mcap")),
+    ],
+)
+def test_an_error_begins_with_the_name_of_its_command(
+    main: Callable[[], None], arguments: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = call(main, *arguments)
+    command = main.__module__.partition(".")[0]
+    assert done.returncode in (1, 2)
+    assert done.stderr.startswith(f"{command}: ") and "none" in done.stderr
+    assert not done.stdout and "Traceback" not in done.stderr

@@ -8,8 +8,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibrate.geometry import pose, rotation_exp
-from calibrate.kinematics import MODELS, forward
-from station.collision import CellGeometry, body_segments, margins, moving_points, plate, segment_distance
+from calibrate.kinematics import MODELS, forward, link_frames
+from station.collision import (
+    ARM_BODIES,
+    CellGeometry,
+    body_segments,
+    gap_to_arm,
+    margins,
+    moving_points,
+    plate,
+    segment_distance,
+)
 from station.config import Capsule, LimitsConfig, Plane
 
 UPRIGHT = np.deg2rad([0.0, -90.0, -90.0, -90.0, 90.0, 0.0])
@@ -44,6 +53,32 @@ def test_a_folded_wrist_runs_into_the_forearm():
     assert labels[gaps[1].argmin()] == "forearm against camera"
 
 
+def test_every_two_bodies_that_can_meet_are_held_against_each_other():
+    """Neighbours always touch; a wrist and the one after the next are as far apart as they were built."""
+    _, labels = margins(CellGeometry(MODELS["UR10"], LimitsConfig()), UPRIGHT)
+    apart = {(a, b) for b in range(len(ARM_BODIES)) for a in range(b - 1)}
+    built = {(0, 2), (3, 5), (4, 6)}
+    assert set(labels) == {f"{ARM_BODIES[a]} against {ARM_BODIES[b]}" for a, b in apart - built}
+
+
+def test_a_stretched_arm_lies_where_the_makers_model_shows_it():
+    """Axes of the bodies of a UR10 with all joints at 0, from its drawing; the thickest first."""
+    starts, ends, radii = body_segments(CellGeometry(MODELS["UR10"], LimitsConfig()), np.zeros((1, 6)))
+    upper, fore, wrist = 0.2209, 0.0490, 0.163941
+    height, elbow, last = 0.1273, -0.612, -0.612 - 0.5723
+    axes = [
+        ((0, 0, 0), (0, 0, height)),
+        ((0, 0, height), (0, -upper, height)),
+        ((0, -upper, height), (elbow, -upper, height)),
+        ((elbow, -fore, height), (last, -fore, height)),
+        ((last, -fore, height), (last, -wrist, height)),
+        ((last, -wrist, height), (last, -wrist, height - 0.1157)),
+        ((last, -wrist, height - 0.1157), (last, -wrist - 0.0922, height - 0.1157)),
+    ]
+    np.testing.assert_allclose(np.stack([starts[0], ends[0]], axis=1), axes, atol=1e-9)
+    assert (np.diff(radii) <= 0).all()
+
+
 def test_the_last_body_ends_at_the_flange():
     joints = np.random.default_rng(1).uniform(-3, 3, (20, 6))
     _, ends, _ = body_segments(CellGeometry(MODELS["UR10e"], LimitsConfig()), joints)
@@ -58,9 +93,35 @@ def test_a_plane_is_named_with_the_body_that_breaks_it():
     broken = {label for label, gap in zip(labels, gaps[1], strict=True) if gap < 0}
     assert gaps[0].min() > 0
     assert "forearm against table" in broken
-    height = body_segments(geometry, UPRIGHT[None])[1][0, 6, 2]
-    wrist = gaps[0][labels.index("wrist 3 against table")]
-    assert wrist == pytest.approx(height - 0.045 - 0.03, abs=0.1)
+
+
+def test_margins_are_distances_less_radii_and_clearance():
+    """By hand: a wrist over a table, a ball in front of the flange, a camera beside the base column."""
+    table = Plane("table", (0.0, 0.0, -0.2), (0.0, 0.0, 2.0))
+    frames = link_frames(MODELS["UR10"], UPRIGHT)
+    wrist, flange, ahead = frames[5, :3, 3], frames[6, :3, 3], frames[6, :3, 2]
+    ball_at = tuple(flange + 0.3 * ahead)
+    camera = Capsule("camera", (0.0, 0.0, 0.1), (0.0, 0.0, 0.18), 0.04)
+    geometry = CellGeometry(
+        MODELS["UR10"],
+        LimitsConfig(planes=(table,), clearance_m=0.03),
+        solids=(camera,),
+        obstacles=(Capsule("ball", ball_at, ball_at, 0.02),),
+        obstacle_clearance_m=0.1,
+    )
+    gaps, labels = margins(geometry, UPRIGHT)
+    margin = dict(zip(labels, gaps[0], strict=True))
+    assert margin["wrist 3 against table"] == pytest.approx(min(wrist[2], flange[2]) + 0.2 - 0.045 - 0.03)
+    assert margin["wrist 3 against the ball"] == pytest.approx(0.3 - 0.02 - 0.045 - 0.1)
+    assert margin["camera against the ball"] == pytest.approx(0.3 - 0.18 - 0.02 - 0.04 - 0.1)
+    share = np.linspace(0, 1, 1001)[:, None]
+    along_camera = flange + (0.1 + 0.08 * share) * ahead
+    column = frames[0, :3, 3] + share * (frames[1, :3, 3] - frames[0, :3, 3])
+    apart_m = np.linalg.norm(along_camera[:, None] - column[None], axis=2).min()
+    assert margin["base column against camera"] == pytest.approx(apart_m - 0.09 - 0.04, abs=1e-3)
+    assert gap_to_arm(
+        CellGeometry(MODELS["UR10"], LimitsConfig()), UPRIGHT, along_camera[:1], along_camera[-1:]
+    )[0] == pytest.approx(min(margin[f"{body} against camera"] for body in ARM_BODIES[:5]) + 0.04)
 
 
 def test_the_workspace_box_holds_for_flange_and_camera():

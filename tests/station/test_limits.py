@@ -6,6 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from calibrate.geometry import rotation_exp
 from calibrate.kinematics import MODELS, forward
 from station.collision import CellGeometry, margins, moving_points, plate
 from station.config import Capsule, LimitsConfig, Plane
@@ -69,6 +70,10 @@ def test_a_plan_may_be_slower_than_the_configuration_but_not_faster():
     fast = check_plan(plan_of(there, joint_speed_rad_s=9.0), REST, FREE).moves[0]
     assert slow.joint_speed_rad_s == 0.1
     assert fast.joint_speed_rad_s == usual.joint_speed_rad_s == FREE.limits.joint_speed_rad_s
+    soft = check_plan(plan_of(there, joint_acceleration_rad_s2=0.2), REST, FREE).moves[0]
+    hard = check_plan(plan_of(there, joint_acceleration_rad_s2=9.0), REST, FREE).moves[0]
+    assert soft.joint_acceleration_rad_s2 == 0.2
+    assert hard.joint_acceleration_rad_s2 == FREE.limits.joint_acceleration_rad_s2
 
 
 def test_an_obstacle_between_two_good_poses_is_found():
@@ -125,6 +130,9 @@ def test_joint_range_and_step_name_the_joint():
         CellGeometry(MODELS["UR10"], limits), REST, REST + np.array([0, 0, 0, 0, 0, 0.6])
     ).problems
     assert {(p.limit, p.joint) for p in problems} == {("joint range", "wrist 3"), ("joint step", "wrist 3")}
+    limits = LimitsConfig(joints_min_rad=(-0.2, *(-6.28,) * 5))
+    below = check_path(CellGeometry(MODELS["UR10"], limits), REST, REST - np.array([0.3, 0, 0, 0, 0, 0]))
+    assert [(p.limit, p.joint) for p in below.problems] == [("joint range", "base")]
     beyond = check_path(FREE, REST, REST + np.array([6.4, 0, 0, 0, 0, 0])).problems
     assert ("joint range", "base") in {(p.limit, p.joint) for p in beyond}
 
@@ -189,6 +197,15 @@ def test_check_plan_names_pose_robot_and_edited_flange():
     assert "pose 1 (p0)" in str(problems[0]) and "20.0 mm" in str(problems[0])
 
 
+@pytest.mark.parametrize(("by_m", "by_rad", "refused"), [(0.0018, 0.0045, 0), (0.0022, 0, 1), (0, 0.0055, 1)])
+def test_an_expected_flange_may_differ_by_its_rounding_only(by_m, by_rad, refused):
+    flange = forward(MODELS["UR10"], REST)
+    flange[1, 3] += by_m
+    flange[:3, :3] = flange[:3, :3] @ rotation_exp([0.0, by_rad, 0.0])
+    pose = PlannedPose("p0", tuple(REST), base_from_flange=tuple(map(tuple, flange.tolist())))
+    assert len(check_plan(Plan("UR10", "eye-in-hand", (pose,)), REST, FREE).problems) == refused
+
+
 def test_the_first_move_starts_where_the_arm_is():
     far = REST + np.array([1.2, 0, 0, 0, 0, 0])
     assert check_plan(plan_of(REST), far, FREE).moves[0].step_rad == pytest.approx(1.2)
@@ -198,8 +215,8 @@ def test_the_first_move_starts_where_the_arm_is():
 def test_trapezoid_times():
     duration, peak = trapezoid(1.0, 0.5, 1.0)
     assert (float(duration), float(peak)) == pytest.approx((2.5, 0.5))
-    duration, peak = trapezoid(0.01, 0.5, 1.0)
-    assert (float(duration), float(peak)) == pytest.approx((0.2, 0.1))
+    duration, peak = trapezoid(0.01, 0.5, 4.0)
+    assert (float(duration), float(peak)) == pytest.approx((0.1, 0.2))
 
 
 def test_point_speed_of_a_turning_base():

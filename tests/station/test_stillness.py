@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import math
 
 import msgspec
@@ -84,6 +85,26 @@ def test_a_slow_creep_is_no_rest_although_no_speed_is_reported() -> None:
     assert not m.at_rest
 
 
+def test_a_flange_that_only_turns_on_the_spot_is_no_rest() -> None:
+    m = monitor()
+    for i in range(60):
+        turned = msgspec.structs.replace(state(i * 0.008), joints_rad=(*HOME[:5], 0.001 * i * 0.008))
+        m.add(turned)
+    found = m.measure()
+    assert found is not None and found.position_scatter_m < 1e-9
+    assert found.rotation_scatter_rad == pytest.approx(0.001 * found.window_s)
+    assert m.unrest(found) == "the flange turns by 0.0170° (limit 0.0029)"
+
+
+def test_a_shift_of_the_flange_is_told_in_millimetres() -> None:
+    m = monitor()
+    shake(m, 0.5, 0.0)
+    found = m.measure()
+    assert found is not None
+    shifted = msgspec.structs.replace(found, position_scatter_m=0.00025)
+    assert m.unrest(shifted) == "the flange scatters by 0.250 mm (limit 0.050)"
+
+
 def test_the_picture_has_a_say() -> None:
     m = monitor()
     shake(m, 0.5, 0.0)
@@ -134,6 +155,16 @@ async def test_an_arm_that_never_rests_is_given_up_with_the_reason() -> None:
     clock = iter([0.0, 1.0, 5.1])
     with pytest.raises(NotStillError, match=r"not at rest within 5 s: joint shoulder moves at"):
         await m.settle(lambda: None, now_s=lambda: next(clock))
+
+
+async def test_waiting_for_rest_leaves_the_loop_to_heartbeat_and_stop() -> None:
+    m = monitor(timeout_s=5.0)
+    shake(m, 0.5, 0.01)
+    clock = iter([0.0, 1.0, 5.1])
+    settling = asyncio.ensure_future(m.settle(lambda: None, now_s=lambda: next(clock)))
+    await asyncio.sleep(0)
+    assert not settling.done()
+    settling.cancel()
 
 
 async def test_old_news_of_an_arm_at_rest_are_no_rest() -> None:

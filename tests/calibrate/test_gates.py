@@ -88,6 +88,22 @@ def test_each_gate_closes_alone_and_says_why(solution: Solution, name: str) -> N
     assert len(text) > 15
 
 
+def test_the_sentences_carry_their_figures_in_the_units_that_people_read(solution: Solution) -> None:
+    gates = {gate.name: gate for gate in judge(solution, GOOD)}
+    said = {name: gate.text for name, gate in gates.items()}
+    assert said["views"] == f"{len(solution.used)} views were used"
+    assert said["rotation"] == "The largest turn between two views is 69°"
+    assert said["agreement"] == "Certified optimum and final X are 1.0 sigmas apart"
+    assert said["view residual"].endswith("fits to 0.20 px")
+    assert said["hold-out"] == "Views that took no part are predicted to 0.50 mm"
+    assert gates["hold-out"].limit == pytest.approx(0.01 * 0.5)
+    assert said["predicted error"] == "A point 500 mm away is expected to be right to 0.50 mm (1σ)"
+    assert said["lens coverage"] == "Corners were seen in 60 % of the picture"
+    assert said["clocks"] == "Pictures and robot poses belong together to 1.0 ms"
+    assert said["robot position"] == "The robot's positions scatter by 0.10 mm"
+    assert said["robot orientation"] == "The robot's orientations scatter by 0.011°"
+
+
 def test_a_scale_that_might_be_chance_does_not_close_the_gate(solution: Solution) -> None:
     uncertain = replace(GOOD, scale=ScaleCheck(0.96, 0.02, 0.024, "24.0 ± 0.5 mm fit"))
     assert failed(judge(solution, uncertain)) == []
@@ -120,7 +136,7 @@ def test_wrong_limits_are_refused_with_the_file(tmp_path: Path, content: str) ->
 
 
 def test_the_documented_defaults_are_those_in_force() -> None:
-    text = Path("docs/calibration-file.md").read_text()
+    text = (Path(__file__).parents[2] / "docs" / "calibration-file.md").read_text()
     table = text[text.index("## Gates") : text.index("Installing asks one gate more")]
     documented: dict[str, str] = {}
     for row in re.findall(r"^\| (`[^|]+) \| ([^|]+) \|", table, re.MULTILINE):

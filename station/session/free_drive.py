@@ -13,7 +13,7 @@ from station.errors import RefusedError, RobotError, StaleStateError, StationErr
 from station.plan.model import Plan, PlannedPose
 from station.session.bench import Bench
 from station.session.capture import PoseFailedError, take_pose
-from station.session.queue import PoseQueue
+from station.session.queue import GUIDED, PoseQueue
 from station.session.recording import SessionRecording
 from station.session.run import disk_failed, recover_parts, unmark_busy
 from station.states import refusal
@@ -65,14 +65,17 @@ class FreeDrive:
         bench, before = self._bench, self._bench.recording
         if bench.queue is None:
             bench.queue = PoseQueue(Plan(bench.cell.config.robot.model, bench.cell.config.mount, ()))
+        queue = bench.queue if before is not None else bench.queue.anew(guided=False)
         if before is not None and before.recorder is not None:
             return
         if before is not None:
             await recover_parts(bench, before)
         recording = before or SessionRecording(bench.root, bench.cell)
         picture = await bench.cell.camera.capture() if bench.cell.config.camera.model is None else None
-        await recording.open(bench.queue, picture)
-        bench.recording = recording
+        await recording.open(queue, picture)
+        if before is None:
+            bench.forget_session()
+        bench.recording, bench.queue = recording, queue
 
     def end(self) -> None:
         """To paused; the recording stays open."""
@@ -106,7 +109,7 @@ class FreeDrive:
         bench = self._bench
         queue, store = bench.require_queue(), bench.store
         joints = bench.cell.robot.latest().joints_rad
-        index = queue.add(PlannedPose(f"hand-{queue.next_index + 1:02d}", joints, why="guided by hand"))
+        index = queue.add(PlannedPose(f"hand-{queue.next_index + 1:02d}", joints, why=GUIDED))
         attempt = queue.start_attempt(index)
         self._last_place = joints
         try:

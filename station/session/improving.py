@@ -109,11 +109,13 @@ class ImproveDesk:
 
     def adopt(self, found: Replanned) -> None:
         """A person said yes: these are the poses now, and the recording says so."""
-        bench, recording = self._bench, self._bench.require_recording()
+        bench, recording = self._bench, self._bench.recording
         bench.queue = found.queue
+        bench.show_poses()
+        if recording is None:
+            return  # the loaded plan, for a session that begins
         if found.purpose == "improve":
             self._improved = recording.name
-        bench.show_poses()
         bench.store.event("; ".join(found.changes))
         with contextlib.suppress(RecordingError):  # a disk that fails is told by the next picture
             recording.attach_plan(found.queue.plan)

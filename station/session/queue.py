@@ -14,6 +14,8 @@ from station.status import PoseState, PoseStatus
 OPEN: frozenset[PoseState] = frozenset({"planned"})
 BUSY: frozenset[PoseState] = frozenset({"moving", "settling", "capturing", "writing"})
 POSE_LIMIT = 2000
+GUIDED = "guided by hand"
+"""Why such a pose is there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -109,6 +111,19 @@ class PoseQueue:
         """A copy with this pose too, at the end, and its number."""
         more = PoseQueue(self.plan, self.statuses)
         return more, more.add(_named(pose, more.next_index, "more"))
+
+    def anew(self, guided: bool = True) -> PoseQueue:
+        """A copy for another session: what is skipped stays left out, all else is planned once more.
+
+        `guided`: with the places that a hand brought the arm to.
+        """
+        kept = {i: pose for i, pose in self._poses.items() if guided or pose.why != GUIDED}
+        left_out = {i for i in kept if self._status[i].state == "skipped"}
+        plan = msgspec.structs.replace(self._plan, poses=tuple(kept.values()))
+        again = PoseQueue(plan, [_fresh(index, pose) for index, pose in kept.items()])
+        for index in left_out:
+            again.skip(index)
+        return again
 
     def start_attempt(self, index: int) -> int:
         """The number of this attempt, from 1; later ones supersede earlier ones in the recording."""

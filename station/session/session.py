@@ -34,7 +34,7 @@ from station.session.queue import PoseQueue
 from station.session.run import unmark_busy
 from station.session.runs import run_for
 from station.session.store import StatusStore
-from station.session.summary import poses_to_drive, summarise
+from station.session.summary import begun_anew, poses_to_drive, summarise
 from station.states import RUNNING, refusal
 from station.status import GoSummary, HoverOffer, Lease, StationState, StationStatus
 from station.stillness import StillnessMonitor
@@ -155,12 +155,9 @@ class Session:
         self.leases.require(client_id)
         self._require("prepare")
         await self._run_ended()  # it is sealed and shown; its control process may take a moment more
-        if purpose == "run" and self.bench.recording is None and self.bench.queue is not None:
-            self.bench.queue = PoseQueue(self.bench.queue.plan)
-            self.bench.show_poses()
         self._void_go()
         voids = self._goes.voids
-        found = await self._improver.replan(purpose)
+        found = await self._improver.replan(purpose) or begun_anew(self.bench, purpose)
         poses = found.poses if found else poses_to_drive(self.bench, purpose, index)
         queue, changes = (found.queue, found.changes) if found else (self.bench.require_queue(), ())
         summary = await summarise(self.bench, purpose, queue, poses, self._notes, changes)
@@ -204,12 +201,12 @@ class Session:
         finally:
             self.store.update(go=None)
         self._notes = ()
-        if go.replanned is not None:
-            self._improver.adopt(go.replanned)
         self.bench.halting = False
         self.bench.pause_wanted, self.bench.finish_wanted = "", False
         if self.bench.recording is None and go.hover is None:
             self.bench.forget_session()
+        if go.replanned is not None:
+            self._improver.adopt(go.replanned)
         run = run_for(self.bench, go)
         self.store.enter(StationState.CHECKING)
         self.store.event(f"go by {self.leases.lease.holder}: {go.summary.purpose}")

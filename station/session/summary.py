@@ -11,13 +11,22 @@ from station.session.bench import Bench
 from station.session.guard import displacement
 from station.session.lease import GoDesk
 from station.session.patience import RestingCheck
-from station.session.queue import PoseQueue
+from station.session.queue import PoseQueue, Replanned
 from station.status import GoSummary, StationState
 
 POSE_OVERHEAD_S = 0.8
 """Settle, expose, look, write: what a stop takes beside the move."""
 _PROBLEMS_SHOWN = 12
 _SLOW_SLIDER = 0.99
+
+
+def begun_anew(bench: Bench, purpose: str) -> Replanned | None:
+    """The loaded plan for a session that begins with this go; until then the last session stays shown."""
+    queue = bench.queue
+    if purpose != "run" or bench.recording is not None or queue is None:
+        return None
+    again = queue.anew()
+    return Replanned(purpose, again, _open(again), queue.sha256, ())
 
 
 def poses_to_drive(bench: Bench, purpose: str, index: int | None) -> tuple[int, ...]:
@@ -39,6 +48,10 @@ def poses_to_drive(bench: Bench, purpose: str, index: int | None) -> tuple[int, 
         raise RefusedError(
             f"unknown purpose '{purpose}'; known are run, check, resume, retake, improve, best"
         )
+    return _open(queue)
+
+
+def _open(queue: PoseQueue) -> tuple[int, ...]:
     if not queue.open:
         raise RefusedError("no pose is left to take: retake some, or finish")
     return queue.open

@@ -12,6 +12,7 @@ import msgspec
 import numpy as np
 import typer
 import yaml
+from rich.text import Text
 
 from calibrate.geometry import Array
 from calibrate.load import load_views
@@ -21,10 +22,11 @@ from recordings.files import write_atomically
 from recordings.messages import Mount, SessionInfo, Vector6
 from recordings.reader import open_recording
 from station.attend import wait_until_idle
-from station.cli_session import Headless, Socket, attended_session, err, load_into, out
+from station.cli_session import Headless, Socket, attended_session, load_into
 from station.client import Client, default_socket
 from station.config import PoseGuess, StationConfig
 from station.config_file import load_config
+from station.console import err, out
 from station.errors import ConfigError, LimitError, StationError
 from station.plan.belief import Glimpse, believe, improved_config
 from station.plan.bootstrap import MOVES_MAX, MOVES_MIN, next_move
@@ -69,7 +71,7 @@ def bootstrap_command(
     guesses = {"camera_guess": found.camera_guess, "board_guess": found.board_guess}
     entries = yaml.safe_dump(msgspec.to_builtins(guesses), sort_keys=False)
     if output is None:
-        out.print(entries, end="", markup=False)
+        out.print(entries, end="")
     else:
         try:
             write_atomically(output, entries.encode())
@@ -80,7 +82,8 @@ def bootstrap_command(
         err.print(f"put the two entries of {output} into {config}, start the daemon anew, then plan")
     if not believe(cell, glimpses).good:
         err.print(
-            "[yellow]not sure enough for a good plan: teach another view and repeat with these guesses[/]"
+            "not sure enough for a good plan: teach another view and repeat with these guesses",
+            style="yellow",
         )
         raise typer.Exit(3)
 
@@ -99,7 +102,7 @@ def _make_moves(
         if np.abs(np.array(asyncio.run(_standing(path, cell.mount))) - before).max() > _STRAYED_RAD:
             raise BootstrapError("the arm was moved meanwhile: teach the view again and start over")
         of = f" (of {MOVES_MIN} to {MOVES_MAX})" if glimpses else ""
-        err.print(f"[bold]{move.name}[/]{of}: {move.why}")
+        err.print(Text.assemble((move.name, "bold"), f"{of}: {move.why}"))
         joints, views = _take(cell, move, views, path, headless, config_sha256)
         glimpses = [
             Glimpse(q, C)
@@ -116,7 +119,7 @@ def _make_moves(
         except LimitError as error:
             if len(glimpses) == 1:
                 raise
-            err.print(f"[yellow]the moves end here:[/] {error}")
+            err.print(Text.assemble(("the moves end here", "yellow"), f": {error}"))
             return glimpses
     return glimpses
 

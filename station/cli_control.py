@@ -10,20 +10,25 @@ from typing import Annotated, Any
 
 import msgspec
 import typer
-from rich.console import Console
+from rich.text import Text
 
 from station.client import Client, ask, default_socket
+from station.console import out
 from station.errors import StationError
 from station.protocol import Verb
 from station.status import StationStatus
 
 app = typer.Typer()
-out = Console(highlight=False, soft_wrap=True)
 
 Socket = Annotated[Path | None, typer.Option(help="The daemon's control socket.")]
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout and nothing else.")]
 PoseNumber = Annotated[int, typer.Argument(min=1, help="Pose number, from 1.")]
-_MARKS = {"ok": "[green]ok[/]", "warning": "[yellow]WARN[/]", "failed": "[red]MISSING[/]", "skipped": "-"}
+_MARKS = {
+    "ok": Text("ok", "green"),
+    "warning": Text("WARN", "yellow"),
+    "failed": Text("MISSING", "red"),
+    "skipped": Text("-"),
+}
 
 
 def status_now(socket: Path | None) -> StationStatus:
@@ -44,7 +49,7 @@ def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
         print(msgspec.json.encode(status).decode())
         return
     marks = " SIMULATED" if status.simulated else " PLAYBACK" if status.playback else ""
-    out.print(f"[bold]{status.state.value}[/]{marks}  {status.reason}", markup=True)
+    out.print(Text.assemble((status.state.value, "bold"), f"{marks}  {status.reason}"))
     robot, session = status.robot, status.session
     words = [f"{robot.model} {robot.safety or 'not connected'}", f"slider {100 * robot.slider:.0f} %"]
     if session.poses:

@@ -17,12 +17,13 @@ from typing import Annotated, Any
 
 import msgspec
 import typer
-from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from station.attend import Confirm, Outcome, carry_out, wait_until_idle
 from station.cli_serve import require_choices
 from station.client import Client, default_socket
+from station.console import err, out
 from station.demo import DemoOptions, run_demo
 from station.drift_check import PLAN_ANSWER_S, POSES, SEED, check_arguments, never_run, require_installed
 from station.errors import ConfigError, RefusedError, StationError
@@ -33,9 +34,6 @@ from station.progress import SessionProgress
 from station.session.folder import default_root
 from station.simulation.netns import is_isolated, isolated_command
 from station.status import GoSummary, StationStatus
-
-out = Console(highlight=False, soft_wrap=True)
-err = Console(stderr=True, highlight=False, soft_wrap=True)
 
 Socket = Annotated[Path | None, typer.Option(help="The daemon's control socket.")]
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout and nothing else.")]
@@ -84,8 +82,9 @@ def _show_demo(result: dict[str, Any], duration_s: float) -> None:
     for name, value in (("error against the truth", error), ("claimed sigma", sigma)):
         table.add_row(name, f"{value['translation_mm']:.3f} mm", f"{value['rotation_deg']:.4f}°")
     out.print(table)
-    verdict = "all gates passed" if result["gates_passed"] else "[red]a gate FAILED[/]"
-    out.print(f"{poses['captured']} of {poses['planned']} poses, {verdict}, {duration_s:.0f} s in all")
+    verdict = "all gates passed" if result["gates_passed"] else ("a gate FAILED", "red")
+    taken = f"{poses['captured']} of {poses['planned']} poses, "
+    out.print(Text.assemble(taken, verdict, f", {duration_s:.0f} s in all"))
     for name in ("recording", "calibration", "report"):
         out.print(f"{name:<12} {result[name]}")
 
@@ -143,7 +142,7 @@ def best_command(headless: Headless = False, socket: Socket = None) -> None:
     outcome = asyncio.run(attended_session(socket, "best", headless, "", False, None))
     added = max(outcome.status.session.poses, key=lambda pose: pose.index)
     out.print(f"pose {added.index + 1}: {added.state}{f', {added.reason}' if added.reason else ''}")
-    err.print(f"[bold]{outcome.status.state.value}[/]: {outcome.status.reason or outcome.recording}")
+    _say_state(outcome.status, outcome.status.reason or outcome.recording)
     raise typer.Exit(0 if added.state == "done" else 1)
 
 
@@ -243,13 +242,13 @@ def _confirmation(go: str, interactive: bool, simulated: bool) -> Confirm:
 
 def ask_person(summary: GoSummary) -> bool:
     many = "1 pose" if summary.poses == 1 else f"{summary.poses} poses"
-    err.print(f"\n[bold]The arm will move[/]: {summary.purpose}, {many}")
+    err.print(Text.assemble(("\nThe arm will move", "bold"), f": {summary.purpose}, {many}"))
     err.print(f"first {summary.first_move}; {summary.path_m:.2f} m, up to {summary.top_speed_m_s:.2f} m/s")
     err.print(f"about {summary.duration_s:.0f} s, plan {summary.plan_sha256[:12]}")
     for change in summary.changes:
         err.print(change)
     for warning in summary.warnings:
-        err.print(f"[yellow]{warning}[/]")
+        err.print(warning, style="yellow")
     err.print("The emergency stop on the pendant is the safety device. Ctrl-C stops too.")
     try:
         with ctrl_c_at_once():
@@ -277,5 +276,9 @@ def _finish(outcome: Outcome, as_json: bool) -> None:
     elif outcome.recording:
         out.print(f"{outcome.captured} of {outcome.planned} poses, sealed: {outcome.recording}")
     else:
-        err.print(f"[bold]{outcome.status.state.value}[/]: {outcome.status.reason}")
+        _say_state(outcome.status, outcome.status.reason)
     raise typer.Exit(outcome.exit_code)
+
+
+def _say_state(status: StationStatus, why: str) -> None:
+    err.print(Text.assemble((status.state.value, "bold"), f": {why}"))

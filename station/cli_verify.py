@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import msgspec
 import typer
+from rich.text import Text
 
 from calibrate.calibration import Calibration, Touch, read_calibration
 from calibrate.errors import CalibrationError
@@ -18,8 +19,9 @@ from calibrate.geometry import Array
 from calibrate.install import load_installed
 from calibrate.verification import note_in_file, note_installed, touch_text
 from station.attend import stop_and_say, wait_until_idle, watch_until_rest
-from station.cli_session import AsJson, Socket, ask_person, ctrl_c_at_once, err, out
+from station.cli_session import AsJson, Socket, ask_person, ctrl_c_at_once
 from station.client import Client, default_socket
+from station.console import err, out
 from station.errors import RefusedError, StationError
 from station.plan.hover import outer_corners
 from station.status import HoverOffer, StationState, StationStatus
@@ -121,7 +123,7 @@ class _Visit:
         except RefusedError as refused:
             if f"corner {corner}" not in str(refused):
                 raise  # it would be the same at every corner
-            err.print(f"[yellow]corner {corner} is left out[/]: {refused}")
+            err.print(Text.assemble((f"corner {corner} is left out", "yellow"), f": {refused}"))
             return True
         offer = msgspec.convert(answer, HoverOffer)
         if not self._quiet and not ask_person(offer.go):
@@ -171,7 +173,7 @@ class _Visit:
                 else:
                     offset, found = read_offset_mm(offer, await self._tip_now(offer)), "read from the arm"
             except RefusedError as problem:
-                err.print(f"[yellow]{problem}[/]")
+                err.print(str(problem), style="yellow")
                 continue
             self._touches.append(touch := touch_of(hovering, offset, found))
             err.print(touch_text(touch))
@@ -195,7 +197,7 @@ class _Visit:
                 made = note_installed(self._root, self._touches)
                 out.print(f"written: generation {made.number} is installed, {made.path}")
         except (CalibrationError, OSError) as problem:
-            err.print(f"[red]not written[/]: {problem}")
+            err.print(Text.assemble(("not written", "red"), f": {problem}"))
             for touch in self._touches:
                 err.print(f"  {touch_text(touch)}")
 

@@ -5,8 +5,8 @@ from __future__ import annotations
 from types import TracebackType
 
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TaskID, TextColumn, TimeElapsedColumn
+from rich.text import Text
 
 from station.status import Event, StationStatus
 
@@ -36,7 +36,7 @@ class SessionProgress:
     def say(self, text: str) -> None:
         """One line about what is going on outside a session."""
         if not self._quiet:
-            self._bar.console.print(f"[dim]{escape(text)}[/]", highlight=False)
+            self._bar.console.print(Text(text, "dim"))
 
     def __exit__(
         self,
@@ -68,7 +68,7 @@ class SessionProgress:
         for event in self._new(status):
             number = f"pose {event.pose_index + 1:>2}  " if event.pose_index is not None else ""
             style = {"warning": "yellow", "error": "red"}.get(event.level, "dim")
-            self._bar.console.print(f"[{style}]{number}{escape(event.text)}[/]", highlight=False)
+            self._bar.console.print(Text(f"{number}{event.text}", style))
 
     def _new(self, status: StationStatus) -> list[Event]:
         events = list(status.events)

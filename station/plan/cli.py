@@ -9,12 +9,13 @@ from typing import Annotated, Any
 import msgspec
 import numpy as np
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
+from rich.text import Text
 
 from station.config import StationConfig
 from station.config_file import load_config
+from station.console import err, out
 from station.errors import ConfigError, LimitError
 from station.limits import PlanCheck, check_plan
 from station.plan.choose import Criterion
@@ -28,7 +29,6 @@ from station.plan.scene import Scene, cell_geometry, scene_of
 from station.plan.sketch import sketch
 from station.plan.standing import geometry_from
 
-_errors = Console(stderr=True)
 _NOTHING_KNOWN_M = 0.05
 """A larger expected error says no more than that there are too few poses yet."""
 
@@ -142,7 +142,7 @@ def _made(
     quiet: bool,
 ) -> Plan:
     with Progress(
-        TextColumn("{task.description}"), BarColumn(), console=_errors, transient=True, disable=quiet
+        TextColumn("{task.description}"), BarColumn(), console=err, transient=True, disable=quiet
     ) as bar:
         task = bar.add_task("planning", total=1.0)
 
@@ -191,7 +191,6 @@ def _goal_text(plan: Plan, goal_m: float) -> str:
 def _show(
     plan: Plan, outcome: PlanCheck, picture: str, cut: tuple[str, ...], output: Path | None, goal_m: float
 ) -> None:
-    console = Console(highlight=False, soft_wrap=True)
     table = Table(box=None, pad_edge=False)
     for heading in ("pose", "move s", "turn °", "margin mm", "σ mm"):
         table.add_column(heading, justify="left" if heading == "pose" else "right", no_wrap=True)
@@ -207,21 +206,21 @@ def _show(
             sigma,
             pose.why,
         )
-    console.print(table)
+    out.print(table)
     if picture:
-        console.print(picture, markup=False)
-    console.print(
+        out.print(picture)
+    out.print(
         f"{len(plan.poses)} poses, {outcome.duration_s:.0f} s of motion over {outcome.path_m:.1f} m, "
         f"at most {outcome.top_speed_m_s:.2f} m/s and {np.rad2deg(outcome.largest_step_rad):.0f}° in one move"
     )
     if expected := _goal_text(plan, goal_m):
-        console.print(expected)
+        out.print(expected)
     if cut:
-        console.print(f"by the guesses these do not show the whole board: {', '.join(cut)}")
+        out.print(f"by the guesses these do not show the whole board: {', '.join(cut)}")
     if plan.note:
-        console.print(f"note: {plan.note}")
+        out.print(f"note: {plan.note}")
     for problem in outcome.problems:
-        console.print(f"[red]✗[/] {problem}")
+        out.print(Text.assemble(("✗", "red"), f" {problem}"))
     if output is not None:
-        console.print(f"written to {output}")
-    console.print("check: " + ("FAILED, nothing may move" if outcome.problems else "passed"))
+        out.print(f"written to {output}")
+    out.print("check: " + ("FAILED, nothing may move" if outcome.problems else "passed"))

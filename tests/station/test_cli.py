@@ -103,7 +103,7 @@ def test_a_session_from_the_shell(shell: Shell, tmp_path: Path) -> None:
 
     sha = plan_sha256(load_plan(plan))
     code, out, err = shell.ask("capture", "--plan", str(plan), "--headless", "--go", sha[:12], "--json")
-    assert code in (0, 3), err
+    assert code in (0, 3), out + err
     result = json.loads(out)
     assert result["poses"]["planned"] == 4
     assert Path(result["recording"]).is_file()

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
+import numpy as np
 import pytest
 
-from calibrate.calibration import write_calibration
+from calibrate.calibration import FramePose, write_calibration
+from calibrate.geometry import Transform, perturb
 from calibrate.pipeline import SolvedRecording, solve_recording
 from tests.calibrate.sessions import Scene, write_session
 
@@ -40,3 +43,22 @@ def real_file(solved_real: SolvedRecording, tmp_path_factory: pytest.TempPathFac
     path = tmp_path_factory.mktemp("calibration") / "real.yaml"
     write_calibration(solved_real.calibration, path)
     return path
+
+
+@pytest.fixture
+def make_file(solved_real: SolvedRecording, tmp_path: Path):  # type: ignore[no-untyped-def]
+    """make_file(shift_m, **changes) → path of a calibration file like the real one."""
+    count = 0
+
+    def make(shift_m: float = 0.0, **changes: object) -> Path:
+        nonlocal count
+        count += 1
+        base = solved_real.calibration
+        moved = perturb(base.transform.matrix, np.array([shift_m, 0, 0, 0, 0, 0.0]))
+        frames = ("base" if changes.get("mount") == "eye-to-hand" else "flange", "camera")
+        result = FramePose.of(Transform(*frames, moved))
+        path = tmp_path / f"made-{count}.yaml"
+        write_calibration(msgspec.structs.replace(base, result=result, **changes), path)
+        return path
+
+    return make

@@ -15,34 +15,13 @@ import pytest
 from calibrate.calibration import (
     Calibration,
     CalibrationFileError,
-    FramePose,
     Touch,
     read_calibration,
-    write_calibration,
 )
 from calibrate.gates import Gate
 from calibrate.generations import InstallError, generations, read_log
-from calibrate.geometry import Transform, perturb
 from calibrate.install import InstallGateError, install, install_line, load_installed, rollback
 from calibrate.pipeline import SolvedRecording
-
-
-@pytest.fixture
-def make_file(solved_real: SolvedRecording, tmp_path: Path):  # type: ignore[no-untyped-def]
-    """make_file(shift_m, **changes) → path of a calibration file like the real one."""
-    count = 0
-
-    def make(shift_m: float = 0.0, **changes: object) -> Path:
-        nonlocal count
-        count += 1
-        base = solved_real.calibration
-        moved = perturb(base.transform.matrix, np.array([shift_m, 0, 0, 0, 0, 0.0]))
-        result = FramePose.of(Transform("flange", "camera", moved))
-        path = tmp_path / f"made-{count}.yaml"
-        write_calibration(msgspec.structs.replace(base, result=result, **changes), path)
-        return path
-
-    return make
 
 
 def test_the_next_step_of_a_solve_is_one_that_works() -> None:

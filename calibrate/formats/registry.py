@@ -36,7 +36,7 @@ FORMATS: dict[str, Format] = {
     "easy-handeye2": Format(".calib", "easy_handeye2 calibration", easy_handeye2.text),
     "opencv": Format(".yml", "OpenCV FileStorage: transform and lens", opencv.text),
     "json": Format(".json", "everything, as JSON", plain_json.text),
-    "ur-tool": Format(".txt", "the camera as a tool frame (TCP) or feature for the UR pendant", ur_tool.text),
+    "ur-tool": Format(".txt", "camera as tool (TCP) or feature on the UR pendant", ur_tool.text),
 }
 
 

@@ -73,12 +73,14 @@ class JobScreen(ModalScreen[int]):
             lines.write(self.said[-1])
         self._exit_code = await self._process.wait()
         self.query_one("#job-title", Label).update(self._title)
-        if self._cancelled:
+        if self._cancelled and self._exit_code != 0:
             self.dismiss(-1)
-        elif self._exit_code in self._close_on:
+        elif self._cancelled or self._exit_code in self._close_on:  # it may have been done all the same
             self.dismiss(self._exit_code)
         else:  # The person reads why before it goes away.
-            self.query_one("#job-cancel", Button).label = "Close"
+            close = self.query_one("#job-cancel", Button)
+            close.label = "Close"
+            close.focus()
 
     async def action_cancel(self) -> None:
         if self._process is None or self._exit_code is not None:

@@ -10,6 +10,7 @@ from textual.binding import Binding
 from textual.containers import Vertical
 from textual.screen import ModalScreen
 from textual.widgets import Input, Label, OptionList, Static
+from textual.widgets.option_list import Option
 
 from calibrate.calibration import Calibration
 from calibrate.errors import CalibrationError
@@ -38,10 +39,12 @@ class ChooseFormat(ModalScreen[str | None]):
     def compose(self) -> ComposeResult:
         with Vertical(id="choose"):
             yield Label("Export for", id="choose-title")
-            yield OptionList(*FORMATS, id="formats")
+            lines = [Option(f"{name:<20}  {kind.says}", id=name) for name, kind in FORMATS.items()]
+            yield OptionList(*lines, id="formats", markup=False, compact=True)
+            yield Label("Enter writes it beside the recording, Escape: no", id="choose-keys")
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
-        self.dismiss(str(event.option.prompt))
+        self.dismiss(event.option.id)
 
 
 class Reason(ModalScreen[str]):
@@ -121,6 +124,9 @@ async def _install(app: StationApp, path: str, *options: str) -> str:
     if code == 0:
         app.notify("Installed. Key b on this screen goes back to the one before.")
         return ""
+    if code < 0:
+        app.notify("Cancelled: what is installed now stands on this screen.")
+        return ""
     return " ".join(job.said) or NOTHING_INSTALLED
 
 
@@ -150,7 +156,8 @@ def _named(generation: Generation) -> str:
         return f"generation {generation.number}"
     taken = calibration.override
     reason = "" if taken is None else f" with the reason “{taken.reason}”"
-    return f"generation {generation.number}, solved {calibration.created[:16]}{reason}"
+    session = calibration.provenance.session
+    return f"generation {generation.number}, session {session}, solved {calibration.created[:16]}{reason}"
 
 
 async def check(app: StationApp, recording: str, folder: str) -> None:
@@ -167,7 +174,7 @@ async def export(app: StationApp, path: str) -> None:
     output = str(Path(path).with_name(f"calibration-{chosen}{FORMATS[chosen].suffix}"))
     command = ("export", path, "--to", chosen, "-o", output)
     if await app.push_screen_wait(JobScreen(f"Exporting for {chosen}", "calibrate.cli", *command)) == 0:
-        app.notify(f"Written: {output}")
+        app.notify(f"Written: {output}", timeout=20)
 
 
 async def discard(app: StationApp, path: str) -> bool:

@@ -39,6 +39,7 @@ def verdict_text(calibration: Calibration, installed: bool = False) -> Text:
     ready = "INSTALLED" if installed else "READY TO INSTALL"
     head = ", ".join(against) + f": {REASONED[installed]}" if against else ready
     text = Text().append(stamp, "bold").append(f"{head}\n", "bold reverse" if against else "bold")
+    text.append(f"session {calibration.provenance.session}\n")
     for passed, words in (
         *((agrees(touch), f"by hand: {touch_text(touch)}") for touch in touches),
         *((gate.passed, f"{gate.name}: {gate.text}") for gate in gates),

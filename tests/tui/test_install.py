@@ -8,15 +8,16 @@ from pathlib import Path
 import msgspec
 import pytest
 from textual.pilot import Pilot
-from textual.widgets import Input, Static
+from textual.widgets import Input, OptionList, Static
 
 from calibrate.calibration import Touch, write_calibration
+from calibrate.formats import FORMATS
 from calibrate.install import InstallError, install
 from recordings.messages import CameraIdentity, RobotIdentity
 from station.tui import offline
 from station.tui.confirm import Confirm
 from station.tui.jobs import JobScreen
-from station.tui.offline import OVERRIDE, PERSON, Reason
+from station.tui.offline import OVERRIDE, PERSON, ChooseFormat, Reason
 from station.tui.result import verdict_text
 from tests.station.hover_cell import calibration_of
 from tests.station.session_rig import TRUTH
@@ -124,9 +125,29 @@ async def test_going_back_names_both_and_asks(link: FakeLink, asked: Path, calib
         await pilot.press("b")
         await until(pilot, lambda: isinstance(pilot.app.screen, Confirm))
         body = str(pilot.app.screen.query_one("#confirm-body", Static).render())
-        assert "Now: generation 2" in body
+        assert f"Now: generation 2, session {GOOD.provenance.session}, solved" in body
         assert "Before: generation 1" in body
         await pilot.press("tab", "enter")
         await until(pilot, lambda: "installed again" in said(pilot))
     (call,) = [json.loads(line) for line in asked.read_text().splitlines()]
     assert call == ["rollback", "--root", str(calibration.parents[2])]
+
+
+def test_a_result_names_its_session() -> None:
+    assert f"session {GOOD.provenance.session}" in verdict_text(GOOD).plain.splitlines()
+
+
+async def test_the_formats_say_who_reads_them(link: FakeLink, asked: Path, calibration: Path) -> None:
+    async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
+        await press_on_result(pilot, calibration, "e")
+        await until(pilot, lambda: isinstance(pilot.app.screen, ChooseFormat))
+        await until(pilot, lambda: pilot.app.screen.query(OptionList))
+        shown = pilot.app.screen.query_one(OptionList)
+        lines = [str(option.prompt) for option in shown.options]
+        assert lines[0] == "ros-camera-info       ROS camera_info YAML: the lens"
+        assert shown.size.height == len(FORMATS)  # a line each, none cut, on the smallest screen
+        assert max(map(len, lines)) <= shown.content_size.width
+        await pilot.press("enter")
+        await until(pilot, lambda: "Written" in said(pilot))
+    (call,) = [json.loads(line) for line in asked.read_text().splitlines()]
+    assert call[:4] == ["export", str(calibration), "--to", "ros-camera-info"]

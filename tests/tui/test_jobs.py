@@ -84,3 +84,46 @@ async def test_cancelling_ends_the_process(link: FakeLink, job: Path, tmp_path: 
         assert codes == [-1]
         with pytest.raises(ProcessLookupError):
             os.kill(int(pid_file.read_text()), 0)
+
+
+async def test_enter_by_mistake_cancels_nothing(link: FakeLink, job: Path) -> None:
+    """A second Enter after the question that began it."""
+    job.write_text("import time; time.sleep(600)")
+    async with app_on(link).run_test() as pilot:
+        codes = await run_job(pilot.app)  # type: ignore[arg-type]
+        screen = pilot.app.screen
+        assert isinstance(screen, JobScreen)
+        await until(pilot, lambda: screen._process)
+        await pilot.press("enter")
+        await pilot.pause()
+        assert codes == [] and not screen._cancelled
+        await pilot.press("escape")
+        await until(pilot, lambda: codes)
+
+
+async def test_enter_closes_what_was_read(link: FakeLink, job: Path) -> None:
+    job.write_text("import sys; sys.exit('no board in any view')")
+    async with app_on(link).run_test() as pilot:
+        codes = await run_job(pilot.app)  # type: ignore[arg-type]
+        button = pilot.app.screen.query_one("#job-cancel", Button)
+        await until(pilot, lambda: str(button.label) == "Close")
+        await pilot.press("enter")
+        await until(pilot, lambda: codes)
+        assert codes == [1]
+
+
+async def test_what_was_done_when_it_was_cancelled_counts(link: FakeLink, job: Path) -> None:
+    job.write_text(
+        "import signal, sys, time\n"
+        "signal.signal(signal.SIGTERM, lambda *_: sys.exit(0))\n"
+        "print('installed', flush=True)\n"
+        "time.sleep(600)"
+    )
+    async with app_on(link).run_test() as pilot:
+        codes = await run_job(pilot.app)  # type: ignore[arg-type]
+        screen = pilot.app.screen
+        assert isinstance(screen, JobScreen)
+        await until(pilot, lambda: screen.said)
+        await pilot.press("escape")
+        await until(pilot, lambda: codes)
+        assert codes == [0]

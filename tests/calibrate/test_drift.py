@@ -91,6 +91,26 @@ def test_where_the_robots_base_has_its_origin_changes_nothing(mount: Mount) -> N
     np.testing.assert_allclose(there.covariance, here.covariance, rtol=1e-3, atol=1e-12)
 
 
+def test_the_noise_of_a_calibration_comes_in_metres_and_radians(solved_real: SolvedRecording) -> None:
+    calibration = solved_real.calibration
+    quality = msgspec.structs.replace(
+        calibration.quality, noise={"corner_px": 0.12, "robot_mm": 0.05, "robot_deg": 0.02}
+    )
+    noise = Noise.of(msgspec.structs.replace(calibration, quality=quality))
+    assert (noise.corner_px, noise.robot_m) == (0.12, 0.00005)
+    assert noise.robot_rad == pytest.approx(np.radians(0.02))
+    assert noise.degrees_of_freedom == 3 * len(calibration.views.used) - 6
+    silent = msgspec.structs.replace(quality, noise={})
+    with pytest.raises(BadViewsError, match="--profile robust"):
+        Noise.of(msgspec.structs.replace(calibration, quality=silent))
+
+
+def test_the_verdict_is_that_of_the_p_value_at_five_percent() -> None:
+    for check in checks(12, 0.2e-3, 0, 21):
+        assert check.passed == (check.p_value >= 0.05) == (check.statistic <= check.threshold)
+        assert check.p_value == pytest.approx(1 - stats.f.cdf(check.statistic / 6, 6, 69))
+
+
 def test_the_shift_is_named_and_the_stated_power_is_a_lower_bound() -> None:
     found = checks(40, 2e-3, 0, 4)
     assert np.median([c.shift_mm for c in found]) == pytest.approx(2.0, abs=0.3)

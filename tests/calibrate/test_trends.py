@@ -38,6 +38,12 @@ def session(number: int, shift_mm: float = 0.0, camera: str = "MER 17", seed: in
     )
 
 
+def still(number: int, shift_mm: float = 0.0) -> BatchResult:
+    """A session that found X exactly, or beside it in y."""
+    place = tuple((X[:3, 3] + [0.0, shift_mm * 1e-3, 0.0]).tolist())
+    return replace(session(number), translation_m=place, rotation_xyzw=quaternion(X))
+
+
 def quaternion(matrix: Array) -> tuple[float, ...]:
     return tuple(Transform("flange", "camera", matrix).quaternion_xyzw.tolist())
 
@@ -66,6 +72,51 @@ def test_a_creep_that_no_step_shows_is_found_from_end_to_end() -> None:
 def test_an_untouched_camera_raises_no_alarm_in_hundreds_of_comparisons() -> None:
     quiet = [cells([session(k, seed=seed) for k in range(5)])[0] for seed in range(100)]
     assert sum(bool(cell.findings) for cell in quiet) <= 1
+
+
+def test_three_sessions_are_enough_to_see_a_creep() -> None:
+    (cell,) = cells([still(k, shift_mm=0.55 * k) for k in range(3)])
+    assert not any(move.real for move in cell.moves)
+    assert len(cell.findings) == 1
+    assert cells([still(k, shift_mm=0.55 * k) for k in range(2)])[0].findings == []
+
+
+def test_a_move_is_measured_in_millimetres_degrees_and_sigmas_of_both() -> None:
+    turned = replace(still(1), rotation_xyzw=quaternion(perturb(X, np.r_[0, 0, 0, 0.003, 0, 0.004])))
+    (cell,) = cells([still(0), turned])
+    (move,) = cell.moves
+    assert move.distance_mm == pytest.approx(0, abs=1e-9)
+    assert move.angle_deg == pytest.approx(np.degrees(0.005))
+    assert move.sigmas == pytest.approx(0.005 / 0.2e-3 / np.sqrt(2))
+    (cell,) = cells([still(0), still(1, shift_mm=0.7)])
+    assert cell.moves[0].distance_mm == pytest.approx(0.7)
+    assert cell.moves[0].sigmas == pytest.approx(0.7 / 0.1 / np.sqrt(2))
+    assert not cell.moves[0].real
+    assert cells([still(0), still(1, shift_mm=0.9)])[0].moves[0].real
+
+
+@pytest.mark.parametrize("part", ["robot", "camera", "mount"])
+def test_cells_are_told_apart_by_robot_camera_and_mount(part: str) -> None:
+    """Half a metre between two robots' cameras is no move of either."""
+    other = replace(still(1, shift_mm=500.0), **{part: "eye-to-hand" if part == "mount" else "another"})
+    first, second = cells([still(0), other])
+    assert (len(first.sessions), len(second.sessions)) == (1, 1)
+    assert {first.moves, second.moves} == {()}
+
+
+def test_recordings_that_were_not_solved_are_of_no_cell() -> None:
+    (cell,) = cells([still(0), replace(still(1, shift_mm=9.0), solved=False)])
+    assert [s.session for s in cell.sessions] == ["session-0"]
+
+
+def test_a_session_that_failed_a_gate_says_so_in_its_row() -> None:
+    found = cells([still(0), replace(still(1), failed_gates=["views", "axes"])])
+    assert "failed: views, axes" in trends_text(found)
+
+
+def test_one_unnamed_robot_does_not_silence_the_others() -> None:
+    found = cells([still(0), still(1), replace(still(2), robot="", camera="x")])
+    assert "No camera moved by more than chance explains." in trends_text(found)
 
 
 def test_the_page_is_whole_and_asks_the_network_for_nothing() -> None:

@@ -105,13 +105,13 @@ def run_batch(
         for count, solved in enumerate(solve(todo, options), 1):
             result = solved.result
             if solved.content:
-                _write(output / result.calibration, solved.content)
+                write_output(output / result.calibration, solved.content)
             done[result.key] = result
             append_line(output / RESULTS, result)
             if progress:
                 progress(count, len(todo), result)
         results = [done[key] for _, key in keys]
-        _write(output / "results.csv", _csv(results))
+        write_output(output / "results.csv", _csv(results))
     except OSError as problem:
         raise BatchError(f"{output}: {problem.strerror or problem}.") from None
     return results
@@ -131,10 +131,6 @@ def batch_key(path: Path, options: JobOptions) -> str:
 def read_results(output: Path) -> list[BatchResult]:
     """Of earlier runs, oldest first."""
     return read_lines(output / RESULTS, BatchResult)
-
-
-def _write(path: Path, content: bytes) -> None:
-    write_output(path, content)
 
 
 def solve_one(recording: str, key: str, options: JobOptions, limits: Limits) -> Solved:

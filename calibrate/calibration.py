@@ -8,8 +8,6 @@ of `geometry.perturb`'s delta.
 from __future__ import annotations
 
 import hashlib
-import os
-import secrets
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,7 +18,7 @@ import yaml
 from calibrate.errors import CalibrationError
 from calibrate.gates import Gate
 from calibrate.geometry import Transform, is_rigid, matrix_from_quaternion
-from recordings.files import sync_folder
+from recordings.files import ASKED_FOR, write_atomically
 from recordings.messages import BoardSpec, CameraIdentity, CameraModel, Matrix4, Mount, RobotIdentity, Source
 
 FORMAT: Literal["handeye-calibration/1"] = "handeye-calibration/1"
@@ -299,23 +297,13 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def write_calibration(calibration: Calibration, path: Path) -> None:
-    """Atomically: temporary file, fsync, rename, fsync of the folder. Raises CalibrationFileError."""
+    """In one durable step. Raises CalibrationFileError."""
     write_output(path, encode_calibration(calibration))
 
 
 def write_output(path: Path, content: bytes) -> None:
-    """A file for whoever asked for it, with their permissions for new files; old or new, never half.
-
-    Several processes may write it at once. Raises CalibrationFileError, and leaves nothing beside it then.
-    """
-    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    """A file for whoever asked for it, in one durable step. Raises CalibrationFileError."""
     try:
-        with temporary.open("xb") as file:
-            file.write(content)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-        sync_folder(path.parent)
+        write_atomically(path, content, ASKED_FOR)
     except OSError as problem:
-        temporary.unlink(missing_ok=True)
         raise CalibrationFileError(f"{path} cannot be written: {problem.strerror or problem}.") from None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import os
 import re
+import secrets
 import shutil
 from pathlib import Path
 
@@ -14,6 +15,8 @@ PART_SUFFIX = ".part"
 """Of a recording that is being written; gone once it is finished and on the disk."""
 EMPTY_SUFFIX = ".empty"
 """Of a session's part that was begun but holds nothing; recovery sets it aside."""
+ASKED_FOR = 0o666
+"""Permissions of a file that somebody asked for: their umask decides."""
 _SESSION_NAME = re.compile(r"[a-z0-9-]{1,40}")
 _ATTACHMENT_NAME = re.compile(r"[a-z0-9]([a-z0-9_-]|\.(?!\.)){0,39}")
 
@@ -89,16 +92,23 @@ def rename_new(source: Path, target: Path) -> None:
     sync_folder(target.parent)
 
 
-def write_atomically(path: Path, content: bytes) -> None:
-    """Replaces a small file in one step. OSError as it comes."""
-    temporary = path.with_name(path.name + ".tmp")
-    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o640)
-    with os.fdopen(descriptor, "wb") as file:
-        file.write(content)
-        file.flush()
-        os.fsync(file.fileno())
-    temporary.rename(path)
-    sync_folder(path.parent)
+def write_atomically(path: Path, content: bytes, mode: int = 0o640) -> None:
+    """The file is the old one or the new one, never half, also when several write it or the power fails.
+
+    `mode`: its permissions, less the umask. OSError as it comes; nothing is left beside the file then.
+    """
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
+    descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
+    try:
+        with os.fdopen(descriptor, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.rename(path)
+        sync_folder(path.parent)
+    except OSError:
+        temporary.unlink(missing_ok=True)
+        raise
 
 
 def require_free_space(folder: Path, reserve_bytes: int) -> int:

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,7 @@ from mcap_protobuf.writer import Writer
 from numpy.typing import NDArray
 
 from recordings.errors import RecordingError
-from recordings.files import sync_folder
+from recordings.files import ASKED_FOR, write_atomically
 
 TOPIC = "/plan/scene"
 Colour = tuple[float, float, float, float]
@@ -44,20 +44,15 @@ class Entity:
 
 def write_scene(path: Path, steps: Sequence[tuple[float, Sequence[Entity]]]) -> None:
     """Writes (seconds, entities) steps in time order, whole or not at all. RecordingError with the remedy."""
-    part = path.with_name(path.name + ".part")
+    stream = BytesIO()
+    writer = Writer(stream)
+    for seconds, entities in steps:
+        time_ns = int(seconds * 1e9)
+        writer.write_message(TOPIC, _update(entities, time_ns), time_ns, time_ns)
+    writer.finish()  # type: ignore[no-untyped-call]
     try:
-        with part.open("wb") as stream:
-            writer = Writer(stream)
-            for seconds, entities in steps:
-                time_ns = int(seconds * 1e9)
-                writer.write_message(TOPIC, _update(entities, time_ns), time_ns, time_ns)
-            writer.finish()  # type: ignore[no-untyped-call]
-            stream.flush()
-            os.fsync(stream.fileno())
-        part.replace(path)
-        sync_folder(path.parent)
+        write_atomically(path, stream.getvalue(), ASKED_FOR)
     except OSError as error:
-        part.unlink(missing_ok=True)
         raise RecordingError(f"cannot write {path}: {error.strerror}; choose another folder") from error
 
 

@@ -18,7 +18,7 @@ from calibrate.geometry import Array
 from calibrate.load import load_views
 from calibrate.pnp import solve_pnp
 from calibrate.views import ViewSet
-from recordings.files import write_atomically
+from recordings.files import ASKED_FOR, write_atomically
 from recordings.messages import Mount, SessionInfo, Vector6
 from recordings.reader import open_recording
 from station.attend import wait_until_idle
@@ -74,7 +74,7 @@ def bootstrap_command(
         out.print(entries, end="")
     else:
         try:
-            write_atomically(output, entries.encode())
+            write_atomically(output, entries.encode(), ASKED_FOR)
         except OSError as error:
             raise ConfigError(
                 f"cannot write {output}: {error.strerror}; the guesses are:\n{entries}"

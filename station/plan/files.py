@@ -14,7 +14,7 @@ import yaml
 from calibrate.geometry import Array, pose_from_quaternion
 from calibrate.kinematics import MODELS, forward, inverse_nearest
 from recordings import strict_yaml
-from recordings.files import write_atomically
+from recordings.files import ASKED_FOR, write_atomically
 from recordings.messages import Mount
 from recordings.reader import open_recording
 from station.errors import ConfigError
@@ -44,7 +44,7 @@ def save_plan(plan: Plan, path: Path) -> None:
         allow_unicode=True,
     )
     try:
-        write_atomically(path, text.encode())
+        write_atomically(path, text.encode(), ASKED_FOR)
     except OSError as error:
         raise ConfigError(
             f"cannot write the plan to {path}: {error.strerror}; choose another folder"

@@ -3,6 +3,10 @@
 from __future__ import annotations
 
 import os
+import stat
+import subprocess
+import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
@@ -10,12 +14,22 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from recordings.errors import RecordingError, UnsealedRecordingError
-from recordings.files import is_attachment_name, is_session_name, require_free_space, session_name_from
+from recordings.files import (
+    ASKED_FOR,
+    is_attachment_name,
+    is_session_name,
+    require_free_space,
+    session_name_from,
+    write_atomically,
+)
 from recordings.reader import open_recording
 from recordings.writer import RecordingWriter
+from tests.durability import disk_order
 from tests.recordings.small_recording import make_info, make_picture, write_small
 
 EVIL = ["../../etc/x", "/etc/passwd", "a\0b", "x" * 300, "", "..", ".", "a/b", "Ä", "a..b", "A", "a\n"]
+
+NEW = b"new" * 1000
 
 
 def test_the_name_is_there_only_after_finish(tmp_path: Path) -> None:
@@ -127,3 +141,59 @@ def test_free_space_below_the_reserve_is_refused_with_the_amount(tmp_path: Path)
     assert free > 1
     with pytest.raises(RecordingError, match=r"free 4\.0 GB and go on"):
         require_free_space(tmp_path, free + 4_000_000_000)
+
+
+def test_a_small_file_is_on_the_disk_before_it_has_its_name(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with disk_order(monkeypatch) as order:
+        write_atomically(tmp_path / "a.json", b"new")
+    temporary = order[0].removeprefix("sync ")
+    assert order == [f"sync {temporary}", f"rename {temporary} a.json", f"sync {tmp_path.name}"]
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"new"]
+
+
+def test_a_small_file_that_cannot_be_written_stays_as_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / "a.json").write_bytes(b"old")
+
+    def full(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(OSError, match="No space left"):
+        write_atomically(tmp_path / "a.json", b"new")
+    assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"], "and no scraps beside it"
+
+
+@pytest.mark.parametrize(("call", "found"), [("fsync", b"old"), ("rename", b"old"), ("close", NEW)])
+def test_a_small_file_is_never_half_after_a_kill(tmp_path: Path, call: str, found: bytes) -> None:
+    path = tmp_path / "a.json"
+    path.write_bytes(b"old")
+    program = (
+        "import os, signal, sys, pathlib, recordings.files as files\n"
+        f"os.{call} = lambda *_: os.kill(os.getpid(), signal.SIGKILL)\n"
+        f"files.write_atomically(pathlib.Path(sys.argv[1]), {NEW!r})"
+    )
+    done = subprocess.run([sys.executable, "-c", program, path], check=False)
+    assert done.returncode == -9
+    assert path.read_bytes() == found
+
+
+def test_several_writers_of_one_small_file_leave_one_of_theirs(tmp_path: Path) -> None:
+    contents = [bytes([k]) * 100_000 for k in range(8)]
+    with ThreadPoolExecutor(8) as pool:
+        list(pool.map(lambda content: write_atomically(tmp_path / "a.json", content), contents * 5))
+    assert [path.read_bytes() in contents for path in tmp_path.iterdir()] == [True]
+
+
+def test_a_file_that_was_asked_for_has_its_owners_permissions(tmp_path: Path) -> None:
+    before = os.umask(0o002)
+    try:
+        write_atomically(tmp_path / "ours.json", b"")
+        write_atomically(tmp_path / "theirs.yaml", b"", ASKED_FOR)
+    finally:
+        os.umask(before)
+    modes = {path.name: stat.S_IMODE(path.stat().st_mode) for path in tmp_path.iterdir()}
+    assert modes == {"ours.json": 0o640, "theirs.yaml": 0o664}

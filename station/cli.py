@@ -17,9 +17,8 @@ from calibrate.errors import CalibrationError
 from recordings.errors import RecordingError
 from station.cli_control import app as control
 from station.client import default_socket
+from station.console import Socket
 from station.errors import StationError
-
-Socket = Annotated[Path | None, typer.Option(help="The daemon's control socket.")]
 
 
 def command_line(arguments: Sequence[str]) -> typer.Typer:

@@ -22,11 +22,11 @@ from recordings.files import ASKED_FOR, write_atomically
 from recordings.messages import Mount, SessionInfo, Vector6
 from recordings.reader import open_recording
 from station.attend import wait_until_idle
-from station.cli_session import Headless, Socket, attended_session, load_into
+from station.cli_session import Headless, attended_session, load_into
 from station.client import Client, default_socket
 from station.config import PoseGuess, StationConfig
 from station.config_file import load_config
-from station.console import err, out
+from station.console import Socket, err, out
 from station.errors import ConfigError, LimitError, StationError
 from station.plan.belief import Glimpse, believe, improved_config
 from station.plan.bootstrap import MOVES_MAX, MOVES_MIN, next_move

@@ -13,15 +13,13 @@ import typer
 from rich.text import Text
 
 from station.client import Client, ask, default_socket
-from station.console import out
+from station.console import AsJson, Socket, out
 from station.errors import StationError
 from station.protocol import Verb
 from station.status import StationStatus
 
 app = typer.Typer()
 
-Socket = Annotated[Path | None, typer.Option(help="The daemon's control socket.")]
-AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout and nothing else.")]
 PoseNumber = Annotated[int, typer.Argument(min=1, help="Pose number, from 1.")]
 _MARKS = {
     "ok": Text("ok", "green"),

@@ -23,7 +23,7 @@ from rich.text import Text
 from station.attend import Confirm, Outcome, carry_out, wait_until_idle
 from station.cli_serve import require_choices
 from station.client import Client, default_socket
-from station.console import err, out
+from station.console import AsJson, Socket, err, out
 from station.demo import DemoOptions, run_demo
 from station.drift_check import PLAN_ANSWER_S, POSES, SEED, check_arguments, never_run, require_installed
 from station.errors import ConfigError, RefusedError, StationError
@@ -35,8 +35,6 @@ from station.session.folder import default_root
 from station.simulation.netns import is_isolated, isolated_command
 from station.status import GoSummary, StationStatus
 
-Socket = Annotated[Path | None, typer.Option(help="The daemon's control socket.")]
-AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout and nothing else.")]
 Headless = Annotated[bool, typer.Option("--headless", help="Nobody is asked; no progress bar.")]
 GoHash = Annotated[str, typer.Option("--go", help="Hash of the plan that a person approved.")]
 

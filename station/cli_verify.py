@@ -19,9 +19,9 @@ from calibrate.geometry import Array
 from calibrate.install import load_installed
 from calibrate.verification import note_in_file, note_installed, touch_text
 from station.attend import stop_and_say, wait_until_idle, watch_until_rest
-from station.cli_session import AsJson, Socket, ask_person, ctrl_c_at_once
+from station.cli_session import ask_person, ctrl_c_at_once
 from station.client import Client, default_socket
-from station.console import err, out
+from station.console import AsJson, Socket, err, out
 from station.errors import RefusedError, StationError
 from station.plan.hover import outer_corners
 from station.status import HoverOffer, StationState, StationStatus

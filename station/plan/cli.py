@@ -15,7 +15,7 @@ from rich.text import Text
 
 from station.config import StationConfig
 from station.config_file import load_config
-from station.console import err, out
+from station.console import AsJson, err, out
 from station.errors import ConfigError, LimitError
 from station.limits import PlanCheck, check_plan
 from station.plan.choose import Criterion
@@ -54,7 +54,7 @@ def plan_command(
     ] = False,
     picture: Annotated[Path | None, typer.Option(help="Save a picture of the plan (png, svg, pdf).")] = None,
     foxglove: Annotated[Path | None, typer.Option(help="Save a scene for Foxglove (mcap).")] = None,
-    as_json: Annotated[bool, typer.Option("--json", help="One JSON object, nothing else.")] = False,
+    as_json: AsJson = False,
 ) -> None:
     """Make a pose plan, or check one. Nothing moves."""
     cell, standing = _cell(config, scene, start)

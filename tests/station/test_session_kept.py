@@ -1,0 +1,72 @@
+"""What a session keeps: what a restart finds again, what the recording tells, what a person was told."""
+
+from __future__ import annotations
+
+import pytest
+
+from station.status import StationState as S
+from tests.station.session_rig import POSES, NewRig, Rig, crash, sealed
+
+
+def under_way(rig: Rig, moves: int) -> bool:
+    return rig.arm.under_way and rig.arm.log.count("move") == moves
+
+
+async def test_a_pose_that_failed_is_known_after_a_crash(new_rig: NewRig) -> None:
+    first = await new_rig()
+    first.camera.fail = ["frame lost"] * 3
+    first.arm.slow = True
+    await first.give_go()
+    await first.until_true(lambda: under_way(first, 1))
+    first.arm.arrive.set()
+    await first.until_true(lambda: under_way(first, 2))
+    crash(first)
+    second = await new_rig(with_plan=False)
+    assert second.pose_states == ["failed", "planned", "planned", "planned"]
+    assert "frame lost" in second.session.store.status.session.poses[0].reason
+
+
+async def test_a_plan_that_was_changed_in_a_pause_is_known_after_a_crash(new_rig: NewRig) -> None:
+    first = await new_rig()
+    first.arm.slow = True
+    await first.give_go()
+    await first.until(S.MOVING)
+    first.session.pause("anna")
+    first.arm.arrive.set()
+    await first.until(S.PAUSED)
+    first.session.edit(1, "skip", lambda queue: queue.skip(2))
+    saving = first.session._saving
+    assert saving is not None
+    await saving
+    crash(first)
+    second = await new_rig(with_plan=False)
+    assert second.pose_states == ["done", "planned", "skipped", "planned"]
+
+
+async def test_an_arm_that_stands_at_its_pose_is_not_moved(rig: Rig) -> None:
+    rig.arm.slow = True
+    await rig.give_go()
+    await rig.until(S.MOVING)
+    rig.session.pause("anna")
+    rig.arm.arrive.set()
+    await rig.until(S.PAUSED)
+    summary = await rig.session.prepare(1, "retake", 0)
+    rig.session.go(1, summary.token)
+    poses = rig.session.store
+    await rig.until_true(lambda: rig.state is S.PAUSED and poses.status.session.poses[0].attempt == 2)
+    assert rig.pose_states[0] == "done"
+    assert rig.arm.log.count("move") == 1
+
+
+@pytest.mark.parametrize("trouble", [(), ("frame lost",)])
+async def test_what_people_were_told_is_in_the_recording(rig: Rig, trouble: tuple[str, ...]) -> None:
+    rig.camera.fail = list(trouble)
+    await rig.give_go()
+    await rig.until(S.IDLE)
+    recording = sealed(rig)
+    told = [event.text for event in rig.session.store.status.events]
+    assert any(text.startswith("go by anna: run plan") for text in told)
+    assert f"sealed: {recording.path}, {POSES} of {POSES} poses" in told
+    written = [event.detail for event in recording.events()]
+    assert any(text.startswith("recording to ") for text in written)
+    assert sum("frame lost" in text for text in written) == len(trouble)

@@ -200,17 +200,18 @@ def list_installed(root: Root = None, as_json: AsJson = False) -> None:
     if not known:
         err.print(f"nothing is installed in {state_root(root)}. Run: calibrate install FILE")
         return
-    table = Table("", "generation", "solved", "result", "verdict", box=None)
     for generation in known:
-        calibration = generation.calibration
-        table.add_row(
-            "→" if generation.current else "",
-            str(generation.number),
-            "" if calibration is None else calibration.created,
-            generation.problem if calibration is None else pose_text(calibration),
-            "" if calibration is None else _verdict_text(calibration),
-        )
-    out.print(table)
+        mark = "→" if generation.current else " "
+        lines = _lines(generation)
+        out.print(f"{mark} {generation.number:>3}  " + "\n       ".join(lines), soft_wrap=True)
+
+
+def _lines(generation: Generation) -> list[str]:
+    calibration = generation.calibration
+    if calibration is None:
+        return [generation.problem]
+    made = f"{calibration.provenance.session}, solved {calibration.created}"
+    return [made, pose_text(calibration), _verdict_text(calibration)]
 
 
 def _verdict_text(calibration: Calibration) -> str:
@@ -233,6 +234,7 @@ def _plain(generation: Generation) -> dict[str, Any]:
         "current": generation.current,
         "path": str(generation.path),
         "problem": generation.problem,
+        "session": None if calibration is None else calibration.provenance.session,
         "created": None if calibration is None else calibration.created,
         "source": None if calibration is None else calibration.source,
         "sigma": None if calibration is None else msgspec.to_builtins(calibration.sigma),

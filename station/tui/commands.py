@@ -12,7 +12,7 @@ from textual.reactive import reactive
 from station.errors import RefusedError, StationError
 from station.protocol import Verb
 from station.states import RUNNING, refusal
-from station.status import GoSummary, StationState, StationStatus
+from station.status import GoSummary, SessionStatus, StationState, StationStatus
 from station.tui.confirm import Confirm, ConfirmGo
 from station.tui.link import Link
 from station.tui.replay_screen import ReplayScreen
@@ -20,6 +20,7 @@ from station.tui.replay_screen import ReplayScreen
 STOP_UNHEARD = "STOP was sent, but the station does not answer: use the EMERGENCY STOP on the pendant."
 
 
+CLOSES = "The recording is closed; F9 then solves it."
 WITHOUT = "It decelerates at once, and the session pauses."
 STAYS = "The daemon and its session stay as they are; `station` opens this screen again."
 PLAN_ANSWER_S = 200.0
@@ -143,8 +144,8 @@ class Commands(App[None]):
         if self.status is not None and (reason := refusal("finish", self.status.state)):
             self.notify(reason, severity="warning")
             return
-        captured = self.status.session.captured if self.status else 0
-        question = f"{captured} poses are captured. The recording is closed and can be solved."
+        session = SessionStatus() if self.status is None else self.status.session
+        question = f"{session.captured} of {len(session.poses)} poses are captured. {CLOSES}"
         if await self.push_screen_wait(Confirm("Finish this session?", question, yes="Finish")):
             await self.ask_with_control("finish")
 

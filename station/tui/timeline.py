@@ -12,6 +12,7 @@ from recordings.messages import CaptureEvent, Matrix4, RobotState, View
 from recordings.reader import open_recording
 from station.status import (
     CameraStatus,
+    EstimateStatus,
     Event,
     PoseState,
     PoseStatus,
@@ -27,6 +28,7 @@ WITHOUT_CLOCK_S = 1.0
 MOVING_RAD_S = 0.01
 EVENTS_SHOWN = 100
 END_TEXT = "end of the recording"
+NO_ESTIMATE = "a playback has no estimate"
 _POSE_STATES: dict[StationState, PoseState] = {
     StationState.MOVING: "moving",
     StationState.SETTLING: "settling",
@@ -93,6 +95,7 @@ class Timeline:
                 height=info.camera.height,
                 frames=done,
             ),
+            estimate=EstimateStatus(views=done, advice=NO_ESTIMATE),
             recorder=RecorderStatus(path=str(self.recording.path)),
             session=SessionStatus(
                 name=info.name,

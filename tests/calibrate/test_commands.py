@@ -120,6 +120,9 @@ def test_solve_install_check_diff_rollback(real_session_file: Path, real_file: P
     assert run("rollback", "--reason", "moved", cwd=tmp_path).returncode == 0
     listed = json.loads(run("list", "--json", cwd=tmp_path).stdout)
     assert [(row["generation"], row["current"]) for row in listed] == [(1, True), (2, False)]
+    session = calibration.provenance.session
+    assert [row["session"] for row in listed] == [session, session]
+    assert run("list", cwd=tmp_path).stdout.count(session) == 2
     text = run("export", "--to", "urdf", cwd=tmp_path)
     assert text.stdout.count("<joint") == 2
 

@@ -88,3 +88,14 @@ async def test_on_the_screen_it_is_the_first_line(link: FakeLink, size: tuple[in
         await pilot.resize_terminal(60, 20)
         await pilot.pause()
         assert text_of(pilot.app, "#bar").endswith("F12=STOP")
+
+
+@pytest.mark.parametrize(
+    ("state", "key"),
+    [(StationState.FREE_DRIVE, "F2"), (StationState.PAUSED, "F5"), (StationState.FAULT, "F8: I looked")],
+)
+async def test_the_reason_names_the_next_key(link: FakeLink, state: StationState, key: str) -> None:
+    link.show(idle(state, "why"))
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: "why │ " in text_of(pilot.app, "#reason"))
+        assert key in text_of(pilot.app, "#reason")

@@ -92,6 +92,18 @@ def test_the_time_that_is_left_stands_beside_the_steps() -> None:
     assert len(steps) <= 48  # what 80 columns leave
 
 
+def test_a_pose_that_failed_says_why_in_place_of_its_steps() -> None:
+    status = idle()
+    failed = msgspec.structs.replace(status.session.poses[0], state="failed", reason="the board is cut")
+    session = msgspec.structs.replace(
+        status.session, poses=(failed, *status.session.poses[1:]), current=0, captured=0
+    )
+    assert progress_lines(msgspec.structs.replace(status, session=session)) == [
+        f"{failed.name}: failed",
+        "the board is cut",
+    ]
+
+
 def test_a_plan_that_was_not_begun_says_which_key_is_next() -> None:
     status = idle()
     session = msgspec.structs.replace(status.session, name="")

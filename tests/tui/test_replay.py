@@ -15,7 +15,7 @@ from station.status import StationState
 from station.tui.app import ReplayApp
 from station.tui.replay import ReplayLink
 from station.tui.replay_screen import ReplayScreen
-from station.tui.timeline import END_TEXT, Timeline
+from station.tui.timeline import END_TEXT, NO_ESTIMATE, Timeline
 from station.tui.widgets.preview import Preview
 from tests.recordings.small_recording import make_info, make_picture, make_view
 from tests.tui.conftest import FakeLink, idle, until
@@ -56,6 +56,7 @@ async def test_it_plays_to_its_end_with_pictures_and_marks(link: FakeLink) -> No
         await until(pilot, lambda: "25/25" in text_of(pilot.app, "#bar"))
         assert "PLAYBACK" in text_of(pilot.app, "#bar")
         assert END_TEXT in text_of(pilot.app, "#reason")
+        assert text_of(pilot.app, "#estimate").split("\n") == ["25 views", NO_ESTIMATE]
         preview = pilot.app.screen.query_one(Preview)
         await until(pilot, lambda: preview._picture is not None and len(preview._corners) == 42)
 

@@ -13,9 +13,10 @@ _ALARM = {StationState.STOPPED, StationState.FAULT, StationState.DISCONNECTED}
 STOP_KEY = "F12=STOP"
 LEVELS = 6
 _NEXT = {
-    StationState.STOPPED: "F8",
-    StationState.FAULT: "F8",
+    StationState.STOPPED: "F8: I looked at the cell",
+    StationState.FAULT: "F8: I looked at the cell",
     StationState.PAUSED: "F5 goes on, F7 finishes",
+    StationState.FREE_DRIVE: "F2 takes a picture here, F3 ends it",
 }
 """Which key is next. The daemon's own sentence is for shells too."""
 NO_DAEMON = " NO DAEMON: trying again every second. To stop the arm use the pendant."

@@ -112,6 +112,8 @@ def progress_lines(status: StationStatus) -> list[str]:
         counted = f"{done} of {len(session.poses)} poses captured" if session.poses else "no plan loaded"
         return [counted + (", sealed: F9 solves it" if session.recording else "")]
     pose = session.poses[session.current]
+    if pose.state == "failed":
+        return [f"{pose.name}: failed", pose.reason]
     steps = ("moving", "settling", "capturing", "writing")
     at = steps.index(pose.state) if pose.state in steps else (4 if pose.state == "done" else -1)
     words = ("move", "settle", "capture", "write")
@@ -155,7 +157,8 @@ def coverage_lines(status: StationStatus) -> list[str]:
 def estimate_lines(status: StationStatus) -> list[str]:
     estimate = status.estimate
     if estimate.sigma_translation_mm is None or estimate.translation_mm is None:
-        return [f"{estimate.views} view{'s' * (estimate.views != 1)}: too few yet"]
+        seen = f"{estimate.views} view{'s' * (estimate.views != 1)}"
+        return [seen, estimate.advice] if status.playback and estimate.advice else [f"{seen}: too few yet"]
     x, y, z = estimate.translation_mm
     advice = "F9 finds the final one" if status.session.recording else estimate.advice
     rotation = "" if estimate.sigma_rotation_deg is None else f"  {estimate.sigma_rotation_deg:.3f}°"

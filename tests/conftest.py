@@ -18,6 +18,9 @@ from station.simulation.netns import isolated_thread
 
 DATASETS = Path(os.environ.get("STATION_DATASETS", Path(__file__).parents[2] / "shared" / "datasets"))
 
+for _size in ("COLUMNS", "LINES"):  # a shell may export them: what is printed would break elsewhere
+    os.environ.pop(_size, None)
+
 MAY_BE_SENT = {
     "dashboard: stop", "dashboard: PolyscopeVersion", "dashboard: get serial number",
     "dashboard: get robot model", "dashboard: is in remote control", "dashboard: robotmode",

@@ -8,10 +8,12 @@ from typing import Any
 
 import pytest
 
+from recordings.errors import RecordingError
 from station.plan.model import Plan
 from station.plan.planner import make_plan
+from station.session.recording import SessionRecording
 from station.status import StationState
-from tests.station.session_rig import POSES, TRUTH, NewRig, Rig, memory_config
+from tests.station.session_rig import POSES, TRUTH, HeldDisk, NewRig, Rig, memory_config
 
 
 @pytest.fixture(scope="session")
@@ -41,3 +43,26 @@ async def new_rig(tmp_path: Path, small_plan: Plan) -> AsyncIterator[NewRig]:
 @pytest.fixture
 async def rig(new_rig: NewRig) -> Rig:
     return await new_rig()
+
+
+@pytest.fixture
+async def bare_rig(new_rig: NewRig) -> Rig:
+    """Without a plan; the operator has control."""
+    rig = await new_rig(with_plan=False)
+    await rig.until(StationState.IDLE)
+    rig.session.take_lease(1, "anna")
+    return rig
+
+
+@pytest.fixture
+def held_disk(monkeypatch: pytest.MonkeyPatch) -> HeldDisk:
+    disk, sync = HeldDisk(), SessionRecording.sync
+
+    async def held(recording: SessionRecording) -> None:
+        await disk.wait()
+        if disk.fails:
+            raise RecordingError("cannot write: no space left on device")
+        await sync(recording)
+
+    monkeypatch.setattr(SessionRecording, "sync", held)
+    return disk

@@ -273,11 +273,20 @@ class Rig:
         summary = await self.session.prepare(1, purpose)
         self.session.go(1, summary.token)
 
-    async def go_until_the_second_move(self) -> None:
-        """One pose is on the disk; the slow arm is on its way to the next."""
+    async def go_until_it_moves(self) -> None:
+        """The slow arm is on its way to the first pose."""
         self.arm.slow = True
         await self.give_go()
         await self.until(StationState.MOVING)
+
+    async def pause_after_this_pose(self, who: str) -> None:
+        self.session.pause(who)
+        self.arm.arrive.set()
+        await self.until(StationState.PAUSED)
+
+    async def go_until_the_second_move(self) -> None:
+        """One pose is on the disk; the slow arm is on its way to the next."""
+        await self.go_until_it_moves()
         self.arm.arrive.set()
         await self.until(StationState.WRITING)
         await self.until(StationState.MOVING)
@@ -285,6 +294,12 @@ class Rig:
     @property
     def pose_states(self) -> list[str]:
         return [pose.state for pose in self.session.store.status.session.poses]
+
+
+class HeldDisk(asyncio.Event):
+    """A disk that takes nothing until the event is set; then it fails if it `fails`."""
+
+    fails = False
 
 
 def crash(rig: Rig) -> None:

@@ -19,7 +19,7 @@ from station.session.hovering import HoverRequest
 from station.status import DetectionStatus, HoverOffer
 from station.status import StationState as S
 from tests.station.hover_cell import POINTER, calibration_of, seen_from
-from tests.station.session_rig import TRUTH, NewRig, Rig
+from tests.station.session_rig import TRUTH, Rig
 
 BOARD = np.array(TRUTH.board_place)
 
@@ -31,14 +31,11 @@ def request(path: Path, corner: int = 0, **more: object) -> HoverRequest:
 
 
 @pytest.fixture
-async def hover_rig(new_rig: NewRig) -> Rig:
-    rig = await new_rig(with_plan=False)
-    await rig.until(S.IDLE)
-    rig.session.take_lease(1, "anna")
+async def hover_rig(bare_rig: Rig) -> Rig:
     view = seen_from(TRUTH, forward(MODELS["UR10"], TRUTH.start_joints_rad), BOARD)
     status = DetectionStatus(found=True, corners=len(view.pixels), expected=len(view.pixels))
-    rig.worker.sees = Sighting(status, np.arange(len(view.pixels)), view.pixels)
-    return rig
+    bare_rig.worker.sees = Sighting(status, np.arange(len(view.pixels)), view.pixels)
+    return bare_rig
 
 
 @pytest.fixture
@@ -50,6 +47,14 @@ def calibration(hover_rig: Rig, tmp_path: Path) -> Path:
 
 def tip_of(rig: Rig) -> Array:
     return board_from_tip(BOARD, forward(MODELS["UR10"], rig.arm.joints), POINTER)
+
+
+async def on_its_way(rig: Rig, calibration: Path) -> None:
+    """The slow arm moves to a hover."""
+    rig.arm.slow = True
+    offer = await rig.session.prepare_hover(1, request(calibration))
+    rig.session.go(1, offer.go.token)
+    await rig.until(S.MOVING)
 
 
 async def test_a_go_brings_the_tip_over_the_corner_and_is_used_up(hover_rig: Rig, calibration: Path) -> None:
@@ -96,10 +101,7 @@ async def test_what_is_said_of_the_tip_goes_when_the_arm_is_moved(hover_rig: Rig
 
 async def test_stop_in_mid_hover_latches(hover_rig: Rig, calibration: Path) -> None:
     rig = hover_rig
-    rig.arm.slow = True
-    offer = await rig.session.prepare_hover(1, request(calibration))
-    rig.session.go(1, offer.go.token)
-    await rig.until(S.MOVING)
+    await on_its_way(rig, calibration)
     await rig.session.stop("bert")
     assert rig.state is S.STOPPED
     assert "stop" in rig.arm.log
@@ -118,10 +120,7 @@ async def test_a_lost_lease_stops_it_and_voids_the_next_go(hover_rig: Rig, calib
     rig.session.take_lease(1, "anna")
     with pytest.raises(RefusedError, match="not valid"):
         rig.session.go(1, waiting.go.token)
-    rig.arm.slow = True
-    offer = await rig.session.prepare_hover(1, request(calibration))
-    rig.session.go(1, offer.go.token)
-    await rig.until(S.MOVING)
+    await on_its_way(rig, calibration)
     await rig.session.lease_lost(1)
     assert rig.state is S.PAUSED
     assert "connection" in rig.session.store.status.reason
@@ -184,9 +183,7 @@ async def test_what_is_not_fit_to_drive_by_is_refused(
 
 
 async def test_not_within_an_open_session(rig: Rig, tmp_path: Path) -> None:
-    rig.arm.slow = True
-    await rig.give_go()
-    await rig.until(S.MOVING)
+    await rig.go_until_it_moves()
     with pytest.raises(RefusedError, match="hover is not possible now"):
         await rig.session.prepare_hover(1, HoverRequest())
     await rig.session.stop("anna")
@@ -197,10 +194,7 @@ async def test_not_within_an_open_session(rig: Rig, tmp_path: Path) -> None:
 
 async def test_pause_keeps_the_tip_high(hover_rig: Rig, calibration: Path) -> None:
     rig = hover_rig
-    rig.arm.slow = True
-    offer = await rig.session.prepare_hover(1, request(calibration))
-    rig.session.go(1, offer.go.token)
-    await rig.until(S.MOVING)
+    await on_its_way(rig, calibration)
     rig.session.pause("bert")
     rig.arm.arrive.set()
     await rig.until(S.IDLE)

@@ -13,9 +13,8 @@ import pytest
 from recordings.reader import open_recording
 from station.errors import LimitError, RefusedError, RobotError
 from station.plan.model import Plan
-from station.session.recording import SessionRecording
 from station.status import StationState as S
-from tests.station.session_rig import POSES, Rig, sealed
+from tests.station.session_rig import POSES, HeldDisk, Rig, sealed
 
 WHOLE_POSE = [S.MOVING, S.SETTLING, S.CAPTURING, S.WRITING]
 
@@ -52,9 +51,7 @@ async def test_control_lives_only_for_a_go(rig: Rig) -> None:
 async def test_the_heart_beats_only_while_a_go_is_carried_out(rig: Rig) -> None:
     await asyncio.sleep(0.1)
     assert rig.arm.beats == 0
-    rig.arm.slow = True
-    await rig.give_go()
-    await rig.until(S.MOVING)
+    await rig.go_until_it_moves()
     await rig.until_true(lambda: rig.arm.beats > 3)
     await rig.session.stop("anna")
     beats = rig.arm.beats
@@ -62,33 +59,21 @@ async def test_the_heart_beats_only_while_a_go_is_carried_out(rig: Rig) -> None:
     assert rig.arm.beats == beats
 
 
-async def test_a_pose_counts_only_once_it_is_on_the_disk(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    on_disk = asyncio.Event()
-    sync = SessionRecording.sync
-
-    async def slow_sync(self: SessionRecording) -> None:
-        await on_disk.wait()
-        await sync(self)
-
-    monkeypatch.setattr(SessionRecording, "sync", slow_sync)
+async def test_a_pose_counts_only_once_it_is_on_the_disk(rig: Rig, held_disk: HeldDisk) -> None:
     await rig.give_go()
     await rig.until(S.WRITING)
     await asyncio.sleep(0.05)
     assert rig.state is S.WRITING
     assert rig.pose_states[0] == "writing"
     assert rig.session.store.status.session.captured == 0
-    on_disk.set()
+    held_disk.set()
     await rig.until(S.IDLE)
     assert rig.pose_states == ["done"] * POSES
 
 
 async def test_pause_is_after_this_pose_and_going_on_needs_a_new_go(rig: Rig) -> None:
-    rig.arm.slow = True
-    await rig.give_go()
-    await rig.until(S.MOVING)
-    rig.session.pause("bert")
-    rig.arm.arrive.set()
-    await rig.until(S.PAUSED)
+    await rig.go_until_it_moves()
+    await rig.pause_after_this_pose("bert")
     assert rig.pose_states == ["done", "planned", "planned", "planned"]
     assert "bert" in rig.session.store.status.reason
     await asyncio.sleep(0.05)
@@ -100,9 +85,7 @@ async def test_pause_is_after_this_pose_and_going_on_needs_a_new_go(rig: Rig) ->
 
 
 async def test_stop_is_latched_and_the_go_is_gone(rig: Rig) -> None:
-    rig.arm.slow = True
-    await rig.give_go()
-    await rig.until(S.MOVING)
+    await rig.go_until_it_moves()
     await rig.session.stop("bert")
     assert rig.state is S.STOPPED
     assert "stop" in rig.arm.log
@@ -157,9 +140,7 @@ async def test_stop_in_every_phase_keeps_what_was_taken(rig: Rig, phase: S) -> N
 
 
 async def test_a_lost_commander_stops_the_arm_at_once(rig: Rig) -> None:
-    rig.arm.slow = True
-    await rig.give_go()
-    await rig.until(S.MOVING)
+    await rig.go_until_it_moves()
     await rig.session.lease_lost(2)
     assert rig.state is S.MOVING
     await rig.session.lease_lost(1)
@@ -177,9 +158,7 @@ async def test_a_lost_commander_stops_the_arm_at_once(rig: Rig) -> None:
 
 
 async def test_who_lets_go_in_mid_move_stops_the_arm_and_is_named(rig: Rig) -> None:
-    rig.arm.slow = True
-    await rig.give_go()
-    await rig.until(S.MOVING)
+    await rig.go_until_it_moves()
     with pytest.raises(RefusedError, match=r"held by anna.*F4 on their screen.*STOP"):
         rig.session.take_lease(2, "bert")
     await rig.session.release_lease(1)
@@ -190,9 +169,7 @@ async def test_who_lets_go_in_mid_move_stops_the_arm_and_is_named(rig: Rig) -> N
 
 
 async def test_finish_seals_what_is_there(rig: Rig) -> None:
-    rig.arm.slow = True
-    await rig.give_go()
-    await rig.until(S.MOVING)
+    await rig.go_until_it_moves()
     await rig.session.finish(1)
     rig.arm.arrive.set()
     await rig.until(S.IDLE)
@@ -270,9 +247,7 @@ async def test_the_end_of_the_daemon_stops_then_seals(rig: Rig) -> None:
 
 
 async def test_the_log_is_in_the_recording_too(rig: Rig) -> None:
-    rig.arm.slow = True
-    await rig.give_go()
-    await rig.until(S.MOVING)
+    await rig.go_until_it_moves()
     logging.getLogger("station.devices.ur").warning("a path of the stop failed")
     rig.arm.slow = False
     rig.arm.arrive.set()

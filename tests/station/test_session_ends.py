@@ -10,25 +10,20 @@ from typing import Any
 
 import pytest
 
-from recordings.errors import RecordingError
 from station.errors import RobotError
 from station.estimation import running_estimate
-from station.session import recording
 from station.session.recording import SessionRecording
 from station.status import StationState as S
 from station.workers import WorkerError, Workers
-from tests.station.session_rig import POSES, NewRig, Rig
+from tests.station.session_rig import POSES, HeldDisk, Rig
 
 
 @pytest.fixture
-async def guided(new_rig: NewRig) -> Rig:
+async def guided(bare_rig: Rig) -> Rig:
     """In free drive, at a place where no picture was taken yet."""
-    rig = await new_rig(with_plan=False)
-    await rig.until(S.IDLE)
-    rig.session.take_lease(1, "anna")
-    rig.arm.rest()
-    await rig.session.switch_free_drive(1, True, auto=False)
-    return rig
+    bare_rig.arm.rest()
+    await bare_rig.session.switch_free_drive(1, True, auto=False)
+    return bare_rig
 
 
 @asynccontextmanager
@@ -96,30 +91,15 @@ async def test_control_has_ended_before_the_recording_is_sealed(
     assert rig.arm.log.index("end control") < rig.arm.log.index("seal")
 
 
-@pytest.fixture
-def sync_gate(monkeypatch: pytest.MonkeyPatch) -> asyncio.Event:
-    """The disk takes nothing until this is set, then it fails if `fails` is in its attributes."""
-    opened, sync = asyncio.Event(), SessionRecording.sync
-
-    async def held(self: SessionRecording) -> None:
-        await opened.wait()
-        if getattr(opened, "fails", False):
-            raise RecordingError("cannot write: no space left on device")
-        await sync(self)
-
-    monkeypatch.setattr(recording.SessionRecording, "sync", held)
-    return opened
-
-
 async def test_a_disk_that_fails_after_stop_is_told_and_stop_stays_latched(
-    rig: Rig, sync_gate: asyncio.Event
+    rig: Rig, held_disk: HeldDisk
 ) -> None:
-    sync_gate.fails = True  # type: ignore[attr-defined]
+    held_disk.fails = True
     await rig.give_go()
     await rig.until(S.WRITING)
     stopping = asyncio.ensure_future(rig.session.stop("bert"))
     await rig.until(S.STOPPED)
-    sync_gate.set()
+    held_disk.set()
     await stopping
     assert rig.state is S.STOPPED
     assert "STOP by bert" in rig.session.store.status.reason
@@ -129,7 +109,7 @@ async def test_a_disk_that_fails_after_stop_is_told_and_stop_stays_latched(
     assert "done" not in rig.pose_states
 
 
-async def test_a_picture_being_written_outlives_every_halt(rig: Rig, sync_gate: asyncio.Event) -> None:
+async def test_a_picture_being_written_outlives_every_halt(rig: Rig, held_disk: HeldDisk) -> None:
     await rig.give_go()
     await rig.until(S.WRITING)
     run = rig.session._run
@@ -138,16 +118,16 @@ async def test_a_picture_being_written_outlives_every_halt(rig: Rig, sync_gate: 
         run.cancel()
         await asyncio.sleep(0.01)
     assert not run.done()
-    sync_gate.set()
+    held_disk.set()
     await asyncio.wait({run})
     assert rig.pose_states[0] == "done"
 
 
-async def test_a_fault_between_moves_stops_the_arm_by_both_ways(rig: Rig, sync_gate: asyncio.Event) -> None:
+async def test_a_fault_between_moves_stops_the_arm_by_both_ways(rig: Rig, held_disk: HeldDisk) -> None:
     await rig.give_go()
     await rig.until(S.WRITING)
     rig.arm.trouble = RobotError("the program was stopped")
-    sync_gate.set()
+    held_disk.set()
     await rig.until(S.FAULT)
     await rig.until_true(lambda: "end control" in rig.arm.log)
     assert "stop" in rig.arm.log

@@ -24,7 +24,7 @@ async def test_a_bad_picture_is_taken_again_and_then_the_pose_fails_alone(rig: R
     await rig.give_go()
     await rig.until(S.PAUSED)
     assert rig.pose_states == ["failed", "done", "done", "done"]
-    assert "pose 1 failed" in rig.session.store.status.reason
+    assert "pose 1 failed (no good picture" in rig.session.store.status.reason
     await rig.session.finish(1)
     assert [view.index for view in sealed(rig).views()] == [1, 2, 3]
 
@@ -38,7 +38,7 @@ async def test_a_picture_without_the_board_does_not_count(rig: Rig) -> None:
     status = rig.session.store.status
     assert rig.pose_states == ["failed"] * 3 + ["planned"]
     assert status.session.poses[0].reason == "board half hidden"
-    assert "3 poses in a row" in status.reason
+    assert "3 poses in a row failed (board half hidden)" in status.reason
     assert status.session.captured == 0
 
 
@@ -50,9 +50,7 @@ async def test_an_arm_that_does_not_rest_fails_the_pose(rig: Rig, monkeypatch: p
 
 
 async def test_a_protective_stop_stops_and_sends_nothing(rig: Rig) -> None:
-    rig.arm.slow = True
-    await rig.give_go()
-    await rig.until(S.MOVING)
+    await rig.go_until_it_moves()
     rig.arm.trouble = SafetyStopError("protective stop: find what the arm ran into")
     rig.arm.arrive.set()
     await rig.until(S.STOPPED)
@@ -98,12 +96,8 @@ async def test_a_full_disk_is_noticed_before_the_pose(rig: Rig, monkeypatch: pyt
 
 
 async def test_a_jogged_arm_is_named_and_its_go_is_void(rig: Rig) -> None:
-    rig.arm.slow = True
-    await rig.give_go()
-    await rig.until(S.MOVING)
-    rig.session.pause("anna")
-    rig.arm.arrive.set()
-    await rig.until(S.PAUSED)
+    await rig.go_until_it_moves()
+    await rig.pause_after_this_pose("anna")
     summary = await rig.session.prepare(1, "resume")
     await asyncio.sleep(0.3)
     rig.arm.joints = (*rig.arm.joints[:5], rig.arm.joints[5] + 0.3)
@@ -128,9 +122,7 @@ async def test_a_session_cut_by_a_crash_waits_for_a_person_and_goes_on_in_a_new_
     new_rig: NewRig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     first = await new_rig()
-    first.arm.slow = True
-    await first.give_go()
-    await first.until(S.MOVING)
+    await first.go_until_it_moves()
     first.arm.arrive.set()
     await first.until(S.WRITING)
     await first.until(S.MOVING)

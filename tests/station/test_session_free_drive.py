@@ -9,23 +9,20 @@ import pytest
 
 from station.errors import RefusedError, TriggerError
 from station.status import StationState as S
-from tests.station.session_rig import POSES, NewRig, Rig, sealed
+from tests.station.session_rig import POSES, Rig, sealed
 
 
-async def test_a_free_hand_records_without_control(new_rig: NewRig) -> None:
-    rig = await new_rig(with_plan=False)
-    await rig.until(S.IDLE)
-    rig.session.take_lease(1, "anna")
-    await rig.session.switch_free_drive(1, True, auto=False)
-    assert rig.state is S.FREE_DRIVE
+async def test_a_free_hand_records_without_control(bare_rig: Rig) -> None:
+    await bare_rig.session.switch_free_drive(1, True, auto=False)
+    assert bare_rig.state is S.FREE_DRIVE
     for turn in (0.0, 0.2):
-        rig.arm.joints = (*rig.arm.joints[:5], rig.arm.joints[5] + turn)
-        rig.arm.rest()
-        await rig.session.record(1)
-    await rig.session.switch_free_drive(1, False, auto=False)
-    await rig.session.finish(1)
-    assert [view.name for view in sealed(rig).views()] == ["hand-01", "hand-02"]
-    assert "start control" not in rig.arm.log
+        bare_rig.arm.joints = (*bare_rig.arm.joints[:5], bare_rig.arm.joints[5] + turn)
+        bare_rig.arm.rest()
+        await bare_rig.session.record(1)
+    await bare_rig.session.switch_free_drive(1, False, auto=False)
+    await bare_rig.session.finish(1)
+    assert [view.name for view in sealed(bare_rig).views()] == ["hand-01", "hand-02"]
+    assert "start control" not in bare_rig.arm.log
 
 
 async def test_a_dropped_pose_does_not_take_the_name_of_the_next_picture(rig: Rig) -> None:
@@ -39,56 +36,47 @@ async def test_a_dropped_pose_does_not_take_the_name_of_the_next_picture(rig: Ri
     assert names[-2:] == [f"hand-{POSES + 1:02d}", f"hand-{POSES + 2:02d}"]
 
 
-async def test_auto_record_takes_a_new_place_once(new_rig: NewRig) -> None:
-    rig = await new_rig(with_plan=False)
-    await rig.until(S.IDLE)
-    rig.session.take_lease(1, "anna")
-    rig.arm.rest()
-    await rig.session.switch_free_drive(1, True, auto=True)
-    await rig.until_true(lambda: rig.session.store.status.session.captured == 1)
+async def test_auto_record_takes_a_new_place_once(bare_rig: Rig) -> None:
+    bare_rig.arm.rest()
+    await bare_rig.session.switch_free_drive(1, True, auto=True)
+    await bare_rig.until_true(lambda: bare_rig.session.store.status.session.captured == 1)
     await asyncio.sleep(0.3)
-    assert rig.session.store.status.session.captured == 1
-    rig.arm.joints = (*rig.arm.joints[:5], rig.arm.joints[5] + 0.2)
-    rig.arm.rest()
-    await rig.until_true(lambda: rig.session.store.status.session.captured == 2)
-    await rig.session.stop("anna")
-    assert rig.state is S.STOPPED
+    assert bare_rig.session.store.status.session.captured == 1
+    bare_rig.arm.joints = (*bare_rig.arm.joints[:5], bare_rig.arm.joints[5] + 0.2)
+    bare_rig.arm.rest()
+    await bare_rig.until_true(lambda: bare_rig.session.store.status.session.captured == 2)
+    await bare_rig.session.stop("anna")
+    assert bare_rig.state is S.STOPPED
 
 
-async def test_auto_record_outlives_a_moment_without_news(new_rig: NewRig) -> None:
-    rig = await new_rig(with_plan=False)
-    await rig.until(S.IDLE)
-    rig.session.take_lease(1, "anna")
-    rig.arm.rest()
-    await rig.session.switch_free_drive(1, True, auto=True)
-    await rig.until_true(lambda: rig.session.store.status.session.captured == 1)
-    rig.arm.stale = True
-    rig.arm.joints = (*rig.arm.joints[:5], rig.arm.joints[5] + 0.2)
+async def test_auto_record_outlives_a_moment_without_news(bare_rig: Rig) -> None:
+    bare_rig.arm.rest()
+    await bare_rig.session.switch_free_drive(1, True, auto=True)
+    await bare_rig.until_true(lambda: bare_rig.session.store.status.session.captured == 1)
+    bare_rig.arm.stale = True
+    bare_rig.arm.joints = (*bare_rig.arm.joints[:5], bare_rig.arm.joints[5] + 0.2)
     await asyncio.sleep(0.25)  # two rounds of its watch
-    rig.arm.stale = False
-    rig.arm.rest()
-    await rig.until_true(lambda: rig.session.store.status.session.captured == 2)
+    bare_rig.arm.stale = False
+    bare_rig.arm.rest()
+    await bare_rig.until_true(lambda: bare_rig.session.store.status.session.captured == 2)
 
 
 @pytest.mark.parametrize("broken", [TriggerError("the trigger box is gone"), ZeroDivisionError("a defect")])
 async def test_a_picture_that_ends_oddly_leaves_no_state_of_work(
-    new_rig: NewRig, monkeypatch: pytest.MonkeyPatch, broken: Exception
+    bare_rig: Rig, monkeypatch: pytest.MonkeyPatch, broken: Exception
 ) -> None:
-    rig = await new_rig(with_plan=False)
-    await rig.until(S.IDLE)
-    rig.session.take_lease(1, "anna")
-    rig.arm.rest()
-    await rig.session.switch_free_drive(1, True, auto=False)
+    bare_rig.arm.rest()
+    await bare_rig.session.switch_free_drive(1, True, auto=False)
 
     async def capture(timeout_s: float = 5.0) -> None:
         raise broken
 
-    monkeypatch.setattr(rig.camera, "capture", capture)
+    monkeypatch.setattr(bare_rig.camera, "capture", capture)
     with contextlib.suppress(type(broken)):
-        await rig.session.record(1)
-    assert rig.state is S.FAULT
-    assert str(broken.args[0]) in rig.session.store.status.reason
-    assert rig.pose_states == ["planned"]
+        await bare_rig.session.record(1)
+    assert bare_rig.state is S.FAULT
+    assert str(broken.args[0]) in bare_rig.session.store.status.reason
+    assert bare_rig.pose_states == ["planned"]
 
 
 async def _begins(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> tuple[asyncio.Event, asyncio.Future[None]]:
@@ -106,17 +94,14 @@ async def _begins(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> tuple[asyncio.Ev
 
 
 async def test_stop_while_free_drive_begins_stays_latched(
-    new_rig: NewRig, monkeypatch: pytest.MonkeyPatch
+    bare_rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rig = await new_rig(with_plan=False)
-    await rig.until(S.IDLE)
-    rig.session.take_lease(1, "anna")
-    opened, beginning = await _begins(rig, monkeypatch)
-    await rig.session.stop("bert")
+    opened, beginning = await _begins(bare_rig, monkeypatch)
+    await bare_rig.session.stop("bert")
     opened.set()
     with pytest.raises(RefusedError, match="STOP is latched"):
         await beginning
-    assert rig.state is S.STOPPED and rig.session.bench.halting
+    assert bare_rig.state is S.STOPPED and bare_rig.session.bench.halting
 
 
 async def test_no_go_is_given_while_free_drive_begins(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -28,12 +28,8 @@ async def test_a_pose_that_failed_is_known_after_a_crash(new_rig: NewRig) -> Non
 
 async def test_a_plan_that_was_changed_in_a_pause_is_known_after_a_crash(new_rig: NewRig) -> None:
     first = await new_rig()
-    first.arm.slow = True
-    await first.give_go()
-    await first.until(S.MOVING)
-    first.session.pause("anna")
-    first.arm.arrive.set()
-    await first.until(S.PAUSED)
+    await first.go_until_it_moves()
+    await first.pause_after_this_pose("anna")
     first.session.edit(1, "skip", lambda queue: queue.skip(2))
     saving = first.session._saving
     assert saving is not None
@@ -44,12 +40,8 @@ async def test_a_plan_that_was_changed_in_a_pause_is_known_after_a_crash(new_rig
 
 
 async def test_an_arm_that_stands_at_its_pose_is_not_moved(rig: Rig) -> None:
-    rig.arm.slow = True
-    await rig.give_go()
-    await rig.until(S.MOVING)
-    rig.session.pause("anna")
-    rig.arm.arrive.set()
-    await rig.until(S.PAUSED)
+    await rig.go_until_it_moves()
+    await rig.pause_after_this_pose("anna")
     summary = await rig.session.prepare(1, "retake", 0)
     rig.session.go(1, summary.token)
     poses = rig.session.store

@@ -11,9 +11,8 @@ import pytest
 from station import limits
 from station.errors import RefusedError
 from station.session import run, session
-from station.session.recording import SessionRecording
 from station.status import StationState as S
-from tests.station.session_rig import POSES, Rig
+from tests.station.session_rig import POSES, HeldDisk, Rig
 
 
 class HeldStart:
@@ -121,16 +120,9 @@ async def test_a_run_that_cannot_be_made_leaves_the_station_at_rest(
 
 
 async def test_nothing_new_begins_beside_a_run_that_does_not_end(
-    rig: Rig, monkeypatch: pytest.MonkeyPatch
+    rig: Rig, held_disk: HeldDisk, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(session, "END_RUN_S", 0.05)
-    on_disk, sync = asyncio.Event(), SessionRecording.sync
-
-    async def hangs(self: SessionRecording) -> None:
-        await on_disk.wait()
-        await sync(self)
-
-    monkeypatch.setattr(SessionRecording, "sync", hangs)
     await rig.give_go()
     await rig.until(S.WRITING)
     await rig.session.stop("bert")
@@ -144,6 +136,6 @@ async def test_nothing_new_begins_beside_a_run_that_does_not_end(
         with pytest.raises(RefusedError, match="still ending"):
             await what()
     assert rig.session.bench.halting
-    on_disk.set()
+    held_disk.set()
     await rig.until_true(lambda: rig.session._run is not None and rig.session._run.done())
     assert rig.arm.log.count("move") == 1

@@ -20,7 +20,7 @@ from station.session import guard, keeper, monitor
 from station.session.recording import SessionRecording
 from station.status import StationState as S
 from station.workers import WorkerError, Workers
-from tests.station.session_rig import POSES, NewRig, Rig
+from tests.station.session_rig import POSES, HeldDisk, NewRig, Rig
 
 
 class Gate:
@@ -111,9 +111,7 @@ async def test_an_arm_moved_while_control_started_is_not_driven(
 async def test_stop_while_an_interrupted_session_is_closed_stays_latched(
     new_rig: NewRig, rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    rig.arm.slow = True
-    await rig.give_go()
-    await rig.until(S.MOVING)
+    await rig.go_until_it_moves()
     await rig.session.stop("bert")
     recorder = rig.session.bench.require_recording().recorder
     assert recorder is not None
@@ -132,15 +130,7 @@ async def test_stop_while_an_interrupted_session_is_closed_stays_latched(
     assert other.state is S.STOPPED
 
 
-async def test_finish_waits_for_what_is_being_written(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    on_disk = asyncio.Event()
-    sync = SessionRecording.sync
-
-    async def slow_sync(self: SessionRecording) -> None:
-        await on_disk.wait()
-        await sync(self)
-
-    monkeypatch.setattr(SessionRecording, "sync", slow_sync)
+async def test_finish_waits_for_what_is_being_written(rig: Rig, held_disk: HeldDisk) -> None:
     await rig.give_go()
     await rig.until(S.WRITING)
     losing = asyncio.ensure_future(rig.session.lease_lost(1))
@@ -148,7 +138,7 @@ async def test_finish_waits_for_what_is_being_written(rig: Rig, monkeypatch: pyt
     rig.session.take_lease(2, "bert")
     finishing = asyncio.ensure_future(rig.session.finish(2))
     await asyncio.sleep(0.02)
-    on_disk.set()
+    held_disk.set()
     await asyncio.gather(losing, finishing)
     assert rig.state is S.IDLE
     assert rig.pose_states[0] == "done"
@@ -166,9 +156,7 @@ async def test_a_client_that_leaves_at_once_is_served_to_the_end(rig: Rig, tmp_p
         await asyncio.sleep(0.05)
 
     rig.arm.stop = slow_stop  # type: ignore[method-assign]
-    rig.arm.slow = True
-    await rig.give_go()
-    await rig.until(S.MOVING)
+    await rig.go_until_it_moves()
     with socket.socket(socket.AF_UNIX) as client:
         client.setblocking(False)
         await asyncio.get_running_loop().sock_connect(client, str(tmp_path / "s"))
@@ -198,9 +186,7 @@ async def test_the_guard_outlives_an_error_in_what_it_shows(
 
 
 async def test_an_open_session_keeps_its_plan(rig: Rig, small_plan: Plan) -> None:
-    rig.arm.slow = True
-    await rig.give_go()
-    await rig.until(S.MOVING)
+    await rig.go_until_it_moves()
     await rig.session.stop("bert")
     rig.arm.stale = True
     rig.session.acknowledge("anna")
@@ -213,9 +199,7 @@ async def test_an_open_session_keeps_its_plan(rig: Rig, small_plan: Plan) -> Non
 async def test_a_session_of_a_simulated_cell_is_not_gone_on_with_by_a_real_arm(
     new_rig: NewRig, rig: Rig
 ) -> None:
-    rig.arm.slow = True
-    await rig.give_go()
-    await rig.until(S.MOVING)
+    await rig.go_until_it_moves()
     await rig.session.stop("bert")
     real = await new_rig(with_plan=False, source="real")
     await real.until(S.IDLE)
@@ -315,9 +299,7 @@ async def test_an_arm_that_still_brakes_was_not_moved_by_anybody(
         return msgspec.structs.replace(state(), joint_speeds_rad_s=(speed, *(0.0,) * 5))
 
     monkeypatch.setattr(rig.arm, "_state", braking)
-    rig.arm.slow = True
-    await rig.give_go()
-    await rig.until(S.MOVING)
+    await rig.go_until_it_moves()
     await rig.session.lease_lost(1)
     await asyncio.sleep(0.15)
     first, *rest = rig.arm.joints

@@ -9,7 +9,7 @@ import pytest
 
 from recordings.messages import RobotState, Stamps, Vector6
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode, SafetyStatus
-from station.devices.ur_moves import MoveWatch
+from station.devices.ur_moves import MoveWatch, check_goal
 from station.errors import RobotError, SafetyStopError, StaleStateError
 
 START = (0.0,) * 6
@@ -41,6 +41,29 @@ def state(joint_rad: float = 0.0, **changes: Any) -> RobotState:
 @pytest.fixture
 def watch() -> MoveWatch:
     return MoveWatch(START, GOAL, BEFORE, begun_s=0.0)
+
+
+def test_goals_within_the_caps_are_let_through() -> None:
+    check_goal((0.0, -1.0, 2.0, -6.28, 6.28, 0.1), 1.05, 1.5, limit_rad=6.2832)
+
+
+@pytest.mark.parametrize(
+    ("joints", "speed", "acceleration", "words"),
+    [
+        ((0.0,) * 5, 0.5, 0.5, "not six joint angles"),
+        ((0.0,) * 7, 0.5, 0.5, "not six joint angles"),
+        ((*START[:5], float("nan")), 0.5, 0.5, "not six joint angles"),
+        ((*START[:5], 6.3), 0.5, 0.5, "not six joint angles within ± 6.28"),
+        ((*START[:5], -6.3), 0.5, 0.5, "not six joint angles within ± 6.28"),
+        *((START, speed, 0.5, "joint speed") for speed in (0.0, -0.1, 1.06, float("nan"))),
+        *((START, 0.5, value, "joint acceleration") for value in (0.0, -0.1, 1.51, float("nan"))),
+    ],
+)
+def test_the_driver_itself_refuses_what_is_beyond_its_caps(
+    joints: Vector6, speed: float, acceleration: float, words: str
+) -> None:
+    with pytest.raises(RobotError, match=words):
+        check_goal(joints, speed, acceleration, limit_rad=6.2832)
 
 
 def test_a_move_that_was_just_accepted_still_looks_finished(watch: MoveWatch) -> None:

@@ -86,6 +86,27 @@ def test_with_the_nominal_table_alone_the_check_is_coarse_but_there() -> None:
         check.check(sample(arm, THERE, (TOOL[0] + 0.015, *TOOL[1:])), Installation())
 
 
+def test_the_coarse_check_sees_a_turned_tool_too() -> None:
+    check = TcpCheck(UR10, False, sample(UR10, HERE, TOOL), Installation())
+    with pytest.raises(RobotError, match="changed"):
+        check.check(sample(UR10, HERE, (*TOOL[:5], TOOL[5] + 0.03)), Installation())
+
+
+def test_with_a_configured_table_the_check_is_fine_without_the_controllers_words() -> None:
+    arm = UR10.calibrated(FACTORY)
+    check = TcpCheck(arm, True, sample(arm, HERE, TOOL), Installation())
+    check.check(sample(arm, THERE, TOOL), Installation())
+    for moved in ((TOOL[0] + 0.001, *TOOL[1:]), (*TOOL[:5], TOOL[5] + 0.003)):
+        with pytest.raises(RobotError, match="changed"):
+            check.check(sample(arm, THERE, moved), Installation())
+
+
+def test_a_tool_of_more_than_a_metre_is_a_mix_up() -> None:
+    long: Vector6 = (0.0, 0.0, 1.05, 0.0, 0.0, 0.0)
+    with pytest.raises(RobotError, match=r"lies 1\.05 m from the flange"):
+        TcpCheck(UR10, False, sample(UR10, HERE, long), stated(UR10, long))
+
+
 def test_a_changed_statement_is_noticed_before_the_arm_shows_it() -> None:
     check = TcpCheck(UR10, False, sample(UR10, HERE, TOOL), stated(UR10, TOOL))
     with pytest.raises(RobotError, match="set it back"):

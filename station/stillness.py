@@ -22,6 +22,9 @@ from station.config import StillnessConfig
 from station.errors import StationError
 
 POLL_S = 0.02
+FIND_SHAKE = "Look for what shakes the arm or the camera, or take this pose again later"
+UNSEEN = "the joints rest, but the camera gave no pictures to see by whether it does"
+CHECK_CAMERA = "Check the camera's cable and power, or take this pose again later"
 LEAST_SAMPLES = 8
 KEPT_SAMPLES = 4096
 
@@ -134,24 +137,21 @@ class StillnessMonitor:
             old = alive() is False
             found = self.measure() if not old else None
             unrest = self.unrest(found) if found is not None else "too few robot states"
-            unrest = "no fresh news of the robot" if old else unrest
+            unrest, remedy = "no fresh news of the robot" if old else unrest, FIND_SHAKE
             if found is None or unrest:
                 resting_since_ns = None
             else:
                 resting_since_ns = resting_since_ns or self._window_begin_ns(found)
                 seen = look(resting_since_ns)
                 if seen is None:
-                    unrest = "the joints rest, the picture's motion is not known yet"
+                    unrest, remedy = UNSEEN, CHECK_CAMERA
                 else:
                     found = msgspec.structs.replace(found, image_motion_px=seen.motion_px)
                     unrest = self.unrest(found)
                     if not unrest:
                         return found
             if now_s() >= give_up_s:
-                raise NotStillError(
-                    f"not at rest within {self._limits.timeout_s:g} s: {unrest}. Look for what shakes "
-                    "the arm or the camera, or take this pose again later"
-                )
+                raise NotStillError(f"not at rest within {self._limits.timeout_s:g} s: {unrest}. {remedy}")
             await asyncio.sleep(POLL_S)
 
     def _window_begin_ns(self, found: Stillness) -> int:

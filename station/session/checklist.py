@@ -81,7 +81,8 @@ async def _camera_check(bench: Bench, troubles: dict[str, str]) -> Check:
     except (CameraError, TimeoutError) as error:
         return Check("camera", "failed", str(error) or "no answer", "check cable and power of the camera")
     if picture is None:
-        return Check("camera", "warning", f"{camera.identity.model}: no preview", "take a test picture")
+        remedy = "check its cable and power, then take one by hand (F3, F2 on the screen)"
+        return Check("camera", "warning", f"{camera.identity.model}: no picture", remedy)
     height, width = picture.image.shape[:2]
     return Check("camera", "ok", f"{camera.identity.model} {camera.identity.serial}, {width}×{height}")
 

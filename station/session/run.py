@@ -40,7 +40,7 @@ class Run:
         self._go = go
         geometry = geometry_from(bench.cell.config, go.start_joints_rad)
         self._geometry = with_plan_speeds(geometry, bench.require_queue().plan)
-        self._failures = 0
+        self._failures, self._why = 0, ""
         self._unsettled: list[int] = []
         """Poses where something still moved."""
         self._tried_again = False
@@ -179,7 +179,7 @@ class Run:
             await take_pose(bench, index, attempt)
             self._failures = 0
         except (PoseFailedError, NotStillError, LimitError) as error:
-            self._failures += 1
+            self._failures, self._why = self._failures + 1, str(error)
             if isinstance(error, NotStillError):
                 self._unsettled.append(index)
             queue.mark(index, "failed", str(error))
@@ -234,7 +234,7 @@ class Run:
         if bench.pause_wanted:
             reason = f"paused by {bench.pause_wanted}: give a new go to go on"
         elif self._failures >= FAILURES_IN_A_ROW:
-            reason = f"{self._failures} poses in a row failed: look at the reasons, then go on or finish"
+            reason = f"{self._failures} poses in a row failed ({self._why}): mend that, then go on, or finish"
         elif queue.open:
             reason = f"{len(queue.open)} poses are left: give a new go to go on"
         elif unsettled := [index for index in self._unsettled if index in queue.failed]:
@@ -243,7 +243,8 @@ class Run:
                 "take again (retake) or leave out (skip), or finish"
             )
         else:
-            reason = f"{_numbers(queue.failed)} failed: retake or skip them, or finish"
+            why = queue.status(queue.failed[0]).reason
+            reason = f"{_numbers(queue.failed)} failed ({why}): retake or skip, or finish"
         bench.pause_wanted = ""
         bench.store.enter(StationState.PAUSED, reason)
         bench.store.event(reason)

@@ -128,5 +128,5 @@ class SweepRun(Run):
 
     def _give_up(self, reason: str) -> None:
         """The arm rests after this swing; a person decides."""
-        self._failures = FAILURES_IN_A_ROW
+        self._failures, self._why = FAILURES_IN_A_ROW, reason
         self._bench.store.event(reason, "error")

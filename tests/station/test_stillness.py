@@ -189,6 +189,15 @@ async def test_news_that_stay_away_are_the_reason() -> None:
         await m.settle(lambda: False, now_s=lambda: next(clock))
 
 
+async def test_a_camera_that_shows_nothing_is_not_called_a_shake() -> None:
+    m = monitor(timeout_s=5.0)
+    shake(m, 0.5, 0.0)
+    clock = iter([0.0, 1.0, 5.1])
+    with pytest.raises(NotStillError, match="Check the camera") as told:
+        await m.settle(lambda: True, lambda since_ns: None, now_s=lambda: next(clock))
+    assert "shakes" not in str(told.value)
+
+
 async def test_a_lost_robot_ends_the_waiting() -> None:
     def dead() -> None:
         raise StaleStateError("no news")

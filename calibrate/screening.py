@@ -32,7 +32,7 @@ class Screening:
     """Places of the views that agree with each other."""
     voters: Places
     scale_rad: float
-    scale_m: float
+    """Noise of a pair's rotation, as the agreeing pairs show it."""
 
     @property
     def share(self) -> float:
@@ -51,7 +51,7 @@ def screen(H: Array, camera_from_board: Array) -> Screening:
     matrix = np.eye(len(voters), dtype=bool)
     matrix[first, second] = matrix[second, first] = agree
     group = _largest_group(matrix)
-    return Screening(voters[group], voters, float(scale[0]), float(scale[1]))
+    return Screening(voters[group], voters, float(scale[0]))
 
 
 def detect_shift(H: Array, camera_from_board: Array) -> int:

@@ -5,7 +5,6 @@ All levels are shares of full scale, 0 … 1. It assumes a linear sensor, as mac
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +22,6 @@ _SATURATED, _SATURATED_SHARE = 0.98, 0.005
 _DARK_WHITE, _BRIGHT_WHITE = 0.35, 0.95
 _LOW_CONTRAST = 0.25
 _BLUR_PX = 2.0
-_FLICKER = 0.03
 LONGEST_EXPOSURE_US = 40_000.0
 """The arm is at rest, but not for ever: beyond this, gain is raised instead."""
 SHORTEST_EXPOSURE_US = 50.0
@@ -77,23 +75,6 @@ def assess(
     if blur_px is not None and blur_px > _BLUR_PX:
         warnings.append(f"blurred: edges are {blur_px:.1f} px wide; focus the lens, or the arm moves")
     return ExposureAdvice(wanted_us, wanted_db, white, black, saturated, blur_px, tuple(warnings))
-
-
-def flicker_warning(whites: Sequence[float], exposure_us: float) -> str:
-    """From the whites of several pictures with the same settings; empty while they agree.
-
-    Lamps on the mains flicker at twice its frequency: exposures of whole periods see none of it.
-    """
-    if len(whites) < 4 or np.mean(whites) <= 0:
-        return ""
-    spread = float((np.max(whites) - np.min(whites)) / np.mean(whites))
-    if spread < _FLICKER:
-        return ""
-    periods = [max(1, round(exposure_us / period_us)) * period_us for period_us in (10_000, 25_000 / 3)]
-    return (
-        f"flicker: brightness changes by {spread:.0%} from picture to picture; expose {periods[0]:.0f} µs on "
-        f"50 Hz mains or {periods[1]:.0f} µs on 60 Hz, or use a light without flicker"
-    )
 
 
 def _levels(image: NDArray[Any]) -> NDArray[np.float32]:

@@ -31,10 +31,6 @@ class ProbeResult:
     def is_e_series(self) -> bool:
         return bool(self.version) and self.version[0] >= 5
 
-    @property
-    def version_text(self) -> str:
-        return ".".join(map(str, self.version))
-
 
 async def probe(host: str) -> ProbeResult:
     """Asks all ports at once; takes at most a few seconds and never raises."""

@@ -58,10 +58,6 @@ class Hover:
     outward: Array
     """(3,) unit normal in `board`, to the side that the camera sees."""
 
-    def tip_in_board_m(self, base_from_flange: Array, pointer: PointerConfig) -> Array:
-        """(3,) where the tip is when the flange is there."""
-        return board_from_tip(self.base_from_board, base_from_flange, pointer)
-
 
 def board_from_tip(base_from_board: Array, base_from_flange: Array, pointer: PointerConfig) -> Array:
     """The tip (3,) in `board`, metres."""

@@ -11,7 +11,7 @@ from calibrate.board import board_points
 from calibrate.geometry import Array, transform_points
 from recordings.messages import CameraModel
 from station.config import PAPER_BOARD
-from station.exposure import ExposureAdvice, assess, flicker_warning
+from station.exposure import ExposureAdvice, assess
 from station.simulation.placement import seen_from
 from station.simulation.renderer import Light, render
 
@@ -86,10 +86,3 @@ def test_deep_and_colour_pictures_count_the_same() -> None:
     deep = assess(picture.astype(np.uint16) << 4, None, 10_000, 0.0)
     colour = assess(np.repeat(picture[:, :, None], 3, axis=2), None, 10_000, 0.0)
     assert deep.white == pytest.approx(plain.white, abs=0.01) and colour.white == plain.white
-
-
-def test_flicker_is_named_with_the_exposures_that_avoid_it() -> None:
-    assert flicker_warning([0.70, 0.71, 0.70, 0.70], 4000) == ""
-    assert flicker_warning([0.6, 0.8], 4000) == "", "two pictures are no pattern"
-    text = flicker_warning([0.6, 0.75, 0.62, 0.7], 4000)
-    assert "10000 µs on 50 Hz" in text and "8333 µs on 60 Hz" in text

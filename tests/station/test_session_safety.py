@@ -138,6 +138,7 @@ async def test_finish_waits_for_what_is_being_written(rig: Rig, held_disk: HeldD
     rig.session.take_lease(2, "bert")
     finishing = asyncio.ensure_future(rig.session.finish(2))
     await asyncio.sleep(0.02)
+    assert not finishing.done()
     held_disk.set()
     await asyncio.gather(losing, finishing)
     assert rig.state is S.IDLE

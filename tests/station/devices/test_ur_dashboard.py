@@ -60,7 +60,7 @@ async def test_answers_keep_their_order_without_waiting(serve: Serve) -> None:
 async def test_the_e_series_leaves_its_letter_out(serve: Serve) -> None:
     dashboard = await Dashboard.open(await serve(E_SERIES))
     found = await identify(dashboard)
-    assert (found.model, found.serial, found.version_text) == ("UR10e", "20195500001", "5.11.1.108318")
+    assert (found.model, found.serial, found.version) == ("UR10e", "20195500001", (5, 11, 1, 108318))
     assert found.remote is False and found.is_e_series
     await dashboard.close()
 

@@ -81,7 +81,7 @@ class Recorder:
 
     @property
     def queued_bytes(self) -> int:
-        """Waiting for the disk; the session pauses when it grows."""
+        """Waiting for the disk."""
         return self._queued_bytes
 
     @property

@@ -119,7 +119,12 @@ def require_free_space(folder: Path, reserve_bytes: int) -> int:
     free = shutil.disk_usage(folder).free
     if free < reserve_bytes:
         raise RecordingError(
-            f"only {free / 1e9:.1f} GB are free at {folder}, the reserve is {reserve_bytes / 1e9:.1f} GB: "
-            f"free {(reserve_bytes - free) / 1e9:.1f} GB and go on"
+            f"only {bytes_text(free)} are free at {folder}, the reserve is {bytes_text(reserve_bytes)}: "
+            f"free {bytes_text(reserve_bytes - free)} and go on"
         )
     return free
+
+
+def bytes_text(count: int) -> str:
+    """For people: 4.0 GB, 120 MB."""
+    return f"{count / 1e9:.1f} GB" if count >= 1_000_000_000 else f"{count / 1e6:.0f} MB"

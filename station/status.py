@@ -110,7 +110,8 @@ class RecorderStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     bytes: int = 0
     drops: int = 0
     sync_ms: float = 0.0
-    free_bytes: int = 0
+    free_bytes: int | None = None
+    """On the sessions' disk; None: not known."""
     error: str = ""
 
 

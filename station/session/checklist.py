@@ -8,6 +8,7 @@ import shutil
 import msgspec
 
 from calibrate.board import BoardError, check_board, describe_board
+from recordings.files import bytes_text
 from station.devices.ur_condition import mode_word, not_powered, safety_stop, safety_word
 from station.devices.ur_probe import probe
 from station.errors import CameraError, RobotError
@@ -113,9 +114,9 @@ def _disk_check(bench: Bench) -> Check:
         probe.unlink()
     except OSError as error:
         return Check("disk", "failed", f"{bench.root}: {error.strerror}", "give --root a writable folder")
-    text = f"{free / 1e9:.0f} GB free at {bench.root}"
+    text = f"{bytes_text(free)} free at {bench.root}"
     if free < reserve:
-        return Check("disk", "failed", text, f"free {(reserve - free) / 1e9:.1f} GB")
+        return Check("disk", "failed", text, f"free {bytes_text(reserve - free)}")
     return Check("disk", "ok", text)
 
 

@@ -26,7 +26,7 @@ WALL_STEP_S = 0.5
 class Monitor:
     def __init__(self, bench: Bench) -> None:
         self._bench = bench
-        self._free_bytes = 0
+        self._free_bytes: int | None = None
         self._free_checked_s = -DISK_PERIOD_S
         self._controller: tuple[float, float] | None = None
         self._states_seen = 0
@@ -156,12 +156,14 @@ def _wall_ahead_ns() -> int:
     return time.time_ns() - time.monotonic_ns()
 
 
-def _free_bytes(root: Path) -> int:
-    """In steps of 100 MB; 0 where the disk is gone."""
+def _free_bytes(root: Path) -> int | None:
+    """In steps of 100 MB, the last 1 GB in steps of 1 MB; None where the disk is gone."""
     try:
-        return shutil.disk_usage(root).free // 100_000_000 * 100_000_000
+        free = shutil.disk_usage(root).free
     except OSError:
-        return 0
+        return None
+    step = 100_000_000 if free >= 1_000_000_000 else 1_000_000
+    return free // step * step
 
 
 def _clock_facts(fit: ClockFit | None) -> tuple[float | None, float | None, float | None]:

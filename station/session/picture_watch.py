@@ -70,7 +70,10 @@ class PictureWatch:
         """The camera is free again when this returns: a request to it is never given up half-way."""
         assert self._task is not None
         self._task.cancel()
-        await asyncio.wait({self._task, *([self._glimpsing] if self._glimpsing else [])})
+        ending = {self._task, *([self._glimpsing] if self._glimpsing else [])}
+        await asyncio.wait(ending)
+        # Nobody waits for this look any more: its failure is the next picture's to tell.
+        await asyncio.gather(*ending, return_exceptions=True)
 
     async def _run(self) -> None:
         try:

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import msgspec
 
+from recordings.errors import RecordingError
+from recordings.files import require_free_space
 from station.analysis import check_run
 from station.errors import LimitError, RefusedError
 from station.limits import PlanCheck
@@ -67,6 +69,10 @@ async def summarise(
 ) -> GoSummary:
     """Checks the whole way in the worker. LimitError lists what is wrong with it, RobotError with the arm."""
     robot = bench.cell.robot
+    try:
+        require_free_space(bench.root, bench.cell.config.capture.free_space_bytes)
+    except (RecordingError, OSError) as full:
+        raise RefusedError(f"{full}. Nothing moved.") from None
     await RestingCheck(robot.check).news()
     start = robot.latest().joints_rad
     plan = queue.plan

@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 from recordings.errors import RecordingError, UnsealedRecordingError
 from recordings.files import (
     ASKED_FOR,
+    bytes_text,
     is_attachment_name,
     is_session_name,
     require_free_space,
@@ -141,6 +142,11 @@ def test_free_space_below_the_reserve_is_refused_with_the_amount(tmp_path: Path)
     assert free > 1
     with pytest.raises(RecordingError, match=r"free 4\.0 GB and go on"):
         require_free_space(tmp_path, free + 4_000_000_000)
+
+
+@pytest.mark.parametrize(("count", "text"), [(12_000_000, "12 MB"), (4_040_000_000, "4.0 GB"), (0, "0 MB")])
+def test_bytes_are_said_in_a_unit_that_shows_them(count: int, text: str) -> None:
+    assert bytes_text(count) == text
 
 
 def test_a_small_file_is_on_the_disk_before_it_has_its_name(

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import gc
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import pytest
 
 from recordings.reader import open_recording
 from station.config import StillnessConfig
+from station.errors import CameraError
 from station.picture_motion import board_box, picture_motion
 from station.plan.model import ExpectedView
 from station.session.picture_watch import GLIMPSE_TRIES, PictureWatch
@@ -125,6 +127,25 @@ async def test_stop_leaves_the_camera_free(rig: Rig) -> None:
     seen_before = rig.camera.glimpses
     await asyncio.sleep(0.1)
     assert rig.camera.glimpses == seen_before and rig.state is S.STOPPED
+
+
+async def test_a_camera_that_fails_when_nobody_looks_any_more_is_no_traceback(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given_up, logged = asyncio.Event(), []
+
+    async def hangs() -> None:
+        await given_up.wait()
+        raise CameraError("no answer")
+
+    asyncio.get_running_loop().set_exception_handler(lambda loop, context: logged.append(context))
+    monkeypatch.setattr(rig.camera, "glimpse", hangs)
+    async with PictureWatch(rig.session.bench, 0):
+        await asyncio.sleep(0.01)
+        asyncio.get_running_loop().call_later(0.05, given_up.set)  # the pose ends before that
+    gc.collect()
+    await asyncio.sleep(0)
+    assert logged == []
 
 
 @pytest.mark.process

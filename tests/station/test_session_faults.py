@@ -95,6 +95,14 @@ async def test_a_full_disk_is_noticed_before_the_pose(rig: Rig, monkeypatch: pyt
     assert "move" not in rig.arm.log
 
 
+async def test_a_full_disk_is_told_before_anybody_is_asked(rig: Rig) -> None:
+    cell = rig.session.bench.cell
+    capture = msgspec.structs.replace(cell.config.capture, free_space_bytes=10**18)
+    object.__setattr__(cell, "config", msgspec.structs.replace(cell.config, capture=capture))
+    with pytest.raises(RefusedError, match=r"free \d+\.\d GB and go on\. Nothing moved"):
+        await rig.session.prepare(1, "run")
+
+
 async def test_a_jogged_arm_is_named_and_its_go_is_void(rig: Rig) -> None:
     await rig.go_until_it_moves()
     await rig.pause_after_this_pose("anna")

@@ -90,6 +90,12 @@ async def test_on_the_screen_it_is_the_first_line(link: FakeLink, size: tuple[in
         assert text_of(pilot.app, "#bar").endswith("F12=STOP")
 
 
+def test_a_disk_that_is_nearly_full_is_not_left_out() -> None:
+    status = msgspec.structs.replace(working(), recorder=RecorderStatus(free_bytes=0))
+    assert "│0 B free│" in bar_line(status, 120)
+    assert "│0 B│" in bar_line(status, 74)
+
+
 @pytest.mark.parametrize(
     ("state", "key"),
     [(StationState.FREE_DRIVE, "F2"), (StationState.PAUSED, "F5"), (StationState.FAULT, "F8: I looked")],

@@ -78,8 +78,8 @@ def _parts(status: StationStatus, level: int) -> list[str]:
         " ".join(p for p in (robot.safety or "-", where) if p),
         count if level >= 2 else f"{count} {duration(session.elapsed_s)}",
     ]
-    if level < 3 and status.recorder.free_bytes:
-        parts.append(size(status.recorder.free_bytes))
+    if level < 3 and status.recorder.free_bytes is not None:
+        parts.append(size(status.recorder.free_bytes) + " free" * (level < 1))
     if level < 1 and status.lease.holder:
         parts.append(f"control: {status.lease.holder}")
     return parts if level < LEVELS - 1 else [parts[0], parts[2], parts[3]]

@@ -1,11 +1,14 @@
 """A worn arm: its errors are found, said, and no longer hidden in a sigma that is far too small."""
 
 import numpy as np
+import pytest
 
 from benchmarks.kinematics import worn_cell
-from calibrate.geometry import difference
+from calibrate.geometry import difference, inverse
+from calibrate.kinematics import MODELS, DhDeltas, forward
 from calibrate.likelihood.kinematics import kinematic_derivatives
 from calibrate.solve import SolveOptions, solve_views
+from tests.calibrate.cells import with_flange
 
 AUTO = SolveOptions(holdout=False)
 OFF = SolveOptions(holdout=False, kinematic_prior="off")
@@ -33,6 +36,20 @@ def test_table_errors_are_found_and_coverage_comes_back():
         assert auto.rejected == ()
     assert inside_auto >= 5
     assert inside_off <= 2
+
+
+def test_the_joint_that_is_off_is_named_with_its_size_in_millimetres():
+    """A forearm that is 0.8 mm longer than the table says."""
+    views = worn_cell(np.random.default_rng(3), 0.0).views
+    joints = np.array([view.joints_rad for view in views])
+    table = MODELS["UR10"].calibrated(DhDeltas(a_m=(0.0, 0.0, 0.0008, 0.0, 0.0, 0.0)))
+    error = inverse(forward(MODELS["UR10"], joints)) @ forward(table, joints)
+    found = solve_views(with_flange(views, views.base_from_flange @ error), AUTO).systematics
+    assert found.detected and found.worst_joint == "elbow"
+    assert found.worst_joint_rms_m == pytest.approx(0.0008, rel=0.4)
+    assert found.scale_mm == pytest.approx(0.8 / np.sqrt(24), rel=1.0)
+    assert f"about {found.scale_mm:.2f} mm (or mrad)" in found.text
+    assert f"most at the elbow ({1000 * found.worst_joint_rms_m:.2f} mm at the flange)" in found.text
 
 
 def test_a_good_arm_is_not_accused():

@@ -6,12 +6,14 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from textual.pilot import Pilot
 from textual.widgets import DataTable
 
 from calibrate.calibration import write_calibration
 from calibrate.install import install, rollback
 from station.errors import StationError
 from station.tui import result, sessions
+from station.tui.app import StationApp
 from tests.tui.conftest import FakeLink, until
 from tests.tui.test_install import GOOD
 from tests.tui.test_keys import app_on, text_of
@@ -41,13 +43,17 @@ def put(root: Path, session: str) -> None:
     install(root / "sessions" / session / "calibration.yaml", root, cell="simulated")
 
 
+async def list_of_sessions(app: StationApp, pilot: Pilot[None]) -> DataTable[str]:
+    await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
+    await pilot.press("4")
+    await until(pilot, lambda: app.current_mode == "sessions")
+    return app.screen.query_one(DataTable)
+
+
 async def test_the_list_of_sessions_names_what_is_installed_now(link: FakeLink, root: Path) -> None:
     app = app_on(link)
     async with app.run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
-        await pilot.press("4")
-        await until(pilot, lambda: app.current_mode == "sessions")
-        table = app.screen.query_one(DataTable)
+        table = await list_of_sessions(app, pilot)
 
         def states() -> list[str]:
             return [table.get_row_at(line)[-1] for line in range(table.row_count)]
@@ -87,10 +93,7 @@ async def test_a_list_that_did_not_come_is_asked_for_again_and_the_old_one_stays
 ) -> None:
     app = app_on(link)
     async with app.run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
-        await pilot.press("4")
-        await until(pilot, lambda: app.current_mode == "sessions")
-        table = app.screen.query_one(DataTable)
+        table = await list_of_sessions(app, pilot)
         await until(pilot, lambda: table.row_count == 2)
         link.refuse["sessions"] = StationError("the daemon is gone")
         (root / "sessions" / "s-3").mkdir()

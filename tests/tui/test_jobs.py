@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
 from pathlib import Path
 
 import pytest
+from textual.pilot import Pilot
 from textual.widgets import Button, Label, RichLog
 
-from station.tui.app import StationApp
 from station.tui.jobs import JobScreen
 from tests.tui.conftest import FakeLink, until
 from tests.tui.test_keys import app_on
@@ -21,26 +24,28 @@ def job(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "some_job.py"
 
 
-async def run_job(app: StationApp, *args: str) -> list[int | None]:
+@asynccontextmanager
+async def running(
+    link: FakeLink, *args: str, size: tuple[int, int] = (80, 24)
+) -> AsyncIterator[tuple[Pilot[None], JobScreen, list[int | None]]]:
+    """The screen at work on the module, and the exit codes that it came back with."""
     codes: list[int | None] = []
-    await app.push_screen(JobScreen("Working", "some_job", *args), codes.append)
-    return codes
+    async with app_on(link).run_test(size=size) as pilot:
+        screen = JobScreen("Working", "some_job", *args)
+        await pilot.app.push_screen(screen, codes.append)
+        yield pilot, screen, codes
 
 
 async def test_its_exit_code_comes_back(link: FakeLink, job: Path) -> None:
     job.write_text("import sys; print('half way', flush=True); sys.exit(int(sys.argv[1]))")
-    async with app_on(link).run_test() as pilot:
-        codes = await run_job(pilot.app, "4")  # type: ignore[arg-type]
+    async with running(link, "4") as (pilot, _screen, codes):
         await until(pilot, lambda: codes)
         assert codes == [4]
 
 
 async def test_its_lines_are_as_wide_as_the_window(link: FakeLink, job: Path) -> None:
     job.write_text("import os; print('x' * int(os.environ['COLUMNS'])); raise SystemExit(1)")
-    async with app_on(link).run_test(size=(100, 30)) as pilot:
-        await run_job(pilot.app)  # type: ignore[arg-type]
-        screen = pilot.app.screen
-        assert isinstance(screen, JobScreen)
+    async with running(link, size=(100, 30)) as (pilot, screen, _codes):
         await until(pilot, lambda: screen.said)
         # The scroll bar's place is not theirs, or they would be broken a second time.
         assert len(screen.said[0]) == screen.query_one(RichLog).scrollable_content_region.width > 80
@@ -48,12 +53,9 @@ async def test_its_lines_are_as_wide_as_the_window(link: FakeLink, job: Path) ->
 
 async def test_seconds_tell_that_it_works(link: FakeLink, job: Path) -> None:
     job.write_text("import time; time.sleep(600)")
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await run_job(pilot.app)  # type: ignore[arg-type]
-        screen = pilot.app.screen
-        assert isinstance(screen, JobScreen)
+    async with running(link) as (pilot, screen, _codes):
         await until(pilot, lambda: screen._process)
-        screen._begun_s -= 65.0
+        screen._begun_s = time.monotonic() - 65.0
         screen._say_how_long()
         assert "Working … 1:05" in str(screen.query_one("#job-title", Label).render())
         await pilot.press("escape")
@@ -62,11 +64,10 @@ async def test_seconds_tell_that_it_works(link: FakeLink, job: Path) -> None:
 
 async def test_a_failure_stays_on_the_screen_until_it_is_read(link: FakeLink, job: Path) -> None:
     job.write_text("import sys; sys.exit('no board in any view')")
-    async with app_on(link).run_test() as pilot:
-        codes = await run_job(pilot.app)  # type: ignore[arg-type]
-        button = pilot.app.screen.query_one("#job-cancel", Button)
+    async with running(link) as (pilot, screen, codes):
+        button = screen.query_one("#job-cancel", Button)
         await until(pilot, lambda: str(button.label) == "Close")
-        assert any("no board in any view" in line.text for line in pilot.app.screen.query_one(RichLog).lines)
+        assert any("no board in any view" in line.text for line in screen.query_one(RichLog).lines)
         assert codes == []
         await pilot.press("escape")
         await until(pilot, lambda: codes)
@@ -76,8 +77,7 @@ async def test_a_failure_stays_on_the_screen_until_it_is_read(link: FakeLink, jo
 async def test_cancelling_ends_the_process(link: FakeLink, job: Path, tmp_path: Path) -> None:
     pid_file = tmp_path / "pid"
     job.write_text(f"import os, time; open({str(pid_file)!r}, 'w').write(str(os.getpid())); time.sleep(600)")
-    async with app_on(link).run_test() as pilot:
-        codes = await run_job(pilot.app)  # type: ignore[arg-type]
+    async with running(link) as (pilot, _screen, codes):
         await until(pilot, lambda: pid_file.exists() and pid_file.read_text())
         await pilot.press("escape")
         await until(pilot, lambda: codes)
@@ -89,10 +89,7 @@ async def test_cancelling_ends_the_process(link: FakeLink, job: Path, tmp_path: 
 async def test_enter_by_mistake_cancels_nothing(link: FakeLink, job: Path) -> None:
     """A second Enter after the question that began it."""
     job.write_text("import time; time.sleep(600)")
-    async with app_on(link).run_test() as pilot:
-        codes = await run_job(pilot.app)  # type: ignore[arg-type]
-        screen = pilot.app.screen
-        assert isinstance(screen, JobScreen)
+    async with running(link) as (pilot, screen, codes):
         await until(pilot, lambda: screen._process)
         await pilot.press("enter")
         await pilot.pause()
@@ -103,9 +100,8 @@ async def test_enter_by_mistake_cancels_nothing(link: FakeLink, job: Path) -> No
 
 async def test_enter_closes_what_was_read(link: FakeLink, job: Path) -> None:
     job.write_text("import sys; sys.exit('no board in any view')")
-    async with app_on(link).run_test() as pilot:
-        codes = await run_job(pilot.app)  # type: ignore[arg-type]
-        button = pilot.app.screen.query_one("#job-cancel", Button)
+    async with running(link) as (pilot, screen, codes):
+        button = screen.query_one("#job-cancel", Button)
         await until(pilot, lambda: str(button.label) == "Close")
         await pilot.press("enter")
         await until(pilot, lambda: codes)
@@ -119,10 +115,7 @@ async def test_what_was_done_when_it_was_cancelled_counts(link: FakeLink, job: P
         "print('installed', flush=True)\n"
         "time.sleep(600)"
     )
-    async with app_on(link).run_test() as pilot:
-        codes = await run_job(pilot.app)  # type: ignore[arg-type]
-        screen = pilot.app.screen
-        assert isinstance(screen, JobScreen)
+    async with running(link) as (pilot, screen, codes):
         await until(pilot, lambda: screen.said)
         await pilot.press("escape")
         await until(pilot, lambda: codes)

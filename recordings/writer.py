@@ -1,4 +1,4 @@
-"""Writes one recording file, synchronously: `.mcap.part` until it is finished, checked in and renamed.
+"""Writes one recording file, synchronously: `.mcap.part` until it is finished, synced and renamed.
 
 Layout: one MCAP, chunks of 1 MiB without compression, checksums of every chunk, of the data section and of
 the summary. Raw values and all clocks go in; geometry is applied by the reader's users.

@@ -1,5 +1,6 @@
 """Causes named to people: robot poses that contradict themselves, a lens counted elsewhere."""
 
+import re
 from dataclasses import replace
 
 import msgspec
@@ -11,7 +12,7 @@ from calibrate.gates import Evidence, GateLimits, judge
 from calibrate.geometry import rotation_exp
 from calibrate.pnp import solve_pnp
 from calibrate.solve import SolveOptions, solve_views
-from tests.calibrate.cells import LOW, MID, make_cell, with_flange
+from tests.calibrate.cells import LOW, MID, error_mm_deg, make_cell, with_flange
 
 QUICK = SolveOptions(holdout=False)
 
@@ -55,3 +56,16 @@ def test_a_middle_that_the_pictures_confirm_is_left_alone():
     c = make_cell(np.random.default_rng(2), 25, LOW)
     as_if_larger = moved_centre(c.views, 0.0, width=1279)
     assert solve_views(as_if_larger, QUICK).warnings == ()
+
+
+def test_a_wrong_focal_length_is_said_with_what_it_costs():
+    c = make_cell(np.random.default_rng(2), 25, LOW)
+    (fx, s, cx), (_, fy, cy), last = c.views.camera.matrix
+    camera = msgspec.structs.replace(
+        c.views.camera, matrix=((1.004 * fx, s, cx), (0.0, 1.004 * fy, cy), last)
+    )
+    solution = solve_views(solve_pnp(replace(c.views, camera=camera)), QUICK)
+    (said,) = [text for text in solution.warnings if "The given intrinsics do not fit" in text]
+    told_mm = float(re.search(r"would move X by ([\d.]+) mm", said)[1])
+    assert told_mm == pytest.approx(error_mm_deg(solution.matrix, c.X)[0], rel=0.2)
+    assert float(re.search(r"misfit ([\d.]+) times", said)[1]) > 1

@@ -9,8 +9,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.calibration import write_calibration
-from calibrate.geometry import Array
+from calibrate.calibration import FramePose, write_calibration
+from calibrate.gates import Gate
+from calibrate.geometry import Array, Transform
 from calibrate.kinematics import MODELS, forward
 from station.analysis import Sighting
 from station.errors import LimitError, RefusedError, RobotError
@@ -180,6 +181,29 @@ async def test_what_is_not_fit_to_drive_by_is_refused(
     with pytest.raises(RefusedError, match="too dark"):
         await rig.session.prepare_hover(1, request(calibration))
     assert "start control" not in rig.arm.log
+
+
+@pytest.mark.parametrize("flaw", ["source", "camera", "gates", "mount"])
+async def test_a_calibration_of_another_cell_or_one_that_failed_is_not_driven_by(
+    hover_rig: Rig, tmp_path: Path, flaw: str
+) -> None:
+    camera = hover_rig.camera.identity
+    good = calibration_of(TRUTH, hover_rig.arm.identity, camera)
+    failed = Gate("views", False, 3.0, 8.0, "3 views were used")
+    fixed = FramePose.of(Transform("base", "camera", good.transform.matrix))
+    changes, said = {
+        "source": ({"source": "real"}, "the calibration is real, eye-in-hand; this cell is simulated"),
+        "camera": ({"camera": msgspec.structs.replace(camera, serial="9")}, "and camera 9, this"),
+        "gates": (
+            {"quality": msgspec.structs.replace(good.quality, gates=[failed])},
+            r"failed its gates \(views\): nothing is driven by it",
+        ),
+        "mount": ({"mount": "eye-to-hand", "result": fixed}, "eye-to-hand; this cell is simulated"),
+    }[flaw]
+    write_calibration(msgspec.structs.replace(good, **changes), tmp_path / "c.yaml")
+    with pytest.raises(RefusedError, match=said):
+        await hover_rig.session.prepare_hover(1, request(tmp_path / "c.yaml"))
+    assert hover_rig.session.store.status.go is None
 
 
 async def test_not_within_an_open_session(rig: Rig, tmp_path: Path) -> None:

@@ -105,6 +105,23 @@ def test_nearer_than_50_mm_is_impossible() -> None:
         plan_hover(cell_config(truth), X, place, NORMAL, 0, 0.08, 0.03, POINTER, truth.start_joints_rad)
 
 
+def test_three_sigma_and_the_arms_own_miss_are_kept_away_from() -> None:
+    truth = make_cell()
+    start, config = truth.start_joints_rad, cell_config(truth)
+    calibration = calibration_of(truth, ROBOT, CAMERA)
+    view = seen_from(truth, forward(MODELS["UR10"], start), board_of(truth))
+    now, points = locate_board(calibration, view, truth.board), board_points(truth.board)
+    worst_m = max(
+        np.sqrt(np.linalg.eigvalsh(offset_covariance(calibration, view, now, points[k], POINTER.tip_m)).max())
+        for k in outer_corners(truth.board)
+    )
+    least_m = 0.05 + 0.005 + 0.005 + 3 * worst_m + 0.004
+    near, far = (HoverQuestion(0, least_m + by, POINTER, start, 0.004) for by in (-1e-5, 1e-5))
+    assert answer_hover(config, calibration, view, far).hover.standoff_m == far.standoff_m
+    with pytest.raises(LimitError, match="too near"):
+        answer_hover(config, calibration, view, near)
+
+
 def test_an_unreachable_corner_is_said() -> None:
     truth = make_cell()
     X, place = np.array(truth.camera_mount), pose(np.eye(3), [0.0, 2.5, 0.0]) @ np.array(truth.board_place)

@@ -1,0 +1,81 @@
+"""The figures of a calibration file are those of the solution, in the units that its fields name."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from calibrate.pipeline import SolvedRecording
+from calibrate.pnp import view_rms_px
+
+
+def test_result_and_sigmas(solved_real: SolvedRecording) -> None:
+    file, found = solved_real.calibration, solved_real.solution
+    np.testing.assert_allclose(file.transform.matrix, found.matrix, atol=1e-12)
+    np.testing.assert_allclose(file.covariance, found.covariance)
+    assert file.confidence_threshold == found.confidence_threshold
+    assert file.sigma.translation_mm == pytest.approx(1000 * found.sigma_translation_m)
+    assert file.sigma.rotation_deg == pytest.approx(np.degrees(found.sigma_rotation_rad))
+    # Both are the covariance's own: roots of the traces of its blocks.
+    assert file.sigma.translation_mm == pytest.approx(1000 * np.sqrt(np.trace(found.covariance[:3, :3])))
+    assert file.sigma.rotation_deg == pytest.approx(np.degrees(np.sqrt(np.trace(found.covariance[3:, 3:]))))
+
+
+def test_quality_is_in_millimetres_and_degrees(solved_real: SolvedRecording) -> None:
+    quality, found = solved_real.calibration.quality, solved_real.solution
+    assert quality.gates == list(solved_real.gates)
+    assert quality.rms_px == found.rms_px
+    assert quality.board_spread_mm == pytest.approx(1000 * found.board_spread_m)
+    assert quality.board_spread_deg == pytest.approx(np.degrees(found.board_spread_rad))
+    assert found.predicted_error_m is not None
+    assert quality.predicted_error_mm == pytest.approx(1000 * found.predicted_error_m)
+    assert quality.working_distance_m == found.working_distance_m
+    assert quality.weakest == found.observability.weakest_text
+    assert solved_real.scale is not None and quality.board_scale == solved_real.scale.scale
+
+
+def test_noise_and_the_shares_of_the_error(solved_real: SolvedRecording) -> None:
+    quality, found = solved_real.calibration.quality, solved_real.solution
+    assert found.noise is not None and found.budget is not None
+    assert quality.noise["corner_px"] == found.noise.corner_px
+    assert quality.noise["robot_mm"] == pytest.approx(1000 * found.noise.robot_m)
+    assert quality.noise["robot_deg"] == pytest.approx(np.degrees(found.noise.robot_rad))
+    assert quality.error_shares == {name: float(share) for name, share in vars(found.budget).items()}
+
+
+def test_each_view_has_its_residuals(solved_real: SolvedRecording) -> None:
+    file, found = solved_real.calibration, solved_real.solution
+    assert [view.index for view in file.quality.views] == list(found.used) == file.views.used
+    for view in file.quality.views:
+        metres, radians = found.residual_robot[view.index]
+        assert view.rms_px == found.residual_px[view.index]
+        assert view.robot_mm == pytest.approx(1000 * metres)
+        assert view.robot_deg == pytest.approx(np.degrees(radians))
+
+
+def test_the_holdout_is_told_pair_by_pair(solved_real: SolvedRecording) -> None:
+    told, score = solved_real.calibration.quality.holdout, solved_real.solution.holdout
+    assert told is not None and score is not None
+    assert (told.e_t_m, told.e_R, told.fitted_views) == (score.e_t_m, score.e_R, score.fitted_views)
+    assert told.e_t_m == pytest.approx(np.mean(told.samples_e_t_m))
+    assert told.e_R == pytest.approx(np.mean(told.samples_e_R))
+    assert told.pairs == [tuple(pair) for pair in score.pairs]
+    assert len(told.pairs) == len(told.samples_e_t_m) == len(told.samples_e_R)
+
+
+def test_a_given_lens_is_called_given_and_judged_by_these_pictures(solved_real: SolvedRecording) -> None:
+    lens, views = solved_real.calibration.intrinsics, solved_real.views
+    assert solved_real.intrinsics is None
+    assert (lens.found, lens.sigma, lens.held) == ("given", {}, [])
+    assert lens.matrix == views.camera.matrix
+    squares = [view_rms_px(v, views.camera, v.camera_from_board) ** 2 for v in views]  # type: ignore[arg-type]
+    assert lens.rms_px == pytest.approx(np.sqrt(np.mean(squares)))
+
+
+def test_a_lens_of_these_pictures_is_called_so_with_its_sigmas(solved: SolvedRecording) -> None:
+    lens, found = solved.calibration.intrinsics, solved.intrinsics
+    assert found is not None
+    assert (lens.found, lens.rms_px) == ("from these pictures", found.rms_px)
+    assert lens.sigma == found.sigma and lens.sigma["fx"] > 0
+    assert lens.held == list(found.held)
+    assert lens.matrix == solved.solution.camera.matrix

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import msgspec
 
-from recordings.files import PART_SUFFIX, session_name_from, write_atomically
+from recordings.files import PART_SUFFIX, session_name_from, sync_folder, write_atomically
 from recordings.messages import Source
 from station.errors import StationError
 from station.plan.model import Plan
@@ -84,6 +84,7 @@ def read_state(folder: Path) -> SessionState | None:
 
 
 def mark_active(root: Path, folder: Path) -> None:
+    sync_folder(folder.parent)  # the folder's own name, before anything points to it
     write_atomically(root / _ACTIVE, folder.name.encode())
 
 

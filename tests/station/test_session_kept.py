@@ -5,6 +5,7 @@ from __future__ import annotations
 import pytest
 
 from station.status import StationState as S
+from tests.durability import disk_order
 from tests.station.session_rig import POSES, NewRig, Rig, crash, sealed
 
 
@@ -62,3 +63,15 @@ async def test_what_people_were_told_is_in_the_recording(rig: Rig, trouble: tupl
     written = [event.detail for event in recording.events()]
     assert any(text.startswith("recording to ") for text in written)
     assert sum("frame lost" in text for text in written) == len(trouble)
+
+
+async def test_the_name_of_a_sessions_folder_is_on_the_disk_before_its_first_pose_counts(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Data that no name leads to after a power loss would be lost with it."""
+    with disk_order(monkeypatch) as order:
+        await rig.give_go()
+        await rig.until_true(lambda: rig.pose_states[0] == "done")
+        until_then = list(order)
+        await rig.until(S.IDLE)
+    assert {"sync sessions", f"sync {rig.session.bench.root.name}"} <= set(until_then)

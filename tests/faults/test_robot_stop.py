@@ -19,7 +19,6 @@ from station.errors import RobotError
 pytestmark = pytest.mark.process
 
 Make = Callable[..., Awaitable[Any]]
-Keep = Callable[[Any], None]
 
 
 @pytest.mark.parametrize("model", ["UR10", "UR10e"])

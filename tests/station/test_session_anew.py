@@ -1,4 +1,4 @@
-"""The same plan run once more after its session was sealed: what stays shown until the go, what begins anew."""
+"""The same plan run again after its session was sealed: what stays shown until the go, what begins anew."""
 
 from __future__ import annotations
 

@@ -55,7 +55,7 @@ def _require_camera(views: ViewSet) -> None:
 
 
 def _require_view(view: ImageView, fewest_corners: int) -> None:
-    where = f"View {view.index} ({view.name})"
+    where = f"View {view.index + 1} ({view.name})"
     if not is_rigid(np.asarray(view.base_from_flange)):
         raise BadViewsError(
             f"{where}: the robot pose is not a rigid transform (NaN, or a rotation that is not orthonormal). "

@@ -87,9 +87,9 @@ def _require_no_shift(views: ViewSet, H: Array, C: Array) -> None:
         i = max(0, -shift)
         here, there = views.views[i], views.views[i + shift]
         raise BadViewsError(
-            f"Pictures and robot poses are shifted by {abs(shift)}: the picture of view {here.index} "
-            f"({here.name}) fits the robot pose of view {there.index} ({there.name}), and so on through the "
-            "session. Move the poses by that many rows (poses.csv) and import again."
+            f"Pictures and robot poses are shifted by {abs(shift)}: the picture of view {here.index + 1} "
+            f"({here.name}) fits the robot pose of view {there.index + 1} ({there.name}), and so on "
+            "through the session. Move the poses by that many rows (poses.csv) and import again."
         )
 
 

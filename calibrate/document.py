@@ -181,7 +181,7 @@ def _quality(
             *loaded.losses,
             *([ambiguity] if ambiguity else []),
             *(
-                f"view {i} left out of the lens: {why}"
+                f"view {i + 1} left out of the lens: {why}"
                 for i, why in (intrinsics.dropped if intrinsics else {}).items()
             ),
             *solution.warnings,

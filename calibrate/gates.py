@@ -161,8 +161,8 @@ def _accuracy_gates(solution: Solution, limits: GateLimits) -> Iterator[Gate]:
             "view residual",
             value,
             limits.view_rms_px,
-            f"The worst view, pose {worst}, fits to {value:.2f} px",
-            f"Retake pose {worst}, or check the lens.",
+            f"The worst view, pose {worst + 1}, fits to {value:.2f} px",
+            f"Retake pose {worst + 1}, or check the lens.",
         )
     if limits.holdout_share is not None and solution.holdout is not None and solution.working_distance_m:
         e_t_mm = solution.holdout.e_t_m * 1000

@@ -125,7 +125,7 @@ def _finished(
     except BadPictureError as problem:
         return view, problem
     except ValueError as problem:
-        raise BadViewsError(f"view {view.index} ({view.name}): {problem}") from None
+        raise BadViewsError(f"view {view.index + 1} ({view.name}): {problem}") from None
 
 
 def _decode_and_detect(recording: Recording, view: View, spec: BoardSpec, camera: CameraModel) -> Detection:
@@ -141,9 +141,9 @@ def _available_cores() -> int:
 def _check_size(view: View, width: int, height: int, camera: CameraModel) -> None:
     if camera.width and (width, height) != (camera.width, camera.height):
         raise BadViewsError(
-            f"view {view.index} ({view.name}): the picture is {width}×{height}, the camera or its lens is "
-            f"given for {camera.width}×{camera.height}. All pictures, and the lens, must be of one camera in "
-            "one setting: check the region of interest, the width and height in dataset.yaml, or whether "
+            f"view {view.index + 1} ({view.name}): the picture is {width}×{height}, the camera or its lens "
+            f"is given for {camera.width}×{camera.height}. All pictures, and the lens, must be of one camera "
+            "in one setting: check the region of interest, the width and height in dataset.yaml, or whether "
             "this lens (--camera, the calibration that is checked) belongs to these pictures."
         )
 
@@ -152,8 +152,8 @@ def _image_view(view: View, detection: Detection, spec: BoardSpec) -> ImageView:
     base_from_flange = np.array(view.base_from_flange, dtype=float)
     if base_from_flange.shape != (4, 4) or not is_rigid(base_from_flange, 1e-5):
         raise BadViewsError(
-            f"view {view.index} ({view.name}): base_from_flange is not a rigid transform. Record it again, "
-            "or leave the view out of the folder and import again."
+            f"view {view.index + 1} ({view.name}): base_from_flange is not a rigid transform. Record it "
+            "again, or leave the view out of the folder and import again."
         )
     return ImageView(
         index=view.index,
@@ -175,7 +175,7 @@ def _too_few_text(
         "are needed."
     )
     if missing:
-        text += f" First reason, view {missing[0].index} ({missing[0].name}): {missing[0].reason}."
+        text += f" First reason, view {missing[0].index + 1} ({missing[0].name}): {missing[0].reason}."
     if total >= fewest:
         text += " Check the board's kind, columns and rows; solve again with --board to try another."
     return text

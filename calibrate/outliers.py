@@ -135,7 +135,7 @@ def _explain_one(
         return RejectedView(view.index, view.name, reason, "corners")
     other = _owner_of_pose(views, verdict, i)
     if other is not None:
-        reason = f"wrong pose: it carries the robot pose of view {views.views[other].index} ({gap})"
+        reason = f"wrong pose: it carries the robot pose of view {views.views[other].index + 1} ({gap})"
         return RejectedView(view.index, view.name, reason, "wrong-pose")
     if i in moved:
         return RejectedView(view.index, view.name, f"{moved[i]} ({gap})", "moved-board")
@@ -187,7 +187,7 @@ def _moved_boards(views: ViewSet, state: State, verdict: Judgement, places: Plac
         )
         if near.sum() >= 2:
             shift_mm, turn_deg = _size(difference(where[i], state.Y))
-            numbers = ", ".join(str(views.views[int(j)].index) for j in places[near])
+            numbers = ", ".join(str(views.views[int(j)].index + 1) for j in places[near])
             found[int(i)] = (
                 f"moved board: views {numbers} agree on a place {shift_mm:.1f} mm and {turn_deg:.2f}° away"
             )

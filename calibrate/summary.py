@@ -58,7 +58,7 @@ def summary(calibration: Calibration) -> RenderableType:
         parts.append(Text(f"checked by hand, {touch.wall}, {touch.who}: {touch_text(touch)}", style=style))
     parts += [Text(f"! {warning}", style="yellow") for warning in calibration.quality.warnings]
     for view in calibration.views.rejected:
-        parts.append(Text(f"- view {view.index} ({view.name}) left out: {view.reason}"))
+        parts.append(Text(f"- view {view.index + 1} ({view.name}) left out: {view.reason}"))
     return Group(*parts)
 
 

@@ -94,7 +94,7 @@ def _orphans(descriptor: int, contents: Contents) -> tuple[set[int], list[str]]:
             continue
         if view.picture_sequence not in whole:
             dropped.add(offset)
-            reasons.append(f"pose {view.index} (attempt {view.attempt}) lost its picture")
+            reasons.append(f"pose {view.index + 1} (attempt {view.attempt}) lost its picture")
     return dropped, reasons
 
 

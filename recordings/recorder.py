@@ -104,7 +104,7 @@ class Recorder:
         """Raises RecordingError when its picture was dropped or an earlier write failed."""
         if self.error is None and view.picture_sequence in self._dropped_pictures:
             raise RecordingError(
-                f"the picture of pose {view.index} was dropped, the disk is too slow: take the pose again"
+                f"the picture of pose {view.index + 1} was dropped, the disk is too slow: take the pose again"
             )
         self._put(_Item(lambda: self._writer.view(view), _SMALL_BYTES))
 

@@ -88,7 +88,7 @@ def flange_transform(view: View, time_ns: int) -> Any:
 def log_line(event: CaptureEvent, time_ns: int) -> Any:
     text = event.detail or event.kind
     if event.pose_index is not None:
-        text = f"pose {event.pose_index}: {text}"
+        text = f"pose {event.pose_index + 1}: {text}"
     message = Log(level=_LEVELS[event.level], message=text, name=event.kind)
     _stamp(message, time_ns)
     return message

@@ -268,7 +268,7 @@ def _views(job: SolvedRecording) -> Iterator[str]:
         names = {view.index: view.name for view in job.recording.views()}
         yield html.table(
             ("pose", "name", "why it was left out"),
-            [(str(index), names.get(index, ""), reason) for index, reason in rejected.items()],
+            [(str(index + 1), names.get(index, ""), reason) for index, reason in rejected.items()],
         )
     modelled = _modelled_pixels(job)
     cells = []
@@ -282,7 +282,7 @@ def _views(job: SolvedRecording) -> Iterator[str]:
         )
         px = job.solution.residual_px.get(view.index)
         name = "" if view.name == str(view.index) else f": {view.name}"
-        caption = f"pose {view.index}{name}" + (f", {px:.2f} px" if px is not None else "")
+        caption = f"pose {view.index + 1}{name}" + (f", {px:.2f} px" if px is not None else "")
         if view.index in rejected:
             caption += ", left out"
         mark = "out" if view.index in rejected else "in"

@@ -56,7 +56,7 @@ def residuals_by_view(
             (axes[0], residual_px, "corners, px rms"),
             (axes[1], robot_mm, "robot, mm"),
         ):
-            axis.bar([str(k) for k in values], list(values.values()), color=_BLUE)
+            axis.bar([str(k + 1) for k in values], list(values.values()), color=_BLUE)
             axis.set_xlabel("pose")
             axis.set_ylabel(unit)
             axis.tick_params(axis="x", labelsize=7)

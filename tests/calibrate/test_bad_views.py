@@ -47,7 +47,7 @@ def test_a_pose_of_another_view_is_named():
     solution = solve_views(changed(c.views, [4], base_from_flange=lambda _: other), QUICK)
     (rejected,) = solution.rejected
     assert (rejected.index, rejected.kind) == (4, "wrong-pose")
-    assert "view 11" in rejected.reason
+    assert "view 12 (" in rejected.reason  # as people count
 
 
 def test_a_nudged_robot_pose_is_named_with_its_size():

@@ -207,7 +207,7 @@ def test_mixed_picture_sizes_name_the_view(session_file: Path, tmp_path: Path) -
     (tmp_path / "camera.yaml").write_text(
         "width: 640\nheight: 480\nmatrix: [[600, 0, 320], [0, 600, 240], [0, 0, 1]]\n"
     )
-    refused(run("solve", session_file, "--camera", "camera.yaml", cwd=tmp_path), 1, "view 0", "640×480")
+    refused(run("solve", session_file, "--camera", "camera.yaml", cwd=tmp_path), 1, "view 1", "640×480")
 
 
 def test_lenses_of_different_picture_sizes_are_not_compared(real_file: Path, tmp_path: Path) -> None:

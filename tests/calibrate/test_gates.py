@@ -143,3 +143,13 @@ def test_the_documented_defaults_are_those_in_force() -> None:
         documented |= zip(re.findall(r"`(\w+)`", row[0]), row[1].strip().split(", "), strict=True)
     defaults = msgspec.structs.asdict(GateLimits())
     assert documented == {name: f"{v}".lower() if v is True else f"{v:g}" for name, v in defaults.items()}
+
+
+def test_the_pose_to_retake_is_numbered_as_on_the_screen(solution: Solution) -> None:
+    """From 1, as `station retake` takes it."""
+    bad = solution.used[3]
+    residual_px = {**solution.residual_px, bad: 9.0}
+    (gate,) = (
+        g for g in judge(replace(solution, residual_px=residual_px), GOOD) if g.name == "view residual"
+    )
+    assert f"pose {bad + 1}, fits to 9.00 px" in gate.text and f"Retake pose {bad + 1}," in gate.text

@@ -81,7 +81,7 @@ def test_a_picture_of_impossible_size_is_refused_before_decoding(source: Recordi
         return message
 
     part._image_message = lying  # type: ignore[method-assign]
-    with pytest.raises(TooFewViewsError, match=r"First reason, view 0 .* impossible size 30000×30000"):
+    with pytest.raises(TooFewViewsError, match=r"First reason, view 1 .* impossible size 30000×30000"):
         load_views(recording)
 
 

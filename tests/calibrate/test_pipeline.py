@@ -90,7 +90,7 @@ def test_a_lens_of_another_camera_is_refused(real_session_file: Path) -> None:
     with pytest.raises(BadViewsError, match=r"another camera|do not belong"):
         solve_recording(real_session_file, JobOptions(camera=other))
     small = replace_size(CAMERA, 640, 480)
-    with pytest.raises(BadViewsError, match=r"view 0 .*480×384.*640×480"):
+    with pytest.raises(BadViewsError, match=r"view 1 .*480×384.*640×480"):
         solve_recording(real_session_file, JobOptions(camera=small))
 
 

@@ -16,7 +16,7 @@ def main() -> None:
     from recordings.errors import RecordingError
 
     try:
-        app()
+        app(prog_name="calibrate")  # the station calls it as a module
     except (CalibrationError, RecordingError) as problem:
         print(f"calibrate: {problem}", file=sys.stderr)
         sys.exit(problem.exit_code)

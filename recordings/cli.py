@@ -30,6 +30,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
 )
 Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session's folder", show_default=False)]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
@@ -55,7 +56,12 @@ def import_(
     output: Annotated[Path, typer.Option("-o", "--output", help="The recording to write (.mcap).")],
     json_: Json = False,
 ) -> None:
-    """Your own pictures and poses (dataset.yaml, poses.csv, pictures) to a recording."""
+    """Your own pictures and poses (dataset.yaml, poses.csv, pictures) to a recording.
+
+    poses.csv: image,x,y,z,qx,qy,qz,qw, where the flange is in the robot's base, in metres. dataset.yaml: the
+    README has one to start from. Example: `recordings import FOLDER -o mine.mcap`. Next: `calibrate solve
+    mine.mcap`.
+    """
     with _progress("importing", not json_) as progress:
         done = import_folder(folder, output, progress)
     if json_:
@@ -75,7 +81,10 @@ def export(
     ],
     json_: Json = False,
 ) -> None:
-    """A recording as a folder of pictures and poses, as CSV tables, or as a ROS 2 bag."""
+    """A recording as a folder of pictures and poses, as CSV tables, or as a ROS 2 bag.
+
+    Example: `recordings export session.mcap --to csv -o tables`.
+    """
     written = export_recording(open_recording(recording), output, to)
     print(json.dumps({"output": str(written)}) if json_ else f"{written} written")
 

@@ -20,11 +20,19 @@ from station.client import default_socket
 from station.console import Socket
 from station.errors import StationError
 
+EPILOG = (
+    "First time: station demo. A cell: station doctor --example > station.yaml; station serve --config "
+    "station.yaml; then station, in another terminal. Without a screen: station plan -o plan.yaml; station "
+    "capture --plan plan.yaml; calibrate solve RECORDING.\n\n"
+    "Exit codes: 0 good, 1 failed or stopped, 2 wrong usage or configuration, 3 done with loss, 4 a gate "
+    "failed or a check did not hold."
+)
+
 
 def command_line(arguments: Sequence[str]) -> typer.Typer:
     """All commands, or the small ones alone when one of them is called."""
-    app = typer.Typer(add_completion=False, no_args_is_help=False)
-    app.callback(invoke_without_command=True)(screen_by_default)
+    app = typer.Typer(add_completion=False, no_args_is_help=False, rich_markup_mode="markdown")
+    app.callback(invoke_without_command=True, epilog=EPILOG)(screen_by_default)
     app.registered_commands += control.registered_commands
     small = {command.name for command in control.registered_commands}
     if not arguments or arguments[0] not in small:

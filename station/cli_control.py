@@ -41,7 +41,10 @@ def status_now(socket: Path | None) -> StationStatus:
 
 @app.command("status")
 def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
-    """What the station is doing."""
+    """What the station is doing. --json: every figure, the unit in its name.
+
+    Needs no control, and works beside any screen.
+    """
     status = status_now(socket)
     if as_json:
         print(msgspec.json.encode(status).decode())
@@ -77,38 +80,56 @@ def camera_words(status: StationStatus) -> str:
 
 @app.command("stop")
 def stop_command(socket: Socket = None) -> None:
-    """STOP the arm now. The pendant's emergency stop is the safety device."""
+    """STOP the arm now. The pendant's emergency stop is the safety device.
+
+    Anyone may, at any time. Latched: next look at the cell, then `station acknowledge`.
+    """
     ask(socket or default_socket(), "stop")
     out.print("stopped; latched until acknowledged: look at the cell, then `station acknowledge`")
 
 
 @app.command("acknowledge")
 def acknowledge_command(socket: Socket = None) -> None:
-    """Leave `stopped` or `fault` after looking at the cell. Nothing moves."""
+    """Leave `stopped` or `fault` after looking at the cell. Nothing moves.
+
+    Next: `station resume` goes on with the session, `station finish` seals it.
+    """
     ask(socket or default_socket(), "acknowledge")
 
 
 @app.command("pause")
 def pause_command(socket: Socket = None) -> None:
-    """Pause after the pose that is being taken."""
+    """Pause after the pose that is being taken.
+
+    Anyone may. Next: `station resume`, `improve`, `best` or `finish`.
+    """
     ask(socket or default_socket(), "pause")
 
 
 @app.command("finish")
 def finish_command(socket: Socket = None) -> None:
-    """Seal what is recorded (a pose under way is taken first)."""
+    """Seal what is recorded (a pose under way is taken first).
+
+    Next: `calibrate solve RECORDING`; `station status` names it.
+    """
     _command(socket, "finish")
 
 
 @app.command("retake")
 def retake_command(pose: PoseNumber, socket: Socket = None) -> None:
-    """Plan a pose once more; it is taken at the next go."""
+    """Plan a pose once more; it is taken at the next go.
+
+    Example: `station retake 7`, then `station resume`.
+    """
     _command(socket, "retake", index=pose - 1)
 
 
 @app.command("skip")
 def skip_command(pose: PoseNumber, socket: Socket = None) -> None:
-    """Leave a pose out."""
+    """Leave a pose out, in later runs of this plan too, until it is retaken.
+
+    Example: `station skip 7`.
+    """
     _command(socket, "skip", index=pose - 1)
 
 
@@ -119,7 +140,13 @@ def doctor_command(
     config: Annotated[Path | None, typer.Option(help="Only check this configuration; no daemon.")] = None,
     example: Annotated[bool, typer.Option("--example", help="Print a configuration to start from.")] = False,
 ) -> None:
-    """Look at everything a capture needs; each missing thing with its remedy. Nothing moves."""
+    """Look at everything a capture needs; each missing thing with its remedy. Nothing moves.
+
+    Without options it asks the daemon. For a new cell: `station doctor --example > station.yaml`, write the
+    cell into it, `station doctor --config station.yaml`, then `station serve --config station.yaml`.
+
+    Exit codes: 0 all is there, 1 something is missing, 2 the configuration is wrong.
+    """
     if example:
         print((Path(__file__).parent / "example.yaml").read_text(), end="")
         return

@@ -30,9 +30,11 @@ def serve_command(
     config: Annotated[Path | None, typer.Option(help="The cell's configuration.")] = None,
     simulate: Annotated[bool, typer.Option("--simulate", help="A simulated cell, marked so.")] = False,
     replay: Annotated[Path | None, typer.Option(help="Play this recording as a cell.")] = None,
-    socket: Annotated[Path | None, typer.Option(help="Where to listen.")] = None,
-    root: Annotated[Path | None, typer.Option(help="Where sessions go.")] = None,
-    seed: Annotated[int, typer.Option(help="Of the simulated cell.")] = 0,
+    socket: Annotated[
+        Path | None, typer.Option(help="Where to listen; the default is told when it is ready.")
+    ] = None,
+    root: Annotated[Path | None, typer.Option(help="State folder: sessions, calibrations.")] = None,
+    seed: Annotated[int, typer.Option(help="Simulated: another mount, board place, lens, noise.")] = 0,
     scene: Annotated[str, typer.Option(help="Simulated: paper, blog or paper-binned.")] = "paper",
     noise: Annotated[str, typer.Option(help="Simulated: low, mid or high.")] = "low",
     mount: Annotated[str, typer.Option(help="Simulated: eye-in-hand or eye-to-hand.")] = "eye-in-hand",
@@ -45,7 +47,11 @@ def serve_command(
     time_scale: Annotated[float, typer.Option(hidden=True)] = 1.0,
     end_with_stdin: Annotated[bool, typer.Option("--end-with-stdin", hidden=True)] = False,
 ) -> None:
-    """Own the cell and serve it on a Unix socket. Nothing moves without a person's go."""
+    """Own the cell and serve it on a Unix socket. Nothing moves without a person's go.
+
+    Example: `station serve --config station.yaml`, then `station` in another terminal. It runs until Ctrl-C
+    (or SIGTERM): that stops the arm, seals what is recorded, and ends.
+    """
     if [simulate, config is not None, replay is not None].count(True) != 1:
         raise ConfigError(
             "say what to serve, one of: --config FILE (a real cell), --simulate, --replay RECORDING"

@@ -51,7 +51,13 @@ def demo_command(
     as_json: AsJson = False,
     time_scale: Annotated[float, typer.Option(hidden=True)] = 1.0,
 ) -> None:
-    """The whole job with no hardware: simulated UR10 and camera to a calibration, compared with the truth."""
+    """The whole job with no hardware: simulated UR10 and camera to a calibration, compared with the truth.
+
+    Takes about a minute, and ends with the paths of recording, calibration and report (open that in a
+    browser). The same cell to play with: `station`.
+
+    Exit codes: 0 done, 1 failed, 3 done with fewer poses than planned, 4 a gate failed.
+    """
     require_choices(scene=scene, noise=noise, mount=mount)
     if gige and not is_isolated():
         # Discovery broadcasts on every network: the same command again, where there is only loopback.
@@ -99,8 +105,14 @@ def capture_command(
 ) -> None:
     """One session: load the plan, check it, ask, go, watch, seal. Ctrl-C is STOP.
 
+    Example: `station plan --config station.yaml -o plan.yaml`, `station capture --plan plan.yaml`. Next:
+    `calibrate solve RECORDING`. Nobody there: `--headless --go HASH`, with the hash (12 digits and more) that
+    `station plan --json` prints.
+
     With --sweep no poses are taken: the arm swings slowly where it stands, with the board in view, and
     `calibrate sweep RECORDING` tells the time between camera and robot.
+
+    Exit codes: 0 all poses, sealed; 1 failed or stopped; 2 usage; 3 sealed with fewer poses than planned.
     """
     if (plan is None) != sweep:
         raise ConfigError("say what to do, one of: --plan FILE (poses), --sweep (the clocks)")
@@ -117,7 +129,12 @@ def capture_command(
 def resume_command(
     headless: Headless = False, go: GoHash = "", socket: Socket = None, as_json: AsJson = False
 ) -> None:
-    """Go on with a paused or interrupted session, from where the arm is. Ctrl-C is STOP."""
+    """Go on with a paused or interrupted session, from where the arm is. Ctrl-C is STOP.
+
+    Shows what would move and asks. After STOP or a fault first `station acknowledge`.
+
+    Exit codes: as of `station capture`.
+    """
     _finish(asyncio.run(attended_session(socket, "resume", headless, go, as_json, None)), as_json)
 
 

@@ -10,6 +10,7 @@ app = typer.Typer(
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,
+    rich_markup_mode="markdown",
     help="From a recording to a calibration that can be trusted, installed and undone.\n\n"
     "A round: calibrate solve REC -o cell.yaml --report cell.html, then calibrate install cell.yaml. Your "
     "own pictures become a recording by: recordings import FOLDER -o REC.",

@@ -66,7 +66,10 @@ def diff(
     root: Root = None,
     as_json: AsJson = False,
 ) -> None:
-    """How far two calibrations are apart, and whether that is more than their uncertainty."""
+    """How far two calibrations are apart, and whether that is more than their uncertainty.
+
+    Example: `calibrate diff cell.yaml` (against the installed one).
+    """
     a, b = read_calibration(first), named_or_installed(second, root)
     if a.mount != b.mount:
         raise OutputError(f"{first} is {a.mount}, the other is {b.mount}: there is nothing to compare.")
@@ -122,7 +125,10 @@ def export_file(
     body: Annotated[str, typer.Option(help="… the camera's body frame")] = FrameNames.body,
     root: Root = None,
 ) -> None:
-    """Write a calibration in another program's format."""
+    """Write a calibration in another program's format.
+
+    Example: `calibrate export --to ros-launch -o camera.launch.py` (of the installed one).
+    """
     calibration = named_or_installed(file, root)
     text = export(calibration, str(to.value), FrameNames(base, flange, camera, body))
     if output is None:
@@ -176,7 +182,10 @@ def roll_back(
     reason: Annotated[str, typer.Option(help="Goes into the log")] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Go back to an older installed calibration: the one before, or a generation of `calibrate list`."""
+    """Go back to an older installed calibration: the one before, or a generation of `calibrate list`.
+
+    Example: `calibrate rollback --reason "camera was knocked"`, or `calibrate rollback 3`.
+    """
     _switched(rollback(root, to, reason), root, as_json)
 
 

@@ -45,7 +45,11 @@ def solve(
     time_limit_s: TimeLimit = TIME_LIMIT_S,
     memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
 ) -> None:
-    """Solve a recording and write the calibration file. Exit 4: written, but a gate failed."""
+    """Solve a recording and write the calibration file. Exit 4: written, but a gate failed.
+
+    Example: `calibrate solve session.mcap -o cell.yaml --report cell.html`. Next: look at the report, then
+    `calibrate install cell.yaml`.
+    """
     target = output or Path(f"{recording.name.removesuffix('.mcap')}.calibration.yaml")
     check_target(target)
     if report is not None:
@@ -102,7 +106,10 @@ def report_file(
     time_limit_s: TimeLimit = TIME_LIMIT_S,
     memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
 ) -> None:
-    """Solve a recording again and write its report: one HTML file. With the history of what is installed."""
+    """Solve a recording again and write its report: one HTML file. With the history of what is installed.
+
+    Example: `calibrate report session.mcap -o cell.html`; it opens in any browser, without a network.
+    """
     target = output or Path(f"{recording.name.removesuffix('.mcap')}.report.html")
     check_folder(target)
     with bounded(time_limit_s, memory_limit_mib), detection_progress() as progress:
@@ -138,7 +145,11 @@ def compare(
     options: JobOptions,
     as_json: AsJson = False,
 ) -> None:
-    """Every method side by side on the same views."""
+    """Every method side by side on the same views. Nothing is written.
+
+    e_t, e_R: how far views that took no part are missed; spread: how far apart the views see the board; px:
+    how far the corners are missed; σ from ours: distance to what `solve` finds, in its own sigmas.
+    """
     from calibrate.peers import compare_all
 
     with bounded(), detection_progress() as progress:

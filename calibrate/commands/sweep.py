@@ -25,7 +25,10 @@ def sweep(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Estimate the time offset between camera and robot, with its sigma."""
+    """Estimate the time offset between camera and robot, with its sigma.
+
+    `station capture --sweep` makes such a recording: the arm swings while the camera sees the board.
+    """
     lens = None if calibration_file is None else read_calibration(calibration_file).intrinsics.model
     found = sweep_time_offset(open_recording(recording), lens)
     for problem in found.lost:

@@ -56,7 +56,14 @@ def plan_command(
     foxglove: Annotated[Path | None, typer.Option(help="Save a scene for Foxglove (mcap).")] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Make a pose plan, or check one. Nothing moves."""
+    """Make a pose plan, or check one. Nothing moves.
+
+    Example: `station plan --config station.yaml --start 0,-94,-90,-86,90,0 -o plan.yaml`. The file holds
+    radians and metres and may be edited; then `station plan --config station.yaml --check plan.yaml`. Next:
+    `station capture --plan plan.yaml`.
+
+    Exit codes: 0 it may be run, 1 the check lists what is wrong, 2 usage or configuration.
+    """
     cell, standing = _cell(config, scene, start)
     criterion: Criterion = "D" if d_optimal else "A"
     plan = _given(cell, standing, check, from_list, taught)

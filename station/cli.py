@@ -92,10 +92,12 @@ def open_screen(socket: Path | None, replay: Path | None) -> None:
     if replay is not None:
         run_replay(replay)
         return
-    from station.cli_serve import ensure_daemon
+    from station.cli_serve import ensure_daemon, tell_what_goes_on
 
     # A socket that is named belongs to somebody: on a cell's console a second daemon would be a wrong one.
-    run(socket or ensure_daemon(default_socket()))
+    served = socket or ensure_daemon(default_socket())
+    run(served)
+    tell_what_goes_on(served)
 
 
 def main() -> None:

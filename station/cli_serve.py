@@ -6,10 +6,13 @@ import asyncio
 import json
 import logging
 import os
+import struct
 import subprocess
 import sys
 import time
 from pathlib import Path
+from socket import AF_UNIX, SO_PEERCRED, SOL_SOCKET
+from socket import socket as connection
 from typing import Annotated, get_args
 
 import typer
@@ -156,6 +159,20 @@ def ensure_daemon(socket: Path) -> Path:
         time.sleep(0.2)
     tail = "\n".join(log.read_text(errors="replace").splitlines()[-3:])
     raise StationError(f"the daemon did not start; {log} ends with:\n{tail}")
+
+
+def tell_what_goes_on(socket: Path) -> None:
+    """Who closed the screen is told that the daemon has not ended, and how to end it."""
+    with connection(AF_UNIX) as link:
+        try:
+            link.connect(str(socket))
+        except OSError:
+            return
+        credentials = link.getsockopt(SOL_SOCKET, SO_PEERCRED, struct.calcsize("3i"))
+    pid, user, _ = struct.unpack("3i", credentials)
+    own = pid and user == os.getuid()
+    ends = f"; `kill {pid}` ends it: the arm stops first, and what is recorded is sealed" if own else ""
+    print(f"The station goes on without this screen. `station` opens it again{ends}.")
 
 
 def _answers(socket: Path) -> bool:

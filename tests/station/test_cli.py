@@ -6,6 +6,7 @@ import asyncio
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -18,6 +19,7 @@ import typer
 
 from station import attend, cli_session
 from station.cli import main
+from station.cli_serve import tell_what_goes_on
 from station.client import NoAnswerError
 from station.errors import RefusedError
 from station.plan.files import load_plan
@@ -206,3 +208,14 @@ def test_the_command_line_loads_no_screen_and_no_driver() -> None:
     program = f"import sys, station.cli; print([m for m in {foreign} if m in sys.modules])"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_closing_the_screen_tells_what_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "control.sock"
+    tell_what_goes_on(path)
+    assert capsys.readouterr().out == ""  # none serves there
+    with socket.socket(socket.AF_UNIX) as daemon:
+        daemon.bind(str(path))
+        daemon.listen()
+        tell_what_goes_on(path)
+    assert f"`kill {os.getpid()}` ends it" in capsys.readouterr().out

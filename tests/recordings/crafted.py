@@ -5,6 +5,7 @@ from __future__ import annotations
 import struct
 import zlib
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import msgspec
 
@@ -118,3 +119,9 @@ def sealed(data: bytes, counts: Counts, declarations: bytes = b"", profile: str 
     footer_head = struct.pack("<BQQQ", Opcode.FOOTER, 20, summary_start, 0)
     crc = zlib.crc32(footer_head, zlib.crc32(summary))
     return start + end + summary + footer_head + struct.pack("<I", crc) + MAGIC
+
+
+def write(tmp_path: Path, content: bytes) -> Path:
+    path = tmp_path / "crafted.mcap"
+    path.write_bytes(content)
+    return path

@@ -56,6 +56,24 @@ def test_a_missing_file_says_what_to_do(tmp_path: Path) -> None:
             "joints_min_rad: [1, 0, 0, 0, 0, 0]\n  joints_max_rad: [0, 1, 1, 1, 1, 1]",
             "must not be above",
         ),
+        (
+            "speed_m_s: 0.2",
+            "workspace_min_m: [-1, -1, 0.5]\n  workspace_max_m: [1, 1, 0.5]",
+            "workspace_min_m must be below workspace_max_m",
+        ),
+        ("square_m: 0.025", "square_m: 0", "columns and rows must be at least 2 and square_m above 0"),
+        ("rows: 6", "rows: 1", "columns and rows must be at least 2"),
+        ("limits:", "working_distance_m: 600\nlimits:", "working_distance_m: 600.0 is out of reach"),
+        (
+            "limits:",
+            "camera_guess: {translation_m: [0, 0, 60], rotation_xyzw: [0, 0, 0, 1]}\nlimits:",
+            "further than",
+        ),
+        (
+            "limits:",
+            "camera_guess: {translation_m: [0, 0, 0], rotation_xyzw: [0, 0, 1, 1]}\nlimits:",
+            "must be 1",
+        ),
         ("limits:", f"camera_guess: {{{PLACE}, sigma_m: -0.02}}\nlimits:", "must not be below 0"),
         ("limits:", f"board_guess: {{{PLACE}, sigma_rad: -0.1}}\nlimits:", "must not be below 0"),
         (
@@ -77,6 +95,15 @@ def test_what_cannot_be_is_said(tmp_path: Path, old: str, new: str, said: str) -
         load_config(path)
     assert said in str(caught.value)
     assert "station.yaml" in str(caught.value)
+
+
+def test_equal_limits_of_a_joint_hold_it_and_open_sides_of_the_box_are_fine(tmp_path: Path) -> None:
+    path = tmp_path / "station.yaml"
+    held = "joints_min_rad: [0, -2, -3, -3, -3, -3]\n  joints_max_rad: [0, 2, 3, 3, 3, 3]"
+    box = "workspace_min_m: [-1, -1, 0]\n  workspace_max_m: [1, 1, 1.5]"
+    for more in (held, box, "joints_min_rad: [1, 1, 1, 1, 1, 1]", "workspace_max_m: [-1, -1, -1]"):
+        path.write_text(GOOD.replace("speed_m_s: 0.2", more))
+        load_config(path)
 
 
 def test_every_trap_of_yaml_is_named_in_one_report_with_its_line(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from typing import Any
 import pytest
 
 from station.client import Client, DaemonGoneError
-from station.control import ControlServer, Peer
+from station.control import OPEN_REQUESTS_LIMIT, ControlServer, Peer
 from station.errors import RefusedError, StationError
 from station.protocol import CLIENT_LIMIT, LINE_LIMIT_BYTES, PIECE_BYTES, REQUEST_LIMIT_BYTES
 from station.status import StationState, StationStatus
@@ -144,6 +144,26 @@ async def test_an_endless_line_costs_no_memory(server: Served) -> None:
             await asyncio.wait_for(writer.drain(), 5)
             sent += 65536
     assert sent < 10_000_000
+
+
+async def test_of_too_many_questions_at_once_the_last_are_turned_away_but_never_a_stop(
+    server: Served, handler: RecordingHandler
+) -> None:
+    _, path = server
+    waiting = [
+        json.dumps({"id": k, "verb": "make_plan", "args": {}}).encode() + b"\n"
+        for k in range(OPEN_REQUESTS_LIMIT + 1)
+    ]
+    reader, writer = await asyncio.open_unix_connection(str(path))
+    writer.write(b"".join(waiting) + b'{"id": 99, "verb": "stop", "args": {}}\n')
+    first, second = [json.loads(await reader.readline()) for _ in range(2)]
+    assert first["id"] == OPEN_REQUESTS_LIMIT and "too many requests" in first["error"]
+    assert (second["id"], second["ok"]) == (99, True)
+    assert handler.order == ["stop"]
+    handler.release.set()
+    answers = [json.loads(await reader.readline()) for _ in range(OPEN_REQUESTS_LIMIT)]
+    assert all(answer["ok"] for answer in answers)
+    writer.close()
 
 
 async def test_a_long_request_goes_in_pieces_and_stop_passes_between_them(

@@ -8,7 +8,9 @@ import contextlib
 import pytest
 
 from station.errors import RefusedError, TriggerError
+from station.session import free_drive
 from station.status import StationState as S
+from station.stillness import StillnessMonitor
 from tests.station.session_rig import POSES, Rig, sealed
 
 
@@ -47,6 +49,20 @@ async def test_auto_record_takes_a_new_place_once(bare_rig: Rig) -> None:
     await bare_rig.until_true(lambda: bare_rig.session.store.status.session.captured == 2)
     await bare_rig.session.stop("anna")
     assert bare_rig.state is S.STOPPED
+
+
+async def test_auto_record_waits_for_an_arm_that_is_still_guided(
+    bare_rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = bare_rig
+    monkeypatch.setattr(StillnessMonitor, "at_rest", False)
+    monkeypatch.setattr(free_drive, "WATCH_PERIOD_S", 0.005)
+    await rig.session.switch_free_drive(1, True, auto=True)
+    await asyncio.sleep(0.05)
+    assert rig.state is S.FREE_DRIVE and rig.pose_states == []
+    rig.arm.rest()
+    monkeypatch.setattr(StillnessMonitor, "at_rest", True)
+    await rig.until_true(lambda: rig.session.store.status.session.captured == 1)
 
 
 async def test_auto_record_outlives_a_moment_without_news(bare_rig: Rig) -> None:

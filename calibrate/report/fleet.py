@@ -23,11 +23,12 @@ _COLOURS = ("#0969da", "#1a7f37", "#bc4c00")
 def fleet_page(results: Sequence[BatchResult], cells: Sequence[Cell]) -> str:
     """The findings, then one section per cell, then what could not be solved."""
     solved = sum(result.solved for result in results)
+    count = f"{len(cells)} cell{'s' * (len(cells) != 1)}"
     return html.page(
         "Calibrations of a fleet",
         [
             "<h1>Calibrations of a fleet</h1>",
-            html.paragraph(f"{len(results)} recordings, {solved} solved, {len(cells)} cells."),
+            html.paragraph(f"{len(results)} recordings, {solved} solved, {count}."),
             *_findings(cells),
             *(part for cell in cells for part in _section(cell)),
             *_unsolved(results),

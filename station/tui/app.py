@@ -319,6 +319,7 @@ class StationApp(Commands):
 class ReplayApp(Player, StationApp):
     """The same screens over a recording alone."""
 
+    serves = False
     BINDINGS: ClassVar[list[BindingType]] = [*Player.BINDINGS]
 
     def __init__(self, link: ReplayLink) -> None:

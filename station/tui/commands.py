@@ -31,6 +31,8 @@ class Commands(App[None]):
     """Every wish goes through `ask`; the daemon decides, nothing is decided here."""
 
     status: reactive[StationStatus | None] = reactive(None, repaint=False)
+    serves = True
+    """A station stands behind this screen, not a recording alone."""
     link: Link | None = None
     """The connection while there is one."""
     silent_s: float | None = None
@@ -182,7 +184,7 @@ class Commands(App[None]):
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_leave(self) -> None:
         state = None if self.status is None else self.status.state
-        if state not in (None, StationState.IDLE, StationState.DISCONNECTED):
+        if self.serves and state not in (None, StationState.IDLE, StationState.DISCONNECTED):
             held = state in RUNNING and self.has_control()
             text = f"The arm works, commanded from here. {WITHOUT}" if held else STAYS
             if not await self.push_screen_wait(Confirm("Close the screen?", text, yes="Close")):

@@ -138,3 +138,10 @@ async def test_the_cells_own_work_ends_the_playback(beside: FakeLink) -> None:
         beside.show(idle(StationState.STOPPED, "protective stop"))
         await until(pilot, lambda: not isinstance(pilot.app.screen, ReplayScreen))
         await until(pilot, lambda: "STOPPED" in text_of(pilot.app, "#bar"))
+
+
+async def test_a_recording_alone_is_left_without_a_question() -> None:
+    async with replay_app(pace=1.0).run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: "PLAYBACK" in text_of(pilot.app, "#bar"))
+        await pilot.press("ctrl+q")
+        await until(pilot, lambda: pilot.app._exit)

@@ -156,7 +156,8 @@ async def test_of_too_many_questions_at_once_the_last_are_turned_away_but_never_
     ]
     reader, writer = await asyncio.open_unix_connection(str(path))
     writer.write(b"".join(waiting) + b'{"id": 99, "verb": "stop", "args": {}}\n')
-    first, second = [json.loads(await reader.readline()) for _ in range(2)]
+    async with asyncio.timeout(5):
+        first, second = [json.loads(await reader.readline()) for _ in range(2)]
     assert first["id"] == OPEN_REQUESTS_LIMIT and "too many requests" in first["error"]
     assert (second["id"], second["ok"]) == (99, True)
     assert handler.order == ["stop"]

@@ -244,13 +244,13 @@ class UrRobot(UrLink):
                 child.stop()
             if self.dashboard is not None and self.dashboard.alive:
                 reply = self.dashboard.send(STOP)
-            self._later(self._finish_stop(child, reply))
-            both = (reply, child.stop_acknowledged if child is not None else None)
-            waits: list[asyncio.Future[Any]] = [w for w in both if w is not None]
-            if waits:
-                await asyncio.wait(waits, timeout=STOP_WAIT_S)
         except Exception:
             log.exception("a path of the stop failed")
+        self._later(self._finish_stop(child, reply))  # whatever failed above
+        both = (reply, child.stop_acknowledged if child is not None else None)
+        waits: list[asyncio.Future[Any]] = [w for w in both if w is not None]
+        if waits:
+            await asyncio.wait(waits, timeout=STOP_WAIT_S)
 
     async def idle(self) -> None:
         """Returns when everything behind a stop is done: control ended, its process gone."""

@@ -1,0 +1,96 @@
+"""A stop leaves by both ways in the very call, before anything is waited for, whatever hangs behind it."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from station.config import RobotConfig
+from station.devices import ur
+from station.devices.ur import UrRobot
+from station.devices.ur_dashboard import STOP
+
+
+class Ways:
+    """In place of dashboard and control process: what reached them, in order; neither answers by itself."""
+
+    def __init__(self) -> None:
+        self.log: list[str] = []
+        self.alive = True
+        self.reply: asyncio.Future[str] = asyncio.get_running_loop().create_future()
+        self.stop_acknowledged: asyncio.Future[None] = asyncio.get_running_loop().create_future()
+
+    def send(self, command: str) -> asyncio.Future[str]:
+        self.log.append(f"dashboard {command}")
+        return self.reply
+
+    def stop(self) -> None:
+        self.log.append("child stop")
+
+    async def end_after_stop(self, moment_s: float) -> None:
+        self.log.append("child ends")
+
+    async def anew(self) -> None:
+        self.log.append("dashboard anew")
+
+
+@pytest.fixture
+async def ways() -> Ways:
+    return Ways()
+
+
+@pytest.fixture
+async def robot(ways: Ways, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.setattr(ur, "LEFTOVER_WAIT_NS", 0)
+    made: Any = UrRobot(RobotConfig(model="UR10", host="127.0.0.1"), tmp_path)
+    monkeypatch.setattr(made, "_dashboard_stop_anew", ways.anew)
+    made.dashboard, made._child, made._controls = ways, ways, True
+    return made
+
+
+async def test_both_ways_are_taken_before_anything_is_waited_for(robot: Any, ways: Ways) -> None:
+    stopping = asyncio.ensure_future(robot.stop("STOP by anna"))
+    await asyncio.sleep(0)
+    assert ways.log[:2] == ["child stop", f"dashboard {STOP}"]
+    assert not robot.control, "no move is taken from here on"
+    ways.reply.set_result("Stopped")
+    ways.stop_acknowledged.set_result(None)
+    await stopping
+    await robot.idle()
+    assert ways.log[2:] == ["child ends"]
+
+
+async def test_a_dashboard_that_does_not_answer_is_asked_by_a_new_connection(robot: Any, ways: Ways) -> None:
+    await robot.stop("STOP by anna")
+    await robot.idle()
+    assert sorted(ways.log[2:]) == ["child ends", "dashboard anew"]
+
+
+@pytest.mark.parametrize("alive", [True, False])
+async def test_without_control_of_ours_the_dashboard_stops_what_runs(
+    robot: Any, ways: Ways, alive: bool
+) -> None:
+    robot._child, ways.alive = None, alive
+    ways.reply.set_result("Stopped")
+    await robot.stop("STOP by anna")
+    await robot.idle()
+    assert ways.log == [f"dashboard {STOP}" if alive else "dashboard anew"]
+
+
+@pytest.mark.parametrize(
+    ("broken", "reached"),
+    [("send", ["child ends", "child stop", "dashboard anew"]), ("stop", ["child ends", "dashboard anew"])],
+)
+async def test_a_way_that_breaks_in_the_call_costs_neither_the_other_nor_the_end_of_control(
+    robot: Any, ways: Ways, broken: str, reached: list[str]
+) -> None:
+    def fails(*_: object) -> None:
+        raise RuntimeError("a defect")
+
+    setattr(ways, broken, fails)
+    await robot.stop("STOP by anna")
+    await robot.idle()
+    assert sorted(ways.log) == reached

@@ -98,6 +98,7 @@ def _result_table(calibration: Calibration) -> Table:
         "robot, camera",
         f"{robot.model} {robot.serial}".strip() + f", {camera.model} {camera.serial}".rstrip(),
     )
+    table.add_row("session", f"{calibration.provenance.session}, solved {calibration.created}")
     return table
 
 

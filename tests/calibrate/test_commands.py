@@ -123,6 +123,7 @@ def test_solve_install_check_diff_rollback(real_session_file: Path, real_file: P
     session = calibration.provenance.session
     assert [row["session"] for row in listed] == [session, session]
     assert run("list", cwd=tmp_path).stdout.count(session) == 2
+    assert f"{session}, solved {calibration.created}" in run("show", cwd=tmp_path).stdout
     text = run("export", "--to", "urdf", cwd=tmp_path)
     assert text.stdout.count("<joint") == 2
 

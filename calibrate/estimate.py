@@ -16,7 +16,7 @@ from calibrate.errors import BadViewsError
 from calibrate.geometry import Array
 from calibrate.likelihood.model import Observations, State
 from calibrate.likelihood.noise import FLOOR, reml_scales
-from calibrate.likelihood.normal import PRIOR, Normal, Solved
+from calibrate.likelihood.normal import PRIOR, ROBOT_ROTATION, ROBOT_TRANSLATION, Normal, Solved
 from calibrate.likelihood.residuals import (
     Misses,
     corner_residuals,
@@ -63,7 +63,7 @@ class Estimate:
         With kinematic errors their scale dominates and is known worst: then ν is the number of them that
         the data leave free (24 minus the trace), if that is less.
         """
-        freedom = 3.0 * len(self.state.C) - 6.0
+        freedom = float(self.normal.count[[ROBOT_TRANSLATION, ROBOT_ROTATION]].mean()) - 6.0
         if len(self.state.theta):
             precision = self.sigma**-2
             used = self.normal.solve(precision).traces() * precision

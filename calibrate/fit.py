@@ -47,15 +47,25 @@ class Fit:
 class Settled:
     """An estimate and the views that it accepts."""
 
-    places: Places
+    everything: Observations
+    """Of all views."""
+    fitted: Places
     """Those that the estimate rests on."""
-    observed: Observations
-    """Of those."""
     estimate: Estimate
     verdict: Judgement
     """On all views."""
     boards: BoardPoses
     """Of all views, by their own corners and the final lens."""
+
+    @property
+    def observed(self) -> Observations:
+        """Of the fitted views."""
+        return self.everything.part(self.fitted)
+
+    @property
+    def places(self) -> Places:
+        """Fitted views all of whose numbers are trusted."""
+        return self.fitted[self.everything.trust[self.fitted].all(axis=1)]
 
 
 def fit_views(
@@ -72,18 +82,20 @@ def fit_views(
     views, places = consensus.views, consensus.places
     everything = observe_views(views)
     H, C = pose_arrays(views)
-    start = first_state(_part(everything, places), consensus.start.X, C[places], H[places], views.camera)
-    plain = estimate(_part(everything, places), start, intrinsics_free)
-    group = _judged(everything, views, places, plain)
-    settled = _settle(everything, views, group, reject)
+    start = first_state(everything.part(places), consensus.start.X, C[places], H[places], views.camera)
+    plain = estimate(everything.part(places), start, intrinsics_free)
+    boards = refine_board_poses(everything, replace(plain.state, C=C))
+    group = Settled(everything, places, plain, judge_views(everything, plain, boards, places), boards)
+    settled = _settle(group, reject)
     _require_plausible_noise(settled.estimate)
     watch.lap("maximum likelihood")
-    finding, settled = _with_kinematics(everything, views, group, settled, kinematic_prior, reject)
+    finding, settled = _with_kinematics(views, group, settled, kinematic_prior, reject)
     watch.lap("robot systematics")
     places = settled.places
     bad = np.setdiff1d(np.arange(len(views)), places)
     full = replace(settled.estimate.state, C=settled.boards.C)
     rejected = explain(views, full, settled.verdict, bad)
+    settled = _with_good_numbers(settled, rejected, bad)
     pairs = all_pairs(H[places], settled.boards.C[places])
     problem = f"chordal objective over all {len(pairs)} pairs of the {len(places)} used views"
     certified = solve_global(pairs, seed, problem)
@@ -91,7 +103,7 @@ def fit_views(
     return Fit(consensus, views, settled, rejected, pairs, certified, finding)
 
 
-def _settle(everything: Observations, views: ViewSet, group: Settled, reject: bool) -> Settled:
+def _settle(group: Settled, reject: bool) -> Settled:
     """Those that the mixture finds good judge each other; where it finds no bad ones, the group judges all.
 
     Many bad views widen the scales until each of them seems likely, and so does every one let in again: where
@@ -99,90 +111,82 @@ def _settle(everything: Observations, views: ViewSet, group: Settled, reject: bo
     """
     if not reject:
         return group
-    good = find_good_views(group.verdict.linear, group.places, ~group.verdict.blurred)
-    closed = not np.array_equal(good, group.places)
-    settled = _again(everything, views, group, good) if closed else group
+    count = len(group.everything.flange)
+    good = find_good_views(group.verdict.linear, group.fitted, ~group.verdict.blurred)
+    closed = not np.array_equal(good, group.fitted)
+    settled = _again(group, good) if closed else group
     for round_ in range(_ROUNDS):
         good = settled.verdict.good
-        if closed or (round_ and len(good) < (1 - _FEW) * len(views)):
-            good = np.intersect1d(good, settled.places)
+        if closed or (round_ and len(good) < (1 - _FEW) * count):
+            good = np.intersect1d(good, settled.fitted)
         if len(good) < _FEWEST:
-            raise disagreement(f"Only {len(good)} of {len(views)} views agree; {_FEWEST} are needed.")
-        if np.array_equal(good, settled.places):
+            raise disagreement(f"Only {len(good)} of {count} views agree; {_FEWEST} are needed.")
+        if np.array_equal(good, settled.fitted):
             break
-        settled = _again(everything, views, settled, good)
+        settled = _again(settled, good)
     return settled
 
 
-def _judged(
-    everything: Observations,
-    views: ViewSet,
-    places: Places,
-    result: Estimate,
-    before: BoardPoses | None = None,
-) -> Settled:
+def _judged(everything: Observations, fitted: Places, result: Estimate, boards: BoardPoses) -> Settled:
     """Board poses are sought from those before, which another lens hardly moves and nothing else does."""
-    C = views.camera_from_board if before is None else before.C
-    boards = before
-    if boards is None or result.intrinsics_free:
-        boards = refine_board_poses(everything, replace(result.state, C=C))
-    verdict = judge_views(everything, result, boards, places)
-    return Settled(places, _part(everything, places), result, verdict, boards)
+    if result.intrinsics_free:
+        boards = refine_board_poses(everything, replace(result.state, C=boards.C))
+    verdict = judge_views(everything, result, boards, fitted)
+    return Settled(everything, fitted, result, verdict, boards)
 
 
-def _again(everything: Observations, views: ViewSet, settled: Settled, places: Places) -> Settled:
+def _again(settled: Settled, fitted: Places) -> Settled:
     """Estimated by other views."""
     before = settled.estimate
-    start = replace(before.state, C=settled.boards.C[places])
-    result = estimate(_part(everything, places), start, before.intrinsics_free, before.sigma)
-    return _judged(everything, views, places, result, settled.boards)
-
-
-def _part(everything: Observations, places: Places) -> Observations:
-    return replace(
-        everything,
-        flange=everything.flange[places],
-        points=everything.points[places],
-        pixels=everything.pixels[places],
-        present=everything.present[places],
-        kinematics=None if everything.kinematics is None else everything.kinematics[places],
-    )
+    start = replace(before.state, C=settled.boards.C[fitted])
+    observed = settled.everything.part(fitted)
+    result = estimate(observed, start, before.intrinsics_free, before.sigma)
+    return _judged(settled.everything, fitted, result, settled.boards)
 
 
 def _with_kinematics(
-    everything: Observations,
-    views: ViewSet,
-    group: Settled,
-    plain: Settled,
-    prior: KinematicPrior,
-    reject: bool,
+    views: ViewSet, group: Settled, plain: Settled, prior: KinematicPrior, reject: bool
 ) -> tuple[RobotSystematics | None, Settled]:
     """The finding, and the estimate that counts: with the kinematic model where it is due.
 
     With the model, views are judged again: some looked wrong only because the arm is. Where many of the group
     were left out and the others do not show it, the whole group is asked, and believed if that explains them.
     """
-    derivatives = kinematic_derivatives(views) if len(plain.places) >= FEWEST_VIEWS else None
+    derivatives = kinematic_derivatives(views) if len(plain.fitted) >= FEWEST_VIEWS else None
     if derivatives is None:
         return None, plain
-    with_table = replace(everything, kinematics=derivatives)
+    with_table = replace(group.everything, kinematics=derivatives)
 
     def settle(start: Settled) -> tuple[RobotSystematics, Settled | None]:
-        fitted = fit_kinematics(start.observed, start.estimate, derivatives[start.places])
+        fitted = fit_kinematics(start.observed, start.estimate, derivatives[start.fitted])
         if prior == "off" or not (fitted.finding.detected or prior == "on"):
             return fitted.finding, None
-        judged = _judged(with_table, views, start.places, fitted.estimate)
-        settled = _settle(with_table, views, judged, reject)
+        settled = _settle(_judged(with_table, start.fitted, fitted.estimate, start.boards), reject)
         table_errors = tuple((UNIT * settled.estimate.state.theta).tolist())
         return replace(fitted.finding, prior_applied=True, table_errors=table_errors), settled
 
     finding, settled = settle(plain)
-    most = (1 - _FEW) * len(group.places)
-    if not finding.detected and len(plain.places) < most:
+    most = (1 - _FEW) * len(group.fitted)
+    if not finding.detected and len(plain.fitted) < most:
         of_all, explained = settle(group)
-        if of_all.detected and explained is not None and len(explained.places) >= most:
+        if of_all.detected and explained is not None and len(explained.fitted) >= most:
             return of_all, explained
     return finding, settled or plain
+
+
+def _with_good_numbers(settled: Settled, rejected: tuple[RejectedView, ...], places: Places) -> Settled:
+    """The estimate rests also on the good numbers of views that have one wrong number."""
+    wrong = {
+        int(i): view.wrong_number
+        for i, view in zip(places, rejected, strict=True)
+        if view.wrong_number is not None
+    }
+    if not wrong:
+        return settled
+    trusted = settled.everything.trust.copy()
+    trusted[list(wrong), list(wrong.values())] = 0.0
+    everything = replace(settled.everything, trusted=trusted)
+    return _again(replace(settled, everything=everything), np.union1d(settled.fitted, list(wrong)))
 
 
 def _require_plausible_noise(result: Estimate) -> None:

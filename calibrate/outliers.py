@@ -21,6 +21,7 @@ from calibrate.mixture import LinearMisses
 from calibrate.pairs import Places, mount_poses
 from calibrate.solution import RejectedView
 from calibrate.views import ImageView, ViewSet
+from calibrate.wrong_number import tell_wrong_number, wrong_numbers
 
 _FALSE_ALARM = 5e-4
 """Probability that a good view is rejected (more with few views, by the limit below)."""
@@ -40,9 +41,12 @@ class Judgement:
     distance2: Array
     """(n,) squared sigmas, 6 degrees of freedom."""
     linear: LinearMisses
+    covariance: Array
+    """(n, 6, 6) of the misses, were all views good."""
     modelled: Array
     """(n, 4, 4)"""
-    limit: float
+    freedom: float
+    """Of the noise scales: `distance2` / 6 of good views follows F(6, freedom)."""
     blurred: NDArray[np.bool_]
     """(n,)"""
 
@@ -50,6 +54,12 @@ class Judgement:
     def miss(self) -> Array:
         """(n, 6) modelled against recorded flange."""
         return self.linear.miss
+
+    @property
+    def limit(self) -> float:
+        """Of `distance2`."""
+        chance = float(6 * stats.f.ppf(1 - _FALSE_ALARM, 6, self.freedom))
+        return min(chance, _LARGEST_SIGMAS**2)
 
     @property
     def good(self) -> Places:
@@ -71,11 +81,9 @@ def judge_views(observed: Observations, result: Estimate, boards: BoardPoses, fi
     distance2 = np.einsum("ni,ni->n", miss, np.linalg.solve(covariance, miss[..., None])[..., 0])
     # Two scales, each from 3N - 6 residuals: simulated, the tail is that of F with half as many again.
     freedom = 1.5 * max(3 * len(fitted) - 6, 3)
-    chance = float(6 * stats.f.ppf(1 - _FALSE_ALARM, 6, freedom))
-    limit = min(chance, _LARGEST_SIGMAS**2)
     typical = float(np.median(boards.typical_px))
     blurred = boards.typical_px > max(_BLURRED * typical, _BLURRED_PX)
-    return Judgement(distance2, linear, modelled_flange(observed, state), limit, blurred)
+    return Judgement(distance2, linear, covariance, modelled_flange(observed, state), freedom, blurred)
 
 
 def _linear_misses(
@@ -121,7 +129,15 @@ def turn_view(view: ImageView, turn: Array) -> ImageView:
 def explain(views: ViewSet, state: State, verdict: Judgement, places: Places) -> tuple[RejectedView, ...]:
     """Name and reason for each rejected place."""
     moved = _moved_boards(views, state, verdict, places)
-    return tuple(_explain_one(views, state, verdict, int(i), moved) for i in places)
+    found = [_explain_one(views, state, verdict, int(i), moved) for i in places]
+    unclear = [n for n, view in enumerate(found) if view.kind == "inconsistent"]
+    at = places[unclear]
+    for n, number in wrong_numbers(verdict.miss[at], verdict.covariance[at], verdict.freedom).items():
+        reason = tell_wrong_number(verdict.miss[at[n]], number)
+        found[unclear[n]] = replace(
+            found[unclear[n]], reason=reason, kind="wrong-number", wrong_number=number
+        )
+    return tuple(found)
 
 
 def _explain_one(
@@ -158,14 +174,16 @@ def _tolerance(verdict: Judgement) -> Array:
     return np.array([max(5 * float(np.median(v)), 1e-6) for v in lengths])
 
 
+def _near(poses: Array, other: Array, tolerance: Array) -> NDArray[np.bool_]:
+    delta = difference(poses, other)
+    lengths = np.stack([np.linalg.norm(delta[..., :3], axis=-1), np.linalg.norm(delta[..., 3:], axis=-1)], -1)
+    return np.asarray((lengths < tolerance).all(axis=-1))
+
+
 def _owner_of_pose(views: ViewSet, verdict: Judgement, i: int) -> int | None:
     """Whose modelled flange pose is the one recorded for view i?"""
     recorded = np.asarray(views.views[i].base_from_flange)
-    delta = difference(verdict.modelled, recorded)
-    tolerance = _tolerance(verdict)
-    near = (np.linalg.norm(delta[:, :3], axis=1) < tolerance[0]) & (
-        np.linalg.norm(delta[:, 3:], axis=1) < tolerance[1]
-    )
+    near = _near(verdict.modelled, recorded, _tolerance(verdict))
     near[i] = False
     found = np.flatnonzero(near)
     return int(found[0]) if len(found) else None
@@ -178,13 +196,12 @@ def _board_places(views: ViewSet, state: State) -> Array:
 def _moved_boards(views: ViewSet, state: State, verdict: Judgement, places: Places) -> dict[int, str]:
     """Rejected views that agree with each other on another place of the board."""
     where = _board_places(views, state)
-    tolerance = 2 * _tolerance(verdict)
+    tolerance = _tolerance(verdict)
     found: dict[int, str] = {}
     for i in places:
-        delta = difference(where[places], where[i])
-        near = (np.linalg.norm(delta[:, :3], axis=1) < tolerance[0]) & (
-            np.linalg.norm(delta[:, 3:], axis=1) < tolerance[1]
-        )
+        if _near(where[i], state.Y, 2 * tolerance):
+            continue  # as small as this, any errors agree with each other
+        near = _near(where[places], where[i], tolerance)
         if near.sum() >= 2:
             shift_mm, turn_deg = _size(difference(where[i], state.Y))
             numbers = ", ".join(str(views.views[int(j)].index + 1) for j in places[near])

@@ -52,7 +52,9 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
     lens_finding = "" if free else check_lens(settled.observed, result)
     watch.lap("lens check")
     # A fitted kinematic table accounts for such a turn itself.
-    frames_finding = "" if len(state.theta) else check_frames(settled.observed, replace(state, C=C[places]))
+    frames_finding = (
+        "" if len(state.theta) else check_frames(settled.everything.part(places), replace(state, C=C[places]))
+    )
     holdout = _holdout(fit, free) if options.holdout else None
     watch.lap("hold-out")
     indices = [view.index for view in fit.views]
@@ -126,7 +128,8 @@ def _robot_misses(settled: Settled, indices: list[int]) -> dict[int, tuple[float
     e = robot_residuals(settled.observed, settled.estimate.state)
     return {
         indices[i]: (float(np.linalg.norm(row[:3])), float(np.linalg.norm(row[3:])))
-        for i, row in zip(settled.places.tolist(), e, strict=True)
+        for i, row in zip(settled.fitted.tolist(), e, strict=True)
+        if i in settled.places
     }
 
 

@@ -48,10 +48,13 @@ class RejectedView:
         "wrong-pose",
         "wrong-square-size",
         "moved-board",
+        "wrong-number",
         "inconsistent",
         "corners",
         "unreadable-picture",
     ]
+    wrong_number: int | None = None
+    """Place in [δt, δφ] of the only wrong number of its recorded pose: X rests on the other five."""
 
 
 @dataclass(frozen=True, eq=False)

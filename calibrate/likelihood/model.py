@@ -11,6 +11,7 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
 from calibrate.geometry import Array, perturb
 from calibrate.projection import INTRINSICS, intrinsics_vector, with_intrinsics_vector
@@ -34,10 +35,30 @@ class Observations:
 
     held: tuple[int, ...] = ()
     """Places in `projection.INTRINSICS` that stay as they are."""
+    trusted: Array | None = None
+    """(n, 6) 0 for a number of the recorded pose that is known to be wrong, else 1; None: all are trusted."""
 
     @property
     def has_pixels(self) -> bool:
         return bool(self.present.any())
+
+    @property
+    def trust(self) -> Array:
+        """(n, 6)"""
+        return np.ones((len(self.flange), 6)) if self.trusted is None else self.trusted
+
+    def part(self, places: NDArray[np.int64]) -> Observations:
+        """Of these views only."""
+        kinematics, trusted = self.kinematics, self.trusted
+        return replace(
+            self,
+            flange=self.flange[places],
+            points=self.points[places],
+            pixels=self.pixels[places],
+            present=self.present[places],
+            kinematics=None if kinematics is None else kinematics[places],
+            trusted=None if trusted is None else trusted[places],
+        )
 
 
 @dataclass(frozen=True, eq=False)

@@ -22,14 +22,14 @@ class Misses:
     """What a state leaves unexplained."""
 
     robot: Array
-    """(n, 6)"""
+    """(n, 6), 0 for a number that is not trusted."""
     distance_px: Array
     """(n, k) of the corners, 0 for padding; not finite for corners behind the camera."""
 
 
 def misses(observed: Observations, state: State) -> Misses:
-    corners = corner_residuals(observed, state)
-    return Misses(robot_residuals(observed, state), corner_distance(corners))
+    robot = observed.trust * robot_residuals(observed, state)
+    return Misses(robot, corner_distance(corner_residuals(observed, state)))
 
 
 def corner_distance(residuals: Array) -> Array:
@@ -144,6 +144,8 @@ def _add_robot(normal: Normal, observed: Observations, state: State) -> None:
     J_G[..., :6], J_G[..., 6:12] = by_X, by_Y
     if observed.kinematics is not None:
         J_G[..., -observed.kinematics.shape[2] :] = -observed.kinematics
+    trust = observed.trust
+    e, by_C, J_G = e * trust, by_C * trust[..., None], J_G * trust[..., None]
     for group, rows in ((ROBOT_TRANSLATION, slice(0, 3)), (ROBOT_ROTATION, slice(3, 6))):
         G, c, r = J_G[:, rows], by_C[:, rows], e[:, rows]
         flat = G.reshape(-1, normal.size)
@@ -153,7 +155,7 @@ def _add_robot(normal: Normal, observed: Observations, state: State) -> None:
         normal.W[group] = np.swapaxes(G, 1, 2) @ c
         normal.h[group] = -np.einsum("nri,nr->ni", c, r)
         normal.square[group] = float((r**2).sum())
-        normal.count[group] = 3 * len(e)
+        normal.count[group] = float(trust[:, rows].sum())
 
 
 def robot_derivatives(observed: Observations, state: State) -> tuple[Array, Array, Array]:

@@ -188,7 +188,7 @@ def mirrored(C):
     ],
 )
 def test_a_broken_view_is_named(profile, field, value, says):
-    with pytest.raises(BadViewsError, match=f"View 3.*{says}"):
+    with pytest.raises(BadViewsError, match=f"View 4.*{says}"):
         solve_views(broken(field, value), SolveOptions(profile=profile))
 
 

@@ -111,11 +111,12 @@ def _motion_gates(solution: Solution, limits: GateLimits) -> Iterator[Gate]:
         )
     if limits.rotation_deg is not None:
         angle = float(np.degrees(seen.largest_angle_rad))
+        compared = "two views" if solution.profile == "robust" else "neighbouring views"
         yield _at_least(
             "rotation",
             angle,
             limits.rotation_deg,
-            f"The largest turn between two views is {angle:.0f}°",
+            f"The largest turn between {compared} is {angle:.0f}°",
             "Add poses that tilt and roll the flange further.",
         )
     if limits.axis_spread is not None:

@@ -9,7 +9,7 @@ from pathlib import Path
 import msgspec
 
 from recordings.errors import CorruptRecordingError, RecordingError, UnsealedRecordingError
-from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, discard_leftover, lock, rename_new
+from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, discard_leftover, lock, rename_new, sync_folder
 from recordings.manifest import MANIFEST_FILE, give_up_parts, missing_parts, read_manifest
 from recordings.messages import SessionInfo
 from recordings.part import RecordingPart
@@ -157,9 +157,9 @@ def _rebuild(descriptor: int, source: Path, final: Path, in_place: bool) -> tupl
         rebuilt = rebuild(descriptor, source, temporary)
         original = source
         if in_place:
-            original = _free_name(source.with_name(source.name + DAMAGED_SUFFIX))
-            rename_new(source, original)
-        rename_new(temporary, final)
+            original = _put_in_place(source, temporary, final)
+        else:
+            rename_new(temporary, final)
         return _report(final, rebuilt.part, original, rebuilt.lost_bytes, rebuilt.losses)
     except OSError as error:
         raise RecordingError(
@@ -167,6 +167,20 @@ def _rebuild(descriptor: int, source: Path, final: Path, in_place: bool) -> tupl
         ) from error
     finally:
         temporary.unlink(missing_ok=True)
+
+
+def _put_in_place(source: Path, temporary: Path, final: Path) -> Path:
+    """Where the damaged file is now. A kill at any moment leaves one under a name that the next run finds."""
+    original = _free_name(source.with_name(source.name + DAMAGED_SUFFIX))
+    try:
+        os.link(source, original)
+    except OSError:  # no second names here (exFAT): for a moment there is none at all
+        rename_new(source, original)
+    temporary.replace(source)
+    sync_folder(source.parent)
+    if final != source:
+        rename_new(source, final)
+    return original
 
 
 def _free_name(path: Path) -> Path:

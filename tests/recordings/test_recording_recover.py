@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -157,6 +159,55 @@ def test_what_a_killed_recovery_left_is_no_obstacle(small: Path) -> None:
     (result,) = recover(small)
     assert result.poses == 3
     assert not leftover.exists()
+
+
+@pytest.mark.parametrize("unfinished", [True, False], ids=["unfinished", "damaged"])
+def test_a_recovery_killed_between_its_renames_can_be_done_again(tmp_path: Path, unfinished: bool) -> None:
+    program = (
+        "import os, pathlib, signal, sys\n"
+        "from recordings.recover import recover\n"
+        "left = int(sys.argv[2])\n"
+        "def mortal(call):\n"
+        "    def made(*given, **named):\n"
+        "        global left\n"
+        "        if not left:\n"
+        "            os.kill(os.getpid(), signal.SIGKILL)\n"
+        "        left -= 1\n"
+        "        return call(*given, **named)\n"
+        "    return made\n"
+        "os.link, os.replace, os.rename = map(mortal, (os.link, os.replace, os.rename))\n"
+        "recover(pathlib.Path(sys.argv[1]))\n"
+    )
+    kills = 0
+    while True:
+        folder = tmp_path / str(kills)
+        folder.mkdir()
+        path = write_unfinished(folder / "a.mcap") if unfinished else write_small(folder / "a.mcap", poses=3)
+        if not unfinished:
+            path.write_bytes(path.read_bytes()[:-9000])
+        done = subprocess.run([sys.executable, "-c", program, path, str(kills)], check=False)
+        (result,) = recover(folder)
+        assert (result.path, result.poses) == (folder / "a.mcap", 2 if unfinished else 3)
+        assert list(folder.glob("*.damaged"))
+        if done.returncode == 0:
+            break
+        kills += 1
+    assert kills >= 2
+
+
+def test_where_files_have_one_name_only_they_are_recovered_too(
+    small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: Path) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    data = small.read_bytes()[:-9000]
+    small.write_bytes(data)
+    monkeypatch.setattr(os, "link", refused)
+    (result,) = recover(small)
+    assert result.kept_original is not None
+    assert result.kept_original.read_bytes() == data
+    assert len(open_recording(small).views()) == result.poses
 
 
 def test_a_recovery_that_still_runs_is_not_disturbed(small: Path) -> None:

@@ -106,8 +106,8 @@ def test_a_recovered_file_is_on_the_disk_before_it_takes_the_damaged_ones_name(
         recover(part)
     assert order == [
         "sync a.mcap.recovering",
-        "rename a.mcap.part a.mcap.part.damaged",
+        "rename a.mcap.recovering a.mcap.part",
         f"sync {tmp_path.name}",
-        "rename a.mcap.recovering a.mcap",
+        "rename a.mcap.part a.mcap",
         f"sync {tmp_path.name}",
     ]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -153,6 +155,24 @@ def test_other_peoples_recordings_solve(datasets: Path, tmp_path: Path, name: st
     if truth_mm is not None:
         plain = yaml.safe_load((datasets / name / "truth.yaml").read_text())
         assert error_mm_deg(job.solution.matrix, np.array(plain["matrix"]))[0] < truth_mm
+
+
+def test_a_slip_of_typing_in_a_real_list_of_poses_is_named_and_costs_one_number(
+    datasets: Path, tmp_path: Path
+) -> None:
+    shutil.copytree(datasets / "rendered-truth", tmp_path / "typed")
+    poses = tmp_path / "typed/poses.csv"
+    lines = poses.read_text().splitlines()
+    image, x, y, *others = lines[6].split(",")
+    lines[6] = ",".join([image, x, str(float(y) + 0.09), *others])
+    poses.write_text("\n".join(lines) + "\n")
+    import_folder(tmp_path / "typed", tmp_path / "typed.mcap")
+    import_folder(datasets / "rendered-truth", tmp_path / "right.mcap")
+    typed, right = (solve_recording(tmp_path / f"{name}.mcap").solution for name in ("typed", "right"))
+    (rejected,) = typed.rejected
+    assert rejected.index == 5
+    assert re.match(r"only y in base is off, by (89|90)\.\d\d mm", rejected.reason)
+    assert error_mm_deg(typed.matrix, right.matrix)[0] < 0.05
 
 
 def test_the_colours_decide_the_small_board_in_every_view(datasets: Path, tmp_path: Path) -> None:

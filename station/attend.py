@@ -52,14 +52,14 @@ class Outcome:
 
 async def wait_until_idle(client: Client) -> StationStatus:
     """The devices need a moment after the daemon's start. RefusedError names what does not come."""
-    status = StationStatus()
+    status, told = StationStatus(), False
     with contextlib.suppress(TimeoutError):
         async with asyncio.timeout(CONNECT_WAIT_S):
             async for status in client.statuses():
                 told = status.playback or status.robot.joints_rad is not None
                 if status.state is not StationState.DISCONNECTED and status.camera.connected and told:
                     return status
-    missing = "the camera" if status.robot.connected else "the robot"
+    missing = "the camera" if status.robot.connected and told else "the robot"
     raise RefusedError(f"{missing} did not come within {CONNECT_WAIT_S:.0f} s: `station doctor` says why")
 
 

@@ -52,6 +52,7 @@ def test_a_playback_needs_no_joints() -> None:
     [
         (StationStatus(), "the robot did not come"),
         (StationStatus(state=StationState.IDLE, robot=STANDING), "the camera did not come"),
+        (idle(robot=RobotStatus(connected=True)), "the robot did not come"),
     ],
 )
 def test_what_does_not_come_is_named(

@@ -307,8 +307,10 @@ def crash(rig: Rig) -> None:
     for task in (*rig.session._tasks, rig.session._run):
         if task is not None:
             task.cancel()
-    assert rig.session.bench.recording is not None
-    rig.session.bench.recording.abandon()
+    recording = rig.session.bench.require_recording()
+    recording.abandon()
+    assert recording._closing is not None
+    recording._closing.join()  # a dead process holds no file
     rig.session.bench.recording = None
 
 

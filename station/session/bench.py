@@ -18,7 +18,7 @@ from station.collision import CellGeometry
 from station.session.queue import PoseQueue
 from station.session.recording import SessionRecording
 from station.session.store import StatusStore
-from station.status import Event, SessionStatus
+from station.status import Event, SessionStatus, StationState
 from station.stillness import StillnessMonitor
 from station.workers import Workers
 
@@ -52,6 +52,11 @@ class Bench:
     finish_wanted: bool = False
     halting: bool = False
     """STOP, a fault or a lost lease ends the run: it must not change the state any more."""
+
+    @property
+    def resting(self) -> StationState:
+        """Where the station stands between two goes: `paused` always has a session to go on with."""
+        return StationState.IDLE if self.recording is None else StationState.PAUSED
 
     def require_queue(self) -> PoseQueue:
         """Inside a run there always is one."""

@@ -104,8 +104,7 @@ class Guard:
             return
         self._stale_rounds = 0
         if store.state is StationState.DISCONNECTED:
-            resting = StationState.IDLE if self._bench.recording is None else StationState.PAUSED
-            store.enter(resting)
+            store.enter(self._bench.resting)
             store.event("robot connected")
 
     def _watch_rest(self) -> None:

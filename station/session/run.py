@@ -78,8 +78,7 @@ class Run:
 
     async def _begin(self) -> bool:
         """Opens control and the recording. False when refused: the state is as before the go."""
-        bench = self._bench
-        resting = StationState.PAUSED if bench.recording is not None else StationState.IDLE
+        bench, resting = self._bench, self._bench.resting
         try:
             if bench.recording is not None:
                 # Nothing moves by poses that a restart would not find again.

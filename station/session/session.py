@@ -120,8 +120,8 @@ class Session:
             return
         self._void_go()
         self.store.update(lease=self.leases.lease)
-        if self.store.state in RUNNING and self.store.state is not StationState.SEALING:
-            await self._halt(StationState.PAUSED, how.format(holder) + ": give a new go to go on")
+        if self.store.state in RUNNING:
+            await self._halt(self.bench.resting, how.format(holder) + ": give a new go to go on")
 
     async def _halt(self, state: StationState, reason: str) -> None:
         bench, run = self.bench, self._run
@@ -142,7 +142,7 @@ class Session:
         self._require("acknowledge")
         try:
             self.bench.cell.robot.latest()
-            resting = StationState.IDLE if self.bench.recording is None else StationState.PAUSED
+            resting = self.bench.resting
         except RobotError:
             resting = StationState.DISCONNECTED
         self.store.enter(resting)

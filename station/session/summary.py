@@ -14,7 +14,7 @@ from station.session.guard import displacement
 from station.session.lease import GoDesk
 from station.session.patience import RestingCheck
 from station.session.queue import PoseQueue, Replanned
-from station.status import GoSummary, StationState
+from station.status import GoSummary
 
 POSE_OVERHEAD_S = 0.8
 """Settle, expose, look, write: what a stop takes beside the move."""
@@ -124,8 +124,6 @@ def _warnings(bench: Bench) -> list[str]:
     slider = bench.cell.robot.latest().target_speed_fraction
     if slider < _SLOW_SLIDER:
         warnings.append(f"the speed slider stands at {100 * slider:.0f} %")
-    if bench.recording is None and bench.store.state is StationState.PAUSED:
-        warnings.append("this begins a new recording")
     if bench.cell.simulated:
         warnings.append("SIMULATED cell: nothing real moves")
     return warnings

@@ -123,7 +123,7 @@ async def test_a_lost_lease_stops_it_and_voids_the_next_go(hover_rig: Rig, calib
         rig.session.go(1, waiting.go.token)
     await on_its_way(rig, calibration)
     await rig.session.lease_lost(1)
-    assert rig.state is S.PAUSED
+    assert rig.state is S.IDLE
     assert "connection" in rig.session.store.status.reason
     assert "stop" in rig.arm.log
 

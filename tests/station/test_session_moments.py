@@ -10,6 +10,7 @@ import pytest
 
 from station import limits
 from station.errors import RefusedError
+from station.plan.model import Plan
 from station.session import run, session
 from station.status import StationState as S
 from tests.station.session_rig import POSES, HeldDisk, Rig
@@ -48,6 +49,19 @@ async def test_finish_while_control_starts_seals_without_a_move(rig: Rig) -> Non
     await rig.until(S.IDLE, S.FAULT)
     assert rig.state is S.IDLE, rig.session.store.status.reason
     assert "move" not in rig.arm.log and rig.session.store.status.session.recording
+
+
+async def test_a_lost_lease_before_anything_is_recorded_leaves_no_paused_session(
+    rig: Rig, small_plan: Plan
+) -> None:
+    HeldStart(rig)
+    await rig.give_go()
+    await rig.until_true(lambda: rig.arm.control)
+    await rig.session.lease_lost(1)
+    assert rig.state is S.IDLE and "stop" in rig.arm.log
+    assert "connection" in rig.session.store.status.reason
+    rig.session.take_lease(1, "anna")
+    rig.session.load_plan(1, small_plan)  # neither finish nor resume would have had anything to do
 
 
 async def test_finish_before_a_way_that_is_not_free_seals(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

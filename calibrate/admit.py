@@ -6,6 +6,7 @@ import numpy as np
 
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import is_rigid
+from calibrate.projection import camera_matrix
 from calibrate.views import ImageView, ViewSet
 
 MIN_VIEWS = 4
@@ -39,17 +40,7 @@ def _require_camera(views: ViewSet) -> None:
         if any(len(view.pixels) for view in views):
             raise BadViewsError("No camera matrix: calibrate the intrinsics first.")
         return
-    K = np.array(views.camera.matrix)
-    if (
-        K.shape != (3, 3)
-        or not np.isfinite(K).all()
-        or abs(np.linalg.det(K)) < 1e-9
-        or K[0, 0] <= 0
-        or K[1, 1] <= 0
-    ):
-        raise BadViewsError(
-            f"The camera matrix is singular or not a camera matrix: {K.tolist()}. Give fx, fy > 0 in pixels."
-        )
+    camera_matrix(views.camera)
     if not np.isfinite(views.camera.distortion).all():
         raise BadViewsError("The lens distortion contains NaN or infinity.")
 

@@ -34,6 +34,15 @@ def dictionary_id(name: str) -> int:
     return value
 
 
+def _require_markers(spec: BoardSpec, dictionary: str, count: int) -> None:
+    held = len(cv2.aruco.getPredefinedDictionary(dictionary_id(dictionary)).bytesList)
+    if count > held:
+        raise BoardError(
+            f"board: {spec.columns} × {spec.rows} needs {count} markers, {dictionary} holds {held}. "
+            "Fewer columns and rows, or a larger dictionary."
+        )
+
+
 def check_board(spec: BoardSpec) -> None:
     """Raises BoardError where the numbers cannot belong to a real board."""
     smallest = 1 if spec.kind is BoardKind.APRIL_GRID else 2
@@ -45,11 +54,11 @@ def check_board(spec: BoardSpec) -> None:
     if not 1e-4 <= spec.square_m <= 10.0:
         raise BoardError(f"board: square_m = {spec.square_m} is not a size in metres (25 mm is 0.025).")
     if spec.kind is BoardKind.CHARUCO:
-        dictionary_id(spec.dictionary or "")
+        _require_markers(spec, spec.dictionary or "", spec.columns * spec.rows // 2)
         if spec.marker_m is None or not 0 < spec.marker_m < spec.square_m:
             raise BoardError("board: a charuco board needs marker_m, smaller than square_m.")
     elif spec.kind is BoardKind.APRIL_GRID:
-        dictionary_id(spec.dictionary or APRIL_DICTIONARY)
+        _require_markers(spec, spec.dictionary or APRIL_DICTIONARY, spec.columns * spec.rows)
         if spec.marker_m is None or not 0 < spec.marker_m < spec.square_m:
             raise BoardError(
                 "board: an april-grid needs marker_m, the gap between tags, smaller than square_m."

@@ -71,7 +71,8 @@ class Evidence:
 def read_limits(path: Path) -> GateLimits:
     """YAML with some of GateLimits' fields. Raises GatesError naming file and field."""
     try:
-        return strict_yaml.load(path.read_bytes(), GateLimits)
+        with path.open("rb") as file:
+            return strict_yaml.load(file.read(strict_yaml.LIMIT_BYTES + 1), GateLimits)
     except (OSError, strict_yaml.StrictYamlError) as problem:
         raise GatesError(f"{path}: {problem}. Allowed: {', '.join(GateLimits.__struct_fields__)}.") from None
 

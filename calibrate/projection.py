@@ -75,9 +75,16 @@ def camera_matrix(camera: CameraModel) -> Array:
     if camera.matrix is None:
         raise BadViewsError("the camera's intrinsics are not known yet: calibrate them first")
     K = np.array(camera.matrix, dtype=float)
-    if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
+    if (
+        K.shape != (3, 3)
+        or not np.isfinite(K).all()
+        or not (K[0, 0] > 0 and K[1, 1] > 0)
+        or K[1, 0] != 0
+        or K[2].tolist() != [0, 0, 1]
+    ):
         raise BadViewsError(
-            f"the camera matrix {camera.matrix} is not one: 3 × 3, finite, positive focal lengths are needed"
+            f"the camera matrix {camera.matrix} is not one: [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] is "
+            "needed, finite, with positive focal lengths in pixels"
         )
     return K
 

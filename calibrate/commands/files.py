@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
+import msgspec
 import numpy as np
 import yaml
 
 from calibrate.board import check_board
 from calibrate.calibration import FORMAT, read_calibration
 from calibrate.errors import CalibrationError
+from calibrate.intrinsics import LensModel
 from calibrate.lens import distortion
 from calibrate.projection import camera_matrix
 from recordings import strict_yaml
@@ -42,6 +44,8 @@ def read_camera(path: Path) -> CameraModel:
         camera = _camera_info(path, plain)
     else:
         camera = _strictly(path, CameraModel, "camera")
+    if camera.width < 1 or camera.height < 1:
+        raise InputFileError(f"{path}: {camera.width}×{camera.height} is no picture size.")
     camera_matrix(camera)
     distortion(camera)
     return camera
@@ -57,14 +61,20 @@ def read_cell_serials(path: Path) -> tuple[str, str]:
 
 
 def _camera_info(path: Path, plain: dict[str, Any]) -> CameraModel:
+    model = plain.get("distortion_model", "plumb_bob")
+    if model not in get_args(LensModel):
+        known = ", ".join(get_args(LensModel))
+        raise InputFileError(f"{path}: distortion_model {model!r} is not known here; known are {known}.")
     try:
-        return CameraModel(
-            width=int(plain["image_width"]),
-            height=int(plain["image_height"]),
-            matrix=tuple(map(tuple, np.array(plain["camera_matrix"]["data"], float).reshape(3, 3).tolist())),
-            distortion=tuple(map(float, plain["distortion_coefficients"]["data"])),
-            distortion_model=plain.get("distortion_model", "plumb_bob"),
-        )
+        fields = {
+            "width": plain["image_width"],
+            "height": plain["image_height"],
+            "matrix": np.array(plain["camera_matrix"]["data"], float).reshape(3, 3).tolist(),
+            # one by one: PyYAML takes 1e-05 for a text
+            "distortion": [float(value) for value in plain["distortion_coefficients"]["data"]],
+            "distortion_model": model,
+        }
+        return msgspec.convert(fields, CameraModel)
     except (KeyError, TypeError, ValueError) as problem:
         raise InputFileError(f"{path}: not a whole camera_info file ({problem!r}).") from None
 

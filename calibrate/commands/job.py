@@ -46,13 +46,15 @@ Threads = Annotated[
     int | None, typer.Option(min=1, help="For finding boards; the result does not depend on it")
 ]
 Distance = Annotated[
-    float | None, typer.Option("--working-distance-mm", min=1.0, help="Where the error is stated")
+    float | None, typer.Option("--working-distance-mm", min=1.0, max=1e5, help="Where the error is stated")
 ]
 
 TimeLimit = Annotated[
-    float, typer.Option(min=0.0, help="A solve ends with an error after so long; 0: no limit")
+    float, typer.Option(min=0.0, max=1e6, help="A solve ends with an error after so long; 0: no limit")
 ]
-MemoryLimit = Annotated[int, typer.Option(min=0, help="… when its process needs so much; 0: no limit")]
+MemoryLimit = Annotated[
+    int, typer.Option(min=0, max=2**30, help="… when its process needs so much; 0: no limit")
+]
 
 
 def takes(build: Callable[..., JobOptions]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:

@@ -52,6 +52,16 @@ def rasterise(sheet: Sheet) -> np.ndarray:
     return cv2.resize(canvas, None, fx=1 / fine, fy=1 / fine, interpolation=cv2.INTER_AREA)
 
 
+@pytest.mark.parametrize(
+    ("kind", "columns", "rows", "held"), [(BoardKind.CHARUCO, 10, 10, 50), (BoardKind.APRIL_GRID, 5, 10, 50)]
+)
+def test_a_board_needs_no_more_markers_than_its_dictionary_holds(kind, columns, rows, held) -> None:  # type: ignore[no-untyped-def]
+    spec = BoardSpec(kind, columns, rows, 0.02, 0.015, "DICT_4X4_50")
+    assert board_sheet(spec).shapes
+    with pytest.raises(BoardError, match=f"needs {held + 5} markers, DICT_4X4_50 holds {held}"):
+        board_sheet(BoardSpec(kind, columns, rows + 1, 0.02, 0.015, "DICT_4X4_50"))
+
+
 @pytest.mark.parametrize("spec", BOARDS, ids=lambda s: f"{s.kind.value}-{s.columns}x{s.rows}")
 def test_every_printed_board_is_found_whole_and_to_scale(spec: BoardSpec) -> None:
     found = detect(rasterise(board_sheet(spec)), spec)

@@ -13,10 +13,13 @@ from subprocess import CompletedProcess
 import msgspec
 import numpy as np
 import pytest
+import yaml
 
 from calibrate.calibration import read_calibration, write_calibration
 from calibrate.cli import main
 from calibrate.commands import output
+from calibrate.commands.files import read_camera
+from calibrate.errors import CalibrationError
 from recordings.excerpt import write_excerpt
 from recordings.messages import CameraModel
 from recordings.reader import open_recording
@@ -190,6 +193,7 @@ def test_wrong_usage_is_exit_2_and_says_what_is_allowed(session_file: Path, tmp_
     refused(run("solve", session_file, "--profile", "nix", cwd=tmp_path), 2, "robust")
     for option in ("--threads", "--time-limit-s", "--memory-limit-mib", "--seed", "--working-distance-mm"):
         refused(run("solve", session_file, option, "-3", cwd=tmp_path), 2, option)
+        refused(run("solve", session_file, option, "1e300", cwd=tmp_path), 2, option)
     refused(run("solve", cwd=tmp_path), 2)
     refused(run("export", "c.yaml", "--to", "nix", cwd=tmp_path), 2, "urdf")
 
@@ -287,6 +291,38 @@ def test_a_lens_known_before_can_be_given(session_file: Path, real_file: Path, t
     first, second = json.loads(by_info.stdout), json.loads(by_file.stdout)
     assert first["result"] == second["result"]
     assert CameraModel(480, 384).width == first["intrinsics"]["width"]
+
+
+@pytest.mark.parametrize(
+    ("field", "value", "says"),
+    [
+        ("distortion_model", "fisheye", "'fisheye' is not known here; known are plumb_bob"),
+        ("distortion_model", None, "None is not known here"),
+        ("image_width", float("inf"), "camera_info"),
+        ("image_height", 0, "480×0 is no picture size"),
+        ("camera_matrix", {"data": [900, 0, 240, 9, 900, 190, 0, 0, 1]}, "is not one"),
+        ("camera_matrix", {"data": [900, 0, 0, 0, 900, 0, 240, 190, 1]}, "is not one"),
+        ("camera_matrix", {"data": [900, 0, 240, 0, 900, 190, 0, 0, 2]}, "is not one"),
+        ("camera_matrix", {"data": [900, 0, 240, 0, 900, float("nan"), 0, 0, 1]}, "is not one"),
+        ("distortion_coefficients", {"data": [0] * 9}, "does not fit plumb_bob"),
+    ],
+)
+def test_a_lens_that_is_none_is_never_used(tmp_path: Path, field: str, value: object, says: str) -> None:
+    """Taken for another model or read in another order it would give a wrong X, and no gate need fail."""
+    info = {
+        "image_width": 480,
+        "image_height": 384,
+        "camera_matrix": {"data": [900, 0, 240, 0, 900, 190, 0, 0, 1]},
+        "distortion_model": "plumb_bob",
+        "distortion_coefficients": {"data": ["1e-05", 0, 0, 0, 0]},  # 1e-05 is a text to PyYAML
+    }
+    path = tmp_path / "info.yaml"
+    path.write_text(yaml.safe_dump(info))
+    assert read_camera(path).distortion[0] == 1e-5
+    path.write_text(yaml.safe_dump(info | {field: value}))
+    with pytest.raises(CalibrationError) as problem:
+        read_camera(path)
+    assert says in str(problem.value)
 
 
 def test_few_views_are_refused(tmp_path: Path) -> None:

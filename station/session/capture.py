@@ -10,7 +10,6 @@ import msgspec
 import numpy as np
 
 from calibrate.geometry import Array, inverse, pose_from_rotvec
-from recordings.errors import RecordingError
 from recordings.messages import Matrix4, Picture, RobotState, Stamps, Stillness, Vector6, View
 from station.analysis import Sighting, sight
 from station.devices.frames import mid_exposure
@@ -18,6 +17,7 @@ from station.errors import CameraError, StaleStateError, StationError
 from station.session.bench import Bench, SeenView
 from station.session.patience import RestingCheck
 from station.session.picture_watch import PictureWatch
+from station.session.recording import to_the_end
 from station.status import PoseState, StationState
 from station.workers import WorkerError
 
@@ -51,17 +51,7 @@ async def take_pose(bench: Bench, index: int, attempt: int) -> None:
     view = _view(bench, index, attempt, picture, state, still, camera_bound_s)
     _require_bound(bench, view)
     _phase(bench, index, StationState.WRITING, "writing")
-    writing = asyncio.ensure_future(_write(bench, index, picture, view))
-    try:
-        await asyncio.shield(writing)
-    except asyncio.CancelledError:
-        # STOP halts the arm, never the disk, however often it comes: what was taken is kept.
-        while not writing.done():
-            with contextlib.suppress(asyncio.CancelledError):
-                await asyncio.wait({writing})
-        if isinstance(failed := writing.exception(), RecordingError):
-            raise failed from None
-        raise
+    await to_the_end(_write(bench, index, picture, view))
 
 
 def _phase(bench: Bench, index: int, state: StationState, pose_state: PoseState) -> None:

@@ -11,8 +11,8 @@ from station.errors import StationError
 from station.session.bench import Bench, SeenView
 from station.session.folder import interrupted_session
 from station.session.queue import PoseQueue
-from station.session.recording import SessionRecording
-from station.session.run import recover_parts, seal
+from station.session.recording import SessionRecording, to_the_end
+from station.session.run import recover_parts, seal, sealed
 from station.status import StationState
 from station.workers import WorkerError
 
@@ -83,13 +83,11 @@ async def close_or_seal(bench: Bench) -> None:
 
 async def close_interrupted(bench: Bench) -> None:
     """Nothing was added since the crash: what is whole becomes the recording. Raises RecordingError."""
-    recording, queue = bench.require_recording(), bench.require_queue()
     bench.store.enter(StationState.SEALING)
+    await to_the_end(_make_whole(bench, bench.require_recording()))
+
+
+async def _make_whole(bench: Bench, recording: SessionRecording) -> None:
     await recover_parts(bench, recording)
-    whole = recording.whole
-    await recording.save_state(queue, whole)
-    bench.recording = None
-    bench.store.update(session=msgspec.structs.replace(bench.store.status.session, recording=str(whole)))
-    if bench.store.state is StationState.SEALING:  # a STOP meanwhile stays latched
-        bench.store.enter(StationState.IDLE)
-    bench.store.event(f"sealed: {whole}, {queue.done} of {len(queue.statuses)} poses")
+    await recording.save_state(bench.require_queue(), recording.whole)
+    sealed(bench, recording.whole)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import platform
 import threading
 import time
+from collections.abc import Coroutine
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
@@ -37,6 +39,8 @@ _PACKAGES = (
 )  # fmt: skip
 SYNC_TIMEOUT_S = 30.0
 
+R = TypeVar("R")
+
 
 def software() -> dict[str, str]:
     """Versions of what takes part in a capture."""
@@ -47,6 +51,20 @@ def software() -> dict[str, str]:
         except PackageNotFoundError:
             found[package] = "absent"
     return found
+
+
+async def to_the_end(work: Coroutine[Any, Any, R]) -> R:
+    """What it returns or raises. STOP halts the arm, never the disk: who is cancelled waits for it."""
+    writing = asyncio.ensure_future(work)
+    try:
+        return await asyncio.shield(writing)
+    except asyncio.CancelledError:
+        while not writing.done():
+            with contextlib.suppress(asyncio.CancelledError):
+                await asyncio.wait({writing})
+        if isinstance(failed := writing.exception(), RecordingError):
+            raise failed from None
+        raise
 
 
 def stamps_now(controller_s: float = 0.0) -> Stamps:
@@ -218,7 +236,7 @@ class SessionRecording:
             recording=str(recording or ""),
         )
         async with self._saving:
-            await asyncio.to_thread(self._write_state, state)
+            await to_the_end(asyncio.to_thread(self._write_state, state))  # the next one is newer
 
     def _write_state(self, state: SessionState) -> None:
         try:

@@ -6,6 +6,7 @@ import asyncio
 import logging
 import time
 from collections.abc import Sequence
+from pathlib import Path
 
 import msgspec
 import numpy as np
@@ -21,7 +22,7 @@ from station.session.capture import PoseFailedError, take_pose
 from station.session.guard import JOGGED_RAD
 from station.session.lease import START_TOLERANCE_RAD, Go
 from station.session.patience import RestingCheck
-from station.session.recording import SessionRecording
+from station.session.recording import SessionRecording, to_the_end
 from station.status import StationState
 from station.stillness import NotStillError
 
@@ -267,16 +268,24 @@ async def recover_parts(bench: Bench, recording: SessionRecording) -> None:
 
 async def seal(bench: Bench) -> None:
     """sealing → idle. A disk that fails leaves a fault; the `.part` file is kept for recovery."""
-    recording, queue = bench.require_recording(), bench.require_queue()
     bench.store.enter(StationState.SEALING)
     bench.show_poses()
     bench.pause_wanted, bench.finish_wanted = "", False
-    path = await recording.seal(queue)
+    await to_the_end(_seal(bench))
+
+
+async def _seal(bench: Bench) -> None:
+    sealed(bench, await bench.require_recording().seal(bench.require_queue()))
+
+
+def sealed(bench: Bench, path: Path) -> None:
+    """The session is whole. A STOP meanwhile stays latched; was it acknowledged, nothing is left paused."""
+    queue = bench.require_queue()
     bench.recording = None
     session = msgspec.structs.replace(bench.store.status.session, recording=str(path), remaining_s=0.0)
     bench.store.update(session=session)
     bench.store.event(f"sealed: {path}, {queue.done} of {len(queue.statuses)} poses")
-    if bench.store.state is StationState.SEALING:
+    if bench.store.state in (StationState.SEALING, StationState.PAUSED):
         bench.store.enter(StationState.IDLE)
 
 

@@ -41,6 +41,8 @@ from station.stillness import StillnessMonitor
 from station.workers import Workers
 
 END_RUN_S = 10.0
+STOP_WAIT_S = 1.0
+"""The answer to STOP waits no longer for what still goes to the disk: the arm stands."""
 PLAN_TIMEOUT_S = 180.0
 
 
@@ -125,16 +127,15 @@ class Session:
 
     async def _halt(self, state: StationState, reason: str) -> None:
         bench, run = self.bench, self._run
-        keep_running = self.store.state in (StationState.WRITING, StationState.SEALING)
         self._void_go()
         bench.halting, bench.pause_wanted, bench.finish_wanted = True, "", False
         self.store.enter(state, reason)
-        if run is not None and not keep_running:
+        if run is not None:
             run.cancel()
         await bench.cell.robot.stop(reason)
         self.store.event(reason, "warning")
         if run is not None:
-            await asyncio.wait({run}, timeout=END_RUN_S)
+            await asyncio.wait({run}, timeout=STOP_WAIT_S)
         unmark_busy(bench)
 
     def acknowledge(self, who: str) -> None:
@@ -231,7 +232,10 @@ class Session:
             raise RefusedError("nothing is recorded yet: there is nothing to finish")
         await asyncio.gather(self._run_ended(), self.free_drive.last_picture())
         self._require("finish")
-        await close_or_seal(self.bench)
+        self._run = closing = asyncio.create_task(close_or_seal(self.bench))  # nothing new begins beside it
+        await asyncio.wait({closing})
+        if not closing.cancelled():
+            closing.result()
 
     async def _run_ended(self) -> None:
         """RefusedError when it does not: nothing new begins beside it."""

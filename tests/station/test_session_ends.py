@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import threading
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -10,8 +11,11 @@ from typing import Any
 
 import pytest
 
-from station.errors import RobotError
+from station.attend import STOP_ANSWER_S
+from station.errors import RefusedError, RobotError
 from station.estimation import running_estimate
+from station.session import session
+from station.session.folder import SessionState
 from station.session.recording import SessionRecording
 from station.status import StationState as S
 from station.workers import WorkerError, Workers
@@ -121,6 +125,89 @@ async def test_a_picture_being_written_outlives_every_halt(rig: Rig, held_disk: 
     held_disk.set()
     await asyncio.wait({run})
     assert rig.pose_states[0] == "done"
+
+
+async def test_stop_is_answered_before_a_slow_disk_has_the_picture(rig: Rig, held_disk: HeldDisk) -> None:
+    await rig.give_go()
+    await rig.until(S.WRITING)
+    await asyncio.wait_for(rig.session.stop("bert"), STOP_ANSWER_S)  # else `station capture` says: no answer
+    assert "stop" in rig.arm.log
+    held_disk.set()
+    await rig.until_true(lambda: "done" in rig.pose_states)
+
+
+async def test_of_two_states_of_a_session_the_newer_one_stays_on_the_disk(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await rig.go_until_it_moves()
+    recording, queue = rig.session.bench.require_recording(), rig.session.bench.require_queue()
+    disk, begun, written = threading.Event(), [], []
+
+    def slow(self: SessionRecording, state: SessionState) -> None:
+        begun.append(1)
+        if len(begun) == 1:
+            disk.wait(5)
+        written.append(len(state.poses))
+
+    monkeypatch.setattr(SessionRecording, "_write_state", slow)
+    older = asyncio.create_task(recording.save_state(queue))
+    await asyncio.sleep(0.01)
+    older.cancel()  # as STOP does
+    queue.drop(POSES - 1)
+    newer = asyncio.create_task(recording.save_state(queue))
+    await asyncio.sleep(0.05)
+    disk.set()
+    await asyncio.wait({older, newer})
+    assert written == [POSES, POSES - 1]
+
+
+class HeldSeal(asyncio.Event):
+    """A recording that is not sealed before this is set; `begun` counts."""
+
+    begun = 0
+
+
+@pytest.fixture
+def held_seal(monkeypatch: pytest.MonkeyPatch) -> HeldSeal:
+    held, seal = HeldSeal(), SessionRecording.seal
+
+    async def slow(recording: SessionRecording, queue: Any) -> Any:
+        held.begun += 1
+        await held.wait()
+        return await seal(recording, queue)
+
+    monkeypatch.setattr(SessionRecording, "seal", slow)
+    return held
+
+
+@pytest.mark.parametrize("by", ["the run's end", "finish"])
+async def test_nothing_begins_beside_a_sealing_that_stop_came_into(
+    rig: Rig, held_seal: HeldSeal, monkeypatch: pytest.MonkeyPatch, by: str
+) -> None:
+    monkeypatch.setattr(session, "END_RUN_S", 0.05)
+    monkeypatch.setattr(session, "STOP_WAIT_S", 0.05)
+    finishing: asyncio.Future[None] | None = None
+    if by == "finish":
+        await rig.go_until_it_moves()
+        await rig.pause_after_this_pose("anna")
+        finishing = asyncio.ensure_future(rig.session.finish(1))
+    else:
+        await rig.give_go()
+    await rig.until(S.SEALING)
+    for _ in range(2):
+        await rig.session.stop("bert")
+        rig.session.acknowledge("anna")
+        with pytest.raises(RefusedError, match="still ending"):
+            await rig.session.prepare(1, "resume")
+        with pytest.raises(RefusedError, match="still ending"):
+            await rig.session.finish(1)
+    moves = rig.arm.log.count("move")
+    held_seal.set()
+    await rig.until(S.IDLE)
+    if finishing is not None:
+        await finishing
+    assert held_seal.begun == 1 and rig.session.store.status.session.recording
+    assert rig.arm.log.count("move") == moves
 
 
 async def test_a_fault_between_moves_stops_the_arm_by_both_ways(rig: Rig, held_disk: HeldDisk) -> None:

@@ -88,7 +88,6 @@ class UrRobot(UrLink):
         await self._may_start()
         if why := self._why_stopped():
             raise RobotError(f"stopped before control started{why}")
-        self._log_path.parent.mkdir(parents=True, exist_ok=True)
         child = self._child = ControlChild.spawn(self.config.host, self._log_path)
         try:
             tcp = await child.ready()

@@ -14,7 +14,7 @@ import sys
 import time
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 from station.errors import RobotError
 
@@ -57,22 +57,29 @@ class ControlChild:
 
     @classmethod
     def spawn(cls, host: str, log_path: Path) -> ControlChild:
-        """Starts the process (milliseconds). From the loop's thread: the child dies with that thread."""
-        with contextlib.suppress(FileNotFoundError):
-            if log_path.stat().st_size > LOG_LIMIT_BYTES:
-                log_path.replace(log_path.with_suffix(".log.1"))
+        """Starts the process (milliseconds). From the loop's thread: the child dies with that thread.
+
+        Raises RobotError when this computer does not let it.
+        """
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
         ours.setblocking(False)
         command = [sys.executable, "-m", "station.devices.ur_control", host, str(theirs.fileno())]
-        with theirs, log_path.open("ab") as log:
-            process = subprocess.Popen(
-                [*command, str(os.getpid())],
-                stdin=subprocess.DEVNULL,
-                stdout=log,
-                stderr=log,
-                pass_fds=(theirs.fileno(),),
-                start_new_session=True,
-            )
+        try:
+            with theirs, _log(log_path) as log:
+                process = subprocess.Popen(
+                    [*command, str(os.getpid())],
+                    stdin=subprocess.DEVNULL,
+                    stdout=log,
+                    stderr=log,
+                    pass_fds=(theirs.fileno(),),
+                    start_new_session=True,
+                )
+        except OSError as error:
+            ours.close()
+            raise RobotError(
+                f"the control process, which logs to {log_path}, cannot be started ({error}): make room on "
+                "this computer's disk or in its memory, then give a new go"
+            ) from None
         return cls(process, ours, log_path)
 
     @property
@@ -178,10 +185,13 @@ class ControlChild:
     async def end(self, timeout_s: float = END_S) -> None:
         """Ends script and process in good order, by force when that takes too long. Reaps it."""
         self._send({"do": "end"})
-        with contextlib.suppress(TimeoutError):
+        try:
             async with asyncio.timeout(timeout_s):
                 await self.gone.wait()
-        self.kill()
+        except TimeoutError:
+            pass
+        finally:
+            self.kill()  # cancelled, too: a process left behind would keep the robot's registers
         await self.reap()
 
     async def end_after_stop(self, moment_s: float) -> None:
@@ -255,6 +265,15 @@ class ControlChild:
                 waiter.set_result(died)
         if not self.stop_acknowledged.done():
             self.stop_acknowledged.set_result(None)
+
+
+def _log(path: Path) -> BinaryIO:
+    """Open for more; what grew too long is put aside once."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    with contextlib.suppress(FileNotFoundError):
+        if path.stat().st_size > LOG_LIMIT_BYTES:
+            path.replace(path.with_suffix(".log.1"))
+    return path.open("ab")
 
 
 def _refusal(text: str) -> str:

@@ -7,7 +7,7 @@ import json
 import os
 import socket
 import time
-from collections.abc import Callable
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
@@ -202,15 +202,60 @@ class Undying:
         return None
 
 
-async def test_a_process_that_does_not_end_holds_nobody_up(
-    monkeypatch: pytest.MonkeyPatch, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+class Parent:
+    """The parent's side beside a process that only this test answers for."""
+
+    def __init__(self, folder: Path) -> None:
+        ours, self.theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
+        self.theirs.setblocking(False)
+        self.process: Any = Undying()
+        self.child = ControlChild(self.process, ours, folder / "control.log")
+
+    async def asked(self) -> dict[str, Any]:
+        message = await asyncio.get_running_loop().sock_recv(self.theirs, 4096)
+        return dict(json.loads(message))
+
+    def answer(self, reply: dict[str, Any]) -> None:
+        self.theirs.send(json.dumps(reply).encode())
+
+
+@pytest.fixture
+async def parent(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[Parent]:
     monkeypatch.setattr(ur_child, "REAP_S", 0.05)
-    ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-    process: Any = Undying()
-    child = ControlChild(process, ours, tmp_path / "control.log")
+    made = Parent(tmp_path)
+    yield made
+    made.child.kill()
+    made.theirs.close()
+
+
+async def test_a_process_that_does_not_end_holds_nobody_up(
+    parent: Parent, caplog: pytest.LogCaptureFixture
+) -> None:
     async with asyncio.timeout(2.0):
-        await child.end(timeout_s=0.01)
-    theirs.close()
-    assert process.kills and child.gone.is_set()
+        await parent.child.end(timeout_s=0.01)
+    assert parent.process.kills and parent.child.gone.is_set()
     assert "did not end" in caplog.text
+
+
+async def test_a_stop_into_its_end_leaves_no_process_behind(parent: Parent) -> None:
+    ending = asyncio.create_task(parent.child.end(timeout_s=5.0))
+    assert await parent.asked() == {"do": "end"}
+    ending.cancel()
+    await asyncio.wait({ending})
+    assert parent.process.kills and parent.child.gone.is_set()
+
+
+async def test_a_move_that_was_not_taken_raises(parent: Parent) -> None:
+    moving = asyncio.create_task(parent.child.move([0.0] * 6, 0.5, 0.5))
+    number = (await parent.asked())["id"]
+    parent.answer({"id": number + 1, "ok": True, "error": ""})  # of another one
+    parent.answer({"id": number, "ok": False, "error": "a stop was asked for"})
+    with pytest.raises(RobotError, match="not started: a stop was asked for"):
+        await moving
+
+
+async def test_a_computer_that_starts_no_process_is_told_of_in_words(tmp_path: Path) -> None:
+    in_the_way = tmp_path / "log"
+    in_the_way.touch()
+    with pytest.raises(RobotError, match=r"cannot be started .*new go"):
+        ControlChild.spawn("127.0.0.1", in_the_way / "control.log")

@@ -39,10 +39,11 @@ class FreeDrive:
 
     async def begin(self, auto: bool) -> None:
         """Opens the recording if none is open. `auto`: a picture whenever the arm rests anew."""
+        if self.taking:
+            raise RefusedError("the last picture is still ending: try again in a moment")
         self._end_watch()
         bench, store = self._bench, self._bench.store
         bench.cell.robot.check()
-        resting = store.state
         bench.halting = False
         # At once, and taking: while the disk works nobody is offered a go, and no picture is begun.
         store.enter(StationState.FREE_DRIVE, "the recording is being opened")
@@ -50,8 +51,8 @@ class FreeDrive:
             try:
                 await self._open_recording()
             except BaseException:
-                if store.state is StationState.FREE_DRIVE:
-                    store.enter(resting)
+                if store.state in (StationState.FREE_DRIVE, StationState.PAUSED):
+                    store.enter(bench.resting)
                 raise
         if reason := refusal("record", store.state):
             raise RefusedError(reason)  # STOP, or the end of free drive, came in between
@@ -72,10 +73,15 @@ class FreeDrive:
             await recover_parts(bench, before)
         recording = before or SessionRecording(bench.root, bench.cell)
         picture = await bench.cell.camera.capture() if bench.cell.config.camera.model is None else None
-        await recording.open(queue, picture)
+        bench.recording = recording  # before it is open: after a STOP in between it must be closed
+        try:
+            await recording.open(queue, picture)
+        except BaseException:
+            bench.recording = before
+            raise
         if before is None:
             bench.forget_session()
-        bench.recording, bench.queue = recording, queue
+        bench.queue = queue
 
     def end(self) -> None:
         """To paused; the recording stays open."""

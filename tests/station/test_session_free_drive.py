@@ -7,8 +7,12 @@ import contextlib
 
 import pytest
 
+from recordings.errors import RecordingError
+from recordings.messages import Picture
 from station.errors import RefusedError, TriggerError
 from station.session import free_drive
+from station.session.queue import PoseQueue
+from station.session.recording import SessionRecording
 from station.status import StationState as S
 from station.stillness import StillnessMonitor
 from tests.station.session_rig import POSES, Rig, sealed
@@ -127,3 +131,54 @@ async def test_no_go_is_given_while_free_drive_begins(rig: Rig, monkeypatch: pyt
     opened.set()
     await beginning
     assert rig.state is S.FREE_DRIVE
+
+
+async def test_free_drive_does_not_begin_beside_a_picture_that_a_lost_lease_left(
+    bare_rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig, comes, capture = bare_rig, asyncio.Event(), bare_rig.camera.capture
+
+    async def slow(timeout_s: float = 5.0) -> Picture:
+        await comes.wait()
+        return await capture(timeout_s)
+
+    monkeypatch.setattr(rig.camera, "capture", slow)
+    await rig.session.switch_free_drive(1, True, auto=False)
+    taking = asyncio.ensure_future(rig.session.record(1))
+    await rig.until(S.CAPTURING)
+    await rig.session.lease_lost(1)
+    rig.session.take_lease(1, "anna")
+    with pytest.raises(RefusedError, match="still ending"):
+        await rig.session.switch_free_drive(1, True, auto=False)
+    comes.set()
+    await taking
+    await rig.session.switch_free_drive(1, True, auto=False)
+    assert rig.state is S.FREE_DRIVE
+
+
+@pytest.mark.parametrize("fails", [False, True])
+async def test_stop_while_free_drive_opens_the_recording_leaves_a_way_on(
+    bare_rig: Rig, monkeypatch: pytest.MonkeyPatch, fails: bool
+) -> None:
+    rig, disk, opening = bare_rig, asyncio.Event(), SessionRecording.open
+
+    async def slow(recording: SessionRecording, queue: PoseQueue, picture: Picture | None = None) -> None:
+        await disk.wait()
+        if fails:
+            raise RecordingError("no space left on device")
+        await opening(recording, queue, picture)
+
+    monkeypatch.setattr(SessionRecording, "open", slow)
+    beginning = asyncio.ensure_future(rig.session.switch_free_drive(1, True, auto=False))
+    await rig.until(S.FREE_DRIVE)
+    await rig.session.stop("bert")
+    rig.session.acknowledge("anna")
+    disk.set()
+    with pytest.raises(RecordingError if fails else RefusedError):
+        await beginning
+    assert (rig.state, rig.session.bench.recording is None) == (
+        (S.IDLE, True) if fails else (S.PAUSED, False)
+    )
+    if not fails:
+        await rig.session.finish(1)  # in idle it was refused, and so was every plan
+        assert rig.state is S.IDLE

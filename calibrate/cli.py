@@ -13,12 +13,12 @@ def main() -> None:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from calibrate.commands.app import app
     from calibrate.errors import CalibrationError
-    from recordings.errors import RecordingError
+    from recordings.errors import RecordingError, printed
 
     try:
         app(prog_name="calibrate")  # the station calls it as a module
     except (CalibrationError, RecordingError) as problem:
-        print(f"calibrate: {problem}", file=sys.stderr)
+        print(f"calibrate: {printed(problem)}", file=sys.stderr)
         sys.exit(problem.exit_code)
 
 

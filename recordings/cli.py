@@ -15,7 +15,7 @@ import typer
 from rich.console import Console
 from rich.progress import Progress
 
-from recordings.errors import RecordingError
+from recordings.errors import RecordingError, printed
 from recordings.excerpt import write_excerpt
 from recordings.export import Target, export_recording
 from recordings.importer import import_folder
@@ -140,7 +140,7 @@ def main() -> None:
     try:
         app()
     except RecordingError as problem:
-        print(f"recordings: {problem}", file=sys.stderr)
+        print(f"recordings: {printed(problem)}", file=sys.stderr)
         sys.exit(problem.exit_code)
 
 

@@ -15,6 +15,12 @@ class RecordingError(Exception):
     exit_code = 1
 
 
+def printed(problem: Exception) -> str:
+    """An error as all commands print it: without a full stop at its end."""
+    said = str(problem)
+    return said[:-1] if said.endswith(".") and not said.endswith((" .", "/.", "..")) else said
+
+
 class UnsealedRecordingError(RecordingError):
     """The file was never finished or is cut; `recordings recover` can help."""
 

@@ -14,7 +14,7 @@ from typing import Annotated
 import typer
 
 from calibrate.errors import CalibrationError
-from recordings.errors import RecordingError
+from recordings.errors import RecordingError, printed
 from station.cli_control import app as control
 from station.client import default_socket
 from station.console import Socket
@@ -106,7 +106,7 @@ def main() -> None:
     try:
         command_line(sys.argv[1:])()
     except (StationError, RecordingError, CalibrationError) as problem:
-        print(f"station: {problem}", file=sys.stderr)
+        print(f"station: {printed(problem)}", file=sys.stderr)
         sys.exit(problem.exit_code)
     except KeyboardInterrupt:
         sys.exit(130)

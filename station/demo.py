@@ -153,7 +153,8 @@ async def _solve(recording: Path, calibration: Path, report: Path) -> dict[str, 
             child.kill()
         raise
     if child.returncode not in (0, _GATE_FAILED):
-        raise DemoError(words.decode(errors="replace").strip() or f"calibrate ended with {child.returncode}")
+        said = words.decode(errors="replace").strip().removeprefix("calibrate: ")
+        raise DemoError(said or f"calibrate ended with {child.returncode}")
     result: dict[str, Any] = json.loads(out)
     return result
 

@@ -10,6 +10,7 @@ import pytest
 import calibrate.cli
 import recordings.cli
 import station.cli
+from recordings.errors import RecordingError, printed
 from tests.command_line import call
 
 
@@ -34,3 +35,19 @@ def test_an_error_begins_with_the_name_of_its_command(
     assert done.returncode in (1, 2)
     assert done.stderr.startswith(f"{command}: ") and "none" in done.stderr
     assert not done.stdout and "Traceback" not in done.stderr
+    assert not done.stderr.strip().endswith(".")
+
+
+@pytest.mark.parametrize(
+    ("said", "told"),
+    [
+        ("x.yaml: no such file.", "x.yaml: no such file"),
+        ("what. Do that.", "what. Do that"),
+        ("nothing in .", "nothing in ."),
+        ("nothing in ..", "nothing in .."),
+        ("nothing in a/.", "nothing in a/."),
+        ("", ""),
+    ],
+)
+def test_an_error_is_printed_without_a_full_stop_and_a_folder_keeps_its_own(said: str, told: str) -> None:
+    assert printed(RecordingError(said)) == told

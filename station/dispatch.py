@@ -178,7 +178,9 @@ class SessionDispatcher:
             return self._session.take_lease(caller.client_id, caller.who)
         if args.action == "release":
             return await self._to_the_end(self._session.release_lease(caller.client_id))
-        raise RefusedError(f"lease: take or release, not '{args.action}'")
+        if args.action == "lost":
+            return await self._to_the_end(self._session.lease_lost(caller.client_id))
+        raise RefusedError(f"lease: take, release or lost, not '{args.action}'")
 
     async def _acknowledge(self, caller: _Caller, args: _Args) -> None:
         self._session.acknowledge(caller.who)

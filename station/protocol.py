@@ -22,7 +22,7 @@ CLIENT_LIMIT = 16
 Verb = Literal[
     "hello",  # {who} → {version, pid}
     "watch",  # → status, then changes
-    "lease",  # {action: take|release}
+    "lease",  # {action: take|release|lost}; lost: nobody is at the screen that holds it
     "stop",  # now; from anyone
     "acknowledge",  # leave `stopped` or `fault` after a person looked
     "plan",  # → the loaded plan

@@ -84,9 +84,15 @@ def check_transition(old: S, new: S) -> None:
         raise TransitionError(f"the station may not go from {old.value} to {new.value}")
 
 
+_SAID: dict[Verb, str] = {"prepare": "a go", "make_plan": "a new plan", "load_plan": "another plan"}
+"""What a person asked for, where the verb is the program's own."""
+
+
 def refusal(verb: Verb, state: S) -> str:
     """Why `verb` is not possible now, as a sentence for people; empty when it is."""
     if state in VERB_STATES[verb]:
         return ""
     reason = _REMEDIES.get(state, f"the session is {state.value}: pause or stop it first")
-    return f"{verb.replace('_', ' ')} is not possible now: {reason}."
+    if verb == "acknowledge":
+        reason = "nothing is stopped"
+    return f"{_SAID.get(verb, verb.replace('_', ' '))} is not possible now: {reason}"

@@ -55,6 +55,8 @@ class RobotStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     """Of the newest state."""
     safety: str = ""
     """NORMAL, PROTECTIVE STOP, EMERGENCY STOP … in words"""
+    held: str = ""
+    """What holds the arm (a stop, no power, brakes) and what to do at the pendant; empty: nothing"""
     mode: str = ""
     remote: bool | None = None
     program: str = ""
@@ -161,6 +163,8 @@ class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     remaining_s: float | None = None
     recording: str = ""
     """Path of the sealed recording, once there is one."""
+    calibration: str = ""
+    """Path of the calibration file that was made of it, once there is one."""
     source: Source = "real"
 
 
@@ -223,6 +227,8 @@ class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     state: StationState = StationState.DISCONNECTED
     reason: str = ""
     """Why stopped, paused or at fault, and what to do: the sentence for the top bar."""
+    pending: str = ""
+    """What comes after the pose under way: a pause or the end."""
     simulated: bool = False
     playback: bool = False
     cell: str = ""

@@ -177,7 +177,7 @@ class PlaybackRobot:
     def plan(self) -> Plan:
         """The recorded poses as a plan."""
         poses = tuple(
-            PlannedPose(v.name, _joints(v), v.base_from_flange, why="as recorded") for v in self.views
+            PlannedPose(v.name, _joints(v), v.base_from_flange, why="of the recording") for v in self.views
         )
         return Plan(self.identity.model, self._recording.info.mount, poses, note="playback")
 

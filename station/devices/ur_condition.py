@@ -67,10 +67,20 @@ _MODE_WORDS: dict[int, str] = {mode: mode.name.replace("_", " ") for mode in Rob
 
 def safety_stop(state: RobotState) -> SafetyStopError | None:
     """The reason why safety holds the arm, or None. Bits and mode both count: either may come first."""
+    sentence = _safety_sentence(state)
+    return SafetyStopError(f"{sentence}. Then acknowledge here and give a new go.") if sentence else None
+
+
+def _safety_sentence(state: RobotState) -> str:
     for bits, modes, sentence in _SAFETY_SENTENCES:
         if state.safety_status_bits & bits or state.safety_mode in modes:
-            return SafetyStopError(f"{sentence}. Then acknowledge here and give a new go.")
-    return None
+            return sentence
+    return ""
+
+
+def what_holds(state: RobotState) -> str:
+    """Why the arm cannot move now, and what to do about it; empty: nothing holds it."""
+    return _safety_sentence(state) or str(not_powered(state) or "")
 
 
 def not_powered(state: RobotState) -> RobotError | None:

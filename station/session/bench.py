@@ -82,7 +82,7 @@ class Bench:
         self.seen.clear()
         session = self.store.status.session
         fresh = msgspec.structs.replace(
-            session, name="", folder="", recording="", elapsed_s=0.0, remaining_s=None
+            session, name="", folder="", recording="", calibration="", elapsed_s=0.0, remaining_s=None
         )
         self.store.update(session=fresh)
 
@@ -104,6 +104,7 @@ class Bench:
                 elapsed_s=old.elapsed_s,
                 remaining_s=old.remaining_s,
                 recording=old.recording,
+                calibration=old.calibration,
                 source=self.cell.source,
             )
         )

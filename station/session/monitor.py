@@ -10,15 +10,19 @@ import msgspec
 
 from recordings.messages import RobotState
 from station.clocks import ClockFit
-from station.devices.ur_condition import mode_word, program_word, safety_word
+from station.devices.ur_condition import mode_word, program_word, safety_word, what_holds
 from station.errors import RobotError
 from station.limits import SPEED_CAP_M_S, point_speed_m_s
 from station.session.bench import Bench
 from station.session.capture import flange_pose, matrix4
+from station.session.folder import CALIBRATION_FILE
+from station.states import RUNNING
 from station.status import CameraStatus, ClockStatus, RecorderStatus, RobotStatus, StationState, TriggerStatus
 
 DISK_PERIOD_S = 2.0
 FPS_PERIOD_S = 2.0
+PAUSES = "pauses after this pose"
+FINISHES = "finishes after this pose"
 WALL_STEP_S = 0.5
 """Less is a clock that is being disciplined, or a moment between two readings on a busy computer."""
 
@@ -51,7 +55,15 @@ class Monitor:
             recorder=self._recorder(),
             clock=self._clock(),
             loop_lag_ms=round(lag_ms, 1),
+            pending=self._pending(),
         )
+
+    def _pending(self) -> str:
+        """A wish that waits for the end of the pose under way: who asked sees that it was heard."""
+        bench = self._bench
+        if bench.store.state not in RUNNING:
+            return ""
+        return FINISHES if bench.finish_wanted else PAUSES if bench.pause_wanted else ""
 
     def _watch_wall_clock(self) -> None:
         """Nothing is placed by it, but a person who compares times with another computer wants to know."""
@@ -85,6 +97,7 @@ class Monitor:
             age_ms=round((time.monotonic_ns() - state.stamps.host_monotonic_ns) / 1e6, 0),
             safety=safety_word(state),
             mode=mode_word(state),
+            held="" if bench.cell.source == "playback" else what_holds(state),
             program=program_word(state),
             speed_m_s=round(self._speed_m_s(state), 3),
             slider=round(state.target_speed_fraction, 3),
@@ -133,6 +146,7 @@ class Monitor:
         if now_s - self._free_checked_s >= DISK_PERIOD_S:
             self._free_checked_s = now_s
             self._free_bytes = _free_bytes(self._bench.root)
+            self._look_for_calibration()
         recording = self._bench.recording
         recorder = recording.recorder if recording is not None else None
         if recording is None or recorder is None:
@@ -146,6 +160,14 @@ class Monitor:
             free_bytes=self._free_bytes,
             error=str(recorder.error or ""),
         )
+
+    def _look_for_calibration(self) -> None:
+        """A process of its own solves a sealed session, and puts what it found beside the recording."""
+        store = self._bench.store
+        session = store.status.session
+        path = Path(session.folder) / CALIBRATION_FILE
+        solved = str(path) if session.recording and path.is_file() else ""
+        store.update(session=msgspec.structs.replace(session, calibration=solved))
 
     def _clock(self) -> ClockStatus:
         robot, camera = self._bench.cell.robot.clock(), self._bench.cell.camera.clock

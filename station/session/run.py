@@ -284,7 +284,8 @@ def sealed(bench: Bench, path: Path) -> None:
     bench.recording = None
     session = msgspec.structs.replace(bench.store.status.session, recording=str(path), remaining_s=0.0)
     bench.store.update(session=session)
-    bench.store.event(f"sealed: {path}, {queue.done} of {len(queue.statuses)} poses")
+    # What matters first: a narrow screen cuts the end.
+    bench.store.event(f"sealed with {queue.done} of {len(queue.statuses)} poses: {path}")
     if bench.store.state in (StationState.SEALING, StationState.PAUSED):
         bench.store.enter(StationState.IDLE)
 

@@ -210,7 +210,7 @@ class Session:
             self._improver.adopt(go.replanned)
         run = run_for(self.bench, go)
         self.store.enter(StationState.CHECKING)
-        self.store.event(f"go by {self.leases.lease.holder}: {go.summary.purpose}")
+        self.store.event(f"go: {go.summary.purpose} (by {self.leases.lease.holder})")
         self._run = asyncio.create_task(run.drive())
 
     def pause(self, who: str) -> None:

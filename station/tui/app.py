@@ -25,8 +25,8 @@ from station.client import Client
 from station.errors import StationError
 from station.status import StationState, StationStatus
 from station.tui import offline
+from station.tui.attendance import Attended
 from station.tui.checklist import ChecklistScreen
-from station.tui.commands import Commands
 from station.tui.drift import drift_check
 from station.tui.help import Help
 from station.tui.link import Connect, Link, listen
@@ -82,7 +82,7 @@ class StatusChanged(Message):
         self.status, self.why = status, why
 
 
-class StationApp(Commands):
+class StationApp(Attended):
     """One app, several screens; the same keys everywhere."""
 
     TITLE = "Calibration station"
@@ -196,6 +196,7 @@ class StationApp(Commands):
 
     def on_status_changed(self, message: StatusChanged) -> None:
         self.status = message.status
+        self.known = message.status or self.known
         if message.status is None:
             self.silent_s = None
         if message.status is not None and not self._greeted:
@@ -285,8 +286,8 @@ class StationApp(Commands):
         await offline.recover(self, folder)
 
     @work(exclusive=True, group="job", exit_on_error=False)
-    async def install(self, calibration: str) -> None:
-        await offline.install(self, calibration)
+    async def install(self, calibration: str, ended: str) -> None:
+        await offline.install(self, calibration, ended)
 
     @work(exclusive=True, group="job", exit_on_error=False)
     async def roll_back(self, calibration: str) -> None:

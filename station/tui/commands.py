@@ -31,6 +31,8 @@ class Commands(App[None]):
     """Every wish goes through `ask`; the daemon decides, nothing is decided here."""
 
     status: reactive[StationStatus | None] = reactive(None, repaint=False)
+    known: StationStatus | None = None
+    """The newest status; it outlives the daemon."""
     serves = True
     """A station stands behind this screen, not a recording alone."""
     link: Link | None = None
@@ -135,7 +137,10 @@ class Commands(App[None]):
         go = msgspec.structs.replace(go, changes=(*changes, *go.changes))
         if not await self.push_screen_wait(ConfirmGo(go)):
             return False
-        return await self.ask("go", token=go.token) is not None
+        went = await self.ask("go", token=go.token) is not None
+        if went:
+            self.clear_notifications()  # they were of the time before
+        return went
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_pause(self) -> None:
@@ -165,7 +170,8 @@ class Commands(App[None]):
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_acknowledge(self) -> None:
-        await self.ask("acknowledge")
+        if await self.ask("acknowledge") is not None:
+            self.clear_notifications()  # what they said of the stop is over
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_let_go(self) -> None:

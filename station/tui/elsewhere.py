@@ -5,9 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from calibrate.errors import CalibrationError
 from calibrate.generations import calibrations_folder
-from calibrate.install import load_installed
 
 LOOK_S = 2.0
 Marks = frozenset[tuple[str, int]]
@@ -30,11 +28,3 @@ def _mark(path: Path) -> tuple[str, int]:
         return str(path), path.lstat().st_mtime_ns
     except OSError:
         return str(path), 0
-
-
-def installed_session(root: Path) -> str:
-    """The session that gave what is installed; empty when nothing is, or what is there is damaged."""
-    try:
-        return load_installed(root, allow_simulated=True).provenance.session
-    except CalibrationError:
-        return ""

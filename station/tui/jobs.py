@@ -54,7 +54,7 @@ class JobScreen(ModalScreen[int]):
         """It may say nothing for a while; the seconds tell that it works."""
         if self._exit_code is None:
             spent = duration(time.monotonic() - self._begun_s)
-            self.query_one("#job-title", Label).update(f"{self._title} … {spent}")
+            self.query_one("#job-title", Label).update(f"{spent} {self._title} …")
 
     @work(exclusive=True, exit_on_error=False)
     async def run_job(self) -> None:

@@ -12,11 +12,8 @@ from textual.screen import ModalScreen
 from textual.widgets import Input, Label, OptionList, Static
 from textual.widgets.option_list import Option
 
-from calibrate.calibration import Calibration
-from calibrate.errors import CalibrationError
 from calibrate.formats import FORMATS
 from calibrate.generations import Generation, generations
-from calibrate.install import load_installed
 from station.drift_check import check_arguments
 from station.tui.confirm import Confirm
 from station.tui.jobs import JobScreen
@@ -76,14 +73,6 @@ def state_root(calibration: str) -> Path:
     return Path(calibration).resolve().parents[2]
 
 
-def installed_beside(calibration: str) -> Calibration | None:
-    """What consumers of this cell read now; None when there is nothing or it is damaged."""
-    try:
-        return load_installed(state_root(calibration), allow_simulated=True)
-    except CalibrationError:
-        return None
-
-
 async def solve(app: StationApp, recording: str, folder: str) -> str | None:
     """The calibration file, or None when it did not come to one."""
     output, report = (str(Path(folder) / name) for name in (CALIBRATION_FILE, "report.html"))
@@ -100,9 +89,13 @@ async def recover(app: StationApp, folder: str) -> None:
     )
 
 
-async def install(app: StationApp, path: str) -> None:
-    """Asks, then installs below the daemon's root. A simulated result only on a simulated cell's root."""
+async def install(app: StationApp, path: str, ended: str) -> None:
+    """Asks, then installs below the daemon's root. A simulated result only on a simulated cell's root.
+
+    `ended`: how this one stopped being installed before; empty: it never was.
+    """
     body = f"{path}\nbecomes what every consumer of this cell reads. Key b on this screen undoes it."
+    body += f"\n\n{ended}" if ended else ""
     if not await app.push_screen_wait(Confirm("Install this calibration?", body, yes="Install")):
         return
     cell = "simulated" if app.status is not None and app.status.simulated else "real"

@@ -8,6 +8,7 @@ from typing import ClassVar
 
 import numpy as np
 from rich.text import Text
+from textual import work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, VerticalScroll
@@ -18,16 +19,23 @@ from calibrate.errors import CalibrationError
 from calibrate.geometry import difference
 from calibrate.verification import agrees, touch_text
 from station.tui.elsewhere import LOOK_S, Marks, marks
-from station.tui.offline import installed_beside, state_root
+from station.tui.installed import Ended, Installed, is_same, read_installed
+from station.tui.offline import state_root
 from station.tui.screen import StationScreen
 
 NO_RESULT = "No result yet. F9 solves the session just captured; on screen 4, v shows older ones."
+NOTHING = Installed()
 BAR_CELLS = 24
 REASONED = {False: "installs only with a reason", True: "installed all the same"}
 
 
-def verdict_text(calibration: Calibration, installed: bool = False) -> Text:
+def ended_words(end: Ended) -> str:
+    return f"It was installed before, and {end.how} by {end.by}"
+
+
+def verdict_text(calibration: Calibration, state: Installed = NOTHING) -> Text:
     """The checklist: what passed, what failed and what to do about it."""
+    installed, end = is_same(calibration, state.now), state.end_of(calibration)
     gates = sorted(calibration.quality.gates, key=lambda gate: gate.passed)  # the failed ones first
     touches = sorted(calibration.verification, key=agrees)
     against = [
@@ -36,9 +44,11 @@ def verdict_text(calibration: Calibration, installed: bool = False) -> Text:
     ]
     against = [words for words in against if not words.startswith("0 ")]
     stamp = "" if calibration.source == "real" else f"{calibration.source.upper()}: never for a real cell\n"
-    ready = "INSTALLED" if installed else "READY TO INSTALL"
+    ready = "INSTALLED" if installed else end.how.upper() if end else "READY TO INSTALL"
     head = ", ".join(against) + f": {REASONED[installed]}" if against else ready
     text = Text().append(stamp, "bold").append(f"{head}\n", "bold reverse" if against else "bold")
+    if end is not None:
+        text.append(f"{ended_words(end)}. i installs it again\n")
     text.append(f"session {calibration.provenance.session}\n")
     for passed, words in (
         *((agrees(touch), f"by hand: {touch_text(touch)}") for touch in touches),
@@ -75,7 +85,7 @@ def answer_text(calibration: Calibration) -> Text:
 
 
 def residual_text(calibration: Calibration) -> Text:
-    """Reprojection per view as bars, rejected views with their reasons below."""
+    """Rejected views with their reasons, then reprojection per view as bars."""
     rms = {v.index: v.rms_px for v in calibration.quality.views if v.rms_px is not None}
     longest = max(rms.values(), default=1.0)
     lines = [
@@ -83,12 +93,7 @@ def residual_text(calibration: Calibration) -> Text:
         for index, value in sorted(rms.items())
     ]
     rejected = [f"{r.index + 1:>3} REJECTED {r.name}: {r.reason}" for r in calibration.views.rejected]
-    return Text("\n".join(["reprojection per view", *lines, *rejected]))
-
-
-def is_same(one: Calibration, other: Calibration | None) -> bool:
-    """Of the same solve; a reason or a check by hand may have come to one of them."""
-    return other is not None and (one.created, one.provenance) == (other.created, other.provenance)
+    return Text("\n".join([*rejected, "reprojection per view", *lines]))
 
 
 def change_text(calibration: Calibration, installed: Calibration | None) -> Text:
@@ -119,6 +124,7 @@ class ResultScreen(StationScreen):
     def __init__(self) -> None:
         super().__init__()
         self._calibration: Calibration | None = None
+        self._state = NOTHING
         self._marks: Marks = frozenset()
 
     def body(self) -> ComposeResult:
@@ -140,39 +146,46 @@ class ResultScreen(StationScreen):
 
     async def look_again(self) -> None:
         """Another screen or a shell may have installed, gone back or solved again."""
-        path = self.station.result_path
-        if path is None or not self.is_current:
+        path = self._shown
+        if not path or not self.is_current:
             return
         before, self._marks = self._marks, await asyncio.to_thread(marks, state_root(path))
         if self._marks != before:
             self.load()
 
-    def load(self) -> None:
-        path = self.station.result_path
-        if path is None:
-            return
-        try:
-            self._calibration = read_calibration(Path(path))
-        except CalibrationError as problem:
-            self._calibration = None
-            self.query_one("#verdict", Static).update(Text(str(problem)))
-            return
-        installed = installed_beside(path)
-        same = is_same(self._calibration, installed)
-        self.query_one("#verdict", Static).update(verdict_text(self._calibration, same))
-        self.query_one("#answer", Static).update(answer_text(self._calibration))
-        self.query_one("#change", Static).update(change_text(self._calibration, installed))
-        self.query_one("#residuals", Static).update(residual_text(self._calibration))
+    @property
+    def _shown(self) -> str:
+        """The file that was picked, else that of the session just captured; empty: neither."""
+        status = self.station.status
+        return self.station.result_path or (status.session.calibration if status is not None else "")
+
+    @work(exclusive=True, group="load", exit_on_error=False)
+    async def load(self) -> None:
+        path = self._shown
+        self._calibration, why = None, NO_RESULT
+        if path:
+            try:
+                self._state = await asyncio.to_thread(read_installed, state_root(path))
+                self._calibration = await asyncio.to_thread(read_calibration, Path(path))
+            except CalibrationError as problem:
+                why = str(problem)
+        texts = [Text(why), Text(), Text(), Text()]
+        if (found := self._calibration) is not None:
+            change = change_text(found, self._state.now)
+            texts = [verdict_text(found, self._state), answer_text(found), change, residual_text(found)]
+        for name, text in zip(("verdict", "answer", "change", "residuals"), texts, strict=True):
+            self.query_one(f"#{name}", Static).update(text)
 
     def _path(self) -> str | None:
         if self._calibration is None:
             self.notify("There is no result to use: F9 on the sessions screen makes one.")
             return None
-        return self.station.result_path
+        return self._shown
 
     def action_install(self) -> None:
-        if (path := self._path()) is not None:
-            self.station.install(path)
+        if (path := self._path()) is not None and self._calibration is not None:
+            end = self._state.end_of(self._calibration)
+            self.station.install(path, f"{ended_words(end)}." if end is not None else "")
 
     def action_roll_back(self) -> None:
         if (path := self._path()) is not None:

@@ -33,7 +33,8 @@ class StationScreen(Screen[None]):
         return cast("StationApp", self.app)
 
     def on_screen_resume(self) -> None:
-        self.show(self.station.status)
+        for status in (self.station.known, self.station.status):  # it may be the first time, or long ago
+            self.show(status)
         self.doubt(self.station.trouble, self.station.silent_s)
         self.say_busy(self.station.busy)
 

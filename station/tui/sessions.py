@@ -8,22 +8,23 @@ from typing import Any, ClassVar
 from textual import work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
+from textual.widgets import Static
 
 from station.drift_check import POSES
 from station.states import RUNNING
-from station.tui.elsewhere import LOOK_S, Marks, installed_session, marks
+from station.tui.elsewhere import LOOK_S, Marks, marks
+from station.tui.installed import Installed, read_installed
 from station.tui.screen import StationScreen
 from station.tui.widgets.rows import Rows
 from station.tui.words import size
 
 DRIFT = f"Take {POSES} pictures in place of the loaded plan: does the installed one still hold? (asks)"
+NO_SESSION = "No session is recorded yet: 2 then n makes a plan, F5 shows its way and asks."
 COLUMNS = ("session", "source", "views", "size", "state", "calibration")
 
 
-def calibration_word(session: dict[str, Any], installed: str) -> str:
-    if installed and session.get("name") == installed:
-        return "INSTALLED"
-    return "yes" if session.get("calibration") else "-"
+def calibration_word(session: dict[str, Any], installed: Installed) -> str:
+    return installed.word(str(session.get("name"))) or ("solved" if session.get("calibration") else "-")
 
 
 class SessionsScreen(StationScreen):
@@ -33,7 +34,7 @@ class SessionsScreen(StationScreen):
     )
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("f9", "solve", "Solve", tooltip="Solve this recording again, outside the daemon"),
-        Binding("v", "result", "Result", tooltip="Show this session's calibration"),
+        Binding("v", "result", "Result", tooltip="Show this session's calibration; so does Enter"),
         Binding("w", "watch", "Watch", tooltip="Play this recording in the live screen"),
         Binding("k", "check", "Check", tooltip="Does the installed calibration still hold on this one?"),
         Binding("d", "drift", "Drift", tooltip=DRIFT),
@@ -46,6 +47,7 @@ class SessionsScreen(StationScreen):
         self._marks: Marks = frozenset()
 
     def body(self) -> ComposeResult:
+        yield Static(NO_SESSION, id="sessions-none")
         yield Rows(id="sessions-table")
 
     def on_mount(self) -> None:
@@ -81,9 +83,10 @@ class SessionsScreen(StationScreen):
         if answer is None:
             self._marks = frozenset()
             return  # why was said; what was known stays
-        installed = "" if root is None else await asyncio.to_thread(installed_session, root)
+        installed = Installed() if root is None else await asyncio.to_thread(read_installed, root)
         at = self._sessions[self.table.cursor_row]["name"] if self._sessions else ""
         self._sessions = list(answer)
+        self.query_one("#sessions-none").display = not self._sessions
         self.table.clear()
         for session in self._sessions:
             self.table.add_row(
@@ -99,7 +102,7 @@ class SessionsScreen(StationScreen):
 
     def _selected(self) -> dict[str, Any] | None:
         if not self._sessions:
-            self.notify("No session is recorded yet: F5 on the live screen starts one.")
+            self.notify(NO_SESSION)
             return None
         return self._sessions[self.table.cursor_row]
 
@@ -116,6 +119,10 @@ class SessionsScreen(StationScreen):
                 self.notify("Not solved yet: F9 solves it.")
                 return
             await self.station.show_result(str(session["calibration"]))
+
+    async def on_data_table_row_selected(self) -> None:
+        """Enter on a session: what it gave."""
+        await self.action_result()
 
     def action_check(self) -> None:
         if (session := self._selected()) is not None:

@@ -135,7 +135,11 @@ class Timeline:
     def _pose(self, number: int, done: int, state: StationState) -> PoseStatus:
         view = self.views[number]
         pose = PoseStatus(
-            number, view.name, why="as recorded", attempt=view.attempt, base_from_flange=view.base_from_flange
+            number,
+            view.name,
+            why="of the recording",
+            attempt=view.attempt,
+            base_from_flange=view.base_from_flange,
         )
         if number < done:
             return msgspec.structs.replace(pose, state="done")

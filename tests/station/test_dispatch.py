@@ -92,6 +92,21 @@ async def test_the_second_operator_may_watch_pause_and_stop_only(served: Served,
         await bert.request("lease", action="take")
 
 
+async def test_a_screen_at_which_nobody_is_may_say_that_it_is_lost(served: Served, small_plan: Plan) -> None:
+    async with await served.client() as anna:
+        await anna.request("lease", action="take")
+        await anna.request("load_plan", plan=msgspec.to_builtins(small_plan))
+        served.rig.arm.slow = True
+        offer = await anna.request("prepare")
+        await anna.request("go", token=offer["token"], plan_sha256=offer["plan_sha256"])
+        await served.rig.until(StationState.MOVING)
+        await anna.request("lease", action="lost")
+        assert served.rig.state is StationState.PAUSED
+        assert "tty1" in served.rig.session.store.status.reason
+        assert "was lost" in served.rig.session.store.status.reason
+        assert served.rig.session.store.status.lease.holder == ""
+
+
 @pytest.mark.parametrize(
     ("verb", "args"),
     [

@@ -17,8 +17,8 @@ ROBOT = RobotStatus(
 )
 
 WIDE = (
-    " FREE-DRIVE SIMULATED PLAYBACK UR10e Series 5 (lab bench)│0.21/0.25 m/s│"
-    "AUTOMATIC MODE SAFEGUARD REMOTE│18/25│  F12=STOP"
+    " FREE-DRIVE SIMULATED UR10e Series 5 (lab bench)│0.21/0.25 m/s│"
+    "AUTOMATIC MODE SAFEGUARD REMOTE│18/25│212 GB│    F12=STOP"
 )
 
 
@@ -34,7 +34,11 @@ def long_one() -> StationStatus:
     robot = msgspec.structs.replace(
         ROBOT, model="UR10e Series 5 (lab bench)", safety="AUTOMATIC MODE SAFEGUARD"
     )
-    return msgspec.structs.replace(status, playback=True, robot=robot)
+    return msgspec.structs.replace(status, robot=robot)
+
+
+def played() -> StationStatus:
+    return msgspec.structs.replace(working(), playback=True)
 
 
 @pytest.mark.parametrize(
@@ -49,13 +53,14 @@ def long_one() -> StationStatus:
         (
             long_one(),
             80,
-            " FREE-DRIVE SIMULATED PLAYBACK U…│AUTOMATIC MODE SAFEGUARD REMOTE│18/25│F12=STOP",
+            " FREE-DRIVE SIMULATED UR10e Seri…│AUTOMATIC MODE SAFEGUARD REMOTE│18/25│F12=STOP",
         ),
         (
             long_one(),
             120,
             WIDE,
         ),
+        (played(), 80, " PLAYBACK, no arm: MOVING SIMULATED UR10│18/25 6:02│212 GB free│        F12=STOP"),
     ],
 )
 def test_golden_lines(status: StationStatus, width: int, line: str) -> None:
@@ -105,3 +110,29 @@ async def test_the_reason_names_the_next_key(link: FakeLink, state: StationState
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: "why │ " in text_of(pilot.app, "#reason"))
         assert key in text_of(pilot.app, "#reason")
+
+
+HELD = "protective stop: find what the arm ran into, then enable it again on the pendant"
+
+
+@pytest.mark.parametrize(
+    ("state", "key"), [(StationState.IDLE, ""), (StationState.PAUSED, "then F5 goes on")]
+)
+async def test_what_holds_the_arm_at_rest_is_said_before_the_next_key(
+    link: FakeLink, state: StationState, key: str
+) -> None:
+    """Acknowledged here, and still stopped at the pendant."""
+    status = idle(state)
+    link.show(msgspec.structs.replace(status, robot=msgspec.structs.replace(status.robot, held=HELD)))
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: HELD in text_of(pilot.app, "#reason"))
+        assert key in text_of(pilot.app, "#reason")
+        assert not pilot.app.screen.query_one("#reason").has_class("note")
+        link.show(status)
+        await until(pilot, lambda: HELD not in text_of(pilot.app, "#reason"))
+
+
+async def test_a_pause_that_waits_for_the_pose_is_said_at_once(link: FakeLink) -> None:
+    link.show(msgspec.structs.replace(working(), pending="pauses after this pose"))
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: text_of(pilot.app, "#reason") == "pauses after this pose")

@@ -10,12 +10,15 @@ from textual.pilot import Pilot
 from textual.widgets import DataTable
 
 from calibrate.calibration import write_calibration
-from calibrate.install import install, rollback
+from calibrate.generations import add_generation, calibrations_folder, locked, who
+from calibrate.install import install, load_installed, rollback
 from station.errors import StationError
 from station.tui import result, sessions
 from station.tui.app import StationApp
-from tests.tui.conftest import FakeLink, until
-from tests.tui.test_install import GOOD
+from station.tui.confirm import Confirm
+from station.tui.installed import read_installed
+from tests.tui.conftest import FakeLink, idle, until
+from tests.tui.test_install import GOOD, OFF
 from tests.tui.test_keys import app_on, text_of
 
 
@@ -58,18 +61,18 @@ async def test_the_list_of_sessions_names_what_is_installed_now(link: FakeLink, 
         def states() -> list[str]:
             return [table.get_row_at(line)[-1] for line in range(table.row_count)]
 
-        await until(pilot, lambda: states() == ["yes", "yes"])
+        await until(pilot, lambda: states() == ["solved", "solved"])
         await pilot.press("end")
         put(root, "s-1")
-        await until(pilot, lambda: states() == ["yes", "INSTALLED"])
+        await until(pilot, lambda: states() == ["solved", "INSTALLED"])
         assert table.cursor_row == 1  # what was marked still is
         put(root, "s-2")
-        await until(pilot, lambda: states() == ["INSTALLED", "yes"])
+        await until(pilot, lambda: states() == ["INSTALLED", "replaced"])
         rollback(root)
-        await until(pilot, lambda: states() == ["yes", "INSTALLED"])
+        await until(pilot, lambda: states() == ["taken back", "INSTALLED"])
         link.answers["sessions"] = [{"name": "s-3"}, *link.answers["sessions"]]
         (root / "sessions" / "s-3").mkdir()
-        await until(pilot, lambda: states() == ["-", "yes", "INSTALLED"])
+        await until(pilot, lambda: states() == ["-", "taken back", "INSTALLED"])
         assert table.cursor_row == 2
 
 
@@ -85,7 +88,52 @@ async def test_the_result_says_when_it_is_the_installed_one(link: FakeLink, root
         assert "this one is installed" in text_of(app, "#change")
         put(root, "s-2")
         await until(pilot, lambda: "against the installed one" in text_of(app, "#change"))
-        assert "READY TO INSTALL" in text_of(app, "#verdict")
+        assert "REPLACED" in text_of(app, "#verdict").splitlines()[1]
+
+
+async def test_a_calibration_that_was_taken_back_says_so_and_who_did_it(link: FakeLink, root: Path) -> None:
+    app = app_on(link)
+    async with app.run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
+        put(root, "s-1")
+        put(root, "s-2")
+        rollback(root, reason="the camera had slipped")
+        await app.show_result(str(root / "sessions" / "s-2" / "calibration.yaml"))
+        await until(pilot, lambda: "TAKEN BACK" in text_of(app, "#verdict").splitlines()[1:])
+        said = text_of(app, "#verdict")
+        assert "READY TO INSTALL" not in said
+        assert f"installed before, and taken back by {who()}, 20" in said
+        assert "the camera had slipped" in said
+        await pilot.press("i")
+        await until(pilot, lambda: isinstance(app.screen, Confirm) and app.screen.query("#confirm-body"))
+        assert "installed before, and taken back" in text_of(app, "#confirm-body")
+        await pilot.press("escape")
+        put(root, "s-2")
+        await until(pilot, lambda: "INSTALLED" in text_of(app, "#verdict").splitlines()[1:])
+        assert "taken back" not in text_of(app, "#verdict")
+
+
+def test_a_check_by_hand_is_no_end_of_what_is_installed(root: Path) -> None:
+    put(root, "s-1")
+    with locked(calibrations_folder(root)):
+        touched = msgspec.structs.replace(load_installed(root, True), verification=[OFF])
+        add_generation(root, touched, "verify", "")
+    assert read_installed(root).word("s-1") == "INSTALLED"
+    put(root, "s-2")
+    (end,) = read_installed(root).ended
+    assert (end.how, end.calibration.verification) == ("replaced", [OFF])
+
+
+async def test_the_result_of_the_session_just_captured_needs_no_picking(link: FakeLink, root: Path) -> None:
+    app, status = app_on(link), idle()
+    path = str(root / "sessions" / "s-1" / "calibration.yaml")
+    link.show(
+        msgspec.structs.replace(status, session=msgspec.structs.replace(status.session, calibration=path))
+    )
+    async with app.run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: app.status is not None and app.status.session.calibration)
+        await pilot.press("3")
+        await until(pilot, lambda: "session s-1" in text_of(app, "#verdict"))
 
 
 async def test_a_list_that_did_not_come_is_asked_for_again_and_the_old_one_stays(

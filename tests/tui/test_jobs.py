@@ -57,7 +57,7 @@ async def test_seconds_tell_that_it_works(link: FakeLink, job: Path) -> None:
         await until(pilot, lambda: screen._process)
         screen._begun_s = time.monotonic() - 65.0
         screen._say_how_long()
-        assert "Working … 1:05" in str(screen.query_one("#job-title", Label).render())
+        assert "1:05 Working …" in str(screen.query_one("#job-title", Label).render())
         await pilot.press("escape")
         await until(pilot, lambda: not isinstance(pilot.app.screen, JobScreen))
 

@@ -248,3 +248,25 @@ async def test_a_hundred_resizes_leave_a_working_screen(link: FakeLink) -> None:
         await pilot.resize_terminal(80, 24)
         await pilot.pause()
         assert "F12=STOP" in text_of(pilot.app, "#bar")
+
+
+async def test_what_a_stop_refused_is_not_said_any_more_after_it(link: FakeLink) -> None:
+    """A notice outlives its reason by seconds otherwise."""
+    link.show(idle(StationState.STOPPED, "STOP by ann"))
+    link.refuse["prepare"] = RefusedError("STOP is latched")
+    async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
+        await until(pilot, lambda: "STOPPED" in text_of(pilot.app, "#bar"))
+        await pilot.press("f5")
+        await until(pilot, lambda: [n.message for n in pilot.app._notifications] == ["STOP is latched"])
+        link.refuse["acknowledge"] = RefusedError("not you")
+        await pilot.press("f8")
+        await until(pilot, lambda: len(pilot.app._notifications) == 2)
+        link.refuse.clear()
+        await pilot.press("f8")
+        await until(pilot, lambda: not pilot.app._notifications)
+        await pilot.press("f3", "f4")
+        await until(pilot, lambda: len(pilot.app._notifications) == 1)
+        await pilot.press("f5")
+        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmGo))
+        await pilot.press("tab", "enter")
+        await until(pilot, lambda: "go" in link.verbs and not pilot.app._notifications)

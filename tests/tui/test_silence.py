@@ -88,3 +88,19 @@ async def test_the_plan_stays_in_sight_too(link: FakeLink) -> None:
         link.show(None)
         await until(pilot, lambda: "NO DAEMON" in text_of(pilot.app, "#bar"))
         assert table.row_count == 25
+
+
+async def test_a_screen_that_was_away_meanwhile_shows_what_was_known_last(link: FakeLink) -> None:
+    """Not what it had shown itself when it was left."""
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+        await pilot.press("2")
+        moving = idle(StationState.MOVING)
+        link.show(msgspec.structs.replace(moving, session=msgspec.structs.replace(moving.session, current=7)))
+        await until(pilot, lambda: "MOVING" in text_of(pilot.app, "#bar"))
+        link.show(None)
+        await until(pilot, lambda: "NO DAEMON" in text_of(pilot.app, "#bar"))
+        await pilot.press("1")
+        await until(pilot, lambda: "p08" in text_of(pilot.app, "#progress"))
+        assert "NO DAEMON" in text_of(pilot.app, "#bar")
+        assert str(pilot.app.screen.query_one("#progress").border_title) == "Pose: OLD"

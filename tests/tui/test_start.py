@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import msgspec
 import pytest
+from textual.widgets import DataTable
 
 from station.status import StationState
 from station.tui.app import StationApp
@@ -74,6 +75,18 @@ async def test_a_key_that_can_do_nothing_says_why(
         await pilot.press(*keys)
         await until(pilot, lambda: any(words in said.message for said in pilot.app._notifications))
         assert not {"go", "prepare", "finish"} & set(link.verbs)
+
+
+async def test_an_empty_list_says_how_to_begin_but_not_before_it_is_known(link: FakeLink) -> None:
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+        await pilot.press("4")
+        await until(pilot, lambda: pilot.app.screen.query_one(DataTable).row_count == 1)
+        hint = pilot.app.screen.query_one("#sessions-none")
+        assert not hint.display
+        link.answers["sessions"] = []
+        await pilot.press("1", "4")
+        await until(pilot, lambda: hint.display)
 
 
 async def test_without_a_daemon_every_key_says_so(link: FakeLink) -> None:

@@ -6,6 +6,7 @@ from rich.text import Text
 from textual.reactive import reactive
 from textual.widgets import Static
 
+from station.states import RUNNING
 from station.status import StationState, StationStatus
 from station.tui.words import STATE_WORDS, duration, size
 
@@ -19,6 +20,7 @@ _NEXT = {
     StationState.FREE_DRIVE: "F2 takes a picture here, F3 ends it",
 }
 """Which key is next. The daemon's own sentence is for shells too."""
+_AT_REST = {StationState.IDLE, StationState.PAUSED, StationState.FREE_DRIVE}
 NO_DAEMON = " NO DAEMON: trying again every second. To stop the arm use the pendant."
 
 NO_ANSWER = " NO ANSWER for {:.0f} s: state UNKNOWN. To stop the arm: EMERGENCY STOP."
@@ -33,7 +35,8 @@ class StatusBar(Static):
     def watch_status(self) -> None:
         status, silent = self.status, self.silent_s is not None
         self.set_class(silent or status is None or status.state in _ALARM, "alarm")
-        self.set_class(status is not None and status.state is StationState.PAUSED and not silent, "warn")
+        waits = status is not None and (status.state is StationState.PAUSED or bool(status.robot.held))
+        self.set_class(waits and not silent, "warn")
         self.refresh()
 
     def watch_silent_s(self) -> None:
@@ -68,21 +71,39 @@ def _line(parts: list[str]) -> str:
 def _parts(status: StationStatus, level: int) -> list[str]:
     """`level` 0 has everything; every level leaves something out."""
     robot, session = status.robot, status.session
-    marks = [m for m, on in (("SIMULATED", status.simulated), ("PLAYBACK", status.playback)) if on]
-    limit = f"/{robot.speed_limit_m_s:.2f}" if level < 4 else ""
-    where = {True: "REMOTE", False: "LOCAL", None: ""}[robot.remote]
+    simulated = ["SIMULATED"] if status.simulated else []
+    who = [*simulated, robot.model or "no robot"]
     count = f"{session.captured}/{len(session.poses)}"
-    parts = [
-        " ".join([STATE_WORDS[status.state], *marks, robot.model or "no robot"]),
-        f"{robot.speed_m_s:.2f}{limit} m/s",
-        " ".join(p for p in (robot.safety or "-", where) if p),
-        count if level >= 2 else f"{count} {duration(session.elapsed_s)}",
-    ]
+    progress = count if level >= 2 else f"{count} {duration(session.elapsed_s)}"
+    if status.playback:  # a recorded arm has no speed and no safety that anybody must look at
+        parts = [" ".join(["PLAYBACK, no arm:", STATE_WORDS[status.state], *who]), progress]
+    else:
+        limit = f"/{robot.speed_limit_m_s:.2f}" if level < 4 else ""
+        where = {True: "REMOTE", False: "LOCAL", None: ""}[robot.remote]
+        parts = [
+            " ".join([STATE_WORDS[status.state], *who]),
+            *([f"{robot.speed_m_s:.2f}{limit} m/s"] if level < LEVELS - 1 else []),
+            " ".join(p for p in (robot.safety or "-", where) if p),
+            progress,
+        ]
     if level < 3 and status.recorder.free_bytes is not None:
         parts.append(size(status.recorder.free_bytes) + " free" * (level < 1))
     if level < 1 and status.lease.holder:
         parts.append(f"control: {status.lease.holder}")
-    return parts if level < LEVELS - 1 else [parts[0], parts[2], parts[3]]
+    return parts
+
+
+def said_of(status: StationStatus) -> str:
+    """Why it does not work, what comes next by itself, and which key is next."""
+    held, next_key = "", _NEXT.get(status.state, "")
+    if status.state in _AT_REST and status.robot.held:  # elsewhere the reason says it
+        held, next_key = status.robot.held, next_key and f"then {next_key}"
+    return " │ ".join(words for words in (status.reason, status.pending, held, next_key) if words)
+
+
+def _is_well(status: StationStatus) -> bool:
+    at_ease = status.state is StationState.IDLE and not status.robot.held
+    return at_ease or (status.state in RUNNING and not status.reason)
 
 
 class ReasonLine(Static):
@@ -104,10 +125,9 @@ class ReasonLine(Static):
     def watch_status(self) -> None:
         said = ""
         if self.status is not None and not self.trouble:
-            reason, next_key = self.status.reason, _NEXT.get(self.status.state, "")
-            said = " │ ".join(words for words in (reason, next_key) if words)
-        # A playback has no trouble, and a cell at rest neither: the line only tells.
-        calm = self.status is None or self.status.playback or self.status.state is StationState.IDLE
+            said = said_of(self.status)
+        # A playback has no trouble, and a cell at rest or at work neither: the line only tells.
+        calm = self.status is None or self.status.playback or _is_well(self.status)
         self.set_class(calm and not self.trouble, "note")
         told = "\n".join(words for words in (self.trouble, self.busy, said) if words)
         if told != self._reason:

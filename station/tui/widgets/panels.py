@@ -10,7 +10,7 @@ from rich.text import Text
 from textual.reactive import reactive
 from textual.widgets import Static
 
-from station.status import StationStatus
+from station.status import SessionStatus, StationState, StationStatus
 from station.tui.words import POSE_MARKS, degrees, duration, mm
 
 CLOCKS_POOR_MS = 20.0
@@ -63,10 +63,13 @@ def _line(name: str, text: str, good: bool | None) -> str:
 
 def device_lines(status: StationStatus) -> list[str]:
     robot, camera, recorder, bounds = status.robot, status.camera, status.recorder, status.clock
-    lines = [
-        _line("robot", f"{robot.rate_hz:.0f} Hz {robot.age_ms:.0f} ms", robot.connected),
-        _line("camera", f"{camera.fps:.0f} fps drop {camera.dropped}", camera.connected),
-    ]
+    if status.playback:
+        lines = [_line("robot", "played, no arm", None), _line("camera", "played pictures", None)]
+    else:
+        lines = [
+            _line("robot", f"{robot.rate_hz:.0f} Hz {robot.age_ms:.0f} ms", robot.connected),
+            _line("camera", f"{camera.fps:.0f} fps drop {camera.dropped}", camera.connected),
+        ]
     if status.trigger.present:
         pulses, frames = status.trigger.pulses, status.trigger.frames
         lines.append(_line("trigger", f"{pulses} = {frames}", pulses == frames))
@@ -103,15 +106,16 @@ def robot_lines(status: StationStatus) -> list[str]:
     ]
 
 
+_AT_REST = (StationState.IDLE, StationState.PAUSED)
+
+
 def progress_lines(status: StationStatus) -> list[str]:
     session = status.session
     if session.current is None or session.current >= len(session.poses):
-        done = sum(p.state == "done" for p in session.poses)
-        if session.poses and not session.name:
-            return [f"{len(session.poses)} poses planned: F5 shows the way and asks"]
-        counted = f"{done} of {len(session.poses)} poses captured" if session.poses else "no plan loaded"
-        return [counted + (", sealed: F9 solves it" if session.recording else "")]
+        return _counted(session)
     pose = session.poses[session.current]
+    if pose.state == "done" and status.state in _AT_REST:
+        return _counted(session)
     if pose.state == "failed":
         return [f"{pose.name}: failed", pose.reason]
     steps = ("moving", "settling", "capturing", "writing")
@@ -119,7 +123,21 @@ def progress_lines(status: StationStatus) -> list[str]:
     words = ("move", "settle", "capture", "write")
     marks = [f"{w} {'██' if i < at else '█▒' if i == at else '░░'}" for i, w in enumerate(words)]
     left = "" if session.remaining_s is None else f" {duration(session.remaining_s)} left"
-    return [f"{pose.name}: {pose.why}", " ".join(marks) + left]
+    why = "played, no arm moves" if status.playback else pose.why
+    return [f"{pose.name}: {why}", " ".join(marks) + left]
+
+
+def _counted(session: SessionStatus) -> list[str]:
+    """How far the session is while no pose is being taken, and what comes next."""
+    if not session.poses:
+        return ["no plan loaded"]
+    if not session.name:
+        return [f"{len(session.poses)} poses planned: F5 shows the way and asks"]
+    done = sum(pose.state == "done" for pose in session.poses)
+    closed = ", sealed: F9 solves it" if session.recording else ""
+    if session.calibration:
+        closed = ", solved: 3 shows it"
+    return [f"{done} of {len(session.poses)} poses captured{closed}"]
 
 
 def pose_map_lines(status: StationStatus) -> list[str]:
@@ -160,11 +178,14 @@ def estimate_lines(status: StationStatus) -> list[str]:
         seen = f"{estimate.views} view{'s' * (estimate.views != 1)}"
         return [seen, estimate.advice] if status.playback and estimate.advice else [f"{seen}: too few yet"]
     x, y, z = estimate.translation_mm
-    advice = "F9 finds the final one" if status.session.recording else estimate.advice
+    session = status.session
+    next_key = "3 shows the final one" if session.calibration else "F9 finds the final one"
+    advice = next_key if session.recording else estimate.advice
+    left = estimate.improve and not (estimate.enough or session.recording)
     rotation = "" if estimate.sigma_rotation_deg is None else f"  {estimate.sigma_rotation_deg:.3f}°"
     return [
         f"{x:7.1f} {y:7.1f} {z:7.1f} mm",
         f"± {estimate.sigma_translation_mm:.2f} mm{rotation}",
-        *(["p on screen 2 plans the rest"] if estimate.improve and not status.session.recording else []),
+        *(["p on screen 2 plans the rest"] if left else []),
         advice or ("enough" if estimate.enough else "not final"),
     ]

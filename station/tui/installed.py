@@ -1,0 +1,92 @@
+"""What is installed on this cell, and what was: taken back, or replaced by another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from datetime import datetime
+from functools import lru_cache
+from itertools import pairwise
+from pathlib import Path
+
+from calibrate.calibration import Calibration, read_calibration
+from calibrate.errors import CalibrationError
+from calibrate.generations import LogEntry, calibrations_folder, read_log
+from calibrate.install import load_installed
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How a calibration that was installed stopped being it."""
+
+    calibration: Calibration
+    how: str
+    """'taken back' or 'replaced'"""
+    by: str
+    """'anna, 2026-11-22 04:50 (“the board had moved”)'"""
+
+
+@dataclass(frozen=True)
+class Installed:
+    """`now`: what consumers of the cell read; None when there is nothing, or it is damaged."""
+
+    now: Calibration | None = None
+    ended: tuple[Ended, ...] = ()
+    """The newest end last, one for each solve; without what is installed again."""
+
+    def word(self, session: str) -> str:
+        """For a session whose calibration is or was installed; else empty."""
+        if self.now is not None and self.now.provenance.session == session:
+            return "INSTALLED"
+        ends = [end.how for end in self.ended if end.calibration.provenance.session == session]
+        return ends[-1] if ends else ""
+
+    def end_of(self, calibration: Calibration) -> Ended | None:
+        return next((end for end in self.ended if is_same(end.calibration, calibration)), None)
+
+
+def is_same(one: Calibration, other: Calibration | None) -> bool:
+    """Of the same solve; a reason or a check by hand may have come to one of them."""
+    return other is not None and (one.created, one.provenance) == (other.created, other.provenance)
+
+
+def read_installed(root: Path) -> Installed:
+    """For a thread: reading many of them takes a moment."""
+    try:
+        now = load_installed(root, allow_simulated=True)
+    except CalibrationError:
+        now = None
+    ended: list[Ended] = []
+    try:
+        log = read_log(root)
+    except OSError:
+        log = []
+    for before, entry in pairwise(log):
+        was = _generation(root, before.generation)
+        if was is None or entry.generation == before.generation or entry.action == "verify":
+            continue  # a check by hand goes into a generation of its own, of the same solve
+        how = "taken back" if entry.action == "rollback" else "replaced"
+        ended = [end for end in ended if not is_same(end.calibration, was)]
+        ended.append(Ended(was, how, _by(entry)))
+    return Installed(now, tuple(end for end in ended if not is_same(end.calibration, now)))
+
+
+def _generation(root: Path, number: int) -> Calibration | None:
+    """None when it is damaged or gone."""
+    return next(map(_read, (calibrations_folder(root) / "gen").glob(f"{number:04d}-*.yaml")), None)
+
+
+@lru_cache(maxsize=256)
+def _read(path: Path) -> Calibration | None:
+    """A generation's file never changes."""
+    try:
+        return read_calibration(path)
+    except CalibrationError:
+        return None
+
+
+def _by(entry: LogEntry) -> str:
+    try:
+        when = datetime.fromisoformat(entry.wall).astimezone().strftime("%Y-%m-%d %H:%M")
+    except ValueError:
+        when = entry.wall
+    return f"{entry.who}, {when}" + (f" (“{entry.reason}”)" if entry.reason else "")

@@ -1,0 +1,70 @@
+"""A terminal that answers no more: the arm must not go on for a screen at which nobody can be."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+from textual import events
+
+from station.status import Lease, StationState, StationStatus
+from station.tui import attendance
+from tests.tui.conftest import FakeLink, idle, until
+from tests.tui.test_keys import app_on, text_of
+
+LOST = ("lease", {"action": "lost"})
+
+
+def commanded(state: StationState, client_id: int = 7) -> StationStatus:
+    return msgspec.structs.replace(idle(state), lease=Lease("anna on pts/1", client_id))
+
+
+@pytest.mark.parametrize(
+    ("state", "holder", "answered", "lost"),
+    [
+        (StationState.MOVING, 7, True, True),
+        (StationState.MOVING, 7, False, False),  # one that never answers cannot be missed
+        (StationState.MOVING, 8, True, False),  # somebody else commands
+        (StationState.PAUSED, 7, True, False),  # nothing moves
+    ],
+)
+async def test_who_commands_a_moving_arm_is_asked_for(
+    link: FakeLink,
+    monkeypatch: pytest.MonkeyPatch,
+    state: StationState,
+    holder: int,
+    answered: bool,
+    lost: bool,
+) -> None:
+    monkeypatch.setattr(attendance, "ASK_S", 0.01)
+    asked = []
+    monkeypatch.setattr(attendance.Attended, "_ask_terminal", lambda app: asked.append(app))
+    link.show(commanded(state, holder))
+    app = app_on(link)
+    async with app.run_test(size=(80, 24), notifications=True) as pilot:
+        await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
+        app._own_id = 7
+        if answered:
+            app.post_message(events.CursorPosition(0, 0))
+        for _ in range(10 * attendance.UNANSWERED):
+            await app._look_for_terminal()
+            await pilot.pause()
+        assert (LOST in link.asked) is lost
+        assert any("Nothing came back" in said.message for said in app._notifications) is lost
+        assert len(asked) >= attendance.UNANSWERED or not lost
+
+
+async def test_a_terminal_that_answers_keeps_control(link: FakeLink, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(attendance, "ASK_S", 60.0)  # only the test asks
+    link.show(commanded(StationState.MOVING))
+    app = app_on(link)
+    async with app.run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
+        app._own_id = 7
+        for _ in range(3):
+            app.post_message(events.CursorPosition(0, 0))
+            await until(pilot, lambda: app._unanswered == 0)
+            for _ in range(attendance.UNANSWERED):
+                await app._look_for_terminal()
+        assert LOST not in link.asked
+        await app._look_for_terminal()
+        assert LOST in link.asked

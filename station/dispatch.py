@@ -85,14 +85,15 @@ class _Caller:
 
     def __init__(self, peer: Peer) -> None:
         self.client_id = peer.client_id
-        self.who = f"{_user(peer.uid)} (pid {peer.pid})"
+        self.who = f"uid {peer.uid} (pid {peer.pid})"
         self.interactive = False
         """A person answers at the other end."""
         self._peer = peer
 
-    def introduce(self, who: str, interactive: bool) -> None:
+    async def introduce(self, who: str, interactive: bool) -> None:
         """The user's name is the kernel's word; the place is the client's."""
-        user = _user(self._peer.uid)
+        # In a thread: where users come from the network, a name may take seconds.
+        user = await asyncio.to_thread(_user, self._peer.uid)
         said = "".join(c for c in who if c.isprintable())[:_WHO_LIMIT] or user
         told = said if said.split(" ")[0] == user else f"{user} ({said})"
         self.who = f"{told} (pid {self._peer.pid})"
@@ -139,7 +140,8 @@ class SessionDispatcher:
 
     def stop_now(self, peer: Peer) -> Awaitable[None]:
         """STOP is on its way to the arm before anything else is looked at."""
-        return self._to_the_end(self._session.stop(self._caller(peer).who))
+        caller = self._callers.get(peer.client_id) or _Caller(peer)  # the house may be full: nobody is kept
+        return self._to_the_end(self._session.stop(caller.who))
 
     def gone(self, peer: Peer) -> None:
         """The arm decelerates at once when this was the commander."""
@@ -166,10 +168,12 @@ class SessionDispatcher:
         return {} if result is None else msgspec.to_builtins(result)
 
     def _caller(self, peer: Peer) -> _Caller:
-        return self._callers.setdefault(peer.client_id, _Caller(peer))
+        if peer.client_id not in self._callers:
+            self._callers[peer.client_id] = _Caller(peer)
+        return self._callers[peer.client_id]
 
     async def _hello(self, caller: _Caller, args: _Hello) -> Any:
-        caller.introduce(args.who, args.interactive)
+        await caller.introduce(args.who, args.interactive)
         root = str(self._session.bench.root)
         return {"version": software()["calibration-station"], "pid": os.getpid(), "root": root}
 
@@ -257,4 +261,5 @@ class SessionDispatcher:
         return await checklist(self._session.bench, self._session.troubles)
 
     async def _sessions(self, caller: _Caller, args: _Args) -> Any:
-        return list_sessions(self._session.bench.root)
+        # In a thread: hundreds of files are read, and the arm's heartbeat does not wait.
+        return await asyncio.to_thread(list_sessions, self._session.bench.root)

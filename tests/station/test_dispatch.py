@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import asyncio
+import time
 from collections.abc import AsyncIterator
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import pytest
 
+from station import dispatch
 from station.client import Client
-from station.control import ControlServer
+from station.control import ControlServer, Peer
 from station.dispatch import SessionDispatcher
 from station.errors import RefusedError
 from station.plan.model import Plan, plan_sha256
@@ -164,6 +168,28 @@ async def test_without_a_person_a_real_arm_s_plan_is_not_changed_on_the_way(
             with pytest.raises(RefusedError, match=told):
                 await client.request("prepare", purpose="improve")
     await served.control.close()
+
+
+async def test_neither_a_long_list_of_sessions_nor_a_slow_name_holds_the_loop_up(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def slow(_: object) -> Any:
+        time.sleep(0.4)
+        return []
+
+    monkeypatch.setattr(dispatch, "list_sessions", slow)
+    monkeypatch.setattr(dispatch, "_user", lambda uid: str(slow(uid)))
+    async with await served.client() as anna:
+        assert await anna.request("sessions") == []
+        await anna.request("stop")
+        await asyncio.sleep(0.1)  # a frozen loop shows in the round after
+    assert served.rig.session.guard.lag_ms() < 300
+
+
+async def test_who_is_turned_away_is_not_kept(served: Served) -> None:
+    dispatcher = SessionDispatcher(served.rig.session)
+    await dispatcher.stop_now(Peer(client_id=99, pid=1, uid=0, gid=0))
+    assert not dispatcher._callers and "uid 0 (pid 1)" in served.rig.session.store.status.reason
 
 
 async def test_leaving_voids_the_go(served: Served, small_plan: Plan) -> None:

@@ -28,6 +28,8 @@ from recordings.reader import Recording
 UNSEEN_DELAY_S = 1e-4
 """1 sigma of the controller's shortest delay: no arrival shows it, so it stays in the offset."""
 
+_LARGEST_STAMP_S = 1e12
+
 
 def sweep_time_offset(
     recording: Recording, camera: CameraModel | None = None, limit_s: float = LIMIT_S
@@ -70,8 +72,11 @@ def _robot(recording: Recording) -> tuple[Array, Array]:
 def on_host(device_s: Array, arrivals_s: Array) -> Array:
     """Host times of device times, both (n,) s: the nearest straight line that lies under all arrivals.
 
-    A linear program in offset and drift. The arrivals themselves where the device has no clock.
+    A linear program in offset and drift. The arrivals themselves where the device has no clock. Raises
+    BadViewsError for what is no time.
     """
+    if not (np.abs(device_s) < _LARGEST_STAMP_S).all():
+        raise BadViewsError("a clock of this recording gives times that are none: take the sweep again")
     if len(device_s) < 2 or np.ptp(device_s) == 0:
         return arrivals_s
     since_s = device_s - device_s[0]

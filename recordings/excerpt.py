@@ -9,7 +9,7 @@ import msgspec
 
 from recordings.messages import RobotState
 from recordings.reader import Recording
-from recordings.writer import RecordingWriter
+from recordings.writer import derived_recording
 
 _NS = 1_000_000_000
 
@@ -24,7 +24,7 @@ def write_excerpt(recording: Recording, output: Path, window_s: float = 0.5) -> 
     note = f"excerpt: robot states within {window_s:g} s of the pictures"
     note = " ".join([*filter(None, [recording.info.note]), note, *recording.losses])
     info = msgspec.structs.replace(recording.info, part=1, note=note)
-    with RecordingWriter(output, info, lossless_png=True) as writer:
+    with derived_recording(output, info, lossless_png=True) as writer:
         for name, content in recording.attachments().items():
             writer.attach(name, recording.media_types()[name], content)
         for state in recording.robot_states():

@@ -10,6 +10,7 @@ from typing import Any
 import msgspec
 
 from recordings.cdr import definition_text, encode_cdr
+from recordings.errors import RecordingError
 from recordings.mcap_file import McapFile
 from recordings.messages import CameraModel, View
 from recordings.part import RecordingPart
@@ -19,6 +20,8 @@ from recordings.topics import Topic
 from recordings.viewing import CAMERA_FRAME, quaternion_xyzw
 
 _NS = 1_000_000_000
+_LAST_S = 2**31 - 1
+"""That builtin_interfaces/Time can hold."""
 _BAG_VERSION = 8
 """Of metadata.yaml: what ROS 2 Iron writes; offered_qos_profiles is still a text."""
 _JOINTS = [
@@ -90,6 +93,11 @@ def _write_picture(bag: _Bag, part: RecordingPart, sequence: int, time_ns: int) 
 
 def _header(time_ns: int, frame: str) -> dict[str, Any]:
     seconds, nanoseconds = divmod(time_ns, _NS)
+    if seconds > _LAST_S:
+        raise RecordingError(
+            f"a message is stamped {seconds} s after 1970, and ROS 2 ends in 2038: the host's clock was "
+            "wrong. Export to csv or folder instead"
+        )
     return {"stamp": {"sec": seconds, "nanosec": nanoseconds}, "frame_id": frame}
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -29,7 +30,7 @@ from recordings.pictures import (
     read_header,
 )
 from recordings.poses import PoseRow, read_poses
-from recordings.writer import RecordingWriter
+from recordings.writer import RecordingWriter, derived_recording
 
 _HEADER_BYTES = 1024 * 1024
 """A JPEG's size may stand behind large comments."""
@@ -57,8 +58,7 @@ def import_folder(
     rows, poses_bytes = read_poses(folder)
     for row in rows:
         _check_picture(folder, row, dataset)
-    writer = RecordingWriter(output, _session_info(folder, dataset))
-    try:
+    with derived_recording(output, _session_info(folder, dataset)) as writer:
         writer.attach(DATASET_FILE, "application/yaml", dataset_bytes)
         writer.attach(POSES_FILE, "text/csv", poses_bytes)
         for index, row in enumerate(rows):
@@ -71,10 +71,6 @@ def import_folder(
         )
         path = writer.finish()
         return Imported(path, len(rows), path.stat().st_size)
-    except BaseException:
-        writer.close()
-        writer.part_path.unlink(missing_ok=True)
-        raise
 
 
 def _session_info(folder: Path, dataset: Dataset) -> SessionInfo:
@@ -95,9 +91,11 @@ def _session_info(folder: Path, dataset: Dataset) -> SessionInfo:
 
 def _check_picture(folder: Path, row: PoseRow, dataset: Dataset) -> PictureHeader:
     path = folder / row.image
-    if not path.resolve().is_relative_to(folder.resolve()):
-        raise _wrong(folder, row, "lies outside the folder; copy it inside")
     try:
+        if path.exists() and not path.is_file():  # a pipe would never be read to its end
+            raise _wrong(folder, row, "cannot be read (not a file); add it or delete the line")
+        if not Path(os.path.realpath(path)).is_relative_to(folder.resolve()):
+            raise _wrong(folder, row, "lies outside the folder; copy it inside")
         with path.open("rb") as file:
             header = read_header(file.read(_HEADER_BYTES))
     except OSError as error:

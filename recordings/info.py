@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from itertools import chain
 from typing import Any
 
@@ -16,6 +17,8 @@ from recordings.topics import Topic
 _NS = 1e9
 _SHORTEST_SPAN_S = 0.01
 """Messages that all came at once have no rate."""
+_LARGEST_STAMP_S = 1e12
+"""30 000 years: what is more, or no number, is no time."""
 _FRAME_ID_WRAP = 65535
 """GigE Vision frame ids go 1 … 65535 and start at 1 again."""
 
@@ -89,19 +92,20 @@ def _robot_stream(parts: list[list[RobotState]]) -> dict[str, Any] | None:
     The time between two parts is no gap.
     """
     count = sum(len(states) for states in parts)
-    steps = np.concatenate([np.diff([state.stamps.controller_s for state in states]) for states in parts])
+    stamps = ([state.stamps.controller_s for state in states] for states in parts)
+    steps = np.concatenate([np.diff([s for s in part if abs(s) < _LARGEST_STAMP_S]) for part in stamps])
     if not len(steps):
         return None
-    period = float(np.median(steps))
+    period, backward = float(np.median(steps)), int((steps < 0).sum())
     if period <= 0:
-        return {"count": count, "rate_hz": None, "gaps": 0, "largest_gap_s": 0.0, "backward": 0}
+        return {"count": count, "rate_hz": None, "gaps": 0, "largest_gap_s": 0.0, "backward": backward}
     gaps = steps[steps > 1.5 * period]
     return {
         "count": count,
         "rate_hz": 1 / period,
         "gaps": len(gaps),
         "largest_gap_s": float(gaps.max()) if len(gaps) else 0.0,
-        "backward": int((steps < 0).sum()),
+        "backward": backward,
     }
 
 
@@ -114,8 +118,8 @@ def _picture_stream(parts: list[list[PictureFacts]]) -> dict[str, Any] | None:
     return {
         "count": len(facts),
         "frame_id_jumps": int((wrapped != 1).sum()),
-        "exposure_us": sorted({fact.exposure_us for fact in facts}),
-        "gain_db": sorted({fact.gain_db for fact in facts}),
+        "exposure_us": sorted({fact.exposure_us for fact in facts if math.isfinite(fact.exposure_us)}),
+        "gain_db": sorted({fact.gain_db for fact in facts if math.isfinite(fact.gain_db)}),
         "pixel_formats": sorted({fact.pixel_format for fact in facts}),
     }
 
@@ -133,7 +137,9 @@ def _clock_fit(pairs: list[tuple[float, float]]) -> dict[str, float] | None:
 
     The spread is of arrival times, the network's delay included: an upper bound on what a pairing can suffer.
     """
-    table: NDArray[np.float64] = np.array([pair for pair in pairs if pair[0] and pair[1]])
+    table: NDArray[np.float64] = np.array(
+        [pair for pair in pairs if pair[0] and pair[1] and abs(pair[0]) < _LARGEST_STAMP_S]
+    )
     if len(table) < 3 or np.ptp(table[:, 0]) <= 0:
         return None
     device = table[:, 0] - table[0, 0]

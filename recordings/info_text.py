@@ -52,12 +52,14 @@ def _info_rows(facts: dict[str, Any]) -> Iterator[tuple[str | Text, str]]:
     retakes = views["attempts"] - views["poses"]
     yield "views", f"{views['poses']} poses" + (f", {retakes} retaken" if retakes else "")
     if states := facts["robot_states"]:
-        rate = f"{states['rate_hz']:.1f} Hz" if states["rate_hz"] else "controller time stands still"
+        rate = f"{states['rate_hz']:.1f} Hz" if states["rate_hz"] else "a controller time that does not go on"
         count = states["gaps"]
         gaps = "no gap"
         if count:
             plural = "s" if count > 1 else ""
             gaps = f"{count} gap{plural}, largest {states['largest_gap_s'] * 1e3:.0f} ms"
+        if back := states["backward"]:
+            gaps += f", controller time goes back {back} time{'s' * (back > 1)}"
         yield "robot states", f"{states['count']} at {rate}, {gaps}"
     if pictures := facts["pictures"]:
         yield "pictures", _pictures_text(pictures)

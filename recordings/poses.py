@@ -67,7 +67,7 @@ def _pose_row(path: Path, line: int, cells: list[str]) -> PoseRow:
             raise wrong(f"{name} = '{cell[:40]}' is not a number") from error
         if not math.isfinite(numbers[-1]):
             raise wrong(f"{name} = {cell} is not finite; correct the pose or delete the line")
-    if not cells[0]:
+    if not cells[0] or "\0" in cells[0]:
         raise wrong("the image's name is missing")
     position, quaternion = numbers[:3], numbers[3:]
     if max(map(abs, position)) > _REACH_LIMIT_M:

@@ -2,8 +2,8 @@
 
 int → int64, float → double, str → string, tuple of floats → repeated double (a matrix row by row),
 struct → message, `| None` → optional. Field numbers are the order of the struct's fields, so a new field goes
-at the end with a default; `tests/recordings/test_schema.py` freezes the numbers. The schema travels inside
-every file, and the reader refuses one that says something else than these.
+at the end with a default; `tests/recordings/test_recording_schema.py` freezes the numbers. The schema
+travels inside every file, and the reader refuses one that says something else than these.
 """
 
 from __future__ import annotations

@@ -231,3 +231,23 @@ class RecordingWriter:
             )
             self._file.close()
             raise self.error from error
+
+
+@contextmanager
+def derived_recording(
+    path: Path, info: SessionInfo, *, lossless_png: bool = False
+) -> Iterator[RecordingWriter]:
+    """For what is made from something that stays: nothing is left behind when the block fails."""
+    writer = RecordingWriter(path, info, lossless_png=lossless_png)
+    try:
+        yield writer
+    except BaseException as problem:
+        writer.part_path.unlink(missing_ok=True)
+        if problem is writer.error and isinstance(problem.__cause__, OSError):
+            raise RecordingError(
+                f"writing {path} failed ({problem.__cause__.strerror}); nothing is left of it. Free space or "
+                "name another disk, and try again"
+            ) from problem
+        raise
+    finally:
+        writer.close()

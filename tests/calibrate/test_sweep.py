@@ -14,7 +14,7 @@ from calibrate.commands.app import app
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import Array, inverse, rotation_log
 from calibrate.kinematics import MODELS, forward
-from calibrate.sweep import sweep_time_offset
+from calibrate.sweep import on_host, sweep_time_offset
 from recordings.messages import CameraModel, Picture, RobotState, SessionInfo, Stamps
 from recordings.pictures import encode_png
 from recordings.reader import open_recording
@@ -91,3 +91,9 @@ def test_a_picture_that_cannot_be_decoded_costs_itself_only(tmp_path: Path) -> N
     answer = json.loads(done.stdout)
     assert answer["offset_s"] == pytest.approx(-LATENCY_S, abs=max(4 * answer["sigma_s"], 1e-4))
     assert len(answer["lost"]) == 1
+
+
+@pytest.mark.parametrize("stamp_s", [np.nan, np.inf, -1e308])
+def test_a_clock_that_gives_no_time_is_refused(stamp_s: float) -> None:
+    with pytest.raises(BadViewsError, match="times that are none"):
+        on_host(np.array([1.0, stamp_s, 3.0]), np.array([1.0, 2.0, 3.0]))

@@ -9,6 +9,7 @@ import struct
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import msgspec
 import numpy as np
@@ -23,7 +24,7 @@ from recordings.errors import RecordingError
 from recordings.excerpt import write_excerpt
 from recordings.export import Target, export_recording
 from recordings.importer import import_folder
-from recordings.messages import Stamps
+from recordings.messages import CameraModel, Stamps
 from recordings.reader import open_recording
 from recordings.viewing import quaternion_xyzw
 from recordings.writer import RecordingWriter
@@ -125,6 +126,24 @@ def test_an_excerpt_keeps_the_views_and_the_states_around_them(tmp_path: Path) -
     assert excerpt.attachments() == original.attachments()
 
 
+@pytest.mark.parametrize("make", ["import", "excerpt"])
+def test_a_full_disk_leaves_no_half_of_a_recording_that_can_be_made_again(
+    small: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: str
+) -> None:
+    recording, real_write = open_recording(small), os.writev
+
+    def write(descriptor: int, pieces: list[memoryview]) -> int:
+        if os.fstat(descriptor).st_size > 2000:
+            raise OSError(28, "No space left on device")
+        return real_write(descriptor, pieces)
+
+    monkeypatch.setattr("recordings.mcap_file.os.writev", write)
+    output = tmp_path / "out.mcap"
+    with pytest.raises(RecordingError, match=r"No space left on device.*nothing is left of it.*try again"):
+        import_folder(folder, output) if make == "import" else write_excerpt(recording, output)
+    assert not list(tmp_path.glob("out*"))
+
+
 @pytest.mark.parametrize("target", ["folder", "csv", "ros2"])
 def test_the_command_line_writes_each_target(small: Path, tmp_path: Path, target: str) -> None:
     result = call(main, "export", small, "--to", target, "-o", tmp_path / "out")
@@ -177,6 +196,54 @@ def test_the_bag_has_the_profile_and_counts_that_ros_wants(small: Path, tmp_path
     assert (out / described["relative_file_paths"][0]).read_bytes()[17:25] == b"\x04\0\0\0ros2"
 
 
+def read_bag(bag: Path) -> dict[str, list[Any]]:
+    """Topic → messages, each topic declared once and each message at the time that its header says."""
+    found: dict[str, list[Any]] = {}
+    with AnyReader([bag]) as reader:
+        assert len({c.topic for c in reader.connections}) == len(reader.connections)
+        for connection, time_ns, raw in reader.messages():
+            message = reader.deserialize(raw, connection.msgtype)
+            header = message.transforms[0].header if connection.topic == "/tf" else message.header
+            assert header.stamp.sec * 10**9 + header.stamp.nanosec == time_ns
+            found.setdefault(connection.topic, []).append(message)
+    return found
+
+
+def test_a_bag_holds_the_pose_that_counts_and_no_lens_that_nobody_knows(tmp_path: Path) -> None:
+    """A retaken pose's first attempt is not in /tf. ROS knows an uncalibrated camera by a K of zeros."""
+    first = ((1.0, 0.0, 0.0, 9.0), (0.0, 1.0, 0.0, 9.0), (0.0, 0.0, 1.0, 9.0), (0.0, 0.0, 0.0, 1.0))
+    with RecordingWriter(tmp_path / "a.mcap", make_info(camera=CameraModel(WIDTH, HEIGHT))) as writer:
+        writer.picture(make_picture(0))
+        writer.view(msgspec.structs.replace(make_view(0), base_from_flange=first))
+        writer.picture(make_picture(1))
+        writer.view(make_view(0, 1, attempt=2))
+        recording = open_recording(writer.finish())
+    found = read_bag(export_recording(recording, tmp_path / "bag", Target.ROS2))
+    assert [message.transforms[0].transform.translation.z for message in found["/tf"]] == [TURNED[2][3]]
+    (camera,) = found["/camera/camera_info"]
+    assert (camera.k.tolist(), len(camera.d), camera.p.tolist()) == ([0.0] * 9, 0, [0.0] * 12)
+    assert camera.r.tolist() == np.eye(3).ravel().tolist()
+
+
+def test_a_short_list_of_distortion_is_filled_up_as_ros_expects_it(tmp_path: Path) -> None:
+    camera = CameraModel(WIDTH, HEIGHT, ((900.0, 0, 16), (0, 900, 12), (0, 0, 1)), (0.1,))
+    with RecordingWriter(tmp_path / "a.mcap", make_info(camera=camera)) as writer:
+        writer.picture(make_picture(0))
+        recording = open_recording(writer.finish())
+    (info,) = read_bag(export_recording(recording, tmp_path / "bag", Target.ROS2))["/camera/camera_info"]
+    assert info.d.tolist() == [0.1, 0.0, 0.0, 0.0, 0.0]
+
+
+def test_times_that_ros_cannot_hold_are_said(tmp_path: Path) -> None:
+    late = Stamps(1, 2**62)
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        writer.robot_state(msgspec.structs.replace(make_state(0), stamps=late))
+        recording = open_recording(writer.finish())
+    with pytest.raises(RecordingError, match="ROS 2 ends in 2038"):
+        export_recording(recording, tmp_path / "bag", Target.ROS2)
+    assert not list(tmp_path.glob("bag*"))
+
+
 @pytest.mark.parametrize("lossless_png", [False, True])
 def test_rosbags_reads_the_bag_back(tmp_path: Path, lossless_png: bool) -> None:
     """By the `rosbags` package; ROS itself was not available to try."""
@@ -186,25 +253,25 @@ def test_rosbags_reads_the_bag_back(tmp_path: Path, lossless_png: bool) -> None:
             writer.picture(make_picture(index))
             writer.view(make_view(index))
         path = writer.finish()
-    bag = export_recording(open_recording(path), tmp_path / "bag", Target.ROS2)
-    found: dict[str, list[object]] = {}
-    with AnyReader([bag]) as reader:
-        for connection, time_ns, raw in reader.messages():
-            assert time_ns >= START_NS
-            found.setdefault(connection.topic, []).append(reader.deserialize(raw, connection.msgtype))
+    found = read_bag(export_recording(open_recording(path), tmp_path / "bag", Target.ROS2))
     joints = found["/joint_states"][2]
-    np.testing.assert_array_equal(joints.position, make_state(2).joints_rad)  # type: ignore[attr-defined]
-    transform = found["/tf"][0].transforms[0]  # type: ignore[attr-defined]
+    np.testing.assert_array_equal(joints.position, make_state(2).joints_rad)
+    assert joints.header.stamp.sec * 10**9 + joints.header.stamp.nanosec == make_state(2).stamps.host_wall_ns
+    assert joints.name == [
+        *("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"),
+        *("wrist_1_joint", "wrist_2_joint", "wrist_3_joint"),
+    ]
+    transform = found["/tf"][0].transforms[0]
     assert (transform.header.frame_id, transform.child_frame_id) == ("base", "flange")
     assert transform.transform.translation.z == TURNED[2][3]
     camera = found["/camera/camera_info"][0]
-    assert (camera.width, camera.distortion_model, camera.k[0]) == (WIDTH, "plumb_bob", 900.0)  # type: ignore[attr-defined]
+    assert (camera.width, camera.distortion_model, camera.k[0]) == (WIDTH, "plumb_bob", 900.0)
     if lossless_png:
-        assert [m.format for m in found["/camera/image_raw/compressed"]] == ["png"] * 3  # type: ignore[attr-defined]
+        assert [m.format for m in found["/camera/image_raw/compressed"]] == ["png"] * 3
         return
     image = found["/camera/image_raw"][1]
-    assert (image.encoding, image.height, image.step) == ("mono8", HEIGHT, WIDTH)  # type: ignore[attr-defined]
-    np.testing.assert_array_equal(image.data.reshape(HEIGHT, WIDTH), make_image(1))  # type: ignore[attr-defined]
+    assert (image.encoding, image.height, image.step) == ("mono8", HEIGHT, WIDTH)
+    np.testing.assert_array_equal(image.data.reshape(HEIGHT, WIDTH), make_image(1))
 
 
 def test_rerun_opens_the_recording_without_a_plugin(tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Callable
 from pathlib import Path
 
@@ -86,6 +87,14 @@ def flip_picture(folder: Path) -> None:
     (folder / "images/1.png").write_bytes(data)
 
 
+def replaced(make: Callable[[Path], object]) -> Change:
+    def change(folder: Path) -> None:
+        (folder / "images/1.png").unlink()
+        make(folder / "images/1.png")
+
+    return change
+
+
 def another_size(folder: Path) -> None:
     cv2.imwrite(str(folder / "images/2.png"), make_image(2, 40, 30))
 
@@ -125,10 +134,28 @@ BAD: dict[str, tuple[Change, str]] = {
         r"line 4: images/0.png stands already in line 2",
     ),
     "no image name": (edit("poses.csv", "images/1.png", ""), r"line 3: the image's name is missing"),
+    "zero in the image name": (
+        edit("poses.csv", "images/1.png", "images/\0.png"),
+        r"line 3: the image's name is missing",
+    ),
     "binary poses": (lambda f: (f / "poses.csv").write_bytes(b"\xff\xfe\x00"), r"not UTF-8"),
     "picture missing": (
         lambda f: (f / "images/1.png").unlink(),
         r"line 3: picture images/1.png cannot be read",
+    ),
+    "picture is a folder": (
+        replaced(Path.mkdir),
+        r"line 3: picture images/1.png cannot be read \(not a file",
+    ),
+    "picture is a pipe": (replaced(os.mkfifo), r"line 3: picture images/1.png cannot be read \(not a file"),
+    "picture is its own link": (
+        replaced(lambda p: p.symlink_to(p.name)),
+        r"line 3: picture images/1.png cannot be read \(Too many levels of symbolic links",
+    ),
+    "picture is a link to outside": (replaced(lambda p: p.symlink_to("/etc/passwd")), r"outside the folder"),
+    "picture's name too long": (
+        edit("poses.csv", "images/1.png", "ü" * 3000),
+        r"line 3: picture ü+ cannot be read \(File name too long",
     ),
     "picture unreadable": (lambda f: (f / "images/1.png").write_text("no"), r"line 3: .*neither PNG"),
     "picture empty": (lambda f: (f / "images/1.png").write_bytes(b""), r"line 3: .*neither PNG"),

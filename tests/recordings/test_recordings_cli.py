@@ -78,6 +78,28 @@ def test_info_for_people_says_the_same(tmp_path: Path) -> None:
         assert words in text, f"'{words}' is missing in: {text}"
 
 
+def test_info_of_clocks_that_go_back_or_are_no_time(tmp_path: Path) -> None:
+    """Whatever a robot or a hostile file says: no traceback, and JSON that a strict reader takes."""
+    stamps_s = [50.0, 50.002, 50.004, 50.001, 50.003, float("nan"), float("inf"), -1e308, 1e308]
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        for controller_s in stamps_s:
+            stamps = Stamps(1, START_NS, controller_s)
+            writer.robot_state(msgspec.structs.replace(make_state(0), stamps=stamps))
+        writer.picture(
+            msgspec.structs.replace(make_picture(0), exposure_us=float("nan"), gain_db=float("inf"))
+        )
+        path = writer.finish()
+    result = run("info", path)
+    assert "9 at 500.0 Hz, no gap, controller time goes back 1 time" in " ".join(result.stdout.split())
+    plain = run("info", path, "--json").stdout
+    assert json.loads(plain, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
+    with RecordingWriter(tmp_path / "b.mcap", make_info()) as writer:
+        for count in reversed(range(5)):
+            writer.robot_state(make_state(count))
+        path = writer.finish()
+    assert recording_info(open_recording(path))["robot_states"]["backward"] == 4
+
+
 def test_info_json_is_one_object(small: Path) -> None:
     result = run("info", small, "--json")
     assert json.loads(result.stdout)["name"] == "test-cell"

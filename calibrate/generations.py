@@ -38,7 +38,7 @@ _NAME = re.compile(r"(\d{4,})-[0-9a-f]{8}\.yaml")
 
 
 class InstallError(CalibrationError):
-    """Nothing was installed; what was installed before still is."""
+    """Refused or failed: what was installed before still is, or the message says what is now."""
 
 
 @dataclass(frozen=True)
@@ -166,11 +166,17 @@ def locked(folder: Path) -> Iterator[None]:
         raise InstallError(
             f"{folder} cannot be used: {problem.strerror}. Name another with --root."
         ) from None
+    before = ""
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
+        before = _current_name(folder)
         yield
     except OSError as problem:
-        raise InstallError(f"{folder}: {problem.strerror or problem}. Nothing was switched.") from None
+        now = _current_name(folder)
+        switched = (
+            f"{now} is installed now, and the log may not say so" if now != before else "Nothing was switched"
+        )
+        raise InstallError(f"{folder}: {problem.strerror or problem}. {switched}.") from None
     finally:
         os.close(descriptor)
 

@@ -67,6 +67,25 @@ def test_what_does_not_read_back_as_written_is_not_installed(  # type: ignore[no
     assert len(read_log(root)) == 1
 
 
+@pytest.mark.parametrize(
+    ("fails", "says"), [("write_atomically", "Nothing was switched"), ("append_line", "0002-")]
+)
+def test_a_full_disk_says_what_is_installed_now(  # type: ignore[no-untyped-def]
+    make_file, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails: str, says: str
+) -> None:
+    """The log is written last: when that fails, the switch has been made."""
+    install(make_file(0.0), tmp_path / "root")
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(f"calibrate.generations.{fails}", full)
+    with pytest.raises(InstallError, match=f"No space left on device. {says}"):
+        install(make_file(1e-4), tmp_path / "root")
+    current = next(g.number for g in generations(tmp_path / "root") if g.current)
+    assert current == (1 if fails == "write_atomically" else 2)
+
+
 def test_files_of_others_beside_the_generations_are_left_alone(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     root = tmp_path / "s"
     install(make_file(), root)

@@ -18,6 +18,7 @@ from station.errors import StationError
 log = logging.getLogger(__name__)
 
 R = TypeVar("R")
+START_S = 60.0
 REAP_S = 5.0
 
 
@@ -30,36 +31,46 @@ class Workers:
 
     def __init__(self) -> None:
         self._pool: ProcessPoolExecutor | None = None
+        self._turn = asyncio.Lock()
+        self._closed = False
         self.waiting = 0
         """Calls under way: a preview is not worth queueing for."""
 
     async def start(self) -> None:
         """Returns when the worker has loaded what it needs (about a second)."""
-        await self.call(warm_up, timeout_s=60.0)
+        await self.call(warm_up)
 
     async def call(self, function: Callable[..., R], *args: Any, timeout_s: float = 60.0) -> R:
-        """The function's result or exception. WorkerError when the process fails or is too slow."""
-        if self._pool is None:
-            self._pool = ProcessPoolExecutor(1, get_context("spawn"), initializer=start_worker)
-        pool = self._pool
+        """The function's result or exception. WorkerError when the process fails or is too slow.
+
+        `timeout_s`: from when its turn comes and the worker is there, so that no call ends another one.
+        """
         self.waiting += 1
+        try:
+            async with self._turn:
+                if self._closed:
+                    raise WorkerError("the station is ending")
+                pool = self._pool
+                if pool is None:
+                    pool = self._pool = ProcessPoolExecutor(1, get_context("spawn"), initializer=start_worker)
+                    await self._ask(pool, START_S, warm_up)
+                return await self._ask(pool, timeout_s, function, *args)
+        finally:
+            self.waiting -= 1
+
+    async def _ask(
+        self, pool: ProcessPoolExecutor, timeout_s: float, function: Callable[..., R], *args: Any
+    ) -> R:
         try:
             async with asyncio.timeout(timeout_s):
                 return await asyncio.wrap_future(pool.submit(function, *args))
-        except asyncio.CancelledError:
-            task = asyncio.current_task()
-            if task is not None and task.cancelling():
-                raise
-            # Not ours: the pool was replaced under a call that still waited in it.
-            raise WorkerError(f"the worker process was replaced before {function.__name__}") from None
         except (BrokenProcessPool, TimeoutError) as error:
             self._discard(pool)
             what = "took too long" if isinstance(error, TimeoutError) else "died"
             raise WorkerError(f"the worker process {what} in {function.__name__}; it is replaced") from error
-        finally:
-            self.waiting -= 1
 
     def close(self) -> None:
+        self._closed = True
         if self._pool is not None:
             self._discard(self._pool)
 

@@ -237,21 +237,31 @@ async def test_speeds_that_are_none_are_refused_before_a_go(
         await rig.session.prepare(1, "run")
 
 
-def _doze(seconds: float) -> float:
-    time.sleep(seconds)
-    return seconds
-
-
-async def test_calls_that_waited_behind_a_hanging_one_hear_of_it() -> None:
+async def test_a_call_that_hangs_costs_its_own_answer_only() -> None:
     workers = Workers()
     try:
-        await workers.call(_doze, 0.0)
-        hanging = asyncio.ensure_future(workers.call(_doze, 30.0, timeout_s=0.5))
-        behind = [asyncio.ensure_future(workers.call(_doze, 0.0)) for _ in range(4)]
-        results = await asyncio.gather(hanging, *behind, return_exceptions=True)
-        assert [type(result) for result in results] == [WorkerError] * 5
+        await workers.start()
+        slow = asyncio.ensure_future(workers.call(time.sleep, 1.0))
+        hanging = asyncio.ensure_future(workers.call(time.sleep, 30.0, timeout_s=0.5))
+        # Neither the calls before it nor the worker that starts anew count as its own time.
+        behind = asyncio.ensure_future(workers.call(time.sleep, 0.0, timeout_s=0.5))
+        results = await asyncio.gather(slow, hanging, behind, return_exceptions=True)
+        assert results[0] is None and results[2] is None
+        assert isinstance(results[1], WorkerError) and "too long" in str(results[1])
     finally:
         workers.close()
+
+
+async def test_a_call_that_waits_when_the_station_ends_starts_no_worker() -> None:
+    workers = Workers()
+    await workers.start()
+    running = asyncio.ensure_future(workers.call(time.sleep, 30.0))
+    behind = asyncio.ensure_future(workers.call(time.sleep, 0.0))
+    await asyncio.sleep(0.05)
+    workers.close()
+    results = await asyncio.gather(running, behind, return_exceptions=True)
+    assert [type(result) for result in results] == [WorkerError] * 2
+    assert workers._pool is None
 
 
 async def test_an_error_nobody_foresaw_is_answered(rig: Rig, tmp_path: Path) -> None:

@@ -107,7 +107,7 @@ class Client:
     async def request(self, verb: Verb, *, timeout_s: float = ANSWER_S, **args: Any) -> Any:
         """The daemon's result as plain data. RefusedError with its reason; DaemonGoneError; NoAnswerError."""
         if self._gone:
-            raise self._gone_error()
+            raise DaemonGoneError(f"The station daemon at {self._path} is gone; nothing was sent to the arm.")
         request = Request(self._next_id, verb, args)
         self._next_id += 1
         line = msgspec.json.encode(request) + b"\n"
@@ -202,7 +202,11 @@ class Client:
         self._fresh.set()
 
     def _gone_error(self) -> DaemonGoneError:
-        return DaemonGoneError(f"The station daemon at {self._path} is gone; nothing was sent to the arm.")
+        """While it was asked: it may have done what it was asked for, and then have gone."""
+        return DaemonGoneError(
+            f"The station daemon at {self._path} is gone and did not answer: whether it heard this is not "
+            "known. Look at the cell."
+        )
 
 
 def default_socket() -> Path:

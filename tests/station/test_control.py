@@ -254,8 +254,10 @@ async def test_a_dying_daemon_ends_requests_and_statuses(server: Served) -> None
     planning = asyncio.create_task(client.request("make_plan"))
     await asyncio.sleep(0.05)
     await control.close()
-    with pytest.raises(DaemonGoneError, match="gone"):
+    with pytest.raises(DaemonGoneError, match=r"not known\. Look at the cell"):
         await planning
+    with pytest.raises(DaemonGoneError, match="nothing was sent"):
+        await client.request("go", token="")
     async with asyncio.timeout(2):
         assert len([s async for s in statuses]) <= 1
     await client.close()

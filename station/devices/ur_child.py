@@ -38,6 +38,7 @@ class ControlChild:
     def __init__(self, process: subprocess.Popen[bytes], channel: socket.socket, log_path: Path) -> None:
         self._process = process
         self._channel = channel
+        channel.setblocking(False)  # the loop waits for no process, least of all for one that hangs
         self._log_path = log_path
         self._loop = asyncio.get_running_loop()
         self._ready: asyncio.Future[dict[str, Any]] = self._loop.create_future()
@@ -62,7 +63,6 @@ class ControlChild:
         Raises RobotError when this computer does not let it.
         """
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        ours.setblocking(False)
         command = [sys.executable, "-m", "station.devices.ur_control", host, str(theirs.fileno())]
         try:
             with theirs, _log(log_path) as log:

@@ -254,6 +254,56 @@ async def test_a_move_that_was_not_taken_raises(parent: Parent) -> None:
         await moving
 
 
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("One of the RTDE input registers are already in use!", "another program controls the robot"),
+        ("please enable Remote Control on the robot", "switch the pendant to Remote"),
+        ("Failed to start control script, before timeout of 5 seconds", "release the brakes"),
+        ("boost: no route", "control could not start: boost: no route"),
+    ],
+)
+async def test_a_start_that_the_library_refuses_is_told_with_the_remedy(
+    parent: Parent, words: str, said: str
+) -> None:
+    parent.answer({"refused": words})
+    with pytest.raises(RobotError, match=said):
+        await parent.child.ready(timeout_s=5.0)
+    assert parent.process.kills
+
+
+@pytest.mark.parametrize("asked", ["ready", "move", "heard"])
+async def test_a_process_that_dies_is_told_at_once(parent: Parent, asked: str) -> None:
+    child = parent.child
+    doing = {"ready": child.ready, "move": lambda: child.move([0.0] * 6, 0.5, 0.5), "heard": child.heard}
+    waiting = asyncio.ensure_future(doing[asked]())
+    await asyncio.sleep(0.01)
+    parent.theirs.close()
+    with pytest.raises(RobotError, match="process died"):
+        await asyncio.wait_for(waiting, 0.8)
+
+
+async def test_a_process_that_reads_nothing_does_not_hold_the_loop_up(parent: Parent) -> None:
+    async with asyncio.timeout(5.0):
+        for _ in range(1000):  # more than its socket holds
+            parent.child.beat()
+        parent.child.stop()
+        with pytest.raises(RobotError, match="takes no requests"):
+            await parent.child.move([0.0] * 6, 0.5, 0.5)
+    with pytest.raises(RobotError, match="hangs"):
+        parent.child.check(patience_s=0.0)
+
+
+async def test_a_stop_is_acknowledged_by_its_answer_and_by_the_end(parent: Parent, tmp_path: Path) -> None:
+    parent.child.stop()
+    assert await parent.asked() == {"do": "stop", "deceleration": 2.0}
+    parent.answer({"stopped": True})
+    await asyncio.wait_for(parent.child.stop_acknowledged, 1.0)
+    dying = Parent(tmp_path)
+    dying.theirs.close()
+    await asyncio.wait_for(dying.child.stop_acknowledged, 1.0)
+
+
 async def test_a_computer_that_starts_no_process_is_told_of_in_words(tmp_path: Path) -> None:
     in_the_way = tmp_path / "log"
     in_the_way.touch()

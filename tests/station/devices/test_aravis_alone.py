@@ -1,0 +1,211 @@
+"""What a GenICam camera may do to its driver, shown by doubles: no Aravis and no network is needed."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from station.config import CameraConfig
+from station.devices import aravis_device
+from station.devices.aravis import AravisCamera
+from station.devices.aravis_device import GenicamDevice
+from station.devices.aravis_settings import apply_settings, require_settings
+from station.devices.base import TriggerPulse
+from station.devices.frames import DeviceClock
+from station.errors import CameraError
+
+REGION = (0, 0, 1280, 1024)
+
+
+class Clockwork:
+    """In place of `Aravis.Camera`: a clock of `rate_hz` that shows what was latched only after some reads."""
+
+    def __init__(self, rate_hz: int = 1_000_000_000, before: int = 111, latched: int = 5_000) -> None:
+        self.rate_hz, self.value, self.latched = rate_hz, before, latched
+        self.late_reads, self.asked = 3, False
+
+    def is_feature_available(self, name: str) -> bool:
+        return name in ("TimestampLatch", "GevTimestampTickFrequency")
+
+    def execute_command(self, name: str) -> None:
+        self.asked = True
+
+    def get_integer(self, name: str) -> int:
+        if name == "GevTimestampTickFrequency":
+            return self.rate_hz
+        if self.asked:
+            self.late_reads -= 1
+            if self.late_reads < 0:
+                self.value = self.latched
+        return self.value
+
+
+@pytest.fixture
+def device(monkeypatch: pytest.MonkeyPatch) -> Any:
+    monkeypatch.setattr(aravis_device, "_aravis", lambda: (None, SimpleNamespace(Error=OSError)))
+    return GenicamDevice(CameraConfig())
+
+
+def shown_ns(device: Any, camera: Clockwork) -> list[int]:
+    """What the clock was told, one latch."""
+    told: list[int] = []
+    device._camera = camera
+    clock: Any = SimpleNamespace(reading=lambda device_ns, asked, answered: told.append(device_ns))
+    device.latch(clock)
+    return told
+
+
+def test_a_time_that_an_earlier_client_latched_is_not_now(device: Any) -> None:
+    assert shown_ns(device, Clockwork()) == [5_000]
+
+
+def test_a_clock_that_shows_no_other_time_says_nothing(device: Any) -> None:
+    assert shown_ns(device, Clockwork(latched=111)) == []
+
+
+@pytest.mark.parametrize(("rate_hz", "ticks_ns"), [(0, 1), (1_000_000_000, 1), (125_000_000, 8)])
+def test_a_clock_that_ticks_slower_is_told_in_nanoseconds(device: Any, rate_hz: int, ticks_ns: int) -> None:
+    assert shown_ns(device, Clockwork(rate_hz)) == [5_000 * ticks_ns]
+
+
+def test_a_camera_that_is_gone_is_not_waited_for(device: Any) -> None:
+    device._stream = SimpleNamespace(
+        try_pop_buffer=lambda: None, timeout_pop_buffer=lambda microseconds: None
+    )
+    device._lost = True
+    with pytest.raises(CameraError, match="is gone"):
+        device.fresh_frame(60.0)
+
+
+class Device:
+    """In place of `GenicamDevice`."""
+
+    lost, surplus = False, 0
+
+    def latch(self, clock: DeviceClock) -> None: ...
+
+    def check_settings(self) -> tuple[float, float]:
+        return 1000.0, 0.0
+
+    def drain(self) -> int:
+        return self.surplus
+
+    def frame(self, timeout_s: float) -> None:
+        raise CameraError("it is gone" if self.lost else "a frame came incomplete")
+
+    def close(self) -> None: ...
+
+
+class Box:
+    fired = 0
+
+    async def fire(self) -> TriggerPulse:
+        self.fired += 1
+        return TriggerPulse(self.fired, 0, 0)
+
+
+def opened(device: Device, config: CameraConfig, trigger: Any = None) -> AravisCamera:
+    camera: Any = AravisCamera(config, trigger)
+    camera._device = device
+    return camera  # type: ignore[no-any-return]
+
+
+async def test_a_stream_outlives_a_bad_frame_and_ends_with_its_camera() -> None:
+    device, stop = Device(), threading.Event()
+    camera = opened(device, CameraConfig(trigger="free-running"))
+    streaming = asyncio.ensure_future(camera.stream(lambda picture: None, stop))
+    await asyncio.sleep(0.05)
+    assert not streaming.done()
+    device.lost, device.close, camera._open = True, stop.set, lambda: None  # type: ignore[method-assign]
+    with pytest.raises(CameraError):
+        await asyncio.wait_for(streaming, 5.0)
+    await camera.close()
+
+
+async def test_a_preview_fires_no_trigger_box() -> None:
+    box = Box()
+    camera = opened(Device(), CameraConfig(trigger="hardware"), box)
+    assert await camera.preview() is None and box.fired == 0
+    await camera.close()
+
+
+async def test_a_frame_that_nobody_asked_for_costs_the_pose_not_the_next() -> None:
+    device = Device()
+    camera = opened(device, CameraConfig(trigger="software"))
+    device.surplus = 2
+    with pytest.raises(CameraError, match=r"2 frame.* without a trigger"):
+        await camera.capture()
+    await camera.close()
+
+
+async def test_a_camera_that_was_not_opened_says_so() -> None:
+    camera = AravisCamera(CameraConfig())
+    with pytest.raises(CameraError, match="not open"):
+        await camera.capture()
+    await camera.close()
+
+
+class Settable:
+    """In place of `Aravis.Camera`: notes what is set and tells of what stands."""
+
+    def __init__(self, exposure_us: float, gain_db: float, region: tuple[int, int, int, int]) -> None:
+        self._stands = exposure_us, gain_db, region
+        self.set: dict[str, tuple[Any, ...]] = {}
+
+    def get_exposure_time(self) -> float:
+        return self._stands[0]
+
+    def get_gain(self) -> float:
+        return self._stands[1]
+
+    def get_region(self) -> Any:
+        return SimpleNamespace(**dict(zip(("x", "y", "width", "height"), self._stands[2], strict=True)))
+
+    def get_sensor_size(self) -> tuple[int, int]:
+        return 1280, 1024
+
+    def is_gain_available(self) -> bool:
+        return True
+
+    def is_gv_device(self) -> bool:
+        return False
+
+    def is_feature_available(self, name: str) -> bool:
+        return True
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *values: self.set.__setitem__(
+            f"{name} {values[0]}" if name == "set_string" else name, values
+        )
+
+
+@pytest.mark.parametrize(
+    ("exposure_us", "gain_db", "region"),
+    [(1030.0, 0.0, REGION), (970.0, 0.0, REGION), (1000.0, 0.3, REGION), (1000.0, 0.0, (8, 0, 1280, 1024))],
+)
+def test_another_exposure_gain_or_region_than_asked_for_is_refused(
+    exposure_us: float, gain_db: float, region: tuple[int, int, int, int]
+) -> None:
+    wanted = CameraConfig(exposure_us=1000.0, gain_db=0.0)
+    assert require_settings(Settable(1010.0, 0.1, REGION), wanted, REGION) == (1010.0, 0.1)
+    with pytest.raises(CameraError, match="set were 1000 µs"):
+        require_settings(Settable(exposure_us, gain_db, region), wanted, REGION)
+
+
+@pytest.mark.parametrize(
+    ("trigger", "line"), [("software", ("Software",)), ("hardware", ("Line0",)), ("free-running", None)]
+)
+def test_the_whole_sensor_is_set_with_the_right_trigger_and_automatics_off(trigger: Any, line: Any) -> None:
+    library = SimpleNamespace(
+        RangeCheckPolicy=SimpleNamespace(ENABLE=1), AcquisitionMode=SimpleNamespace(CONTINUOUS="continuous")
+    )
+    camera = Settable(1000.0, 0.0, REGION)
+    assert apply_settings(library, camera, CameraConfig(trigger=trigger)) == REGION
+    assert camera.set["set_region"] == REGION and camera.set.get("set_trigger") == line
+    assert camera.set["set_string ExposureAuto"] == ("ExposureAuto", "Off")
+    assert camera.set["set_string GainAuto"] == ("GainAuto", "Off")
+    assert camera.set["set_acquisition_mode"] == ("continuous",)

@@ -162,6 +162,17 @@ def test_identical_views_are_refused():
         solve_views(replace(cell.views, views=(view,) * 8))
 
 
+@pytest.mark.parametrize("with_pixels", [True, False])
+def test_a_view_counts_once(with_pixels):
+    """Ten views given twice would claim an error smaller by the root of two."""
+    views = make_cell(np.random.default_rng(0), 10, LOW).views
+    if not with_pixels:
+        bare = (replace(v, pixels=v.pixels[:0], board_points=v.board_points[:0]) for v in views)
+        views = replace(views, views=tuple(bare))
+    with pytest.raises(BadViewsError, match=r"Views 1 \(view 0\) and 1 \(view 0\) are one"):
+        solve_views(views.select([*range(10), 0]))
+
+
 def broken(field, value):
     cell = make_cell(np.random.default_rng(0), 8, LOW)
     views = list(cell.views.views)

@@ -43,7 +43,7 @@ class SweepRun(Run):
             )
         await super()._open_recording()
 
-    async def _poses(self) -> None:
+    async def _all_poses(self) -> None:
         try:
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._take_pictures())
@@ -55,7 +55,6 @@ class SweepRun(Run):
             raise failed.exceptions[0] from None  # of two the first one tells the cause
         if not self._bench.halting:
             self._bench.store.event(f"{self._pictures} pictures while the arm moved")
-            await self._rest()
 
     async def _swings(self) -> None:
         bench, queue = self._bench, self._bench.require_queue()

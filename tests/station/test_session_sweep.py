@@ -41,6 +41,8 @@ async def test_it_swings_takes_pictures_and_comes_back(sweeping: Rig) -> None:
     summary = await sweeping.session.prepare(1, "run")
     assert "sweep: 8 slow swings" in summary.purpose and sweeping.arm.log == []
     sweeping.session.go(1, summary.token)
+    await sweeping.until(S.MOVING)
+    assert sweeping.session.bench.require_recording().elapsed_s > 0
     await swing_to_the_end(sweeping)
     assert sweeping.arm.joints == pytest.approx(TRUTH.start_joints_rad)
     assert sweeping.pose_states == ["done"] * SWINGS

@@ -62,30 +62,28 @@ def serve_command(
     require_choices(scene=scene, noise=noise, mount=mount)
     logging.basicConfig(level=logging.INFO, format=_log_format(), stream=sys.stderr)
     place = root or default_root()
+    # What only one kind of cell needs is loaded only for it.
     if config is not None:
-        asyncio.run(serve_cell(_real_cell(config, place), place, socket or default_socket(), end_with_stdin))
-        return
-    if replay is not None:
+        cell = _real_cell(config, place)
+    elif replay is not None:
         from station.playback_cell import playback_cell
 
-        played = playback_cell(replay)
-        asyncio.run(serve_cell(played, place, socket or default_socket(), end_with_stdin))
-        return
-    # Simulation is loaded only where it is wanted.
-    from station.simulation.launch_cell import SimulationOptions, simulated_cell
+        cell = playback_cell(replay)
+    else:
+        from station.simulation.launch_cell import SimulationOptions, simulated_cell
 
-    options = SimulationOptions(
-        scene,  # type: ignore[arg-type]
-        seed,
-        noise,  # type: ignore[arg-type]
-        mount,  # type: ignore[arg-type]
-        time_scale,
-        gige,
-        hardware_trigger,
-        frame_rate_hz,
-        robot,
-    )
-    cell = simulated_cell(options, place / "simulation")
+        options = SimulationOptions(
+            scene,  # type: ignore[arg-type]
+            seed,
+            noise,  # type: ignore[arg-type]
+            mount,  # type: ignore[arg-type]
+            time_scale,
+            gige,
+            hardware_trigger,
+            frame_rate_hz,
+            robot,
+        )
+        cell = simulated_cell(options, place / "simulation")
     asyncio.run(serve_cell(cell, place, socket or default_socket(), end_with_stdin))
 
 

@@ -9,12 +9,15 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 
+from recordings.messages import CameraModel
 from station.estimation import next_best_text, running_estimate
 from station.session.bench import Bench
 from station.status import EstimateStatus
 from station.workers import WorkerError
 
 log = logging.getLogger(__name__)
+
+_TIMEOUT_S = 20.0
 
 
 class Estimator:
@@ -41,24 +44,8 @@ class Estimator:
             camera = config.camera.model
             if camera is None or camera.matrix is None:
                 continue
-            seen = [(v.index, v.base_from_flange, v.indices, v.pixels) for v in bench.seen.values()]
-            known = bench.cell.camera_model is not None
             try:
-                estimate = await bench.workers.call(
-                    running_estimate,
-                    config.mount,
-                    camera,
-                    known,
-                    config.board,
-                    seen,
-                    config.capture.goal_m,
-                    timeout_s=20.0,
-                )
-                joints = bench.store.status.robot.joints_rad
-                if joints is not None and estimate.sigma_translation_mm is not None and not estimate.enough:
-                    flange = np.array([v[1] for v in seen])
-                    text = await bench.workers.call(next_best_text, config, flange, joints, timeout_s=20.0)
-                    estimate = msgspec.structs.replace(estimate, advice=text or estimate.advice)
+                estimate = await self._estimate(camera)
             except Exception as error:  # this task looks on; it must outlive every picture and every defect
                 if not isinstance(error, WorkerError):
                     log.exception("the running estimate failed")
@@ -68,3 +55,24 @@ class Estimator:
             if hint and not bench.store.status.estimate.improve:
                 bench.store.event(hint)
             bench.store.update(estimate=msgspec.structs.replace(estimate, improve=hint))
+
+    async def _estimate(self, camera: CameraModel) -> EstimateStatus:
+        """With advice on the next pose, where one more would help."""
+        bench, config = self._bench, self._bench.cell.config
+        seen = [(v.index, v.base_from_flange, v.indices, v.pixels) for v in bench.seen.values()]
+        estimate = await bench.workers.call(
+            running_estimate,
+            config.mount,
+            camera,
+            bench.cell.camera_model is not None,
+            config.board,
+            seen,
+            config.capture.goal_m,
+            timeout_s=_TIMEOUT_S,
+        )
+        joints = bench.store.status.robot.joints_rad
+        if joints is None or estimate.sigma_translation_mm is None or estimate.enough:
+            return estimate
+        flange = np.array([v[1] for v in seen])
+        text = await bench.workers.call(next_best_text, config, flange, joints, timeout_s=_TIMEOUT_S)
+        return msgspec.structs.replace(estimate, advice=text or estimate.advice)

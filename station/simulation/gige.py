@@ -260,19 +260,26 @@ def main(
     print(json.dumps({"ready": True, "address": address, "serial": serial}), flush=True)
     for line in sys.stdin:
         request = json.loads(line)
-        if request["name"] == "packet-loss":
-            camera.set_packet_loss(float(request["value"]))
-        elif request["name"] == "number":
-            numbers.next_number = int(request["value"])
-        elif request["name"] == "sent":
-            pass  # every answer says it
-        elif request["name"] == "pulse":
-            camera.set_register(genicam.TRIGGER_PULSE, 1)
-        elif request["name"] == "register":
-            camera.set_register(*request["value"])
-        else:
-            rendered.faults.inject(request["name"], request.get("value"))
+        _carry_out(request["name"], request.get("value"), camera, numbers, rendered)
         print(json.dumps({"done": request["name"], "number": numbers.next_number}), flush=True)
+
+
+def _carry_out(
+    name: str, value: Any, camera: GigeCamera, numbers: NumberedSource, rendered: CameraProcess
+) -> None:
+    match name:
+        case "packet-loss":
+            camera.set_packet_loss(float(value))
+        case "number":
+            numbers.next_number = int(value)
+        case "sent":
+            pass  # every answer says it
+        case "pulse":
+            camera.set_register(genicam.TRIGGER_PULSE, 1)
+        case "register":
+            camera.set_register(*value)
+        case _:
+            rendered.faults.inject(name, value)
 
 
 if __name__ == "__main__":

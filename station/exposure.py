@@ -48,7 +48,6 @@ def assess(
     corners: Array | None,
     exposure_us: float,
     gain_db: float,
-    gain_limit_db: float = HIGHEST_GAIN_DB,
 ) -> ExposureAdvice:
     """What a picture (h, w[, 3]) taken at this exposure and gain asks for.
 
@@ -60,7 +59,7 @@ def assess(
     black, white = (float(v) for v in np.percentile(region, (8.0, share)))
     saturated = float((region >= _SATURATED).mean())
     factor = _factor(black, white, saturated)
-    wanted_us, wanted_db = _settings(exposure_us, gain_db, factor, gain_limit_db)
+    wanted_us, wanted_db = _settings(exposure_us, gain_db, factor)
     blur_px = _blur(grey, white - black)
     advice = f"set {wanted_us:.0f} µs and {wanted_db:.1f} dB"
     warnings = []
@@ -101,13 +100,13 @@ def _factor(black: float, white: float, saturated: float) -> float:
     return 1.0 if _KEEP[0] <= factor <= _KEEP[1] else min(factor, 16.0)
 
 
-def _settings(exposure_us: float, gain_db: float, factor: float, gain_limit_db: float) -> tuple[float, float]:
+def _settings(exposure_us: float, gain_db: float, factor: float) -> tuple[float, float]:
     """Light is spent on exposure first; gain comes last and goes first."""
     if factor == 1.0:
         return exposure_us, gain_db
     total_us = exposure_us * 10 ** (gain_db / 20) * factor
     wanted_us = float(np.clip(total_us, SHORTEST_EXPOSURE_US, LONGEST_EXPOSURE_US))
-    wanted_db = float(np.clip(20 * np.log10(total_us / wanted_us), 0.0, gain_limit_db))
+    wanted_db = float(np.clip(20 * np.log10(total_us / wanted_us), 0.0, HIGHEST_GAIN_DB))
     return wanted_us, wanted_db
 
 

@@ -123,11 +123,7 @@ def sample_path(geometry: CellGeometry, from_rad: Array, to_rad: Array, spacing_
 
 
 def check_path(
-    geometry: CellGeometry,
-    from_joints_rad: ArrayLike,
-    to_joints_rad: ArrayLike,
-    name: str = "move",
-    spacing_m: float = SPACING_M,
+    geometry: CellGeometry, from_joints_rad: ArrayLike, to_joints_rad: ArrayLike, name: str = "move"
 ) -> MoveCheck:
     """Everything that can be wrong with one move, and the speed it may be driven at."""
     start, target = (np.asarray(q, dtype=float) for q in (from_joints_rad, to_joints_rad))
@@ -136,9 +132,9 @@ def check_path(
     problems = _joint_problems(geometry, start, target, name)
     if np.abs(target - start).max() > _LONGEST_TURN_RAD:
         return _refused(name, problems)
-    samples = sample_path(geometry, start, target, spacing_m)
+    samples = sample_path(geometry, start, target, SPACING_M)
     gaps, labels = margins(geometry, samples)
-    problems += _margin_problems(leaving(gaps - spacing_m / 2), labels, name)
+    problems += _margin_problems(leaving(gaps - SPACING_M / 2), labels, name)
     speed, acceleration, duration, peak = allowed_speed(geometry, samples)
     flange = forward(geometry.model, samples)[:, :3, 3]
     return MoveCheck(

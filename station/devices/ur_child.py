@@ -105,19 +105,19 @@ class ControlChild:
             raise RobotError(_refusal(str(answer["refused"])) + self.epitaph())
         return tuple(answer["tcp"]) if answer.get("tcp") else None
 
-    async def heard(self, timeout_s: float = HEARD_S) -> None:
+    async def heard(self) -> None:
         """Waits for a fresh heartbeat that kicked the watchdog: without, no move is taken. RobotError."""
         try:
-            async with asyncio.timeout(timeout_s):
+            async with asyncio.timeout(HEARD_S):
                 while time.monotonic_ns() - self._kicked_ns > HEARD_NS:
                     if self.gone.is_set() or self.kicks_refused:
                         break
                     self._news.clear()
                     await self._news.wait()
         except TimeoutError:
-            self.check(patience_s=timeout_s / 2)
+            self.check(patience_s=HEARD_S / 2)
             raise RobotError(
-                f"no heartbeat of the session reached the control process within {timeout_s:g} s: look for "
+                f"no heartbeat of the session reached the control process within {HEARD_S:g} s: look for "
                 f"what loads this computer; see {self._log_path}"
             ) from None
         self.check()

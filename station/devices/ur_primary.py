@@ -27,6 +27,7 @@ CARTESIAN_INFO = 4
 KINEMATICS_INFO = 5
 MESSAGE_LIMIT = 64 * 1024
 SILENCE_S = 3.0
+FIRST_S = 1.0
 _HEADER = struct.Struct(">iB")
 PACKED_HEADER_BYTES = _HEADER.size
 _CARTESIAN = struct.Struct(">12d")
@@ -106,10 +107,10 @@ class PrimaryReader:
         self._first = asyncio.Event()
         self._task = asyncio.create_task(self._run(), name=f"installation of {host}")
 
-    async def first(self, timeout_s: float = 1.0) -> Installation:
+    async def first(self) -> Installation:
         """What the controller states; empty when it says nothing in time (a firewalled or old one)."""
         with contextlib.suppress(TimeoutError):
-            async with asyncio.timeout(timeout_s):
+            async with asyncio.timeout(FIRST_S):
                 await self._first.wait()
         return self.installation
 

@@ -12,6 +12,7 @@ from station.plan.scene import Scene, flange_poses
 
 _SHADES = " ░▒▓█"
 _BARS = "▁▂▃▄▅▆▇█"
+_WIDTH, _ROWS = 78, 11
 
 
 def expected_pixels(scene: Scene, plan: Plan) -> Array:
@@ -41,21 +42,22 @@ def board_from_cameras(scene: Scene, plan: Plan) -> Array:
     return np.asarray(-np.einsum("nji,nj->ni", seen[:, :3, :3], seen[:, :3, 3]))
 
 
-def sketch(scene: Scene, plan: Plan, width: int = 78) -> str:
-    """Three small panels as lines of text, at most `width` wide."""
+def sketch(scene: Scene, plan: Plan) -> str:
+    """Three small panels as lines of text, at most 78 wide."""
     left, right = _picture_panel(scene, plan), _camera_panel(scene, plan)
-    lines = [f"{a:<40}{b}"[:width] for a, b in zip(left, right, strict=True)]
+    lines = [f"{a:<40}{b}"[:_WIDTH] for a, b in zip(left, right, strict=True)]
     sigmas = [pose.predicted_sigma_m for pose in plan.poses]
     known = [s for s in sigmas if s is not None]
     if known:
         bars = "".join(_bar(s, known) for s in known)
         lines.append(
-            f"expected error of X  {bars}  {1000 * known[-1]:.2f} mm after {len(plan.poses)} poses"[:width]
+            f"expected error of X  {bars}  {1000 * known[-1]:.2f} mm after {len(plan.poses)} poses"[:_WIDTH]
         )
     return "\n".join(lines)
 
 
-def _picture_panel(scene: Scene, plan: Plan, columns: int = 34, rows: int = 11) -> list[str]:
+def _picture_panel(scene: Scene, plan: Plan) -> list[str]:
+    columns, rows = 34, _ROWS
     counts = coverage_grid(scene, plan, columns, rows)
     top = max(float(counts.max()), 1.0)
     shade = np.ceil((len(_SHADES) - 1) * counts / top).astype(int)
@@ -65,7 +67,8 @@ def _picture_panel(scene: Scene, plan: Plan, columns: int = 34, rows: int = 11) 
     return [title, "┌" + "─" * columns + "┐", *body, "└" + "─" * columns + "┘"]
 
 
-def _camera_panel(scene: Scene, plan: Plan, columns: int = 33, rows: int = 11) -> list[str]:
+def _camera_panel(scene: Scene, plan: Plan) -> list[str]:
+    columns, rows = 33, _ROWS
     """Camera centres over the board plane, numbered in order of visit."""
     centres = board_from_cameras(scene, plan)
     middle = transform_points(np.eye(4), board_points(scene.board)).mean(axis=0)

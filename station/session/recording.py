@@ -67,8 +67,8 @@ async def to_the_end(work: Coroutine[Any, Any, R]) -> R:
         raise
 
 
-def stamps_now(controller_s: float = 0.0) -> Stamps:
-    return Stamps(time.monotonic_ns(), time.time_ns(), controller_s)
+def stamps_now() -> Stamps:
+    return Stamps(time.monotonic_ns(), time.time_ns())
 
 
 class SessionRecording:

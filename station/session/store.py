@@ -23,9 +23,8 @@ _LEVELS = {"debug": logging.DEBUG, "info": logging.INFO, "warning": logging.WARN
 class StatusStore:
     """Holds the newest immutable snapshot. Only the event loop's thread may call it."""
 
-    def __init__(self, status: StationStatus, wall_ns: Callable[[], int] = time.time_ns) -> None:
+    def __init__(self, status: StationStatus) -> None:
         self._status = status
-        self._wall_ns = wall_ns
         self._watchers: list[Callable[[], None]] = []
         self._listeners: list[Callable[[Event], None]] = []
 
@@ -66,7 +65,7 @@ class StatusStore:
 
     def event(self, text: str, level: Level = "info", pose_index: int | None = None) -> None:
         text = text if len(text) <= EVENT_TEXT_LIMIT else text[: EVENT_TEXT_LIMIT - 1] + "…"
-        event = Event(self._wall_ns(), level, text, pose_index)
+        event = Event(time.time_ns(), level, text, pose_index)
         log.log(_LEVELS[level], "%s%s", f"pose {pose_index + 1}: " if pose_index is not None else "", text)
         self.update(events=(*self._status.events, event)[-EVENTS_KEPT:])
         for listener in self._listeners:

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from station.devices.trigger_lines import PRODUCT, PROTOCOL, LineReader, frame
 
 _COUNTS = 1 << 32
+_SERIAL = "SIM1"
 
 
 class SimulatedTriggerBox:
@@ -20,7 +21,7 @@ class SimulatedTriggerBox:
     Faults are attributes: set them, and they hold until set back.
     """
 
-    def __init__(self, on_pulse: Callable[[], None] = lambda: None, serial: str = "SIM1") -> None:
+    def __init__(self, on_pulse: Callable[[], None] = lambda: None) -> None:
         self.on_pulse = on_pulse
         self.product = PRODUCT
         """Another one = some other device sits on this port"""
@@ -31,7 +32,6 @@ class SimulatedTriggerBox:
         """Sent before every answer"""
         self.cut_answers = 0
         """So many answers end in the middle, without a newline"""
-        self._serial = serial
         self._boot_id = "00000001"
         self._start_s = time.monotonic()
         self._lines = LineReader()
@@ -81,7 +81,7 @@ class SimulatedTriggerBox:
     def _answer(self, words: list[str]) -> str:
         match words:
             case ["ID?"]:
-                return f"ID {self.product} {PROTOCOL} {self._serial}"
+                return f"ID {self.product} {PROTOCOL} {_SERIAL}"
             case ["STATUS?"]:
                 return f"STATUS {self._boot_id} {self.count} {self.light_permille}"
             case ["FIRE", width] if width.isdecimal() and 10 <= int(width) <= 100_000:

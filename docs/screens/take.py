@@ -139,7 +139,7 @@ def take(terminals: list[Terminal]) -> None:
     both([first], "result", ("F9",), "READY TO INSTALL|GATE")
     for terminal in terminals[1:]:
         terminal.press("1", "4")
-        terminal.wait_for("yes")
+        terminal.wait_for("solved")
         both([terminal], "result", ("v",), "READY TO INSTALL|GATE")
     both(terminals, "log", ("5",), "saved")
     both(terminals, "help", ("1", "F1"), "Stop the arm now")

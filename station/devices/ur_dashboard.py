@@ -7,6 +7,7 @@ per reply, in order. Nothing here can unlock, power or reset a robot: what is no
 from __future__ import annotations
 
 import asyncio
+import os
 from collections import deque
 
 from station.errors import RobotError
@@ -24,6 +25,12 @@ LINE_LIMIT = 4096
 
 class DashboardError(RobotError):
     """The dashboard is silent, gone or does not speak its protocol."""
+
+
+def in_words(error: OSError | ValueError) -> str:
+    """'Connection refused': asyncio's own words are numbers, and repeat the address."""
+    number = error.errno if isinstance(error, OSError) else None
+    return os.strerror(number) if number and number > 0 else str(error)
 
 
 class Dashboard:
@@ -55,7 +62,7 @@ class Dashboard:
                 words = f"no answer within {timeout_s:g} s; is this the robot?"
                 raise DashboardError(f"{where}: {words}") from None
             if isinstance(error, OSError | ValueError):
-                words = f"{type(error).__name__}: {error}; check cable, address and that it is on"
+                words = f"{in_words(error)}; check cable, address and that it is on"
                 raise DashboardError(f"{where}: {words}") from None
             raise
 

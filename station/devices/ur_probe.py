@@ -7,7 +7,7 @@ import ipaddress
 import re
 from dataclasses import dataclass, field, replace
 
-from station.devices.ur_dashboard import Dashboard, DashboardError
+from station.devices.ur_dashboard import Dashboard, DashboardError, in_words
 from station.errors import RobotError
 
 SCRIPT_PORT = 30002
@@ -26,6 +26,8 @@ class ProbeResult:
     program: str = ""
     problems: tuple[str, ...] = field(default=())
     """What is wrong, each with its remedy; empty = reachable and complete."""
+    answers: bool = True
+    """Anything does, at any port."""
 
     @property
     def is_e_series(self) -> bool:
@@ -37,7 +39,8 @@ async def probe(host: str) -> ProbeResult:
     result, *answers = await asyncio.gather(
         _ask_dashboard(host), _port_problem(host, SCRIPT_PORT), _port_problem(host, RTDE_PORT)
     )
-    return replace(result, problems=(*result.problems, *(p for p in answers if p)))
+    silent = bool(result.problems) and all(answers)
+    return replace(result, problems=(*result.problems, *(p for p in answers if p)), answers=not silent)
 
 
 async def identify(dashboard: Dashboard) -> ProbeResult:
@@ -92,7 +95,7 @@ async def _port_problem(host: str, port: int) -> str:
     except TimeoutError:
         return f"{host}:{port} did not answer within {CONNECT_S:g} s: check cable, address and firewall"
     except OSError as error:
-        return f"{host}:{port}: {error.strerror or error}; is the robot on, is this service enabled?"
+        return f"{host}:{port}: {in_words(error)}; is the robot on, is this service enabled?"
     writer.transport.abort()
     return ""
 

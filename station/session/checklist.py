@@ -65,9 +65,10 @@ async def _from_outside(host: str) -> str:
     if not host:
         return "give robot.host in the configuration"
     found = await probe(host)
-    who = f"{found.model} {found.serial} answers at {host}" if found.model else f"nothing known at {host}"
-    remedy = "check power, network cable and robot.host in the configuration"
-    return "; ".join([who, *found.problems, *([remedy] if not found.model else [])])
+    if not found.answers:
+        return f"is the robot on, its network cable plugged in, and robot.host ({host}) its address?"
+    who = f"{found.model} {found.serial}" if found.model else "something that is no UR robot"
+    return "; ".join([f"{who} answers at {host}", *found.problems])
 
 
 async def _camera_check(bench: Bench, troubles: dict[str, str]) -> Check:

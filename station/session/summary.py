@@ -126,4 +126,6 @@ def _warnings(bench: Bench) -> list[str]:
         warnings.append(f"the speed slider stands at {100 * slider:.0f} %")
     if bench.cell.simulated:
         warnings.append("SIMULATED cell: nothing real moves")
+    if bench.cell.source == "playback":
+        warnings.append("PLAYBACK of a recording: no arm moves")
     return warnings

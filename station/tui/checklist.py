@@ -47,6 +47,7 @@ class ChecklistScreen(StationScreen):
         self._missing = True
 
     def on_mount(self) -> None:
+        self.query_one("#checklist-scroll").focus()  # where much is missing, keys reach the end of it
         self.set_interval(AGAIN_S, self.look_again)
 
     def body(self) -> ComposeResult:

@@ -85,8 +85,12 @@ def _read(path: Path) -> Calibration | None:
 
 
 def _by(entry: LogEntry) -> str:
+    return f"{entry.who}, {local(entry.wall)}" + (f" (“{entry.reason}”)" if entry.reason else "")
+
+
+def local(iso: str) -> str:
+    """The files' UTC as the clock on the wall says it; as it is where it is no time."""
     try:
-        when = datetime.fromisoformat(entry.wall).astimezone().strftime("%Y-%m-%d %H:%M")
+        return datetime.fromisoformat(iso).astimezone().strftime("%Y-%m-%d %H:%M")
     except ValueError:
-        when = entry.wall
-    return f"{entry.who}, {when}" + (f" (“{entry.reason}”)" if entry.reason else "")
+        return iso

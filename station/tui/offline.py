@@ -16,6 +16,7 @@ from calibrate.formats import FORMATS
 from calibrate.generations import Generation, generations
 from station.drift_check import check_arguments
 from station.tui.confirm import Confirm
+from station.tui.installed import local
 from station.tui.jobs import JobScreen
 
 if TYPE_CHECKING:
@@ -24,6 +25,8 @@ if TYPE_CHECKING:
 OVERRIDE = "--override"
 PERSON = "If a person takes responsibility"
 """Before it the command says why it refuses, after it how a person overrules that."""
+NOT_INSTALLED = " is not installed. "
+"""Between the file's path and why."""
 NOTHING_INSTALLED = "Nothing was installed."
 CALIBRATION_FILE = "calibration.yaml"
 
@@ -102,9 +105,8 @@ async def install(app: StationApp, path: str, ended: str) -> None:
     where = ("--root", str(state_root(path)), "--cell", cell)
     refusal = await _install(app, path, *where)
     if refusal and OVERRIDE in refusal:
-        reason = await app.push_screen_wait(
-            Reason(refusal.partition(PERSON)[0].strip().removeprefix("calibrate: "))
-        )
+        why = refusal.partition(PERSON)[0].partition(NOT_INSTALLED)[2] or refusal
+        reason = await app.push_screen_wait(Reason(why.strip()))
         refusal = await _install(app, path, *where, OVERRIDE, reason) if reason else NOTHING_INSTALLED
     if refusal:
         app.notify(refusal, title="Not installed", severity="error", timeout=20)
@@ -150,7 +152,7 @@ def _named(generation: Generation) -> str:
     taken = calibration.override
     reason = "" if taken is None else f" with the reason “{taken.reason}”"
     session = calibration.provenance.session
-    return f"generation {generation.number}, session {session}, solved {calibration.created[:16]}{reason}"
+    return f"generation {generation.number}, session {session}, solved {local(calibration.created)}{reason}"
 
 
 async def check(app: StationApp, recording: str, folder: str) -> None:

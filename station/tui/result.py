@@ -47,6 +47,8 @@ def verdict_text(calibration: Calibration, state: Installed = NOTHING) -> Text:
     ready = "INSTALLED" if installed else end.how.upper() if end else "READY TO INSTALL"
     head = ", ".join(against) + f": {REASONED[installed]}" if against else ready
     text = Text().append(stamp, "bold").append(f"{head}\n", "bold reverse" if against else "bold")
+    if installed and state.now is not None and (taken := state.now.override) is not None:
+        text.append(f"{taken.who} took responsibility: “{taken.reason}”\n")
     if end is not None:
         text.append(f"{ended_words(end)}. i installs it again\n")
     text.append(f"session {calibration.provenance.session}\n")
@@ -107,7 +109,7 @@ def change_text(calibration: Calibration, installed: Calibration | None) -> Text
     delta = difference(calibration.transform.matrix, installed.transform.matrix)
     moved_mm, turned_deg = 1000 * np.linalg.norm(delta[:3]), np.degrees(np.linalg.norm(delta[3:]))
     return Text(
-        f"\nagainst the installed one the camera moved {moved_mm:.2f} mm and turned {turned_deg:.3f}°"
+        f"\nagainst the installed one the camera is {moved_mm:.2f} mm and {turned_deg:.3f}° elsewhere"
     )
 
 
@@ -124,6 +126,8 @@ class ResultScreen(StationScreen):
     def __init__(self) -> None:
         super().__init__()
         self._calibration: Calibration | None = None
+        self._loaded = ""
+        """Its file; the one to be shown next may be another already."""
         self._state = NOTHING
         self._marks: Marks = frozenset()
 
@@ -162,15 +166,16 @@ class ResultScreen(StationScreen):
     @work(exclusive=True, group="load", exit_on_error=False)
     async def load(self) -> None:
         path = self._shown
-        self._calibration, why = None, NO_RESULT
+        found, why = None, NO_RESULT
         if path:
             try:
                 self._state = await asyncio.to_thread(read_installed, state_root(path))
-                self._calibration = await asyncio.to_thread(read_calibration, Path(path))
+                found = await asyncio.to_thread(read_calibration, Path(path))
             except CalibrationError as problem:
                 why = str(problem)
+        self._calibration, self._loaded = found, path  # only now: keys work on what is shown
         texts = [Text(why), Text(), Text(), Text()]
-        if (found := self._calibration) is not None:
+        if found is not None:
             change = change_text(found, self._state.now)
             texts = [verdict_text(found, self._state), answer_text(found), change, residual_text(found)]
         for name, text in zip(("verdict", "answer", "change", "residuals"), texts, strict=True):
@@ -180,7 +185,7 @@ class ResultScreen(StationScreen):
         if self._calibration is None:
             self.notify("There is no result to use: F9 on the sessions screen makes one.")
             return None
-        return self._shown
+        return self._loaded
 
     def action_install(self) -> None:
         if (path := self._path()) is not None and self._calibration is not None:

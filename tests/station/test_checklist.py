@@ -7,6 +7,7 @@ from collections.abc import Callable
 import msgspec
 import pytest
 
+from station.devices.ur_dashboard import Dashboard, DashboardError
 from station.session.checklist import Check, checklist
 from station.simulation.launch import SimulatedController
 from tests.station.session_rig import Rig
@@ -23,11 +24,28 @@ async def test_a_robot_that_is_there_is_ok(rig: Rig) -> None:
     assert (await robot_check(rig, "127.0.0.1")).state == "ok"
 
 
-@pytest.mark.parametrize(("host", "words"), [("", "give robot.host"), ("127.77.1.9", "127.77.1.9:30004")])
-async def test_a_robot_without_state_is_asked_port_by_port(rig: Rig, host: str, words: str) -> None:
+@pytest.mark.parametrize(
+    ("host", "remedy"),
+    [
+        ("", "give robot.host in the configuration"),
+        (
+            "127.77.1.9",
+            "is the robot on, its network cable plugged in, and robot.host (127.77.1.9) its address?",
+        ),
+    ],
+)
+async def test_where_nothing_answers_the_remedy_is_one_sentence(rig: Rig, host: str, remedy: str) -> None:
     rig.arm.stale = True
     found = await robot_check(rig, host)
-    assert found.state == "failed" and words in found.remedy
+    assert (found.state, found.remedy) == ("failed", remedy)
+
+
+async def test_what_the_network_says_is_said_in_words() -> None:
+    with pytest.raises(DashboardError) as refused:
+        await Dashboard.open("127.77.1.9")
+    assert str(refused.value) == (
+        "dashboard of 127.77.1.9 (port 29999): Connection refused; check cable, address and that it is on"
+    )
 
 
 @pytest.mark.process

@@ -10,7 +10,7 @@ import pytest
 from station.devices.rtde import RobotMode, SafetyMode
 from station.session import monitor
 from station.status import StationState as S
-from tests.station.session_rig import Rig
+from tests.station.session_rig import NewRig, Rig
 
 
 async def test_a_wish_that_waits_for_the_pose_is_told_until_it_is_carried_out(rig: Rig) -> None:
@@ -62,3 +62,10 @@ async def test_a_session_is_told_as_solved_while_its_calibration_is_there(
     rig.arm.slow = True
     await rig.give_go()
     assert rig.session.store.status.session.calibration == ""
+
+
+async def test_the_question_says_that_a_playback_moves_nothing(new_rig: NewRig) -> None:
+    rig = await new_rig(source="playback")
+    summary = await rig.session.prepare(1, "run")
+    assert summary.warnings == ("PLAYBACK of a recording: no arm moves",)
+    assert rig.session.store.status.robot.held == ""

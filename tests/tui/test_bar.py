@@ -60,7 +60,7 @@ def played() -> StationStatus:
             120,
             WIDE,
         ),
-        (played(), 80, " PLAYBACK, no arm: MOVING SIMULATED UR10│18/25 6:02│212 GB free│        F12=STOP"),
+        (played(), 80, " PLAYBACK, no live arm: MOVING SIMULATED UR10│18/25 6:02│212 GB free│   F12=STOP"),
     ],
 )
 def test_golden_lines(status: StationStatus, width: int, line: str) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import time
 from pathlib import Path
 
 import msgspec
@@ -10,12 +11,13 @@ import pytest
 from textual.pilot import Pilot
 from textual.widgets import Input, OptionList, Static
 
-from calibrate.calibration import Touch, write_calibration
+from calibrate.calibration import Override, Touch, write_calibration
 from calibrate.formats import FORMATS
 from calibrate.install import InstallError, install
 from recordings.messages import CameraIdentity, RobotIdentity
 from station.tui import offline
 from station.tui.confirm import Confirm
+from station.tui.installed import Installed, local
 from station.tui.jobs import JobScreen
 from station.tui.offline import OVERRIDE, PERSON, ChooseFormat, Reason
 from station.tui.result import verdict_text
@@ -34,7 +36,8 @@ import json, pathlib, sys
 with (pathlib.Path(__file__).parent / "asked").open("a") as asked:
     asked.write(json.dumps(sys.argv[1:]) + "\\n")
 if sys.argv[1] == "install" and "--override" not in sys.argv:
-    sys.exit("It is not installed. corner 0 is off. If a person takes responsibility: … --override REASON")
+    why = "corner 0 is off. If a person takes responsibility: … --override REASON"
+    sys.exit(f"calibrate: {sys.argv[2]} is not installed. {why}")
 """
 
 
@@ -89,6 +92,7 @@ async def test_who_overrules_gives_a_reason(link: FakeLink, asked: Path, calibra
         await install_until_a_reason_is_asked_for(pilot, calibration)
         shown = " ".join(str(part.render()) for part in pilot.app.screen.query(Static))
         assert "corner 0 is off" in shown
+        assert str(calibration) not in shown  # the question before named it
         assert OVERRIDE not in shown  # that is the shell's word
         await pilot.press("enter")  # without a reason nothing happens
         assert isinstance(pilot.app.screen, Reason)
@@ -131,6 +135,24 @@ async def test_going_back_names_both_and_asks(link: FakeLink, asked: Path, calib
         await until(pilot, lambda: "installed again" in said(pilot))
     (call,) = [json.loads(line) for line in asked.read_text().splitlines()]
     assert call == ["rollback", "--root", str(calibration.parents[2])]
+
+
+def test_a_calibration_that_was_installed_all_the_same_says_by_whom_and_why() -> None:
+    taken = Override("measured with the tape", "anna", ["corner 0 is off"])
+    said = verdict_text(DOUBTED, Installed(msgspec.structs.replace(DOUBTED, override=taken))).plain
+    assert "anna took responsibility: “measured with the tape”" in said
+    assert "responsibility" not in verdict_text(DOUBTED, Installed(DOUBTED)).plain
+
+
+def test_times_are_the_wall_clocks(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TZ", "UTC-2")
+    time.tzset()
+    try:
+        assert local("2026-01-31T23:30:00+00:00") == "2026-02-01 01:30"
+        assert local("some time ago") == "some time ago"
+    finally:
+        monkeypatch.undo()
+        time.tzset()
 
 
 def test_a_result_names_its_session() -> None:

@@ -25,8 +25,8 @@ def sealed(calibration: str = "") -> StationStatus:
 
 def test_a_played_arm_is_said_to_be_none() -> None:
     (robot, camera, *_) = device_lines(msgspec.structs.replace(idle(), playback=True))
-    assert "no arm" in robot and "Hz" not in robot and not robot.endswith("ok")
-    assert "played" in camera and not camera.endswith("ok")
+    assert "not live" in robot and "Hz" not in robot and not robot.endswith("ok")
+    assert "not live" in camera and not camera.endswith("ok")
     session = msgspec.structs.replace(idle().session, current=3)
     played = msgspec.structs.replace(idle(StationState.MOVING), playback=True, session=session)
     assert progress_lines(played)[0] == "p04: played, no arm moves"

@@ -31,6 +31,17 @@ async def test_without_a_robot_the_checklist_comes_first(link: FakeLink) -> None
         assert "MISSING" in pilot.app.export_screenshot()
 
 
+async def test_a_long_checklist_is_read_to_its_end_with_keys(link: FakeLink) -> None:
+    link.answers["doctor"] = MISSING * 20
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+        await pilot.press("6")
+        await until(pilot, lambda: "MISSING" in pilot.app.export_screenshot())
+        assert "Something&#160;is&#160;missing" not in pilot.app.export_screenshot()
+        await pilot.press("end")
+        await until(pilot, lambda: "Something&#160;is&#160;missing" in pilot.app.export_screenshot())
+
+
 async def test_before_the_first_session_too(link: FakeLink) -> None:
     link._statuses.get_nowait()
     fresh = idle()

@@ -76,7 +76,7 @@ def _parts(status: StationStatus, level: int) -> list[str]:
     count = f"{session.captured}/{len(session.poses)}"
     progress = count if level >= 2 else f"{count} {duration(session.elapsed_s)}"
     if status.playback:  # a recorded arm has no speed and no safety that anybody must look at
-        parts = [" ".join(["PLAYBACK, no arm:", STATE_WORDS[status.state], *who]), progress]
+        parts = [" ".join(["PLAYBACK, no live arm:", STATE_WORDS[status.state], *who]), progress]
     else:
         limit = f"/{robot.speed_limit_m_s:.2f}" if level < 4 else ""
         where = {True: "REMOTE", False: "LOCAL", None: ""}[robot.remote]

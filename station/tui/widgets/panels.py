@@ -64,7 +64,7 @@ def _line(name: str, text: str, good: bool | None) -> str:
 def device_lines(status: StationStatus) -> list[str]:
     robot, camera, recorder, bounds = status.robot, status.camera, status.recorder, status.clock
     if status.playback:
-        lines = [_line("robot", "played, no arm", None), _line("camera", "played pictures", None)]
+        lines = [_line("robot", "not live", None), _line("camera", "not live", None)]
     else:
         lines = [
             _line("robot", f"{robot.rate_hz:.0f} Hz {robot.age_ms:.0f} ms", robot.connected),

@@ -1,0 +1,82 @@
+"""The read-only half of an arm, without one: who listens, which robot answers, and what is opened again."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import msgspec
+import pytest
+
+from station.config import RobotConfig
+from station.devices.ur_link import UrLink
+from station.devices.ur_lock import RobotLock
+from station.devices.ur_probe import ProbeResult
+from station.errors import RobotError
+
+CONFIG = RobotConfig(model="UR10", host="127.0.0.1", serial="2016")
+
+
+@pytest.fixture
+def link(tmp_path: Path) -> Any:
+    return UrLink(CONFIG, tmp_path)
+
+
+def test_a_listener_that_fails_is_dropped_alone(link: Any) -> None:
+    heard: list[str] = []
+
+    def fails(state: Any) -> None:
+        heard.append("fails")
+        raise ZeroDivisionError
+
+    for listener in (lambda state: heard.append("first"), fails, lambda state: heard.append("last")):
+        link.subscribe(listener)
+    link._deliver(None)
+    link._deliver(None)
+    assert heard == ["first", "fails", "last", "first", "last"]
+
+
+@pytest.mark.parametrize(
+    ("found", "said"),
+    [
+        (ProbeResult(model="UR5", serial="2016"), "is a UR5, the configuration says UR10"),
+        (ProbeResult(model="UR10", serial="1999"), "has serial 1999, the configuration says 2016"),
+    ],
+)
+def test_another_robot_than_configured_is_refused(link: Any, found: ProbeResult, said: str) -> None:
+    link._check_identity(ProbeResult(model="UR10", serial="2016"))
+    link._check_identity(ProbeResult())  # an old controller does not say
+    with pytest.raises(RobotError, match=said):
+        link._check_identity(found)
+
+
+def test_another_robot_than_before_is_refused_when_the_link_comes_back(tmp_path: Path) -> None:
+    link: Any = UrLink(msgspec.structs.replace(CONFIG, serial=""), tmp_path)
+    link._check_identity(ProbeResult(serial="2016"))
+    link._lock = RobotLock("2016", tmp_path)
+    link._identity = msgspec.structs.replace(link.identity, serial="2016")
+    link._check_identity(ProbeResult(serial="2016"))
+    with pytest.raises(RobotError, match=r"another robot .*1999.* end this session"):
+        link._check_identity(ProbeResult(serial="1999"))
+    link._unlock()
+
+
+@pytest.mark.parametrize("dead", [None, SimpleNamespace(alive=False)])
+async def test_a_dashboard_that_is_gone_is_opened_again(link: Any, dead: Any) -> None:
+    async def opened() -> None:
+        link.dashboard = SimpleNamespace(alive=True)
+
+    link.dashboard, link.renew_dashboard = dead, opened
+    await link.supervise_more()
+    assert link.dashboard.alive
+    kept = link.dashboard
+    await link.supervise_more()
+    assert link.dashboard is kept
+
+
+async def test_a_robot_that_cannot_be_asked_for_is_named(tmp_path: Path) -> None:
+    with pytest.raises(RobotError, match=r"unknown robot.model 'UR7'; known: .*UR10"):
+        UrLink(RobotConfig(model="UR7", host="127.0.0.1"))  # type: ignore[arg-type]
+    with pytest.raises(RobotError, match=r"robot.host is empty"):
+        await UrLink(RobotConfig(model="UR10", host=""), tmp_path).connect()

@@ -58,7 +58,8 @@ class LineReader:
 
 def _checked(line: bytes) -> str | None:
     try:
-        text, _, given = line.decode("ascii").strip().rpartition("*")
+        # A space is under the checksum; a carriage return stands behind it.
+        text, _, given = line.decode("ascii").rstrip("\r").rpartition("*")
     except UnicodeDecodeError:
         return None
     return text if text and given == checksum(text) else None

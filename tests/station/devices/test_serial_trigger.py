@@ -154,6 +154,11 @@ def test_a_changed_byte_is_noticed(text: str, data: st.DataObject) -> None:
     assert LineReader().feed(bytes(line)) == []
 
 
+def test_a_space_is_under_the_checksum_as_all_else() -> None:
+    assert LineReader().feed(b" 00*00\n") == []
+    assert LineReader().feed(b" 00*20\r\n") == [" 00"]
+
+
 def test_an_endless_line_takes_no_memory() -> None:
     reader = LineReader()
     for _ in range(1000):

@@ -14,6 +14,7 @@ Grey = NDArray[np.uint8]
 
 _WINDOW_SHARE = 0.35
 """Half window of the refinement over the local spacing: as much edge as possible, no other corner."""
+_LARGEST_HALF_WINDOW_PX = 16
 _IRREGULAR_SHARE = 0.3
 _REFINEMENT_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 5e-3)
 _SMOOTHING_PX = 1.0
@@ -79,14 +80,14 @@ def right_handed(grid: Array) -> Array:
     return grid if x[0] * y[1] - x[1] * y[0] > 0 else grid[:, ::-1]
 
 
-def refine(grey: Grey, corners: Array, spacing_px: Array, largest_half_window: int = 16) -> Array:
+def refine(grey: Grey, corners: Array, spacing_px: Array) -> Array:
     """Saddle points to sub-pixel accuracy; each corner with a window that fits its own spacing.
 
     corners: (n, 2); spacing_px: (n,). A corner that runs away by more than 0.4 spacings keeps its place.
     The grey values are smoothed first: noise in the flat parts of a window pulls a corner to where the search
     began, and a saddle stays where it is under any symmetric smoothing.
     """
-    half = np.clip(np.floor(spacing_px * _WINDOW_SHARE), 2, largest_half_window).astype(int)
+    half = np.clip(np.floor(spacing_px * _WINDOW_SHARE), 2, _LARGEST_HALF_WINDOW_PX).astype(int)
     smooth = float(np.median(spacing_px)) >= _SMOOTH_FROM_PX
     refined, last = corners.copy(), np.array([grey.shape[1] - 1, grey.shape[0] - 1])
     for size in np.unique(half):

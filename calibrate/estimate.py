@@ -6,7 +6,7 @@ steps. At most MAX_STEPS linearisations: bounded time.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import stats
@@ -198,15 +198,7 @@ def _shares(normal: Normal, solved: Solved, sigma: Array, intrinsics_free: bool)
 def _without(normal: Normal, columns: slice) -> Normal:
     """The same equations with some global parameters held."""
     keep = np.delete(np.arange(normal.size), columns)
-    return Normal(
-        normal.U[:, keep][:, :, keep],
-        normal.V,
-        normal.W[:, :, keep],
-        normal.g[:, keep],
-        normal.h,
-        normal.square,
-        normal.count,
-    )
+    return replace(normal, U=normal.U[:, keep][:, :, keep], W=normal.W[:, :, keep], g=normal.g[:, keep])
 
 
 def _without_intrinsics(covariance: Array, intrinsics_free: bool) -> Array:

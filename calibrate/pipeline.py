@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
@@ -24,6 +23,7 @@ from calibrate.pnp import solve_pnp, view_rms_px
 from calibrate.scale import ScaleCheck, check_scale
 from calibrate.solution import Profile, Solution, SolveOptions
 from calibrate.solve import solve_views
+from calibrate.stopwatch import Stopwatch
 from calibrate.views import ViewSet
 from recordings.messages import BoardSpec, CameraModel
 from recordings.reader import Recording, open_recording
@@ -105,25 +105,25 @@ def single_threaded_opencv() -> Iterator[None]:
 
 
 def _prepare(path: Path, options: JobOptions, progress: Progress | None, fewest: int) -> PreparedViews:
-    clock = _Stages()
-    with clock.stage("open"):
-        recording = open_recording(path)
-    with clock.stage("detect"):
-        camera = options.camera
-        if options.find_intrinsics:
-            recorded = recording.info.camera
-            camera = CameraModel(recorded.width, recorded.height)
-        board = _board(options, recording.info.board)
-        loaded = load_views(recording, board, camera, progress, options.threads, fewest)
+    watch = Stopwatch()
+    recording = open_recording(path)
+    watch.lap("open")
+    camera = options.camera
+    if options.find_intrinsics:
+        recorded = recording.info.camera
+        camera = CameraModel(recorded.width, recorded.height)
+    board = _board(options, recording.info.board)
+    loaded = load_views(recording, board, camera, progress, options.threads, fewest)
+    watch.lap("detect")
     views, intrinsics = loaded.views, None
-    with clock.stage("intrinsics"):
-        if views.camera.matrix is None:
-            intrinsics = calibrate_intrinsics(views, options.lens_model)
-            views = replace(views, camera=intrinsics.camera, held_intrinsics=intrinsics.held_names)
-    with clock.stage("board poses"):
-        views = solve_pnp(views, loaded.board)
-        _check_lens_fits(views)
-    return PreparedViews(recording, loaded, views, intrinsics, clock.ms)
+    if views.camera.matrix is None:
+        intrinsics = calibrate_intrinsics(views, options.lens_model)
+        views = replace(views, camera=intrinsics.camera, held_intrinsics=intrinsics.held_names)
+    watch.lap("intrinsics")
+    views = solve_pnp(views, loaded.board)
+    _check_lens_fits(views)
+    watch.lap("board poses")
+    return PreparedViews(recording, loaded, views, intrinsics, watch.stage_ms)
 
 
 def solver_options(options: JobOptions, prepared: PreparedViews) -> SolveOptions:
@@ -142,33 +142,32 @@ def solve_recording(
     options = options or JobOptions()
     prepared = prepare_views(path, options, progress)
     recording, loaded, views = prepared.recording, prepared.loaded, prepared.views
-    clock = _Stages()
-    with clock.stage("solve"), single_threaded_opencv():
+    watch = Stopwatch()
+    with single_threaded_opencv():
         solution = solve_views(views, solver_options(options, prepared))
-    with clock.stage("judge"):
-        used = views.select([k for k, view in enumerate(views) if view.index in set(solution.used)])
-        scale = None
-        if not solution.on_box:  # a wrong X says nothing about the board
-            scale = check_scale(
-                used, solution.matrix[:3, :3], loaded.board, options.limits.board_scale or 0.01
-            )
-        coverage = picture_coverage(used)
-        known = _lens_known(used, prepared.intrinsics, solution)
-        evidence = Evidence(
-            scale,
-            coverage if prepared.intrinsics is not None else None,
-            _clock_bound_s(recording, solution),
-        )
-        gates = judge(solution, evidence, options.limits)
-        calibration = make_calibration(
-            recording, loaded, views, prepared.intrinsics, solution, scale, gates, options, known
-        )
+    watch.lap("solve")
+    used = views.select([k for k, view in enumerate(views) if view.index in set(solution.used)])
+    scale = None
+    if not solution.on_box:  # a wrong X says nothing about the board
+        scale = check_scale(used, solution.matrix[:3, :3], loaded.board, options.limits.board_scale or 0.01)
+    coverage = picture_coverage(used)
+    known = _lens_known(used, prepared.intrinsics, solution)
+    evidence = Evidence(
+        scale,
+        coverage if prepared.intrinsics is not None else None,
+        _clock_bound_s(recording, solution),
+    )
+    gates = judge(solution, evidence, options.limits)
+    calibration = make_calibration(
+        recording, loaded, views, prepared.intrinsics, solution, scale, gates, options, known
+    )
+    watch.lap("judge")
     return SolvedRecording(
         recording,
         loaded,
         views,
         prepared.intrinsics,
-        prepared.stage_ms | clock.ms,
+        prepared.stage_ms | watch.stage_ms,
         solution,
         scale,
         coverage,
@@ -219,14 +218,3 @@ def _clock_bound_s(recording: Recording, solution: Solution) -> float | None:
     used = set(solution.used)
     bounds = [v.time_bound_s for v in recording.views() if v.index in used and v.time_bound_s is not None]
     return max(bounds) if bounds else None
-
-
-class _Stages:
-    def __init__(self) -> None:
-        self.ms: dict[str, float] = {}
-
-    @contextmanager
-    def stage(self, name: str) -> Iterator[None]:
-        start = time.perf_counter()
-        yield
-        self.ms[name] = (time.perf_counter() - start) * 1000

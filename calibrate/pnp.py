@@ -135,7 +135,7 @@ def _least_squares(views: ViewSet, owner: NDArray[np.intp], poses: Array) -> tup
             going = going[np.sqrt(square / count)[going] <= limit[going]]
         if not len(going):
             break
-        observed = _rows(everything, owner[going])
+        observed = everything.part(owner[going])
         state = _state(views.camera, poses[going])
         normal = linearise_corners(observed, state, observed.present)
         V = normal.V[CORNERS]
@@ -154,18 +154,8 @@ def _least_squares(views: ViewSet, owner: NDArray[np.intp], poses: Array) -> tup
 
 def _squares(everything: Observations, camera: CameraModel, owner: NDArray[np.intp], poses: Array) -> Array:
     """(m,) sums of squared distances, px²."""
-    misses = corner_residuals(_rows(everything, owner), _state(camera, poses))
+    misses = corner_residuals(everything.part(owner), _state(camera, poses))
     return np.asarray((misses**2).sum(axis=(1, 2)))
-
-
-def _rows(observed: Observations, rows: NDArray[np.intp]) -> Observations:
-    return replace(
-        observed,
-        flange=observed.flange[rows],
-        points=observed.points[rows],
-        pixels=observed.pixels[rows],
-        present=observed.present[rows],
-    )
 
 
 def _state(camera: CameraModel, poses: Array) -> State:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 from scipy import stats
 
 from calibrate.assess import (
@@ -24,6 +22,7 @@ from calibrate.pair_covariance import pair_covariance
 from calibrate.pairs import consecutive_pairs, mount_poses
 from calibrate.paper import solve_paper
 from calibrate.solution import Certificate, Solution, SolveOptions
+from calibrate.stopwatch import Stopwatch
 from calibrate.views import ViewSet
 
 HELD_OUT = 6
@@ -32,14 +31,14 @@ HELD_OUT = 6
 
 def solve_paper_profile(views: ViewSet, options: SolveOptions) -> Solution:
     """Consecutive pairs (eq. 21), all but the last 6 to solve, those 6 to score (eqs. 24-26)."""
-    start = time.perf_counter()
+    watch = Stopwatch()
     H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
     pairs = consecutive_pairs(H, C)
     held = HELD_OUT if options.holdout and len(pairs) >= HELD_OUT + 3 else 0
     fit = pairs.select(slice(0, len(pairs) - held))
     require_motion(fit)
     result = solve_paper(fit, options.seed)
-    solved = time.perf_counter()
+    watch.lap("evolution")
     X, indices = result.X, [view.index for view in views]
     covariance = pair_covariance(result.objective, fit, X)
     distance = options.working_distance_m or median_distance_m(C)
@@ -48,7 +47,7 @@ def solve_paper_profile(views: ViewSet, options: SolveOptions) -> Solution:
     spread_m, spread_rad = board_spread(H, C, X)
     fitted = len(fit) + 1
     note = f"pairs {len(fit)} and {len(fit) + 1} share a pose, as in the paper"
-    end = time.perf_counter()
+    watch.lap("assess")
     return Solution(
         mount=views.mount,
         profile="paper",
@@ -72,8 +71,8 @@ def solve_paper_profile(views: ViewSet, options: SolveOptions) -> Solution:
         board_spread_rad=spread_rad,
         on_box=result.on_box,
         warnings=_warnings(result.on_box, held, certificate),
-        stage_ms={"evolution": 1e3 * (solved - start), "assess": 1e3 * (end - solved)},
-        solve_ms=1e3 * (end - start),
+        stage_ms=watch.stage_ms,
+        solve_ms=watch.total_ms,
         seed=options.seed,
     )
 

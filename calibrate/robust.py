@@ -25,6 +25,7 @@ from calibrate.solution import Certificate
 SETTINGS = EvolutionSettings(population=30, generations=40)
 MAX_RESTARTS = 6
 """After these the result is returned uncertified, and says so: bounded time (about 20 ms each)."""
+_POLISH_STEPS = 40
 _GENERATORS = skew(np.eye(3))
 """(3, 3, 3) d Exp(δ) / dδ_k at 0."""
 
@@ -80,7 +81,7 @@ def _best_of(objective: Objective, starts: Array) -> tuple[Array, float]:
     return R[best], float(values[best])
 
 
-def polish(objective: Objective, R: Array, iterations: int = 40) -> tuple[Array, Array]:
+def polish(objective: Objective, R: Array) -> tuple[Array, Array]:
     """Damped Newton on SO(3) for many rotations at once, (m, 3, 3) → minima (m, 3, 3) and values (m,).
 
     With R ← Exp(δ) R, Γ = ½ ∂f/∂R and P the derivative of vec R, half the Hessian is
@@ -96,7 +97,7 @@ def polish(objective: Objective, R: Array, iterations: int = 40) -> tuple[Array,
 
     R, f = R.copy(), value(R)
     damping = np.zeros(len(R))
-    for _ in range(iterations):
+    for _ in range(_POLISH_STEPS):
         gamma = ((R.reshape(-1, 9) - centre) @ quadratic + linear).reshape(-1, 3, 3)
         P = np.einsum("kij,mjl->mkil", _GENERATORS, R).reshape(-1, 3, 9)
         turned = gamma @ np.swapaxes(R, 1, 2)

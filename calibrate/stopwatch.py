@@ -7,7 +7,7 @@ import time
 
 class Stopwatch:
     def __init__(self) -> None:
-        self.start = self._last = time.perf_counter()
+        self._start = self._last = time.perf_counter()
         self.stage_ms: dict[str, float] = {}
 
     def lap(self, stage: str) -> None:
@@ -18,4 +18,4 @@ class Stopwatch:
 
     @property
     def total_ms(self) -> float:
-        return 1e3 * (time.perf_counter() - self.start)
+        return 1e3 * (time.perf_counter() - self._start)

@@ -19,7 +19,7 @@ from calibrate.detect import detect
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import Array, pose_from_rotvec
 from calibrate.pnp import candidate_poses
-from calibrate.time_offset import FEWEST_PICTURES, LIMIT_S, TimeOffset, estimate_time_offset
+from calibrate.time_offset import FEWEST_PICTURES, TimeOffset, estimate_time_offset
 from calibrate.views import ImageView
 from recordings.errors import BadPictureError
 from recordings.messages import CameraModel, Picture
@@ -31,9 +31,7 @@ UNSEEN_DELAY_S = 1e-4
 _LARGEST_STAMP_S = 1e12
 
 
-def sweep_time_offset(
-    recording: Recording, camera: CameraModel | None = None, limit_s: float = LIMIT_S
-) -> TimeOffset:
+def sweep_time_offset(recording: Recording, camera: CameraModel | None = None) -> TimeOffset:
     """Of every picture in the recording, whether it belongs to a stop of the arm or not.
 
     A picture that cannot be decoded is left out, and told of in `lost`.
@@ -54,7 +52,7 @@ def sweep_time_offset(
             f"few for a time offset; {FEWEST_PICTURES} pictures are needed"
         )
     times, poses = (np.array(column) for column in zip(*seen, strict=True))
-    found = estimate_time_offset(robot_s, flange, times, poses, limit_s)
+    found = estimate_time_offset(robot_s, flange, times, poses)
     return replace(found, sigma_s=math.hypot(found.sigma_s, UNSEEN_DELAY_S), lost=tuple(lost))
 
 

@@ -40,17 +40,16 @@ def estimate_time_offset(
     base_from_flange: Array,
     camera_s: Array,
     camera_from_board: Array,
-    limit_s: float = LIMIT_S,
 ) -> TimeOffset:
     """Robot times (n,) and poses (n, 4, 4); picture times (m,) and PnP poses (m, 4, 4), both in order.
 
-    Offsets up to ± limit_s are looked for. Raises TooFewViewsError, BadViewsError for times out of order,
+    Offsets up to ± LIMIT_S are looked for. Raises TooFewViewsError, BadViewsError for times out of order,
     DegenerateMotionError where the motion does not determine the offset.
     """
     for name, times in (("robot", robot_s), ("camera", camera_s)):
         if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
             raise BadViewsError(f"the {name}'s times are not in order; are two recordings mixed?")
-    inside = (camera_s - limit_s >= robot_s[0]) & (camera_s + limit_s <= robot_s[-1])
+    inside = (camera_s - LIMIT_S >= robot_s[0]) & (camera_s + LIMIT_S <= robot_s[-1])
     times, poses = camera_s[inside], camera_from_board[inside]
     if len(times) < FEWEST_PICTURES:
         raise TooFewViewsError(
@@ -65,28 +64,28 @@ def estimate_time_offset(
         turned = flange(times + offset_s)
         return np.asarray((turned[:-1].inv() * turned[1:]).magnitude() - seen)
 
-    grid = np.linspace(-limit_s, limit_s, _STEPS)
+    grid = np.linspace(-LIMIT_S, LIMIT_S, _STEPS)
     offset_s = float(grid[np.argmin([np.abs(residual(o)).sum() for o in grid])])
     for _ in range(_ITERATIONS):
-        r, slope = residual(offset_s), _slope(residual, offset_s, limit_s)
+        r, slope = residual(offset_s), _slope(residual, offset_s)
         weight = _weights(r)
         step_s = float(-(weight * slope * r).sum() / max((weight * slope**2).sum(), 1e-30))
-        offset_s = float(np.clip(offset_s + step_s, -limit_s, limit_s))
+        offset_s = float(np.clip(offset_s + step_s, -LIMIT_S, LIMIT_S))
         if abs(step_s) < 1e-8:
             break
-    r, slope = residual(offset_s), _slope(residual, offset_s, limit_s)
+    r, slope = residual(offset_s), _slope(residual, offset_s)
     sigma_s = _sigma(r, slope, _weights(r))
-    if sigma_s > limit_s / 4 or abs(offset_s) >= limit_s - 1e-9:
+    if sigma_s > LIMIT_S / 4 or abs(offset_s) >= LIMIT_S - 1e-9:
         raise DegenerateMotionError(
             f"the motion does not determine the time offset (sigma {1000 * sigma_s:.0f} ms within "
-            f"± {1000 * limit_s:.0f} ms): the arm must turn, and speed up and slow down, during the sweep"
+            f"± {1000 * LIMIT_S:.0f} ms): the arm must turn, and speed up and slow down, during the sweep"
         )
     return TimeOffset(offset_s, sigma_s, float(np.sqrt(np.mean(r**2))), len(r))
 
 
-def _slope(residual: Callable[[float], Array], offset_s: float, limit_s: float) -> Array:
-    low = max(offset_s - _DIFFERENCE_S, -limit_s)
-    high = min(offset_s + _DIFFERENCE_S, limit_s)
+def _slope(residual: Callable[[float], Array], offset_s: float) -> Array:
+    low = max(offset_s - _DIFFERENCE_S, -LIMIT_S)
+    high = min(offset_s + _DIFFERENCE_S, LIMIT_S)
     return np.asarray((residual(high) - residual(low)) / (high - low))
 
 

@@ -87,7 +87,7 @@ class State:
         )
 
 
-def observe_views(views: ViewSet, kinematics: Array | None = None) -> Observations:
+def observe_views(views: ViewSet) -> Observations:
     """Pad the views' corners to one array."""
     count = max(1, max(len(view.pixels) for view in views))
     n = len(views)
@@ -96,4 +96,4 @@ def observe_views(views: ViewSet, kinematics: Array | None = None) -> Observatio
         k = len(view.pixels)
         points[i, :k], pixels[i, :k], present[i, :k] = view.board_points, view.pixels, 1.0
     held = tuple(INTRINSICS.index(name) for name in views.held_intrinsics if name in INTRINSICS)
-    return Observations(views.mount, views.base_from_flange, points, pixels, present, kinematics, held)
+    return Observations(views.mount, views.base_from_flange, points, pixels, present, held=held)

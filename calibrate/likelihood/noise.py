@@ -16,9 +16,11 @@ FLOOR = np.array([1e-4, 1e-6, 1e-6, 1e-4])
 """No source is taken as better than this: px, m, rad, and the kinematic prior's unit."""
 _CEILING = np.array([1e3, 1.0, 1.0, 1e2])
 MAX_PASSES = 100
+_STEADY = 1e-4
+"""Relative change of every scale after which it counts as found."""
 
 
-def reml_scales(normal: Normal, sigma: Array, with_corners: bool, tolerance: float = 1e-4) -> Array:
+def reml_scales(normal: Normal, sigma: Array, with_corners: bool) -> Array:
     """σ (4,) after the fixed point, from a start; sources without residuals keep theirs."""
     active = normal.count > 0
     active[CORNERS] &= with_corners
@@ -31,7 +33,7 @@ def reml_scales(normal: Normal, sigma: Array, with_corners: bool, tolerance: flo
         updated = np.clip(np.where(active, updated, sigma), FLOOR, _CEILING)
         change = np.abs(np.log(updated / sigma))
         sigma = updated
-        if change.max() < tolerance:
+        if change.max() < _STEADY:
             break
     return sigma
 

@@ -63,12 +63,21 @@ def test_other_formats_and_colour_are_stored_without_loss(folder: Path, tmp_path
     for (_, picture), expected in zip(recording.pictures(), [colour, make_image(1), deep], strict=True):
         np.testing.assert_array_equal(picture.image, expected)
         assert picture.image.dtype == expected.dtype
+    assert [picture.pixel_format for _, picture in recording.pictures()] == ["BGR8", "Mono8", "Mono16"]
 
 
 def test_a_byte_order_mark_spaces_and_crlf_are_fine(folder: Path, tmp_path: Path) -> None:
     text = (folder / "poses.csv").read_text().replace(",", ", ").replace("\n", "\r\n") + "\r\n"
     (folder / "poses.csv").write_bytes(b"\xef\xbb\xbf" + text.encode())
     assert import_folder(folder, tmp_path / "out.mcap").pictures == 3
+
+
+def test_quaternions_of_three_digits_are_made_rotations(folder: Path, tmp_path: Path) -> None:
+    text = (folder / "poses.csv").read_text().replace("0.7071067811865476", "0.707")
+    (folder / "poses.csv").write_text(text)
+    view = open_recording(import_folder(folder, tmp_path / "out.mcap").path).views()[1]
+    expected = [[0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]]
+    np.testing.assert_allclose(view.base_from_flange, expected, atol=1e-12)
 
 
 def cut_picture(folder: Path) -> None:

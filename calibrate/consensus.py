@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibrate.assess import board_places, mean_pose, require_motion
-from calibrate.errors import BadViewsError
+from calibrate.errors import BadViewsError, PosesDisagreeError
 from calibrate.evolution_robust import solve_geman_mcclure
 from calibrate.geometry import Array, difference
 from calibrate.outliers import board_turns, turn_view
@@ -50,7 +50,7 @@ def find_consensus(views: ViewSet, seed: int, reject: bool = True) -> Consensus:
     turned: frozenset[int] = frozenset()
     for _ in range(_ROUNDS):
         if len(places) < _FEWEST:
-            raise disagreement(f"No {_FEWEST} of the {len(views)} views agree with each other.")
+            raise PosesDisagreeError(f"No {_FEWEST} of the {len(views)} views agree with each other.")
         pairs = _pairs_of(H, C, places)
         require_motion(pairs)
         start = _solve(pairs, seed, len(places))
@@ -67,14 +67,6 @@ def find_consensus(views: ViewSet, seed: int, reject: bool = True) -> Consensus:
 def pose_arrays(views: ViewSet) -> tuple[Array, Array]:
     """H (n, 4, 4) as in `pairs` and camera_from_board (n, 4, 4)."""
     return mount_poses(views.base_from_flange, views.mount), views.camera_from_board
-
-
-def disagreement(what: str) -> BadViewsError:
-    return BadViewsError(
-        f"{what} The robot poses do not belong to these pictures, or are in another convention (rotation "
-        "vector or Euler angles, mm or m, flange_from_base instead of base_from_flange), or the mount is "
-        "wrong. Check the first rows."
-    )
 
 
 def _solve(pairs: Pairs, seed: int, views: int) -> GlobalResult:

@@ -24,5 +24,9 @@ class BadViewsError(CalibrationError):
     """Input that cannot be solved: NaN, mixed picture sizes, singular intrinsics …"""
 
 
+class PosesDisagreeError(BadViewsError):
+    """Robot poses and pictures contradict each other. What to mend is added where all views are known."""
+
+
 class GateFailedError(CalibrationError):
     exit_code = 4

@@ -7,7 +7,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibrate.board_poses import BoardPoses, refine_board_poses
-from calibrate.consensus import Consensus, disagreement, find_consensus, pose_arrays
+from calibrate.consensus import Consensus, find_consensus, pose_arrays
+from calibrate.errors import PosesDisagreeError
 from calibrate.estimate import Estimate, estimate, first_state
 from calibrate.likelihood.kinematics import UNIT, kinematic_derivatives
 from calibrate.likelihood.model import Observations, observe_views
@@ -120,7 +121,7 @@ def _settle(group: Settled, reject: bool) -> Settled:
         if closed or (round_ and len(good) < (1 - _FEW) * count):
             good = np.intersect1d(good, settled.fitted)
         if len(good) < _FEWEST:
-            raise disagreement(f"Only {len(good)} of {count} views agree; {_FEWEST} are needed.")
+            raise PosesDisagreeError(f"Only {len(good)} of {count} views agree; {_FEWEST} are needed.")
         if np.array_equal(good, settled.fitted):
             break
         settled = _again(settled, good)
@@ -192,6 +193,6 @@ def _with_good_numbers(settled: Settled, rejected: tuple[RejectedView, ...], pla
 def _require_plausible_noise(result: Estimate) -> None:
     robot_m, robot_rad = float(result.sigma[1]), float(result.sigma[2])
     if robot_m > MAX_ROBOT_M or robot_rad > MAX_ROBOT_RAD:
-        raise disagreement(
+        raise PosesDisagreeError(
             f"Robot and pictures disagree by {robot_m * 1e3:.0f} mm, {np.degrees(robot_rad):.1f}° per axis."
         )

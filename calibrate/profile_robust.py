@@ -17,6 +17,7 @@ from calibrate.assess import (
 )
 from calibrate.board_poses import refine_board_poses
 from calibrate.consensus import pose_arrays
+from calibrate.errors import BadViewsError, PosesDisagreeError
 from calibrate.estimate import Estimate, estimate, first_state
 from calibrate.fit import Fit, Settled, fit_views
 from calibrate.frame_check import check_frames
@@ -25,6 +26,7 @@ from calibrate.geometry import Transform
 from calibrate.lens_check import check_lens
 from calibrate.likelihood.model import observe_views
 from calibrate.likelihood.residuals import corner_residuals, robot_residuals
+from calibrate.misread import what_to_mend
 from calibrate.pair_covariance import pair_covariance
 from calibrate.pairs import all_pairs
 from calibrate.solution import ErrorBudget, HoldoutScore, NoiseScales, Solution, SolveOptions
@@ -39,7 +41,10 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
     """All views to fit; a second fit without the last 6 for the hold-out score."""
     watch = Stopwatch()
     free = options.intrinsics_from_same_pictures and views.camera.distortion_model == "plumb_bob"
-    fit = fit_views(views, options.seed, free, options.reject_outliers, watch, options.kinematic_prior)
+    try:
+        fit = fit_views(views, options.seed, free, options.reject_outliers, watch, options.kinematic_prior)
+    except PosesDisagreeError as problem:
+        raise BadViewsError(f"{problem} {what_to_mend(views, options.seed)}") from None
     settled = fit.settled
     result, state, places = settled.estimate, settled.estimate.state, settled.places
     parent, child = camera_frames(views.mount)

@@ -1,0 +1,105 @@
+"""In which other convention would the robot's poses fit the pictures? So that an error can say what to mend.
+
+Rotation vectors read as Euler angles, quaternions in another order, poses the wrong way round: each gives
+rigid poses, and no test of a single one can tell. In the right reading one X puts the board of every view in
+one place.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from calibrate.assess import board_places
+from calibrate.evolution_robust import solve_geman_mcclure
+from calibrate.geometry import (
+    Array,
+    difference,
+    inverse,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    rotation_exp,
+    rotation_log,
+)
+from calibrate.pairs import all_pairs, mount_poses
+from calibrate.views import ViewSet
+
+_VIEWS = 60
+"""More are thinned evenly: each convention costs an evolution."""
+_MUCH_BETTER = 100.0
+"""Times smaller the spread (metres times radians) has to be than with the poses as they were read."""
+
+
+def what_to_mend(views: ViewSet, seed: int) -> str:
+    """Two sentences for an error about views that contradict each other."""
+    found = fitting_convention(views, seed)
+    if found is not None:
+        return (
+            f"They would agree if the robot poses were {found}. Correct that where the poses come from "
+            "(poses.csv, dataset.yaml) and import again."
+        )
+    return (
+        "The robot poses do not belong to these pictures, or are in another convention (rotation vector or "
+        "Euler angles, mm or m, flange_from_base instead of base_from_flange), or the mount is wrong. Check "
+        "the first rows."
+    )
+
+
+def fitting_convention(views: ViewSet, seed: int) -> str | None:
+    """What the poses seem to be, in words, when the views then agree far better; None where nothing helps."""
+    some = np.unique(np.linspace(0, len(views) - 1, min(len(views), _VIEWS)).astype(np.intp))
+    as_read, C = views.base_from_flange[some], views.camera_from_board[some]
+    least = _spread(mount_poses(as_read, views.mount), C, seed) / _MUCH_BETTER
+    best = None
+    for words, change in _CONVENTIONS.items():
+        spread = _spread(mount_poses(change(as_read), views.mount), C, seed)
+        if spread < least:
+            best, least = words, spread
+    return best
+
+
+def _spread(H: Array, C: Array, seed: int) -> float:
+    """Median distance times median angle of the board's places from the most central one, m rad."""
+    places = board_places(H, C, solve_geman_mcclure(all_pairs(H, C), seed))
+    apart = difference(places[:, None], places[None])
+    medians = [np.median(np.linalg.norm(part, axis=2), axis=1) for part in (apart[..., :3], apart[..., 3:])]
+    return float(np.prod(medians, axis=0).min())
+
+
+def _turned(change: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    """Of rotations (n, 3, 3), for poses (n, 4, 4)."""
+
+    def changed(poses: Array) -> Array:
+        result = poses.copy()
+        result[:, :3, :3] = change(poses[:, :3, :3])
+        return result
+
+    return changed
+
+
+def _w_first(R: Array) -> Array:
+    return matrix_from_quaternion(np.roll(quaternion_from_matrix(R), -1, axis=-1))
+
+
+def _vectors(R: Array) -> Array:
+    """Of the two triples of angles that make R, the one that can be a rotation vector (at most 180° long)."""
+    angles = Rotation.from_matrix(R).as_euler("xyz")
+    other = np.stack([angles[:, 0] + np.pi, np.pi - angles[:, 1], angles[:, 2] + np.pi], axis=1)
+    other = (other + np.pi) % (2 * np.pi) - np.pi
+    shorter = np.linalg.norm(angles, axis=1) <= np.linalg.norm(other, axis=1)
+    return rotation_exp(np.where(shorter[:, None], angles, other))
+
+
+def _angles(R: Array) -> Array:
+    return np.asarray(Rotation.from_euler("xyz", rotation_log(R)).as_matrix())
+
+
+_CONVENTIONS: dict[str, Callable[[Array], Array]] = {
+    "flange_from_base in place of base_from_flange, or of a cell with the other mount": inverse,
+    "quaternions in the order w, x, y, z in place of x, y, z, w": _turned(_w_first),
+    "rotation vectors that were read as roll, pitch, yaw": _turned(_vectors),
+    "roll, pitch, yaw that were read as rotation vectors": _turned(_angles),
+    "inverse rotations beside right positions": _turned(lambda R: np.asarray(R.transpose(0, 2, 1))),
+}

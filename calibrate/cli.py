@@ -14,7 +14,9 @@ def main() -> None:
     from calibrate.commands.app import app
     from calibrate.errors import CalibrationError
     from recordings.errors import RecordingError, printed
+    from recordings.terminal import print_what_it_can
 
+    print_what_it_can()
     try:
         app(prog_name="calibrate")  # the station calls it as a module
     except (CalibrationError, RecordingError) as problem:

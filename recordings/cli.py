@@ -23,6 +23,7 @@ from recordings.info import recording_info
 from recordings.info_text import print_info, print_recovery
 from recordings.reader import open_recording
 from recordings.recover import recover as recover_recording
+from recordings.terminal import print_what_it_can
 
 app = typer.Typer(
     help="Look into, make, convert and rescue recordings.",
@@ -137,6 +138,7 @@ def _progress(text: str, shown: bool) -> Iterator[Callable[[int, int], None]]:
 
 def main() -> None:
     """The entry point. Exit codes: 0 good, 1 failed, 2 usage, 3 done with loss."""
+    print_what_it_can()
     try:
         app()
     except RecordingError as problem:

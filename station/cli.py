@@ -15,6 +15,7 @@ import typer
 
 from calibrate.errors import CalibrationError
 from recordings.errors import RecordingError, printed
+from recordings.terminal import print_what_it_can
 from station.cli_control import app as control
 from station.client import default_socket
 from station.console import Socket
@@ -103,6 +104,7 @@ def open_screen(socket: Path | None, replay: Path | None) -> None:
 def main() -> None:
     # Ctrl-C is STOP, also where a shell started this in the background with SIGINT ignored.
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    print_what_it_can()
     try:
         command_line(sys.argv[1:])()
     except (StationError, RecordingError, CalibrationError) as problem:

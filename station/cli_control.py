@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import shlex
 import sys
 from collections.abc import Awaitable, Callable
 from pathlib import Path
@@ -155,6 +156,7 @@ def doctor_command(
 
         found, _ = load_config(config)
         out.print(f"{config}: good; {found.robot.model} at {found.robot.host}, {found.mount}")
+        out.print(f"next: station serve --config {shlex.quote(str(config))}, then station doctor beside it")
         return
     checks: list[dict[str, Any]] = ask(socket or default_socket(), "doctor")
     good = all(check["state"] != "failed" for check in checks)

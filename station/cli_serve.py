@@ -41,7 +41,9 @@ def serve_command(
     scene: Annotated[str, typer.Option(help="Simulated: paper, blog or paper-binned.")] = "paper",
     noise: Annotated[str, typer.Option(help="Simulated: low, mid or high.")] = "low",
     mount: Annotated[str, typer.Option(help="Simulated: eye-in-hand or eye-to-hand.")] = "eye-in-hand",
-    gige: Annotated[bool, typer.Option("--gige", hidden=True)] = False,
+    gige: Annotated[
+        bool, typer.Option("--gige", help="Simulated: the camera over GigE Vision packets.")
+    ] = False,
     hardware_trigger: Annotated[
         bool, typer.Option("--hardware-trigger", help="Simulated: a trigger box fires the camera.")
     ] = False,

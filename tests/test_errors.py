@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -36,6 +38,14 @@ def test_an_error_begins_with_the_name_of_its_command(
     assert done.stderr.startswith(f"{command}: ") and "none" in done.stderr
     assert not done.stdout and "Traceback" not in done.stderr
     assert not done.stderr.strip().endswith(".")
+
+
+@pytest.mark.parametrize("command", ["calibrate.cli solve", "station.cli plan", "recordings.cli info"])
+def test_a_terminal_without_our_letters_gets_what_it_can_show(command: str) -> None:
+    latin = {"PATH": "/usr/bin:/bin", "LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
+    asked = [sys.executable, "-m", *command.split(), "--help"]
+    done = subprocess.run(asked, env=latin, capture_output=True)
+    assert done.returncode == 0 and b"Traceback" not in done.stderr and b"Usage" in done.stdout
 
 
 @pytest.mark.parametrize(

@@ -55,7 +55,10 @@ class StatusStore:
         if changed:
             self._status = msgspec.structs.replace(self._status, **changed)
             for watcher in list(self._watchers):
-                watcher()
+                try:
+                    watcher()
+                except Exception:  # who only looks on must not come between STOP and the arm
+                    log.exception("a watcher of the status failed")
 
     def enter(self, state: StationState, reason: str = "") -> None:
         """Raises TransitionError for a step that the table does not allow."""

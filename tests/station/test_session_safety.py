@@ -53,6 +53,17 @@ async def test_an_unforeseen_error_stops_the_arm_and_is_a_fault(
     assert "move" not in rig.arm.log
 
 
+async def test_a_watcher_that_fails_does_not_come_between_stop_and_the_arm(rig: Rig) -> None:
+    def fails() -> None:
+        raise ZeroDivisionError("a defect")
+
+    await rig.go_until_it_moves()
+    end = rig.session.store.watch(fails)
+    await rig.session.stop("bert")
+    end()
+    assert rig.state is S.STOPPED and "stop" in rig.arm.log
+
+
 @pytest.mark.parametrize("change", ["stop", "edit", "lease", "prepare"])
 async def test_what_changes_while_the_way_is_checked_leaves_no_go(rig: Rig, change: str) -> None:
     gate = Gate(rig)

@@ -30,7 +30,10 @@ def project(camera: CameraModel, camera_from_board: Array, points: Array) -> Arr
 
 
 def undistort(camera: CameraModel, pixels: Array) -> Array:
-    """Pixels (n, 2) → the pixels (n, 2) that a lens without distortion and the same matrix would show."""
+    """Pixels (n, 2) → the pixels (n, 2) that a lens without distortion and the same matrix would show.
+
+    OpenCV passes over a skew in the matrix: good enough for a start.
+    """
     K, D = camera_matrix(camera), distortion(camera)
     points = np.ascontiguousarray(pixels, dtype=float).reshape(-1, 1, 2)
     if camera.distortion_model == "equidistant":

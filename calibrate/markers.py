@@ -168,7 +168,9 @@ def _tags(grey: Grey, spec: BoardSpec, border_bits: int) -> tuple[Indices, Array
     markers, ids, _ = detector.detectMarkers(grey)
     if ids is None:
         return _NOTHING
-    tags = [(int(i), m) for i, m in zip(ids.ravel(), markers, strict=True) if i < spec.columns * spec.rows]
+    numbers, count = ids.ravel().tolist(), spec.columns * spec.rows
+    # A tag that is seen twice is on two boards, and nobody knows on which of them.
+    tags = [(i, m) for i, m in zip(numbers, markers, strict=True) if i < count and numbers.count(i) == 1]
     if not tags:
         return _NOTHING
     # OpenCV goes clockwise from the top left, Kalibr counter-clockwise from the bottom left.

@@ -62,6 +62,19 @@ def test_a_board_needs_no_more_markers_than_its_dictionary_holds(kind, columns, 
         board_sheet(BoardSpec(kind, columns, rows + 1, 0.02, 0.015, "DICT_4X4_50"))
 
 
+def test_a_tag_that_is_seen_on_two_boards_is_read_on_neither() -> None:
+    """Its corners would be in two places at once, and the board's pose anywhere."""
+    spec = BOARDS[-1]
+    sheet = rasterise(board_sheet(spec))
+    first_column = sheet[:, : sheet.shape[1] // 4 + 10]
+    assert not detect(np.concatenate([sheet, sheet], axis=1), spec).found
+    found = detect(np.concatenate([sheet, first_column], axis=1), spec)
+    alone = detect(sheet, spec)
+    assert sorted(found.indices.tolist()) == [i for i in range(48) if i // 4 % spec.columns]
+    at = dict(zip(alone.indices.tolist(), alone.pixels, strict=True))
+    np.testing.assert_allclose(found.pixels, [at[i] for i in found.indices.tolist()], atol=0.05)
+
+
 @pytest.mark.parametrize("spec", BOARDS, ids=lambda s: f"{s.kind.value}-{s.columns}x{s.rows}")
 def test_every_printed_board_is_found_whole_and_to_scale(spec: BoardSpec) -> None:
     found = detect(rasterise(board_sheet(spec)), spec)

@@ -215,8 +215,9 @@ def plate(name: str, frame: Array, low_m: Array, high_m: Array, rods: int = 5) -
     ys = low_m[1] + spacing * (np.arange(rods) + 0.5)
     ends = np.array([[(low_m[0], y, 0.0), (high_m[0], y, 0.0)] for y in ys])
     placed = transform_points(frame, ends.reshape(-1, 3)).reshape(-1, 2, 3)
-    return tuple(Capsule(name, _vector(a), _vector(b), radius_m=max(spacing / 2, 0.005)) for a, b in placed)
+    return tuple(Capsule(name, as_point(a), as_point(b), radius_m=max(spacing / 2, 0.005)) for a, b in placed)
 
 
-def _vector(point: Array) -> tuple[float, float, float]:
+def as_point(point: Array) -> tuple[float, float, float]:
+    """(3,) as the configuration writes it."""
     return float(point[0]), float(point[1]), float(point[2])

@@ -46,7 +46,7 @@ class Handler(Protocol):
     """What the daemon does with requests."""
 
     def stop_now(self, peer: Peer) -> Any:
-        """STOP, from anyone; must start stopping before it returns. May return an awaitable."""
+        """STOP, from anyone: under way when it returns, even if the client leaves. May return an awaitable."""
 
     async def handle(self, peer: Peer, verb: str, args: dict[str, Any]) -> Any:
         """The result; StationError or RecordingError becomes the reply's sentence."""
@@ -185,7 +185,7 @@ class _Connection:
 
     def _take(self, request: Request) -> None:
         if request.verb == "stop":
-            # First in line and in this very call: nothing queued may come before it.
+            # In this very call: no limit holds it up, and nothing that is read later comes before it.
             stopping = self._handler.stop_now(self.peer)
             self._spawn(self._answer_stop(request.id, stopping))
         elif request.verb == "part":

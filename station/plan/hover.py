@@ -20,7 +20,7 @@ from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, t
 from calibrate.kinematics import RobotModel, forward, inverse_all, jacobian
 from calibrate.views import ImageView
 from recordings.messages import BoardSpec, Vector6
-from station.collision import CellGeometry, margins, plate
+from station.collision import CellGeometry, as_point, margins, plate
 from station.config import Capsule, PointerConfig, StationConfig
 from station.errors import LimitError
 from station.limits import PlanCheck, check_plan
@@ -162,7 +162,7 @@ def hover_geometry(
         others = cell.obstacles
     along = np.array(pointer.along) / np.linalg.norm(pointer.along)
     end = np.array(pointer.tip_m) - pointer.radius_m * along
-    rod = Capsule("pointer", (0.0, 0.0, 0.0), _vector(end), pointer.radius_m)
+    rod = Capsule("pointer", (0.0, 0.0, 0.0), as_point(end), pointer.radius_m)
     limits = config.limits
     slow = msgspec.structs.replace(
         limits,
@@ -254,10 +254,6 @@ def _plan(config: StationConfig, model: RobotModel, corner: int, high: Array, lo
         joint_acceleration_rad_s2=_ACCELERATION_RAD_S2,
         note="verification hover",
     )
-
-
-def _vector(point: Array) -> tuple[float, float, float]:
-    return float(point[0]), float(point[1]), float(point[2])
 
 
 @dataclass(frozen=True, eq=False)

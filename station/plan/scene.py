@@ -11,7 +11,7 @@ from calibrate.board import board_points
 from calibrate.geometry import Array, inverse, pose_from_quaternion, transform_points
 from calibrate.kinematics import MODELS, DhDeltas, RobotModel, forward
 from recordings.messages import BoardSpec, CameraModel, Mount
-from station.collision import CellGeometry, plate
+from station.collision import CellGeometry, as_point, plate
 from station.config import Capsule, PoseGuess, StationConfig
 from station.errors import ConfigError, LimitError
 from station.plan.model import Plan
@@ -138,7 +138,7 @@ def geometry_of(
     clearance = limits.clearance_m
     if config.mount == "eye-in-hand":
         if X is not None:
-            watched = (_point(X[:3, 3]),)
+            watched = (as_point(X[:3, 3]),)
             solids = solids or (camera_body("camera", X, camera_radius_m(camera_doubt_m)),)
         if Y is not None:
             obstacles = plate("board", Y, low, high)
@@ -151,7 +151,7 @@ def geometry_of(
                 for rod in plate("board", Y, low, high)
             )
             corners = np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
-            watched = tuple(_point(p) for p in transform_points(Y, corners))
+            watched = tuple(as_point(p) for p in transform_points(Y, corners))
         if X is not None:
             obstacles = (camera_body("camera", X),)
             clearance = limits.clearance_m + 2 * camera_doubt_m
@@ -195,8 +195,4 @@ def camera_ends(parent_from_camera: Array) -> Array:
 def camera_body(name: str, parent_from_camera: Array, radius_m: float = _CAMERA_RADIUS_M) -> Capsule:
     """A camera as it stands behind its optical centre."""
     ends = camera_ends(parent_from_camera)
-    return Capsule(name, _point(ends[0]), _point(ends[1]), radius_m)
-
-
-def _point(p: Array) -> tuple[float, float, float]:
-    return float(p[0]), float(p[1]), float(p[2])
+    return Capsule(name, as_point(ends[0]), as_point(ends[1]), radius_m)

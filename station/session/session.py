@@ -126,6 +126,7 @@ class Session:
             await self._halt(self.bench.resting, how.format(holder) + ": give a new go to go on")
 
     async def _halt(self, state: StationState, reason: str) -> None:
+        """No go is left, the arm stops both ways, its run ends: where it writes, once the disk has it."""
         bench, run = self.bench, self._run
         self._void_go()
         bench.halting, bench.pause_wanted, bench.finish_wanted = True, "", False

@@ -46,7 +46,7 @@ class Handler(Protocol):
     """What the daemon does with requests."""
 
     def stop_now(self, peer: Peer) -> Any:
-        """STOP, from anyone: under way when it returns, even if the client leaves. May return an awaitable."""
+        """STOP, from anyone: under way when it returns, should the client leave. May return an awaitable."""
 
     async def handle(self, peer: Peer, verb: str, args: dict[str, Any]) -> Any:
         """The result; StationError or RecordingError becomes the reply's sentence."""

@@ -165,6 +165,8 @@ class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     """Path of the sealed recording, once there is one."""
     calibration: str = ""
     """Path of the calibration file that was made of it, once there is one."""
+    check: bool = False
+    """A drift check: to be compared with what is installed, not to be solved."""
     source: Source = "real"
 
 

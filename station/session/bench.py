@@ -77,12 +77,19 @@ class Bench:
             with contextlib.suppress(RecordingError):
                 self.recording.event(event)
 
-    def forget_session(self) -> None:
-        """What is shown of the session before ends when the next one begins."""
+    def forget_session(self, check: bool = False) -> None:
+        """What is shown of the session before ends when the next one begins; `check`: as a drift check."""
         self.seen.clear()
         session = self.store.status.session
         fresh = msgspec.structs.replace(
-            session, name="", folder="", recording="", calibration="", elapsed_s=0.0, remaining_s=None
+            session,
+            name="",
+            folder="",
+            recording="",
+            calibration="",
+            check=check,
+            elapsed_s=0.0,
+            remaining_s=None,
         )
         self.store.update(session=fresh)
 
@@ -105,6 +112,7 @@ class Bench:
                 remaining_s=old.remaining_s,
                 recording=old.recording,
                 calibration=old.calibration,
+                check=old.check,
                 source=self.cell.source,
             )
         )

@@ -34,7 +34,7 @@ from station.session.queue import PoseQueue
 from station.session.run import unmark_busy
 from station.session.runs import run_for
 from station.session.store import StatusStore
-from station.session.summary import begun_anew, poses_to_drive, summarise
+from station.session.summary import DRIFT_CHECK, begun_anew, poses_to_drive, summarise
 from station.states import RUNNING, refusal
 from station.status import GoSummary, HoverOffer, Lease, StationState, StationStatus
 from station.stillness import StillnessMonitor
@@ -206,7 +206,7 @@ class Session:
         self.bench.halting = False
         self.bench.pause_wanted, self.bench.finish_wanted = "", False
         if self.bench.recording is None and go.hover is None:
-            self.bench.forget_session()
+            self.bench.forget_session(check=go.summary.purpose == DRIFT_CHECK)
         if go.replanned is not None:
             self._improver.adopt(go.replanned)
         run = run_for(self.bench, go)

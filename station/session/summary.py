@@ -18,6 +18,7 @@ from station.status import GoSummary
 
 POSE_OVERHEAD_S = 0.8
 """Settle, expose, look, write: what a stop takes beside the move."""
+DRIFT_CHECK = "drift check of the installed calibration"
 _PROBLEMS_SHOWN = 12
 _SLOW_SLIDER = 0.99
 
@@ -109,7 +110,7 @@ def _purpose_words(bench: Bench, purpose: str, poses: tuple[int, ...]) -> str:
     if bench.queue is not None and bench.queue.plan.motion == "sweep":
         return f"sweep: {len(poses)} slow swings without a stop, the camera running"
     if purpose == "check":
-        return "drift check of the installed calibration"
+        return DRIFT_CHECK
     if bench.recording is None:
         return "run plan"
     if purpose == "best":

@@ -39,6 +39,13 @@ def test_a_solved_session_is_not_to_be_solved() -> None:
     assert estimate_lines(solved)[-1] == "3 shows the final one"
 
 
+def test_a_drift_check_is_to_be_judged_and_not_solved() -> None:
+    check = sealed()
+    check = msgspec.structs.replace(check, session=msgspec.structs.replace(check.session, check=True))
+    said = " ".join([*progress_lines(check), *estimate_lines(check)])
+    assert "k on 4 judges it" in said and "F9" not in said
+
+
 def test_what_is_enough_needs_no_better_plan() -> None:
     running = sealed()
     running = msgspec.structs.replace(running, session=msgspec.structs.replace(running.session, recording=""))

@@ -134,7 +134,9 @@ def _counted(session: SessionStatus) -> list[str]:
     if not session.name:
         return [f"{len(session.poses)} poses planned: F5 shows the way and asks"]
     done = sum(pose.state == "done" for pose in session.poses)
-    closed = ", sealed: F9 solves it" if session.recording else ""
+    closed = ""
+    if session.recording:
+        closed = ", sealed: k on 4 judges it" if session.check else ", sealed: F9 solves it"
     if session.calibration:
         closed = ", solved: 3 shows it"
     return [f"{done} of {len(session.poses)} poses captured{closed}"]
@@ -180,6 +182,8 @@ def estimate_lines(status: StationStatus) -> list[str]:
     x, y, z = estimate.translation_mm
     session = status.session
     next_key = "3 shows the final one" if session.calibration else "F9 finds the final one"
+    if session.check:
+        next_key = "k on screen 4 judges it"
     advice = next_key if session.recording else estimate.advice
     left = estimate.improve and not (estimate.enough or session.recording)
     rotation = "" if estimate.sigma_rotation_deg is None else f"  {estimate.sigma_rotation_deg:.3f}°"

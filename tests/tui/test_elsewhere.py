@@ -150,3 +150,12 @@ async def test_a_list_that_did_not_come_is_asked_for_again_and_the_old_one_stays
         link.answers["sessions"] = [{"name": "s-3"}, *link.answers["sessions"]]
         del link.refuse["sessions"]
         await until(pilot, lambda: table.row_count == 3)
+
+
+async def test_enter_on_a_session_shows_what_it_gave(link: FakeLink, root: Path) -> None:
+    app = app_on(link)
+    async with app.run_test(size=(80, 24)) as pilot:
+        table = await list_of_sessions(app, pilot)
+        await until(pilot, lambda: table.row_count == 2)
+        await pilot.press("down", "enter")
+        await until(pilot, lambda: app.current_mode == "result" and "session s-1" in text_of(app, "#verdict"))

@@ -17,7 +17,7 @@ from station.client import Client, ask, default_socket
 from station.console import AsJson, Socket, out
 from station.errors import StationError
 from station.protocol import Verb
-from station.status import StationStatus
+from station.status import StationState, StationStatus
 
 app = typer.Typer()
 
@@ -50,8 +50,7 @@ def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
     if as_json:
         print(msgspec.json.encode(status).decode())
         return
-    marks = " SIMULATED" if status.simulated else " PLAYBACK" if status.playback else ""
-    out.print(Text.assemble((status.state.value, "bold"), f"{marks}  {status.reason}"))
+    _print_state(status)
     robot, session = status.robot, status.session
     words = [f"{robot.model} {robot.safety or 'not connected'}", f"slider {100 * robot.slider:.0f} %"]
     if session.poses:
@@ -64,6 +63,11 @@ def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
     out.print(camera_words(status))
     if session.recording:
         out.print(f"recording {session.recording}")
+
+
+def _print_state(status: StationStatus) -> None:
+    marks = " SIMULATED" if status.simulated else " PLAYBACK" if status.playback else ""
+    out.print(Text.assemble((status.state.value, "bold"), f"{marks}  {status.reason}"))
 
 
 def camera_words(status: StationStatus) -> str:
@@ -96,6 +100,10 @@ def acknowledge_command(socket: Socket = None) -> None:
     Next: `station resume` goes on with the session, `station finish` seals it.
     """
     ask(socket or default_socket(), "acknowledge")
+    status = status_now(socket)
+    _print_state(status)
+    if status.state is StationState.PAUSED:
+        out.print("next: `station resume` goes on, `station finish` seals")
 
 
 @app.command("pause")
@@ -105,6 +113,7 @@ def pause_command(socket: Socket = None) -> None:
     Anyone may. Next: `station resume`, `improve`, `best` or `finish`.
     """
     ask(socket or default_socket(), "pause")
+    out.print("pauses after this pose; then `station resume`, `improve`, `best` or `finish`")
 
 
 @app.command("finish")
@@ -114,6 +123,10 @@ def finish_command(socket: Socket = None) -> None:
     Next: `calibrate solve RECORDING`; `station status` names it.
     """
     _command(socket, "finish")
+    status = status_now(socket)
+    _print_state(status)
+    if status.session.recording:
+        out.print(f"recording {status.session.recording}")
 
 
 @app.command("retake")
@@ -123,6 +136,7 @@ def retake_command(pose: PoseNumber, socket: Socket = None) -> None:
     Example: `station retake 7`, then `station resume`.
     """
     _command(socket, "retake", index=pose - 1)
+    out.print(f"pose {pose} is taken once more at the next go: `station resume`")
 
 
 @app.command("skip")
@@ -132,6 +146,7 @@ def skip_command(pose: PoseNumber, socket: Socket = None) -> None:
     Example: `station skip 7`.
     """
     _command(socket, "skip", index=pose - 1)
+    out.print(f"pose {pose} is left out until `station retake {pose}`")
 
 
 @app.command("doctor")

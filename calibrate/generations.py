@@ -72,8 +72,11 @@ def state_root(root: Path | None = None) -> Path:
 
 
 def generations(root: Path | None = None) -> list[Generation]:
-    """Everything ever installed, oldest first; damaged files are listed with their problem."""
-    folder = calibrations_folder(root)
+    """Everything ever installed, oldest first; damaged files are listed with their problem.
+
+    InstallError where the folder may not be looked into.
+    """
+    folder = readable_folder(root)
     current = _current_name(folder)
     found = []
     for path in sorted((folder / "gen").glob("*.yaml")):
@@ -91,7 +94,7 @@ def generations(root: Path | None = None) -> list[Generation]:
 
 def read_log(root: Path | None = None) -> list[LogEntry]:
     """Oldest first."""
-    return read_lines(calibrations_folder(root) / "log.jsonl", LogEntry)
+    return read_lines(readable_folder(root) / "log.jsonl", LogEntry)
 
 
 def add_generation(
@@ -131,6 +134,16 @@ def _content_name(content: bytes) -> str:
 
 def calibrations_folder(root: Path | None) -> Path:
     return state_root(root) / "calibrations"
+
+
+def readable_folder(root: Path | None) -> Path:
+    """The same; InstallError where it may not be looked into."""
+    folder = calibrations_folder(root)
+    try:
+        (folder / "gen").exists()
+    except PermissionError as problem:
+        raise InstallError(f"{folder}: {problem.strerror}. Name another state folder with --root.") from None
+    return folder
 
 
 def _current_name(folder: Path) -> str:

@@ -23,6 +23,7 @@ from calibrate.generations import (
     locked,
     make_current,
     no_generation,
+    readable_folder,
     who,
 )
 from calibrate.geometry import difference
@@ -53,7 +54,7 @@ def load_installed(root: Path | None = None, allow_simulated: bool = False) -> C
     both frame names in it; `calibration.intrinsics.model` is the lens. Raises InstallError when nothing is
     installed or when it is simulated and that was not asked for, CalibrationFileError when it is damaged.
     """
-    current = calibrations_folder(root) / "current"
+    current = readable_folder(root) / "current"
     if not current.exists():
         raise InstallError(f"{current}: nothing is installed. Run: calibrate install FILE")
     calibration = read_calibration(current)

@@ -34,10 +34,14 @@ class OutputError(CalibrationError):
 
 def check_folder(target: Path) -> None:
     """Before the work, not after it: a file can be written there."""
-    if not target.parent.is_dir():
-        raise OutputError(f"{target}: the folder {target.parent} does not exist. Create it, or name another.")
-    if target.is_dir():
-        raise OutputError(f"{target} is a folder; name a file in it.")
+    try:
+        if not target.parent.is_dir():
+            text = f"{target}: the folder {target.parent} does not exist. Create it, or name another."
+            raise OutputError(text)
+        if target.is_dir():
+            raise OutputError(f"{target} is a folder; name a file in it.")
+    except PermissionError as problem:
+        raise OutputError(f"{target}: {problem.strerror}. Name another place.") from None
 
 
 def check_target(target: Path) -> None:

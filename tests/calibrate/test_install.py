@@ -6,6 +6,7 @@ import re
 import shutil
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
@@ -152,6 +153,18 @@ def test_an_unwritable_place_is_said(make_file, tmp_path: Path) -> None:  # type
     (tmp_path / "file").write_text("")
     with pytest.raises(InstallError, match="--root"):
         install(make_file(), tmp_path / "file")
+
+
+@pytest.mark.parametrize("look", [generations, read_log, load_installed])
+def test_a_place_that_may_not_be_looked_into_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, look: Callable[[Path], object]
+) -> None:
+    def refused(path: Path) -> bool:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "exists", refused)  # who runs the tests may be root
+    with pytest.raises(InstallError, match=r"calibrations: Permission denied\. Name another"):
+        look(tmp_path)
 
 
 INSTALL = """

@@ -141,7 +141,7 @@ class _Bag:
         self._channels: dict[str, int] = {}
         self._kinds: dict[str, str] = {}
         self._counts: Counter[str] = Counter()
-        self._times_ns: list[int] = []
+        self._span_ns: tuple[int, int] | None = None
 
     def add(self, topic: str, kind: str, time_ns: int, message: dict[str, Any]) -> None:
         if topic not in self._channels:
@@ -152,13 +152,14 @@ class _Bag:
         content = encode_cdr(kind, message)
         self._file.message(self._channels[topic], [content], time_ns, self._counts[topic])
         self._counts[topic] += 1
-        self._times_ns = [min([*self._times_ns, time_ns]), max([*self._times_ns, time_ns])]
+        first, last = self._span_ns or (time_ns, time_ns)
+        self._span_ns = min(first, time_ns), max(last, time_ns)
 
     def finish(self) -> None:
         self._file.finish()
 
     def metadata(self, file_name: str) -> bytes:
-        first, last = self._times_ns or (0, 0)
+        first, last = self._span_ns or (0, 0)
         span = {
             "duration": {"nanoseconds": last - first},
             "starting_time": {"nanoseconds_since_epoch": first},

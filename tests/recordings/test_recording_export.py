@@ -193,6 +193,8 @@ def test_the_bag_has_the_profile_and_counts_that_ros_wants(small: Path, tmp_path
     counts = {t["topic_metadata"]["name"]: t["message_count"] for t in described["topics_with_message_count"]}
     assert counts == {"/camera/camera_info": 1, "/joint_states": 9, "/camera/image_raw": 3, "/tf": 3}
     assert described["message_count"] == 16
+    assert described["starting_time"] == {"nanoseconds_since_epoch": START_NS}
+    assert described["duration"] == {"nanoseconds": 10**9}
     assert (out / described["relative_file_paths"][0]).read_bytes()[17:25] == b"\x04\0\0\0ros2"
 
 

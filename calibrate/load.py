@@ -6,7 +6,7 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -34,7 +34,7 @@ class LoadedViews:
     board: BoardSpec
     pictures: int
     without_board: tuple[RejectedView, ...]
-    """Also those whose picture cannot be decoded."""
+    """Also those whose picture cannot be decoded, and those left out by hand."""
     detections: dict[int, Detection] = field(default_factory=dict)
     """Pose number → what was seen, also where nothing was."""
     losses: tuple[str, ...] = ()
@@ -83,6 +83,29 @@ def load_views(
     )
     found = ViewSet(info.mount, tuple(views), model, info.robot.model)
     return LoadedViews(found, spec, pictures, tuple(missing), seen, recording.losses)
+
+
+def without_views(loaded: LoadedViews, numbers: tuple[int, ...], fewest: int = FEWEST_VIEWS) -> LoadedViews:
+    """Without the poses of these numbers (from 1), which a person chose; they are listed as left out.
+
+    Raises BadViewsError for a number that no view has, TooFewViewsError when fewer than `fewest` stay.
+    """
+    chosen = {number - 1 for number in numbers}
+    views = loaded.views
+    if unknown := chosen - {view.index for view in views}:
+        told = ", ".join(str(index + 1) for index in sorted(unknown))
+        raise BadViewsError(f"--without {told}: the board is seen in no view of that number.")
+    left = tuple(
+        RejectedView(view.index, view.name, "left out by hand (--without)", "by-hand")
+        for view in views
+        if view.index in chosen
+    )
+    if len(views) - len(left) < fewest:
+        raise TooFewViewsError(
+            f"--without leaves {len(views) - len(left)} of {len(views)} views; at least {fewest} are needed."
+        )
+    kept = views.select([place for place, view in enumerate(views) if view.index not in chosen])
+    return replace(loaded, views=kept, without_board=(*loaded.without_board, *left))
 
 
 def _detect_all(

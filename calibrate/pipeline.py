@@ -18,7 +18,7 @@ from calibrate.errors import BadViewsError
 from calibrate.gates import Evidence, Gate, GateLimits, judge
 from calibrate.intrinsics import Intrinsics, LensModel, calibrate_intrinsics
 from calibrate.lens_uncertainty import LensUncertainty, lens_uncertainty
-from calibrate.load import FEWEST_VIEWS, LoadedViews, Progress, load_views
+from calibrate.load import FEWEST_VIEWS, LoadedViews, Progress, load_views, without_views
 from calibrate.pnp import solve_pnp, view_rms_px
 from calibrate.scale import ScaleCheck, check_scale
 from calibrate.solution import Profile, Solution, SolveOptions
@@ -48,6 +48,8 @@ class JobOptions:
     """Find them from these pictures even where some are recorded."""
     limits: GateLimits = field(default_factory=GateLimits)
     working_distance_m: float | None = None
+    without: tuple[int, ...] = ()
+    """Numbers, from 1, of the poses that a person leaves out."""
     threads: int | None = None
 
 
@@ -114,6 +116,8 @@ def _prepare(path: Path, options: JobOptions, progress: Progress | None, fewest:
         camera = CameraModel(recorded.width, recorded.height)
     board = _board(options, recording.info.board)
     loaded = load_views(recording, board, camera, progress, options.threads, fewest)
+    if options.without:
+        loaded = without_views(loaded, options.without, fewest)
     watch.lap("detect")
     views, intrinsics = loaded.views, None
     if views.camera.matrix is None:

@@ -52,6 +52,7 @@ class RejectedView:
         "inconsistent",
         "corners",
         "unreadable-picture",
+        "by-hand",
     ]
     wrong_number: int | None = None
     """Place in [δt, δφ] of the only wrong number of its recorded pose: X rests on the other five."""

@@ -42,6 +42,9 @@ CameraFile = Annotated[
 Find = Annotated[bool, typer.Option("--find-intrinsics", help="Find the lens even where it is recorded")]
 LensKind = Annotated[LensName, typer.Option("--lens", help="Model of a lens that has to be found")]
 GatesFile = Annotated[Path | None, typer.Option("--gates", help="YAML of other limits")]
+Without = Annotated[
+    str | None, typer.Option(help="Numbers of poses to leave out, such as 3,7; the file says so")
+]
 Threads = Annotated[
     int | None, typer.Option(min=1, help="For finding boards; the result does not depend on it")
 ]
@@ -88,6 +91,7 @@ def picture_options(
     camera: CameraFile = None,
     find_intrinsics: Find = False,
     lens: LensKind = LensName.plumb_bob,
+    without: Without = None,
     threads: Threads = None,
 ) -> JobOptions:
     """How pictures are read."""
@@ -98,8 +102,16 @@ def picture_options(
         camera=None if camera is None else read_camera(camera),
         lens_model=lens.value,
         find_intrinsics=find_intrinsics,
+        without=() if without is None else _numbers(without),
         threads=threads,
     )
+
+
+def _numbers(words: str) -> tuple[int, ...]:
+    try:
+        return tuple(sorted({int(word) for word in words.split(",")}))
+    except ValueError:
+        raise typer.BadParameter(f"--without {words}: give numbers of poses, such as 3,7") from None
 
 
 @takes(picture_options)

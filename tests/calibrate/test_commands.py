@@ -336,3 +336,17 @@ def test_another_camera_is_no_drift(real_session_file: Path, real_file: Path, tm
     write_calibration(msgspec.structs.replace(calibration, camera=other), tmp_path / "other.yaml")
     done = run("check", real_session_file, "--calibration", "other.yaml", cwd=tmp_path)
     refused(done, 2, "the calibration is of camera other", "Calibrate the new one")
+
+
+def test_poses_are_left_out_by_hand_and_the_file_says_so(session_file: Path, tmp_path: Path) -> None:
+    target = tmp_path / "c.yaml"
+    done = run("solve", session_file, "-o", target, "--without", "2,5", "--json", cwd=tmp_path)
+    assert done.returncode in (0, 4), done.stderr
+    views = json.loads(done.stdout)["views"]
+    by_hand = [view["index"] for view in views["rejected"] if "left out by hand" in view["reason"]]
+    assert by_hand == [1, 4] and not {1, 4} & set(views["used"])
+    assert read_calibration(target).provenance.options["without"] == [2, 5]
+    refused(run("solve", session_file, "--without", "99", cwd=tmp_path), 1, "--without 99", "no view")
+    few = ",".join(str(number) for number in range(1, 9))
+    refused(run("solve", session_file, "--without", few, cwd=tmp_path), 1, "--without", "needed")
+    assert run("solve", session_file, "--without", "a", cwd=tmp_path).returncode == 2

@@ -144,6 +144,10 @@ def main() -> None:
     except RecordingError as problem:
         print(f"recordings: {printed(problem)}", file=sys.stderr)
         sys.exit(problem.exit_code)
+    except OSError as problem:  # of a full disk behind stdout, say
+        where = problem.filename or "the output"
+        print(f"recordings: {where}: {problem.strerror or problem}", file=sys.stderr)
+        sys.exit(1)
 
 
 if __name__ == "__main__":

@@ -19,10 +19,12 @@ from calibrate.calibration import (
     Touch,
     read_calibration,
 )
+from calibrate.cli import main
 from calibrate.gates import Gate
 from calibrate.generations import InstallError, generations, read_log
 from calibrate.install import InstallGateError, install, install_line, load_installed, rollback
 from calibrate.pipeline import SolvedRecording
+from tests.command_line import call
 
 
 def test_the_next_step_of_a_solve_is_one_that_works() -> None:
@@ -165,6 +167,17 @@ def test_a_place_that_may_not_be_looked_into_is_said(
     monkeypatch.setattr(Path, "exists", refused)  # who runs the tests may be root
     with pytest.raises(InstallError, match=r"calibrations: Permission denied\. Name another"):
         look(tmp_path)
+
+
+def test_trouble_that_no_other_error_names_is_one_sentence(
+    real_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("calibrate.commands.install.print_json", full)
+    done = call(main, "show", real_file, "--json")
+    assert (done.returncode, done.stderr) == (1, "calibrate: the output: No space left on device\n")
 
 
 INSTALL = """

@@ -113,6 +113,17 @@ def test_info_of_an_empty_recording(tmp_path: Path) -> None:
     assert recording_info(open_recording(path))["robot_states"] is None
 
 
+def test_a_full_disk_behind_the_output_is_one_sentence_and_1(
+    small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("recordings.cli.print_info", full)
+    result = run("info", small)
+    assert (result.returncode, result.stderr) == (1, "recordings: the output: No space left on device\n")
+
+
 @pytest.mark.parametrize("command", ["info", "recover"])
 def test_a_missing_file_is_one_sentence_and_1(tmp_path: Path, command: str) -> None:
     result = run(command, tmp_path / "none.mcap")

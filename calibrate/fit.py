@@ -20,6 +20,7 @@ from calibrate.solution import KinematicPrior, RejectedView, RobotSystematics
 from calibrate.stopwatch import Stopwatch
 from calibrate.systematics import FEWEST_VIEWS, fit_kinematics
 from calibrate.views import ViewSet
+from calibrate.worth import number_worths, widen
 
 _ROUNDS = 5
 _FEWEST = 4
@@ -50,8 +51,10 @@ class Settled:
 
     everything: Observations
     """Of all views."""
+    places: Places
+    """Those that count as good."""
     fitted: Places
-    """Those that the estimate rests on."""
+    """Those that the estimate rests on: the good ones, and what is of worth in the others."""
     estimate: Estimate
     verdict: Judgement
     """On all views."""
@@ -62,11 +65,6 @@ class Settled:
     def observed(self) -> Observations:
         """Of the fitted views."""
         return self.everything.part(self.fitted)
-
-    @property
-    def places(self) -> Places:
-        """Fitted views all of whose numbers are trusted."""
-        return self.fitted[self.everything.trust[self.fitted].all(axis=1)]
 
 
 def fit_views(
@@ -86,7 +84,7 @@ def fit_views(
     start = first_state(everything.part(places), consensus.start.X, C[places], H[places], views.camera)
     plain = estimate(everything.part(places), start, intrinsics_free)
     boards = refine_board_poses(everything, replace(plain.state, C=C))
-    group = Settled(everything, places, plain, judge_views(everything, plain, boards, places), boards)
+    group = Settled(everything, places, places, plain, judge_views(everything, plain, boards, places), boards)
     settled = _settle(group, reject)
     _require_plausible_noise(settled.estimate)
     watch.lap("maximum likelihood")
@@ -96,7 +94,7 @@ def fit_views(
     bad = np.setdiff1d(np.arange(len(views)), places)
     full = replace(settled.estimate.state, C=settled.boards.C)
     rejected = explain(views, full, settled.verdict, bad)
-    settled = _with_good_numbers(settled, rejected, bad)
+    settled = _with_worths(settled) if reject else settled
     pairs = all_pairs(H[places], settled.boards.C[places])
     problem = f"chordal objective over all {len(pairs)} pairs of the {len(places)} used views"
     certified = solve_global(pairs, seed, problem)
@@ -133,7 +131,7 @@ def _judged(everything: Observations, fitted: Places, result: Estimate, boards: 
     if result.intrinsics_free:
         boards = refine_board_poses(everything, replace(result.state, C=boards.C))
     verdict = judge_views(everything, result, boards, fitted)
-    return Settled(everything, fitted, result, verdict, boards)
+    return Settled(everything, fitted, fitted, result, verdict, boards)
 
 
 def _again(settled: Settled, fitted: Places) -> Settled:
@@ -175,19 +173,19 @@ def _with_kinematics(
     return finding, settled or plain
 
 
-def _with_good_numbers(settled: Settled, rejected: tuple[RejectedView, ...], places: Places) -> Settled:
-    """The estimate rests also on the good numbers of views that have one wrong number."""
-    wrong = {
-        int(i): view.wrong_number
-        for i, view in zip(places, rejected, strict=True)
-        if view.wrong_number is not None
-    }
-    if not wrong:
+def _with_worths(settled: Settled) -> Settled:
+    """Estimated also by what the bad views are worth, at the noise scales of the good ones."""
+    usable = ~settled.verdict.blurred
+    if len(settled.places) == usable.sum():
         return settled
-    trusted = settled.everything.trust.copy()
-    trusted[list(wrong), list(wrong.values())] = 0.0
-    everything = replace(settled.everything, trusted=trusted)
-    return _again(replace(settled, everything=everything), np.union1d(settled.fitted, list(wrong)))
+    found = number_worths(settled.verdict.linear, settled.places, usable)
+    everything = replace(settled.everything, worth=found.worth)
+    fitted = np.flatnonzero(found.worth.any(axis=1))
+    before = settled.estimate
+    start = replace(before.state, C=settled.boards.C[fitted])
+    result = estimate(everything.part(fitted), start, before.intrinsics_free, before.sigma, fit_scales=False)
+    result = replace(result, joint_covariance=widen(result.joint_covariance, found.lost))
+    return replace(_judged(everything, fitted, result, settled.boards), places=settled.places)
 
 
 def _require_plausible_noise(result: Estimate) -> None:

@@ -35,21 +35,21 @@ class Observations:
 
     held: tuple[int, ...] = ()
     """Places in `projection.INTRINSICS` that stay as they are."""
-    trusted: Array | None = None
-    """(n, 6) 0 for a number of the recorded pose that is known to be wrong, else 1; None: all are trusted."""
+    worth: Array | None = None
+    """(n, 6) factor 0…1 on the residual of each number of the recorded pose; None: all count fully."""
 
     @property
     def has_pixels(self) -> bool:
         return bool(self.present.any())
 
     @property
-    def trust(self) -> Array:
+    def worths(self) -> Array:
         """(n, 6)"""
-        return np.ones((len(self.flange), 6)) if self.trusted is None else self.trusted
+        return np.ones((len(self.flange), 6)) if self.worth is None else self.worth
 
     def part(self, places: NDArray[np.int64]) -> Observations:
         """Of these views only."""
-        kinematics, trusted = self.kinematics, self.trusted
+        kinematics, worth = self.kinematics, self.worth
         return replace(
             self,
             flange=self.flange[places],
@@ -57,7 +57,7 @@ class Observations:
             pixels=self.pixels[places],
             present=self.present[places],
             kinematics=None if kinematics is None else kinematics[places],
-            trusted=None if trusted is None else trusted[places],
+            worth=None if worth is None else worth[places],
         )
 
 

@@ -22,13 +22,13 @@ class Misses:
     """What a state leaves unexplained."""
 
     robot: Array
-    """(n, 6), 0 for a number that is not trusted."""
+    """(n, 6), each by what it is worth."""
     distance_px: Array
     """(n, k) of the corners, 0 for padding; not finite for corners behind the camera."""
 
 
 def misses(observed: Observations, state: State) -> Misses:
-    robot = observed.trust * robot_residuals(observed, state)
+    robot = observed.worths * robot_residuals(observed, state)
     return Misses(robot, corner_distance(corner_residuals(observed, state)))
 
 
@@ -144,8 +144,8 @@ def _add_robot(normal: Normal, observed: Observations, state: State) -> None:
     J_G[..., :6], J_G[..., 6:12] = by_X, by_Y
     if observed.kinematics is not None:
         J_G[..., -observed.kinematics.shape[2] :] = -observed.kinematics
-    trust = observed.trust
-    e, by_C, J_G = e * trust, by_C * trust[..., None], J_G * trust[..., None]
+    worth = observed.worths
+    e, by_C, J_G = e * worth, by_C * worth[..., None], J_G * worth[..., None]
     for group, rows in ((ROBOT_TRANSLATION, slice(0, 3)), (ROBOT_ROTATION, slice(3, 6))):
         G, c, r = J_G[:, rows], by_C[:, rows], e[:, rows]
         flat = G.reshape(-1, normal.size)
@@ -155,7 +155,7 @@ def _add_robot(normal: Normal, observed: Observations, state: State) -> None:
         normal.W[group] = np.swapaxes(G, 1, 2) @ c
         normal.h[group] = -np.einsum("nri,nr->ni", c, r)
         normal.square[group] = float((r**2).sum())
-        normal.count[group] = float(trust[:, rows].sum())
+        normal.count[group] = float((worth[:, rows] ** 2).sum())
 
 
 def robot_derivatives(observed: Observations, state: State) -> tuple[Array, Array, Array]:

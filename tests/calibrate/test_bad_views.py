@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 from calibrate import mixture
+from calibrate.assess import distance_in_sigmas
 from calibrate.errors import BadViewsError
 from calibrate.evolution_robust import solve_geman_mcclure
 from calibrate.geometry import inverse, perturb, pose, rotation_exp, transform_points
@@ -77,15 +78,15 @@ def test_one_wrong_number_is_named_and_only_that_number_is_lost(mount, number, s
     assert (rejected.index, rejected.kind, rejected.wrong_number) == (7, "wrong-number", number)
     assert re.search(said, rejected.reason)
     assert 7 not in wrong.used
-    # What the wrong number says does not matter.
+    # What the wrong number says hardly matters.
     far = solve_views(nudged(c, 7, 2 * slip), QUICK)
-    np.testing.assert_allclose(far.matrix, wrong.matrix, atol=2e-6)
+    assert distance_in_sigmas(far.matrix, wrong.matrix, wrong.covariance) < 0.1
 
 
 def test_the_other_five_numbers_bring_X_nearer_than_the_good_views_alone():
     ours, known = [], []
-    for seed in range(6):
-        rng = np.random.default_rng(seed)
+    for seed in range(8):
+        rng = np.random.default_rng([77, seed])
         c = make_cell(rng, 25, MID)
         good = sorted(set(range(25)) - set(bad := rng.choice(25, 10, replace=False).tolist()))
         known.append(error_mm_deg(solve_views(c.views.select(good), QUICK).matrix, c.X))

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import re
 from xml.sax.saxutils import quoteattr
 
 from scipy.spatial.transform import Rotation
@@ -15,7 +16,7 @@ from calibrate.geometry import Array
 
 
 def text(calibration: Calibration, frames: FrameNames) -> str:
-    note = comment(calibration).replace("--", "- -")
+    note = re.sub("-(?=-)", "- ", comment(calibration))  # no -- inside a comment of XML
     parent = frames.parent(calibration)
     return (
         f"<!-- {note} -->\n"

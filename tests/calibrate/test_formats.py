@@ -124,6 +124,13 @@ def urdf_origin(joint: ElementTree.Element) -> Array:
     return pose(R, xyz)
 
 
+def test_a_name_with_hyphens_does_not_end_the_urdfs_comment(calibration: Calibration) -> None:
+    named = msgspec.structs.replace(calibration.provenance, session="a--b---c----")
+    text = export(msgspec.structs.replace(calibration, provenance=named), "urdf")
+    assert len(ElementTree.fromstring(f"<robot name='x'>{text}</robot>")) == 4
+    assert "a- -b- - -c- - - -" in text
+
+
 def test_urdf_chain_ends_in_the_optical_frame(calibration: Calibration) -> None:
     tree = ElementTree.fromstring(f"<robot name='x'>{export(calibration, 'urdf')}</robot>")
     first, second = tree.findall("joint")
@@ -213,6 +220,8 @@ def test_ur_tool_by_the_pendants_rule(calibration: Calibration) -> None:
     values = [float(v) for v in numbers[1].split(",")]
     same(pose_from_rotvec(values[:3], values[3:]), calibration, 1e-9)
     assert ("set_tcp(" in text) == (calibration.mount == "eye-in-hand")
+    assert ("Installation > TCP: " in text) == (calibration.mount == "eye-in-hand")
+    assert ("Installation > Features: " in text) == (calibration.mount == "eye-to-hand")
 
 
 @pytest.mark.parametrize("name", FORMATS)

@@ -15,6 +15,7 @@ from calibrate.calibration import encode_calibration
 from calibrate.errors import BadViewsError, CalibrationError, TooFewViewsError
 from calibrate.geometry import Array, difference
 from calibrate.load import load_views
+from calibrate.misread import fitting_convention
 from calibrate.pipeline import JobOptions, SolvedRecording, prepare_views, solve_recording
 from recordings.importer import import_folder
 from recordings.messages import BoardKind, BoardSpec, CameraModel
@@ -173,6 +174,13 @@ def test_a_slip_of_typing_in_a_real_list_of_poses_is_named_and_costs_one_number(
     assert rejected.index == 5
     assert re.match(r"only y in base is off, by (89|90)\.\d\d mm", rejected.reason)
     assert error_mm_deg(typed.matrix, right.matrix)[0] < 0.05
+
+
+def test_the_wrong_mount_of_a_real_recording_is_named(datasets: Path, tmp_path: Path) -> None:
+    """An approximate X once made quaternions with w first look likelier."""
+    import_folder(datasets / "charuco-eye-to-hand", tmp_path / "r.mcap")
+    views = replace(prepare_views(tmp_path / "r.mcap").views, mount="eye-in-hand")
+    assert "the other mount" in (fitting_convention(views, 0) or "")
 
 
 def test_the_colours_decide_the_small_board_in_every_view(datasets: Path, tmp_path: Path) -> None:

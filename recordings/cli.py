@@ -26,6 +26,7 @@ from recordings.recover import recover as recover_recording
 from recordings.terminal import print_what_it_can
 
 app = typer.Typer(
+    context_settings={"help_option_names": ["-h", "--help"]},
     help="Look into, make, convert and rescue recordings.",
     epilog="Exit codes: 0 good, 1 failed, 2 wrong usage, 3 done with loss.",
     no_args_is_help=True,

@@ -32,7 +32,12 @@ EPILOG = (
 
 def command_line(arguments: Sequence[str]) -> typer.Typer:
     """All commands, or the small ones alone when one of them is called."""
-    app = typer.Typer(add_completion=False, no_args_is_help=False, rich_markup_mode="markdown")
+    app = typer.Typer(
+        add_completion=False,
+        no_args_is_help=False,
+        rich_markup_mode="markdown",
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
     app.callback(invoke_without_command=True, epilog=EPILOG)(screen_by_default)
     app.registered_commands += control.registered_commands
     small = {command.name for command in control.registered_commands}

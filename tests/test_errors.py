@@ -40,6 +40,21 @@ def test_an_error_begins_with_the_name_of_its_command(
     assert not done.stderr.strip().endswith(".")
 
 
+@pytest.mark.parametrize(
+    ("main", "asked"),
+    [
+        (calibrate.cli.main, ("-h",)),
+        (calibrate.cli.main, ("solve", "-h")),
+        (recordings.cli.main, ("info", "-h")),
+        (station.cli.main, ("-h",)),
+        (station.cli.main, ("stop", "-h")),
+    ],
+)
+def test_help_may_be_asked_for_shortly(main: Callable[[], None], asked: tuple[str, ...]) -> None:
+    done = call(main, *asked)
+    assert done.returncode == 0 and "Usage" in done.stdout
+
+
 @pytest.mark.parametrize("command", ["calibrate.cli solve", "station.cli plan", "recordings.cli info"])
 def test_a_terminal_without_our_letters_gets_what_it_can_show(command: str) -> None:
     latin = {"PATH": "/usr/bin:/bin", "LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}

@@ -7,6 +7,7 @@ import typer
 from calibrate.commands import batch, board, check, install, solve, sweep
 
 app = typer.Typer(
+    context_settings={"help_option_names": ["-h", "--help"]},
     no_args_is_help=True,
     add_completion=False,
     pretty_exceptions_enable=False,

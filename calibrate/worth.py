@@ -28,6 +28,8 @@ _WHOLE = 0.1
 _FIRST_KINDS = np.append((1 - _WHOLE) * np.exp(LOG_KINDS), np.full(len(SIZES), _WHOLE / len(SIZES)))
 _WIDEST = 2.0
 """Times a sigma: guessing at the kinds makes X no more uncertain than this."""
+_DOUBT = 0.2
+"""Chance to be bad below which a view counts fully: else gross errors elsewhere would cost good views."""
 _NOTHING = 0.02
 """A number that is worth less is not used at all."""
 
@@ -77,6 +79,7 @@ def _weigh(left: Array, covariance: Array, sigma: Array, odds: Array) -> tuple[A
     whole = 0.5 * (1 - 1 / _WIDER) * d2 - 3 * np.log(_WIDER)
     each = np.concatenate([found.gains - LOG_KINDS, whole], axis=1) + np.log(odds)
     chances = np.exp(each - np.logaddexp(0.0, logsumexp(each, axis=1))[:, None])
+    chances[chances.sum(axis=1) < _DOUBT] = 0.0
     of_robot, of_whole = np.split(chances, [len(LOG_KINDS)], axis=1)
     taken = (of_whole @ (1 - 1 / _WIDER))[:, None, None] * found.precision
     return chances, found.expected_precision(of_robot) - taken

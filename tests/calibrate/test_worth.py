@@ -37,7 +37,7 @@ def test_nothing_is_used_of_a_view_that_is_wrong_in_everything(seed):
     rng = np.random.default_rng(seed)
     found = worths(misses_of(rng, error=1000 * rng.choice([-1, 1], 6)))
     assert (found.worth[0] == 0).all()
-    assert np.median(found.worth[1:]) > 0.95
+    assert (found.worth[1:] > 1 - 1e-6).mean() > 0.8
 
 
 @pytest.mark.parametrize("number", range(6))

@@ -63,12 +63,20 @@ class RecordingWriter:
         self._attachments: set[str] = set()
         self._file = McapFile(self.part_path)
         self._background = BackgroundSync(self._file.descriptor)
-        with self._disk():
+        try:
             self._file.start()
             content = with_crc({"format": FORMAT, "session": msgspec.json.encode(info).decode()})
             for name in SESSION_RECORDS:
                 self._file.metadata(name, content)
             sync_folder(path.parent)
+        except OSError as error:
+            self._file.close()
+            self.part_path.unlink(
+                missing_ok=True
+            )  # nothing is in it, and its name is wanted for the next try
+            raise RecordingError(
+                f"{path} cannot be begun ({error.strerror}): free space or replace the disk, then begin again"
+            ) from error
         if info.camera.matrix is not None:
             self.camera_model(info.camera)
 

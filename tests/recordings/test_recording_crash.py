@@ -28,9 +28,9 @@ WRITER = textwrap.dedent(
     from recordings.recorder import Recorder
     from tests.recordings.small_recording import make_info, make_picture, make_state, make_view
 
-    recorder = Recorder(Path(sys.argv[1]), make_info())
-    print("ready", flush=True)
     try:
+        recorder = Recorder(Path(sys.argv[1]), make_info())
+        print("ready", flush=True)
         for index in itertools.count():
             for count in range(20):
                 recorder.robot_state(make_state(20 * index + count))
@@ -123,6 +123,15 @@ def fill_the_disk(folder: Path, limit_bytes: int) -> None:
 @pytest.mark.parametrize("limit_bytes", [20_000, 45_678, 99_999])
 def test_a_full_disk_loses_nothing_acknowledged(tmp_path: Path, limit_bytes: int) -> None:
     fill_the_disk(tmp_path, limit_bytes)
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("limit_bytes", [0, 100])
+def test_a_disk_that_is_full_at_the_beginning_leaves_the_name_free(tmp_path: Path, limit_bytes: int) -> None:
+    process = start(tmp_path / "a.mcap", limit_bytes)
+    said = process.communicate(timeout=60)[0]
+    assert "a.mcap cannot be begun (File too large)" in said
+    assert not list(tmp_path.iterdir())
 
 
 @pytest.mark.soak

@@ -55,7 +55,7 @@ class RejectedView:
         "by-hand",
     ]
     wrong_number: int | None = None
-    """Place in [δt, δφ] of the only wrong number of its recorded pose: X rests on the other five."""
+    """Place in [δt, δφ] of the only wrong number of its recorded pose."""
 
 
 @dataclass(frozen=True, eq=False)

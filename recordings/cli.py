@@ -23,7 +23,7 @@ from recordings.info import recording_info
 from recordings.info_text import print_info, print_recovery
 from recordings.reader import open_recording
 from recordings.recover import recover as recover_recording
-from recordings.terminal import print_what_it_can
+from recordings.terminal import examples, print_what_it_can
 
 app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -38,7 +38,7 @@ Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session's fo
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
 
 
-@app.command()
+@app.command(epilog=examples("recordings info session.mcap", "recordings info SESSION-FOLDER --json"))
 def info(recording: Rec, json_: Json = False) -> None:
     """What a recording holds: contents, rates, gaps, clock quality, size. Ends with 3 when a part lacks."""
     facts = recording_info(open_recording(recording, incomplete=True))
@@ -50,7 +50,7 @@ def info(recording: Rec, json_: Json = False) -> None:
         raise typer.Exit(3)
 
 
-@app.command("import")
+@app.command("import", epilog=examples("recordings import FOLDER -o mine.mcap"))
 def import_(
     folder: Annotated[
         Path, typer.Argument(help="Holds dataset.yaml, poses.csv and the pictures", show_default=False)
@@ -61,8 +61,7 @@ def import_(
     """Your own pictures and poses (dataset.yaml, poses.csv, pictures) to a recording.
 
     poses.csv: image,x,y,z,qx,qy,qz,qw, where the flange is in the robot's base, in metres. dataset.yaml: the
-    README has one to start from. Example: `recordings import FOLDER -o mine.mcap`. Next: `calibrate solve
-    mine.mcap`.
+    README has one to start from. Next: `calibrate solve`.
     """
     with _progress("importing", not json_) as progress:
         done = import_folder(folder, output, progress)
@@ -73,7 +72,12 @@ def import_(
         print(f"next: calibrate solve {shlex.quote(str(done.path))}")
 
 
-@app.command()
+@app.command(
+    epilog=examples(
+        "recordings export session.mcap --to csv -o tables",
+        "recordings export session.mcap --to folder -o pictures  # to change poses.csv, and import again",
+    )
+)
 def export(
     recording: Rec,
     output: Annotated[Path, typer.Option("-o", "--output", help="The folder to write; it must not exist.")],
@@ -83,15 +87,12 @@ def export(
     ],
     json_: Json = False,
 ) -> None:
-    """A recording as a folder of pictures and poses, as CSV tables, or as a ROS 2 bag.
-
-    Example: `recordings export session.mcap --to csv -o tables`.
-    """
+    """A recording as a folder of pictures and poses, as CSV tables, or as a ROS 2 bag."""
     written = export_recording(open_recording(recording), output, to)
     print(json.dumps({"output": str(written)}) if json_ else f"{written} written")
 
 
-@app.command()
+@app.command(epilog=examples("recordings excerpt session.mcap -o small.mcap"))
 def excerpt(
     recording: Rec,
     output: Annotated[Path, typer.Option("-o", "--output", help="The smaller recording (.mcap) to write.")],
@@ -102,7 +103,9 @@ def excerpt(
     print(json.dumps({"output": str(written)}) if json_ else f"{written} written")
 
 
-@app.command()
+@app.command(
+    epilog=examples("recordings recover session.mcap.part", "recordings recover cut.mcap -o saved.mcap")
+)
 def recover(
     recording: Annotated[
         Path, typer.Argument(help="A recording (.mcap, .mcap.part) or a session's folder", show_default=False)

@@ -1,4 +1,4 @@
-"""Any terminal will do."""
+"""What all commands share: any terminal will do, and help ends with examples."""
 
 from __future__ import annotations
 
@@ -11,3 +11,8 @@ def print_what_it_can() -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="replace")
+
+
+def examples(*commands: str) -> str:
+    """The end of a command's help (`epilog`): commands as a person types them, a remark behind `#`."""
+    return "Examples:\n" + "\n".join(f"- `{command}`" for command in commands)

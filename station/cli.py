@@ -15,18 +15,22 @@ import typer
 
 from calibrate.errors import CalibrationError
 from recordings.errors import RecordingError, printed
-from recordings.terminal import print_what_it_can
+from recordings.terminal import examples, print_what_it_can
 from station.cli_control import app as control
 from station.client import default_socket
 from station.console import Socket
 from station.errors import StationError
 
 EPILOG = (
-    "First time: station demo. A cell: station doctor --example > station.yaml; station serve --config "
-    "station.yaml; then station, in another terminal. Without a screen: station plan -o plan.yaml; station "
-    "capture --plan plan.yaml; calibrate solve RECORDING.\n\n"
-    "Exit codes: 0 good, 1 failed or stopped, 2 wrong usage or configuration, 3 done with loss, 4 a gate "
-    "failed or a check did not hold."
+    examples(
+        "station demo  # first time: everything, with no hardware",
+        "station doctor --example > station.yaml  # a cell: its configuration",
+        "station serve --config station.yaml  # then, in another terminal: station",
+        "station plan --config station.yaml -o plan.yaml  # without a screen",
+        "station capture --plan plan.yaml  # then: calibrate solve RECORDING",
+    )
+    + "\n\nExit codes: 0 good, 1 failed or stopped, 2 wrong usage or configuration, 3 done with loss, 4 a "
+    "gate failed or a check did not hold."
 )
 
 
@@ -60,17 +64,48 @@ def _add_large_commands(app: typer.Typer) -> None:
     from station.cli_verify import verify_command
     from station.plan.cli import plan_command
 
-    app.command("tui")(tui_command)
-    app.command("serve")(serve_command)
-    app.command("demo")(demo_command)
-    app.command("capture")(capture_command)
-    app.command("resume")(resume_command)
-    app.command("improve")(improve_command)
-    app.command("best")(best_command)
-    app.command("check")(check_command)
-    app.command("verify")(verify_command)
-    app.command("bootstrap")(bootstrap_command)
-    app.command("plan")(plan_command)
+    app.command("tui", epilog=examples("station tui", "station tui --replay session.mcap"))(tui_command)
+    app.command(
+        "serve",
+        epilog=examples(
+            "station serve --config station.yaml  # then, in another terminal: station",
+            "station serve --simulate --mount eye-to-hand --noise mid",
+            "station serve --replay session.mcap",
+        ),
+    )(serve_command)
+    app.command(
+        "demo",
+        epilog=examples("station demo", "station demo --seed 3 --mount eye-to-hand --noise mid --out trial"),
+    )(demo_command)
+    app.command(
+        "capture",
+        epilog=examples(
+            "station capture --plan plan.yaml",
+            "station capture --plan plan.yaml --headless --go 0123456789ab  # the approved plan's hash",
+            "station capture --sweep",
+        ),
+    )(capture_command)
+    app.command("resume", epilog=examples("station resume"))(resume_command)
+    app.command("improve", epilog=examples("station improve"))(improve_command)
+    app.command("best", epilog=examples("station best"))(best_command)
+    app.command("check", epilog=examples("station check", "station check --poses 12"))(check_command)
+    app.command(
+        "verify",
+        epilog=examples(
+            "station verify --pointer-mm 120  # the installed one, over the four outermost corners",
+            "station verify cell.yaml --corner 0 --corner 20",
+        ),
+    )(verify_command)
+    app.command("bootstrap", epilog=examples("station bootstrap --config station.yaml -o guesses.yaml"))(
+        bootstrap_command
+    )
+    app.command(
+        "plan",
+        epilog=examples(
+            "station plan --config station.yaml --start 0,-94,-90,-86,90,0 -o plan.yaml --picture plan.png",
+            "station plan --config station.yaml --check plan.yaml",
+        ),
+    )(plan_command)
 
 
 def screen_by_default(context: typer.Context) -> None:

@@ -13,6 +13,7 @@ import msgspec
 import typer
 from rich.text import Text
 
+from recordings.terminal import examples
 from station.client import Client, ask, default_socket
 from station.console import AsJson, Socket, out
 from station.errors import StationError
@@ -40,7 +41,7 @@ def status_now(socket: Path | None) -> StationStatus:
     return asyncio.run(first())
 
 
-@app.command("status")
+@app.command("status", epilog=examples("station status", "station status --json"))
 def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
     """What the station is doing. --json: every figure, the unit in its name.
 
@@ -83,7 +84,7 @@ def camera_words(status: StationStatus) -> str:
     return ", ".join(words)
 
 
-@app.command("stop")
+@app.command("stop", epilog=examples("station stop"))
 def stop_command(socket: Socket = None) -> None:
     """STOP the arm now. The pendant's emergency stop is the safety device.
 
@@ -93,7 +94,7 @@ def stop_command(socket: Socket = None) -> None:
     out.print("stopped; latched until acknowledged: look at the cell, then `station acknowledge`")
 
 
-@app.command("acknowledge")
+@app.command("acknowledge", epilog=examples("station acknowledge"))
 def acknowledge_command(socket: Socket = None) -> None:
     """Leave `stopped` or `fault` after looking at the cell. Nothing moves.
 
@@ -106,7 +107,7 @@ def acknowledge_command(socket: Socket = None) -> None:
         out.print("next: `station resume` goes on, `station finish` seals")
 
 
-@app.command("pause")
+@app.command("pause", epilog=examples("station pause"))
 def pause_command(socket: Socket = None) -> None:
     """Pause after the pose that is being taken.
 
@@ -116,7 +117,7 @@ def pause_command(socket: Socket = None) -> None:
     out.print("pauses after this pose; then `station resume`, `improve`, `best` or `finish`")
 
 
-@app.command("finish")
+@app.command("finish", epilog=examples("station finish"))
 def finish_command(socket: Socket = None) -> None:
     """Seal what is recorded (a pose under way is taken first).
 
@@ -129,27 +130,24 @@ def finish_command(socket: Socket = None) -> None:
         out.print(f"recording {status.session.recording}")
 
 
-@app.command("retake")
+@app.command("retake", epilog=examples("station retake 7  # then: station resume"))
 def retake_command(pose: PoseNumber, socket: Socket = None) -> None:
-    """Plan a pose once more; it is taken at the next go.
-
-    Example: `station retake 7`, then `station resume`.
-    """
+    """Plan a pose once more; it is taken at the next go."""
     _command(socket, "retake", index=pose - 1)
     out.print(f"pose {pose} is taken once more at the next go: `station resume`")
 
 
-@app.command("skip")
+@app.command("skip", epilog=examples("station skip 7"))
 def skip_command(pose: PoseNumber, socket: Socket = None) -> None:
-    """Leave a pose out, in later runs of this plan too, until it is retaken.
-
-    Example: `station skip 7`.
-    """
+    """Leave a pose out, in later runs of this plan too, until it is retaken."""
     _command(socket, "skip", index=pose - 1)
     out.print(f"pose {pose} is left out until `station retake {pose}`")
 
 
-@app.command("doctor")
+@app.command(
+    "doctor",
+    epilog=examples("station doctor --example > station.yaml", "station doctor --config station.yaml"),
+)
 def doctor_command(
     socket: Socket = None,
     as_json: AsJson = False,
@@ -158,8 +156,8 @@ def doctor_command(
 ) -> None:
     """Look at everything a capture needs; each missing thing with its remedy. Nothing moves.
 
-    Without options it asks the daemon. For a new cell: `station doctor --example > station.yaml`, write the
-    cell into it, `station doctor --config station.yaml`, then `station serve --config station.yaml`.
+    Without options it asks the daemon. For a new cell: print an example, write the cell into it, check it,
+    then `station serve --config station.yaml`.
 
     Exit codes: 0 all is there, 1 something is missing, 2 the configuration is wrong.
     """

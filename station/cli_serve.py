@@ -54,8 +54,7 @@ def serve_command(
 ) -> None:
     """Own the cell and serve it on a Unix socket. Nothing moves without a person's go.
 
-    Example: `station serve --config station.yaml`, then `station` in another terminal. It runs until Ctrl-C
-    (or SIGTERM): that stops the arm, seals what is recorded, and ends.
+    It runs until Ctrl-C (or SIGTERM): that stops the arm, seals what is recorded, and ends.
     """
     if [simulate, config is not None, replay is not None].count(True) != 1:
         raise ConfigError(

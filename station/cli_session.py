@@ -105,9 +105,8 @@ def capture_command(
 ) -> None:
     """One session: load the plan, check it, ask, go, watch, seal. Ctrl-C is STOP.
 
-    Example: `station plan --config station.yaml -o plan.yaml`, `station capture --plan plan.yaml`. Next:
-    `calibrate solve RECORDING`. Nobody there: `--headless --go HASH`, with the hash (12 digits and more) that
-    `station plan --json` prints.
+    `station plan` makes the plan. Next: `calibrate solve RECORDING`. Nobody there: `--headless --go HASH`,
+    with the hash (12 digits and more) that `station plan --json` prints.
 
     With --sweep no poses are taken: the arm swings slowly where it stands, with the board in view, and
     `calibrate sweep RECORDING` tells the time between camera and robot.

@@ -20,12 +20,19 @@ from calibrate.commands.output import AsJson, OutputError, err, out
 from calibrate.gates import GateLimits, read_limits
 from calibrate.pipeline import JobOptions
 from calibrate.trends import Cell, cells, trends_text
+from recordings.terminal import examples
 
 DONE_WITH_LOSS = 3
 
 
 def register(app: typer.Typer) -> None:
-    app.command("batch")(batch)
+    app.command(
+        "batch",
+        epilog=examples(
+            "calibrate batch monday.mcap tuesday.mcap -o results",
+            "calibrate batch sessions/* -o results --workers 2  # each worker needs the memory of a solve",
+        ),
+    )(batch)
 
 
 def batch(

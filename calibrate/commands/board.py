@@ -14,10 +14,17 @@ from calibrate.commands.files import read_board
 from calibrate.commands.output import OutputError, check_folder, err, out
 from calibrate.vector import pdf, svg
 from recordings.messages import BoardKind, BoardSpec
+from recordings.terminal import examples
 
 
 def register(app: typer.Typer) -> None:
-    app.command("board")(board)
+    app.command(
+        "board",
+        epilog=examples(
+            "calibrate board -o board.pdf --paper A4",
+            "calibrate board --kind charuco --columns 12 --rows 9 --square-mm 30 --marker-mm 22 -o board.svg",
+        ),
+    )(board)
 
 
 def board(

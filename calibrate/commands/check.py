@@ -18,6 +18,7 @@ from calibrate.errors import BadViewsError
 from calibrate.generations import generations
 from calibrate.pipeline import JobOptions, prepare_views
 from recordings.messages import SessionInfo
+from recordings.terminal import examples
 
 DRIFTED = 4
 OWN_VIEWS = (
@@ -29,7 +30,10 @@ _BY_CHANCE = 0.001
 
 
 def register(app: typer.Typer) -> None:
-    app.command("check")(check)
+    app.command(
+        "check",
+        epilog=examples("calibrate check later.mcap", "calibrate check later.mcap --calibration cell.yaml"),
+    )(check)
 
 
 def check(

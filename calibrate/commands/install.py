@@ -19,6 +19,7 @@ from calibrate.formats.frames import FrameNames
 from calibrate.generations import Generation, generations, read_log, state_root
 from calibrate.install import install, load_installed, rollback
 from calibrate.summary import override_text, pose_difference, pose_text, summary, verdict
+from recordings.terminal import examples
 
 Root = Annotated[
     Path | None,
@@ -39,12 +40,32 @@ class CellKind(StrEnum):
 
 
 def register(app: typer.Typer) -> None:
-    app.command("show")(show)
-    app.command("diff")(diff)
-    app.command("export")(export_file)
-    app.command("install")(install_file)
-    app.command("list")(list_installed)
-    app.command("rollback")(roll_back)
+    app.command("show", epilog=examples("calibrate show  # the installed one", "calibrate show cell.yaml"))(
+        show
+    )
+    app.command(
+        "diff",
+        epilog=examples("calibrate diff cell.yaml  # and the installed one", "calibrate diff a.yaml b.yaml"),
+    )(diff)
+    app.command(
+        "export",
+        epilog=examples(
+            "calibrate export --to ros-launch -o camera.launch.py  # of the installed one",
+            "calibrate export cell.yaml --to ros-camera-info -o camera_info.yaml",
+        ),
+    )(export_file)
+    app.command(
+        "install",
+        epilog=examples(
+            "calibrate install cell.yaml --cell-config station.yaml",
+            "calibrate install mine.yaml --cell imported --root my-cell  # of your own pictures",
+        ),
+    )(install_file)
+    app.command("list", epilog=examples("calibrate list", "calibrate list --root my-cell"))(list_installed)
+    app.command(
+        "rollback",
+        epilog=examples("calibrate rollback --reason 'camera was knocked'", "calibrate rollback 3"),
+    )(roll_back)
 
 
 def named_or_installed(file: Path | None, root: Path | None) -> Calibration:
@@ -66,10 +87,7 @@ def diff(
     root: Root = None,
     as_json: AsJson = False,
 ) -> None:
-    """How far two calibrations are apart, and whether that is more than their uncertainty.
-
-    Example: `calibrate diff cell.yaml` (against the installed one).
-    """
+    """How far two calibrations are apart, and whether that is more than their uncertainty."""
     a, b = read_calibration(first), named_or_installed(second, root)
     if a.mount != b.mount:
         raise OutputError(f"{first} is {a.mount}, the other is {b.mount}: there is nothing to compare.")
@@ -125,10 +143,7 @@ def export_file(
     body: Annotated[str, typer.Option(help="… the camera's body frame")] = FrameNames.body,
     root: Root = None,
 ) -> None:
-    """Write a calibration in another program's format.
-
-    Example: `calibrate export --to ros-launch -o camera.launch.py` (of the installed one).
-    """
+    """Write a calibration in another program's format."""
     calibration = named_or_installed(file, root)
     text = export(calibration, str(to.value), FrameNames(base, flange, camera, body))
     if output is None:
@@ -182,10 +197,7 @@ def roll_back(
     reason: Annotated[str, typer.Option(help="Goes into the log")] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Go back to an older installed calibration: the one before, or a generation of `calibrate list`.
-
-    Example: `calibrate rollback --reason "camera was knocked"`, or `calibrate rollback 3`.
-    """
+    """Go back to an older installed calibration: the one before, or a generation of `calibrate list`."""
     _switched(rollback(root, to, reason), root, as_json)
 
 

@@ -22,15 +22,27 @@ from calibrate.install import install_line, load_installed
 from calibrate.pipeline import JobOptions, SolvedRecording, prepare_views, solve_recording, solver_options
 from calibrate.solution import PeerResult
 from calibrate.summary import summary
+from recordings.terminal import examples
 
 Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session folder", show_default=False)]
 GATE_FAILED = 4
 
 
 def register(app: typer.Typer) -> None:
-    app.command("solve")(solve)
-    app.command("compare")(compare)
-    app.command("report")(report_file)
+    app.command(
+        "solve",
+        epilog=examples(
+            "calibrate solve session.mcap -o cell.yaml --report cell.html",
+            "calibrate solve session.mcap -o cell.yaml --without 3,7",
+        ),
+    )(solve)
+    app.command(
+        "compare",
+        epilog=examples(
+            "calibrate compare session.mcap", "calibrate compare session.mcap --camera cell.yaml"
+        ),
+    )(compare)
+    app.command("report", epilog=examples("calibrate report session.mcap -o cell.html"))(report_file)
 
 
 @takes(job_options)
@@ -47,8 +59,7 @@ def solve(
 ) -> None:
     """Solve a recording and write the calibration file. Exit 4: written, but a gate failed.
 
-    Example: `calibrate solve session.mcap -o cell.yaml --report cell.html`. Next: look at the report, then
-    `calibrate install cell.yaml`.
+    Next: look at the report, then `calibrate install`.
     """
     target = output or Path(f"{recording.name.removesuffix('.mcap')}.calibration.yaml")
     check_target(target)
@@ -108,7 +119,7 @@ def report_file(
 ) -> None:
     """Solve a recording again and write its report: one HTML file. With the history of what is installed.
 
-    Example: `calibrate report session.mcap -o cell.html`; it opens in any browser, without a network.
+    It opens in any browser, without a network.
     """
     target = output or Path(f"{recording.name.removesuffix('.mcap')}.report.html")
     check_folder(target)

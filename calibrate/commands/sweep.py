@@ -12,10 +12,14 @@ from calibrate.calibration import read_calibration
 from calibrate.commands.output import AsJson, err, out, print_json
 from calibrate.sweep import sweep_time_offset
 from recordings.reader import open_recording
+from recordings.terminal import examples
 
 
 def register(app: typer.Typer) -> None:
-    app.command("sweep")(sweep)
+    app.command(
+        "sweep",
+        epilog=examples("calibrate sweep sweep.mcap", "calibrate sweep sweep.mcap --calibration cell.yaml"),
+    )(sweep)
 
 
 def sweep(

@@ -58,9 +58,8 @@ def plan_command(
 ) -> None:
     """Make a pose plan, or check one. Nothing moves.
 
-    Example: `station plan --config station.yaml --start 0,-94,-90,-86,90,0 -o plan.yaml`. The file holds
-    radians and metres and may be edited; then `station plan --config station.yaml --check plan.yaml`. Next:
-    `station capture --plan plan.yaml`.
+    The file holds radians and metres and may be edited; then `--check` it. Next: `station capture --plan
+    plan.yaml`.
 
     Exit codes: 0 it may be run, 1 the check lists what is wrong, 2 usage or configuration.
     """

@@ -1,0 +1,92 @@
+"""Every command's help ends with examples; the parser takes them, and the commands in the documents."""
+
+from __future__ import annotations
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import typer
+
+import recordings.cli
+import station.cli
+from calibrate.commands.app import app as calibrate_app
+
+PROGRAMS = {
+    "calibrate": typer.main.get_command(calibrate_app),
+    "recordings": typer.main.get_command(recordings.cli.app),
+    "station": typer.main.get_command(station.cli.command_line([])),
+}
+HANDED_ON = ("station", "board")
+"""Its help is that of `calibrate board`."""
+COMMANDS = [
+    (program, name)
+    for program, group in PROGRAMS.items()
+    for name in group.commands  # type: ignore[attr-defined]
+    if (program, name) != HANDED_ON
+]
+DOCUMENTS = ("README.md", "docs/*.md", "systemd/README.md")
+_ROOT = Path(__file__).parent.parent
+
+
+def examples_in(epilog: str | None) -> list[str]:
+    return re.findall(r"^- `(.+)`$", epilog or "", re.MULTILINE)
+
+
+def parse(line: str) -> str:
+    """The command's name. Raises click's UsageError; nothing is run."""
+    program, *words = shlex.split(line.partition(" > ")[0], comments=True)
+    if not words:
+        return ""
+    group = PROGRAMS[program]
+    name, command, rest = group.resolve_command(typer.Context(group), words)  # type: ignore[attr-defined]
+    command.make_context(name, rest)
+    return str(name)
+
+
+@pytest.mark.parametrize(("program", "name"), COMMANDS)
+def test_every_command_ends_its_help_with_examples_that_parse(program: str, name: str) -> None:
+    command = PROGRAMS[program].commands[name]  # type: ignore[attr-defined]
+    given = examples_in(command.epilog)
+    assert given
+    for line in given:
+        assert line.startswith(f"{program} ")
+        assert parse(line) == name
+
+
+def test_the_first_steps_parse() -> None:
+    given = examples_in(PROGRAMS["station"].epilog)
+    assert len(given) == 5
+    for line in given:
+        parse(line)
+
+
+def commands_in(text: str) -> list[str]:
+    """Lines of code blocks that are one whole command: not those with `…`, `[…]` or `a|b` in them.
+
+    Two spaces and more part a command from what is said of it.
+    """
+    fenced = "\n".join(re.findall(r"^```\w*\n(.*?)^```", text, re.MULTILINE | re.DOTALL))
+    indented = "\n".join(line for line in text.splitlines() if line.startswith("    "))
+    lines = [re.split(r"\s{2,}", line.strip())[0] for line in (fenced + indented).splitlines()]
+    return [
+        line
+        for line in lines
+        if re.match(rf"({'|'.join(PROGRAMS)})( |$)", line) and not re.search(r"[…\[|]|\.\.\.", line)
+    ]
+
+
+def test_the_commands_in_the_documents_parse() -> None:
+    found = [
+        (path.name, line)
+        for pattern in DOCUMENTS
+        for path in _ROOT.glob(pattern)
+        for line in commands_in(path.read_text())
+    ]
+    assert len(found) > 15
+    for name, line in found:
+        try:
+            parse(line)
+        except Exception as problem:
+            pytest.fail(f"{name}: {line}: {problem}")

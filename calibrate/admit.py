@@ -33,7 +33,7 @@ def require_solvable(views: ViewSet) -> None:
     first = views.views[0].base_from_flange
     if all(np.abs(view.base_from_flange - first).max() < 1e-9 for view in views):
         raise BadViewsError("All robot poses are identical. Check how the poses were recorded.")
-    _require_no_copies(views)
+    require_no_copies(views)
 
 
 def _require_camera(views: ViewSet) -> None:
@@ -71,8 +71,8 @@ def _require_view(view: ImageView, fewest_corners: int) -> None:
         raise BadViewsError(f"{where}: NaN among its corners. Remove this view.")
 
 
-def _require_no_copies(views: ViewSet) -> None:
-    """A view that is in the set twice tells nothing new, and would halve the stated variance."""
+def require_no_copies(views: ViewSet) -> None:
+    """BadViewsError for a view that is in the set twice: it tells nothing, and halves the stated variance."""
     first: dict[bytes, ImageView] = {}
     for view in views:
         seen = view.pixels if len(view.pixels) else np.asarray(view.camera_from_board)
@@ -81,6 +81,7 @@ def _require_no_copies(views: ViewSet) -> None:
             other = first[key]
             raise BadViewsError(
                 f"Views {other.index + 1} ({other.name}) and {view.index + 1} ({view.name}) are one: their "
-                "robot poses and corners agree to the last bit. Leave one out."
+                "robot poses and corners agree to the last bit. Solve with "
+                f"--without {view.index + 1}, or take it out of the folder and import again."
             )
         first[key] = view

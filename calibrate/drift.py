@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from scipy import stats
 
+from calibrate.admit import require_no_copies
 from calibrate.calibration import Calibration
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import Array, difference, inverse, perturb
@@ -95,8 +96,9 @@ class Noise:
 def check_drift(views: ViewSet, calibration: Calibration) -> DriftCheck:
     """Tests the calibration on views (3 or more) with board poses from its own lens.
 
-    Raises TooFewViewsError, or BadViewsError where the views do not determine a shift.
+    Raises TooFewViewsError, or BadViewsError where the views do not determine a shift or one is there twice.
     """
+    require_no_copies(views)
     return judge_shift(
         views, calibration.transform.matrix, np.array(calibration.covariance), Noise.of(calibration)
     )

@@ -8,40 +8,16 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from subprocess import CompletedProcess
 
 import msgspec
 import numpy as np
 import pytest
-import yaml
 
 from calibrate.calibration import read_calibration, write_calibration
-from calibrate.cli import main
-from calibrate.commands import output
-from calibrate.commands.files import read_camera
-from calibrate.errors import CalibrationError
 from recordings.excerpt import write_excerpt
-from recordings.messages import CameraModel
 from recordings.reader import open_recording
+from tests.calibrate.calling import refused, run
 from tests.calibrate.sessions import Scene, write_session
-from tests.command_line import call
-
-
-def run(*arguments: object, cwd: Path) -> CompletedProcess[str]:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.chdir(cwd)
-        patch.setenv("XDG_STATE_HOME", str(cwd / "state"))
-        patch.delenv("STATE_DIRECTORY", raising=False)
-        patch.setattr(output.out, "width", 150)  # whatever a test before it told
-        return call(main, *arguments)
-
-
-def refused(done: CompletedProcess[str], code: int, *words: str) -> None:
-    assert done.returncode == code, done.stderr
-    assert done.stdout == ""
-    assert "Traceback" not in done.stderr
-    for word in words:
-        assert word in " ".join(done.stderr.split())
 
 
 def test_solve_json_is_exactly_the_contract(session_file: Path, tmp_path: Path) -> None:
@@ -158,63 +134,6 @@ def test_the_same_bits_in_two_processes(session_file: Path, tmp_path: Path) -> N
     assert all(line.startswith("created:") for line in different), different
 
 
-def test_recordings_that_are_not_whole(session_file: Path, tmp_path: Path) -> None:
-    cut = tmp_path / "cut.mcap"
-    cut.write_bytes(session_file.read_bytes()[:-5000])
-    refused(run("solve", cut, cwd=tmp_path), 1, "cut.mcap", "recordings recover")
-    part = tmp_path / "x.mcap.part"
-    shutil.copy(session_file, part)
-    refused(run("solve", part, cwd=tmp_path), 1, "recordings recover")
-    refused(run("solve", "nowhere.mcap", cwd=tmp_path), 1, "nowhere.mcap")
-    flipped = bytearray(session_file.read_bytes())
-    flipped[len(flipped) // 2] ^= 4
-    (tmp_path / "flip.mcap").write_bytes(flipped)
-    refused(run("solve", "flip.mcap", cwd=tmp_path), 1, "flip.mcap")
-    assert not list(tmp_path.glob("*.yaml"))
-    assert not list(tmp_path.glob(".*tmp"))
-
-
-def test_wrong_usage_is_exit_2_and_says_what_is_allowed(session_file: Path, tmp_path: Path) -> None:
-    (tmp_path / "precious.yaml").write_text("not: a calibration\n")
-    refused(run("solve", session_file, "-o", "precious.yaml", cwd=tmp_path), 2, "precious.yaml", "-o")
-    assert (tmp_path / "precious.yaml").read_text() == "not: a calibration\n"
-    refused(run("solve", session_file, "-o", "no/such/c.yaml", cwd=tmp_path), 2, "no/such")
-    refused(run("solve", session_file, "--report", "no/such/r.html", cwd=tmp_path), 2, "no/such")
-    refused(run("report", session_file, "-o", "no/such/r.html", cwd=tmp_path), 2, "no/such")
-    assert not list(tmp_path.glob("*.calibration.yaml")), "said before the solve, not after it"
-    (tmp_path / "board.yaml").write_text("kind: chesboard\ncolums: 7\nrows: 6\nsquare_m: 0.025\n")
-    said = ("line 1: kind: must be one of chessboard", "line 2: colums: unknown key; did you mean 'columns'")
-    refused(run("solve", session_file, "--board", "board.yaml", cwd=tmp_path), 2, *said)
-    (tmp_path / "gates.yaml").write_text("view: 20\n")
-    refused(run("solve", session_file, "--gates", "gates.yaml", cwd=tmp_path), 2, "gates.yaml", "view")
-    (tmp_path / "camera.yaml").write_text("image_width: 3\ncamera_matrix: {data: [1]}\n")
-    refused(run("solve", session_file, "--camera", "camera.yaml", cwd=tmp_path), 2, "camera_info")
-    refused(run("solve", session_file, "--square-mm", "-4", cwd=tmp_path), 2, "square_m")
-    refused(run("solve", session_file, "--profile", "nix", cwd=tmp_path), 2, "robust")
-    for option in ("--threads", "--time-limit-s", "--memory-limit-mib", "--seed", "--working-distance-mm"):
-        refused(run("solve", session_file, option, "-3", cwd=tmp_path), 2, option)
-        refused(run("solve", session_file, option, "1e300", cwd=tmp_path), 2, option)
-    refused(run("solve", cwd=tmp_path), 2)
-    refused(run("export", "c.yaml", "--to", "nix", cwd=tmp_path), 2, "urdf")
-
-
-def test_nothing_installed_is_said(session_file: Path, tmp_path: Path) -> None:
-    refused(run("check", session_file, cwd=tmp_path), 1, "nothing is installed")
-    refused(run("rollback", cwd=tmp_path), 1, "no older")
-    refused(run("show", cwd=tmp_path), 1, "nothing is installed")
-
-
-def test_a_check_of_the_wrong_kind_is_refused(session_file: Path, real_file: Path, tmp_path: Path) -> None:
-    refused(run("check", session_file, "--calibration", real_file, cwd=tmp_path), 2, "simulated", "real")
-
-
-def test_mixed_picture_sizes_name_the_view(session_file: Path, tmp_path: Path) -> None:
-    (tmp_path / "camera.yaml").write_text(
-        "width: 640\nheight: 480\nmatrix: [[600, 0, 320], [0, 600, 240], [0, 0, 1]]\n"
-    )
-    refused(run("solve", session_file, "--camera", "camera.yaml", cwd=tmp_path), 1, "view 1", "640×480")
-
-
 def test_lenses_of_different_picture_sizes_are_not_compared(real_file: Path, tmp_path: Path) -> None:
     calibration = read_calibration(real_file)
     lens = msgspec.structs.replace(calibration.intrinsics, width=2 * calibration.intrinsics.width)
@@ -281,72 +200,3 @@ def test_the_report_is_one_page_with_no_network(session_file: Path, tmp_path: Pa
     assert page.count("data:image/jpeg") == 10
     for heading in ("Where the error comes from", "Residuals", "Every method", "Lens", "Where it comes from"):
         assert heading in page
-
-
-def test_a_lens_known_before_can_be_given(session_file: Path, real_file: Path, tmp_path: Path) -> None:
-    exported = run("export", real_file, "--to", "ros-camera-info", "-o", "info.yaml", cwd=tmp_path)
-    assert exported.returncode == 0, exported.stderr
-    by_info = run("solve", session_file, "--camera", "info.yaml", "-o", "a.yaml", "--json", cwd=tmp_path)
-    by_file = run("solve", session_file, "--camera", real_file, "-o", "b.yaml", "--json", cwd=tmp_path)
-    first, second = json.loads(by_info.stdout), json.loads(by_file.stdout)
-    assert first["result"] == second["result"]
-    assert CameraModel(480, 384).width == first["intrinsics"]["width"]
-
-
-@pytest.mark.parametrize(
-    ("field", "value", "says"),
-    [
-        ("distortion_model", "fisheye", "'fisheye' is not known here; known are plumb_bob"),
-        ("distortion_model", None, "None is not known here"),
-        ("image_width", float("inf"), "camera_info"),
-        ("image_height", 0, "480×0 is no picture size"),
-        ("camera_matrix", {"data": [900, 0, 240, 9, 900, 190, 0, 0, 1]}, "is not one"),
-        ("camera_matrix", {"data": [900, 0, 0, 0, 900, 0, 240, 190, 1]}, "is not one"),
-        ("camera_matrix", {"data": [900, 0, 240, 0, 900, 190, 0, 0, 2]}, "is not one"),
-        ("camera_matrix", {"data": [900, 0, 240, 0, 900, float("nan"), 0, 0, 1]}, "is not one"),
-        ("distortion_coefficients", {"data": [0] * 9}, "does not fit plumb_bob"),
-    ],
-)
-def test_a_lens_that_is_none_is_never_used(tmp_path: Path, field: str, value: object, says: str) -> None:
-    """Taken for another model or read in another order it would give a wrong X, and no gate need fail."""
-    info = {
-        "image_width": 480,
-        "image_height": 384,
-        "camera_matrix": {"data": [900, 0, 240, 0, 900, 190, 0, 0, 1]},
-        "distortion_model": "plumb_bob",
-        "distortion_coefficients": {"data": ["1e-05", 0, 0, 0, 0]},  # 1e-05 is a text to PyYAML
-    }
-    path = tmp_path / "info.yaml"
-    path.write_text(yaml.safe_dump(info))
-    assert read_camera(path).distortion[0] == 1e-5
-    path.write_text(yaml.safe_dump(info | {field: value}))
-    with pytest.raises(CalibrationError) as problem:
-        read_camera(path)
-    assert says in str(problem.value)
-
-
-def test_few_views_are_refused(tmp_path: Path) -> None:
-    path = write_session(tmp_path / "few.mcap", Scene(views=3), known_lens=True)
-    refused(run("solve", path, cwd=tmp_path), 1, "at least 4 views")
-
-
-def test_another_camera_is_no_drift(real_session_file: Path, real_file: Path, tmp_path: Path) -> None:
-    calibration = read_calibration(real_file)
-    other = msgspec.structs.replace(calibration.camera, serial="other")
-    write_calibration(msgspec.structs.replace(calibration, camera=other), tmp_path / "other.yaml")
-    done = run("check", real_session_file, "--calibration", "other.yaml", cwd=tmp_path)
-    refused(done, 2, "the calibration is of camera other", "Calibrate the new one")
-
-
-def test_poses_are_left_out_by_hand_and_the_file_says_so(session_file: Path, tmp_path: Path) -> None:
-    target = tmp_path / "c.yaml"
-    done = run("solve", session_file, "-o", target, "--without", "2,5", "--json", cwd=tmp_path)
-    assert done.returncode in (0, 4), done.stderr
-    views = json.loads(done.stdout)["views"]
-    by_hand = [view["index"] for view in views["rejected"] if "left out by hand" in view["reason"]]
-    assert by_hand == [1, 4] and not {1, 4} & set(views["used"])
-    assert read_calibration(target).provenance.options["without"] == [2, 5]
-    refused(run("solve", session_file, "--without", "99", cwd=tmp_path), 1, "--without 99", "no view")
-    few = ",".join(str(number) for number in range(1, 9))
-    refused(run("solve", session_file, "--without", few, cwd=tmp_path), 1, "--without", "needed")
-    assert run("solve", session_file, "--without", "a", cwd=tmp_path).returncode == 2

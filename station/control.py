@@ -164,6 +164,7 @@ class _Connection:
                     self._take(decoder.decode(line))
                 except (ValueError, RecursionError) as error:  # msgspec's, base64's
                     self.reply(Reply(0, False, error=f"not a request: {error}"))
+                await asyncio.sleep(0)  # readline gives lines that wait without a pause: STOP of others first
         except ValueError:  # readline: the line is longer than the limit
             self.drop(f"a line of more than {LINE_LIMIT_BYTES} bytes")
         except OSError:

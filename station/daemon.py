@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import gc
 import logging
 import signal
 import time
@@ -21,6 +22,12 @@ log = logging.getLogger(__name__)
 
 CONTROL_SERVED_S = 1.0
 GATHER_S = 0.04
+
+
+def freeze_startup() -> None:
+    """What was loaded stays loaded: looking through it again and again would hold up heartbeat and STOP."""
+    gc.collect()
+    gc.freeze()
 
 
 class Watchdog:
@@ -61,6 +68,7 @@ class Daemon:
         try:
             await self.session.start()
             self.session.store.watch(self._changed.set)
+            freeze_startup()
             notify("READY=1")
             ready()
             telling = asyncio.create_task(self._tell())

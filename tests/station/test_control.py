@@ -19,7 +19,7 @@ import pytest
 from station.client import Client, DaemonGoneError
 from station.control import OPEN_REQUESTS_LIMIT, ControlServer, Peer
 from station.errors import RefusedError, StationError
-from station.protocol import CLIENT_LIMIT, LINE_LIMIT_BYTES, PIECE_BYTES, REQUEST_LIMIT_BYTES
+from station.protocol import CLIENT_LIMIT, LINE_LIMIT_BYTES, PIECE_BYTES, REQUEST_LIMIT_BYTES, Reply
 from station.status import StationState, StationStatus
 
 
@@ -165,6 +165,24 @@ async def test_of_too_many_questions_at_once_the_last_are_turned_away_but_never_
     answers = [json.loads(await reader.readline()) for _ in range(OPEN_REQUESTS_LIMIT)]
     assert all(answer["ok"] for answer in answers)
     writer.close()
+
+
+async def test_a_flood_of_lines_holds_up_neither_stop_nor_the_heartbeat(
+    server: Served, handler: RecordingHandler, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Lines that lie there already are read without a pause: a quarter of a megabyte took a second."""
+    answered: list[Reply] = []
+    monkeypatch.setattr("station.control._Connection.reply", lambda _, reply: answered.append(reply))
+    _, path = server
+    with socket.socket(socket.AF_UNIX) as flood, socket.socket(socket.AF_UNIX) as other:
+        for link, lines in ((flood, b"\n" * 50_000), (other, b'{"id": 1, "verb": "stop"}\n')):
+            link.setblocking(False)
+            link.connect(str(path))
+            assert link.send(lines) == len(lines)
+        async with asyncio.timeout(5):
+            while "stop" not in handler.order:
+                await asyncio.sleep(0)
+    assert len(answered) < 100
 
 
 async def test_a_long_request_goes_in_pieces_and_stop_passes_between_them(

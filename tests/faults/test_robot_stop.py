@@ -47,15 +47,23 @@ async def test_both_paths_are_used(cell: Make) -> None:
     assert c.asked("script: stopJ") + c.asked("controller: program stopped") > 0
 
 
-async def test_with_a_hung_child_the_dashboard_stops_the_arm(cell: Make) -> None:
+async def test_with_a_hung_child_the_dashboard_stops_the_arm(
+    cell: Make, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By the connection that is open: a new one, behind the stop, is for one that does not answer."""
     c = await cell()
+
+    async def no_other() -> None:
+        return None
+
+    monkeypatch.setattr(c.robot, "_dashboard_stop_anew", no_other)
     move = await c.cruising()
     os.kill(c.robot.control_pid, signal.SIGSTOP)
     begun = time.monotonic()
     await c.robot.stop("operator")
     assert time.monotonic() - begun < 0.1
     assert await c.at_rest() < 0.4
-    assert c.asked("script: stopJ") == 0
+    assert c.asked("script: stopJ") == 0 and c.asked("dashboard: stop") >= 1
     with pytest.raises(RobotError):
         await move
 

@@ -134,14 +134,22 @@ def finish_command(socket: Socket = None) -> None:
 def retake_command(pose: PoseNumber, socket: Socket = None) -> None:
     """Plan a pose once more; it is taken at the next go."""
     _command(socket, "retake", index=pose - 1)
-    out.print(f"pose {pose} is taken once more at the next go: `station resume`")
+    out.print(f"pose {pose}: {_why(socket, pose)}. Next: `station resume`")
 
 
 @app.command("skip", epilog=examples("station skip 7"))
 def skip_command(pose: PoseNumber, socket: Socket = None) -> None:
-    """Leave a pose out, in later runs of this plan too, until it is retaken."""
+    """Leave a pose out, in later runs of this plan too, until it is retaken.
+
+    Of one that has a picture and was to be taken again only that is left out: its picture counts.
+    """
     _command(socket, "skip", index=pose - 1)
-    out.print(f"pose {pose} is left out until `station retake {pose}`")
+    out.print(f"pose {pose}: {_why(socket, pose)}; `station retake {pose}` plans it")
+
+
+def _why(socket: Path | None, pose: int) -> str:
+    """What became of a pose, as the daemon says it."""
+    return next((p.reason for p in status_now(socket).session.poses if p.index == pose - 1), "")
 
 
 @app.command(

@@ -234,19 +234,21 @@ class SessionDispatcher:
         await self._to_the_end(self._session.finish(caller.client_id))
 
     async def _retake(self, caller: _Caller, args: _Index) -> None:
-        self._session.edit(caller.client_id, "retake", lambda queue: queue.retake(args.index))
+        await self._session.edit(caller.client_id, "retake", lambda queue: queue.retake(args.index))
 
     async def _skip(self, caller: _Caller, args: _Index) -> None:
-        self._session.edit(caller.client_id, "skip", lambda queue: queue.skip(args.index))
+        await self._session.edit(caller.client_id, "skip", lambda queue: queue.skip(args.index))
 
     async def _reorder(self, caller: _Caller, args: _Order) -> None:
-        self._session.edit(caller.client_id, "reorder", lambda queue: queue.reorder(args.order))
+        await self._session.edit(caller.client_id, "reorder", lambda queue: queue.reorder(args.order))
 
     async def _add(self, caller: _Caller, args: _Pose) -> Any:
-        return {"index": self._session.edit(caller.client_id, "add", lambda queue: queue.add(args.pose))}
+        return {
+            "index": await self._session.edit(caller.client_id, "add", lambda queue: queue.add(args.pose))
+        }
 
     async def _drop(self, caller: _Caller, args: _Index) -> None:
-        self._session.edit(caller.client_id, "drop", lambda queue: queue.drop(args.index))
+        await self._session.edit(caller.client_id, "drop", lambda queue: queue.drop(args.index))
 
     async def _free_drive(self, caller: _Caller, args: _FreeDrive) -> None:
         await self._to_the_end(self._session.switch_free_drive(caller.client_id, args.on, args.auto))

@@ -42,6 +42,13 @@ class PoseStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     coverage: float | None = None
     base_from_flange: Matrix4 | None = None
     """Where the flange is expected to be."""
+    kept: bool = False
+    """To be taken again: the picture it has counts until another takes its place."""
+
+    @property
+    def counts(self) -> bool:
+        """The recording has a picture of it that is used."""
+        return self.state == "done" or self.kept
 
 
 class RobotStatus(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -85,7 +85,10 @@ class Camera(Protocol):
         """Since it was made. At once, from any thread."""
 
     async def settings(self) -> dict[str, Any]:
-        """As the camera reports them now, for the recording; JSON types only. Raises CameraError."""
+        """As the camera reports them now, for the recording; JSON types only. Raises CameraError.
+
+        `region`, where it has one: x, y, width, height of its pictures.
+        """
 
     async def glimpse(self) -> Picture | None:
         """A picture exposed after this call, of any size, that takes no number and is never recorded.

@@ -36,6 +36,8 @@ class SessionState(msgspec.Struct, frozen=True, omit_defaults=True):
     parts: int = 1
     elapsed_s: float = 0.0
     """Of all its runs."""
+    check: bool = False
+    """A drift check of the installed calibration."""
     sealed: bool = False
     recording: str = ""
 
@@ -124,7 +126,7 @@ def _described(folder: Path) -> dict[str, object]:
         "folder": str(folder),
         "recording": str(files[0] if len(files) == 1 else folder) if files else "",
         "source": state.source if state else "",
-        "views": sum(p.state == "done" for p in state.poses) if state else 0,
+        "views": sum(pose.counts for pose in state.poses) if state else 0,
         "bytes": sum(file.stat().st_size for file in files),
         "sealed": sealed,
         "calibration": str(calibration) if calibration.is_file() else "",

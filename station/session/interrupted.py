@@ -33,7 +33,9 @@ def find_interrupted(bench: Bench) -> None:
         )
         return
     bench.queue = PoseQueue(state.plan, state.poses)
-    bench.recording = SessionRecording(bench.root, bench.cell, folder, state.parts, state.elapsed_s)
+    bench.recording = SessionRecording(
+        bench.root, bench.cell, folder, state.parts, state.elapsed_s, state.check
+    )
     reason = (
         f"the daemon ended during session {folder.name}; its {bench.queue.done} poses are on the disk. "
         "Look at the arm, acknowledge, then resume or finish."
@@ -41,7 +43,8 @@ def find_interrupted(bench: Bench) -> None:
     bench.store.enter(StationState.STOPPED, reason)
     bench.show_poses()
     session = bench.store.status.session
-    bench.store.update(session=msgspec.structs.replace(session, elapsed_s=state.elapsed_s))
+    session = msgspec.structs.replace(session, elapsed_s=state.elapsed_s, check=state.check)
+    bench.store.update(session=session)
     bench.store.event(reason, "warning")
 
 

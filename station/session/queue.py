@@ -16,6 +16,9 @@ BUSY: frozenset[PoseState] = frozenset({"moving", "settling", "capturing", "writ
 POSE_LIMIT = 2000
 GUIDED = "guided by hand"
 """Why such a pose is there."""
+TAKE_AGAIN = "to be taken again"
+STILL_COUNTS = "; the picture it has counts until then"
+NOT_AGAIN = "not taken again: the picture it has counts"
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +79,8 @@ class PoseQueue:
 
     @property
     def done(self) -> int:
-        return sum(s.state == "done" for s in self._status.values())
+        """Poses whose picture counts, those that are to be taken again included."""
+        return sum(status.counts for status in self._status.values())
 
     @property
     def failed(self) -> tuple[int, ...]:
@@ -92,7 +96,9 @@ class PoseQueue:
         return self._status[index]
 
     def mark(self, index: int, state: PoseState, reason: str = "") -> None:
-        self._status[index] = msgspec.structs.replace(self.status(index), state=state, reason=reason)
+        before = self.status(index)
+        kept = before.counts and state != "done"
+        self._status[index] = msgspec.structs.replace(before, state=state, reason=reason, kept=kept)
 
     def note(self, index: int, *, corners: int | None = None, coverage: float | None = None) -> None:
         """What the picture showed."""
@@ -133,12 +139,18 @@ class PoseQueue:
 
     def retake(self, index: int) -> None:
         """Plans it once more, where it stands in the order."""
-        if self.status(index).state in BUSY:
+        status = self.status(index)
+        if status.state in BUSY:
             raise RefusedError(f"pose {index + 1} is being taken right now")
-        self.mark(index, "planned", "to be taken again")
+        self.mark(index, "planned", TAKE_AGAIN + (STILL_COUNTS if status.counts else ""))
 
     def skip(self, index: int) -> None:
-        state = self.status(index).state
+        """Leaves it out; of one that has a picture only the retake, for the recording keeps the picture."""
+        status = self.status(index)
+        state = status.state
+        if status.kept and state not in BUSY:
+            self.mark(index, "done", NOT_AGAIN)
+            return
         if state in BUSY or state == "done":
             raise RefusedError(
                 f"pose {index + 1} is {state}: only a pose that waits or failed can be skipped"

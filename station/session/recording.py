@@ -75,10 +75,19 @@ class SessionRecording:
     """Open from a go to sealing. Pictures are numbered here, without gaps or repeats."""
 
     def __init__(
-        self, root: Path, cell: Cell, folder: Path | None = None, parts: int = 0, elapsed_s: float = 0.0
+        self,
+        root: Path,
+        cell: Cell,
+        folder: Path | None = None,
+        parts: int = 0,
+        elapsed_s: float = 0.0,
+        check: bool = False,
     ) -> None:
-        """`folder`, `parts`, `elapsed_s`: of an interrupted session; its next part follows. StationError."""
-        self._root, self._cell = root, cell
+        """`folder`, `parts`, `elapsed_s`: of an interrupted session; its next part follows. StationError.
+
+        `check`: it is a drift check, also after a restart.
+        """
+        self._root, self._cell, self._check = root, cell, check
         self.part = parts + 1
         self.folder = folder or new_session_folder(root, cell.config.name)
         self.recorder: Recorder | None = None
@@ -232,6 +241,7 @@ class SessionRecording:
             poses=queue.statuses,
             parts=self.part,
             elapsed_s=round(self.elapsed_s, 1),
+            check=self._check,
             sealed=recording is not None,
             recording=str(recording or ""),
         )

@@ -116,7 +116,7 @@ class Run:
             first = await bench.cell.camera.capture()
         if recording is not None:
             await recover_parts(bench, recording)
-        fresh = recording or SessionRecording(bench.root, bench.cell)
+        fresh = recording or SessionRecording(bench.root, bench.cell, check=bench.store.status.session.check)
         # Before it is open: after a STOP in between, what is there must be closed.
         bench.recording = fresh
         try:
@@ -236,7 +236,9 @@ class Run:
         elif self._failures >= FAILURES_IN_A_ROW:
             reason = f"{self._failures} poses in a row failed ({self._why}): mend that, then go on, or finish"
         elif queue.open:
-            reason = f"{len(queue.open)} poses are left: give a new go to go on"
+            count = len(queue.open)
+            left = "1 pose is left" if count == 1 else f"{count} poses are left"
+            reason = f"{left}: give a new go to go on"
         elif unsettled := [index for index in self._unsettled if index in queue.failed]:
             reason = (
                 f"{_numbers(unsettled)} did not come to rest ({queue.status(unsettled[0]).reason}): "

@@ -68,7 +68,6 @@ class Session:
         self._hovers = HoverDesk(self.bench)
         self._run: asyncio.Task[None] | None = None
         self._tasks: list[asyncio.Task[None]] = []
-        self._saving: asyncio.Task[None] | None = None
         self._notes: tuple[str, ...] = ()
         cell.robot.subscribe(monitor.add)
         cell.robot.subscribe(self.bench.record_state)
@@ -297,17 +296,20 @@ class Session:
         self.bench.show_poses()
         self.store.event(f"plan of {len(plan.poses)} poses loaded")
 
-    def edit(self, client_id: int, verb: Any, change: Callable[[PoseQueue], object]) -> object:
-        """Retake, skip, reorder, add, drop: voids a waiting go."""
+    async def edit(self, client_id: int, verb: Any, change: Callable[[PoseQueue], object]) -> object:
+        """Retake, skip, reorder, add, drop: voids a waiting go. RecordingError: done, but not on the disk."""
         self.leases.require(client_id)
         self._require(verb)
         if self.bench.queue is None:
             raise RefusedError("no plan is loaded: load or make one first")
         result = change(self.bench.queue)
         self._void_go()
-        if self.bench.recording is not None:
-            self._saving = asyncio.create_task(self.bench.recording.save_state(self.bench.queue))
         self.bench.show_poses(self.store.status.session.current)
+        if self.bench.recording is not None:
+            try:
+                await self.bench.recording.save_state(self.bench.queue)
+            except RecordingError as error:
+                raise RecordingError(f"it is changed, but a restart would forget it: {error}") from None
         return result
 
     # -- without control --------------------------------------------------------------------------------

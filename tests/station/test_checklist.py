@@ -40,6 +40,20 @@ async def test_where_nothing_answers_the_remedy_is_one_sentence(rig: Rig, host: 
     assert (found.state, found.remedy) == ("failed", remedy)
 
 
+async def test_the_size_of_the_camera_is_that_of_its_pictures_not_of_the_preview(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def settings() -> dict[str, object]:
+        return {"region": [0, 0, 1280, 1024]}
+
+    monkeypatch.setattr(rig.camera, "preview", rig.camera.glimpse)
+    said = {check.name: check.text for check in await checklist(rig.session.bench, {})}
+    assert said["camera"].endswith("80×64")  # a camera that tells no more
+    monkeypatch.setattr(rig.camera, "settings", settings)
+    said = {check.name: check.text for check in await checklist(rig.session.bench, {})}
+    assert said["camera"].endswith("1280×1024")
+
+
 async def test_what_the_network_says_is_said_in_words() -> None:
     with pytest.raises(DashboardError) as refused:
         await Dashboard.open("127.77.1.9")

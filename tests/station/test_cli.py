@@ -122,6 +122,8 @@ def test_a_session_from_the_shell(shell: Shell, tmp_path: Path) -> None:
     code, out, _ = shell.ask("acknowledge")
     assert code == 0 and out.startswith("idle SIMULATED")
     assert shell.ask("retake", "9")[0] == 1
+    assert "pose 2: to be taken again; the picture it has counts until then" in shell.ask("retake", "2")[1]
+    assert "pose 2: not taken again: the picture it has counts" in shell.ask("skip", "2")[1]
 
 
 def test_ctrl_c_is_stop(shell: Shell, tmp_path: Path) -> None:

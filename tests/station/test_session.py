@@ -203,18 +203,18 @@ async def test_a_retake_supersedes(rig: Rig) -> None:
 async def test_plans_can_be_changed_and_a_waiting_go_is_void_then(rig: Rig, small_plan: Plan) -> None:
     session = rig.session
     summary = await session.prepare(1, "run")
-    session.edit(1, "skip", lambda queue: queue.skip(1))
+    await session.edit(1, "skip", lambda queue: queue.skip(1))
     with pytest.raises(RefusedError, match="not valid"):
         session.go(1, summary.token)
-    session.edit(1, "reorder", lambda queue: queue.reorder([3, 2, 1, 0]))
-    session.edit(1, "drop", lambda queue: queue.drop(0))
+    await session.edit(1, "reorder", lambda queue: queue.reorder([3, 2, 1, 0]))
+    await session.edit(1, "drop", lambda queue: queue.drop(0))
     extra = msgspec.structs.replace(small_plan.poses[0], name="again")
-    assert session.edit(1, "add", lambda queue: queue.add(extra)) == POSES
+    assert await session.edit(1, "add", lambda queue: queue.add(extra)) == POSES
     with pytest.raises(RefusedError, match="no pose 1"):
-        session.edit(1, "retake", lambda queue: queue.retake(0))
+        await session.edit(1, "retake", lambda queue: queue.retake(0))
     assert [pose.index for pose in session.store.status.session.poses] == [3, 2, 1, 4]
     with pytest.raises(RefusedError, match="watch and STOP"):
-        session.edit(2, "skip", lambda queue: queue.skip(2))
+        await session.edit(2, "skip", lambda queue: queue.skip(2))
 
 
 async def test_a_plan_that_leaves_its_limits_is_refused_whole(rig: Rig, small_plan: Plan) -> None:

@@ -27,7 +27,7 @@ async def test_the_sealed_session_stays_shown_until_the_go(rig: Rig) -> None:
 
 async def test_a_pose_that_was_left_out_stays_left_out(rig: Rig) -> None:
     """Before the first run, and in the next one."""
-    rig.session.edit(1, "skip", lambda queue: queue.skip(1))
+    await rig.session.edit(1, "skip", lambda queue: queue.skip(1))
     for _ in range(2):
         assert (await rig.session.prepare(1, "run")).poses == POSES - 1
         await _sealed_session(rig)

@@ -35,7 +35,7 @@ async def test_a_dropped_pose_does_not_take_the_name_of_the_next_picture(rig: Ri
     await rig.session.switch_free_drive(1, True, auto=False)
     await rig.session.record(1)
     await rig.session.switch_free_drive(1, False, auto=False)
-    rig.session.edit(1, "drop", lambda queue: queue.drop(POSES - 1))
+    await rig.session.edit(1, "drop", lambda queue: queue.drop(POSES - 1))
     await rig.session.switch_free_drive(1, True, auto=False)
     assert await rig.session.record(1) == POSES + 1
     names = [pose.name for pose in rig.session.store.status.session.poses]

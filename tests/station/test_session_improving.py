@@ -176,7 +176,7 @@ async def test_nothing_moves_by_poses_that_the_disk_did_not_take(
 
 async def test_it_is_void_when_the_poses_change_meanwhile(half_way: Rig) -> None:
     summary = await half_way.session.prepare(1, "improve")
-    half_way.session.edit(1, "skip", lambda queue: queue.skip(BEFORE + 1))
+    await half_way.session.edit(1, "skip", lambda queue: queue.skip(BEFORE + 1))
     with pytest.raises(RefusedError, match="not valid"):
         half_way.session.go(1, summary.token)
     assert "p09" in [status.name for status in queue_of(half_way).statuses]

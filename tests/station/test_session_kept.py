@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import os
+
 import pytest
 
+from recordings.errors import RecordingError
 from station.status import StationState as S
 from tests.durability import disk_order
 from tests.station.session_rig import POSES, NewRig, Rig, crash, sealed
@@ -31,13 +35,50 @@ async def test_a_plan_that_was_changed_in_a_pause_is_known_after_a_crash(new_rig
     first = await new_rig()
     await first.go_until_it_moves()
     await first.pause_after_this_pose("anna")
-    first.session.edit(1, "skip", lambda queue: queue.skip(2))
-    saving = first.session._saving
-    assert saving is not None
-    await saving
+    await first.session.edit(1, "skip", lambda queue: queue.skip(2))
     crash(first)
     second = await new_rig(with_plan=False)
     assert second.pose_states == ["done", "planned", "skipped", "planned"]
+
+
+async def test_a_change_that_the_disk_does_not_take_is_told_to_who_asked(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await rig.go_until_it_moves()
+    await rig.pause_after_this_pose("anna")
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("station.session.recording.write_state", full)
+    with pytest.raises(RecordingError, match=r"a restart would forget it.*No space left"):
+        await rig.session.edit(1, "skip", lambda queue: queue.skip(2))
+    assert rig.pose_states == ["done", "planned", "skipped", "planned"]
+
+
+async def test_a_drift_check_is_still_one_after_a_crash(new_rig: NewRig) -> None:
+    first = await new_rig()
+    first.arm.slow = True
+    await first.give_go("check")
+    await first.until(S.MOVING)
+    await first.pause_after_this_pose("anna")
+    crash(first)
+    second = await new_rig(with_plan=False)
+    assert second.session.store.status.session.check
+    second.session.acknowledge("anna")
+    second.session.take_lease(1, "anna")
+    await second.session.finish(1)
+    await second.give_go()
+    assert not second.session.store.status.session.check
+
+
+async def test_a_picture_counts_until_its_pose_was_taken_again(rig: Rig) -> None:
+    await rig.go_until_it_moves()
+    await rig.pause_after_this_pose("anna")
+    await rig.session.edit(1, "retake", lambda queue: queue.retake(0))
+    assert rig.session.store.status.session.captured == 1
+    await rig.session.finish(1)
+    assert len(list(sealed(rig).views())) == rig.session.store.status.session.captured
 
 
 async def test_an_arm_that_stands_at_its_pose_is_not_moved(rig: Rig) -> None:

@@ -33,7 +33,7 @@ async def test_a_pose_dropped_while_control_starts_is_not_driven(rig: Rig) -> No
     held = HeldStart(rig)
     await rig.give_go()
     await rig.until_true(lambda: rig.arm.control)
-    rig.session.edit(1, "drop", lambda queue: queue.drop(1))
+    await rig.session.edit(1, "drop", lambda queue: queue.drop(1))
     held.go_on.set()
     await rig.until(S.IDLE, S.FAULT)
     assert rig.state is S.IDLE, rig.session.store.status.reason

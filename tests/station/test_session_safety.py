@@ -73,7 +73,7 @@ async def test_what_changes_while_the_way_is_checked_leaves_no_go(rig: Rig, chan
         await rig.session.stop("bert")
         rig.session.acknowledge("anna")
     elif change == "edit":
-        rig.session.edit(1, "reorder", lambda queue: queue.reorder([1, 0, *range(2, POSES)]))
+        await rig.session.edit(1, "reorder", lambda queue: queue.reorder([1, 0, *range(2, POSES)]))
     elif change == "lease":
         await rig.session.release_lease(1)
         rig.session.take_lease(1, "anna")

@@ -178,9 +178,9 @@ async def test_a_full_disk_stops_a_stream_and_the_arm(
 async def test_a_swing_that_a_person_leaves_out_or_drops_is_not_driven(sweeping: Rig) -> None:
     rig = sweeping
     await rig.go_until_it_moves()
-    rig.session.edit(1, "skip", lambda queue: queue.skip(1))
+    await rig.session.edit(1, "skip", lambda queue: queue.skip(1))
     for index in range(2, SWINGS - 1):
-        rig.session.edit(1, "drop", lambda queue, index=index: queue.drop(index))
+        await rig.session.edit(1, "drop", lambda queue, index=index: queue.drop(index))
     for number in (1, 2):
         await rig.until_true(lambda n=number: rig.arm.log.count("move") == n)
         rig.arm.arrive.set()

@@ -65,7 +65,7 @@ async def test_a_person_is_asked(rig: Rig, shaken: list[int]) -> None:
     assert rig.pose_states == ["done", "failed", "done", "done"]
     assert "pose 2 did not come to rest" in rig.session.store.status.reason
     moves = rig.arm.log.count("move")
-    rig.session.edit(1, "retake", lambda queue: queue.retake(SHAKY))
+    await rig.session.edit(1, "retake", lambda queue: queue.retake(SHAKY))
     assert rig.arm.log.count("move") == moves
     await rig.give_go("resume")
     await rig.until(S.IDLE)

@@ -8,7 +8,7 @@ from __future__ import annotations
 import re
 from xml.sax.saxutils import quoteattr
 
-from scipy.spatial.transform import Rotation
+import numpy as np
 
 from calibrate.calibration import Calibration
 from calibrate.formats.frames import BODY_FROM_OPTICAL, FrameNames, comment, number, parent_from_body
@@ -26,9 +26,22 @@ def text(calibration: Calibration, frames: FrameNames) -> str:
     )
 
 
+def _roll_pitch_yaw(R: Array) -> tuple[float, float, float]:
+    """Radians, of R (3, 3). Yaw is what is left after the roll: Rz(yaw) Ry(pitch) = R Rx(roll)ᵀ.
+
+    So the three are right together at a pitch of 90° too, where SciPy's lose half the digits: the body frame
+    of a camera that looks straight along the flange is pitched so.
+    """
+    roll = np.arctan2(R[2, 1], R[2, 2])
+    pitch = np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0]))
+    across = R[:, 1] * np.cos(roll) - R[:, 2] * np.sin(roll)
+    yaw = np.arctan2(-across[0], across[1])
+    return float(roll), float(pitch), float(yaw)
+
+
 def _joint(parent: str, child: str, matrix: Array) -> str:
     xyz = " ".join(number(v) for v in matrix[:3, 3])
-    rpy = " ".join(number(v) for v in Rotation.from_matrix(matrix[:3, :3]).as_euler("xyz"))
+    rpy = " ".join(number(v) for v in _roll_pitch_yaw(matrix[:3, :3]))
     return (
         f'<joint name={quoteattr(f"{child}_joint")} type="fixed">\n'
         f"  <parent link={quoteattr(parent)}/>\n  <child link={quoteattr(child)}/>\n"

@@ -144,6 +144,20 @@ def test_urdf_chain_ends_in_the_optical_frame(calibration: Calibration) -> None:
     assert optical[:3, :3] @ [1, 0, 0] == pytest.approx([0, -1, 0])
 
 
+@pytest.mark.parametrize("off_rad", [0.0, 1e-9, 1e-7])
+@pytest.mark.parametrize("roll_rad", [0.0, np.pi, -2.3])
+def test_urdf_of_a_camera_that_looks_straight_along_the_flange(
+    calibration: Calibration, off_rad: float, roll_rad: float
+) -> None:
+    """The usual mount: its body frame is pitched by 90°, where roll and yaw turn about the same axis."""
+    R = rotation_exp([0.0, 0.0, roll_rad]) @ rotation_exp([0.6 * off_rad, -0.8 * off_rad, 0.0])
+    transform = Transform(calibration.result.parent_frame, "camera", pose(R, [0.0, 0.0, 0.1]))
+    straight = msgspec.structs.replace(calibration, result=FramePose.of(transform))
+    tree = ElementTree.fromstring(f"<robot name='x'>{export(straight, 'urdf')}</robot>")
+    body, optical = (urdf_origin(joint) for joint in tree.findall("joint"))
+    same(body @ optical, straight)
+
+
 def test_easy_handeye2(calibration: Calibration) -> None:
     plain = yaml.safe_load(export(calibration, "easy-handeye2"))
     kind, parent_key = {
@@ -158,6 +172,7 @@ def test_easy_handeye2(calibration: Calibration) -> None:
         "name", "calibration_type", "tracking_base_frame", "tracking_marker_frame", "robot_base_frame",
         "robot_effector_frame", "freehand_robot_movement", "move_group_namespace", "move_group",
     }  # fmt: skip
+    assert parameters["freehand_robot_movement"] is True  # no MoveIt is asked for
     t, q = plain["transform"]["translation"], plain["transform"]["rotation"]
     R = Rotation.from_quat([q["x"], q["y"], q["z"], q["w"]]).as_matrix()
     same(pose(R, [t["x"], t["y"], t["z"]]), calibration)
@@ -176,18 +191,40 @@ def test_camera_info(calibration: Calibration) -> None:
     assert np.array(plain["camera_matrix"]["data"]).reshape(3, 3).tolist() == [list(r) for r in camera.matrix]
     assert plain["distortion_model"] == "plumb_bob"
     assert plain["distortion_coefficients"] == {"rows": 1, "cols": 5, "data": list(camera.distortion)}
+    assert plain["camera_name"] == "camera"
+    assert plain["rectification_matrix"] == {"rows": 3, "cols": 3, "data": np.eye(3).ravel().tolist()}
     P = np.array(plain["projection_matrix"]["data"]).reshape(3, 4)
     assert P[:, :3].tolist() == [list(r) for r in camera.matrix]
     assert not P[:, 3].any()
 
 
-@pytest.mark.parametrize(("model", "count"), [("equidistant", 4), ("rational_polynomial", 8)])
-def test_camera_info_of_other_lenses(calibration: Calibration, model: str, count: int) -> None:
+@pytest.mark.parametrize(
+    ("model", "given", "named", "count"),
+    [
+        ("equidistant", 4, "equidistant", 4),
+        ("rational_polynomial", 8, "rational_polynomial", 8),
+        ("plumb_bob", 8, "rational_polynomial", 8),  # ROS's plumb_bob has five
+        ("plumb_bob", 4, "plumb_bob", 5),
+    ],
+)
+def test_camera_info_of_other_lenses(
+    calibration: Calibration, model: str, given: int, named: str, count: int
+) -> None:
     lens = msgspec.structs.replace(
-        calibration.intrinsics, distortion_model=model, distortion=tuple(0.01 * k for k in range(count))
+        calibration.intrinsics, distortion_model=model, distortion=tuple(0.01 * k for k in range(given))
     )
     plain = yaml.safe_load(export(msgspec.structs.replace(calibration, intrinsics=lens), "ros-camera-info"))
-    assert (plain["distortion_model"], plain["distortion_coefficients"]["cols"]) == (model, count)
+    found = plain["distortion_coefficients"]
+    assert (plain["distortion_model"], found["cols"]) == (named, count)
+    assert found["data"] == [*lens.distortion, *[0.0] * (count - given)]
+
+
+def test_camera_info_is_named_by_the_body_frame(calibration: Calibration) -> None:
+    for body, name in (("left_eye_link", "left_eye"), ("_link", "camera")):
+        assert (
+            yaml.safe_load(export(calibration, "ros-camera-info", FrameNames(body=body)))["camera_name"]
+            == name
+        )
 
 
 def test_opencv_file_storage(calibration: Calibration, tmp_path: Path) -> None:
@@ -201,6 +238,12 @@ def test_opencv_file_storage(calibration: Calibration, tmp_path: Path) -> None:
     assert K.tolist() == [list(r) for r in calibration.intrinsics.matrix]
     assert storage.getNode("distortion_coefficients").mat().shape == (1, 5)
     assert storage.getNode("mount").string() == calibration.mount
+    assert storage.getNode("source").string() == calibration.source
+    assert storage.getNode("distortion_model").string() == "plumb_bob"
+    size = (storage.getNode("image_width").real(), storage.getNode("image_height").real())
+    assert size == (calibration.intrinsics.width, calibration.intrinsics.height)
+    np.testing.assert_array_equal(storage.getNode("covariance").mat(), calibration.covariance)
+    assert calibration.provenance.session in path.read_text()
 
 
 def test_json(calibration: Calibration) -> None:

@@ -154,6 +154,17 @@ class StillnessMonitor:
                 raise NotStillError(f"not at rest within {self._limits.timeout_s:g} s: {unrest}. {remedy}")
             await asyncio.sleep(POLL_S)
 
+    def require_rest(self, state: RobotState) -> None:
+        """NotStillError when the arm moved at that moment: rest before a picture is no rest during it."""
+        speeds, limit = np.abs(state.joint_speeds_rad_s), self._limits.joint_speed_rad_s
+        joint = int(speeds.argmax())
+        if speeds[joint] > limit:
+            raise NotStillError(
+                f"the arm was moved while the picture was taken: joint {JOINT_NAMES[joint]} at "
+                f"{math.degrees(speeds[joint]):.2f}°/s (limit {math.degrees(limit):.2f}). "
+                "Leave it at rest, and take this pose again"
+            )
+
     def _window_begin_ns(self, found: Stillness) -> int:
         """Host monotonic time."""
         return self._states[-1].stamps.host_monotonic_ns - round(found.window_s * 1e9)

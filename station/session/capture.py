@@ -34,7 +34,7 @@ class PoseFailedError(StationError):
 async def take_pose(bench: Bench, index: int, attempt: int) -> None:
     """At rest → picture → disk; marks the pose done.
 
-    PoseFailedError when this pose gave nothing; RobotError and RecordingError end the run.
+    PoseFailedError and NotStillError when this pose gave nothing; RobotError and RecordingError end the run.
     """
     _phase(bench, index, StationState.SETTLING, "settling")
     resting = RestingCheck(bench.cell.robot.check)
@@ -48,6 +48,7 @@ async def take_pose(bench: Bench, index: int, attempt: int) -> None:
     mid_ns, camera_bound_s = mid_exposure(device_ns, arrival_ns, picture.exposure_us, clock)
     state = await _state_at(bench, mid_ns)
     await resting.news()
+    bench.stillness.require_rest(state)
     view = _view(bench, index, attempt, picture, state, still, camera_bound_s)
     _require_bound(bench, view)
     _phase(bench, index, StationState.WRITING, "writing")

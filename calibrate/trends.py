@@ -19,7 +19,7 @@ _FALSE_ALARM = 1e-4
 
 @dataclass(frozen=True)
 class Move:
-    """From one session's X to another's; in X's parent frame."""
+    """From one session's X to another's; in X's parent frame (flange or base)."""
 
     earlier: BatchResult
     later: BatchResult
@@ -55,7 +55,7 @@ class Cell:
     """Solved ones, oldest first."""
     moves: tuple[Move, ...]
     """From each session to the next; none where the robot is not named."""
-    followed: bool = True
+    followed: bool
     """False: the robot is not named, these may be sessions of many cells."""
 
     @property
@@ -150,7 +150,8 @@ def _row(cells_of_row: Sequence[str]) -> str:
 
 
 def _move(earlier: BatchResult, later: BatchResult) -> Move:
-    """Both covariances add; the threshold is that of Hotelling's T² with the smaller session's freedom."""
+    """Both covariances add. If nothing moved, δᵀ C⁻¹ δ follows 6 F(6, ν) as in `drift`; ν = 3n - 6 is that of
+    the session of fewer views."""
     delta = difference(place(later), place(earlier))
     covariance = np.array(earlier.covariance) + np.array(later.covariance)
     square = max(0.0, float(delta @ np.linalg.pinv(covariance, hermitian=True) @ delta))

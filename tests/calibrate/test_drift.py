@@ -100,6 +100,8 @@ def test_the_noise_of_a_calibration_comes_in_metres_and_radians(solved_real: Sol
     assert (noise.corner_px, noise.robot_m) == (0.12, 0.00005)
     assert noise.robot_rad == pytest.approx(np.radians(0.02))
     assert noise.degrees_of_freedom == 3 * len(calibration.views.used) - 6
+    exact = msgspec.structs.replace(quality, noise={"corner_px": 0.0, "robot_mm": 0.0, "robot_deg": 0.0})
+    assert Noise.of(msgspec.structs.replace(calibration, quality=exact)).corner_px == 0.02  # no corner is
     silent = msgspec.structs.replace(quality, noise={})
     with pytest.raises(BadViewsError, match="--profile robust"):
         Noise.of(msgspec.structs.replace(calibration, quality=silent))
@@ -109,6 +111,37 @@ def test_the_verdict_is_that_of_the_p_value_at_five_percent() -> None:
     for check in checks(12, 0.2e-3, 0, 21):
         assert check.passed == (check.p_value >= 0.05) == (check.statistic <= check.threshold)
         assert check.p_value == pytest.approx(1 - stats.f.cdf(check.statistic / 6, 6, 69))
+        assert stats.f.sf(check.threshold / 6, 6, 69) == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_twice_the_noise_everywhere_is_twice_the_doubt(mount: Mount) -> None:
+    views = few_views(np.random.default_rng(23), X_TRUE, mount=mount)
+    doubled = Noise(2 * NOISE.corner_px, 2 * NOISE.robot_m, 2 * NOISE.robot_rad, NOISE.degrees_of_freedom)
+    once = judge_shift(views, X_TRUE, INSTALLED_COVARIANCE, NOISE)
+    twice = judge_shift(views, X_TRUE, 4 * INSTALLED_COVARIANCE, doubled)
+    np.testing.assert_allclose(twice.covariance, 4 * once.covariance, rtol=1e-6, atol=1e-15)
+    np.testing.assert_allclose(twice.shift, once.shift, rtol=1e-6, atol=1e-12)
+    assert twice.statistic == pytest.approx(once.statistic / 4)
+    assert twice.disagreement == pytest.approx(once.disagreement / 4)
+
+
+def test_the_power_is_that_of_half_a_millimetre_and_a_tenth_of_a_degree() -> None:
+    """In the worst direction, by the non-central F distribution, for what else is unknown too."""
+    covariance = np.diag([1e-4, 2e-4, 1e-4, 4e-4, 2e-4, 2e-4]) ** 2
+    limit = stats.f.ppf(0.95, 6, 69)
+    by_shift, by_turn = (
+        stats.ncf.sf(limit, 6, 69, (size / sigma) ** 2)
+        for size, sigma in ((0.0005, 2e-4), (np.pi / 1800, 4e-4))
+    )
+    assert powers(covariance, 69) == pytest.approx((by_shift, by_turn))
+
+
+def test_a_shift_is_told_in_millimetres_and_degrees() -> None:
+    (check,) = checks(1, 0, 0, 5)
+    moved = replace(check, shift=np.r_[3e-4, 0.0, -4e-4, np.radians([0.0, 0.03, 0.04])])
+    assert (moved.shift_mm, moved.shift_deg) == pytest.approx((0.5, 0.05))
+    assert replace(check, power_translation=0.9, power_rotation=0.8).power == 0.8
 
 
 def test_the_shift_is_named_and_the_stated_power_is_a_lower_bound() -> None:
@@ -129,6 +162,9 @@ def test_it_says_how_many_views_would_do() -> None:
     views = few_views(rng, X_TRUE, weak.views_needed + 4)
     enough = judge_shift(views, X_TRUE, 4 * INSTALLED_COVARIANCE, MID)
     assert enough.power >= POWER and enough.views_needed == len(views)
+    blind_to_turns = INSTALLED_COVARIANCE * np.repeat([1.0, 100.0], 3)
+    half = judge_shift(views, X_TRUE, blind_to_turns, MID)
+    assert half.power_translation >= POWER > half.power_rotation and half.views_needed is None
     hopeless = judge_shift(few_views(rng, X_TRUE, 5), X_TRUE, 100 * INSTALLED_COVARIANCE, MID)
     assert hopeless.views_needed is None
 
@@ -186,10 +222,12 @@ def test_the_pose_covariance_is_that_of_many_repetitions() -> None:
     assert np.sqrt(np.diag(measured)) == pytest.approx(np.sqrt(np.diag(predicted)), rel=0.15)
 
 
-def entry(day: float, shift_mm: float, generation: int = 1) -> CheckEntry:
+def entry(day: float, shift_mm: float, generation: int = 1, turn_deg: float = 0.0) -> CheckEntry:
+    """1σ is 0.05 mm and 1e-5 rad."""
     covariance = np.diag([(0.05e-3) ** 2] * 3 + [1e-10] * 3)
     rows = tuple(tuple(row) for row in covariance.tolist())
-    return CheckEntry(day * 86400, generation, "r", True, (shift_mm / 1e3, 0, 0, 0, 0, 0), rows, 1.0, 13.0)
+    shift = (shift_mm / 1e3, 0.0, 0.0, 0.0, float(np.radians(turn_deg)), 0.0)
+    return CheckEntry(day * 86400, generation, "r", True, shift, rows, 1.0, 13.0)
 
 
 def test_a_trend_is_warned_of_before_a_check_fails(tmp_path: Path) -> None:
@@ -205,6 +243,30 @@ def test_a_trend_is_warned_of_before_a_check_fails(tmp_path: Path) -> None:
     failed = msgspec.structs.replace(steady[0], passed=False)
     assert "generation 1: 4, it held in 3" in earlier_text([*steady[:3], failed], 1)
     assert earlier_text(steady, 2) == ""
+
+
+def test_a_trend_is_told_from_chance_at_one_percent() -> None:
+    """The slope of eight days has a variance of σ² / 42; its square follows χ²(6)."""
+    slope_mm = 0.05 * np.sqrt(stats.chi2.ppf(0.99, 6) / 42)
+    for factor in (0.99, 1.01):
+        wandering = trend_text([entry(day, 0.3 + factor * slope_mm * day) for day in range(8)], 1)
+        assert bool(wandering) == (factor > 1)
+
+
+def test_four_checks_or_one_moment_are_no_trend() -> None:
+    strong = [entry(day, 1.0 * day) for day in range(5)]
+    assert "4.00 mm" in trend_text(strong, 1)
+    assert trend_text(strong[:4], 1) == ""
+    assert trend_text([entry(3.0, 1.0 * k) for k in range(5)], 1) == ""
+
+
+@pytest.mark.parametrize(
+    ("days", "said"),
+    [(2.0, "in 2 days"), (1.9, "in 46 hours"), (2.1 / 24, "in 2 hours"), (1.9 / 24, "in 114 min")],
+)
+def test_a_turning_camera_is_told_in_degrees_and_in_a_time_that_people_read(days: float, said: str) -> None:
+    turning = [entry(100 + days * k / 4, 0.0, turn_deg=0.05 * k) for k in range(5)]
+    assert f"by about 0.00 mm and 0.200° {said}." in trend_text(turning, 1)
 
 
 def test_a_trend_over_minutes_is_not_stretched_to_a_month() -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 from msgspec.structs import replace
+from scipy import stats
 
 from calibrate.batch import BatchResult
 from calibrate.geometry import Array, Transform, perturb, pose, rotation_exp
@@ -93,6 +94,17 @@ def test_a_move_is_measured_in_millimetres_degrees_and_sigmas_of_both() -> None:
     assert cell.moves[0].sigmas == pytest.approx(0.7 / 0.1 / np.sqrt(2))
     assert not cell.moves[0].real
     assert cells([still(0), still(1, shift_mm=0.9)])[0].moves[0].real
+
+
+def test_the_limit_is_one_false_alarm_in_ten_thousand_for_the_session_of_fewer_views() -> None:
+    """6 F(6, 3n - 6): what few views say of their own noise is worth less."""
+    few = replace(still(0), views=8)
+    limit_mm = np.sqrt(2 * 6 * stats.f.ppf(1 - 1e-4, 6, 18)) * 0.1
+    for factor in (0.99, 1.01):
+        later = still(1, shift_mm=factor * limit_mm)
+        for results in ([few, later], [replace(few, views=25), replace(later, views=8)]):
+            assert cells(results)[0].moves[0].real == (factor > 1)
+    assert cells([still(0), still(1)])[0].moves[0].sigmas == 0.0
 
 
 @pytest.mark.parametrize("part", ["robot", "camera", "mount"])

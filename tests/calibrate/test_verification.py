@@ -14,7 +14,7 @@ from calibrate.install import install, load_installed, rollback
 from calibrate.pipeline import SolvedRecording
 from calibrate.report.page import report_page
 from calibrate.summary import summary
-from calibrate.verification import agrees, note_in_file, note_installed, touch_text
+from calibrate.verification import agrees, note_in_file, note_installed, touch_sigmas, touch_text
 
 GOOD = Touch(
     0, (0.0, 0.0), (0.3, -0.2), (0.15, 0.15), "told by a person", "anna", "2026-11-21T12:00:00+00:00"
@@ -36,6 +36,14 @@ def test_an_offset_is_judged_by_prediction_and_hand_together() -> None:
     assert "MORE than the calibration claims" in touch_text(BAD)
     vague = msgspec.structs.replace(BAD, sigma_mm=(1.0, 1.0))
     assert agrees(vague)
+
+
+def test_a_corner_alarms_beyond_three_sigmas_of_both_together() -> None:
+    """0.4 mm predicted and 0.3 mm by hand are 0.5 mm; of two numbers 1 % lies beyond 3.03 sigmas."""
+    touch = msgspec.structs.replace(GOOD, sigma_mm=(0.4, 0.4), offset_mm=(0.3, -0.4))
+    assert touch_sigmas(touch) == pytest.approx(1.0)
+    near, far = (msgspec.structs.replace(touch, offset_mm=(0.0, 0.5 * sigmas)) for sigmas in (3.02, 3.05))
+    assert agrees(near) and not agrees(far)
 
 
 def test_entries_go_into_a_file_and_stay_when_it_is_installed(file: Path, tmp_path: Path) -> None:

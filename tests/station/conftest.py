@@ -59,6 +59,7 @@ def held_disk(monkeypatch: pytest.MonkeyPatch) -> HeldDisk:
     disk, sync = HeldDisk(), SessionRecording.sync
 
     async def held(recording: SessionRecording) -> None:
+        disk.asked += 1
         await disk.wait()
         if disk.fails:
             raise RecordingError("cannot write: no space left on device")

@@ -300,6 +300,8 @@ class HeldDisk(asyncio.Event):
     """A disk that takes nothing until the event is set; then it fails if it `fails`."""
 
     fails = False
+    asked = 0
+    """How often it was to take everything so far."""
 
 
 def crash(rig: Rig) -> None:

@@ -61,8 +61,7 @@ async def test_the_heart_beats_only_while_a_go_is_carried_out(rig: Rig) -> None:
 
 async def test_a_pose_counts_only_once_it_is_on_the_disk(rig: Rig, held_disk: HeldDisk) -> None:
     await rig.give_go()
-    await rig.until(S.WRITING)
-    await asyncio.sleep(0.05)
+    await rig.until_true(lambda: held_disk.asked > 0 or rig.session.store.status.session.captured > 0)
     assert rig.state is S.WRITING
     assert rig.pose_states[0] == "writing"
     assert rig.session.store.status.session.captured == 0

@@ -52,13 +52,17 @@ def board_spread(H: Array, camera_from_board: Array, X: Array) -> tuple[float, f
 
 
 def axis_spread(pairs: Pairs) -> tuple[Array, Array]:
-    """Singular values (3,) of the rotation vectors α (rms, rad), and their directions (3, 3) by row."""
+    """Singular values (3,) of the rotation vectors α of A (rms, rad), and their directions (3, 3) by row."""
     _, singular, directions = np.linalg.svd(pairs.alpha, full_matrices=False)
     return np.asarray(singular / np.sqrt(len(pairs))), np.asarray(directions)
 
 
 def require_motion(pairs: Pairs) -> None:
-    """Raise DegenerateMotionError, naming what is missing, unless two axes are turned about."""
+    """Raise DegenerateMotionError, naming what is missing, unless two axes are turned about.
+
+    By more (rms) than four times the noise of the angles, which A and B would have in common without it
+    (`screw_invariants`): its scale is 1.48 medians, as that of the normal distribution.
+    """
     angle_A, _ = screw_invariants(pairs.A)
     angle_B, _ = screw_invariants(pairs.B)
     noise = 1.48 * float(np.median(np.abs(angle_A - angle_B)))
@@ -80,7 +84,10 @@ def require_motion(pairs: Pairs) -> None:
 
 
 def observe(pairs: Pairs, covariance: Array, distance_m: float, parent: str) -> Observability:
-    """Which direction of X is known worst, rotations weighed as metres at `distance_m`."""
+    """Which direction of X is known worst, rotations weighed as metres at `distance_m`.
+
+    covariance: (6, 6) of X; parent: the name of X's parent frame, for the sentence.
+    """
     scale = np.array([1.0, 1.0, 1.0, distance_m, distance_m, distance_m])
     eigenvalues, vectors = np.linalg.eigh(covariance * np.outer(scale, scale))
     worst = vectors[:, -1]
@@ -108,17 +115,24 @@ def observe(pairs: Pairs, covariance: Array, distance_m: float, parent: str) -> 
 
 
 def point_error_m(X: Array, covariance: Array, distance_m: float) -> float:
-    """Root mean squared error, in X's parent, of a point on the camera's axis at `distance_m` (1σ)."""
+    """Root mean squared error, in X's parent, of a point on the camera's axis at `distance_m` (1σ).
+
+    X (4, 4), covariance C (6, 6). p = R z + t moves by δt + δφ × R z, so J = [1, -[R z]×]: √trace(J C Jᵀ).
+    """
     lever = X[:3, :3] @ np.array([0.0, 0.0, distance_m])
     J = np.concatenate([np.eye(3), -skew(lever)], axis=1)
     return float(np.sqrt(np.trace(J @ covariance @ J.T)))
 
 
 def median_distance_m(camera_from_board: Array) -> float:
+    """From the camera to the board's origin, over poses (n, 4, 4)."""
     return float(np.median(np.linalg.norm(camera_from_board[:, :3, 3], axis=1)))
 
 
 def distance_in_sigmas(X: Array, reference: Array, covariance: Array) -> float:
-    """Largest number of sigmas between two X over all directions: the Mahalanobis norm of their delta."""
+    """Largest number of sigmas between two X (4, 4) over all directions: the Mahalanobis norm of their delta.
+
+    covariance: (6, 6) of that delta.
+    """
     delta = difference(X, reference)
     return float(np.sqrt(max(0.0, float(delta @ np.linalg.pinv(covariance, 1e-14, hermitian=True) @ delta))))

@@ -38,16 +38,16 @@ _SMALLEST_EIGENVALUE = 1e-9
 class DriftCheck:
     passed: bool
     shift: Array
-    """(6,) [δt (m), δφ (rad)]: where the camera seems to be against where it was installed."""
+    """(6,) [δt (m), δφ (rad)] in X's parent frame: where the camera is now against where it was installed."""
     covariance: Array
     """(6, 6) of `shift` if nothing changed."""
     statistic: float
     threshold: float
     p_value: float
     power_translation: float
-    """Probability to notice a shift of 0.5 mm in the direction that is hardest to see."""
+    """Probability to notice a shift of `SHIFT_M` in the direction that is hardest to see."""
     power_rotation: float
-    """… a turn of 0.1°."""
+    """… a turn of `TURN_RAD`."""
     views_needed: int | None
     """About how many views like these give both a probability of 95 %; None where not even 30 do."""
     disagreement: float
@@ -105,7 +105,11 @@ def check_drift(views: ViewSet, calibration: Calibration) -> DriftCheck:
 
 
 def judge_shift(views: ViewSet, installed: Array, covariance: Array, noise: Noise) -> DriftCheck:
-    """The test itself. installed: (4, 4) X; covariance: (6, 6) of it."""
+    """The test itself. installed: (4, 4) X; covariance: (6, 6) of it. Raises as `check_drift` does.
+
+    δX and the board's place P by Gauss-Newton: each picture shows the board by r off from where X and P put
+    it, and r has the covariance of PnP plus that of the robot's pose, carried over to r.
+    """
     if len(views) < FEWEST_VIEWS:
         raise TooFewViewsError(f"{len(views)} views are too few for a check: {FEWEST_VIEWS} to 5 are needed.")
     flanges, in_hand = views.base_from_flange, views.mount == "eye-in-hand"
@@ -160,7 +164,10 @@ def _inverse(information: Array) -> Array:
 
 
 def powers(covariance: Array, nu: float) -> tuple[float, float]:
-    """Of a check whose shift has this covariance (6, 6): for 0.5 mm and 0.1°, each the worst direction."""
+    """To notice `SHIFT_M` and `TURN_RAD`, each in the worst direction; covariance S: (6, 6) of a shift.
+
+    After a true shift d, δᵀ S⁻¹ δ / 6 follows the non-central F(6, nu) of noncentrality dᵀ S⁻¹ d.
+    """
     weight: Any = np.linalg.inv(covariance)
     threshold = stats.f.ppf(1 - FALSE_ALARM, 6, nu)
 
@@ -210,7 +217,7 @@ def _normal_equations(
 
 
 def pnp_covariance(points: Array, camera: CameraModel, camera_from_board: Array) -> Array:
-    """(6, 6) of the board's pose in `camera`, for corner noise of 1 px per axis."""
+    """(6, 6) of the board's pose in `camera`, of its points (n, 3): (JᵀJ)⁻¹, for noise of 1 px per axis."""
     base = project(camera, camera_from_board, points)
     moved = perturb(camera_from_board, _STEP * np.eye(6))
     J = np.stack([(project(camera, m, points) - base).ravel() / _STEP for m in moved], axis=1)

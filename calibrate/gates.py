@@ -52,6 +52,7 @@ class Gate(msgspec.Struct, frozen=True, omit_defaults=True):
     name: str
     passed: bool
     value: float | None
+    """In the unit of the limit of its name in `GateLimits`; None in a file where it was no finite number."""
     limit: float | None
     text: str
     """What was found and, where it failed, what to do."""

@@ -2,7 +2,7 @@
 
 A lens found from pictures and the cameras' poses are one fit: a wrong principal point is mostly made good by
 turned cameras. What stays after the best turn is what counts, as in mrcal's projection uncertainty
-(D. Kogan, "How to stop worrying and love calibration", mrcal.secretsauce.net).
+(D. Kogan, mrcal's documentation, chapter "Projection uncertainty").
 """
 
 from __future__ import annotations
@@ -43,8 +43,10 @@ class LensUncertainty:
 def lens_uncertainty(views: ViewSet, camera: CameraModel, corner_px: float) -> LensUncertainty | None:
     """From the corners alone (no robot), for noise of `corner_px` per axis.
 
-    views: those that fixed the lens, with board poses. None for other lenses than plumb_bob, and where the
-    views do not fix it.
+    views: those that fixed the lens, with board poses. None for other lenses than plumb_bob, where a view
+    has no pixels, and where the views do not fix the lens. J being how a pixel moves by the lens, T how by a
+    turn, Σ the covariance of the lens: σ² = trace(S Σ Sᵀ), S = J + T φ, and φ the turn by the lens that makes
+    S least over all corners that were seen.
     """
     if camera.distortion_model != "plumb_bob" or not all(len(view.pixels) for view in views):
         return None

@@ -34,7 +34,8 @@ def check_scale(
 
     A board point stays put: F_i (R_X s c_i + t_X) = p for every view, F_i = base_from_flange (its inverse for
     eye-to-hand), c_i the board's centre in `camera`; unknown s, t_X, p: 7 numbers, 3 equations per view.
-    rotation: (3, 3) of X. None with fewer than 4 views or when the motion does not tell s.
+    rotation: (3, 3) of X; allowed: the |s - 1| from which the text says what to do. 1σ is by the residuals of
+    these equations. None with fewer than 4 views or when the motion does not tell s.
     """
     if len(views) < 4:
         return None

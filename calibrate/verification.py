@@ -30,13 +30,13 @@ CONFIDENCE = 0.99
 
 
 def touch_sigmas(touch: Touch) -> float:
-    """How far off the corner, in sigmas of prediction and hand together."""
+    """How far off the corner, in sigmas of prediction and hand together: √Σ o² / (σ² + `HAND_MM`²)."""
     offset, sigma = np.array(touch.offset_mm), np.array(touch.sigma_mm)
     return float(np.sqrt(np.square(offset / np.hypot(sigma, HAND_MM)).sum()))
 
 
 def agrees(touch: Touch) -> bool:
-    """Whether the offset is within what was predicted (two numbers: 3.03 sigmas for 99 %)."""
+    """Whether the offset is within what was predicted (two numbers, χ²(2): 3.03 sigmas for 99 %)."""
     return touch_sigmas(touch) <= float(np.sqrt(stats.chi2.ppf(CONFIDENCE, 2)))
 
 
@@ -64,7 +64,10 @@ def note_in_file(path: Path, touches: Sequence[Touch]) -> Calibration:
 
 
 def note_installed(root: Path | None, touches: Sequence[Touch]) -> Generation:
-    """Adds them to the installed calibration: a new generation, for generations never change."""
+    """Adds them to the installed calibration: a new generation, for generations never change.
+
+    Raises InstallError where no whole calibration is installed, or the folder or the disk does not allow it.
+    """
     folder = calibrations_folder(root)
     with locked(folder):
         current = next((g for g in generations(root) if g.current), None)

@@ -9,7 +9,7 @@ import numpy as np
 from benchmarks.scene import Noise, make_cell, zhang
 from calibrate.geometry import Array, rotation_exp
 from calibrate.lens import undistort
-from calibrate.lens_uncertainty import lens_uncertainty
+from calibrate.lens_uncertainty import LensUncertainty, lens_uncertainty
 from calibrate.projection import camera_matrix, project_pixels
 from recordings.messages import CameraModel
 
@@ -60,6 +60,15 @@ def test_it_is_the_scatter_of_repeated_calibrations() -> None:
     assert figures["centre"] < figures["corner"] <= figures["worst"]
 
 
+def test_the_figures_are_those_of_the_middle_the_worst_corner_and_the_worst_place() -> None:
+    camera = CameraModel(1280, 1024)
+    for row, column in ((0, 0), (0, 4), (2, 0), (2, 4)):
+        grid = np.array([[4.0, 2, 1, 2, 4], [2, 9, 0.5, 2, 2], [4, 2, 1, 2, 4]])
+        grid[row, column] = 5.0
+        figures = LensUncertainty(camera, np.zeros((9, 9)), grid).figures
+        assert figures == {"centre": 0.5, "corner": 5.0, "worst": 9.0}
+
+
 def test_what_is_held_is_exact_and_other_lenses_are_not_judged() -> None:
     cell = make_cell(np.random.default_rng(4), 10)
     free = lens_uncertainty(cell.views, cell.camera, 0.1)
@@ -69,3 +78,5 @@ def test_what_is_held_is_exact_and_other_lenses_are_not_judged() -> None:
     assert (held.covariance[[6, 7, 8]] == 0).all()
     fisheye = CameraModel(1280, 1024, cell.camera.matrix, (0.0,) * 4, "equidistant")
     assert lens_uncertainty(cell.views, fisheye, 0.1) is None
+    unseen = replace(cell.views.views[0], pixels=np.zeros((0, 2)), board_points=np.zeros((0, 3)))
+    assert lens_uncertainty(replace(cell.views, views=(*cell.views.views, unseen)), cell.camera, 0.1) is None

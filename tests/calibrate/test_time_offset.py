@@ -78,3 +78,18 @@ def test_bad_input_is_named() -> None:
         estimate_time_offset(robot_s, flange, camera_s[:5], seen[:5])
     with pytest.raises(BadViewsError, match="robot's times"):
         estimate_time_offset(robot_s[::-1], flange, camera_s, seen)
+    for wrong_s in (camera_s[6], camera_s[6] - 1e-3, np.nan):  # twice the same, one back, none
+        stamps_s = camera_s.copy()
+        stamps_s[7] = wrong_s
+        with pytest.raises(BadViewsError, match="camera's times"):
+            estimate_time_offset(robot_s, flange, stamps_s, seen)
+
+
+def test_pictures_from_before_and_after_the_robots_recording_are_passed_over() -> None:
+    """By 0.2 s and more: any offset that is looked for must find the robot recorded."""
+    robot_s, flange, camera_s, seen = sweep(np.random.default_rng(4), 0.02)
+    inside = (robot_s > 2.0) & (robot_s < 9.0)
+    found = estimate_time_offset(robot_s[inside], flange[inside], camera_s, seen)
+    assert found.offset_s == pytest.approx(0.02, abs=4 * found.sigma_s)
+    first_s, last_s = robot_s[inside][[0, -1]]
+    assert found.pairs == ((camera_s >= first_s + 0.2) & (camera_s <= last_s - 0.2)).sum() - 1

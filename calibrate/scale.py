@@ -18,13 +18,15 @@ class ScaleCheck:
     scale: float
     """True size over configured size."""
     sigma: float
+    """1σ of it."""
     square_m: float
     """The size that fits the robot's motion."""
     text: str
 
     @property
     def significant(self) -> bool:
-        return abs(self.scale - 1.0) > SIGNIFICANT_SIGMAS * self.sigma
+        """Not within `SIGNIFICANT_SIGMAS` of 1; what is no number is not within."""
+        return not abs(self.scale - 1.0) <= SIGNIFICANT_SIGMAS * self.sigma
 
 
 def check_scale(

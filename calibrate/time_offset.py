@@ -18,9 +18,12 @@ from calibrate.geometry import Array, rotation_angle
 
 FEWEST_PICTURES = 12
 LIMIT_S = 0.2
+"""Offsets beyond it are not looked for."""
 _STEPS = 81
+"""Of the first search, 5 ms apart."""
 _ITERATIONS = 20
 _DIFFERENCE_S = 1e-4
+"""Half the distance of the two values that give a slope."""
 
 
 @dataclass(frozen=True)
@@ -41,10 +44,12 @@ def estimate_time_offset(
     camera_s: Array,
     camera_from_board: Array,
 ) -> TimeOffset:
-    """Robot times (n,) and poses (n, 4, 4); picture times (m,) and PnP poses (m, 4, 4), both in order.
+    """Robot times (n,) and poses (n, 4, 4); picture times (m,) and PnP poses (m, 4, 4), in order; seconds.
 
-    Offsets up to ± LIMIT_S are looked for. Raises TooFewViewsError, BadViewsError for times out of order,
-    DegenerateMotionError where the motion does not determine the offset.
+    Least squares over r_i = ∠(F(t_i + τ)⁻¹ F(t_i+1 + τ)) - ∠(C_i⁻¹ C_i+1), F base_from_flange (slerp between
+    the robot's times) and C camera_from_board: the best of a grid, then Gauss-Newton with Huber's weights.
+    Raises TooFewViewsError, BadViewsError for times out of order, DegenerateMotionError where the motion does
+    not determine the offset.
     """
     for name, times in (("robot", robot_s), ("camera", camera_s)):
         if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
@@ -90,13 +95,13 @@ def _slope(residual: Callable[[float], Array], offset_s: float) -> Array:
 
 
 def _weights(r: Array) -> Array:
-    """Huber's: a picture with a wrong pose must not shift the time."""
+    """Huber's (1964), 95 % efficient at 1.345 sigmas: a picture with a wrong pose must not shift the time."""
     scale = 1.345 * max(1.4826 * float(np.median(np.abs(r))), 1e-12)
     return np.asarray(np.minimum(1.0, scale / np.maximum(np.abs(r), 1e-15)))
 
 
 def _sigma(r: Array, slope: Array, weight: Array) -> float:
-    """Sandwich estimate; neighbouring angles share a picture, so their products count too."""
+    """Sandwich estimate (Huber 1967); neighbouring angles share a picture, so their products count too."""
     score = weight * slope * r
     together = float((score**2).sum() + 2 * (score[:-1] * score[1:]).sum())
     # The sum of neighbours can be negative by chance: a quarter of the plain estimate is the least believed.

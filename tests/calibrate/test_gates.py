@@ -109,6 +109,15 @@ def test_a_scale_that_might_be_chance_does_not_close_the_gate(solution: Solution
     assert failed(judge(solution, uncertain)) == []
 
 
+@pytest.mark.parametrize(("sigmas", "closed"), [(4.9, False), (5.1, True), (float("nan"), True)])
+def test_the_board_gate_closes_beyond_five_sigmas_and_for_what_is_no_number(
+    solution: Solution, sigmas: float, closed: bool
+) -> None:
+    for sign in (-1, 1):
+        off = replace(GOOD, scale=ScaleCheck(1 + sign * 0.004 * sigmas, 0.004, 0.024, "24.0 ± 0.1 mm fit"))
+        assert (failed(judge(solution, off)) == ["board scale"]) == closed
+
+
 def test_what_cannot_be_judged_is_left_out(solution: Solution) -> None:
     bare = replace(solution, noise=None, holdout=None, predicted_error_m=None)
     names = [gate.name for gate in judge(bare, Evidence())]

@@ -92,6 +92,27 @@ def generations(root: Path | None = None) -> list[Generation]:
     return sorted(found, key=lambda generation: generation.number)
 
 
+def same_solve(one: Calibration, other: Calibration | None) -> bool:
+    """They differ at most in what people added: a reason, or a check by hand."""
+    if other is None:
+        return False
+    return msgspec.structs.replace(one, override=other.override, verification=other.verification) == other
+
+
+def before_current(known: list[Generation]) -> Generation | None:
+    """The newest whole one before the current one that is of another solve; None when there is none.
+
+    A check by hand makes a generation too: going back to the same numbers would undo nothing.
+    """
+    current = next((generation for generation in known if generation.current), None)
+    for older in reversed(known):
+        if current is None or older.number >= current.number or older.calibration is None:
+            continue
+        if not same_solve(older.calibration, current.calibration):
+            return older
+    return None
+
+
 def read_log(root: Path | None = None) -> list[LogEntry]:
     """Oldest first."""
     return read_lines(readable_folder(root) / "log.jsonl", LogEntry)

@@ -18,6 +18,7 @@ from calibrate.generations import (
     Generation,
     InstallError,
     add_generation,
+    before_current,
     calibrations_folder,
     generations,
     locked,
@@ -41,6 +42,8 @@ _ARTICLE: dict[Cell, str] = {"real": "a", "imported": "an", "simulated": "a"}
 
 WORSE_TIMES = 1.5
 """More than the estimates of two good sessions differ by chance."""
+REASON_LETTERS = 5
+"""Different ones; fewer are a pressed key, not words, in any script."""
 
 
 class InstallGateError(GateFailedError, InstallError):
@@ -96,6 +99,7 @@ def install(
                 'responsibility: calibrate install --override "REASON".'
             )
         if failed or objections:
+            _require_words(override)
             taken = Override(override.strip(), who(), [*objections, *failed])
             calibration = msgspec.structs.replace(calibration, override=taken)
         change = change_text(before, calibration)
@@ -103,16 +107,21 @@ def install(
 
 
 def rollback(root: Path | None = None, to: int | None = None, reason: str = "") -> Generation:
-    """Switches back: to the generation before the current one, or to `to`. The same switch as `install`."""
+    """Switches back: to the calibration before the current one, or to generation `to`. As `install` does.
+
+    `reason`: may be empty. Raises InstallError.
+    """
+    if reason.strip():
+        _require_words(reason)
     folder = calibrations_folder(root)
     with locked(folder):
         known = generations(root)
         current = next((g for g in known if g.current), None)
         if to is None:
-            older = [g for g in known if current is not None and g.number < current.number and not g.problem]
-            if not older:
+            older = before_current(known)
+            if older is None:
                 raise InstallError(f"{folder}: there is no older calibration to go back to.")
-            target = older[-1]
+            target = older
         else:
             target = next((g for g in known if g.number == to), None) or no_generation(folder, to, known)
         if target.calibration is None:
@@ -120,6 +129,27 @@ def rollback(root: Path | None = None, to: int | None = None, reason: str = "") 
         before = None if current is None else current.calibration
         make_current(root, target, "rollback", change_text(before, target.calibration), reason)
     return Generation(target.number, target.path, True, target.calibration)
+
+
+def reason_problem(reason: str) -> str:
+    """Why this is no reason that a person may give; empty when it is one."""
+    if len({letter for letter in reason.casefold() if letter.isalpha()}) >= REASON_LETTERS:
+        return ""
+    return f"“{reason.strip()}” is no reason: say in words why, so that it is understood in a year."
+
+
+def _require_words(reason: str) -> None:
+    if problem := reason_problem(reason):
+        raise InstallError(f"{problem} Nothing was changed.")
+
+
+def objections_beside(calibration: Calibration, root: Path | None = None) -> list[str]:
+    """What else than its gates and checks by hand makes `install` ask for a reason: the installed one.
+
+    Another robot, camera or mount than that, or much less certain.
+    """
+    before = _installed_before(root)
+    return [*_objections(calibration, before, "", ""), *_worse(calibration, before)]
 
 
 def change_text(before: Calibration | None, after: Calibration) -> str:

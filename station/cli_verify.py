@@ -25,7 +25,15 @@ from station.console import AsJson, Socket, err, out
 from station.errors import RefusedError, StationError
 from station.plan.hover import outer_corners
 from station.status import HoverOffer, StationState, StationStatus
-from station.touching import Hovering, read_offset_mm, tip_on_board_m, told_offset_mm, touch_of, two_numbers
+from station.touching import (
+    Hovering,
+    axes_words,
+    read_offset_mm,
+    tip_on_board_m,
+    told_offset_mm,
+    touch_of,
+    two_numbers,
+)
 
 
 def verify_command(
@@ -94,7 +102,8 @@ class _Visit:
                 raise RefusedError("--json asks nobody: it is for simulated cells only. Nothing moved.")
             self._root = Path((await holder.request("hello", interactive=interactive))["root"])
             await holder.request("lease", action="take")
-            corners = self._asked.corners or outer_corners(self._calibration().board)
+            self._board = self._calibration().board
+            corners = self._asked.corners or outer_corners(self._board)
             self.wanted = len(corners)
             try:
                 for number, corner in enumerate(corners):
@@ -155,7 +164,8 @@ class _Visit:
         err.print(
             f"The tip stands {height} above corner {offer.corner}. Guide it by hand (free-drive on the "
             "pendant). Either\n"
-            "  lower it straight and type how far from the corner it lands, in mm along x,y: 0.2,-0.1\n"
+            "  lower it straight and type how far from the corner it lands, in mm along the board's\n"
+            f"  {axes_words(self._board)}: 0.2,-0.1\n"
             "  or bring it exactly onto the corner, hold it, press Enter: the arm's position is read\n"
             "  (s: leave this corner out, q: no more corners)"
         )

@@ -11,7 +11,9 @@ import numpy as np
 
 from calibrate.calibration import Touch
 from calibrate.geometry import Array, inverse, transform_points
+from recordings.messages import BoardSpec
 from station.errors import RefusedError, StationError
+from station.plan.hover import outer_corners
 from station.status import HoverOffer
 
 _ARRIVED_M = 0.005
@@ -41,6 +43,12 @@ class Hovering:
     def beside_mm(self) -> Array:
         """(2,) how far the tip stands beside the place it was sent to."""
         return np.asarray(1000 * (self.tip_m[:2] - self.offer.corner_m))
+
+
+def axes_words(board: BoardSpec) -> str:
+    """Which way the board's x and y run, by corners that a person was led to."""
+    origin, x_end, _, y_end = outer_corners(board)
+    return f"x (from corner {origin} to {x_end}) and y (from {origin} to {y_end})"
 
 
 def tip_on_board_m(offer: HoverOffer, base_from_flange: Any) -> Array:

@@ -139,8 +139,8 @@ class HoverDesk:
         tip, along = tcp[:3], pose_from_rotvec(tcp[:3], tcp[3:])[:3, 2]
         if np.linalg.norm(tip) < 0.01:
             raise RefusedError(
-                "the station knows no pointer: give its length (--pointer-mm), or `pointer` in the "
-                "configuration, or set the tool centre point on the pendant"
+                "the station knows no pointer: give its length (--pointer-mm; on the screen Tab), or "
+                "`pointer` in the configuration, or set the tool centre point on the pendant"
             )
         x, y, z = (float(v) for v in along)
         return PointerConfig(tip, (x, y, z)), f"the pendant's tool, tip at {_mm(tip)} mm in the flange"

@@ -62,7 +62,7 @@ class ImproveDesk:
         if purpose not in ("improve", "best"):
             return None
         if bench.recording is None or bench.queue is None:
-            raise RefusedError("no session is open: the plan is improved from its first pictures")
+            raise RefusedError("no session is open: run the plan, and pause after its first pictures")
         if bench.queue.plan.motion != "stops":
             raise RefusedError("a sweep has no poses to improve")
         if not bench.seen and bench.queue.done:

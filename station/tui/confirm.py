@@ -39,6 +39,7 @@ class Confirm(ModalScreen[bool]):
             yield Label("Tab marks the other answer, Enter gives it; Escape: no", id="confirm-keys")
 
     def on_mount(self) -> None:
+        self.app.clear_notifications()  # they would stand before the words
         self.query_one("#no", Button).focus()
 
     def on_button_pressed(self, event: Button.Pressed) -> None:

@@ -16,6 +16,8 @@ if TYPE_CHECKING:
 LOOK_S = 0.2
 PLANNING_CHECK = f"Planning the {POSES} poses of the check … Nothing moves."
 INSTEAD = "takes the place of the loaded plan of {} poses, which was never run (a no keeps it)"
+SHELLS_REMEDY = "Run: calibrate install FILE"
+REMEDY = "3 shows the newest result, i installs it"
 CHANGED = (
     "Another plan was loaded: the drift check has no verdict. Its pictures, if any, are on screen 4 (k)."
 )
@@ -27,7 +29,8 @@ async def drift_check(app: StationApp) -> None:
         try:
             require_installed(app.link.root)
         except CalibrationError as problem:
-            app.notify(f"No drift check: {problem}", severity="warning", timeout=10)
+            why = str(problem).replace(SHELLS_REMEDY, REMEDY)
+            app.notify(f"No drift check: {why}", severity="warning", timeout=10)
             return
     before = "" if app.status is None else app.status.session.recording
     loaded = await _unused_plan(app)

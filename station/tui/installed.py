@@ -10,7 +10,7 @@ from pathlib import Path
 
 from calibrate.calibration import Calibration, read_calibration
 from calibrate.errors import CalibrationError
-from calibrate.generations import LogEntry, calibrations_folder, read_log
+from calibrate.generations import LogEntry, calibrations_folder, read_log, same_solve
 from calibrate.install import load_installed
 
 
@@ -41,12 +41,7 @@ class Installed:
         return ends[-1] if ends else ""
 
     def end_of(self, calibration: Calibration) -> Ended | None:
-        return next((end for end in self.ended if is_same(end.calibration, calibration)), None)
-
-
-def is_same(one: Calibration, other: Calibration | None) -> bool:
-    """Of the same solve; a reason or a check by hand may have come to one of them."""
-    return other is not None and (one.created, one.provenance) == (other.created, other.provenance)
+        return next((end for end in self.ended if same_solve(end.calibration, calibration)), None)
 
 
 def read_installed(root: Path) -> Installed:
@@ -65,9 +60,9 @@ def read_installed(root: Path) -> Installed:
         if was is None or entry.generation == before.generation or entry.action == "verify":
             continue  # a check by hand goes into a generation of its own, of the same solve
         how = "taken back" if entry.action == "rollback" else "replaced"
-        ended = [end for end in ended if not is_same(end.calibration, was)]
+        ended = [end for end in ended if not same_solve(end.calibration, was)]
         ended.append(Ended(was, how, _by(entry)))
-    return Installed(now, tuple(end for end in ended if not is_same(end.calibration, now)))
+    return Installed(now, tuple(end for end in ended if not same_solve(end.calibration, now)))
 
 
 def _generation(root: Path, number: int) -> Calibration | None:

@@ -13,7 +13,8 @@ from textual.widgets import Input, Label, OptionList, Static
 from textual.widgets.option_list import Option
 
 from calibrate.formats import FORMATS
-from calibrate.generations import Generation, generations
+from calibrate.generations import Generation, before_current, generations
+from calibrate.install import reason_problem
 from station.drift_check import check_arguments
 from station.tui.confirm import Confirm
 from station.tui.installed import local
@@ -61,13 +62,16 @@ class Reason(ModalScreen[str]):
             yield Label("It is not installed", id="verify-title")
             yield Static(self._refusal, markup=False)
             yield Input(id="reason", placeholder="your reason, if you take responsibility", compact=True)
+            yield Label("", id="verify-problem", markup=False)
             yield Label(
                 "Your name and the reason go into the file. Enter installs, Escape not.",
                 id="verify-keys",
             )
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
-        if event.value.strip():
+        if problem := reason_problem(event.value):
+            self.query_one("#verify-problem", Label).update(problem)
+        else:
             self.dismiss(event.value.strip())
 
 
@@ -126,16 +130,16 @@ async def _install(app: StationApp, path: str, *options: str) -> str:
 
 
 async def roll_back(app: StationApp, path: str) -> None:
-    """Asks, naming both, then switches back to the generation before the installed one."""
+    """Asks, naming both, then switches back to the calibration before the installed one."""
     root = state_root(path)
     known = generations(root)
     current = next((g for g in known if g.current), None)
-    older = [g for g in known if current is not None and g.number < current.number and not g.problem]
-    if current is None or not older:
+    older = before_current(known)
+    if current is None or older is None:
         there = "nothing is" if current is None else "only one was ever"
         app.notify(f"There is no older calibration to go back to: {there} installed.")
         return
-    body = f"Now: {_named(current)}\nBefore: {_named(older[-1])}\nConsumers then read the one before."
+    body = f"Now: {_named(current)}\nBefore: {_named(older)}\nConsumers then read the one before."
     if not await app.push_screen_wait(Confirm("Go back to the calibration before?", body, yes="Go back")):
         return
     if (

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Sequence
 from pathlib import Path
 from typing import ClassVar
 
@@ -16,10 +17,12 @@ from textual.widgets import Static
 
 from calibrate.calibration import Calibration, read_calibration
 from calibrate.errors import CalibrationError
+from calibrate.generations import same_solve
 from calibrate.geometry import difference
+from calibrate.install import objections_beside
 from calibrate.verification import agrees, touch_text
 from station.tui.elsewhere import LOOK_S, Marks, marks
-from station.tui.installed import Ended, Installed, is_same, read_installed
+from station.tui.installed import Ended, Installed, read_installed
 from station.tui.offline import state_root
 from station.tui.screen import StationScreen
 
@@ -33,14 +36,20 @@ def ended_words(end: Ended) -> str:
     return f"It was installed before, and {end.how} by {end.by}"
 
 
-def verdict_text(calibration: Calibration, state: Installed = NOTHING) -> Text:
-    """The checklist: what passed, what failed and what to do about it."""
-    installed, end = is_same(calibration, state.now), state.end_of(calibration)
+def verdict_text(
+    calibration: Calibration, state: Installed = NOTHING, objections: Sequence[str] = ()
+) -> Text:
+    """The checklist: what passed, what failed and what to do about it.
+
+    `objections`: what else installing would ask a reason for.
+    """
+    installed, end = same_solve(calibration, state.now), state.end_of(calibration)
     gates = sorted(calibration.quality.gates, key=lambda gate: gate.passed)  # the failed ones first
     touches = sorted(calibration.verification, key=agrees)
     against = [
         _many(len(calibration.quality.failed), "GATE") + " FAILED",
         _many(sum(not agrees(touch) for touch in touches), "CORNER") + " OFF BY HAND",
+        _many(len(objections), "OBJECTION"),
     ]
     against = [words for words in against if not words.startswith("0 ")]
     stamp = "" if calibration.source == "real" else f"{calibration.source.upper()}: never for a real cell\n"
@@ -53,6 +62,7 @@ def verdict_text(calibration: Calibration, state: Installed = NOTHING) -> Text:
         text.append(f"{ended_words(end)}. i installs it again\n")
     text.append(f"session {calibration.provenance.session}\n")
     for passed, words in (
+        *((False, words) for words in objections),
         *((agrees(touch), f"by hand: {touch_text(touch)}") for touch in touches),
         *((gate.passed, f"{gate.name}: {gate.text}") for gate in gates),
     ):
@@ -102,7 +112,7 @@ def change_text(calibration: Calibration, installed: Calibration | None) -> Text
     """What installing would change."""
     if installed is None:
         return Text("\nnothing is installed yet")
-    if is_same(calibration, installed):
+    if same_solve(calibration, installed):
         return Text("\nthis one is installed")
     if installed.mount != calibration.mount:
         return Text(f"\ninstalled: {installed.mount}, this one: {calibration.mount}")
@@ -166,18 +176,21 @@ class ResultScreen(StationScreen):
     @work(exclusive=True, group="load", exit_on_error=False)
     async def load(self) -> None:
         path = self._shown
-        found, why = None, NO_RESULT
+        found, why, objections = None, NO_RESULT, []
         if path:
             try:
-                self._state = await asyncio.to_thread(read_installed, state_root(path))
+                root = state_root(path)
+                self._state = await asyncio.to_thread(read_installed, root)
                 found = await asyncio.to_thread(read_calibration, Path(path))
+                objections = await asyncio.to_thread(objections_beside, found, root)
             except CalibrationError as problem:
                 why = str(problem)
         self._calibration, self._loaded = found, path  # only now: keys work on what is shown
         texts = [Text(why), Text(), Text(), Text()]
         if found is not None:
             change = change_text(found, self._state.now)
-            texts = [verdict_text(found, self._state), answer_text(found), change, residual_text(found)]
+            verdict = verdict_text(found, self._state, objections)
+            texts = [verdict, answer_text(found), change, residual_text(found)]
         for name, text in zip(("verdict", "answer", "change", "residuals"), texts, strict=True):
             self.query_one(f"#{name}", Static).update(text)
 

@@ -17,13 +17,24 @@ from textual.widgets.option_list import Option
 from calibrate.board import board_points
 from calibrate.calibration import Touch, read_calibration
 from calibrate.errors import CalibrationError
-from calibrate.verification import note_in_file, touch_text
+from calibrate.generations import same_solve
+from calibrate.install import load_installed
+from calibrate.verification import note_in_file, note_installed, touch_text
 from recordings.messages import BoardSpec
 from station.errors import RefusedError, StationError
 from station.plan.hover import outer_corners
 from station.status import HoverOffer, StationState, StationStatus
-from station.touching import Hovering, read_offset_mm, tip_on_board_m, told_offset_mm, touch_of, two_numbers
+from station.touching import (
+    Hovering,
+    axes_words,
+    read_offset_mm,
+    tip_on_board_m,
+    told_offset_mm,
+    touch_of,
+    two_numbers,
+)
 from station.tui.confirm import ConfirmGo
+from station.tui.offline import state_root
 
 if TYPE_CHECKING:
     from station.tui.app import StationApp
@@ -40,7 +51,8 @@ POINTER = "pointer's length in mm; empty: as configured, or as on the pendant"
 BY_HAND = (
     "The tip stands {height:.0f} mm above corner {corner}. Guide it by hand (free-drive on the pendant).\n"
     "Either\n"
-    "  lower it straight and type how far from the corner it lands, in mm along the board's x,y: 0.2,-0.1\n"
+    "  lower it straight and type how far from the corner it lands, in mm along the board's\n"
+    "  {axes}: 0.2,-0.1\n"
     "  or bring it exactly onto the corner, hold it and press Enter: the arm's position is read"
 )
 
@@ -66,6 +78,11 @@ class ChooseCorner(ModalScreen[int | None]):
             yield OptionList(*lines, Option(self._end(), "end"), id="corners", compact=True)
             yield Input(self.pointer_mm, id="pointer", type="number", placeholder=POINTER, compact=True)
             yield Label("Enter: that corner. Tab: the pointer's length. Escape: no more.", id="verify-keys")
+
+    def on_mount(self) -> None:
+        corners = outer_corners(self._board)
+        left = [line for line, corner in enumerate(corners) if corner not in self._found]
+        self.query_one(OptionList).highlighted = left[0] if left else len(corners)
 
     def _line(self, corner: int) -> Text:
         if (touch := self._found.get(corner)) is not None:
@@ -93,9 +110,9 @@ class Touching(ModalScreen[Touch | None]):
         Binding("escape", "leave", "Leave out", tooltip="Leave this corner out")
     ]
 
-    def __init__(self, offer: HoverOffer) -> None:
+    def __init__(self, offer: HoverOffer, board: BoardSpec) -> None:
         super().__init__()
-        self._offer = offer
+        self._offer, self._board = offer, board
         self._hovering: Hovering | None = None
         self._began = self._over = False
 
@@ -138,7 +155,8 @@ class Touching(ModalScreen[Touch | None]):
             self.dismiss(None)
             return
         height_mm = 1000 * abs(float(self._hovering.tip_m[2]))
-        words = BY_HAND.format(height=height_mm, corner=self._offer.corner)
+        axes = axes_words(self._board)
+        words = BY_HAND.format(height=height_mm, corner=self._offer.corner, axes=axes)
         self.query_one("#verify-text", Static).update(words)
         self.query_one(Input).display = True
         self.query_one(Input).focus()
@@ -183,12 +201,25 @@ async def verify(app: StationApp, path: str) -> bool:
     if not found:
         return False
     try:
-        note_in_file(Path(path), list(found.values()))
+        words = _note(Path(path), list(found.values()))
     except (CalibrationError, OSError) as problem:
         app.notify(f"Not written: {problem}", severity="error", timeout=30)
         return False
-    app.notify(f"Written into {path}")
+    app.notify(words)
     return True
+
+
+def _note(path: Path, touches: list[Touch]) -> str:
+    """Into the file, and into the installed one where it is the same; where to, in words."""
+    noted, root = note_in_file(path, touches), state_root(str(path))
+    try:
+        now = load_installed(root, allow_simulated=True)
+    except CalibrationError:
+        now = None
+    if not same_solve(noted, now):
+        return f"Written into {path}"
+    made = note_installed(root, touches)
+    return f"Written into {path} and into the installed one, now generation {made.number}"
 
 
 async def _look_at_corners(app: StationApp, path: str, board: BoardSpec) -> dict[int, Touch]:
@@ -206,7 +237,7 @@ async def _look_at_corners(app: StationApp, path: str, board: BoardSpec) -> dict
             continue
         if await app.ask("go", token=offer.go.token, plan_sha256=offer.go.plan_sha256) is None:
             continue
-        if (touch := await app.push_screen_wait(Touching(offer))) is not None:
+        if (touch := await app.push_screen_wait(Touching(offer, board))) is not None:
             found[corner] = touch
     return found
 

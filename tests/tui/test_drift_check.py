@@ -71,7 +71,9 @@ async def test_nothing_is_planned_where_nothing_is_installed(link: FakeLink, tmp
     app = app_on(link)
     async with app.run_test(size=(80, 24), notifications=True) as pilot:
         await ask_for_it(pilot)
-        await until(pilot, lambda: said(app, "nothing is installed"))
+        await until(
+            pilot, lambda: said(app, "nothing is installed. 3 shows the newest result, i installs it")
+        )
         assert link.verbs == []
 
 

@@ -14,6 +14,7 @@ from textual.widgets import Input, OptionList, Static
 from calibrate.calibration import Override, Touch, write_calibration
 from calibrate.formats import FORMATS
 from calibrate.install import InstallError, install
+from calibrate.verification import note_installed
 from recordings.messages import CameraIdentity, RobotIdentity
 from station.tui import offline
 from station.tui.confirm import Confirm
@@ -30,6 +31,7 @@ GOOD = calibration_of(
     TRUTH, RobotIdentity(serial="1", model="UR10"), CameraIdentity(serial="2", model="camera")
 )
 OFF = Touch(0, (0.0, 0.0), (9.0, 0.0), (0.1, 0.1), "told by a person", "anna", "2026-01-01T00:00:00+00:00")
+LATER = msgspec.structs.replace(GOOD, created="2026-02-01T00:00:00+00:00")
 DOUBTED = msgspec.structs.replace(GOOD, verification=[OFF])
 JOB = """
 import json, pathlib, sys
@@ -96,6 +98,9 @@ async def test_who_overrules_gives_a_reason(link: FakeLink, asked: Path, calibra
         assert OVERRIDE not in shown  # that is the shell's word
         await pilot.press("enter")  # without a reason nothing happens
         assert isinstance(pilot.app.screen, Reason)
+        await pilot.press("x", "enter")  # nor with a pressed key
+        assert isinstance(pilot.app.screen, Reason)
+        assert "say in words why" in text_of(pilot.app, "#verify-problem")
         pilot.app.screen.query_one(Input).value = "measured with the tape"
         await pilot.press("enter")
         await until(pilot, lambda: "Installed" in said(pilot))
@@ -123,13 +128,14 @@ async def test_going_back_names_both_and_asks(link: FakeLink, asked: Path, calib
     async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
         await press_on_result(pilot, calibration, "b")
         await until(pilot, lambda: "no older calibration" in said(pilot))
-        for path in (calibration.with_name("a.yaml"), calibration.with_name("b.yaml")):
-            write_calibration(GOOD, path)
+        for path, made in ((calibration.with_name("a.yaml"), GOOD), (calibration.with_name("b.yaml"), LATER)):
+            write_calibration(made, path)
             install(path, calibration.parents[2], cell="simulated")
+        note_installed(calibration.parents[2], [OFF])  # a generation more, of the same solve
         await pilot.press("b")
         await until(pilot, lambda: isinstance(pilot.app.screen, Confirm))
         body = str(pilot.app.screen.query_one("#confirm-body", Static).render())
-        assert f"Now: generation 2, session {GOOD.provenance.session}, solved" in body
+        assert f"Now: generation 3, session {GOOD.provenance.session}, solved" in body
         assert "Before: generation 1" in body
         await pilot.press("tab", "enter")
         await until(pilot, lambda: "installed again" in said(pilot))
@@ -142,6 +148,25 @@ def test_a_calibration_that_was_installed_all_the_same_says_by_whom_and_why() ->
     said = verdict_text(DOUBTED, Installed(msgspec.structs.replace(DOUBTED, override=taken))).plain
     assert "anna took responsibility: “measured with the tape”" in said
     assert "responsibility" not in verdict_text(DOUBTED, Installed(DOUBTED)).plain
+
+
+async def test_a_result_that_is_worse_than_the_installed_one_is_not_called_ready(
+    link: FakeLink, calibration: Path
+) -> None:
+    """`install` would ask for a reason: who looks at the result knows it before."""
+    assert GOOD.quality.predicted_error_mm is None
+    write_calibration(GOOD, calibration.with_name("a.yaml"))
+    install(calibration.with_name("a.yaml"), calibration.parents[2], cell="simulated")
+    vague = msgspec.structs.replace(GOOD.sigma, translation_mm=9 * GOOD.sigma.translation_mm)
+    write_calibration(msgspec.structs.replace(LATER, sigma=vague), calibration)
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+        pilot.app.result_path = str(calibration)  # type: ignore[attr-defined]
+        await pilot.press("3")
+        await until(pilot, lambda: "INSTALL" in text_of(pilot.app, "#verdict").upper())
+        told = text_of(pilot.app, "#verdict")
+        assert "1 OBJECTION: installs only with a reason" in told and "READY" not in told
+        assert "[FAIL] gate no worse: the camera's position is uncertain" in told
 
 
 def test_times_are_the_wall_clocks(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -51,6 +51,16 @@ async def test_the_harmless_answer_is_the_easy_one(link: FakeLink, answer: str) 
         assert "go" not in link.verbs
 
 
+async def test_no_notice_stands_before_the_question(link: FakeLink) -> None:
+    """On a small terminal it hid how to answer."""
+    async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+        pilot.app.notify("no session is open", timeout=3600)
+        await pilot.press("f5")
+        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmGo))
+        await until(pilot, lambda: not pilot.app._notifications)
+
+
 async def test_stop_works_inside_the_question_too(link: FakeLink) -> None:
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
@@ -145,7 +155,8 @@ async def test_changing_the_plan_on_the_way_asks_as_every_motion_does(
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
         await pilot.press("2", key)
-        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmGo))
+        await until(pilot, lambda: pilot.app.screen.query("#confirm-body"))
+        assert isinstance(pilot.app.screen, ConfirmGo)
         assert ("prepare", {"purpose": purpose, "timeout_s": PLAN_ANSWER_S}) in link.asked
         assert "go" not in link.verbs
         facts = text_of(pilot.app, "#confirm-body").splitlines()

@@ -39,6 +39,15 @@ def test_a_solved_session_is_not_to_be_solved() -> None:
     assert estimate_lines(solved)[-1] == "3 shows the final one"
 
 
+def test_a_picture_counts_until_its_pose_was_taken_again() -> None:
+    first, second, *rest = idle().session.poses
+    first = msgspec.structs.replace(first, state="done")
+    second = msgspec.structs.replace(second, kept=True)
+    session = msgspec.structs.replace(idle().session, poses=(first, second, *rest))
+    paused = msgspec.structs.replace(idle(StationState.PAUSED), session=session)
+    assert progress_lines(paused) == ["2 of 25 poses captured, 1 to be taken again"]
+
+
 def test_a_drift_check_is_to_be_judged_and_not_solved() -> None:
     check = sealed()
     check = msgspec.structs.replace(check, session=msgspec.structs.replace(check.session, check=True))

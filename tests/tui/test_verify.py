@@ -8,10 +8,11 @@ import msgspec
 import numpy as np
 import pytest
 from textual.pilot import Pilot
-from textual.widgets import Input, Static
+from textual.widgets import Input, OptionList, Static
 
 from calibrate.calibration import read_calibration, write_calibration
 from calibrate.geometry import inverse
+from calibrate.install import install, load_installed
 from recordings.messages import CameraIdentity, RobotIdentity
 from station.errors import RefusedError
 from station.plan.hover import outer_corners
@@ -117,6 +118,40 @@ async def test_what_is_told_goes_into_the_file(link: FakeLink, calibration: Path
         (touch,) = read_calibration(calibration).verification
         assert touch.offset_mm == pytest.approx((0.2, -0.2), abs=1e-6)
         assert touch.found == "told by a person"
+
+
+async def test_what_is_found_of_the_installed_one_is_noted_there_too(
+    link: FakeLink, calibration: Path
+) -> None:
+    root = calibration.parents[2]
+    install(calibration, root, cell="simulated")
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await hover(pilot, link, calibration)
+        link.show(at(0.1, 0, 80))
+        await until(pilot, lambda: "80 mm above" in shown(pilot, "#verify-text"))
+        pilot.app.screen.query_one(Input).value = "9,0"
+        await pilot.press("enter")
+        await until(pilot, lambda: isinstance(pilot.app.screen, ChooseCorner))
+        await pilot.press("escape")
+        await until(pilot, lambda: load_installed(root, allow_simulated=True).verification != [])
+        assert load_installed(root, allow_simulated=True) == read_calibration(calibration)
+
+
+async def test_the_next_corner_is_marked_and_the_boards_axes_are_told(
+    link: FakeLink, calibration: Path
+) -> None:
+    origin, x_end, _, y_end = outer_corners(TRUTH.board)
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await hover(pilot, link, calibration)
+        link.show(at(0.1, 0, 80))
+        await until(pilot, lambda: "80 mm above" in shown(pilot, "#verify-text"))
+        axes = f"x (from corner {origin} to {x_end}) and y (from {origin} to {y_end})"
+        assert axes in shown(pilot, "#verify-text")
+        pilot.app.screen.query_one(Input).value = "0.3,-0.2"
+        await pilot.press("enter")
+        await until(pilot, lambda: isinstance(pilot.app.screen, ChooseCorner))
+        await until(pilot, lambda: pilot.app.screen.query(OptionList))
+        assert pilot.app.screen.query_one(OptionList).highlighted == 1
 
 
 async def test_or_is_read_from_the_arm_once_the_tip_is_on_the_corner(

@@ -133,12 +133,15 @@ def _counted(session: SessionStatus) -> list[str]:
         return ["no plan loaded"]
     if not session.name:
         return [f"{len(session.poses)} poses planned: F5 shows the way and asks"]
-    done = sum(pose.state == "done" for pose in session.poses)
+    done = sum(pose.counts for pose in session.poses)
+    again = sum(pose.kept for pose in session.poses)
     closed = ""
     if session.recording:
         closed = ", sealed: k on 4 judges it" if session.check else ", sealed: F9 solves it"
     if session.calibration:
         closed = ", solved: 3 shows it"
+    if again and not closed:
+        closed = f", {again} to be taken again"
     return [f"{done} of {len(session.poses)} poses captured{closed}"]
 
 

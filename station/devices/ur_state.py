@@ -40,6 +40,8 @@ HANDSHAKE_S = 2.0
 SO_TIMESTAMPNS = 35
 """Linux, 64 bit: receive time by the kernel, wall clock; `socket` does not name it."""
 RECEIVE_BUFFER_BYTES = 1 << 20
+WALL_STEP_NS = 1_000_000
+"""Between two packets no wall clock is slewed by so much: it was set."""
 _TIMESPEC = struct.Struct("@qq")
 _ANCILLARY_BYTES = socket.CMSG_SPACE(_TIMESPEC.size)
 
@@ -88,6 +90,9 @@ class StateReader(threading.Thread):
         self._packets = PacketReader()
         self._pending: deque[tuple[int, bytes]] = deque()
         self._stop_read, self._stop_write = socket.socketpair()
+        self._wall_ahead_ns = _wall_ahead_ns()
+        self._wall_set_ns = 0
+        """When the wall clock was last seen to have been set (host monotonic)."""
 
     # -- the life of a connection ---------------------------------------------------------------------
 
@@ -193,7 +198,7 @@ class StateReader(threading.Thread):
                 continue
             if not data:
                 raise RtdeError("the robot closed the connection")
-            monotonic_ns, wall_ns = _arrival(ancillary)
+            monotonic_ns, wall_ns = self._arrival(ancillary)
             for kind, payload in self._packets.feed(data):
                 self._take(kind, payload, recipe, monotonic_ns, wall_ns)
 
@@ -235,13 +240,26 @@ class StateReader(threading.Thread):
             self.started.set_result(self.newest)
         self._on_state(state)
 
+    def _arrival(self, ancillary: list[tuple[int, int, bytes]]) -> tuple[int, int]:
+        """Host monotonic and wall time of the newest bytes, as the kernel saw them come.
 
-def _arrival(ancillary: list[tuple[int, int, bytes]]) -> tuple[int, int]:
-    """Host monotonic and wall time of the newest bytes, as the kernel saw them come."""
-    for level, kind, value in ancillary:
-        if level == socket.SOL_SOCKET and kind == SO_TIMESTAMPNS:
-            seconds, ns = _TIMESPEC.unpack(value)
-            wall_ns = seconds * 1_000_000_000 + ns
-            if 0 <= time.time_ns() - wall_ns < 10_000_000_000:  # else the wall clock was set in between
-                return monotonic_from_wall_ns(wall_ns), wall_ns
-    return time.monotonic_ns(), time.time_ns()
+        A stamp from before the wall clock was set is none: these bytes come now. However old another one is,
+        after a long halt of this process, it holds.
+        """
+        ahead_ns = _wall_ahead_ns()
+        if abs(ahead_ns - self._wall_ahead_ns) > WALL_STEP_NS:
+            self._wall_set_ns = time.monotonic_ns()
+        self._wall_ahead_ns = ahead_ns
+        for level, kind, value in ancillary:
+            if level == socket.SOL_SOCKET and kind == SO_TIMESTAMPNS:
+                seconds, ns = _TIMESPEC.unpack(value)
+                wall_ns = seconds * 1_000_000_000 + ns
+                arrived_ns = monotonic_from_wall_ns(wall_ns)
+                if self._wall_set_ns < arrived_ns <= time.monotonic_ns():
+                    return arrived_ns, wall_ns
+        return time.monotonic_ns(), time.time_ns()
+
+
+def _wall_ahead_ns() -> int:
+    """Wall time minus monotonic; of two looks, for a thread held up between the clocks sees too much."""
+    return min(-time.monotonic_ns() + time.time_ns() for _ in range(2))

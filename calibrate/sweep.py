@@ -17,7 +17,7 @@ from scipy.optimize import linprog
 from calibrate.board import board_points
 from calibrate.detect import detect
 from calibrate.errors import BadViewsError, TooFewViewsError
-from calibrate.geometry import Array, pose_from_rotvec
+from calibrate.geometry import Array, pose_from_rotvec, rotation_angle
 from calibrate.pnp import candidate_poses
 from calibrate.time_offset import FEWEST_PICTURES, TimeOffset, estimate_time_offset
 from calibrate.views import ImageView
@@ -29,6 +29,9 @@ UNSEEN_DELAY_S = 1e-4
 """1 sigma of the controller's shortest delay: no arrival shows it, so it stays in the offset."""
 
 _LARGEST_STAMP_S = 1e12
+_STILL_RAD_S = math.radians(0.5)
+"""A sweep turns ten times faster and more."""
+_MOMENT_S = 0.05
 
 
 def sweep_time_offset(recording: Recording, camera: CameraModel | None = None) -> TimeOffset:
@@ -52,6 +55,11 @@ def sweep_time_offset(recording: Recording, camera: CameraModel | None = None) -
             f"few for a time offset; {FEWEST_PICTURES} pictures are needed"
         )
     times, poses = (np.array(column) for column in zip(*seen, strict=True))
+    if _median_turning_rad_s(robot_s, flange, times) < _STILL_RAD_S:
+        raise BadViewsError(
+            f"{recording.path} is no sweep: the arm stood still at most of its pictures, so they say "
+            "nothing of the time. Take one with: station capture --sweep"
+        )
     found = estimate_time_offset(robot_s, flange, times, poses)
     return replace(found, sigma_s=math.hypot(found.sigma_s, UNSEEN_DELAY_S), lost=tuple(lost))
 
@@ -65,6 +73,16 @@ def _robot(recording: Recording) -> tuple[Array, Array]:
     # Arrivals may coincide where there is no controller clock; the first of them is the one on time.
     fresh = np.diff(times, prepend=-np.inf) > 0
     return times[fresh], pose_from_rotvec(tcp[fresh, :3], tcp[fresh, 3:])
+
+
+def _median_turning_rad_s(robot_s: Array, poses: Array, times: Array) -> float:
+    """How fast the arm turned when the pictures were taken; about 0 in a capture with stops."""
+    last = len(robot_s) - 1
+    before = np.clip(np.searchsorted(robot_s, times - _MOMENT_S), 0, last - 1)
+    after = np.clip(np.searchsorted(robot_s, times + _MOMENT_S), before + 1, last)
+    R = poses[:, :3, :3]
+    turned = rotation_angle(np.swapaxes(R[before], -1, -2) @ R[after])
+    return float(np.median(turned / (robot_s[after] - robot_s[before])))
 
 
 def on_host(device_s: Array, arrivals_s: Array) -> Array:

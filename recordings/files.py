@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import fcntl
 import os
 import re
@@ -95,8 +96,11 @@ def rename_new(source: Path, target: Path) -> None:
 def write_atomically(path: Path, content: bytes, mode: int = 0o640) -> None:
     """The file is the old one or the new one, never half, also when several write it or the power fails.
 
-    `mode`: its permissions, less the umask. OSError as it comes; nothing is left beside the file then.
+    `mode`: its permissions, less the umask. OSError as it comes; nothing is left beside the file then. A
+    device or a pipe is never replaced.
     """
+    if path.exists() and not path.is_file():
+        raise OSError(errno.EEXIST, "it exists and is no file", str(path))
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
     try:

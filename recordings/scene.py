@@ -18,6 +18,7 @@ from recordings.errors import RecordingError
 from recordings.files import ASKED_FOR, write_atomically
 
 TOPIC = "/plan/scene"
+_SUMMARY_BYTES = 256 * 1024
 Colour = tuple[float, float, float, float]
 """Red, green, blue, opacity, each 0…1."""
 
@@ -43,7 +44,12 @@ class Entity:
 
 
 def write_scene(path: Path, steps: Sequence[tuple[float, Sequence[Entity]]]) -> None:
-    """Writes (seconds, entities) steps in time order, whole or not at all. RecordingError with the remedy."""
+    """Writes (seconds, entities) steps in time order, whole or not at all. RecordingError with the remedy.
+
+    Only a scene is replaced: a recording's name ends like one.
+    """
+    if path.is_file() and not _is_scene(path):
+        raise RecordingError(f"{path} exists and is no scene of a plan; choose another name")
     stream = BytesIO()
     writer = Writer(stream)
     for seconds, entities in steps:
@@ -54,6 +60,13 @@ def write_scene(path: Path, steps: Sequence[tuple[float, Sequence[Entity]]]) -> 
         write_atomically(path, stream.getvalue(), ASKED_FOR)
     except OSError as error:
         raise RecordingError(f"cannot write {path}: {error.strerror}; choose another folder") from error
+
+
+def _is_scene(path: Path) -> bool:
+    """The schemas stand in the summary, at the file's end."""
+    with path.open("rb") as file:
+        file.seek(max(0, path.stat().st_size - _SUMMARY_BYTES))
+        return SceneUpdate.DESCRIPTOR.full_name.encode() in file.read()
 
 
 def _update(entities: Sequence[Entity], time_ns: int) -> Message:

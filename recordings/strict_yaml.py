@@ -100,7 +100,7 @@ def load(content: bytes, kind: type[T], under: str = "") -> T:
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError, OverflowError) as error:
         if isinstance(error, StrictYamlError):
             raise
-        raise StrictYamlError([Problem(0, "", f"not YAML: {error}")]) from None
+        raise StrictYamlError([Problem(0, "", f"not YAML: {' '.join(str(error).split())}")]) from None
     try:
         return msgspec.convert(plain, kind)
     except msgspec.ValidationError as error:
@@ -171,9 +171,10 @@ def _leaf_problems(node: yaml.Node, kind: Any, where: str) -> Iterator[Problem]:
     except msgspec.ValidationError as error:
         found = f" (found {node.value[:40]!r})" if isinstance(node, yaml.ScalarNode) else ""
         words = [str(word) for option in _options(kind) for word in _words(option)]
-        yield Problem(
-            line, where, f"must be one of {', '.join(words)}{found}" if words else f"{error}{found}"
-        )
+        said = f"must be one of {', '.join(words)}" if words else str(error)
+        if any(isinstance(option, type) and issubclass(option, msgspec.Struct) for option in _options(kind)):
+            said = "fields are needed here, each as key: value"
+        yield Problem(line, where, said + found)
         return
     if isinstance(value, float) and not math.isfinite(value):
         yield Problem(line, where, "is not a finite number")

@@ -39,6 +39,7 @@ def command_line(arguments: Sequence[str]) -> typer.Typer:
     app = typer.Typer(
         add_completion=False,
         no_args_is_help=False,
+        pretty_exceptions_enable=False,
         rich_markup_mode="markdown",
         context_settings={"help_option_names": ["-h", "--help"]},
     )
@@ -150,6 +151,10 @@ def main() -> None:
     except (StationError, RecordingError, CalibrationError) as problem:
         print(f"station: {printed(problem)}", file=sys.stderr)
         sys.exit(problem.exit_code)
+    except OSError as problem:  # of a folder that may not be written, of a full disk behind stdout
+        where = problem.filename or "the output"
+        print(f"station: {where}: {problem.strerror or problem}", file=sys.stderr)
+        sys.exit(1)
     except KeyboardInterrupt:
         sys.exit(130)
 

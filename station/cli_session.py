@@ -59,6 +59,8 @@ def demo_command(
     Exit codes: 0 done, 1 failed, 3 done with fewer poses than planned, 4 a gate failed.
     """
     require_choices(scene=scene, noise=noise, mount=mount)
+    if output is not None and output.exists() and not output.is_dir():
+        raise ConfigError(f"--out {output} is a file: name a folder for what the demo makes")
     if gige and not is_isolated():
         # Discovery broadcasts on every network: the same command again, where there is only loopback.
         command = isolated_command([sys.executable, "-m", "station.cli", *sys.argv[1:]])

@@ -37,7 +37,7 @@ def read_board(path: Path) -> BoardSpec:
 
 def read_camera(path: Path) -> CameraModel:
     """A calibration file, ROS camera_info YAML, or the fields of a camera (width, height, matrix …)."""
-    plain = _read(path)
+    plain = _read(path, "a calibration file, a camera_info file or a camera's width, height and matrix")
     if plain.get("format") == FORMAT:
         return read_calibration(path).intrinsics.model
     if "camera_matrix" in plain:
@@ -53,7 +53,7 @@ def read_camera(path: Path) -> CameraModel:
 
 def read_cell_serials(path: Path) -> tuple[str, str]:
     """(robot's, camera's) serial number of a station's configuration; empty where it names none."""
-    plain = _read(path)
+    plain = _read(path, "a station's configuration")
     robot, camera = plain.get("robot"), plain.get("camera")
     if not isinstance(robot, dict) or not isinstance(camera, dict):
         raise InputFileError(f"{path}: no station configuration, robot and camera are missing.")
@@ -93,15 +93,15 @@ def _content(path: Path) -> bytes:
     except OSError as problem:
         raise InputFileError(f"{path}: {problem.strerror or problem}.") from None
     if len(content) > _LIMIT_BYTES:
-        raise InputFileError(f"{path}: larger than {_LIMIT_BYTES} bytes.")
+        raise InputFileError(f"{path}: larger than {_LIMIT_BYTES // 1024} kB. Is it the right file?")
     return content
 
 
-def _read(path: Path) -> dict[str, Any]:
+def _read(path: Path, wanted: str) -> dict[str, Any]:
     try:
         plain = yaml.safe_load(_content(path))
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as problem:
-        raise InputFileError(f"{path}: not YAML ({problem}).") from None
+        raise InputFileError(f"{path}: not YAML ({' '.join(str(problem).split())}).") from None
     if not isinstance(plain, dict):
-        raise InputFileError(f"{path}: holds no fields.")
+        raise InputFileError(f"{path}: {wanted} is needed, and no fields are in it.")
     return plain

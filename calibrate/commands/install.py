@@ -13,7 +13,7 @@ from rich.table import Column, Table
 
 from calibrate.calibration import Calibration, Lens, read_calibration, write_output
 from calibrate.commands.files import read_cell_serials
-from calibrate.commands.output import AsJson, OutputError, check_folder, err, out, print_json
+from calibrate.commands.output import AsJson, OutputError, check_export, err, out, print_json
 from calibrate.formats import FORMATS, export
 from calibrate.formats.frames import FrameNames
 from calibrate.generations import Generation, generations, read_log, state_root
@@ -149,7 +149,7 @@ def export_file(
     if output is None:
         typer.echo(text, nl=False)
         return
-    check_folder(output)
+    check_export(output)
     write_output(output, text.encode())
 
 

@@ -13,6 +13,7 @@ from typing import Annotated, Any
 import typer
 
 from calibrate.commands.files import read_board, read_camera
+from calibrate.commands.output import OutputError
 from calibrate.gates import GateLimits, read_limits
 from calibrate.pipeline import JobOptions
 
@@ -95,6 +96,8 @@ def picture_options(
     threads: Threads = None,
 ) -> JobOptions:
     """How pictures are read."""
+    if camera is not None and find_intrinsics:
+        raise OutputError("--camera gives the lens, --find-intrinsics finds it: choose one of them.")
     return JobOptions(
         seed=seed,
         board=None if board is None else read_board(board),

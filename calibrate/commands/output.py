@@ -14,9 +14,10 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
-from calibrate.calibration import CalibrationFileError, read_calibration
+from calibrate.calibration import FORMAT, CalibrationFileError, read_calibration
 from calibrate.errors import CalibrationError
 from calibrate.load import Progress as LoadProgress
+from recordings.records import MAGIC
 
 _told_width = sys.stdout.isatty() or "COLUMNS" in os.environ
 # no markup: brackets and colons of a name are the name's own
@@ -40,7 +41,31 @@ def check_folder(target: Path) -> None:
             raise OutputError(text)
         if target.is_dir():
             raise OutputError(f"{target} is a folder; name a file in it.")
+        if target.exists() and not target.is_file():
+            raise OutputError(f"{target} is a device or a pipe; name a file.")
     except PermissionError as problem:
+        raise OutputError(f"{target}: {problem.strerror}. Name another place.") from None
+
+
+def check_page(target: Path) -> None:
+    """A report may be replaced; anything else that stands there, the recording say, is left alone."""
+    check_folder(target)
+    if target.exists() and not _beginning(target).startswith(b"<!doctype html>"):
+        raise OutputError(f"{target} exists and is no report; give the report another name.")
+
+
+def check_export(target: Path) -> None:
+    """What an arm or a solve was needed for is not replaced by a file that one command makes again."""
+    check_folder(target)
+    if target.exists() and _beginning(target).startswith((MAGIC, f"format: {FORMAT}".encode())):
+        raise OutputError(f"{target} is a recording or a calibration file; give another name with -o.")
+
+
+def _beginning(target: Path) -> bytes:
+    try:
+        with target.open("rb") as file:
+            return file.read(64)
+    except OSError as problem:
         raise OutputError(f"{target}: {problem.strerror}. Name another place.") from None
 
 

@@ -14,7 +14,15 @@ from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, bounded
 from calibrate.calibration import Touch, write_calibration
 from calibrate.commands.install import Root, history_rows
 from calibrate.commands.job import MemoryLimit, TimeLimit, job_options, picture_options, takes
-from calibrate.commands.output import AsJson, check_folder, check_target, detection_progress, out, print_json
+from calibrate.commands.output import (
+    AsJson,
+    OutputError,
+    check_page,
+    check_target,
+    detection_progress,
+    out,
+    print_json,
+)
 from calibrate.errors import CalibrationError
 from calibrate.frames import camera_frames
 from calibrate.geometry import rotation_log
@@ -64,7 +72,9 @@ def solve(
     target = output or Path(f"{recording.name.removesuffix('.mcap')}.calibration.yaml")
     check_target(target)
     if report is not None:
-        check_folder(report)
+        check_page(report)
+        if report.resolve() == target.resolve():
+            raise OutputError(f"{target} cannot be calibration and report; give --report another name.")
     with bounded(time_limit_s, memory_limit_mib), detection_progress() as progress:
         job = solve_recording(recording, options, progress)
     write_calibration(job.calibration, target)
@@ -122,7 +132,7 @@ def report_file(
     It opens in any browser, without a network.
     """
     target = output or Path(f"{recording.name.removesuffix('.mcap')}.report.html")
-    check_folder(target)
+    check_page(target)
     with bounded(time_limit_s, memory_limit_mib), detection_progress() as progress:
         job = solve_recording(recording, options, progress)
     _write_report(job, target, options, root)

@@ -63,6 +63,8 @@ def plan_command(
 
     Exit codes: 0 it may be run, 1 the check lists what is wrong, 2 usage or configuration.
     """
+    if output is not None and check is None:
+        _require_replaceable(output)
     cell, standing = _cell(config, scene, start)
     criterion: Criterion = "D" if d_optimal else "A"
     plan = _given(cell, standing, check, from_list, taught)
@@ -86,6 +88,15 @@ def plan_command(
         _show(told, outcome, drawn, cut, output if check is None else None, cell.capture.goal_m)
     if outcome.problems:
         raise typer.Exit(LimitError.exit_code)
+
+
+def _require_replaceable(output: Path) -> None:
+    """A plan may be replaced; anything else that stands there, the configuration say, is left alone."""
+    if output.exists():
+        try:
+            load_plan(output)
+        except ConfigError:
+            raise ConfigError(f"{output} exists and is no plan; give another name with -o") from None
 
 
 def _cell(config: Path | None, scene: str, start: str | None) -> tuple[StationConfig, list[float] | None]:

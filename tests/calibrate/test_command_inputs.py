@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -160,3 +161,58 @@ def test_a_view_given_twice_is_refused_by_solve_and_check(
     said = ("Views 3 (", "and 11 (again) are one", "--without 11")
     refused(run("solve", twice, cwd=tmp_path), 1, *said)
     refused(run("check", twice, "--calibration", real_file, cwd=tmp_path), 1, *said)
+
+
+def test_what_an_arm_or_a_solve_was_needed_for_is_never_written_over(
+    session_file: Path, real_file: Path, tmp_path: Path
+) -> None:
+    """A slip of the name after -o must not cost a recording, a calibration or a device."""
+    recording = Path(shutil.copy(session_file, tmp_path / "s.mcap"))
+    calibration = Path(shutil.copy(real_file, tmp_path / "c.yaml"))
+    (tmp_path / "notes.txt").write_text("mine")
+    for name in ("s.mcap", "c.yaml", "notes.txt"):
+        refused(run("report", recording, "-o", name, cwd=tmp_path), 2, f"{name} exists and is no report")
+        told = run("solve", recording, "-o", "new.yaml", "--report", name, cwd=tmp_path)
+        refused(told, 2, f"{name} exists and is no report")
+    same = run("solve", recording, "-o", "new.yaml", "--report", "./new.yaml", cwd=tmp_path)
+    refused(same, 2, "new.yaml cannot be calibration and report")
+    for name in ("s.mcap", "c.yaml"):
+        refused(
+            run("export", calibration, "--to", "json", "-o", name, cwd=tmp_path), 2, f"{name} is a recording"
+        )
+    for _ in range(2):
+        assert run("export", calibration, "--to", "json", "-o", "c.json", cwd=tmp_path).returncode == 0
+    os.mkfifo(tmp_path / "pipe")
+    for command in (("report", recording), ("export", calibration, "--to", "json"), ("solve", recording)):
+        refused(run(*command, "-o", "pipe", cwd=tmp_path), 2, "pipe is a device or a pipe")
+    assert recording.read_bytes() == session_file.read_bytes()
+    assert calibration.read_bytes() == real_file.read_bytes()
+    assert (tmp_path / "pipe").is_fifo() and (tmp_path / "notes.txt").read_text() == "mine"
+    assert not (tmp_path / "new.yaml").exists()
+
+
+def test_a_file_of_another_kind_is_named_with_what_to_give(session_file: Path, tmp_path: Path) -> None:
+    said = ("is a recording, no calibration file", f"calibrate solve {session_file}")
+    refused(run("install", session_file, cwd=tmp_path), 1, *said)
+    refused(run("show", session_file, cwd=tmp_path), 1, *said)
+    for name, content, about in (
+        ("empty", b"", "no fields are in it"),
+        ("latin", b"caf\xe9: 1\n", "not YAML"),
+        ("cut", b"a: [1,2\n", "not YAML"),
+        ("huge", b"#" * 300_000, "larger than 256 kB"),
+    ):
+        path = tmp_path / f"{name}.yaml"
+        path.write_bytes(content)
+        done = run("solve", session_file, "--camera", path, cwd=tmp_path)
+        refused(done, 2, f"{name}.yaml: ", about)
+        assert done.stderr.count("\n") == 1, "one line says it"
+    word = tmp_path / "word.yaml"
+    word.write_text("board\n")
+    refused(run("solve", session_file, "--board", word, cwd=tmp_path), 2, "fields are needed here")
+
+
+def test_options_that_contradict_each_other_are_refused(
+    session_file: Path, real_file: Path, tmp_path: Path
+) -> None:
+    done = run("solve", session_file, "--camera", real_file, "--find-intrinsics", cwd=tmp_path)
+    refused(done, 2, "choose one of them")

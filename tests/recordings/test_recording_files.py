@@ -173,6 +173,13 @@ def test_a_small_file_that_cannot_be_written_stays_as_it_was(
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"], "and no scraps beside it"
 
 
+def test_a_pipe_or_a_device_is_never_replaced_by_a_file(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(OSError, match="is no file"):
+        write_atomically(tmp_path / "pipe", b"new")
+    assert (tmp_path / "pipe").is_fifo() and len(list(tmp_path.iterdir())) == 1
+
+
 @pytest.mark.parametrize(("call", "found"), [("fsync", b"old"), ("rename", b"old"), ("close", NEW)])
 def test_a_small_file_is_never_half_after_a_kill(tmp_path: Path, call: str, found: bytes) -> None:
     path = tmp_path / "a.json"

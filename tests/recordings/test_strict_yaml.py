@@ -70,7 +70,7 @@ def test_all_problems_come_in_one_report_with_their_lines() -> None:
         ("[" * 100_000, "nested"),
         ("", "empty"),
         ("inner: {speed_m_s: 1", "line 1"),
-        ("- 1", "object"),
+        ("- 1", "fields are needed here"),
         ("x" * 300_000, "larger than 256 kB"),
     ],
 )

@@ -184,6 +184,8 @@ def test_the_demo_finds_the_truth(tmp_path: Path) -> None:
     assert result["truth_error"]["rotation_deg"] <= 0.05
     for name in ("recording", "calibration", "report"):
         assert Path(result[name]).is_file()
+        (("demo", "--out", __file__), 2, "is a file: name a folder"),
+        (("serve", "--simulate", "--root", __file__), 1, f"{__file__}"),
 
 
 @pytest.mark.parametrize(

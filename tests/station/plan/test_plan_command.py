@@ -14,6 +14,7 @@ from station.cli import main
 from station.plan.files import load_plan, save_plan
 from station.simulation.scenes import build_cell, cell_config
 from tests.command_line import call
+from tests.recordings.small_recording import write_small
 
 run = partial(call, main, "plan")
 
@@ -24,6 +25,11 @@ def made(tmp_path_factory):
     files = {name: folder / name for name in ("plan.yaml", "plan.png", "plan.mcap")}
     options = ["-o", files["plan.yaml"], "--picture", files["plan.png"], "--foxglove", files["plan.mcap"]]
     return run("--poses", 12, *options), files
+
+
+@pytest.fixture
+def small_recording(tmp_path):
+    return write_small(tmp_path / "session.mcap")
 
 
 def test_a_plan_is_made_shown_and_saved(made):
@@ -134,3 +140,19 @@ def test_checking_needs_no_lens_but_a_picture_does(made, tmp_path):
     refused = run(*check, "--picture", tmp_path / "plan.png")
     assert refused.returncode == 2
     assert "rough lens" in refused.stderr.replace("\n", " ")
+
+
+def test_only_plans_and_scenes_are_written_over(made, tmp_path, small_recording):
+    """A slip of the name must not cost a configuration or a recording."""
+    truth = build_cell("paper", 0, "low", "eye-in-hand")
+    config = tmp_path / "cell.yaml"
+    config.write_bytes(msgspec.yaml.encode(cell_config(truth, "127.0.0.1")))
+    before = config.read_bytes(), small_recording.read_bytes()
+    refused = run("--config", config, "-o", config)
+    assert refused.returncode == 2 and "cell.yaml exists and is no plan" in refused.stderr
+    files = made[1]
+    check = ["--config", config, "--check", files["plan.yaml"], "--foxglove"]
+    refused = run(*check, small_recording)
+    assert refused.returncode == 1 and "exists and is no scene of a plan" in refused.stderr
+    assert (config.read_bytes(), small_recording.read_bytes()) == before
+    assert run(*check, files["plan.mcap"]).returncode == 0

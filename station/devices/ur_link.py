@@ -121,7 +121,10 @@ class UrLink:
                 "correct robot.serial or robot.host"
             )
         if self._lock is not None and found.serial != self._identity.serial:
-            raise RobotError(f"another robot (serial {found.serial}) answers at {host} now; end this session")
+            raise RobotError(
+                f"another robot (serial {found.serial}) answers at {host} now: finish this session, then "
+                "start the station's daemon anew"
+            )
         self.remote, self.program = found.remote, found.program
 
     def _adopt(

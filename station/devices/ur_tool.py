@@ -28,7 +28,7 @@ FACTORY_LIMIT = (0.02, math.radians(2.0))
 LONGEST_M = 1.0
 _MODEL_REMEDY = "check robot.model and robot.kinematics in the configuration"
 _CHANGED = "the TCP offset on the pendant was changed during the session"
-_CHANGED_REMEDY = "set it back, or end this session and begin a new one"
+_CHANGED_REMEDY = "set it back, or finish this session and start the station's daemon anew"
 
 
 class TcpCheck:

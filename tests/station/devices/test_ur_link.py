@@ -57,7 +57,7 @@ def test_another_robot_than_before_is_refused_when_the_link_comes_back(tmp_path:
     link._lock = RobotLock("2016", tmp_path)
     link._identity = msgspec.structs.replace(link.identity, serial="2016")
     link._check_identity(ProbeResult(serial="2016"))
-    with pytest.raises(RobotError, match=r"another robot .*1999.* end this session"):
+    with pytest.raises(RobotError, match=r"another robot .*1999.* start the station.s daemon anew"):
         link._check_identity(ProbeResult(serial="1999"))
     link._unlock()
 

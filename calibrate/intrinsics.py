@@ -24,8 +24,11 @@ LensModel = Literal["plumb_bob", "rational_polynomial", "equidistant"]
 
 FEWEST_VIEWS = 3
 _SIGNIFICANT_SIGMAS = 2.0
+"""A coefficient that is nearer to zero is not told from it."""
 _LARGEST_BEND_PX = 1.0
+"""By which such a one may bend the picture's corner (1σ) and still be left free."""
 _LARGEST_CENTRE_SIGMA_SHARE = 0.03
+"""Of the picture's longer side: a principal point known worse (1σ) is held."""
 _STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-9)
 _POWERS = {"k1": 3, "k2": 5, "p1": 2, "p2": 2, "k3": 7}
 """Of the distance from the middle, by which a coefficient bends."""
@@ -36,6 +39,7 @@ _NAMES = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"
 class Intrinsics:
     camera: CameraModel
     rms_px: float
+    """Of the corners' distances from where the lens shows them; without dropped views."""
     view_rms_px: dict[int, float]
     """Pose number → rms over its corners."""
     sigma: dict[str, float]
@@ -61,7 +65,7 @@ class _Fit:
 
 
 def calibrate_intrinsics(views: ViewSet, model: LensModel = "plumb_bob") -> Intrinsics:
-    """Fits the lens to all views; a view that fits four times worse than the median is left out.
+    """Fits the lens to all views, leaving out those four times worse than the median until there is none.
 
     Raises TooFewViewsError below three views, BadViewsError when no lens explains the corners.
     """
@@ -72,7 +76,7 @@ def calibrate_intrinsics(views: ViewSet, model: LensModel = "plumb_bob") -> Intr
         )
     dropped: dict[int, str] = {}
     used = views
-    for _ in range(3):
+    while True:
         try:
             fit, held = _FITS[model](used)
         except (cv2.error, np.linalg.LinAlgError) as problem:

@@ -15,6 +15,7 @@ from recordings.messages import CameraModel
 
 _FALSE_ALARM = 1e-5
 _FEWEST_VIEWS = 10
+"""Fewer would have to tell nine parameters of the lens from chance."""
 _ORIGINS = {
     1.0: "if the first pixel is counted as 1",
     0.5: "if pixel coordinates start at the corner of the first pixel",
@@ -26,9 +27,12 @@ the picture's exact middle there: nobody measured it."""
 
 
 def check_lens(observed: Observations, held: Estimate) -> str:
-    """A sentence when refining the held intrinsics would change them beyond chance (Wald test), else "".
+    """A sentence when refining the held intrinsics would change them beyond chance, else "".
 
-    A principal point counted from another origin is named first.
+    Wald's test: with d their change and C its covariance, dᵀ C⁻¹ d / 9 follows F(9, 3n - 6) if they hold, n
+    views. A principal point counted from another origin is named first. `held`: the estimate with the given
+    lens. "" for fewer than ten views too, without pixels, for lenses other than plumb_bob, where the views
+    determine no lens.
     """
     camera = held.state.camera
     if len(held.state.C) < _FEWEST_VIEWS or not observed.has_pixels or camera.distortion_model != "plumb_bob":

@@ -51,6 +51,12 @@ def test_a_principal_point_counted_from_another_origin_is_said(offset, says):
     assert "exact middle" in warning
 
 
+def test_nine_views_are_too_few_to_blame_a_lens():
+    views = moved_centre(make_cell(np.random.default_rng(2), 25, LOW).views, 1.0)
+    assert solve_views(views.select(list(range(9))), QUICK).warnings == ()
+    assert len(solve_views(views.select(list(range(10))), QUICK).warnings) == 1
+
+
 def test_a_middle_that_the_pictures_confirm_is_left_alone():
     """Half the width is a fine principal point where it is the true one."""
     c = make_cell(np.random.default_rng(2), 25, LOW)

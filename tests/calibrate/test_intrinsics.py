@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -64,6 +65,34 @@ def test_what_the_pictures_cannot_tell_is_held_and_said() -> None:
     assert "k3" not in found.sigma
 
 
+def nearly_frontal(tilt_rad: float, distance_m: float) -> list[Array]:
+    return [
+        pose(rotation_exp([tilt_rad * np.cos(a), tilt_rad * np.sin(a), 0]), [-0.075, -0.06, distance_m])
+        for a in np.linspace(0, 6, 8)
+    ]
+
+
+def test_pictures_that_face_the_board_fix_no_principal_point() -> None:
+    """All that is held has no sigma and its nominal value, and is named to the solver, which holds it too."""
+    found = calibrate_intrinsics(views_of(CAMERA, nearly_frontal(0.15, 1.0), 0.3))
+    assert found.held_names == ("cx", "cy", "k1", "k2", "k3")
+    assert set(found.sigma) == {"fx", "fy", "p1", "p2"}
+    assert [text.split(" held at")[0] for text in found.held] == ["principal point", "k3", "k2", "k1"]
+    K, D = np.array(found.camera.matrix), np.array(found.camera.distortion)
+    assert (K[0, 2], K[1, 2]) == (239.5, 191.5)
+    assert (D[[0, 1, 4]] == 0).all() and (D[[2, 3]] != 0).all()
+    known_px = re.search(r"only to (\d+) px", found.held[0])
+    assert known_px is not None and int(known_px[1]) > 0.03 * 480
+    assert calibrate_intrinsics(views_of(CAMERA, around(25), 0.02)).held_names == ()
+
+
+def test_a_rational_lens_holds_its_principal_point_too() -> None:
+    found = calibrate_intrinsics(views_of(CAMERA, nearly_frontal(0.2, 1.5), 0.4), "rational_polynomial")
+    (text,) = found.held
+    assert text.startswith("principal point held at the centre") and not {"cx", "cy"} & set(found.sigma)
+    assert np.array(found.camera.matrix)[:2, 2].tolist() == [239.5, 191.5]
+
+
 def test_one_view_with_wrong_corners_is_left_out_and_named() -> None:
     views = views_of(CAMERA, around(10))
     bad = replace(
@@ -74,6 +103,20 @@ def test_one_view_with_wrong_corners_is_left_out_and_named() -> None:
     assert set(found.dropped) == {4}
     assert "the median is" in found.dropped[4]
     assert np.array(found.camera.matrix)[0, 0] == pytest.approx(620.0, rel=0.01)
+
+
+def test_worse_views_do_not_hide_the_less_bad_ones() -> None:
+    """Each round of leaving out lowers the median, by which the next are found: here in the third."""
+    noise_px = np.repeat([0.0, 0.6, 2.5, 12.0, 60.0], [5, 2, 3, 3, 2])
+    views = views_of(CAMERA, around(15), 0.05)
+    rng = np.random.default_rng(0)
+    shaken = (
+        replace(v, pixels=v.pixels + rng.normal(0, s, (42, 2))) for v, s in zip(views, noise_px, strict=True)
+    )
+    found = calibrate_intrinsics(replace(views, views=tuple(shaken)))
+    assert set(found.dropped) == set(range(5, 15))
+    assert set(found.view_rms_px) == set(range(5))
+    assert found.rms_px < 0.1
 
 
 def test_fisheye_and_rational_lenses() -> None:

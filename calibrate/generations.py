@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Literal
+from typing import Literal, NoReturn
 
 import msgspec
 
@@ -138,7 +138,7 @@ def add_generation(
 def make_current(
     root: Path | None, generation: Generation, action: Action, change: str, reason: str = ""
 ) -> None:
-    """Switches to it, and writes that down. Inside `locked` only."""
+    """Switches to it, and writes that down. In `locked` only. InstallError where it does not read back."""
     folder = calibrations_folder(root)
     _switch(folder, generation.path.name, generation.path.read_bytes())
     entry = LogEntry(_now_text(), action, generation.number, who(), change, reason)
@@ -215,7 +215,8 @@ def locked(folder: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def no_generation(folder: Path, number: int, known: list[Generation]) -> Generation:
+def no_generation(folder: Path, number: int, known: list[Generation]) -> NoReturn:
+    """Raises InstallError, which names those that there are."""
     have = ", ".join(str(g.number) for g in known) or "none"
     raise InstallError(f"{folder}: there is no generation {number}; there are: {have}.")
 

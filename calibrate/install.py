@@ -153,7 +153,7 @@ def objections_beside(calibration: Calibration, root: Path | None = None) -> lis
 
 
 def change_text(before: Calibration | None, after: Calibration) -> str:
-    """'0.12 mm, 0.004° from generation before', or empty when there was none of the same frames."""
+    """'0.120 mm, 0.0040° from the one before', lengths of δt and δφ; empty without one of the same mount."""
     if before is None or before.mount != after.mount:
         return ""
     delta = difference(after.transform.matrix, before.transform.matrix)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -57,9 +57,11 @@ class Settled:
     """Those that the estimate rests on: the good ones, and what is of worth in the others."""
     estimate: Estimate
     verdict: Judgement
-    """On all views."""
+    """On all views, by the good ones."""
     boards: BoardPoses
     """Of all views, by their own corners and the final lens."""
+    doubts: dict[int, float] = field(default_factory=dict)
+    """By place, the good ones that count in part: how likely they are bad."""
 
     @property
     def observed(self) -> Observations:
@@ -90,11 +92,11 @@ def fit_views(
     watch.lap("maximum likelihood")
     finding, settled = _with_kinematics(views, group, settled, kinematic_prior, reject)
     watch.lap("robot systematics")
+    before = settled
+    settled = _with_worths(before) if reject else before
     places = settled.places
     bad = np.setdiff1d(np.arange(len(views)), places)
-    full = replace(settled.estimate.state, C=settled.boards.C)
-    rejected = explain(views, full, settled.verdict, bad)
-    settled = _with_worths(settled) if reject else settled
+    rejected = explain(views, replace(before.estimate.state, C=before.boards.C), before.verdict, bad)
     pairs = all_pairs(H[places], settled.boards.C[places])
     problem = f"chordal objective over all {len(pairs)} pairs of the {len(places)} used views"
     certified = solve_global(pairs, seed, problem)
@@ -127,11 +129,16 @@ def _settle(group: Settled, reject: bool) -> Settled:
 
 
 def _judged(everything: Observations, fitted: Places, result: Estimate, boards: BoardPoses) -> Settled:
-    """Board poses are sought from those before, which another lens hardly moves and nothing else does."""
-    if result.intrinsics_free:
-        boards = refine_board_poses(everything, replace(result.state, C=boards.C))
+    boards = _boards_seen_by(result, everything, boards)
     verdict = judge_views(everything, result, boards, fitted)
     return Settled(everything, fitted, fitted, result, verdict, boards)
+
+
+def _boards_seen_by(result: Estimate, everything: Observations, before: BoardPoses) -> BoardPoses:
+    """Sought from those before, which another lens hardly moves and nothing else does."""
+    if not result.intrinsics_free:
+        return before
+    return refine_board_poses(everything, replace(result.state, C=before.C))
 
 
 def _again(settled: Settled, fitted: Places) -> Settled:
@@ -174,18 +181,25 @@ def _with_kinematics(
 
 
 def _with_worths(settled: Settled) -> Settled:
-    """Estimated also by what the bad views are worth, at the noise scales of the good ones."""
+    """Estimated also by what the bad views are worth, at the noise scales of the good ones.
+
+    A view that came within the limit may be bad by all that is known of the kinds.
+    """
     usable = ~settled.verdict.blurred
     if len(settled.places) == usable.sum():
         return settled
     found = number_worths(settled.verdict.linear, settled.places, usable)
+    good = np.setdiff1d(settled.places, found.bad)
+    places = good if len(good) >= _FEWEST else settled.places
     everything = replace(settled.everything, worth=found.worth)
     fitted = np.flatnonzero(found.worth.any(axis=1))
     before = settled.estimate
     start = replace(before.state, C=settled.boards.C[fitted])
     result = estimate(everything.part(fitted), start, before.intrinsics_free, before.sigma, fit_scales=False)
     result = replace(result, joint_covariance=widen(result.joint_covariance, found.lost))
-    return replace(_judged(everything, fitted, result, settled.boards), places=settled.places)
+    boards = _boards_seen_by(result, everything, settled.boards)
+    doubts = {int(i): float(found.chance_bad[i]) for i in places if found.chance_bad[i]}
+    return Settled(everything, places, fitted, result, settled.verdict, boards, doubts)
 
 
 def _require_plausible_noise(result: Estimate) -> None:

@@ -4,8 +4,8 @@ At an estimate each view is one miss of six numbers, linear in X, Y (and kinemat
 covariance known up to the robot's two scales. A bad view has a wider error (`bad_kinds.py`).
 Expectation-maximisation (Dempster, Laird, Rubin 1977) weighs each view by its chance to be good. It starts at
 the tightest 60 % (least trimmed squares: Rousseeuw 1984), as many bad views together widen the scales until
-each of them seems likely. What it finds is believed only where it explains the views better than that all are
-good. The lens is held.
+each of them seems likely. What it finds is believed unless it is far likelier that all are good. The lens is
+held.
 """
 
 from __future__ import annotations
@@ -33,6 +33,8 @@ _FEWEST_WEIGHED = 4.0
 """Fewer do not tell X, Y and two scales."""
 _FEWEST_GOOD = 6
 """With fewer left the mixture is not believed."""
+_COST_OF_KEEPING = 3.0
+"""Bad views kept do this many times the harm of good ones left out, which still count by their worth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,8 +90,8 @@ def find_good_views(misses: LinearMisses, group: Places, usable: NDArray[np.bool
     inside = np.intersect1d(good, whole)
     if not _FEWEST_GOOD <= len(inside) < len(whole):
         return group
-    likelier = _evidence(misses, whole, inside) > _evidence(misses, whole, whole)
-    return good if likelier else group
+    gained = _evidence(misses, whole, inside) - _evidence(misses, whole, whole)
+    return good if gained > -np.log(_COST_OF_KEEPING) else group
 
 
 def _weigh(misses: LinearMisses, group: Places, usable: NDArray[np.bool_]) -> Places:

@@ -63,6 +63,7 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
     holdout = _holdout(fit, free) if options.holdout else None
     watch.lap("hold-out")
     indices = [view.index for view in fit.views]
+    in_doubt = {indices[place]: chance for place, chance in settled.doubts.items()}
     return Solution(
         mount=views.mount,
         profile="robust",
@@ -89,7 +90,8 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
         residual_px={indices[i]: float(settled.boards.rms_px[i]) for i in places},
         residual_robot=_robot_misses(settled, indices),
         frames_finding=frames_finding,
-        warnings=_warnings(fit, options, result, (lens_finding, frames_finding)),
+        in_doubt=in_doubt,
+        warnings=_warnings(fit, options, result, in_doubt, (lens_finding, frames_finding)),
         stage_ms=watch.stage_ms,
         solve_ms=watch.total_ms,
         seed=options.seed,
@@ -139,13 +141,23 @@ def _robot_misses(settled: Settled, indices: list[int]) -> dict[int, tuple[float
 
 
 def _warnings(
-    fit: Fit, options: SolveOptions, result: Estimate, findings: tuple[str, ...]
+    fit: Fit,
+    options: SolveOptions,
+    result: Estimate,
+    in_doubt: dict[int, float],
+    findings: tuple[str, ...],
 ) -> tuple[str, ...]:
     warnings = [finding for finding in findings if finding]
     if options.intrinsics_from_same_pictures and not result.intrinsics_free:
         warnings.append(
             "The intrinsics came from the same pictures but could not be refined with X (only the plumb_bob "
             "model can): their uncertainty is not in the stated sigma."
+        )
+    if in_doubt:
+        chances = ", ".join(f"{index + 1} ({chance:.0%})" for index, chance in in_doubt.items())
+        warnings.append(
+            f"In doubt, so counted in part: view {chances}, in brackets how likely it is wrong. "
+            "Retake to be sure."
         )
     if not result.converged:
         warnings.append(f"The final estimate had not settled after {result.steps} steps.")

@@ -189,6 +189,8 @@ class Solution:
     """The used views as the solver read them, boards turned where that was needed."""
     turned: tuple[int, ...] = ()
     """Views whose corner order was turned by 180° to agree with the others, and kept."""
+    in_doubt: dict[int, float] = field(default_factory=dict)
+    """Used views that count in part, by pose number: the chance that they are wrong."""
     noise: NoiseScales | None = None
     budget: ErrorBudget | None = None
     systematics: RobotSystematics | None = None

@@ -29,7 +29,8 @@ _FIRST_KINDS = np.append((1 - _WHOLE) * np.exp(LOG_KINDS), np.full(len(SIZES), _
 _WIDEST = 2.0
 """Times a sigma: guessing at the kinds makes X no more uncertain than this."""
 _DOUBT = 0.2
-"""Chance to be bad below which a view counts fully: else gross errors elsewhere would cost good views."""
+"""Chance to be bad below which a view counts fully (else gross errors elsewhere would cost good views), and
+chance to be good below which it is bad."""
 _NOTHING = 0.02
 """A number that is worth less is not used at all."""
 
@@ -40,6 +41,12 @@ class Worths:
     """(n, 6) factors 0…1 on the residuals of the numbers."""
     lost: Array
     """(g, g) information on X, Y (and kinematic errors) that is lost as the kinds are only guessed."""
+    chance_bad: Array
+    """(n,) 0 of those that count fully."""
+
+    @property
+    def bad(self) -> Places:
+        return np.flatnonzero(self.chance_bad > 1 - _DOUBT)
 
 
 def number_worths(misses: LinearMisses, good: Places, usable: NDArray[np.bool_]) -> Worths:
@@ -69,7 +76,7 @@ def number_worths(misses: LinearMisses, good: Places, usable: NDArray[np.bool_])
     J = misses.by_global
     spread = _spread(left, covariance, misses.sigma, chances)
     lost = np.einsum("nia,nij,njb->ab", J[usable], spread[usable], J[usable], optimize=True)
-    return Worths(np.where(worth < _NOTHING, 0.0, worth), np.asarray(lost))
+    return Worths(np.where(worth < _NOTHING, 0.0, worth), np.asarray(lost), chances.sum(axis=1))
 
 
 def _weigh(left: Array, covariance: Array, sigma: Array, odds: Array) -> tuple[Array, Array]:

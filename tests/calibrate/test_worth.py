@@ -5,7 +5,7 @@ import pytest
 from scipy.special import softmax
 
 from calibrate.bad_kinds import SIZES, bad_kinds
-from calibrate.mixture import LinearMisses
+from calibrate.mixture import LinearMisses, find_good_views
 from calibrate.worth import number_worths, widen
 
 SIGMA = np.array([3e-4, 5e-4])
@@ -38,6 +38,18 @@ def test_nothing_is_used_of_a_view_that_is_wrong_in_everything(seed):
     found = worths(misses_of(rng, error=1000 * rng.choice([-1, 1], 6)))
     assert (found.worth[0] == 0).all()
     assert (found.worth[1:] > 1 - 1e-6).mean() > 0.8
+
+
+@pytest.mark.parametrize("seed", [14, 33])
+def test_where_all_good_is_hardly_likelier_than_some_bad_the_bad_ones_are_left_out(seed):
+    """What is left out by mistake still counts by its worth, so keeping is the worse mistake."""
+    rng = np.random.default_rng(seed)
+    misses = misses_of(rng, 25)
+    for bad in range(3):
+        number = rng.integers(6)
+        misses.miss[bad, number] += 7 * ROBOT[number]
+    everyone = np.arange(25)
+    np.testing.assert_array_equal(find_good_views(misses, everyone, everyone >= 0), everyone[3:])
 
 
 @pytest.mark.parametrize("number", range(6))

@@ -21,6 +21,8 @@ from station.tui.words import POSE_MARKS
 COLUMNS = ("#", "pose", "state", "± then", "why it is there / what happened", "try", "corners")
 NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves); a adds the arm's posture."
 PLANNING = "Planning 25 poses … (seconds; minutes on a busy computer). Nothing moves."
+RETAKE = "Take this pose again at the next run; the picture it has counts until then"
+SKIP = "Leave this pose out; of one that has a picture only its retake"
 MOVE = Binding.Group("Move", compact=True)
 SIGMA_SHOWN_MM = 100.0
 
@@ -57,8 +59,8 @@ class PlanScreen(StationScreen):
         "as planned."
     )
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("r", "pose('retake')", "Retake", tooltip="Take this pose again at the next run"),
-        Binding("s", "pose('skip')", "Skip", tooltip="Leave this pose out"),
+        Binding("r", "pose('retake')", "Retake", tooltip=RETAKE),
+        Binding("s", "pose('skip')", "Skip", tooltip=SKIP),
         Binding("d", "pose('drop')", "Drop", tooltip="Remove this pose from the plan"),
         Binding("a", "add", "Add", tooltip="Add the arm's present posture as a pose"),
         Binding("n", "make", "New", tooltip="Plan 25 poses from the configured guesses (seconds)"),

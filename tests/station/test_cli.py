@@ -33,17 +33,6 @@ pytestmark = pytest.mark.process
 __all__ = ["short_folder"]
 
 
-def station(*args: str, timeout_s: float = 100.0, **environment: str) -> subprocess.CompletedProcess[str]:
-    return subprocess.run(
-        [sys.executable, "-m", "station.cli", *args],
-        capture_output=True,
-        text=True,
-        timeout=timeout_s,
-        stdin=subprocess.DEVNULL,
-        env=dict(os.environ) | environment,
-    )
-
-
 class Shell:
     """The command line in this process, beside a daemon that is another."""
 

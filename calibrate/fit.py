@@ -165,7 +165,7 @@ def _with_kinematics(
 
     def settle(start: Settled) -> tuple[RobotSystematics, Settled | None]:
         fitted = fit_kinematics(start.observed, start.estimate, derivatives[start.fitted])
-        if prior == "off" or not (fitted.finding.detected or prior == "on"):
+        if prior == "off" or not (fitted.finding.possible or prior == "on"):
             return fitted.finding, None
         settled = _settle(_judged(with_table, start.fitted, fitted.estimate, start.boards), reject)
         table_errors = tuple((UNIT * settled.estimate.state.theta).tolist())

@@ -56,9 +56,10 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
     apart = distance_in_sigmas(start.X, state.X, pair_covariance(start.objective, pairs, start.X))
     lens_finding = "" if free else check_lens(settled.observed, result)
     watch.lap("lens check")
-    # A fitted kinematic table accounts for such a turn itself.
+    # A kinematic table found wrong accounts for such a turn itself.
+    worn = fit.systematics is not None and fit.systematics.detected
     frames_finding = (
-        "" if len(state.theta) else check_frames(settled.everything.part(places), replace(state, C=C[places]))
+        "" if worn else check_frames(settled.everything.part(places), replace(state, C=C[places]))
     )
     holdout = _holdout(fit, free) if options.holdout else None
     watch.lap("hold-out")

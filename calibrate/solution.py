@@ -29,8 +29,8 @@ class SolveOptions:
     (robust profile; plumb_bob only), and its uncertainty is part of X's covariance."""
     reject_outliers: bool = True
     kinematic_prior: KinematicPrior = "auto"
-    """Model errors of the arm's Denavit-Hartenberg table. auto: when the residuals show them and joints
-    were recorded."""
+    """Model errors of the arm's Denavit-Hartenberg table. auto: where joints were recorded, unless the
+    residuals speak against them."""
     working_distance_m: float | None = None
     """Where the predicted error is stated, along the camera's axis; None = median board distance."""
     holdout: bool = True
@@ -145,6 +145,8 @@ class RobotSystematics:
     """Do the robot's residuals follow its joints?"""
 
     detected: bool
+    possible: bool
+    """Not to be excluded either."""
     statistic: float
     """Twice the gain of the restricted log-likelihood by the kinematic model; threshold beside it."""
     threshold: float

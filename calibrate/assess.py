@@ -102,15 +102,12 @@ def observe(pairs: Pairs, covariance: Array, distance_m: float, parent: str) -> 
         f" at {distance_m:.2f} m" if kind == "turn about" else ""
     )
     singular, _ = axis_spread(pairs)
-    D = (pairs.A[:, :3, :3] - np.eye(3)).reshape(-1, 3)
-    values = np.linalg.svd(D.T @ D, compute_uv=False)
     return Observability(
         weakest_direction=worst,
         weakest_text=text,
         weakest_sigma_m=sigma,
         largest_angle_rad=float(screw_invariants(pairs.A)[0].max()),
         axis_spread=float(singular[1] / max(singular[0], 1e-300)),
-        condition=float(np.sqrt(values[0] / max(values[-1], 1e-300))),
     )
 
 

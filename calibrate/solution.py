@@ -111,8 +111,6 @@ class Observability:
     """Largest rotation between any two views."""
     axis_spread: float
     """0: all rotations about one axis; 1: axes in all directions alike (second over first singular value)."""
-    condition: float
-    """Of the translation's normal matrix: largest over smallest singular value."""
 
 
 @dataclass(frozen=True)

@@ -24,7 +24,8 @@ from calibrate.solution import RobotSystematics
 THRESHOLD = 9.55
 POSSIBLE = 0.5
 """Above this errors of the table are allowed for, though they may be chance: simulated, the stated error of
-arms whose errors nearly drown in the noise else was too small (coverage 65 … 88 %); good ones lose 2 %."""
+arms whose errors nearly drown in the noise else was too small (coverage 65 … 88 %); good ones
+lose 1 … 3 %."""
 FEWEST_VIEWS = 8
 """Fewer cannot tell 24 parameters from noise."""
 

@@ -71,9 +71,8 @@ class RecordingWriter:
             sync_folder(path.parent)
         except OSError as error:
             self._file.close()
-            self.part_path.unlink(
-                missing_ok=True
-            )  # nothing is in it, and its name is wanted for the next try
+            # Nothing is in it, and its name is wanted for the next try.
+            self.part_path.unlink(missing_ok=True)
             raise RecordingError(
                 f"{path} cannot be begun ({error.strerror}): free space or replace the disk, then begin again"
             ) from error

@@ -73,6 +73,15 @@ def test_errors_that_nearly_drown_in_the_noise_are_allowed_for_though_nobody_is_
     assert not any("kinematic table" in text for text in auto.warnings)
 
 
+@pytest.mark.parametrize(("seed", "size_mm", "asked"), [(11, 0.08, True), (0, 0.4, False)])
+def test_turned_orientations_are_asked_about_unless_the_arm_is_found_worn(seed, size_mm, asked, monkeypatch):
+    """A table that is only allowed for does not explain them away."""
+    monkeypatch.setattr("calibrate.profile_robust.check_frames", lambda *_: "turned")
+    solution = solve_views(worn_cell(np.random.default_rng(seed), size_mm).views, AUTO)
+    assert solution.systematics.prior_applied
+    assert ("turned" in solution.warnings) == asked
+
+
 def test_without_joints_or_with_foreign_joints_nothing_is_claimed():
     from dataclasses import replace
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import msgspec
@@ -94,3 +95,12 @@ def test_they_are_shown_in_the_terminal_and_in_the_report(solved_real: SolvedRec
     page = report_page(solved_real, touches=[GOOD, BAD])
     assert "Checked by hand" in page and "corner 41" in page
     assert "Checked by hand" not in report_page(solved_real)
+
+
+def test_a_picture_of_a_view_in_doubt_says_so_in_the_report(solved_real: SolvedRecording) -> None:
+    index = solved_real.solution.used[3]
+    doubted = replace(solved_real, solution=replace(solved_real.solution, in_doubt={index: 0.37}))
+    said = "in doubt: wrong with a chance of 37%"
+    captions = [line for line in report_page(doubted).splitlines() if said in line]
+    assert len(captions) == 1 and f"pose {index + 1}" in captions[0]
+    assert said not in report_page(solved_real)

@@ -124,7 +124,7 @@ def _taught(X: Array, Y: Array, rng: np.random.Generator) -> Array | None:
 def _free_views(X: Array, Y: Array, start: Array, rng: np.random.Generator) -> int:
     """How many of the tried views some arm posture near the taught one can take."""
     shown = np.array([C for C in _views(rng, _TRIED, (0.38, 0.60), np.deg2rad(35)) if shows_board(C)])
-    view, q = inverse_many(ARM, Y @ inverse(X @ shown))
+    view, q, _ = inverse_many(ARM, Y @ inverse(X @ shown))
     q = start + (q - start + np.pi) % (2 * np.pi) - np.pi
     near = (np.sign(q[:, [2, 4]]) == np.sign(start[[2, 4]])).all(axis=1) & (
         np.abs(q - start).max(axis=1) < 2.0

@@ -124,8 +124,11 @@ def inverse_all(model: RobotModel, base_from_flange: Array) -> Array:
     return inverse_many(model, np.asarray(base_from_flange, dtype=float)[None])[1]
 
 
-def inverse_many(model: RobotModel, base_from_flange: Array) -> tuple[NDArray[np.intp], Array]:
-    """`inverse_all` of many poses (n, 4, 4): the pose that each solution belongs to (m,), and joints (m, 6).
+def inverse_many(
+    model: RobotModel, base_from_flange: Array
+) -> tuple[NDArray[np.intp], Array, NDArray[np.intp]]:
+    """`inverse_all` of many poses (n, 4, 4): the pose that each solution belongs to (m,), joints (m, 6), and the
+    branch 0 … 7 of shoulder, wrist and elbow (m,).
 
     Source: K. Hawkins, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms" (2013).
     """
@@ -155,7 +158,7 @@ def inverse_many(model: RobotModel, base_from_flange: Array) -> tuple[NDArray[np
     q2 = np.arctan2(y, x) - np.arctan2(a3 * np.sin(q3), a2 + a3 * np.cos(q3))
     joints = np.stack(np.broadcast_arrays(q1, q2, q3, tilt - q2 - q3, q5, q6), axis=-1).reshape(-1, 6)
     possible = np.flatnonzero(np.broadcast_to(np.abs(c3) <= 1 + 1e-9, q2.shape))
-    return reachable[possible // 8], (joints[possible] + np.pi) % (2 * np.pi) - np.pi
+    return reachable[possible // 8], (joints[possible] + np.pi) % (2 * np.pi) - np.pi, possible % 8
 
 
 def _in_arm_plane(

@@ -17,7 +17,12 @@ from calibrate.geometry import Array
 from recordings.messages import CameraModel
 
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
-"""What the last stage can refine, in this order."""
+"""The parameters of a plumb_bob lens, in this order."""
+_PARAMETERS = {
+    "plumb_bob": INTRINSICS,
+    "rational_polynomial": (*INTRINSICS, "k4", "k5", "k6"),
+    "equidistant": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
+}
 _Bent = tuple[Array, Array, Callable[[], Array]]
 """Distorted x, y of rays (x, y, 1), and on demand their derivatives by x and y (..., 2, 2)."""
 
@@ -29,7 +34,7 @@ class Projected:
     by_point: Array
     """(..., 2, 3) ∂pixel/∂point, 1/m"""
     by_intrinsics: Array | None
-    """(..., 2, 9) in the order of INTRINSICS; None unless asked for (plumb_bob only)."""
+    """(..., 2, p) in the order of `intrinsics_names`; None unless asked for."""
 
 
 def project(camera: CameraModel, points: Array, with_intrinsics: bool = False) -> Projected:
@@ -44,7 +49,7 @@ def project(camera: CameraModel, points: Array, with_intrinsics: bool = False) -
     J[..., :2] = by_x * w[..., None, None]
     J[..., 2] = -(by_x[..., 0] * (x * w)[..., None] + by_x[..., 1] * (y * w)[..., None])
     pixels = _pixels(K, xd, yd)
-    return Projected(pixels, J, _by_intrinsics(K, x, y, xd, yd) if with_intrinsics else None)
+    return Projected(pixels, J, _by_intrinsics(camera, K, x, y, xd, yd) if with_intrinsics else None)
 
 
 def project_pixels(camera: CameraModel, points: Array) -> Array:
@@ -89,16 +94,21 @@ def camera_matrix(camera: CameraModel) -> Array:
     return K
 
 
+def intrinsics_names(camera: CameraModel) -> tuple[str, ...]:
+    """The parameters of the camera's lens model, in the order of `intrinsics_vector`."""
+    return _PARAMETERS[camera.distortion_model]
+
+
 def intrinsics_vector(camera: CameraModel) -> Array:
-    """(9,) in the order of INTRINSICS."""
+    """(p,) in the order of `intrinsics_names`: pixels for the first four, the others plain."""
     K = camera_matrix(camera)
-    distortion = np.zeros(5)
-    distortion[: len(camera.distortion)] = camera.distortion[:5]
+    distortion = np.zeros(len(intrinsics_names(camera)) - 4)
+    distortion[: len(camera.distortion)] = camera.distortion[: len(distortion)]
     return np.concatenate([[K[0, 0], K[1, 1], K[0, 2], K[1, 2]], distortion])
 
 
 def with_intrinsics_vector(camera: CameraModel, vector: Array) -> CameraModel:
-    """The same plumb_bob camera with other numbers, skew kept."""
+    """The same lens model with other numbers, skew kept."""
     fx, fy, cx, cy, *distortion = (float(v) for v in vector)
     skewed = float(camera_matrix(camera)[0, 1])
     matrix = ((fx, skewed, cx), (0.0, fy, cy), (0.0, 0.0, 1.0))
@@ -148,14 +158,25 @@ def _equidistant(x: Array, y: Array, coefficients: tuple[float, ...]) -> _Bent:
     return x * scale, y * scale, derivatives
 
 
-def _by_intrinsics(K: Array, x: Array, y: Array, xd: Array, yd: Array) -> Array:
+def _by_intrinsics(camera: CameraModel, K: Array, x: Array, y: Array, xd: Array, yd: Array) -> Array:
     r2 = x * x + y * y
-    J = np.zeros((*x.shape, 2, len(INTRINSICS)))
+    J = np.zeros((*x.shape, 2, len(intrinsics_names(camera))))
     J[..., 0, 0], J[..., 0, 2] = xd, 1.0
     J[..., 1, 1], J[..., 1, 3] = yd, 1.0
-    by_k_x = [x * r2, x * r2 * r2, 2 * x * y, r2 + 2 * x * x, x * r2 * r2 * r2]
-    by_k_y = [y * r2, y * r2 * r2, r2 + 2 * y * y, 2 * x * y, y * r2 * r2 * r2]
-    for place, (a, b) in enumerate(zip(by_k_x, by_k_y, strict=True), start=4):
+    if camera.distortion_model == "equidistant":
+        r = np.maximum(np.sqrt(r2), 1e-9)
+        theta = np.arctan(r)
+        terms = [(x * s, y * s) for s in (theta ** (2 * power + 1) / r for power in range(1, 5))]
+    else:
+        k1, k2, _, _, k3, k4, k5, k6 = (*camera.distortion, *(0.0,) * 8)[:8]
+        bottom = 1 + r2 * (k4 + r2 * (k5 + r2 * k6))
+        radial = (1 + r2 * (k1 + r2 * (k2 + r2 * k3))) / bottom
+        tops = [(x * s, y * s) for s in (r2 / bottom, r2**2 / bottom)]
+        tangential = [(2 * x * y, r2 + 2 * y * y), (r2 + 2 * x * x, 2 * x * y)]
+        terms = [*tops, *tangential, (x * r2**3 / bottom, y * r2**3 / bottom)]
+        if camera.distortion_model == "rational_polynomial":
+            terms += [(-x * s, -y * s) for s in (radial * r2**power / bottom for power in (1, 2, 3))]
+    for place, (a, b) in enumerate(terms, start=4):
         J[..., 0, place] = K[0, 0] * a + K[0, 1] * b
         J[..., 1, place] = K[1, 1] * b
     return J

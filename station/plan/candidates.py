@@ -141,7 +141,7 @@ def _limit_of(label: str, scene: Scene) -> str:
 def _all_branches(scene: Scene, flange: Array, near: Array | None) -> tuple[NDArray[np.intp], Array]:
     """Inverse kinematics of all poses: row in `flange` (m,), and joints (m, 6)."""
     low, high = joint_bounds(scene.geometry)
-    rows, q = inverse_many(scene.geometry.model, flange)
+    rows, q, _ = inverse_many(scene.geometry.model, flange)
     branches = branch_of(scene, q)
     for branch in np.unique(branches):
         here = branches == branch

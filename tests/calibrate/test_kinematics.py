@@ -213,7 +213,7 @@ def test_the_inverses_of_many_poses_are_those_of_each() -> None:
     model = MODELS["UR10"]
     poses = forward(model, np.random.default_rng(3).uniform(-3, 3, (30, 6)))
     poses[::7, :3, 3] *= 2.0  # some beyond the reach
-    rows, joints = inverse_many(model, poses)
+    rows, joints, _ = inverse_many(model, poses)
     assert forward(model, joints) == pytest.approx(poses[rows], abs=1e-9)
     each = [inverse_all(model, target) for target in poses]
     assert np.bincount(rows, minlength=30).tolist() == [len(found) for found in each]

@@ -1,0 +1,113 @@
+"""The one estimate: every unknown of a cell together, each view with the weight that its residual earns.
+
+Gauss-Newton on one posterior (`linear`), noise scales by restricted maximum likelihood between the steps; at
+most MAX_STEPS linearisations.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import stats
+
+from calibrate.errors import BadViewsError
+from calibrate.geometry import Array
+from calibrate.handeye.corners import corner_distance, corner_residuals
+from calibrate.handeye.linear import GAIN, ROBOT_PRIOR_COUNT, STUDENT, Fit, Linear, Scales, first_scales
+from calibrate.handeye.observations import Observations, State
+from calibrate.handeye.priors import Priors
+
+MAX_STEPS = 15
+_SETTLED = 0.01
+"""Length of a step, in sigmas of all unknowns together."""
+
+
+@dataclass(frozen=True, eq=False)
+class Estimate:
+    state: State
+    scales: Scales
+    chances: Array
+    """(n, K) of the classes, per view."""
+    covariance: Array
+    """(G, G) posterior of the shared unknowns, in the order of `Layout`."""
+    robot: Array
+    """(n, 6) residuals at the optimum: implied minus recorded flange, the board seen by its corners alone."""
+    robot_covariance: Array
+    """(n, 6, 6) of `robot` for a view of the first class."""
+    board_poses: Array
+    """(n, 4, 4) camera_from_board by each view's corners alone, with the final lens and shape."""
+    corner_weights: Array
+    """(n, k)"""
+    log_evidence: float
+    steps: int
+    converged: bool
+
+    @property
+    def weight(self) -> Array:
+        """(n,) what each view counts for: 1 fully, 0 not at all."""
+        return np.asarray(self.chances[:, :3] @ GAIN**-2.0)
+
+    @property
+    def threshold(self) -> float:
+        """95 % region δᵀ C⁻¹ δ: 6·F(6, ν), ν = 3n - 6 of the n views that count."""
+        freedom = 3.0 * float(self.chances[:, 0].sum()) - 6.0 + ROBOT_PRIOR_COUNT
+        return float(6 * stats.f.ppf(0.95, 6, max(freedom, 1.0)))
+
+
+def estimate(
+    observed: Observations,
+    start: State,
+    priors: Priors,
+    scales: Scales | None = None,
+    fit_scales: bool = True,
+    max_steps: int = MAX_STEPS,
+) -> Estimate:
+    """Maximum of the posterior from `start`.
+
+    scales: where to start, or what to keep (`fit_scales` False). Raises BadViewsError where views and priors
+    together do not determine the unknowns.
+    """
+    state, weights = start, observed.present
+    converged, steps = False, 0
+    fit: Fit = "all" if fit_scales else "nothing"
+    linear = Linear.at(observed, state, weights)
+    scales = scales or first_scales(linear)
+    try:
+        while steps < max_steps and not converged:
+            steps += 1
+            solved = linear.solve(priors.linearise(state, scales.table), scales, fit)
+            scales = solved.scales
+            state = state.moved(solved.step, linear.board_step(solved))
+            weights = corner_weights(observed, state, scales.sigma_px)
+            converged = bool(np.sqrt(solved.step @ solved.precision @ solved.step) < _SETTLED)
+            linear = Linear.at(observed, state, weights)
+        solved = linear.solve(priors.linearise(state, scales.table), scales, "nothing")
+        covariance = linear.covariance(solved)
+    except np.linalg.LinAlgError as problem:
+        raise BadViewsError(
+            f"The views do not determine the camera's pose ({problem}). "
+            "Record more poses, tilted about two axes."
+        ) from None
+    return Estimate(
+        state=state,
+        scales=scales,
+        chances=solved.chances,
+        covariance=covariance,
+        robot=solved.residual,
+        robot_covariance=scales.tau_px**2 * linear.B + np.diag(scales.classes[0]),
+        board_poses=linear.seen_boards(state.C),
+        corner_weights=weights,
+        log_evidence=solved.log_evidence,
+        steps=steps,
+        converged=converged,
+    )
+
+
+def corner_weights(observed: Observations, state: State, sigma_px: float) -> Array:
+    """(n, k): Student's t about the model; 0 for padding."""
+    if not observed.has_pixels:
+        return observed.present
+    distance = corner_distance(corner_residuals(observed, state.camera, state.C, state.shape))
+    square = (np.nan_to_num(distance, nan=1e6, posinf=1e6) / sigma_px) ** 2
+    return (STUDENT + 2) / (STUDENT + square) * observed.present

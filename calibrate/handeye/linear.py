@@ -1,0 +1,320 @@
+"""The posterior linearised at one state: board poses eliminated, views weighed, noise scales fitted.
+
+A view's board pose C_i is eliminated exactly. What is left of the view is a robot residual m_i with
+covariance S = τ² B + D: B from the corners, D the robot's own noise, a mixture of three scales and one class
+of garbage. Corner errors are smooth over a board, so they have three variances: τ² on the six modes that move
+the board's pose, λ² on those of lens and board shape, σ² on the rest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Literal
+
+import numpy as np
+
+from calibrate.geometry import Array, perturb
+from calibrate.handeye.corners import CornerBlocks, linearise_corners
+from calibrate.handeye.flange import flange_derivatives, flange_residuals
+from calibrate.handeye.observations import Layout, Observations, State
+from calibrate.handeye.priors import Quadratic
+
+_ROUNDS = 8
+GAIN = np.array([1.0, 3.0, 10.0])
+"""Robot noise of a view, in multiples of the usual one."""
+GARBAGE_M, GARBAGE_RAD = 0.3, 1.0
+"""A view of the last class tells nothing: its pose may be anywhere in the cell."""
+_COUNTS = np.array([5.0, 0.5 / 3, 0.5 / 3, 0.5 / 3])
+"""Dirichlet prior of the classes."""
+Fit = Literal["all", "robot", "nothing"]
+"""Noise scales to be fitted."""
+STUDENT = 8.0
+"""Degrees of freedom of Student's t of a corner: a wrong detection loses its weight."""
+_INFORMATION = (STUDENT + 2) / (STUDENT + 4)
+"""Of a corner with that distribution, against a normal one of the same scale."""
+ROBOT_PRIOR_COUNT = 1.0
+_ROBOT_PRIOR_M, _ROBOT_PRIOR_RAD = 1e-4, float(np.radians(0.02))
+_MODE_COUNT = 4.0
+"""Weight, in residuals, of the rule that no mode of the corners is quieter than those below it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scales:
+    """Noise, 1σ."""
+
+    robot: Array
+    """(2,) metres and radians per axis, of a view of the first class."""
+    tau_px: float
+    lambda_px: float
+    sigma_px: float
+    shares: Array
+    """(K,) prior chance of each class."""
+    table: float = 0.0
+    """Errors of the kinematic table, mm and mrad."""
+
+    @property
+    def classes(self) -> Array:
+        """(K, 6) variances of the robot's noise."""
+        robot = np.repeat(self.robot, 3) ** 2
+        garbage = np.repeat([GARBAGE_M**2, GARBAGE_RAD**2], 3)
+        return np.concatenate([GAIN[:, None] ** 2 * robot, garbage[None]])
+
+
+def first_scales(linear: Linear) -> Scales:
+    """Medians of the residuals as they are."""
+    robot = [1.48 * float(np.median(np.abs(part))) for part in (linear.m[:, :3], linear.m[:, 3:])]
+    pixel = 1.0 if linear.modes is None else linear.modes.typical_px
+    robot_m, robot_rad = (max(value, 1e-5) for value in robot)
+    return Scales(np.array([robot_m, robot_rad]), pixel, pixel, pixel, _COUNTS / _COUNTS.sum())
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """A solution of the linearised posterior."""
+
+    step: Array
+    """(G,) in the order of `Layout`."""
+    precision: Array
+    """(G, G) for the classes' chances as they are."""
+    scales: Scales
+    chances: Array
+    """(n, K)"""
+    residual: Array
+    """(n, 6) m at the step's end."""
+    z: Array
+    """(n, K, 6) S_k⁻¹ m at the step's end."""
+    log_evidence: float
+    """Of the robot residuals, up to a constant of the linearisation (Laplace)."""
+
+
+@dataclass(frozen=True, eq=False)
+class CornerModes:
+    """What the corners tell of lens and board shape, board poses eliminated."""
+
+    to_optimum: Array
+    """(n, 6) step of each board pose to its own corners' optimum."""
+    by_shared: Array
+    """(n, 6, g) by which that optimum moves with lens and shape, negative."""
+    information: Array
+    """(n, g, g)"""
+    right: Array
+    """(n, g)"""
+    whole: Array
+    """(n, g, g) information with the board poses held: it tells the size of a column."""
+    left: Array
+    """(n,) weighted squares (px²) at each board pose's optimum."""
+    rows: Array
+    """(n,) twice the weighted number of corners."""
+    shared: slice
+    """Places of lens and shape among the unknowns."""
+
+    @classmethod
+    def of(cls, blocks: CornerBlocks, H: Array, shared: slice) -> CornerModes:
+        c = np.einsum("nij,nj->ni", H, blocks.Lr)
+        HLG = H @ blocks.LG
+        LG_t = np.swapaxes(blocks.LG, 1, 2)
+        return cls(
+            c,
+            HLG,
+            blocks.GG - LG_t @ HLG,
+            blocks.Gr - (LG_t @ c[..., None])[..., 0],
+            blocks.GG,
+            np.maximum(blocks.rr - np.einsum("ni,ni->n", blocks.Lr, c), 0.0) / _INFORMATION,
+            blocks.rows / _INFORMATION,
+            shared,
+        )
+
+    def gain(self, step: Array) -> float:
+        """Half the squares (px²) that a step (G,) takes away."""
+        x = step[self.shared]
+        return float(self.right.sum(axis=0) @ x - 0.5 * x @ self.information.sum(axis=0) @ x)
+
+    def variances(self, lambda_px: float, covariance: Array, step: Array) -> tuple[float, float]:
+        """σ² of the plain corner noise and λ² of that in the modes of lens and shape, px², after a step."""
+        scale = 1.0 / np.sqrt(np.maximum(np.einsum("nii->ni", self.whole), 1e-300))
+        values, vectors = np.linalg.eigh(self.information * scale[:, :, None] * scale[:, None, :])
+        kept = values > 1e-6
+        inverse = np.where(kept, 1.0 / np.where(kept, values, 1.0), 0.0) / _INFORMATION
+
+        def inside(right: Array) -> float:
+            return float((np.einsum("nij,ni->nj", vectors, right * scale) ** 2 * inverse).sum())
+
+        rank = float(kept.sum())
+        rest = max(float(self.left.sum()) - inside(self.right), 0.0)
+        sigma2 = max(rest / max(float(self.rows.sum()) - 6 * len(self.rows) - rank, 1.0), 1e-8)
+        after = self.right - np.einsum("nij,j->ni", self.information, step[self.shared])
+        part = covariance[self.shared, self.shared]
+        used = float(np.einsum("ij,ji", part, self.information.sum(axis=0))) / lambda_px**2
+        lambda2 = (inside(after) + _MODE_COUNT * sigma2) / max(rank - used + _MODE_COUNT, 1.0)
+        return sigma2, max(lambda2, sigma2)
+
+    @property
+    def typical_px(self) -> float:
+        """Noise of a corner per axis, median over the views."""
+        return max(float(np.sqrt(np.median(self.left / np.maximum(self.rows - 6, 1.0)))), 1e-3)
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """The posterior around one state."""
+
+    H: Array
+    """(n, 6, 6) covariance of each board pose by its own corners, for corners of 1 px."""
+    A: Array
+    """(n, 6, 6) ∂m/∂C"""
+    m: Array
+    """(n, 6) robot residual with each board pose at its own corners' optimum."""
+    J: Array
+    """(n, 6, G)"""
+    modes: CornerModes | None = None
+    """None where board poses were given, not seen."""
+
+    @cached_property
+    def B(self) -> Array:
+        """(n, 6, 6) covariance of m from corners of 1 px."""
+        B = self.A @ self.H @ np.swapaxes(self.A, 1, 2)
+        return np.asarray((B + np.swapaxes(B, 1, 2)) / 2)
+
+    @classmethod
+    def at(cls, observed: Observations, state: State, weights: Array) -> Linear:
+        """weights: (n, k) of the corners."""
+        at, n = Layout.of(state), len(observed)
+        m = flange_residuals(observed, state)
+        bare = m if observed.table is None or not len(state.table) else m + observed.table @ state.table
+        by_X, by_Y, A = flange_derivatives(observed.mount, *state.poses(observed), state.C, bare)
+        J = np.zeros((n, 6, at.size))
+        J[..., at.X], J[..., at.Y] = by_X, by_Y
+        if observed.table is not None and len(state.table):
+            J[..., at.table] = -observed.table
+        if state.second is not None and observed.later is not None:
+            first = at.X if observed.moved == "camera" else at.Y
+            later = observed.later[:, None, None]
+            J[..., at.second] = np.where(later, J[..., first], 0.0)
+            J[..., first] = np.where(later, 0.0, J[..., first])
+        if not observed.has_pixels:
+            return cls(np.zeros((n, 6, 6)), A, m, J)
+        blocks = linearise_corners(observed, state.camera, state.C, _INFORMATION * weights, True, state.shape)
+        H = np.asarray(np.linalg.inv(blocks.LL), dtype=float)
+        modes = CornerModes.of(blocks, H, slice(at.lens.start, at.shape.stop))
+        J[..., modes.shared] = -A @ modes.by_shared
+        return cls(H, A, m + (A @ modes.to_optimum[..., None])[..., 0], J, modes)
+
+    def solve(self, prior: Quadratic, scales: Scales, fit: Fit = "all") -> Solved:
+        """The step, and the noise scales that are to be fitted, by rounds of expectation and maximisation."""
+        residual = self.m
+        for _ in range(1 if fit == "nothing" else _ROUNDS):
+            S, S_inverse = self._noise(scales)
+            chances, _ = _chances(residual, S, S_inverse, scales.shares)
+            WJ = np.einsum("nk,nkij->nij", chances, S_inverse) @ self.J
+            N = prior.N + np.einsum("nia,nib->ab", self.J, WJ, optimize=True)
+            right = prior.right - np.einsum("nia,ni->a", WJ, self.m)
+            if self.modes is not None:
+                N[self.modes.shared, self.modes.shared] += (
+                    self.modes.information.sum(axis=0) / scales.lambda_px**2
+                )
+                right[self.modes.shared] += self.modes.right.sum(axis=0) / scales.lambda_px**2
+            covariance = inverse_of(N)
+            step = covariance @ right
+            residual = self.m + self.J @ step
+            if fit != "nothing":
+                scales = self._scales(scales, fit, chances, S_inverse, residual, covariance, step)
+        z = np.einsum("nkij,nj->nki", S_inverse, residual)
+        _, log_density = _chances(residual, S, S_inverse, scales.shares)
+        # Quadratic in the step, so its gain over the point of linearisation is right·step - ½ step·N·step.
+        evidence = (
+            float(log_density.sum()) + prior.log + prior.gain(step) - 0.5 * float(np.linalg.slogdet(N)[1])
+        )
+        if self.modes is not None:
+            evidence += self.modes.gain(step) / scales.lambda_px**2
+        return Solved(step, N, scales, chances, residual, z, evidence)
+
+    def _noise(self, scales: Scales) -> tuple[Array, Array]:
+        """Covariances (n, K, 6, 6) of m by class, and their inverses."""
+        S = scales.tau_px**2 * self.B[:, None] + scales.classes[:, :, None] * np.eye(6)
+        return S, np.asarray(np.linalg.inv(S), dtype=float)
+
+    def _scales(
+        self,
+        scales: Scales,
+        fit: Fit,
+        chances: Array,
+        S_inverse: Array,
+        residual: Array,
+        covariance: Array,
+        step: Array,
+    ) -> Scales:
+        z = np.einsum("nkij,nj->nki", S_inverse, residual)
+        leverage = self.J @ covariance @ np.swapaxes(self.J, 1, 2)
+        P = S_inverse - S_inverse @ leverage[:, None] @ S_inverse
+        square = scales.robot**2
+        gained = np.einsum("nk,k,nki->i", chances[:, :3], GAIN**2, z[:, :3] ** 2)
+        spent = np.einsum("nk,k,nki->i", chances[:, :3], GAIN**2, np.einsum("nkii->nki", P[:, :3]))
+        floor = np.array([_ROBOT_PRIOR_M, _ROBOT_PRIOR_RAD]) ** 2
+        count = ROBOT_PRIOR_COUNT
+        up = gained.reshape(2, 3).sum(axis=1) + count * floor / square**2
+        down = spent.reshape(2, 3).sum(axis=1) + count / square
+        square = square * up / down
+        total = chances.sum(axis=0) + _COUNTS
+        updated = replace(scales, robot=np.sqrt(square), shares=total / total.sum())
+        if fit == "robot" or self.modes is None:
+            return updated
+        sigma2, lambda2 = self.modes.variances(scales.lambda_px, covariance, step)
+        tau2 = scales.tau_px**2
+        gained = np.einsum("nk,nki,nij,nkj->", chances, z, self.B, z, optimize=True)
+        spent = np.einsum("nk,nkij,nji->", chances, P, self.B, optimize=True)
+        tau2 *= float((gained + _MODE_COUNT * lambda2 / tau2**2) / (spent + _MODE_COUNT / tau2))
+        tau, lambda_, sigma = np.sqrt([max(tau2, lambda2), lambda2, sigma2]).tolist()
+        return replace(updated, tau_px=tau, lambda_px=lambda_, sigma_px=sigma)
+
+    def board_step(self, solved: Solved) -> Array:
+        """(n, 6) step of the board poses that belongs to the step of the shared unknowns."""
+        pull = np.einsum("nk,nki->ni", solved.chances, solved.z)
+        by_robot = np.einsum("nij,nkj,nk->ni", self.H, self.A, pull, optimize=True)
+        step = -(solved.scales.tau_px**2) * by_robot
+        if self.modes is not None:
+            step += self.modes.to_optimum - self.modes.by_shared @ solved.step[self.modes.shared]
+        return np.asarray(step)
+
+    def seen_boards(self, C: Array) -> Array:
+        """(n, 4, 4) the board poses C, each moved to its own corners' optimum."""
+        return C if self.modes is None else perturb(C, self.modes.to_optimum)
+
+    def lost(self, solved: Solved) -> Array:
+        """(G, G) information that not knowing the views' classes costs (Louis 1982)."""
+        mean = np.einsum("nk,nki->ni", solved.chances, solved.z)
+        spread = np.einsum("nk,nki,nkj->nij", solved.chances, solved.z, solved.z, optimize=True)
+        spread -= mean[:, :, None] * mean[:, None, :]
+        _, S_inverse = self._noise(solved.scales)
+        W = np.einsum("nk,nkij->nij", solved.chances, S_inverse)
+        # A view cannot cost more than it tells.
+        root = np.linalg.cholesky(W)
+        inner = np.linalg.solve(root, np.swapaxes(np.linalg.solve(root, spread), 1, 2))
+        values, vectors = np.linalg.eigh((inner + np.swapaxes(inner, 1, 2)) / 2)
+        inner = (vectors * np.clip(values, 0.0, 1.0)[:, None]) @ np.swapaxes(vectors, 1, 2)
+        spread = root @ inner @ np.swapaxes(root, 1, 2)
+        return np.asarray(np.einsum("nia,nij,njb->ab", self.J, spread, self.J, optimize=True))
+
+    def covariance(self, solved: Solved) -> Array:
+        """(G, G) of the posterior, doubts about the views' classes included."""
+        return inverse_of(solved.precision - self.lost(solved))
+
+
+def _chances(residual: Array, S: Array, S_inverse: Array, shares: Array) -> tuple[Array, Array]:
+    """Chances (n, K) of the classes and the log density (n,) of each view's residual (n, 6)."""
+    square = np.einsum("ni,nkij,nj->nk", residual, S_inverse, residual, optimize=True)
+    log = np.log(shares) - 0.5 * (square + np.linalg.slogdet(S)[1] + 6 * np.log(2 * np.pi))
+    top = log.max(axis=1, keepdims=True)
+    density = np.exp(log - top)
+    total = density.sum(axis=1, keepdims=True)
+    return density / total, (top + np.log(total))[:, 0]
+
+
+def inverse_of(N: Array) -> Array:
+    """Of a symmetric positive matrix, scaled to ones first. LinAlgError where it is not."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-300))
+    values, vectors = np.linalg.eigh((N + N.T) / 2 * np.outer(scale, scale))
+    if not values[0] > 1e-13:
+        raise np.linalg.LinAlgError("some unknowns are left open")
+    root = vectors * scale[:, None]
+    return np.asarray((root / values) @ root.T)

@@ -1,0 +1,154 @@
+"""What was observed and what is unknown: the two halves of the one likelihood.
+
+Unknown: the camera's pose X, the board's pose Y, the lens, the board's shape, errors of the arm's kinematic
+table, and every camera_from_board C_i. Observed: the corners and the recorded flange poses F_i. The true
+flange is Y C⁻¹ X⁻¹ (eye-in-hand) or X C Y⁻¹ (eye-to-hand): the robot's noise sits where it arises, in base.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.geometry import Array, perturb
+from calibrate.projection import intrinsics_names, intrinsics_vector, with_intrinsics_vector
+from calibrate.views import ViewSet
+from recordings.messages import CameraModel, Mount
+
+Places = NDArray[np.intp]
+Moved = Literal["camera", "board"]
+
+SHAPE = ("scale", "anisotropy", "bend xx", "bend yy", "bend xy")
+"""The board's shape: a point (x, y) of the sheet, (u, v) the same mapped to -1 … 1 over the corners, lies at
+(x + s x + a x/2, y + s y - a y/2, b1 (1 - u²) + b2 (1 - v²) + b3 u v); s and a plain, b in metres."""
+
+
+@dataclass(frozen=True, eq=False)
+class Observations:
+    """Padded arrays of all views, one row a view."""
+
+    mount: Mount
+    flange: Array
+    """(n, 4, 4) recorded base_from_flange."""
+    points: Array
+    """(n, k, 3) corners on the board, metres; rows beyond a view's own corners are padding."""
+    pixels: Array
+    """(n, k, 2)"""
+    present: Array
+    """(n, k) 1 for a corner, 0 for padding."""
+    table: Array | None = None
+    """(n, 6, q) motion of the flange, in base, by each error of the kinematic table; None without joints."""
+    extent: Array = field(default_factory=lambda: np.array([[0.0, 0.0], [1.0, 1.0]]))
+    """(2, 2) middle and half size of all corners seen, metres: what the board's bends refer to."""
+    later: NDArray[np.bool_] | None = None
+    """(n,) the views after something was moved (`State.second`); None where nothing was."""
+    moved: Moved = "board"
+    """What was moved: the camera (X has a second value) or the board (Y has)."""
+
+    def __len__(self) -> int:
+        return len(self.flange)
+
+    @property
+    def has_pixels(self) -> bool:
+        return bool(self.present.any())
+
+    def part(self, places: Places) -> Observations:
+        """These views only."""
+        return replace(
+            self,
+            flange=self.flange[places],
+            points=self.points[places],
+            pixels=self.pixels[places],
+            present=self.present[places],
+            table=None if self.table is None else self.table[places],
+            later=None if self.later is None else self.later[places],
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class State:
+    """A value of every unknown."""
+
+    X: Array
+    """(4, 4)"""
+    Y: Array
+    """(4, 4)"""
+    C: Array
+    """(n, 4, 4)"""
+    camera: CameraModel
+    shape: Array
+    """(5,) as in `SHAPE`."""
+    table: Array
+    """(q,) errors of the kinematic table, empty where they are not modelled."""
+    second: Array | None = None
+    """(4, 4) X or Y of the later views, where something was moved."""
+
+    def poses(self, observed: Observations) -> tuple[Array, Array]:
+        """X and Y of every view, (n, 4, 4) each or one (4, 4) for all."""
+        if self.second is None or observed.later is None:
+            return self.X, self.Y
+        later = observed.later[:, None, None]
+        if observed.moved == "camera":
+            return np.where(later, self.second, self.X), self.Y
+        return self.X, np.where(later, self.second, self.Y)
+
+    def moved(self, step: Array, by_view: Array) -> State:
+        """After a step (G,) in the order of `Layout` and (n, 6) for C."""
+        at = Layout.of(self)
+        camera = with_intrinsics_vector(self.camera, intrinsics_vector(self.camera) + step[at.lens])
+        return replace(
+            self,
+            X=perturb(self.X, step[at.X]),
+            Y=perturb(self.Y, step[at.Y]),
+            C=perturb(self.C, by_view),
+            camera=camera,
+            shape=self.shape + step[at.shape],
+            table=self.table + step[at.table],
+            second=None if self.second is None else perturb(self.second, step[at.second]),
+        )
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Places of the unknowns that all views share."""
+
+    X: slice
+    Y: slice
+    lens: slice
+    shape: slice
+    table: slice
+    second: slice
+    size: int
+
+    @classmethod
+    def of(cls, state: State) -> Layout:
+        lens = 12 + len(intrinsics_names(state.camera))
+        shape = lens + len(SHAPE)
+        table = shape + len(state.table)
+        size = table + 6 * (state.second is not None)
+        return cls(
+            slice(0, 6),
+            slice(6, 12),
+            slice(12, lens),
+            slice(lens, shape),
+            slice(shape, table),
+            slice(table, size),
+            size,
+        )
+
+
+def observe_views(views: ViewSet) -> Observations:
+    """Pad the views' corners to one array."""
+    count = max(1, max(len(view.pixels) for view in views))
+    n = len(views)
+    points, pixels, present = np.zeros((n, count, 3)), np.zeros((n, count, 2)), np.zeros((n, count))
+    for i, view in enumerate(views):
+        k = len(view.pixels)
+        points[i, :k], pixels[i, :k], present[i, :k] = view.board_points, view.pixels, 1.0
+    seen = points[present > 0][:, :2] if present.any() else np.array([[-1.0, -1.0], [1.0, 1.0]])
+    low, high = seen.min(axis=0), seen.max(axis=0)
+    extent = np.stack([(low + high) / 2, np.maximum((high - low) / 2, 1e-6)])
+    return Observations(views.mount, views.base_from_flange, points, pixels, present, extent=extent)

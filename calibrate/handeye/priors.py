@@ -1,0 +1,123 @@
+"""What is known of a cell before its pictures are looked at: lens, board, arm."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from calibrate.geometry import Array
+from calibrate.handeye.observations import SHAPE, Layout, State
+from calibrate.handeye.table import RELATIVE_SIGMA, UNIT
+from calibrate.projection import intrinsics_names, intrinsics_vector
+from recordings.messages import CameraModel
+
+ASPECT_SIGMA = 0.001
+"""Of log(fy/fx): a sensor's pixels are square. It tells an unequal print from the lens."""
+_NOT_SQUARE = 0.02
+"""A lens farther from square pixels than this belongs to a sensor that has none: it keeps its ratio."""
+_KNOWN = {"k1": 0.01, "k2": 0.02, "k3": 0.02, "k4": 0.02, "k5": 0.02, "k6": 0.02, "p1": 5e-4, "p2": 5e-4}
+"""1σ of a given lens whose uncertainty nobody states, beside 0.2 % of the focal length and of the width."""
+_KNOWN_SHARE = 0.002
+_UNKNOWN = {"k1": 1.0, "k2": 3.0, "k3": 10.0, "k4": 1.0, "k5": 3.0, "k6": 10.0, "p1": 0.02, "p2": 0.02}
+"""1σ of a lens of which nothing is known, about no distortion; the centre is the middle ± 20 %."""
+_UNKNOWN_CENTRE = 0.2
+
+
+@dataclass(frozen=True)
+class BoardTolerance:
+    """1σ of the board's shape against its drawing."""
+
+    square: float = 0.003
+    """Relative, of the size of its squares, and of x against y of the print."""
+    flatness_m: float = 0.001
+
+
+MEASURED_BOARD = BoardTolerance(1e-5, 2e-5)
+"""A board whose size and shape were measured: 0.001 % and 0.02 mm."""
+
+
+@dataclass(frozen=True, eq=False)
+class LensPrior:
+    mean: Array
+    """(p,) as `intrinsics_vector`."""
+    sigma: Array
+    """(p,); infinite where nothing is known."""
+    log_aspect: float = 0.0
+
+    @classmethod
+    def given(cls, camera: CameraModel, sigma: Array | None = None) -> LensPrior:
+        """A lens that somebody calibrated, with the uncertainty (p,) stated for it or the usual one."""
+        mean = intrinsics_vector(camera)
+        if sigma is None:
+            names = intrinsics_names(camera)
+            sigma = np.array([_KNOWN.get(name, 0.0) for name in names])
+            sigma[:2] = _KNOWN_SHARE * mean[:2]
+            sigma[2:4] = _KNOWN_SHARE * max(camera.width, 1)
+        return cls(mean, np.asarray(sigma, dtype=float), _log_aspect(mean))
+
+    @classmethod
+    def unknown(cls, camera: CameraModel) -> LensPrior:
+        """Of a lens found from the same pictures: only its model is known."""
+        start = intrinsics_vector(camera)
+        names = intrinsics_names(camera)
+        mean = np.zeros(len(names))
+        mean[:2] = start[:2]
+        mean[2:4] = (camera.width - 1) / 2, (camera.height - 1) / 2
+        sigma = np.array([_UNKNOWN.get(name, np.inf) for name in names])
+        sigma[2:4] = _UNKNOWN_CENTRE * np.maximum(mean[2:4], 1.0)
+        return cls(mean, sigma, _log_aspect(start))
+
+
+def _log_aspect(vector: Array) -> float:
+    ratio = float(np.log(vector[1] / vector[0]))
+    return ratio if abs(ratio) > _NOT_SQUARE else 0.0
+
+
+@dataclass(frozen=True, eq=False)
+class Quadratic:
+    """Log density around a state: log + right · step - ½ step · N · step."""
+
+    N: Array
+    """(G, G)"""
+    right: Array
+    """(G,)"""
+    log: float = 0.0
+
+    def gain(self, step: Array) -> float:
+        """Log density at a step (G,) against that at the state."""
+        return float(self.right @ step - 0.5 * step @ self.N @ step)
+
+
+@dataclass(frozen=True, eq=False)
+class Priors:
+    lens: LensPrior
+    board: BoardTolerance = field(default_factory=BoardTolerance)
+
+    def linearise(self, state: State, table: float) -> Quadratic:
+        """Around `state`, for errors of the kinematic table of size `table` (mm and mrad)."""
+        at = Layout.of(state)
+        N, right = np.zeros((at.size, at.size)), np.zeros(at.size)
+        vector = intrinsics_vector(state.camera)
+        table_sigma = UNIT * table * RELATIVE_SIGMA[: len(state.table)]
+        sigma = np.concatenate([self.lens.sigma, self.board_sigma, table_sigma])
+        value = np.concatenate([vector - self.lens.mean, state.shape, state.table])
+        places = np.arange(at.lens.start, at.table.stop)
+        N[places, places] = sigma**-2.0
+        right[places] = -value / sigma**2
+        fx, fy = at.lens.start, at.lens.start + 1
+        slope = np.array([-1 / vector[0], 1 / vector[1]]) / ASPECT_SIGMA
+        miss = (np.log(vector[1] / vector[0]) - self.lens.log_aspect) / ASPECT_SIGMA
+        N[fx : fy + 1, fx : fy + 1] += np.outer(slope, slope)
+        right[fx : fy + 1] -= slope * miss
+        # Only what differs between sizes of the table's errors.
+        log = -0.5 * float(((state.table / table_sigma) ** 2).sum()) - float(np.log(table_sigma).sum())
+        return Quadratic(N, right, log)
+
+    @property
+    def board_sigma(self) -> Array:
+        """(5,) in the order of `SHAPE`."""
+        square, bend = self.board.square, self.board.flatness_m
+        sigma = np.array([square, square, bend, bend, bend])
+        assert len(sigma) == len(SHAPE)
+        return sigma

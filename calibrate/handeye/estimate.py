@@ -9,6 +9,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 from scipy import stats
 
 from calibrate.errors import BadViewsError
@@ -19,6 +20,10 @@ from calibrate.handeye.observations import Observations, State
 from calibrate.handeye.priors import Priors
 
 MAX_STEPS = 15
+REJECTED = 0.05
+"""A view of less weight than this counts for nothing."""
+FULL = 0.35
+"""A view whose chance to be an ordinary one is larger than this counts fully."""
 _SETTLED = 0.01
 """Length of a step, in sigmas of all unknowns together."""
 
@@ -47,6 +52,11 @@ class Estimate:
     def weight(self) -> Array:
         """(n,) what each view counts for: 1 fully, 0 not at all."""
         return np.asarray(self.chances[:, :3] @ GAIN**-2.0)
+
+    @property
+    def used(self) -> NDArray[np.bool_]:
+        """(n,) the views that count for something."""
+        return np.asarray(self.weight > REJECTED)
 
     @property
     def threshold(self) -> float:

@@ -35,6 +35,7 @@ _INFORMATION = (STUDENT + 2) / (STUDENT + 4)
 """Of a corner with that distribution, against a normal one of the same scale."""
 ROBOT_PRIOR_COUNT = 1.0
 _ROBOT_PRIOR_M, _ROBOT_PRIOR_RAD = 1e-4, float(np.radians(0.02))
+_WIDE = 3.0
 _MODE_COUNT = 4.0
 """Weight, in residuals, of the rule that no mode of the corners is quieter than those below it."""
 
@@ -62,8 +63,8 @@ class Scales:
 
 
 def first_scales(linear: Linear) -> Scales:
-    """Medians of the residuals as they are."""
-    robot = [1.48 * float(np.median(np.abs(part))) for part in (linear.m[:, :3], linear.m[:, 3:])]
+    """Medians of the residuals as they are, the robot's wide: a view must be found wrong, not start so."""
+    robot = [_WIDE * 1.48 * float(np.median(np.abs(part))) for part in (linear.m[:, :3], linear.m[:, 3:])]
     pixel = 1.0 if linear.modes is None else linear.modes.typical_px
     robot_m, robot_rad = (max(value, 1e-5) for value in robot)
     return Scales(np.array([robot_m, robot_rad]), pixel, pixel, pixel, _COUNTS / _COUNTS.sum())
@@ -249,12 +250,12 @@ class Linear:
         P = S_inverse - S_inverse @ leverage[:, None] @ S_inverse
         square = scales.robot**2
         gained = np.einsum("nk,k,nki->i", chances[:, :3], GAIN**2, z[:, :3] ** 2)
-        spent = np.einsum("nk,k,nki->i", chances[:, :3], GAIN**2, np.einsum("nkii->nki", P[:, :3]))
+        spent = np.einsum("nk,k,nki->i", chances[:, :3], GAIN**2, np.einsum("nkii->nki", P[:, :3]).clip(0.0))
         floor = np.array([_ROBOT_PRIOR_M, _ROBOT_PRIOR_RAD]) ** 2
         count = ROBOT_PRIOR_COUNT
         up = gained.reshape(2, 3).sum(axis=1) + count * floor / square**2
         down = spent.reshape(2, 3).sum(axis=1) + count / square
-        square = square * up / down
+        square = square * up / np.maximum(down, 1e-300)
         total = chances.sum(axis=0) + _COUNTS
         updated = replace(scales, robot=np.sqrt(square), shares=total / total.sum())
         if fit == "robot" or self.modes is None:

@@ -11,18 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.geometry import Array, difference, inverse, perturb
+from calibrate.handeye.corners import linearise_corners
 from calibrate.handeye.flange import flange_derivatives, implied_flange
-from calibrate.handeye.linear import Linear, Scales, Solved, first_scales
-from calibrate.handeye.observations import Moved, Places
+from calibrate.handeye.linear import CornerModes, Linear, Scales, Solved, first_scales
+from calibrate.handeye.observations import Moved, Places, observe_views
 from calibrate.handeye.priors import Quadratic
 from calibrate.handeye.start import BoardPoses, agreed_start, central_pose
 from calibrate.pairs import mount_poses
+from calibrate.projection import intrinsics_vector
+from calibrate.views import ViewSet
 from recordings.messages import Mount
 
 _STEPS = 8
 _SETTLED = 0.3
 """Length of a step, in sigmas: evidence is not asked to be exact."""
-_FACTOR_SIGMA = 1.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +54,28 @@ class PoseViews:
         )
 
 
+def pose_views(views: ViewSet, focal_sigma: float, size_sigma: float) -> PoseViews:
+    """The views with `camera_from_board`; 1σ of the lens' focal length and of the board's size, relative.
+
+    Two factors move the board poses: true over assumed size of the board, and focal length.
+    """
+    observed, C = observe_views(views), views.camera_from_board
+    size = np.concatenate([C[:, :3, 3], np.zeros((len(C), 3))], axis=1)
+    if not observed.has_pixels:
+        return PoseViews(
+            views.mount,
+            observed.flange,
+            BoardPoses(C, size[None], np.array([size_sigma])),
+            np.zeros((len(C), 6, 6)),
+        )
+    blocks = linearise_corners(observed, views.camera, C, observed.present, with_lens=True)
+    H = np.asarray(np.linalg.inv(blocks.LL), dtype=float)
+    focal = -(H @ blocks.LG[..., :2]) @ intrinsics_vector(views.camera)[:2]
+    modes = CornerModes.of(blocks, H, slice(0))
+    boards = BoardPoses(C, np.stack([size, focal]), np.array([size_sigma, focal_sigma]))
+    return PoseViews(views.mount, observed.flange, boards, modes.typical_px**2 * H)
+
+
 @dataclass(frozen=True, eq=False)
 class PoseFit:
     X: Array
@@ -79,7 +103,7 @@ def fit_poses(views: PoseViews, seed: int = 0) -> PoseFit:
     for _ in range(_STEPS):
         linear = _linearise(views, X, Y, factors)
         scales = scales or first_scales(linear)
-        solved = linear.solve(_prior(linear, X, Y, factors), scales, "robot")
+        solved = linear.solve(_prior(views.boards, len(X) + len(Y), factors), scales, "robot")
         scales, step = solved.scales, solved.step
         at_Y, at_factors = 6 * len(X), 6 * (len(X) + len(Y))
         X = perturb(X, step[:at_Y].reshape(-1, 6))
@@ -110,12 +134,15 @@ def _start(views: PoseViews, seed: int) -> tuple[Array, Array, Array]:
     return both, start.Y[None], start.factors
 
 
-def _prior(linear: Linear, X: Array, Y: Array, factors: Array) -> Quadratic:
-    """A metre and a radian for poses, so that each one let free costs its share of evidence."""
-    size = linear.J.shape[2]
-    poses = 6 * (len(X) + len(Y))
-    N = np.diag(np.concatenate([np.full(poses, 1e-6), np.full(size - poses, _FACTOR_SIGMA**-2.0)]))
-    return Quadratic(N, np.zeros(size))
+def _prior(boards: BoardPoses, poses: int, factors: Array) -> Quadratic:
+    """For `poses` poses, known to a metre and a radian, and the factors: open ones may be of any size."""
+    precision = np.concatenate([np.full(6 * poses, 1e-6), boards.sigma**-2.0])
+    precision[6 * poses + boards.open] = 1e-9
+    miss = np.concatenate([np.zeros(6 * poses), factors - 1.0])
+    width = boards.sigma.copy()
+    width[boards.open] = np.abs(factors[boards.open])
+    log = -0.5 * float((precision * miss**2).sum()) - float(np.log(width).sum())
+    return Quadratic(np.diag(precision), -precision * miss, log)
 
 
 def _linearise(views: PoseViews, X: Array, Y: Array, factors: Array) -> Linear:
@@ -127,5 +154,5 @@ def _linearise(views: PoseViews, X: Array, Y: Array, factors: Array) -> Linear:
     by_X, by_Y, A = flange_derivatives(views.mount, X[of_X], Y[of_Y], C, m)
     columns = [np.where((of_X == part)[:, None, None], by_X, 0.0) for part in range(len(X))]
     columns += [np.where((of_Y == part)[:, None, None], by_Y, 0.0) for part in range(len(Y))]
-    columns += [(A[:, :, :3] @ t[..., None]) for t in views.boards.free]
+    columns += [A @ motion[..., None] for motion in views.boards.motion]
     return Linear(views.covariance, A, m, np.concatenate(columns, axis=2))

@@ -1,0 +1,107 @@
+"""From views to the estimate: a certain start, boards set right, every unknown together."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from calibrate.assess import require_motion
+from calibrate.errors import BadViewsError, PosesDisagreeError
+from calibrate.handeye.arm import WithTable, allow_for_table
+from calibrate.handeye.estimate import Estimate, estimate
+from calibrate.handeye.observations import SHAPE, Moved, Observations, State, observe_views
+from calibrate.handeye.poses import PoseViews, fit_poses
+from calibrate.handeye.priors import Priors
+from calibrate.handeye.start import BoardPoses, agreed_start
+from calibrate.handeye.table import table_motion
+from calibrate.handeye.turns import set_boards_right
+from calibrate.pairs import all_pairs, mount_poses
+from calibrate.robust import GlobalResult, solve_global
+from calibrate.views import ViewSet
+
+FEWEST_FOR_TABLE = 8
+"""Fewer views cannot tell 18 errors of a table from noise."""
+MAX_ROBOT_M, MAX_ROBOT_RAD = 0.03, float(np.radians(3.0))
+"""Noise beyond this per axis is none: no X is returned."""
+
+
+@dataclass(frozen=True, eq=False)
+class CellFit:
+    """Everything about a cell that its views tell."""
+
+    views: ViewSet
+    """As they were read, boards turned where that was needed."""
+    turned: tuple[int, ...]
+    """Places of the views whose board was turned."""
+    observed: Observations
+    priors: Priors
+    estimate: Estimate
+    table: WithTable | None
+    """None where errors of the arm's kinematic table were not modelled."""
+    certified: GlobalResult
+    """Optimum of the quadratic objective over the pairs of all views that count."""
+
+
+def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True) -> CellFit:
+    """Raises BadViewsError or DegenerateMotionError where the views determine no X."""
+    H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
+    pairs = all_pairs(H, C)
+    require_motion(pairs)
+    certified = solve_global(pairs, seed)
+    start = agreed_start(H, BoardPoses.known(C), seed, certified.X)
+    views, turned = set_boards_right(views, start.X, start.Y)
+    observed, C = observe_views(views), views.camera_from_board
+    state = State(start.X, start.Y, C, views.camera, np.zeros(len(SHAPE)), np.zeros(0))
+    found = estimate(observed, state, priors)
+    require_plausible_noise(found)
+    table = None
+    motion = table_motion(views) if with_table and len(views) >= FEWEST_FOR_TABLE else None
+    if motion is not None:
+        observed = replace(observed, table=motion)
+        try:
+            table = allow_for_table(observed, found, priors)
+            found = table.estimate
+        except np.linalg.LinAlgError:
+            observed = replace(observed, table=None)
+    used = np.flatnonzero(found.used)
+    problem = f"the quadratic objective over the pairs of the {len(used)} used views"
+    certified = solve_global(all_pairs(H[used], found.board_poses[used]), seed, problem)
+    return CellFit(views, turned, observed, priors, found, table, certified)
+
+
+def fit_moved(fit: CellFit, poses: PoseViews, at: int, moved: Moved, seed: int) -> CellFit:
+    """The same cell, camera or board moved before the view at place `at`: both halves count.
+
+    X and the board's pose are those after the move. Raises BadViewsError where a half determines nothing.
+    """
+    later = np.arange(len(fit.views)) >= at
+    try:
+        start = fit_poses(replace(poses, later=later, moved=moved), seed)
+    except np.linalg.LinAlgError as problem:
+        raise BadViewsError(f"The views before or after the move determine no pose ({problem}).") from None
+    X, Y = start.X[-1], start.Y[-1]
+    # The later value is the one that holds now: `second` is that of the views before.
+    observed = replace(observe_views(fit.views), later=~later, moved=moved)
+    state = State(
+        X,
+        Y,
+        fit.views.camera_from_board,
+        fit.views.camera,
+        np.zeros(len(SHAPE)),
+        np.zeros(0),
+        start.X[0] if moved == "camera" else start.Y[0],
+    )
+    found = estimate(observed, state, fit.priors)
+    require_plausible_noise(found)
+    return replace(fit, observed=observed, estimate=found, table=None)
+
+
+def require_plausible_noise(found: Estimate) -> None:
+    """PosesDisagreeError where robot and pictures have nothing to do with each other."""
+    robot_m, robot_rad = found.scales.robot
+    if robot_m > MAX_ROBOT_M or robot_rad > MAX_ROBOT_RAD:
+        raise PosesDisagreeError(
+            f"Robot poses and pictures disagree by {robot_m * 1e3:.0f} mm, "
+            f"{np.degrees(robot_rad):.1f}° per axis."
+        )

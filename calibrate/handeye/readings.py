@@ -1,0 +1,214 @@
+"""Other readings of a whole recording: what would explain all views at once, before any single one is blamed.
+
+Poses in another convention, pictures that belong to their neighbours' poses, squares of another size,
+something moved half-way: each is a reading of the same views, fitted like the recording as it stands (`poses`)
+and compared with it by evidence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
+from enum import Enum
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from calibrate.geometry import (
+    Array,
+    inverse,
+    matrix_from_quaternion,
+    quaternion_from_matrix,
+    rotation_exp,
+    rotation_log,
+)
+from calibrate.handeye.observations import Moved
+from calibrate.handeye.poses import PoseFit, PoseViews, fit_poses
+from calibrate.handeye.start import BoardPoses
+
+_CLEAR = 10.0
+"""Log evidence beyond chance by which another reading has to win."""
+_MOST_VIEWS = 60
+"""Of more, this many are read, evenly spread (neighbours for shifted pictures)."""
+_LARGEST_SHIFT = 3
+_FEWEST_PER_PART = 4
+_LOST_VIEW = 15.0
+"""Log evidence charged for each view that a reading leaves without a partner."""
+_SIZE, _FOCAL = 0, 1
+"""Places of the factors of `pose_views`."""
+_FREE = 1.0
+"""1σ of a factor that a reading lets free."""
+
+
+class Reading(Enum):
+    """What a recording may be instead of what it says; the value is its code in files."""
+
+    AS_RECORDED = "as-recorded"
+    INVERSE_POSES = "inverse-poses"
+    QUATERNION_ORDER = "quaternion-order"
+    ROTATION_VECTOR_AS_ANGLES = "rotation-vector-as-angles"
+    ANGLES_AS_ROTATION_VECTOR = "angles-as-rotation-vector"
+    INVERSE_ROTATIONS = "inverse-rotations"
+    SHIFTED = "shifted-pictures"
+    MIRRORED = "mirrored-pictures"
+    SQUARE_SIZE = "square-size"
+    FOCAL_LENGTH = "focal-length"
+    BOARD_MOVED = "board-moved"
+    CAMERA_MOVED = "camera-moved"
+    REFOCUSED = "refocused"
+
+
+@dataclass(frozen=True, eq=False)
+class Explanation:
+    """The reading that explains a recording best, and by how much."""
+
+    reading: Reading
+    log_evidence_gain: float
+    """Over the recording as it stands."""
+    at: int = 0
+    """Place of the first view after a change; pictures by which they are shifted."""
+    factor: float = 1.0
+    """True over configured size of the squares, or focal length, of the later part where it changed."""
+    share: float = 1.0
+    """Of the views that carry full weight under this reading."""
+
+
+_FACTOR = {Reading.SQUARE_SIZE: _SIZE, Reading.FOCAL_LENGTH: _FOCAL, Reading.REFOCUSED: -1}
+
+
+def explain_recording(views: PoseViews, seed: int = 0) -> Explanation:
+    """The best reading; AS_RECORDED unless another one's evidence is clear beyond chance."""
+    as_recorded = _fit(views, seed)
+    if as_recorded is None:
+        base = -np.inf
+    else:
+        base = as_recorded.log_evidence
+    best = Explanation(Reading.AS_RECORDED, 0.0, share=_share(as_recorded))
+    winning = _CLEAR + np.log(max(len(views), 2))
+    for reading, changed, at, charge in _readings(views, as_recorded):
+        fit = _fit(changed, seed)
+        if fit is None:
+            continue
+        gain = fit.log_evidence - charge - base
+        if np.isfinite(gain) and gain > max(winning, best.log_evidence_gain):
+            factor = float(fit.factors[_FACTOR.get(reading, 0)]) if reading in _FACTOR else 1.0
+            best = Explanation(reading, gain, at, factor, _share(fit))
+    return best
+
+
+def _fit(views: PoseViews, seed: int) -> PoseFit | None:
+    try:
+        return fit_poses(views, seed)
+    except np.linalg.LinAlgError:
+        return None
+
+
+def _share(fit: PoseFit | None) -> float:
+    return 0.0 if fit is None else float((fit.full > 0.35).mean())
+
+
+def _readings(
+    views: PoseViews, as_recorded: PoseFit | None
+) -> Iterator[tuple[Reading, PoseViews, int, float]]:
+    """Reading, the views in it, `Explanation.at`, and the evidence that it is charged beforehand."""
+    for reading, change in _CONVENTIONS.items():
+        yield reading, replace(views, flange=change(views.flange)), 0, 0.0
+    yield Reading.MIRRORED, replace(views, boards=_mirrored(views.boards)), 0, 0.0
+    for shift in (*range(-_LARGEST_SHIFT, 0), *range(1, _LARGEST_SHIFT + 1)):
+        if len(views) - abs(shift) >= _FEWEST_PER_PART + 2:
+            yield Reading.SHIFTED, _shifted(views, shift), shift, _LOST_VIEW * abs(shift)
+    yield Reading.SQUARE_SIZE, replace(views, boards=_let_free(views.boards, _SIZE)), 0, 0.0
+    if len(views.boards.sigma) > _FOCAL:
+        yield Reading.FOCAL_LENGTH, replace(views, boards=_let_free(views.boards, _FOCAL)), 0, 0.0
+    for at in _changes(views, as_recorded):
+        later = np.arange(len(views)) >= at
+        moved: Moved
+        for reading, moved in ((Reading.BOARD_MOVED, "board"), (Reading.CAMERA_MOVED, "camera")):
+            yield reading, replace(views, later=later, moved=moved), at, 0.0
+        if len(views.boards.sigma) > _FOCAL:
+            yield Reading.REFOCUSED, replace(views, boards=_refocused(views.boards, later)), at, 0.0
+
+
+def _changes(views: PoseViews, as_recorded: PoseFit | None) -> list[int]:
+    """Places where something may have been moved: where the views' weights part best, and the middle."""
+    n = len(views)
+    places = np.arange(_FEWEST_PER_PART, n - _FEWEST_PER_PART + 1)
+    if not len(places):
+        return []
+    chosen = [n // 2]
+    if as_recorded is not None:
+        weight = as_recorded.full
+        total = np.cumsum(weight)[places - 1]
+        left, right = total / places, (weight.sum() - total) / (n - places)
+        parted = (left - right) ** 2 * places * (n - places)
+        chosen = [*places[np.argsort(-parted)[:3]].tolist(), *chosen]
+    return list(dict.fromkeys(chosen))
+
+
+def _let_free(boards: BoardPoses, factor: int) -> BoardPoses:
+    sigma = boards.sigma.copy()
+    sigma[factor] = _FREE
+    return replace(boards, sigma=sigma)
+
+
+def _refocused(boards: BoardPoses, later: NDArray[np.bool_]) -> BoardPoses:
+    """One focal length before, another one after; the last factor is that of the later part."""
+    focal = boards.motion[_FOCAL]
+    parts = np.stack([focal * ~later[:, None], focal * later[:, None]])
+    return replace(
+        boards,
+        motion=np.concatenate([boards.motion[:_FOCAL], parts]),
+        sigma=np.array([*boards.sigma[:_FOCAL], _FREE, _FREE]),
+    )
+
+
+def _mirrored(boards: BoardPoses) -> BoardPoses:
+    """Board poses of mirrored pictures: x of the camera and of the board change their sign."""
+    mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
+    motion = boards.motion * [-1.0, 1.0, 1.0, 1.0, -1.0, -1.0]
+    return replace(boards, C=mirror @ boards.C @ mirror, motion=motion)
+
+
+def _shifted(views: PoseViews, shift: int) -> PoseViews:
+    """Picture i with pose i + shift."""
+    n = len(views)
+    pictures = np.arange(max(0, -shift), n - max(0, shift))
+    return replace(views.part(pictures), flange=views.flange[pictures + shift])
+
+
+def _rotations(change: Callable[[Array], Array]) -> Callable[[Array], Array]:
+    """A change of rotations (n, 3, 3), for poses (n, 4, 4)."""
+
+    def changed(poses: Array) -> Array:
+        result = poses.copy()
+        result[:, :3, :3] = change(poses[:, :3, :3])
+        return result
+
+    return changed
+
+
+def _w_first(R: Array) -> Array:
+    return matrix_from_quaternion(np.roll(quaternion_from_matrix(R), -1, axis=-1))
+
+
+def _vectors(R: Array) -> Array:
+    """Of the two triples of angles that make R, the one that can be a rotation vector (at most 180° long)."""
+    angles = Rotation.from_matrix(R).as_euler("xyz")
+    other = np.stack([angles[:, 0] + np.pi, np.pi - angles[:, 1], angles[:, 2] + np.pi], axis=1)
+    other = (other + np.pi) % (2 * np.pi) - np.pi
+    shorter = np.linalg.norm(angles, axis=1) <= np.linalg.norm(other, axis=1)
+    return rotation_exp(np.where(shorter[:, None], angles, other))
+
+
+def _angles(R: Array) -> Array:
+    return np.asarray(Rotation.from_euler("xyz", rotation_log(R)).as_matrix())
+
+
+_CONVENTIONS: dict[Reading, Callable[[Array], Array]] = {
+    Reading.INVERSE_POSES: inverse,
+    Reading.QUATERNION_ORDER: _rotations(_w_first),
+    Reading.ROTATION_VECTOR_AS_ANGLES: _rotations(_vectors),
+    Reading.ANGLES_AS_ROTATION_VECTOR: _rotations(_angles),
+    Reading.INVERSE_ROTATIONS: _rotations(lambda R: np.asarray(R.transpose(0, 2, 1))),
+}

@@ -33,14 +33,14 @@ _FULL = 0.99
 OURS = "ours"
 
 RULE = (
-    f"{FOLDS}-fold cross-validation over {FOLD_SEEDS} seeds. Lens, X and board place come from the training "
-    "views. In every left-out view, X, the robot's pose and the view's own PnP put the board centre "
-    "somewhere, and its distance from the trained place counts. No left-out view is dropped. Where a "
-    "method fails or refuses a fold, each left-out view of that fold is charged that method's own "
-    "worst error in the set; a method that answers in less than half of the folds has no figure. OpenCV's lens is "
-    "`cv2.calibrateCamera`'s on the training pictures, or the given one where there is one, whichever serves "
-    "the method better; calibration-rs finds its own. `95 %` is a paired bootstrap over views of ours over "
-    "the best peer of that set."
+    f"{FOLDS}-fold cross-validation over {FOLD_SEEDS} seeds. Lens, X and board place come from the "
+    "training views. In every left-out view, X, the robot's pose and the view's own PnP put the board "
+    "centre somewhere, and its distance from the trained place counts. No left-out view is dropped. "
+    "Where a method fails or refuses a fold, each left-out view of that fold is charged that method's "
+    "own worst error in the set; a method that answers in less than half of the folds has no figure. "
+    "OpenCV's lens is `cv2.calibrateCamera`'s on the training pictures, or the given one where there is "
+    "one, whichever serves the method better; calibration-rs finds its own. `95 %` is a paired "
+    "bootstrap over views of ours over the best peer of that set."
 )
 
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, pose, rotation_exp
-from recordings.messages import BoardKind, BoardSpec
+from recordings.messages import LARGEST_FLATNESS_M, LARGEST_TOLERANCE, SINGLE_TAGS, BoardKind, BoardSpec
 
 APRIL_DICTIONARY = "DICT_APRILTAG_36h11"
 _LARGEST_SIDE = 200
@@ -45,7 +45,7 @@ def _require_markers(spec: BoardSpec, dictionary: str, count: int) -> None:
 
 def check_board(spec: BoardSpec) -> None:
     """Raises BoardError where the numbers cannot belong to a real board."""
-    smallest = 1 if spec.kind is BoardKind.APRIL_GRID else 2
+    smallest = 1 if spec.kind in (BoardKind.APRIL_GRID, *SINGLE_TAGS) else 2
     if not all(smallest <= side <= _LARGEST_SIDE for side in (spec.columns, spec.rows)):
         raise BoardError(
             f"board: {spec.columns} × {spec.rows} is impossible; columns and rows must be {smallest} … "
@@ -53,7 +53,15 @@ def check_board(spec: BoardSpec) -> None:
         )
     if not 1e-4 <= spec.square_m <= 10.0:
         raise BoardError(f"board: square_m = {spec.square_m} is not a size in metres (25 mm is 0.025).")
-    if spec.kind is BoardKind.CHARUCO:
+    if spec.square_tolerance is not None and not 0 < spec.square_tolerance <= LARGEST_TOLERANCE:
+        raise BoardError(
+            f"board: square_tolerance = {spec.square_tolerance} is not a relative tolerance (0.3 % is 0.003)."
+        )
+    if spec.flatness_m is not None and not 0 < spec.flatness_m <= LARGEST_FLATNESS_M:
+        raise BoardError(f"board: flatness_m = {spec.flatness_m} is not in metres (1 mm is 0.001).")
+    if spec.kind in SINGLE_TAGS:
+        _check_tag(spec)
+    elif spec.kind is BoardKind.CHARUCO:
         _require_markers(spec, spec.dictionary or "", spec.columns * spec.rows // 2)
         if spec.marker_m is None or not 0 < spec.marker_m < spec.square_m:
             raise BoardError("board: a charuco board needs marker_m, smaller than square_m.")
@@ -67,10 +75,27 @@ def check_board(spec: BoardSpec) -> None:
         raise BoardError("board: fewer than 4 points do not fix a pose.")
 
 
+def _check_tag(spec: BoardSpec) -> None:
+    if (spec.columns, spec.rows) != (1, 1):
+        raise BoardError("board: a single tag has no columns and rows; leave them out.")
+    if spec.kind is BoardKind.ARUCO and not spec.dictionary:
+        raise BoardError("board: an aruco tag needs its dictionary, for example DICT_4X4_50.")
+    held = len(cv2.aruco.getPredefinedDictionary(dictionary_id(tag_dictionary(spec))).bytesList)
+    if not 0 <= spec.tag_id < held:
+        raise BoardError(f"board: id {spec.tag_id} is not in {tag_dictionary(spec)} (0 … {held - 1}).")
+
+
+def tag_dictionary(spec: BoardSpec) -> str:
+    """Dictionary of a board of tags; AprilTags have a usual one."""
+    return spec.dictionary or APRIL_DICTIONARY
+
+
 def grid_shape(spec: BoardSpec) -> tuple[int, int]:
     """Columns and rows of points (not for april-grid, whose points come four to a tag)."""
     if spec.kind is BoardKind.CHARUCO:
         return spec.columns - 1, spec.rows - 1
+    if spec.kind in SINGLE_TAGS:
+        return 2, 2
     return spec.columns, spec.rows
 
 
@@ -80,7 +105,8 @@ def board_points(spec: BoardSpec) -> Array:
 
     Asymmetric circles: `square_m` is the distance of neighbouring rows, half that of circles in a row
     (OpenCV's convention). april-grid: corners of tag 0, 1 … row by row from the bottom left as Kalibr counts,
-    each tag's four from its bottom left, counter-clockwise as printed.
+    each tag's four from its bottom left, counter-clockwise as printed. A single tag: the corners of its black
+    square, row by row from its top left.
     """
     if spec.kind is BoardKind.APRIL_GRID:
         points = _april_points(spec)
@@ -110,7 +136,7 @@ def looks_same_turns(spec: BoardSpec) -> tuple[int, ...]:
     a radon board are not read.
     """
     columns, rows = spec.columns, spec.rows
-    if spec.kind in (BoardKind.CHARUCO, BoardKind.APRIL_GRID):
+    if spec.kind in (BoardKind.CHARUCO, BoardKind.APRIL_GRID, *SINGLE_TAGS):
         return (0,)
     if spec.kind is BoardKind.CHESSBOARD:
         if (columns + rows) % 2:
@@ -159,6 +185,8 @@ def ambiguity_text(spec: BoardSpec) -> str:
 
 def describe_board(spec: BoardSpec) -> str:
     """'chessboard 7×6, 25 mm'"""
+    if spec.kind in SINGLE_TAGS:
+        return f"{spec.kind.value} {spec.tag_id} of {tag_dictionary(spec)}, {spec.square_m * 1000:g} mm"
     text = f"{spec.kind.value} {spec.columns}×{spec.rows}, {spec.square_m * 1000:g} mm"
     if spec.kind is BoardKind.CHARUCO:
         layout = ", legacy layout" if spec.legacy else ""

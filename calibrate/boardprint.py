@@ -5,10 +5,10 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from calibrate.board import APRIL_DICTIONARY, BoardError, check_board, describe_board, dictionary_id
+from calibrate.board import BoardError, check_board, describe_board, dictionary_id, tag_dictionary
 from calibrate.markers import charuco_board
 from calibrate.vector import Circle, Line, Rectangle, Shape, Sheet, moved
-from recordings.messages import BoardKind, BoardSpec
+from recordings.messages import SINGLE_TAGS, BoardKind, BoardSpec
 
 _MARGIN_MM = 7.0
 _FOOT_MM = 16.0
@@ -112,8 +112,16 @@ def _april_grid(spec: BoardSpec) -> tuple[list[Shape], float, float]:
     for number in range(spec.columns * spec.rows):
         r, c = divmod(number, spec.columns)
         top = height - gap - r * pitch - side
-        shapes += _marker(spec.dictionary or APRIL_DICTIONARY, number, gap + c * pitch, top, side, 2)
+        shapes += _marker(tag_dictionary(spec), number, gap + c * pitch, top, side, 2)
     return shapes, width, height
+
+
+def _tag(spec: BoardSpec) -> tuple[list[Shape], float, float]:
+    """One tag with a quiet zone of one cell."""
+    side, dictionary = spec.square_m * 1000, tag_dictionary(spec)
+    family = cv2.aruco.getPredefinedDictionary(dictionary_id(dictionary))
+    quiet = side / (family.markerSize + 2)
+    return _marker(dictionary, spec.tag_id, quiet, quiet, side, 1), side + 2 * quiet, side + 2 * quiet
 
 
 _BOARDS = {
@@ -122,6 +130,8 @@ _BOARDS = {
     BoardKind.ASYMMETRIC_CIRCLES: _circles,
     BoardKind.CHARUCO: _charuco,
     BoardKind.APRIL_GRID: _april_grid,
+    BoardKind.ARUCO: _tag,
+    BoardKind.APRIL_TAG: _tag,
 }
 
 
@@ -156,7 +166,11 @@ def _foot(spec: BoardSpec, x: float, y: float, width: float) -> list[Shape]:
 
 
 def _yaml(spec: BoardSpec) -> str:
-    fields = [f"kind: {spec.kind.value}", f"columns: {spec.columns}", f"rows: {spec.rows}"]
+    fields = [f"kind: {spec.kind.value}"]
+    if spec.kind in SINGLE_TAGS:
+        fields.append(f"id: {spec.tag_id}")
+    else:
+        fields += [f"columns: {spec.columns}", f"rows: {spec.rows}"]
     fields.append(f"square_m: {spec.square_m:g}")
     if spec.marker_m is not None:
         fields.append(f"marker_m: {spec.marker_m:g}")

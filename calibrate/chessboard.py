@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 
 import cv2
+import msgspec
 import numpy as np
 
 from calibrate.board import looks_same_turns
@@ -89,6 +90,19 @@ def _orient(grey: Grey, grid: Array, spec: BoardSpec) -> Array:
     means, grey_level = square_means(grey, grid), float(cv2.mean(grey)[0])
     dark_first = [t for t in turns if square_contrast(np.rot90(means, t), grey_level) > 0] or turns
     return min((np.rot90(grid, t) for t in dark_first), key=lambda c: float(c[0, 0].sum()))
+
+
+def other_size(grey: Grey, spec: BoardSpec) -> tuple[int, int] | None:
+    """Inner corners (columns, rows) of a chessboard that is seen where that of `spec` is not; None: none is.
+
+    One smaller each way is looked for by name: that is what a board looks like whose squares were counted.
+    """
+    seen = seen_size(grey)
+    if seen is None or min(spec.columns, spec.rows) < 3:
+        return seen
+    smaller = msgspec.structs.replace(spec, columns=spec.columns - 1, rows=spec.rows - 1)
+    found = find_chessboard(grey, smaller) is not None
+    return (smaller.columns, smaller.rows) if found else seen
 
 
 def seen_size(grey: Grey) -> tuple[int, int] | None:

@@ -10,12 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.board import board_points, check_board, describe_board, fixes_a_plane
-from calibrate.chessboard import find_chessboard, seen_size
+from calibrate.chessboard import find_chessboard, other_size
 from calibrate.circles import find_circles
 from calibrate.corners import Grey, to_grey
 from calibrate.geometry import Array
 from calibrate.markers import find_april_grid, find_charuco
-from recordings.messages import BoardKind, BoardSpec
+from calibrate.tags import find_tag
+from recordings.messages import SINGLE_TAGS, BoardKind, BoardSpec
 
 FEWEST_POINTS = 6
 """Fewer corners of a partial board do not give a trustworthy pose."""
@@ -44,6 +45,10 @@ class Detection:
     """Share of pixels at the upper end of the scale there, 0 … 1; NaN when not asked for."""
     coverage: float
     """Share of the picture inside the outline of the points, 0 … 1."""
+    seen_instead: tuple[int, int] | None = None
+    """Inner corners (columns, rows) of another chessboard that is seen; looked for where none is found."""
+    squares_counted: bool = False
+    """The other chessboard is one smaller each way: the squares were declared, not the inner corners."""
 
     @property
     def corners(self) -> int:
@@ -67,13 +72,24 @@ def detect(
     fewest = min(FEWEST_POINTS, expected)
     whole = len(indices) == expected
     found = whole or (len(indices) >= fewest and fixes_a_plane(board_points(spec)[indices]))
-    reason = "" if found else _reason(grey, spec, len(indices), fewest, thorough)
+    reason, instead = ("", None) if found else _reason(grey, spec, len(indices), fewest, thorough)
     if not found:
         indices, pixels = indices[:0], pixels[:0]
     sharpness, saturated = _picture_quality(grey, pixels) if with_quality else (np.nan, np.nan)
     area = cv2.contourArea(cv2.convexHull(pixels.astype(np.float32))) if found else 0.0
     return Detection(
-        found, reason, indices, pixels, expected, width, height, sharpness, saturated, area / (width * height)
+        found,
+        reason,
+        indices,
+        pixels,
+        expected,
+        width,
+        height,
+        sharpness,
+        saturated,
+        area / (width * height),
+        instead,
+        instead == (spec.columns - 1, spec.rows - 1),
     )
 
 
@@ -82,6 +98,8 @@ def _find(grey: Grey, spec: BoardSpec, thorough: bool) -> tuple[NDArray[np.intp]
         return find_charuco(grey, spec, thorough)
     if spec.kind is BoardKind.APRIL_GRID:
         return find_april_grid(grey, spec)
+    if spec.kind in SINGLE_TAGS:
+        return find_tag(grey, spec, thorough)
     if spec.kind is BoardKind.CHESSBOARD:
         pixels = find_chessboard(grey, spec, thorough)
     else:
@@ -91,26 +109,32 @@ def _find(grey: Grey, spec: BoardSpec, thorough: bool) -> tuple[NDArray[np.intp]
     return np.arange(len(pixels)), pixels
 
 
-def _reason(grey: Grey, spec: BoardSpec, count: int, fewest: int, thorough: bool) -> str:
+def _reason(
+    grey: Grey, spec: BoardSpec, count: int, fewest: int, thorough: bool
+) -> tuple[str, tuple[int, int] | None]:
+    """A sentence for people, and the other chessboard that is seen."""
     if count >= fewest:
-        return f"the {count} corners of the board that are seen lie in a line: they fix no pose"
+        return f"the {count} corners of the board that are seen lie in a line: they fix no pose", None
     if count:
-        return f"only {count} corners of the board are seen, {fewest} are needed"
+        return f"only {count} corners of the board are seen, {fewest} are needed", None
     level = float(grey.mean())
     if level < 12.0:
-        return f"the picture is too dark (mean grey {level:.0f})"
+        return f"the picture is too dark (mean grey {level:.0f})", None
     if float((grey >= _SATURATED_GREY).mean()) > 0.5:
-        return "the picture is over-exposed: more than half of it is saturated"
+        return "the picture is over-exposed: more than half of it is saturated", None
     if float(grey.std()) < 3.0:
-        return f"the picture is empty (grey {level:.0f}, no contrast)"
+        return f"the picture is empty (grey {level:.0f}, no contrast)", None
     if thorough and spec.kind is BoardKind.CHESSBOARD:
-        seen = seen_size(grey)
+        seen = other_size(grey, spec)
         if seen is not None and sorted(seen) != sorted((spec.columns, spec.rows)):
-            return (
-                f"board {spec.columns}×{spec.rows} expected, {seen[0]}×{seen[1]} seen "
-                "(inner corners; partly hidden, or another board)"
+            why = "partly hidden, or another board"
+            if seen == (spec.columns - 1, spec.rows - 1):
+                why = "were squares counted?"
+            text = (
+                f"board {spec.columns}×{spec.rows} expected, {seen[0]}×{seen[1]} seen (inner corners; {why})"
             )
-    return f"no {describe_board(spec)} found"
+            return text, seen
+    return f"no {describe_board(spec)} found", None
 
 
 def _picture_quality(grey: Grey, pixels: Array) -> tuple[float, float]:

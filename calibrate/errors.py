@@ -16,6 +16,15 @@ class TooFewViewsError(CalibrationError):
     """Fewer usable views than the method needs."""
 
 
+class SquaresCountedError(TooFewViewsError):
+    """A chessboard was declared in squares where inner corners are counted."""
+
+    def __init__(self, text: str, columns: int, rows: int) -> None:
+        super().__init__(text)
+        self.columns, self.rows = columns, rows
+        """Inner corners that the pictures show."""
+
+
 class DegenerateMotionError(CalibrationError):
     """The rotations do not determine X; the message names the missing direction."""
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from calibrate.board import board_points
 from calibrate.detect import Detection, detect
-from calibrate.errors import BadViewsError, TooFewViewsError
+from calibrate.errors import BadViewsError, SquaresCountedError, TooFewViewsError
 from calibrate.geometry import is_rigid
 from calibrate.solution import RejectedView
 from calibrate.views import ImageView, ViewSet
@@ -73,6 +73,9 @@ def load_views(
             missing.append(RejectedView(view.index, view.name, detection.reason, "corners"))
     pictures = len(seen) + sum(view.kind == "unreadable-picture" for view in missing)
     if len(views) < fewest:
+        counted = sum(detection.squares_counted for detection in seen.values())
+        if counted >= max(1, len(missing) / 2):
+            raise _squares_counted(recording, spec, counted, pictures)
         raise TooFewViewsError(_too_few_text(recording, len(views), pictures, missing, fewest))
     model = CameraModel(
         model.width or next(iter(seen.values())).width,
@@ -88,13 +91,14 @@ def load_views(
 def without_views(loaded: LoadedViews, numbers: tuple[int, ...], fewest: int = FEWEST_VIEWS) -> LoadedViews:
     """Without the poses of these numbers (from 1), which a person chose; they are listed as left out.
 
-    Raises BadViewsError for a number that no view has, TooFewViewsError when fewer than `fewest` stay.
+    A pose whose picture shows no board is left out already. Raises BadViewsError for a number that no pose
+    has, TooFewViewsError when fewer than `fewest` stay.
     """
     chosen = {number - 1 for number in numbers}
     views = loaded.views
-    if unknown := chosen - {view.index for view in views}:
+    if unknown := chosen - {view.index for view in (*views, *loaded.without_board)}:
         told = ", ".join(str(index + 1) for index in sorted(unknown))
-        raise BadViewsError(f"--without {told}: the board is seen in no view of that number.")
+        raise BadViewsError(f"--without {told}: there is no view of that number.")
     left = tuple(
         RejectedView(view.index, view.name, "left out by hand (--without)", "by-hand")
         for view in views
@@ -185,6 +189,17 @@ def _image_view(view: View, detection: Detection, spec: BoardSpec) -> ImageView:
         board_points=board_points(spec)[detection.indices],
         pixels=detection.pixels,
         joints_rad=None if view.joints_rad is None else np.array(view.joints_rad),
+    )
+
+
+def _squares_counted(recording: Recording, spec: BoardSpec, counted: int, total: int) -> SquaresCountedError:
+    columns, rows = spec.columns - 1, spec.rows - 1
+    return SquaresCountedError(
+        f"{recording.path}: {counted} of {total} pictures show {columns}×{rows} inner corners where "
+        f"{spec.columns}×{spec.rows} are declared: squares were counted. Declare columns: {columns}, "
+        f"rows: {rows} (solve again with --board).",
+        columns,
+        rows,
     )
 
 

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board import APRIL_DICTIONARY, board_points, dictionary_id
+from calibrate.board import board_points, dictionary_id, tag_dictionary
 from calibrate.corners import Grey, equalise, local_spacing, refine, sample
 from calibrate.geometry import Array
 from recordings.messages import BoardSpec
@@ -24,7 +24,7 @@ _NEAR_SHARE, _FAR_MOVES = 0.025, 4.0
 """A corner ran away where the refinement moves it farther from the prediction than this share of the spacing
 and than so many times the middle one."""
 Indices = NDArray[np.intp]
-_NOTHING = (np.zeros(0, dtype=np.intp), np.zeros((0, 2)))
+NOTHING = (np.zeros(0, dtype=np.intp), np.zeros((0, 2)))
 
 
 @lru_cache(maxsize=8)
@@ -51,7 +51,7 @@ def find_charuco(grey: Grey, spec: BoardSpec, thorough: bool = True) -> tuple[In
     if thorough and len(seen) < few and _small(seen) and _ENLARGED * max(grey.shape) <= _LARGEST_SIDE_PX:
         seen = max(seen, _markers_enlarged(grey, spec, plane_of), key=len)
     if len(seen) < 2:
-        return _NOTHING
+        return NOTHING
     # OpenCV's sub-pixel step needs both markers of a corner; ours takes every corner the plane predicts.
     plane = np.concatenate([corners[:, :2] for corners, _ in seen]).astype(float)
     pixels = np.concatenate([marker.reshape(4, 2) for _, marker in seen]).astype(float)
@@ -63,7 +63,7 @@ def _markers(
     grey: Grey, spec: BoardSpec, plane_of: dict[int, Any], smallest: float = _SMALLEST_PERIMETER
 ) -> list[tuple[Any, Any]]:
     """Corners on the board and in the picture of every marker of the board that is seen."""
-    markers, ids, _ = _marker_detector(spec.dictionary or "", 1, smallest).detectMarkers(grey)
+    markers, ids, _ = marker_detector(spec.dictionary or "", 1, smallest).detectMarkers(grey)
     found = [] if ids is None else ids.ravel().tolist()
     return [(plane_of[i], marker) for i, marker in zip(found, markers, strict=False) if i in plane_of]
 
@@ -87,7 +87,7 @@ def _snap_to_corners(
     found: Any = cv2.findHomography(plane, pixels, cv2.RANSAC, 6.0)
     H = found[0]
     if H is None:
-        return _NOTHING
+        return NOTHING
     predicted = _apply(H, points)
     shown = _apply(H, plane)
     # The lens bends the plane: shift each prediction by what its nearest markers missed.
@@ -106,7 +106,7 @@ def _snap_to_corners(
     )
     chosen = np.flatnonzero(known & inside & (spacing > 5.0))
     if len(chosen) == 0:
-        return _NOTHING
+        return NOTHING
     # No edge of a marker may come into the window: they run beside the corner, not through it.
     margin_share = 0.5 * (1.0 - (spec.marker_m or 0.0) / spec.square_m)
     across, down = (
@@ -145,7 +145,7 @@ def _apply(H: Array, points: Array) -> Array:
 
 
 @lru_cache(maxsize=8)
-def _marker_detector(dictionary: str, border_bits: int, smallest: float = _SMALLEST_PERIMETER) -> Any:
+def marker_detector(dictionary: str, border_bits: int, smallest: float = _SMALLEST_PERIMETER) -> Any:
     parameters = cv2.aruco.DetectorParameters()
     parameters.minMarkerPerimeterRate = smallest
     parameters.markerBorderBits = border_bits
@@ -155,7 +155,7 @@ def _marker_detector(dictionary: str, border_bits: int, smallest: float = _SMALL
 
 def find_april_grid(grey: Grey, spec: BoardSpec) -> tuple[Indices, Array]:
     """Four corners of every tag that is seen. Printed borders of one and of two bits (Kalibr) are tried."""
-    best = _NOTHING
+    best = NOTHING
     for border_bits in (2, 1):
         found = _tags(grey, spec, border_bits)
         if len(found[0]) > len(best[0]):
@@ -164,15 +164,15 @@ def find_april_grid(grey: Grey, spec: BoardSpec) -> tuple[Indices, Array]:
 
 
 def _tags(grey: Grey, spec: BoardSpec, border_bits: int) -> tuple[Indices, Array]:
-    detector = _marker_detector(spec.dictionary or APRIL_DICTIONARY, border_bits)
+    detector = marker_detector(tag_dictionary(spec), border_bits)
     markers, ids, _ = detector.detectMarkers(grey)
     if ids is None:
-        return _NOTHING
+        return NOTHING
     numbers, count = ids.ravel().tolist(), spec.columns * spec.rows
     # A tag that is seen twice is on two boards, and nobody knows on which of them.
     tags = [(i, m) for i, m in zip(numbers, markers, strict=True) if i < count and numbers.count(i) == 1]
     if not tags:
-        return _NOTHING
+        return NOTHING
     # OpenCV goes clockwise from the top left, Kalibr counter-clockwise from the bottom left.
     corners = np.concatenate([m.reshape(4, 2)[[3, 2, 1, 0]] for _, m in tags]).astype(float)
     sides = np.repeat([np.linalg.norm(np.diff(m.reshape(4, 2), axis=0), axis=1).min() for _, m in tags], 4)

@@ -10,7 +10,16 @@ import numpy as np
 
 from recordings import strict_yaml
 from recordings.errors import ImportFolderError
-from recordings.messages import BoardKind, BoardSpec, CameraModel, Mount, RobotIdentity
+from recordings.messages import (
+    LARGEST_FLATNESS_M,
+    LARGEST_TOLERANCE,
+    SINGLE_TAGS,
+    BoardKind,
+    BoardSpec,
+    CameraModel,
+    Mount,
+    RobotIdentity,
+)
 from recordings.pictures import SIDE_LIMIT_PX
 
 DATASET_FILE = "dataset.yaml"
@@ -45,8 +54,12 @@ _HELP = "docs/recording-format.md, 'Bring your own pictures'"
 
 
 def _board_problem(board: BoardSpec) -> str:
-    if not (2 <= board.columns <= 100 and 2 <= board.rows <= 100):
+    if board.kind not in SINGLE_TAGS and not (2 <= board.columns <= 100 and 2 <= board.rows <= 100):
         return f"board: {board.columns}×{board.rows} columns×rows; each is 2 to 100"
+    if board.kind in SINGLE_TAGS and (board.columns, board.rows) != (1, 1):
+        return f"board: {board.columns}×{board.rows} columns×rows; a single tag has none, leave them out"
+    if board.kind is BoardKind.ARUCO and not board.dictionary:
+        return "board: an aruco tag needs its dictionary, such as DICT_4X4_50"
     if not 1e-4 <= board.square_m <= 10:
         return f"board: square_m = {board.square_m} is not a length in metres (25 mm = 0.025)"
     if board.kind is BoardKind.CHARUCO and not (board.marker_m and board.dictionary):
@@ -55,6 +68,16 @@ def _board_problem(board: BoardSpec) -> str:
         return f"board: marker_m = {board.marker_m} is not a length in metres"
     if board.kind is BoardKind.CHARUCO and board.marker_m and board.marker_m >= board.square_m:
         return f"board: marker_m = {board.marker_m} must be smaller than square_m = {board.square_m}"
+    if board.square_tolerance is not None and not 0 < board.square_tolerance <= LARGEST_TOLERANCE:
+        return (
+            f"board: square_tolerance = {board.square_tolerance} is no relative tolerance of square_m "
+            f"(0.003 is 0.3 %; above 0, at most {LARGEST_TOLERANCE:g})"
+        )
+    if board.flatness_m is not None and not 0 < board.flatness_m <= LARGEST_FLATNESS_M:
+        return (
+            f"board: flatness_m = {board.flatness_m} is no flatness in metres (1 mm is 0.001; above 0, "
+            f"at most {LARGEST_FLATNESS_M:g})"
+        )
     return ""
 
 

@@ -134,6 +134,7 @@ def _write_view(writer: RecordingWriter, folder: Path, index: int, row: PoseRow,
             name=Path(row.image).stem,
             picture_sequence=index,
             base_from_flange=row.base_from_flange,
+            joints_rad=row.joints_rad,
             source_file=row.image,
         )
     )

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from recordings.messages import BoardSpec, RobotState
+from recordings.messages import SINGLE_TAGS, BoardSpec, RobotState
 from recordings.reader import Recording
 from recordings.schema import PictureFacts
 from recordings.topics import Topic
@@ -66,6 +66,8 @@ def recording_info(recording: Recording) -> dict[str, Any]:
 
 
 def _board_text(board: BoardSpec) -> str:
+    if board.kind in SINGLE_TAGS:
+        return f"{board.kind} {board.tag_id}, {board.square_m * 1e3:g} mm"
     return f"{board.kind} {board.columns}×{board.rows}, {board.square_m * 1e3:g} mm"
 
 

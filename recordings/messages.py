@@ -26,23 +26,41 @@ class BoardKind(StrEnum):
     CIRCLES = "circles"
     ASYMMETRIC_CIRCLES = "asymmetric-circles"
     APRIL_GRID = "april-grid"
+    ARUCO = "aruco"
+    """One ArUco tag."""
+    APRIL_TAG = "april-tag"
+    """One AprilTag."""
+
+
+SINGLE_TAGS = (BoardKind.ARUCO, BoardKind.APRIL_TAG)
 
 
 class BoardSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     """A calibration board as its owner would describe it."""
 
     kind: BoardKind
-    columns: int
-    """Inner corners (chessboard), circles, tags, or squares (charuco, as OpenCV counts)."""
-    rows: int
-    square_m: float
-    """Side of a square; distance of neighbouring circles; side of a tag (april-grid)."""
+    columns: int = 1
+    """Inner corners (chessboard), circles, tags, or squares (charuco, as OpenCV counts); a single tag: 1."""
+    rows: int = 1
+    square_m: float = 0.0
+    """Side of a square; distance of neighbouring circles; side of a tag's black square. Must be given."""
     marker_m: float | None = None
     """charuco: side of a marker. april-grid: the gap between tags."""
     dictionary: str | None = None
     legacy: bool = False
     radon_marker: bool = False
     """A chessboard with OpenCV's three-dot marker."""
+    tag_id: int = msgspec.field(default=0, name="id")
+    """Number of a single tag in its dictionary."""
+    square_tolerance: float | None = None
+    """Relative standard uncertainty of `square_m`; None: the solver's default."""
+    flatness_m: float | None = None
+    """Standard deviation of the board's points from a plane; None: the solver's default."""
+
+
+LARGEST_TOLERANCE = 0.1
+"""Relative; a square known worse than this is not known."""
+LARGEST_FLATNESS_M = 0.05
 
 
 class RobotIdentity(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):

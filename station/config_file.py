@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from calibrate.board import BoardError, check_board
 from calibrate.kinematics import MODELS
 from recordings import strict_yaml
 from station.config import PoseGuess, StationConfig
@@ -85,8 +86,10 @@ def _meaning_problems(config: StationConfig) -> Iterator[str]:
             yield f"limits.planes: the normal of '{plane.name}' is zero"
     if camera.trigger == "hardware" and config.trigger is None:
         yield "camera.trigger: hardware needs a section 'trigger' with the box's port"
-    if config.board.square_m <= 0 or config.board.columns < 2 or config.board.rows < 2:
-        yield "board: columns and rows must be at least 2 and square_m above 0"
+    try:
+        check_board(config.board)
+    except BoardError as problem:
+        yield str(problem)
     if config.board.square_m > LARGEST_SQUARE_M:
         yield f"board.square_m: {config.board.square_m} m is no board's square; lengths are in metres"
     if not 0 < config.working_distance_m <= LARGEST_REACH_M:

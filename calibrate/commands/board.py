@@ -13,7 +13,7 @@ from calibrate.calibration import write_output
 from calibrate.commands.files import read_board
 from calibrate.commands.output import OutputError, check_folder, err, out
 from calibrate.vector import pdf, svg
-from recordings.messages import BoardKind, BoardSpec
+from recordings.messages import SINGLE_TAGS, BoardKind, BoardSpec
 from recordings.terminal import examples
 
 
@@ -23,6 +23,7 @@ def register(app: typer.Typer) -> None:
         epilog=examples(
             "calibrate board -o board.pdf --paper A4",
             "calibrate board --kind charuco --columns 12 --rows 9 --square-mm 30 --marker-mm 22 -o board.svg",
+            "calibrate board --kind april-tag --id 3 --square-mm 120 -o tag.pdf",
         ),
     )(board)
 
@@ -36,9 +37,10 @@ def board(
     kind: Annotated[BoardKind, typer.Option(help="Of the pattern")] = BoardKind.CHESSBOARD,
     columns: Annotated[int, typer.Option(help="Inner corners; circles; tags; charuco: squares")] = 7,
     rows: Annotated[int, typer.Option(help="As columns")] = 6,
-    square_mm: Annotated[float, typer.Option(help="Square; circle distance; april-grid: tag")] = 25.0,
+    square_mm: Annotated[float, typer.Option(help="Square; circle distance; side of a tag")] = 25.0,
     marker_mm: Annotated[float | None, typer.Option(help="charuco: marker; april-grid: gap")] = None,
     dictionary: Annotated[str | None, typer.Option(help="Of markers, such as DICT_6X6_250")] = None,
+    tag_id: Annotated[int, typer.Option("--id", help="aruco, april-tag: number of the tag")] = 0,
     legacy: Annotated[bool, typer.Option(help="charuco: layout before OpenCV 4.6")] = False,
     paper: Annotated[
         str | None, typer.Option(help=f"{', '.join(PAPER_MM)}; default: as large as needed")
@@ -56,7 +58,11 @@ def board(
         marker_m = square_mm / 1000 * (0.75 if kind is BoardKind.CHARUCO else 0.3)
     if dictionary is None and kind is BoardKind.CHARUCO:
         dictionary = "DICT_6X6_250"
-    spec = BoardSpec(kind, columns, rows, square_mm / 1000, marker_m, dictionary, legacy)
+    if kind in SINGLE_TAGS:
+        columns = rows = 1
+    if dictionary is None and kind is BoardKind.ARUCO:
+        dictionary = "DICT_4X4_50"
+    spec = BoardSpec(kind, columns, rows, square_mm / 1000, marker_m, dictionary, legacy, tag_id=tag_id)
     if board_file is not None:
         spec = read_board(board_file)
     sheet = board_sheet(spec, paper)

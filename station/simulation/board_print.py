@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.board import APRIL_DICTIONARY, dictionary_id
-from recordings.messages import BoardKind, BoardSpec
+from recordings.messages import SINGLE_TAGS, BoardKind, BoardSpec
 
 Floats = NDArray[np.float32]
 
@@ -125,6 +125,8 @@ def board_print(board: BoardSpec) -> BoardPrint:
         markers = _charuco_markers(board)
         sheet = (-1.5 * s, -1.5 * s, (columns - 0.5) * s, (rows - 0.5) * s)
         return BoardPrint(sheet, _Markers(squares, markers))
+    if board.kind in SINGLE_TAGS:
+        return _single_tag(board)
     return _april_grid(board)
 
 
@@ -160,6 +162,14 @@ def _charuco_markers(board: BoardSpec) -> tuple[_Marker, ...]:
         )
         for number, corners in zip(np.asarray(layout.getIds()).ravel(), layout.getObjPoints(), strict=True)
     )
+
+
+def _single_tag(board: BoardSpec) -> BoardPrint:
+    dictionary, side = _dictionary(board, APRIL_DICTIONARY), board.square_m
+    corners = np.array([[0.0, 0.0], [side, side]], dtype=np.float32)
+    tag = _marker(dictionary, board.tag_id, 1, corners)
+    blank = _Dots(np.zeros((0, 2), np.float32), 0.0)
+    return BoardPrint((-side / 4, -side / 4, 1.25 * side, 1.25 * side), _Markers(blank, (tag,)))
 
 
 def _april_grid(board: BoardSpec) -> BoardPrint:

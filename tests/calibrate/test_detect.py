@@ -30,6 +30,8 @@ BOARDS = [
     msgspec.structs.replace(CHARUCO, legacy=True),
     BoardSpec(BoardKind.ASYMMETRIC_CIRCLES, 4, 11, 0.013),
     BoardSpec(BoardKind.APRIL_GRID, 4, 3, 0.036, 0.0108),
+    BoardSpec(BoardKind.ARUCO, square_m=0.12, dictionary="DICT_4X4_50", tag_id=7),
+    BoardSpec(BoardKind.APRIL_TAG, square_m=0.12, tag_id=3),
 ]
 EXACT_LIMIT_PX = {BoardKind.APRIL_GRID: 0.25, BoardKind.ASYMMETRIC_CIRCLES: 0.05}
 
@@ -139,6 +141,32 @@ def test_sixteen_bits_and_colour_give_the_corners_of_eight_bits() -> None:
     assert np.abs(detect(twelve_bits, PAPER_BOARD).pixels - plain.pixels)[1:].max() < 0.02
 
 
+def test_a_tag_of_another_number_is_not_the_board() -> None:
+    image, _ = picture(BoardSpec(BoardKind.APRIL_TAG, square_m=0.12, tag_id=3), 0)
+    assert not detect(image, BoardSpec(BoardKind.APRIL_TAG, square_m=0.12, tag_id=4)).found
+
+
+def test_a_tag_seen_twice_is_not_the_board() -> None:
+    spec = BoardSpec(BoardKind.APRIL_TAG, square_m=0.12, tag_id=3)
+    image, _ = picture(spec, 0)
+    assert detect(image, spec).found
+    assert not detect(np.concatenate([image, image], axis=1), spec).found
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(7, 6), (11, 9), (4, 3)])
+def test_a_board_declared_in_squares_is_told_by_its_inner_corners(columns: int, rows: int) -> None:
+    image, _ = picture(BoardSpec(BoardKind.CHESSBOARD, columns, rows, 0.15 / columns), 8)
+    found = detect(image, BoardSpec(BoardKind.CHESSBOARD, columns + 1, rows + 1, 0.15 / columns))
+    assert (found.found, found.squares_counted, found.seen_instead) == (False, True, (columns, rows))
+
+
+def test_another_board_is_not_one_declared_in_squares() -> None:
+    image, _ = picture(PAPER_BOARD, 8)
+    found = detect(image, BoardSpec(BoardKind.CHESSBOARD, 9, 6, 0.025))
+    assert (found.squares_counted, found.seen_instead) == (False, (7, 6))
+    assert not detect(np.full_like(image, 120), PAPER_BOARD).squares_counted
+
+
 def test_reasons_are_for_people() -> None:
     image, _ = picture(PAPER_BOARD, 8)
     nothing = np.full_like(image, 120)
@@ -162,6 +190,11 @@ def test_reasons_are_for_people() -> None:
         BoardSpec(BoardKind.CHESSBOARD, 7, 6, float("nan")),
         BoardSpec(BoardKind.CHARUCO, 7, 6, 0.025, 0.03, "DICT_5X5_100"),
         BoardSpec(BoardKind.CHARUCO, 7, 6, 0.025, 0.02, "DICT_NONE"),
+        BoardSpec(BoardKind.CHESSBOARD, 7, 6, 0.025, square_tolerance=0.5),
+        BoardSpec(BoardKind.CHESSBOARD, 7, 6, 0.025, flatness_m=1.0),
+        BoardSpec(BoardKind.ARUCO, square_m=0.1),
+        BoardSpec(BoardKind.ARUCO, square_m=0.1, dictionary="DICT_4X4_50", tag_id=50),
+        BoardSpec(BoardKind.APRIL_TAG, 2, 2, 0.1),
     ],
 )
 def test_impossible_boards_are_refused(spec: BoardSpec) -> None:

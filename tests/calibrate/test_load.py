@@ -6,10 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import msgspec
+import numpy as np
 import pytest
 
-from calibrate.errors import TooFewViewsError
-from calibrate.load import load_views
+from calibrate.errors import BadViewsError, SquaresCountedError, TooFewViewsError
+from calibrate.load import load_views, without_views
 from calibrate.pipeline import solve_recording
 from calibrate.report.page import report_page
 from recordings.errors import CorruptRecordingError, MissingPartError
@@ -64,6 +65,26 @@ def test_a_picture_that_cannot_be_decoded_costs_its_own_pose_only(source: Record
     job = solve_recording(path)
     assert [rejected.index for rejected in job.calibration.views.rejected] == [3, 7]
     assert "the PNG is cut" in report_page(job)
+
+
+def test_leaving_out_a_view_that_shows_no_board_is_fine(source: Recording, tmp_path: Path) -> None:
+    flat = lambda data: encode_png(np.full((384, 480), 90, np.uint8))  # noqa: E731
+    path = copied(source, tmp_path / "r.mcap", range(8), damaged={2: flat})
+    loaded = load_views(open_recording(path))
+    assert [view.index for view in loaded.without_board] == [2]
+    left = without_views(loaded, (2, 3))
+    assert [view.index for view in left.views] == [0, 3, 4, 5, 6, 7]
+    assert sorted((view.index, view.kind) for view in left.without_board) == [(1, "by-hand"), (2, "corners")]
+    with pytest.raises(BadViewsError):
+        without_views(loaded, (99,))
+
+
+def test_a_board_declared_in_squares_is_named_with_its_inner_corners(source: Recording) -> None:
+    board = source.info.board
+    squares = msgspec.structs.replace(board, columns=board.columns + 1, rows=board.rows + 1)
+    with pytest.raises(SquaresCountedError) as caught:
+        load_views(source, squares)
+    assert (caught.value.columns, caught.value.rows) == (board.columns, board.rows)
 
 
 def test_a_picture_of_impossible_size_is_refused_before_decoding(source: Recording, tmp_path: Path) -> None:

@@ -74,6 +74,21 @@ def test_a_byte_order_mark_spaces_and_crlf_are_fine(folder: Path, tmp_path: Path
     assert import_folder(folder, tmp_path / "out.mcap").pictures == 3
 
 
+def with_joints(folder: Path, *joints: str) -> None:
+    """Joints behind the poses, one text a row; the last one for all that follow."""
+    header, *rows = (folder / "poses.csv").read_text().split()
+    texts = [*joints, *[joints[-1]] * (len(rows) - len(joints))]
+    lines = [f"{header},j1,j2,j3,j4,j5,j6", *(f"{row},{text}" for row, text in zip(rows, texts, strict=True))]
+    (folder / "poses.csv").write_text("\n".join(lines) + "\n")
+
+
+def test_joints_behind_the_pose_reach_the_view(folder: Path, tmp_path: Path) -> None:
+    with_joints(folder, "0.1,-1.5,1.5,-1,-1.57,3.2", ",,,,,")
+    views = open_recording(import_folder(folder, tmp_path / "r.mcap").path).views()
+    assert views[0].joints_rad == (0.1, -1.5, 1.5, -1.0, -1.57, 3.2)
+    assert views[1].joints_rad is None, "empty cells: not known for that picture"
+
+
 def test_quaternions_of_three_digits_are_made_rotations(folder: Path, tmp_path: Path) -> None:
     text = (folder / "poses.csv").read_text().replace("0.7071067811865476", "0.707")
     (folder / "poses.csv").write_text(text)
@@ -144,6 +159,9 @@ BAD: dict[str, tuple[Change, str]] = {
         edit("poses.csv", "images/2.png", "images/0.png"),
         r"line 4: images/0.png stands already in line 2",
     ),
+    "joints in degrees": (lambda f: with_joints(f, "10,-90,90,-60,-90,180"), r"line 2: .*radians"),
+    "a joint missing": (lambda f: with_joints(f, "0.1,,1.5,-1,-1.57,3.2"), r"line 2: j2 = ''"),
+    "five joints": (lambda f: with_joints(f, "0.1,0.1,1.5,-1,-1.57"), r"line 2: 13 values where 14"),
     "no image name": (edit("poses.csv", "images/1.png", ""), r"line 3: the image's name is missing"),
     "zero in the image name": (
         edit("poses.csv", "images/1.png", "images/\0.png"),

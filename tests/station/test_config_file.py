@@ -61,8 +61,8 @@ def test_a_missing_file_says_what_to_do(tmp_path: Path) -> None:
             "workspace_min_m: [-1, -1, 0.5]\n  workspace_max_m: [1, 1, 0.5]",
             "workspace_min_m must be below workspace_max_m",
         ),
-        ("square_m: 0.025", "square_m: 0", "columns and rows must be at least 2 and square_m above 0"),
-        ("rows: 6", "rows: 1", "columns and rows must be at least 2"),
+        ("square_m: 0.025", "square_m: 0", "board: square_m = 0"),
+        ("rows: 6", "rows: 1", "board: 7 × 1"),
         ("limits:", "working_distance_m: 600\nlimits:", "working_distance_m: 600.0 is out of reach"),
         (
             "limits:",

@@ -1,0 +1,310 @@
+"""Mistakes that users make, on other people's recordings: is the cause named? (STATION_DATASETS)"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import os
+import re
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import cv2
+import msgspec
+import numpy as np
+import yaml
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from benchmarks.real_sets import DATASETS
+from benchmarks.trials import table
+from calibrate.commands.solve import solve_json
+from calibrate.detect import Detection, detect
+from calibrate.errors import CalibrationError
+from calibrate.geometry import Array, inverse, pose, quaternion_from_matrix, rotation_exp, rotation_log
+from calibrate.pipeline import solve_recording
+from recordings.dataset import read_dataset
+from recordings.errors import RecordingError
+from recordings.importer import import_folder
+from recordings.messages import BoardSpec
+from recordings.poses import HEADER, read_poses
+
+SETS = ("ur5-chessboard", "charuco-eye-to-hand", "rendered-truth")
+_SWAPPED = (3, 9)
+"""Places of the two views whose poses are exchanged."""
+_REFOCUS = 1.06
+_TCP_M = 0.12
+_BOARD_MOVED = pose(rotation_exp([0.0, 0.02, 0.05]), [0.03, -0.02, 0.01])
+
+
+@dataclass(frozen=True, eq=False)
+class Session:
+    """What a user would hand to `recordings import`."""
+
+    description: dict[str, Any]
+    """dataset.yaml"""
+    names: list[str]
+    poses: Array
+    """(n, 4, 4) base_from_flange"""
+    quaternion_order: tuple[int, ...] = (0, 1, 2, 3)
+    """Which of x, y, z, w stands in each of the four columns."""
+    edit: dict[int, Callable[[Array], Array]] = field(default_factory=dict)
+    """Place to what happens to its picture."""
+
+
+@dataclass(frozen=True)
+class Said:
+    """What `calibrate solve` answers."""
+
+    code: str
+    """The hypothesis where one is named; else the error's class; else the verdict."""
+    hypothesis: str
+    rejected: tuple[int, ...]
+    text: str
+    answered: bool = True
+    """False where nothing was solved."""
+
+
+@dataclass(frozen=True)
+class Mistake:
+    name: str
+    make: Callable[[Session], Session]
+    causes: tuple[str, ...]
+    """Hypotheses that are true of it. Some mistakes are the same to the data: inverted poses and the other
+    mounting; in eye-to-hand a board that slipped on the flange and a changed TCP."""
+    words: str
+    """The cause in a sentence, for answers that carry no hypothesis."""
+    rejected: tuple[int, ...] = ()
+    """Views that must be rejected, and no others; for mistakes of single views."""
+
+
+def what_is_said(folder: Path, output: Path) -> Said:
+    """Import and solve as a user does. THE place to change when the answer's shape changes."""
+    try:
+        import_folder(folder, output)
+        job = solve_recording(output)
+    except (CalibrationError, RecordingError) as error:
+        hypothesis = str(getattr(error, "hypothesis", "") or "")
+        return Said(hypothesis or type(error).__name__, hypothesis, (), str(error), answered=False)
+    answer = solve_json(job)
+    session = answer.get("session", {})
+    hypothesis = session.get("hypothesis", "")
+    if hypothesis == "as-recorded":
+        hypothesis = ""
+    rejected = tuple(view["index"] for view in answer["views"]["rejected"])
+    failed = [gate for gate in answer["gates"] if not gate["passed"]]
+    texts = [session.get("text", ""), *(gate["text"] for gate in failed), *job.solution.warnings]
+    texts += [view["reason"] for view in answer["views"]["rejected"]]
+    verdict = "fail: " + ", ".join(gate["name"] for gate in failed) if failed else "pass"
+    return Said(hypothesis or verdict, hypothesis, rejected, " ".join(filter(None, texts)))
+
+
+def named_truly(mistake: Mistake, said: Said) -> bool:
+    """Is the cause named, and is what is named the cause?"""
+    if mistake.rejected:
+        return said.rejected == mistake.rejected
+    if not mistake.causes:
+        return said.answered and not said.hypothesis and not said.rejected
+    if said.hypothesis:
+        return said.hypothesis in mistake.causes
+    return re.search(mistake.words, said.text, re.IGNORECASE) is not None
+
+
+def _half(session: Session) -> slice:
+    return slice(len(session.poses) // 2, None)
+
+
+def _with_poses(change: Callable[[Session, Array], None]) -> Callable[[Session], Session]:
+    """A mistake in the poses; `change` works on a copy of them."""
+
+    def make(session: Session) -> Session:
+        poses = session.poses.copy()
+        change(session, poses)
+        return replace(session, poses=poses)
+
+    return make
+
+
+def _swap(session: Session, poses: Array) -> None:
+    poses[list(_SWAPPED)] = poses[list(reversed(_SWAPPED))]
+
+
+def _millimetres(session: Session, poses: Array) -> None:
+    poses[:, :3, 3] *= 1e3
+
+
+def _invert(session: Session, poses: Array) -> None:
+    poses[:] = inverse(poses)
+
+
+def _vector_as_angles(session: Session, poses: Array) -> None:
+    poses[:, :3, :3] = Rotation.from_euler("xyz", rotation_log(poses[:, :3, :3])).as_matrix()
+
+
+def _change_tcp(session: Session, poses: Array) -> None:
+    poses[_half(session)] = poses[_half(session)] @ pose(np.eye(3), [0.0, 0.0, _TCP_M])
+
+
+def _move_board(session: Session, poses: Array) -> None:
+    """The same as if, with these poses, the pictures showed the board elsewhere."""
+    part = poses[_half(session)]
+    in_hand = session.description["mount"] == "eye-in-hand"
+    poses[_half(session)] = _BOARD_MOVED @ part if in_hand else part @ _BOARD_MOVED
+
+
+def _shift(session: Session) -> Session:
+    return replace(session, names=session.names[1:], poses=session.poses[:-1])
+
+
+def _w_first(session: Session) -> Session:
+    return replace(session, quaternion_order=(3, 0, 1, 2))
+
+
+def _other_mount(session: Session) -> Session:
+    other = {"eye-in-hand": "eye-to-hand", "eye-to-hand": "eye-in-hand"}
+    return replace(session, description=session.description | {"mount": other[session.description["mount"]]})
+
+
+def _size(factor: float) -> Callable[[Session], Session]:
+    def make(session: Session) -> Session:
+        board = dict(session.description["board"])
+        for key in ("square_m", "marker_m"):
+            if key in board:
+                board[key] *= factor
+        return replace(session, description=session.description | {"board": board})
+
+    return make
+
+
+def _mirror(session: Session) -> Session:
+    return replace(session, edit=dict.fromkeys(range(len(session.names)), lambda image: image[:, ::-1]))
+
+
+def _refocus(session: Session) -> Session:
+    return replace(session, edit=dict.fromkeys(range(len(session.names))[_half(session)], _zoomed_out))
+
+
+def _zoomed_out(image: Array) -> Array:
+    height, width = image.shape[:2]
+    scale = 1 / _REFOCUS
+    shift = np.array([width - 1, height - 1]) / 2 * (1 - scale)
+    M = np.array([[scale, 0.0, shift[0]], [0.0, scale, shift[1]]])
+    return np.asarray(
+        cv2.warpAffine(image, M, (width, height), flags=cv2.INTER_AREA, borderMode=cv2.BORDER_REPLICATE)
+    )
+
+
+_CONVENTION = ("inverse-poses", "mounting")
+_FRAME = ("board-moved", "tcp-changed")
+_SIZE_WORDS = r"square_m|squares of|size of (the )?square|board scaled"
+MISTAKES = (
+    Mistake("none", lambda session: session, (), ""),
+    Mistake("two poses swapped", _with_poses(_swap), (), "", rejected=_SWAPPED),
+    Mistake(
+        "poses shifted by one picture", _shift, ("shifted-poses",), r"shifted|one picture (later|earlier)"
+    ),
+    Mistake("millimetres", _with_poses(_millimetres), ("millimetres",), r"not millimetres"),
+    Mistake("quaternion w first", _w_first, ("quaternion-order",), r"order w, x, y, z"),
+    Mistake("inverse poses", _with_poses(_invert), _CONVENTION, r"flange_from_base in place"),
+    Mistake("other mounting", _other_mount, _CONVENTION, r"in place of base_from_flange.*other mount"),
+    Mistake(
+        "rotation vector as rpy",
+        _with_poses(_vector_as_angles),
+        ("rotation-vector-as-rpy",),
+        r"rotation vectors that were read as roll",
+    ),
+    Mistake("square size + 4 %", _size(1.04), ("square-size",), _SIZE_WORDS),
+    Mistake("square size - 4 %", _size(0.96), ("square-size",), _SIZE_WORDS),
+    Mistake("square size × 2", _size(2.0), ("square-size",), _SIZE_WORDS),
+    Mistake("square size × 0.5", _size(0.5), ("square-size",), _SIZE_WORDS),
+    Mistake("mirrored pictures", _mirror, ("mirrored",), r"mirror"),
+    Mistake("refocused at half", _refocus, ("refocused",), r"focus"),
+    Mistake("TCP changed at half", _with_poses(_change_tcp), ("tcp-changed",), r"TCP"),
+    Mistake("board moved at half", _with_poses(_move_board), ("board-moved",), r"board (was )?moved"),
+)
+
+
+def run() -> str:
+    if not DATASETS.is_dir():
+        return "not measured: no recordings found (set STATION_DATASETS)"
+    chosen = tuple(name for name in os.environ.get("BENCH_SETS", "").split(",") if name) or SETS
+    parts = []
+    for name in chosen:
+        rows = []
+        with remembered_detections():
+            for mistake in MISTAKES:
+                said = _try(DATASETS / name, mistake)
+                true = named_truly(mistake, said)
+                rows.append([mistake.name, said.code, "yes" if true else "no", _short(said)])
+        right = sum(row[2] == "yes" for row in rows)
+        parts.append(
+            f"**{name}**: {right} of {len(rows)} right\n\n"
+            + table(["mistake", "code", "named truly", "views rejected, first words"], rows)
+        )
+    return "\n\n".join(parts)
+
+
+def _short(said: Said) -> str:
+    text = " ".join(said.text.split()).replace("|", "/")
+    text = re.sub(r"\S*/\S+\.(mcap|csv|yaml)", "…", text)
+    rejected = f"{len(said.rejected)} rejected. " if said.rejected else ""
+    return rejected + (text if len(text) <= 140 else text[:140] + " …")
+
+
+def _try(source: Path, mistake: Mistake) -> Said:
+    session = mistake.make(_session(source))
+    if session.description["mount"] == "eye-to-hand" and set(mistake.causes) & set(_FRAME):
+        mistake = replace(mistake, causes=_FRAME)
+    with tempfile.TemporaryDirectory() as temporary:
+        folder = Path(temporary) / "folder"
+        _write(session, source, folder)
+        return what_is_said(folder, Path(temporary) / "recording.mcap")
+
+
+def _session(source: Path) -> Session:
+    read_dataset(source)  # an understandable error, should the set be broken
+    rows, _ = read_poses(source)
+    description = yaml.safe_load((source / "dataset.yaml").read_text())
+    return Session(description, [row.image for row in rows], np.array([row.base_from_flange for row in rows]))
+
+
+def _write(session: Session, source: Path, folder: Path) -> None:
+    folder.mkdir()
+    (folder / "dataset.yaml").write_text(yaml.safe_dump(session.description))
+    with (folder / "poses.csv").open("w", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(HEADER)
+        for name, T in zip(session.names, session.poses, strict=True):
+            q = quaternion_from_matrix(T[:3, :3])[list(session.quaternion_order)]
+            rows.writerow([name, *T[:3, 3].tolist(), *q.tolist()])
+    for place, name in enumerate(session.names):
+        target = folder / name
+        target.parent.mkdir(parents=True, exist_ok=True)
+        if (change := session.edit.get(place)) is None:
+            shutil.copy(source / name, target)
+        else:
+            image: Any = cv2.imread(str(source / name), cv2.IMREAD_UNCHANGED)
+            cv2.imwrite(str(target), np.ascontiguousarray(change(image)))
+
+
+@contextmanager
+def remembered_detections() -> Iterator[None]:
+    """Each picture is searched once: most mistakes leave the pictures as they are."""
+    known: dict[tuple[bytes, BoardSpec], Detection] = {}
+
+    def remembered(image: NDArray[Any], spec: BoardSpec, **options: Any) -> Detection:
+        digest = hashlib.sha256(np.ascontiguousarray(image).tobytes()).digest()
+        pattern = msgspec.structs.replace(spec, square_m=1.0, marker_m=(spec.marker_m or 0.0) / spec.square_m)
+        key = (digest, pattern)
+        if key not in known:
+            known[key] = detect(image, spec, **options)
+        return known[key]
+
+    with patch("calibrate.load.detect", remembered):
+        yield

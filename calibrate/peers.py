@@ -15,10 +15,11 @@ from calibrate.assess import board_spread, distance_in_sigmas, motion_errors
 from calibrate.consensus import pose_arrays
 from calibrate.errors import CalibrationError
 from calibrate.estimate import estimate, first_state
-from calibrate.geometry import Array, is_rigid
+from calibrate.geometry import Array, is_rigid, rotation_log
+from calibrate.held_out import HeldOut, held_out_pairs, held_out_views
 from calibrate.likelihood.model import observe_views
 from calibrate.pairs import Pairs, all_pairs, consecutive_pairs
-from calibrate.paper import solve_paper
+from calibrate.paper import on_box, solve_paper
 from calibrate.peer_methods import (
     HAND_EYE,
     ROBOT_WORLD,
@@ -30,12 +31,13 @@ from calibrate.peer_methods import (
     zhao_minimax,
     zhi_linear,
 )
-from calibrate.profile_robust import HELD_OUT, solve_robust_profile
+from calibrate.profile_robust import solve_robust_profile
 from calibrate.reprojection import reprojection_px
 from calibrate.solution import PeerResult, Solution, SolveOptions
 from calibrate.views import ViewSet
 
 Method = Callable[[ViewSet], Array]
+PAPER = "DE, paper"
 _MAX_PAIRS = 2000
 _REPROJECTION_SIGMA = np.array([1.0, 1e-6, 1e-6, 1.0])
 """Robot poses as good as exact."""
@@ -44,16 +46,23 @@ _REPROJECTION_SIGMA = np.array([1.0, 1e-6, 1e-6, 1.0])
 def compare_all(views: ViewSet, options: SolveOptions | None = None) -> list[PeerResult]:
     """One row per method, ours last. All get the views that ours keeps (turned boards set right), with the
     board poses of the given intrinsics; e_t and e_R are scored on the last 6 of them, fitted without.
+
+    With the paper's profile all get every view, as the paper's method does, and are scored on its samples.
     """
     require_solvable(views)
-    options = replace(options or SolveOptions(), profile="robust")
+    options = options or SolveOptions()
+    paper = options.profile == "paper"
+    options = replace(options, profile="robust")
     start = time.perf_counter()
     ours = solve_robust_profile(views, options)
     ours_ms = 1e3 * (time.perf_counter() - start)
-    kept = replace(views, views=ours.kept)
-    rows = [_row(name, method, kept, ours) for name, method in _methods(options).items()]
-    final = _scored("ours", ours.matrix, None, kept, ours)
-    if ours.holdout is not None:
+    kept = views if paper else replace(views, views=ours.kept)
+    held = held_out_pairs(kept) if paper else held_out_views(kept)
+    rows = [_row(name, method, kept, held, ours) for name, method in _methods(options).items()]
+    final = _scored("ours", ours.matrix, kept, ours)
+    if paper and held is not None:
+        final = _with_samples(final, _ours_without(held.fitted, options), held.pairs)
+    elif ours.holdout is not None:
         final = replace(
             final,
             e_t_m=ours.holdout.e_t_m,
@@ -76,7 +85,7 @@ def _methods(options: SolveOptions) -> dict[str, Method]:
     methods["Strobl-Hirzinger"] = _strobl
     methods["Heller, certified"] = partial(_by_pairs, heller_global)
     methods["reprojection only"] = _reprojection_only
-    methods["DE, paper"] = partial(_paper, seed=options.seed)
+    methods[PAPER] = partial(_paper, seed=options.seed)
     return methods
 
 
@@ -108,25 +117,34 @@ def _reprojection_only(views: ViewSet) -> Array:
     return estimate(observed, start, sigma=_REPROJECTION_SIGMA, fit_scales=False).state.X
 
 
-def _row(name: str, method: Method, views: ViewSet, ours: Solution) -> PeerResult:
+def _ours_without(fitted: ViewSet, options: SolveOptions) -> Array | None:
+    try:
+        return solve_robust_profile(fitted, replace(options, holdout=False)).matrix
+    except CalibrationError:
+        return None
+
+
+def _row(name: str, method: Method, views: ViewSet, held: HeldOut | None, ours: Solution) -> PeerResult:
     start = time.perf_counter()
     try:
         X = method(views)
         elapsed_ms = 1e3 * (time.perf_counter() - start)
-        fitted = len(views) - HELD_OUT
-        partial_X = method(views.select(list(range(fitted)))) if fitted >= 5 else None
+        partial_X = None if held is None else method(held.fitted)
     except (CalibrationError, cv2.error, np.linalg.LinAlgError, ValueError) as error:
         return PeerResult(name, None, note=f"failed: {str(error).splitlines()[0]}")
     if not np.isfinite(X).all():
         return PeerResult(name, None, note="failed: not a number")
-    return replace(_scored(name, X, partial_X, views, ours), time_ms=elapsed_ms)
+    row = replace(_scored(name, X, views, ours), time_ms=elapsed_ms)
+    if name == PAPER and (boxed := on_box(np.append(rotation_log(X[:3, :3]), X[:3, 3]))):
+        row = replace(row, on_box=boxed, note=f"on the paper's box ({', '.join(boxed)}): X is wrong")
+    return row if held is None else _with_samples(row, partial_X, held.pairs)
 
 
-def _scored(name: str, X: Array, partial_X: Array | None, views: ViewSet, ours: Solution) -> PeerResult:
+def _scored(name: str, X: Array, views: ViewSet, ours: Solution) -> PeerResult:
     rigid = is_rigid(X)
     H, C = pose_arrays(views)
     spread = board_spread(H, C, X) if rigid else (None, None)
-    result = PeerResult(
+    return PeerResult(
         name=name,
         matrix=X,
         board_spread_m=spread[0],
@@ -136,8 +154,11 @@ def _scored(name: str, X: Array, partial_X: Array | None, views: ViewSet, ours: 
         rigid=rigid,
         note="" if rigid else "raw matrix, not a rigid transform",
     )
+
+
+def _with_samples(row: PeerResult, partial_X: Array | None, pairs: Pairs) -> PeerResult:
+    """With e_t and e_R of an X (4, 4) that was fitted without these pairs."""
     if partial_X is None or not np.isfinite(partial_X).all():
-        return result
-    last = slice(len(views) - HELD_OUT, None)
-    e_t, e_R = motion_errors(partial_X, all_pairs(H[last], C[last]))
-    return replace(result, e_t_m=float(e_t.mean()), e_R=float(e_R.mean()), samples_e_t_m=e_t, samples_e_R=e_R)
+        return row
+    e_t, e_R = motion_errors(partial_X, pairs)
+    return replace(row, e_t_m=float(e_t.mean()), e_R=float(e_R.mean()), samples_e_t_m=e_t, samples_e_R=e_R)

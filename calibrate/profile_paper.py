@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from scipy import stats
 
 from calibrate.assess import (
@@ -16,8 +18,8 @@ from calibrate.assess import (
 )
 from calibrate.certificate import certify
 from calibrate.frames import board_frames, camera_frames
-from calibrate.geometry import Transform
-from calibrate.objective import build_objective
+from calibrate.geometry import Array, Transform
+from calibrate.objective import Objective, build_objective
 from calibrate.pair_covariance import pair_covariance
 from calibrate.pairs import consecutive_pairs, mount_poses
 from calibrate.paper import solve_paper
@@ -43,7 +45,7 @@ def solve_paper_profile(views: ViewSet, options: SolveOptions) -> Solution:
     covariance = pair_covariance(result.objective, fit, X)
     distance = options.working_distance_m or median_distance_m(C)
     parent, _ = camera_frames(views.mount)
-    certificate = certify(build_objective(fit, "log", centre=X), _PROBLEM.format(len(fit))).certificate
+    certificate = _of_returned(build_objective(fit, "log", centre=X), X, len(fit))
     spread_m, spread_rad = board_spread(H, C, X)
     fitted = len(fit) + 1
     note = f"pairs {len(fit)} and {len(fit) + 1} share a pose, as in the paper"
@@ -75,6 +77,17 @@ def solve_paper_profile(views: ViewSet, options: SolveOptions) -> Solution:
         solve_ms=watch.total_ms,
         seed=options.seed,
     )
+
+
+def _of_returned(objective: Objective, X: Array, pairs: int) -> Certificate:
+    """The bound of the relaxation against the value at the X that is returned, translation included.
+
+    `certify` itself judges the rotation, with the best translation for it.
+    """
+    proof = certify(objective, _PROBLEM.format(pairs)).certificate
+    value = objective.value(X)
+    gap = max(0.0, value - proof.lower_bound) / max(value, proof.floor)
+    return replace(proof, objective=value, relative_gap=gap, certified=gap <= proof.tolerance)
 
 
 _PROBLEM = "logarithmic objective of eq. 16 (lambda 1) over the {} consecutive pairs that were fitted"

@@ -247,5 +247,7 @@ class PeerResult:
     """Distance from ours, sigmas of ours."""
     time_ms: float = 0.0
     note: str = ""
+    on_box: tuple[str, ...] = ()
+    """The paper's method: components of X on the box of equation 22. Such an X is wrong."""
     rigid: bool = True
     """False where the method's raw matrix is not a rigid transform."""

@@ -188,7 +188,9 @@ def _holdout(job: SolvedRecording, peers: Sequence[PeerResult]) -> Iterator[str]
     methods += [
         (peer.name, peer.samples_e_t_m, peer.samples_e_R)
         for peer in peers
-        if peer.name != "ours" and peer.samples_e_t_m is not None and peer.samples_e_R is not None
+        if (peer.name != "ours" or job.solution.profile == "paper")
+        and peer.samples_e_t_m is not None
+        and peer.samples_e_R is not None
     ]
     yield html.figure(
         plots.holdout_samples(methods),

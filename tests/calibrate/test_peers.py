@@ -3,11 +3,13 @@
 import numpy as np
 import pytest
 
-from calibrate.geometry import inverse, is_rigid, pose, random_rotation
-from calibrate.pairs import all_pairs, mount_poses
+from calibrate.geometry import inverse, is_rigid, pose, random_rotation, rotation_exp
+from calibrate.objective import build_objective
+from calibrate.pairs import all_pairs, consecutive_pairs, mount_poses
 from calibrate.peer_methods import linear_system, orthonormalised, zhao_minimax
 from calibrate.peers import compare_all
 from calibrate.reprojection import reprojection_px
+from calibrate.solve import SolveOptions, solve_views
 from tests.calibrate.cells import LOW, MID, Noise, error_mm_deg, make_cell
 
 NAMES = [
@@ -47,6 +49,35 @@ def test_columns_are_filled_and_ours_is_the_reference():
     assert rows["reprojection only"].reprojection_px == min(
         r.reprojection_px for r in rows.values() if r.rigid
     )
+
+
+def test_with_the_papers_profile_all_are_scored_on_the_papers_own_samples():
+    """18 pairs to solve and 6 to score of 25 views: the curves 4 and 5 have the same samples."""
+    cell = make_cell(np.random.default_rng(1), 25, MID)
+    published = solve_views(cell.views, SolveOptions(profile="paper"))
+    rows = {row.name: row for row in compare_all(cell.views, SolveOptions(profile="paper"))}
+    assert all(len(row.samples_e_t_m) == len(row.samples_e_R) == 6 for row in rows.values())
+    np.testing.assert_array_equal(rows["DE, paper"].samples_e_t_m, published.holdout.samples_e_t_m)
+    np.testing.assert_array_equal(rows["DE, paper"].samples_e_R, published.holdout.samples_e_R)
+
+
+def test_the_papers_row_says_when_its_answer_lies_on_the_box():
+    beyond = pose(rotation_exp([0.1, 0.2, 0.0]), [1.25, 0.0, 0.6])
+    cell = make_cell(np.random.default_rng(1), 12, MID, mount="eye-to-hand", X=beyond)
+    rows = {row.name: row for row in compare_all(cell.views)}
+    assert rows["DE, paper"].on_box == ("translation x",)
+    assert all(row.on_box == () for name, row in rows.items() if name != "DE, paper")
+    assert solve_views(cell.views, SolveOptions(profile="paper")).on_box == ("translation x",)
+
+
+def test_the_papers_gap_is_that_of_the_X_returned():
+    cell = make_cell(np.random.default_rng(1), 25, MID)
+    solved = solve_views(cell.views, SolveOptions(profile="paper"))
+    fitted = consecutive_pairs(cell.views.base_from_flange, cell.views.camera_from_board).select(slice(0, 18))
+    value = build_objective(fitted, "log").value(solved.matrix)
+    proof = solved.certificate
+    assert proof.objective == pytest.approx(value, rel=1e-9)
+    assert proof.relative_gap == pytest.approx((value - proof.lower_bound) / max(value, proof.floor))
 
 
 def test_the_minimax_solution_has_the_smallest_largest_residual():

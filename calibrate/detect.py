@@ -49,6 +49,8 @@ class Detection:
     """Inner corners (columns, rows) of another chessboard that is seen; looked for where none is found."""
     squares_counted: bool = False
     """The other chessboard is one smaller each way: the squares were declared, not the inner corners."""
+    mirrored: bool = False
+    """The board's markers are seen in the mirror image of the picture only."""
 
     @property
     def corners(self) -> int:
@@ -75,6 +77,9 @@ def detect(
     reason, instead = ("", None) if found else _reason(grey, spec, len(indices), fewest, thorough)
     if not found:
         indices, pixels = indices[:0], pixels[:0]
+    mirrored = not found and thorough and _seen_in_a_mirror(grey, spec)
+    if mirrored:
+        reason = "the board is seen in the mirror image only: the camera or its driver mirrors the pictures"
     sharpness, saturated = _picture_quality(grey, pixels) if with_quality else (np.nan, np.nan)
     area = cv2.contourArea(cv2.convexHull(pixels.astype(np.float32))) if found else 0.0
     return Detection(
@@ -90,6 +95,7 @@ def detect(
         area / (width * height),
         instead,
         instead == (spec.columns - 1, spec.rows - 1),
+        mirrored,
     )
 
 
@@ -135,6 +141,14 @@ def _reason(
             )
             return text, seen
     return f"no {describe_board(spec)} found", None
+
+
+def _seen_in_a_mirror(grey: Grey, spec: BoardSpec) -> bool:
+    """Only markers tell: a chessboard looks right in a mirror."""
+    if spec.kind not in (BoardKind.CHARUCO, BoardKind.APRIL_GRID, *SINGLE_TAGS):
+        return False
+    indices, _ = _find(np.ascontiguousarray(grey[:, ::-1]), spec, thorough=False)
+    return len(indices) >= min(FEWEST_POINTS, len(board_points(spec)))
 
 
 def _picture_quality(grey: Grey, pixels: Array) -> tuple[float, float]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import ClassVar
+
 
 class CalibrationError(Exception):
     """Something a person can act on. `str()` says what, where and what to do next.
@@ -10,6 +12,8 @@ class CalibrationError(Exception):
     """
 
     exit_code = 1
+    hypothesis: ClassVar[str] = ""
+    """The cause as a word for programs, where it is known."""
 
 
 class TooFewViewsError(CalibrationError):
@@ -19,10 +23,18 @@ class TooFewViewsError(CalibrationError):
 class SquaresCountedError(TooFewViewsError):
     """A chessboard was declared in squares where inner corners are counted."""
 
+    hypothesis = "squares-counted"
+
     def __init__(self, text: str, columns: int, rows: int) -> None:
         super().__init__(text)
         self.columns, self.rows = columns, rows
         """Inner corners that the pictures show."""
+
+
+class MirroredPicturesError(TooFewViewsError):
+    """The board's markers can be read only in the mirror image of the pictures."""
+
+    hypothesis = "mirrored"
 
 
 class DegenerateMotionError(CalibrationError):

@@ -12,7 +12,7 @@ import numpy as np
 
 from calibrate.board import board_points
 from calibrate.detect import Detection, detect
-from calibrate.errors import BadViewsError, SquaresCountedError, TooFewViewsError
+from calibrate.errors import BadViewsError, MirroredPicturesError, SquaresCountedError, TooFewViewsError
 from calibrate.geometry import is_rigid
 from calibrate.solution import RejectedView
 from calibrate.views import ImageView, ViewSet
@@ -76,6 +76,12 @@ def load_views(
         counted = sum(detection.squares_counted for detection in seen.values())
         if counted >= max(1, len(missing) / 2):
             raise _squares_counted(recording, spec, counted, pictures)
+        mirrored = sum(detection.mirrored for detection in seen.values())
+        if mirrored >= max(1, len(missing) / 2):
+            raise MirroredPicturesError(
+                f"{recording.path}: the board is seen only in the mirror image, in {mirrored} of {pictures} "
+                "pictures. Switch the camera's mirroring (flip, reverse x) off and record again."
+            )
         raise TooFewViewsError(_too_few_text(recording, len(views), pictures, missing, fewest))
     model = CameraModel(
         model.width or next(iter(seen.values())).width,

@@ -167,6 +167,18 @@ def test_another_board_is_not_one_declared_in_squares() -> None:
     assert not detect(np.full_like(image, 120), PAPER_BOARD).squares_counted
 
 
+@pytest.mark.parametrize(
+    "spec", [CHARUCO, BoardSpec(BoardKind.APRIL_TAG, square_m=0.12, tag_id=3)], ids=lambda s: s.kind.value
+)
+def test_a_mirrored_picture_of_markers_is_said_to_be_one(spec: BoardSpec) -> None:
+    image, _ = picture(spec, 0)
+    seen = detect(image, spec)
+    assert (seen.found, seen.mirrored) == (True, False)
+    mirrored = detect(np.ascontiguousarray(image[:, ::-1]), spec)
+    assert (mirrored.found, mirrored.mirrored) == (False, True)
+    assert not detect(np.full_like(image, 120), spec).mirrored
+
+
 def test_reasons_are_for_people() -> None:
     image, _ = picture(PAPER_BOARD, 8)
     nothing = np.full_like(image, 120)

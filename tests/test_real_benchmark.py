@@ -1,10 +1,12 @@
-"""The rules by which `benchmarks real` counts."""
+"""The rules by which `benchmarks real` and `benchmarks mistakes` count."""
 
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import yaml
 
+from benchmarks.mistakes import MISTAKES, Mistake, Said, named_truly
 from benchmarks.real import charge, geometric_mean, paired_bootstrap
 from benchmarks.real_sets import _GOOD_VIEWS
 
@@ -35,3 +37,20 @@ def test_good_views_are_numbered_within_their_set() -> None:
     for name, listed in yaml.safe_load(_GOOD_VIEWS.read_text()).items():
         numbers = [*listed["not_good"], *listed.get("no_board", []), *listed.get("seen", {})]
         assert all(1 <= number <= listed["views"] for number in numbers), name
+
+
+SHIFTED = next(mistake for mistake in MISTAKES if mistake.name == "poses shifted by one picture")
+SWAPPED = next(mistake for mistake in MISTAKES if mistake.name == "two poses swapped")
+
+
+@pytest.mark.parametrize(
+    ("mistake", "said", "true"),
+    [
+        (SHIFTED, Said("shifted-poses", "shifted-poses", (), ""), True),
+        (SHIFTED, Said("board-moved", "board-moved", (), "poses shifted"), False),
+        (SWAPPED, Said("pass", "", (3, 9), ""), True),
+        (SWAPPED, Said("pass", "", (3, 9, 11), ""), False),
+    ],
+)
+def test_a_mistake_counts_as_named_only_by_its_own_cause(mistake: Mistake, said: Said, true: bool) -> None:
+    assert named_truly(mistake, said) is true

@@ -18,7 +18,7 @@ from recordings.export_ros2 import write_ros2
 from recordings.files import sync_folder
 from recordings.messages import Stamps, View
 from recordings.pictures import encode_png
-from recordings.poses import HEADER
+from recordings.poses import HEADER, JOINTS
 from recordings.reader import Recording
 from recordings.viewing import quaternion_xyzw
 
@@ -70,7 +70,12 @@ def _write_folder(recording: Recording, folder: Path) -> None:
     info = recording.info
     (folder / "images").mkdir()
     rows = [_write_picture(recording, view, folder) for view in recording.views()]
-    _write_csv(folder / POSES_FILE, HEADER, rows)
+    header = HEADER
+    if any(view.joints_rad is not None for view in recording.views()):
+        header = HEADER + JOINTS
+        joints = (view.joints_rad or ("",) * len(JOINTS) for view in recording.views())
+        rows = [[*row, *six] for row, six in zip(rows, joints, strict=True)]
+    _write_csv(folder / POSES_FILE, header, rows)
     described = {
         "mount": info.mount,
         "board": msgspec.to_builtins(info.board),

@@ -15,6 +15,7 @@ import pytest
 
 from recordings.cli import main
 from recordings.errors import ImportFolderError, RecordingError
+from recordings.export import Target, export_recording
 from recordings.importer import import_folder
 from recordings.poses import matrix_from_quaternion, read_poses
 from recordings.reader import open_recording
@@ -87,6 +88,9 @@ def test_joints_behind_the_pose_reach_the_view(folder: Path, tmp_path: Path) -> 
     views = open_recording(import_folder(folder, tmp_path / "r.mcap").path).views()
     assert views[0].joints_rad == (0.1, -1.5, 1.5, -1.0, -1.57, 3.2)
     assert views[1].joints_rad is None, "empty cells: not known for that picture"
+    out = export_recording(open_recording(tmp_path / "r.mcap"), tmp_path / "out", Target.FOLDER)
+    again = open_recording(import_folder(out, tmp_path / "again.mcap").path).views()
+    assert [view.joints_rad for view in again] == [view.joints_rad for view in views]
 
 
 def test_quaternions_of_three_digits_are_made_rotations(folder: Path, tmp_path: Path) -> None:

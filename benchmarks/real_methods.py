@@ -12,11 +12,13 @@ from vision_calibration import models as rs
 
 from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, inverse, pose_from_quaternion, quaternion_from_matrix
+from calibrate.handeye.corners import bent_points
+from calibrate.handeye.observations import observe_views
 from calibrate.intrinsics import calibrate_intrinsics
 from calibrate.peer_methods import HAND_EYE, ROBOT_WORLD, opencv_hand_eye, opencv_robot_world
 from calibrate.pipeline import single_threaded_opencv
 from calibrate.pnp import solve_pnp
-from calibrate.solution import SolveOptions
+from calibrate.solution import Solution, SolveOptions
 from calibrate.solve import solve_views
 from calibrate.views import ImageView, ViewSet
 from recordings.messages import BoardSpec, CameraModel
@@ -54,20 +56,34 @@ def ours(views: ViewSet, board: BoardSpec) -> Answer:
     free = views.camera.matrix is None
     with single_threaded_opencv():
         if free:
-            found = calibrate_intrinsics(views)
-            views = replace(views, camera=found.camera, held_intrinsics=found.held_names)
+            views = replace(views, camera=calibrate_intrinsics(views).camera)
         views = solve_pnp(views, board)
-        solution = solve_views(views, SolveOptions(intrinsics_from_same_pictures=free))
-    weights = {view.index: 0.0 for view in views}
-    weights |= {index: 1.0 - solution.in_doubt.get(index, 0.0) for index in solution.used}
+        options = SolveOptions(intrinsics_from_same_pictures=free, holdout=False, folds=False)
+        solution = solve_views(views, options)
     Y = solution.board_place.matrix
+    shape = _shape(views, solution)
     return Answer(
         X=solution.matrix,
-        centre=Y[:3, :3] @ board_centre(board, views) + Y[:3, 3],
+        centre=Y[:3, :3] @ shape(board_centre(board, views)[None])[0] + Y[:3, 3],
         camera=solution.camera,
+        shape=shape,
         covariance=solution.covariance,
-        weights=weights,
+        weights=solution.weights,
     )
+
+
+def _shape(views: ViewSet, solution: Solution) -> Callable[[Array], Array]:
+    """Points of the board as stated (k, 3) to where the solution has them."""
+    found = solution.board
+    if found is None:
+        return _as_described
+    observed = observe_views(views)
+    numbers = np.array([found.scale, found.anisotropy, *found.bend_m])
+
+    def bent(points: Array) -> Array:
+        return bent_points(replace(observed, points=points[None]), numbers)[0]
+
+    return bent
 
 
 def opencv(views: ViewSet, board: BoardSpec) -> dict[str, Answer]:

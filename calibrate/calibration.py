@@ -68,10 +68,17 @@ class Rejected(msgspec.Struct, frozen=True):
     reason: str
 
 
+class ViewWeight(msgspec.Struct, frozen=True):
+    index: int
+    weight: float
+
+
 class Views(msgspec.Struct, frozen=True, omit_defaults=True):
     used: list[int]
     rejected: list[Rejected] = []
     turned: list[int] = []
+    weights: list[ViewWeight] = []
+    """Of the views that count for less than 1."""
 
 
 class Lens(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -115,6 +122,48 @@ class ViewQuality(msgspec.Struct, frozen=True, omit_defaults=True):
     robot_deg: float | None = None
 
 
+class BoardFound(msgspec.Struct, frozen=True):
+    """What the views say of the board's shape."""
+
+    scale: float
+    """True over stated size, minus 1."""
+    anisotropy: float
+    bend_m: Vector3
+    sigma: tuple[float, float, float, float, float]
+
+
+class Folds(msgspec.Struct, frozen=True):
+    """Left-out views against what was claimed of them."""
+
+    rms_mm: float
+    rms_deg: float
+    claimed_mm: float
+    folds: int
+
+
+class Session(msgspec.Struct, frozen=True):
+    """How the recording as a whole has to be read."""
+
+    hypothesis: str
+    text: str
+
+
+class TableError(msgspec.Struct, frozen=True):
+    """One error of the arm's kinematic table, true minus nominal, metres or radians."""
+
+    parameter: str
+    value: float
+    sigma: float
+
+
+class Arm(msgspec.Struct, frozen=True):
+    applied: bool
+    """The evidence for errors of the table is clear."""
+    log_bayes: float
+    size_mm: float
+    table: list[TableError]
+
+
 class Quality(msgspec.Struct, frozen=True, omit_defaults=True):
     gates: list[Gate]
     certificate: Proof
@@ -132,8 +181,16 @@ class Quality(msgspec.Struct, frozen=True, omit_defaults=True):
     error_shares: dict[str, float] = {}
     weakest: str = ""
     board_scale: float | None = None
+    """True over stated size."""
+    board: BoardFound | None = None
+    cross_validation: Folds | None = None
+    session: Session | None = None
+    arm: Arm | None = None
     robot_systematics: str = ""
+    """Of files from before version 0.2; see `arm`."""
     warnings: list[str] = []
+    warning_codes: list[str] = []
+    """One for each of `warnings`."""
 
     @property
     def failed(self) -> list[Gate]:

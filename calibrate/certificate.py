@@ -21,13 +21,37 @@ from scipy import sparse
 
 from calibrate.geometry import Array, project_to_rotation
 from calibrate.objective import Objective
-from calibrate.solution import Certificate
 
 TOLERANCE = 1e-6
 FLOOR = 1e-8
 """Of the form's trace: below this an objective counts as zero in the relative gap."""
 _UNIQUE = 1e-9
 """Of the form's trace."""
+
+
+@dataclass(frozen=True)
+class Certificate:
+    """Proof that the quadratic objective has no better X: a lower bound from the dual of the SDP relaxation.
+
+    It speaks of `problem` on the inlier pairs, not of the final maximum-likelihood X; `distance_sigma`
+    is how far the two are apart.
+    """
+
+    certified: bool
+    relative_gap: float
+    """(objective - lower_bound) / max(objective, floor)"""
+    objective: float
+    lower_bound: float
+    floor: float
+    """Absolute floor of the denominator, 1e-8 times the trace of the form."""
+    tolerance: float
+    unique: bool
+    """False where another X reaches the same value (all axes parallel)."""
+    distance_sigma: float | None = None
+    """Largest number of sigmas, over all directions, between the certified X and the final X."""
+    problem: str = ""
+    pairs: int = 0
+    restarts: int = 0
 
 
 @dataclass(frozen=True, eq=False)

@@ -15,7 +15,10 @@ import numpy as np
 from calibrate.board import ambiguity_text
 from calibrate.calibration import (
     FORMAT,
+    Arm,
+    BoardFound,
     Calibration,
+    Folds,
     FramePose,
     Holdout,
     Lens,
@@ -23,17 +26,20 @@ from calibrate.calibration import (
     Provenance,
     Quality,
     Rejected,
+    Session,
     Sigma,
+    TableError,
     ViewQuality,
     Views,
+    ViewWeight,
 )
 from calibrate.gates import Gate
 from calibrate.intrinsics import Intrinsics
 from calibrate.lens_uncertainty import LensUncertainty
 from calibrate.load import LoadedViews
 from calibrate.pnp import view_rms_px
-from calibrate.scale import ScaleCheck
-from calibrate.solution import Solution
+from calibrate.projection import intrinsics_names
+from calibrate.solution import Remark, Solution
 from calibrate.views import ViewSet
 from recordings.reader import Recording
 
@@ -49,7 +55,6 @@ def make_calibration(
     views: ViewSet,
     intrinsics: Intrinsics | None,
     solution: Solution,
-    scale: ScaleCheck | None,
     gates: tuple[Gate, ...],
     options: JobOptions,
     lens_known: LensUncertainty | None = None,
@@ -76,8 +81,9 @@ def make_calibration(
                 key=lambda r: r.index,
             ),
             turned=list(solution.turned),
+            weights=[ViewWeight(i, round(w, 4)) for i, w in solution.weights.items() if w < 0.9999],
         ),
-        quality=_quality(solution, scale, gates, loaded, intrinsics, lens_known),
+        quality=_quality(solution, gates, loaded, intrinsics, lens_known),
         provenance=Provenance(
             recording=recording.path.name,
             recording_sha256=recording.sha256,
@@ -132,21 +138,19 @@ def _lens(views: ViewSet, intrinsics: Intrinsics | None, solution: Solution) -> 
         distortion_model=camera.distortion_model,
         rms_px=rms_px,
         found="given" if intrinsics is None else "from these pictures",
-        sigma={} if intrinsics is None else intrinsics.sigma,
-        held=[] if intrinsics is None else list(intrinsics.held),
+        sigma=_lens_sigma(solution),
     )
 
 
 def _quality(
     solution: Solution,
-    scale: ScaleCheck | None,
     gates: tuple[Gate, ...],
     loaded: LoadedViews,
     intrinsics: Intrinsics | None,
     lens_known: LensUncertainty | None,
 ) -> Quality:
     proof, noise = solution.certificate, solution.noise
-    ambiguity = ambiguity_text(loaded.board)
+    remarks = _remarks(solution, loaded, intrinsics)
     return Quality(
         gates=list(gates),
         certificate=Proof(
@@ -171,22 +175,56 @@ def _quality(
             "robot_mm": noise.robot_m * 1e3,
             "robot_deg": float(np.degrees(noise.robot_rad)),
         },
-        error_shares={}
-        if solution.budget is None
-        else {k: float(v) for k, v in vars(solution.budget).items()},
+        error_shares=solution.error_shares,
         weakest=solution.observability.weakest_text,
-        board_scale=None if scale is None else scale.scale,
-        robot_systematics="" if solution.systematics is None else solution.systematics.text,
-        warnings=[
-            *loaded.losses,
-            *([ambiguity] if ambiguity else []),
-            *(
-                f"view {i + 1} left out of the lens: {why}"
-                for i, why in (intrinsics.dropped if intrinsics else {}).items()
-            ),
-            *solution.warnings,
-        ],
+        board_scale=None if solution.board is None else 1.0 + solution.board.scale,
+        board=None if solution.board is None else BoardFound(**vars(solution.board)),
+        cross_validation=_folds(solution),
+        session=Session(solution.session.reading.value, _session_text(solution)),
+        arm=_arm(solution),
+        warnings=[remark.text for remark in remarks],
+        warning_codes=[remark.code for remark in remarks],
     )
+
+
+def _remarks(solution: Solution, loaded: LoadedViews, intrinsics: Intrinsics | None) -> list[Remark]:
+    ambiguity = ambiguity_text(loaded.board)
+    return [
+        *(Remark("recording-loss", loss) for loss in loaded.losses),
+        *([Remark("symmetric-board", ambiguity)] if ambiguity else []),
+        *(
+            Remark("view-left-out-of-lens", f"View {i + 1} left out of the first lens: {why}.")
+            for i, why in (intrinsics.dropped if intrinsics else {}).items()
+        ),
+        *solution.warnings,
+    ]
+
+
+def _session_text(solution: Solution) -> str:
+    code = solution.session.reading.value
+    return next((remark.text for remark in solution.warnings if remark.code == code), "")
+
+
+def _lens_sigma(solution: Solution) -> dict[str, float]:
+    if solution.lens_covariance is None:
+        return {}
+    sigma = np.sqrt(np.maximum(np.diag(solution.lens_covariance), 0.0)).tolist()
+    return dict(zip(intrinsics_names(solution.camera), sigma, strict=True))
+
+
+def _folds(solution: Solution) -> Folds | None:
+    found = solution.cross_validation
+    if found is None:
+        return None
+    return Folds(found.rms_m * 1e3, float(np.degrees(found.rms_rad)), found.claimed_m * 1e3, found.folds)
+
+
+def _arm(solution: Solution) -> Arm | None:
+    arm = solution.arm
+    if arm is None:
+        return None
+    table = [TableError(name, value, sigma) for name, (value, sigma) in arm.errors.items()]
+    return Arm(arm.detected, arm.log_bayes, arm.size_mm, table)
 
 
 def _scaled(value: float | None, factor: float) -> float | None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import ClassVar
-
 
 class CalibrationError(Exception):
     """Something a person can act on. `str()` says what, where and what to do next.
@@ -12,7 +10,7 @@ class CalibrationError(Exception):
     """
 
     exit_code = 1
-    hypothesis: ClassVar[str] = ""
+    hypothesis: str = ""
     """The cause as a word for programs, where it is known."""
 
 
@@ -46,7 +44,11 @@ class BadViewsError(CalibrationError):
 
 
 class PosesDisagreeError(BadViewsError):
-    """Robot poses and pictures contradict each other. What to mend is added where all views are known."""
+    """Robot poses and pictures contradict each other; `hypothesis` is the code of the reading that fits."""
+
+    def __init__(self, text: str, hypothesis: str = "") -> None:
+        super().__init__(text)
+        self.hypothesis = hypothesis
 
 
 class GateFailedError(CalibrationError):

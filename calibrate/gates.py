@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from calibrate.errors import CalibrationError
-from calibrate.scale import ScaleCheck
+from calibrate.handeye.readings import Reading
 from calibrate.solution import Solution
 from recordings import strict_yaml
 
@@ -25,27 +25,38 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """Limits as an owner writes them; None switches a gate off."""
 
     views: int | None = 8
+    weight: float | None = 0.8
+    """Mean weight of the views: below it too much was left out of account."""
+    session: bool | None = True
+    """The recording is what it says: no other reading of it as a whole explains it better."""
     rotation_deg: float | None = 30.0
     """Largest turn between two views."""
     axis_spread: float | None = 0.1
     """0: all turns about one axis, 1: about all axes alike."""
-    certificate: bool | None = True
-    agreement_sigma: float | None = 6.0
-    """Between the certified optimum of the quadratic objective and the final X."""
     view_rms_px: float | None = 1.5
     """Worst view."""
     holdout_share: float | None = 0.01
     """Hold-out translation error over the working distance."""
+    cross_validation: float | None = 1.0
+    """Error of left-out views over the claimed one, in units of the largest that chance allows."""
     predicted_error_m: float | None = 0.002
     """1σ of a point at the working distance."""
     coverage: float | None = 0.25
     """Share of the picture in which corners were seen, when the lens was found from these pictures."""
-    board_scale: float | None = 0.01
-    """|scale - 1| of the board against the robot's motion, when it is also significant."""
+    lens_pull: float | None = 1.0
+    """By which believing the given lens moves X beyond its tolerance, over the predicted error."""
+    board_pull: float | None = 1.0
+    """The same of the stated board: size, print and flatness."""
     clock_bound_s: float | None = 0.02
     """The arm is at rest: at the stillness limit of 2 mrad/s this is 0.04 mm at one metre."""
     robot_error_m: float | None = 0.002
     robot_error_deg: float | None = 0.3
+    certificate: bool | None = None
+    """No effect: of files for earlier versions. The certificate is information."""
+    agreement_sigma: float | None = None
+    """No effect: of files for earlier versions."""
+    board_scale: float | None = None
+    """No effect: of files for earlier versions; see `board_pull`."""
 
 
 class Gate(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -59,10 +70,9 @@ class Gate(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 @dataclass(frozen=True)
-class Evidence:
+class GateInputs:
     """What the gates look at besides the solution."""
 
-    scale: ScaleCheck | None = None
     coverage: float | None = None
     """None when the lens was not found from these pictures."""
     clock_bound_s: float | None = None
@@ -78,14 +88,15 @@ def read_limits(path: Path) -> GateLimits:
         raise GatesError(f"{path}: {problem}. Allowed: {', '.join(GateLimits.__struct_fields__)}.") from None
 
 
-def judge(solution: Solution, evidence: Evidence, limits: GateLimits | None = None) -> tuple[Gate, ...]:
+def judge(solution: Solution, inputs: GateInputs, limits: GateLimits | None = None) -> tuple[Gate, ...]:
     """Every gate that is switched on and can be judged, in the order a person would read them."""
     limits = limits or GateLimits()
     return (
+        *_session_gates(solution, limits),
         *_motion_gates(solution, limits),
-        *_optimum_gates(solution, limits),
         *_accuracy_gates(solution, limits),
-        *_evidence_gates(evidence, limits),
+        *_input_gates(inputs, limits),
+        *_statement_gates(solution, limits),
         *_robot_gates(solution, limits),
     )
 
@@ -131,28 +142,23 @@ def _motion_gates(solution: Solution, limits: GateLimits) -> Iterator[Gate]:
         )
 
 
-def _optimum_gates(solution: Solution, limits: GateLimits) -> Iterator[Gate]:
-    proof = solution.certificate
-    if limits.certificate:
-        gap = f"relative gap {proof.relative_gap:.1e}" if proof.relative_gap > 1e-15 else "no gap at all"
-        yield Gate(
-            "certificate",
-            proof.certified,
-            proof.relative_gap,
-            proof.tolerance,
-            f"The optimum of the {proof.problem or 'quadratic objective'} is proven global ({gap})"
-            if proof.certified
-            else f"The optimum is not proven ({gap}). Add views, or look for wrong ones.",
-        )
-    if limits.agreement_sigma is not None and proof.distance_sigma is not None:
-        yield _at_most(
-            "agreement",
-            proof.distance_sigma,
-            limits.agreement_sigma,
-            f"Certified optimum and final X are {proof.distance_sigma:.1f} sigmas apart",
-            "The robot's orientations contradict its positions: see the warning below."
-            if solution.frames_finding
-            else "Two sound methods disagree: look for views that do not belong, or a wrong lens.",
+def _session_gates(solution: Solution, limits: GateLimits) -> Iterator[Gate]:
+    session = solution.session
+    if limits.session and solution.profile == "robust":
+        as_recorded = session.reading is Reading.AS_RECORDED or solution.move_accepted
+        text = "The recording is what it says"
+        remark = next((w.text for w in solution.warnings if w.code == session.reading.value), "")
+        if session.reading is not Reading.AS_RECORDED:
+            text = f"{remark} Accepted: both parts were used" if as_recorded else remark
+        yield Gate("session", as_recorded, session.log_evidence_gain, None, text)
+    if limits.weight is not None and solution.weights:
+        weight = float(np.mean(list(solution.weights.values())))
+        yield _at_least(
+            "weight",
+            weight,
+            limits.weight,
+            f"The views count for {weight:.0%} of their number",
+            "Retake the rejected and suspect views, or leave them out with a reason (--without).",
         )
 
 
@@ -176,6 +182,17 @@ def _accuracy_gates(solution: Solution, limits: GateLimits) -> Iterator[Gate]:
             f"Views that took no part are predicted to {e_t_mm:.2f} mm",
             "The robot's poses or the corners are worse than this cell needs.",
         )
+    folds = solution.cross_validation
+    if limits.cross_validation is not None and folds is not None:
+        value = folds.rms_m / folds.claimed_m / folds.limit
+        yield _at_most(
+            "cross-validation",
+            value,
+            limits.cross_validation,
+            f"Left-out views are missed by {folds.rms_m * 1e3:.2f} mm, {folds.claimed_m * 1e3:.2f} mm are "
+            f"claimed (at most {folds.claimed_m * folds.limit * 1e3:.2f})",
+            "The stated error is too small for this cell: check lens, board and looseness of the mounts.",
+        )
     if limits.predicted_error_m is not None and solution.predicted_error_m is not None:
         value_mm = solution.predicted_error_m * 1000
         distance = solution.working_distance_m or 0.0
@@ -188,29 +205,47 @@ def _accuracy_gates(solution: Solution, limits: GateLimits) -> Iterator[Gate]:
         )
 
 
-def _evidence_gates(evidence: Evidence, limits: GateLimits) -> Iterator[Gate]:
-    if limits.coverage is not None and evidence.coverage is not None:
-        share = evidence.coverage * 100
+def _input_gates(inputs: GateInputs, limits: GateLimits) -> Iterator[Gate]:
+    if limits.coverage is not None and inputs.coverage is not None:
+        share = inputs.coverage * 100
         yield _at_least(
             "lens coverage",
-            evidence.coverage,
+            inputs.coverage,
             limits.coverage,
             f"Corners were seen in {share:.0f} % of the picture",
             "Bring the board into the corners of the picture, or give a lens calibrated before.",
         )
-    if limits.board_scale is not None and evidence.scale is not None:
-        check = evidence.scale
-        miss = abs(check.scale - 1.0)
-        passed = miss <= limits.board_scale or not check.significant
-        yield Gate("board scale", passed, float(miss), limits.board_scale, check.text)
-    if limits.clock_bound_s is not None and evidence.clock_bound_s is not None:
-        bound_ms = evidence.clock_bound_s * 1000
+    if limits.clock_bound_s is not None and inputs.clock_bound_s is not None:
+        bound_ms = inputs.clock_bound_s * 1000
         yield _at_most(
             "clocks",
-            evidence.clock_bound_s,
+            inputs.clock_bound_s,
             limits.clock_bound_s,
             f"Pictures and robot poses belong together to {bound_ms:.1f} ms",
             "Check the camera's clock and the network; use a hardware trigger.",
+        )
+
+
+def _statement_gates(solution: Solution, limits: GateLimits) -> Iterator[Gate]:
+    """What was stated of lens and board, by what believing it does to X."""
+    remedies = {
+        "lens": "Solve with --estimate-intrinsics, or calibrate the camera again.",
+        "board": "Measure the squares both ways and the flatness, correct square_m and solve again.",
+    }
+    for name, finding, limit in (
+        ("lens", solution.lens_finding, limits.lens_pull),
+        ("board", solution.board_finding, limits.board_pull),
+    ):
+        if finding is None or limit is None or not solution.predicted_error_m:
+            continue
+        told = f"The stated {name} moves the camera by {finding.pull_m * 1e3:.2f} mm at the working distance"
+        yield _at_most(
+            name,
+            finding.unexplained_m / solution.predicted_error_m,
+            limit,
+            f"{told}, {finding.unexplained_m * 1e3:.2f} mm more than its tolerance explains "
+            f"(predicted error {solution.predicted_error_m * 1e3:.2f} mm)",
+            remedies[name],
         )
 
 

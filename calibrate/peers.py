@@ -11,14 +11,15 @@ import cv2
 import numpy as np
 
 from calibrate.admit import require_solvable
-from calibrate.assess import board_spread, distance_in_sigmas, motion_errors
-from calibrate.consensus import pose_arrays
+from calibrate.assess import board_places, board_spread, distance_in_sigmas, mean_pose, motion_errors
 from calibrate.errors import CalibrationError
-from calibrate.estimate import estimate, first_state
 from calibrate.geometry import Array, is_rigid, rotation_log
+from calibrate.handeye.estimate import estimate
+from calibrate.handeye.linear import Scales
+from calibrate.handeye.observations import SHAPE, State, observe_views
+from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from calibrate.held_out import HeldOut, held_out_pairs, held_out_views
-from calibrate.likelihood.model import observe_views
-from calibrate.pairs import Pairs, all_pairs, consecutive_pairs
+from calibrate.pairs import Pairs, all_pairs, consecutive_pairs, mount_poses
 from calibrate.paper import on_box, solve_paper
 from calibrate.peer_methods import (
     HAND_EYE,
@@ -32,6 +33,7 @@ from calibrate.peer_methods import (
     zhi_linear,
 )
 from calibrate.profile_robust import solve_robust_profile
+from calibrate.projection import intrinsics_vector
 from calibrate.reprojection import reprojection_px
 from calibrate.solution import PeerResult, Solution, SolveOptions
 from calibrate.views import ViewSet
@@ -39,8 +41,8 @@ from calibrate.views import ViewSet
 Method = Callable[[ViewSet], Array]
 PAPER = "DE, paper"
 _MAX_PAIRS = 2000
-_REPROJECTION_SIGMA = np.array([1.0, 1e-6, 1e-6, 1.0])
-"""Robot poses as good as exact."""
+_EXACT = 1e-6
+"""1σ of robot poses, lens and board that are as good as exact: metres and radians, or relative."""
 
 
 def compare_all(views: ViewSet, options: SolveOptions | None = None) -> list[PeerResult]:
@@ -90,11 +92,11 @@ def _methods(options: SolveOptions) -> dict[str, Method]:
 
 
 def _by_poses(solve: Callable[[Array, Array], Array], views: ViewSet) -> Array:
-    return solve(*pose_arrays(views))
+    return solve(*_pose_arrays(views))
 
 
 def _by_pairs(solve: Callable[[Pairs], Array], views: ViewSet) -> Array:
-    return solve(all_pairs(*pose_arrays(views), limit=_MAX_PAIRS))
+    return solve(all_pairs(*_pose_arrays(views), limit=_MAX_PAIRS))
 
 
 def _strobl(views: ViewSet) -> Array:
@@ -103,7 +105,7 @@ def _strobl(views: ViewSet) -> Array:
 
 
 def _paper(views: ViewSet, seed: int) -> Array:
-    return solve_paper(consecutive_pairs(*pose_arrays(views)), seed).X
+    return solve_paper(consecutive_pairs(*_pose_arrays(views)), seed).X
 
 
 def _reprojection_only(views: ViewSet) -> Array:
@@ -111,10 +113,20 @@ def _reprojection_only(views: ViewSet) -> Array:
     observed = observe_views(views)
     if not observed.has_pixels:
         raise CalibrationError("no corners in this recording")
-    H, C = pose_arrays(views)
+    H, C = _pose_arrays(views)
     X = opencv_hand_eye(H, C, HAND_EYE["Park-Martin"])
-    start = first_state(observed, X, C, H, views.camera)
-    return estimate(observed, start, sigma=_REPROJECTION_SIGMA, fit_scales=False).state.X
+    lens = LensPrior.given(views.camera, _EXACT * np.maximum(np.abs(intrinsics_vector(views.camera)), 1.0))
+    priors = Priors(lens, BoardTolerance(_EXACT, _EXACT))
+    shares = np.array([1.0, *[1e-12] * 3])
+    scales = Scales(np.array([_EXACT, _EXACT]), 1.0, 1.0, 1.0, shares)
+    Y = mean_pose(board_places(H, C, X))
+    start = State(X, Y, C, views.camera, np.zeros(len(SHAPE)), np.zeros(0))
+    return estimate(observed, start, priors, scales, fit_scales=False).state.X
+
+
+def _pose_arrays(views: ViewSet) -> tuple[Array, Array]:
+    """H (n, 4, 4) as in `pairs` and camera_from_board (n, 4, 4)."""
+    return mount_poses(views.base_from_flange, views.mount), views.camera_from_board
 
 
 def _ours_without(fitted: ViewSet, options: SolveOptions) -> Array | None:
@@ -142,7 +154,7 @@ def _row(name: str, method: Method, views: ViewSet, held: HeldOut | None, ours: 
 
 def _scored(name: str, X: Array, views: ViewSet, ours: Solution) -> PeerResult:
     rigid = is_rigid(X)
-    H, C = pose_arrays(views)
+    H, C = _pose_arrays(views)
     spread = board_spread(H, C, X) if rigid else (None, None)
     return PeerResult(
         name=name,

@@ -15,12 +15,13 @@ from calibrate.board import check_board
 from calibrate.calibration import Calibration
 from calibrate.document import make_calibration
 from calibrate.errors import BadViewsError
-from calibrate.gates import Evidence, Gate, GateLimits, judge
+from calibrate.gates import Gate, GateInputs, GateLimits, judge
+from calibrate.handeye.priors import BoardTolerance
 from calibrate.intrinsics import Intrinsics, LensModel, calibrate_intrinsics
 from calibrate.lens_uncertainty import LensUncertainty, lens_uncertainty
 from calibrate.load import FEWEST_VIEWS, LoadedViews, Progress, load_views, without_views
 from calibrate.pnp import solve_pnp, view_rms_px
-from calibrate.scale import ScaleCheck, check_scale
+from calibrate.projection import intrinsics_names
 from calibrate.solution import Profile, Solution, SolveOptions
 from calibrate.solve import solve_views
 from calibrate.stopwatch import Stopwatch
@@ -43,10 +44,14 @@ class JobOptions:
     """Another size of square; a charuco board's markers and an april-grid's gaps grow with it."""
     camera: CameraModel | None = None
     """Known intrinsics, instead of the recorded ones or of finding them."""
+    camera_sigma: dict[str, float] = field(default_factory=dict)
+    """Their 1σ by parameter, where it is stated; else the usual 0.2 %."""
     lens_model: LensModel = "plumb_bob"
     find_intrinsics: bool = False
     """Find them from these pictures even where some are recorded."""
     limits: GateLimits = field(default_factory=GateLimits)
+    accept_move: bool = False
+    """Use both parts of a session in which camera or board was moved half-way."""
     working_distance_m: float | None = None
     without: tuple[int, ...] = ()
     """Numbers, from 1, of the poses that a person leaves out."""
@@ -68,10 +73,9 @@ class PreparedViews:
 @dataclass(frozen=True, eq=False)
 class SolvedRecording(PreparedViews):
     solution: Solution
-    scale: ScaleCheck | None
     coverage: float
     lens_known: LensUncertainty | None
-    """None where the lens was given, or is of a kind that is not judged."""
+    """None without corners, or with the paper's profile."""
     gates: tuple[Gate, ...]
     calibration: Calibration
 
@@ -122,7 +126,7 @@ def _prepare(path: Path, options: JobOptions, progress: Progress | None, fewest:
     views, intrinsics = loaded.views, None
     if views.camera.matrix is None:
         intrinsics = calibrate_intrinsics(views, options.lens_model)
-        views = replace(views, camera=intrinsics.camera, held_intrinsics=intrinsics.held_names)
+        views = replace(views, camera=intrinsics.camera)
     watch.lap("intrinsics")
     views = solve_pnp(views, loaded.board)
     _check_lens_fits(views)
@@ -135,6 +139,9 @@ def solver_options(options: JobOptions, prepared: PreparedViews) -> SolveOptions
         profile=options.profile,
         seed=options.seed,
         intrinsics_from_same_pictures=prepared.intrinsics is not None,
+        lens_sigma=_lens_sigma(options, prepared.views.camera),
+        board=_tolerance(prepared.loaded.board),
+        accept_move=options.accept_move,
         working_distance_m=options.working_distance_m,
     )
 
@@ -151,19 +158,14 @@ def solve_recording(
         solution = solve_views(views, solver_options(options, prepared))
     watch.lap("solve")
     used = views.select([k for k, view in enumerate(views) if view.index in set(solution.used)])
-    scale = None
-    if not solution.on_box:  # a wrong X says nothing about the board
-        scale = check_scale(used, solution.matrix[:3, :3], loaded.board, options.limits.board_scale or 0.01)
     coverage = picture_coverage(used)
-    known = _lens_known(used, prepared.intrinsics, solution)
-    evidence = Evidence(
-        scale,
-        coverage if prepared.intrinsics is not None else None,
-        _clock_bound_s(recording, solution),
+    known = _lens_known(used, solution)
+    inputs = GateInputs(
+        coverage if prepared.intrinsics is not None else None, _clock_bound_s(recording, solution)
     )
-    gates = judge(solution, evidence, options.limits)
+    gates = judge(solution, inputs, options.limits)
     calibration = make_calibration(
-        recording, loaded, views, prepared.intrinsics, solution, scale, gates, options, known
+        recording, loaded, views, prepared.intrinsics, solution, gates, options, known
     )
     watch.lap("judge")
     return SolvedRecording(
@@ -173,7 +175,6 @@ def solve_recording(
         prepared.intrinsics,
         prepared.stage_ms | watch.stage_ms,
         solution,
-        scale,
         coverage,
         known,
         gates,
@@ -181,11 +182,26 @@ def solve_recording(
     )
 
 
-def _lens_known(used: ViewSet, intrinsics: Intrinsics | None, solution: Solution) -> LensUncertainty | None:
-    if intrinsics is None or not solution.kept:
+def _lens_known(used: ViewSet, solution: Solution) -> LensUncertainty | None:
+    if solution.lens_covariance is None or not all(len(view.pixels) for view in used):
         return None
-    corner_px = intrinsics.rms_px / 2**0.5 if solution.noise is None else solution.noise.corner_px
-    return lens_uncertainty(replace(used, views=solution.kept), solution.camera, corner_px)
+    seen = np.concatenate([view.pixels for view in used])
+    return lens_uncertainty(solution.camera, solution.lens_covariance, seen)
+
+
+def _lens_sigma(options: JobOptions, camera: CameraModel) -> tuple[float, ...] | None:
+    names = intrinsics_names(camera)
+    if options.camera is None or not all(options.camera_sigma.get(name, 0.0) > 0 for name in names):
+        return None
+    return tuple(options.camera_sigma[name] for name in names)
+
+
+def _tolerance(board: BoardSpec) -> BoardTolerance:
+    usual = BoardTolerance()
+    return BoardTolerance(
+        usual.square if board.square_tolerance is None else board.square_tolerance,
+        usual.flatness_m if board.flatness_m is None else board.flatness_m,
+    )
 
 
 def _board(options: JobOptions, recorded: BoardSpec) -> BoardSpec:
@@ -214,7 +230,7 @@ def _check_lens_fits(views: ViewSet) -> None:
         raise BadViewsError(
             f"The board does not fit the pictures: corners miss by {median:.0f} px in the median view. The "
             "intrinsics belong to another camera or resolution, or the board's columns and rows are wrong. "
-            "Solve with --find-intrinsics, or correct the board."
+            "Solve with --estimate-intrinsics, or correct the board."
         )
 
 

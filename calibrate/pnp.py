@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 from calibrate.board import board_from_turned, looks_same_turns
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
+from calibrate.handeye.corners import corner_residuals, linearise_corners
+from calibrate.handeye.observations import Observations, observe_views
 from calibrate.lens import project, undistort
-from calibrate.likelihood.model import Observations, State, observe_views
-from calibrate.likelihood.normal import CORNERS
-from calibrate.likelihood.residuals import corner_residuals, linearise_corners
 from calibrate.orientation import choose_candidates
 from calibrate.projection import camera_matrix
 from calibrate.views import ImageView, ViewSet
@@ -136,12 +135,11 @@ def _least_squares(views: ViewSet, owner: NDArray[np.intp], poses: Array) -> tup
         if not len(going):
             break
         observed = everything.part(owner[going])
-        state = _state(views.camera, poses[going])
-        normal = linearise_corners(observed, state, observed.present)
-        V = normal.V[CORNERS]
+        blocks = linearise_corners(observed, views.camera, poses[going], observed.present)
+        V = blocks.LL
         np.einsum("nii->ni", V)[:] *= 1 + damping[going, None]
         V += 1e-9 * np.eye(6)
-        trial = perturb(poses[going], np.linalg.solve(V, normal.h[CORNERS][..., None])[..., 0])
+        trial = perturb(poses[going], np.linalg.solve(V, blocks.Lr[..., None])[..., 0])
         ahead = _squares(everything, views.camera, owner[going], trial)
         before = square[going]
         better = ahead <= before
@@ -154,12 +152,8 @@ def _least_squares(views: ViewSet, owner: NDArray[np.intp], poses: Array) -> tup
 
 def _squares(everything: Observations, camera: CameraModel, owner: NDArray[np.intp], poses: Array) -> Array:
     """(m,) sums of squared distances, px²."""
-    misses = corner_residuals(everything.part(owner), _state(camera, poses))
+    misses = corner_residuals(everything.part(owner), camera, poses)
     return np.asarray((misses**2).sum(axis=(1, 2)))
-
-
-def _state(camera: CameraModel, poses: Array) -> State:
-    return State(np.eye(4), np.eye(4), poses, camera, np.zeros(0))
 
 
 def view_rms_px(view: ImageView, camera: CameraModel, camera_from_board: Array) -> float:

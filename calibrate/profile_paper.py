@@ -16,14 +16,14 @@ from calibrate.assess import (
     require_motion,
     score_holdout,
 )
-from calibrate.certificate import certify
+from calibrate.certificate import Certificate, certify
 from calibrate.frames import board_frames, camera_frames
 from calibrate.geometry import Array, Transform
 from calibrate.objective import Objective, build_objective
 from calibrate.pair_covariance import pair_covariance
 from calibrate.pairs import consecutive_pairs, mount_poses
 from calibrate.paper import solve_paper
-from calibrate.solution import Certificate, Solution, SolveOptions
+from calibrate.solution import Remark, Solution, SolveOptions
 from calibrate.stopwatch import Stopwatch
 from calibrate.views import ViewSet
 
@@ -93,15 +93,19 @@ def _of_returned(objective: Objective, X: Array, pairs: int) -> Certificate:
 _PROBLEM = "logarithmic objective of eq. 16 (lambda 1) over the {} consecutive pairs that were fitted"
 
 
-def _warnings(on_box: tuple[str, ...], held: int, certificate: Certificate) -> tuple[str, ...]:
-    warnings = []
+def _warnings(on_box: tuple[str, ...], held: int, certificate: Certificate) -> tuple[Remark, ...]:
+    remarks = []
     if on_box:
-        warnings.append(
-            f"THE RESULT LIES ON THE BOX of eq. 22 ({', '.join(on_box)}): the true camera is outside "
-            "±90° or ±1 m, and this X is wrong. Use the robust profile."
+        remarks.append(
+            Remark(
+                "on-box",
+                f"The result lies on the box of eq. 22 ({', '.join(on_box)}): the true camera is outside "
+                "±90° or ±1 m, and this X is wrong. Use the robust profile.",
+            )
         )
     if not held:
-        warnings.append(f"Too few pairs to hold out {HELD_OUT}: nothing scores this X.")
+        remarks.append(Remark("no-hold-out", f"Too few pairs to hold out {HELD_OUT}: nothing scores this X."))
     if certificate.objective > 1.05 * max(certificate.lower_bound, certificate.floor):
-        warnings.append("The paper's budget ended more than 5 % above the proven bound of its own objective.")
-    return tuple(warnings)
+        text = "The paper's budget ended more than 5 % above the proven bound of its own objective."
+        remarks.append(Remark("budget-ended", text))
+    return tuple(remarks)

@@ -1,4 +1,4 @@
-"""`--profile robust`: certain first estimate, then what makes it precise and honest."""
+"""`--profile robust`: one estimate of everything that a cell does not know, and what may be said of it."""
 
 from __future__ import annotations
 
@@ -7,165 +7,261 @@ from dataclasses import replace
 import numpy as np
 
 from calibrate.assess import (
+    HoldoutScore,
     board_spread,
     distance_in_sigmas,
     median_distance_m,
     observe,
     point_error_m,
-    require_motion,
     score_holdout,
 )
-from calibrate.board_poses import refine_board_poses
-from calibrate.consensus import pose_arrays
 from calibrate.errors import BadViewsError, PosesDisagreeError
-from calibrate.estimate import Estimate, estimate, first_state
-from calibrate.fit import Fit, Settled, fit_views
-from calibrate.frame_check import check_frames
 from calibrate.frames import board_frames, camera_frames
-from calibrate.geometry import Transform
-from calibrate.lens_check import check_lens
-from calibrate.likelihood.model import observe_views
-from calibrate.likelihood.residuals import corner_residuals, robot_residuals
-from calibrate.misread import what_to_mend
+from calibrate.geometry import Array, Transform
+from calibrate.handeye.corners import boards_by_corners, corner_distance, corner_residuals
+from calibrate.handeye.estimate import FULL, estimate
+from calibrate.handeye.findings import error_shares, judge_board, judge_lens
+from calibrate.handeye.fit import CellFit, fit_cell, fit_moved
+from calibrate.handeye.folds import cross_validate
+from calibrate.handeye.observations import Layout, Moved
+from calibrate.handeye.poses import pose_views
+from calibrate.handeye.priors import LensPrior, Priors
+from calibrate.handeye.readings import Explanation, Reading, explain_recording
+from calibrate.handeye.suspects import explain_views
+from calibrate.handeye.table import PARAMETERS
+from calibrate.held_out import HELD_OUT
 from calibrate.pair_covariance import pair_covariance
-from calibrate.pairs import all_pairs
-from calibrate.solution import ErrorBudget, HoldoutScore, NoiseScales, Solution, SolveOptions
+from calibrate.pairs import all_pairs, mount_poses
+from calibrate.session_text import explain_text, suspect_text
+from calibrate.solution import (
+    ArmTable,
+    BoardShape,
+    NoiseScales,
+    RejectedView,
+    Remark,
+    Solution,
+    SolveOptions,
+)
 from calibrate.stopwatch import Stopwatch
 from calibrate.views import ViewSet
 
-HELD_OUT = 6
-"""Views kept for the score: fit on the first 19 of 25."""
+_ENOUGH = 0.7
+"""Share of views with full weight above which a recording is taken as it stands."""
+_NOISY_M, _NOISY_RAD = 0.002, float(np.radians(0.3))
+"""Noise of the robot that is more than an arm's."""
+_FREE_FOCAL = 0.02
+"""1σ of the focal length of a lens that was found from the same pictures, relative, for other readings."""
 
 
 def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
-    """All views to fit; a second fit without the last 6 for the hold-out score."""
+    """The estimate of all views. Raises BadViewsError, naming the reading that would explain the recording."""
     watch = Stopwatch()
-    free = options.intrinsics_from_same_pictures and views.camera.distortion_model == "plumb_bob"
+    priors = _priors(views, options)
+    poses = pose_views(views, _focal_sigma(priors), priors.board.square)
+    session = Explanation(Reading.AS_RECORDED, 0.0)
     try:
-        fit = fit_views(views, options.seed, free, options.reject_outliers, watch, options.kinematic_prior)
+        fit = fit_cell(views, priors, options.seed, options.model_arm)
     except PosesDisagreeError as problem:
-        raise BadViewsError(f"{problem} {what_to_mend(views, options.seed)}") from None
-    settled = fit.settled
-    result, state, places = settled.estimate, settled.estimate.state, settled.places
-    parent, child = camera_frames(views.mount)
-    H, _ = pose_arrays(fit.views)
-    C = settled.boards.C
-    distance = options.working_distance_m or median_distance_m(C[places])
-    spread_m, spread_rad = board_spread(H[places], C[places], state.X)
-    pairs, start = fit.pairs, fit.certified
-    apart = distance_in_sigmas(start.X, state.X, pair_covariance(start.objective, pairs, start.X))
-    lens_finding = "" if free else check_lens(settled.observed, result)
-    watch.lap("lens check")
-    # A kinematic table found wrong accounts for such a turn itself.
-    worn = fit.systematics is not None and fit.systematics.detected
-    frames_finding = (
-        "" if worn else check_frames(settled.everything.part(places), replace(state, C=C[places]))
+        session = explain_recording(poses, options.seed)
+        raise PosesDisagreeError(f"{problem} {explain_text(session, views)}", session.reading.value) from None
+    watch.lap("estimate")
+    if float((fit.estimate.chances[:, 0] > FULL).mean()) < _ENOUGH:
+        session = explain_recording(poses, options.seed)
+        moved = _MOVED.get(session.reading)
+        if options.accept_move and moved is not None:
+            fit = fit_moved(fit, poses, session.at, moved, options.seed)
+        watch.lap("readings")
+    solution = _describe(fit, options, watch)
+    if session.reading is Reading.AS_RECORDED and _doubtful(solution):
+        session = explain_recording(poses, options.seed)
+        watch.lap("readings")
+    return replace(
+        solution,
+        session=session,
+        move_accepted=fit.estimate.state.second is not None,
+        warnings=_remarks(fit, options, solution, session),
+        stage_ms=watch.stage_ms,
+        solve_ms=watch.total_ms,
     )
-    holdout = _holdout(fit, free) if options.holdout else None
+
+
+_MOVED: dict[Reading, Moved] = {Reading.BOARD_MOVED: "board", Reading.CAMERA_MOVED: "camera"}
+
+
+def _priors(views: ViewSet, options: SolveOptions) -> Priors:
+    if options.intrinsics_from_same_pictures:
+        return Priors(LensPrior.unknown(views.camera), options.board)
+    sigma = None if options.lens_sigma is None else np.array(options.lens_sigma)
+    return Priors(LensPrior.given(views.camera, sigma), options.board)
+
+
+def _focal_sigma(priors: Priors) -> float:
+    sigma, focal = priors.lens.sigma[0], priors.lens.mean[0]
+    return float(min(sigma / focal, _FREE_FOCAL))
+
+
+def _doubtful(solution: Solution) -> bool:
+    """Is there something that another reading of the whole recording might explain?"""
+    folds, noise = solution.cross_validation, solution.noise
+    findings = (solution.lens_finding, solution.board_finding)
+    return bool(
+        (folds is not None and folds.rms_m > folds.limit * folds.claimed_m)
+        or any(finding is not None and finding.unexplained_m > 0 for finding in findings)
+        or (noise is not None and (noise.robot_m > _NOISY_M or noise.robot_rad > _NOISY_RAD))
+    )
+
+
+def _describe(fit: CellFit, options: SolveOptions, watch: Stopwatch) -> Solution:
+    views, found, state = fit.views, fit.estimate, fit.estimate.state
+    at, indices = Layout.of(state), [view.index for view in views]
+    used = np.flatnonzero(found.used)
+    H, C = mount_poses(views.base_from_flange, views.mount), found.board_poses
+    parent, child = camera_frames(views.mount)
+    distance = options.working_distance_m or median_distance_m(C[used])
+    covariance = found.covariance[:6, :6]
+    pairs = all_pairs(H[used], C[used])
+    certified = fit.certified
+    apart = distance_in_sigmas(certified.X, state.X, pair_covariance(certified.objective, pairs, certified.X))
+    spread_m, spread_rad = board_spread(H[used], C[used], state.X)
+    given = not options.intrinsics_from_same_pictures
+    seen = fit.observed.has_pixels
+    lens_finding = judge_lens(fit, distance) if given and seen else None
+    board_finding = judge_board(fit, distance) if seen else None
+    watch.lap("findings")
+    folds = cross_validate(fit, options.seed) if options.folds and state.second is None else None
+    watch.lap("cross-validation")
+    holdout = _holdout(fit) if options.holdout and state.second is None else None
     watch.lap("hold-out")
-    indices = [view.index for view in fit.views]
-    in_doubt = {indices[place]: chance for place, chance in settled.doubts.items()}
+    weight = found.weight
+    rms_px, view_rms_px = _corner_rms(fit)
     return Solution(
         mount=views.mount,
         profile="robust",
         parent_from_child=Transform(parent, child, state.X),
-        covariance=result.covariance,
-        confidence_threshold=result.threshold,
+        covariance=covariance,
+        confidence_threshold=found.threshold,
         board_place=Transform(*board_frames(views.mount), state.Y),
         camera=state.camera,
-        rms_px=_rms_px(settled),
-        used=tuple(indices[i] for i in places),
-        rejected=fit.rejected,
-        certificate=replace(start.certificate, distance_sigma=apart),
-        observability=observe(pairs, result.covariance, distance, parent),
+        rms_px=rms_px,
+        used=tuple(indices[i] for i in used),
+        rejected=_rejected(fit),
+        certificate=replace(certified.certificate, distance_sigma=apart),
+        observability=observe(pairs, covariance, distance, parent),
         holdout=holdout,
-        kept=tuple(fit.views.views[i] for i in places),
-        turned=tuple(indices[i] for i in sorted(fit.consensus.turned)),
-        noise=NoiseScales(*(float(s) for s in result.sigma[:3])),
-        systematics=fit.systematics,
-        budget=ErrorBudget(**result.shares),
-        predicted_error_m=point_error_m(state.X, result.covariance, distance),
+        kept=tuple(replace(views.views[i], camera_from_board=C[i]) for i in used),
+        turned=tuple(indices[i] for i in fit.turned),
+        weights={index: float(w) for index, w in zip(indices, weight, strict=True)},
+        in_doubt={indices[i]: float(1 - found.chances[i, 0]) for i in used if found.chances[i, 0] <= FULL},
+        cross_validation=folds,
+        lens_finding=lens_finding,
+        lens_covariance=found.covariance[at.lens, at.lens] if seen else None,
+        board=_board(fit, found.covariance[at.shape, at.shape]) if seen else None,
+        board_finding=board_finding,
+        noise=NoiseScales(found.scales.tau_px, *(float(s) for s in found.scales.robot)),
+        error_shares=error_shares(fit),
+        arm=_arm(fit, found.covariance[at.table, at.table]),
+        predicted_error_m=point_error_m(state.X, covariance, distance),
         working_distance_m=distance,
         board_spread_m=spread_m,
         board_spread_rad=spread_rad,
-        residual_px={indices[i]: float(settled.boards.rms_px[i]) for i in places},
-        residual_robot=_robot_misses(settled, indices),
-        frames_finding=frames_finding,
-        in_doubt=in_doubt,
-        warnings=_warnings(fit, options, result, in_doubt, (lens_finding, frames_finding)),
-        stage_ms=watch.stage_ms,
-        solve_ms=watch.total_ms,
+        residual_px={indices[i]: float(view_rms_px[i]) for i in used} if seen else {},
+        residual_robot={
+            indices[i]: (float(np.linalg.norm(found.robot[i, :3])), float(np.linalg.norm(found.robot[i, 3:])))
+            for i in used
+        },
         seed=options.seed,
     )
 
 
-def _holdout(fit: Fit, intrinsics_free: bool) -> HoldoutScore | None:
-    """Fit on all but the last 6 kept views, lens included; score all pairs inside those 6.
+def _corner_rms(fit: CellFit) -> tuple[float | None, Array]:
+    """Over all corners of the used views, and for each view (n,), at the board poses that fit its corners."""
+    found = fit.estimate
+    if not fit.observed.has_pixels:
+        return None, np.zeros(len(fit.views))
+    residual = corner_residuals(fit.observed, found.state.camera, found.board_poses, found.state.shape)
+    square = np.nan_to_num(corner_distance(residual), nan=1e6, posinf=1e6) ** 2 * fit.observed.present
+    count = fit.observed.present.sum(axis=1)
+    used = found.used
+    return float(np.sqrt(square[used].sum() / count[used].sum())), np.sqrt(square.sum(axis=1) / count)
 
-    That fit starts at the X of all views: a start decides how long the way to its own optimum is, not where
-    the optimum lies.
+
+def _board(fit: CellFit, covariance: Array) -> BoardShape:
+    scale, anisotropy, *bend = fit.estimate.state.shape.tolist()
+    return BoardShape(scale, anisotropy, tuple(bend), tuple(np.sqrt(np.diag(covariance)).tolist()))
+
+
+def _arm(fit: CellFit, covariance: Array) -> ArmTable | None:
+    if fit.table is None:
+        return None
+    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
+    errors = dict(zip(PARAMETERS, zip(fit.estimate.state.table.tolist(), sigma, strict=True), strict=True))
+    return ArmTable(fit.table.log_bayes, fit.table.size, errors)
+
+
+def _rejected(fit: CellFit) -> tuple[RejectedView, ...]:
+    places = np.flatnonzero(~fit.estimate.used)
+    return tuple(
+        RejectedView(
+            fit.views.views[suspect.place].index,
+            fit.views.views[suspect.place].name,
+            suspect_text(suspect, fit.views),
+            suspect.cause,
+            suspect.number,
+        )
+        for suspect in explain_views(fit, places)
+    )
+
+
+def _holdout(fit: CellFit) -> HoldoutScore | None:
+    """Fit on all but the last 6 used views, lens included; score all pairs inside those 6.
+
+    That fit starts at the estimate of all views: a start decides how long the way to its own optimum is, not
+    where the optimum lies.
     """
-    kept = fit.views.select(fit.settled.places.tolist())
-    fitted = len(kept) - HELD_OUT
-    if fitted < 5:
+    used = np.flatnonzero(fit.estimate.used)
+    first, last = used[:-HELD_OUT], used[-HELD_OUT:]
+    if len(first) < 5:
         return None
-    first = kept.select(list(range(fitted)))
-    last = kept.select(list(range(fitted, len(kept))))
-    H, C = pose_arrays(first)
-    require_motion(all_pairs(H, C))
-    observed = observe_views(first)
-    start = first_state(observed, fit.settled.estimate.state.X, C, H, first.camera)
-    partial = estimate(observed, start, intrinsics_free).state
-    H, C = pose_arrays(last)
-    boards = refine_board_poses(observe_views(last), replace(partial, C=C))
-    pairs = all_pairs(H, boards.C)
-    note = f"fit on {fitted} views, all {len(pairs)} pairs inside the other {HELD_OUT} scored"
-    return score_holdout(partial.X, pairs, [view.index for view in last], fitted, note)
-
-
-def _rms_px(settled: Settled) -> float | None:
-    """Over all corners of the fitted views, bad ones included with their weight."""
-    if not settled.observed.has_pixels:
+    whole = fit.estimate
+    try:
+        partial = estimate(fit.observed.part(first), whole.state.of_views(first), fit.priors, whole.scales)
+    except BadViewsError:
         return None
-    square = (corner_residuals(settled.observed, settled.estimate.state) ** 2).sum(axis=-1)
-    weights = settled.estimate.weights
-    return float(np.sqrt((weights * square).sum() / weights.sum()))
+    H = mount_poses(fit.views.base_from_flange, fit.views.mount)[last]
+    state = partial.state
+    C = boards_by_corners(fit.observed.part(last), state.camera, whole.board_poses[last], state.shape)
+    pairs = all_pairs(H, C)
+    indices = [fit.views.views[i].index for i in last]
+    note = f"fit on {len(first)} views, all {len(pairs)} pairs inside the other {HELD_OUT} scored"
+    return score_holdout(partial.state.X, pairs, indices, len(first), note)
 
 
-def _robot_misses(settled: Settled, indices: list[int]) -> dict[int, tuple[float, float]]:
-    e = robot_residuals(settled.observed, settled.estimate.state)
-    return {
-        indices[i]: (float(np.linalg.norm(row[:3])), float(np.linalg.norm(row[3:])))
-        for i, row in zip(settled.fitted.tolist(), e, strict=True)
-        if i in settled.places
-    }
-
-
-def _warnings(
-    fit: Fit,
-    options: SolveOptions,
-    result: Estimate,
-    in_doubt: dict[int, float],
-    findings: tuple[str, ...],
-) -> tuple[str, ...]:
-    warnings = [finding for finding in findings if finding]
-    if options.intrinsics_from_same_pictures and not result.intrinsics_free:
-        warnings.append(
-            "The intrinsics came from the same pictures but could not be refined with X (only the plumb_bob "
-            "model can): their uncertainty is not in the stated sigma."
+def _remarks(
+    fit: CellFit, options: SolveOptions, solution: Solution, session: Explanation
+) -> tuple[Remark, ...]:
+    found, remarks = fit.estimate, []
+    if session.reading is not Reading.AS_RECORDED:
+        remarks.append(Remark(session.reading.value, explain_text(session, fit.views)))
+    if solution.in_doubt:
+        chances = ", ".join(f"{index + 1} ({chance:.0%})" for index, chance in solution.in_doubt.items())
+        remarks.append(
+            Remark("suspect-views", f"Suspect views, down-weighted: {chances} likely wrong. Retake them.")
         )
-    if in_doubt:
-        chances = ", ".join(f"{index + 1} ({chance:.0%})" for index, chance in in_doubt.items())
-        warnings.append(
-            f"In doubt, so counted in part: view {chances}, in brackets how likely it is wrong. "
-            "Retake to be sure."
+    if not found.converged:
+        remarks.append(Remark("not-converged", f"Not converged after {found.steps} iterations."))
+    if not fit.observed.has_pixels:
+        remarks.append(
+            Remark(
+                "no-corners",
+                "No corners were recorded: board poses are taken as exact, all error is the robot's.",
+            )
         )
-    if not result.converged:
-        warnings.append(f"The final estimate had not settled after {result.steps} steps.")
-    if not fit.certified.certificate.certified:
-        warnings.append("The global optimum of the pair objective could not be certified.")
-    if not fit.settled.observed.has_pixels:
-        warnings.append("No corners were recorded: board poses are taken as exact, all error is the robot's.")
-    if fit.systematics is not None and fit.systematics.detected:
-        warnings.append(fit.systematics.text)
-    return tuple(warnings)
+    if solution.arm is not None and solution.arm.detected:
+        remarks.append(
+            Remark(
+                "arm-table",
+                f"The robot's residuals follow its joints: errors of about {solution.arm.size_mm:.2f} mm or mrad "
+                "in its kinematic table. X allows for them; have the arm calibrated.",
+            )
+        )
+    return tuple(remarks)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibrate.certificate import certify
+from calibrate.certificate import Certificate, certify
 from calibrate.evolution import (
     EvolutionSettings,
     evolve,
@@ -20,7 +20,6 @@ from calibrate.evolution import (
 from calibrate.geometry import Array, pose, project_to_rotation, skew
 from calibrate.objective import Objective, build_objective
 from calibrate.pairs import Pairs
-from calibrate.solution import Certificate
 
 SETTINGS = EvolutionSettings(population=30, generations=40)
 MAX_RESTARTS = 6

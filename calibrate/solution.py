@@ -12,12 +12,17 @@ from typing import Literal
 
 import numpy as np
 
+from calibrate.assess import HoldoutScore, Observability
+from calibrate.certificate import Certificate
 from calibrate.geometry import Array, Transform
+from calibrate.handeye.findings import Finding
+from calibrate.handeye.folds import CrossValidation
+from calibrate.handeye.priors import BoardTolerance
+from calibrate.handeye.readings import Explanation, Reading
 from calibrate.views import ImageView
 from recordings.messages import CameraModel, Mount
 
 Profile = Literal["robust", "paper"]
-KinematicPrior = Literal["auto", "on", "off"]
 
 
 @dataclass(frozen=True)
@@ -25,15 +30,19 @@ class SolveOptions:
     profile: Profile = "robust"
     seed: int = 0
     intrinsics_from_same_pictures: bool = False
-    """The camera model was fitted to these very pictures: the last stage refines it together with X
-    (robust profile; plumb_bob only), and its uncertainty is part of X's covariance."""
-    reject_outliers: bool = True
-    kinematic_prior: KinematicPrior = "auto"
-    """Model errors of the arm's Denavit-Hartenberg table. auto: where joints were recorded, unless the
-    residuals speak against them."""
+    """The camera model was fitted to these very pictures: nothing is known of the lens beforehand."""
+    lens_sigma: tuple[float, ...] | None = None
+    """1σ of a given lens in the order of `projection.intrinsics_names`; None: the usual 0.2 %."""
+    board: BoardTolerance = field(default_factory=BoardTolerance)
+    model_arm: bool = True
+    """Allow for errors of the arm's kinematic table where its model is known."""
+    accept_move: bool = False
+    """Where camera or board was moved half-way, model the move instead of refusing the recording."""
     working_distance_m: float | None = None
     """Where the predicted error is stated, along the camera's axis; None = median board distance."""
     holdout: bool = True
+    folds: bool = True
+    """Cross-validate."""
 
 
 @dataclass(frozen=True)
@@ -43,90 +52,17 @@ class RejectedView:
     name: str
     reason: str
     """One sentence for people."""
-    kind: Literal[
-        "turned-board",
-        "wrong-pose",
-        "wrong-square-size",
-        "moved-board",
-        "wrong-number",
-        "inconsistent",
-        "corners",
-        "unreadable-picture",
-        "by-hand",
-    ]
+    kind: Literal["wrong-pose", "wrong-number", "inconsistent", "corners", "unreadable-picture", "by-hand"]
     wrong_number: int | None = None
     """Place in [δt, δφ] of the only wrong number of its recorded pose."""
 
 
-@dataclass(frozen=True, eq=False)
-class HoldoutScore:
-    """Equations 24 to 26 of the paper on pairs that took no part in the fit."""
-
-    e_t_m: float
-    """Mean translation error."""
-    e_R: float
-    """Mean spectral norm of the rotation error."""
-    samples_e_t_m: Array
-    """(m,) per held-out pair."""
-    samples_e_R: Array
-    pairs: tuple[tuple[int, int], ...]
-    """Pose numbers (earlier, later) of the held-out pairs."""
-    fitted_views: int
-    note: str = ""
-
-
 @dataclass(frozen=True)
-class Certificate:
-    """Proof that the quadratic objective has no better X: a lower bound from the dual of the SDP relaxation.
+class Remark:
+    """Something that is doubtful, as a code for programs and a sentence for people."""
 
-    It speaks of `problem` on the inlier pairs, not of the final maximum-likelihood X; `distance_sigma`
-    is how far the two are apart.
-    """
-
-    certified: bool
-    relative_gap: float
-    """(objective - lower_bound) / max(objective, floor)"""
-    objective: float
-    lower_bound: float
-    floor: float
-    """Absolute floor of the denominator, 1e-8 times the trace of the form."""
-    tolerance: float
-    unique: bool
-    """False where another X reaches the same value (all axes parallel)."""
-    distance_sigma: float | None = None
-    """Largest number of sigmas, over all directions, between the certified X and the final X."""
-    problem: str = ""
-    pairs: int = 0
-    restarts: int = 0
-
-
-@dataclass(frozen=True, eq=False)
-class Observability:
-    weakest_direction: Array
-    """(6,) unit [δt, δφ] in X's parent frame, rotation weighed at the working distance."""
-    weakest_text: str
-    weakest_sigma_m: float
-    """1σ along it, as metres at the working distance."""
-    largest_angle_rad: float
-    """Largest rotation between any two views."""
-    axis_spread: float
-    """0: all rotations about one axis; 1: axes in all directions alike (second over first singular value)."""
-
-
-@dataclass(frozen=True)
-class ErrorBudget:
-    """Share of X's variance by source, summing to 1, and the source that dominates."""
-
-    corners: float
-    robot_translation: float
-    robot_rotation: float
-    intrinsics: float
-    kinematics: float
-
-    @property
-    def dominant(self) -> str:
-        shares = vars(self)
-        return max(shares, key=lambda name: float(shares[name])).replace("_", " ")
+    code: str
+    text: str
 
 
 @dataclass(frozen=True)
@@ -134,31 +70,37 @@ class NoiseScales:
     """Standard deviations that the residuals show (restricted maximum likelihood)."""
 
     corner_px: float
+    """Of what moves a board's pose: corner errors are smooth over a board."""
     robot_m: float
     robot_rad: float
 
 
-@dataclass(frozen=True, eq=False)
-class RobotSystematics:
-    """Do the robot's residuals follow its joints?"""
+@dataclass(frozen=True)
+class BoardShape:
+    """What the views say of the board, with 1σ each; see `handeye.observations.SHAPE`."""
 
-    detected: bool
-    possible: bool
-    """Not to be excluded either."""
-    statistic: float
-    """Twice the gain of the restricted log-likelihood by the kinematic model; threshold beside it."""
-    threshold: float
-    worst_joint: str = ""
-    worst_joint_rms_m: float = 0.0
-    """Flange displacement that errors at this joint explain, rms over the views."""
-    prior_applied: bool = False
-    """X and its covariance come from the model with kinematic errors."""
-    scale_mm: float = 0.0
-    """Fitted size of the table's errors, mm or mrad."""
-    table_errors: tuple[float, ...] = ()
-    """Where applied: estimated a (6), d (6) in metres, alpha (6), theta (6) in radians, true minus nominal.
-    Only their sum at the flange is known well, not each one."""
-    text: str = ""
+    scale: float
+    """True over stated size, minus 1."""
+    anisotropy: float
+    """x against y of the print."""
+    bend_m: tuple[float, float, float]
+    sigma: tuple[float, float, float, float, float]
+
+
+@dataclass(frozen=True)
+class ArmTable:
+    """Errors of the arm's kinematic table."""
+
+    log_bayes: float
+    """Log evidence for any errors against none."""
+    size_mm: float
+    """Their 1σ, mm and mrad."""
+    errors: dict[str, tuple[float, float]]
+    """Name → value and 1σ, metres or radians. Only their sum at the flange is known well, not each one."""
+
+    @property
+    def detected(self) -> bool:
+        return self.log_bayes > 3.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +114,7 @@ class Solution:
     covariance: Array
     """(6, 6)"""
     confidence_threshold: float
-    """δᵀ C⁻¹ δ below this holds the truth in 95 % of cases: 6·F(6, ν), ν ≤ 3N - 6 (see `Estimate`)."""
+    """δᵀ C⁻¹ δ below this holds the truth in 95 % of cases: 6·F(6, ν), ν = 3N - 6."""
     board_place: Transform
     """base_from_board or flange_from_board."""
     camera: CameraModel
@@ -189,11 +131,24 @@ class Solution:
     """The used views as the solver read them, boards turned where that was needed."""
     turned: tuple[int, ...] = ()
     """Views whose corner order was turned by 180° to agree with the others, and kept."""
+    weights: dict[int, float] = field(default_factory=dict)
+    """Pose number → what the view counts for, 1 fully … 0."""
     in_doubt: dict[int, float] = field(default_factory=dict)
     """Used views that count in part, by pose number: the chance that they are wrong."""
+    session: Explanation = field(default_factory=lambda: Explanation(Reading.AS_RECORDED, 0.0))
+    """How the recording as a whole has to be read."""
+    move_accepted: bool = False
+    """The move that `session` names is modelled: X is that after it."""
+    cross_validation: CrossValidation | None = None
+    lens_finding: Finding | None = None
+    """None where no lens was given."""
+    lens_covariance: Array | None = None
+    """(p, p) of `projection.intrinsics_names`."""
+    board: BoardShape | None = None
+    board_finding: Finding | None = None
     noise: NoiseScales | None = None
-    budget: ErrorBudget | None = None
-    systematics: RobotSystematics | None = None
+    error_shares: dict[str, float] = field(default_factory=dict)
+    arm: ArmTable | None = None
     predicted_error_m: float | None = None
     """1σ (root of the mean squared length) of a point at the working distance on the camera's axis."""
     working_distance_m: float | None = None
@@ -206,9 +161,7 @@ class Solution:
     """Pose number → (metres, radians) between the recorded and the modelled flange."""
     on_box: tuple[str, ...] = ()
     """Paper profile: components of X that lie on the box of equation 22."""
-    frames_finding: str = ""
-    """The robot's orientations and positions contradict each other (see `frame_check`); "" if they do not."""
-    warnings: tuple[str, ...] = ()
+    warnings: tuple[Remark, ...] = ()
     stage_ms: dict[str, float] = field(default_factory=dict)
     solve_ms: float = 0.0
     seed: int = 0

@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from calibrate.board import describe_board
 from calibrate.calibration import Calibration, Override
+from calibrate.cell_text import cell_sentences
 from calibrate.geometry import difference
 from calibrate.verification import agrees, touch_text
 
@@ -28,9 +29,9 @@ def source_stamp(calibration: Calibration) -> str:
 def verdict(calibration: Calibration) -> tuple[bool, str]:
     failed = calibration.quality.failed
     if not failed:
-        return True, f"GOOD: all {len(calibration.quality.gates)} gates passed"
+        return True, f"PASS: {len(calibration.quality.gates)} of {len(calibration.quality.gates)} gates"
     names = ", ".join(gate.name for gate in failed)
-    return False, f"NOT GOOD ENOUGH: {names} ({len(failed)} of {len(calibration.quality.gates)} gates failed)"
+    return False, f"FAIL: {names} ({len(failed)} of {len(calibration.quality.gates)} gates)"
 
 
 def override_text(override: Override) -> str:
@@ -56,6 +57,7 @@ def summary(calibration: Calibration) -> RenderableType:
     for touch in calibration.verification:
         style = "green" if agrees(touch) else "bold red"
         parts.append(Text(f"checked by hand, {touch.wall}, {touch.who}: {touch_text(touch)}", style=style))
+    parts += [Text(sentence) for sentence in cell_sentences(calibration)]
     parts += [Text(f"! {warning}", style="yellow") for warning in calibration.quality.warnings]
     for view in calibration.views.rejected:
         parts.append(Text(f"- view {view.index + 1} ({view.name}) left out: {view.reason}"))

@@ -39,8 +39,6 @@ class ViewSet:
     camera: CameraModel
     """matrix is None until intrinsics are known."""
     robot_model: str = "unknown"
-    held_intrinsics: tuple[str, ...] = ()
-    """Parameters (`projection.INTRINSICS`) that the pictures leave open: kept as they are, never refined."""
 
     def __len__(self) -> int:
         return len(self.views)

@@ -51,6 +51,12 @@ def read_camera(path: Path) -> CameraModel:
     return camera
 
 
+def read_lens_sigma(path: Path) -> dict[str, float]:
+    """1σ of each parameter of the lens, as a calibration file states them; empty for other files."""
+    plain = _read(path, "a calibration file, a camera_info file or a camera's width, height and matrix")
+    return dict(read_calibration(path).intrinsics.sigma) if plain.get("format") == FORMAT else {}
+
+
 def read_cell_serials(path: Path) -> tuple[str, str]:
     """(robot's, camera's) serial number of a station's configuration; empty where it names none."""
     plain = _read(path, "a station's configuration")

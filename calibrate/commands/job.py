@@ -12,7 +12,7 @@ from typing import Annotated, Any
 
 import typer
 
-from calibrate.commands.files import read_board, read_camera
+from calibrate.commands.files import read_board, read_camera, read_lens_sigma
 from calibrate.commands.output import OutputError
 from calibrate.gates import GateLimits, read_limits
 from calibrate.pipeline import JobOptions
@@ -40,7 +40,18 @@ SquareMm = Annotated[float | None, typer.Option("--square-mm", help="Another squ
 CameraFile = Annotated[
     Path | None, typer.Option("--camera", help="Known lens: camera_info YAML or a calibration file")
 ]
-Find = Annotated[bool, typer.Option("--find-intrinsics", help="Find the lens even where it is recorded")]
+Find = Annotated[
+    bool,
+    typer.Option(
+        "--estimate-intrinsics",
+        "--find-intrinsics",
+        help="Estimate the intrinsics from these pictures, even where some are recorded",
+    ),
+]
+AcceptMove = Annotated[
+    bool,
+    typer.Option("--accept-move", help="Use both parts of a session in which camera or board was moved"),
+]
 LensKind = Annotated[LensName, typer.Option("--lens", help="Model of a lens that has to be found")]
 GatesFile = Annotated[Path | None, typer.Option("--gates", help="YAML of other limits")]
 Without = Annotated[
@@ -97,12 +108,13 @@ def picture_options(
 ) -> JobOptions:
     """How pictures are read."""
     if camera is not None and find_intrinsics:
-        raise OutputError("--camera gives the lens, --find-intrinsics finds it: choose one of them.")
+        raise OutputError("--camera gives the lens, --estimate-intrinsics finds it: choose one of them.")
     return JobOptions(
         seed=seed,
         board=None if board is None else read_board(board),
         square_m=None if square_mm is None else square_mm / 1000,
         camera=None if camera is None else read_camera(camera),
+        camera_sigma={} if camera is None else read_lens_sigma(camera),
         lens_model=lens.value,
         find_intrinsics=find_intrinsics,
         without=() if without is None else _numbers(without),
@@ -122,6 +134,7 @@ def job_options(
     options: JobOptions,
     profile: Profile = ProfileName.robust,
     gates: GatesFile = None,
+    accept_move: AcceptMove = False,
     working_distance_mm: Distance = None,
 ) -> JobOptions:
     """And how they are solved and judged."""
@@ -129,5 +142,6 @@ def job_options(
         options,
         profile=profile.value,
         limits=GateLimits() if gates is None else read_limits(gates),
+        accept_move=accept_move,
         working_distance_m=None if working_distance_mm is None else working_distance_mm / 1000,
     )

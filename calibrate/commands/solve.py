@@ -105,6 +105,7 @@ def solve_json(job: SolvedRecording) -> dict[str, Any]:
         "views": {
             "used": views["used"],
             "rejected": [{"index": r["index"], "reason": r["reason"]} for r in views.get("rejected", [])],
+            "weights": [{"index": i, "weight": w} for i, w in job.solution.weights.items()],
         },
         "intrinsics": {key: lens[key] for key in ("width", "height", "matrix", "distortion", "rms_px")},
         "holdout": None if holdout is None else {"e_t_m": holdout["e_t_m"], "e_R": holdout["e_R"]},
@@ -112,6 +113,15 @@ def solve_json(job: SolvedRecording) -> dict[str, Any]:
             key: proof[key] for key in ("certified", "relative_gap", "objective", "distance_sigma")
         },
         "gates": quality["gates"],
+        "verdict": "pass" if job.passed else "fail",
+        "warnings": [
+            {"code": code, "text": text}
+            for code, text in zip(quality.get("warning_codes", []), quality.get("warnings", []), strict=True)
+        ],
+        "cross_validation": quality.get("cross_validation"),
+        "board": quality.get("board"),
+        "session": quality.get("session"),
+        "arm": quality.get("arm"),
         "solve_ms": sum(job.stage_ms.values()),
     }
 

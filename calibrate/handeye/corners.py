@@ -6,13 +6,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.geometry import Array, skew
+from calibrate.geometry import Array, perturb, skew
 from calibrate.handeye.observations import SHAPE, Observations
 from calibrate.projection import intrinsics_names, project, project_pixels
 from recordings.messages import CameraModel
 
 _CHUNK_POINTS = 40_000
 """Corners linearised at once: bounds memory for thousands of views."""
+_STEPS, _LIMIT_SIGMA = 10, 4.0
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,6 +139,26 @@ def _linearise_chunk(
         blocks.LG[part] = L_t @ G
         blocks.GG[part] = G_t @ G
         blocks.Gr[part] = (G_t @ r[..., None])[..., 0]
+
+
+def boards_by_corners(observed: Observations, camera: CameraModel, C: Array, shape: Array) -> Array:
+    """Board poses (n, 4, 4) by each view's own corners, far corners weighed down; sought from C."""
+    if not observed.has_pixels:
+        return C
+    for _ in range(_STEPS):
+        distance = np.nan_to_num(corner_distance(corner_residuals(observed, camera, C, shape)), nan=1e6)
+        typical = np.nanmedian(np.where(observed.present > 0, distance, np.nan), axis=1, keepdims=True)
+        limit = _LIMIT_SIGMA * np.maximum(typical, 0.01)
+        weights = (
+            np.where(distance > limit, (limit / np.maximum(distance, limit)) ** 2, 1.0) * observed.present
+        )
+        blocks = linearise_corners(observed, camera, C, weights, shape=shape)
+        delta = np.linalg.solve(blocks.LL + 1e-9 * np.eye(6), blocks.Lr[..., None])[..., 0]
+        length = np.linalg.norm(delta, axis=1, keepdims=True)
+        C = perturb(C, delta * np.minimum(1.0, 0.2 / np.maximum(length, 1e-12)))
+        if length.max() < 1e-9:
+            break
+    return C
 
 
 def _by_shape(observed: Observations) -> Array:

@@ -44,6 +44,8 @@ class Estimate:
     """(n, 4, 4) camera_from_board by each view's corners alone, with the final lens and shape."""
     corner_weights: Array
     """(n, k)"""
+    noise_parts: Array
+    """(3,) variance of X, whitened, from corners, robot translation and robot rotation."""
     log_evidence: float
     steps: int
     converged: bool
@@ -108,6 +110,7 @@ def estimate(
         robot_covariance=scales.tau_px**2 * linear.B + np.diag(scales.classes[0]),
         board_poses=linear.seen_boards(state.C),
         corner_weights=weights,
+        noise_parts=linear.noise_parts(solved, covariance),
         log_evidence=solved.log_evidence,
         steps=steps,
         converged=converged,

@@ -296,6 +296,22 @@ class Linear:
         spread = root @ inner @ np.swapaxes(root, 1, 2)
         return np.asarray(np.einsum("nia,nij,njb->ab", self.J, spread, self.J, optimize=True))
 
+    def noise_parts(self, solved: Solved, covariance: Array) -> Array:
+        """(3,) whitened variance of X that corners, robot translation and robot rotation make."""
+        _, S_inverse = self._noise(solved.scales)
+        gain = covariance[:6] @ np.swapaxes(self.J, 1, 2)
+        ordinary = solved.scales.classes[0]
+        whiten = np.linalg.inv(covariance[:6, :6])
+        parts = []
+        for noise in (
+            solved.scales.tau_px**2 * self.B,
+            np.diag(ordinary * [1, 1, 1, 0, 0, 0]),
+            np.diag(ordinary * [0, 0, 0, 1, 1, 1]),
+        ):
+            G = gain @ np.einsum("nk,nkij->nij", solved.chances, S_inverse)
+            parts.append(float(np.einsum("xy,nyi,nij,nxj->", whiten, G, np.broadcast_to(noise, G.shape), G)))
+        return np.array(parts)
+
     def covariance(self, solved: Solved) -> Array:
         """(G, G) of the posterior, doubts about the views' classes included."""
         return inverse_of(solved.precision - self.lost(solved))

@@ -95,6 +95,14 @@ class State:
             return np.where(later, self.second, self.X), self.Y
         return self.X, np.where(later, self.second, self.Y)
 
+    def of_views(self, places: Places) -> State:
+        """With the board poses of these views only."""
+        return replace(self, C=self.C[places])
+
+    def with_boards(self, C: Array) -> State:
+        """With other board poses (m, 4, 4)."""
+        return replace(self, C=C)
+
     def moved(self, step: Array, by_view: Array) -> State:
         """After a step (G,) in the order of `Layout` and (n, 6) for C."""
         at = Layout.of(self)

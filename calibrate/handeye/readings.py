@@ -93,7 +93,7 @@ def explain_recording(views: PoseViews, seed: int = 0) -> Explanation:
         gain = fit.log_evidence - charge - base
         if np.isfinite(gain) and gain > max(winning, best.log_evidence_gain):
             factor = float(fit.factors[_FACTOR.get(reading, 0)]) if reading in _FACTOR else 1.0
-            best = Explanation(reading, gain, at, factor, _share(fit))
+            best = Explanation(reading, float(gain), at, factor, _share(fit))
     return best
 
 

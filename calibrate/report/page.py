@@ -10,7 +10,10 @@ import numpy as np
 
 from calibrate.board import describe_board
 from calibrate.calibration import Touch, write_output
+from calibrate.cell_text import cell_sentences
 from calibrate.geometry import Array
+from calibrate.handeye.corners import bent_points
+from calibrate.handeye.observations import SHAPE, observe_views
 from calibrate.lens import project
 from calibrate.pipeline import SolvedRecording
 from calibrate.pnp import solve_pnp
@@ -143,17 +146,24 @@ def _error(job: SolvedRecording) -> Iterator[str]:
             f"{noise['robot_deg']:.4f}° (estimated from the residuals)."
         )
     yield html.paragraph(f"Least known: {quality.weakest}." if quality.weakest else "")
-    yield html.paragraph(quality.robot_systematics)
+    for sentence in cell_sentences(job.calibration):
+        yield html.paragraph(sentence)
 
 
 def _modelled_pixels(job: SolvedRecording) -> dict[int, tuple[Array, Array]]:
     """Pose number → (found, modelled) pixels by the board's own pose, through the final lens."""
-    camera = job.solution.camera
+    camera, board = job.solution.camera, job.solution.board
     # Solving began with poses through the first lens: they would shift every corner alike.
     refitted = solve_pnp(replace(job.views, camera=camera))
+    kept = {view.index: view for view in job.solution.kept}
+    views = replace(refitted, views=tuple(kept.get(view.index, view) for view in refitted))
+    shape = (
+        np.zeros(len(SHAPE)) if board is None else np.array([board.scale, board.anisotropy, *board.bend_m])
+    )
+    points = bent_points(observe_views(views), shape)
     return {
-        view.index: (view.pixels, project(camera, view.camera_from_board, view.board_points))
-        for view in refitted
+        view.index: (view.pixels, project(camera, view.camera_from_board, points[i, : len(view.pixels)]))
+        for i, view in enumerate(views)
         if view.camera_from_board is not None
     }
 
@@ -225,7 +235,7 @@ def _methods(peers: Sequence[PeerResult]) -> Iterator[str]:
 def _lens(job: SolvedRecording) -> Iterator[str]:
     lens = job.calibration.intrinsics
     yield html.heading("Lens")
-    origin = "found from these pictures" if job.intrinsics is not None else "given, not fitted"
+    origin = "found from these pictures" if job.intrinsics is not None else "given, refined with X"
     rms = "" if lens.rms_px is None else f", rms {lens.rms_px:.3f} px"
     yield html.paragraph(f"{lens.distortion_model}, {lens.width}×{lens.height}, {origin}{rms}.")
     values = {
@@ -239,8 +249,6 @@ def _lens(job: SolvedRecording) -> Iterator[str]:
         for name, value in values.items()
     ]
     yield html.table(("", "value", "1σ"), rows, (1, 2))
-    for text in lens.held:
-        yield html.paragraph(text, "note")
     yield html.figure(
         plots.coverage_map(job.views),
         f"Left: where corners were seen ({job.coverage:.0%} of the picture). Right: what the lens bends.",

@@ -1,1 +1,0 @@
-"""The maximum-likelihood model: corners, robot poses and what joins them."""

@@ -17,6 +17,7 @@ from recordings.cli import main
 from recordings.errors import ImportFolderError, RecordingError
 from recordings.export import Target, export_recording
 from recordings.importer import import_folder
+from recordings.messages import BoardKind
 from recordings.poses import matrix_from_quaternion, read_poses
 from recordings.reader import open_recording
 from tests.command_line import call
@@ -91,6 +92,17 @@ def test_joints_behind_the_pose_reach_the_view(folder: Path, tmp_path: Path) -> 
     out = export_recording(open_recording(tmp_path / "r.mcap"), tmp_path / "out", Target.FOLDER)
     again = open_recording(import_folder(out, tmp_path / "again.mcap").path).views()
     assert [view.joints_rad for view in again] == [view.joints_rad for view in views]
+
+
+def test_a_tag_and_what_is_known_of_the_board_reach_the_recording(folder: Path, tmp_path: Path) -> None:
+    text = (folder / "dataset.yaml").read_text()
+    tag = "{kind: aruco, dictionary: DICT_4X4_50, id: 7, square_m: 0.1"
+    tag += ", square_tolerance: 0.001, flatness_m: 2e-4}"
+    changed = [f"board: {tag}" if line.startswith("board:") else line for line in text.split("\n")]
+    (folder / "dataset.yaml").write_text("\n".join(changed))
+    board = open_recording(import_folder(folder, tmp_path / "r.mcap").path).info.board
+    assert (board.kind, board.tag_id, board.dictionary) == (BoardKind.ARUCO, 7, "DICT_4X4_50")
+    assert (board.square_m, board.square_tolerance, board.flatness_m) == (0.1, 0.001, 0.0002)
 
 
 def test_quaternions_of_three_digits_are_made_rotations(folder: Path, tmp_path: Path) -> None:
@@ -215,6 +227,21 @@ BAD: dict[str, tuple[Change, str]] = {
         r"board.kind: must be one of chessboard, .*'chess'",
     ),
     "board size": (edit("dataset.yaml", "columns: 7", "columns: 0"), r"0×6 columns×rows"),
+    "rows forgotten": (edit("dataset.yaml", "rows: 6, ", ""), r"7×1 columns×rows"),
+    "size forgotten": (edit("dataset.yaml", ", square_m: 0.025", ""), r"square_m = 0.0 is not a length"),
+    "tolerance in percent": (
+        edit("dataset.yaml", "0.025", "0.025, square_tolerance: 0.3"),
+        r"square_tolerance",
+    ),
+    "flatness in mm": (edit("dataset.yaml", "0.025", "0.025, flatness_m: 0.2"), r"flatness_m"),
+    "a tag of no dictionary": (
+        edit("dataset.yaml", "kind: chessboard, columns: 7, rows: 6", "kind: aruco, id: 3"),
+        r"needs its dictionary",
+    ),
+    "a tag with columns": (
+        edit("dataset.yaml", "chessboard", "april-tag"),
+        r"7×6 columns×rows; a single tag",
+    ),
     "square in mm": (edit("dataset.yaml", "0.025", "25"), r"square_m = 25.0 is not a length in metres"),
     "no number": (edit("dataset.yaml", "0.025", "25 mm"), r"board.square_m: Expected `float`.*25 mm"),
     "key twice": (

@@ -1,6 +1,7 @@
 """`python -m benchmarks [name …]`: run benchmarks and write their tables into benchmarks/README.md.
 
-Every module here with a `run() -> str` is one. BENCH_SHARE=0.05 runs a twentieth of the trials.
+Every module here with a `run() -> str` is one. BENCH_SHARE=0.05 runs a twentieth of the trials,
+BENCH_SETS=six-views,denso-long only these recordings (real, mistakes).
 """
 
 from __future__ import annotations

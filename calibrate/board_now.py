@@ -6,17 +6,20 @@ the board lying free in the fixed camera's view.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from calibrate.board import board_points
 from calibrate.calibration import Calibration
-from calibrate.drift import Noise, pnp_covariance
+from calibrate.drift import Noise, pnp_covariance, with_found_shape
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, difference, inverse, perturb, transform_points
-from calibrate.pnp import candidate_poses
-from calibrate.views import ImageView
+from calibrate.handeye.corners import bent_points
+from calibrate.handeye.observations import observe_views
+from calibrate.pnp import Candidate, candidate_poses
+from calibrate.views import ImageView, ViewSet
 from recordings.messages import BoardSpec
 
 _SAME_PLACE_M, _SAME_PLACE_RAD = 0.01, 0.03
@@ -43,7 +46,7 @@ def locate_board(calibration: Calibration, view: ImageView, board: BoardSpec) ->
     camera, X, E = calibration.intrinsics.model, calibration.transform.matrix, view.base_from_flange
     in_hand = calibration.mount == "eye-in-hand"
     place = np.array(calibration.board_place.matrix)
-    readings = candidate_poses(view, camera, board)
+    readings = [_shaped(reading, view, calibration) for reading in candidate_poses(view, camera, board)]
     at = [E @ X @ r.camera_from_board if in_hand else X @ r.camera_from_board for r in readings]
     misses = [difference(each if in_hand else inverse(E) @ each, place) for each in at]
     same = [k for k, miss in enumerate(misses) if _is_small(miss)]
@@ -68,6 +71,25 @@ def locate_board(calibration: Calibration, view: ImageView, board: BoardSpec) ->
         float(np.linalg.norm(misses[best][:3])) if in_hand else 0.0,
         float(np.linalg.norm(misses[best][3:])) if in_hand else 0.0,
     )
+
+
+def _shaped(reading: Candidate, view: ImageView, calibration: Calibration) -> Candidate:
+    """The same reading, with the board's shape that the calibration found."""
+    placed = replace(view, camera_from_board=reading.camera_from_board)
+    views = ViewSet(calibration.mount, (placed,), calibration.intrinsics.model)
+    return replace(reading, camera_from_board=with_found_shape(views, calibration).camera_from_board[0])
+
+
+def found_points(calibration: Calibration, board: BoardSpec) -> Array:
+    """(k, 3) of the board, in its own frame: as the calibration found them where it is the same board."""
+    points = board_points(board)
+    found = calibration.quality.board
+    if found is None or board != calibration.board:
+        return points
+    whole = ImageView(0, "", np.eye(4), points, np.zeros((len(points), 2)))
+    observed = observe_views(ViewSet(calibration.mount, (whole,), calibration.intrinsics.model))
+    shape = np.array([found.scale, found.anisotropy, *found.bend_m])
+    return np.asarray(bent_points(observed, shape)[0])
 
 
 def _is_small(miss: Array) -> bool:

@@ -27,9 +27,8 @@ def cell_sentences(calibration: Calibration) -> list[str]:
     if quality.board is not None:
         sentences += _board(quality.board, calibration.board.square_m * 1e3)
     if quality.arm is not None and quality.arm.applied:
-        sentences.append(
-            f"The arm's kinematic table is off by about {quality.arm.size_mm:.2f} mm or mrad; X allows for it."
-        )
+        size = f"{quality.arm.size_mm:.2f} mm or mrad"
+        sentences.append(f"The arm's kinematic table is off by about {size}; X allows for it.")
     shares = sorted(quality.error_shares.items(), key=lambda item: -item[1])
     if shares and shares[0][1] > _COSTLY and (name := shares[0][0]) in _REMEDIES:
         label = name.replace("_", " ")

@@ -8,16 +8,19 @@ moved since). If nothing changed, δX is normal with covariance S = S_fit + S_in
 from __future__ import annotations
 
 from bisect import bisect_left
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 from scipy import stats
 
 from calibrate.admit import require_no_copies
+from calibrate.board import board_points
 from calibrate.calibration import Calibration
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import Array, difference, inverse, perturb
+from calibrate.handeye.corners import bent_points, boards_by_corners
+from calibrate.handeye.observations import extent_of, observe_views
 from calibrate.lens import project
 from calibrate.views import ViewSet
 from recordings.messages import CameraModel
@@ -99,9 +102,26 @@ def check_drift(views: ViewSet, calibration: Calibration) -> DriftCheck:
     Raises TooFewViewsError, or BadViewsError where the views do not determine a shift or one is there twice.
     """
     require_no_copies(views)
+    views = with_found_shape(views, calibration)
     return judge_shift(
         views, calibration.transform.matrix, np.array(calibration.covariance), Noise.of(calibration)
     )
+
+
+def with_found_shape(views: ViewSet, calibration: Calibration) -> ViewSet:
+    """The views with the board as the calibration found it, board poses refined to it."""
+    found = calibration.quality.board
+    if found is None:
+        return views
+    observed = replace(observe_views(views), extent=extent_of(board_points(calibration.board)))
+    shape = np.array([found.scale, found.anisotropy, *found.bend_m])
+    C = boards_by_corners(observed, views.camera, views.camera_from_board, shape)
+    points = bent_points(observed, shape)
+    shaped = [
+        replace(view, board_points=points[i, : len(view.pixels)], camera_from_board=C[i])
+        for i, view in enumerate(views)
+    ]
+    return replace(views, views=tuple(shaped))
 
 
 def judge_shift(views: ViewSet, installed: Array, covariance: Array, noise: Noise) -> DriftCheck:

@@ -127,8 +127,9 @@ def inverse_all(model: RobotModel, base_from_flange: Array) -> Array:
 def inverse_many(
     model: RobotModel, base_from_flange: Array
 ) -> tuple[NDArray[np.intp], Array, NDArray[np.intp]]:
-    """`inverse_all` of many poses (n, 4, 4): the pose that each solution belongs to (m,), joints (m, 6), and the
-    branch 0 … 7 of shoulder, wrist and elbow (m,).
+    """`inverse_all` of many poses (n, 4, 4): the pose of each solution (m,), joints (m, 6), branch (m,).
+
+    Branches 0 … 7 are those of shoulder, wrist and elbow.
 
     Source: K. Hawkins, "Analytic inverse kinematics for the Universal Robots UR-5/UR-10 arms" (2013).
     """

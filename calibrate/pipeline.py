@@ -140,7 +140,7 @@ def solver_options(options: JobOptions, prepared: PreparedViews) -> SolveOptions
         seed=options.seed,
         intrinsics_from_same_pictures=prepared.intrinsics is not None,
         lens_sigma=_lens_sigma(options, prepared.views.camera),
-        board=_tolerance(prepared.loaded.board),
+        board=BoardTolerance.of(prepared.loaded.board),
         accept_move=options.accept_move,
         working_distance_m=options.working_distance_m,
     )
@@ -194,14 +194,6 @@ def _lens_sigma(options: JobOptions, camera: CameraModel) -> tuple[float, ...] |
     if options.camera is None or not all(options.camera_sigma.get(name, 0.0) > 0 for name in names):
         return None
     return tuple(options.camera_sigma[name] for name in names)
-
-
-def _tolerance(board: BoardSpec) -> BoardTolerance:
-    usual = BoardTolerance()
-    return BoardTolerance(
-        usual.square if board.square_tolerance is None else board.square_tolerance,
-        usual.flatness_m if board.flatness_m is None else board.flatness_m,
-    )
 
 
 def _board(options: JobOptions, recorded: BoardSpec) -> BoardSpec:

@@ -63,7 +63,8 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
         fit = fit_cell(views, priors, options.seed, options.model_arm)
     except PosesDisagreeError as problem:
         session = explain_recording(poses, options.seed)
-        raise PosesDisagreeError(f"{problem} {explain_text(session, views)}", session.reading.value) from None
+        text = f"{problem} {explain_text(session, views)}"
+        raise PosesDisagreeError(text, session.reading.value) from None
     watch.lap("estimate")
     if float((fit.estimate.chances[:, 0] > FULL).mean()) < _ENOUGH:
         session = explain_recording(poses, options.seed)
@@ -260,8 +261,8 @@ def _remarks(
         remarks.append(
             Remark(
                 "arm-table",
-                f"The robot's residuals follow its joints: errors of about {solution.arm.size_mm:.2f} mm or mrad "
-                "in its kinematic table. X allows for them; have the arm calibrated.",
+                "The robot's residuals follow its joints: errors of about "
+                f"{solution.arm.size_mm:.2f} mm or mrad in its kinematic table. Have the arm calibrated.",
             )
         )
     return tuple(remarks)

@@ -17,9 +17,6 @@ _CONVENTIONS = {
     Reading.ANGLES_AS_ROTATION_VECTOR: "roll, pitch, yaw that were read as rotation vectors",
     Reading.INVERSE_ROTATIONS: "inverse rotations beside right positions",
 }
-_MILLIMETRES = 1000.0
-_NEAR = 0.1
-"""Relative, of a factor to a thousand."""
 
 
 def explain_text(session: Explanation, views: ViewSet) -> str:
@@ -44,25 +41,20 @@ def explain_text(session: Explanation, views: ViewSet) -> str:
         return (
             "The pictures are mirrored. Switch the camera's mirroring (flip, reverse x) off and record again."
         )
+    if reading is Reading.MILLIMETRES:
+        wrong = "robot positions" if session.factor > 1 else "size of the squares"
+        return f"The {wrong} are in millimetres. Write them in metres and import again."
     if reading is Reading.SQUARE_SIZE:
-        return _size_text(session.factor)
+        return (
+            f"The board's squares are {session.factor:.4g} times as large as configured. "
+            "Measure the board, correct square_m and solve again with --square-mm."
+        )
     if reading is Reading.FOCAL_LENGTH:
         return (
             f"The focal length is {session.factor:.3f} times the given one. "
             "Solve with --estimate-intrinsics, or calibrate the camera again."
         )
     return _change_text(session, views)
-
-
-def _size_text(factor: float) -> str:
-    for unit in (_MILLIMETRES, 1 / _MILLIMETRES):
-        if abs(np.log(factor / unit)) < _NEAR:
-            wrong, right = ("robot positions", "metres") if unit > 1 else ("square_m", "metres")
-            return f"The {wrong} are in millimetres. Write them in {right} and import again."
-    return (
-        f"The board's squares are {factor:.4g} times as large as configured. "
-        "Measure the board, correct square_m and solve again with --square-mm."
-    )
 
 
 def _change_text(session: Explanation, views: ViewSet) -> str:

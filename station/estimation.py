@@ -15,7 +15,8 @@ from numpy.typing import NDArray
 from calibrate.board import board_points
 from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, inverse, pose
-from calibrate.information import Noise, covariance_of, view_information
+from calibrate.handeye.priors import BoardTolerance
+from calibrate.information import Noise, covariance_of, prior_information, view_information
 from calibrate.intrinsics import calibrate_intrinsics
 from calibrate.pnp import solve_pnp
 from calibrate.views import ImageView, ViewSet
@@ -29,8 +30,6 @@ from station.status import EstimateStatus
 FEWEST_VIEWS = 4
 FEWEST_FOR_LENS = 6
 COVERAGE_ROWS, COVERAGE_COLUMNS = 4, 6
-_WEAK_PRIOR = (1.0, 1.0, 1.0, 0.1, 0.1, 0.1)
-_LENS_PRIOR_SHARE = 0.05
 
 Seen = tuple[int, Array, NDArray[np.intp], Array]
 """Pose number, base_from_flange (4, 4), rows of `board_points` (k,), pixels (k, 2)."""
@@ -154,13 +153,9 @@ def _quick_solution(views: ViewSet) -> tuple[Array, Array]:
 
 def quick_sigma(views: ViewSet, board: BoardSpec, X: Array, Y: Array, free_lens: bool) -> tuple[float, float]:
     """1σ of X: translation (m) and rotation (rad), roots of the summed variances."""
-    information = view_information(
-        views.mount, views.camera, views.base_from_flange, X, Y, board_points(board), Noise(), free_lens
-    ).sum(axis=0)
-    prior = np.array([*_WEAK_PRIOR, *_WEAK_PRIOR])
-    if free_lens:
-        focal_px = np.asarray(views.camera.matrix)[0, 0]
-        lens = [1 / (_LENS_PRIOR_SHARE * focal_px) ** 2] * 4
-        prior = np.array([*prior, *lens, *([1.0] * (len(information) - len(prior) - 4))])
+    points = board_points(board)
+    flange = views.base_from_flange
+    information = view_information(views.mount, views.camera, flange, X, Y, points, Noise()).sum(axis=0)
+    prior = prior_information(views.camera, not free_lens, BoardTolerance.of(board))
     variances = np.diag(covariance_of(information, prior))
     return float(np.sqrt(variances[:3].sum())), float(np.sqrt(variances[3:6].sum()))

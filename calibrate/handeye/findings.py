@@ -57,11 +57,10 @@ def _judge(fit: CellFit, places: Array, miss: Array, sigma: Array, distance_m: f
     told = values > 1e-3
     square = float(((vectors.T @ (miss * root))[told] ** 2 / values[told]).sum())
     log_chance = float(stats.chi2.logsf(square, max(int(told.sum()), 1)))
-    sigmas = (
-        float(stats.norm.isf(np.exp(log_chance) / 2))
-        if log_chance > -600
-        else float(np.sqrt(-2 * log_chance))
-    )
+    if log_chance < -600:
+        sigmas = float(np.sqrt(-2 * log_chance))
+    else:
+        sigmas = float(stats.norm.isf(np.exp(log_chance) / 2))
     precision = np.zeros(len(covariance))
     precision[places] = (1 - _LOOSER) * sigma**-2.0
     step = np.zeros(len(covariance))
@@ -72,7 +71,7 @@ def _judge(fit: CellFit, places: Array, miss: Array, sigma: Array, distance_m: f
         moved = np.zeros(len(covariance))
     lever = fit.estimate.state.X[:3, :3] @ np.array([0.0, 0.0, distance_m])
     J = np.concatenate([np.eye(3), -skew(lever)], axis=1)
-    return Finding(float(sigmas) if told.any() else 0.0, float(np.linalg.norm(J @ moved[:6])))
+    return Finding(sigmas if told.any() else 0.0, float(np.linalg.norm(J @ moved[:6])))
 
 
 def error_shares(fit: CellFit) -> dict[str, float]:

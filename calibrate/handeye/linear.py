@@ -178,8 +178,10 @@ class Linear:
         return np.asarray((B + np.swapaxes(B, 1, 2)) / 2)
 
     @classmethod
-    def at(cls, observed: Observations, state: State, weights: Array) -> Linear:
-        """weights: (n, k) of the corners."""
+    def at(
+        cls, observed: Observations, state: State, weights: Array, information: float = _INFORMATION
+    ) -> Linear:
+        """weights: (n, k) of the corners; information: of a corner of weight 1, against a normal one."""
         at, n = Layout.of(state), len(observed)
         m = flange_residuals(observed, state)
         bare = m if observed.table is None or not len(state.table) else m + observed.table @ state.table
@@ -195,7 +197,7 @@ class Linear:
             J[..., first] = np.where(later, 0.0, J[..., first])
         if not observed.has_pixels:
             return cls(np.zeros((n, 6, 6)), A, m, J)
-        blocks = linearise_corners(observed, state.camera, state.C, _INFORMATION * weights, True, state.shape)
+        blocks = linearise_corners(observed, state.camera, state.C, information * weights, True, state.shape)
         H = np.asarray(np.linalg.inv(blocks.LL), dtype=float)
         modes = CornerModes.of(blocks, H, slice(at.lens.start, at.shape.stop))
         J[..., modes.shared] = -A @ modes.by_shared

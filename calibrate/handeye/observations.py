@@ -156,7 +156,11 @@ def observe_views(views: ViewSet) -> Observations:
     for i, view in enumerate(views):
         k = len(view.pixels)
         points[i, :k], pixels[i, :k], present[i, :k] = view.board_points, view.pixels, 1.0
-    seen = points[present > 0][:, :2] if present.any() else np.array([[-1.0, -1.0], [1.0, 1.0]])
-    low, high = seen.min(axis=0), seen.max(axis=0)
-    extent = np.stack([(low + high) / 2, np.maximum((high - low) / 2, 1e-6)])
+    extent = extent_of(points[present > 0]) if present.any() else np.array([[0.0, 0.0], [1.0, 1.0]])
     return Observations(views.mount, views.base_from_flange, points, pixels, present, extent=extent)
+
+
+def extent_of(points: Array) -> Array:
+    """(2, 2) middle and half size, metres, of points (m, 3) on the board."""
+    low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
+    return np.stack([(low + high) / 2, np.maximum((high - low) / 2, 1e-6)])

@@ -10,7 +10,7 @@ from calibrate.geometry import Array
 from calibrate.handeye.observations import SHAPE, Layout, State
 from calibrate.handeye.table import RELATIVE_SIGMA, UNIT
 from calibrate.projection import intrinsics_names, intrinsics_vector
-from recordings.messages import CameraModel
+from recordings.messages import BoardSpec, CameraModel
 
 ASPECT_SIGMA = 0.001
 """Of log(fy/fx): a sensor's pixels are square. It tells an unequal print from the lens."""
@@ -31,6 +31,15 @@ class BoardTolerance:
     square: float = 0.003
     """Relative, of the size of its squares, and of x against y of the print."""
     flatness_m: float = 0.001
+
+    @classmethod
+    def of(cls, board: BoardSpec) -> BoardTolerance:
+        """As the board's description states it, else the usual one."""
+        usual = cls()
+        return cls(
+            usual.square if board.square_tolerance is None else board.square_tolerance,
+            usual.flatness_m if board.flatness_m is None else board.flatness_m,
+        )
 
 
 MEASURED_BOARD = BoardTolerance(1e-5, 2e-5)

@@ -1,8 +1,8 @@
-"""Other readings of a whole recording: what would explain all views at once, before any single one is blamed.
+"""Other readings of a whole recording: what explains all views at once, before any single one is blamed.
 
 Poses in another convention, pictures that belong to their neighbours' poses, squares of another size,
-something moved half-way: each is a reading of the same views, fitted like the recording as it stands (`poses`)
-and compared with it by evidence.
+something moved half-way: each is a reading of the same views, fitted like the recording as it stands
+(`poses`) and compared with it by evidence.
 """
 
 from __future__ import annotations
@@ -37,6 +37,8 @@ _LOST_VIEW = 15.0
 """Log evidence charged for each view that a reading leaves without a partner."""
 _SIZE, _FOCAL = 0, 1
 """Places of the factors of `pose_views`."""
+_NEAR = 0.1
+"""Relative, of a factor to a thousand."""
 _FREE = 1.0
 """1σ of a factor that a reading lets free."""
 
@@ -53,6 +55,7 @@ class Reading(Enum):
     SHIFTED = "shifted-pictures"
     MIRRORED = "mirrored-pictures"
     SQUARE_SIZE = "square-size"
+    MILLIMETRES = "millimetres"
     FOCAL_LENGTH = "focal-length"
     BOARD_MOVED = "board-moved"
     CAMERA_MOVED = "camera-moved"
@@ -93,6 +96,8 @@ def explain_recording(views: PoseViews, seed: int = 0) -> Explanation:
         gain = fit.log_evidence - charge - base
         if np.isfinite(gain) and gain > max(winning, best.log_evidence_gain):
             factor = float(fit.factors[_FACTOR.get(reading, 0)]) if reading in _FACTOR else 1.0
+            if reading is Reading.SQUARE_SIZE and abs(abs(np.log(factor)) - np.log(1000.0)) < _NEAR:
+                reading = Reading.MILLIMETRES
             best = Explanation(reading, float(gain), at, factor, _share(fit))
     return best
 

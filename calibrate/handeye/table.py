@@ -1,8 +1,8 @@
 """Errors of the arm's Denavit-Hartenberg table: how they move the flange, and from which joints.
 
 Of the 24 errors of a table, eight change nothing that X and the board's pose would not take: six of the first
-and the last joint, and two of the three shifts along the parallel axes of joints 2, 3 and 4. They are held. Two
-turns of those axes about y (S. Hayati, 1983) are added, which the table cannot say.
+and the last joint, and two of the three shifts along the parallel axes of joints 2, 3 and 4. They are held.
+Two turns of those axes about y (S. Hayati, 1983) are added, which the table cannot say.
 """
 
 from __future__ import annotations

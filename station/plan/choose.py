@@ -10,13 +10,12 @@ import numpy as np
 
 from calibrate.board import board_points
 from calibrate.geometry import Array
-from calibrate.information import Noise, covariance_of, lens_can_be_free, view_information
-from calibrate.projection import INTRINSICS, camera_matrix
+from calibrate.handeye.priors import BoardTolerance
+from calibrate.information import Noise, covariance_of, prior_information, view_information
+from calibrate.projection import intrinsics_names
 from station.plan.scene import Scene
 
 Criterion = Literal["A", "D"]
-LENS_PRIOR_SHARE = 0.05
-"""The lens is known beforehand to about this share of its values; keeps few views from being hopeless."""
 _LENS_SHARE = {"A": 0.02, "D": 0.2}
 """Weight of the lens, so that the picture is covered."""
 _ENOUGH_TO_RANK, _SHORTLIST = 8, 60
@@ -31,7 +30,9 @@ class Objective:
     lever_m: float
     """A rotation error counts as the error it makes at this distance."""
     prior: Array
-    """(p,) added to the diagonal."""
+    """(p, p) what is known beforehand."""
+    lens: slice | None
+    """Places of a lens that is found from the same pictures; None where it is known."""
 
     def __call__(self, information: Array) -> Array:
         covariance, share = covariance_of(information, self.prior), _LENS_SHARE[self.criterion]
@@ -50,32 +51,27 @@ class Objective:
         else:
             weight = np.repeat([1.0, self.lever_m**2], 3)
             inner[:6, :6] = np.diag(weight / (weight * np.diag(C)[:6]).sum())
-        if len(C) > 12:
-            inner[12:, 12:] = _LENS_SHARE[self.criterion] * np.linalg.inv(C[12:, 12:])
+        if self.lens is not None:
+            lens = C[self.lens, self.lens]
+            inner[self.lens, self.lens] = _LENS_SHARE[self.criterion] * np.linalg.inv(lens)
         return np.asarray(C @ inner @ C)
 
     def _lens(self, covariance: Array) -> Array:
-        if covariance.shape[-1] == 12:
+        if self.lens is None:
             return np.zeros(covariance.shape[:-2])
-        return np.asarray(np.linalg.slogdet(covariance[..., 12:, 12:])[1])
+        return np.asarray(np.linalg.slogdet(covariance[..., self.lens, self.lens])[1])
 
 
-def informations(scene: Scene, base_from_flange: Array, noise: Noise, free_intrinsics: bool) -> Array:
+def informations(scene: Scene, base_from_flange: Array, noise: Noise) -> Array:
     """(n, p, p) information of each pose by the scene's guess."""
     points = board_points(scene.board)
-    return view_information(
-        scene.mount, scene.camera, base_from_flange, scene.X, scene.Y, points, noise, free_intrinsics
-    )
+    return view_information(scene.mount, scene.camera, base_from_flange, scene.X, scene.Y, points, noise)
 
 
 def objective_for(scene: Scene, criterion: Criterion, free_intrinsics: bool) -> Objective:
-    lens: list[float] = []
-    if free_intrinsics and lens_can_be_free(scene.camera):
-        f = float(camera_matrix(scene.camera)[0, 0])
-        lens = [1 / (LENS_PRIOR_SHARE * f) ** 2] * 4 + [1.0] * (len(INTRINSICS) - 4)
-    # A metre and three radians: no knowledge, only so that the first few views have a finite sigma.
-    weak = np.array([1.0, 1, 1, 0.1, 0.1, 0.1] * 2 + lens)
-    return Objective(criterion, scene.working_distance_m, weak)
+    prior = prior_information(scene.camera, not free_intrinsics, BoardTolerance.of(scene.board))
+    lens = slice(12, 12 + len(intrinsics_names(scene.camera))) if free_intrinsics else None
+    return Objective(criterion, scene.working_distance_m, prior, lens)
 
 
 def choose(

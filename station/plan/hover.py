@@ -14,7 +14,7 @@ import msgspec
 import numpy as np
 
 from calibrate.board import board_points
-from calibrate.board_now import locate_board, offset_covariance
+from calibrate.board_now import found_points, locate_board, offset_covariance
 from calibrate.calibration import Calibration
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
 from calibrate.kinematics import RobotModel, forward, inverse_all, jacobian
@@ -282,7 +282,7 @@ def answer_hover(
 ) -> HoverAnswer:
     """From one picture of the board to a checked way. LimitError, BadViewsError."""
     now = locate_board(calibration, view, config.board)
-    points = board_points(config.board)
+    points = found_points(calibration, config.board)
     tip = np.array(question.pointer.tip_m)
     covariance = offset_covariance(calibration, view, now, points[question.corner], tip)
     worst = max(

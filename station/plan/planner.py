@@ -143,10 +143,10 @@ def _choose_and_order(
 ) -> Plan:
     """The checked plan. Poses that no free way leads to leave the pool, and the choice is made again."""
     objective = objective_for(scene, options.criterion, options.free_intrinsics)
-    information = informations(scene, pool.base_from_flange, options.noise, options.free_intrinsics)
+    information = informations(scene, pool.base_from_flange, options.noise)
     known: Array | None = None
     if captured is not None:
-        known = informations(scene, captured, options.noise, options.free_intrinsics).sum(axis=0)
+        known = informations(scene, captured, options.noise).sum(axis=0)
     left = np.arange(len(pool))
     picked: list[int] = []
     while len(left) >= options.count:

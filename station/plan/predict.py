@@ -82,7 +82,7 @@ def forecast_views(
     A view that by the guess does not show the whole board brings nothing.
     """
     objective = objective_for(scene, "A", free_intrinsics)
-    gains = informations(scene, base_from_flange, noise, free_intrinsics)
+    gains = informations(scene, base_from_flange, noise)
     gains[~_whole(scene, base_from_flange)] = 0.0
     return [Forecast(*sigma_of(information, objective)) for information in gains.cumsum(axis=0)]
 
@@ -103,7 +103,7 @@ def advise(
     options = options or AdviceOptions()
     flange = np.asarray(captured, dtype=float).reshape(-1, 4, 4)
     objective = objective_for(scene, "A", options.free_intrinsics)
-    known = informations(scene, flange, options.noise, options.free_intrinsics).sum(axis=0)
+    known = informations(scene, flange, options.noise).sum(axis=0)
     now = Forecast(*sigma_of(known, objective))
     state = f"expected error {1000 * now.sigma_m:.2f} mm after {len(flange)} views"
     if now.sigma_m <= goal_m:
@@ -114,7 +114,7 @@ def advise(
     pool = find_candidates(scene, view, options.pool, rng, start)
     if len(pool) == 0:
         return Advice(now, False, f"{state}; no further pose is reachable with the board in view")
-    gains = informations(scene, pool.base_from_flange, options.noise, options.free_intrinsics)
+    gains = informations(scene, pool.base_from_flange, options.noise)
     stops = [start] if options.onward_rad is None else [start, np.asarray(options.onward_rad, dtype=float)]
     best = _best_free(scene, stops, pool.joints_rad, objective(known + gains))
     if best is None:

@@ -18,8 +18,9 @@ from benchmarks.trials import share_spread, table, trials
 from calibrate.board import board_points
 from calibrate.drift import SHIFT_M, TURN_RAD, DriftCheck, Noise, judge_shift
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp
+from calibrate.handeye.priors import BoardTolerance
 from calibrate.information import Noise as PlanNoise
-from calibrate.information import view_information
+from calibrate.information import prior_information, view_information
 from calibrate.lens import project
 from calibrate.pnp import solve_pnp
 from calibrate.views import ImageView, ViewSet
@@ -37,7 +38,7 @@ _CAMERA = CameraModel(1280, 1024, ((1667.0, 0, 639.5), (0, 1667.0, 511.5), (0, 0
 _BOARD = BoardSpec(kind=BoardKind.CHESSBOARD, columns=7, rows=6, square_m=0.025)
 _PLACE = pose(rotation_exp([np.pi - 0.2, 0.1, 0.4]), [0.6, 0.1, 0.0])
 _MOUNT = pose(rotation_exp([0.1, -0.2, 1.5]), [0.06, -0.07, 0.05])
-_OBJECTIVE = Objective("A", 0.45, np.array([1.0, 1, 1, 0.1, 0.1, 0.1] * 2))
+_OBJECTIVE = Objective("A", 0.45, prior_information(_CAMERA, True, BoardTolerance()), None)
 """As the planner's own (`objective_for`), the lens known."""
 
 
@@ -159,7 +160,7 @@ def _choice(level: _Level, views: int, mount: Mount, rng: np.random.Generator) -
     flanges = np.array([_flange(seen, mount, _MOUNT, _PLACE) for seen in pool])
     noise = PlanNoise(level.noise.corner_px, level.noise.robot_m, level.noise.robot_rad)
     points = board_points(_BOARD)
-    information = view_information(mount, _CAMERA, flanges, _MOUNT, _PLACE, points, noise, False)
+    information = view_information(mount, _CAMERA, flanges, _MOUNT, _PLACE, points, noise)
     return [pool[k] for k in choose(information, views, _OBJECTIVE, rng)]
 
 

@@ -28,6 +28,7 @@ from calibrate.commands.solve import solve_json
 from calibrate.detect import Detection, detect
 from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, inverse, pose, quaternion_from_matrix, rotation_exp, rotation_log
+from calibrate.handeye.readings import Reading
 from calibrate.pipeline import solve_recording
 from recordings.dataset import read_dataset
 from recordings.errors import RecordingError
@@ -66,9 +67,12 @@ class Said:
     """The hypothesis where one is named; else the error's class; else the verdict."""
     hypothesis: str
     rejected: tuple[int, ...]
+    """Views of which it is said that their recorded pose belongs to another picture."""
     text: str
     answered: bool = True
     """False where nothing was solved."""
+    inconsistent: tuple[int, ...] = ()
+    """Views rejected for another reason."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +85,7 @@ class Mistake:
     words: str
     """The cause in a sentence, for answers that carry no hypothesis."""
     rejected: tuple[int, ...] = ()
-    """Views that must be rejected, and no others; for mistakes of single views."""
+    """Views whose poses were exchanged: these must be named, and no others."""
 
 
 def what_is_said(folder: Path, output: Path) -> Said:
@@ -93,16 +97,18 @@ def what_is_said(folder: Path, output: Path) -> Said:
         hypothesis = str(getattr(error, "hypothesis", "") or "")
         return Said(hypothesis or type(error).__name__, hypothesis, (), str(error), answered=False)
     answer = solve_json(job)
-    session = answer.get("session", {})
-    hypothesis = session.get("hypothesis", "")
-    if hypothesis == "as-recorded":
+    hypothesis = answer["session"]["hypothesis"]
+    if hypothesis == Reading.AS_RECORDED.value:
         hypothesis = ""
-    rejected = tuple(view["index"] for view in answer["views"]["rejected"])
+    rejected = job.solution.rejected
+    swapped = tuple(view.index for view in rejected if view.kind == "wrong-pose")
+    inconsistent = tuple(view.index for view in rejected if view.kind != "wrong-pose")
     failed = [gate for gate in answer["gates"] if not gate["passed"]]
-    texts = [session.get("text", ""), *(gate["text"] for gate in failed), *job.solution.warnings]
-    texts += [view["reason"] for view in answer["views"]["rejected"]]
+    texts = [answer["session"].get("text", ""), *(gate["text"] for gate in failed)]
+    texts += [remark.text for remark in job.solution.warnings] + [view.reason for view in rejected]
     verdict = "fail: " + ", ".join(gate["name"] for gate in failed) if failed else "pass"
-    return Said(hypothesis or verdict, hypothesis, rejected, " ".join(filter(None, texts)))
+    text = " ".join(filter(None, texts))
+    return Said(hypothesis or verdict, hypothesis, swapped, text, inconsistent=inconsistent)
 
 
 def named_truly(mistake: Mistake, said: Said) -> bool:
@@ -110,7 +116,7 @@ def named_truly(mistake: Mistake, said: Said) -> bool:
     if mistake.rejected:
         return said.rejected == mistake.rejected
     if not mistake.causes:
-        return said.answered and not said.hypothesis and not said.rejected
+        return said.answered and not (said.hypothesis or said.rejected or said.inconsistent)
     if said.hypothesis:
         return said.hypothesis in mistake.causes
     return re.search(mistake.words, said.text, re.IGNORECASE) is not None
@@ -200,14 +206,14 @@ def _zoomed_out(image: Array) -> Array:
     )
 
 
-_CONVENTION = ("inverse-poses", "mounting")
-_FRAME = ("board-moved", "tcp-changed")
+_CONVENTION = ("inverse-poses",)
+_FRAME = ("board-moved", "camera-moved")
 _SIZE_WORDS = r"square_m|squares of|size of (the )?square|board scaled"
 MISTAKES = (
     Mistake("none", lambda session: session, (), ""),
     Mistake("two poses swapped", _with_poses(_swap), (), "", rejected=_SWAPPED),
     Mistake(
-        "poses shifted by one picture", _shift, ("shifted-poses",), r"shifted|one picture (later|earlier)"
+        "poses shifted by one picture", _shift, ("shifted-pictures",), r"shifted|one picture (later|earlier)"
     ),
     Mistake("millimetres", _with_poses(_millimetres), ("millimetres",), r"not millimetres"),
     Mistake("quaternion w first", _w_first, ("quaternion-order",), r"order w, x, y, z"),
@@ -216,16 +222,16 @@ MISTAKES = (
     Mistake(
         "rotation vector as rpy",
         _with_poses(_vector_as_angles),
-        ("rotation-vector-as-rpy",),
+        ("rotation-vector-as-angles", "angles-as-rotation-vector"),
         r"rotation vectors that were read as roll",
     ),
     Mistake("square size + 4 %", _size(1.04), ("square-size",), _SIZE_WORDS),
     Mistake("square size - 4 %", _size(0.96), ("square-size",), _SIZE_WORDS),
     Mistake("square size × 2", _size(2.0), ("square-size",), _SIZE_WORDS),
     Mistake("square size × 0.5", _size(0.5), ("square-size",), _SIZE_WORDS),
-    Mistake("mirrored pictures", _mirror, ("mirrored",), r"mirror"),
+    Mistake("mirrored pictures", _mirror, ("mirrored-pictures", "mirrored"), r"mirror"),
     Mistake("refocused at half", _refocus, ("refocused",), r"focus"),
-    Mistake("TCP changed at half", _with_poses(_change_tcp), ("tcp-changed",), r"TCP"),
+    Mistake("TCP changed at half", _with_poses(_change_tcp), ("camera-moved",), r"TCP"),
     Mistake("board moved at half", _with_poses(_move_board), ("board-moved",), r"board (was )?moved"),
 )
 
@@ -253,7 +259,8 @@ def run() -> str:
 def _short(said: Said) -> str:
     text = " ".join(said.text.split()).replace("|", "/")
     text = re.sub(r"\S*/\S+\.(mcap|csv|yaml)", "…", text)
-    rejected = f"{len(said.rejected)} rejected. " if said.rejected else ""
+    count = len(said.rejected) + len(said.inconsistent)
+    rejected = f"{count} rejected. " if count else ""
     return rejected + (text if len(text) <= 140 else text[:140] + " …")
 
 

@@ -1,172 +1,293 @@
-"""What do bad views do to X? Our fit against an oracle that knows which views are bad."""
+"""What do wrong views, and changes half-way, do to X? Ours against an oracle that knows which to use."""
 
 from __future__ import annotations
 
-from collections import Counter
-from dataclasses import replace
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import islice
 
 import numpy as np
-from numpy.typing import NDArray
-from scipy import stats
 
-from benchmarks.scene import MID, Cell, make_cell
-from benchmarks.trials import rms, table, trials
-from calibrate.board_poses import refine_board_poses
+from benchmarks.imperfect_cells import BOARD, ImperfectCell, Known, imperfect_cell
+from benchmarks.scene import MID
+from benchmarks.trials import in_processes, rms, table, trials
 from calibrate.errors import CalibrationError
-from calibrate.geometry import Array, difference, perturb, pose, rotation_exp, transform_points
-from calibrate.likelihood.model import State, observe_views
-from calibrate.likelihood.residuals import robot_derivatives, robot_residuals
-from calibrate.peer_methods import HAND_EYE, opencv_hand_eye, orthonormalised
-from calibrate.solve import SolveOptions, solve_views
+from calibrate.gates import GateInputs, judge
+from calibrate.geometry import Array, difference, inverse, perturb, pose, rotation_exp, transform_points
+from calibrate.handeye.observations import Places
+from calibrate.handeye.readings import Reading
+from calibrate.pipeline import single_threaded_opencv
+from calibrate.pnp import solve_pnp
+from calibrate.solution import Solution, SolveOptions
+from calibrate.solve import solve_views
 from calibrate.views import ImageView, ViewSet
+from recordings.messages import Mount
 
 TRIALS = 60
-HELD_OUT_TRIALS = 200
-_HELD_OUT = ("one", "length")
-_SHARES = (0.0, 0.08, 0.2, 0.4)
-_COUNTED = ("bad", "by five", "kept", "truly beyond 6", "unavoidable", "bad in doubt", "good lost",
-            "good in doubt", "failed")  # fmt: skip
-_BEST_LIMIT = float(np.sqrt(stats.chi2.ppf(1 - 5e-4, 6)))
-"""Sigmas; the solver's rate of false alarms with everything known."""
+_VIEWS = 25
 _OPTIONS = SolveOptions(holdout=False)
-_ORACLE = replace(_OPTIONS, reject_outliers=False)
+_ORACLE = SolveOptions(holdout=False, folds=False)
+_SINGLE, _CHANGES = (0.1, 0.2, 0.4), (0.2, 0.35, 0.5)
+MOUNTS: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
+HEADER = ("what is wrong", "views", "mount", "pass %", "refused, a reading named %", "ours rms mm",
+          "oracle rms mm", "ours / oracle", "rotation ours / oracle", "coverage %", "named truly %",
+          "named falsely %", "move accepted: / oracle")  # fmt: skip
 
-Indices = NDArray[np.int64]
+
+@dataclass(frozen=True, eq=False)
+class Spoilt:
+    views: ViewSet
+    X: Array
+    """(4, 4) the true one of the last view."""
+    good: list[int]
+    """Views that the oracle uses: those that are right, or those on the longer side of a change."""
+    reading: Reading = Reading.AS_RECORDED
+    kind: str = ""
+    """True cause of each bad view."""
+    X_oracle: Array | None = None
+    """The true one of the oracle's views, where it is another one."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    passed: bool
+    reading: str
+    """What was named; where nothing was solved, the error's own name."""
+    oracle: tuple[float, float]
+    """Error of the oracle, metres and radians."""
+    truly: bool
+    falsely: bool
+    ours: tuple[float, float] | None = None
+    """None where nothing was solved."""
+    covered: bool = False
+    accepted: tuple[float, float] | None = None
+    """Error with the move accepted."""
+
+
+Spoil = Callable[[ImperfectCell, Places, np.random.Generator], Spoilt]
 
 
 def run() -> str:
     count = trials(TRIALS)
-    rows = [_row(kind, share, count) for kind in _SPOIL for share in _SHARES if share or kind == "swapped"]
-    rows += [_row(kind, 0.4, trials(HELD_OUT_TRIALS), held_out=True) for kind in _HELD_OUT]
+    cases = [
+        (name, share, mount)
+        for shares, kinds in ((_SINGLE, _VIEWS_WRONG), (_CHANGES, _CHANGED))
+        for name in kinds
+        for share in shares
+        for mount in MOUNTS
+    ]
+    results = in_processes(measure, [(*case, k) for case in cases for k in range(count)])
+    rows = []
+    for case in cases:
+        rows.append(line(*case, list(islice(results, count))))
+        print(" | ".join(rows[-1]), flush=True)
     text = (
-        f"{count} trials per row, paper's cell, 25 views, mid noise, intrinsics known. Swapped: robot poses "
-        "exchanged; turned: corners in the order of the board turned by 180°; far, every: robot pose off by "
-        "10 … 60 or 6 … 10 robot sigmas in every component; one: by 6 … 10 in one component; length: off by "
-        "6 … 10 sigmas in all (Mahalanobis length in the noise of robot and corners of that view, any "
-        "direction in the six dimensions). Oracle: the same estimate on the good views only (turned views we "
-        "set right, and every number of the bad ones counts by its worth, so ours can beat it). By five: bad "
-        "views named with one wrong number. Kept: bad views still used as they are; of them truly beyond 6: "
-        "where the error injected and that view's own noise together are longer than 6 sigmas. Unavoidable: "
-        "bad views that a test which knows X, the board's place and all noise keeps at the same rate of "
-        "false alarms. In doubt: counted in part and said to be. Held out: "
-        f"{trials(HELD_OUT_TRIALS)} trials on seeds on which nothing was chosen."
+        f"{count} cells per row (`imperfect_cells`, the lens given, nothing else wrong), {_VIEWS} views. "
+        "Swapped: two poses exchanged, pair by pair; shuffled: the poses of all bad views exchanged; turned: "
+        "corners in the order of the board turned by 180°; far: robot pose off by 10 … 60 robot sigmas in "
+        "each component. Board, TCP, focus: changed for so many of the views (the last or, in every other "
+        "cell, the first ones): board by 10 … 50 mm and 1 … 5°, TCP by 20 … 120 mm, focal length by "
+        "2 … 6 %. Oracle: the same estimate of the right views, or of the longer part. Ours and ratios: over "
+        "the cells in which no other reading of the recording was named. Truly: the reading, or the cause of "
+        "every bad view and of no other. Falsely: another reading, a good view rejected, or a wrong cause. "
+        "Move accepted: `--accept-move`, where a move was named."
     )
-    header = ["bad views", "share", "ours rms mm", "oracle rms mm", "ours / oracle", "rotation ours / oracle",
-              *_COUNTED, "coverage %", "Park-Martin rms mm"]  # fmt: skip
-    return text + "\n\n" + table(header, rows)
+    return text + "\n\n" + table(HEADER, rows)
 
 
-def _row(kind: str, share: float, count: int, held_out: bool = False) -> list[object]:
-    rng = np.random.default_rng([int(100 * share), *kind.encode(), *(b"later" if held_out else b"")])
-    ours, oracle, park, covered = [], [], [], []
-    counts: Counter[str] = Counter()
-    for _ in range(count):
-        cell = make_cell(rng, 25, MID)
-        bad = rng.choice(25, round(25 * share), replace=False)
-        views = list(cell.views.views)
-        _SPOIL[kind](cell, views, bad, rng)
-        spoilt = replace(cell.views, views=tuple(views))
-        good = [i for i in range(25) if i not in set(bad.tolist())]
-        oracle.append(_error(solve_views(cell.views.select(good), _ORACLE).matrix, cell))
-        flange, C = spoilt.base_from_flange, spoilt.camera_from_board
-        # OpenCV's Park-Martin may return a mirrored rotation here
-        park.append(_error(orthonormalised(opencv_hand_eye(flange, C, HAND_EYE["Park-Martin"])), cell))
+def measure(task: tuple[str, float, Mount, int]) -> Trial:
+    name, share, mount, seed = task
+    rng = np.random.default_rng([43, seed, MOUNTS.index(mount), int(100 * share), *name.encode()])
+    with single_threaded_opencv():
+        cell = imperfect_cell(rng, mount, known=Known(lens=True))
+        bad = _bad_views(name, share, seed, rng)
+        spoilt = (_VIEWS_WRONG | _CHANGED)[name](cell, bad, rng)
+        X_oracle = spoilt.X if spoilt.X_oracle is None else spoilt.X_oracle
+        oracle = _error(solve_views(spoilt.views.select(spoilt.good), _ORACLE).matrix, X_oracle)
         try:
-            solution = solve_views(spoilt, _OPTIONS)
-        except CalibrationError:
-            counts["failed"] += 1
-            continue
-        ours.append(_error(solution.matrix, cell))
-        delta = difference(solution.matrix, cell.X)
-        square = float(delta @ np.linalg.solve(solution.covariance, delta))
-        covered.append(square <= solution.confidence_threshold)
-        distance = _true_distance(cell, spoilt)
-        wrong, used, in_doubt = set(bad.tolist()), set(solution.used), set(solution.in_doubt)
-        kept = sorted((wrong & used) - in_doubt - set(solution.turned))
-        named = {view.index for view in solution.rejected if view.kind == "wrong-number"}
-        counts["bad"] += len(wrong)
-        counts["by five"] += len(named & wrong)
-        counts["kept"] += len(kept)
-        counts["truly beyond 6"] += int((distance[kept] > 6).sum())
-        counts["unavoidable"] += int((distance[bad] < _BEST_LIMIT).sum())
-        counts["bad in doubt"] += len(in_doubt & wrong)
-        counts["good lost"] += len(set(good) - used)
-        counts["good in doubt"] += len(in_doubt - wrong)
-    a, b, p = np.array(ours), np.array(oracle), np.array(park)
-    name = f"{kind}, held out" if held_out else kind
-    return [name, f"{100 * share:.0f} %", f"{1e3 * rms(a[:, 0]):.3f}", f"{1e3 * rms(b[:, 0]):.3f}",
-            f"{rms(a[:, 0]) / rms(b[:, 0]):.3f}", f"{rms(a[:, 1]) / rms(b[:, 1]):.3f}",
-            *(counts[name] for name in _COUNTED),
-            f"{100 * np.mean(covered):.0f}", f"{1e3 * rms(p[:, 0]):.1f}"]  # fmt: skip
+            solution = solve_views(spoilt.views, _OPTIONS)
+        except CalibrationError as problem:
+            named = problem.hypothesis or type(problem).__name__
+            truly = named == spoilt.reading.value
+            return Trial(False, named, oracle, truly, bool(problem.hypothesis) and not truly)
+        reading = solution.session.reading
+        accepted = None
+        if reading in (Reading.BOARD_MOVED, Reading.CAMERA_MOVED):
+            accepted = _accepted(spoilt)
+    delta = difference(solution.matrix, spoilt.X)
+    square = float(delta @ np.linalg.solve(solution.covariance, delta))
+    passed = all(gate.passed for gate in judge(solution, GateInputs()))
+    truly, falsely = _named(solution, spoilt, set(bad.tolist()))
+    covered = square <= solution.confidence_threshold
+    ours = _error(solution.matrix, spoilt.X)
+    return Trial(passed, reading.value, oracle, truly, falsely, ours, covered, accepted)
 
 
-def _error(X: Array, cell: Cell) -> tuple[float, float]:
-    delta = difference(X, cell.X)
+def _bad_views(name: str, share: float, seed: int, rng: np.random.Generator) -> Places:
+    count = round(_VIEWS * share)
+    if name in _CHANGED:
+        return np.arange(_VIEWS)[-count:] if seed % 2 else np.arange(count)
+    return np.asarray(rng.choice(_VIEWS, count - count % 2 if name == "swapped" else count, replace=False))
+
+
+def _accepted(spoilt: Spoilt) -> tuple[float, float] | None:
+    try:
+        solution = solve_views(spoilt.views, replace(_ORACLE, accept_move=True))
+    except CalibrationError:
+        return None
+    return _error(solution.matrix, spoilt.X) if solution.move_accepted else None
+
+
+def _named(solution: Solution, spoilt: Spoilt, bad: set[int]) -> tuple[bool, bool]:
+    """Truly, falsely."""
+    reading = solution.session.reading
+    if spoilt.reading is not Reading.AS_RECORDED:
+        return reading is spoilt.reading, reading not in (spoilt.reading, Reading.AS_RECORDED)
+    kinds = {view.index: view.kind for view in solution.rejected}
+    right = {index for index, kind in kinds.items() if index in bad and kind == spoilt.kind}
+    found = set(solution.turned) if spoilt.kind == "" else right
+    falsely = reading is not Reading.AS_RECORDED or bool(set(kinds) - right)
+    return found == bad and not falsely, falsely
+
+
+def _error(X: Array, truth: Array) -> tuple[float, float]:
+    delta = difference(X, truth)
     return float(np.linalg.norm(delta[:3])), float(np.linalg.norm(delta[3:]))
 
 
-def _noise(cell: Cell, views: ViewSet) -> tuple[Array, Array]:
-    """True misses (n, 6) of the recorded flange poses, by the view's own corners, and their covariances."""
-    observed = observe_views(views)
-    boards = refine_board_poses(observed, State(cell.X, cell.Y, cell.C, cell.camera, np.zeros(0)))
-    state = State(cell.X, cell.Y, boards.C, cell.camera, np.zeros(0))
-    _, _, by_C = robot_derivatives(observed, state)
-    covariance = MID.corner_px**2 * by_C @ boards.covariance @ np.swapaxes(by_C, 1, 2)
-    covariance += np.diag(np.repeat([MID.robot_m, MID.robot_rad], 3) ** 2)
-    return robot_residuals(observed, state), covariance
+def line(name: str, share: float, mount: Mount, found: Sequence[Trial]) -> list[str]:
+    plain = Reading.AS_RECORDED.value
+    taken = [t for t in found if t.ours is not None and t.reading == plain]
+    accepted = [t for t in found if t.accepted is not None]
 
+    def percent(count: int, of: Sequence[Trial]) -> str:
+        return f"{100 * count / len(of):.0f}" if of else "-"
 
-def _true_distance(cell: Cell, views: ViewSet) -> Array:
-    """(n,) sigmas."""
-    miss, covariance = _noise(cell, views)
-    weighted = np.linalg.solve(covariance, miss[..., None])[..., 0]
-    return np.asarray(np.sqrt(np.einsum("ni,ni->n", miss, weighted)))
-
-
-def _swap(cell: Cell, views: list[ImageView], bad: Indices, rng: np.random.Generator) -> None:
-    flanges = [views[i].base_from_flange for i in np.roll(bad, 1)]
-    for i, flange in zip(bad, flanges, strict=True):
-        views[i] = replace(views[i], base_from_flange=flange)
-
-
-def _turn(cell: Cell, views: list[ImageView], bad: Indices, rng: np.random.Generator) -> None:
-    for i in bad:
-        points, seen = views[i].board_points, views[i].camera_from_board
-        assert seen is not None
-        turn = pose(rotation_exp([0, 0, np.pi]), [*points[:, :2].max(axis=0), 0.0])
-        views[i] = replace(
-            views[i], board_points=transform_points(turn, points), camera_from_board=seen @ turn
+    ours = np.array([t.ours for t in taken]).reshape(-1, 2)
+    oracle = np.array([t.oracle for t in taken]).reshape(-1, 2)
+    numbers = ["-"] * 4
+    if taken:
+        a, b = ([rms(e[:, i]) for i in (0, 1)] for e in (ours, oracle))
+        numbers = [f"{1e3 * a[0]:.3f}", f"{1e3 * b[0]:.3f}", *(f"{a[i] / b[i]:.3f}" for i in (0, 1))]
+    both = "-"
+    if accepted:
+        a, b = (
+            [rms(np.array([getattr(t, who)[i] for t in accepted])) for i in (0, 1)]
+            for who in ("accepted", "oracle")
         )
+        both = f"{a[0] / b[0]:.2f}, {a[1] / b[1]:.2f}"
+    return [
+        name,
+        f"{100 * share:.0f} %",
+        mount,
+        percent(sum(t.passed for t in found), found),
+        percent(sum(t.reading != plain for t in found), found),
+        *numbers,
+        percent(sum(t.covered for t in taken), taken),
+        percent(sum(t.truly for t in found), found),
+        percent(sum(t.falsely for t in found), found),
+        both,
+    ]
 
 
-def _far(cell: Cell, views: list[ImageView], bad: Indices, rng: np.random.Generator) -> None:
-    _nudge(views, bad, rng.uniform(10, 60, (len(bad), 6)) * rng.choice([-1, 1], (len(bad), 6)))
+def _views_wrong(cell: ImperfectCell, bad: Places, changed: Sequence[ImageView], kind: str) -> Spoilt:
+    views = list(cell.views.views)
+    for place, view in zip(bad, changed, strict=True):
+        views[place] = view
+    good = np.setdiff1d(np.arange(_VIEWS), bad).tolist()
+    return Spoilt(replace(cell.views, views=tuple(views)), cell.X, good, kind=kind)
 
 
-def _every(cell: Cell, views: list[ImageView], bad: Indices, rng: np.random.Generator) -> None:
-    _nudge(views, bad, rng.uniform(6, 10, (len(bad), 6)) * rng.choice([-1, 1], (len(bad), 6)))
+def _exchange(cell: ImperfectCell, bad: Places, other: Places) -> Spoilt:
+    views = cell.views.views
+    changed = [
+        replace(views[i], base_from_flange=views[j].base_from_flange) for i, j in zip(bad, other, strict=True)
+    ]
+    return _views_wrong(cell, bad, changed, "wrong-pose")
 
 
-def _one(cell: Cell, views: list[ImageView], bad: Indices, rng: np.random.Generator) -> None:
-    sizes = np.zeros((len(bad), 6))
-    sizes[np.arange(len(bad)), rng.integers(6, size=len(bad))] = rng.uniform(6, 10, len(bad))
-    _nudge(views, bad, sizes)
+def _swap(cell: ImperfectCell, bad: Places, rng: np.random.Generator) -> Spoilt:
+    return _exchange(cell, bad, bad.reshape(-1, 2)[:, ::-1].ravel())
 
 
-def _length(cell: Cell, views: list[ImageView], bad: Indices, rng: np.random.Generator) -> None:
-    _, covariance = _noise(cell, replace(cell.views, views=tuple(views)))
-    for i in bad:
-        direction = rng.normal(size=6)
-        whole = rng.uniform(6, 10) * direction / np.linalg.norm(direction)
-        flange = perturb(views[i].base_from_flange, np.linalg.cholesky(covariance[i]) @ whole)
-        views[i] = replace(views[i], base_from_flange=flange)
+def _shuffle(cell: ImperfectCell, bad: Places, rng: np.random.Generator) -> Spoilt:
+    return _exchange(cell, bad, np.roll(bad, 1))
 
 
-def _nudge(views: list[ImageView], bad: Indices, sizes: Array) -> None:
-    """`sizes` (n, 6) in robot sigmas."""
+def _turn(cell: ImperfectCell, bad: Places, rng: np.random.Generator) -> Spoilt:
+    changed = []
+    for view in (cell.views.views[i] for i in bad):
+        turn = pose(rotation_exp([0, 0, np.pi]), [*view.board_points[:, :2].max(axis=0), 0.0])
+        seen = np.asarray(view.camera_from_board) @ inverse(turn)
+        points = transform_points(turn, view.board_points)
+        changed.append(replace(view, board_points=points, camera_from_board=seen))
+    return _views_wrong(cell, bad, changed, "")
+
+
+def _far(cell: ImperfectCell, bad: Places, rng: np.random.Generator) -> Spoilt:
     sigma = np.repeat([MID.robot_m, MID.robot_rad], 3)
-    for i, size in zip(bad, sizes, strict=True):
-        views[i] = replace(views[i], base_from_flange=perturb(views[i].base_from_flange, size * sigma))
+    sizes = rng.uniform(10, 60, (len(bad), 6)) * rng.choice([-1, 1], (len(bad), 6))
+    changed = []
+    for place, size in zip(bad, sizes, strict=True):
+        view = cell.views.views[place]
+        changed.append(replace(view, base_from_flange=perturb(view.base_from_flange, size * sigma)))
+    return _views_wrong(cell, bad, changed, "inconsistent")
 
 
-_SPOIL = {"swapped": _swap, "turned": _turn, "far": _far, "every": _every, "one": _one, "length": _length}
+def _longer(bad: Places) -> list[int]:
+    """The longer part of the session."""
+    rest = np.setdiff1d(np.arange(_VIEWS), bad)
+    return [int(i) for i in (rest if len(rest) >= len(bad) else bad)]
+
+
+def _move(cell: ImperfectCell, bad: Places, D: Array, in_base: bool, reading: Reading) -> Spoilt:
+    """Flange poses of the bad views, all D (4, 4) off, in base or in the flange."""
+    views = list(cell.views.views)
+    for i in bad:
+        F = views[i].base_from_flange
+        views[i] = replace(views[i], base_from_flange=D @ F if in_base else F @ D)
+    camera = in_base == (cell.views.mount == "eye-to-hand")
+    other = (D @ cell.X if in_base else inverse(D) @ cell.X) if camera else cell.X
+    good = _longer(bad)
+    X = {True: other, False: cell.X}
+    return Spoilt(
+        replace(cell.views, views=tuple(views)),
+        X[_VIEWS - 1 in bad],
+        good,
+        reading,
+        X_oracle=X[good[0] in bad],
+    )
+
+
+def _move_board(cell: ImperfectCell, bad: Places, rng: np.random.Generator) -> Spoilt:
+    shift, turn = rng.normal(size=(2, 3))
+    shift *= rng.uniform(0.01, 0.05) / np.linalg.norm(shift)
+    turn *= np.radians(rng.uniform(1, 5)) / np.linalg.norm(turn)
+    in_hand = cell.views.mount == "eye-in-hand"
+    return _move(cell, bad, pose(rotation_exp(turn), shift), in_hand, Reading.BOARD_MOVED)
+
+
+def _change_tcp(cell: ImperfectCell, bad: Places, rng: np.random.Generator) -> Spoilt:
+    """What the flange holds seems to have moved on it: the camera, or the board."""
+    in_hand = cell.views.mount == "eye-in-hand"
+    D = pose(np.eye(3), [0.0, 0.0, rng.uniform(0.02, 0.12)])
+    return _move(cell, bad, D, False, Reading.CAMERA_MOVED if in_hand else Reading.BOARD_MOVED)
+
+
+def _refocus(cell: ImperfectCell, bad: Places, rng: np.random.Generator) -> Spoilt:
+    factor = 1 + rng.choice([-1, 1]) * rng.uniform(0.02, 0.06)
+    centre = np.array(cell.lens.matrix)[:2, 2]
+    views = list(cell.views.views)
+    for i in bad:
+        views[i] = replace(views[i], pixels=centre + factor * (views[i].pixels - centre))
+    good = _longer(bad)
+    spoilt = solve_pnp(replace(cell.views, views=tuple(views)), BOARD)
+    return Spoilt(spoilt, cell.X, good, Reading.REFOCUSED)
+
+
+_VIEWS_WRONG: dict[str, Spoil] = {"swapped": _swap, "shuffled": _shuffle, "turned": _turn, "far": _far}
+_CHANGED: dict[str, Spoil] = {
+    "board moved": _move_board,
+    "TCP changed": _change_tcp,
+    "refocused": _refocus,
+}

@@ -10,13 +10,10 @@ from collections.abc import Callable
 
 import numpy as np
 
-from benchmarks.scene import Cell, Noise, make_cell
+from benchmarks.scene import Cell, Noise, make_cell, pose_arrays
 from benchmarks.trials import rms, table, trials
 from calibrate.assess import motion_errors
-from calibrate.consensus import pose_arrays
-from calibrate.estimate import estimate, first_state
 from calibrate.geometry import Array, difference
-from calibrate.likelihood.model import observe_views
 from calibrate.pairs import Pairs, all_pairs, consecutive_pairs
 from calibrate.paper import solve_paper
 from calibrate.peer_methods import (
@@ -30,11 +27,13 @@ from calibrate.peer_methods import (
     zhi_linear,
 )
 from calibrate.robust import solve_global
+from calibrate.solve import SolveOptions, solve_views
 from calibrate.views import ViewSet
 
 TRIALS = 200
 NOISE = Noise(0.2, 0.88e-3, np.radians(0.064))
 _FITTED = 19
+_OPTIONS = SolveOptions(intrinsics_from_same_pictures=True, holdout=False, folds=False)
 
 Method = Callable[[ViewSet, Pairs, int], Array]
 
@@ -96,10 +95,7 @@ def _park(views: ViewSet) -> Array:
 
 
 def _ours(views: ViewSet) -> Array:
-    observed = observe_views(views)
-    H, C = pose_arrays(views)
-    start = first_state(observed, solve_global(_all(views), 0).X, C, H, views.camera)
-    return estimate(observed, start, True).state.X
+    return solve_views(views, _OPTIONS).matrix
 
 
 def _row(name: str, scores: Array, errors: Array) -> list[str]:

@@ -1,7 +1,7 @@
 """Are planned poses worth it? Error of X, its prediction, safety, time, and plans from a bad first guess.
 
 Cells come from `random_cells`, every check of a plan too. X is estimated by the product's own
-maximum-likelihood estimate with the lens free, from simulated corners and robot poses at mid noise (0.2 px,
+estimate with the lens free, from simulated corners and robot poses at mid noise (0.2 px,
 0.3 mm, 0.03°). PLANNING_LOG=FILE keeps each cell's results there, and a run that was stopped goes on.
 """
 
@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Sequence
+from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
@@ -29,11 +30,13 @@ from benchmarks.random_cells import (
 )
 from benchmarks.scene import MID
 from benchmarks.trials import trials
-from calibrate.estimate import estimate
 from calibrate.geometry import Array, difference, perturb, pose, rotation_exp
+from calibrate.handeye.corners import bent_points
+from calibrate.handeye.estimate import estimate
+from calibrate.handeye.observations import SHAPE, Observations, State, extent_of
+from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.information import Noise
 from calibrate.kinematics import forward
-from calibrate.likelihood.model import Observations, State
 from calibrate.projection import project
 from station.analysis import check_run
 from station.errors import LimitError
@@ -52,6 +55,7 @@ NOISE = Noise(MID.corner_px, MID.robot_m, MID.robot_rad)
 MODERATE = ViewRange((0.38, 0.60), (0.0, np.deg2rad(30)), roll_rad=np.pi / 4, doubt=0.0)
 WIDE = ViewRange((0.34, 0.75), (0.0, np.deg2rad(50)), roll_rad=np.pi / 2, off_centre=0.8, doubt=0.0)
 AHEAD_M = 0.5
+_PRIORS = Priors(LensPrior.unknown(CAMERA))
 RANDOM_ORDERS = 3
 VISITS = 5
 """How often each set of poses is visited, with new noise; random poses are drawn anew for each visit."""
@@ -97,7 +101,7 @@ def _compare_choices(cell: RandomCell, result: CellResult, rng: np.random.Genera
     for name, view in (("moderate", MODERATE), ("wide", WIDE)):
         options = PlanOptions(seed=seed, noise=NOISE, view=view)
         pool, _ = candidate_pool(scene, options, cell.start, rng)
-        each = informations(scene, pool.base_from_flange, NOISE, True)
+        each = informations(scene, pool.base_from_flange, NOISE)
         objective = objective_for(scene, "A", True)
         for label, sets in (
             (f"{name} planned 25", [choose(each, 25, objective, rng)] * VISITS),
@@ -159,17 +163,27 @@ def _random_time(scene: Scene, plan: Plan, cell: RandomCell, rng: np.random.Gene
 
 
 def x_error(cell: RandomCell, flange: Array, rng: np.random.Generator) -> Array:
-    """Error (6,) of the estimate from one noisy visit to these flange poses (n, 4, 4)."""
+    """Error (6,) of the estimate from one noisy visit to these flange poses (n, 4, 4).
+
+    The board is a new one each time, off by its tolerance, which the prediction contains.
+    """
     n, k = len(flange), len(POINTS)
     there = perturb(flange, rng.normal(size=(n, 6)) * np.repeat([NOISE.robot_m, NOISE.robot_rad], 3))
     C = cell.camera_from_board(there)
-    points = np.einsum("nij,kj->nki", C[:, :3, :3], POINTS) + C[:, None, :3, 3]
-    pixels = project(CAMERA, points).pixels + rng.normal(0, NOISE.pixel_px, (n, k, 2))
     observed = Observations(
-        "eye-in-hand", flange, np.broadcast_to(POINTS, (n, k, 3)), pixels, np.ones((n, k))
+        "eye-in-hand",
+        flange,
+        np.broadcast_to(POINTS, (n, k, 3)),
+        np.zeros((n, k, 2)),
+        np.ones((n, k)),
+        extent=extent_of(POINTS),
     )
+    board = bent_points(observed, rng.normal(size=len(SHAPE)) * _PRIORS.board_sigma)
+    points = np.einsum("nij,nkj->nki", C[:, :3, :3], board) + C[:, None, :3, 3]
+    pixels = project(CAMERA, points).pixels + rng.normal(0, NOISE.pixel_px, (n, k, 2))
     # From where the boards truly were: starting where the arm says would set its noise to zero at first.
-    found = estimate(observed, State(cell.X, cell.Y, C, CAMERA, np.zeros(0)), intrinsics_free=True)
+    start = State(cell.X, cell.Y, C, CAMERA, np.zeros(len(SHAPE)), np.zeros(0))
+    found = estimate(replace(observed, pixels=pixels), start, _PRIORS)
     return difference(found.state.X, cell.X)
 
 

@@ -22,6 +22,7 @@ from calibrate.geometry import (
     random_rotation,
     rotation_exp,
 )
+from calibrate.pairs import mount_poses
 from calibrate.projection import camera_matrix, project
 from calibrate.views import ImageView, ViewSet
 from recordings.messages import CameraModel, Mount
@@ -118,6 +119,11 @@ def view_set(
         C = np.array([pnp(board, seen, camera) for seen in pixels])
     found = [ImageView(i, f"view {i}", flange[i], board, pixels[i], None, C[i]) for i in range(len(flange))]
     return ViewSet(mount, tuple(found), camera)
+
+
+def pose_arrays(views: ViewSet) -> tuple[Array, Array]:
+    """H and C of `pairs`' convention, (n, 4, 4) each."""
+    return mount_poses(views.base_from_flange, views.mount), views.camera_from_board
 
 
 def pnp(board: Array, pixels: Array, camera: CameraModel) -> Array:

@@ -3,11 +3,24 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import ProcessPoolExecutor
+from multiprocessing import get_context
+from typing import TypeVar
 
 import numpy as np
 
 from calibrate.geometry import Array
+
+_PROCESSES = 2
+Task = TypeVar("Task")
+Result = TypeVar("Result")
+
+
+def in_processes(work: Callable[[Task], Result], tasks: Sequence[Task]) -> Iterator[Result]:
+    """`work` of each task, in their order, by two fresh processes; `work` must be a module's own function."""
+    with ProcessPoolExecutor(_PROCESSES, mp_context=get_context("spawn")) as pool:
+        yield from pool.map(work, tasks, chunksize=2)
 
 
 def trials(full: int) -> int:

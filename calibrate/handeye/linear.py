@@ -36,6 +36,7 @@ _INFORMATION = (STUDENT + 2) / (STUDENT + 4)
 ROBOT_PRIOR_COUNT = 1.0
 _ROBOT_PRIOR_M, _ROBOT_PRIOR_RAD = 1e-4, float(np.radians(0.02))
 _WIDE = 3.0
+_ROUNDING = 1e-14
 _MODE_COUNT = 4.0
 """Weight, in residuals, of the rule that no mode of the corners is quieter than those below it."""
 
@@ -330,10 +331,14 @@ def _chances(residual: Array, S: Array, S_inverse: Array, shares: Array) -> tupl
 
 
 def inverse_of(N: Array) -> Array:
-    """Of a symmetric positive matrix, scaled to ones first. LinAlgError where it is not."""
+    """Of a symmetric positive matrix, scaled to ones first. LinAlgError where it is not.
+
+    What rounding cannot tell from open (two terms of a rational lens, say) gets a huge variance, not an
+    infinite one.
+    """
     scale = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-300))
     values, vectors = np.linalg.eigh((N + N.T) / 2 * np.outer(scale, scale))
-    if not values[0] > 1e-13:
+    if not values[0] > -_ROUNDING:
         raise np.linalg.LinAlgError("some unknowns are left open")
     root = vectors * scale[:, None]
-    return np.asarray((root / values) @ root.T)
+    return np.asarray((root / np.maximum(values, _ROUNDING)) @ root.T)

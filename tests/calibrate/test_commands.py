@@ -27,7 +27,7 @@ def test_solve_json_is_exactly_the_contract(session_file: Path, tmp_path: Path) 
     answer = json.loads(done.stdout)
     assert list(answer) == [
         "mount", "result", "sigma", "covariance", "views", "intrinsics", "holdout", "certificate", "gates",
-        "solve_ms",
+        "verdict", "warnings", "cross_validation", "board", "session", "arm", "solve_ms",
     ]  # fmt: skip
     assert set(answer["result"]) == {
         "parent_frame",
@@ -37,11 +37,18 @@ def test_solve_json_is_exactly_the_contract(session_file: Path, tmp_path: Path) 
         "matrix",
     }
     assert set(answer["sigma"]) == {"translation_mm", "rotation_deg"}
-    assert set(answer["views"]) == {"used", "rejected"}
+    assert set(answer["views"]) == {"used", "rejected", "weights"}
+    assert [view["index"] for view in answer["views"]["weights"]] == answer["views"]["used"]
     assert set(answer["intrinsics"]) == {"width", "height", "matrix", "distortion", "rms_px"}
     assert answer["holdout"] is None or set(answer["holdout"]) == {"e_t_m", "e_R"}
     assert set(answer["certificate"]) == {"certified", "relative_gap", "objective", "distance_sigma"}
     assert all(set(gate) == {"name", "passed", "value", "limit", "text"} for gate in answer["gates"])
+    assert answer["verdict"] == ("pass" if all(gate["passed"] for gate in answer["gates"]) else "fail")
+    assert all(set(warning) == {"code", "text"} for warning in answer["warnings"])
+    assert set(answer["cross_validation"]) == {"rms_mm", "rms_deg", "claimed_mm", "folds"}
+    assert set(answer["board"]) == {"scale", "anisotropy", "bend_m", "sigma"}
+    assert answer["session"]["hypothesis"] == "as-recorded"
+    assert answer["arm"] is None or set(answer["arm"]) == {"applied", "log_bayes", "size_mm", "table"}
     assert np.array(answer["covariance"]).shape == (6, 6)
     assert np.array(answer["result"]["matrix"]).shape == (4, 4)
     assert done.returncode == (0 if all(gate["passed"] for gate in answer["gates"]) else 4)

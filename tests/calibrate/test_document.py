@@ -31,16 +31,37 @@ def test_quality_is_in_millimetres_and_degrees(solved_real: SolvedRecording) -> 
     assert quality.predicted_error_mm == pytest.approx(1000 * found.predicted_error_m)
     assert quality.working_distance_m == found.working_distance_m
     assert quality.weakest == found.observability.weakest_text
-    assert solved_real.scale is not None and quality.board_scale == solved_real.scale.scale
+    assert found.board is not None and quality.board is not None
+    assert quality.board_scale == 1 + found.board.scale == 1 + quality.board.scale
+    assert (quality.board.anisotropy, quality.board.bend_m) == (found.board.anisotropy, found.board.bend_m)
+    assert quality.board.sigma == found.board.sigma
 
 
 def test_noise_and_the_shares_of_the_error(solved_real: SolvedRecording) -> None:
     quality, found = solved_real.calibration.quality, solved_real.solution
-    assert found.noise is not None and found.budget is not None
+    assert found.noise is not None
     assert quality.noise["corner_px"] == found.noise.corner_px
     assert quality.noise["robot_mm"] == pytest.approx(1000 * found.noise.robot_m)
     assert quality.noise["robot_deg"] == pytest.approx(np.degrees(found.noise.robot_rad))
-    assert quality.error_shares == {name: float(share) for name, share in vars(found.budget).items()}
+    assert quality.error_shares == found.error_shares
+    assert sum(quality.error_shares.values()) == pytest.approx(1.0)
+
+
+def test_left_out_views_against_what_is_claimed_of_them(solved_real: SolvedRecording) -> None:
+    told, found = solved_real.calibration.quality.cross_validation, solved_real.solution.cross_validation
+    assert told is not None and found is not None
+    assert told.rms_mm == pytest.approx(1000 * found.rms_m)
+    assert told.rms_deg == pytest.approx(np.degrees(found.rms_rad))
+    assert told.claimed_mm == pytest.approx(1000 * found.claimed_m)
+
+
+def test_warnings_come_with_their_codes_and_the_session_with_its_reading(
+    solved_real: SolvedRecording,
+) -> None:
+    quality, found = solved_real.calibration.quality, solved_real.solution
+    assert len(quality.warning_codes) == len(quality.warnings)
+    assert {w.code for w in found.warnings} <= set(quality.warning_codes)
+    assert quality.session is not None and quality.session.hypothesis == found.session.reading.value
 
 
 def test_each_view_has_its_residuals(solved_real: SolvedRecording) -> None:
@@ -65,9 +86,13 @@ def test_the_holdout_is_told_pair_by_pair(solved_real: SolvedRecording) -> None:
 
 def test_a_given_lens_is_called_given_and_judged_by_these_pictures(solved_real: SolvedRecording) -> None:
     lens, views = solved_real.calibration.intrinsics, solved_real.views
-    assert solved_real.intrinsics is None
-    assert (lens.found, lens.sigma, lens.held) == ("given", {}, [])
-    assert lens.matrix == views.camera.matrix
+    found = solved_real.solution
+    assert solved_real.intrinsics is None and lens.found == "given"
+    assert found.lens_covariance is not None
+    assert list(lens.sigma.values()) == pytest.approx(np.sqrt(np.diag(found.lens_covariance)))
+    # A given lens is what is known beforehand, no constant: 0.2 % of it, and the pictures say the rest.
+    assert lens.matrix == found.camera.matrix != views.camera.matrix
+    assert 0 < lens.sigma["fx"] < 0.002 * lens.matrix[0][0]
     squares = [view_rms_px(v, views.camera, v.camera_from_board) ** 2 for v in views]  # type: ignore[arg-type]
     assert lens.rms_px == pytest.approx(np.sqrt(np.mean(squares)))
 
@@ -76,6 +101,5 @@ def test_a_lens_of_these_pictures_is_called_so_with_its_sigmas(solved: SolvedRec
     lens, found = solved.calibration.intrinsics, solved.intrinsics
     assert found is not None
     assert (lens.found, lens.rms_px) == ("from these pictures", found.rms_px)
-    assert lens.sigma == found.sigma and lens.sigma["fx"] > 0
-    assert lens.held == list(found.held)
+    assert set(lens.sigma) == set(found.sigma) and lens.sigma["fx"] > 0
     assert lens.matrix == solved.solution.camera.matrix

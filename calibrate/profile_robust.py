@@ -21,7 +21,7 @@ from calibrate.geometry import Array, Transform
 from calibrate.handeye.corners import boards_by_corners, corner_distance, corner_residuals
 from calibrate.handeye.estimate import FULL, estimate
 from calibrate.handeye.findings import error_shares, judge_board, judge_lens
-from calibrate.handeye.fit import CellFit, fit_cell, fit_moved
+from calibrate.handeye.fit import FEWEST_FOR_TABLE, CellFit, fit_cell, fit_moved
 from calibrate.handeye.folds import cross_validate
 from calibrate.handeye.observations import Layout, Moved
 from calibrate.handeye.poses import pose_views
@@ -54,7 +54,7 @@ _FREE_FOCAL = 0.02
 
 
 def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
-    """The estimate of all views. Raises BadViewsError, naming the reading that would explain the recording."""
+    """The estimate of all views. PosesDisagreeError names the reading that would explain the recording."""
     watch = Stopwatch()
     priors = _priors(views, options)
     poses = pose_views(views, _focal_sigma(priors), priors.board.square)
@@ -257,6 +257,11 @@ def _remarks(
                 "No corners were recorded: board poses are taken as exact, all error is the robot's.",
             )
         )
+    if solution.arm is None and options.model_arm and len(fit.views) >= FEWEST_FOR_TABLE:
+        text = (
+            "Errors of the arm's kinematic table are not in the stated error: the arm's model is not known."
+        )
+        remarks.append(Remark("arm-not-modelled", text))
     if solution.arm is not None and solution.arm.detected:
         remarks.append(
             Remark(

@@ -50,7 +50,7 @@ def judge_board(fit: CellFit, distance_m: float) -> Finding:
 
 def _judge(fit: CellFit, places: Array, miss: Array, sigma: Array, distance_m: float) -> Finding:
     covariance = fit.estimate.covariance
-    # Where views and statement agree, the difference of both estimates has the difference of both covariances.
+    # Where both agree, the difference of the estimates has the difference of their covariances.
     root = 1.0 / sigma
     left = np.eye(len(places)) - covariance[np.ix_(places, places)] * root * root[:, None]
     values, vectors = np.linalg.eigh((left + left.T) / 2)

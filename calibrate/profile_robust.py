@@ -259,7 +259,7 @@ def _remarks(
         )
     if solution.arm is None and options.model_arm and len(fit.views) >= FEWEST_FOR_TABLE:
         text = (
-            "Errors of the arm's kinematic table are not in the stated error: the arm's model is not known."
+            "The arm's model is not known: errors of its kinematic table are not in the stated error."
         )
         remarks.append(Remark("arm-not-modelled", text))
     if solution.arm is not None and solution.arm.detected:

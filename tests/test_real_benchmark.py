@@ -64,7 +64,7 @@ SWAPPED = next(mistake for mistake in MISTAKES if mistake.name == "two poses swa
 @pytest.mark.parametrize(
     ("mistake", "said", "true"),
     [
-        (SHIFTED, Said("shifted-poses", "shifted-poses", (), ""), True),
+        (SHIFTED, Said("shifted-pictures", "shifted-pictures", (), ""), True),
         (SHIFTED, Said("board-moved", "board-moved", (), "poses shifted"), False),
         (SWAPPED, Said("pass", "", (3, 9), ""), True),
         (SWAPPED, Said("pass", "", (3, 9, 11), ""), False),

@@ -4,13 +4,52 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import msgspec
 import numpy as np
 
-from benchmarks.scene import HIGH, LOW, MID, Cell, Noise, make_cell
-from calibrate.geometry import Array, pose, random_rotation
-from calibrate.views import ViewSet
+from benchmarks.scene import HIGH, LOW, MID, PAPER_CAMERA, Cell, Noise, make_cell
+from calibrate.geometry import Array, difference, perturb, pose, random_rotation
+from calibrate.pnp import solve_pnp
+from calibrate.projection import project_pixels
+from calibrate.solution import Solution
+from calibrate.views import ImageView, ViewSet
+from recordings.messages import CameraModel, Mount
 
-__all__ = ["HIGH", "LOW", "MID", "Cell", "Noise", "error_mm_deg", "exact_motions", "make_cell", "with_flange"]
+__all__ = [
+    "HIGH",
+    "LENSES",
+    "LOW",
+    "MID",
+    "NONE",
+    "Cell",
+    "Noise",
+    "changed",
+    "error_mm_deg",
+    "exact_motions",
+    "inside",
+    "make_cell",
+    "nudged",
+    "printed",
+    "real_cell",
+    "seen_through",
+    "sigmas_of",
+    "smooth_bias",
+    "with_flange",
+    "with_focal",
+]
+
+NONE = Noise(0.0, 0.0, 0.0)
+LENSES = {
+    "plumb_bob": msgspec.structs.replace(PAPER_CAMERA, distortion=(-0.12, 0.1, 4e-4, -3e-4, 0.02)),
+    "rational_polynomial": msgspec.structs.replace(
+        PAPER_CAMERA,
+        distortion=(0.3, -0.2, 4e-4, -3e-4, 0.02, 0.4, -0.1, 0.01),
+        distortion_model="rational_polynomial",
+    ),
+    "equidistant": msgspec.structs.replace(
+        PAPER_CAMERA, distortion=(0.03, -0.01, 0.003, 0.0), distortion_model="equidistant"
+    ),
+}
 
 
 def exact_motions(rng: np.random.Generator, views: int, X: Array) -> tuple[Array, Array]:
@@ -20,12 +59,90 @@ def exact_motions(rng: np.random.Generator, views: int, X: Array) -> tuple[Array
     return H, np.linalg.inv(X) @ np.linalg.inv(H) @ Y
 
 
+def printed(points: Array, shape: tuple[float, ...]) -> Array:
+    """Corners (k, 3) where a board has them: size, x against y, three bends (m), by its drawing's corners."""
+    size, unequal, bend_x, bend_y, twist = shape
+    low, high = points.min(axis=0), points.max(axis=0)
+    u, v, _ = (2 * (points - low) / np.maximum(high - low, 1e-9) - 1).T
+    x, y, _ = points.T
+    z = bend_x * (1 - u**2) + bend_y * (1 - v**2) + twist * u * v
+    return np.stack([x * (1 + size + unequal / 2), y * (1 + size - unequal / 2), z], axis=1)
+
+
+def real_cell(
+    rng: np.random.Generator,
+    views: int = 20,
+    noise: Noise = MID,
+    *,
+    mount: Mount = "eye-in-hand",
+    camera: CameraModel = PAPER_CAMERA,
+    stated: CameraModel | None = None,
+    shape: tuple[float, ...] = (0.0,) * 5,
+    bias_px: float = 0.0,
+) -> Cell:
+    """A cell seen through the lens `camera`, of a board of this shape; `stated` is the lens that is given."""
+    cell = make_cell(rng, views, noise, mount=mount, with_pnp=False)
+    pictures = []
+    for view, C in zip(cell.views, cell.C, strict=True):
+        bent = printed(view.board_points, shape)
+        pixels = project_pixels(camera, bent @ C[:3, :3].T + C[:3, 3])
+        pixels = pixels + rng.normal(size=pixels.shape) * noise.corner_px
+        pixels = pixels + smooth_bias(rng, view.board_points, bias_px)
+        pictures.append(replace(view, pixels=pixels))
+    seen = solve_pnp(replace(cell.views, views=tuple(pictures), camera=stated or camera))
+    return replace(cell, views=seen, camera=camera)
+
+
+def smooth_bias(rng: np.random.Generator, points: Array, size_px: float) -> Array:
+    """(k, 2) errors that vary slowly over the board, as lighting, focus and print make them."""
+    low, high = points.min(axis=0), points.max(axis=0)
+    u, v, _ = (2 * (points - low) / np.maximum(high - low, 1e-9) - 1).T
+    modes = np.stack([u**0, u, v, u * v, u * u - 1 / 3, v * v - 1 / 3], axis=1)
+    return np.asarray(modes @ rng.normal(size=(6, 2)) * size_px / np.sqrt(2.6))
+
+
+def seen_through(views: ViewSet, camera: CameraModel) -> ViewSet:
+    """The same pictures with another lens given for them."""
+    return solve_pnp(replace(views, camera=camera))
+
+
+def with_focal(camera: CameraModel, factor: float) -> CameraModel:
+    (fx, skew, cx), (_, fy, cy), last = camera.matrix or ()
+    return msgspec.structs.replace(camera, matrix=((factor * fx, skew, cx), (0.0, factor * fy, cy), last))
+
+
 def with_flange(views: ViewSet, flange: Array) -> ViewSet:
     """The same pictures with other robot poses."""
     changed = (replace(view, base_from_flange=F) for view, F in zip(views, flange, strict=True))
     return replace(views, views=tuple(changed))
 
 
+def nudged(views: ViewSet, places: list[int], deltas: Array) -> ViewSet:
+    """The views at these places with recorded poses off by these deltas (m, 6)."""
+    flange = views.base_from_flange
+    flange[places] = perturb(flange[places], deltas)
+    return with_flange(views, flange)
+
+
+def changed(views: ViewSet, places: list[int], **fields) -> ViewSet:  # type: ignore[no-untyped-def]
+    """The views, at these places with fields replaced by functions of the old view."""
+    out: list[ImageView] = list(views.views)
+    for i in places:
+        out[i] = replace(out[i], **{name: make(out[i]) for name, make in fields.items()})
+    return replace(views, views=tuple(out))
+
+
 def error_mm_deg(X: Array, truth: Array) -> tuple[float, float]:
     turn = np.clip((np.trace(X[:3, :3].T @ truth[:3, :3]) - 1) / 2, -1, 1)
     return 1e3 * float(np.linalg.norm(X[:3, 3] - truth[:3, 3])), float(np.degrees(np.arccos(turn)))
+
+
+def sigmas_of(solution: Solution, truth: Array) -> float:
+    """Squared length δᵀ C⁻¹ δ of the error that was made, by the covariance that was stated."""
+    delta = difference(solution.matrix, truth)
+    return float(delta @ np.linalg.solve(solution.covariance, delta))
+
+
+def inside(solution: Solution, truth: Array) -> bool:
+    """Does the stated 95 % region hold the truth?"""
+    return sigmas_of(solution, truth) < solution.confidence_threshold

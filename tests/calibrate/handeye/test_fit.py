@@ -1,0 +1,65 @@
+"""A cell in which camera or board was moved half-way still gives an X, when its owner agrees."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibrate.gates import GateInputs, judge
+from calibrate.geometry import inverse, perturb
+from calibrate.handeye.readings import Reading
+from calibrate.solve import SolveOptions, solve_views
+from tests.calibrate.cells import MID, error_mm_deg, inside, make_cell, with_flange
+
+OPTIONS = SolveOptions(holdout=True, folds=True)
+SLIP = np.array([0.02, -0.015, 0.01, 0.02, 0.03, -0.02])
+
+
+def moved_cell(seed, mount, what, at, views=24):
+    """Views, and X after the slip before view `at`."""
+    rng = np.random.default_rng([8, seed])
+    c = make_cell(rng, views, MID, mount=mount)
+    X, Y = (perturb(c.X, SLIP), c.Y) if what == "camera" else (c.X, perturb(c.Y, SLIP))
+    true = Y @ inverse(c.C) @ inverse(X) if mount == "eye-in-hand" else X @ c.C @ inverse(Y)
+    noise = rng.normal(size=(views, 6)) * np.repeat([MID.robot_m, MID.robot_rad], 3)
+    later = (np.arange(views) >= at)[:, None, None]
+    return with_flange(c.views, np.where(later, perturb(true, noise), c.views.base_from_flange)), X, Y
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("what", ["camera", "board"])
+def test_an_accepted_move_gives_the_camera_of_now_within_its_stated_error(mount, what):
+    held = 0
+    for seed, at in enumerate((12, 9, 14)):
+        views, X, Y = moved_cell(seed, mount, what, at)
+        solution = solve_views(views, replace(OPTIONS, accept_move=True))
+        reading = Reading.CAMERA_MOVED if what == "camera" else Reading.BOARD_MOVED
+        assert (solution.session.reading, solution.session.at) == (reading, at)
+        assert solution.move_accepted and len(solution.used) == 24
+        assert solution.holdout is None and solution.cross_validation is None
+        assert [g.name for g in judge(solution, GateInputs()) if not g.passed] == []
+        assert error_mm_deg(solution.board_place.matrix, Y)[0] < 3.0
+        held += inside(solution, X)
+    assert held >= 2
+
+
+def test_a_move_that_nobody_accepts_is_named_and_does_not_pass():
+    views, _, _ = moved_cell(0, "eye-in-hand", "camera", 12)
+    solution = solve_views(views, OPTIONS)
+    assert not solution.move_accepted
+    assert solution.session.reading is Reading.CAMERA_MOVED
+    assert "session" in [g.name for g in judge(solution, GateInputs()) if not g.passed]
+
+
+def test_both_parts_tell_more_than_the_later_one():
+    views, _, _ = moved_cell(1, "eye-in-hand", "board", 12)
+    both = solve_views(views, replace(OPTIONS, accept_move=True))
+    later = solve_views(views.select(list(range(12, 24))), OPTIONS)
+    assert both.sigma_translation_m < 0.9 * later.sigma_translation_m
+
+
+def test_accepting_a_move_changes_nothing_where_nothing_moved():
+    views = make_cell(np.random.default_rng(1), 16, MID).views
+    plain, accepted = (solve_views(views, replace(OPTIONS, accept_move=a)) for a in (False, True))
+    assert not accepted.move_accepted
+    assert np.array_equal(plain.matrix, accepted.matrix)

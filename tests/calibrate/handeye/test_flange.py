@@ -1,0 +1,53 @@
+"""How the implied flange moves with X, the board's pose and each picture: against differences."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from calibrate.geometry import difference, perturb, pose, random_rotation
+from calibrate.handeye.flange import flange_derivatives, flange_residuals, implied_flange
+from calibrate.handeye.observations import Observations, State
+from recordings.messages import CameraModel
+
+
+def anywhere(rng, count=None):
+    if count is None:
+        return pose(random_rotation(rng), rng.normal(size=3))
+    return np.array([anywhere(rng) for _ in range(count)])
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@settings(max_examples=20, deadline=None)
+@given(seed=st.integers(0, 10_000), far=st.sampled_from([1e-9, 0.01, 0.5]))
+def test_derivatives_are_those_of_differences_near_and_far(mount, seed, far):
+    rng = np.random.default_rng(seed)
+    X, Y, C = anywhere(rng), anywhere(rng), anywhere(rng, 4)
+    recorded = perturb(implied_flange(mount, X, Y, C), far * rng.normal(size=(4, 6)))
+
+    def miss(dX, dY, dC):
+        implied = implied_flange(mount, perturb(X, dX), perturb(Y, dY), perturb(C, np.tile(dC, (4, 1))))
+        return difference(implied, recorded)
+
+    exact = flange_derivatives(mount, X, Y, C, miss(*np.zeros((3, 6))))
+    h = 1e-6
+    for which in range(3):
+        for k in range(6):
+            step = np.zeros((3, 6))
+            step[which, k] = h
+            numeric = (miss(*step) - miss(*-step)) / (2 * h)
+            np.testing.assert_allclose(exact[which][:, :, k], numeric, atol=2e-7 * (1 + np.abs(numeric).max()))
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("moved", ["camera", "board"])
+def test_a_moved_cell_has_two_places_and_no_residual_at_either(mount, moved):
+    rng = np.random.default_rng(1)
+    X, Y, second, C = anywhere(rng), anywhere(rng), anywhere(rng), anywhere(rng, 6)
+    later = np.arange(6) >= 4
+    places = [(second, Y) if moved == "camera" else (X, second), (X, Y)]
+    flange = np.array([implied_flange(mount, *places[0 if late else 1], C[i : i + 1])[0] for i, late in enumerate(later)])
+    empty = np.zeros((6, 1, 3)), np.zeros((6, 1, 2)), np.zeros((6, 1))
+    observed = Observations(mount, flange, *empty, later=later, moved=moved)
+    state = State(X, Y, C, CameraModel(640, 480), np.zeros(5), np.zeros(0), second)
+    np.testing.assert_allclose(flange_residuals(observed, state), 0, atol=1e-12)

@@ -1,0 +1,122 @@
+"""Left-out and held-out views judge the claim, and take no part in what they judge."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibrate import profile_robust
+from calibrate.gates import GateInputs, judge
+from calibrate.geometry import perturb
+from calibrate.handeye import folds
+from calibrate.handeye.estimate import estimate
+from calibrate.handeye.fit import fit_cell
+from calibrate.handeye.folds import cross_validate
+from calibrate.handeye.priors import LensPrior, Priors
+from calibrate.held_out import HELD_OUT
+from calibrate.solve import SolveOptions, solve_views
+from tests.calibrate.cells import LOW, MID, make_cell, nudged
+
+VIEWS = 20
+CV = SolveOptions(holdout=False)
+
+
+@pytest.fixture(scope="module")
+def fit():
+    cell = make_cell(np.random.default_rng(0), VIEWS, MID)
+    return fit_cell(cell.views, Priors(LensPrior.given(cell.camera)), 0)
+
+
+def spoiled(fit, places):
+    """The same fit, but these views' poses and pictures are garbage now."""
+    flange, pixels = fit.observed.flange.copy(), fit.observed.pixels.copy()
+    flange[places] = perturb(flange[places], np.full(6, 0.3))
+    pixels[places] += 40.0
+    return replace(fit, observed=replace(fit.observed, flange=flange, pixels=pixels))
+
+
+def test_held_out_views_take_no_part_in_the_fit_that_they_judge(fit, monkeypatch):
+    """Bit for bit: whatever they say, X of the partial fit is the same."""
+    judged = []
+    monkeypatch.setattr(profile_robust, "score_holdout", lambda X, *_: judged.append(X))
+    last = np.arange(VIEWS - HELD_OUT, VIEWS)
+    for seen in (fit, spoiled(fit, last), spoiled(fit, last[:1])):
+        profile_robust._holdout(seen)
+    assert np.array_equal(judged[0], judged[1]) and np.array_equal(judged[0], judged[2])
+    # The guard can go red: views that do take part change it.
+    profile_robust._holdout(spoiled(fit, np.array([0])))
+    assert not np.array_equal(judged[0], judged[3])
+
+
+def test_the_held_out_views_of_a_solve_leave_its_partial_fit_alone(monkeypatch):
+    """By the front door: another start is all that they may give."""
+    views = make_cell(np.random.default_rng(0), VIEWS, MID).views
+    last = list(range(VIEWS - HELD_OUT, VIEWS))
+    slips = 1e-3 * np.random.default_rng(1).normal(size=(HELD_OUT, 6))
+    judged, score = [], profile_robust.score_holdout
+    monkeypatch.setattr(profile_robust, "score_holdout", lambda X, *a: judged.append(X) or score(X, *a))
+    scores = [
+        solve_views(seen, SolveOptions(folds=False)).holdout
+        for seen in (views, nudged(views, last, slips))
+    ]
+    assert scores[0].fitted_views == VIEWS - HELD_OUT
+    assert min(place for pair in scores[0].pairs for place in pair) == last[0]
+    np.testing.assert_allclose(judged[0], judged[1], atol=1e-5)  # a leak moves it by ten times that
+    assert abs(scores[0].e_t_m - scores[1].e_t_m) > 1e-6
+
+
+def test_left_out_views_take_no_part_in_the_fold_that_predicts_them(fit, monkeypatch):
+    found = {}
+
+    def remembered(name):
+        def fold(*given, **options):
+            result = estimate(*given, **options)
+            found.setdefault(name, []).append(result.state.X)
+            return result
+
+        return fold
+
+    spoilt = spoiled(fit, np.array([3]))
+    for name, seen in (("as it is", fit), ("spoilt", spoilt)):
+        monkeypatch.setattr(folds, "estimate", remembered(name))
+        cross_validate(seen, 0)
+    same = [np.array_equal(a, b) for a, b in zip(found["as it is"], found["spoilt"], strict=True)]
+    assert len(same) == folds.FOLDS and sum(same) == 1
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_sound_claims_are_confirmed(mount):
+    for seed in range(5):
+        cell = make_cell(np.random.default_rng(seed), 15, LOW if seed % 2 else MID, mount=mount)
+        solution = solve_views(cell.views, CV)
+        cv = solution.cross_validation
+        assert cv.folds == 5 and len(cv.residual_m) == len(solution.used)
+        assert 0.5 < cv.rms_m / cv.claimed_m < cv.limit
+        assert cv.rms_m == pytest.approx(np.sqrt(np.mean(np.square(list(cv.residual_m.values())))))
+        assert all(g.passed for g in judge(solution, GateInputs()) if g.name == "cross-validation")
+
+
+def test_a_claim_that_is_too_small_closes_the_gate(fit, monkeypatch):
+    """Each fold claims a third of its error: covariance and noise."""
+
+    def boasting(*given, **options):
+        found = estimate(*given, **options)
+        scales = replace(found.scales, robot=found.scales.robot / 3, tau_px=found.scales.tau_px / 3)
+        return replace(found, covariance=found.covariance / 9, scales=scales)
+
+    honest = cross_validate(fit, 0)
+    monkeypatch.setattr(folds, "estimate", boasting)
+    boasted = cross_validate(fit, 0)
+    assert boasted.claimed_m == pytest.approx(honest.claimed_m / 3, rel=0.01)
+    assert honest.rms_m < honest.limit * honest.claimed_m
+    assert boasted.rms_m > boasted.limit * boasted.claimed_m
+    solution = replace(
+        solve_views(fit.views, replace(CV, folds=False)), cross_validation=boasted
+    )
+    assert "cross-validation" in [g.name for g in judge(solution, GateInputs()) if not g.passed]
+
+
+def test_five_views_are_too_few_to_leave_some_out():
+    views = make_cell(np.random.default_rng(0), 6, LOW).views
+    assert solve_views(views.select(list(range(5))), CV).cross_validation is None
+    assert solve_views(views, CV).cross_validation is not None

@@ -1,0 +1,213 @@
+"""A recording that has to be read in another way is recognised, and a sound one is taken as it is."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calibrate.errors import PosesDisagreeError
+from calibrate.gates import GateInputs, judge
+from calibrate.geometry import (
+    inverse,
+    matrix_from_quaternion,
+    perturb,
+    quaternion_from_matrix,
+    rotation_exp,
+    rotation_log,
+)
+from calibrate.handeye.poses import pose_views
+from calibrate.handeye.readings import Reading, explain_recording
+from calibrate.projection import project_pixels
+from calibrate.solve import SolveOptions, solve_views
+from tests.calibrate.cells import HIGH, LOW, MID, changed, make_cell, seen_through, with_flange, with_focal
+
+MOUNTS = pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+HALF = 8
+SLIP = np.array([0.012, -0.008, 0.004, 0.02, 0.01, -0.015])
+
+
+def cell(mount, seed=4, views=16, noise=LOW):
+    return make_cell(np.random.default_rng(seed), views, noise, mount=mount)
+
+
+def rotations(change):
+    def changed_poses(c):
+        flange = c.views.base_from_flange
+        flange[:, :3, :3] = change(flange[:, :3, :3])
+        return with_flange(c.views, flange)
+
+    return changed_poses
+
+
+def mirrored(c):
+    """Each picture left to right; the detector then counts the corners of a row from its other end."""
+    width = c.camera.width
+
+    def flipped(view):
+        return view.pixels * [-1, 1] + [width - 1, 0]
+
+    def counted(view):
+        return view.board_points * [-1, 1, 1] + [view.board_points[:, 0].max(), 0, 0]
+
+    views = changed(c.views, list(range(len(c.views))), pixels=flipped, board_points=counted)
+    return seen_through(views, c.camera)
+
+
+def moved(what):
+    def views_of(c):
+        """Camera or board slips before view `HALF`: the pictures stay, so the poses must be others."""
+        X, Y = (perturb(c.X, SLIP), c.Y) if what == "camera" else (c.X, perturb(c.Y, SLIP))
+        hand = c.views.mount == "eye-in-hand"
+        flange = Y @ inverse(c.C) @ inverse(X) if hand else X @ c.C @ inverse(Y)
+        noise = np.random.default_rng(0).normal(size=(len(flange), 6))
+        noise = noise * np.repeat([LOW.robot_m, LOW.robot_rad], 3)
+        later = (np.arange(len(flange)) >= HALF)[:, None, None]
+        return with_flange(c.views, np.where(later, perturb(flange, noise), c.views.base_from_flange))
+
+    return views_of
+
+
+def refocused(c):
+    lens = with_focal(c.camera, 1.04)
+
+    def pixels(view):
+        C = c.C[view.index]
+        return project_pixels(lens, view.board_points @ C[:3, :3].T + C[:3, 3])
+
+    return seen_through(changed(c.views, list(range(HALF, len(c.views))), pixels=pixels), c.camera)
+
+
+def of_other_size(c):
+    every = list(range(len(c.views)))
+    return seen_through(changed(c.views, every, board_points=lambda v: v.board_points / 1.08), c.camera)
+
+
+def in_millimetres(c):
+    flange = c.views.base_from_flange
+    flange[:, :3, 3] *= 1e3
+    return with_flange(c.views, flange)
+
+
+MISREAD = {
+    Reading.INVERSE_POSES: lambda c: with_flange(c.views, inverse(c.views.base_from_flange)),
+    Reading.QUATERNION_ORDER: rotations(
+        lambda R: matrix_from_quaternion(np.roll(quaternion_from_matrix(R), 1, axis=-1))
+    ),
+    Reading.ROTATION_VECTOR_AS_ANGLES: rotations(
+        lambda R: Rotation.from_euler("xyz", rotation_log(R)).as_matrix()
+    ),
+    Reading.ANGLES_AS_ROTATION_VECTOR: rotations(
+        lambda R: rotation_exp(Rotation.from_matrix(R).as_euler("xyz"))
+    ),
+    Reading.INVERSE_ROTATIONS: rotations(lambda R: R.transpose(0, 2, 1)),
+    Reading.SHIFTED: lambda c: with_flange(c.views, np.roll(c.views.base_from_flange, 1, axis=0)),
+    Reading.MIRRORED: mirrored,
+    Reading.MILLIMETRES: in_millimetres,
+    Reading.SQUARE_SIZE: of_other_size,
+    Reading.FOCAL_LENGTH: lambda c: seen_through(c.views, with_focal(c.camera, 1.05)),
+    Reading.BOARD_MOVED: moved("board"),
+    Reading.CAMERA_MOVED: moved("camera"),
+    Reading.REFOCUSED: refocused,
+}
+
+
+NUMBERS = {
+    # reading: (at, factor), where there is one
+    Reading.SHIFTED: (1, 1.0),
+    Reading.SQUARE_SIZE: (0, 1.08),
+    Reading.MILLIMETRES: (0, 1000.0),
+    Reading.FOCAL_LENGTH: (0, 1 / 1.05),
+    Reading.BOARD_MOVED: (HALF, 1.0),
+    Reading.CAMERA_MOVED: (HALF, 1.0),
+    Reading.REFOCUSED: (HALF, 1.04),
+}
+
+
+def explained(views):
+    return explain_recording(pose_views(views, 0.002, 0.003))
+
+
+@MOUNTS
+@pytest.mark.parametrize("reading", [reading for reading in Reading if reading is not Reading.AS_RECORDED])
+def test_every_misread_recording_is_recognised_with_its_numbers(reading, mount):
+    found = explained(MISREAD[reading](cell(mount)))
+    at, factor = NUMBERS.get(reading, (0, 1.0))
+    assert (found.reading, found.at) == (reading, at)
+    assert found.factor == pytest.approx(factor, rel=0.01)
+    assert found.log_evidence_gain > 10
+    assert found.share > 0.6
+
+
+@pytest.mark.parametrize(
+    ("reading", "mount"),
+    [
+        (Reading.INVERSE_POSES, "eye-in-hand"),
+        (Reading.SHIFTED, "eye-to-hand"),
+        (Reading.MIRRORED, "eye-in-hand"),
+        (Reading.SQUARE_SIZE, "eye-to-hand"),
+        (Reading.FOCAL_LENGTH, "eye-in-hand"),
+        (Reading.BOARD_MOVED, "eye-to-hand"),
+        (Reading.CAMERA_MOVED, "eye-in-hand"),
+    ],
+)
+def test_a_misread_recording_is_refused_or_closes_the_session_gate(reading, mount):
+    views = MISREAD[reading](cell(mount))
+    try:
+        solution = solve_views(views, SolveOptions(holdout=False))
+    except PosesDisagreeError as problem:
+        assert problem.hypothesis == reading.value
+        return
+    assert solution.session.reading is reading
+    assert reading.value in {remark.code for remark in solution.warnings}
+    assert "session" in [gate.name for gate in judge(solution, GateInputs()) if not gate.passed]
+
+
+def test_a_board_given_in_millimetres_is_told_from_robot_poses_that_are():
+    """One factor for the board: a thousand where the robot's numbers are too large, a thousandth here."""
+    c = cell("eye-in-hand")
+    views = changed(c.views, list(range(len(c.views))), board_points=lambda v: v.board_points * 1e3)
+    found = explained(seen_through(views, c.camera))
+    assert found.reading is Reading.MILLIMETRES
+    assert found.factor == pytest.approx(1e-3, rel=0.1)
+
+
+@MOUNTS
+def test_a_sound_recording_is_what_it_says(mount):
+    for seed, noise in enumerate((LOW, MID, HIGH)):
+        found = explained(cell(mount, seed, 12 + 4 * seed, noise).views)
+        assert (found.reading, found.at, found.factor) == (Reading.AS_RECORDED, 0, 1.0)
+        assert found.share > 0.7
+
+
+def test_two_bad_views_hide_no_convention():
+    views = MISREAD[Reading.QUATERNION_ORDER](cell("eye-in-hand"))
+    flange = views.base_from_flange
+    flange[[0, 1, 5]] = flange[[5, 2, 0]]
+    found = explained(with_flange(views, flange))
+    assert found.reading is Reading.QUATERNION_ORDER
+    assert 0.7 < found.share < 1.0
+
+
+@pytest.mark.parametrize("shift", [-3, -1, 2])
+def test_pictures_may_belong_to_any_neighbour(shift):
+    c = cell("eye-in-hand", views=20)
+    views = with_flange(c.views, np.roll(c.views.base_from_flange, shift, axis=0))
+    found = explained(views)
+    assert (found.reading, found.at) == (Reading.SHIFTED, shift)
+
+
+@MOUNTS
+def test_the_other_mount_is_the_inverse_poses(mount):
+    """Who takes one mounting for the other has in effect inverted every pose."""
+    c = cell(mount)
+    other = "eye-to-hand" if mount == "eye-in-hand" else "eye-in-hand"
+    found = explained(replace(c.views, mount=other))
+    assert found.reading is Reading.INVERSE_POSES
+
+
+def test_poses_of_another_recording_are_refused_without_a_reading():
+    poses = cell("eye-in-hand", 1).views.base_from_flange
+    with pytest.raises(PosesDisagreeError) as refused:
+        solve_views(with_flange(cell("eye-in-hand").views, poses))
+    assert refused.value.hypothesis == Reading.AS_RECORDED.value

@@ -23,7 +23,7 @@ from recordings.messages import Mount, SessionInfo, Vector6
 from recordings.reader import open_recording
 from station.attend import wait_until_idle
 from station.cli_session import Headless, attended_session, load_into
-from station.client import Client, default_socket
+from station.client import Client
 from station.config import PoseGuess, StationConfig
 from station.config_file import load_config
 from station.console import Socket, err, out
@@ -31,6 +31,7 @@ from station.errors import ConfigError, LimitError, StationError
 from station.plan.belief import Glimpse, believe, improved_config
 from station.plan.bootstrap import MOVES_MAX, MOVES_MIN, next_move
 from station.plan.model import Plan, PlannedPose
+from station.socket_folder import default_socket
 
 _STRAYED_RAD = 0.01
 """Somebody moved the arm: the next move was checked from elsewhere."""

@@ -14,11 +14,13 @@ import typer
 from rich.text import Text
 
 from recordings.terminal import examples
-from station.client import Client, ask, default_socket
+from station.client import Client, ask
 from station.console import AsJson, Socket, out
 from station.errors import StationError
 from station.protocol import Verb
+from station.socket_folder import default_socket
 from station.status import StationState, StationStatus
+from station.stop_client import stop_and_tell
 
 app = typer.Typer()
 
@@ -89,9 +91,10 @@ def stop_command(socket: Socket = None) -> None:
     """STOP the arm now. The pendant's emergency stop is the safety device.
 
     Anyone may, at any time. Latched: next look at the cell, then `station acknowledge`.
+
+    Exit codes: 0 the station confirmed it and the arm rests; 1 not confirmed: press the emergency stop.
     """
-    ask(socket or default_socket(), "stop")
-    out.print("stopped; latched until acknowledged: look at the cell, then `station acknowledge`")
+    raise typer.Exit(stop_and_tell(socket or default_socket()))
 
 
 @app.command("acknowledge", epilog=examples("station acknowledge"))

@@ -19,11 +19,12 @@ import typer
 
 from recordings.messages import Mount
 from station.cell import Cell
-from station.client import DaemonGoneError, ask, default_socket
+from station.client import DaemonGoneError, ask
 from station.errors import ConfigError, StationError
 from station.priority import DAEMON_NICENESS, go_before_others
 from station.session.folder import default_root
 from station.simulation.cell import NoiseLevel, SceneName
+from station.socket_folder import default_socket
 
 START_WAIT_S = 30.0
 _RANGES = {"scene": SceneName, "noise": NoiseLevel, "mount": Mount}

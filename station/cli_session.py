@@ -22,7 +22,7 @@ from rich.text import Text
 
 from station.attend import Confirm, Outcome, carry_out, wait_until_idle
 from station.cli_serve import require_choices
-from station.client import Client, default_socket
+from station.client import Client
 from station.console import AsJson, Socket, err, out
 from station.demo import DemoOptions, run_demo
 from station.drift_check import PLAN_ANSWER_S, POSES, SEED, check_arguments, never_run, require_installed
@@ -33,6 +33,7 @@ from station.plan.sweep import sweep_plan
 from station.progress import SessionProgress
 from station.session.folder import default_root
 from station.simulation.netns import is_isolated, isolated_command
+from station.socket_folder import default_socket
 from station.status import GoSummary, StationStatus
 
 Headless = Annotated[bool, typer.Option("--headless", help="Nobody is asked; no progress bar.")]

@@ -20,10 +20,11 @@ from calibrate.install import load_installed
 from calibrate.verification import note_in_file, note_installed, touch_text
 from station.attend import stop_and_say, wait_until_idle, watch_until_rest
 from station.cli_session import ask_person, ctrl_c_at_once
-from station.client import Client, default_socket
+from station.client import Client
 from station.console import AsJson, Socket, err, out
 from station.errors import RefusedError, StationError
 from station.plan.hover import outer_corners
+from station.socket_folder import default_socket
 from station.status import HoverOffer, StationState, StationStatus
 from station.touching import (
     Hovering,

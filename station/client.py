@@ -15,6 +15,7 @@ import msgspec
 from station.errors import RefusedError, StationError
 from station.protocol import LINE_LIMIT_BYTES, PIECE_BYTES, REQUEST_LIMIT_BYTES, Reply, Request, Verb
 from station.status import StationStatus
+from station.stop_client import send_stop
 
 CONNECT_S = 5.0
 ANSWER_S = 30.0
@@ -106,6 +107,8 @@ class Client:
 
     async def request(self, verb: Verb, *, timeout_s: float = ANSWER_S, **args: Any) -> Any:
         """The daemon's result as plain data. RefusedError with its reason; DaemonGoneError; NoAnswerError."""
+        if verb == "stop":
+            send_stop(self._path)  # the way that nobody can hold up; the request brings the answer
         if self._gone:
             raise DaemonGoneError(f"The station daemon at {self._path} is gone; nothing was sent to the arm.")
         request = Request(self._next_id, verb, args)
@@ -207,17 +210,6 @@ class Client:
             f"The station daemon at {self._path} is gone and did not answer: whether it heard this is not "
             "known. Look at the cell."
         )
-
-
-def default_socket() -> Path:
-    """Where systemd puts it, when it is there; else the user's own runtime folder."""
-    if runtime := os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]:
-        return Path(runtime) / "control.sock"
-    system = Path("/run/station/control.sock")
-    if system.exists():
-        return system
-    own = os.environ.get("XDG_RUNTIME_DIR") or f"/tmp/station-{os.getuid()}"
-    return Path(own) / "station-control.sock"
 
 
 def ask(path: Path, verb: Verb, **args: Any) -> Any:

@@ -12,6 +12,7 @@ import logging
 import os
 import socket
 import struct
+from collections import defaultdict, deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,15 +22,27 @@ import msgspec
 
 from recordings.errors import RecordingError
 from station.errors import StationError
-from station.protocol import CLIENT_LIMIT, LINE_LIMIT_BYTES, REQUEST_LIMIT_BYTES, Notice, Reply, Request
+from station.protocol import (
+    CLIENT_LIMIT,
+    LINE_LIMIT_BYTES,
+    REQUEST_LIMIT_BYTES,
+    USER_CLIENT_LIMIT,
+    Notice,
+    Reply,
+    Request,
+)
+from station.socket_folder import make_folder
 from station.status import StationStatus, changed_sections
 
 log = logging.getLogger(__name__)
 UNSENT_LIMIT_BYTES = 4 * 1024 * 1024
 OPEN_REQUESTS_LIMIT = 8
 HANG_UP_S = 1.0
-STANDING_LIMIT = 48
-STANDING_S = 2.0
+ACCEPT_BATCH = 32
+ACCEPT_PAUSE_S = 0.01
+"""Between batches: a flood of connections costs the working loop no more than that."""
+NEW_PER_S = 200
+"""Connections that one user may open within a second."""
 
 
 @dataclass(frozen=True)
@@ -65,25 +78,33 @@ class ControlServer:
         self._path, self._handler = path, handler
         self._status = StationStatus()
         self._newest = newest or (lambda: self._status)
-        self._server: asyncio.Server | None = None
+        self._listening: socket.socket | None = None
         self._connections: set[_Connection] = set()
+        self._serving: dict[asyncio.Task[None], int] = {}
+        """Connections, and whose they are."""
         self._next_client_id = 1
-        self._standing = 0
-        """Clients beyond the limit that are listened to for a moment."""
+        self._opened: dict[int, deque[float]] = defaultdict(lambda: deque(maxlen=NEW_PER_S))
+        """When each user's newest connections were opened."""
 
     async def start(self) -> None:
-        """Binds with mode 0660. StationError when another daemon serves here; a stale socket is replaced."""
-        self._path.parent.mkdir(parents=True, exist_ok=True)
+        """Binds with mode 0660; a stale socket is replaced.
+
+        StationError when another daemon serves here, or when others could put a socket in its place.
+        """
+        make_folder(self._path.parent)
         _remove_stale(self._path)
+        listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
         old = os.umask(0o117)
         try:
-            self._server = await asyncio.start_unix_server(
-                self._serve, str(self._path), limit=LINE_LIMIT_BYTES
-            )
+            listening.bind(str(self._path))
+            listening.listen(ACCEPT_BATCH)
         except OSError as error:
+            listening.close()
             raise StationError(f"{self._path}: the control socket cannot be made ({error}).") from None
         finally:
             os.umask(old)
+        self._listening = listening
+        self._listen()
 
     def publish(self, status: StationStatus) -> None:
         changes = changed_sections(self._status, status)
@@ -95,39 +116,68 @@ class ControlServer:
                     connection.send(line)
 
     async def close(self) -> None:
-        if self._server is not None:
-            self._server.close()
+        if self._listening is not None:
+            asyncio.get_running_loop().remove_reader(self._listening)
+            self._listening.close()
+            self._listening = None
         for connection in list(self._connections):
             connection.drop("the daemon ends")
-        await asyncio.gather(*(c.ended.wait() for c in list(self._connections)))
+        await asyncio.gather(*self._serving, return_exceptions=True)
         self._path.unlink(missing_ok=True)
 
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        peer = _peer_of(writer, self._next_client_id)
-        self._next_client_id += 1
+    def _listen(self) -> None:
+        if self._listening is not None:
+            asyncio.get_running_loop().add_reader(self._listening, self._accept)
+
+    def _accept(self) -> None:
+        assert self._listening is not None
+        loop = asyncio.get_running_loop()
+        for _ in range(ACCEPT_BATCH):
+            try:
+                link, _ = self._listening.accept()
+            except BlockingIOError:
+                return
+            except OSError as error:  # no descriptors left, for one
+                log.warning("a client could not be let in: %s", error)
+                break
+            link.setblocking(False)
+            peer = _peer_of(link, self._next_client_id)
+            if why := self._full_for(peer.uid):
+                with link, contextlib.suppress(OSError):
+                    link.send(msgspec.json.encode(Reply(0, False, error=why)) + b"\n")
+                continue
+            self._next_client_id += 1
+            self._opened[peer.uid].append(loop.time())
+            serving = loop.create_task(self._serve(link, peer))
+            self._serving[serving] = peer.uid
+            serving.add_done_callback(self._serving.pop)
+        loop.remove_reader(self._listening)
+        loop.call_later(ACCEPT_PAUSE_S, self._listen)
+
+    def _full_for(self, uid: int) -> str:
+        """Why this user is not let in now; empty: there is room."""
+        if len(self._serving) >= CLIENT_LIMIT:
+            return f"{CLIENT_LIMIT} clients are connected already: close one (`station stop` needs none)."
+        if list(self._serving.values()).count(uid) >= USER_CLIENT_LIMIT:
+            return f"{USER_CLIENT_LIMIT} clients of this user are connected already: close one."
+        newest = self._opened[uid]
+        if len(newest) == NEW_PER_S and asyncio.get_running_loop().time() - newest[0] < 1.0:
+            return f"this user opened {NEW_PER_S} connections within a second: wait a moment."
+        return ""
+
+    async def _serve(self, link: socket.socket, peer: Peer) -> None:
+        loop = asyncio.get_running_loop()
+        reader = asyncio.StreamReader(limit=LINE_LIMIT_BYTES)
+        protocol = asyncio.StreamReaderProtocol(reader)
+        transport, _ = await loop.connect_accepted_socket(lambda: protocol, link)
+        writer = asyncio.StreamWriter(transport, protocol, reader, loop)
         connection = _Connection(peer, reader, writer, self._handler, self._full_status)
-        if len(self._connections) >= CLIENT_LIMIT:
-            await self._turn_away(connection)
-            return
         self._connections.add(connection)
         try:
             await connection.run()
         finally:
             self._connections.discard(connection)
             self._handler.gone(peer)
-            connection.ended.set()
-
-    async def _turn_away(self, connection: _Connection) -> None:
-        """The house is full; STOP still gets in, if it comes at once."""
-        text = f"{CLIENT_LIMIT} clients are connected already: close one."
-        connection.reply(Reply(0, False, error=text))
-        if self._standing < STANDING_LIMIT:
-            self._standing += 1
-            try:
-                await connection.run_stop_only()
-            finally:
-                self._standing -= 1
-        connection.hang_up()
 
     def _full_status(self) -> bytes:
         # Published first, so that the next changes start from exactly what this watcher was told.
@@ -149,7 +199,6 @@ class _Connection:
     ) -> None:
         self.peer = peer
         self.watching = False
-        self.ended = asyncio.Event()
         self._reader, self._writer, self._handler = reader, writer, handler
         self._full_status = full_status
         self._tasks: set[asyncio.Task[None]] = set()
@@ -173,16 +222,6 @@ class _Connection:
             for task in self._tasks:
                 task.cancel()
             self.hang_up()
-
-    async def run_stop_only(self) -> None:
-        """One line, within a short time, and only STOP."""
-        try:
-            async with asyncio.timeout(STANDING_S):
-                request = msgspec.json.decode(await self._reader.readline(), type=Request)
-        except (TimeoutError, OSError, ValueError, msgspec.DecodeError):
-            return
-        if request.verb == "stop":
-            await self._answer_stop(request.id, self._handler.stop_now(self.peer))
 
     def _take(self, request: Request) -> None:
         if request.verb == "stop":
@@ -261,10 +300,10 @@ class _Connection:
         asyncio.get_running_loop().call_later(HANG_UP_S, self._writer.transport.abort)
 
 
-def _peer_of(writer: asyncio.StreamWriter, client_id: int) -> Peer:
-    raw = writer.get_extra_info("socket").getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
+def _peer_of(link: socket.socket, client_id: int) -> Peer:
+    raw = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
     pid, uid, gid = struct.unpack("3i", raw)
-    log.info("client %d: pid %d, uid %d, gid %d", client_id, pid, uid, gid)
+    log.debug("client %d: pid %d, uid %d, gid %d", client_id, pid, uid, gid)
     return Peer(client_id, pid, uid, gid)
 
 

@@ -14,9 +14,11 @@ from pathlib import Path
 from station.cell import Cell
 from station.control import ControlServer
 from station.dispatch import SessionDispatcher
+from station.errors import RobotError
 from station.notify import notify, watchdog_period_s
 from station.session.session import Session
 from station.status import StationState
+from station.stop_server import StopServer
 
 log = logging.getLogger(__name__)
 
@@ -50,10 +52,10 @@ class Watchdog:
 class Daemon:
     def __init__(self, cell: Cell, root: Path, socket: Path) -> None:
         self._watchdog = Watchdog(self._healthy)
-        self.session = Session(cell, root, ticked=self._watchdog.tick)
-        self._control = ControlServer(
-            socket, SessionDispatcher(self.session), newest=lambda: self.session.store.status
-        )
+        self.session = Session(cell, root, ticked=self._watchdog.tick, first=lambda: self._stop.round())
+        dispatcher = SessionDispatcher(self.session)
+        self._control = ControlServer(socket, dispatcher, newest=lambda: self.session.store.status)
+        self._stop = StopServer(socket, dispatcher.stop_from, self._latched, self._speed_rad_s)
         self._changed = asyncio.Event()
         self._ending = asyncio.Event()
         self._served_s = time.monotonic()
@@ -66,6 +68,7 @@ class Daemon:
             loop.add_signal_handler(number, self.end)
         await self._control.start()
         try:
+            self._stop.start()
             await self.session.start()
             self.session.store.watch(self._changed.set)
             freeze_startup()
@@ -79,10 +82,20 @@ class Daemon:
             await self.session.close()
             notify("STOPPING=1")
             await self._control.close()
+            self._stop.close()
             log.info("ended")
 
     def end(self) -> None:
         self._ending.set()
+
+    def _latched(self) -> bool:
+        return self.session.store.state is StationState.STOPPED
+
+    def _speed_rad_s(self) -> float | None:
+        try:
+            return max(map(abs, self.session.bench.cell.robot.latest().joint_speeds_rad_s))
+        except RobotError:
+            return None
 
     async def _tell(self) -> None:
         """Watchers are told of changes, gathered for a moment; the same loop serves their requests."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import pwd
 from collections.abc import Awaitable, Callable, Coroutine
 from typing import Any, cast
 
@@ -19,6 +18,8 @@ from station.session.folder import list_sessions
 from station.session.hovering import HoverRequest
 from station.session.recording import software
 from station.session.session import Session
+from station.socket_folder import user_name
+from station.stop_server import Sender
 
 
 class _Args(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -84,27 +85,17 @@ class _Caller:
     """A connection and what it said about itself."""
 
     def __init__(self, peer: Peer) -> None:
-        self.client_id = peer.client_id
+        self.client_id, self.pid, self.uid = peer.client_id, peer.pid, peer.uid
         self.who = f"uid {peer.uid} (pid {peer.pid})"
         self.interactive = False
         """A person answers at the other end."""
-        self._peer = peer
 
-    async def introduce(self, who: str, interactive: bool) -> None:
+    def introduce(self, user: str, who: str, interactive: bool) -> None:
         """The user's name is the kernel's word; the place is the client's."""
-        # In a thread: where users come from the network, a name may take seconds.
-        user = await asyncio.to_thread(_user, self._peer.uid)
         said = "".join(c for c in who if c.isprintable())[:_WHO_LIMIT] or user
         told = said if said.split(" ")[0] == user else f"{user} ({said})"
-        self.who = f"{told} (pid {self._peer.pid})"
+        self.who = f"{told} (pid {self.pid})"
         self.interactive = interactive
-
-
-def _user(uid: int) -> str:
-    try:
-        return pwd.getpwuid(uid).pw_name
-    except KeyError:
-        return f"uid {uid}"
 
 
 class SessionDispatcher:
@@ -114,6 +105,8 @@ class SessionDispatcher:
         self._session = session
         self._callers: dict[int, _Caller] = {}
         self._leaving: set[asyncio.Task[None]] = set()
+        self._names: dict[int, str] = {}
+        """Users by their number, once they were looked up."""
         self._table: dict[Verb, tuple[type[msgspec.Struct], Callable[[_Caller, Any], Awaitable[Any]]]] = {
             "hello": (_Hello, self._hello),
             "lease": (_Lease, self._lease),
@@ -142,6 +135,20 @@ class SessionDispatcher:
         """STOP is on its way to the arm before anything else is looked at."""
         caller = self._callers.get(peer.client_id) or _Caller(peer)  # the house may be full: nobody is kept
         return self._to_the_end(self._session.stop(caller.who))
+
+    def stop_from(self, sender: Sender) -> None:
+        """STOP without a connection; who has one as well is known by what was said there."""
+        known = (c for c in self._callers.values() if (c.pid, c.uid) == (sender.pid, sender.uid))
+        caller = next(known, None)
+        user = self._names.get(sender.uid, f"uid {sender.uid}")
+        who = caller.who if caller else f"{user} (pid {sender.pid})"
+        self._to_the_end(self._session.stop(who))
+        if sender.uid not in self._names:
+            self._to_the_end(self._learn_name(sender.uid))
+
+    async def _learn_name(self, uid: int) -> None:
+        # In a thread: where users come from the network, a name may take seconds.
+        self._names[uid] = await asyncio.to_thread(user_name, uid)
 
     def gone(self, peer: Peer) -> None:
         """The arm decelerates at once when this was the commander."""
@@ -173,7 +180,9 @@ class SessionDispatcher:
         return self._callers[peer.client_id]
 
     async def _hello(self, caller: _Caller, args: _Hello) -> Any:
-        await caller.introduce(args.who, args.interactive)
+        if caller.uid not in self._names:
+            await self._learn_name(caller.uid)
+        caller.introduce(self._names[caller.uid], args.who, args.interactive)
         root = str(self._session.bench.root)
         return {"version": software()["calibration-station"], "pid": os.getpid(), "root": root}
 

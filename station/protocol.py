@@ -4,7 +4,8 @@ client → daemon   {"id": 1, "verb": "go", "args": {…}}
 daemon → client   {"id": 1, "ok": true, "result": {…}}      or   {"id": 1, "ok": false, "error": "…"}
                   {"status": {…}}      full, right after `watch`
                   {"changes": {…}}     changed top-level sections of the status
-`stop` needs no lease and is handled before anything that is queued, pieces of a long request included.
+`stop` needs no lease and is handled before anything that is queued, pieces of a long request included. It has
+a socket of its own as well, which needs no connection: `station.stop_server`.
 """
 
 from __future__ import annotations
@@ -17,7 +18,9 @@ LINE_LIMIT_BYTES = 64 * 1024
 REQUEST_LIMIT_BYTES = 2 * 1024 * 1024
 """Of a request in pieces: a plan of some thousand poses. A connection costs the daemon no more than that."""
 PIECE_BYTES = 32 * 1024
-CLIENT_LIMIT = 16
+CLIENT_LIMIT = 64
+USER_CLIENT_LIMIT = 16
+"""One user cannot take the others' places."""
 
 Verb = Literal[
     "hello",  # {who} → {version, pid}

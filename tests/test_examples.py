@@ -10,13 +10,13 @@ import pytest
 import typer
 
 import recordings.cli
-import station.cli
+import station.command_line
 from calibrate.commands.app import app as calibrate_app
 
 PROGRAMS = {
     "calibrate": typer.main.get_command(calibrate_app),
     "recordings": typer.main.get_command(recordings.cli.app),
-    "station": typer.main.get_command(station.cli.command_line([])),
+    "station": typer.main.get_command(station.command_line.command_line([])),
 }
 HANDED_ON = ("station", "board")
 """Its help is that of `calibrate board`."""

@@ -40,12 +40,13 @@ class Guard:
         jogged: Callable[[str], None],
         ticked: Callable[[], None],
         lost: Callable[[], None],
+        first: Callable[[], None] = lambda: None,
     ) -> None:
         """`jogged`: the resting arm was moved by somebody, in words. `ticked`: after every round. `lost`: the
-        resting robot was silent for too long."""
+        resting robot was silent for too long. `first`: before anything else in every round."""
         self._bench = bench
         self._monitor = Monitor(bench)
-        self._jogged, self._ticked, self._lost = jogged, ticked, lost
+        self._jogged, self._ticked, self._lost, self._first = jogged, ticked, lost, first
         self._failure = ""
         self._rest_joints: Vector6 | None = None
         self._stale_rounds = 0
@@ -64,6 +65,7 @@ class Guard:
             await asyncio.sleep(max(0.0, due_s - time.monotonic()))
 
     def _round(self, number: int) -> None:
+        self._first()
         if self._bench.store.state in RUNNING:
             self._bench.cell.robot.heartbeat()
         if number % STATUS_TICKS == 0:

@@ -49,7 +49,14 @@ PLAN_TIMEOUT_S = 180.0
 class Session:
     """Knows devices through `cell`, and nothing of sockets and screens."""
 
-    def __init__(self, cell: Cell, root: Path, ticked: Callable[[], None] = lambda: None) -> None:
+    def __init__(
+        self,
+        cell: Cell,
+        root: Path,
+        ticked: Callable[[], None] = lambda: None,
+        first: Callable[[], None] = lambda: None,
+    ) -> None:
+        """`first`, `ticked`: before and after everything else in each round of the working loop."""
         config, playback = cell.config, cell.source == "playback"
         geometry = cell_geometry(config)
         self.store = StatusStore(
@@ -59,7 +66,7 @@ class Session:
         self.bench = Bench(cell, geometry, self.store, Workers(), monitor, root)
         self.leases = LeaseDesk()
         self._goes = GoDesk(time.monotonic)
-        self.guard = Guard(self.bench, self._jogged, ticked, self._void_go)
+        self.guard = Guard(self.bench, self._jogged, ticked, self._void_go, first)
         self._keeper = Keeper(self.bench)
         self._improver = ImproveDesk(self.bench)
         self._estimator = Estimator(self.bench, self._improver.hint)

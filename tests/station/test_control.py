@@ -19,7 +19,7 @@ import pytest
 from station.client import Client, DaemonGoneError
 from station.control import OPEN_REQUESTS_LIMIT, ControlServer, Peer
 from station.errors import RefusedError, StationError
-from station.protocol import CLIENT_LIMIT, LINE_LIMIT_BYTES, PIECE_BYTES, REQUEST_LIMIT_BYTES, Reply
+from station.protocol import LINE_LIMIT_BYTES, PIECE_BYTES, REQUEST_LIMIT_BYTES, USER_CLIENT_LIMIT, Reply
 from station.status import StationState, StationStatus
 
 
@@ -230,7 +230,7 @@ async def test_a_client_that_does_not_read_is_dropped(server: Served, handler: R
 
 async def test_more_clients_than_seats_are_told(server: Served) -> None:
     _, path = server
-    clients = [await Client.connect(path) for _ in range(CLIENT_LIMIT)]
+    clients = [await Client.connect(path) for _ in range(USER_CLIENT_LIMIT)]
     answers = await raw(path)
     assert "connected already" in answers[0]["error"]
     for client in clients:
@@ -279,18 +279,6 @@ async def test_a_dying_daemon_ends_requests_and_statuses(server: Served) -> None
     async with asyncio.timeout(2):
         assert len([s async for s in statuses]) <= 1
     await client.close()
-
-
-async def test_stop_gets_in_when_the_house_is_full(server: Served, handler: RecordingHandler) -> None:
-    _, path = server
-    clients = [await Client.connect(path) for _ in range(CLIENT_LIMIT)]
-    answers = await raw(path, b'{"id": 7, "verb": "stop"}\n')
-    assert answers[-1] == {"id": 7, "ok": True, "result": {}}
-    assert handler.order[-1] == "stop"
-    await raw(path, b'{"id": 8, "verb": "go"}\n')
-    assert "go" not in handler.order
-    for client in clients:
-        await client.close()
 
 
 @pytest.mark.skipif(os.getuid() != 0, reason="only root can become somebody else")

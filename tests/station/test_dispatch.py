@@ -178,7 +178,7 @@ async def test_neither_a_long_list_of_sessions_nor_a_slow_name_holds_the_loop_up
         return []
 
     monkeypatch.setattr(dispatch, "list_sessions", slow)
-    monkeypatch.setattr(dispatch, "_user", lambda uid: str(slow(uid)))
+    monkeypatch.setattr(dispatch, "user_name", lambda uid: str(slow(uid)))
     async with await served.client() as anna:
         assert await anna.request("sessions") == []
         await anna.request("stop")

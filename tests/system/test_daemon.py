@@ -17,7 +17,8 @@ from recordings.reader import open_recording
 from station.client import Client, DaemonGoneError
 from station.plan.model import Plan
 from station.status import StationState as S
-from tests.system.conftest import DaemonProcess, SystemRig, go, status_when
+from station.stop_client import Outcome, stop
+from tests.system.conftest import SystemRig, go, status_when
 
 pytestmark = pytest.mark.process
 
@@ -164,24 +165,10 @@ async def test_a_crowd_does_not_keep_stop_out(rig: SystemRig, short_plan: Plan) 
                 link.connect(str(daemon.socket))
             crowd.append(link)
         await rig.moving()
-        await asyncio.sleep(2.2)  # those that stand beyond the seats are sent away after this
-        await rig.moving()
-        await asyncio.to_thread(_press_stop, daemon)
+        assert (await asyncio.to_thread(stop, daemon.socket))[0] is Outcome.RESTS
         assert await rig.at_rest() < 1.0
         for link in crowd:
             link.close()
-
-
-def _press_stop(daemon: DaemonProcess) -> None:
-    with socket.socket(socket.AF_UNIX) as link:
-        link.settimeout(5.0)
-        link.connect(str(daemon.socket))
-        link.sendall(b'{"id": 1, "verb": "stop"}\n')
-        said = b""
-        while b'"id":1' not in said.replace(b" ", b""):
-            piece = link.recv(4096)
-            assert piece, said
-            said += piece
 
 
 async def test_a_stale_socket_of_a_crash_is_no_obstacle(rig: SystemRig) -> None:

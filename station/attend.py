@@ -64,9 +64,17 @@ async def wait_until_idle(client: Client) -> StationStatus:
 
 
 async def carry_out(
-    client: Client, purpose: str, *, confirm: Confirm, watch: Watcher, finish_with_loss: bool = False
+    client: Client,
+    purpose: str,
+    *,
+    confirm: Confirm,
+    watch: Watcher,
+    finish_with_loss: bool = False,
+    headless: bool = False,
 ) -> Outcome:
     """Prepares, lets `confirm` decide, goes, and watches. `finish_with_loss`: seal although poses failed.
+
+    `headless`: nobody will be asked on the way; poses that do not come to rest are tried once more.
 
     RefusedError when the daemon or the person says no. Being cancelled (Ctrl-C) sends STOP and says so.
     """
@@ -76,7 +84,7 @@ async def carry_out(
         raise RefusedError("nothing moved: the go was not given")
     await asyncio.sleep(0)  # Ctrl-C at the question strikes here, before the go is sent
     try:
-        await client.request("go", token=summary.token, plan_sha256=summary.plan_sha256)
+        await client.request("go", token=summary.token, plan_sha256=summary.plan_sha256, headless=headless)
         client.outdate()  # it would show the session before, sealed and at rest
         status = await watch_until_rest(client, watch)
         if status.state is StationState.PAUSED and finish_with_loss and status.session.captured:

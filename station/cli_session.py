@@ -37,7 +37,8 @@ from station.socket_folder import default_socket
 from station.status import GoSummary, StationStatus
 
 Headless = Annotated[bool, typer.Option("--headless", help="Nobody is asked; no progress bar.")]
-GoHash = Annotated[str, typer.Option("--go", help="Hash of the plan that a person approved.")]
+Approve = Annotated[str, typer.Option("--approve", help="Hash of the plan that a person approved.")]
+OldApprove = Annotated[str, typer.Option("--go", hidden=True)]
 
 
 def demo_command(
@@ -102,14 +103,16 @@ def capture_command(
         bool, typer.Option("--sweep", help="Swing slowly about where the arm stands, camera running.")
     ] = False,
     headless: Headless = False,
-    go: GoHash = "",
+    approve: Approve = "",
+    go: OldApprove = "",
     socket: Socket = None,
     as_json: AsJson = False,
 ) -> None:
     """One session: load the plan, check it, ask, go, watch, seal. Ctrl-C is STOP.
 
-    `station plan` makes the plan. Next: `calibrate solve RECORDING`. Nobody there: `--headless --go HASH`,
-    with the hash (12 digits and more) that `station plan --json` prints.
+    `station plan` makes the plan. Next: `calibrate solve RECORDING`. Nobody there:
+    `--headless --approve HASH`, with the hash (12 digits and more) that `station plan --json` prints, as a
+    user that the configuration names in approval.services.
 
     With --sweep no poses are taken: the arm swings slowly where it stands, with the board in view, and
     `calibrate sweep RECORDING` tells the time between camera and robot.
@@ -122,14 +125,18 @@ def capture_command(
         before = load_sweep
     else:
         before = partial(load_into, plan=load_plan(plan))
-    outcome = asyncio.run(attended_session(socket, "run", headless, go, as_json, before))
+    outcome = asyncio.run(attended_session(socket, "run", headless, approve or go, as_json, before))
     if sweep and outcome.recording and not as_json:
         out.print(f"next: calibrate sweep {outcome.recording}")
     _finish(outcome, as_json)
 
 
 def resume_command(
-    headless: Headless = False, go: GoHash = "", socket: Socket = None, as_json: AsJson = False
+    headless: Headless = False,
+    approve: Approve = "",
+    go: OldApprove = "",
+    socket: Socket = None,
+    as_json: AsJson = False,
 ) -> None:
     """Go on with a paused or interrupted session, from where the arm is. Ctrl-C is STOP.
 
@@ -137,7 +144,7 @@ def resume_command(
 
     Exit codes: as of `station capture`.
     """
-    _finish(asyncio.run(attended_session(socket, "resume", headless, go, as_json, None)), as_json)
+    _finish(asyncio.run(attended_session(socket, "resume", headless, approve or go, as_json, None)), as_json)
 
 
 def improve_command(headless: Headless = False, socket: Socket = None, as_json: AsJson = False) -> None:
@@ -166,7 +173,8 @@ def best_command(headless: Headless = False, socket: Socket = None) -> None:
 def check_command(
     poses: Annotated[int, typer.Option(min=4, max=50, help="How many to take")] = POSES,
     headless: Headless = False,
-    go: GoHash = "",
+    approve: Approve = "",
+    go: OldApprove = "",
     socket: Socket = None,
 ) -> None:
     """Does the installed calibration still hold? A few poses, then `calibrate check` on them.
@@ -177,7 +185,9 @@ def check_command(
     Exit codes: 0 it holds, 4 it does not, 1 no recording or nothing installed, 2 usage.
     """
     asyncio.run(_require_installed(socket or default_socket()))  # or the arm would move for nothing
-    outcome = asyncio.run(attended_session(socket, "check", headless, go, False, lambda c: _make(c, poses)))
+    outcome = asyncio.run(
+        attended_session(socket, "check", headless, approve or go, False, lambda c: _make(c, poses))
+    )
     if not outcome.recording:
         _finish(outcome, False)
     what = check_arguments(outcome.recording, outcome.status.session.folder)
@@ -210,12 +220,17 @@ async def _make(client: Client, poses: int) -> None:
 
 
 async def attended_session(
-    socket: Path | None, purpose: str, headless: bool, go: str, quiet: bool, before: Callable[..., Any] | None
+    socket: Path | None,
+    purpose: str,
+    headless: bool,
+    approved: str,
+    quiet: bool,
+    before: Callable[..., Any] | None,
 ) -> Outcome:
-    """One session as `purpose` says, with the go of the person or of the approved hash."""
+    """One session as `purpose` says, approved by a person here or by the hash of what was approved."""
     path = socket or default_socket()
     interactive = not headless and sys.stdin.isatty()
-    async with await Client.connect(path, interactive=interactive) as client:
+    async with await Client.connect(path) as client:
         await wait_until_idle(client)
         await client.request("lease", action="take")
         if before is not None:
@@ -223,12 +238,17 @@ async def attended_session(
         standing = await _status(client)
         progress = SessionProgress(err, quiet=headless or quiet)
         progress.skip(standing)
-        confirm = _confirmation(go, interactive, standing.simulated)
+        confirm = _confirmation(approved, interactive, standing.simulated)
         with progress:
             # One pose more never ends a session that has others left.
             to_the_end = headless and purpose != "best"
             return await carry_out(
-                client, purpose, confirm=confirm, watch=progress, finish_with_loss=to_the_end
+                client,
+                purpose,
+                confirm=confirm,
+                watch=progress,
+                finish_with_loss=to_the_end,
+                headless=not interactive,
             )
 
 
@@ -238,21 +258,19 @@ async def _status(client: Client) -> StationStatus:
     raise StationError("the daemon ended")
 
 
-def _confirmation(go: str, interactive: bool, simulated: bool) -> Confirm:
+def _confirmation(approved: str, interactive: bool, simulated: bool) -> Confirm:
     """Who says yes: the approved hash, the person, or, for a simulated cell only, nobody."""
 
     def confirm(summary: GoSummary) -> bool:
-        if go:
-            if not summary.plan_sha256.startswith(go) or len(go) < 12:
-                raise RefusedError(
-                    f"--go {go} is not the hash of this plan ({summary.plan_sha256}): nothing moved"
-                )
+        if approved:
+            if not summary.plan_sha256.startswith(approved) or len(approved) < 12:
+                raise RefusedError(f"--approve {approved} is not the hash of this plan: nothing moved")
             return True
         if interactive:
             return ask_person(summary)
         if simulated:
             return True
-        raise RefusedError(f"nobody is here to confirm: approve the plan with --go {summary.plan_sha256}")
+        raise RefusedError("Nobody is asked here. A person must review and approve the plan (docs: Safety).")
 
     return confirm
 

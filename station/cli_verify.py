@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import asyncio
 import json
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -93,15 +92,14 @@ class _Visit:
         self._root: Path | None = None
 
     async def corners(self) -> _Visit:
-        interactive = sys.stdin.isatty() and not self._quiet
         async with (
-            await Client.connect(self._socket, interactive=interactive) as holder,
+            await Client.connect(self._socket) as holder,
             await Client.connect(self._socket) as watcher,
         ):
             status = await wait_until_idle(watcher)
             if self._quiet and not status.simulated:
                 raise RefusedError("--json asks nobody: it is for simulated cells only. Nothing moved.")
-            self._root = Path((await holder.request("hello", interactive=interactive))["root"])
+            self._root = holder.root
             await holder.request("lease", action="take")
             self._board = self._calibration().board
             corners = self._asked.corners or outer_corners(self._board)

@@ -72,13 +72,8 @@ class Client:
         self._task = asyncio.create_task(self._read(), name="client-read")
 
     @classmethod
-    async def connect(
-        cls, path: Path, who: str = "", timeout_s: float = CONNECT_S, interactive: bool = False
-    ) -> Client:
-        """Raises DaemonGoneError with the remedy when nobody serves there.
-
-        `interactive`: a person reads and confirms here what is about to move.
-        """
+    async def connect(cls, path: Path, who: str = "", timeout_s: float = CONNECT_S) -> Client:
+        """Raises DaemonGoneError with the remedy when nobody serves there."""
         try:
             async with asyncio.timeout(timeout_s):
                 reader, writer = await asyncio.open_unix_connection(str(path), limit=_ANSWER_LIMIT_BYTES)
@@ -97,7 +92,7 @@ class Client:
         client = cls(path, reader, writer)
         try:
             who = who or who_am_i()
-            hello = await client.request("hello", who=who, interactive=interactive, timeout_s=timeout_s)
+            hello = await client.request("hello", who=who, timeout_s=timeout_s)
         except StationError:
             await client.close()
             raise

@@ -82,7 +82,7 @@ def _add_large_commands(app: typer.Typer) -> None:
         "capture",
         epilog=examples(
             "station capture --plan plan.yaml",
-            "station capture --plan plan.yaml --headless --go 0123456789ab  # the approved plan's hash",
+            "station capture --plan plan.yaml --headless --approve 0123456789ab  # the approved plan's hash",
             "station capture --sweep",
         ),
     )(capture_command)

@@ -135,6 +135,15 @@ class CaptureConfig(Section, frozen=True):
     """The session is good enough when the expected error of X (1 sigma of its translation) is below this."""
 
 
+class ApprovalConfig(Section, frozen=True):
+    """Users by their names; who may connect at all is the socket's group."""
+
+    persons: tuple[str, ...] = ()
+    """Who may approve motion at a terminal; empty: everybody who may connect."""
+    services: tuple[str, ...] = ()
+    """Whose programs may approve a plan by its hash, with no terminal."""
+
+
 class StationConfig(Section, frozen=True):
     robot: RobotConfig
     camera: CameraConfig
@@ -150,6 +159,7 @@ class StationConfig(Section, frozen=True):
     limits: LimitsConfig = LimitsConfig()
     stillness: StillnessConfig = StillnessConfig()
     capture: CaptureConfig = CaptureConfig()
+    approval: ApprovalConfig = ApprovalConfig()
     working_distance_m: float = 0.5
     pointer: PointerConfig | None = None
     """None = the pendant's tool centre point, along its z axis."""

@@ -98,7 +98,12 @@ async def _capture(options: DemoOptions, progress: SessionProgress) -> Outcome:
         await client.request("make_plan", poses=options.poses, seed=options.seed, timeout_s=120.0)
         with progress:
             return await carry_out(
-                client, "run", confirm=lambda summary: True, watch=progress, finish_with_loss=True
+                client,
+                "run",
+                confirm=lambda summary: True,
+                watch=progress,
+                finish_with_loss=True,
+                headless=True,
             )
 
 

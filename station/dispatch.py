@@ -9,6 +9,7 @@ from typing import Any, cast
 
 import msgspec
 
+from station.approval import Applicant, ApprovalRule, Process, process
 from station.control import Peer
 from station.errors import RefusedError
 from station.plan.model import Plan, PlannedPose
@@ -28,7 +29,6 @@ class _Args(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 class _Hello(_Args, frozen=True):
     who: str = ""
-    interactive: bool = False
 
 
 class _Lease(_Args, frozen=True):
@@ -53,6 +53,8 @@ class _Prepare(_Args, frozen=True):
 class _Go(_Args, frozen=True):
     token: str
     plan_sha256: str = ""
+    headless: bool = False
+    """Nobody will be asked: poses that do not come to rest are tried once more."""
 
 
 class _Index(_Args, frozen=True):
@@ -87,22 +89,26 @@ class _Caller:
     def __init__(self, peer: Peer) -> None:
         self.client_id, self.pid, self.uid = peer.client_id, peer.pid, peer.uid
         self.who = f"uid {peer.uid} (pid {peer.pid})"
-        self.interactive = False
-        """A person answers at the other end."""
+        self.began_ticks: int | None = None
+        """Of its process, when it first asked for anything."""
 
-    def introduce(self, user: str, who: str, interactive: bool) -> None:
+    def asks(self, user: str) -> Applicant:
+        return Applicant(self.pid, self.uid, user, self.began_ticks)
+
+    def introduce(self, user: str, who: str) -> None:
         """The user's name is the kernel's word; the place is the client's."""
         said = "".join(c for c in who if c.isprintable())[:_WHO_LIMIT] or user
         told = said if said.split(" ")[0] == user else f"{user} ({said})"
         self.who = f"{told} (pid {self.pid})"
-        self.interactive = interactive
 
 
 class SessionDispatcher:
     """Behind `station.control.Handler`."""
 
-    def __init__(self, session: Session) -> None:
-        self._session = session
+    def __init__(self, session: Session, see: Callable[[int], Process | None] = process) -> None:
+        self._session, self._see = session, see
+        cell = session.bench.cell
+        self._rule = ApprovalRule(cell.config.approval, cell.simulated, see)
         self._callers: dict[int, _Caller] = {}
         self._leaving: set[asyncio.Task[None]] = set()
         self._names: dict[int, str] = {}
@@ -144,18 +150,20 @@ class SessionDispatcher:
         who = caller.who if caller else f"{user} (pid {sender.pid})"
         self._to_the_end(self._session.stop(who))
         if sender.uid not in self._names:
-            self._to_the_end(self._learn_name(sender.uid))
+            self._to_the_end(self._name(sender.uid))
 
-    async def _learn_name(self, uid: int) -> None:
-        # In a thread: where users come from the network, a name may take seconds.
-        self._names[uid] = await asyncio.to_thread(user_name, uid)
+    async def _name(self, uid: int) -> str:
+        if uid not in self._names:
+            # In a thread: where users come from the network, a name may take seconds.
+            self._names[uid] = await asyncio.to_thread(user_name, uid)
+        return self._names[uid]
 
     def gone(self, peer: Peer) -> None:
         """The arm decelerates at once when this was the commander."""
         self._callers.pop(peer.client_id, None)
         self._to_the_end(self._session.lease_lost(peer.client_id))
 
-    def _to_the_end(self, work: Coroutine[Any, Any, None]) -> asyncio.Future[None]:
+    def _to_the_end(self, work: Coroutine[Any, Any, Any]) -> asyncio.Future[None]:
         """A client that leaves takes its requests with it, but not these."""
         task = asyncio.create_task(work)
         self._leaving.add(task)
@@ -176,13 +184,13 @@ class SessionDispatcher:
 
     def _caller(self, peer: Peer) -> _Caller:
         if peer.client_id not in self._callers:
-            self._callers[peer.client_id] = _Caller(peer)
+            caller = self._callers[peer.client_id] = _Caller(peer)
+            seen = self._see(peer.pid)
+            caller.began_ticks = seen.began_ticks if seen else None
         return self._callers[peer.client_id]
 
     async def _hello(self, caller: _Caller, args: _Hello) -> Any:
-        if caller.uid not in self._names:
-            await self._learn_name(caller.uid)
-        caller.introduce(self._names[caller.uid], args.who, args.interactive)
+        caller.introduce(await self._name(caller.uid), args.who)
         root = str(self._session.bench.root)
         return {"version": software()["calibration-station"], "pid": os.getpid(), "root": root}
 
@@ -214,27 +222,25 @@ class SessionDispatcher:
         return {"poses": len(plan.poses), "sha256": self._session.bench.require_queue().sha256}
 
     async def _prepare(self, caller: _Caller, args: _Prepare) -> Any:
-        if args.purpose in ("improve", "best") and not (
-            self._session.bench.cell.simulated or caller.interactive
-        ):
-            raise RefusedError("a real arm's plan is changed on the way only with a person at the screen")
+        if args.purpose in ("improve", "best"):
+            self._rule.by_person(await self._asks(caller), "a plan that is changed on the way")
         return await self._session.prepare(caller.client_id, args.purpose, args.index)
 
     async def _hover(self, caller: _Caller, args: HoverRequest) -> Any:
-        if not (self._session.bench.cell.simulated or caller.interactive):
-            raise RefusedError("a real arm hovers over the board only with a person at the screen")
+        self._rule.by_person(await self._asks(caller), "a move over the board")
         return await self._session.prepare_hover(caller.client_id, args)
 
     async def _go(self, caller: _Caller, args: _Go) -> None:
-        cell, queue = self._session.bench.cell, self._session.bench.queue
-        unseen = not (cell.simulated or caller.interactive)
-        if unseen and (queue is None or args.plan_sha256 != queue.sha256):
-            # Nobody looks at a summary there: the plan that a person approved must be named.
-            raise RefusedError(
-                "without a person at the screen a real arm moves only with the approved plan's hash: "
-                f"--go {queue.sha256 if queue else 'PLAN_SHA'}"
-            )
-        self._session.go(caller.client_id, args.token, again=not caller.interactive)
+        asks, waiting = await self._asks(caller), self._session.waiting_go
+        if waiting is not None and waiting.hover is not None:
+            how = self._rule.by_person(asks, "a move over the board")
+        else:
+            how = self._rule.approve(asks, args.plan_sha256, waiting.summary.plan_sha256 if waiting else "")
+        approval = f"motion approved by {caller.who}, {how}"
+        self._session.go(caller.client_id, args.token, approval, again=args.headless)
+
+    async def _asks(self, caller: _Caller) -> Applicant:
+        return caller.asks(await self._name(caller.uid))
 
     async def _pause(self, caller: _Caller, args: _Args) -> None:
         self._session.pause(caller.who)

@@ -33,7 +33,7 @@ Verb = Literal[
     "make_plan",  # {poses, seed, lens_known} → made in a worker, then loaded
     "prepare",  # {purpose: run|check|resume|retake|improve|best, index?} → GoSummary; checks the whole way
     "hover",  # {calibration?, corner, standoff_m, …} → HoverOffer; a slow way over a corner of the board
-    "go",  # {token} the person's confirmation of exactly that summary
+    "go",  # {token, plan_sha256?, headless?} approves that summary; whose approval counts: station.approval
     "pause",  # after this pose
     "finish",  # seal what is there
     "retake",  # {index}

@@ -68,6 +68,13 @@ class Go:
     """Poses that take the place of the session's with this go."""
     hover: Hover | None = None
     """A way over one corner of the board instead of poses of the plan."""
+    approval: str = ""
+    """Who approved it, and how."""
+
+    @property
+    def said(self) -> str:
+        """For log and recording."""
+        return f"{self.approval}: {self.summary.purpose}, plan {self.summary.plan_sha256[:12]}"
 
 
 class GoDesk:

@@ -23,7 +23,7 @@ from station.session.guard import JOGGED_RAD
 from station.session.lease import START_TOLERANCE_RAD, Go
 from station.session.patience import RestingCheck
 from station.session.recording import SessionRecording, to_the_end
-from station.status import StationState
+from station.status import Event, StationState
 from station.stillness import NotStillError
 
 log = logging.getLogger(__name__)
@@ -125,6 +125,7 @@ class Run:
             bench.recording = recording
             raise
         bench.show_poses()
+        bench.record_event(Event(time.time_ns(), "info", self._go.said))  # said before it was open
         bench.store.event(f"recording to {fresh.folder}, part {fresh.part}")
 
     async def _poses(self) -> None:

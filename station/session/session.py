@@ -10,8 +10,11 @@ import contextlib
 import logging
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
+
+import msgspec
 
 from recordings.errors import RecordingError
 from station.analysis import plan_poses
@@ -27,7 +30,7 @@ from station.session.hovering import HoverDesk, HoverRequest
 from station.session.improving import ImproveDesk
 from station.session.interrupted import close_or_seal, find_interrupted
 from station.session.keeper import Keeper
-from station.session.lease import GoDesk, LeaseDesk
+from station.session.lease import Go, GoDesk, LeaseDesk
 from station.session.logbook import Logbook
 from station.session.preview import Previewer
 from station.session.queue import PoseQueue
@@ -171,7 +174,7 @@ class Session:
         summary = await summarise(self.bench, purpose, queue, poses, self._notes, changes)
         self._require_unchanged(client_id, voids)
         self._goes.offer(summary, client_id, poses, replanned=found)
-        self.store.update(go=summary)
+        self._show_go(summary)
         return summary
 
     async def prepare_hover(self, client_id: int, request: HoverRequest) -> HoverOffer:
@@ -185,8 +188,12 @@ class Session:
         hover, offer = await self._hovers.prepare(request)
         self._require_unchanged(client_id, voids)
         self._goes.offer(offer.go, client_id, (), hover)
-        self.store.update(go=offer.go)
+        self._show_go(offer.go)
         return offer
+
+    def _show_go(self, summary: GoSummary) -> None:
+        """To every watcher, without the token that is for the one who asked."""
+        self.store.update(go=msgspec.structs.replace(summary, token=""))
 
     def _require_unchanged(self, client_id: int, voids: int) -> None:
         """RefusedError when something happened while the way was checked."""
@@ -195,8 +202,16 @@ class Session:
         if self._goes.voids != voids:
             raise RefusedError("something changed while the way was checked: prepare again")
 
-    def go(self, client_id: int, token: str, again: bool = False) -> None:
-        """The person's yes to exactly that summary; `again`: see Go. RefusedError when anything changed."""
+    @property
+    def waiting_go(self) -> Go | None:
+        """What was offered last and is not approved yet."""
+        return self._goes.waiting
+
+    def go(self, client_id: int, token: str, approval: str = "", again: bool = False) -> None:
+        """The person's yes to exactly that summary. RefusedError when anything changed.
+
+        `approval`: who gave it and how, for log and recording. `again`: see Go.
+        """
         self.leases.require(client_id)
         self._require("go")
         self._require_run_ended()
@@ -206,6 +221,7 @@ class Session:
         queue = self.bench.queue
         try:
             go = self._goes.redeem(token, client_id, queue.sha256 if queue else "", joints, again)
+            go = replace(go, approval=approval or f"motion approved by {self.leases.lease.holder}")
         finally:
             self.store.update(go=None)
         self._notes = ()
@@ -217,7 +233,7 @@ class Session:
             self._improver.adopt(go.replanned)
         run = run_for(self.bench, go)
         self.store.enter(StationState.CHECKING)
-        self.store.event(f"go: {go.summary.purpose} (by {self.leases.lease.holder})")
+        self.store.event(go.said)
         self._run = asyncio.create_task(run.drive())
 
     def pause(self, who: str) -> None:

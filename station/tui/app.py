@@ -335,7 +335,7 @@ def run(socket: Path, who: str = "") -> None:
     """Opens the screen on the daemon that serves `socket` and returns when it is closed."""
 
     async def connect() -> Link:
-        return await Client.connect(socket, who, interactive=True)
+        return await Client.connect(socket, who)
 
     app = StationApp(connect)
     app.graphics = detect()

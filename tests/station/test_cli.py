@@ -93,7 +93,7 @@ def test_a_session_from_the_shell(shell: Shell, tmp_path: Path) -> None:
     assert "is not the hash of this plan" in err and "nothing moved" in err
 
     sha = plan_sha256(load_plan(plan))
-    code, out, err = shell.ask("capture", "--plan", str(plan), "--headless", "--go", sha[:12], "--json")
+    code, out, err = shell.ask("capture", "--plan", str(plan), "--headless", "--approve", sha[:12], "--json")
     assert code in (0, 3), out + err
     result = json.loads(out)
     assert result["poses"]["planned"] == 4

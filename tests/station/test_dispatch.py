@@ -3,31 +3,43 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import dataclasses
+import os
+import pty
+import subprocess
+import sys
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import pytest
 
+from recordings.reader import open_recording
 from station import dispatch
+from station.approval import Process, process
 from station.client import Client
+from station.config import ApprovalConfig
 from station.control import ControlServer, Peer
 from station.dispatch import SessionDispatcher
 from station.errors import RefusedError
 from station.plan.model import Plan, plan_sha256
+from station.socket_folder import user_name
 from station.status import StationState
 from tests.station.session_rig import POSES, NewRig, Rig
 
+See = Callable[[int], Process | None]
+
 
 class Served:
-    def __init__(self, rig: Rig, path: Path) -> None:
+    def __init__(self, rig: Rig, path: Path, see: See = process) -> None:
         self.rig, self.path = rig, path
-        self.control = ControlServer(path, SessionDispatcher(rig.session))
+        self.control = ControlServer(path, SessionDispatcher(rig.session, see))
 
-    async def client(self, interactive: bool = True) -> Client:
-        return await Client.connect(self.path, "tty1", interactive=interactive)
+    async def client(self) -> Client:
+        return await Client.connect(self.path, "tty1")
 
 
 @pytest.fixture
@@ -134,40 +146,150 @@ async def test_arguments_that_do_not_fit_are_refused_in_words(
         assert len(str(caught.value).split()) > 3
 
 
-async def test_without_a_person_a_real_arm_needs_the_plans_hash(
+async def real_cell(new_rig: NewRig, folder: Path, see: See, approval: ApprovalConfig) -> Served:
+    rig = await new_rig(with_plan=False, source="real")
+    cell = rig.session.bench.cell
+    config = msgspec.structs.replace(cell.config, approval=approval)
+    rig.session.bench.cell = dataclasses.replace(cell, config=config)
+    await rig.until(StationState.IDLE)
+    served = Served(rig, folder / "r", see)
+    await served.control.start()
+    return served
+
+
+def at_a_terminal(pid: int) -> Process:
+    return Process(os.getuid(), 77, "pts/3")
+
+
+def with_none(pid: int) -> Process:
+    return Process(os.getuid(), 77, "")
+
+
+ME = user_name(os.getuid())
+
+
+async def offered(client: Client, plan: Plan) -> dict[str, Any]:
+    await client.request("lease", action="take")
+    await client.request("load_plan", plan=msgspec.to_builtins(plan))
+    answer: dict[str, Any] = await client.request("prepare")
+    return answer
+
+
+@pytest.mark.parametrize("approval", [ApprovalConfig(), ApprovalConfig(services=("somebody",))])
+async def test_a_program_cannot_approve_motion_of_a_real_arm_whatever_it_says(
+    new_rig: NewRig, small_plan: Plan, tmp_path: Path, approval: ApprovalConfig
+) -> None:
+    served = await real_cell(new_rig, tmp_path, with_none, approval)
+    async with await served.client() as program:
+        with pytest.raises(RefusedError):
+            await program.request("hello", who="tty1", interactive=True)
+        for named in ({}, {"plan_sha256": plan_sha256(small_plan)}):
+            summary = await offered(program, small_plan)
+            with pytest.raises(RefusedError) as refused:
+                await program.request("go", token=summary["token"], **named)
+            said = str(refused.value)
+            assert summary["token"] not in said and plan_sha256(small_plan)[:12] not in said
+        with pytest.raises(RefusedError, match="terminal"):
+            await program.request("prepare", purpose="improve")
+    assert "move" not in served.rig.arm.log and "start control" not in served.rig.arm.log
+    await served.control.close()
+
+
+async def test_a_named_service_approves_by_the_plans_hash_and_is_written_down(
     new_rig: NewRig, small_plan: Plan, tmp_path: Path
 ) -> None:
-    real = await new_rig(with_plan=False, source="real")
-    await real.until(StationState.IDLE)
-    served = Served(real, tmp_path / "r")
-    await served.control.start()
-    async with await served.client(interactive=False) as program:
-        await program.request("lease", action="take")
-        await program.request("load_plan", plan=msgspec.to_builtins(small_plan))
+    served = await real_cell(new_rig, tmp_path, with_none, ApprovalConfig(services=(ME,)))
+    session = served.rig.session
+    async with await served.client() as program:
         for wrong in ({}, {"plan_sha256": "ab" * 32}):
-            summary = await program.request("prepare")
-            with pytest.raises(RefusedError, match="approved plan"):
+            summary = await offered(program, small_plan)
+            with pytest.raises(RefusedError):
                 await program.request("go", token=summary["token"], **wrong)
-        assert "move" not in real.arm.log
-        summary = await program.request("prepare")
+        assert "move" not in served.rig.arm.log
+        with pytest.raises(RefusedError, match="terminal"):
+            await program.request("prepare", purpose="best")
+        summary = await offered(program, small_plan)
         await program.request("go", token=summary["token"], plan_sha256=plan_sha256(small_plan))
-        await real.until_true(lambda: "move" in real.arm.log)
+        await served.rig.until_true(lambda: bool(session.store.status.session.recording))
+    told = [event.text for event in session.store.status.events if "approved by" in event.text]
+    recording = open_recording(Path(session.store.status.session.recording))
+    recorded = [event.detail for event in recording.events() if "approved by" in event.detail]
+    for texts in (told, recorded):
+        assert len(texts) == 1 and ME in texts[0] and f"pid {os.getpid()}" in texts[0]
+        assert "service" in texts[0] and plan_sha256(small_plan)[:12] in texts[0]
     await served.control.close()
 
 
-async def test_without_a_person_a_real_arm_s_plan_is_not_changed_on_the_way(
-    new_rig: NewRig, tmp_path: Path
+@pytest.mark.parametrize(
+    ("persons", "see", "may"),
+    [
+        ((), at_a_terminal, True),
+        ((ME,), at_a_terminal, True),
+        (("somebody",), at_a_terminal, False),
+        ((), lambda pid: None, False),
+        ((), lambda pid: Process(os.getuid() + 1, 77, "pts/3"), False),
+    ],
+)
+async def test_a_person_at_a_terminal_approves_when_the_configuration_lets_them(
+    new_rig: NewRig, small_plan: Plan, tmp_path: Path, persons: tuple[str, ...], see: See, may: bool
 ) -> None:
-    real = await new_rig(with_plan=False, source="real")
-    await real.until(StationState.IDLE)
-    served = Served(real, tmp_path / "r")
-    await served.control.start()
-    for interactive, told in ((False, "only with a person at the screen"), (True, "no session is open")):
-        async with await served.client(interactive=interactive) as client:
-            await client.request("lease", action="take")
-            with pytest.raises(RefusedError, match=told):
-                await client.request("prepare", purpose="improve")
+    served = await real_cell(new_rig, tmp_path, see, ApprovalConfig(persons=persons))
+    async with await served.client() as anna:
+        summary = await offered(anna, small_plan)
+        if not may:
+            with pytest.raises(RefusedError):
+                await anna.request("go", token=summary["token"])
+            assert "start control" not in served.rig.arm.log
+        else:
+            await anna.request("go", token=summary["token"])
+            assert any("at pts/3" in event.text for event in served.rig.session.store.status.events)
     await served.control.close()
+
+
+async def test_another_process_with_the_same_number_is_nobody_s_terminal(
+    new_rig: NewRig, small_plan: Plan, tmp_path: Path
+) -> None:
+    began = iter(range(100))
+    served = await real_cell(
+        new_rig, tmp_path, lambda pid: Process(os.getuid(), next(began), "pts/3"), ApprovalConfig()
+    )
+    async with await served.client() as anna:
+        summary = await offered(anna, small_plan)
+        with pytest.raises(RefusedError):
+            await anna.request("go", token=summary["token"])
+    await served.control.close()
+
+
+async def test_watchers_are_not_told_the_token(served: Served, small_plan: Plan) -> None:
+    async with await served.client() as anna:
+        summary = await offered(anna, small_plan)
+        shown = served.rig.session.store.status.go
+    assert shown is not None and summary["token"] and not shown.token
+
+
+def test_a_process_is_seen_at_its_terminal_only_in_the_foreground() -> None:
+    program = (
+        "import os, signal, sys\nfrom station.approval import process\n"
+        "print(process(os.getpid()).terminal == os.ttyname(0)[len('/dev/'):], flush=True)\n"
+        "signal.signal(signal.SIGTTOU, signal.SIG_IGN)\nif os.fork() == 0:\n"
+        "    os.setpgid(0, 0)\n    print('<' + process(os.getpid()).terminal + '>', flush=True)\n"
+        "    os._exit(0)\nos.wait()\n"
+    )
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.execv(sys.executable, [sys.executable, "-c", program])
+    said = b""
+    with contextlib.suppress(OSError):  # its end
+        while piece := os.read(terminal, 1000):
+            said += piece
+    os.waitpid(pid, 0)
+    os.close(terminal)
+    assert said.split() == [b"True", b"<>"]
+    alone = "import os; from station.approval import process; print(repr(process(os.getpid()).terminal))"
+    done = subprocess.run(
+        [sys.executable, "-c", alone], start_new_session=True, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "''"
 
 
 async def test_neither_a_long_list_of_sessions_nor_a_slow_name_holds_the_loop_up(

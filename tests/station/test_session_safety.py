@@ -282,7 +282,7 @@ async def test_an_error_nobody_foresaw_is_answered(rig: Rig, tmp_path: Path) -> 
     await control.start()
     await rig.session.release_lease(1)
     rig.session.bench.queue = None
-    async with await Client.connect(tmp_path / "s", "tty1", interactive=True) as anna:
+    async with await Client.connect(tmp_path / "s", "tty1") as anna:
         await anna.request("lease", action="take")
         async with asyncio.timeout(3):
             with pytest.raises(StationError):

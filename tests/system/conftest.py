@@ -89,7 +89,7 @@ class DaemonProcess:
         assert line, "the daemon ended at once; see its log"
 
     async def client(self) -> Client:
-        return await Client.connect(self.socket, interactive=True)
+        return await Client.connect(self.socket)
 
     def end(self) -> None:
         if self.process.poll() is None:

@@ -100,7 +100,7 @@ async def station(machine: Machine, rig: SystemRig) -> AsyncIterator[Machine]:
 
 
 async def client_of(machine: Machine) -> Client:
-    return await Client.connect(machine.path(SOCKET), interactive=True)
+    return await Client.connect(machine.path(SOCKET))
 
 
 async def test_stopping_the_service_stops_the_arm_seals_and_ends(

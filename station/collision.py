@@ -100,8 +100,38 @@ def gap_to_arm(geometry: CellGeometry, joints_rad: Array, starts: Array, ends: A
     return np.asarray((gap - radii[bodies]).min(axis=1))
 
 
+_JOINTS_BEHIND = (0, 1, 2, 3, 4, 5, 6)
+"""How many joints move each of ARM_BODIES; solids on the flange move with all six."""
+
+
+def surface_speeds(geometry: CellGeometry, joints_rad: Array, joint_speeds_rad_s: Array) -> Array:
+    """(n, 6) and (n, 6) or (6,) → (n, k) m/s: the fastest point of every body's surface at both of its ends.
+
+    Between them no point is faster. A point of a rigid body has v = ω × p − Σ ω_j × o_j; of all points at a
+    distance r from p the fastest has √(v∥² + (v⊥ + r·|ω|)²), parts along and across ω.
+    """
+    starts, ends, radii = body_segments(geometry, joints_rad)
+    frames = link_frames(geometry.model, joints_rad)
+    turns = frames[:, :6, :3, 2] * np.broadcast_to(joint_speeds_rad_s, joints_rad.shape)[:, :, None]
+    none = np.zeros_like(turns[:, :1])
+    turning = np.concatenate([none, np.cumsum(turns, axis=1)], axis=1)
+    carried = np.concatenate([none, np.cumsum(np.cross(turns, frames[:, :6, :3, 3]), axis=1)], axis=1)
+    behind = list(_JOINTS_BEHIND) + [6] * len(geometry.solids)
+    points, by, radius = [starts, ends], behind * 2, [radii, radii]
+    if geometry.watched_m:
+        points.append(transform_points(frames[:, 6], np.array(geometry.watched_m)))
+        by = by + [6] * len(geometry.watched_m)
+        radius.append(np.zeros(len(geometry.watched_m)))
+    omega, r = turning[:, by], np.concatenate(radius)
+    v = np.cross(omega, np.concatenate(points, axis=1)) - carried[:, by]
+    rate = np.linalg.norm(omega, axis=-1)
+    along = np.einsum("...i,...i->...", v, omega) / np.maximum(rate, _TINY)
+    across = np.sqrt(np.maximum(np.einsum("...i,...i->...", v, v) - along**2, 0.0))
+    return np.asarray(np.hypot(along, across + r * rate))
+
+
 def moving_points(geometry: CellGeometry, joints_rad: Array) -> Array:
-    """(n, 6) → points (n, k, 3) in `base` whose speed counts: ends of every body beyond the shoulder."""
+    """(n, 6) → points (n, k, 3) in `base` whose way counts: ends of every body beyond the shoulder."""
     starts, ends, _ = body_segments(geometry, joints_rad)
     points = [starts[:, 2:], ends[:, 2:]]
     if geometry.watched_m:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from calibrate.geometry import Array, difference
 from calibrate.kinematics import JOINT_NAMES, forward
-from station.collision import CellGeometry, margins, moving_points
+from station.collision import CellGeometry, margins, moving_points, surface_speeds
 from station.plan.model import Plan, PlannedPose
 
 SPEED_CAP_M_S = 0.25
@@ -25,6 +25,8 @@ _SPEED_RESERVE = 0.97
 """Between samples a point may be a little faster than at them."""
 SPACING_M = 0.01
 """No modelled point moves further between two checked samples; margins are reduced by half of it."""
+_TURN_RAD = 0.05
+"""No joint turns further between two of them: surfaces are fast where centre lines hardly move."""
 _PIECES = 48
 """A move is first looked at in so many, to find how dense its samples must be."""
 _LONGEST_TURN_RAD = 4 * np.pi
@@ -106,11 +108,9 @@ def joint_bounds(geometry: CellGeometry) -> tuple[Array, Array]:
 
 
 def point_speed_m_s(geometry: CellGeometry, joints_rad: ArrayLike, joint_speeds_rad_s: ArrayLike) -> float:
-    """Speed of the fastest modelled point of arm, tool or camera, now."""
+    """Speed of the fastest point on the surface of arm, tool or camera, now."""
     q, dq = np.asarray(joints_rad, dtype=float), np.asarray(joint_speeds_rad_s, dtype=float)
-    step = 1e-4
-    ends = moving_points(geometry, np.array([q - step * dq, q + step * dq]))
-    return float(np.linalg.norm(ends[1] - ends[0], axis=-1).max() / (2 * step))
+    return float(surface_speeds(geometry, q[None], dq).max())
 
 
 def sample_path(geometry: CellGeometry, from_rad: Array, to_rad: Array, spacing_m: float) -> Array:
@@ -119,7 +119,8 @@ def sample_path(geometry: CellGeometry, from_rad: Array, to_rad: Array, spacing_
     steps = np.linalg.norm(np.diff(moving_points(geometry, coarse), axis=0), axis=-1)
     # An arc is longer than its chord, and speed changes along it: 10 % covers both in a piece this short.
     count = int(np.ceil(1.1 * _PIECES * steps.max() / spacing_m)) + 1
-    return np.asarray(from_rad + np.linspace(0, 1, max(count, 3))[:, None] * (to_rad - from_rad))
+    turns = int(np.ceil(np.abs(to_rad - from_rad).max() / _TURN_RAD)) + 1
+    return np.asarray(from_rad + np.linspace(0, 1, max(count, turns, 3))[:, None] * (to_rad - from_rad))
 
 
 def check_path(
@@ -163,9 +164,7 @@ def allowed_speed(geometry: CellGeometry, samples: Array) -> tuple[float, float,
     speed = min(limits.joint_speed_rad_s, JOINT_SPEED_CAP_RAD_S)
     if step_rad < 1e-9:
         return speed, acceleration, 0.0, 0.0
-    points = moving_points(geometry, samples)
-    travel = np.linalg.norm(np.diff(points, axis=0), axis=-1).max()
-    metres_per_rad = travel * (len(samples) - 1) / step_rad
+    metres_per_rad = float(surface_speeds(geometry, samples, (samples[-1] - samples[0]) / step_rad).max())
     speed = min(speed, _SPEED_RESERVE * min(limits.speed_m_s, SPEED_CAP_M_S) / max(metres_per_rad, 1e-9))
     duration, peak = trapezoid(step_rad, speed, acceleration)
     return float(speed), acceleration, float(duration), float(peak * metres_per_rad)

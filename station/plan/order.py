@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.geometry import Array
-from station.collision import CellGeometry, margins, moving_points
+from station.collision import CellGeometry, margins, moving_points, surface_speeds
 from station.limits import (
     JOINT_ACCELERATION_CAP_RAD_S2,
     JOINT_SPEED_CAP_RAD_S,
@@ -58,7 +58,8 @@ def _sampled(
     free = leaving(gaps - slack[:, None, None]).min(axis=(1, 2)) >= 0
     hopeless = leaving(gaps - SPACING_M / 2).min(axis=(1, 2)) < 0
     step = np.abs(joints_to - joints_from).max(axis=1)
-    rate = travel * (samples - 1) / np.maximum(step, 1e-9)
+    per_rad = np.repeat((joints_to - joints_from) / np.maximum(step, 1e-9)[:, None], samples, axis=0)
+    rate = surface_speeds(geometry, flat, per_rad).reshape(n, -1).max(axis=1)
     limits = geometry.limits
     speed = min(limits.joint_speed_rad_s, JOINT_SPEED_CAP_RAD_S)
     speed = np.minimum(speed, 0.97 * min(limits.speed_m_s, SPEED_CAP_M_S) / np.maximum(rate, 1e-9))

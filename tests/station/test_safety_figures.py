@@ -17,7 +17,7 @@ PROMISES = (Path(__file__).parents[2] / "docs" / "safety.md").read_text()
 @pytest.mark.parametrize(
     ("figure", "most", "promised"),
     [
-        (limits.SPEED_CAP_M_S, 0.25, "0.25 m/s at any modelled point"),
+        (limits.SPEED_CAP_M_S, 0.25, "0.25 m/s at any point on the surface"),
         (limits.JOINT_SPEED_CAP_RAD_S, 1.05, "1.05 rad/s and 1.4 rad/s²"),
         (limits.JOINT_ACCELERATION_CAP_RAD_S2, 1.4, "1.05 rad/s and 1.4 rad/s²"),
         (ur_moves.JOINT_SPEED_LIMIT_RAD_S, 1.05, "refuses more than 1.05 rad/s or 1.5 rad/s²"),

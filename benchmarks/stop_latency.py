@@ -115,7 +115,7 @@ async def trial(bench: Bench, way: str, times: Times) -> None:
 
 
 async def measure(host: str, admin: AdminClient, folder: Path, count: int) -> list[tuple[str, ...]]:
-    robot = UrRobot(RobotConfig(model="UR10e", host=host), folder / "log", folder / "lock")
+    robot = UrRobot(RobotConfig(model="UR10e", host=host), folder / "log")
     await robot.connect()
 
     async def heart() -> None:

@@ -72,7 +72,7 @@ async def measure(pictures: int, moving: bool, settle_s: float = SETTLE_S) -> Sy
         file = Path(folder) / "truth.json"
         write_truth(truth, file)
         controller = await asyncio.to_thread(start_controller, truth=file)
-        robot = UrRobot(RobotConfig("UR10", controller.host), Path(folder), Path(folder))
+        robot = UrRobot(RobotConfig("UR10", controller.host), Path(folder))
         camera = RenderedCamera(truth, controller.host)
         jogging = asyncio.create_task(jog(controller.host, truth)) if moving else None
         try:

@@ -23,9 +23,10 @@ from station.devices.ur_condition import (
     program_ended,
     program_not_running,
     safety_stop,
+    watchdog_cause,
 )
 from station.devices.ur_dashboard import STOP, Dashboard, came
-from station.devices.ur_heart import Heart
+from station.devices.ur_heart import Heart, longest_gap_s
 from station.devices.ur_link import UrLink, link_lost_words
 from station.devices.ur_moves import STALE_S, MoveWatch, check_goal
 from station.errors import RobotError, SafetyStopError, StaleStateError
@@ -34,8 +35,6 @@ log = logging.getLogger(__name__)
 
 POLL_S = 0.005
 STOP_WAIT_S = 0.05
-WATCHDOG_S = 0.15
-"""A pause of the heartbeat that can have tripped the watchdog (1/5 s, and ticks)."""
 UNANSWERED_S = 0.1
 """A heartbeat that the control process did not answer for so long kicked nothing any more."""
 OUTLIVED_S = 0.3
@@ -49,8 +48,8 @@ LOCAL_CONTROL = "the robot is in local control: switch the pendant to Remote (to
 class UrRobot(UrLink):
     """`log_dir`: where the control process's words go."""
 
-    def __init__(self, config: RobotConfig, log_dir: Path, lock_dir: Path | None = None) -> None:
-        super().__init__(config, lock_dir)
+    def __init__(self, config: RobotConfig, log_dir: Path) -> None:
+        super().__init__(config)
         self.notice = ""
         """What a person should know while a move is under way, though it is no fault; empty = nothing."""
         self._log_path = log_dir / "control.log"
@@ -200,16 +199,17 @@ class UrRobot(UrLink):
         if reader is None or state is None:
             return error
         if reader.ended is not None or isinstance(error, StaleStateError):
-            return StaleStateError(self._stale_words(self.age_s()))
+            pause_s = self._heart.worst_s(time.monotonic() - self.age_s() - OUTLIVED_S)
+            busy = watchdog_cause(pause_s, 0.0) if reader.ended is None else None
+            return busy or StaleStateError(self._stale_words(self.age_s()))
         refused = child.kicks_refused and state.runtime_state == RuntimeState.PLAYING  # it tells no more yet
         if state.runtime_state != RuntimeState.STOPPED and not refused:
             return error
-        pause_s = self._heart.worst_s(since_s=self._played_s - OUTLIVED_S)
-        if pause_s > WATCHDOG_S:
-            return RobotError(
-                f"the session was busy for {pause_s * 1000:.0f} ms and the watchdog stopped the arm. "
-                "Look for what loads this computer, then give a new go."
-            )
+        since_s = self._played_s - OUTLIVED_S
+        arrivals_s = [s.stamps.host_monotonic_ns / 1e9 for s in reader.history.copy()]
+        cause = watchdog_cause(self._heart.worst_s(since_s), longest_gap_s(arrivals_s, since_s))
+        if cause is not None:
+            return cause
         if refused:
             return program_ended(RuntimeState.STOPPED)
         try:

@@ -6,6 +6,8 @@ from recordings.messages import RobotState
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode, SafetyStatus
 from station.errors import RobotError, SafetyStopError
 
+WATCHDOG_S = 0.15
+"""A silence that can have tripped the control program's watchdog (1/5 s, and ticks)."""
 _EMERGENCY = (
     SafetyStatus.EMERGENCY_STOPPED
     | SafetyStatus.ROBOT_EMERGENCY_STOPPED
@@ -95,10 +97,28 @@ def program_not_running(state: RobotState) -> RobotError | None:
     return None if state.runtime_state == RuntimeState.PLAYING else program_ended(state.runtime_state)
 
 
+def watchdog_cause(pause_s: float, gap_s: float) -> RobotError | None:
+    """Why the watchdog can have stopped the arm: `pause_s` without a heartbeat of ours, `gap_s` without news.
+
+    A computer that is busy holds up both, so its pause is named first. None: neither was long enough.
+    """
+    if pause_s > WATCHDOG_S:
+        return RobotError(
+            f"the session was busy for {pause_s * 1000:.0f} ms and the watchdog stopped the arm "
+            "(limit 200 ms). Look for what loads this computer, then give a new go."
+        )
+    if gap_s > WATCHDOG_S:
+        return RobotError(
+            f"the network carried nothing from the robot for {gap_s * 1000:.0f} ms and the watchdog stopped "
+            "the arm (limit 200 ms). Check cable, switch and what else uses this network, then give a new go."
+        )
+    return None
+
+
 def program_ended(runtime_state: int) -> RobotError:
     """Our own control script plays no more."""
     word = _program_word(runtime_state)
-    by = "on the pendant, by the switch to local control, or by its watchdog"
+    by = "on the pendant, by the switch to local control, or by its watchdog (network or computer too slow)"
     if runtime_state in (RuntimeState.PAUSED, RuntimeState.PAUSING):
         by = "on the pendant"
     return RobotError(

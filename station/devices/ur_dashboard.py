@@ -33,6 +33,16 @@ def in_words(error: OSError | ValueError) -> str:
     return os.strerror(number) if number and number > 0 else str(error)
 
 
+def connect_trouble(error: OSError | ValueError, service: str) -> str:
+    """Why a port does not take a connection, and what to look at."""
+    if isinstance(error, ConnectionRefusedError):
+        return (
+            f"{in_words(error)}: another address, a robot that is starting, or its {service} is off "
+            "(PolyScope 5.17 and later: Settings → Security → Services)"
+        )
+    return f"{in_words(error)}; check cable, address and that it is on"
+
+
 class Dashboard:
     """One connection, for one event loop. A reply that is too late breaks it: its order would be lost."""
 
@@ -62,8 +72,7 @@ class Dashboard:
                 words = f"no answer within {timeout_s:g} s; is this the robot?"
                 raise DashboardError(f"{where}: {words}") from None
             if isinstance(error, OSError | ValueError):
-                words = f"{in_words(error)}; check cable, address and that it is on"
-                raise DashboardError(f"{where}: {words}") from None
+                raise DashboardError(f"{where}: {connect_trouble(error, 'Dashboard Server')}") from None
             raise
 
     @property

@@ -10,7 +10,6 @@ import contextlib
 import logging
 import time
 from collections.abc import Callable
-from pathlib import Path
 
 from calibrate.kinematics import MODELS, DhDeltas
 from recordings.messages import RobotIdentity, RobotState
@@ -22,8 +21,8 @@ from station.devices.ur_history import state_at
 from station.devices.ur_lock import RobotLock
 from station.devices.ur_primary import Installation, PrimaryReader
 from station.devices.ur_probe import SCRIPT_PORT, ProbeResult, check_port, identify, lock_name
-from station.devices.ur_state import Sample, StateReader
-from station.devices.ur_tool import TcpCheck
+from station.devices.ur_state import Payload, Sample, StateReader
+from station.devices.ur_tool import TcpCheck, check_payload
 from station.errors import RobotError, StaleStateError, StationError
 
 log = logging.getLogger(__name__)
@@ -36,7 +35,7 @@ RECONNECT_S = (0.2, 0.5, 1.0, 2.0)
 
 
 class UrLink:
-    def __init__(self, config: RobotConfig, lock_dir: Path | None = None) -> None:
+    def __init__(self, config: RobotConfig) -> None:
         """Raises RobotError for an unknown model."""
         if config.model not in MODELS:
             raise RobotError(f"unknown robot.model {config.model!r}; known: {', '.join(sorted(MODELS))}")
@@ -54,12 +53,13 @@ class UrLink:
         self.lost = 0
         """Connections that ended by themselves."""
         self._ended_reader: StateReader | None = None
-        self._lock_dir = lock_dir
         self._lock: RobotLock | None = None
         self._identity = RobotIdentity(model=config.model)
         self._subscribers: list[Callable[[RobotState], None]] = []
         self._primary: PrimaryReader | None = None
         self._tool: TcpCheck | None = None
+        self._payload: Payload | None = None
+        """As of connect."""
         self._trouble: RobotError | None = None
         self._supervisor: asyncio.Task[None] | None = None
 
@@ -89,7 +89,7 @@ class UrLink:
         found = await identify(await self.renew_dashboard())
         self._check_identity(found)
         if self._lock is None:
-            self._lock = RobotLock(lock_name(host, found.serial), self._lock_dir)
+            self._lock = RobotLock(lock_name(host, found.serial))
         await check_port(host, SCRIPT_PORT)
         loop = asyncio.get_running_loop()
         reader = StateReader(host, self._deliver, lambda why: _call(loop, self._reader_ended, reader, why))
@@ -130,6 +130,8 @@ class UrLink:
     def _adopt(
         self, found: ProbeResult, first: Sample, reader: StateReader, installation: Installation
     ) -> None:
+        if self._payload is None:
+            self._payload = first.payload
         if self._tool is None:
             calibrated = self.config.kinematics is not None
             self._tool = TcpCheck(self.model, calibrated, first.state, installation)
@@ -140,7 +142,7 @@ class UrLink:
             serial=found.serial,
             controller_version=".".join(map(str, reader.version)),
             tcp_offset=self._tool.offset,
-            payload_kg=first.payload_kg,
+            payload_kg=self._payload.mass_kg,
         )
 
     async def close(self) -> None:
@@ -151,7 +153,7 @@ class UrLink:
             self._supervisor = None
         await self._close_link()
         self._unlock()
-        self._tool = None
+        self._tool = self._payload = None
 
     def _unlock(self) -> None:
         if self._lock is not None:
@@ -247,6 +249,8 @@ class UrLink:
             raise stop
         if self._tool is not None and self._primary is not None:
             self._tool.check(state, self._primary.installation)
+        if self._payload is not None:
+            check_payload(self.newest().payload, self._payload)
         if self._trouble is not None:
             raise self._trouble
 
@@ -304,7 +308,7 @@ class UrLink:
 
 
 def link_lost_words(why: str) -> str:
-    return f"connection to the robot lost ({why}): check cable and controller"
+    return f"connection to the robot lost ({why}): check cable, network and controller"
 
 
 def _call(loop: asyncio.AbstractEventLoop, function: Callable[..., None], *arguments: object) -> None:

@@ -7,11 +7,12 @@ import ipaddress
 import re
 from dataclasses import dataclass, field, replace
 
-from station.devices.ur_dashboard import Dashboard, DashboardError, in_words
+from station.devices.ur_dashboard import Dashboard, DashboardError, connect_trouble
 from station.errors import RobotError
 
 SCRIPT_PORT = 30002
 RTDE_PORT = 30004
+_SERVICES = {SCRIPT_PORT: "Secondary Client interface", RTDE_PORT: "RTDE service"}
 CONNECT_S = 2.0
 
 
@@ -95,7 +96,7 @@ async def _port_problem(host: str, port: int) -> str:
     except TimeoutError:
         return f"{host}:{port} did not answer within {CONNECT_S:g} s: check cable, address and firewall"
     except OSError as error:
-        return f"{host}:{port}: {in_words(error)}; is the robot on, is this service enabled?"
+        return f"{host}:{port}: {connect_trouble(error, _SERVICES[port])}"
     writer.transport.abort()
     return ""
 

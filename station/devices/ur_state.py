@@ -30,6 +30,7 @@ from station.devices.rtde import (
     packet,
     split_names,
 )
+from station.devices.ur_dashboard import connect_trouble
 
 log = logging.getLogger(__name__)
 
@@ -54,11 +55,19 @@ PAYLOAD_SINCE = {3: (3, 11), 5: (5, 5)}
 """First versions that report the payload."""
 
 
+class Payload(NamedTuple):
+    """What the pendant says hangs on the flange."""
+
+    mass_kg: float = 0.0
+    centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    """Of gravity, in `flange`."""
+
+
 class Sample(NamedTuple):
     state: RobotState
     operation: int
     """ur_rtde's word about asynchronous moves, see `ur_moves`."""
-    payload_kg: float
+    payload: Payload
 
 
 class StateReader(threading.Thread):
@@ -110,6 +119,8 @@ class StateReader(threading.Thread):
             why = f"no answer from {self.host}:{PORT} within {HANDSHAKE_S:g} s"
         except ConnectionResetError:
             why = "the robot reset the connection"
+        except ConnectionRefusedError as error:
+            why = connect_trouble(error, "RTDE service")
         except (OSError, RtdeError) as error:
             why = str(error)
         finally:
@@ -146,7 +157,7 @@ class StateReader(threading.Thread):
         self.history = deque(maxlen=int(HISTORY_S * self.rate_hz) + 1)
         names: tuple[str, ...] = NAMES
         if self.version[:2] >= PAYLOAD_SINCE.get(self.version[0], (0, 0)):
-            names += ("payload",)
+            names += ("payload", "payload_cog")
         wanted = struct.pack(">d", self.rate_hz) + join_names(names)
         answer = self._ask(link, PacketType.OUTPUT_SETUP, wanted)
         types = split_names(answer[1:])
@@ -235,7 +246,9 @@ class StateReader(threading.Thread):
         self.stands_still = False
         self.clock.add(controller_s, monotonic_ns)
         self.history.append(state)
-        self.newest = Sample(state, int(v[32]), v[33] if len(v) > 33 else 0.0)
+        self.newest = Sample(
+            state, int(v[32]), Payload(v[33], (v[34], v[35], v[36])) if len(v) > 33 else Payload()
+        )
         if not self.started.done():
             self.started.set_result(self.newest)
         self._on_state(state)

@@ -1,4 +1,4 @@
-"""Guards against a mixed-up TCP: what lies between our flange pose and the controller's tool pose.
+"""Guards against a mixed-up TCP or payload: what lies between our flange pose and the controller's tool pose.
 
 flange_from_tcp = forward(joints)⁻¹ · base_from_tcp, from one and the same sample. It must be the offset that
 the controller states, and it must not change. The controller knows the factory calibration of its arm and our
@@ -17,6 +17,7 @@ from calibrate.geometry import Array, difference, inverse, pose_from_rotvec, rot
 from calibrate.kinematics import DhDeltas, RobotModel, forward
 from recordings.messages import RobotState, Vector6
 from station.devices.ur_primary import DhParameters, Installation
+from station.devices.ur_state import Payload
 from station.errors import RobotError
 
 log = logging.getLogger(__name__)
@@ -26,6 +27,8 @@ CALIBRATED_TOLERANCE = (0.0005, math.radians(0.1))
 STATED_TOLERANCE = (1e-6, 1e-6)
 FACTORY_LIMIT = (0.02, math.radians(2.0))
 LONGEST_M = 1.0
+PAYLOAD_TOLERANCE_KG = 0.005
+CENTRE_TOLERANCE_M = 0.001
 _MODEL_REMEDY = "check robot.model and robot.kinematics in the configuration"
 _CHANGED = "the TCP offset on the pendant was changed during the session"
 _CHANGED_REMEDY = "set it back, or finish this session and start the station's daemon anew"
@@ -92,6 +95,16 @@ class TcpCheck:
 
     def _derive(self, state: RobotState) -> Array:
         return _flange_from_tcp(self._model, state)
+
+
+def check_payload(now: Payload, first: Payload) -> None:
+    """Raises RobotError when the payload on the pendant is another one than at connect."""
+    centre_off_m = math.dist(now.centre_m, first.centre_m)
+    if abs(now.mass_kg - first.mass_kg) > PAYLOAD_TOLERANCE_KG or centre_off_m > CENTRE_TOLERANCE_M:
+        raise RobotError(
+            f"the payload on the pendant was changed during the session ({first.mass_kg:.2f} → "
+            f"{now.mass_kg:.2f} kg, its centre by {1000 * centre_off_m:.0f} mm): {_CHANGED_REMEDY}"
+        )
 
 
 def _flange_from_tcp(model: RobotModel, state: RobotState) -> Array:

@@ -78,7 +78,7 @@ def simulated_cell(options: SimulationOptions, folder: Path) -> Cell:
 
     return Cell(
         config=config,
-        robot=UrRobot(config.robot, folder, folder),
+        robot=UrRobot(config.robot, folder),
         camera=camera,
         source="simulated",
         trigger=wires.trigger,

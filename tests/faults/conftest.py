@@ -160,7 +160,7 @@ async def cell(controller: Callable[..., SimulatedController], tmp_path: Path) -
 
     async def make(model: str = "UR10", control: bool = True, **options: Any) -> Cell:
         running = await asyncio.to_thread(controller, model, **options)
-        robot = UrRobot(RobotConfig(model=model, host=running.host), tmp_path / "log", tmp_path / "lock")
+        robot = UrRobot(RobotConfig(model=model, host=running.host), tmp_path / "log")
         made = Cell(running, running.admin(), robot)
         cells.append(made)
         made.start_heart()

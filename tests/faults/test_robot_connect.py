@@ -24,7 +24,7 @@ Start = Callable[..., SimulatedController]
 
 
 def robot_at(host: str, folder: Path, **config: Any) -> UrRobot:
-    return UrRobot(RobotConfig(host=host, **config), folder / "log", folder / "lock")
+    return UrRobot(RobotConfig(host=host, **config), folder / "log")
 
 
 def complaint(robot: UrRobot) -> str:
@@ -36,7 +36,7 @@ def complaint(robot: UrRobot) -> str:
 
 
 async def test_nobody_is_there(tmp_path: Path) -> None:
-    with pytest.raises(RobotError, match="check cable, address and that it is on"):
+    with pytest.raises(RobotError, match="Settings → Security → Services"):
         await robot_at("127.255.3.9", tmp_path).connect()
 
 
@@ -87,7 +87,7 @@ async def test_one_owner(controller: Start, tmp_path: Path) -> None:
     running = await asyncio.to_thread(controller)
     first, second = robot_at(running.host, tmp_path), robot_at(running.host, tmp_path)
     await first.connect()
-    with pytest.raises(RobotError, match=r"owned by another station .*pid \d+, .* since"):
+    with pytest.raises(RobotError, match=r"owned by another station .*pid \d+, "):
         await second.connect()
     await first.close()
     await second.connect()
@@ -178,6 +178,20 @@ async def test_tcp_changed_on_the_pendant(cell: Make) -> None:
     await c.stays_at_rest()
 
 
+async def test_payload_changed_on_the_pendant(cell: Make) -> None:
+    c = await cell(control=True)
+    c.robot.check()
+    c.admin.ask("payload", kg=1.5, cog_m=[0.0, 0.0, 0.05])
+    await c.until(lambda: "payload on the pendant was changed" in complaint(c.robot))
+    goal = c.joints_rad()
+    goal[0] += 0.2
+    with pytest.raises(RobotError, match="payload"):
+        await c.robot.move(goal, 0.5, 1.0)
+    await c.stays_at_rest()
+    c.admin.ask("payload", kg=0.0, cog_m=[0.0, 0.0, 0.0])
+    await c.until(lambda: not complaint(c.robot))
+
+
 async def test_a_tool_on_the_pendant_is_reported_and_not_mixed_in(cell: Make) -> None:
     c = await cell(control=False)
     await c.robot.close()
@@ -216,11 +230,12 @@ async def test_safety_stop_between_moves_ends_control(cell: Make) -> None:
 async def test_a_daemon_that_died_leaves_no_lock(controller: Start, tmp_path: Path) -> None:
     running = await asyncio.to_thread(controller)
     program = (
-        "import sys; from pathlib import Path; from station.devices.ur_lock import RobotLock\n"
-        "RobotLock(sys.argv[1], Path(sys.argv[2])); print('held', flush=True); sys.stdin.read()"
+        "import os, sys; from station.devices.ur_lock import RobotLock\n"
+        "if os.getuid() == 0: os.setgid(65534); os.setuid(65534)  # another user's, where that can be tried\n"
+        "lock = RobotLock(sys.argv[1]); print('held', flush=True); sys.stdin.read()"
     )
     holder = subprocess.Popen(
-        [sys.executable, "-c", program, running.host, str(tmp_path / "lock")],
+        [sys.executable, "-c", program, running.host],
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
     )

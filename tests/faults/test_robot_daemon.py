@@ -24,7 +24,7 @@ from station.config import RobotConfig
 from station.devices.ur import UrRobot
 
 async def main(host, folder):
-    robot = UrRobot(RobotConfig(host=host), folder / "log", folder / "lock")
+    robot = UrRobot(RobotConfig(host=host), folder / "log")
     await robot.connect()
     async def heart():
         while True:

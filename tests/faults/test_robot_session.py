@@ -39,7 +39,7 @@ async def cell(
     admin.ask("jog", joints_rad=HOME.tolist())
     while np.abs(np.array(admin.ask("state")["joints_rad"]) - HOME).max() > 1e-6:
         await asyncio.sleep(0.02)
-    robot = UrRobot(RobotConfig("UR10", running.host), tmp_path / "log", tmp_path / "lock")
+    robot = UrRobot(RobotConfig("UR10", running.host), tmp_path / "log")
     rig = Rig(tmp_path / "root", robot=robot)
     await rig.start()
     await rig.until(S.IDLE)

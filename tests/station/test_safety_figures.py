@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from station import limits
-from station.devices import ur, ur_child, ur_control, ur_moves
+from station.devices import ur_child, ur_condition, ur_control, ur_moves
 from station.plan import hover
 from station.session import guard, lease, patience
 
@@ -48,5 +48,5 @@ def test_the_distance_kept_over_the_board_is_the_one_that_is_promised() -> None:
 
 def test_a_heartbeat_reaches_the_controller_before_its_watchdog_bites() -> None:
     """The loop beats, the child takes beats of a certain age, the script waits for its kick."""
-    assert guard.TICK_S < ur_child.HEARD_NS / 1e9 < ur_control.BEAT_FRESH_NS / 1e9 < ur.WATCHDOG_S
-    assert ur.WATCHDOG_S < 1 / ur_control.WATCHDOG_HZ
+    assert guard.TICK_S < ur_child.HEARD_NS / 1e9 < ur_control.BEAT_FRESH_NS / 1e9 < ur_condition.WATCHDOG_S
+    assert ur_condition.WATCHDOG_S < 1 / ur_control.WATCHDOG_HZ

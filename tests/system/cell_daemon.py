@@ -32,7 +32,7 @@ def main() -> None:
     place = Path(root)
     cell = Cell(
         config=config,
-        robot=UrRobot(config.robot, place, place),
+        robot=UrRobot(config.robot, place),
         camera=RenderedCamera(truth, host, config.camera),
         source="simulated",
         attachments={"truth.json": Path(truth_file).read_bytes()},

@@ -6,11 +6,31 @@ import msgspec
 import pytest
 
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode, SafetyStatus
-from station.devices.ur_condition import foreign_program, not_powered, program_not_running, safety_stop
+from station.devices.ur_condition import (
+    WATCHDOG_S,
+    foreign_program,
+    not_powered,
+    program_not_running,
+    safety_stop,
+    watchdog_cause,
+)
 from tests.station.devices.test_ur_moves import STATE
 
 MOVES = {SafetyMode.NORMAL, SafetyMode.REDUCED}
 HARMLESS = {SafetyStatus.NORMAL, SafetyStatus.REDUCED}
+
+
+@pytest.mark.parametrize(
+    ("pause_s", "gap_s", "blamed"),
+    [(0.3, 0.0, "computer"), (0.0, 0.3, "network"), (0.3, 0.3, "computer"), (0.1, 0.1, "")],
+)
+def test_computer_and_network_are_told_apart_as_causes_of_a_watchdog_stop(
+    pause_s: float, gap_s: float, blamed: str
+) -> None:
+    assert 0.1 < WATCHDOG_S < 0.3
+    cause = watchdog_cause(pause_s, gap_s)
+    assert (cause is None) == (not blamed)
+    assert (blamed in str(cause) and "300 ms" in str(cause)) or cause is None
 
 
 @pytest.mark.parametrize("mode", SafetyMode)

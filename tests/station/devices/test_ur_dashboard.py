@@ -104,4 +104,4 @@ async def test_the_probe_names_every_port_that_does_not_answer(serve: Serve) -> 
 async def test_the_probe_of_nobody_has_remedies_and_does_not_raise() -> None:
     found = await probe("127.255.3.9")
     assert found.model == "" and len(found.problems) == 3
-    assert "check cable" in found.problems[0]
+    assert "Services" in found.problems[0]

@@ -20,7 +20,7 @@ CONFIG = RobotConfig(model="UR10", host="127.0.0.1", serial="2016")
 
 @pytest.fixture
 def link(tmp_path: Path) -> Any:
-    return UrLink(CONFIG, tmp_path)
+    return UrLink(CONFIG)
 
 
 def test_a_listener_that_fails_is_dropped_alone(link: Any) -> None:
@@ -52,9 +52,9 @@ def test_another_robot_than_configured_is_refused(link: Any, found: ProbeResult,
 
 
 def test_another_robot_than_before_is_refused_when_the_link_comes_back(tmp_path: Path) -> None:
-    link: Any = UrLink(msgspec.structs.replace(CONFIG, serial=""), tmp_path)
+    link: Any = UrLink(msgspec.structs.replace(CONFIG, serial=""))
     link._check_identity(ProbeResult(serial="2016"))
-    link._lock = RobotLock("2016", tmp_path)
+    link._lock = RobotLock("2016-test")
     link._identity = msgspec.structs.replace(link.identity, serial="2016")
     link._check_identity(ProbeResult(serial="2016"))
     with pytest.raises(RobotError, match=r"another robot .*1999.* start the station.s daemon anew"):
@@ -79,4 +79,4 @@ async def test_a_robot_that_cannot_be_asked_for_is_named(tmp_path: Path) -> None
     with pytest.raises(RobotError, match=r"unknown robot.model 'UR7'; known: .*UR10"):
         UrLink(RobotConfig(model="UR7", host="127.0.0.1"))  # type: ignore[arg-type]
     with pytest.raises(RobotError, match=r"robot.host is empty"):
-        await UrLink(RobotConfig(model="UR10", host=""), tmp_path).connect()
+        await UrLink(RobotConfig(model="UR10", host="")).connect()

@@ -150,7 +150,7 @@ def test_a_port_that_is_no_rtde_is_refused() -> None:
 
 async def test_the_pose_at_a_moment(controller: Start, tmp_path: Path) -> None:
     running = await asyncio.to_thread(controller, "UR10e")
-    link = UrLink(RobotConfig(model="UR10e", host=running.host), tmp_path)
+    link = UrLink(RobotConfig(model="UR10e", host=running.host))
     await link.connect()
     with running.admin() as admin:
         admin.ask("hand_move", path=[[1.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0]], speed_rad_s=0.8)

@@ -19,6 +19,7 @@ import yaml
 from calibrate.errors import CalibrationError
 from calibrate.gates import Gate
 from calibrate.geometry import Transform, is_rigid, matrix_from_quaternion
+from recordings import strict_yaml
 from recordings.files import ASKED_FOR, write_atomically
 from recordings.messages import BoardSpec, CameraIdentity, CameraModel, Matrix4, Mount, RobotIdentity, Source
 from recordings.records import MAGIC
@@ -297,12 +298,9 @@ def decode_calibration(content: bytes, where: str) -> Calibration:
     if len(content) > _LIMIT_BYTES:
         raise CalibrationFileError(f"{where}: larger than any calibration file ({len(content)} bytes).")
     try:
-        if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(content, yaml.CSafeLoader)):
-            raise CalibrationFileError(f"{where}: YAML aliases do not belong in a calibration file.")
-        plain = yaml.load(content, yaml.CSafeLoader)
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as problem:
-        said = " ".join(str(problem).split())
-        raise CalibrationFileError(f"{where}: damaged, or no calibration file: not YAML ({said}).") from None
+        plain = strict_yaml.load_plain(content)
+    except strict_yaml.StrictYamlError as problem:
+        raise CalibrationFileError(f"{where}: damaged, or no calibration file: {problem}.") from None
     if not isinstance(plain, dict) or plain.get("format") != FORMAT:
         found = plain.get("format") if isinstance(plain, dict) else None
         raise CalibrationFileError(

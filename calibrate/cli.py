@@ -14,6 +14,7 @@ def main() -> None:
     from calibrate.commands.app import app
     from calibrate.errors import CalibrationError
     from recordings.errors import RecordingError, printed
+    from recordings.plain_text import plain_text
     from recordings.terminal import print_what_it_can
 
     print_what_it_can()
@@ -24,7 +25,7 @@ def main() -> None:
         sys.exit(problem.exit_code)
     except OSError as problem:  # of a full disk behind stdout, say
         where = problem.filename or "the output"
-        print(f"calibrate: {where}: {problem.strerror or problem}", file=sys.stderr)
+        print(plain_text(f"calibrate: {where}: {problem.strerror or problem}"), file=sys.stderr)
         sys.exit(1)
 
 

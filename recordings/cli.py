@@ -12,15 +12,16 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.progress import Progress
 
+from recordings.console import plain_console
 from recordings.errors import RecordingError, printed
 from recordings.excerpt import write_excerpt
 from recordings.export import Target, export_recording
 from recordings.importer import import_folder
 from recordings.info import recording_info
 from recordings.info_text import print_info, print_recovery
+from recordings.plain_text import plain_text
 from recordings.reader import open_recording
 from recordings.recover import recover as recover_recording
 from recordings.terminal import examples, print_what_it_can
@@ -68,7 +69,7 @@ def import_(
     if json_:
         print(json.dumps({"recording": str(done.path), "views": done.pictures, "bytes": done.size_bytes}))
     else:
-        print(f"{done.path}: {done.pictures} views, {done.size_bytes / 1e6:.1f} MB")
+        print(f"{plain_text(str(done.path))}: {done.pictures} views, {done.size_bytes / 1e6:.1f} MB")
         print(f"next: calibrate solve {shlex.quote(str(done.path))}")
 
 
@@ -131,7 +132,7 @@ def recover(
 @contextmanager
 def _progress(text: str, shown: bool) -> Iterator[Callable[[int, int], None]]:
     """A bar on stderr, where it is a terminal."""
-    console = Console(stderr=True)
+    console = plain_console(stderr=True)
     if not shown or not console.is_terminal:
         yield lambda done, total: None
         return
@@ -150,7 +151,7 @@ def main() -> None:
         sys.exit(problem.exit_code)
     except OSError as problem:  # of a full disk behind stdout, say
         where = problem.filename or "the output"
-        print(f"recordings: {where}: {problem.strerror or problem}", file=sys.stderr)
+        print(plain_text(f"recordings: {where}: {problem.strerror or problem}"), file=sys.stderr)
         sys.exit(1)
 
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 import shlex
 from pathlib import Path
 
+from recordings.plain_text import plain_text
+
 
 class RecordingError(Exception):
     """Something is wrong with a recording, a folder or a disk. `str()` says what, where and what to do next.
@@ -17,7 +19,7 @@ class RecordingError(Exception):
 
 def printed(problem: Exception) -> str:
     """An error as all commands print it: without a full stop at its end."""
-    said = str(problem)
+    said = plain_text(str(problem))
     return said[:-1] if said.endswith(".") and not said.endswith((" .", "/.", "..")) else said
 
 

@@ -6,10 +6,11 @@ from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import Any
 
-from rich.console import Console
 from rich.table import Column, Table
 from rich.text import Text
 
+from recordings.console import plain_console
+from recordings.plain_text import plain_text
 from recordings.recover import Recovery
 
 _LOSSES_SHOWN = 20
@@ -17,8 +18,7 @@ _LOSSES_SHOWN = 20
 
 def print_info(facts: dict[str, Any]) -> None:
     """Prints what `recording_info` found as two small tables."""
-    # no markup: brackets and colons of a name are the name's own
-    console = Console(markup=False, emoji=False)
+    console = plain_console()
     table = Table("", Column("", overflow="fold"), box=None, show_header=False, padding=(0, 2, 0, 0))
     for name, value in _info_rows(facts):
         table.add_row(name, value)
@@ -89,11 +89,11 @@ def _clock_text(clock: dict[str, float]) -> str:
 
 def print_recovery(result: Recovery) -> None:
     """What `recordings recover` did with one file."""
-    print(result.text)
+    print(plain_text(result.text))
     if not result.rebuilt:
         return
     for loss in result.losses[:_LOSSES_SHOWN]:
-        print(f"  lost: {loss}")
+        print(plain_text(f"  lost: {loss}"))
     if len(result.losses) > _LOSSES_SHOWN:
         print(f"  and {len(result.losses) - _LOSSES_SHOWN} more")
-    print(f"the damaged file is kept as {result.kept_original}")
+    print(plain_text(f"the damaged file is kept as {result.kept_original}"))

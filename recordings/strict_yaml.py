@@ -19,6 +19,8 @@ from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_
 import msgspec
 import yaml
 
+from recordings.plain_text import ORDERS
+
 LIMIT_BYTES = 256 * 1024
 _NEST_LIMIT = 20
 T = TypeVar("T")
@@ -57,12 +59,37 @@ class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # yaml has no types
             raise yaml.MarkedYAMLError(problem="anchors (&) and aliases (*) are refused", problem_mark=mark)
         if getattr(self.peek_event(), "tag", None):
             raise yaml.MarkedYAMLError(problem="tags (!) are refused", problem_mark=mark)
+        _refuse_orders(self.peek_event())
         self.depth += 1
         if self.depth > _NEST_LIMIT:
             raise yaml.MarkedYAMLError(problem="nested too deeply", problem_mark=mark)
         node = super().compose_node(parent, index)
         self.depth -= 1
         return node
+
+
+def _refuse_orders(event: Any) -> None:
+    if isinstance(event, yaml.ScalarEvent) and ORDERS.search(event.value):
+        raise yaml.MarkedYAMLError(problem="control characters are refused", problem_mark=event.start_mark)
+
+
+def load_plain(content: bytes) -> Any:
+    """Plain data of a file that a program wrote, bounded in depth and so in time.
+
+    libyaml itself knows no bound: 200 kB of brackets take minutes, or the stack. Raises StrictYamlError.
+    """
+    depth = 0
+    try:
+        for event in yaml.parse(content, yaml.CSafeLoader):
+            depth += isinstance(event, yaml.CollectionStartEvent) - isinstance(event, yaml.CollectionEndEvent)
+            if depth > _NEST_LIMIT:
+                raise yaml.MarkedYAMLError(problem="nested too deeply", problem_mark=event.start_mark)
+            if isinstance(event, yaml.AliasEvent):
+                raise yaml.MarkedYAMLError(problem="aliases (*) are refused", problem_mark=event.start_mark)
+            _refuse_orders(event)
+        return yaml.load(content, yaml.CSafeLoader)
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
+        raise StrictYamlError([Problem(0, "", f"not YAML ({' '.join(str(error).split())})")]) from None
 
 
 for _tag, _pattern, _first in (

@@ -6,12 +6,14 @@ import asyncio
 import base64
 import getpass
 import os
+import re
 from collections.abc import AsyncIterator
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
+from recordings.plain_text import plain_data
 from station.errors import RefusedError, StationError
 from station.protocol import LINE_LIMIT_BYTES, PIECE_BYTES, REQUEST_LIMIT_BYTES, Reply, Request, Verb
 from station.status import StationStatus
@@ -21,6 +23,12 @@ CONNECT_S = 5.0
 ANSWER_S = 30.0
 _ANSWER_LIMIT_BYTES = 8 * 1024 * 1024
 """The daemon is trusted more than its clients are: a preview is larger than any request."""
+
+
+_SUSPECT = re.compile(
+    rb"\\(u00[01]|[bfr])|\x7f|\xc2[\x80-\x9f]|\xe2(\x80[\x8e\x8f\xaa-\xae]|\x81[\xa6-\xa9])"
+)
+"""How orders to a terminal look in JSON; where none can be, nothing is looked through."""
 
 
 class DaemonGoneError(StationError):
@@ -176,7 +184,10 @@ class Client:
         decoder = msgspec.json.Decoder(_Incoming)
         try:
             while line := await self._reader.readline():
-                self._take(decoder.decode(line))
+                message = decoder.decode(line)
+                if _SUSPECT.search(line):
+                    message = msgspec.convert(plain_data(msgspec.to_builtins(message)), _Incoming)
+                self._take(message)
         except (OSError, ValueError, msgspec.DecodeError):
             pass  # A daemon that speaks nonsense is as good as gone.
         finally:

@@ -15,6 +15,7 @@ import typer
 
 from calibrate.errors import CalibrationError
 from recordings.errors import RecordingError, printed
+from recordings.plain_text import plain_text
 from recordings.terminal import examples, print_what_it_can
 from station.cli_control import app as control
 from station.console import Socket
@@ -153,7 +154,7 @@ def main() -> None:
         sys.exit(problem.exit_code)
     except OSError as problem:  # of a folder that may not be written, of a full disk behind stdout
         where = problem.filename or "the output"
-        print(f"station: {where}: {problem.strerror or problem}", file=sys.stderr)
+        print(plain_text(f"station: {where}: {problem.strerror or problem}"), file=sys.stderr)
         sys.exit(1)
     except KeyboardInterrupt:
         sys.exit(130)

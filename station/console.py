@@ -6,11 +6,12 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
-# No markup: brackets and colons of a name are the name's own. What stands out does so by `style` or a Text.
-out = Console(highlight=False, markup=False, emoji=False, soft_wrap=True)
-err = Console(stderr=True, highlight=False, markup=False, emoji=False, soft_wrap=True)
+from recordings.console import plain_console
+
+# What stands out does so by `style` or a Text.
+out = plain_console(soft_wrap=True)
+err = plain_console(stderr=True, soft_wrap=True)
 
 Socket = Annotated[Path | None, typer.Option(help="The daemon's control socket.")]
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout and nothing else.")]

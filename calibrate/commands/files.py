@@ -7,7 +7,6 @@ from typing import Any, TypeVar, get_args
 
 import msgspec
 import numpy as np
-import yaml
 
 from calibrate.board import check_board
 from calibrate.calibration import FORMAT, read_calibration
@@ -105,9 +104,9 @@ def _content(path: Path) -> bytes:
 
 def _read(path: Path, wanted: str) -> dict[str, Any]:
     try:
-        plain = yaml.safe_load(_content(path))
-    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as problem:
-        raise InputFileError(f"{path}: not YAML ({' '.join(str(problem).split())}).") from None
+        plain = strict_yaml.load_plain(_content(path))
+    except strict_yaml.StrictYamlError as problem:
+        raise InputFileError(f"{path}: {problem}.") from None
     if not isinstance(plain, dict):
         raise InputFileError(f"{path}: {wanted} is needed, and no fields are in it.")
     return plain

@@ -11,18 +11,17 @@ from typing import Annotated
 
 import msgspec
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from calibrate.calibration import FORMAT, CalibrationFileError, read_calibration
 from calibrate.errors import CalibrationError
 from calibrate.load import Progress as LoadProgress
+from recordings.console import plain_console
 from recordings.records import MAGIC
 
 _told_width = sys.stdout.isatty() or "COLUMNS" in os.environ
-# no markup: brackets and colons of a name are the name's own
-out = Console(highlight=False, markup=False, emoji=False, width=None if _told_width else 150)
-err = Console(stderr=True, highlight=False, markup=False, emoji=False)
+out = plain_console(width=None if _told_width else 150)
+err = plain_console(stderr=True)
 
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout and nothing else")]
 

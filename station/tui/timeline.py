@@ -9,6 +9,7 @@ import numpy as np
 
 from calibrate.geometry import Array, pose_from_rotvec
 from recordings.messages import CaptureEvent, Matrix4, RobotState, View
+from recordings.plain_text import plain_text
 from recordings.reader import open_recording
 from station.status import (
     CameraStatus,
@@ -168,7 +169,8 @@ def _state(robot: RobotState | None) -> StationState:
 
 
 def _event(event: CaptureEvent) -> Event:
-    return Event(event.stamps.host_wall_ns, event.level, event.detail or event.kind, event.pose_index)
+    text = plain_text(event.detail or event.kind)
+    return Event(event.stamps.host_wall_ns, event.level, text, event.pose_index)
 
 
 def _rows(matrix: Array) -> Matrix4:

@@ -1,0 +1,36 @@
+"""A console that prints other people's text without obeying it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+from rich.console import Console, ConsoleOptions, ConsoleRenderable, RenderHook, RenderResult
+from rich.measure import Measurement
+from rich.segment import Segment
+
+from recordings.plain_text import plain_text
+
+
+def plain_console(**settings: Any) -> Console:
+    """A console without markup and emoji: brackets of a name are its own, colours come from styles alone."""
+    console = Console(**{"highlight": False, "markup": False, "emoji": False, **settings})
+    console.push_render_hook(_Hook())
+    return console
+
+
+class _Hook(RenderHook):
+    def process_renderables(self, renderables: Iterable[ConsoleRenderable]) -> list[ConsoleRenderable]:
+        return [_Plain(renderable) for renderable in renderables]
+
+
+class _Plain:
+    def __init__(self, inside: ConsoleRenderable) -> None:
+        self._inside = inside
+
+    def __rich_console__(self, console: Console, options: ConsoleOptions) -> RenderResult:
+        for segment in console.render(self._inside, options):
+            yield segment if segment.control else Segment(plain_text(segment.text), segment.style)
+
+    def __rich_measure__(self, console: Console, options: ConsoleOptions) -> Measurement:
+        return Measurement.get(console, options, self._inside)

@@ -1,0 +1,30 @@
+"""Text that somebody else wrote, made harmless for a terminal.
+
+A file, a recording, a camera or a robot may hold characters that a terminal takes for orders: colours, a
+moved cursor, a new window title, lines that overwrite what stood there, letters in another order.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+
+ORDERS = re.compile("[\x00-\x08\x0b-\x1f\x7f-\x9f\u200e\u200f\u202a-\u202e\u2066-\u2069]")
+"""Control characters but for tab and line feed, and marks that turn the direction of writing."""
+SIGN = "\N{REPLACEMENT CHARACTER}"
+
+
+def plain_text(text: str) -> str:
+    """The same text with a sign in place of each order to the terminal."""
+    return ORDERS.sub(SIGN, text)
+
+
+def plain_data(value: Any) -> Any:
+    """`plain_text` for every text in plain data (dict, list, scalars), keys included."""
+    if isinstance(value, str):
+        return plain_text(value)
+    if isinstance(value, dict):
+        return {plain_data(key): plain_data(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [plain_data(item) for item in value]
+    return value

@@ -104,9 +104,12 @@ def test_events_of_a_session() -> None:
 
 
 def test_no_command_makes_a_console_of_its_own() -> None:
-    """The ones of `station.console` read no markup; the screen is Textual's."""
+    """`plain_console` reads no markup and obeys no foreign text; the screen is Textual's."""
     room = Path(main.__code__.co_filename).parent
     files = {
-        file for file in room.rglob("*.py") if "tui" not in file.parts and "Console(" in file.read_text()
+        file
+        for file in room.rglob("*.py")
+        if "tui" not in file.parts
+        and ("Console(" in file.read_text() or "plain_console(" in file.read_text())
     }
     assert files == {room / "console.py"}

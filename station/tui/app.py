@@ -24,6 +24,7 @@ from textual.screen import Screen
 from station.client import Client
 from station.errors import StationError
 from station.status import StationState, StationStatus
+from station.stop_client import send_stop
 from station.tui import offline
 from station.tui.attendance import Attended
 from station.tui.checklist import ChecklistScreen
@@ -339,6 +340,7 @@ def run(socket: Path, who: str = "") -> None:
 
     app = StationApp(connect)
     app.graphics = detect()
+    app.stop_unconnected = partial(send_stop, socket)
     app.run()
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import msgspec
@@ -37,6 +38,8 @@ class Commands(App[None]):
     """A station stands behind this screen, not a recording alone."""
     link: Link | None = None
     """The connection while there is one."""
+    stop_unconnected: Callable[[], bool] = staticmethod(lambda: False)
+    """Sends STOP where there is no connection (`station.stop_client.send_stop`); False: nobody listens."""
     silent_s: float | None = None
     """For how long the daemon has not answered; None while it does."""
     trouble = ""
@@ -52,6 +55,9 @@ class Commands(App[None]):
             self.notify("This is the PLAYBACK of a recording: Escape leaves it. F12 still stops the arm.")
             return None
         if self.link is None:
+            if verb == "stop" and self.stop_unconnected():
+                self.notify("STOP was sent without a connection: look at the arm.", severity="warning")
+                return None
             self.notify("No connection to the daemon: nothing was sent.", severity="error")
             return None
         if self.silent_s is not None:

@@ -6,8 +6,10 @@ import msgspec
 import pytest
 from textual.widgets import DataTable
 
+from station.client import DaemonGoneError
 from station.status import Event, StationState
 from station.tui import link as link_module
+from station.tui.app import StationApp
 from station.tui.commands import STOP_UNHEARD
 from station.tui.widgets.preview import OLD, Preview
 from tests.tui.conftest import FakeLink, idle, until
@@ -104,3 +106,15 @@ async def test_a_screen_that_was_away_meanwhile_shows_what_was_known_last(link: 
         await until(pilot, lambda: "p08" in text_of(pilot.app, "#progress"))
         assert "NO DAEMON" in text_of(pilot.app, "#bar")
         assert str(pilot.app.screen.query_one("#progress").border_title) == "Pose: OLD"
+
+
+async def test_without_a_connection_stop_is_sent_all_the_same() -> None:
+    async def nobody() -> FakeLink:
+        raise DaemonGoneError("16 clients of this user are connected already")
+
+    sent: list[bool] = []
+    app = StationApp(nobody)
+    app.stop_unconnected = lambda: sent.append(True) is None
+    async with app.run_test(size=(80, 24)) as pilot:
+        await pilot.press("f12")
+        await until(pilot, lambda: bool(sent))

@@ -80,14 +80,15 @@ def _row(f: Found) -> tuple[object, ...]:
 
 
 @contextmanager
-def _folder() -> Iterator[Path]:
+def _folder() -> Iterator[tuple[Path, bool]]:
+    """And whether it is a small disk of its own, that may be filled."""
     folder = Path("/run") / f"station-benchmark-{os.getpid()}"
     folder.mkdir()
     mounted = subprocess.run(["mount", "-t", "tmpfs", "-o", "size=64k", "none", str(folder)]).returncode == 0
     os.chown(folder, 0, GROUP)
     folder.chmod(0o750)
     try:
-        yield folder
+        yield folder, mounted
     finally:
         if mounted:
             subprocess.run(["umount", str(folder)], check=False)
@@ -297,7 +298,7 @@ def _burn() -> None:
 
 
 async def _measure() -> list[Found]:
-    with _folder() as folder, tempfile.TemporaryDirectory() as scratch:
+    with _folder() as (folder, small), tempfile.TemporaryDirectory() as scratch:
         control = folder / "control.sock"
         async with _daemon(control, Path(scratch)), await Client.connect(control) as operator:
             await _until(operator, lambda s: s.state is StationState.IDLE and s.camera.connected)
@@ -340,12 +341,11 @@ async def _measure() -> list[Found]:
                 await situation("frozen screen that holds control", (OTHER, "screen", 1), moving=False),
                 await situation("16 busy processes", *[(OTHER, "burn", 1)] * 16),
             ]
-            with suppress(OSError):
-                (folder / "full").write_bytes(bytes(60 * 1024))
-                while True:
-                    with (folder / "full").open("ab", buffering=0) as file:
+            if small:
+                with suppress(OSError), (folder / "full").open("wb", buffering=0) as file:
+                    while True:
                         file.write(bytes(512))
-            found.append(await situation("full disk below the sockets", moving=False))
+                found.append(await situation("full disk below the sockets", moving=False))
             member.end()
     found += _untrusted()
     return found

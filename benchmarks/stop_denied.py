@@ -91,7 +91,7 @@ def _folder() -> Iterator[tuple[Path, bool]]:
         yield folder, mounted
     finally:
         if mounted:
-            subprocess.run(["umount", str(folder)], check=False)
+            subprocess.run(["umount", "--lazy", str(folder)], check=False)
         shutil.rmtree(folder, ignore_errors=True)
 
 

@@ -22,6 +22,8 @@ from calibrate.views import ViewSet
 
 FEWEST_FOR_TABLE = 8
 """Fewer views cannot tell 18 errors of a table from noise."""
+FEWEST_USED = 3
+"""Views that must count for something: fewer have no two motions."""
 MAX_ROBOT_M, MAX_ROBOT_RAD = 0.03, float(np.radians(3.0))
 """Noise beyond this per axis is none: no X is returned."""
 
@@ -100,6 +102,8 @@ def fit_moved(fit: CellFit, poses: PoseViews, at: int, moved: Moved, seed: int) 
 def require_plausible_noise(found: Estimate) -> None:
     """PosesDisagreeError where robot and pictures have nothing to do with each other."""
     robot_m, robot_rad = found.scales.robot
+    if found.used.sum() < FEWEST_USED:
+        raise PosesDisagreeError("Robot poses and pictures disagree in nearly every view.")
     if robot_m > MAX_ROBOT_M or robot_rad > MAX_ROBOT_RAD:
         raise PosesDisagreeError(
             f"Robot poses and pictures disagree by {robot_m * 1e3:.0f} mm, "

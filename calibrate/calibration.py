@@ -21,8 +21,8 @@ from calibrate.gates import Gate
 from calibrate.geometry import Transform, is_rigid, matrix_from_quaternion
 from recordings import strict_yaml
 from recordings.files import ASKED_FOR, write_atomically
+from recordings.mcap.records import MAGIC
 from recordings.messages import BoardSpec, CameraIdentity, CameraModel, Matrix4, Mount, RobotIdentity, Source
-from recordings.records import MAGIC
 
 FORMAT: Literal["handeye-calibration/1"] = "handeye-calibration/1"
 _LIMIT_BYTES = 4 * 1024 * 1024

@@ -11,7 +11,7 @@ import msgspec
 
 from recordings.cdr import definition_text, encode_cdr
 from recordings.errors import RecordingError
-from recordings.mcap_file import McapFile
+from recordings.mcap.writer import McapFile
 from recordings.messages import CameraModel, View
 from recordings.part import RecordingPart
 from recordings.pictures import raw_encoding
@@ -50,9 +50,10 @@ def write_ros2(recording: Recording, folder: Path) -> None:
 def _write_part(bag: _Bag, recording: Recording, part: RecordingPart) -> None:
     """In time order within each topic; a bag's reader sorts across topics by the chunks' times."""
     camera = part.info.camera
-    if times := part.messages(Topic.PICTURE_FACTS).times_ns:
+    if times := [message.time_ns for message in part.stored(Topic.PICTURE_FACTS)]:
         bag.add("/camera/camera_info", "sensor_msgs/CameraInfo", min(times), _camera_info(camera, min(times)))
-    for time_ns, state in zip(part.messages(Topic.ROBOT_STATE).times_ns, part.robot_states(), strict=True):
+    for stored, state in zip(part.stored(Topic.ROBOT_STATE), part.robot_states(), strict=True):
+        time_ns = stored.time_ns
         joints = {
             "header": _header(time_ns, ""),
             "name": _JOINTS,
@@ -64,9 +65,14 @@ def _write_part(bag: _Bag, recording: Recording, part: RecordingPart) -> None:
     for time_ns, sequence in zip(times, part.picture_sequences(), strict=True):
         _write_picture(bag, part, sequence, time_ns)
     counted = recording.views()
-    for time_ns, view in zip(part.messages(Topic.VIEW).times_ns, part.views, strict=True):
+    for stored, view in zip(part.stored(Topic.VIEW), part.views, strict=True):
         if view in counted:
-            bag.add("/tf", "tf2_msgs/TFMessage", time_ns, {"transforms": [_transform(view, time_ns)]})
+            bag.add(
+                "/tf",
+                "tf2_msgs/TFMessage",
+                stored.time_ns,
+                {"transforms": [_transform(view, stored.time_ns)]},
+            )
 
 
 def _write_picture(bag: _Bag, part: RecordingPart, sequence: int, time_ns: int) -> None:

@@ -77,12 +77,12 @@ def _count(recording: Recording, topic: Topic) -> int:
 
 def _topic(recording: Recording, topic: Topic) -> dict[str, Any]:
     indexes = [part.messages(topic) for part in recording.parts]
-    span_s = sum((max(i.times_ns) - min(i.times_ns)) / _NS for i in indexes if len(i))
+    span_s = sum((i.end_ns - i.start_ns) / _NS for i in indexes if len(i))
     intervals = sum(len(i) - 1 for i in indexes if len(i))
     return {
         "topic": topic.value,
         "messages": sum(len(i) for i in indexes),
-        "bytes": sum(sum(i.lengths) for i in indexes),
+        "bytes": sum(i.size_bytes for i in indexes),
         "span_s": span_s,
         "rate_hz": intervals / span_s if span_s > _SHORTEST_SPAN_S else None,
     }

@@ -13,7 +13,7 @@ import msgspec
 
 from recordings.errors import CorruptRecordingError, RecordingError
 from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, write_atomically
-from recordings.scan import open_file
+from recordings.mcap.scan import open_file
 
 MANIFEST_FILE = "parts.json"
 PARTS_LIMIT = 100

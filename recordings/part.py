@@ -14,15 +14,17 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from recordings.contents import MessageIndex
 from recordings.errors import BadPictureError, CorruptRecordingError
 from recordings.files import is_attachment_name, is_session_name
 from recordings.manifest import PARTS_LIMIT
+from recordings.mcap import Message, MessageIndex, open_file, scan_file
+from recordings.mcap.contents import joined
+from recordings.mcap.records import BadRecordError, require_crc
+from recordings.mcap.source import ShortFileError
 from recordings.messages import CaptureEvent, Picture, RobotState, SessionInfo, View
 from recordings.pictures import PictureError, decode_picture, raw_array
-from recordings.scan import open_file, scan_file
 from recordings.schema import (
-    FORMAT,
+    FORMATS,
     RECOVERY_RECORD,
     SESSION_RECORDS,
     PictureFacts,
@@ -47,9 +49,11 @@ class RecordingPart:
         self._descriptor = open_file(path)
         try:
             self.size_bytes = os.fstat(self._descriptor).st_size
-            self._contents, self.sha256 = scan_file(self._descriptor, path)
-            self._topics = self._check_channels()
+            self._contents, self._source, self.sha256 = scan_file(self._descriptor, path)
             self.info = self._session_info()
+            self.foreign: dict[str, MessageIndex] = {}
+            """By topic: what other programs added."""
+            self._topics = self._check_channels()
             self.lost_bytes = self._recovery_loss()
             self.attachments = self._checked_attachments()
             self.media_types = dict(self._contents.media_types)
@@ -92,15 +96,15 @@ class RecordingPart:
         facts = self._message(Topic.PICTURE_FACTS, self._facts[sequence], PictureFacts)
         compressed = sequence in self._compressed
         topic = Topic.COMPRESSED_IMAGE if compressed else Topic.RAW_IMAGE
-        place = (self._compressed if compressed else self._raw)[sequence]
+        address = (self._compressed if compressed else self._raw)[sequence]
         size = (self.info.camera.width, self.info.camera.height)
         try:
             if (facts.width, facts.height) != size:
                 raise PictureError(f"is {facts.width}×{facts.height}, the camera {size[0]}×{size[1]}")
-            image = self._decoded_image(topic, place, *size)
+            image = self._decoded_image(topic, address, *size)
         except PictureError as error:
-            offset = self._topics[topic].offsets[place]
-            raise BadPictureError(f"{self.path} at byte {offset}: picture {sequence} {error}") from error
+            place = self._source.place(address)
+            raise BadPictureError(f"{self.path} at byte {place}: picture {sequence} {error}") from error
         image.flags.writeable = False
         return Picture(
             image=image,
@@ -113,8 +117,8 @@ class RecordingPart:
             trigger_count=facts.trigger_count,
         )
 
-    def _decoded_image(self, topic: Topic, place: int, width: int, height: int) -> NDArray[Any]:
-        message = self._image_message(topic, place)
+    def _decoded_image(self, topic: Topic, address: int, width: int, height: int) -> NDArray[Any]:
+        message = self._image_message(topic, address)
         data = message.data
         if topic is Topic.COMPRESSED_IMAGE:
             del message  # it holds a second copy of the bytes
@@ -130,48 +134,53 @@ class RecordingPart:
         message = self._image_message(Topic.COMPRESSED_IMAGE, self._compressed[sequence])
         return str(message.format), bytes(message.data)
 
-    def corrupt(self, topic: Topic, place: int, reason: str) -> CorruptRecordingError:
-        offset = self._topics[topic].offsets[place]
+    def corrupt(self, topic: Topic, address: int, reason: str) -> CorruptRecordingError:
         return CorruptRecordingError(
-            f"{self.path} is damaged at byte {offset} ({topic.value}): {reason}. Use the original file"
+            f"{self.path} is damaged at byte {self._source.place(address)} ({topic.value}): {reason}. "
+            "Use the original file"
         )
 
-    def _image_message(self, topic: Topic, place: int) -> Any:
+    def _image_message(self, topic: Topic, address: int) -> Any:
         kind: Any = CompressedImage if topic is Topic.COMPRESSED_IMAGE else RawImage
         try:
-            return kind.FromString(self._content(topic, place))
+            return kind.FromString(self._read(topic, address).data)
         except DecodeError as error:
-            raise self.corrupt(topic, place, "the image message cannot be parsed") from error
+            raise self.corrupt(topic, address, "the image message cannot be parsed") from error
 
-    def _content(self, topic: Topic, place: int) -> bytes:
-        index = self._topics[topic]
-        data = os.pread(self._descriptor, index.lengths[place], index.offsets[place])
-        if len(data) != index.lengths[place]:
-            raise self.corrupt(topic, place, "the file became shorter after it was opened")
-        return data
-
-    def _message(self, topic: Topic, place: int, struct: type[S]) -> S:
+    def _read(self, topic: Topic, address: int) -> Message:
         try:
-            return decode(struct, self._content(topic, place))
+            return self._source.message(address)
+        except ShortFileError as error:
+            raise self.corrupt(topic, address, "the file became shorter after it was opened") from error
+
+    def stored(self, topic: Topic) -> Iterator[Message]:
+        """A topic's messages as they are stored, in file order."""
+        return (self._read(topic, address) for address in self.messages(topic).addresses)
+
+    def _message(self, topic: Topic, address: int, struct: type[S]) -> S:
+        try:
+            return decode(struct, self._read(topic, address).data)
         except SchemaError as error:
-            raise self.corrupt(topic, place, str(error)) from error
+            raise self.corrupt(topic, address, str(error)) from error
 
     def _decoded(self, topic: Topic, struct: type[S]) -> Iterator[S]:
-        for place in range(len(self.messages(topic))):
-            yield self._message(topic, place, struct)
+        for address in self.messages(topic).addresses:
+            yield self._message(topic, address, struct)
 
     def _file_error(self, reason: str) -> CorruptRecordingError:
         return CorruptRecordingError(f"{self.path} cannot be used: {reason}")
 
     def _check_channels(self) -> dict[Topic, MessageIndex]:
-        """Known topics with exactly the meaning this version knows."""
+        """Known topics with exactly the meaning this version knows; the others are `foreign`."""
         names = {topic.value: topic for topic in Topic}
-        found: dict[Topic, MessageIndex] = {}
+        found: dict[Topic, list[MessageIndex]] = {}
         for number, channel in self._contents.channels.items():
+            index = self._contents.messages[number]
             topic = names.get(channel.topic)
-            if topic is None or topic in found:
-                raise self._file_error(f"topic '{channel.topic[:60]}' is unknown or declared twice")
-            schema = self._contents.schemas[channel.schema_id]
+            if topic is None:
+                self.foreign[channel.topic] = index
+                continue
+            schema = self._contents.schema_of(channel)
             if (channel.encoding, schema.encoding, schema.name) != (
                 "protobuf",
                 "protobuf",
@@ -186,15 +195,19 @@ class RecordingPart:
                 difference = str(error)
             if difference:
                 raise self._file_error(f"topic {topic.value}: {difference}; use the version that wrote it")
-            found[topic] = self._contents.messages[number]
-        return found
+            found.setdefault(topic, []).append(index)
+        return {topic: joined(indexes) for topic, indexes in found.items()}
 
     def _session_info(self) -> SessionInfo:
         record = self._contents.metadata.get(SESSION_RECORDS[0], {})
-        if record.get("format") != FORMAT:
-            raise self._file_error(
-                f"its format is '{record.get('format', 'unknown')[:40]}', this version reads '{FORMAT}'"
-            )
+        version = record.get("format", "")
+        if version not in FORMATS:
+            raise self._file_error(_other_format(version))
+        if version != FORMATS[0] or "crc32" in record:
+            try:
+                require_crc(record)
+            except BadRecordError as error:
+                raise self._file_error(str(error)) from error
         try:
             info = msgspec.json.decode(record.get("session", ""), type=SessionInfo)
         except (msgspec.DecodeError, RecursionError) as error:
@@ -222,12 +235,13 @@ class RecordingPart:
         return dict(self._contents.attachments)
 
     def _index_pictures(self, topic: Topic) -> dict[int, int]:
-        """Sequence → place on the topic."""
-        places: dict[int, int] = {}
-        for place, sequence in enumerate(self.messages(topic).sequences):
-            if places.setdefault(sequence, place) != place:
-                raise self.corrupt(topic, place, f"picture {sequence} stands twice in the file")
-        return places
+        """Sequence → address of the message."""
+        found: dict[int, int] = {}
+        for address in self.messages(topic).addresses:
+            _, _, sequence = self._source.head(address)
+            if found.setdefault(sequence, address) != address:
+                raise self.corrupt(topic, address, f"picture {sequence} stands twice in the file")
+        return found
 
     def _check_picture_pairs(self) -> None:
         if self._raw.keys() & self._compressed.keys():
@@ -240,15 +254,27 @@ class RecordingPart:
         if len(self.messages(Topic.VIEW)) > VIEWS_LIMIT:
             raise self._file_error(f"more than {VIEWS_LIMIT} views")
         views = []
-        for place, view in enumerate(self._decoded(Topic.VIEW, View)):
+        for address in self.messages(Topic.VIEW).addresses:
+            view = self._message(Topic.VIEW, address, View)
             if view.picture_sequence not in self._facts:
-                raise self.corrupt(Topic.VIEW, place, f"view {view.index} names a picture that is not there")
+                raise self.corrupt(
+                    Topic.VIEW, address, f"view {view.index} names a picture that is not there"
+                )
             if not _is_rigid(view):
                 raise self.corrupt(
-                    Topic.VIEW, place, f"the flange pose of view {view.index} is no rigid transform"
+                    Topic.VIEW, address, f"the flange pose of view {view.index} is no rigid transform"
                 )
             views.append(msgspec.structs.replace(view, part=self.info.part))
         return views
+
+
+def _other_format(version: str) -> str:
+    """Why a file with this format is not read."""
+    name, _, number = version.partition("/")
+    own_name, _, newest = FORMATS[-1].partition("/")
+    if name != own_name or not number.isdecimal():
+        return "it is no recording of this station. Bring in other people's data with `recordings import`"
+    return f"it was written by newer software (format {number[:20]}, this version reads up to {newest})"
 
 
 def _is_rigid(view: View) -> bool:

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recordings import checksum
+from recordings.mcap import checksum
 
 PICTURE_LIMIT_BYTES = 36 * 1024 * 1024
 """Decoded size above which no picture is read or written: bounds the reader's memory."""

@@ -8,17 +8,14 @@ from pathlib import Path
 
 import msgspec
 
-from recordings.contents import Contents
 from recordings.errors import RecordingError
-from recordings.mcap_file import McapFile
+from recordings.mcap.records import MESSAGE_HEAD, Opcode, with_crc
+from recordings.mcap.salvage import Salvage, salvage
+from recordings.mcap.writer import McapFile
 from recordings.messages import View
 from recordings.part import RecordingPart
-from recordings.records import MESSAGE_HEAD, RECORD_HEAD, Opcode, split_records, with_crc
-from recordings.salvage import CompressedError, Salvage, salvage
 from recordings.schema import RECOVERY_RECORD, SESSION_RECORDS, SchemaError, decode
-from recordings.topics import Topic
-
-_DATA_OFFSET = RECORD_HEAD.size + MESSAGE_HEAD.size
+from recordings.topics import Topic, identify
 
 
 class NothingToSaveError(RecordingError):
@@ -38,10 +35,7 @@ def rebuild(descriptor: int, source: Path, target: Path) -> Rebuilt:
 
     Raises NothingToSaveError, RecordingError, or OSError when the disk fails.
     """
-    try:
-        found = salvage(descriptor)
-    except CompressedError as error:
-        raise RecordingError(f"{source} was compressed by another tool; undo it: mcap decompress") from error
+    found = salvage(descriptor, identify)
     session = next(
         (found.contents.metadata[n] for n in SESSION_RECORDS if n in found.contents.metadata), None
     )
@@ -50,11 +44,11 @@ def rebuild(descriptor: int, source: Path, target: Path) -> Rebuilt:
             f"nothing can be saved from {source}: the description of the session itself is lost "
             f"({os.fstat(descriptor).st_size} bytes). The file is unchanged; look for another copy"
         )
-    dropped, reasons = _orphans(descriptor, found.contents)
+    dropped, reasons = _orphans(found)
     losses = (*(f"bytes {start} to {end}: {why}" for start, end, why in found.lost), *reasons)
     file = McapFile(target)
     try:
-        _write(file, descriptor, found, session, dropped, losses)
+        _write(file, found, session, dropped, losses)
         os.fsync(file.descriptor)
     finally:
         file.close()
@@ -69,13 +63,14 @@ def _verified(temporary: Path, source: Path) -> RecordingPart:
         raise RecordingError(f"{source} cannot be recovered and is unchanged: {reason}") from error
 
 
-def _orphans(descriptor: int, contents: Contents) -> tuple[set[int], list[str]]:
-    """Places of messages that lost their partner: a picture without its facts, a view without its picture."""
+def _orphans(found: Salvage) -> tuple[set[int], list[str]]:
+    """Addresses of messages that lost their partner: a picture its facts, a view its picture."""
+    contents, source = found.contents, found.source
     index = {channel.topic: contents.messages[number] for number, channel in contents.channels.items()}
 
     def places(topic: Topic) -> dict[int, int]:
-        messages = index.get(topic.value)
-        return dict(zip(messages.sequences, messages.offsets, strict=True)) if messages else {}
+        addresses = index[topic.value].addresses if topic.value in index else ()
+        return {source.head(address)[2]: address for address in addresses}
 
     facts = places(Topic.PICTURE_FACTS)
     images = places(Topic.RAW_IMAGE) | places(Topic.COMPRESSED_IMAGE)
@@ -84,23 +79,21 @@ def _orphans(descriptor: int, contents: Contents) -> tuple[set[int], list[str]]:
         place for table in (facts, images) for sequence, place in table.items() if sequence not in whole
     }
     reasons = [f"picture {sequence} is incomplete" for sequence in sorted(facts.keys() ^ images.keys())]
-    views = index.get(Topic.VIEW.value)
-    for offset, length in zip(views.offsets, views.lengths, strict=True) if views else ():
+    for address in index[Topic.VIEW.value].addresses if Topic.VIEW.value in index else ():
         try:
-            view = decode(View, os.pread(descriptor, length, offset))
+            view = decode(View, source.message(address).data)
         except SchemaError:
-            dropped.add(offset)
-            reasons.append(f"a view at byte {offset} cannot be read")
+            dropped.add(address)
+            reasons.append(f"a view at byte {source.place(address)} cannot be read")
             continue
         if view.picture_sequence not in whole:
-            dropped.add(offset)
+            dropped.add(address)
             reasons.append(f"pose {view.index + 1} (attempt {view.attempt}) lost its picture")
     return dropped, reasons
 
 
 def _write(
     file: McapFile,
-    descriptor: int,
     found: Salvage,
     session: dict[str, str],
     dropped: set[int],
@@ -118,18 +111,20 @@ def _write(
     for name, data in contents.attachments.items():
         file.attachment(name, contents.media_types[name], data, 0)
     numbers: dict[int, int] = {}
-    for start, length in found.chunks:
-        for place, opcode, content in split_records(memoryview(os.pread(descriptor, length, start))):
-            if opcode != Opcode.MESSAGE or start + place + _DATA_OFFSET in dropped:
+    for chunk in found.chunks:
+        for address, opcode, content in found.records(chunk):
+            if opcode != Opcode.MESSAGE or address in dropped:
                 continue
             number, sequence, time_ns, _ = MESSAGE_HEAD.unpack_from(content)
             if number not in contents.channels:
                 continue
             if number not in numbers:
                 channel = contents.channels[number]
-                schema = contents.schemas[channel.schema_id]
+                schema = contents.schema_of(channel)
                 declared = (schema.name, schema.encoding, schema.data)
-                numbers[number] = file.register(channel.topic, channel.encoding, declared)
-            file.message(numbers[number], [content[MESSAGE_HEAD.size :]], time_ns, sequence)
+                numbers[number] = file.register(
+                    channel.topic, channel.encoding, declared, dict(channel.metadata)
+                )
+            file.message(numbers[number], [content[MESSAGE_HEAD.size :]], time_ns, sequence, more=True)
         file.end_chunk()
     file.finish()

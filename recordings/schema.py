@@ -18,7 +18,8 @@ from msgspec import inspect
 
 from recordings.messages import CaptureEvent, RobotState, Stamps, Stillness, View
 
-FORMAT = "station-recording/1"
+FORMATS = ("station-recording/1", "station-recording/2")
+"""What is read, oldest first; the newest is written."""
 SESSION_RECORDS = ("session", "session-copy")
 """Metadata records with the SessionInfo: twice, because nothing can be saved from a file without it."""
 RECOVERY_RECORD = "recovery"

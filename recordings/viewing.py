@@ -12,7 +12,7 @@ from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from numpy.typing import NDArray
 
-from recordings.mcap_file import Piece
+from recordings.mcap.writer import Piece
 from recordings.messages import CameraModel, CaptureEvent, Matrix4, View
 from recordings.pictures import raw_encoding
 

@@ -26,11 +26,11 @@ from recordings.files import (
     rename_new,
     sync_folder,
 )
-from recordings.mcap_file import McapFile, Piece
+from recordings.mcap.records import with_crc
+from recordings.mcap.writer import McapFile, Piece
 from recordings.messages import CameraModel, CaptureEvent, Picture, RobotState, SessionInfo, Stamps, View
 from recordings.pictures import PictureError, encode_png, read_header
-from recordings.records import with_crc
-from recordings.schema import FORMAT, SESSION_RECORDS, PictureFacts, encode
+from recordings.schema import FORMATS, SESSION_RECORDS, PictureFacts, encode
 from recordings.topics import Topic, schema_bytes, schema_name
 
 ATTACHMENT_LIMIT_BYTES = 16 * 1024 * 1024
@@ -65,7 +65,7 @@ class RecordingWriter:
         self._background = BackgroundSync(self._file.descriptor)
         try:
             self._file.start()
-            content = with_crc({"format": FORMAT, "session": msgspec.json.encode(info).decode()})
+            content = with_crc({"format": FORMATS[-1], "session": msgspec.json.encode(info).decode()})
             for name in SESSION_RECORDS:
                 self._file.metadata(name, content)
             sync_folder(path.parent)
@@ -109,7 +109,9 @@ class RecordingWriter:
             topic, image = self._image(picture, encoded, time_ns)
         except PictureError as error:
             raise RecordingError(f"picture {picture.sequence}: {error}") from error
-        self._add(Topic.PICTURE_FACTS, [encode(facts)], time_ns, picture.sequence)
+        for part_of_it in (Topic.PICTURE_FACTS, topic):  # declared first: the two lie in one chunk
+            self._channel(part_of_it)
+        self._add(Topic.PICTURE_FACTS, [encode(facts)], time_ns, picture.sequence, more=True)
         self._add(topic, image, time_ns, picture.sequence)
         self._pictures.add(picture.sequence)
         self.flush()
@@ -211,15 +213,20 @@ class RecordingWriter:
         """Wall time where there is one; imported pictures have none and follow each other by a second."""
         return stamps.host_wall_ns or self._start_ns + place * _SECOND_NS
 
-    def _add(self, topic: Topic, pieces: list[Piece], time_ns: int, sequence: int | None = None) -> None:
+    def _add(
+        self, topic: Topic, pieces: list[Piece], time_ns: int, sequence: int | None = None, more: bool = False
+    ) -> None:
         if sequence is None:
             sequence = self._sequences.get(topic, 0)
             self._sequences[topic] = sequence + 1
         with self._disk():
-            if topic not in self._channels:
-                schema = (schema_name(topic), "protobuf", schema_bytes(topic))
-                self._channels[topic] = self._file.register(topic.value, "protobuf", schema)
-            self._file.message(self._channels[topic], pieces, time_ns, sequence)
+            self._file.message(self._channel(topic), pieces, time_ns, sequence, more=more)
+
+    def _channel(self, topic: Topic) -> int:
+        if topic not in self._channels:
+            schema = (schema_name(topic), "protobuf", schema_bytes(topic))
+            self._channels[topic] = self._file.register(topic.value, "protobuf", schema)
+        return self._channels[topic]
 
     @contextmanager
     def _disk(self) -> Iterator[None]:

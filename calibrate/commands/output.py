@@ -17,7 +17,7 @@ from calibrate.calibration import FORMAT, CalibrationFileError, read_calibration
 from calibrate.errors import CalibrationError
 from calibrate.load import Progress as LoadProgress
 from recordings.console import plain_console
-from recordings.records import MAGIC
+from recordings.mcap.records import MAGIC
 
 _told_width = sys.stdout.isatty() or "COLUMNS" in os.environ
 out = plain_console(width=None if _told_width else 150)

@@ -22,8 +22,8 @@ import cv2
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
 with atheris.instrument_imports(include=["recordings"]):
-    from recordings import checksum
     from recordings.errors import RecordingError
+    from recordings.mcap import checksum
     from recordings.reader import open_recording
     from recordings.recover import recover
     from recordings.writer import RecordingWriter

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import msgspec
 
+from recordings.mcap.records import MAGIC, Opcode, with_crc
 from recordings.messages import SessionInfo
-from recordings.records import MAGIC, Opcode, with_crc
-from recordings.schema import FORMAT
+from recordings.schema import FORMATS
 from recordings.topics import Topic, schema_bytes, schema_name
 from tests.recordings.small_recording import make_info
 
@@ -76,7 +76,7 @@ def attachment(name: str | bytes, data: bytes, crc: int | None = None) -> bytes:
     return record(Opcode.ATTACHMENT, content + struct.pack("<I", zlib.crc32(content) if crc is None else crc))
 
 
-def session_metadata(info: SessionInfo | None = None, file_format: str = FORMAT) -> bytes:
+def session_metadata(info: SessionInfo | None = None, file_format: str = FORMATS[-1]) -> bytes:
     described = msgspec.json.encode(info or make_info()).decode()
     return metadata("session", with_crc({"format": file_format, "session": described}))
 

@@ -15,9 +15,9 @@ from mcap.reader import make_reader
 from mcap.records import Message
 from mcap.stream_reader import StreamReader
 
-from recordings import checksum
-from recordings.checksum import joined_crc
-from recordings.mcap_file import CHUNK_BYTES, McapFile
+from recordings.mcap import checksum
+from recordings.mcap.checksum import joined_crc
+from recordings.mcap.writer import CHUNK_BYTES, McapFile
 
 
 @given(st.binary(max_size=3000), st.integers(0, 2**32 - 1))
@@ -33,7 +33,7 @@ def test_the_fast_checksum_is_the_one_in_use() -> None:
 def test_it_records_without_zlib_ng_too() -> None:
     code = (
         "import sys, zlib; sys.modules['zlib_ng'] = None\n"
-        "from recordings import checksum; assert checksum.crc32 is zlib.crc32"
+        "from recordings.mcap import checksum; assert checksum.crc32 is zlib.crc32"
     )
     subprocess.run([sys.executable, "-c", code], check=True, cwd=Path(__file__).parents[2])
 
@@ -99,7 +99,7 @@ def test_a_kernel_that_takes_little_at_a_time_changes_nothing(
         taken += 1
         return real_writev(descriptor, [pieces[0][: 1 + taken % 9973]])
 
-    monkeypatch.setattr("recordings.mcap_file.os.writev", reluctant)
+    monkeypatch.setattr("recordings.mcap.writer.os.writev", reluctant)
     contents = write_many(tmp_path / "a.mcap")
     with (tmp_path / "a.mcap").open("rb") as stream:
         records = list(StreamReader(stream, validate_crcs=True).records)

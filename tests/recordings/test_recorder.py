@@ -215,7 +215,7 @@ def break_disk_after(monkeypatch: pytest.MonkeyPatch, good_writes: int) -> None:
             raise OSError(28, "No space left on device")
         return real_write(descriptor, data)
 
-    monkeypatch.setattr("recordings.mcap_file.os.writev", write)
+    monkeypatch.setattr("recordings.mcap.writer.os.writev", write)
 
 
 def test_the_first_write_error_is_final_and_said_to_everyone(

@@ -7,8 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from recordings import checksum
 from recordings.errors import RecordingError
+from recordings.mcap import checksum
 from recordings.reader import open_recording
 from recordings.recover import recover
 

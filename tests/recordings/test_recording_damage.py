@@ -133,7 +133,7 @@ def test_recovery_from_any_flipped_bit_never_saves_a_changed_message(small: Path
 def test_one_damaged_pose_costs_only_that_pose(tmp_path: Path) -> None:
     path = write_small(tmp_path / "a.mcap", poses=6)
     data = bytearray(path.read_bytes())
-    offset = open_recording(path).parts[0].messages(Topic.RAW_IMAGE).offsets[3]
+    offset = open_recording(path).parts[0].messages(Topic.RAW_IMAGE).addresses[3]
     data[offset + 100] ^= 0xFF
     path.write_bytes(data)
     with pytest.raises(CorruptRecordingError, match="checksum"):

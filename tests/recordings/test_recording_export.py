@@ -137,7 +137,7 @@ def test_a_full_disk_leaves_no_half_of_a_recording_that_can_be_made_again(
             raise OSError(28, "No space left on device")
         return real_write(descriptor, pieces)
 
-    monkeypatch.setattr("recordings.mcap_file.os.writev", write)
+    monkeypatch.setattr("recordings.mcap.writer.os.writev", write)
     output = tmp_path / "out.mcap"
     with pytest.raises(RecordingError, match=r"No space left on device.*nothing is left of it.*try again"):
         import_folder(folder, output) if make == "import" else write_excerpt(recording, output)

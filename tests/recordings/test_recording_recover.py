@@ -87,7 +87,7 @@ def test_a_picture_without_its_view_and_a_view_without_its_picture(tmp_path: Pat
     """The chunk of pose 1's picture is cut out: its view must go too, the others stay."""
     path = write_small(tmp_path / "a.mcap", poses=3)
     part = open_recording(path).parts[0]
-    offset = part.messages(Topic.RAW_IMAGE).offsets[1]
+    offset = part.messages(Topic.RAW_IMAGE).addresses[1]
     data = bytearray(path.read_bytes())
     data[offset + 50] ^= 1
     path.write_bytes(data)
@@ -132,7 +132,7 @@ def test_a_lost_dark_picture_does_not_make_recovery_slow(tmp_path: Path) -> None
             writer.view(make_view(index))
         path = writer.finish()
     data = bytearray(path.read_bytes())
-    data[open_recording(path).parts[0].messages(Topic.RAW_IMAGE).offsets[1] - 40] ^= 1
+    data[open_recording(path).parts[0].messages(Topic.RAW_IMAGE).addresses[1] - 40] ^= 1
     path.write_bytes(data)
     start_s = time.perf_counter()
     recover(path)
@@ -143,7 +143,7 @@ def test_a_lost_dark_picture_does_not_make_recovery_slow(tmp_path: Path) -> None
 def test_after_a_destroyed_record_head_the_search_finds_the_next_whole_chunk(tmp_path: Path) -> None:
     path = write_small(tmp_path / "a.mcap", poses=4)
     data = bytearray(path.read_bytes())
-    at = open_recording(path).parts[0].messages(Topic.RAW_IMAGE).offsets[1]
+    at = open_recording(path).parts[0].messages(Topic.RAW_IMAGE).addresses[1]
     head = data.rindex(b"\x06", 0, at - 700)  # of pose 1's chunk, or a byte before it
     data[head : head + 9] = b"\xff" * 9
     path.write_bytes(data)

@@ -27,7 +27,7 @@ def write_unfinished(path: Path) -> Path:
 def broken_chunk(path: Path, pose: int, whole_head: bool = True) -> None:
     """The chunk with this pose's picture gets a wrong head, or a wrong byte in the picture."""
     data = bytearray(path.read_bytes())
-    at = open_recording(path).parts[0].messages(Topic.RAW_IMAGE).offsets[pose]
+    at = open_recording(path).parts[0].messages(Topic.RAW_IMAGE).addresses[pose]
     if whole_head:
         head = data.rindex(b"\x06", 0, at - 700)
         data[head : head + 9] = b"\xff" * 9

@@ -1,7 +1,8 @@
 """Walks a cut or damaged file and finds every chunk whose checksum still proves it.
 
 Nothing that no checksum vouches for is kept: a chunk is either whole or lost. After a damaged place the
-search goes on at the next whole chunk.
+search goes on at the next whole chunk. What the channels mean is gathered from everything that is whole,
+before any message is looked at.
 """
 
 from __future__ import annotations
@@ -9,19 +10,24 @@ from __future__ import annotations
 import os
 import re
 import struct
-from collections.abc import Iterator
+from array import array
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field
 
-from recordings import checksum
-from recordings.contents import Contents
-from recordings.records import (
+from recordings.mcap import checksum
+from recordings.mcap.contents import Contents, MessageIndex
+from recordings.mcap.records import (
     FOOTER,
     FOOTER_BYTES,
     MAGIC,
+    MESSAGE_HEAD,
     RECORD_HEAD,
     BadRecordError,
+    Channel,
+    ChunkHead,
     Opcode,
+    Schema,
     check_message_index,
     parse_chunk_head,
     parse_header,
@@ -29,7 +35,9 @@ from recordings.records import (
     require_crc,
     split_records,
 )
-from recordings.scan import CHUNK_LIMIT_BYTES, COMPRESSIONS, SUMMARY_LIMIT_BYTES
+from recordings.mcap.scan import CHUNK_LIMIT_BYTES, SUMMARY_LIMIT_BYTES
+from recordings.mcap.source import Source
+from recordings.mcap.unpack import unpack
 
 _LIKE_A_RECORD = re.compile(rb"[\x06\x09\x0c].{4}\x00{4}", re.DOTALL)
 """Opcode of a chunk, attachment or metadata record, and a length below 4 GiB."""
@@ -41,15 +49,29 @@ _CHUNK_PEEK = struct.Struct("<QIIQ")
 """Uncompressed size, checksum, length of the compression's name, stored size."""
 _NAME_LIMIT = 60
 _SMALL_RECORD_LIMIT_BYTES = 20 * 1024 * 1024
+_SAMPLES = 20
+_SAMPLES_LIMIT_BYTES = 64 * 1024 * 1024
+
+Identify = Callable[[list[bytes]], tuple[str, str, str, bytes] | None]
+"""Messages of one channel → its topic, schema name, encoding and schema data, where only one kind fits."""
+
+
+@dataclass(frozen=True)
+class Records:
+    """The records inside one proven chunk."""
+
+    address: int
+    """As the source counts: those of a compressed chunk lie unpacked behind the file."""
+    size_bytes: int
 
 
 @dataclass
 class Salvage:
     """What is whole in a damaged file."""
 
-    contents: Contents = field(default_factory=Contents)
-    chunks: list[tuple[int, int]] = field(default_factory=list)
-    """(place in the file, length) of the records inside each good chunk."""
+    source: Source
+    contents: Contents = field(default_factory=lambda: Contents(exact=True))
+    chunks: list[Records] = field(default_factory=list)
     lost: list[tuple[int, int, str]] = field(default_factory=list)
     """(from byte, to byte, why)"""
 
@@ -57,21 +79,75 @@ class Salvage:
     def lost_bytes(self) -> int:
         return sum(end - start for start, end, _ in self.lost)
 
+    def records(self, chunk: Records) -> Iterator[tuple[int, int, memoryview]]:
+        """(address, opcode, content) of each record."""
+        data = memoryview(self.source.read(chunk.address, chunk.size_bytes))
+        for place, opcode, content in split_records(data):
+            yield chunk.address + place, opcode, content
 
-class CompressedError(Exception):
-    """Somebody packed the file: it needs unpacking, not recovery."""
+
+def salvage(descriptor: int, identify: Identify = lambda samples: None) -> Salvage:
+    """Reads the whole open file; memory is bounded as in the strict reader.
+
+    `identify` is asked about channels whose declarations are all lost.
+    """
+    found = _Walk(descriptor).run()
+    _identify_channels(found, identify)
+    for chunk in found.chunks:
+        _index_messages(found, chunk)
+    return found
 
 
-def salvage(descriptor: int) -> Salvage:
-    """Reads the whole open file once; memory is bounded as in the strict reader. Raises CompressedError."""
-    return _Walk(descriptor).run()
+def _identify_channels(found: Salvage, identify: Identify) -> None:
+    """Declares channels that messages name and no declaration speaks of, after what lies on them."""
+    samples: dict[int, list[bytes]] = {}
+    size_bytes = 0
+    for chunk in found.chunks:
+        for _, opcode, content in found.records(chunk):
+            if opcode != Opcode.MESSAGE or len(content) < MESSAGE_HEAD.size:
+                continue
+            number = MESSAGE_HEAD.unpack_from(content)[0]
+            if number in found.contents.channels:
+                continue
+            kept = samples.setdefault(number, [])
+            if len(kept) < _SAMPLES and size_bytes < _SAMPLES_LIMIT_BYTES:
+                kept.append(bytes(content[MESSAGE_HEAD.size :]))
+                size_bytes += len(content)
+    for number, kept in samples.items():
+        if (known := identify(kept)) is not None:
+            topic, name, encoding, data = known
+            free = next(n for n in range(1, 2**16) if n not in found.contents.schemas)
+            found.contents.schemas[free] = Schema(free, name, encoding, data)
+            found.contents.channels[number] = Channel(number, free, topic, encoding, ())
+            found.contents.messages[number] = MessageIndex()
+
+
+def _index_messages(found: Salvage, chunk: Records) -> None:
+    data = found.source.read(chunk.address, chunk.size_bytes)
+    places: array[int] = array("q")
+    for place, opcode, content in split_records(memoryview(data)):
+        if opcode != Opcode.MESSAGE:
+            continue
+        if (
+            len(content) >= MESSAGE_HEAD.size
+            and MESSAGE_HEAD.unpack_from(content)[0] in found.contents.channels
+        ):
+            places.append(place)
+        else:
+            start = chunk.address + place
+            end = start + RECORD_HEAD.size + len(content)
+            found.lost.append((start, end, "nothing says what its channel carries"))
+    try:
+        found.contents.add_messages(data, places, chunk.address)
+    except BadRecordError as error:
+        found.lost.append((chunk.address, chunk.address + chunk.size_bytes, str(error)))
 
 
 class _Walk:
     def __init__(self, descriptor: int) -> None:
         self._descriptor = descriptor
-        self._size = os.fstat(descriptor).st_size
-        self._found = Salvage()
+        self._found = Salvage(Source(descriptor))
+        self._size = self._found.source.size_bytes
 
     def run(self) -> Salvage:
         self._declarations_from_summary()
@@ -110,39 +186,36 @@ class _Walk:
         elif opcode == Opcode.ATTACHMENT:
             self._found.contents.add_attachment(content)
         elif opcode == Opcode.METADATA:
-            require_crc(parse_metadata(content).content)
+            require_crc(parse_metadata(content, exact=True).content)
             self._found.contents.add_metadata(content)
         elif opcode == Opcode.DATA_END and len(content) == _DATA_END_LENGTH:
             return position, True
         elif opcode == Opcode.MESSAGE_INDEX:
             check_message_index(content)
         elif opcode == Opcode.HEADER:
-            parse_header(content)
+            parse_header(content, exact=True)
         else:
             raise BadRecordError(f"a record of kind 0x{opcode:02x} does not belong here")
         return position + RECORD_HEAD.size + len(content), False
 
     def _chunk(self, start: int, content: memoryview) -> None:
-        records, offset = _proven_records(content)
+        head, records = _proven_records(content)
         for _ in split_records(records):
             pass  # its structure is sound before anything of it is taken in
-        for place, opcode, inner in split_records(records):
-            position = start + offset + place
-            try:
-                self._take_in(position + RECORD_HEAD.size, opcode, inner)
-            except BadRecordError as error:
-                end = position + RECORD_HEAD.size + len(inner)
-                self._found.lost.append((position, end, str(error)))
-        self._found.chunks.append((start + offset, len(records)))
+        for _, opcode, inner in split_records(records):
+            with suppress(BadRecordError):  # declared before, differently: the first one counts
+                self._declare(opcode, inner)
+        address = start + head.data_offset
+        if head.compression:
+            stored = len(content) - head.data_offset
+            address = self._found.source.add_packed(address, stored, head.compression, len(records))
+        self._found.chunks.append(Records(address, len(records)))
 
-    def _take_in(self, start: int, opcode: int, content: memoryview) -> None:
-        contents = self._found.contents
-        if opcode == Opcode.MESSAGE:
-            contents.add_message(start, content)
-        elif opcode == Opcode.SCHEMA:
-            contents.add_schema(content)
+    def _declare(self, opcode: int, content: memoryview) -> None:
+        if opcode == Opcode.SCHEMA:
+            self._found.contents.add_schema(content)
         elif opcode == Opcode.CHANNEL:
-            contents.add_channel(content)
+            self._found.contents.add_channel(content)
 
     def _next_good(self, position: int) -> int:
         """The next place where a whole chunk, attachment or metadata record starts, or the file's end."""
@@ -152,9 +225,9 @@ class _Walk:
                 if opcode == Opcode.CHUNK:
                     _proven_records(content)
                 elif opcode == Opcode.ATTACHMENT:
-                    Contents().add_attachment(content)
+                    Contents(exact=True).add_attachment(content)
                 else:
-                    require_crc(parse_metadata(content).content)
+                    require_crc(parse_metadata(content, exact=True).content)
             except BadRecordError:
                 continue
             return candidate
@@ -178,8 +251,11 @@ class _Walk:
         opcode, length = RECORD_HEAD.unpack_from(head)
         content = head[RECORD_HEAD.size :]
         if opcode == Opcode.CHUNK:
-            size, _, compression, stored = _CHUNK_PEEK.unpack_from(content, 16)
-            return bool(compression == 0 and size == stored == length - _PEEK_BYTES)
+            size, _, name_length, stored = _CHUNK_PEEK.unpack_from(content, 16)
+            if name_length:
+                name = content[28 : 28 + name_length]
+                return bool(name in (b"lz4", b"zstd") and size <= CHUNK_LIMIT_BYTES)
+            return bool(size == stored == length - _PEEK_BYTES)
         (name_length,) = struct.unpack_from("<I", content, 16 if opcode == Opcode.ATTACHMENT else 0)
         return bool(0 < name_length <= _NAME_LIMIT and length <= _SMALL_RECORD_LIMIT_BYTES)
 
@@ -197,16 +273,17 @@ class _Walk:
             return
         with suppress(BadRecordError):
             for _, opcode, content in split_records(memoryview(summary)):
-                if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                    self._take_in(0, opcode, content)
+                self._declare(opcode, content)
 
 
-def _proven_records(content: memoryview) -> tuple[memoryview, int]:
-    """(the records inside a chunk, their offset in it) when the checksum fits. BadRecordError otherwise."""
+def _proven_records(content: memoryview) -> tuple[ChunkHead, memoryview]:
+    """(head, the records inside, unpacked) of a chunk whose checksum fits. BadRecordError otherwise."""
     head = parse_chunk_head(content)
-    if head.compression in COMPRESSIONS:
-        raise CompressedError
     records = content[head.data_offset :]
+    if head.uncompressed_size > CHUNK_LIMIT_BYTES:
+        raise BadRecordError("the chunk's size is damaged, or more than is read here")
+    if head.compression:
+        records = memoryview(unpack(records, head.compression, head.uncompressed_size))
     if head.uncompressed_size != len(records) or checksum.crc32(records) != head.crc:
         raise BadRecordError("the chunk's checksum does not fit its content")
-    return records, head.data_offset
+    return head, records

@@ -12,11 +12,13 @@ import struct
 from collections.abc import Sequence
 from pathlib import Path
 
-from recordings import checksum
 from recordings.files import create_exclusively
-from recordings.records import FOOTER, MAGIC, MESSAGE_HEAD, RECORD_HEAD, Opcode, Statistics
+from recordings.mcap import checksum
+from recordings.mcap.records import FOOTER, MAGIC, MESSAGE_HEAD, RECORD_HEAD, Opcode, Statistics
 
 CHUNK_BYTES = 1024 * 1024
+DECLARE_AGAIN_BYTES = 16 * 1024 * 1024
+"""What lies between two copies of the declarations: a scan that lost one meets the next."""
 LIBRARY = "calibration-station"
 _LARGE_BYTES = 32 * 1024
 Piece = bytes | bytearray | memoryview
@@ -33,8 +35,10 @@ class McapFile:
         self._crc = 0
         self._declarations: list[tuple[bytes, bytes]] = []
         """(schema record, channel record) of channel 1, 2 …; the schema has the channel's number."""
+        self._declared_at: int | None = None
+        """Where the newest copy of all declarations is; None when it lacks some."""
         self._indexes: list[bytes] = []
-        """Of chunks, attachments and metadata, for the summary."""
+        """Of chunks, attachments and metadata, in file order, for the summary."""
         self._counts = dict.fromkeys(Statistics._fields[:6], 0)
         self._per_channel: dict[int, int] = {}
         self._span_ns: tuple[int, int] | None = None
@@ -61,22 +65,37 @@ class McapFile:
             _record(Opcode.CHANNEL, channel_content + _map(metadata or {})),
         )
         self._declarations.append(pair)
-        for record in pair:
-            self._chunk.add(record)
+        self._declared_at = None
         self._counts["schemas"] += 1
         self._counts["channels"] += 1
         return number
 
-    def message(self, channel: int, pieces: Sequence[Piece], time_ns: int, sequence: int) -> None:
-        """A message whose content comes in pieces; ends the chunk when it is full."""
+    def message(
+        self, channel: int, pieces: Sequence[Piece], time_ns: int, sequence: int, *, more: bool = False
+    ) -> None:
+        """A message whose content comes in pieces; ends the chunk when it is full.
+
+        `more`: the next message belongs to this one and goes into the same chunk.
+        """
+        if self._declared_at is None or self.size_bytes - self._declared_at > DECLARE_AGAIN_BYTES:
+            self._declare()
         length = MESSAGE_HEAD.size + sum(map(len, pieces))
         self._chunk.note(channel, time_ns)
         head = RECORD_HEAD.pack(Opcode.MESSAGE, length)
         self._chunk.add(head + MESSAGE_HEAD.pack(channel, sequence & 0xFFFFFFFF, time_ns, time_ns))
         for piece in pieces:
             self._chunk.add(piece)
-        if self._chunk.size_bytes > CHUNK_BYTES:
+        if self._chunk.size_bytes > CHUNK_BYTES and not more:
             self.end_chunk()
+
+    def _declare(self) -> None:
+        """All schemas and channels so far, in a chunk of their own: damage elsewhere leaves them alone."""
+        self.end_chunk()
+        self._declared_at = self.size_bytes
+        for pair in self._declarations:
+            for record in pair:
+                self._chunk.add(record)
+        self.end_chunk()
 
     def attachment(self, name: str, media_type: str, data: bytes, time_ns: int) -> None:
         content = struct.pack("<QQ", time_ns, time_ns) + _text(name) + _text(media_type)
@@ -132,7 +151,7 @@ class McapFile:
                 *(schema for schema, _ in self._declarations),
                 *(channel for _, channel in self._declarations),
                 self._statistics(),
-                *sorted(self._indexes),  # grouped by kind, as readers expect
+                *sorted(self._indexes, key=lambda record: record[0]),  # by kind; inside a kind as in the file
             ]
         )
         footer = RECORD_HEAD.pack(Opcode.FOOTER, FOOTER.size) + struct.pack("<QQ", start, 0)

@@ -1,7 +1,7 @@
-"""The records of an MCAP file, parsed strictly: every length checked before it is believed.
+"""The records of an MCAP file: every length is checked before it is believed.
 
-Source: the MCAP format specification, version 0 (mcap.dev/spec). Unlike the reference reader nothing here
-returns short data, skips padding or passes over a record it does not know.
+Source: the MCAP format specification, version 0 (mcap.dev/spec). A record may be longer than its fields:
+later versions of the specification append new ones. `exact` refuses that, where a wrong length must not pass.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from collections.abc import Iterator
 from enum import IntEnum
 from typing import NamedTuple
 
-from recordings import checksum
+from recordings.mcap import checksum
 
 MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")
@@ -136,15 +136,16 @@ class Cursor:
             raise BadRecordError("a map does not end where it says")
         return content
 
-    def done(self) -> None:
-        if self.position != len(self._content):
+    def end(self, exact: bool = True) -> None:
+        """BadRecordError when bytes are left over and nothing may follow."""
+        if exact and self.position != len(self._content):
             raise BadRecordError(f"{len(self._content) - self.position} bytes are left over in the record")
 
 
-def parse_header(content: memoryview) -> Header:
+def parse_header(content: memoryview, exact: bool = False) -> Header:
     cursor = Cursor(content)
     record = Header(cursor.text(), cursor.text())
-    cursor.done()
+    cursor.end(exact)
     return record
 
 
@@ -152,7 +153,6 @@ def parse_schema(content: memoryview) -> Schema:
     cursor = Cursor(content)
     number, name, encoding = cursor.uint(2), cursor.text(), cursor.text()
     record = Schema(number, name, encoding, bytes(cursor.bytes(cursor.uint(4))))
-    cursor.done()
     if record.id == 0:
         raise BadRecordError("schema 0 is not allowed")
     return record
@@ -161,9 +161,7 @@ def parse_schema(content: memoryview) -> Schema:
 def parse_channel(content: memoryview) -> Channel:
     cursor = Cursor(content)
     number, schema_id, topic, encoding = cursor.uint(2), cursor.uint(2), cursor.text(), cursor.text()
-    record = Channel(number, schema_id, topic, encoding, tuple(cursor.text_map().items()))
-    cursor.done()
-    return record
+    return Channel(number, schema_id, topic, encoding, tuple(cursor.text_map().items()))
 
 
 def parse_chunk_head(content: memoryview) -> ChunkHead:
@@ -174,25 +172,25 @@ def parse_chunk_head(content: memoryview) -> ChunkHead:
     stored = cursor.uint(8)
     offset = cursor.position
     cursor.bytes(stored)
-    cursor.done()
+    cursor.end()
     return ChunkHead(start, end, size, crc, compression, offset)
 
 
-def parse_attachment(content: memoryview) -> Attachment:
+def parse_attachment(content: memoryview, exact: bool = False) -> Attachment:
     cursor = Cursor(content)
     cursor.bytes(16)  # log time, creation time
     name, media_type = cursor.text(), cursor.text()
     data = bytes(cursor.bytes(cursor.uint(8)))
     covers = cursor.position
     record = Attachment(name, media_type, data, cursor.uint(4), covers)
-    cursor.done()
+    cursor.end(exact)
     return record
 
 
-def parse_metadata(content: memoryview) -> Metadata:
+def parse_metadata(content: memoryview, exact: bool = False) -> Metadata:
     cursor = Cursor(content)
     record = Metadata(cursor.text(), cursor.text_map())
-    cursor.done()
+    cursor.end(exact)
     return record
 
 
@@ -202,7 +200,6 @@ def parse_statistics(content: memoryview) -> Statistics:
     channels, attachments, metadata, chunks = (cursor.uint(4) for _ in range(4))
     start, end = cursor.uint(8), cursor.uint(8)
     pairs = cursor.bytes(cursor.uint(4))
-    cursor.done()
     if len(pairs) % 10:
         raise BadRecordError("the message counts do not end where they say")
     counts = dict(struct.iter_unpack("<HQ", pairs))
@@ -215,7 +212,7 @@ def check_message_index(content: memoryview) -> None:
     cursor.uint(2)
     if len(cursor.bytes(cursor.uint(4))) % 16:
         raise BadRecordError("a message index does not end where it says")
-    cursor.done()
+    cursor.end()
 
 
 def split_records(content: memoryview) -> Iterator[tuple[int, int, memoryview]]:

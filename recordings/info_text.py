@@ -26,7 +26,8 @@ def print_info(facts: dict[str, Any]) -> None:
     topics = Table("topic", "messages", "rate", "size", box=None, padding=(0, 2, 0, 0), header_style="dim")
     for topic in facts["topics"]:
         rate = f"{topic['rate_hz']:.1f} Hz" if topic["rate_hz"] else "-"
-        topics.add_row(topic["topic"], str(topic["messages"]), rate, f"{topic['bytes'] / 1e6:.2f} MB")
+        name = topic["topic"] + (" (of another program, ignored)" if topic["foreign"] else "")
+        topics.add_row(name, str(topic["messages"]), rate, f"{topic['bytes'] / 1e6:.2f} MB")
     console.print(topics)
 
 
@@ -82,8 +83,10 @@ def _pictures_text(pictures: dict[str, Any]) -> str:
     return ", ".join([str(pictures["count"]), *pictures["pixel_formats"], *settings, order])
 
 
-def _clock_text(clock: dict[str, float]) -> str:
+def _clock_text(clock: dict[str, float | None]) -> str:
     within = f"95 % within {clock['spread_p95_ms']:.2f} ms, all within {clock['spread_max_ms']:.2f} ms"
+    if clock["drift_ppm"] is None:
+        return f"too short for a drift, {within}"
     return f"drift {clock['drift_ppm']:+.1f} ppm against the host, {within}"
 
 

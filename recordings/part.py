@@ -32,6 +32,7 @@ from recordings.schema import (
     decode,
     schema_difference,
 )
+from recordings.stamps_table import StampsTable, stamps_tables
 from recordings.topics import Topic, schema_bytes, schema_name
 
 VIEWS_LIMIT = 10_000
@@ -80,6 +81,20 @@ class RecordingPart:
 
     def robot_states(self) -> Iterator[RobotState]:
         return self._decoded(Topic.ROBOT_STATE, RobotState)
+
+    def state_stamps(self) -> Iterator[StampsTable]:
+        """The clocks of all robot states, many at once."""
+        return self._stamps(Topic.ROBOT_STATE, RobotState)
+
+    def picture_stamps(self) -> Iterator[StampsTable]:
+        """The clocks of all pictures, many at once."""
+        return self._stamps(Topic.PICTURE_FACTS, PictureFacts)
+
+    def _stamps(self, topic: Topic, struct: type[RobotState] | type[PictureFacts]) -> Iterator[StampsTable]:
+        addresses = np.frombuffer(self.messages(topic).addresses, np.uint64)
+        return stamps_tables(
+            self._source, addresses, lambda address: self._message(topic, address, struct).stamps
+        )
 
     def events(self) -> Iterator[CaptureEvent]:
         return self._decoded(Topic.EVENT, CaptureEvent)

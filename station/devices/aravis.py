@@ -12,8 +12,8 @@ from typing import Any, TypeVar
 
 import msgspec
 
+from recordings.clocks import ClockFit
 from recordings.messages import CameraIdentity, Picture
-from station.clocks import ClockFit
 from station.config import CameraConfig
 from station.devices.aravis_device import GenicamDevice
 from station.devices.base import Trigger

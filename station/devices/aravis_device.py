@@ -9,8 +9,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from recordings.clocks import monotonic_from_wall_ns
 from recordings.messages import CameraIdentity, Picture, Stamps
-from station.clocks import monotonic_from_wall_ns
 from station.config import CameraConfig
 from station.devices.aravis_settings import Region, apply_settings, read_settings, require_settings
 from station.devices.frames import DeviceClock, StreamCounts

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 import msgspec
 
-from station.clocks import DRIFT_SPAN_S, UNFITTED_DRIFT, ClockFit
+from recordings.clocks import DRIFT_SPAN_S, UNFITTED_DRIFT, ClockFit
 from station.errors import CameraError
 
 LAST_FRAME_ID = 65_535

@@ -16,10 +16,10 @@ import msgspec
 import numpy as np
 
 from calibrate.geometry import Array, interpolate, pose_from_rotvec, rotation_log
+from recordings.clocks import ClockFit
 from recordings.errors import RecordingError
 from recordings.messages import CameraIdentity, Picture, RobotIdentity, RobotState, Stamps, Vector6, View
 from recordings.reader import Recording, open_recording
-from station.clocks import ClockFit
 from station.config import CameraConfig
 from station.devices.frames import CameraCounts, next_frame_id
 from station.devices.playback_source import Played, Source, open_source

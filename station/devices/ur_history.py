@@ -10,8 +10,8 @@ import numpy as np
 
 from calibrate.geometry import interpolate as between_poses
 from calibrate.geometry import pose_from_rotvec, rotation_log
+from recordings.clocks import ClockFit
 from recordings.messages import RobotState, Stamps, Vector6
-from station.clocks import ClockFit
 from station.errors import StaleStateError
 
 

@@ -12,8 +12,8 @@ import time
 from collections.abc import Callable
 
 from calibrate.kinematics import MODELS, DhDeltas
+from recordings.clocks import ClockFit
 from recordings.messages import RobotIdentity, RobotState
-from station.clocks import ClockFit
 from station.config import RobotConfig
 from station.devices.ur_condition import safety_stop
 from station.devices.ur_dashboard import Dashboard, DashboardError

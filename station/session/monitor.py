@@ -8,8 +8,8 @@ from pathlib import Path
 
 import msgspec
 
+from recordings.clocks import ClockFit
 from recordings.messages import RobotState
-from station.clocks import ClockFit
 from station.devices.ur_condition import mode_word, program_word, safety_word, what_holds
 from station.errors import RobotError
 from station.limits import SPEED_CAP_M_S, point_speed_m_s

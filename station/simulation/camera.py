@@ -12,8 +12,8 @@ from typing import Any
 import msgspec
 import numpy as np
 
+from recordings.clocks import ClockFit
 from recordings.messages import CameraIdentity, Picture, Stamps
-from station.clocks import ClockFit
 from station.config import CameraConfig
 from station.devices.base import Trigger
 from station.devices.frames import CameraCounts, DeviceClock, FrameCounter

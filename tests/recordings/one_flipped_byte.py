@@ -41,7 +41,7 @@ class Cost:
 
 
 def chunks_of_poses(path: Path) -> list[tuple[int, int, set[int]]]:
-    """(from byte, to byte, sequences of pictures with a part in it) of each chunk, by the reference library."""
+    """(from byte, to byte, pictures with a part in it) of each chunk, by the reference library."""
     found = []
     with path.open("rb") as stream:
         end = 8

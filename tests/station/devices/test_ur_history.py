@@ -6,8 +6,8 @@ import msgspec
 import numpy as np
 import pytest
 
+from recordings.clocks import ClockFit
 from recordings.messages import RobotState, Stamps
-from station.clocks import ClockFit
 from station.devices.ur_history import state_at
 from station.errors import StaleStateError
 from tests.station.devices.test_ur_moves import STATE

@@ -1,0 +1,68 @@
+"""The clocks of many messages at once are those that each message holds."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import zstandard
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from recordings.messages import Stamps
+from recordings.reader import open_recording
+from recordings.schema import encode
+from recordings.stream_quality import Steps
+from recordings.topics import Topic
+from tests.recordings.crafted import Counts, channel, chunk, message, schema, sealed, session_metadata
+from tests.recordings.small_recording import make_state
+
+times = st.one_of(st.just(0), st.integers(-(2**63), 2**63 - 1), st.integers(0, 2**40))
+stamps = st.builds(Stamps, times, times, st.floats(allow_nan=False), times)
+
+
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.lists(stamps, min_size=1, max_size=40), st.booleans(), st.booleans())
+def test_every_stamp_comes_back(tmp_path: Path, wanted: list[Stamps], packed: bool, reordered: bool) -> None:
+    states = [msgspec.structs.replace(make_state(0), stamps=value) for value in wanted]
+    encoded = [encode(state) for state in states]
+    if reordered:  # the first field behind the others: allowed, and slow
+        encoded[0] = encoded[0][2 + encoded[0][1] :] + encoded[0][: 2 + encoded[0][1]]
+    declared = schema(1, Topic.ROBOT_STATE) + channel(1, 1, "/robot/state")
+    records = declared + b"".join(message(1, data) for data in encoded)
+    stored = {"compression": "zstd", "stored": zstandard.compress(records)} if packed else {}
+    counts = Counts(messages=len(states), chunks=1, per_channel={1: len(states)})
+    path = tmp_path / "a.mcap"
+    path.write_bytes(sealed(session_metadata() + chunk(records, **stored), counts))
+    part = open_recording(path).parts[0]
+    assert [state.stamps for state in part.robot_states()] == wanted
+    tables = list(part.state_stamps())
+    found = [
+        Stamps(*row)
+        for table in tables
+        for row in zip(
+            table.host_monotonic_ns.tolist(),
+            table.host_wall_ns.tolist(),
+            table.controller_s.tolist(),
+            table.device_ns.tolist(),
+            strict=True,
+        )
+    ]
+    assert found == wanted
+
+
+def test_the_median_of_steps_is_theirs() -> None:
+    rng = np.random.default_rng(3)
+    stamps_s = np.cumsum(rng.exponential(0.002, 20_001))
+    steps = Steps()
+    for block in np.array_split(stamps_s, 7):
+        steps.add(block)
+    real = np.diff(stamps_s)
+    assert steps.count == len(real)
+    assert abs(steps.median_s() / np.median(real) - 1) < 1e-3
+    assert abs(steps.longer_than(0.01)[0] - (real > 0.01).sum()) < 20
+    assert steps.longer_than(0.01)[1] == real.max()
+    steps.begin()
+    steps.add(np.array([0.0, 1.0, 0.5]))
+    assert (steps.count, steps.backward) == (len(real) + 2, 1)

@@ -8,7 +8,7 @@ PYTHON ?= $(or $(SYSTEM_PYTHON),python3)
 VENV_FLAGS := $(if $(SYSTEM_PYTHON),--system-site-packages,)
 READY := $(VENV)/.ready
 
-.PHONY: help venv demo demo-gige test check bench soak install install-files uninstall clean
+.PHONY: help venv demo demo-gige test foreign check bench soak install install-files uninstall clean
 help:  ## list the commands
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
@@ -36,6 +36,21 @@ check: $(READY)  ## ruff, mypy strict, import contracts
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+# Other people's programs, apart from ours: half a gigabyte, and npm's part only where there is npm.
+FOREIGN := .foreign
+MCAP_CORE := @mcap/core@2.2.2
+
+$(FOREIGN)/.ready: $(READY) tests/foreign/requirements.txt
+	$(BIN)/python -m pip --disable-pip-version-check install --quiet --no-deps --upgrade \
+		--target $(FOREIGN)/python -r tests/foreign/requirements.txt
+	@if command -v npm >/dev/null; then \
+		npm install --silent --no-audit --no-fund --ignore-scripts --prefix $(FOREIGN)/node $(MCAP_CORE); \
+	else echo "npm is missing: @mcap/core will not judge. apt install npm, then rm -r $(FOREIGN)"; fi
+	@touch $@
+
+foreign: $(FOREIGN)/.ready  ## our files judged by other people's programs, and theirs read by ours
+	$(BIN)/python -m pytest -n 2 tests/foreign
 
 bench: $(READY)  ## the benchmarks; tables go to benchmarks/README.md
 	$(BIN)/python -m benchmarks
@@ -79,4 +94,4 @@ uninstall:  ## remove what install put there; configuration, recordings and cali
 	rm -f $(DESTDIR)$(SYSCONFDIR)/udev/rules.d/60-station.rules
 
 clean:  ## remove the venv and caches
-	rm -rf $(VENV) build *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(FOREIGN) build *.egg-info .mypy_cache .ruff_cache .pytest_cache

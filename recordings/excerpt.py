@@ -22,7 +22,8 @@ def write_excerpt(recording: Recording, output: Path, window_s: float = 0.5) -> 
     views = recording.views()
     kept_ns = sorted(view.stamps.host_monotonic_ns for view in views)
     note = f"excerpt: robot states within {window_s:g} s of the pictures"
-    note = " ".join([*filter(None, [recording.info.note]), note, *recording.losses])
+    said = recording.info.note.replace(note, "").strip()  # of an excerpt's excerpt: once is enough
+    note = " ".join([*filter(None, [said]), note, *recording.losses])
     info = msgspec.structs.replace(recording.info, part=1, note=note)
     with derived_recording(output, info, lossless_png=True) as writer:
         for name, content in recording.attachments().items():

@@ -15,8 +15,12 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from recordings.errors import RecordingError
-from recordings.messages import CameraModel, CaptureEvent, Picture, RobotState, SessionInfo, View
+from recordings.messages import CameraModel, CaptureEvent, Matrix4, Picture, RobotState, SessionInfo, View
+from recordings.viewing import DETECTED, Marks
 from recordings.writer import RecordingWriter
 
 QUEUE_LIMIT_BYTES = 256 * 1024 * 1024
@@ -113,6 +117,16 @@ class Recorder:
 
     def camera_model(self, model: CameraModel) -> None:
         self._put(_Item(lambda: self._writer.camera_model(model), _SMALL_BYTES))
+
+    def corners(self, sequence: int, pixels: NDArray[np.float64]) -> None:
+        """Detected corners (n, 2) of a recorded picture, for viewers."""
+        marks = [Marks(pixels, DETECTED)]
+        if sequence not in self._dropped_pictures:
+            self._put(_Item(lambda: self._writer.marks(sequence, marks), _SMALL_BYTES))
+
+    def frame(self, parent: str, child: str, parent_from_child: Matrix4) -> None:
+        """Where something stays that is known now, for viewers."""
+        self._put(_Item(lambda: self._writer.frame(parent, child, parent_from_child), _SMALL_BYTES))
 
     def attach(self, name: str, media_type: str, content: bytes) -> None:
         self._put(_Item(lambda: self._writer.attach(name, media_type, content), len(content)))

@@ -8,6 +8,8 @@ from typing import Any
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
@@ -27,6 +29,9 @@ class Topic(StrEnum):
     VIEW = "/session/view"
     EVENT = "/session/event"
     TRANSFORM = "/tf"
+    FIXED_TRANSFORM = "/tf_static"
+    JOINTS = "/joint_states"
+    ANNOTATIONS = "/camera/annotations"
     LOG = "/log"
 
 
@@ -39,6 +44,9 @@ _MESSAGES: dict[Topic, Any] = {
     Topic.VIEW: message_class(View),
     Topic.EVENT: message_class(CaptureEvent),
     Topic.TRANSFORM: FrameTransform,
+    Topic.FIXED_TRANSFORM: FrameTransform,
+    Topic.JOINTS: JointStates,
+    Topic.ANNOTATIONS: ImageAnnotations,
     Topic.LOG: Log,
 }
 
@@ -61,6 +69,8 @@ def identify(samples: list[bytes]) -> tuple[str, str, str, bytes] | None:
     topic's message has, and it says again the same number of bytes.
     """
     fitting = [topic for topic in Topic if all(_fits(topic, data) for data in samples)]
+    if {schema_name(topic) for topic in fitting} == {FrameTransform.DESCRIPTOR.full_name}:
+        fitting = [Topic.TRANSFORM]  # /tf_static holds the same kind, for viewers only
     if len(fitting) != 1 or not samples:
         return None
     return fitting[0].value, schema_name(fitting[0]), "protobuf", schema_bytes(fitting[0])

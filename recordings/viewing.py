@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Any
 
+import cv2
 import numpy as np
 from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from numpy.typing import NDArray
 
 from recordings.mcap.writer import Piece
-from recordings.messages import CameraModel, CaptureEvent, Matrix4, View
+from recordings.messages import CameraModel, CaptureEvent, Matrix4, RobotState, Vector6
 from recordings.pictures import raw_encoding
 
 CAMERA_FRAME = "camera"
+JOINT_NAMES = [
+    f"{joint}_joint" for joint in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+]
+"""As the UR ROS driver names them."""
+DETECTED = (0.1, 0.9, 0.2)
+"""Colour of corners as they were detected."""
 _NS = 1_000_000_000
 _LEVELS = {"debug": Log.DEBUG, "info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
 _FISHEYE = {"equidistant": "kannala_brandt"}
@@ -74,15 +86,75 @@ def camera_calibration(model: CameraModel, time_ns: int) -> Any:
     return message
 
 
-def flange_transform(view: View, time_ns: int) -> Any:
-    """base_from_flange of a view, so that a 3D panel shows where the pictures were taken."""
-    T = view.base_from_flange
+def frame_transform(parent: str, child: str, T: Matrix4, time_ns: int) -> Any:
+    """parent_from_child, so that a 3D panel knows where things are."""
     x, y, z, w = quaternion_xyzw(T)
-    message = FrameTransform(parent_frame_id="base", child_frame_id="flange")
+    message = FrameTransform(parent_frame_id=parent, child_frame_id=child)
     message.translation.x, message.translation.y, message.translation.z = T[0][3], T[1][3], T[2][3]
     message.rotation.x, message.rotation.y, message.rotation.z, message.rotation.w = x, y, z, w
     _stamp(message, time_ns)
     return message
+
+
+def base_from_flange(tcp_pose: Vector6, tcp_offset: Vector6) -> Matrix4:
+    """The controller's tool pose without the tool: base_from_tcp and flange_from_tcp → base_from_flange."""
+    base_from_tcp, flange_from_tcp = _pose(tcp_pose), _pose(tcp_offset)
+    R = base_from_tcp[:3, :3] @ flange_from_tcp[:3, :3].T
+    t = base_from_tcp[:3, 3] - R @ flange_from_tcp[:3, 3]
+    return (*((*map(float, row), float(at)) for row, at in zip(R, t, strict=True)), (0.0, 0.0, 0.0, 1.0))
+
+
+def _pose(pose: Vector6) -> NDArray[np.float64]:
+    T = np.eye(4)
+    T[:3, :3] = cv2.Rodrigues(np.array(pose[3:]))[0]
+    T[:3, 3] = pose[:3]
+    return T
+
+
+def joint_states(state: RobotState, time_ns: int) -> Any:
+    message = JointStates()
+    for name, position, velocity in zip(JOINT_NAMES, state.joints_rad, state.joint_speeds_rad_s, strict=True):
+        message.joints.add(name=name, position=position, velocity=velocity)
+    _stamp(message, time_ns)
+    return message
+
+
+@dataclass(frozen=True, eq=False)
+class Marks:
+    """Points that are drawn over a picture, joined in pairs where `ends` is given."""
+
+    points: NDArray[np.float64]
+    """(n, 2), pixels; (0, 0) is the centre of the top left pixel."""
+    colour: tuple[float, float, float]
+    """Red, green, blue, each 0…1."""
+    ends: NDArray[np.float64] | None = None
+    """(n, 2): a line leads from each point to its end."""
+    thickness_px: float = 4.0
+
+
+def image_annotations(marks: Sequence[Marks], text: str, time_ns: int) -> Any:
+    """`text` stands in the upper left corner. Viewers count from a pixel's corner: half a pixel is added."""
+    message = ImageAnnotations()
+    _stamp(message, time_ns)
+    for mark in marks:
+        kind = PointsAnnotation.POINTS if mark.ends is None else PointsAnnotation.LINE_LIST
+        drawn = message.points.add(type=kind, thickness=mark.thickness_px)
+        _stamp(drawn, time_ns)
+        _paint(drawn.outline_color, mark.colour)
+        points = mark.points if mark.ends is None else np.stack([mark.points, mark.ends], 1).reshape(-1, 2)
+        for x, y in points + 0.5:
+            drawn.points.add(x=x, y=y)
+    if text:
+        label = message.texts.add(text=text, font_size=24)
+        _stamp(label, time_ns)
+        label.position.x, label.position.y = 10, 34
+        _paint(label.text_color, marks[-1].colour if marks else (1.0, 1.0, 1.0))
+        label.background_color.a = 0.6
+    return message
+
+
+def _paint(colour: Any, rgb: tuple[float, float, float]) -> None:
+    colour.r, colour.g, colour.b, colour.a = *rgb, 1.0
 
 
 def log_line(event: CaptureEvent, time_ns: int) -> Any:

@@ -6,13 +6,14 @@ the summary. Raw values and all clocks go in; geometry is applied by the reader'
 
 from __future__ import annotations
 
+import math
 import os
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from types import TracebackType
-from typing import Self
+from typing import Any, Self
 
 import msgspec
 
@@ -28,12 +29,23 @@ from recordings.files import (
 )
 from recordings.mcap.records import with_crc
 from recordings.mcap.writer import McapFile, Piece
-from recordings.messages import CameraModel, CaptureEvent, Picture, RobotState, SessionInfo, Stamps, View
+from recordings.messages import (
+    CameraModel,
+    CaptureEvent,
+    Matrix4,
+    Picture,
+    RobotState,
+    SessionInfo,
+    Stamps,
+    View,
+)
 from recordings.pictures import PictureError, encode_png, read_header
 from recordings.schema import FORMATS, SESSION_RECORDS, PictureFacts, encode
 from recordings.topics import Topic, schema_bytes, schema_name
 
 ATTACHMENT_LIMIT_BYTES = 16 * 1024 * 1024
+SHOWN_PERIOD_NS = 40_000_000
+"""Viewers get the arm at 25 Hz; the states themselves are kept at their full rate."""
 _SECOND_NS = 1_000_000_000
 
 
@@ -59,7 +71,10 @@ class RecordingWriter:
         self._start_ns = info.created_wall_ns or time.time_ns()
         self._channels: dict[Topic, int] = {}
         self._sequences: dict[Topic, int] = {}
-        self._pictures: set[int] = set()
+        self._pictures: dict[int, int] = {}
+        """Sequence → time in the file."""
+        self._shown_ns = 0
+        """Time of the newest state that viewers get."""
         self._attachments: set[str] = set()
         self._file = McapFile(self.part_path)
         self._background = BackgroundSync(self._file.descriptor)
@@ -80,7 +95,14 @@ class RecordingWriter:
             self.camera_model(info.camera)
 
     def robot_state(self, state: RobotState) -> None:
-        self._add(Topic.ROBOT_STATE, [encode(state)], self._time_ns(state.stamps))
+        time_ns = self._time_ns(state.stamps)
+        self._add(Topic.ROBOT_STATE, [encode(state)], time_ns)
+        due = not 0 <= time_ns - self._shown_ns < SHOWN_PERIOD_NS  # a clock that was set back counts, too
+        if due and all(map(math.isfinite, state.tcp_pose)):
+            self._shown_ns = time_ns
+            T = viewing.base_from_flange(state.tcp_pose, self.info.robot.tcp_offset)
+            self._show(Topic.TRANSFORM, viewing.frame_transform("base", "flange", T, time_ns), time_ns)
+            self._show(Topic.JOINTS, viewing.joint_states(state, time_ns), time_ns)
 
     def picture(self, picture: Picture, encoded: bytes | None = None) -> None:
         """`encoded`: the same picture's PNG or JPEG bytes, stored instead of the array (imported files)."""
@@ -113,7 +135,7 @@ class RecordingWriter:
             self._channel(part_of_it)
         self._add(Topic.PICTURE_FACTS, [encode(facts)], time_ns, picture.sequence, more=True)
         self._add(topic, image, time_ns, picture.sequence)
-        self._pictures.add(picture.sequence)
+        self._pictures[picture.sequence] = time_ns
         self.flush()
 
     def _image(self, picture: Picture, encoded: bytes | None, time_ns: int) -> tuple[Topic, list[Piece]]:
@@ -132,18 +154,34 @@ class RecordingWriter:
             )
         time_ns = self._time_ns(view.stamps, view.picture_sequence)
         self._add(Topic.VIEW, [encode(view)], time_ns)
-        self._add(Topic.TRANSFORM, [viewing.flange_transform(view, time_ns).SerializeToString()], time_ns)
+        if not self._shown_ns:  # imported, say: nothing else tells viewers where the flange is
+            T = view.base_from_flange
+            self._show(Topic.TRANSFORM, viewing.frame_transform("base", "flange", T, time_ns), time_ns)
         self.flush()
+
+    def marks(self, sequence: int, marks: Sequence[viewing.Marks], text: str = "") -> None:
+        """What viewers draw over a recorded picture: detected corners, residuals."""
+        time_ns = self._pictures[sequence]
+        self._show(Topic.ANNOTATIONS, viewing.image_annotations(marks, text, time_ns), time_ns)
+
+    def frame(self, parent: str, child: str, parent_from_child: Matrix4) -> None:
+        """A transform that does not change from here on, for viewers: where the camera is, say."""
+        message = viewing.frame_transform(parent, child, parent_from_child, self._start_ns)
+        self._show(Topic.FIXED_TRANSFORM, message, self._start_ns)
+
+    def _show(self, topic: Topic, message: Any, time_ns: int) -> None:
+        self._add(topic, [message.SerializeToString()], time_ns)
 
     def event(self, event: CaptureEvent) -> None:
         time_ns = self._time_ns(event.stamps)
         self._add(Topic.EVENT, [encode(event)], time_ns)
-        self._add(Topic.LOG, [viewing.log_line(event, time_ns).SerializeToString()], time_ns)
+        self._show(Topic.LOG, viewing.log_line(event, time_ns), time_ns)
 
     def camera_model(self, model: CameraModel) -> None:
         """Intrinsics for viewers; what calibrate uses is `SessionInfo.camera`."""
-        message = viewing.camera_calibration(model, self._start_ns)
-        self._add(Topic.CAMERA_CALIBRATION, [message.SerializeToString()], self._start_ns)
+        self._show(
+            Topic.CAMERA_CALIBRATION, viewing.camera_calibration(model, self._start_ns), self._start_ns
+        )
 
     def attach(self, name: str, media_type: str, content: bytes) -> None:
         """A small file that rides along, like `plan.yaml`."""

@@ -160,6 +160,8 @@ async def _write(bench: Bench, index: int, picture: Picture, view: View) -> None
     recording.picture(picture)
     sighting = await _sighting(bench, picture, index)
     reason = _unusable(sighting) if sighting is not None else ""
+    if sighting is not None and len(sighting.pixels):
+        recording.corners(picture.sequence, sighting.pixels)
     if reason:
         await recording.sync()
         raise PoseFailedError(reason)

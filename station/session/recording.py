@@ -15,10 +15,12 @@ from typing import Any, TypeVar
 import msgspec
 import numpy as np
 
+from calibrate.geometry import Array
 from recordings.errors import RecordingError
 from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, require_free_space
 from recordings.manifest import enter_part, read_manifest
 from recordings.messages import CameraModel, CaptureEvent, Picture, RobotState, SessionInfo, Stamps, View
+from recordings.poses import matrix_from_quaternion
 from recordings.recorder import Recorder
 from station.cell import Cell
 from station.errors import CameraError
@@ -169,6 +171,14 @@ class SessionRecording:
         for name, content in self._cell.attachments.items():
             recorder.attach(name, "application/json", content)
         recorder.camera_model(info.camera)
+        in_hand = config.mount == "eye-in-hand"
+        for guess, parent, child in (
+            (config.camera_guess, "flange" if in_hand else "base", "camera"),
+            (config.board_guess, "base" if in_hand else "flange", "board"),
+        ):
+            if guess is not None:
+                at, turn = list(guess.translation_m), list(guess.rotation_xyzw)
+                recorder.frame(parent, child, matrix_from_quaternion(at, turn))
         self.recorder = recorder
 
     def _session_camera(self, picture: Picture | None) -> CameraModel:
@@ -214,6 +224,10 @@ class SessionRecording:
 
     def view(self, view: View) -> None:
         self._require().view(view)
+
+    def corners(self, sequence: int, pixels: Array) -> None:
+        """Of the board in a recorded picture, (n, 2); for whoever looks at the recording."""
+        self._require().corners(sequence, pixels)
 
     async def sync(self) -> None:
         """Returns when all of the above is on the disk (fdatasync). Raises RecordingError."""

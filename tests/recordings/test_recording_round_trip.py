@@ -128,9 +128,8 @@ def test_the_reference_library_reads_the_file_with_published_schemas(small: Path
     assert [transform.translation.x, transform.translation.y, transform.translation.z] == pytest.approx(
         [row[3] for row in TURNED[:3]]
     )
-    half = np.sqrt(0.5)
     rotation = [transform.rotation.x, transform.rotation.y, transform.rotation.z, transform.rotation.w]
-    assert rotation == pytest.approx([0, 0, half, half])  # a quarter turn about z
+    assert rotation == pytest.approx([0, -np.sin(0.25), 0, np.cos(0.25)])  # the states' 0.5 rad about -y
     assert list(by_topic["/robot/state"].joints_rad) == pytest.approx(make_state(8).joints_rad)
 
 

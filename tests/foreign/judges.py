@@ -1,0 +1,105 @@
+"""Programs of other people that read MCAP and say what is wrong with it. `make foreign` installs them.
+
+Each judge takes a path and returns its findings; none means that it is content. A judge that is not installed
+skips its tests and says so.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+from mcap.reader import make_reader
+from mcap.records import Channel, Message, Schema
+from mcap.stream_reader import StreamReader
+from mcap_protobuf.decoder import DecoderFactory
+
+FOLDER = Path(os.environ.get("STATION_FOREIGN", Path(__file__).parents[2] / ".foreign"))
+_TIMEOUT_S = 120
+Judge = Callable[[Path], list[str]]
+
+
+def missing(program: str) -> None:
+    pytest.skip(f"the judge '{program}' is missing: run `make foreign`")
+
+
+def mcap_python(path: Path) -> list[str]:
+    """The reference library: file order and log order, every checksum, every protobuf by its own schema."""
+    findings: list[str] = []
+    channels: dict[int, Channel] = {}
+    schemas: dict[int, Schema] = {}
+    streamed = []
+    decoders = DecoderFactory()
+    with path.open("rb") as stream:
+        for record in StreamReader(stream, validate_crcs=True).records:
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Message):
+                channel = channels[record.channel_id]
+                streamed.append((channel.topic, record.log_time, record.sequence))
+                decode = decoders.decoder_for(channel.message_encoding, schemas.get(channel.schema_id))
+                if decode is not None:
+                    decode(record.data)
+    with path.open("rb") as stream:
+        reader = make_reader(stream, validate_crcs=True)
+        summary = reader.get_summary()
+        offsets = [index.chunk_start_offset for index in summary.chunk_indexes] if summary else []
+        if offsets != sorted(offsets):
+            findings.append("the chunk index is not in file order")
+        for log_order in (True, False):
+            found = [
+                (c.topic, m.log_time, m.sequence)
+                for _, c, m in reader.iter_messages(log_time_order=log_order)
+            ]
+            if sorted(found) != sorted(streamed):
+                findings.append(f"other messages by the index (log order: {log_order})")
+            times = [time_ns for _, time_ns, _ in found]
+            if log_order and times != sorted(times):
+                findings.append("log order goes backwards")
+        list(reader.iter_attachments())
+        list(reader.iter_metadata())
+    return findings
+
+
+def mcap_core(path: Path) -> list[str]:
+    """The TypeScript library that Foxglove and Lichtblick read with."""
+    modules = FOLDER / "node" / "node_modules"
+    node = shutil.which("node")
+    if node is None or not (modules / "@mcap" / "core").is_dir():
+        missing("@mcap/core")
+    done = subprocess.run(
+        [str(node), str(Path(__file__).with_name("mcap_core.cjs")), str(path)],
+        env={**os.environ, "NODE_PATH": str(modules)}, capture_output=True, text=True, timeout=_TIMEOUT_S,
+    )  # fmt: skip
+    if done.returncode:
+        return [done.stderr[-500:]]
+    said = json.loads(done.stdout)
+    backwards = [f"log order goes backwards {said['backwards']} times"] if said["backwards"] else []
+    return [*said["findings"], *backwards]
+
+
+def rerun_check(path: Path) -> list[str]:
+    """`rerun mcap check`: decodes everything, and every chunk of a topic must follow the one before."""
+    rerun = FOLDER / "python" / "rerun_cli" / "rerun"
+    if not rerun.is_file():
+        missing("rerun mcap check")
+    done = subprocess.run(
+        [str(rerun), "mcap", "check", "--full", str(path)], capture_output=True, text=True, timeout=_TIMEOUT_S
+    )
+    lines = (done.stdout + done.stderr).splitlines()
+    rows = [line for line in lines if re.match(r"\w+\s+\d+\s+\d+\s+/", line)]
+    bad = [line for line in rows if not line.startswith("ok")]
+    if done.returncode or not rows:
+        bad += lines[-5:] or ["it said nothing"]
+    return bad
+
+
+JUDGES: dict[str, Judge] = {"mcap": mcap_python, "@mcap/core": mcap_core, "rerun": rerun_check}

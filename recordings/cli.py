@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import shlex
+import math
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -15,12 +15,14 @@ import typer
 from rich.progress import Progress
 
 from recordings.console import plain_console
+from recordings.dataset import DATASET_FILE, POSES_FILE
 from recordings.errors import RecordingError, printed
 from recordings.excerpt import write_excerpt
 from recordings.export import Target, export_recording
 from recordings.importer import import_folder
+from recordings.importers import PAIR_WITHIN_S, POSITION_M, ROTATION_RAD, Limits, Wanted, import_bag
 from recordings.info import recording_info
-from recordings.info_text import print_info, print_recovery
+from recordings.info_text import print_import, print_info, print_recovery
 from recordings.plain_text import plain_text
 from recordings.reader import open_recording
 from recordings.recover import recover as recover_recording
@@ -51,26 +53,68 @@ def info(recording: Rec, json_: Json = False) -> None:
         raise typer.Exit(3)
 
 
-@app.command("import", epilog=examples("recordings import FOLDER -o mine.mcap"))
+@app.command(
+    "import",
+    epilog=examples(
+        "recordings import FOLDER -o mine.mcap",
+        "recordings import BAG --dry-run  # says what would be taken",
+        "recordings import BAG --dataset dataset.yaml --flange tool0 -o mine.mcap",
+    ),
+)
 def import_(
-    folder: Annotated[
-        Path, typer.Argument(help="Holds dataset.yaml, poses.csv and the pictures", show_default=False)
+    source: Annotated[
+        Path,
+        typer.Argument(
+            help="A folder (dataset.yaml, poses.csv, pictures), a ROS 2 bag, or an MCAP file",
+            show_default=False,
+        ),
     ],
-    output: Annotated[Path, typer.Option("-o", "--output", help="The recording to write (.mcap).")],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="The recording to write (.mcap).")
+    ] = None,
+    dataset: Annotated[
+        Path | None, typer.Option(help="dataset.yaml of a bag: mount, board. Default: in or beside it.")
+    ] = None,
+    image_topic: Annotated[str | None, typer.Option(help="Topic of the pictures.")] = None,
+    pose_topic: Annotated[
+        str | None, typer.Option(help="Topic of the flange's poses, instead of frames.")
+    ] = None,
+    base: Annotated[str | None, typer.Option(help="Frame of the robot's base.")] = None,
+    flange: Annotated[str | None, typer.Option(help="Frame of the flange.")] = None,
+    pair_within: Annotated[
+        float, typer.Option(help="Largest time between a picture and the nearest pose, seconds.")
+    ] = PAIR_WITHIN_S,
+    still_mm: Annotated[float, typer.Option(help="What still counts as standing, mm.")] = POSITION_M * 1e3,
+    still_deg: Annotated[float, typer.Option(help="The same in degrees.")] = math.degrees(ROTATION_RAD),
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say what would be taken; write nothing.")
+    ] = False,
     json_: Json = False,
 ) -> None:
-    """Your own pictures and poses (dataset.yaml, poses.csv, pictures) to a recording.
+    """Turn other people's pictures and poses into a recording; next: `calibrate solve`.
 
-    poses.csv: image,x,y,z,qx,qy,qz,qw, where the flange is in the robot's base, in metres. dataset.yaml: the
-    README has one to start from. Next: `calibrate solve`.
+    Of a bag the stops of the arm are found, and the last picture of each is taken. poses.csv:
+    image,x,y,z,qx,qy,qz,qw, where the flange is in the robot's base, in metres.
     """
+    if output is None and not dry_run:
+        raise typer.BadParameter("name the recording to write with -o, or ask with --dry-run")
+    target = None if dry_run else output
     with _progress("importing", not json_) as progress:
-        done = import_folder(folder, output, progress)
+        if (source / DATASET_FILE).is_file() and (source / POSES_FILE).is_file():
+            done = import_folder(source, target, progress)
+            facts = {"recording": str(target or ""), "views": done.pictures, "bytes": done.size_bytes}
+        else:
+            wanted = Wanted(image_topic, pose_topic, base, flange)
+            limits = Limits(still_mm / 1e3, math.radians(still_deg))
+            plan = import_bag(source, target, dataset, wanted, limits, pair_within, progress)
+            facts = {"recording": str(target or ""), "views": plan.stops, "bytes": plan.bytes_written}
+            facts["bag"] = dataclasses.asdict(plan)
     if json_:
-        print(json.dumps({"recording": str(done.path), "views": done.pictures, "bytes": done.size_bytes}))
+        print(json.dumps(facts))
     else:
         print(f"{plain_text(str(done.path))}: {done.pictures} views, {done.size_bytes / 1e6:.1f} MB")
         print(f"next: calibrate solve {shlex.quote(str(done.path))}")
+        print_import(facts)
 
 
 @app.command(

@@ -36,6 +36,33 @@ class Dataset(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     note: str = ""
 
 
+class BagDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """What a bag does not say of itself: dataset.yaml, in which `camera` may be left to the bag."""
+
+    mount: Mount
+    board: BoardSpec
+    camera: CameraModel | None = None
+    robot: str | RobotIdentity = ""
+    note: str = ""
+
+    @property
+    def identity(self) -> RobotIdentity:
+        return RobotIdentity(model=self.robot or "unknown") if isinstance(self.robot, str) else self.robot
+
+
+def read_description(path: Path) -> tuple[BagDescription, bytes]:
+    """(description, the file's bytes). Raises ImportFolderError with file, place and remedy."""
+    content = read_small_file(path, strict_yaml.LIMIT_BYTES)
+    try:
+        described = strict_yaml.load(content, BagDescription)
+    except strict_yaml.StrictYamlError as error:
+        raise ImportFolderError(f"{path}: {'; '.join(map(str, error.problems))} (see {_HELP})") from None
+    problem = _board_problem(described.board) or (described.camera and _camera_problem(described.camera))
+    if problem:
+        raise ImportFolderError(f"{path}: {problem}. See {_HELP}")
+    return described, content
+
+
 def read_dataset(folder: Path) -> tuple[Dataset, bytes]:
     """(description, the file's bytes). Raises ImportFolderError with file, place and remedy."""
     path = folder / DATASET_FILE

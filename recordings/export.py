@@ -14,7 +14,7 @@ import msgspec
 
 from recordings.dataset import DATASET_FILE, POSES_FILE
 from recordings.errors import RecordingError
-from recordings.export_ros2 import write_ros2
+from recordings.exporters import write_ros2
 from recordings.files import sync_folder
 from recordings.messages import Stamps, View
 from recordings.pictures import encode_png

@@ -45,9 +45,11 @@ class Imported:
 
 
 def import_folder(
-    folder: Path, output: Path, progress: Callable[[int, int], None] = lambda done, total: None
+    folder: Path, output: Path | None, progress: Callable[[int, int], None] = lambda done, total: None
 ) -> Imported:
     """Reads `dataset.yaml`, `poses.csv` and the pictures, writes `output` (.mcap), which must not exist.
+
+    `output` None: checks everything and writes nothing.
 
     PNG and JPEG files keep their bytes. Everything is checked before the file is begun, and nothing is left
     behind when a picture turns out bad. Raises ImportFolderError (file, row, remedy) or RecordingError.
@@ -58,6 +60,8 @@ def import_folder(
     rows, poses_bytes = read_poses(folder)
     for row in rows:
         _check_picture(folder, row, dataset)
+    if output is None:
+        return Imported(folder, len(rows), 0)
     with derived_recording(output, _session_info(folder, dataset)) as writer:
         writer.attach(DATASET_FILE, "application/yaml", dataset_bytes)
         writer.attach(POSES_FILE, "text/csv", poses_bytes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from collections.abc import Iterator
 from datetime import UTC, datetime
 from typing import Any
@@ -88,6 +89,23 @@ def _clock_text(clock: dict[str, float | None]) -> str:
     if clock["drift_ppm"] is None:
         return f"too short for a drift, {within}"
     return f"drift {clock['drift_ppm']:+.1f} ppm against the host, {within}"
+
+
+def print_import(facts: dict[str, Any]) -> None:
+    """What `recordings import` took, or would take."""
+    if bag := facts.get("bag"):
+        print(f"pictures  {bag['image_topic']} ({bag['images']}), {bag['camera']}")
+        print(f"poses     {bag['poses_from']}, paired by stamp within {bag['bound_ms']:.2f} ms")
+        print(f"joints    {bag['joints_from'] or 'none of a six-axis arm'}")
+        passed = ", ".join(f"{count} {reason}" for reason, count in bag["passed_over"].items() if count)
+        print(f"stops     {bag['stops']}" + (f"; pictures passed over: {passed}" if passed else ""))
+        if bag["other_topics"]:
+            print(f"not used  {', '.join(bag['other_topics'])}")
+    if not facts["recording"]:
+        print(f"{facts['views']} views would be taken; nothing was written")
+        return
+    print(f"{facts['recording']}: {facts['views']} views, {facts['bytes'] / 1e6:.1f} MB")
+    print(f"next: calibrate solve {shlex.quote(facts['recording'])}")
 
 
 def print_recovery(result: Recovery) -> None:

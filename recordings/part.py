@@ -9,7 +9,9 @@ from typing import Any, TypeVar
 
 import msgspec
 import numpy as np
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
 from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
@@ -21,7 +23,7 @@ from recordings.mcap import Message, MessageIndex, open_file, scan_file
 from recordings.mcap.contents import joined
 from recordings.mcap.records import BadRecordError, require_crc
 from recordings.mcap.source import ShortFileError
-from recordings.messages import CaptureEvent, Picture, RobotState, SessionInfo, View
+from recordings.messages import CameraModel, CaptureEvent, Matrix4, Picture, RobotState, SessionInfo, View
 from recordings.pictures import PictureError, decode_picture, raw_array
 from recordings.schema import (
     FORMATS,
@@ -34,6 +36,7 @@ from recordings.schema import (
 )
 from recordings.stamps_table import StampsTable, stamps_tables
 from recordings.topics import Topic, schema_bytes, schema_name
+from recordings.viewing import camera_model_of, matrix_of
 
 VIEWS_LIMIT = 10_000
 _RIGID_TOLERANCE = 1e-6
@@ -95,6 +98,29 @@ class RecordingPart:
         return stamps_tables(
             self._source, addresses, lambda address: self._message(topic, address, struct).stamps
         )
+
+    @property
+    def camera_model(self) -> CameraModel | None:
+        """The newest intrinsics for viewers: the solved ones in an annotated recording."""
+        last = None
+        for message in self.stored(Topic.CAMERA_CALIBRATION):
+            last = camera_model_of(self._viewer_message(CameraCalibration, message))
+        return last
+
+    @property
+    def fixed_frames(self) -> dict[tuple[str, str], Matrix4]:
+        """(parent, child) → parent_from_child of what does not move, as it was known last."""
+        found = {}
+        for message in self.stored(Topic.FIXED_TRANSFORM):
+            frame = self._viewer_message(FrameTransform, message)
+            found[frame.parent_frame_id, frame.child_frame_id] = matrix_of(frame)
+        return found
+
+    def _viewer_message(self, kind: Any, message: Message) -> Any:
+        try:
+            return kind.FromString(message.data)
+        except DecodeError as error:
+            raise self._file_error("a message for viewers cannot be parsed") from error
 
     def events(self) -> Iterator[CaptureEvent]:
         return self._decoded(Topic.EVENT, CaptureEvent)

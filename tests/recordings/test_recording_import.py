@@ -282,7 +282,7 @@ def test_the_command_line_ends_with_one_paragraph_and_no_traceback(folder: Path,
     result = call(main, "import", folder / "nowhere", "-o", tmp_path / "out.mcap")
     assert result.returncode == 1
     assert result.stderr.startswith("recordings: ")
-    assert "is not a folder" in result.stderr
+    assert "nowhere does not exist" in result.stderr
     assert "Traceback" not in result.stderr
 
 

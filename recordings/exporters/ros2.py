@@ -1,0 +1,217 @@
+"""A recording as a ROS 2 bag that can be played: written by `rosbags` (the extra `ros`), no ROS needed.
+
+A picture, its CameraInfo and the flange's frame carry one stamp: that of mid-exposure, where the picture
+belongs to a view. In between the flange's frame follows at 100 Hz, the joints at their full rate.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from heapq import merge
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from recordings.errors import RecordingError
+from recordings.messages import CameraModel, Matrix4, View
+from recordings.part import RecordingPart
+from recordings.pictures import raw_encoding
+from recordings.reader import Recording
+from recordings.topics import Topic
+from recordings.viewing import CAMERA_FRAME, JOINT_NAMES, base_from_flange, quaternion_xyzw
+
+FRAME_PERIOD_NS = 10_000_000
+_NS = 1_000_000_000
+_LAST_S = 2**31 - 1
+"""That builtin_interfaces/Time can hold."""
+_BAG_VERSION: Literal[8] = 8
+_DISTORTION_COUNT = {"plumb_bob": 5, "rational_polynomial": 8, "equidistant": 4}
+
+
+class _Entry(NamedTuple):
+    time_ns: int
+    topic: str
+    message: Any
+
+
+def write_ros2(recording: Recording, folder: Path) -> None:
+    """Fills the folder with `NAME.mcap` and `metadata.yaml`. Wall time is the bag's time. RecordingError."""
+    try:
+        from rosbags.rosbag2 import StoragePlugin, Writer
+    except ImportError as error:
+        raise RecordingError(
+            "ROS 2 bags need the package rosbags: pip install 'calibration-station[ros]'"
+        ) from error
+    messages = _Messages()
+    inner = folder / recording.info.name
+    with Writer(inner, version=_BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as writer:
+        connections: dict[str, Any] = {}
+        for part in recording.parts:
+            for entry in _entries(messages, recording, part):
+                kind = entry.message.__msgtype__
+                if entry.topic not in connections:
+                    connections[entry.topic] = writer.add_connection(
+                        entry.topic,
+                        kind,
+                        typestore=messages.store,
+                        offered_qos_profiles=messages.qos(entry.topic),
+                    )
+                data = messages.store.serialize_cdr(entry.message, kind)
+                writer.write(connections[entry.topic], entry.time_ns, data)
+    for path in inner.iterdir():
+        path.rename(folder / path.name)
+    inner.rmdir()
+
+
+def _entries(messages: _Messages, recording: Recording, part: RecordingPart) -> Iterator[_Entry]:
+    """In time order."""
+    counted = {view.picture_sequence: view for view in recording.views() if view.part == part.info.part}
+    stored = {message.sequence: message.time_ns for message in part.stored(Topic.PICTURE_FACTS)}
+    times = {number: _mid_exposure_ns(counted.get(number), time_ns) for number, time_ns in stored.items()}
+    states = part.messages(Topic.ROBOT_STATE)
+    first_ns = min([*times.values(), *([states.start_ns] if len(states) else [])], default=0)
+    camera = part.camera_model or part.info.camera
+    return merge(
+        _fixed_frames(messages, part, first_ns),
+        _arm(messages, part),
+        _pictures(messages, part, times, counted, camera),
+        key=lambda entry: entry.time_ns,
+    )
+
+
+def _mid_exposure_ns(view: View | None, recorded_ns: int) -> int:
+    return (view.stamps.host_wall_ns if view else 0) or recorded_ns
+
+
+def _fixed_frames(messages: _Messages, part: RecordingPart, time_ns: int) -> Iterator[_Entry]:
+    """What the recording knows of camera and board; all in one message, as ROS expects it."""
+    if part.fixed_frames:
+        frames = [messages.transform(*names, T, time_ns) for names, T in part.fixed_frames.items()]
+        yield _Entry(time_ns, "/tf_static", messages.make("tf2_msgs/msg/TFMessage", frames))
+
+
+def _arm(messages: _Messages, part: RecordingPart) -> Iterator[_Entry]:
+    shown_ns = -FRAME_PERIOD_NS
+    for stored, state in zip(part.stored(Topic.ROBOT_STATE), part.robot_states(), strict=True):
+        time_ns = stored.time_ns
+        joints = messages.make(
+            "sensor_msgs/msg/JointState",
+            messages.header(time_ns, ""),
+            JOINT_NAMES,
+            np.array(state.joints_rad),
+            np.array(state.joint_speeds_rad_s),
+            np.empty(0),
+        )
+        yield _Entry(time_ns, "/joint_states", joints)
+        if not 0 <= time_ns - shown_ns < FRAME_PERIOD_NS and np.isfinite(state.tcp_pose).all():
+            shown_ns = time_ns
+            T = base_from_flange(state.tcp_pose, part.info.robot.tcp_offset)
+            yield _Entry(time_ns, "/tf", messages.frames("base", "flange", T, time_ns))
+
+
+def _pictures(
+    messages: _Messages,
+    part: RecordingPart,
+    times: dict[int, int],
+    counted: dict[int, View],
+    camera: CameraModel,
+) -> Iterator[_Entry]:
+    for sequence, time_ns in sorted(times.items(), key=lambda item: item[1]):
+        if view := counted.get(sequence):
+            yield _Entry(time_ns, "/tf", messages.frames("base", "flange", view.base_from_flange, time_ns))
+        yield _Entry(time_ns, "/camera/camera_info", messages.camera_info(camera, time_ns))
+        yield _picture(messages, part, sequence, time_ns)
+
+
+def _picture(messages: _Messages, part: RecordingPart, sequence: int, time_ns: int) -> _Entry:
+    header = messages.header(time_ns, CAMERA_FRAME)
+    stored = part.stored_picture(sequence)
+    if stored is not None:
+        file = np.frombuffer(stored[1], np.uint8)
+        message = messages.make("sensor_msgs/msg/CompressedImage", header, stored[0], file)
+        return _Entry(time_ns, "/camera/image_raw/compressed", message)
+    picture = part.picture(sequence)
+    height, width = picture.image.shape[:2]
+    data = np.ascontiguousarray(picture.image).view(np.uint8).ravel()
+    encoding = raw_encoding(picture.image, picture.pixel_format)
+    message = messages.make(
+        "sensor_msgs/msg/Image", header, height, width, encoding, 0, len(data) // height, data
+    )
+    return _Entry(time_ns, "/camera/image_raw", message)
+
+
+class _Messages:
+    """ROS 2's messages, made by the names of their types."""
+
+    def __init__(self) -> None:
+        from rosbags.typesys import Stores, get_typestore
+
+        self.store = get_typestore(Stores.ROS2_HUMBLE)
+
+    def make(self, kind: str, *fields: Any) -> Any:
+        return self.store.types[kind](*fields)
+
+    def qos(self, topic: str) -> list[Any]:
+        """A late listener still gets the fixed frames."""
+        if topic != "/tf_static":
+            return []
+        from rosbags.interfaces import (
+            Qos,
+            QosDurability,
+            QosHistory,
+            QosLiveliness,
+            QosReliability,
+            QosTime,
+        )  # fmt: skip
+
+        never = QosTime(2147483647, 4294967295)
+        return [
+            Qos(
+                QosHistory.KEEP_LAST, 1, QosReliability.RELIABLE, QosDurability.TRANSIENT_LOCAL,
+                never, never, QosLiveliness.AUTOMATIC, never, False,
+            )
+        ]  # fmt: skip
+
+    def header(self, time_ns: int, frame: str) -> Any:
+        seconds, nanoseconds = divmod(time_ns, _NS)
+        if seconds > _LAST_S:
+            raise RecordingError(
+                f"a message is stamped {seconds} s after 1970, and ROS 2 ends in 2038: the host's clock was "
+                "wrong. Export to csv or folder instead"
+            )
+        stamp = self.make("builtin_interfaces/msg/Time", seconds, nanoseconds)
+        return self.make("std_msgs/msg/Header", stamp, frame)
+
+    def transform(self, parent: str, child: str, T: Matrix4, time_ns: int) -> Any:
+        at = self.make("geometry_msgs/msg/Vector3", *(float(row[3]) for row in T[:3]))
+        turn = self.make("geometry_msgs/msg/Quaternion", *quaternion_xyzw(T))
+        return self.make(
+            "geometry_msgs/msg/TransformStamped",
+            self.header(time_ns, parent),
+            child,
+            self.make("geometry_msgs/msg/Transform", at, turn),
+        )
+
+    def frames(self, parent: str, child: str, T: Matrix4, time_ns: int) -> Any:
+        return self.make("tf2_msgs/msg/TFMessage", [self.transform(parent, child, T, time_ns)])
+
+    def camera_info(self, camera: CameraModel, time_ns: int) -> Any:
+        """A camera that nobody calibrated has a K of zeros, as ROS expects."""
+        K = [number for row in camera.matrix for number in row] if camera.matrix else [0.0] * 9
+        count = max(_DISTORTION_COUNT[camera.distortion_model], len(camera.distortion))
+        D = [*camera.distortion, *[0.0] * count][:count] if camera.matrix else []
+        return self.make(
+            "sensor_msgs/msg/CameraInfo",
+            self.header(time_ns, CAMERA_FRAME),
+            camera.height,
+            camera.width,
+            camera.distortion_model,
+            np.array(D, float),
+            np.array(K, float),
+            np.eye(3).ravel(),
+            np.array([*K[:3], 0.0, *K[3:6], 0.0, *K[6:], 0.0], float),
+            0,
+            0,
+            self.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False),
+        )

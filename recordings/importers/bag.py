@@ -1,0 +1,290 @@
+"""A ROS 2 bag, or any MCAP with pictures and poses → a recording like the station's own.
+
+A first pass reads frames, joints and the pictures' stamps, finds the stops of the arm and pairs each with
+its last picture; a second one reads those pictures and the joints, and writes. One picture is in memory at a
+time.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from recordings.dataset import DATASET_FILE, BagDescription, read_description
+from recordings.files import session_name_from
+from recordings.importers.bags import open_bag
+from recordings.importers.selection import Selection, Wanted, select
+from recordings.importers.stops import Limits, Stop, find_stops
+from recordings.importers.values import Array, Bag, Image, ImportSourceError, Joints
+from recordings.messages import (
+    CameraIdentity,
+    CameraModel,
+    Matrix4,
+    Picture,
+    RobotState,
+    SessionInfo,
+    Stamps,
+    Vector6,
+    View,
+)
+from recordings.pictures import PictureError, decode_picture, encode_png, read_header
+from recordings.writer import RecordingWriter, derived_recording
+
+PAIR_WITHIN_S = 0.05
+STOPS_LEAST = 3
+_KEPT_AS_THEY_ARE = ("png", "jpeg")
+_LAYOUTS = {
+    "mono8": (1, np.uint8, None), "8UC1": (1, np.uint8, None), "mono16": (1, np.uint16, None),
+    "bgr8": (3, np.uint8, None), "8UC3": (3, np.uint8, None), "rgb8": (3, np.uint8, cv2.COLOR_RGB2BGR),
+    "bgra8": (4, np.uint8, cv2.COLOR_BGRA2BGR), "rgba8": (4, np.uint8, cv2.COLOR_RGBA2BGR),
+    "bayer_rggb8": (1, np.uint8, cv2.COLOR_BayerRGGB2BGR),
+    "bayer_bggr8": (1, np.uint8, cv2.COLOR_BayerBGGR2BGR),
+    "bayer_gbrg8": (1, np.uint8, cv2.COLOR_BayerGBRG2BGR),
+    "bayer_grbg8": (1, np.uint8, cv2.COLOR_BayerGRBG2BGR),
+    "yuv422": (2, np.uint8, cv2.COLOR_YUV2BGR_UYVY), "uyvy": (2, np.uint8, cv2.COLOR_YUV2BGR_UYVY),
+    "yuv422_yuy2": (2, np.uint8, cv2.COLOR_YUV2BGR_YUYV), "yuyv": (2, np.uint8, cv2.COLOR_YUV2BGR_YUYV),
+}  # fmt: skip
+"""Encoding → channels, number type, conversion."""
+
+
+@dataclass(frozen=True)
+class BagPlan:
+    """What is taken from a bag; what `--dry-run` prints."""
+
+    image_topic: str
+    images: int
+    poses_from: str
+    joints_from: str
+    camera: str
+    stops: int
+    passed_over: dict[str, int]
+    bound_ms: float
+    """How far the nearest report of the arm is from its picture's stamp, at worst."""
+    other_topics: list[str]
+    bytes_written: int = 0
+
+
+def import_bag(
+    source: Path,
+    output: Path | None,
+    description: Path | None = None,
+    wanted: Wanted = Wanted(),  # noqa: B008 - frozen
+    limits: Limits = Limits(),  # noqa: B008 - frozen
+    pair_within_s: float = PAIR_WITHIN_S,
+    progress: Callable[[int, int], None] = lambda done, total: None,
+) -> BagPlan:
+    """`output` None: says what would be taken and writes nothing. Raises ImportSourceError or RecordingError.
+
+    `description`: a dataset.yaml with mount and board (default: the one in or beside the source).
+    """
+    described, description_bytes = _description(source, description, needed=output is not None)
+    bag = open_bag(source)
+    try:
+        chosen = select(bag, wanted)
+        images_ns = np.fromiter(bag.image_stamps(chosen.image.name), np.int64)
+        joints = chosen.joints
+        speeds = (joints.stamps_ns, joints.fastest_rad_s) if joints and joints.has_speeds else None
+        stops, passed = find_stops(chosen.track, images_ns, speeds, limits, pair_within_s)
+        plan = _plan(bag, chosen, described, len(images_ns), stops, passed)
+        if output is None:
+            return plan
+        if len(stops) < STOPS_LEAST:
+            why = ", ".join(f"{count} {reason}" for reason, count in passed.items() if count)
+            raise ImportSourceError(
+                f"{source}: the arm stands still in {len(stops)} pictures of {len(images_ns)} ({why}). "
+                "Look at it with --dry-run; --still-mm and --still-deg allow for a noisier arm"
+            )
+        assert described is not None
+        size = _write(bag, chosen, stops, described, description_bytes, source, output, plan, progress)
+        return replace(plan, bytes_written=size)
+    finally:
+        bag.close()
+
+
+def _description(source: Path, given: Path | None, needed: bool) -> tuple[BagDescription | None, bytes]:
+    folder = source if source.is_dir() else source.parent
+    for path in (given, folder / DATASET_FILE, folder.parent / DATASET_FILE):
+        if path is not None and (path == given or path.is_file()):
+            return read_description(path)
+    if needed:
+        raise ImportSourceError(
+            f"nothing says which board {source} shows and how the camera is mounted. Write a {DATASET_FILE} "
+            "with mount and board (docs/recording-format.md), and name it with --dataset"
+        )
+    return None, b""
+
+
+def _plan(
+    bag: Bag,
+    chosen: Selection,
+    described: BagDescription | None,
+    images: int,
+    stops: list[Stop],
+    passed: dict[str, int],
+) -> BagPlan:
+    given = described is not None and described.camera is not None
+    camera = "of the description" if given else "size of the pictures, intrinsics to be estimated"
+    if not given and chosen.camera is not None and chosen.camera.matrix is not None:
+        camera = "intrinsics of the bag"
+    return BagPlan(
+        image_topic=chosen.image.name,
+        images=images,
+        poses_from=chosen.poses_from,
+        joints_from=chosen.joints.topic if chosen.joints else "",
+        camera=camera,
+        stops=len(stops),
+        passed_over=passed,
+        bound_ms=1e3 * max((stop.bound_s for stop in stops), default=0.0),
+        other_topics=bag.others,
+    )
+
+
+def _write(
+    bag: Bag,
+    chosen: Selection,
+    stops: list[Stop],
+    described: BagDescription,
+    description_bytes: bytes,
+    source: Path,
+    output: Path,
+    plan: BagPlan,
+    progress: Callable[[int, int], None],
+) -> int:
+    in_file_order = sorted(stops, key=lambda stop: stop.place)
+    index = {stop.place: number for number, stop in enumerate(stops)}
+    images = bag.images(chosen.image.name, [stop.place for stop in in_file_order])
+    first = next(images)
+    width, height = _size(first)
+    info = SessionInfo(
+        name=session_name_from(source.resolve().stem),
+        mount=described.mount,
+        source="imported",
+        board=described.board,
+        camera=_camera(described, chosen.camera, width, height),
+        robot=described.identity,
+        camera_identity=CameraIdentity(driver="imported"),
+        created_wall_ns=min(stop.stamp_ns for stop in stops) if stops[0].stamp_ns > 0 else time.time_ns(),
+        software={"calibration-station": version("calibration-station")},
+        note=described.note or f"imported from {source.name}: {plan.image_topic}, {plan.poses_from}",
+    )
+    with derived_recording(output, info) as writer:
+        writer.attach(DATASET_FILE, "application/yaml", description_bytes)
+        writer.attach("import.json", "application/json", msgspec.json.encode(asdict(plan)))
+        states = _states(bag, chosen)
+        waiting = next(states, None)
+        for done, (stop, image) in enumerate(zip(in_file_order, _chain(first, images), strict=True)):
+            while waiting is not None and waiting.stamps.host_wall_ns <= stop.stamp_ns:
+                writer.robot_state(waiting)
+                waiting = next(states, None)
+            _write_view(writer, index[stop.place], stop, image)
+            progress(done + 1, len(stops))
+        while waiting is not None:
+            writer.robot_state(waiting)
+            waiting = next(states, None)
+        return writer.finish().stat().st_size
+
+
+def _chain(first: Image, rest: Iterator[Image]) -> Iterator[Image]:
+    yield first
+    yield from rest
+
+
+def _camera(described: BagDescription, found: CameraModel | None, width: int, height: int) -> CameraModel:
+    """The description's, else the bag's, else the size alone. ImportSourceError for another size."""
+    camera = described.camera or found or CameraModel(width, height)
+    if (camera.width, camera.height) != (width, height):
+        raise ImportSourceError(
+            f"the pictures are {width}×{height}, their camera is described as {camera.width}×{camera.height}"
+        )
+    return camera
+
+
+def _states(bag: Bag, chosen: Selection) -> Iterator[RobotState]:
+    """Joints as robot states; the tool's pose is the flange's, for nobody told of a tool."""
+    if chosen.joints is None:
+        return
+    for value in bag.values(chosen.joints.topic):
+        assert isinstance(value, Joints)
+        if (six := chosen.joints.six(value)) is not None:
+            yield _state(value.stamp_ns, six, chosen.track.at(np.array([value.stamp_ns]))[0])
+
+
+def _state(stamp_ns: int, six: tuple[Vector6, Vector6], base_from_flange: Array) -> RobotState:
+    x, y, z = base_from_flange[:3, 3].tolist()
+    rx, ry, rz = cv2.Rodrigues(base_from_flange[:3, :3])[0].ravel().tolist()
+    return RobotState(
+        stamps=Stamps(host_wall_ns=stamp_ns, controller_s=stamp_ns / 1e9),
+        joints_rad=six[0],
+        joint_speeds_rad_s=six[1],
+        target_joints_rad=six[0],
+        tcp_pose=(x, y, z, rx, ry, rz),
+        robot_mode=0,
+        safety_mode=0,
+        safety_status_bits=0,
+        runtime_state=0,
+        robot_status_bits=0,
+        speed_scaling=1.0,
+        target_speed_fraction=1.0,
+    )
+
+
+def _write_view(writer: RecordingWriter, index: int, stop: Stop, image: Image) -> None:
+    pixels, encoded = _pixels(image, stop.place)
+    pixel_format = "BGR8" if pixels.ndim == 3 else "Mono8" if pixels.itemsize == 1 else "Mono16"
+    stamps = Stamps(host_wall_ns=stop.stamp_ns, device_ns=stop.stamp_ns)
+    writer.picture(Picture(pixels, stamps, stop.place, index, pixel_format=pixel_format), encoded)
+    T: Matrix4 = tuple(tuple(map(float, row)) for row in stop.base_from_flange)
+    writer.view(
+        View(
+            index=index,
+            name=f"stop-{index + 1}",
+            picture_sequence=index,
+            base_from_flange=T,
+            stamps=stamps,
+            time_bound_s=stop.bound_s,
+            stillness=stop.stillness,
+        )
+    )
+
+
+def _size(image: Image) -> tuple[int, int]:
+    if image.encoding != "compressed":
+        return image.width, image.height
+    try:
+        header = read_header(image.data)
+    except PictureError as error:
+        raise ImportSourceError(f"the first picture {error}") from error
+    return header.width, header.height
+
+
+def _pixels(image: Image, place: int) -> tuple[NDArray[Any], bytes | None]:
+    """(array as recordings hold it, file bytes to keep). ImportSourceError for what no camera here writes."""
+    try:
+        if image.encoding == "compressed":
+            header = read_header(image.data)
+            decoded = decode_picture(image.data, header.width, header.height)
+            return decoded, image.data if header.format in _KEPT_AS_THEY_ARE else encode_png(decoded)
+        if image.encoding not in _LAYOUTS:
+            raise PictureError(f"is encoded as '{image.encoding}' (known: {', '.join(_LAYOUTS)}, PNG, JPEG)")
+        channels, kind, conversion = _LAYOUTS[image.encoding]
+        row = image.width * channels * np.dtype(kind).itemsize
+        if image.step < row or len(image.data) < image.step * image.height or not image.height:
+            raise PictureError(f"has {len(image.data)} bytes where {image.width}×{image.height} needs more")
+        rows = np.frombuffer(image.data, np.uint8, image.step * image.height).reshape(
+            image.height, image.step
+        )
+        pixels = np.ascontiguousarray(rows[:, :row]).view(kind)
+        if channels > 1:
+            pixels = pixels.reshape(image.height, image.width, channels)
+        return (pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))), None
+    except PictureError as error:
+        raise ImportSourceError(f"picture {place + 1} {error}") from error

@@ -1,0 +1,185 @@
+"""A bag's frames over time: which chain leads from the base to the flange, and where the flange was when."""
+
+from __future__ import annotations
+
+from array import array
+from collections import deque
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recordings.importers.values import Array, Frame, ImportSourceError
+
+SAMPLES_LIMIT = 4_000_000
+"""Of all frames together: 64 bytes each."""
+KNOWN_PAIRS = (
+    ("base", "flange"), ("base", "tool0_controller"), ("base", "tool0"), ("base_link", "flange"),
+    ("base_link", "tool0"), ("base_link", "ee_link"), ("base_link", "wrist_3_link"),
+    ("panda_link0", "panda_link8"), ("fr3_link0", "fr3_link8"), ("world", "flange"), ("world", "tool0"),
+)  # fmt: skip
+"""(base, flange) as robots' drivers name them, best first."""
+_UNIT_TOLERANCE = 0.01
+
+
+@dataclass
+class Edge:
+    """parent_from_child over time."""
+
+    stamps_ns: array[int] = field(default_factory=lambda: array("q"))
+    numbers: array[float] = field(default_factory=lambda: array("d"))
+    """Seven a sample: position, quaternion x y z w."""
+
+    def sorted(self) -> tuple[NDArray[np.int64], Array]:
+        """(stamps, (n, 7)) in time order, the last of equal stamps; unit quaternions."""
+        stamps = np.frombuffer(self.stamps_ns, np.int64)
+        table = np.frombuffer(self.numbers).reshape(-1, 7)
+        order = np.argsort(stamps, kind="stable")
+        stamps, table = stamps[order], table[order]
+        last = np.append(np.diff(stamps) > 0, True)
+        stamps, table = stamps[last], table[last].copy()
+        table[:, 3:] /= np.linalg.norm(table[:, 3:], axis=1, keepdims=True)
+        return stamps, table
+
+
+class FrameTree:
+    """All frames of a bag."""
+
+    def __init__(self) -> None:
+        self.edges: dict[tuple[str, str], Edge] = {}
+        self._samples = 0
+
+    def add(self, frames: Iterable[Frame]) -> None:
+        for frame in frames:
+            numbers = (*frame.position_m, *frame.rotation_xyzw)
+            length = float(np.linalg.norm(frame.rotation_xyzw))
+            if not np.isfinite(numbers).all() or abs(length - 1) > _UNIT_TOLERANCE:
+                raise ImportSourceError(
+                    f"the frame {frame.parent} → {frame.child} at {frame.stamp_ns} ns is no rigid transform"
+                )
+            self._samples += 1
+            if self._samples > SAMPLES_LIMIT:
+                raise ImportSourceError(f"the bag has more than {SAMPLES_LIMIT} frames. Cut it first")
+            edge = self.edges.setdefault((frame.parent.lstrip("/"), frame.child.lstrip("/")), Edge())
+            edge.stamps_ns.append(frame.stamp_ns)
+            edge.numbers.extend(numbers)
+
+    def names(self) -> set[str]:
+        return {name for pair in self.edges for name in pair}
+
+    def chain(self, base: str, flange: str) -> list[tuple[tuple[str, str], bool]] | None:
+        """The edges from base to flange, each with whether it is walked from parent to child."""
+        before: dict[str, tuple[str, tuple[str, str], bool]] = {}
+        waiting = deque([base])
+        while waiting:
+            name = waiting.popleft()
+            if name == flange:
+                path = []
+                while name != base:
+                    name, pair, forward = before[name]
+                    path.append((pair, forward))
+                return path[::-1]
+            for pair in self.edges:
+                for end, other, forward in ((pair[0], pair[1], True), (pair[1], pair[0], False)):
+                    if end == name and other not in before and other != base:
+                        before[other] = (name, pair, forward)
+                        waiting.append(other)
+        return None
+
+    def find(self, base: str | None, flange: str | None) -> tuple[str, str]:
+        """The names of base and flange: as given, or the best known pair that a moving chain joins."""
+        for known_base, known_flange in KNOWN_PAIRS:
+            pair = (base or known_base, flange or known_flange)
+            if (path := self.chain(*pair)) and any(self.moves(edge) for edge, _ in path):
+                return pair
+        names = ", ".join(sorted(self.names())) or "none"
+        raise ImportSourceError(
+            f"no frames lead from {base or 'a known base'} to {flange or 'a known flange'} "
+            f"(frames: {names}). "
+            "Name them with --base and --flange, or a topic of poses with --pose-topic"
+        )
+
+    def moves(self, pair: tuple[str, str]) -> bool:
+        """Whether a link is ever told to be anywhere else."""
+        table = np.frombuffer(self.edges[pair].numbers).reshape(-1, 7)
+        return len(table) > 1 and bool(np.ptp(table, axis=0).max() > 0)
+
+    def track(self, base: str, flange: str) -> Track:
+        """base_from_flange over time. ImportSourceError when a chain is not there."""
+        path = self.chain(base, flange)
+        if not path:
+            raise ImportSourceError(f"no frames lead from {base} to {flange}")
+        links = [_Link(*self.edges[pair].sorted(), forward, self.moves(pair)) for pair, forward in path]
+        return Track(links)
+
+
+@dataclass(frozen=True, eq=False)
+class _Link:
+    stamps_ns: NDArray[np.int64]
+    table: Array
+    forward: bool
+    moving: bool
+
+    def at(self, times_ns: NDArray[np.int64]) -> tuple[Array, Array]:
+        """(positions (n, 3), rotations (n, 3, 3)) of this link, interpolated; the ends are held."""
+        if not self.moving:
+            row = np.broadcast_to(self.table[-1], (len(times_ns), 7))
+        else:
+            after = np.clip(np.searchsorted(self.stamps_ns, times_ns), 1, len(self.stamps_ns) - 1)
+            t0, t1 = self.stamps_ns[after - 1], self.stamps_ns[after]
+            share = np.clip((times_ns - t0) / (t1 - t0), 0.0, 1.0)[:, None]
+            a, b = self.table[after - 1], self.table[after].copy()
+            b[:, 3:] *= np.where((a[:, 3:] * b[:, 3:]).sum(axis=1) < 0, -1.0, 1.0)[:, None]
+            row = (1 - share) * a + share * b
+        position, R = row[:, :3], rotations(row[:, 3:])
+        if self.forward:
+            return position, R
+        R = np.swapaxes(R, 1, 2)
+        return -np.einsum("nij,nj->ni", R, position), R
+
+
+@dataclass(frozen=True, eq=False)
+class Track:
+    """The flange in the base, wherever its frames are known."""
+
+    links: list[_Link]
+
+    @property
+    def stamps_ns(self) -> NDArray[np.int64]:
+        """Of the link that is told most often: when the arm was looked at."""
+        return max((link.stamps_ns for link in self.links if link.moving), key=len)
+
+    def at(self, times_ns: NDArray[np.int64]) -> Array:
+        """(n, 4, 4)."""
+        T = np.broadcast_to(np.eye(4), (len(times_ns), 4, 4)).copy()
+        for link in self.links:
+            position, R = link.at(times_ns)
+            T[:, :3, 3] += np.einsum("nij,nj->ni", T[:, :3, :3], position)
+            T[:, :3, :3] = T[:, :3, :3] @ R
+        return T
+
+    def gap_s(self, time_ns: int) -> float:
+        """How far the nearest sample of any moving link is; infinite before the first and after the last."""
+        worst = 0.0
+        for link in self.links:
+            if link.moving:
+                if not link.stamps_ns[0] <= time_ns <= link.stamps_ns[-1]:
+                    return float("inf")
+                after = int(np.searchsorted(link.stamps_ns, time_ns))
+                near = link.stamps_ns[max(0, after - 1) : after + 1]
+                worst = max(worst, float(np.abs(near - time_ns).min()) / 1e9)
+        return worst
+
+
+def rotations(q: Array) -> Array:
+    """Quaternions x y z w (n, 4), of any length → (n, 3, 3)."""
+    x, y, z, w = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
+    return np.stack(
+        [
+            np.stack([1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)], -1),
+            np.stack([2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)], -1),
+            np.stack([2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], -1),
+        ],
+        axis=1,
+    )

@@ -1,0 +1,175 @@
+"""Which topics and frames of a bag are taken: named by the user, or found where only one can be meant."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recordings.importers.frames import FrameTree, Track
+from recordings.importers.values import Array, Bag, Camera, Frame, ImportSourceError, Joints, Kind, Topic
+from recordings.messages import CameraModel, Vector6
+
+_UR_ORDER = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+_FLANGE, _POSE_CHILD = "flange", "flange of the pose topic"
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What the user named; None = find it."""
+
+    image_topic: str | None = None
+    pose_topic: str | None = None
+    base: str | None = None
+    flange: str | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Selection:
+    """What is taken."""
+
+    image: Topic
+    camera: CameraModel | None
+    """Of the bag's camera calibration."""
+    track: Track
+    poses_from: str
+    """In words: which frames or topic."""
+    joints: JointSource | None
+
+
+@dataclass(frozen=True, eq=False)
+class JointSource:
+    topic: str
+    order: tuple[int, ...]
+    """Places of the six joints, base … wrist 3, in its messages with these names."""
+    names: tuple[str, ...]
+    stamps_ns: NDArray[np.int64]
+    fastest_rad_s: Array
+    has_speeds: bool
+
+    def six(self, joints: Joints) -> tuple[Vector6, Vector6] | None:
+        """(positions, speeds); None for a message about other joints."""
+        if joints.names != self.names:
+            return None
+        q = [joints.positions_rad[place] for place in self.order]
+        speeds = joints.speeds_rad_s
+        v = [speeds[place] for place in self.order] if len(speeds) == len(self.names) else [0.0] * 6
+        return (q[0], q[1], q[2], q[3], q[4], q[5]), (v[0], v[1], v[2], v[3], v[4], v[5])
+
+
+@dataclass
+class _Speeds:
+    stamps_ns: list[int] = field(default_factory=list)
+    fastest: list[float] = field(default_factory=list)
+
+
+def select(bag: Bag, wanted: Wanted) -> Selection:
+    """Reads everything but the pictures. Raises ImportSourceError that names what is there."""
+    image = _one(bag, Kind.IMAGE, wanted.image_topic, "--image-topic")
+    if wanted.pose_topic is not None:
+        topic = _one(bag, Kind.POSE, wanted.pose_topic, "--pose-topic")
+        track, said = _from_poses(bag, topic.name)
+    else:
+        tree = FrameTree()
+        for topic in _of(bag, Kind.TRANSFORMS):
+            for frames in bag.values(topic.name):
+                assert isinstance(frames, list)
+                tree.add(frames)
+        poses = _of(bag, Kind.POSE)
+        if not tree.edges and len(poses) == 1 and wanted.base is None and wanted.flange is None:
+            track, said = _from_poses(bag, poses[0].name)
+        else:
+            base, flange = tree.find(wanted.base, wanted.flange)
+            track, said = tree.track(base, flange), f"frames {base} → {flange}"
+    return Selection(image, _camera(bag, image), track, said, _joints(bag))
+
+
+def _of(bag: Bag, kind: Kind) -> list[Topic]:
+    return [topic for topic in bag.topics if topic.kind is kind and topic.messages]
+
+
+def _one(bag: Bag, kind: Kind, name: str | None, option: str) -> Topic:
+    topics = _of(bag, kind)
+    there = ", ".join(f"{t.name} ({t.schema}, {t.messages})" for t in topics) or "none"
+    if name is not None:
+        found = [topic for topic in topics if topic.name == name]
+        if not found:
+            raise ImportSourceError(f"the bag has no {kind.value} on {name} (there are: {there})")
+        return found[0]
+    if not topics:
+        others = f"; other topics: {', '.join(bag.others[:10])}" if bag.others else ""
+        raise ImportSourceError(f"the bag holds no topic with {kind.value} of a known kind{others}")
+    if len(topics) > 1:
+        raise ImportSourceError(
+            f"the bag holds {kind.value} on several topics: {there}. Choose with {option}"
+        )
+    return topics[0]
+
+
+def _from_poses(bag: Bag, topic: str) -> tuple[Track, str]:
+    tree, base = FrameTree(), ""
+    for frames in bag.values(topic):
+        assert isinstance(frames, list)
+        base = frames[0].parent or "base"
+        if tree.edges and (base.lstrip("/"), _POSE_CHILD) not in tree.edges:
+            raise ImportSourceError(f"the poses on {topic} are in several frames; export one of them")
+        pose = frames[0]
+        tree.add([Frame(pose.stamp_ns, base, _POSE_CHILD, pose.position_m, pose.rotation_xyzw)])
+    return tree.track(base.lstrip("/"), _POSE_CHILD), f"poses on {topic} in {base}"
+
+
+def _camera(bag: Bag, image: Topic) -> CameraModel | None:
+    """The calibration nearest to the image topic's name; its last message."""
+    cameras = _of(bag, Kind.CAMERA)
+    if not cameras:
+        return None
+
+    def common(topic: Topic) -> int:
+        pairs = zip(topic.name.split("/"), image.name.split("/"), strict=False)
+        return next((n for n, (a, b) in enumerate(pairs) if a != b), 99)
+
+    nearest = max(cameras, key=common)
+    if len(cameras) > 1 and common(nearest) <= 1:
+        return None  # another camera's, for all that is known
+    last = None
+    for value in bag.values(nearest.name):
+        assert isinstance(value, Camera)
+        last = value.model
+    return last
+
+
+def _joints(bag: Bag) -> JointSource | None:
+    """The first topic that tells of six joints; other arms are imported without."""
+    for topic in _of(bag, Kind.JOINTS):
+        order: tuple[int, ...] | None = None
+        names: tuple[str, ...] = ()
+        speeds, has_speeds = _Speeds(), True
+        for value in bag.values(topic.name):
+            assert isinstance(value, Joints)
+            if order is None:
+                order, names = six_joints(value.names), value.names
+            if order is None or value.names != names:
+                continue
+            if len(value.speeds_rad_s) == len(names):
+                speeds.fastest.append(max(abs(value.speeds_rad_s[place]) for place in order))
+                speeds.stamps_ns.append(value.stamp_ns)
+            else:
+                has_speeds = False
+        if order is not None:
+            by_time = np.argsort(speeds.stamps_ns, kind="stable")
+            stamps = np.array(speeds.stamps_ns, np.int64)[by_time]
+            return JointSource(
+                topic.name, order, names, stamps, np.array(speeds.fastest)[by_time], has_speeds
+            )
+    return None
+
+
+def six_joints(names: tuple[str, ...]) -> tuple[int, ...] | None:
+    """Places of the arm's joints, base first: by a UR driver's names, or the six that there are by name."""
+    places = [[n for n, name in enumerate(names) if part in name] for part in _UR_ORDER]
+    if all(len(found) == 1 for found in places):
+        return tuple(found[0] for found in places)
+    if len(names) == 6:
+        return tuple(sorted(range(6), key=lambda n: names[n])) if len(set(names)) == 6 else tuple(range(6))
+    return None

@@ -1,0 +1,127 @@
+"""Where a recorded arm stood still, by the station's own rule, and which picture to take of each stop.
+
+The rule (station/stillness.py): over a window before the picture the flange stays within `POSITION_M` of its
+mean place and `ROTATION_RAD` of its newest orientation, and no joint is faster than `JOINT_SPEED_RAD_S`.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from recordings.importers.frames import Track
+from recordings.importers.values import Array
+from recordings.messages import Stillness
+
+WINDOW_S = 0.3
+POSITION_M = 0.00005
+ROTATION_RAD = 0.00005
+JOINT_SPEED_RAD_S = 0.002
+LEAST_SAMPLES = 8
+NEW_STOP_M = 0.001
+NEW_STOP_RAD = 0.001
+"""Farther from the stop before, it is another one, also when nobody saw the arm move."""
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What still counts as standing; other people's arms report with more noise."""
+
+    position_m: float = POSITION_M
+    rotation_rad: float = ROTATION_RAD
+
+
+@dataclass(frozen=True, eq=False)
+class Stop:
+    place: int
+    """Of the picture on its topic."""
+    stamp_ns: int
+    base_from_flange: Array
+    stillness: Stillness
+    bound_s: float
+    """How far the nearest report of the arm is from the picture's stamp."""
+
+
+def find_stops(
+    track: Track,
+    images_ns: NDArray[np.int64],
+    speeds: tuple[NDArray[np.int64], Array] | None,
+    limits: Limits,
+    pair_within_s: float,
+) -> tuple[list[Stop], dict[str, int]]:
+    """(one picture of each stop, how many pictures were passed over for which reason).
+
+    `speeds`: stamps and the fastest joint's speed. Of several pictures of one stop the last one is taken: the
+    arm has settled longest.
+    """
+    stamps = track.stamps_ns
+    period_s = float(np.median(np.diff(stamps))) / 1e9 if len(stamps) > 1 else np.inf
+    window_s = max(WINDOW_S, LEAST_SAMPLES * period_s)
+    passed = {"moving": 0, "no pose near": 0, "same stop": 0}
+    stops: list[Stop] = []
+    moved = True
+    for place in np.argsort(images_ns, kind="stable").tolist():
+        time_ns = int(images_ns[place])
+        bound_s = track.gap_s(time_ns)
+        if bound_s > pair_within_s:
+            passed["no pose near"] += 1
+            continue
+        still = _stillness(track, stamps, speeds, time_ns, window_s)
+        if still is None or not _rests(still, limits):
+            passed["moving"] += 1
+            moved = True
+            continue
+        T = track.at(np.array([time_ns]))[0]
+        stop = Stop(place, time_ns, T, still, bound_s)
+        if stops and not moved and _same(stops[-1].base_from_flange, T):
+            passed["same stop"] += 1
+            stops[-1] = stop
+        else:
+            stops.append(stop)
+        moved = False
+    return stops, passed
+
+
+def _stillness(
+    track: Track,
+    stamps: NDArray[np.int64],
+    speeds: tuple[NDArray[np.int64], Array] | None,
+    time_ns: int,
+    window_s: float,
+) -> Stillness | None:
+    first, last = np.searchsorted(stamps, [time_ns - window_s * 1e9, time_ns + 1])
+    window = stamps[first:last]
+    if len(window) < LEAST_SAMPLES or np.diff(window).max() > window_s * 1e9 / 3:
+        return None
+    T = track.at(window)
+    places, R = T[:, :3, 3], T[:, :3, :3]
+    turned = np.swapaxes(R, -1, -2) @ R[-1]
+    # the sine's arc: near zero the trace's would lose half of the digits
+    axis = np.stack([turned[:, 2, 1] - turned[:, 1, 2], turned[:, 0, 2] - turned[:, 2, 0],
+                     turned[:, 1, 0] - turned[:, 0, 1]], -1)  # fmt: skip
+    fastest = 0.0
+    if speeds is not None:
+        a, b = np.searchsorted(speeds[0], [time_ns - window_s * 1e9, time_ns + 1])
+        fastest = float(speeds[1][a:b].max(initial=0.0))
+    return Stillness(
+        window_s=float(window[-1] - window[0]) / 1e9,
+        max_joint_speed_rad_s=fastest,
+        position_scatter_m=float(np.linalg.norm(places - places.mean(axis=0), axis=1).max()),
+        rotation_scatter_rad=float(np.arcsin(np.clip(np.linalg.norm(axis, axis=1) / 2, 0, 1)).max()),
+    )
+
+
+def _rests(still: Stillness, limits: Limits) -> bool:
+    return (
+        still.max_joint_speed_rad_s <= JOINT_SPEED_RAD_S
+        and still.position_scatter_m <= limits.position_m
+        and still.rotation_scatter_rad <= limits.rotation_rad
+    )
+
+
+def _same(a: Array, b: Array) -> bool:
+    cosine = (np.trace(a[:3, :3].T @ b[:3, :3]) - 1) / 2
+    near = np.linalg.norm(a[:3, 3] - b[:3, 3]) < NEW_STOP_M
+    return bool(near and np.arccos(np.clip(cosine, -1, 1)) < NEW_STOP_RAD)

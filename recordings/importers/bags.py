@@ -15,6 +15,7 @@ from recordings.importers.values import Bag, Image, ImportSourceError, Kind, Top
 from recordings.mcap import Contents, Message, Source, open_file, scan_file
 from recordings.schema import SESSION_RECORDS
 
+_RESCUE = "mcap recover FILE, with the mcap command line tool"
 _CDR, _PROTOBUF = "cdr", "protobuf"
 
 
@@ -53,7 +54,7 @@ class McapBag:
             for path in paths:
                 descriptor = open_file(path)
                 self._files.append((Contents(), Source(descriptor), path))
-                contents, source, _ = scan_file(descriptor, path)
+                contents, source, _ = scan_file(descriptor, path, _RESCUE)
                 self._files[-1] = (contents, source, path)
                 if SESSION_RECORDS[0] in contents.metadata:
                     raise ImportSourceError(f"{path} is a recording already: calibrate solve {path}")

@@ -49,12 +49,13 @@ _FORBIDDEN = {Opcode.HEADER, Opcode.FOOTER, Opcode.STATISTICS, Opcode.CHUNK_INDE
 """Known kinds that have no place among the data."""
 
 
-def scan_file(descriptor: int, path: Path) -> tuple[Contents, Source, str]:
+def scan_file(descriptor: int, path: Path, rescue: str = "") -> tuple[Contents, Source, str]:
     """Proves the open file → (what it holds, where to read it, its SHA-256).
 
-    Raises UnsealedRecordingError or CorruptRecordingError, naming the byte.
+    `rescue`: the command that saves what is whole, where it is not `recordings recover`. Raises
+    UnsealedRecordingError or CorruptRecordingError, naming the byte.
     """
-    scan = _Scan(Source(descriptor), path)
+    scan = _Scan(Source(descriptor), path, rescue or recover_line(path))
     try:
         return scan.contents, scan.source, scan.run()
     except ShortFileError as error:
@@ -76,8 +77,9 @@ def open_file(path: Path) -> int:
 
 
 class _Scan:
-    def __init__(self, source: Source, path: Path) -> None:
+    def __init__(self, source: Source, path: Path, rescue: str) -> None:
         self.source = source
+        self._rescue = rescue
         self.contents = Contents()
         self._path = path
         self._size = source.size_bytes
@@ -124,13 +126,12 @@ class _Scan:
     def _corrupt(self, offset: int, reason: str) -> CorruptRecordingError:
         return CorruptRecordingError(
             f"{self._path} is damaged at byte {offset}: {reason}. "
-            f"Use the original, or save what is whole: {recover_line(self._path)}"
+            f"Use the original, or save what is whole: {self._rescue}"
         )
 
     def _unsealed(self, reason: str) -> UnsealedRecordingError:
         return UnsealedRecordingError(
-            f"{self._path} was not finished or is cut ({reason}). "
-            f"Save what is whole: {recover_line(self._path)}"
+            f"{self._path} was not finished or is cut ({reason}). Save what is whole: {self._rescue}"
         )
 
     def _tail(self) -> tuple[int, int]:

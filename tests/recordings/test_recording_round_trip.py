@@ -129,7 +129,9 @@ def test_the_reference_library_reads_the_file_with_published_schemas(small: Path
         [row[3] for row in TURNED[:3]]
     )
     rotation = [transform.rotation.x, transform.rotation.y, transform.rotation.z, transform.rotation.w]
-    assert rotation == pytest.approx([0, -np.sin(0.25), 0, np.cos(0.25)])  # the states' 0.5 rad about -y
+    assert rotation == pytest.approx(
+        [0, -np.sin(0.25), 0, np.cos(0.25)], abs=1e-9
+    )  # the states' 0.5 rad about -y
     assert list(by_topic["/robot/state"].joints_rad) == pytest.approx(make_state(8).joints_rad)
 
 

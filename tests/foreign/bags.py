@@ -1,0 +1,190 @@
+"""Bags of a simulated cell, by other people's libraries: an arm that moves and stands, a camera, joints.
+
+The arm stands at `STOPS` places for a second each and moves for a second between them; the camera takes 10
+pictures a second all the time. Nothing is stamped at the same moment as anything else.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+STOPS = 5
+START_NS = 1_700_000_000_000_000_000
+HEIGHT, WIDTH = 24, 32
+FRAMES_HZ, IMAGES_HZ = 100, 10
+JOINTS = (
+    "elbow_joint",
+    "shoulder_lift_joint",
+    "shoulder_pan_joint",
+    "wrist_1_joint",
+    "wrist_2_joint",
+    "wrist_3_joint",
+)
+"""In the alphabet's order, as joint_state_broadcaster has them."""
+K = (900.0, 0.0, 15.5, 0.0, 900.0, 11.5, 0.0, 0.0, 1.0)
+
+
+def progress_of(time_s: float) -> float:
+    """Stops passed: 0, then a second of moving, 1 …"""
+    whole, rest = divmod(time_s, 2.0)
+    return whole + (0.5 - 0.5 * np.cos(np.pi * (rest - 1.0)) if rest > 1 else 0.0)
+
+
+def pose(time_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """(position, quaternion) of tool0 in base_link."""
+    at = progress_of(time_s)
+    return np.array([0.1 * at, 0.3, 0.5]), Rotation.from_rotvec([0.1 * at, 0.2, 0.3 * at]).as_quat()
+
+
+def picture(time_s: float) -> np.ndarray:
+    """Tells the stop by its grey level."""
+    return np.full((HEIGHT, WIDTH), 10 + 40 * round(progress_of(time_s)), np.uint8)
+
+
+def moments() -> Iterator[tuple[int, str, float]]:
+    """(stamp, kind, seconds) in time order."""
+    found = []
+    length_s = 2.0 * STOPS - 1.0
+    for n in range(int(length_s * FRAMES_HZ)):
+        found += [(n / FRAMES_HZ + 0.0013, "tf"), (n / FRAMES_HZ + 0.0041, "joints")]
+    found += [
+        (n / IMAGES_HZ + 0.0507, kind) for n in range(int(length_s * IMAGES_HZ)) for kind in ("info", "image")
+    ]
+    for time_s, kind in sorted(found):
+        yield START_NS + round(time_s * 1e9), kind, time_s
+
+
+class RosMessages:
+    """By rosbags' own types."""
+
+    def __init__(self) -> None:
+        from rosbags.typesys import Stores, get_typestore
+
+        self.store = get_typestore(Stores.ROS2_JAZZY)
+
+    def make(self, kind: str, *fields: Any) -> Any:
+        return self.store.types[kind](*fields)
+
+    def header(self, stamp_ns: int, frame: str) -> Any:
+        stamp = self.make("builtin_interfaces/msg/Time", *divmod(stamp_ns, 10**9))
+        return self.make("std_msgs/msg/Header", stamp, frame)
+
+    def transform(self, stamp_ns: int, parent: str, child: str, position: Any, q: Any) -> Any:
+        vector = self.make("geometry_msgs/msg/Vector3", *map(float, position))
+        turn = self.make("geometry_msgs/msg/Quaternion", *map(float, q))
+        inner = self.make("geometry_msgs/msg/Transform", vector, turn)
+        return self.make("geometry_msgs/msg/TransformStamped", self.header(stamp_ns, parent), child, inner)
+
+    def message(self, stamp_ns: int, kind: str, time_s: float) -> tuple[str, Any]:
+        if kind == "tf":
+            frame = self.transform(stamp_ns, "base_link", "tool0", *pose(time_s))
+            return "/tf", self.make("tf2_msgs/msg/TFMessage", [frame])
+        if kind == "joints":
+            at = progress_of(time_s)
+            speed = (progress_of(time_s + 1e-3) - at) * 1e3
+            q = np.array([3.0, 2.0, 1.0, 4.0, 5.0, 6.0]) + 0.1 * at
+            return "/joint_states", self.make(
+                "sensor_msgs/msg/JointState", self.header(stamp_ns, ""), list(JOINTS), q,
+                np.full(6, 0.1 * speed), np.empty(0),
+            )  # fmt: skip
+        if kind == "info":
+            roi = self.make("sensor_msgs/msg/RegionOfInterest", 0, 0, 0, 0, False)
+            return "/cam/camera_info", self.make(
+                "sensor_msgs/msg/CameraInfo", self.header(stamp_ns, "optical"), HEIGHT, WIDTH, "plumb_bob",
+                np.zeros(5), np.array(K), np.eye(3).ravel(), np.zeros(12), 0, 0, roi,
+            )  # fmt: skip
+        return "/cam/image_raw", self.make(
+            "sensor_msgs/msg/Image", self.header(stamp_ns, "optical"), HEIGHT, WIDTH, "mono8", 0, WIDTH,
+            picture(time_s).ravel(),
+        )  # fmt: skip
+
+
+def write_rosbag2(path: Path, storage: str, compression: str = "none") -> Path:
+    """`storage`: sqlite3 or mcap, by `rosbags`."""
+    from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin, Writer
+
+    ros = RosMessages()
+    writer = Writer(path, version=9, storage_plugin=StoragePlugin[storage.upper()])
+    if compression != "none":
+        writer.set_compression(CompressionMode[compression.upper()], CompressionFormat.ZSTD)
+    with writer:
+        connections: dict[str, Any] = {}
+        for stamp_ns, kind, time_s in moments():
+            topic, message = ros.message(stamp_ns, kind, time_s)
+            if topic not in connections:
+                connections[topic] = writer.add_connection(topic, message.__msgtype__, typestore=ros.store)
+            data = ros.store.serialize_cdr(message, message.__msgtype__)
+            writer.write(connections[topic], stamp_ns + 3_000_000, data)
+    return path
+
+
+def write_ros_mcap(path: Path, **options: Any) -> Path:
+    """The same in one MCAP file without metadata.yaml, by the reference library's writer and its `options`."""
+    from mcap.writer import Writer
+
+    ros = RosMessages()
+    with path.open("wb") as stream:
+        writer = Writer(stream, **options)
+        writer.start("ros2")
+        channels: dict[str, int] = {}
+        for stamp_ns, kind, time_s in moments():
+            topic, message = ros.message(stamp_ns, kind, time_s)
+            if topic not in channels:
+                definition = ros.store.generate_msgdef(message.__msgtype__)[0].encode()
+                schema = writer.register_schema(message.__msgtype__, "ros2msg", definition)
+                channels[topic] = writer.register_channel(topic, "cdr", schema)
+            data = bytes(ros.store.serialize_cdr(message, message.__msgtype__))
+            writer.add_message(channels[topic], stamp_ns, data, stamp_ns)
+        writer.finish()
+    return path
+
+
+def write_foxglove_mcap(path: Path) -> Path:
+    """Foxglove's schemas in protobuf, by Foxglove's Python library; a topic of JSON beside them."""
+    from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+    from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+    from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
+    from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+    from mcap_protobuf.writer import Writer
+
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        for stamp_ns, kind, time_s in moments():
+            seconds, nanos = divmod(stamp_ns, 10**9)
+            message: Any
+            if kind == "tf":
+                topic, message = "/frames", FrameTransforms()
+                frame = message.transforms.add(parent_frame_id="base_link", child_frame_id="tool0")
+                frame.timestamp.seconds, frame.timestamp.nanos = seconds, nanos
+                (frame.translation.x, frame.translation.y, frame.translation.z), q = pose(time_s)
+                frame.rotation.x, frame.rotation.y, frame.rotation.z, frame.rotation.w = q
+            elif kind == "joints":
+                topic, message = "/joints", JointStates()
+                for name in JOINTS:
+                    message.joints.add(name=name, position=progress_of(time_s))
+            elif kind == "info":
+                topic, message = (
+                    "/cam/calibration",
+                    CameraCalibration(width=WIDTH, height=HEIGHT, K=K, D=[0] * 5),
+                )
+            else:
+                topic, message = (
+                    "/cam/image",
+                    RawImage(
+                        width=WIDTH,
+                        height=HEIGHT,
+                        encoding="mono8",
+                        step=WIDTH,
+                        data=picture(time_s).tobytes(),
+                    ),
+                )
+            if kind != "tf":
+                message.timestamp.seconds, message.timestamp.nanos = seconds, nanos
+            writer.write_message(topic, message, stamp_ns, stamp_ns)
+        writer.finish()
+    return path

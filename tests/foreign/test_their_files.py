@@ -1,0 +1,139 @@
+"""Bags and MCAP files of other people's libraries, imported: the stops, their pictures, the right poses."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.writer import CompressionType
+
+from recordings.cli import main
+from recordings.errors import RecordingError
+from recordings.importers import Limits, Wanted, import_bag
+from recordings.importers.stops import JOINT_SPEED_RAD_S, LEAST_SAMPLES
+from recordings.reader import open_recording
+from station.config import StillnessConfig
+from station.stillness import LEAST_SAMPLES as STATION_LEAST_SAMPLES
+from tests.command_line import call
+from tests.foreign.bags import (
+    START_NS,
+    STOPS,
+    K,
+    pose,
+    write_foxglove_mcap,
+    write_ros_mcap,
+    write_rosbag2,
+)
+
+DESCRIPTION = "mount: eye-in-hand\nboard: {kind: chessboard, columns: 7, rows: 6, square_m: 0.025}\n"
+SOURCES = {
+    "rosbag2 sqlite3": lambda folder: write_rosbag2(folder / "bag", "sqlite3"),
+    "rosbag2 sqlite3, messages packed": lambda folder: write_rosbag2(folder / "bag", "sqlite3", "message"),
+    "rosbag2 sqlite3, files packed": lambda folder: write_rosbag2(folder / "bag", "sqlite3", "file"),
+    "rosbag2 sqlite3, the file alone": lambda folder: next(
+        write_rosbag2(folder / "bag", "sqlite3").glob("*.db3")
+    ),
+    "rosbag2 mcap": lambda folder: write_rosbag2(folder / "bag", "mcap"),
+    "rosbag2 mcap, packed": lambda folder: write_rosbag2(folder / "bag", "mcap", "storage"),
+    "mcap, Python's defaults": lambda folder: write_ros_mcap(folder / "a.mcap"),
+    "mcap, lz4": lambda folder: write_ros_mcap(folder / "a.mcap", compression=CompressionType.LZ4),
+    "mcap, no chunks": lambda folder: write_ros_mcap(folder / "a.mcap", use_chunking=False),
+    "mcap, no checksums": lambda folder: write_ros_mcap(folder / "a.mcap", enable_crcs=False),
+    "mcap, no summary": lambda folder: write_ros_mcap(
+        folder / "a.mcap", use_statistics=False, use_summary_offsets=False, repeat_schemas=False,
+        repeat_channels=False,
+    ),
+    "foxglove schemas": lambda folder: write_foxglove_mcap(folder / "a.mcap"),
+}  # fmt: skip
+
+
+@pytest.fixture
+def description(tmp_path: Path) -> Path:
+    path = tmp_path / "dataset.yaml"
+    path.write_text(DESCRIPTION)
+    return path
+
+
+@pytest.mark.parametrize("kind", SOURCES)
+def test_the_stops_come_with_their_picture_and_the_right_pose(
+    tmp_path: Path, description: Path, kind: str
+) -> None:
+    plan = import_bag(SOURCES[kind](tmp_path), tmp_path / "out.mcap", description)
+    assert (plan.stops, plan.images) == (STOPS, 90)
+    assert 0 < plan.bound_ms < 5.0, "no pose has the stamp of a picture; the nearest is half a period away"
+    recording = open_recording(tmp_path / "out.mcap")
+    assert recording.info.source == "imported"
+    np.testing.assert_array_equal(np.ravel(recording.info.camera.matrix), K)
+    for number, (view, image) in enumerate(recording.pictures()):
+        time_s = (view.stamps.host_wall_ns - START_NS) / 1e9
+        assert 2 * number + 0.3 < time_s < 2 * number + 1, "the last picture of the stop"
+        assert np.unique(image.image) == 10 + 40 * number
+        position, _ = pose(2.0 * number)
+        np.testing.assert_allclose(np.array(view.base_from_flange)[:3, 3], position, atol=1e-9)
+        assert view.time_bound_s is not None
+        assert view.time_bound_s < 0.005
+        assert view.stillness is not None
+        assert view.stillness.position_scatter_m < 1e-9
+    states = list(recording.robot_states())
+    assert len(states) == 900
+    if kind != "foxglove schemas":
+        assert states[0].joints_rad == (1.0, 2.0, 3.0, 4.0, 5.0, 6.0), (
+            "base first, whatever order they came in"
+        )
+
+
+def test_the_rule_for_standing_is_the_stations() -> None:
+    ours, theirs = Limits(), StillnessConfig()
+    assert (ours.position_m, ours.rotation_rad) == (theirs.position_m, theirs.rotation_rad)
+    assert (theirs.joint_speed_rad_s, STATION_LEAST_SAMPLES) == (JOINT_SPEED_RAD_S, LEAST_SAMPLES)
+
+
+def test_a_dry_run_says_what_would_be_taken_and_writes_nothing(tmp_path: Path) -> None:
+    source = write_rosbag2(tmp_path / "bag", "mcap")
+    result = call(main, "import", source, "--dry-run", "--json")
+    said = json.loads(result.stdout)
+    assert (result.returncode, said["views"], said["recording"]) == (0, STOPS, "")
+    assert said["bag"]["image_topic"] == "/cam/image_raw"
+    assert said["bag"]["joints_from"] == "/joint_states"
+    assert [path.name for path in tmp_path.iterdir()] == ["bag"]
+    assert call(main, "import", source).returncode == 2, "neither an output nor a dry run"
+
+
+REFUSED = {
+    "no description": (lambda folder: write_rosbag2(folder / "bag", "mcap"), Wanted(), "which board"),
+    "frames that are not there": (
+        lambda folder: write_ros_mcap(folder / "a.mcap"),
+        Wanted(flange="gripper"),
+        "frames: base_link, tool0",
+    ),
+    "a topic that is not there": (
+        lambda folder: write_ros_mcap(folder / "a.mcap"),
+        Wanted(image_topic="/left"),
+        "/cam/image_raw",
+    ),
+    "a ROS 1 bag": (lambda folder: folder / "a.bag", Wanted(), "ROS 1"),
+    "nothing": (lambda folder: folder / "none", Wanted(), "does not exist"),
+    "no bag at all": (lambda folder: Path(__file__), Wanted(), "does not begin like an MCAP file"),
+}
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_cannot_be_imported_is_named(tmp_path: Path, name: str) -> None:
+    make, wanted, reason = REFUSED[name]
+    source = make(tmp_path)
+    if name != "no description":
+        (tmp_path / "dataset.yaml").write_text(DESCRIPTION)
+    before = sorted(tmp_path.iterdir())
+    with pytest.raises(RecordingError, match=reason):
+        given = tmp_path / "dataset.yaml" if name == "no bag at all" else None
+        import_bag(source, tmp_path / "out.mcap", given, wanted)
+    assert sorted(tmp_path.iterdir()) == before
+
+
+def test_a_cut_bag_is_named_as_such(tmp_path: Path, description: Path) -> None:
+    path = write_ros_mcap(tmp_path / "a.mcap")
+    path.write_bytes(path.read_bytes()[:-2000])
+    with pytest.raises(RecordingError, match=r"not finished or is cut.*mcap recover"):
+        import_bag(path, tmp_path / "out.mcap", description)

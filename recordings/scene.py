@@ -54,7 +54,7 @@ def write_scene(path: Path, steps: Sequence[tuple[float, Sequence[Entity]]]) -> 
     writer = Writer(stream)
     for seconds, entities in steps:
         time_ns = int(seconds * 1e9)
-        writer.write_message(TOPIC, _update(entities, time_ns), time_ns, time_ns)
+        writer.write_message(TOPIC, scene_update(entities, time_ns), time_ns, time_ns)
     writer.finish()  # type: ignore[no-untyped-call]
     try:
         write_atomically(path, stream.getvalue(), ASKED_FOR)
@@ -69,7 +69,8 @@ def _is_scene(path: Path) -> bool:
         return SceneUpdate.DESCRIPTOR.full_name.encode() in file.read()
 
 
-def _update(entities: Sequence[Entity], time_ns: int) -> Message:
+def scene_update(entities: Sequence[Entity], time_ns: int) -> Message:
+    """The published message with these entities."""
     update = SceneUpdate()
     for entity in entities:
         made = update.entities.add(id=entity.name, frame_id=entity.frame)

@@ -12,6 +12,7 @@ from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
 from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
 from foxglove_schemas_protobuf.Log_pb2 import Log
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
 from google.protobuf.descriptor_pb2 import FileDescriptorSet
 from google.protobuf.message import DecodeError
 from mcap_protobuf.schema import build_file_descriptor_set
@@ -32,6 +33,7 @@ class Topic(StrEnum):
     FIXED_TRANSFORM = "/tf_static"
     JOINTS = "/joint_states"
     ANNOTATIONS = "/camera/annotations"
+    SCENE = "/scene"
     LOG = "/log"
 
 
@@ -47,6 +49,7 @@ _MESSAGES: dict[Topic, Any] = {
     Topic.FIXED_TRANSFORM: FrameTransform,
     Topic.JOINTS: JointStates,
     Topic.ANNOTATIONS: ImageAnnotations,
+    Topic.SCENE: SceneUpdate,
     Topic.LOG: Log,
 }
 

@@ -40,6 +40,7 @@ from recordings.messages import (
     View,
 )
 from recordings.pictures import PictureError, encode_png, read_header
+from recordings.scene import Entity, scene_update
 from recordings.schema import FORMATS, SESSION_RECORDS, PictureFacts, encode
 from recordings.topics import Topic, schema_bytes, schema_name
 
@@ -163,6 +164,11 @@ class RecordingWriter:
         """What viewers draw over a recorded picture: detected corners, residuals."""
         time_ns = self._pictures[sequence]
         self._show(Topic.ANNOTATIONS, viewing.image_annotations(marks, text, time_ns), time_ns)
+
+    def scene(self, sequence: int, entities: Sequence[Entity]) -> None:
+        """Shapes in space as they are at a recorded picture's time, for viewers."""
+        time_ns = self._pictures[sequence]
+        self._show(Topic.SCENE, scene_update(entities, time_ns), time_ns)
 
     def frame(self, parent: str, child: str, parent_from_child: Matrix4) -> None:
         """A transform that does not change from here on, for viewers: where the camera is, say."""

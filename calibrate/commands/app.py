@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import typer
 
-from calibrate.commands import batch, board, check, install, solve, sweep
+from calibrate.commands import annotate, batch, board, check, install, solve, sweep
 
 app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
@@ -18,5 +18,5 @@ app = typer.Typer(
     epilog="Exit codes: 0 good, 1 failed, 2 wrong usage or configuration, 3 done with loss, 4 a gate failed "
     "or a check did not hold.",
 )
-for family in (solve, install, check, board, batch, sweep):
+for family in (solve, install, check, annotate, board, batch, sweep):
     family.register(app)

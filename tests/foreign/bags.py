@@ -124,7 +124,7 @@ def write_rosbag2(path: Path, storage: str, compression: str = "none") -> Path:
 
 
 def write_ros_mcap(path: Path, **options: Any) -> Path:
-    """The same in one MCAP file without metadata.yaml, by the reference library's writer and its `options`."""
+    """The same in one MCAP file, by the reference library's writer and its `options`."""
     from mcap.writer import Writer
 
     ros = RosMessages()

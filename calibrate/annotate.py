@@ -1,0 +1,164 @@
+"""A recording with a calibration drawn into it: camera, board, residuals of each view, rejected views in red.
+
+To be looked at in Foxglove, Lichtblick or rerun. It holds all that the recording holds, so it can be solved
+and exported like it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from calibrate.board import board_from_turned, board_points, looks_same_turns
+from calibrate.calibration import Calibration, encode_calibration
+from calibrate.detect import Detection
+from calibrate.errors import CalibrationError
+from calibrate.geometry import Array, inverse
+from calibrate.load import Progress, load_views
+from calibrate.projection import project_pixels
+from recordings.messages import CameraModel, Matrix4, View
+from recordings.reader import Recording
+from recordings.scene import Entity, Line
+from recordings.viewing import DETECTED, Marks
+from recordings.writer import RecordingWriter, derived_recording
+
+USED, REJECTED, PREDICTED = DETECTED, (0.95, 0.1, 0.1), (1.0, 0.8, 0.1)
+MAGNIFIED = 20.0
+"""Residuals are drawn so many times longer."""
+_CAMERA_DEPTH_M = 0.05
+_FEWEST_VIEWS = 1
+
+
+class AnnotateError(CalibrationError):
+    """The calibration and the recording do not belong together."""
+
+
+@dataclass(frozen=True, eq=False)
+class ViewResidual:
+    """How far the detected corners of a view are from where robot, camera and board place put them."""
+
+    index: int
+    rms_px: float | None
+    """None where no board was seen."""
+    rejected: str
+    """Why the solver did not use it; empty = used."""
+
+
+def annotate(
+    recording: Recording, calibration: Calibration, output: Path, progress: Progress | None = None
+) -> list[ViewResidual]:
+    """Writes `output` (.mcap), which must not exist. AnnotateError or RecordingError."""
+    camera, info = calibration.intrinsics.model, recording.info
+    if (camera.width, camera.height) != (info.camera.width, info.camera.height):
+        raise AnnotateError(
+            f"the calibration is for {camera.width}×{camera.height} pictures, the recording holds "
+            f"{info.camera.width}×{info.camera.height}. Name the calibration of this camera"
+        )
+    if calibration.mount != info.mount:
+        raise AnnotateError(f"the calibration is {calibration.mount}, the recording {info.mount}")
+    seen = load_views(recording, calibration.board, camera, progress, fewest=_FEWEST_VIEWS).detections
+    rejected = {view.index: view.reason for view in calibration.views.rejected}
+    chain = _camera_from_board(calibration)
+    drawn: list[list[Marks]] = []
+    found: list[ViewResidual] = []
+    for view in recording.views():
+        why = rejected.get(view.index, "")
+        marks, rms_px = _marks(calibration, camera, chain(view), seen.get(view.index), bool(why))
+        drawn.append(marks)
+        found.append(ViewResidual(view.index, rms_px, why))
+    with derived_recording(output, msgspec.structs.replace(info, part=1)) as writer:
+        _copy_beside_views(recording, writer)
+        writer.attach("calibration.yaml", "application/yaml", encode_calibration(calibration))
+        writer.camera_model(camera)
+        for place in (calibration.result, calibration.board_place):
+            T: Matrix4 = tuple(tuple(map(float, row)) for row in place.transform.matrix)
+            writer.frame(place.parent_frame, place.child_frame, T)
+        for sequence, (view, picture) in enumerate(recording.pictures()):
+            stored = recording.stored_picture(view)
+            writer.picture(msgspec.structs.replace(picture, sequence=sequence), stored[1] if stored else None)
+            writer.view(msgspec.structs.replace(view, picture_sequence=sequence, part=1))
+            writer.marks(sequence, drawn[sequence], _text(found[sequence]))
+        pairs = zip(recording.views(), found, strict=True)
+        cameras = [_camera_entity(calibration, camera, view, residual) for view, residual in pairs]
+        writer.scene(0, [_board_entity(calibration), *cameras])
+        writer.finish()
+    return found
+
+
+def _copy_beside_views(recording: Recording, writer: RecordingWriter) -> None:
+    kinds = recording.media_types()
+    for name, content in recording.attachments().items():
+        if name != "calibration.yaml":
+            writer.attach(name, kinds[name], content)
+    for state in recording.robot_states():
+        writer.robot_state(state)
+    for event in recording.events():
+        writer.event(event)
+
+
+def _camera_from_board(calibration: Calibration) -> Callable[[View], Array]:
+    """View → camera_from_board as robot, X and the board's place say it."""
+    X, B = calibration.transform.matrix, calibration.board_place.transform.matrix
+
+    def in_hand(view: View) -> Array:
+        return np.asarray(inverse(X) @ inverse(np.array(view.base_from_flange)) @ B)
+
+    def to_hand(view: View) -> Array:
+        return np.asarray(inverse(X) @ np.array(view.base_from_flange) @ B)
+
+    return in_hand if calibration.mount == "eye-in-hand" else to_hand
+
+
+def _marks(
+    calibration: Calibration, camera: CameraModel, camera_from_board: Array, seen: Detection | None, bad: bool
+) -> tuple[list[Marks], float | None]:
+    """Detected corners, and from each a line towards its predicted place, longer than it is."""
+    if seen is None or not seen.found:
+        return [], None
+    best: Array | None = None
+    for quarters in (0, *looks_same_turns(calibration.board)):  # a board that looks the same turned
+        turned = camera_from_board @ board_from_turned(calibration.board, quarters)
+        points = board_points(calibration.board)[seen.indices] @ turned[:3, :3].T + turned[:3, 3]
+        off = project_pixels(camera, points) - seen.pixels
+        if np.isfinite(off).all() and (best is None or (off**2).sum() < (best**2).sum()):
+            best = off
+    corners = Marks(seen.pixels, REJECTED if bad else USED, thickness_px=5.0)
+    if best is None:
+        return [corners], None
+    towards = Marks(seen.pixels, PREDICTED, seen.pixels + MAGNIFIED * best, thickness_px=2.0)
+    return [corners, towards], float(np.sqrt((best**2).sum(axis=1).mean()))
+
+
+def _text(view: ViewResidual) -> str:
+    said = "no board seen" if view.rms_px is None else f"{view.rms_px:.2f} px RMS, lines ×{MAGNIFIED:.0f}"
+    return f"pose {view.index + 1}: {said}" + (f", REJECTED: {view.rejected}" if view.rejected else "")
+
+
+def _board_entity(calibration: Calibration) -> Entity:
+    points = board_points(calibration.board)
+    low, high = points.min(axis=0), points.max(axis=0)
+    outline = np.array([[low[0], low[1]], [high[0], low[1]], [high[0], high[1]], [low[0], high[1]], low[:2]])
+    line = Line(np.column_stack([outline, np.zeros(5)]), (1.0, 1.0, 1.0, 1.0))
+    return Entity("board", calibration.board_place.child_frame, (line,), "board")
+
+
+def _camera_entity(
+    calibration: Calibration, camera: CameraModel, view: View, residual: ViewResidual
+) -> Entity:
+    """A small pyramid: eye-in-hand where the camera was, eye-to-hand where the flange was."""
+    assert camera.matrix is not None
+    K = np.array(camera.matrix)
+    corners = np.array([[0, 0], [camera.width, 0], [camera.width, camera.height], [0, camera.height], [0, 0]])
+    rays = np.column_stack([(corners - K[:2, 2]) / K[[0, 1], [0, 1]], np.ones(5)]) * _CAMERA_DEPTH_M
+    spokes = np.stack([np.zeros((4, 3)), rays[:4]], axis=1).reshape(-1, 3)
+    T = np.array(view.base_from_flange)
+    if calibration.mount == "eye-in-hand":
+        T = T @ calibration.transform.matrix
+    colour = (*(REJECTED if residual.rejected else USED), 1.0)
+    lines = tuple(Line(points @ T[:3, :3].T + T[:3, 3], colour, 0.0015) for points in (rays, spokes))
+    at = T[:3, 3]
+    return Entity(f"pose {view.index + 1}", "base", lines, str(view.index + 1), (at[0], at[1], at[2]))

@@ -1,0 +1,102 @@
+"""A calibration drawn into its recording: what viewers and a ROS 2 export get of it, and that it tells wrong ones."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from calibrate.annotate import AnnotateError, annotate
+from calibrate.calibration import Calibration, FramePose, Rejected, read_calibration
+from calibrate.cli import main
+from recordings.reader import open_recording
+from tests.command_line import call
+
+SAMPLE = Path(__file__).parents[2] / "recordings" / "samples" / "paper-640.mcap"
+
+
+@pytest.fixture(scope="module")
+def solved(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    path = tmp_path_factory.mktemp("solved") / "cell.yaml"
+    result = call(main, "solve", SAMPLE, "-o", path)
+    assert path.exists(), result.stderr
+    return path
+
+
+def messages(path: Path, topic: str) -> list:
+    with path.open("rb") as stream:
+        reader = make_reader(stream, decoder_factories=[DecoderFactory()])
+        return [decoded for _, _, _, decoded in reader.iter_decoded_messages(topics=[topic])]
+
+
+def test_the_command_writes_the_result_beside_the_pictures(tmp_path: Path, solved: Path) -> None:
+    path = tmp_path / "seen.mcap"
+    result = call(main, "annotate", SAMPLE, solved, "-o", path)
+    assert result.returncode == 0, result.stderr
+    calibration = read_calibration(solved)
+    part = open_recording(path).parts[0]
+    assert part.camera_model == calibration.intrinsics.model
+    np.testing.assert_allclose(
+        part.fixed_frames["flange", "camera"], calibration.transform.matrix, atol=1e-12
+    )
+    assert ("base", "board") in part.fixed_frames
+    marks = messages(path, "/camera/annotations")
+    assert len(marks) == 25
+    assert len(marks[0].points[0].points) == 42, "every corner"
+    assert len(marks[0].points[1].points) == 84, "and a line from each"
+    (scene,) = messages(path, "/scene")
+    assert len(scene.entities) == 26, "the board, and where the camera was in each view"
+    again, original = open_recording(path), open_recording(SAMPLE)
+    assert list(again.robot_states()) == list(original.robot_states())
+    for (_, ours), (_, theirs) in zip(again.pictures(), original.pictures(), strict=True):
+        np.testing.assert_array_equal(ours.image, theirs.image)
+
+
+def test_a_wrong_calibration_is_seen(tmp_path: Path, solved: Path) -> None:
+    """The camera 5 mm beside its place: at half a metre some pixels, in every view."""
+    good = read_calibration(solved)
+    recording = open_recording(SAMPLE)
+    right = annotate(recording, good, tmp_path / "right.mcap")
+    wrong = annotate(recording, shifted(good, 0.005), tmp_path / "wrong.mcap")
+    assert max(view.rms_px for view in right if view.rms_px is not None) < 1.0
+    assert min(view.rms_px for view in wrong if view.rms_px is not None) > 2.0
+
+
+def shifted(calibration: Calibration, by_m: float) -> Calibration:
+    x, y, z = calibration.result.translation_m
+    moved = calibration.transform.matrix.copy()
+    moved[0, 3] += by_m
+    result = msgspec.structs.replace(
+        calibration.result, translation_m=(x + by_m, y, z), matrix=tuple(map(tuple, moved.tolist()))
+    )
+    assert isinstance(result, FramePose)
+    return msgspec.structs.replace(calibration, result=result)
+
+
+def test_rejected_views_are_red_and_say_why(tmp_path: Path, solved: Path) -> None:
+    calibration = read_calibration(solved)
+    views = msgspec.structs.replace(
+        calibration.views, rejected=[Rejected(3, "pose-4", "robot pose is wrong")]
+    )
+    found = annotate(
+        open_recording(SAMPLE), msgspec.structs.replace(calibration, views=views), tmp_path / "a.mcap"
+    )
+    assert [view.index for view in found if view.rejected] == [3]
+    colours = [
+        marks.points[0].outline_color for marks in messages(tmp_path / "a.mcap", "/camera/annotations")
+    ]
+    assert [n for n, colour in enumerate(colours) if colour.r > colour.g] == [3]
+
+
+def test_another_camera_is_refused(tmp_path: Path, solved: Path) -> None:
+    calibration = read_calibration(solved)
+    lens = msgspec.structs.replace(calibration.intrinsics, width=1280, height=1024)
+    with pytest.raises(AnnotateError):
+        annotate(
+            open_recording(SAMPLE), msgspec.structs.replace(calibration, intrinsics=lens), tmp_path / "a.mcap"
+        )
+    assert list(tmp_path.iterdir()) == []

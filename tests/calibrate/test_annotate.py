@@ -1,4 +1,4 @@
-"""A calibration drawn into its recording: what viewers and a ROS 2 export get of it, and that it tells wrong ones."""
+"""A calibration drawn into its recording: what viewers get of it, and that a wrong one is seen."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""A recording, a ROS 2 bag made of it, imported and solved again: the same camera pose. And what ROS gets of it."""
+"""A recording, a ROS 2 bag made of it, imported and solved again: the same camera pose; what ROS gets."""
 
 from __future__ import annotations
 

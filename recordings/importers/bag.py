@@ -104,7 +104,9 @@ def import_bag(
                 "Look at it with --dry-run; --still-mm and --still-deg allow for a noisier arm"
             )
         assert described is not None
-        size = _write(bag, chosen, stops, described, description_bytes, source, output, plan, progress)
+        size = _write(
+            bag, chosen, stops, described, description_bytes, source, output, plan, pair_within_s, progress
+        )
         return replace(plan, bytes_written=size)
     finally:
         bag.close()
@@ -157,6 +159,7 @@ def _write(
     source: Path,
     output: Path,
     plan: BagPlan,
+    pair_within_s: float,
     progress: Callable[[int, int], None],
 ) -> int:
     in_file_order = sorted(stops, key=lambda stop: stop.place)
@@ -180,12 +183,13 @@ def _write(
         writer.attach(DATASET_FILE, "application/yaml", description_bytes)
         writer.attach("import.json", "application/json", msgspec.json.encode(asdict(plan)))
         states = _states(bag, chosen)
-        waiting = next(states, None)
+        last, waiting = None, next(states, None)
         for done, (stop, image) in enumerate(zip(in_file_order, _chain(first, images), strict=True)):
             while waiting is not None and waiting.stamps.host_wall_ns <= stop.stamp_ns:
                 writer.robot_state(waiting)
-                waiting = next(states, None)
-            _write_view(writer, index[stop.place], stop, image)
+                last, waiting = waiting, next(states, None)
+            joints_rad = _joints_at(stop.stamp_ns, last, waiting, pair_within_s)
+            _write_view(writer, index[stop.place], stop, image, joints_rad)
             progress(done + 1, len(stops))
         while waiting is not None:
             writer.robot_state(waiting)
@@ -237,7 +241,23 @@ def _state(stamp_ns: int, six: tuple[Vector6, Vector6], base_from_flange: Array)
     )
 
 
-def _write_view(writer: RecordingWriter, index: int, stop: Stop, image: Image) -> None:
+def _joints_at(
+    stamp_ns: int, before: RobotState | None, after: RobotState | None, within_s: float
+) -> Vector6 | None:
+    """Interpolated between the reports around the stamp; None when they are farther from it than allowed."""
+    near = [state for state in (before, after) if state is not None]
+    if not near or any(abs(s.stamps.host_wall_ns - stamp_ns) > within_s * 1e9 for s in near):
+        return None
+    times = [state.stamps.host_wall_ns - stamp_ns for state in near]
+    a, b, c, d, e, f = (
+        float(np.interp(0, times, joint)) for joint in zip(*[s.joints_rad for s in near], strict=True)
+    )
+    return a, b, c, d, e, f
+
+
+def _write_view(
+    writer: RecordingWriter, index: int, stop: Stop, image: Image, joints_rad: Vector6 | None
+) -> None:
     pixels, encoded = _pixels(image, stop.place)
     pixel_format = "BGR8" if pixels.ndim == 3 else "Mono8" if pixels.itemsize == 1 else "Mono16"
     stamps = Stamps(host_wall_ns=stop.stamp_ns, device_ns=stop.stamp_ns)
@@ -249,6 +269,7 @@ def _write_view(writer: RecordingWriter, index: int, stop: Stop, image: Image) -
             name=f"stop-{index + 1}",
             picture_sequence=index,
             base_from_flange=T,
+            joints_rad=joints_rad,
             stamps=stamps,
             time_bound_s=stop.bound_s,
             stillness=stop.stillness,

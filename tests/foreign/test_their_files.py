@@ -74,6 +74,9 @@ def test_the_stops_come_with_their_picture_and_the_right_pose(
         np.testing.assert_allclose(np.array(view.base_from_flange)[:3, 3], position, atol=1e-9)
         assert view.time_bound_s is not None
         assert view.time_bound_s < 0.005
+        if kind != "foxglove schemas":
+            turned = np.arange(1.0, 7.0) + 0.1 * number
+            np.testing.assert_allclose(view.joints_rad, turned, atol=1e-9)
         assert view.stillness is not None
         assert view.stillness.position_scatter_m < 1e-9
     states = list(recording.robot_states())

@@ -49,7 +49,7 @@ def stamps_tables(
     while first < len(addresses):
         start = int(addresses[first])
         limit = start + _BLOCK_BYTES if start < UNPACKED_START else start + 1
-        last = max(first + 1, int(np.searchsorted(addresses, limit)))
+        last = max(first + 1, int(np.searchsorted(addresses, np.uint64(limit))))
         chosen = addresses[first:last]
         length = int(chosen[-1]) - start + _HEAD_BYTES + _LONGEST_BYTES
         data = source.read(start, min(length, source.room(start)))

@@ -23,11 +23,11 @@ from calibrate.projection import project_pixels
 from recordings.messages import CameraModel, Matrix4, View
 from recordings.reader import Recording
 from recordings.scene import Entity, Line
-from recordings.viewing import DETECTED, Marks
+from recordings.viewing import DETECTED, Marks, drawn
 from recordings.writer import RecordingWriter, derived_recording
 
 USED, REJECTED, PREDICTED = DETECTED, (0.95, 0.1, 0.1), (1.0, 0.8, 0.1)
-MAGNIFIED = 20.0
+MAGNIFIED = 50.0
 """Residuals are drawn so many times longer."""
 _CAMERA_DEPTH_M = 0.05
 _FEWEST_VIEWS = 1
@@ -63,12 +63,12 @@ def annotate(
     seen = load_views(recording, calibration.board, camera, progress, fewest=_FEWEST_VIEWS).detections
     rejected = {view.index: view.reason for view in calibration.views.rejected}
     chain = _camera_from_board(calibration)
-    drawn: list[list[Marks]] = []
+    marks: list[list[Marks]] = []
     found: list[ViewResidual] = []
     for view in recording.views():
         why = rejected.get(view.index, "")
-        marks, rms_px = _marks(calibration, camera, chain(view), seen.get(view.index), bool(why))
-        drawn.append(marks)
+        of_view, rms_px = _marks(calibration, camera, chain(view), seen.get(view.index), bool(why))
+        marks.append(of_view)
         found.append(ViewResidual(view.index, rms_px, why))
     with derived_recording(output, msgspec.structs.replace(info, part=1)) as writer:
         _copy_beside_views(recording, writer)
@@ -81,7 +81,9 @@ def annotate(
             stored = recording.stored_picture(view)
             writer.picture(msgspec.structs.replace(picture, sequence=sequence), stored[1] if stored else None)
             writer.view(msgspec.structs.replace(view, picture_sequence=sequence, part=1))
-            writer.marks(sequence, drawn[sequence], _text(found[sequence]))
+            text = _text(found[sequence])
+            writer.marks(sequence, marks[sequence], text)
+            writer.drawn_picture(sequence, drawn(picture.image, marks[sequence], text))
         pairs = zip(recording.views(), found, strict=True)
         cameras = [_camera_entity(calibration, camera, view, residual) for view, residual in pairs]
         writer.scene(0, [_board_entity(calibration), *cameras])
@@ -129,12 +131,16 @@ def _marks(
     corners = Marks(seen.pixels, REJECTED if bad else USED, thickness_px=5.0)
     if best is None:
         return [corners], None
-    towards = Marks(seen.pixels, PREDICTED, seen.pixels + MAGNIFIED * best, thickness_px=2.0)
+    towards = Marks(seen.pixels, PREDICTED, seen.pixels + MAGNIFIED * best, thickness_px=3.0)
     return [corners, towards], float(np.sqrt((best**2).sum(axis=1).mean()))
 
 
 def _text(view: ViewResidual) -> str:
-    said = "no board seen" if view.rms_px is None else f"{view.rms_px:.2f} px RMS, lines ×{MAGNIFIED:.0f}"
+    said = (
+        "no board seen"
+        if view.rms_px is None
+        else f"{view.rms_px:.2f} px RMS, lines {MAGNIFIED:.0f} times as long"
+    )
     return f"pose {view.index + 1}: {said}" + (f", REJECTED: {view.rejected}" if view.rejected else "")
 
 

@@ -34,6 +34,7 @@ class Topic(StrEnum):
     JOINTS = "/joint_states"
     ANNOTATIONS = "/camera/annotations"
     SCENE = "/scene"
+    DRAWN_IMAGE = "/camera/annotated"
     LOG = "/log"
 
 
@@ -50,6 +51,7 @@ _MESSAGES: dict[Topic, Any] = {
     Topic.JOINTS: JointStates,
     Topic.ANNOTATIONS: ImageAnnotations,
     Topic.SCENE: SceneUpdate,
+    Topic.DRAWN_IMAGE: CompressedImage,
     Topic.LOG: Log,
 }
 
@@ -72,8 +74,9 @@ def identify(samples: list[bytes]) -> tuple[str, str, str, bytes] | None:
     topic's message has, and it says again the same number of bytes.
     """
     fitting = [topic for topic in Topic if all(_fits(topic, data) for data in samples)]
-    if {schema_name(topic) for topic in fitting} == {FrameTransform.DESCRIPTOR.full_name}:
-        fitting = [Topic.TRANSFORM]  # /tf_static holds the same kind, for viewers only
+    for twin in (Topic.FIXED_TRANSFORM, Topic.DRAWN_IMAGE):  # of /tf and of pictures; only annotated copies
+        if len(fitting) > 1 and twin in fitting:
+            fitting.remove(twin)
     if len(fitting) != 1 or not samples:
         return None
     return fitting[0].value, schema_name(fitting[0]), "protobuf", schema_bytes(fitting[0])

@@ -185,6 +185,26 @@ def image_annotations(marks: Sequence[Marks], text: str, time_ns: int) -> Any:
     return message
 
 
+def drawn(image: NDArray[Any], marks: Sequence[Marks], text: str) -> bytes:
+    """The picture as JPEG with marks and text in its pixels."""
+    if image.dtype == np.uint16:
+        image = np.asarray(image / max(1, int(image.max()) >> 8), np.uint8)
+    canvas = image.copy() if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    for mark in marks:
+        colour = [255 * part for part in mark.colour[::-1]]
+        fixed = np.rint(mark.points * 16).astype(int)
+        if mark.ends is None:
+            for x, y in fixed.tolist():
+                cv2.circle(canvas, (x, y), 80, colour, 2, cv2.LINE_AA, 4)
+        else:
+            for start, end in zip(fixed.tolist(), np.rint(mark.ends * 16).astype(int).tolist(), strict=True):
+                cv2.line(canvas, start, end, colour, 3, cv2.LINE_AA, 4)
+    colour = [255 * part for part in marks[0].colour[::-1]] if marks else [255, 255, 255]
+    text = text.encode("ascii", "replace").decode()  # OpenCV's letters
+    cv2.putText(canvas, text, (12, 32), cv2.FONT_HERSHEY_SIMPLEX, 0.8, colour, 2, cv2.LINE_AA)
+    return bytes(cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
+
+
 def _paint(colour: Any, rgb: tuple[float, float, float]) -> None:
     colour.r, colour.g, colour.b, colour.a = *rgb, 1.0
 

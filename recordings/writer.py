@@ -165,6 +165,11 @@ class RecordingWriter:
         time_ns = self._pictures[sequence]
         self._show(Topic.ANNOTATIONS, viewing.image_annotations(marks, text, time_ns), time_ns)
 
+    def drawn_picture(self, sequence: int, jpeg: bytes) -> None:
+        """A recorded picture with something drawn into it, for viewers that draw nothing over pictures."""
+        time_ns = self._pictures[sequence]
+        self._add(Topic.DRAWN_IMAGE, viewing.compressed_image(jpeg, "jpeg", time_ns), time_ns)
+
     def scene(self, sequence: int, entities: Sequence[Entity]) -> None:
         """Shapes in space as they are at a recorded picture's time, for viewers."""
         time_ns = self._pictures[sequence]

@@ -48,6 +48,7 @@ def test_the_command_writes_the_result_beside_the_pictures(tmp_path: Path, solve
     assert len(marks) == 25
     assert len(marks[0].points[0].points) == 42, "every corner"
     assert len(marks[0].points[1].points) == 84, "and a line from each"
+    assert len(messages(path, "/camera/annotated")) == 25
     (scene,) = messages(path, "/scene")
     assert len(scene.entities) == 26, "the board, and where the camera was in each view"
     again, original = open_recording(path), open_recording(SAMPLE)

@@ -138,7 +138,7 @@ def base_from_flange(tcp_pose: Vector6, tcp_offset: Vector6) -> Matrix4:
 
 def _pose(pose: Vector6) -> NDArray[np.float64]:
     T = np.eye(4)
-    T[:3, :3] = cv2.Rodrigues(np.array(pose[3:]))[0]
+    T[:3, :3] = cv2.Rodrigues(np.array(pose[3:], float))[0]
     T[:3, 3] = pose[:3]
     return T
 

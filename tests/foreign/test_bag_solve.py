@@ -15,7 +15,9 @@ from tests.command_line import call
 from tests.foreign.judges import JUDGES
 
 SAMPLE = Path(__file__).parents[2] / "recordings" / "samples" / "paper-640.mcap"
-DESCRIPTION = "mount: eye-in-hand\nboard: {kind: chessboard, columns: 7, rows: 6, square_m: 0.025}\n"
+DESCRIPTION = (
+    "mount: eye-in-hand\nrobot: UR10\nboard: {kind: chessboard, columns: 7, rows: 6, square_m: 0.025}\n"
+)
 
 
 def run(program: object, *arguments: object) -> None:

@@ -107,13 +107,16 @@ class McapBag:
 
     def image_stamps(self, topic: str) -> Iterator[int]:
         encoding, schema = self._encodings[topic]
-        for message in self._messages(topic):
-            if encoding == _CDR:
-                yield ros_messages.image_stamp_ns(message.data, message.time_ns)
-            else:
-                image = foxglove_messages.value(schema, message.data, message.time_ns)
-                assert isinstance(image, Image)
-                yield image.stamp_ns
+        for source, addresses in self._addresses(topic):
+            for address in addresses:
+                if encoding == _CDR:
+                    beginning = source.beginning(address, ros_messages.STAMP_BYTES)
+                    yield ros_messages.image_stamp_ns(beginning.data, beginning.time_ns)
+                else:
+                    message = source.message(address)
+                    image = foxglove_messages.value(schema, message.data, message.time_ns)
+                    assert isinstance(image, Image)
+                    yield image.stamp_ns
 
     def images(self, topic: str, places: list[int]) -> Iterator[Image]:
         encoding, schema = self._encodings[topic]

@@ -19,6 +19,8 @@ KINDS = {
 }
 _NS = 1_000_000_000
 _LITTLE_ENDIAN = 1
+STAMP_BYTES = 12
+"""Of a message with a header: the encapsulation's four, seconds, nanoseconds."""
 
 
 class RosDecoder:
@@ -44,6 +46,8 @@ class RosDecoder:
 
 def image_stamp_ns(data: bytes, time_ns: int) -> int:
     """The stamp of a message that begins with a header, without decoding the rest."""
+    if len(data) < STAMP_BYTES:
+        raise ImportSourceError(f"a picture's message has {len(data)} bytes: it is no ROS 2 message")
     order = "<" if data[1] == _LITTLE_ENDIAN else ">"
     seconds, nanoseconds = struct.unpack_from(f"{order}iI", data, 4)
     return int(seconds * _NS + nanoseconds) or time_ns

@@ -253,7 +253,7 @@ class _Walk:
         if opcode == Opcode.CHUNK:
             size, _, name_length, stored = _CHUNK_PEEK.unpack_from(content, 16)
             if name_length:
-                name = content[28 : 28 + name_length]
+                name = content[32 : 32 + name_length]
                 return bool(name in (b"lz4", b"zstd") and size <= CHUNK_LIMIT_BYTES)
             return bool(size == stored == length - _PEEK_BYTES)
         (name_length,) = struct.unpack_from("<I", content, 16 if opcode == Opcode.ATTACHMENT else 0)

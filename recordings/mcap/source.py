@@ -87,6 +87,11 @@ class Source:
             return Message(time_ns, sequence, window[at : at + length])
         return Message(time_ns, sequence, self.read(address + _HEAD_BYTES, length))
 
+    def beginning(self, address: int, length: int) -> Message:
+        """Like `message`, with at most the first `length` bytes of its data."""
+        size, time_ns, sequence = self.head(address)
+        return Message(time_ns, sequence, self.read(address + _HEAD_BYTES, min(size, length)))
+
     def messages(self, addresses: Iterable[int]) -> Iterator[Message]:
         return map(self.message, addresses)
 

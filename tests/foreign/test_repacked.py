@@ -1,0 +1,78 @@
+"""A recording that went through other people's programs: packed, with a topic of theirs, damaged afterwards."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+
+from recordings.reader import open_recording
+from recordings.recover import recover
+from tests.recordings.small_recording import make_state, make_view, write_small
+
+WAYS: dict[str, dict[str, Any]] = {
+    "zstd": {"compression": CompressionType.ZSTD, "chunk_size": 4096},
+    "lz4": {"compression": CompressionType.LZ4, "chunk_size": 4096},
+    "one chunk": {"compression": CompressionType.ZSTD},
+    "no chunks": {"use_chunking": False},
+    "no checksums": {"enable_crcs": False, "compression": CompressionType.NONE},
+}
+
+
+def repacked(source: Path, target: Path, **options: Any) -> Path:
+    """By the reference library: every message, attachment and metadata record, and a topic of its own."""
+    with source.open("rb") as stream, target.open("wb") as out:
+        reader, writer = make_reader(stream), Writer(out, **options)
+        writer.start()
+        channels: dict[str, int] = {}
+        for record in reader.iter_metadata():
+            writer.add_metadata(record.name, record.metadata)
+        for record in reader.iter_attachments():
+            writer.add_attachment(
+                record.create_time, record.log_time, record.name, record.media_type, record.data
+            )
+        theirs = writer.register_channel(
+            "/diagnostics", "json", writer.register_schema("Any", "jsonschema", b"{}")
+        )
+        for schema, channel, message in reader.iter_messages(log_time_order=False):
+            if channel.topic not in channels:
+                number = writer.register_schema(schema.name, schema.encoding, schema.data)
+                channels[channel.topic] = writer.register_channel(
+                    channel.topic, channel.message_encoding, number
+                )
+            writer.add_message(
+                channels[channel.topic],
+                message.log_time,
+                message.data,
+                message.publish_time,
+                message.sequence,
+            )
+            writer.add_message(theirs, message.log_time, b"{}", message.publish_time)
+        writer.finish()
+    return target
+
+
+@pytest.mark.parametrize("way", WAYS)
+def test_it_reads_like_the_original(tmp_path: Path, way: str) -> None:
+    path = repacked(write_small(tmp_path / "a.mcap", poses=5), tmp_path / "b.mcap", **WAYS[way])
+    recording = open_recording(path)
+    assert recording.views() == [make_view(index) for index in range(5)]
+    assert list(recording.robot_states()) == [make_state(count) for count in range(15)]
+    assert len(list(recording.pictures())) == 5
+    assert list(recording.parts[0].foreign) == ["/diagnostics"]
+
+
+@pytest.mark.parametrize("way", ["zstd", "lz4"])
+def test_one_damaged_chunk_of_a_packed_recording_costs_no_more_than_itself(tmp_path: Path, way: str) -> None:
+    path = repacked(write_small(tmp_path / "a.mcap", poses=20), tmp_path / "b.mcap", **WAYS[way])
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 1
+    path.write_bytes(data[:-1000])
+    (result,) = recover(path, tmp_path / "saved.mcap")
+    views = open_recording(tmp_path / "saved.mcap").views()
+    assert views == [make_view(view.index) for view in views]
+    assert len(views) >= 14, "a chunk of 4 kB holds some four poses' parts"
+    assert result.lost_bytes > 0

@@ -85,7 +85,9 @@ def import_(
         float, typer.Option(help="Largest time between a picture and the nearest pose, seconds.")
     ] = PAIR_WITHIN_S,
     still_mm: Annotated[float, typer.Option(help="What still counts as standing, mm.")] = POSITION_M * 1e3,
-    still_deg: Annotated[float, typer.Option(help="The same in degrees.")] = math.degrees(ROTATION_RAD),
+    still_deg: Annotated[
+        float, typer.Option(help="The same in degrees.", show_default="0.003")
+    ] = math.degrees(ROTATION_RAD),
     dry_run: Annotated[
         bool, typer.Option("--dry-run", help="Say what would be taken; write nothing.")
     ] = False,
@@ -94,7 +96,7 @@ def import_(
     """Turn other people's pictures and poses into a recording; next: `calibrate solve`.
 
     Of a bag the stops of the arm are found, and the last picture of each is taken. poses.csv:
-    image,x,y,z,qx,qy,qz,qw, where the flange is in the robot's base, in metres.
+    image,x,y,z,qx,qy,qz,qw (and j1 … j6), where the flange is in the robot's base, in metres and radians.
     """
     if output is None and not dry_run:
         raise typer.BadParameter("name the recording to write with -o, or ask with --dry-run")

@@ -80,6 +80,15 @@ class RosMessages:
         inner = self.make("geometry_msgs/msg/Transform", vector, turn)
         return self.make("geometry_msgs/msg/TransformStamped", self.header(stamp_ns, parent), child, inner)
 
+    def pose(self, stamp_ns: int, time_s: float) -> Any:
+        position, q = pose(time_s)
+        at = self.make("geometry_msgs/msg/Point", *map(float, position))
+        turn = self.make("geometry_msgs/msg/Quaternion", *map(float, q))
+        return self.make(
+            "geometry_msgs/msg/PoseStamped", self.header(stamp_ns, "base_link"),
+            self.make("geometry_msgs/msg/Pose", at, turn),
+        )  # fmt: skip
+
     def message(self, stamp_ns: int, kind: str, time_s: float) -> tuple[str, Any]:
         if kind == "tf":
             frame = self.transform(stamp_ns, "base_link", "tool0", *pose(time_s))
@@ -123,8 +132,11 @@ def write_rosbag2(path: Path, storage: str, compression: str = "none") -> Path:
     return path
 
 
-def write_ros_mcap(path: Path, **options: Any) -> Path:
-    """The same in one MCAP file, by the reference library's writer and its `options`."""
+def write_ros_mcap(path: Path, poses: bool = False, **options: Any) -> Path:
+    """The same in one MCAP file, by the reference library's writer and its `options`.
+
+    `poses`: a PoseStamped instead of every frame.
+    """
     from mcap.writer import Writer
 
     ros = RosMessages()
@@ -134,6 +146,8 @@ def write_ros_mcap(path: Path, **options: Any) -> Path:
         channels: dict[str, int] = {}
         for stamp_ns, kind, time_s in moments():
             topic, message = ros.message(stamp_ns, kind, time_s)
+            if poses and kind == "tf":
+                topic, message = "/arm/pose", ros.pose(stamp_ns, time_s)
             if topic not in channels:
                 definition = ros.store.generate_msgdef(message.__msgtype__)[0].encode()
                 schema = writer.register_schema(message.__msgtype__, "ros2msg", definition)

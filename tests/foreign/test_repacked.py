@@ -1,4 +1,4 @@
-"""A recording that went through other people's programs: packed, with a topic of theirs, damaged afterwards."""
+"""A recording that went through other programs: packed, with a topic of theirs, damaged afterwards."""
 
 from __future__ import annotations
 

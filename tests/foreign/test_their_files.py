@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -45,6 +46,7 @@ SOURCES = {
         folder / "a.mcap", use_statistics=False, use_summary_offsets=False, repeat_schemas=False,
         repeat_channels=False,
     ),
+    "mcap, poses instead of frames": lambda folder: write_ros_mcap(folder / "a.mcap", poses=True),
     "foxglove schemas": lambda folder: write_foxglove_mcap(folder / "a.mcap"),
 }  # fmt: skip
 
@@ -140,3 +142,12 @@ def test_a_cut_bag_is_named_as_such(tmp_path: Path, description: Path) -> None:
     path.write_bytes(path.read_bytes()[:-2000])
     with pytest.raises(RecordingError, match=r"not finished or is cut.*mcap recover"):
         import_bag(path, tmp_path / "out.mcap", description)
+
+
+def test_without_rosbags_the_way_out_is_named(tmp_path: Path, description: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
+    source = write_ros_mcap(tmp_path / "a.mcap")
+    for module in ("rosbags.typesys", "rosbags.rosbag2"):
+        monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(RecordingError, match=r"pip install .*\[ros\]"):
+        import_bag(source, tmp_path / "out.mcap", description)
+    assert not (tmp_path / "out.mcap").exists()

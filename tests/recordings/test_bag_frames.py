@@ -1,0 +1,79 @@
+"""Frames of a bag: chains walked in both directions, interpolation, and what cannot be a chain."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from recordings.importers.frames import FrameTree
+from recordings.importers.stops import Limits, find_stops
+from recordings.importers.values import Frame, ImportSourceError
+
+
+def frame(stamp_ns: int, parent: str, child: str, T: np.ndarray) -> Frame:
+    x, y, z = T[:3, 3].tolist()
+    qx, qy, qz, qw = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
+    return Frame(stamp_ns, parent, child, (x, y, z), (qx, qy, qz, qw))
+
+
+def random_pose(seed: int) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.random(random_state=seed).as_matrix()
+    T[:3, 3] = np.random.default_rng(seed).normal(size=3)
+    return T
+
+
+def turned(angle_rad: float) -> np.ndarray:
+    T = np.eye(4)
+    T[:3, :3] = Rotation.from_rotvec([0, 0, angle_rad]).as_matrix()
+    return T
+
+
+def test_a_chain_is_walked_against_its_arrows_too() -> None:
+    """world → base_link and tool0 → flange fixed, base_link → tool0 moving; asked from both sides."""
+    A, B = random_pose(1), random_pose(2)
+    tree = FrameTree()
+    tree.add([frame(0, "world", "base_link", A), frame(0, "tool0", "flange", B)])
+    for n in range(11):
+        tree.add([frame(n * 1000, "base_link", "tool0", turned(0.01 * n))])
+    T = tree.track("world", "flange").at(np.array([4500]))[0]
+    np.testing.assert_allclose(T, A @ turned(0.045) @ B, atol=1e-12)
+    back = tree.track("flange", "world").at(np.array([4500]))[0]
+    np.testing.assert_allclose(back, np.linalg.inv(T), atol=1e-12)
+
+
+def test_the_nearest_report_of_every_moving_link_counts() -> None:
+    tree = FrameTree()
+    for n in range(10):
+        tree.add([frame(n * 10_000_000, "base", "flange", turned(0.1 * n))])
+    track = tree.track("base", "flange")
+    assert track.gap_s(23_000_000) == pytest.approx(0.003)
+    assert track.gap_s(-1) == np.inf
+    assert track.gap_s(90_000_001) == np.inf
+
+
+@pytest.mark.parametrize("q", [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.1), (np.nan, 0.0, 0.0, 1.0)])
+def test_what_is_no_rotation_is_refused(q: tuple[float, float, float, float]) -> None:
+    with pytest.raises(ImportSourceError):
+        FrameTree().add([Frame(0, "base", "flange", (0.0, 0.0, 0.0), q)])
+
+
+def test_frames_that_never_move_are_no_arm() -> None:
+    tree = FrameTree()
+    tree.add([frame(n, "base", "flange", turned(0.1)) for n in range(5)])
+    with pytest.raises(ImportSourceError):
+        tree.find(None, None)
+
+
+def test_an_arm_that_drifts_slowly_does_not_stand() -> None:
+    """0.2 mm in the window of 0.3 s: four times the limit; with that limit it stands."""
+    tree = FrameTree()
+    for n in range(400):
+        T = np.eye(4)
+        T[0, 3] = n * 10e-6 * 2 / 3
+        tree.add([frame(n * 10_000_000, "base", "flange", T)])
+    images = np.array([1_000_000_000, 2_000_000_000], np.int64)
+    track = tree.track("base", "flange")
+    assert find_stops(track, images, None, Limits(), 0.05)[0] == []
+    assert len(find_stops(track, images, None, Limits(position_m=0.001), 0.05)[0]) == 1

@@ -161,9 +161,9 @@ class RecordingWriter:
         self.flush()
 
     def marks(self, sequence: int, marks: Sequence[viewing.Marks], text: str = "") -> None:
-        """What viewers draw over a recorded picture: detected corners, residuals."""
-        time_ns = self._pictures[sequence]
-        self._show(Topic.ANNOTATIONS, viewing.image_annotations(marks, text, time_ns), time_ns)
+        """What viewers draw over a picture: detected corners, residuals. Nothing when it was not recorded."""
+        if (time_ns := self._pictures.get(sequence)) is not None:
+            self._show(Topic.ANNOTATIONS, viewing.image_annotations(marks, text, time_ns), time_ns)
 
     def drawn_picture(self, sequence: int, jpeg: bytes) -> None:
         """A recorded picture with something drawn into it, for viewers that draw nothing over pictures."""

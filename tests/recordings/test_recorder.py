@@ -15,6 +15,7 @@ from recordings.errors import RecordingError
 from recordings.messages import CaptureEvent, Stamps
 from recordings.reader import open_recording
 from recordings.recorder import Recorder
+from recordings.schema import encode
 from recordings.writer import RecordingWriter
 from tests.recordings.small_recording import make_info, make_picture, make_state, make_view
 
@@ -102,7 +103,7 @@ def test_data_reach_the_system_and_the_disk_without_being_asked(
     recorder = Recorder(tmp_path / "a.mcap", make_info(), clock=lambda: now_s)
     recorder.robot_state(make_state(0))
     now_s = recorder_module.FLUSH_PERIOD_S * 1.01
-    wait_until(lambda: b"station.RobotState" in recorder.part_path.read_bytes())
+    wait_until(lambda: encode(make_state(0)) in recorder.part_path.read_bytes())
     assert not synced.is_set()
     now_s = recorder_module.SYNC_PERIOD_S * 1.01
     assert synced.wait(TIMEOUT_S)

@@ -81,7 +81,7 @@ def _shape(views: ViewSet, solution: Solution) -> Callable[[Array], Array]:
     numbers = np.array([found.scale, found.anisotropy, *found.bend_m])
 
     def bent(points: Array) -> Array:
-        return bent_points(replace(observed, points=points[None]), numbers)[0]
+        return np.asarray(bent_points(replace(observed, points=points[None]), numbers)[0])
 
     return bent
 

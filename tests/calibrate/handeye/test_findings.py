@@ -73,7 +73,7 @@ def test_a_board_that_was_measured_wrongly_closes_its_gate(mount):
     assert "board" in closed(measured)
     assert measured.session.reading is Reading.SQUARE_SIZE
     usual = solve_views(cell.views, QUICK)
-    assert usual.board_finding.unexplained_m == 0.0
+    assert usual.board_finding.unexplained_m < 0.05 * usual.predicted_error_m
     assert "board" not in closed(usual)
     # What the statement does to X: who takes it back finds it about that far away.
     apart_mm = error_mm_deg(measured.matrix, usual.matrix)[0]

@@ -114,8 +114,6 @@ def import_(
     if json_:
         print(json.dumps(facts))
     else:
-        print(f"{plain_text(str(done.path))}: {done.pictures} views, {done.size_bytes / 1e6:.1f} MB")
-        print(f"next: calibrate solve {shlex.quote(str(done.path))}")
         print_import(facts)
 
 

@@ -94,18 +94,20 @@ def _clock_text(clock: dict[str, float | None]) -> str:
 def print_import(facts: dict[str, Any]) -> None:
     """What `recordings import` took, or would take."""
     if bag := facts.get("bag"):
-        print(f"pictures  {bag['image_topic']} ({bag['images']}), {bag['camera']}")
-        print(f"poses     {bag['poses_from']}, paired by stamp within {bag['bound_ms']:.2f} ms")
-        print(f"joints    {bag['joints_from'] or 'none of a six-axis arm'}")
+        print(plain_text(f"pictures  {bag['image_topic']} ({bag['images']}), {bag['camera']}"))
+        print(plain_text(f"poses     {bag['poses_from']}, paired by stamp within {bag['bound_ms']:.2f} ms"))
+        print(plain_text(f"joints    {bag['joints_from'] or 'none of a six-axis arm'}"))
         passed = ", ".join(f"{count} {reason}" for reason, count in bag["passed_over"].items() if count)
-        print(f"stops     {bag['stops']}" + (f"; pictures passed over: {passed}" if passed else ""))
+        print(
+            plain_text(f"stops     {bag['stops']}" + (f"; pictures passed over: {passed}" if passed else ""))
+        )
         if bag["other_topics"]:
-            print(f"not used  {', '.join(bag['other_topics'])}")
+            print(plain_text(f"not used  {', '.join(bag['other_topics'])}"))
     if not facts["recording"]:
-        print(f"{facts['views']} views would be taken; nothing was written")
+        print(plain_text(f"{facts['views']} views would be taken; nothing was written"))
         return
-    print(f"{facts['recording']}: {facts['views']} views, {facts['bytes'] / 1e6:.1f} MB")
-    print(f"next: calibrate solve {shlex.quote(facts['recording'])}")
+    print(plain_text(f"{facts['recording']}: {facts['views']} views, {facts['bytes'] / 1e6:.1f} MB"))
+    print(plain_text(f"next: calibrate solve {shlex.quote(facts['recording'])}"))
 
 
 def print_recovery(result: Recovery) -> None:

@@ -63,10 +63,12 @@ class Sigma(msgspec.Struct, frozen=True):
     rotation_deg: float
 
 
-class Rejected(msgspec.Struct, frozen=True):
+class Rejected(msgspec.Struct, frozen=True, omit_defaults=True):
     index: int
     name: str
     reason: str
+    kind: str = ""
+    """The cause as a code, where the views name one."""
 
 
 class ViewWeight(msgspec.Struct, frozen=True):

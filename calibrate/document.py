@@ -77,7 +77,10 @@ def make_calibration(
         views=Views(
             used=list(solution.used),
             rejected=sorted(
-                (Rejected(r.index, r.name, r.reason) for r in (*loaded.without_board, *solution.rejected)),
+                (
+                    Rejected(r.index, r.name, r.reason, r.kind)
+                    for r in (*loaded.without_board, *solution.rejected)
+                ),
                 key=lambda r: r.index,
             ),
             turned=list(solution.turned),

@@ -21,14 +21,14 @@ from calibrate.geometry import Array, Transform
 from calibrate.handeye.corners import boards_by_corners, corner_distance, corner_residuals
 from calibrate.handeye.estimate import FULL, estimate
 from calibrate.handeye.findings import error_shares, judge_board, judge_lens
-from calibrate.handeye.fit import FEWEST_FOR_TABLE, CellFit, fit_cell, fit_moved
+from calibrate.handeye.fit import CellFit, fit_cell, fit_moved
 from calibrate.handeye.folds import cross_validate
 from calibrate.handeye.observations import Layout, Moved
 from calibrate.handeye.poses import pose_views
 from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.handeye.readings import Explanation, Reading, explain_recording
 from calibrate.handeye.suspects import explain_views
-from calibrate.handeye.table import PARAMETERS
+from calibrate.handeye.table import FLEX, PARAMETERS, RELATIVE_SIGMA
 from calibrate.held_out import HELD_OUT
 from calibrate.pair_covariance import pair_covariance
 from calibrate.pairs import all_pairs, mount_poses
@@ -45,7 +45,7 @@ from calibrate.solution import (
 from calibrate.stopwatch import Stopwatch
 from calibrate.views import ViewSet
 
-_ENOUGH = 0.7
+_ENOUGH = 0.9
 """Share of views with full weight above which a recording is taken as it stands."""
 _NOISY_M, _NOISY_RAD = 0.002, float(np.radians(0.3))
 """Noise of the robot that is more than an arm's."""
@@ -58,24 +58,33 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
     watch = Stopwatch()
     priors = _priors(views, options)
     poses = pose_views(views, _focal_sigma(priors), priors.board.square)
-    session = Explanation(Reading.AS_RECORDED, 0.0)
+    session, fit, disagree = Explanation(Reading.AS_RECORDED, 0.0), None, None
     try:
         fit = fit_cell(views, priors, options.seed, options.model_arm)
     except PosesDisagreeError as problem:
-        session = explain_recording(poses, options.seed)
-        text = f"{problem} {explain_text(session, views)}"
-        raise PosesDisagreeError(text, session.reading.value) from None
+        disagree = problem
     watch.lap("estimate")
-    if float((fit.estimate.chances[:, 0] > FULL).mean()) < _ENOUGH:
-        session = explain_recording(poses, options.seed)
-        moved = _MOVED.get(session.reading)
-        if options.accept_move and moved is not None:
-            fit = fit_moved(fit, poses, session.at, moved, options.seed)
+
+    def ask() -> tuple[Explanation, CellFit | None]:
+        """How the recording has to be read, and the fit of a move that is accepted."""
+        found = explain_recording(poses, options.seed)
+        moved = _MOVED.get(found.reading)
         watch.lap("readings")
+        if not options.accept_move or moved is None:
+            return found, None
+        return found, fit_moved(views, priors, poses, found.at, moved, options.seed)
+
+    if fit is None or float((fit.estimate.chances[:, 0] > FULL).mean()) < _ENOUGH:
+        session, after_move = ask()
+        fit = after_move or fit
+    if fit is None:
+        text = f"{disagree} {explain_text(session, views)}"
+        raise PosesDisagreeError(text, session.reading.value) from None
     solution = _describe(fit, options, watch)
     if session.reading is Reading.AS_RECORDED and _doubtful(solution):
-        session = explain_recording(poses, options.seed)
-        watch.lap("readings")
+        session, after_move = ask()
+        if after_move is not None:
+            fit, solution = after_move, _describe(after_move, options, watch)
     return replace(
         solution,
         session=session,
@@ -120,8 +129,7 @@ def _describe(fit: CellFit, options: SolveOptions, watch: Stopwatch) -> Solution
     parent, child = camera_frames(views.mount)
     distance = options.working_distance_m or median_distance_m(C[used])
     covariance = found.covariance[:6, :6]
-    pairs = all_pairs(H[used], C[used])
-    certified = fit.certified
+    pairs, certified = fit.pairs, fit.certified
     apart = distance_in_sigmas(certified.X, state.X, pair_covariance(certified.objective, pairs, certified.X))
     spread_m, spread_rad = board_spread(H[used], C[used], state.X)
     given = not options.intrinsics_from_same_pictures
@@ -194,9 +202,12 @@ def _board(fit: CellFit, covariance: Array) -> BoardShape:
 def _arm(fit: CellFit, covariance: Array) -> ArmTable | None:
     if fit.table is None:
         return None
-    sigma = np.sqrt(np.maximum(np.diag(covariance), 0.0)).tolist()
-    errors = dict(zip(PARAMETERS, zip(fit.estimate.state.table.tolist(), sigma, strict=True), strict=True))
-    return ArmTable(fit.table.log_bayes, fit.table.size, errors)
+    names = (*PARAMETERS, *FLEX) if fit.arm_known else FLEX
+    unit = np.concatenate([RELATIVE_SIGMA, np.ones(len(FLEX))])[-len(names) :]
+    value = unit * fit.estimate.state.table
+    sigma = unit * np.sqrt(np.maximum(np.diag(covariance), 0.0))
+    errors = dict(zip(names, zip(value.tolist(), sigma.tolist(), strict=True), strict=True))
+    return ArmTable(fit.table.log_bayes, fit.table.size, errors, fit.arm_known)
 
 
 def _rejected(fit: CellFit) -> tuple[RejectedView, ...]:
@@ -257,17 +268,16 @@ def _remarks(
                 "No corners were recorded: board poses are taken as exact, all error is the robot's.",
             )
         )
-    if solution.arm is None and options.model_arm and len(fit.views) >= FEWEST_FOR_TABLE:
-        text = (
-            "The arm's model is not known: errors of its kinematic table are not in the stated error."
-        )
+    if solution.arm is not None and not solution.arm.arm_known:
+        text = "The arm's model is not known: errors of its kinematic table are not in the stated error."
         remarks.append(Remark("arm-not-modelled", text))
     if solution.arm is not None and solution.arm.detected:
         remarks.append(
             Remark(
-                "arm-table",
-                "The robot's residuals follow its joints: errors of about "
-                f"{solution.arm.size_mm:.2f} mm or mrad in its kinematic table. Have the arm calibrated.",
+                "arm-systematics",
+                "The robot's residuals follow its posture: errors of about "
+                f"{solution.arm.size_mm:.2f} mm or mrad in its kinematic table, or a bracket that bends. "
+                "Have the arm calibrated, and stiffen the bracket.",
             )
         )
     return tuple(remarks)

@@ -89,7 +89,7 @@ class BoardShape:
 
 @dataclass(frozen=True)
 class ArmTable:
-    """Errors of the arm's kinematic table."""
+    """Systematic errors of the robot: of the arm's kinematic table, and of a bracket that bends."""
 
     log_bayes: float
     """Log evidence for any errors against none."""
@@ -97,6 +97,8 @@ class ArmTable:
     """Their 1σ, mm and mrad."""
     errors: dict[str, tuple[float, float]]
     """Name → value and 1σ, metres or radians. Only their sum at the flange is known well, not each one."""
+    arm_known: bool = True
+    """False: the arm's model is not known, only the bracket is modelled."""
 
     @property
     def detected(self) -> bool:

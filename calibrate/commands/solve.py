@@ -104,7 +104,10 @@ def solve_json(job: SolvedRecording) -> dict[str, Any]:
         "covariance": plain["covariance"],
         "views": {
             "used": views["used"],
-            "rejected": [{"index": r["index"], "reason": r["reason"]} for r in views.get("rejected", [])],
+            "rejected": [
+                {"index": r["index"], "reason": r["reason"], "kind": r.get("kind", "")}
+                for r in views.get("rejected", [])
+            ],
             "weights": [{"index": i, "weight": w} for i, w in job.solution.weights.items()],
         },
         "intrinsics": {key: lens[key] for key in ("width", "height", "matrix", "distortion", "rms_px")},

@@ -1,4 +1,4 @@
-"""The estimate with errors of the arm's kinematic table, whose size nobody knows.
+"""The estimate with errors of the arm's kinematic table and a bracket that bends, whose size nobody knows.
 
 The size s is not fitted but averaged over: one solution for each s of a grid, weighed by its evidence; no
 errors at all count as much beforehand as all other sizes together. So the price for an arm without errors is
@@ -16,11 +16,10 @@ from calibrate.handeye.estimate import Estimate, corner_weights
 from calibrate.handeye.linear import Linear, Solved
 from calibrate.handeye.observations import Observations
 from calibrate.handeye.priors import Priors
-from calibrate.handeye.table import PARAMETERS
 
-SIZES = np.array([1e-6, 0.05, 0.12, 0.3, 0.7])
+SIZES = np.array([1e-6, 0.05, 0.12, 0.3, 0.7, 1.5])
 """1σ of the errors, mm and mrad; the first stands for none."""
-_BEFOREHAND = np.array([0.5, 0.125, 0.125, 0.125, 0.125])
+_BEFOREHAND = np.array([0.5, 0.1, 0.1, 0.1, 0.1, 0.1])
 _STEPS = 2
 
 
@@ -35,7 +34,7 @@ class WithTable:
 
 def allow_for_table(observed: Observations, plain: Estimate, priors: Priors) -> WithTable:
     """The estimate for observations with `table`; `plain`: the one without. LinAlgError where it fails."""
-    state = replace(plain.state, table=np.zeros(len(PARAMETERS)))
+    state = replace(plain.state, table=np.zeros(np.asarray(observed.table).shape[2]))
     scales, weights = plain.scales, plain.corner_weights
     for _ in range(_STEPS):
         linear = Linear.at(observed, state, weights)
@@ -60,7 +59,7 @@ def allow_for_table(observed: Observations, plain: Estimate, priors: Priors) -> 
         chances=np.einsum("s,snk->nk", chances, [s.chances for s in solutions]),
         covariance=np.asarray(covariance),
         robot=linear.m + linear.J @ step,
-        robot_covariance=best.scales.tau_px**2 * linear.B + np.diag(best.scales.classes[0]),
+        robot_covariance=linear.predicted(best.scales, np.asarray(covariance)),
         board_poses=linear.seen_boards(before.C),
         corner_weights=weights,
         log_evidence=_log_mean(log_evidence, _BEFOREHAND),

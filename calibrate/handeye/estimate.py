@@ -39,7 +39,7 @@ class Estimate:
     robot: Array
     """(n, 6) residuals at the optimum: implied minus recorded flange, the board seen by its corners alone."""
     robot_covariance: Array
-    """(n, 6, 6) of `robot` for a view of the first class."""
+    """(n, 6, 6) of `robot` for an ordinary view that took no part."""
     board_poses: Array
     """(n, 4, 4) camera_from_board by each view's corners alone, with the final lens and shape."""
     corner_weights: Array
@@ -107,7 +107,7 @@ def estimate(
         chances=solved.chances,
         covariance=covariance,
         robot=solved.residual,
-        robot_covariance=scales.tau_px**2 * linear.B + np.diag(scales.classes[0]),
+        robot_covariance=linear.predicted(scales, covariance),
         board_poses=linear.seen_boards(state.C),
         corner_weights=weights,
         noise_parts=linear.noise_parts(solved, covariance),

@@ -10,13 +10,13 @@ from calibrate.assess import require_motion
 from calibrate.errors import BadViewsError, PosesDisagreeError
 from calibrate.handeye.arm import WithTable, allow_for_table
 from calibrate.handeye.estimate import Estimate, estimate
-from calibrate.handeye.observations import SHAPE, Moved, Observations, State, observe_views
+from calibrate.handeye.observations import SHAPE, Moved, Observations, Places, State, observe_views
 from calibrate.handeye.poses import PoseViews, fit_poses
 from calibrate.handeye.priors import Priors
 from calibrate.handeye.start import BoardPoses, agreed_start
-from calibrate.handeye.table import table_motion
+from calibrate.handeye.table import RELATIVE_SIGMA, flex_motion, table_motion
 from calibrate.handeye.turns import set_boards_right
-from calibrate.pairs import all_pairs, mount_poses
+from calibrate.pairs import Pairs, all_pairs, mount_poses
 from calibrate.robust import GlobalResult, solve_global
 from calibrate.views import ViewSet
 
@@ -40,9 +40,13 @@ class CellFit:
     priors: Priors
     estimate: Estimate
     table: WithTable | None
-    """None where errors of the arm's kinematic table were not modelled."""
+    """None where systematic errors of arm and bracket were not modelled."""
+    arm_known: bool
+    """Errors of the arm's kinematic table are among them."""
+    pairs: Pairs
+    """Of the views that count; after a move, of those after it."""
     certified: GlobalResult
-    """Optimum of the quadratic objective over the pairs of all views that count."""
+    """Optimum of the quadratic objective over these pairs."""
 
 
 def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True) -> CellFit:
@@ -57,46 +61,53 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
     state = State(start.X, start.Y, C, views.camera, np.zeros(len(SHAPE)), np.zeros(0))
     found = estimate(observed, state, priors)
     require_plausible_noise(found)
-    table = None
-    motion = table_motion(views) if with_table and len(views) >= FEWEST_FOR_TABLE else None
-    if motion is not None:
-        observed = replace(observed, table=motion)
+    table, arm = None, table_motion(views) if with_table else None
+    if with_table and len(views) >= FEWEST_FOR_TABLE:
+        held = found.state.X if views.mount == "eye-in-hand" else found.state.Y
+        flex = flex_motion(views.mount, views.base_from_flange, held)
+        motion = flex if arm is None else np.concatenate([arm * RELATIVE_SIGMA, flex], axis=2)
         try:
-            table = allow_for_table(observed, found, priors)
-            found = table.estimate
+            table = allow_for_table(replace(observed, table=motion), found, priors)
+            observed, found = replace(observed, table=motion), table.estimate
         except np.linalg.LinAlgError:
-            observed = replace(observed, table=None)
-    used = np.flatnonzero(found.used)
-    problem = f"the quadratic objective over the pairs of the {len(used)} used views"
-    certified = solve_global(all_pairs(H[used], found.board_poses[used]), seed, problem)
-    return CellFit(views, turned, observed, priors, found, table, certified)
+            pass
+    pairs, certified = _certify(views, found, np.flatnonzero(found.used), seed)
+    known = table is not None and arm is not None
+    return CellFit(views, turned, observed, priors, found, table, known, pairs, certified)
 
 
-def fit_moved(fit: CellFit, poses: PoseViews, at: int, moved: Moved, seed: int) -> CellFit:
-    """The same cell, camera or board moved before the view at place `at`: both halves count.
+def _certify(views: ViewSet, found: Estimate, places: Places, seed: int) -> tuple[Pairs, GlobalResult]:
+    H = mount_poses(views.base_from_flange, views.mount)[places]
+    pairs = all_pairs(H, found.board_poses[places])
+    problem = f"the quadratic objective over the pairs of the {len(places)} used views"
+    return pairs, solve_global(pairs, seed, problem)
+
+
+def fit_moved(views: ViewSet, priors: Priors, poses: PoseViews, at: int, moved: Moved, seed: int) -> CellFit:
+    """A cell whose camera or board was moved before the view at place `at`: both halves count.
 
     X and the board's pose are those after the move. Raises BadViewsError where a half determines nothing.
     """
-    later = np.arange(len(fit.views)) >= at
+    later = np.arange(len(views)) >= at
     try:
         start = fit_poses(replace(poses, later=later, moved=moved), seed)
     except np.linalg.LinAlgError as problem:
         raise BadViewsError(f"The views before or after the move determine no pose ({problem}).") from None
-    X, Y = start.X[-1], start.Y[-1]
     # The later value is the one that holds now: `second` is that of the views before.
-    observed = replace(observe_views(fit.views), later=~later, moved=moved)
+    observed = replace(observe_views(views), later=~later, moved=moved)
     state = State(
-        X,
-        Y,
-        fit.views.camera_from_board,
-        fit.views.camera,
+        start.X[-1],
+        start.Y[-1],
+        views.camera_from_board,
+        views.camera,
         np.zeros(len(SHAPE)),
         np.zeros(0),
         start.X[0] if moved == "camera" else start.Y[0],
     )
-    found = estimate(observed, state, fit.priors)
+    found = estimate(observed, state, priors)
     require_plausible_noise(found)
-    return replace(fit, observed=observed, estimate=found, table=None)
+    pairs, certified = _certify(views, found, np.flatnonzero(found.used & later), seed)
+    return CellFit(views, (), observed, priors, found, None, False, pairs, certified)
 
 
 def require_plausible_noise(found: Estimate) -> None:

@@ -75,8 +75,7 @@ def _predict(fit: CellFit, left_out: Places) -> tuple[Array, Array]:
     found = estimate(fit.observed.part(others), start, fit.priors, whole.scales, max_steps=_STEPS)
     seen = found.state.with_boards(whole.board_poses[left_out])
     linear = Linear.at(fit.observed.part(left_out), seen, whole.corner_weights[left_out])
-    noise = found.scales.tau_px**2 * linear.B + np.diag(found.scales.classes[0])
-    return linear.m, noise + linear.J @ found.covariance @ np.swapaxes(linear.J, 1, 2)
+    return linear.m, linear.predicted(found.scales, found.covariance)
 
 
 def _at_board(fit: CellFit) -> Array:

@@ -271,6 +271,11 @@ class Linear:
         tau, lambda_, sigma = np.sqrt([max(tau2, lambda2), lambda2, sigma2]).tolist()
         return replace(updated, tau_px=tau, lambda_px=lambda_, sigma_px=sigma)
 
+    def predicted(self, scales: Scales, covariance: Array) -> Array:
+        """(n, 6, 6) of m for an ordinary view, where the unknowns have this covariance (G, G) without it."""
+        noise = scales.tau_px**2 * self.B + np.diag(scales.classes[0])
+        return np.asarray(noise + self.J @ covariance @ np.swapaxes(self.J, 1, 2))
+
     def board_step(self, solved: Solved) -> Array:
         """(n, 6) step of the board poses that belongs to the step of the shared unknowns."""
         pull = np.einsum("nk,nki->ni", solved.chances, solved.z)

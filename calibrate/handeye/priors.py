@@ -8,7 +8,7 @@ import numpy as np
 
 from calibrate.geometry import Array
 from calibrate.handeye.observations import SHAPE, Layout, State
-from calibrate.handeye.table import RELATIVE_SIGMA, UNIT
+from calibrate.handeye.table import UNIT
 from calibrate.projection import intrinsics_names, intrinsics_vector
 from recordings.messages import BoardSpec, CameraModel
 
@@ -108,7 +108,7 @@ class Priors:
         at = Layout.of(state)
         N, right = np.zeros((at.size, at.size)), np.zeros(at.size)
         vector = intrinsics_vector(state.camera)
-        table_sigma = UNIT * table * RELATIVE_SIGMA[: len(state.table)]
+        table_sigma = np.full(len(state.table), UNIT * table)
         sigma = np.concatenate([self.lens.sigma, self.board_sigma, table_sigma])
         value = np.concatenate([vector - self.lens.mean, state.shape, state.table])
         places = np.arange(at.lens.start, at.table.stop)

@@ -39,6 +39,8 @@ _SIZE, _FOCAL = 0, 1
 """Places of the factors of `pose_views`."""
 _NEAR = 0.1
 """Relative, of a factor to a thousand."""
+_LEAST = 0.01
+"""A factor nearer to 1 than this (relative) is a tolerance, no other reading."""
 _FREE = 1.0
 """1σ of a factor that a reading lets free."""
 
@@ -95,7 +97,10 @@ def explain_recording(views: PoseViews, seed: int = 0) -> Explanation:
             continue
         gain = fit.log_evidence - charge - base
         if np.isfinite(gain) and gain > max(winning, best.log_evidence_gain):
-            factor = float(fit.factors[_FACTOR.get(reading, 0)]) if reading in _FACTOR else 1.0
+            factor = float(fit.factors[_FACTOR[reading]]) if reading in _FACTOR else 1.0
+            before = float(fit.factors[_FOCAL]) if reading is Reading.REFOCUSED else 1.0
+            if reading in _FACTOR and abs(np.log(factor / before)) < _LEAST:
+                continue
             if reading is Reading.SQUARE_SIZE and abs(abs(np.log(factor)) - np.log(1000.0)) < _NEAR:
                 reading = Reading.MILLIMETRES
             best = Explanation(reading, float(gain), at, factor, _share(fit))

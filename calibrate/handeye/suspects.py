@@ -15,10 +15,8 @@ from calibrate.handeye.flange import implied_flange
 from calibrate.handeye.observations import Places
 
 Cause = Literal["wrong-pose", "wrong-number", "inconsistent"]
-_CHANCE = 1e-3
+_CHANCE = 1e-6
 """Below this a residual is not explained by noise."""
-_CLEAR = 1e-6
-"""And below this it contradicts: a slip of one number must make this much of the difference."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +50,7 @@ def _explain(fit: CellFit, found: Estimate, implied: Array, place: int, places: 
             and _chance(difference(implied[place], fit.observed.flange[other]), covariance) > _CHANCE
         ):
             return Suspect(place, "wrong-pose", *sizes, other=int(other))
-    if _chance(residual, covariance) < _CLEAR:
+    if _chance(residual, covariance) < _CHANCE:
         for number in range(6):
             rest = np.delete(np.arange(6), number)
             inner = covariance[np.ix_(rest, rest)]

@@ -1,4 +1,4 @@
-"""Errors of the arm's Denavit-Hartenberg table: how they move the flange, and from which joints.
+"""Errors of the arm's Denavit-Hartenberg table and of a bracket that bends: how they move the flange.
 
 Of the 24 errors of a table, eight change nothing that X and the board's pose would not take: six of the first
 and the last joint, and two of the three shifts along the parallel axes of joints 2, 3 and 4. They are held.
@@ -9,9 +9,10 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibrate.geometry import Array, difference
+from calibrate.geometry import Array, difference, skew
 from calibrate.kinematics import MODELS, RobotModel, forward, inverse_many, link_frames
 from calibrate.views import ViewSet
+from recordings.messages import Mount
 
 PARAMETERS = (
     *(f"a{joint}" for joint in range(1, 6)),
@@ -22,6 +23,8 @@ PARAMETERS = (
     "beta3",
 )
 """Names of the 18 errors, true minus nominal: a and d in metres, angles in radians."""
+FLEX = tuple(f"flex {row}{column}" for row in "xyz" for column in "xyz")
+"""Names of a bracket's compliance, radians: turn about `row` for gravity along `column` of the flange."""
 RELATIVE_SIGMA = np.array([3**0.5 if name == "d4" else 1.0 for name in PARAMETERS])
 """1σ of each against the common one: d4 stands for d2 + d3 + d4."""
 UNIT = 1e-3
@@ -43,6 +46,20 @@ def table_motion(views: ViewSet) -> Array | None:
     if joints is None:
         joints = _joints_of_one_branch(model, views.base_from_flange)
     return None if joints is None else by_parameters(model, joints)
+
+
+def flex_motion(mount: Mount, flange: Array, held: Array) -> Array:
+    """(n, 6, 9) motion of the flange, in base, by each entry of a bracket's compliance (3, 3), row by row.
+
+    What the flange carries at `held` (4, 4), the camera (eye-in-hand) or the board, turns by
+    compliance times the direction of gravity in it, less its mean over the views: X and Y are those of
+    the mean. Base's z is taken to be up.
+    """
+    R = flange[:, :3, :3]
+    gravity = -R[:, 2, :]
+    gravity = gravity - gravity.mean(axis=0)
+    turn = np.einsum("rk,nc->nkrc", np.eye(3), gravity).reshape(len(R), 3, 9)
+    return np.concatenate([-R @ skew(held[:3, 3]) @ turn, -R @ turn], axis=1)
 
 
 def _recorded_joints(views: ViewSet, model: RobotModel) -> Array | None:

@@ -69,7 +69,9 @@ def test_information_is_that_of_finite_differences(mount):
     J = np.stack([(pixels(d) - pixels(-d)) / (2 * h) for d in h * np.eye(26)], axis=1)
     found = view_information(mount, LENS, E, X, Y, BOARD, Noise(0.5, 0.0, 0.0))[0]
     scale = np.linalg.norm(J, axis=0) / 0.5
-    np.testing.assert_allclose(found / np.outer(scale, scale), J.T @ J / 0.25 / np.outer(scale, scale), atol=1e-5)
+    np.testing.assert_allclose(
+        found / np.outer(scale, scale), J.T @ J / 0.25 / np.outer(scale, scale), atol=1e-5
+    )
 
 
 def test_more_views_never_hurt_and_robot_noise_always_does():

@@ -80,7 +80,9 @@ def test_a_board_that_was_measured_wrongly_closes_its_gate(mount):
     assert 0.2 < 1e3 * measured.board_finding.pull_m / apart_mm < 5
 
 
-@pytest.mark.xfail(reason="a tolerance far below what the views can check hides the contradiction", strict=True)
+@pytest.mark.xfail(
+    reason="a tolerance far below what the views can check hides the contradiction", strict=True
+)
 @pytest.mark.parametrize("true_scale", [0.01, 0.05])
 def test_a_board_that_is_believed_exactly_is_contradicted_too(true_scale):
     """A percent of size makes X wrong by millimetres; saying "exact" must not make that unseen."""
@@ -106,8 +108,6 @@ def test_a_principal_point_that_is_off_is_found():
     assert closed(solution) == set()
 
 
-@pytest.mark.parametrize(
-    ("sigmas", "share"), [(0.0, 0.0), (4.0, 0.0), (5.0, 0.2), (8.0, 0.5), (40.0, 0.9)]
-)
+@pytest.mark.parametrize(("sigmas", "share"), [(0.0, 0.0), (4.0, 0.0), (5.0, 0.2), (8.0, 0.5), (40.0, 0.9)])
 def test_four_sigmas_of_a_statement_are_explained_by_its_tolerance(sigmas, share):
     assert Finding(sigmas, 0.01).unexplained_m == pytest.approx(0.01 * share)

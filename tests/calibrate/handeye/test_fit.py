@@ -13,9 +13,6 @@ from tests.calibrate.cells import MID, error_mm_deg, inside, make_cell, with_fla
 
 OPTIONS = SolveOptions(holdout=True, folds=True)
 SLIP = np.array([0.02, -0.015, 0.01, 0.02, 0.03, -0.02])
-NOT_YET = pytest.mark.xfail(
-    reason="a move is modelled only where single views stand out, not where all noise grows", strict=True
-)
 
 
 def moved_cell(seed, mount, what, at, views=24, size=1.0):
@@ -32,7 +29,6 @@ def moved_cell(seed, mount, what, at, views=24, size=1.0):
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 @pytest.mark.parametrize("what", ["camera", "board"])
-@NOT_YET
 def test_an_accepted_move_gives_the_camera_of_now_within_its_stated_error(mount, what):
     held = 0
     for seed, at in enumerate((12, 9, 14)):
@@ -57,7 +53,6 @@ def test_a_move_that_nobody_accepts_is_named_and_does_not_pass():
     assert "session" in [g.name for g in judge(solution, GateInputs()) if not g.passed]
 
 
-@NOT_YET
 @pytest.mark.parametrize("size", [0.3, 5.0])
 def test_the_move_may_be_small_or_large(size):
     views, X, _ = moved_cell(1, "eye-in-hand", "board", 12, size=size)
@@ -67,14 +62,13 @@ def test_the_move_may_be_small_or_large(size):
 
 
 def test_a_few_views_after_a_move_stand_out_and_are_used_when_it_is_accepted():
-    views, X, _ = moved_cell(1, "eye-in-hand", "board", 17)
+    views, X, _ = moved_cell(1, "eye-in-hand", "board", 16)
     solution = solve_views(views, replace(OPTIONS, accept_move=True))
-    assert solution.move_accepted and solution.session.at == 17
+    assert solution.move_accepted and solution.session.at == 16
     assert len(solution.used) == 24
     assert inside(solution, X)
 
 
-@NOT_YET
 def test_both_parts_tell_more_than_the_later_one():
     views, _, _ = moved_cell(1, "eye-in-hand", "board", 12)
     both = solve_views(views, replace(OPTIONS, accept_move=True))
@@ -87,3 +81,19 @@ def test_accepting_a_move_changes_nothing_where_nothing_moved():
     plain, accepted = (solve_views(views, replace(OPTIONS, accept_move=a)) for a in (False, True))
     assert not accepted.move_accepted
     assert np.array_equal(plain.matrix, accepted.matrix)
+
+
+@pytest.mark.parametrize(
+    "at",
+    [
+        20,
+        pytest.param(
+            22, marks=pytest.mark.xfail(reason="two late views are rejected one by one, unnamed", strict=True)
+        ),
+    ],
+)
+def test_a_camera_that_moved_near_the_end_never_passes(at):
+    """X of before the move is of no use to anybody now."""
+    views, X, _ = moved_cell(1, "eye-in-hand", "camera", at)
+    solution = solve_views(views, OPTIONS)
+    assert inside(solution, X) or [g.name for g in judge(solution, GateInputs()) if not g.passed]

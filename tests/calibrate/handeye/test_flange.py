@@ -36,7 +36,9 @@ def test_derivatives_are_those_of_differences_near_and_far(mount, seed, far):
             step = np.zeros((3, 6))
             step[which, k] = h
             numeric = (miss(*step) - miss(*-step)) / (2 * h)
-            np.testing.assert_allclose(exact[which][:, :, k], numeric, atol=2e-7 * (1 + np.abs(numeric).max()))
+            np.testing.assert_allclose(
+                exact[which][:, :, k], numeric, atol=2e-7 * (1 + np.abs(numeric).max())
+            )
 
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
@@ -46,7 +48,9 @@ def test_a_moved_cell_has_two_places_and_no_residual_at_either(mount, moved):
     X, Y, second, C = anywhere(rng), anywhere(rng), anywhere(rng), anywhere(rng, 6)
     later = np.arange(6) >= 4
     places = [(second, Y) if moved == "camera" else (X, second), (X, Y)]
-    flange = np.array([implied_flange(mount, *places[0 if late else 1], C[i : i + 1])[0] for i, late in enumerate(later)])
+    flange = np.array(
+        [implied_flange(mount, *places[0 if late else 1], C[i : i + 1])[0] for i, late in enumerate(later)]
+    )
     empty = np.zeros((6, 1, 3)), np.zeros((6, 1, 2)), np.zeros((6, 1))
     observed = Observations(mount, flange, *empty, later=later, moved=moved)
     state = State(X, Y, C, CameraModel(640, 480), np.zeros(5), np.zeros(0), second)

@@ -56,8 +56,7 @@ def test_the_held_out_views_of_a_solve_leave_its_partial_fit_alone(monkeypatch):
     judged, score = [], profile_robust.score_holdout
     monkeypatch.setattr(profile_robust, "score_holdout", lambda X, *a: judged.append(X) or score(X, *a))
     scores = [
-        solve_views(seen, SolveOptions(folds=False)).holdout
-        for seen in (views, nudged(views, last, slips))
+        solve_views(seen, SolveOptions(folds=False)).holdout for seen in (views, nudged(views, last, slips))
     ]
     assert scores[0].fitted_views == VIEWS - HELD_OUT
     assert min(place for pair in scores[0].pairs for place in pair) == last[0]
@@ -110,9 +109,7 @@ def test_a_claim_that_is_too_small_closes_the_gate(fit, monkeypatch):
     assert boasted.claimed_m == pytest.approx(honest.claimed_m / 3, rel=0.01)
     assert honest.rms_m < honest.limit * honest.claimed_m
     assert boasted.rms_m > boasted.limit * boasted.claimed_m
-    solution = replace(
-        solve_views(fit.views, replace(CV, folds=False)), cross_validation=boasted
-    )
+    solution = replace(solve_views(fit.views, replace(CV, folds=False)), cross_validation=boasted)
     assert "cross-validation" in [g.name for g in judge(solution, GateInputs()) if not g.passed]
 
 

@@ -69,9 +69,7 @@ def test_elimination_equals_the_dense_solution(mount, moved, with_table):
     scales = Scales(np.array([3e-4, 5e-4]), 0.5, 0.2, 0.1, ONE_CLASS)
     linear = Linear.at(observed, state, weights, information=1.0)
     priors = Priors(LensPrior.given(state.camera), BoardTolerance())
-    prior = (
-        replace_table(priors, state) if with_table else priors.linearise(state, 0.0)
-    )
+    prior = replace_table(priors, state) if with_table else priors.linearise(state, 0.0)
     solved = linear.solve(prior, scales, "nothing")
 
     r, e, by_r, by_e, size = differences(observed, state)
@@ -81,7 +79,9 @@ def test_elimination_equals_the_dense_solution(mount, moved, with_table):
         # The corners' noise: tau along what the view's own board pose can move, lambda along all else.
         white = root[i][:, None] * by_r[i]
         Q, _ = np.linalg.qr(white[:, size + 6 * i : size + 6 * i + 6])
-        shaped = np.eye(len(root[i])) / scales.lambda_px + Q @ Q.T * (1 / scales.tau_px - 1 / scales.lambda_px)
+        shaped = np.eye(len(root[i])) / scales.lambda_px + Q @ Q.T * (
+            1 / scales.tau_px - 1 / scales.lambda_px
+        )
         rows.append(shaped @ white)
         right.append(shaped @ (root[i] * r[i]))
         robot = np.repeat(1 / scales.robot, 3)

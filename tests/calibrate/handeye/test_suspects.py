@@ -1,6 +1,7 @@
 """Bad views, one kind at a time: found, named where the data name a cause, and the good ones kept."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -109,7 +110,7 @@ def test_the_farther_off_a_view_the_less_it_counts_and_doubt_is_said():
         states.append("bad" if rejected else "in doubt" if doubted else "good")
     assert states[0] == "good" and "in doubt" in states
     assert weights[0] > 0.8 and weights[-1] < 0.2
-    assert all(later < before + 0.05 for before, later in zip(weights, weights[1:], strict=False))
+    assert all(later < before + 0.05 for before, later in pairwise(weights))
 
 
 @pytest.mark.parametrize("share", [0.12, 0.4])

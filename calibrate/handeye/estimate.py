@@ -15,7 +15,7 @@ from scipy import stats
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array
 from calibrate.handeye.corners import corner_distance, corner_residuals
-from calibrate.handeye.linear import GAIN, ROBOT_PRIOR_COUNT, STUDENT, Fit, Linear, Scales, first_scales
+from calibrate.handeye.linear import GAIN, ROBOT_PRIOR_COUNT, STUDENT, WIDE, Fit, Linear, Scales, first_scales
 from calibrate.handeye.observations import Observations, State
 from calibrate.handeye.priors import Priors
 
@@ -72,19 +72,20 @@ def estimate(
     start: State,
     priors: Priors,
     scales: Scales | None = None,
+    wide: float = WIDE,
     fit_scales: bool = True,
     max_steps: int = MAX_STEPS,
 ) -> Estimate:
     """Maximum of the posterior from `start`.
 
-    scales: where to start, or what to keep (`fit_scales` False). Raises BadViewsError where views and priors
-    together do not determine the unknowns.
+    scales: where to start, or what to keep (`fit_scales` False); None: `wide` times what residuals show.
+    Raises BadViewsError where views and priors together do not determine the unknowns.
     """
     state, weights = start, observed.present
     converged, steps = False, 0
     fit: Fit = "all" if fit_scales else "nothing"
     linear = Linear.at(observed, state, weights)
-    scales = scales or first_scales(linear)
+    scales = scales or first_scales(linear, wide)
     try:
         while steps < max_steps and not converged:
             steps += 1

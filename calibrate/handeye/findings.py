@@ -31,7 +31,7 @@ class Finding:
     @property
     def unexplained_m(self) -> float:
         """The part of `pull_m` that the statement's tolerance does not explain."""
-        return self.pull_m * max(0.0, 1.0 - _EXPLAINED / max(self.sigmas, 1e-9))
+        return float(self.pull_m * np.maximum(0.0, 1.0 - _EXPLAINED / np.maximum(self.sigmas, 1e-9)))
 
 
 def judge_lens(fit: CellFit, distance_m: float) -> Finding:

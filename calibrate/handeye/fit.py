@@ -24,6 +24,9 @@ FEWEST_FOR_TABLE = 8
 """Fewer views cannot tell 18 errors of a table from noise."""
 FEWEST_USED = 3
 """Views that must count for something: fewer have no two motions."""
+_NARROW = 0.5
+_CLEARLY = 5.0
+"""Log evidence."""
 MAX_ROBOT_M, MAX_ROBOT_RAD = 0.03, float(np.radians(3.0))
 """Noise beyond this per axis is none: no X is returned."""
 
@@ -59,7 +62,7 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
     views, turned = set_boards_right(views, start.X, start.Y)
     observed, C = observe_views(views), views.camera_from_board
     state = State(start.X, start.Y, C, views.camera, np.zeros(len(SHAPE)), np.zeros(0))
-    found = estimate(observed, state, priors)
+    found = _likeliest(observed, state, priors)
     require_plausible_noise(found)
     table, arm = None, table_motion(views) if with_table else None
     if with_table and len(views) >= FEWEST_FOR_TABLE:
@@ -74,6 +77,13 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
     pairs, certified = _certify(views, found, np.flatnonzero(found.used), seed)
     known = table is not None and arm is not None
     return CellFit(views, turned, observed, priors, found, table, known, pairs, certified)
+
+
+def _likeliest(observed: Observations, start: State, priors: Priors) -> Estimate:
+    """From two starts of the robot's noise: the narrow one finds many bad views, and must be clearly likelier."""
+    found = estimate(observed, start, priors)
+    narrow = estimate(observed, start, priors, wide=_NARROW)
+    return narrow if narrow.log_evidence > found.log_evidence + _CLEARLY else found
 
 
 def _certify(views: ViewSet, found: Estimate, places: Places, seed: int) -> tuple[Pairs, GlobalResult]:

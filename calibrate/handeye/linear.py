@@ -35,7 +35,7 @@ _INFORMATION = (STUDENT + 2) / (STUDENT + 4)
 """Of a corner with that distribution, against a normal one of the same scale."""
 ROBOT_PRIOR_COUNT = 1.0
 _ROBOT_PRIOR_M, _ROBOT_PRIOR_RAD = 1e-4, float(np.radians(0.02))
-_WIDE = 3.0
+WIDE = 3.0
 _ROUNDING = 1e-14
 _MODE_COUNT = 4.0
 """Weight, in residuals, of the rule that no mode of the corners is quieter than those below it."""
@@ -63,9 +63,9 @@ class Scales:
         return np.concatenate([GAIN[:, None] ** 2 * robot, garbage[None]])
 
 
-def first_scales(linear: Linear) -> Scales:
-    """Medians of the residuals as they are, the robot's wide: a view must be found wrong, not start so."""
-    robot = [_WIDE * 1.48 * float(np.median(np.abs(part))) for part in (linear.m[:, :3], linear.m[:, 3:])]
+def first_scales(linear: Linear, wide: float = WIDE) -> Scales:
+    """Medians of the residuals, the robot's times `wide`: a view must be found wrong, not start so."""
+    robot = [wide * 1.48 * float(np.median(np.abs(part))) for part in (linear.m[:, :3], linear.m[:, 3:])]
     pixel = 1.0 if linear.modes is None else linear.modes.typical_px
     robot_m, robot_rad = (max(value, 1e-5) for value in robot)
     return Scales(np.array([robot_m, robot_rad]), pixel, pixel, pixel, _COUNTS / _COUNTS.sum())

@@ -80,7 +80,7 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
 
 
 def _likeliest(observed: Observations, start: State, priors: Priors) -> Estimate:
-    """From two starts of the robot's noise; the narrow one, which finds bad views, must be clearly likelier."""
+    """From two starts of the noise; the narrow one, which finds bad views, must be clearly likelier."""
     found = estimate(observed, start, priors)
     narrow = estimate(observed, start, priors, wide=_NARROW)
     return narrow if narrow.log_evidence > found.log_evidence + _CLEARLY else found

@@ -42,10 +42,6 @@ class BoardTolerance:
         )
 
 
-MEASURED_BOARD = BoardTolerance(1e-5, 2e-5)
-"""A board whose size and shape were measured: 0.001 % and 0.02 mm."""
-
-
 @dataclass(frozen=True, eq=False)
 class LensPrior:
     mean: Array

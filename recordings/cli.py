@@ -101,7 +101,7 @@ def import_(
     if output is None and not dry_run:
         raise typer.BadParameter("name the recording to write with -o, or ask with --dry-run")
     target = None if dry_run else output
-    with _progress("importing", not json_) as progress:
+    with _progress(not json_) as progress:
         if (source / DATASET_FILE).is_file() and (source / POSES_FILE).is_file():
             done = import_folder(source, target, progress)
             facts = {"recording": str(target or ""), "views": done.pictures, "bytes": done.size_bytes}
@@ -174,15 +174,15 @@ def recover(
 
 
 @contextmanager
-def _progress(text: str, shown: bool) -> Iterator[Callable[[int, int], None]]:
+def _progress(shown: bool) -> Iterator[Callable[[str, int, int], None]]:
     """A bar on stderr, where it is a terminal."""
     console = plain_console(stderr=True)
     if not shown or not console.is_terminal:
-        yield lambda done, total: None
+        yield lambda text, done, total: None
         return
     with Progress(console=console, transient=True) as bar:
-        task = bar.add_task(text)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+        task = bar.add_task("", total=None)
+        yield lambda text, done, total: bar.update(task, description=text, completed=done, total=total)
 
 
 def main() -> None:

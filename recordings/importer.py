@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
 from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
@@ -12,6 +11,7 @@ from pathlib import Path
 from recordings.dataset import DATASET_FILE, POSES_FILE, Dataset, read_dataset
 from recordings.errors import ImportFolderError, RecordingError
 from recordings.files import session_name_from
+from recordings.importers.values import Progress
 from recordings.messages import (
     CameraIdentity,
     CaptureEvent,
@@ -45,7 +45,7 @@ class Imported:
 
 
 def import_folder(
-    folder: Path, output: Path | None, progress: Callable[[int, int], None] = lambda done, total: None
+    folder: Path, output: Path | None, progress: Progress = lambda text, done, total: None
 ) -> Imported:
     """Reads `dataset.yaml`, `poses.csv` and the pictures, writes `output` (.mcap), which must not exist.
 
@@ -67,7 +67,7 @@ def import_folder(
         writer.attach(POSES_FILE, "text/csv", poses_bytes)
         for index, row in enumerate(rows):
             _write_view(writer, folder, index, row, dataset)
-            progress(index + 1, len(rows))
+            progress("importing", index + 1, len(rows))
         writer.event(
             CaptureEvent(
                 Stamps(host_wall_ns=writer.info.created_wall_ns), "imported", detail=f"{len(rows)} views"

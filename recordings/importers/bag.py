@@ -8,7 +8,7 @@ time.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from importlib.metadata import version
 from pathlib import Path
@@ -21,10 +21,10 @@ from numpy.typing import NDArray
 
 from recordings.dataset import DATASET_FILE, BagDescription, read_description
 from recordings.files import session_name_from
-from recordings.importers.bags import open_bag
+from recordings.importers.bags import CountedBag, open_bag
 from recordings.importers.selection import Selection, Wanted, select
 from recordings.importers.stops import Limits, Stop, find_stops
-from recordings.importers.values import Array, Bag, Image, ImportSourceError, Joints
+from recordings.importers.values import Array, Bag, Image, ImportSourceError, Joints, Progress
 from recordings.messages import (
     CameraIdentity,
     CameraModel,
@@ -80,17 +80,18 @@ def import_bag(
     wanted: Wanted = Wanted(),  # noqa: B008 - frozen
     limits: Limits = Limits(),  # noqa: B008 - frozen
     pair_within_s: float = PAIR_WITHIN_S,
-    progress: Callable[[int, int], None] = lambda done, total: None,
+    progress: Progress = lambda text, done, total: None,
 ) -> BagPlan:
     """`output` None: says what would be taken and writes nothing. Raises ImportSourceError or RecordingError.
 
     `description`: a dataset.yaml with mount and board (default: the one in or beside the source).
     """
     described, description_bytes = _description(source, description, needed=output is not None)
-    bag = open_bag(source)
+    bag = open_bag(source, progress)
     try:
-        chosen = select(bag, wanted)
-        images_ns = np.fromiter(bag.image_stamps(chosen.image.name), np.int64)
+        counted = CountedBag(bag, progress)
+        chosen = select(counted, wanted)
+        images_ns = np.fromiter(counted.image_stamps(chosen.image.name), np.int64)
         joints = chosen.joints
         speeds = (joints.stamps_ns, joints.fastest_rad_s) if joints and joints.has_speeds else None
         stops, passed = find_stops(chosen.track, images_ns, speeds, limits, pair_within_s)
@@ -160,7 +161,7 @@ def _write(
     output: Path,
     plan: BagPlan,
     pair_within_s: float,
-    progress: Callable[[int, int], None],
+    progress: Progress,
 ) -> int:
     in_file_order = sorted(stops, key=lambda stop: stop.place)
     index = {stop.place: number for number, stop in enumerate(stops)}
@@ -190,7 +191,7 @@ def _write(
                 last, waiting = waiting, next(states, None)
             joints_rad = _joints_at(stop.stamp_ns, last, waiting, pair_within_s)
             _write_view(writer, index[stop.place], stop, image, joints_rad)
-            progress(done + 1, len(stops))
+            progress("importing", done + 1, len(stops))
         while waiting is not None:
             writer.robot_state(waiting)
             waiting = next(states, None)

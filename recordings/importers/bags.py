@@ -6,21 +6,24 @@ import os
 from array import array
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from recordings.errors import RecordingError
 from recordings.importers import foxglove_messages, ros_messages
 from recordings.importers.ros_messages import RosDecoder
-from recordings.importers.values import Bag, Image, ImportSourceError, Kind, Topic, Value
+from recordings.importers.values import Bag, Image, ImportSourceError, Kind, Progress, Topic, Value
 from recordings.mcap import Contents, Message, Source, open_file, scan_file
 from recordings.schema import SESSION_RECORDS
 
 _RESCUE = "mcap recover FILE, with the mcap command line tool"
 _CDR, _PROTOBUF = "cdr", "protobuf"
+_SHOWN_EVERY = 64
+"""Messages between two reports of progress."""
+T = TypeVar("T")
 
 
-def open_bag(path: Path) -> Bag:
-    """A bag's folder, or one file. Raises ImportSourceError or RecordingError."""
+def open_bag(path: Path, progress: Progress = lambda text, done, total: None) -> Bag:
+    """A bag's folder, or one file; MCAP is proven first. Raises ImportSourceError or RecordingError."""
     if path.suffix == ".bag":
         raise ImportSourceError(
             f"{path} is a ROS 1 bag. Convert it first: rosbags-convert --src {path} --dst BAG"
@@ -29,7 +32,7 @@ def open_bag(path: Path) -> Bag:
         mcap, sqlite = sorted(path.glob("*.mcap")), sorted(path.glob("*.db3"))
         packed = [file.name for file in path.glob("*.zstd")]
         if mcap:
-            return McapBag(mcap)
+            return McapBag(mcap, progress)
         if sqlite or packed:
             return SqliteBag(path)
         raise ImportSourceError(
@@ -37,13 +40,13 @@ def open_bag(path: Path) -> Bag:
         )
     if not path.exists():
         raise ImportSourceError(f"{path} does not exist")
-    return SqliteBag(path) if path.suffix == ".db3" else McapBag([path])
+    return SqliteBag(path) if path.suffix == ".db3" else McapBag([path], progress)
 
 
 class McapBag:
     """One or several MCAP files, with ROS 2 messages, foxglove's, or both."""
 
-    def __init__(self, paths: list[Path]) -> None:
+    def __init__(self, paths: list[Path], progress: Progress) -> None:
         self._files: list[tuple[Contents, Source, Path]] = []
         self._ros: RosDecoder | None = None
         self._encodings: dict[str, tuple[str, str]] = {}
@@ -52,10 +55,16 @@ class McapBag:
         self.others: list[str] = []
         try:
             for path in paths:
-                descriptor = open_file(path)
-                self._files.append((Contents(), Source(descriptor), path))
-                contents, source, _ = scan_file(descriptor, path, _RESCUE)
-                self._files[-1] = (contents, source, path)
+                self._files.append((Contents(), Source(open_file(path)), path))
+            before, total = 0, sum(source.size_bytes for _, source, _ in self._files)
+            for place, (_, source, path) in enumerate(self._files):
+
+                def scanned(bytes_done: int, before: int = before) -> None:
+                    progress("checking the bag", before + bytes_done, total)
+
+                contents, source, _ = scan_file(source.descriptor, path, _RESCUE, scanned)
+                self._files[place] = (contents, source, path)
+                before += source.size_bytes
                 if SESSION_RECORDS[0] in contents.metadata:
                     raise ImportSourceError(f"{path} is a recording already: calibrate solve {path}")
                 self._note_topics(contents, counts)
@@ -187,3 +196,32 @@ class SqliteBag:
                 image = self._decoder.value(schema, data, time_ns)
                 assert isinstance(image, Image)
                 yield image
+
+
+class CountedBag:
+    """A bag whose first pass tells how far it is: in messages, topic by topic."""
+
+    def __init__(self, bag: Bag, progress: Progress) -> None:
+        self._bag, self._progress = bag, progress
+        self.topics, self.others = bag.topics, bag.others
+        self._total = sum(topic.messages for topic in bag.topics)
+        self._done = 0
+
+    def close(self) -> None:
+        self._bag.close()
+
+    def values(self, topic: str) -> Iterator[Value]:
+        return self._counted(self._bag.values(topic))
+
+    def image_stamps(self, topic: str) -> Iterator[int]:
+        return self._counted(self._bag.image_stamps(topic))
+
+    def images(self, topic: str, places: list[int]) -> Iterator[Image]:
+        return self._counted(self._bag.images(topic, places))
+
+    def _counted(self, messages: Iterator[T]) -> Iterator[T]:
+        for message in messages:
+            yield message
+            self._done += 1
+            if self._done % _SHOWN_EVERY == 0:
+                self._progress("reading the bag", self._done, self._total)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from enum import Enum
 from typing import Protocol
@@ -14,6 +14,8 @@ from recordings.errors import RecordingError
 from recordings.messages import CameraModel
 
 Array = NDArray[np.float64]
+Progress = Callable[[str, int, int], None]
+"""Is told what is being done, how much of it is, and of how much."""
 
 
 class ImportSourceError(RecordingError):

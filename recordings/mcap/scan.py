@@ -13,6 +13,7 @@ import os
 import stat
 import struct
 from array import array
+from collections.abc import Callable
 from pathlib import Path
 
 from recordings.errors import CorruptRecordingError, RecordingError, UnsealedRecordingError, recover_line
@@ -49,13 +50,18 @@ _FORBIDDEN = {Opcode.HEADER, Opcode.FOOTER, Opcode.STATISTICS, Opcode.CHUNK_INDE
 """Known kinds that have no place among the data."""
 
 
-def scan_file(descriptor: int, path: Path, rescue: str = "") -> tuple[Contents, Source, str]:
+def scan_file(
+    descriptor: int,
+    path: Path,
+    rescue: str = "",
+    progress: Callable[[int], None] = lambda bytes_done: None,
+) -> tuple[Contents, Source, str]:
     """Proves the open file → (what it holds, where to read it, its SHA-256).
 
     `rescue`: the command that saves what is whole, where it is not `recordings recover`. Raises
     UnsealedRecordingError or CorruptRecordingError, naming the byte.
     """
-    scan = _Scan(Source(descriptor), path, rescue or recover_line(path))
+    scan = _Scan(Source(descriptor), path, rescue or recover_line(path), progress)
     try:
         return scan.contents, scan.source, scan.run()
     except ShortFileError as error:
@@ -77,9 +83,10 @@ def open_file(path: Path) -> int:
 
 
 class _Scan:
-    def __init__(self, source: Source, path: Path, rescue: str) -> None:
+    def __init__(self, source: Source, path: Path, rescue: str, progress: Callable[[int], None]) -> None:
         self.source = source
         self._rescue = rescue
+        self._progress = progress
         self.contents = Contents()
         self._path = path
         self._size = source.size_bytes
@@ -178,6 +185,7 @@ class _Scan:
         self._sha256.update(done)
         self._crc = checksum.crc32(done, self._crc)
         self._base, self._block = position, self._block[len(done) :]
+        self._progress(position)
 
     def _header(self, position: int) -> int:
         self._base, self._block = 0, self.source.read(0, min(_BLOCK_BYTES, self._size))

@@ -58,6 +58,24 @@ def description(tmp_path: Path) -> Path:
     return path
 
 
+@pytest.mark.parametrize("kind", ["rosbag2 sqlite3", "rosbag2 mcap"])
+def test_every_pass_over_a_bag_tells_how_far_it_is(tmp_path: Path, description: Path, kind: str) -> None:
+    told: dict[str, list[tuple[int, int]]] = {}
+    source = SOURCES[kind](tmp_path)
+    import_bag(
+        source,
+        tmp_path / "out.mcap",
+        description,
+        progress=lambda text, done, total: told.setdefault(text, []).append((done, total)),
+    )
+    assert len(told) == (3 if "mcap" in kind else 2), "sqlite3 has no checksums to prove first"
+    for steps in told.values():
+        assert len(steps) >= 2
+        assert [done for done, _ in steps] == sorted(done for done, _ in steps)
+        assert len({total for _, total in steps}) == 1
+        assert steps[-1][1] * 0.8 < steps[-1][0] <= steps[-1][1]
+
+
 @pytest.mark.parametrize("kind", SOURCES)
 def test_the_stops_come_with_their_picture_and_the_right_pose(
     tmp_path: Path, description: Path, kind: str

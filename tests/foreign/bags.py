@@ -6,12 +6,17 @@ pictures a second all the time. Nothing is stamped at the same moment as anythin
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from scipy.spatial.transform import Rotation
+
+from tests.foreign.judges import FOLDER, missing
 
 STOPS = 5
 START_NS = 1_700_000_000_000_000_000
@@ -155,6 +160,18 @@ def write_ros_mcap(path: Path, poses: bool = False, **options: Any) -> Path:
             data = bytes(ros.store.serialize_cdr(message, message.__msgtype__))
             writer.add_message(channels[topic], stamp_ns, data, stamp_ns)
         writer.finish()
+    return path
+
+
+def write_by_foxglove_sdk(path: Path) -> Path:
+    """The same messages, written by Foxglove's own library, packed as it likes."""
+    library = FOLDER / "python"
+    if not (library / "foxglove").is_dir():
+        missing("foxglove-sdk")
+    source = write_foxglove_mcap(path.with_name("source.mcap"))
+    script = Path(__file__).with_name("foxglove_sdk.py")
+    environment = {**os.environ, "PYTHONPATH": str(library)}
+    subprocess.run([sys.executable, str(script), str(source), str(path)], env=environment, check=True)
     return path
 
 

@@ -23,6 +23,7 @@ from tests.foreign.bags import (
     STOPS,
     K,
     pose,
+    write_by_foxglove_sdk,
     write_foxglove_mcap,
     write_ros_mcap,
     write_rosbag2,
@@ -48,6 +49,7 @@ SOURCES = {
     ),
     "mcap, poses instead of frames": lambda folder: write_ros_mcap(folder / "a.mcap", poses=True),
     "foxglove schemas": lambda folder: write_foxglove_mcap(folder / "a.mcap"),
+    "foxglove schemas, foxglove-sdk": lambda folder: write_by_foxglove_sdk(folder / "a.mcap"),
 }  # fmt: skip
 
 
@@ -94,14 +96,14 @@ def test_the_stops_come_with_their_picture_and_the_right_pose(
         np.testing.assert_allclose(np.array(view.base_from_flange)[:3, 3], position, atol=1e-9)
         assert view.time_bound_s is not None
         assert view.time_bound_s < 0.005
-        if kind != "foxglove schemas":
+        if not kind.startswith("foxglove schemas"):
             turned = np.arange(1.0, 7.0) + 0.1 * number
             np.testing.assert_allclose(view.joints_rad, turned, atol=1e-9)
         assert view.stillness is not None
         assert view.stillness.position_scatter_m < 1e-9
     states = list(recording.robot_states())
     assert len(states) == 900
-    if kind != "foxglove schemas":
+    if not kind.startswith("foxglove schemas"):
         assert states[0].joints_rad == (1.0, 2.0, 3.0, 4.0, 5.0, 6.0), (
             "base first, whatever order they came in"
         )

@@ -1,4 +1,4 @@
-"""What the solve learnt of the cell besides X, in sentences: the board, the lens' price, the arm."""
+"""What the solve learnt of the cell besides X, in sentences: the board, and what limits X."""
 
 from __future__ import annotations
 
@@ -26,11 +26,6 @@ def cell_sentences(calibration: Calibration) -> list[str]:
     sentences: list[str] = []
     if quality.board is not None:
         sentences += _board(quality.board, calibration.board.square_m * 1e3)
-    if quality.arm is not None and quality.arm.applied:
-        size = f"{quality.arm.size_mm:.2f} mm or mrad"
-        sentences.append(
-            f"The arm's kinematic table is off, or a bracket bends, by about {size}; X allows for it."
-        )
     shares = sorted(quality.error_shares.items(), key=lambda item: -item[1])
     if shares and shares[0][1] > _COSTLY and (name := shares[0][0]) in _REMEDIES:
         label = name.replace("_", " ")

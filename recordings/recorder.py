@@ -64,8 +64,7 @@ class Recorder:
         self._queue: deque[_Item] = deque()
         self._queued_bytes = 0
         self._dropped_pictures: set[int] = set()
-        self._lock = threading.RLock()
-        self._wake = threading.Condition(self._lock)
+        self._wake = threading.Condition()
         self._awaited: Future[None] | None = None
         """Of the item that is being written."""
         self._finished: Future[Path] | None = None
@@ -143,7 +142,7 @@ class Recorder:
 
     def finish(self) -> Future[Path]:
         """Seals the file after all that was handed over before; the future is its path. Idempotent."""
-        with self._lock:
+        with self._wake:
             if self._finished is None:
                 self._finished = Future()
                 self._finished.set_running_or_notify_cancel()
@@ -157,19 +156,19 @@ class Recorder:
 
     def close(self) -> None:
         """Stops the thread without sealing, after what is queued; the `.part` file stays. Idempotent."""
-        with self._lock:
+        with self._wake:
             self._closing = True
             self._wake.notify()
         self._thread.join()
 
     def _offer(self, write: Callable[[], object], size_bytes: int) -> bool:
-        with self._lock:
-            if self._ended:
-                return False
+        with self._wake:
             full = (
                 self._queued_bytes + size_bytes > self._queue_limit_bytes
                 or len(self._queue) >= QUEUE_LIMIT_MESSAGES
             )
+            if self._ended:
+                return False
             if full or self.error is not None:
                 self.dropped += 1
                 return False
@@ -179,7 +178,7 @@ class Recorder:
             return True
 
     def _put(self, item: _Item) -> None:
-        with self._lock:
+        with self._wake:
             if self.error is not None:
                 raise self.error
             if self._ended:
@@ -226,7 +225,7 @@ class Recorder:
         Empty when there are none for a flush period, or when there will be no more.
         """
         items: list[_Item] = []
-        with self._lock:
+        with self._wake:
             if not self._queue and not self._ended:
                 self._wake.wait(FLUSH_PERIOD_S)
             while self._queue:
@@ -247,7 +246,7 @@ class Recorder:
         self._awaited = None
 
     def _fail(self, error: RecordingError) -> None:
-        with self._lock:
+        with self._wake:
             self.error = error
             futures = [self._awaited, *(item.done for item in self._queue)]
             self._queue.clear()

@@ -14,7 +14,7 @@ _STAMPS = message_class(Stamps)
 
 
 def robot_state(state: RobotState) -> bytes:
-    """The bytes of `schema.encode`, which is asked where a mode is zero or large: protobuf leaves out zeros.
+    """The bytes of `schema.encode`, whose work it is where a number is zero or large: protobuf leaves out zeros.
 
     `tests/recordings/test_packed.py` compares the two.
     """

@@ -232,7 +232,7 @@ def log_line(event: CaptureEvent, time_ns: int) -> Any:
 
 
 def quaternion_xyzw(transform: Matrix4) -> tuple[float, float, float, float]:
-    """Of a rigid transform, w ≥ 0: from its largest component (Shepperd 1978), good at any angle."""
+    """Of a rigid transform, w ≥ 0: from the largest of the four components (Shepperd 1978), good at any angle."""
     (a, b, c, _), (d, e, f, _), (g, h, i, _) = transform[:3]
     largest = max(a, e, i, a + e + i)
     if largest == a:

@@ -17,7 +17,7 @@ from typing import Any, Self
 
 import msgspec
 
-from recordings import packed, viewing
+from recordings import viewing
 from recordings.background_sync import BackgroundSync
 from recordings.errors import RecordingError, recover_line
 from recordings.files import (
@@ -97,7 +97,7 @@ class RecordingWriter:
 
     def robot_state(self, state: RobotState) -> None:
         time_ns = self._time_ns(state.stamps)
-        self._add(Topic.ROBOT_STATE, [packed.robot_state(state)], time_ns)
+        self._add(Topic.ROBOT_STATE, [encode(state)], time_ns)
         due = not 0 <= time_ns - self._shown_ns < SHOWN_PERIOD_NS  # a clock that was set back counts, too
         if due and all(map(math.isfinite, state.tcp_pose)):
             self._shown_ns = time_ns

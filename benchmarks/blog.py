@@ -7,8 +7,8 @@ import numpy as np
 from benchmarks.scene import Noise, make_cell, pose_arrays
 from benchmarks.trials import rms, rms_spread, table, trials
 from calibrate.geometry import Array, difference
-from calibrate.peer_methods import HAND_EYE, opencv_hand_eye
-from calibrate.solve import SolveOptions, solve_views
+from calibrate.handeye.axxb.peer_methods import HAND_EYE, opencv_hand_eye
+from calibrate.handeye.solve import SolveOptions, solve_views
 
 TRIALS = 200
 _OPTIONS = SolveOptions(holdout=False, folds=False)

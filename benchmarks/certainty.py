@@ -1,6 +1,6 @@
 """Does the robust solver always end in the global minimum, and is that proven?
 
-Each problem is solved by `calibrate.robust.solve_global`. The oracle is the lowest of 40 random starts
+Each problem is solved by `calibrate.handeye.axxb.robust.solve_global`. The oracle is the lowest of 40 starts
 polished by Newton on the same objective; "worse" counts problems in which it found a lower value.
 """
 
@@ -14,8 +14,8 @@ import numpy as np
 from benchmarks.scene import HIGH, LOW, MID, make_cell
 from benchmarks.trials import percentiles, table, trials
 from calibrate.geometry import Array, inverse, perturb, pose, random_rotation, rotation_exp
-from calibrate.pairs import Pairs, all_pairs, consecutive_pairs, mount_poses
-from calibrate.robust import polish, solve_global
+from calibrate.handeye.axxb.pairs import Pairs, all_pairs, consecutive_pairs, mount_poses
+from calibrate.handeye.axxb.robust import polish, solve_global
 
 PER_FAMILY = 350
 _SAME = 1e-7

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import numpy as np
 
-from recordings.messages import Picture, SessionInfo, Stamps
 from recordings.recorder import Recorder
-from station.client import Client
-from station.demo import simulated_daemon
+from recordings.schema.messages import Picture, SessionInfo, Stamps
+from station.cell.status import StationState
+from station.cli.demo import simulated_daemon
+from station.protocol.client import Client
 from station.session import Session
 from station.simulation.launch_cell import SimulationOptions, simulated_cell
-from station.status import StationState
 
 PRESSES = 200
 RECORD_S = 15.0

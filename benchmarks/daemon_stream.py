@@ -25,16 +25,16 @@ import numpy as np
 from benchmarks.processes import DaemonUsage, daemon_of_this_process, put_before_others, step_behind_others
 from recordings.part import RecordingPart
 from recordings.reader import open_recording
-from station.attend import carry_out, wait_until_idle
-from station.client import Client
-from station.demo import simulated_daemon
+from station.cell.plan import Plan, PlannedPose
+from station.cell.status import StationState, StationStatus
+from station.cli.demo import simulated_daemon
 from station.devices.frames import frames_between
-from station.plan.model import Plan, PlannedPose
+from station.operate.attend import carry_out, wait_until_idle
 from station.plan.sweep import sweep_plan
+from station.protocol.client import Client
 from station.simulation.cell import CellTruth
 from station.simulation.gige import numbered_picture, still_picture
 from station.simulation.netns import isolated_command
-from station.status import StationState, StationStatus
 
 SESSION_S = 60.0
 STATE_PERIOD_S = 0.002

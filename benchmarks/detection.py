@@ -15,11 +15,11 @@ import numpy as np
 import yaml
 
 from benchmarks.trials import table, trials
-from calibrate.board import board_points
-from calibrate.detect import detect
+from calibrate.boards.detect import detect
+from calibrate.boards.model import board_points
 from calibrate.geometry import Array, pose, rotation_exp
-from calibrate.lens import project
-from recordings.messages import BoardKind, BoardSpec, CameraModel
+from calibrate.lens.model import project
+from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
 from station.simulation.renderer import Light, render
 
 DATASETS = Path(os.environ.get("STATION_DATASETS", Path(__file__).parents[2] / "shared" / "datasets"))

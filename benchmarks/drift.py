@@ -15,16 +15,16 @@ import numpy as np
 
 from benchmarks.random_cells import random_cell
 from benchmarks.trials import share_spread, table, trials
-from calibrate.board import board_points
-from calibrate.drift import SHIFT_M, TURN_RAD, DriftCheck, Noise, judge_shift
+from calibrate.boards.model import board_points
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp
+from calibrate.handeye.information import Noise as PlanNoise
+from calibrate.handeye.information import prior_information, view_information
 from calibrate.handeye.priors import BoardTolerance
-from calibrate.information import Noise as PlanNoise
-from calibrate.information import prior_information, view_information
-from calibrate.lens import project
-from calibrate.pnp import solve_pnp
+from calibrate.lens.model import project
+from calibrate.lens.pnp import solve_pnp
+from calibrate.quality.drift import SHIFT_M, TURN_RAD, DriftCheck, Noise, judge_shift
 from calibrate.views import ImageView, ViewSet
-from recordings.messages import BoardKind, BoardSpec, CameraModel, Mount
+from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
 from station.plan.choose import Objective, choose
 from station.plan.planner import make_plan
 from station.simulation.scenes import build_cell, cell_config

@@ -13,18 +13,18 @@ import numpy as np
 
 from benchmarks.scene import LEVELS, Cell, Noise, make_cell
 from benchmarks.trials import rms, rms_spread, share_spread, table, trials
-from calibrate.board import board_points
+from calibrate.boards.model import board_points
 from calibrate.geometry import Array, difference
+from calibrate.handeye.information import Noise as ViewNoise
+from calibrate.handeye.information import covariance_of, view_information
 from calibrate.handeye.observations import SHAPE
 from calibrate.handeye.priors import BoardTolerance
-from calibrate.information import Noise as ViewNoise
-from calibrate.information import covariance_of, view_information
-from calibrate.intrinsics import calibrate_intrinsics
-from calibrate.pnp import solve_pnp
+from calibrate.handeye.solution import Solution, SolveOptions
+from calibrate.handeye.solve import solve_views
+from calibrate.lens.intrinsics import calibrate_intrinsics
+from calibrate.lens.pnp import solve_pnp
 from calibrate.projection import intrinsics_names, intrinsics_vector
-from calibrate.solution import Solution, SolveOptions
-from calibrate.solve import solve_views
-from recordings.messages import BoardKind, BoardSpec, CameraModel
+from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
 
 TRIALS = 300
 BOARDS = {"usual tolerance": BoardTolerance(), "measured": BoardTolerance(1e-5, 2e-5)}

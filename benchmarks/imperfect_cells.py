@@ -14,12 +14,12 @@ import numpy as np
 
 from benchmarks.scene import MID, Noise, grid
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
-from calibrate.intrinsics import LensModel, calibrate_intrinsics
 from calibrate.kinematics import MODELS, DhDeltas, forward, inverse_nearest
-from calibrate.pnp import solve_pnp
+from calibrate.lens.intrinsics import LensModel, calibrate_intrinsics
+from calibrate.lens.pnp import solve_pnp
 from calibrate.projection import project_pixels
 from calibrate.views import ImageView, ViewSet
-from recordings.messages import BoardKind, BoardSpec, CameraModel, Mount
+from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
 
 BOARD = BoardSpec(BoardKind.CHESSBOARD, 9, 7, 0.025)
 LENSES: dict[LensModel, CameraModel] = {

@@ -2,7 +2,7 @@
 
 Random cells of `random_cells` with guesses wrong by their sigmas; a plan of 25 is made from the guess, eight
 of its poses are visited with mid noise, and the rest is planned anew from what these pictures show
-(`station.improvement`). Both sets are then visited with new noise and estimated as `planning` does it.
+(`station.analysis.improvement`). Both are then visited with new noise and estimated as `planning` does it.
 """
 
 from __future__ import annotations
@@ -20,12 +20,12 @@ from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, perturb, transform_points
 from calibrate.kinematics import forward
 from calibrate.projection import project
-from station.errors import StationError
-from station.estimation import Seen
-from station.improvement import improve
-from station.plan.model import Plan
+from station.analysis.estimation import Seen
+from station.analysis.improvement import improve
+from station.cell.errors import StationError
+from station.cell.plan import Plan
+from station.cell.scene import scene_of
 from station.plan.planner import PlanOptions, plan_scene
-from station.plan.scene import scene_of
 
 CELLS = 40
 FIRST = 8

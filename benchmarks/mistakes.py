@@ -24,17 +24,17 @@ from scipy.spatial.transform import Rotation
 
 from benchmarks.real_sets import DATASETS
 from benchmarks.trials import table
-from calibrate.commands.solve import solve_json
-from calibrate.detect import Detection, detect
+from calibrate.boards.detect import Detection, detect
+from calibrate.cli.solve import solve_json
 from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, inverse, pose, quaternion_from_matrix, rotation_exp, rotation_log
 from calibrate.handeye.readings import Reading
 from calibrate.pipeline import solve_recording
-from recordings.dataset import read_dataset
 from recordings.errors import RecordingError
-from recordings.importer import import_folder
-from recordings.messages import BoardSpec
-from recordings.poses import HEADER, read_poses
+from recordings.importers.dataset import read_dataset
+from recordings.importers.folder import import_folder
+from recordings.importers.poses import HEADER, read_poses
+from recordings.schema.messages import BoardSpec
 
 SETS = ("ur5-chessboard", "charuco-eye-to-hand", "rendered-truth")
 _SWAPPED = (3, 9)

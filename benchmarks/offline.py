@@ -14,9 +14,18 @@ import cv2
 import numpy as np
 
 from benchmarks.detection import Case, scene
-from calibrate.pipeline import JobOptions, solve_recording
-from recordings.messages import CameraIdentity, CameraModel, Picture, RobotIdentity, SessionInfo, Stamps, View
+from calibrate.options import JobOptions
+from calibrate.pipeline import solve_recording
 from recordings.reader import open_recording
+from recordings.schema.messages import (
+    CameraIdentity,
+    CameraModel,
+    Picture,
+    RobotIdentity,
+    SessionInfo,
+    Stamps,
+    View,
+)
 from recordings.writer import RecordingWriter
 from station.simulation.cell import CellTruth, make_cell
 from station.simulation.renderer import scaled

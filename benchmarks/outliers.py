@@ -12,16 +12,16 @@ from benchmarks.imperfect_cells import BOARD, ImperfectCell, Known, imperfect_ce
 from benchmarks.scene import MID
 from benchmarks.trials import in_processes, rms, table, trials
 from calibrate.errors import CalibrationError
-from calibrate.gates import GateInputs, judge
 from calibrate.geometry import Array, difference, inverse, perturb, pose, rotation_exp, transform_points
 from calibrate.handeye.observations import Places
 from calibrate.handeye.readings import Reading
+from calibrate.handeye.solution import Solution, SolveOptions
+from calibrate.handeye.solve import solve_views
+from calibrate.lens.pnp import solve_pnp
 from calibrate.pipeline import single_threaded_opencv
-from calibrate.pnp import solve_pnp
-from calibrate.solution import Solution, SolveOptions
-from calibrate.solve import solve_views
+from calibrate.quality.gates import GateInputs, judge
 from calibrate.views import ImageView, ViewSet
-from recordings.messages import Mount
+from recordings.schema.messages import Mount
 
 TRIALS = 60
 _VIEWS = 25

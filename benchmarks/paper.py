@@ -12,11 +12,10 @@ import numpy as np
 
 from benchmarks.scene import Cell, Noise, make_cell, pose_arrays
 from benchmarks.trials import rms, table, trials
-from calibrate.assess import motion_errors
 from calibrate.geometry import Array, difference
-from calibrate.pairs import Pairs, all_pairs, consecutive_pairs
-from calibrate.paper import solve_paper
-from calibrate.peer_methods import (
+from calibrate.handeye.axxb.pairs import Pairs, all_pairs, consecutive_pairs
+from calibrate.handeye.axxb.paper import solve_paper
+from calibrate.handeye.axxb.peer_methods import (
     HAND_EYE,
     ROBOT_WORLD,
     opencv_hand_eye,
@@ -26,8 +25,9 @@ from calibrate.peer_methods import (
     zhao_minimax,
     zhi_linear,
 )
-from calibrate.robust import solve_global
-from calibrate.solve import SolveOptions, solve_views
+from calibrate.handeye.axxb.robust import solve_global
+from calibrate.handeye.metrics import motion_errors
+from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.views import ViewSet
 
 TRIALS = 200

@@ -33,20 +33,20 @@ from benchmarks.trials import trials
 from calibrate.geometry import Array, difference, perturb, pose, rotation_exp
 from calibrate.handeye.corners import bent_points
 from calibrate.handeye.estimate import estimate
+from calibrate.handeye.information import Noise
 from calibrate.handeye.observations import SHAPE, Observations, State, extent_of
 from calibrate.handeye.priors import LensPrior, Priors
-from calibrate.information import Noise
 from calibrate.kinematics import forward
 from calibrate.projection import project
-from station.analysis import check_run
-from station.errors import LimitError
-from station.limits import allowed_speed, check_plan, sample_path
+from station.analysis.worker import check_run
+from station.cell.errors import LimitError
+from station.cell.limits import allowed_speed, check_plan, sample_path
+from station.cell.plan import Plan, PlannedPose
+from station.cell.scene import Scene, scene_of
 from station.plan.belief import Glimpse, improved_config
 from station.plan.bootstrap import next_move
 from station.plan.choose import choose, informations, objective_for
-from station.plan.model import Plan, PlannedPose
 from station.plan.planner import PlanOptions, candidate_pool, plan_scene
-from station.plan.scene import Scene, scene_of
 from station.plan.view_range import ViewRange
 from station.simulation.placement import guess_of
 

@@ -15,11 +15,11 @@ import cv2
 import msgspec
 import numpy as np
 
-from calibrate.board import board_points
+from calibrate.boards.model import board_points
 from calibrate.geometry import Array, inverse, pose, rotation_exp
 from calibrate.kinematics import MODELS, inverse_all, inverse_many, link_frames
-from recordings.messages import CameraModel
-from station.config import (
+from recordings.schema.messages import CameraModel
+from station.cell.config import (
     PAPER_BOARD,
     CameraConfig,
     LimitsConfig,

@@ -12,16 +12,16 @@ from vision_calibration import models as rs
 
 from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, inverse, pose_from_quaternion, quaternion_from_matrix
+from calibrate.handeye.axxb.peer_methods import HAND_EYE, ROBOT_WORLD, opencv_hand_eye, opencv_robot_world
 from calibrate.handeye.corners import bent_points
 from calibrate.handeye.observations import observe_views
-from calibrate.intrinsics import calibrate_intrinsics
-from calibrate.peer_methods import HAND_EYE, ROBOT_WORLD, opencv_hand_eye, opencv_robot_world
+from calibrate.handeye.solution import Solution, SolveOptions
+from calibrate.handeye.solve import solve_views
+from calibrate.lens.intrinsics import calibrate_intrinsics
+from calibrate.lens.pnp import solve_pnp
 from calibrate.pipeline import single_threaded_opencv
-from calibrate.pnp import solve_pnp
-from calibrate.solution import Solution, SolveOptions
-from calibrate.solve import solve_views
 from calibrate.views import ImageView, ViewSet
-from recordings.messages import BoardSpec, CameraModel
+from recordings.schema.messages import BoardSpec, CameraModel
 
 FAILURES = (CalibrationError, cv2.error, np.linalg.LinAlgError, ValueError, RuntimeError)
 CALIBRATION_RS = "calibration-rs"

@@ -12,14 +12,14 @@ import numpy as np
 import yaml
 
 from calibrate.geometry import Array, project_to_rotation
-from calibrate.intrinsics import calibrate_intrinsics
+from calibrate.lens.intrinsics import calibrate_intrinsics
+from calibrate.lens.pnp import solve_pnp
 from calibrate.load import load_views
 from calibrate.pipeline import single_threaded_opencv
-from calibrate.pnp import solve_pnp
 from calibrate.views import ViewSet
-from recordings.importer import import_folder
-from recordings.messages import BoardSpec
+from recordings.importers.folder import import_folder
 from recordings.reader import open_recording
+from recordings.schema.messages import BoardSpec
 
 DATASETS = Path(os.environ.get("STATION_DATASETS", Path(__file__).parents[2] / "shared" / "datasets"))
 _GOOD_VIEWS = Path(__file__).with_name("good_views.yaml")

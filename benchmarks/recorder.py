@@ -20,9 +20,17 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from recordings.messages import BoardKind, BoardSpec, CameraModel, Picture, RobotState, SessionInfo, Stamps
 from recordings.reader import open_recording
 from recordings.recorder import SYNC_PERIOD_S, Recorder
+from recordings.schema.messages import (
+    BoardKind,
+    BoardSpec,
+    CameraModel,
+    Picture,
+    RobotState,
+    SessionInfo,
+    Stamps,
+)
 from recordings.writer import RecordingWriter
 
 WIDTH, HEIGHT = 1280, 1024

@@ -22,10 +22,10 @@ from calibrate.geometry import (
     random_rotation,
     rotation_exp,
 )
-from calibrate.pairs import mount_poses
+from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.projection import camera_matrix, project
 from calibrate.views import ImageView, ViewSet
-from recordings.messages import CameraModel, Mount
+from recordings.schema.messages import CameraModel, Mount
 
 
 @dataclass(frozen=True)

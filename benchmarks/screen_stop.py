@@ -19,10 +19,10 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.trials import table, trials
-from station.client import Client
+from station.cell.status import StationState, StationStatus
 from station.daemon import Daemon
+from station.protocol.client import Client
 from station.simulation.launch_cell import SimulationOptions, simulated_cell
-from station.status import StationState, StationStatus
 from tests.tui.terminal import ScreenProcess
 
 PRESSES = 200

@@ -15,20 +15,20 @@ from scipy.spatial.transform import Rotation
 from benchmarks.imperfect_cells import BOARD, Imperfection, Known, imperfect_cell
 from benchmarks.scene import LOW, make_cell, pose_arrays
 from benchmarks.trials import percentiles, table, trials
-from calibrate.evolution import Evaluate, evolve, rotations_from_vectors
 from calibrate.geometry import Array
+from calibrate.handeye.axxb.evolution import Evaluate, evolve, rotations_from_vectors
+from calibrate.handeye.axxb.objective import build_objective
+from calibrate.handeye.axxb.pairs import Pairs, all_pairs, consecutive_pairs
+from calibrate.handeye.axxb.paper import BOX, SETTINGS, paper_evaluate, solve_paper
+from calibrate.handeye.axxb.robust import solve_global
 from calibrate.handeye.fit import fit_cell
 from calibrate.handeye.poses import pose_views
 from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.handeye.readings import explain_recording
-from calibrate.intrinsics import calibrate_intrinsics
-from calibrate.objective import build_objective
-from calibrate.pairs import Pairs, all_pairs, consecutive_pairs
-from calibrate.paper import BOX, SETTINGS, paper_evaluate, solve_paper
-from calibrate.pnp import solve_pnp
-from calibrate.robust import solve_global
-from calibrate.solve import SolveOptions, solve_views
-from recordings.messages import CameraModel
+from calibrate.handeye.solve import SolveOptions, solve_views
+from calibrate.lens.intrinsics import calibrate_intrinsics
+from calibrate.lens.pnp import solve_pnp
+from recordings.schema.messages import CameraModel
 
 SEEDS = 1000
 REPEATED = 100

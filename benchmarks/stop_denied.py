@@ -28,11 +28,11 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.trials import table, trials
-from station.client import Client
-from station.errors import RefusedError
-from station.motion_page import Motion, open_page, read_page
-from station.socket_folder import motion_page, stop_socket
-from station.status import StationState, StationStatus
+from station.cell.errors import RefusedError
+from station.cell.socket_folder import motion_page, stop_socket
+from station.cell.status import StationState, StationStatus
+from station.protocol.client import Client
+from station.protocol.motion_page import Motion, open_page, read_page
 
 TRIALS, MOVING, COMMANDS = 100, 4, 10
 CROWD = 1000

@@ -20,12 +20,12 @@ from pathlib import Path
 import numpy as np
 
 from benchmarks.trials import table, trials
-from recordings.messages import RobotState
-from station.config import RobotConfig
+from recordings.schema.messages import RobotState
+from station.cell.config import RobotConfig
+from station.cell.errors import RobotError
+from station.cell.priority import DAEMON_NICENESS, go_before_others
 from station.devices.ur import UrRobot
 from station.devices.ur_dashboard import STOP
-from station.errors import RobotError
-from station.priority import DAEMON_NICENESS, go_before_others
 from station.simulation.admin import AdminClient
 from station.simulation.launch import start_controller
 

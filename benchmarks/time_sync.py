@@ -19,8 +19,8 @@ from numpy.typing import NDArray
 
 from calibrate.geometry import difference
 from calibrate.kinematics import MODELS, forward
-from recordings.messages import Picture
-from station.config import RobotConfig
+from recordings.schema.messages import Picture
+from station.cell.config import RobotConfig
 from station.devices.frames import mid_exposure
 from station.devices.ur import UrRobot
 from station.simulation.admin import AdminClient

@@ -13,17 +13,17 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from calibrate.board import board_from_turned, board_points, looks_same_turns
-from calibrate.calibration import Calibration, encode_calibration
-from calibrate.detect import Detection
+from calibrate.boards.detect import Detection
+from calibrate.boards.model import board_from_turned, board_points, looks_same_turns
 from calibrate.errors import CalibrationError
+from calibrate.files.calibration import Calibration, encode_calibration
 from calibrate.geometry import Array, inverse
 from calibrate.load import Progress, load_views
 from calibrate.projection import project_pixels
-from recordings.messages import CameraModel, Matrix4, View
 from recordings.reader import Recording
 from recordings.scene import Entity, Line
-from recordings.viewing import DETECTED, Marks, drawn
+from recordings.schema.messages import CameraModel, Matrix4, View
+from recordings.schema.viewing import DETECTED, Marks, drawn
 from recordings.writer import RecordingWriter, derived_recording
 
 USED, REJECTED, PREDICTED = DETECTED, (0.95, 0.1, 0.1), (1.0, 0.8, 0.1)

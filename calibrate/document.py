@@ -7,19 +7,20 @@ import sys
 from datetime import UTC, datetime
 from functools import cache
 from importlib import metadata
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 import numpy as np
 
-from calibrate.board import ambiguity_text
-from calibrate.calibration import (
+from calibrate.boards.model import ambiguity_text
+from calibrate.files.calibration import (
     FORMAT,
     Arm,
     BoardFound,
     Calibration,
     Folds,
     FramePose,
+    Gate,
     Holdout,
     Lens,
     Proof,
@@ -33,18 +34,15 @@ from calibrate.calibration import (
     Views,
     ViewWeight,
 )
-from calibrate.gates import Gate
-from calibrate.intrinsics import Intrinsics
-from calibrate.lens_uncertainty import LensUncertainty
+from calibrate.handeye.solution import Remark, Solution
+from calibrate.lens.intrinsics import Intrinsics
+from calibrate.lens.pnp import view_rms_px
+from calibrate.lens.uncertainty import LensUncertainty
 from calibrate.load import LoadedViews
-from calibrate.pnp import view_rms_px
+from calibrate.options import JobOptions
 from calibrate.projection import intrinsics_names
-from calibrate.solution import Remark, Solution
 from calibrate.views import ViewSet
 from recordings.reader import Recording
-
-if TYPE_CHECKING:
-    from calibrate.pipeline import JobOptions
 
 _PACKAGES = ("calibration-station", "numpy", "scipy", "opencv-python-headless", "clarabel")
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from recordings.messages import Mount
+from recordings.schema.messages import Mount
 
 
 def camera_frames(mount: Mount) -> tuple[str, str]:

@@ -10,15 +10,15 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from calibrate.board import board_points
-from calibrate.detect import Detection, detect
+from calibrate.boards.detect import Detection, detect
+from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, MirroredPicturesError, SquaresCountedError, TooFewViewsError
 from calibrate.geometry import is_rigid
-from calibrate.solution import RejectedView
+from calibrate.handeye.solution import RejectedView
 from calibrate.views import ImageView, ViewSet
 from recordings.errors import BadPictureError
-from recordings.messages import BoardSpec, CameraModel, View
 from recordings.reader import Recording
+from recordings.schema.messages import BoardSpec, CameraModel, View
 
 FEWEST_VIEWS = 4
 Progress = Callable[[int, int, str], None]

@@ -4,58 +4,33 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import cv2
 import msgspec
 import numpy as np
 
-from calibrate.board import check_board
-from calibrate.calibration import Calibration
+from calibrate.boards.model import check_board
 from calibrate.document import make_calibration
 from calibrate.errors import BadViewsError
-from calibrate.gates import Gate, GateInputs, GateLimits, judge
+from calibrate.files.calibration import Calibration, Gate
 from calibrate.handeye.priors import BoardTolerance
-from calibrate.intrinsics import Intrinsics, LensModel, calibrate_intrinsics
-from calibrate.lens_uncertainty import LensUncertainty, lens_uncertainty
+from calibrate.handeye.solution import Solution, SolveOptions
+from calibrate.handeye.solve import solve_views
+from calibrate.lens.intrinsics import Intrinsics, calibrate_intrinsics
+from calibrate.lens.pnp import solve_pnp, view_rms_px
+from calibrate.lens.uncertainty import LensUncertainty, lens_uncertainty
 from calibrate.load import FEWEST_VIEWS, LoadedViews, Progress, load_views, without_views
-from calibrate.pnp import solve_pnp, view_rms_px
+from calibrate.options import JobOptions
 from calibrate.projection import intrinsics_names
-from calibrate.solution import Profile, Solution, SolveOptions
-from calibrate.solve import solve_views
+from calibrate.quality.gates import GateInputs, judge
 from calibrate.stopwatch import Stopwatch
 from calibrate.views import ViewSet
-from recordings.messages import BoardSpec, CameraModel
 from recordings.reader import Recording, open_recording
+from recordings.schema.messages import BoardSpec, CameraModel
 
 _WORST_VIEW_PX = 20.0
-
-
-@dataclass(frozen=True)
-class JobOptions:
-    """What a person may choose for one run; recorded in the calibration's provenance."""
-
-    profile: Profile = "robust"
-    seed: int = 0
-    board: BoardSpec | None = None
-    """Instead of the recorded one."""
-    square_m: float | None = None
-    """Another size of square; a charuco board's markers and an april-grid's gaps grow with it."""
-    camera: CameraModel | None = None
-    """Known intrinsics, instead of the recorded ones or of finding them."""
-    camera_sigma: dict[str, float] = field(default_factory=dict)
-    """Their 1σ by parameter, where it is stated; else the usual 0.2 %."""
-    lens_model: LensModel = "plumb_bob"
-    find_intrinsics: bool = False
-    """Find them from these pictures even where some are recorded."""
-    limits: GateLimits = field(default_factory=GateLimits)
-    accept_move: bool = False
-    """Use both parts of a session in which camera or board was moved half-way."""
-    working_distance_m: float | None = None
-    without: tuple[int, ...] = ()
-    """Numbers, from 1, of the poses that a person leaves out."""
-    threads: int | None = None
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ import numpy as np
 
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array
-from recordings.messages import CameraModel
+from recordings.schema.messages import CameraModel
 
 INTRINSICS = ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3")
 """The parameters of a plumb_bob lens, in this order."""

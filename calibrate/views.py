@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibrate.geometry import Array
-from recordings.messages import CameraModel, Mount
+from recordings.schema.messages import CameraModel, Mount
 
 
 @dataclass(frozen=True, eq=False)

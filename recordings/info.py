@@ -6,11 +6,11 @@ import math
 from typing import Any
 
 from recordings.mcap import MessageIndex
-from recordings.messages import SINGLE_TAGS, BoardSpec
 from recordings.part import RecordingPart
 from recordings.reader import Recording
+from recordings.schema.messages import SINGLE_TAGS, BoardSpec
+from recordings.schema.topics import Topic
 from recordings.stream_quality import Arrivals, Steps
-from recordings.topics import Topic
 
 _SHORTEST_SPAN_S = 0.01
 """Messages that all came at once have no rate."""

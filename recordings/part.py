@@ -23,9 +23,8 @@ from recordings.mcap import Message, MessageIndex, open_file, scan_file
 from recordings.mcap.contents import joined
 from recordings.mcap.records import BadRecordError, require_crc
 from recordings.mcap.source import ShortFileError
-from recordings.messages import CameraModel, CaptureEvent, Matrix4, Picture, RobotState, SessionInfo, View
 from recordings.pictures import PictureError, decode_picture, raw_array
-from recordings.schema import (
+from recordings.schema.definitions import (
     FORMATS,
     RECOVERY_RECORD,
     SESSION_RECORDS,
@@ -34,9 +33,18 @@ from recordings.schema import (
     decode,
     schema_difference,
 )
+from recordings.schema.messages import (
+    CameraModel,
+    CaptureEvent,
+    Matrix4,
+    Picture,
+    RobotState,
+    SessionInfo,
+    View,
+)
+from recordings.schema.topics import Topic, schema_bytes, schema_name
+from recordings.schema.viewing import camera_model_of, matrix_of
 from recordings.stamps_table import StampsTable, stamps_tables
-from recordings.topics import Topic, schema_bytes, schema_name
-from recordings.viewing import camera_model_of, matrix_of
 
 VIEWS_LIMIT = 10_000
 _RIGID_TOLERANCE = 1e-6

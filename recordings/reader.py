@@ -9,8 +9,8 @@ from pathlib import Path
 
 from recordings.errors import MissingPartError, RecordingError, UnsealedRecordingError, recover_line
 from recordings.files import PART_SUFFIX
-from recordings.messages import CaptureEvent, Picture, RobotState, SessionInfo, View
 from recordings.part import RecordingPart
+from recordings.schema.messages import CaptureEvent, Picture, RobotState, SessionInfo, View
 from recordings.session_parts import parts_of_file, parts_of_folder
 
 

@@ -12,10 +12,10 @@ from recordings.errors import RecordingError
 from recordings.mcap.records import MESSAGE_HEAD, Opcode, with_crc
 from recordings.mcap.salvage import Salvage, salvage
 from recordings.mcap.writer import McapFile
-from recordings.messages import View
 from recordings.part import RecordingPart
-from recordings.schema import RECOVERY_RECORD, SESSION_RECORDS, SchemaError, decode
-from recordings.topics import Topic, identify
+from recordings.schema.definitions import RECOVERY_RECORD, SESSION_RECORDS, SchemaError, decode
+from recordings.schema.messages import View
+from recordings.schema.topics import Topic, identify
 
 
 class NothingToSaveError(RecordingError):

@@ -19,8 +19,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recordings.errors import RecordingError
-from recordings.messages import CameraModel, CaptureEvent, Matrix4, Picture, RobotState, SessionInfo, View
-from recordings.viewing import DETECTED, Marks
+from recordings.schema.messages import (
+    CameraModel,
+    CaptureEvent,
+    Matrix4,
+    Picture,
+    RobotState,
+    SessionInfo,
+    View,
+)
+from recordings.schema.viewing import DETECTED, Marks
 from recordings.writer import RecordingWriter
 
 QUEUE_LIMIT_BYTES = 256 * 1024 * 1024

@@ -12,10 +12,10 @@ from recordings.errors import CorruptRecordingError, RecordingError, UnsealedRec
 from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, discard_leftover, lock, rename_new, sync_folder
 from recordings.manifest import MANIFEST_FILE, give_up_parts, missing_parts, read_manifest
 from recordings.mcap.scan import open_file
-from recordings.messages import SessionInfo
 from recordings.part import RecordingPart
 from recordings.rebuild import NothingToSaveError, rebuild
-from recordings.topics import Topic
+from recordings.schema.messages import SessionInfo
+from recordings.schema.topics import Topic
 
 DAMAGED_SUFFIX = ".damaged"
 

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from recordings.mcap import Source
 from recordings.mcap.source import UNPACKED_START
-from recordings.messages import Stamps
+from recordings.schema.messages import Stamps
 
 _BLOCK_BYTES = 256 * 1024
 _HEAD_BYTES = 31

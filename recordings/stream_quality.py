@@ -7,7 +7,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from recordings.clocks import DRIFT_SPAN_S, ClockEstimator
+from recordings.schema.clocks import DRIFT_SPAN_S, ClockEstimator
 
 LARGEST_STAMP_S = 1e12
 """30 000 years: what is more, or no number, is no time."""

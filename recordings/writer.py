@@ -17,7 +17,6 @@ from typing import Any, Self
 
 import msgspec
 
-from recordings import viewing
 from recordings.background_sync import BackgroundSync
 from recordings.errors import RecordingError, recover_line
 from recordings.files import (
@@ -29,7 +28,11 @@ from recordings.files import (
 )
 from recordings.mcap.records import with_crc
 from recordings.mcap.writer import McapFile, Piece
-from recordings.messages import (
+from recordings.pictures import PictureError, encode_png, read_header
+from recordings.scene import Entity, scene_update
+from recordings.schema import viewing
+from recordings.schema.definitions import FORMATS, SESSION_RECORDS, PictureFacts, encode
+from recordings.schema.messages import (
     CameraModel,
     CaptureEvent,
     Matrix4,
@@ -39,10 +42,7 @@ from recordings.messages import (
     Stamps,
     View,
 )
-from recordings.pictures import PictureError, encode_png, read_header
-from recordings.scene import Entity, scene_update
-from recordings.schema import FORMATS, SESSION_RECORDS, PictureFacts, encode
-from recordings.topics import Topic, schema_bytes, schema_name
+from recordings.schema.topics import Topic, schema_bytes, schema_name
 
 ATTACHMENT_LIMIT_BYTES = 16 * 1024 * 1024
 SHOWN_PERIOD_NS = 40_000_000

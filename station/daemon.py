@@ -11,14 +11,14 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from station.cell import Cell
-from station.control import ControlServer
-from station.dispatch import SessionDispatcher
-from station.errors import RobotError
-from station.notify import notify, watchdog_period_s
+from station.cell.errors import RobotError
+from station.cell.status import StationState
+from station.devices.cell import Cell
+from station.server.control import ControlServer
+from station.server.dispatch import SessionDispatcher
+from station.server.notify import notify, watchdog_period_s
+from station.server.stop_server import StopServer
 from station.session.session import Session
-from station.status import StationState
-from station.stop_server import StopServer
 
 log = logging.getLogger(__name__)
 

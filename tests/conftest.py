@@ -11,7 +11,7 @@ from typing import Any
 
 import pytest
 
-from station.errors import StationError
+from station.cell.errors import StationError
 from station.simulation.admin import AdminClient
 from station.simulation.launch import SimulatedController, start_controller
 from station.simulation.netns import isolated_thread

@@ -9,14 +9,14 @@ from pathlib import Path
 import pytest
 import typer
 
-import recordings.cli
-import station.command_line
-from calibrate.commands.app import app as calibrate_app
+import recordings.cli.app
+import station.cli.app
+from calibrate.cli.app import app as calibrate_app
 
 PROGRAMS = {
     "calibrate": typer.main.get_command(calibrate_app),
-    "recordings": typer.main.get_command(recordings.cli.app),
-    "station": typer.main.get_command(station.command_line.command_line([])),
+    "recordings": typer.main.get_command(recordings.cli.app.app),
+    "station": typer.main.get_command(station.cli.app.command_line([])),
 }
 HANDED_ON = ("station", "board")
 """Its help is that of `calibrate board`."""

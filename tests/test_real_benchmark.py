@@ -12,7 +12,7 @@ from benchmarks.real_methods import calibration_rs, opencv, ours
 from benchmarks.real_sets import _GOOD_VIEWS, RealSet
 from benchmarks.scene import Noise, make_cell
 from calibrate.geometry import difference
-from recordings.messages import BoardKind, BoardSpec, Mount
+from recordings.schema.messages import BoardKind, BoardSpec, Mount
 
 
 def test_a_failed_fold_is_charged_the_methods_own_worst_error() -> None:

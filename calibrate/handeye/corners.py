@@ -9,7 +9,7 @@ import numpy as np
 from calibrate.geometry import Array, perturb, skew
 from calibrate.handeye.observations import SHAPE, Observations
 from calibrate.projection import intrinsics_names, project, project_pixels
-from recordings.messages import CameraModel
+from recordings.schema.messages import CameraModel
 
 _CHUNK_POINTS = 40_000
 """Corners linearised at once: bounds memory for thousands of views."""

@@ -6,18 +6,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibrate.assess import require_motion
 from calibrate.errors import BadViewsError, PosesDisagreeError
 from calibrate.handeye.arm import WithTable, allow_for_table
+from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses
+from calibrate.handeye.axxb.robust import GlobalResult, solve_global
 from calibrate.handeye.estimate import Estimate, estimate
+from calibrate.handeye.metrics import require_motion
 from calibrate.handeye.observations import SHAPE, Moved, Observations, Places, State, observe_views
 from calibrate.handeye.poses import PoseViews, fit_poses
 from calibrate.handeye.priors import Priors
 from calibrate.handeye.start import BoardPoses, agreed_start
 from calibrate.handeye.table import RELATIVE_SIGMA, flex_motion, table_motion
 from calibrate.handeye.turns import set_boards_right
-from calibrate.pairs import Pairs, all_pairs, mount_poses
-from calibrate.robust import GlobalResult, solve_global
 from calibrate.views import ViewSet
 
 FEWEST_FOR_TABLE = 8

@@ -8,7 +8,7 @@ import numpy as np
 
 from calibrate.geometry import Array, difference, inverse, skew
 from calibrate.handeye.observations import Observations, State
-from recordings.messages import Mount
+from recordings.schema.messages import Mount
 
 
 def implied_flange(mount: Mount, X: Array, Y: Array, C: Array) -> Array:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from calibrate.geometry import Array, perturb
 from calibrate.projection import intrinsics_names, intrinsics_vector, with_intrinsics_vector
 from calibrate.views import ViewSet
-from recordings.messages import CameraModel, Mount
+from recordings.schema.messages import CameraModel, Mount
 
 Places = NDArray[np.intp]
 Moved = Literal["camera", "board"]

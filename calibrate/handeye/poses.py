@@ -11,16 +11,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.geometry import Array, difference, inverse, perturb
+from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.handeye.corners import linearise_corners
 from calibrate.handeye.flange import flange_derivatives, implied_flange
 from calibrate.handeye.linear import CornerModes, Linear, Scales, Solved, first_scales
 from calibrate.handeye.observations import Moved, Places, observe_views
 from calibrate.handeye.priors import Quadratic
 from calibrate.handeye.start import BoardPoses, agreed_start, central_pose
-from calibrate.pairs import mount_poses
 from calibrate.projection import intrinsics_vector
 from calibrate.views import ViewSet
-from recordings.messages import Mount
+from recordings.schema.messages import Mount
 
 _STEPS = 8
 _SETTLED = 0.3

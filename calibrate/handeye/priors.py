@@ -10,7 +10,7 @@ from calibrate.geometry import Array
 from calibrate.handeye.observations import SHAPE, Layout, State
 from calibrate.handeye.table import UNIT
 from calibrate.projection import intrinsics_names, intrinsics_vector
-from recordings.messages import BoardSpec, CameraModel
+from recordings.schema.messages import BoardSpec, CameraModel
 
 ASPECT_SIGMA = 0.001
 """Of log(fy/fx): a sensor's pixels are square. It tells an unequal print from the lens."""

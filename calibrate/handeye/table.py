@@ -12,7 +12,7 @@ import numpy as np
 from calibrate.geometry import Array, difference, skew
 from calibrate.kinematics import MODELS, RobotModel, forward, inverse_many, link_frames
 from calibrate.views import ViewSet
-from recordings.messages import Mount
+from recordings.schema.messages import Mount
 
 PARAMETERS = (
     *(f"a{joint}" for joint in range(1, 6)),

@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
-from calibrate.pairs import mount_poses
+from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.views import ImageView, ViewSet
 
 _LEVER_M = 0.5

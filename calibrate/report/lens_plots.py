@@ -5,7 +5,7 @@ from __future__ import annotations
 import matplotlib
 import numpy as np
 
-from calibrate.lens_uncertainty import LensUncertainty
+from calibrate.lens.uncertainty import LensUncertainty
 from calibrate.report.plots import STYLE, new_figure, svg_text
 from calibrate.views import ViewSet
 

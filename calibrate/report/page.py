@@ -8,21 +8,21 @@ from pathlib import Path
 
 import numpy as np
 
-from calibrate.board import describe_board
-from calibrate.calibration import Touch, write_output
-from calibrate.cell_text import cell_sentences
+from calibrate.boards.model import describe_board
+from calibrate.files.calibration import Touch, write_output
+from calibrate.files.cell_text import cell_sentences
+from calibrate.files.summary import pose_text, source_stamp, verdict
+from calibrate.files.verification import agrees, touch_text
 from calibrate.geometry import Array
 from calibrate.handeye.corners import bent_points
 from calibrate.handeye.observations import SHAPE, observe_views
-from calibrate.lens import project
+from calibrate.handeye.solution import PeerResult
+from calibrate.lens.model import project
+from calibrate.lens.pnp import solve_pnp
 from calibrate.pipeline import SolvedRecording
-from calibrate.pnp import solve_pnp
 from calibrate.report import html, plots
 from calibrate.report.lens_plots import uncertainty_map
 from calibrate.report.pictures import drawn_view
-from calibrate.solution import PeerResult
-from calibrate.summary import pose_text, source_stamp, verdict
-from calibrate.verification import agrees, touch_text
 
 _PICTURES_LIMIT = 60
 

@@ -7,7 +7,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from calibrate.corners import to_grey
+from calibrate.boards.corners import to_grey
 from calibrate.geometry import Array
 
 _WIDTH_PX = 480

@@ -13,10 +13,10 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
 from calibrate.geometry import Array
-from calibrate.lens import undistort
+from calibrate.lens.model import undistort
 from calibrate.projection import camera_matrix
 from calibrate.views import ViewSet
-from recordings.messages import CameraModel
+from recordings.schema.messages import CameraModel
 
 _BLUE, _RED, _GREY, _ORANGE = "#0969da", "#b42318", "#8c959f", "#bc4c00"
 _FAR_WORSE = 3.0

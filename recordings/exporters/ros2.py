@@ -14,12 +14,12 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from recordings.errors import RecordingError
-from recordings.messages import CameraModel, Matrix4, View
 from recordings.part import RecordingPart
 from recordings.pictures import raw_encoding
 from recordings.reader import Recording
-from recordings.topics import Topic
-from recordings.viewing import CAMERA_FRAME, JOINT_NAMES, base_from_flange, quaternion_xyzw
+from recordings.schema.messages import CameraModel, Matrix4, View
+from recordings.schema.topics import Topic
+from recordings.schema.viewing import CAMERA_FRAME, JOINT_NAMES, base_from_flange, quaternion_xyzw
 
 FRAME_PERIOD_NS = 10_000_000
 _NS = 1_000_000_000

@@ -19,13 +19,14 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from recordings.dataset import DATASET_FILE, BagDescription, read_description
 from recordings.files import session_name_from
 from recordings.importers.bags import CountedBag, open_bag
+from recordings.importers.dataset import DATASET_FILE, BagDescription, read_description
 from recordings.importers.selection import Selection, Wanted, select
 from recordings.importers.stops import Limits, Stop, find_stops
 from recordings.importers.values import Array, Bag, Image, ImportSourceError, Joints, Progress
-from recordings.messages import (
+from recordings.pictures import PictureError, decode_picture, encode_png, read_header
+from recordings.schema.messages import (
     CameraIdentity,
     CameraModel,
     Matrix4,
@@ -36,7 +37,6 @@ from recordings.messages import (
     Vector6,
     View,
 )
-from recordings.pictures import PictureError, decode_picture, encode_png, read_header
 from recordings.writer import RecordingWriter, derived_recording
 
 PAIR_WITHIN_S = 0.05

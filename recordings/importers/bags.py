@@ -13,7 +13,7 @@ from recordings.importers import foxglove_messages, ros_messages
 from recordings.importers.ros_messages import RosDecoder
 from recordings.importers.values import Bag, Image, ImportSourceError, Kind, Progress, Topic, Value
 from recordings.mcap import Contents, Message, Source, open_file, scan_file
-from recordings.schema import SESSION_RECORDS
+from recordings.schema.definitions import SESSION_RECORDS
 
 _RESCUE = "mcap recover FILE, with the mcap command line tool"
 _CDR, _PROTOBUF = "cdr", "protobuf"

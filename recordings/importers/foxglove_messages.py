@@ -14,7 +14,7 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 
 from recordings.importers.values import Camera, Frame, Image, ImportSourceError, Joints, Kind, Value
-from recordings.viewing import camera_model_of
+from recordings.schema.viewing import camera_model_of
 
 _MESSAGES: dict[str, tuple[Any, Kind]] = {
     "foxglove.RawImage": (RawImage, Kind.IMAGE),

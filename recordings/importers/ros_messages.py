@@ -6,7 +6,7 @@ import struct
 from typing import Any
 
 from recordings.importers.values import Camera, Frame, Image, ImportSourceError, Joints, Kind, Value
-from recordings.viewing import intrinsics
+from recordings.schema.viewing import intrinsics
 
 KINDS = {
     "sensor_msgs/msg/Image": Kind.IMAGE,

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from recordings.importers.frames import FrameTree, Track
 from recordings.importers.values import Array, Bag, Camera, Frame, ImportSourceError, Joints, Kind, Topic
-from recordings.messages import CameraModel, Vector6
+from recordings.schema.messages import CameraModel, Vector6
 
 _UR_ORDER = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 _FLANGE, _POSE_CHILD = "flange", "flange of the pose topic"

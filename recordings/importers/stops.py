@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from recordings.importers.frames import Track
 from recordings.importers.values import Array
-from recordings.messages import Stillness
+from recordings.schema.messages import Stillness
 
 WINDOW_S = 0.3
 POSITION_M = 0.00005

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recordings.errors import RecordingError
-from recordings.messages import CameraModel
+from recordings.schema.messages import CameraModel
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]

@@ -12,13 +12,13 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from recordings.clocks import ClockFit
-from recordings.messages import CameraIdentity, Picture
-from station.config import CameraConfig
+from recordings.schema.clocks import ClockFit
+from recordings.schema.messages import CameraIdentity, Picture
+from station.cell.config import CameraConfig
+from station.cell.errors import CameraError
 from station.devices.aravis_device import GenicamDevice
 from station.devices.base import Trigger
 from station.devices.frames import CameraCounts, DeviceClock, FrameCounter, StreamCounts
-from station.errors import CameraError
 
 T = TypeVar("T")
 _CLOCK_READINGS = 8

@@ -9,13 +9,13 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from recordings.clocks import monotonic_from_wall_ns
-from recordings.messages import CameraIdentity, Picture, Stamps
-from station.config import CameraConfig
+from recordings.schema.clocks import monotonic_from_wall_ns
+from recordings.schema.messages import CameraIdentity, Picture, Stamps
+from station.cell.config import CameraConfig
+from station.cell.errors import CameraError
 from station.devices.aravis_settings import Region, apply_settings, read_settings, require_settings
 from station.devices.frames import DeviceClock, StreamCounts
 from station.devices.pixels import bits_per_pixel, decode
-from station.errors import CameraError
 
 if TYPE_CHECKING:
     from collections.abc import Iterator

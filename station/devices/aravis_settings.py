@@ -7,8 +7,8 @@ from __future__ import annotations
 
 from typing import Any
 
-from station.config import CameraConfig
-from station.errors import CameraError
+from station.cell.config import CameraConfig
+from station.cell.errors import CameraError
 
 Region = tuple[int, int, int, int]
 """x, y, width, height, pixels"""

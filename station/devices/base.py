@@ -8,8 +8,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import msgspec
 
-from recordings.clocks import ClockFit
-from recordings.messages import CameraIdentity, Picture, RobotIdentity, RobotState
+from recordings.schema.clocks import ClockFit
+from recordings.schema.messages import CameraIdentity, Picture, RobotIdentity, RobotState
 from station.devices.frames import CameraCounts
 
 

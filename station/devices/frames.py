@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import msgspec
 
-from recordings.clocks import DRIFT_SPAN_S, UNFITTED_DRIFT, ClockFit
-from station.errors import CameraError
+from recordings.schema.clocks import DRIFT_SPAN_S, UNFITTED_DRIFT, ClockFit
+from station.cell.errors import CameraError
 
 LAST_FRAME_ID = 65_535
 """GigE Vision block ids run from 1 to this and start over at 1; 0 means "no frame"."""

@@ -8,7 +8,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from station.errors import CameraError
+from station.cell.errors import CameraError
 
 Image = NDArray[Any]
 

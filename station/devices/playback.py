@@ -16,15 +16,23 @@ import msgspec
 import numpy as np
 
 from calibrate.geometry import Array, interpolate, pose_from_rotvec, rotation_log
-from recordings.clocks import ClockFit
 from recordings.errors import RecordingError
-from recordings.messages import CameraIdentity, Picture, RobotIdentity, RobotState, Stamps, Vector6, View
 from recordings.reader import Recording, open_recording
-from station.config import CameraConfig
+from recordings.schema.clocks import ClockFit
+from recordings.schema.messages import (
+    CameraIdentity,
+    Picture,
+    RobotIdentity,
+    RobotState,
+    Stamps,
+    Vector6,
+    View,
+)
+from station.cell.config import CameraConfig
+from station.cell.errors import CameraError, RobotError, StaleStateError
+from station.cell.plan import Plan, PlannedPose
 from station.devices.frames import CameraCounts, next_frame_id
 from station.devices.playback_source import Played, Source, open_source
-from station.errors import CameraError, RobotError, StaleStateError
-from station.plan.model import Plan, PlannedPose
 
 STATE_RATE_HZ = 100.0
 MOVE_S = 0.2

@@ -9,9 +9,9 @@ from typing import NamedTuple
 import cv2
 
 from recordings.errors import RecordingError
-from recordings.messages import CameraIdentity, Picture, Stamps
 from recordings.reader import open_recording
-from station.errors import CameraError
+from recordings.schema.messages import CameraIdentity, Picture, Stamps
+from station.cell.errors import CameraError
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".mpg", ".mpeg")

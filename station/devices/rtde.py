@@ -12,7 +12,7 @@ from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from enum import IntEnum, IntFlag
 
-from station.errors import RobotError
+from station.cell.errors import RobotError
 
 PORT = 30004
 PROTOCOL_VERSION = 2

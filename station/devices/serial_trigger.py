@@ -13,10 +13,10 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any, TypeVar
 
-from station.config import TriggerConfig
+from station.cell.config import TriggerConfig
+from station.cell.errors import TriggerError
 from station.devices.base import TriggerPulse
 from station.devices.trigger_lines import BAUD, PRODUCT, PROTOCOL, LineReader, frame
-from station.errors import TriggerError
 
 T = TypeVar("T")
 ANSWER_TIMEOUT_S = 1.0

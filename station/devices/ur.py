@@ -14,7 +14,8 @@ from collections.abc import Coroutine, Sequence
 from pathlib import Path
 from typing import Any
 
-from station.config import RobotConfig
+from station.cell.config import RobotConfig
+from station.cell.errors import RobotError, SafetyStopError, StaleStateError
 from station.devices.rtde import RuntimeState
 from station.devices.ur_child import ControlChild
 from station.devices.ur_condition import (
@@ -29,7 +30,6 @@ from station.devices.ur_dashboard import STOP, Dashboard, came
 from station.devices.ur_heart import Heart, longest_gap_s
 from station.devices.ur_link import UrLink, link_lost_words
 from station.devices.ur_moves import STALE_S, MoveWatch, check_goal
-from station.errors import RobotError, SafetyStopError, StaleStateError
 
 log = logging.getLogger(__name__)
 

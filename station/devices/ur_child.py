@@ -16,7 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
-from station.errors import RobotError
+from station.cell.errors import RobotError
 
 log = logging.getLogger(__name__)
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from recordings.messages import RobotState
+from recordings.schema.messages import RobotState
+from station.cell.errors import RobotError, SafetyStopError
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode, SafetyStatus
-from station.errors import RobotError, SafetyStopError
 
 WATCHDOG_S = 0.15
 """A silence that can have tripped the control program's watchdog (1/5 s, and ticks)."""

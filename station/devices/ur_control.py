@@ -24,8 +24,8 @@ import sys
 import time
 from typing import Any, NoReturn
 
-from station.parent import die_with_parent
-from station.priority import DAEMON_NICENESS, go_before_others
+from station.cell.parent import die_with_parent
+from station.cell.priority import DAEMON_NICENESS, go_before_others
 
 BEAT_FRESH_NS = 100_000_000
 WATCHDOG_HZ = 5.0

@@ -10,7 +10,7 @@ import asyncio
 import os
 from collections import deque
 
-from station.errors import RobotError
+from station.cell.errors import RobotError
 
 PORT = 29999
 STOP = "stop"

@@ -10,9 +10,9 @@ import numpy as np
 
 from calibrate.geometry import interpolate as between_poses
 from calibrate.geometry import pose_from_rotvec, rotation_log
-from recordings.clocks import ClockFit
-from recordings.messages import RobotState, Stamps, Vector6
-from station.errors import StaleStateError
+from recordings.schema.clocks import ClockFit
+from recordings.schema.messages import RobotState, Stamps, Vector6
+from station.cell.errors import StaleStateError
 
 
 def state_at(history: Sequence[RobotState], clock: ClockFit | None, host_monotonic_ns: int) -> RobotState:

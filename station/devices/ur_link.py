@@ -12,9 +12,10 @@ import time
 from collections.abc import Callable
 
 from calibrate.kinematics import MODELS, DhDeltas
-from recordings.clocks import ClockFit
-from recordings.messages import RobotIdentity, RobotState
-from station.config import RobotConfig
+from recordings.schema.clocks import ClockFit
+from recordings.schema.messages import RobotIdentity, RobotState
+from station.cell.config import RobotConfig
+from station.cell.errors import RobotError, StaleStateError, StationError
 from station.devices.ur_condition import safety_stop
 from station.devices.ur_dashboard import Dashboard, DashboardError
 from station.devices.ur_history import state_at
@@ -23,7 +24,6 @@ from station.devices.ur_primary import Installation, PrimaryReader
 from station.devices.ur_probe import SCRIPT_PORT, ProbeResult, check_port, identify, lock_name
 from station.devices.ur_state import Payload, Sample, StateReader
 from station.devices.ur_tool import TcpCheck, check_payload
-from station.errors import RobotError, StaleStateError, StationError
 
 log = logging.getLogger(__name__)
 

@@ -10,8 +10,8 @@ import re
 import socket
 import struct
 
-from station.errors import RobotError
-from station.socket_folder import user_name
+from station.cell.errors import RobotError
+from station.cell.socket_folder import user_name
 
 
 class RobotLock:

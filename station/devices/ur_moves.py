@@ -12,9 +12,9 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 
-from recordings.messages import RobotState, Vector6
+from recordings.schema.messages import RobotState, Vector6
+from station.cell.errors import RobotError, StaleStateError
 from station.devices.ur_condition import not_powered, program_not_running, safety_stop
-from station.errors import RobotError, StaleStateError
 
 STALE_S = 0.25
 ARRIVED_RAD = 0.01

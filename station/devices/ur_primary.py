@@ -16,10 +16,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from station.errors import RobotError
+from station.cell.errors import RobotError
 
 if TYPE_CHECKING:  # the simulated controller starts without numpy
-    from recordings.messages import Vector6
+    from recordings.schema.messages import Vector6
 
 PORT = 30001
 ROBOT_STATE = 16

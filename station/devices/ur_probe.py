@@ -7,8 +7,8 @@ import ipaddress
 import re
 from dataclasses import dataclass, field, replace
 
+from station.cell.errors import RobotError
 from station.devices.ur_dashboard import Dashboard, DashboardError, connect_trouble
-from station.errors import RobotError
 
 SCRIPT_PORT = 30002
 RTDE_PORT = 30004

@@ -17,8 +17,8 @@ from collections.abc import Callable
 from concurrent.futures import Future
 from typing import NamedTuple
 
-from recordings.clocks import ClockEstimator, monotonic_from_wall_ns
-from recordings.messages import RobotState, Stamps
+from recordings.schema.clocks import ClockEstimator, monotonic_from_wall_ns
+from recordings.schema.messages import RobotState, Stamps
 from station.devices.rtde import (
     PORT,
     PROTOCOL_VERSION,

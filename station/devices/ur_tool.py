@@ -15,10 +15,10 @@ import numpy as np
 
 from calibrate.geometry import Array, difference, inverse, pose_from_rotvec, rotation_log
 from calibrate.kinematics import DhDeltas, RobotModel, forward
-from recordings.messages import RobotState, Vector6
+from recordings.schema.messages import RobotState, Vector6
+from station.cell.errors import RobotError
 from station.devices.ur_primary import DhParameters, Installation
 from station.devices.ur_state import Payload
-from station.errors import RobotError
 
 log = logging.getLogger(__name__)
 

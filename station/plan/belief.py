@@ -18,10 +18,10 @@ from calibrate.geometry import (
     quaternion_from_matrix,
 )
 from calibrate.kinematics import forward
-from recordings.messages import Mount
-from station.config import PoseGuess, StationConfig
-from station.errors import ConfigError
-from station.plan.scene import arm_model
+from recordings.schema.messages import Mount
+from station.cell.config import PoseGuess, StationConfig
+from station.cell.errors import ConfigError
+from station.cell.scene import arm_model
 
 GOOD_M, GOOD_RAD = 0.006, 0.02
 """A belief this sharp (1 sigma per axis) is enough to plan from."""

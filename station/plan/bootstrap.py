@@ -17,18 +17,18 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board import board_points
+from calibrate.boards.model import board_points
 from calibrate.geometry import Array, perturb, pose, rotation_exp, transform_points
 from calibrate.kinematics import RobotModel, forward, inverse_nearest
-from station.collision import CellGeometry, margins
-from station.config import StationConfig
-from station.errors import LimitError
-from station.limits import SPACING_M, Problem, check_path, joint_bounds
+from station.cell.collision import CellGeometry, margins
+from station.cell.config import StationConfig
+from station.cell.errors import LimitError
+from station.cell.limits import SPACING_M, Problem, check_path, joint_bounds
+from station.cell.plan import PlannedPose
+from station.cell.scene import Scene, arm_model, geometry_of
 from station.plan.belief import Belief, Glimpse, believe, board_place, expected_after, seen_from, spread_of
 from station.plan.describe import planned_pose
-from station.plan.model import PlannedPose
 from station.plan.order import move_times
-from station.plan.scene import Scene, arm_model, geometry_of
 from station.plan.standing import geometry_from
 from station.plan.visibility import outline, visible
 

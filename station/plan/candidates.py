@@ -8,13 +8,13 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board import board_points
+from calibrate.boards.model import board_points
 from calibrate.geometry import Array, pose, rotation_exp
 from calibrate.kinematics import inverse_many, singularity_measure
 from calibrate.projection import camera_matrix
-from station.collision import margins
-from station.limits import joint_bounds
-from station.plan.scene import Scene
+from station.cell.collision import margins
+from station.cell.limits import joint_bounds
+from station.cell.scene import Scene
 from station.plan.view_range import ViewRange
 from station.plan.visibility import seen_for_certain, sees_past_the_arm
 

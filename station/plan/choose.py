@@ -8,12 +8,12 @@ from typing import Literal
 
 import numpy as np
 
-from calibrate.board import board_points
+from calibrate.boards.model import board_points
 from calibrate.geometry import Array
+from calibrate.handeye.information import Noise, covariance_of, prior_information, view_information
 from calibrate.handeye.priors import BoardTolerance
-from calibrate.information import Noise, covariance_of, prior_information, view_information
 from calibrate.projection import intrinsics_names
-from station.plan.scene import Scene
+from station.cell.scene import Scene
 
 Criterion = Literal["A", "D"]
 _LENS_SHARE = {"A": 0.02, "D": 0.2}

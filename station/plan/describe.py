@@ -5,11 +5,11 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from calibrate.board import board_points
+from calibrate.boards.model import board_points
 from calibrate.geometry import Array
 from calibrate.projection import project
-from station.plan.model import ExpectedView, PlannedPose
-from station.plan.scene import Scene, board_extent
+from station.cell.plan import ExpectedView, PlannedPose
+from station.cell.scene import Scene, board_extent
 
 
 def expected_view(scene: Scene, base_from_flange: Array) -> ExpectedView:

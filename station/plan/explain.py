@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibrate.board import board_points
+from calibrate.boards.model import board_points
 from calibrate.geometry import Array, transform_points
-from station.collision import margins
+from station.cell.collision import margins
+from station.cell.scene import Scene
 from station.plan.candidates import ARM_IN_SIGHT, NOT_IN_PICTURE, OUT_OF_REACH, Pool
-from station.plan.scene import Scene
 
 _REMEDIES = {
     NOT_IN_PICTURE: "measure camera_guess and board_guess better, use a smaller board or a wider lens",

@@ -15,10 +15,10 @@ from calibrate.geometry import Array, pose_from_quaternion
 from calibrate.kinematics import MODELS, forward, inverse_nearest
 from recordings import strict_yaml
 from recordings.files import ASKED_FOR, write_atomically
-from recordings.messages import Mount
 from recordings.reader import open_recording
-from station.errors import ConfigError
-from station.plan.model import Plan, PlannedPose
+from recordings.schema.messages import Mount
+from station.cell.errors import ConfigError
+from station.cell.plan import Plan, PlannedPose
 
 _POSE_LIMIT = 200
 _JOINTS_DEG = [f"j{i}_deg" for i in range(1, 7)]

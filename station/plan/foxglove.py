@@ -8,11 +8,11 @@ import numpy as np
 
 from calibrate.geometry import Array
 from recordings.scene import Colour, Entity, Line, write_scene
-from station.collision import body_segments
-from station.limits import check_plan
-from station.plan.model import Plan
+from station.cell.collision import body_segments
+from station.cell.limits import check_plan
+from station.cell.plan import Plan
+from station.cell.scene import Scene, flange_poses
 from station.plan.preview import camera_frustum, printed_outline
-from station.plan.scene import Scene, flange_poses
 
 _ARM: Colour = (0.6, 0.6, 0.65, 0.8)
 _CAMERA: Colour = (0.1, 0.4, 0.9, 1.0)

@@ -7,9 +7,9 @@ from collections.abc import Iterator
 import numpy as np
 
 from calibrate.geometry import Array
+from station.cell.scene import Scene
 from station.plan.candidates import Pool
 from station.plan.order import move_times
-from station.plan.scene import Scene
 
 _HUBS = 6
 _NEARLY_ALL = 0.85

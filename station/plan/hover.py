@@ -13,19 +13,19 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
-from calibrate.board import board_points
-from calibrate.board_now import found_points, locate_board, offset_covariance
-from calibrate.calibration import Calibration
+from calibrate.boards.model import board_points
+from calibrate.files.calibration import Calibration
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
 from calibrate.kinematics import RobotModel, forward, inverse_all, jacobian
+from calibrate.quality.board_now import found_points, locate_board, offset_covariance
 from calibrate.views import ImageView
-from recordings.messages import BoardSpec, Vector6
-from station.collision import CellGeometry, as_point, margins, plate
-from station.config import Capsule, PointerConfig, StationConfig
-from station.errors import LimitError
-from station.limits import PlanCheck, check_plan
-from station.plan.model import Plan, PlannedPose
-from station.plan.scene import board_extent, geometry_of
+from recordings.schema.messages import BoardSpec, Vector6
+from station.cell.collision import CellGeometry, as_point, margins, plate
+from station.cell.config import Capsule, PointerConfig, StationConfig
+from station.cell.errors import LimitError
+from station.cell.limits import PlanCheck, check_plan
+from station.cell.plan import Plan, PlannedPose
+from station.cell.scene import board_extent, geometry_of
 
 CLEARANCE_M = 0.05
 """Nothing that moves comes nearer to the board, on the way or at the end."""

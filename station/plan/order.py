@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.geometry import Array
-from station.collision import CellGeometry, margins, moving_points, surface_speeds
-from station.limits import (
+from station.cell.collision import CellGeometry, margins, moving_points, surface_speeds
+from station.cell.limits import (
     JOINT_ACCELERATION_CAP_RAD_S2,
     JOINT_SPEED_CAP_RAD_S,
     SPACING_M,

@@ -9,21 +9,21 @@ from itertools import pairwise
 import msgspec
 import numpy as np
 
-from calibrate.board import board_points
+from calibrate.boards.model import board_points
 from calibrate.geometry import Array
-from calibrate.information import Noise
+from calibrate.handeye.information import Noise
 from calibrate.kinematics import forward
-from station.config import StationConfig
-from station.errors import LimitError
-from station.limits import check_plan
+from station.cell.config import StationConfig
+from station.cell.errors import LimitError
+from station.cell.limits import check_plan
+from station.cell.plan import Plan
+from station.cell.scene import Scene, require_kept_clear, scene_of
 from station.plan.candidates import Pool, find_candidates
 from station.plan.choose import Criterion, Objective, choose, informations, objective_for, sigma_of
 from station.plan.describe import expected_view, planned_pose
 from station.plan.explain import explain_shortage, looks_back
 from station.plan.groups import best_group
-from station.plan.model import Plan
 from station.plan.order import BLOCKED, move_times, short_order, time_matrix
-from station.plan.scene import Scene, require_kept_clear, scene_of
 from station.plan.view_range import ViewRange, view_range
 from station.plan.visibility import blind_share, visible
 

@@ -9,16 +9,16 @@ import msgspec
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibrate.board import board_points
+from calibrate.boards.model import board_points
 from calibrate.geometry import Array
-from calibrate.information import Noise
+from calibrate.handeye.information import Noise
 from calibrate.kinematics import forward
-from station.limits import check_path
+from station.cell.limits import check_path
+from station.cell.plan import Plan, PlannedPose
+from station.cell.scene import Scene, flange_poses
 from station.plan.candidates import find_candidates
 from station.plan.choose import informations, objective_for, sigma_of
 from station.plan.describe import planned_pose
-from station.plan.model import Plan, PlannedPose
-from station.plan.scene import Scene, flange_poses
 from station.plan.view_range import ViewRange, view_range
 from station.plan.visibility import visible
 

@@ -11,10 +11,10 @@ from matplotlib.figure import Figure
 
 from calibrate.geometry import Array, transform_points
 from calibrate.projection import camera_matrix
-from station.collision import body_segments
-from station.errors import ConfigError
-from station.plan.model import Plan
-from station.plan.scene import Scene, board_extent, flange_poses
+from station.cell.collision import body_segments
+from station.cell.errors import ConfigError
+from station.cell.plan import Plan
+from station.cell.scene import Scene, board_extent, flange_poses
 from station.plan.sketch import expected_pixels
 
 _FRUSTUM_M = 0.06

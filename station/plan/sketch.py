@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibrate.board import board_points
+from calibrate.boards.model import board_points
 from calibrate.geometry import Array, transform_points
 from calibrate.projection import project
-from station.plan.model import Plan
-from station.plan.scene import Scene, flange_poses
+from station.cell.plan import Plan
+from station.cell.scene import Scene, flange_poses
 
 _SHADES = " ░▒▓█"
 _BARS = "▁▂▃▄▅▆▇█"

@@ -7,10 +7,10 @@ from numpy.typing import ArrayLike
 
 from calibrate.geometry import Array, perturb, pose_from_quaternion
 from calibrate.kinematics import forward
-from station.collision import CellGeometry, gap_to_arm
-from station.config import StationConfig
-from station.limits import SPACING_M
-from station.plan.scene import camera_ends, camera_radius_m, cell_geometry, covers_its_doubt, geometry_of
+from station.cell.collision import CellGeometry, gap_to_arm
+from station.cell.config import StationConfig
+from station.cell.limits import SPACING_M
+from station.cell.scene import camera_ends, camera_radius_m, cell_geometry, covers_its_doubt, geometry_of
 
 _DRAWS = 2000
 

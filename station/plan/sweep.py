@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from recordings.messages import Mount, Vector6
-from station.plan.model import Plan, PlannedPose
+from recordings.schema.messages import Mount, Vector6
+from station.cell.plan import Plan, PlannedPose
 
 SWINGS = 8
 JOINT_SPEED_RAD_S = 0.3

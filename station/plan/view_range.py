@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from calibrate.board import board_points
+from calibrate.boards.model import board_points
 from calibrate.projection import camera_matrix
-from station.plan.scene import Scene
+from station.cell.scene import Scene
 
 
 @dataclass(frozen=True)

@@ -5,13 +5,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board import board_points
+from calibrate.boards.model import board_points
 from calibrate.geometry import Array, transform_points
 from calibrate.kinematics import forward
 from calibrate.projection import camera_matrix, project
-from recordings.messages import BoardSpec, CameraModel
-from station.collision import ARM_BODIES, body_segments, segment_distance
-from station.plan.scene import Scene
+from recordings.schema.messages import BoardSpec, CameraModel
+from station.cell.collision import ARM_BODIES, body_segments, segment_distance
+from station.cell.scene import Scene
 from station.plan.view_range import ViewRange
 
 _ON_THE_WAY = 7

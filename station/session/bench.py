@@ -12,15 +12,15 @@ from numpy.typing import NDArray
 
 from calibrate.geometry import Array
 from recordings.errors import RecordingError
-from recordings.messages import RobotState
-from station.cell import Cell
-from station.collision import CellGeometry
+from recordings.schema.messages import RobotState
+from station.analysis.pool import Workers
+from station.cell.collision import CellGeometry
+from station.cell.status import Event, SessionStatus, StationState
+from station.cell.stillness import StillnessMonitor
+from station.devices.cell import Cell
 from station.session.queue import PoseQueue
 from station.session.recording import SessionRecording
 from station.session.store import StatusStore
-from station.status import Event, SessionStatus, StationState
-from station.stillness import StillnessMonitor
-from station.workers import Workers
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,16 +10,16 @@ import msgspec
 import numpy as np
 
 from calibrate.geometry import Array, inverse, pose_from_rotvec
-from recordings.messages import Matrix4, Picture, RobotState, Stamps, Stillness, Vector6, View
-from station.analysis import Sighting, sight
+from recordings.schema.messages import Matrix4, Picture, RobotState, Stamps, Stillness, Vector6, View
+from station.analysis.pool import WorkerError
+from station.analysis.worker import Sighting, sight
+from station.cell.errors import CameraError, StaleStateError, StationError
+from station.cell.status import PoseState, StationState
 from station.devices.frames import mid_exposure
-from station.errors import CameraError, StaleStateError, StationError
 from station.session.bench import Bench, SeenView
 from station.session.patience import RestingCheck
 from station.session.picture_watch import PictureWatch
 from station.session.recording import to_the_end
-from station.status import PoseState, StationState
-from station.workers import WorkerError
 
 STATE_WAIT_S = 1.0
 """The robot state of mid-exposure may come later than the picture, on a busy computer by this much."""

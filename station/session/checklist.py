@@ -7,13 +7,13 @@ import shutil
 
 import msgspec
 
-from calibrate.board import BoardError, check_board, describe_board
+from calibrate.boards.model import BoardError, check_board, describe_board
 from recordings.files import bytes_text
+from station.cell.errors import CameraError, RobotError
+from station.cell.status import StationState
 from station.devices.ur_condition import mode_word, not_powered, safety_stop, safety_word
 from station.devices.ur_probe import probe
-from station.errors import CameraError, RobotError
 from station.session.bench import Bench
-from station.status import StationState
 
 CLOCK_BOUND_S = 0.005
 

@@ -9,11 +9,11 @@ from collections.abc import Callable
 import msgspec
 import numpy as np
 
-from recordings.messages import CameraModel
-from station.estimation import next_best_text, running_estimate
+from recordings.schema.messages import CameraModel
+from station.analysis.estimation import next_best_text, running_estimate
+from station.analysis.pool import WorkerError
+from station.cell.status import EstimateStatus
 from station.session.bench import Bench
-from station.status import EstimateStatus
-from station.workers import WorkerError
 
 log = logging.getLogger(__name__)
 

@@ -8,17 +8,17 @@ import logging
 import numpy as np
 
 from recordings.errors import RecordingError
-from recordings.messages import Vector6
-from station.errors import RefusedError, RobotError, StaleStateError, StationError, TriggerError
-from station.plan.model import Plan, PlannedPose
+from recordings.schema.messages import Vector6
+from station.cell.errors import RefusedError, RobotError, StaleStateError, StationError, TriggerError
+from station.cell.plan import Plan, PlannedPose
+from station.cell.status import StationState
+from station.cell.stillness import NotStillError
+from station.protocol.states import refusal
 from station.session.bench import Bench
 from station.session.capture import PoseFailedError, take_pose
 from station.session.queue import GUIDED, PoseQueue
 from station.session.recording import SessionRecording
 from station.session.run import disk_failed, recover_parts, unmark_busy
-from station.states import refusal
-from station.status import StationState
-from station.stillness import NotStillError
 
 log = logging.getLogger(__name__)
 

@@ -15,12 +15,12 @@ from collections.abc import Callable
 import numpy as np
 
 from calibrate.kinematics import forward
-from recordings.messages import Vector6
-from station.errors import RobotError, StaleStateError
+from recordings.schema.messages import Vector6
+from station.cell.errors import RobotError, StaleStateError
+from station.cell.status import StationState
+from station.protocol.states import RUNNING
 from station.session.bench import Bench
 from station.session.monitor import Monitor
-from station.states import RUNNING
-from station.status import StationState
 
 log = logging.getLogger(__name__)
 

@@ -13,27 +13,27 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from calibrate.board import board_points
-from calibrate.calibration import Calibration, read_calibration
+from calibrate.boards.model import board_points
 from calibrate.errors import CalibrationError
+from calibrate.files.calibration import Calibration, read_calibration
+from calibrate.files.install import load_installed
 from calibrate.geometry import pose_from_rotvec
-from calibrate.install import load_installed
 from calibrate.kinematics import forward
 from calibrate.views import ImageView
-from recordings.messages import Vector6
-from station.analysis import sight
-from station.config import PointerConfig
-from station.errors import LimitError, RefusedError, RobotError
+from recordings.schema.messages import Vector6
+from station.analysis.worker import sight
+from station.cell.config import PointerConfig
+from station.cell.errors import LimitError, RefusedError, RobotError
+from station.cell.plan import plan_sha256
+from station.cell.status import GoSummary, HoverOffer, StationState
+from station.cell.stillness import NotStillError
 from station.plan.hover import Hover, HoverAnswer, HoverQuestion, answer_hover, least_standoff_m
-from station.plan.model import plan_sha256
 from station.session.bench import Bench
 from station.session.capture import flange_pose, matrix4
 from station.session.guard import JOGGED_RAD, displacement
 from station.session.lease import Go, GoDesk
 from station.session.patience import RestingCheck
 from station.session.run import Run
-from station.status import GoSummary, HoverOffer, StationState
-from station.stillness import NotStillError
 
 VIEW_LIFETIME_S = 900.0
 """From close above the board a camera on the flange sees nothing: one picture serves several corners."""

@@ -12,15 +12,15 @@ import msgspec
 import numpy as np
 
 from recordings.errors import RecordingError
-from station.errors import RefusedError
-from station.estimation import Seen, next_best
-from station.improvement import FEWEST_LEFT, FEWEST_VIEWS, Improvement, improve
+from station.analysis.estimation import Seen, next_best
+from station.analysis.improvement import FEWEST_LEFT, FEWEST_VIEWS, Improvement, improve
+from station.cell.errors import RefusedError
+from station.cell.status import EstimateStatus
 from station.plan.predict import Advice
 from station.session.bench import Bench
 from station.session.interrupted import look_back
 from station.session.patience import RestingCheck
 from station.session.queue import PoseQueue, Replanned
-from station.status import EstimateStatus
 
 _SHARPER = 4.0
 """So many times sharper the mount must be known than when the plan was made, to speak of it."""

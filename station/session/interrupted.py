@@ -6,15 +6,15 @@ import msgspec
 import numpy as np
 
 from recordings.errors import RecordingError
-from station.analysis import seen_before
-from station.errors import StationError
+from station.analysis.pool import WorkerError
+from station.analysis.worker import seen_before
+from station.cell.errors import StationError
+from station.cell.session_folder import interrupted_session
+from station.cell.status import StationState
 from station.session.bench import Bench, SeenView
-from station.session.folder import interrupted_session
 from station.session.queue import PoseQueue
 from station.session.recording import SessionRecording, to_the_end
 from station.session.run import recover_parts, seal, sealed
-from station.status import StationState
-from station.workers import WorkerError
 
 _LOOK_BACK_S = 120.0
 

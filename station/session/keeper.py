@@ -7,11 +7,11 @@ import contextlib
 import logging
 from collections.abc import Awaitable, Callable
 
-from station.errors import CameraError, RobotError, StationError
+from station.analysis.pool import WorkerError
+from station.cell.errors import CameraError, RobotError, StationError
+from station.cell.status import TriggerStatus
 from station.session.bench import Bench
 from station.session.monitor import camera_status
-from station.status import TriggerStatus
-from station.workers import WorkerError
 
 log = logging.getLogger(__name__)
 

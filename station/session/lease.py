@@ -8,11 +8,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from recordings.messages import Vector6
-from station.errors import RefusedError
+from recordings.schema.messages import Vector6
+from station.cell.errors import RefusedError
+from station.cell.status import GoSummary, Lease
 from station.plan.hover import Hover
 from station.session.queue import Replanned
-from station.status import GoSummary, Lease
 
 GO_LIFETIME_S = 120.0
 START_TOLERANCE_RAD = 0.005

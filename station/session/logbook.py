@@ -7,7 +7,7 @@ import logging
 from collections.abc import Callable
 
 from recordings.errors import RecordingError
-from recordings.messages import CaptureEvent
+from recordings.schema.messages import CaptureEvent
 from station.session.recording import SessionRecording, stamps_now
 
 _LEVELS = ((logging.ERROR, "error"), (logging.WARNING, "warning"), (logging.INFO, "info"))

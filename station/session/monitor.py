@@ -8,16 +8,23 @@ from pathlib import Path
 
 import msgspec
 
-from recordings.clocks import ClockFit
-from recordings.messages import RobotState
+from recordings.schema.clocks import ClockFit
+from recordings.schema.messages import RobotState
+from station.cell.errors import RobotError
+from station.cell.limits import SPEED_CAP_M_S, point_speed_m_s
+from station.cell.session_folder import CALIBRATION_FILE
+from station.cell.status import (
+    CameraStatus,
+    ClockStatus,
+    RecorderStatus,
+    RobotStatus,
+    StationState,
+    TriggerStatus,
+)
 from station.devices.ur_condition import mode_word, program_word, safety_word, what_holds
-from station.errors import RobotError
-from station.limits import SPEED_CAP_M_S, point_speed_m_s
+from station.protocol.states import RUNNING
 from station.session.bench import Bench
 from station.session.capture import flange_pose, matrix4
-from station.session.folder import CALIBRATION_FILE
-from station.states import RUNNING
-from station.status import CameraStatus, ClockStatus, RecorderStatus, RobotStatus, StationState, TriggerStatus
 
 DISK_PERIOD_S = 2.0
 FPS_PERIOD_S = 2.0

@@ -9,7 +9,7 @@ import asyncio
 import time
 from collections.abc import Callable
 
-from station.errors import StaleStateError
+from station.cell.errors import StaleStateError
 
 REST_PATIENCE_S = 1.0
 _POLL_S = 0.01

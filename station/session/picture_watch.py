@@ -11,11 +11,11 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from recordings.messages import Picture
-from station.errors import CameraError, StationError
-from station.picture_motion import board_box, picture_motion
+from recordings.schema.messages import Picture
+from station.analysis.picture_motion import board_box, picture_motion
+from station.cell.errors import CameraError, StationError
+from station.cell.stillness import Look
 from station.session.bench import Bench
-from station.stillness import Look
 
 log = logging.getLogger(__name__)
 

@@ -11,12 +11,12 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recordings.messages import Picture
-from station.analysis import Sighting, sight
-from station.errors import CameraError
+from recordings.schema.messages import Picture
+from station.analysis.pool import WorkerError
+from station.analysis.worker import Sighting, sight
+from station.cell.errors import CameraError
+from station.cell.status import StationState
 from station.session.bench import Bench
-from station.status import StationState
-from station.workers import WorkerError
 
 PERIOD_S = 0.2
 JPEG_LIMIT_BYTES = 40_000

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import msgspec
 
-from station.errors import RefusedError
-from station.plan.model import Plan, PlannedPose, plan_sha256
-from station.status import PoseState, PoseStatus
+from station.cell.errors import RefusedError
+from station.cell.plan import Plan, PlannedPose, plan_sha256
+from station.cell.status import PoseState, PoseStatus
 
 OPEN: frozenset[PoseState] = frozenset({"planned"})
 BUSY: frozenset[PoseState] = frozenset({"moving", "settling", "capturing", "writing"})

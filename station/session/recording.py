@@ -19,13 +19,20 @@ from calibrate.geometry import Array
 from recordings.errors import RecordingError
 from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, require_free_space
 from recordings.manifest import enter_part, read_manifest
-from recordings.messages import CameraModel, CaptureEvent, Picture, RobotState, SessionInfo, Stamps, View
-from recordings.poses import matrix_from_quaternion
 from recordings.recorder import Recorder
-from station.cell import Cell
-from station.errors import CameraError
-from station.plan.model import Plan
-from station.session.folder import (
+from recordings.schema.messages import (
+    CameraModel,
+    CaptureEvent,
+    Picture,
+    RobotState,
+    SessionInfo,
+    Stamps,
+    View,
+    matrix_from_quaternion,
+)
+from station.cell.errors import CameraError
+from station.cell.plan import Plan
+from station.cell.session_folder import (
     SessionState,
     clear_active,
     mark_active,
@@ -33,8 +40,9 @@ from station.session.folder import (
     part_path,
     write_state,
 )
+from station.cell.status import Event
+from station.devices.cell import Cell
 from station.session.queue import PoseQueue
-from station.status import Event
 
 _PACKAGES = (
     "calibration-station", "numpy", "scipy", "opencv-python-headless", "mcap", "ur-rtde",

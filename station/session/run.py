@@ -12,10 +12,19 @@ import msgspec
 import numpy as np
 
 from recordings.errors import RecordingError
-from recordings.messages import Picture, Vector6
 from recordings.recover import recover
-from station.errors import LimitError, RefusedError, RobotError, SafetyStopError, StationError, TriggerError
-from station.limits import check_path, with_plan_speeds
+from recordings.schema.messages import Picture, Vector6
+from station.cell.errors import (
+    LimitError,
+    RefusedError,
+    RobotError,
+    SafetyStopError,
+    StationError,
+    TriggerError,
+)
+from station.cell.limits import check_path, with_plan_speeds
+from station.cell.status import Event, StationState
+from station.cell.stillness import NotStillError
 from station.plan.standing import geometry_from
 from station.session.bench import Bench
 from station.session.capture import PoseFailedError, take_pose
@@ -23,8 +32,6 @@ from station.session.guard import JOGGED_RAD
 from station.session.lease import START_TOLERANCE_RAD, Go
 from station.session.patience import RestingCheck
 from station.session.recording import SessionRecording, to_the_end
-from station.status import Event, StationState
-from station.stillness import NotStillError
 
 log = logging.getLogger(__name__)
 

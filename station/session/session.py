@@ -17,11 +17,15 @@ from typing import Any
 import msgspec
 
 from recordings.errors import RecordingError
-from station.analysis import plan_poses
-from station.cell import Cell
-from station.errors import RefusedError, RobotError
-from station.plan.model import Plan
-from station.plan.scene import cell_geometry
+from station.analysis.pool import Workers
+from station.analysis.worker import plan_poses
+from station.cell.errors import RefusedError, RobotError
+from station.cell.plan import Plan
+from station.cell.scene import cell_geometry
+from station.cell.status import GoSummary, HoverOffer, Lease, StationState, StationStatus
+from station.cell.stillness import StillnessMonitor
+from station.devices.cell import Cell
+from station.protocol.states import RUNNING, refusal
 from station.session.bench import Bench
 from station.session.estimate import Estimator
 from station.session.free_drive import FreeDrive
@@ -38,10 +42,6 @@ from station.session.run import unmark_busy
 from station.session.runs import run_for
 from station.session.store import StatusStore
 from station.session.summary import DRIFT_CHECK, begun_anew, poses_to_drive, summarise
-from station.states import RUNNING, refusal
-from station.status import GoSummary, HoverOffer, Lease, StationState, StationStatus
-from station.stillness import StillnessMonitor
-from station.workers import Workers
 
 END_RUN_S = 10.0
 STOP_WAIT_S = 1.0

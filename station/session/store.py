@@ -9,8 +9,8 @@ from typing import Any, Literal
 
 import msgspec
 
-from station.states import check_transition
-from station.status import Event, StationState, StationStatus
+from station.cell.status import Event, StationState, StationStatus
+from station.protocol.states import check_transition
 
 log = logging.getLogger("station.events")
 

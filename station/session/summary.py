@@ -6,15 +6,15 @@ import msgspec
 
 from recordings.errors import RecordingError
 from recordings.files import require_free_space
-from station.analysis import check_run
-from station.errors import LimitError, RefusedError
-from station.limits import PlanCheck
+from station.analysis.worker import check_run
+from station.cell.errors import LimitError, RefusedError
+from station.cell.limits import PlanCheck
+from station.cell.status import GoSummary
 from station.session.bench import Bench
 from station.session.guard import displacement
 from station.session.lease import GoDesk
 from station.session.patience import RestingCheck
 from station.session.queue import PoseQueue, Replanned
-from station.status import GoSummary
 
 POSE_OVERHEAD_S = 0.8
 """Settle, expose, look, write: what a stop takes beside the move."""

@@ -5,16 +5,16 @@ from __future__ import annotations
 import asyncio
 import threading
 
-from recordings.messages import Picture
-from station.analysis import sight
+from recordings.schema.messages import Picture
+from station.analysis.worker import sight
+from station.cell.errors import CameraError, LimitError
+from station.cell.status import StationState
 from station.devices.base import StreamingCamera
-from station.errors import CameraError, LimitError
 from station.session.bench import Bench
 from station.session.capture import SIGHT_TIMEOUT_S, show_frame, take_picture
 from station.session.lease import Go
 from station.session.recording import SessionRecording
 from station.session.run import FAILURES_IN_A_ROW, Run
-from station.status import StationState
 
 BREATH_S = 0.02
 """Between two pictures, for whatever else the loop has to do: the arm's heartbeat first of all."""

@@ -6,7 +6,7 @@ import json
 import socket
 from typing import Any
 
-from station.errors import RobotError
+from station.cell.errors import RobotError
 
 PORT = 29990
 

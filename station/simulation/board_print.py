@@ -13,8 +13,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.board import APRIL_DICTIONARY, dictionary_id
-from recordings.messages import SINGLE_TAGS, BoardKind, BoardSpec
+from calibrate.boards.model import APRIL_DICTIONARY, dictionary_id
+from recordings.schema.messages import SINGLE_TAGS, BoardKind, BoardSpec
 
 Floats = NDArray[np.float32]
 

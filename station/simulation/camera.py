@@ -12,12 +12,12 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from recordings.clocks import ClockFit
-from recordings.messages import CameraIdentity, Picture, Stamps
-from station.config import CameraConfig
+from recordings.schema.clocks import ClockFit
+from recordings.schema.messages import CameraIdentity, Picture, Stamps
+from station.cell.config import CameraConfig
+from station.cell.errors import CameraError
 from station.devices.base import Trigger
 from station.devices.frames import CameraCounts, DeviceClock, FrameCounter
-from station.errors import CameraError
 from station.simulation.cell import CellTruth
 
 START_TIMEOUT_S = 20.0

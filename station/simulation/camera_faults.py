@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.geometry import Array, pose_from_rotvec
-from recordings.messages import BoardSpec
+from recordings.schema.messages import BoardSpec
 
 ONE_SHOT = ("missed-trigger", "lost-frame", "double-frame")
 """value: how often, 1 if none is given"""

@@ -17,8 +17,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.geometry import Array, inverse
-from recordings.messages import CameraModel
-from station.errors import RobotError
+from recordings.schema.messages import CameraModel
+from station.cell.errors import RobotError
 from station.simulation.admin import AdminClient
 from station.simulation.camera_faults import CameraFaults
 from station.simulation.cell import CellTruth

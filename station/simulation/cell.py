@@ -11,8 +11,8 @@ from typing import Literal
 
 import msgspec
 
-from recordings.messages import BoardSpec, CameraModel, Matrix4, Mount, Vector6
-from station.errors import ConfigError
+from recordings.schema.messages import BoardSpec, CameraModel, Matrix4, Mount, Vector6
+from station.cell.errors import ConfigError
 
 SceneName = Literal["paper", "blog", "paper-binned"]
 NoiseLevel = Literal["low", "mid", "high"]

@@ -26,8 +26,8 @@ import typer
 from numpy.typing import NDArray
 
 from calibrate.kinematics import MODELS, forward
+from station.cell.errors import CameraError, RobotError
 from station.devices.pixels import encode
-from station.errors import CameraError, RobotError
 from station.simulation import genicam
 from station.simulation.camera_process import CameraProcess
 from station.simulation.cell import CellTruth, make_cell, read_truth

@@ -8,7 +8,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from station.errors import CameraError
+from station.cell.errors import CameraError
 from station.simulation.netns import is_isolated
 
 _STOP_TIMEOUT_S = 3.0

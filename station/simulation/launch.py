@@ -12,7 +12,7 @@ import time
 from pathlib import Path
 from types import TracebackType
 
-from station.errors import RobotError
+from station.cell.errors import RobotError
 from station.simulation.admin import AdminClient
 
 ATTEMPTS = 5

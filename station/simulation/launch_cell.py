@@ -9,11 +9,11 @@ from typing import TYPE_CHECKING
 
 import msgspec
 
-from recordings.messages import Mount
-from station.cell import Cell
-from station.config import StationConfig, TriggerConfig
+from recordings.schema.messages import Mount
+from station.cell.config import StationConfig, TriggerConfig
+from station.cell.errors import ConfigError, StationError
 from station.devices.base import Camera, Trigger
-from station.errors import ConfigError, StationError
+from station.devices.cell import Cell
 from station.simulation.cell import CellTruth, NoiseLevel, SceneName, make_cell, write_truth
 from station.simulation.launch import start_controller
 

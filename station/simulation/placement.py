@@ -10,15 +10,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from calibrate.board import board_points
+from calibrate.boards.model import board_points
 from calibrate.geometry import Array, inverse, pose, quaternion_from_matrix, rotation_exp, transform_points
 from calibrate.kinematics import MODELS, forward, inverse_all, singularity_measure
-from recordings.messages import BoardSpec, CameraModel, Mount
-from station.collision import body_segments, margins, segment_distance
-from station.config import CameraConfig, LimitsConfig, Plane, PoseGuess, RobotConfig, StationConfig
-from station.errors import ConfigError
+from recordings.schema.messages import BoardSpec, CameraModel, Mount
+from station.cell.collision import body_segments, margins, segment_distance
+from station.cell.config import CameraConfig, LimitsConfig, Plane, PoseGuess, RobotConfig, StationConfig
+from station.cell.errors import ConfigError
+from station.cell.scene import Scene, scene_of
 from station.plan.candidates import find_candidates
-from station.plan.scene import Scene, scene_of
 from station.plan.view_range import view_range
 
 ROBOT = "UR10"

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.geometry import Array, is_rigid
-from recordings.messages import BoardSpec, CameraModel
+from recordings.schema.messages import BoardSpec, CameraModel
 from station.simulation.board_print import BoardPrint, Floats, board_print
 
 TABLE_ALBEDO = 0.30

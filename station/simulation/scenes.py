@@ -14,9 +14,9 @@ from numpy.typing import ArrayLike
 
 from calibrate.geometry import Array, pose, project_to_rotation, random_rotation, rotation_exp
 from calibrate.kinematics import MODELS, forward
-from recordings.messages import BoardSpec, CameraModel, Matrix4, Mount, Vector6
-from station.config import BLOG_BOARD, PAPER_BOARD, PoseGuess, StationConfig
-from station.errors import ConfigError
+from recordings.schema.messages import BoardSpec, CameraModel, Matrix4, Mount, Vector6
+from station.cell.config import BLOG_BOARD, PAPER_BOARD, PoseGuess, StationConfig
+from station.cell.errors import ConfigError
 from station.simulation.cell import CellTruth, NoiseLevel, SceneName
 from station.simulation.placement import (
     Placement,

@@ -21,10 +21,10 @@ from textual.binding import Binding, BindingType
 from textual.message import Message
 from textual.screen import Screen
 
-from station.client import Client
-from station.errors import StationError
-from station.status import StationState, StationStatus
-from station.stop_client import send_stop
+from station.cell.errors import StationError
+from station.cell.status import StationState, StationStatus
+from station.protocol.client import Client
+from station.protocol.stop_client import send_stop
 from station.tui import offline
 from station.tui.attendance import Attended
 from station.tui.checklist import ChecklistScreen

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from textual import events
 
-from station.states import RUNNING
+from station.protocol.states import RUNNING
 from station.tui.commands import Commands
 
 WHERE_IS_THE_CURSOR = "\x1b[6n"

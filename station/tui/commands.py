@@ -10,10 +10,10 @@ from textual import work
 from textual.app import App
 from textual.reactive import reactive
 
-from station.errors import RefusedError, StationError
-from station.protocol import Verb
-from station.states import RUNNING, refusal
-from station.status import GoSummary, SessionStatus, StationState, StationStatus
+from station.cell.errors import RefusedError, StationError
+from station.cell.status import GoSummary, SessionStatus, StationState, StationStatus
+from station.protocol.messages import Verb
+from station.protocol.states import RUNNING, refusal
 from station.tui.confirm import Confirm, ConfirmGo
 from station.tui.link import Link
 from station.tui.replay_screen import ReplayScreen
@@ -39,7 +39,7 @@ class Commands(App[None]):
     link: Link | None = None
     """The connection while there is one."""
     stop_unconnected: Callable[[], bool] = staticmethod(lambda: False)
-    """Sends STOP where there is no connection (`station.stop_client.send_stop`); False: nobody listens."""
+    """Sends STOP where there is no connection (`protocol.stop_client.send_stop`); False: nobody listens."""
     silent_s: float | None = None
     """For how long the daemon has not answered; None while it does."""
     trouble = ""

@@ -11,7 +11,7 @@ from textual.containers import Horizontal, Vertical
 from textual.screen import ModalScreen
 from textual.widgets import Button, Label, Static
 
-from station.status import GoSummary
+from station.cell.status import GoSummary
 from station.tui.words import degrees, duration
 
 WIDTH, INDENT = 70, 11

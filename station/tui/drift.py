@@ -6,8 +6,8 @@ import asyncio
 from typing import TYPE_CHECKING, Any
 
 from calibrate.errors import CalibrationError
-from station.drift_check import POSES, SEED, never_run, require_installed
-from station.status import SessionStatus, StationState
+from station.cell.status import SessionStatus, StationState
+from station.operate.drift_check import POSES, SEED, never_run, require_installed
 from station.tui import offline
 
 if TYPE_CHECKING:

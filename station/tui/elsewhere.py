@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from calibrate.generations import calibrations_folder
+from calibrate.files.generations import calibrations_folder
 
 LOOK_S = 2.0
 Marks = frozenset[tuple[str, int]]

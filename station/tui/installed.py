@@ -8,10 +8,10 @@ from functools import lru_cache
 from itertools import pairwise
 from pathlib import Path
 
-from calibrate.calibration import Calibration, read_calibration
 from calibrate.errors import CalibrationError
-from calibrate.generations import LogEntry, calibrations_folder, read_log, same_solve
-from calibrate.install import load_installed
+from calibrate.files.calibration import Calibration, read_calibration
+from calibrate.files.generations import LogEntry, calibrations_folder, read_log, same_solve
+from calibrate.files.install import load_installed
 
 
 @dataclass(frozen=True)

@@ -8,13 +8,13 @@ from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
 from typing import Any, Protocol
 
-from station.errors import RefusedError
-from station.protocol import Verb
-from station.status import StationStatus
+from station.cell.errors import RefusedError
+from station.cell.status import StationStatus
+from station.protocol.messages import Verb
 
 
 class Link(Protocol):
-    """What the screen needs of a connection; `station.client.Client` is one, tests bring another."""
+    """What the screen needs of a connection; `station.protocol.client.Client` is one, tests bring another."""
 
     root: Path | None
     """Below which the daemon keeps sessions and what is installed."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from textual.app import ComposeResult
 from textual.widgets import RichLog
 
-from station.status import Event, StationStatus
+from station.cell.status import Event, StationStatus
 from station.tui.screen import StationScreen
 from station.tui.widgets.events import event_text
 

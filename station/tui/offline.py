@@ -12,10 +12,10 @@ from textual.screen import ModalScreen
 from textual.widgets import Input, Label, OptionList, Static
 from textual.widgets.option_list import Option
 
-from calibrate.formats import FORMATS
-from calibrate.generations import Generation, before_current, generations
-from calibrate.install import reason_problem
-from station.drift_check import check_arguments
+from calibrate.files.exports import FORMATS
+from calibrate.files.generations import Generation, before_current, generations
+from calibrate.files.install import reason_problem
+from station.operate.drift_check import check_arguments
 from station.tui.confirm import Confirm
 from station.tui.installed import local
 from station.tui.jobs import JobScreen

@@ -11,8 +11,8 @@ from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
 from textual.widgets import DataTable, Static
 
-from station.protocol import Verb
-from station.status import PoseStatus, StationStatus
+from station.cell.status import PoseStatus, StationStatus
+from station.protocol.messages import Verb
 from station.tui.screen import StationScreen
 from station.tui.widgets.rows import Rows
 from station.tui.widgets.sketch import PlanSketch

@@ -13,12 +13,12 @@ import cv2
 import msgspec
 import numpy as np
 
-from calibrate.detect import Detection, detect
+from calibrate.boards.detect import Detection, detect
 from recordings.errors import RecordingError
-from recordings.messages import View
-from station.errors import RefusedError, StationError
-from station.protocol import Verb
-from station.status import DetectionStatus, StationStatus
+from recordings.schema.messages import View
+from station.cell.errors import RefusedError, StationError
+from station.cell.status import DetectionStatus, StationStatus
+from station.protocol.messages import Verb
 from station.tui.timeline import END_TEXT, Timeline
 from station.tui.words import duration
 

@@ -7,7 +7,7 @@ from typing import ClassVar
 from textual import work
 from textual.binding import Binding, BindingType
 
-from station.status import StationState, StationStatus
+from station.cell.status import StationState, StationStatus
 from station.tui.live import LiveScreen
 from station.tui.replay import ReplayLink
 

@@ -15,12 +15,12 @@ from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, VerticalScroll
 from textual.widgets import Static
 
-from calibrate.calibration import Calibration, read_calibration
 from calibrate.errors import CalibrationError
-from calibrate.generations import same_solve
+from calibrate.files.calibration import Calibration, read_calibration
+from calibrate.files.generations import same_solve
+from calibrate.files.install import objections_beside
+from calibrate.files.verification import agrees, touch_text
 from calibrate.geometry import difference
-from calibrate.install import objections_beside
-from calibrate.verification import agrees, touch_text
 from station.tui.elsewhere import LOOK_S, Marks, marks
 from station.tui.installed import Ended, Installed, read_installed
 from station.tui.offline import state_root

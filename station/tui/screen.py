@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, cast
 from textual.app import ComposeResult
 from textual.screen import Screen
 
-from station.status import StationStatus
+from station.cell.status import StationStatus
 from station.tui.widgets.bar import ReasonLine, StatusBar
 from station.tui.widgets.keys import Keys
 

@@ -10,8 +10,8 @@ from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.widgets import Static
 
-from station.drift_check import POSES
-from station.states import RUNNING
+from station.operate.drift_check import POSES
+from station.protocol.states import RUNNING
 from station.tui.elsewhere import LOOK_S, Marks, marks
 from station.tui.installed import Installed, read_installed
 from station.tui.screen import StationScreen

@@ -8,10 +8,10 @@ import msgspec
 import numpy as np
 
 from calibrate.geometry import Array, pose_from_rotvec
-from recordings.messages import CaptureEvent, Matrix4, RobotState, View
 from recordings.plain_text import plain_text
 from recordings.reader import open_recording
-from station.status import (
+from recordings.schema.messages import CaptureEvent, Matrix4, RobotState, View
+from station.cell.status import (
     CameraStatus,
     EstimateStatus,
     Event,

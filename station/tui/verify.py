@@ -14,17 +14,16 @@ from textual.screen import ModalScreen
 from textual.widgets import Input, Label, OptionList, Static
 from textual.widgets.option_list import Option
 
-from calibrate.board import board_points
-from calibrate.calibration import Touch, read_calibration
+from calibrate.boards.model import board_points
 from calibrate.errors import CalibrationError
-from calibrate.generations import same_solve
-from calibrate.install import load_installed
-from calibrate.verification import note_in_file, note_installed, touch_text
-from recordings.messages import BoardSpec
-from station.errors import RefusedError, StationError
-from station.plan.hover import outer_corners
-from station.status import HoverOffer, StationState, StationStatus
-from station.touching import (
+from calibrate.files.calibration import Touch, read_calibration
+from calibrate.files.generations import same_solve
+from calibrate.files.install import load_installed
+from calibrate.files.verification import note_in_file, note_installed, touch_text
+from recordings.schema.messages import BoardSpec
+from station.cell.errors import RefusedError, StationError
+from station.cell.status import HoverOffer, StationState, StationStatus
+from station.operate.touching import (
     Hovering,
     axes_words,
     read_offset_mm,
@@ -33,6 +32,7 @@ from station.touching import (
     touch_of,
     two_numbers,
 )
+from station.plan.hover import outer_corners
 from station.tui.confirm import ConfirmGo
 from station.tui.offline import state_root
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 
-from station.status import PoseState, StationState
+from station.cell.status import PoseState, StationState
 
 STATE_WORDS: dict[StationState, str] = {
     StationState.DISCONNECTED: "NO ROBOT",

@@ -7,8 +7,7 @@ from subprocess import CompletedProcess
 
 import pytest
 
-from calibrate.cli import main
-from calibrate.commands import output
+from calibrate.cli import main, output
 from tests.command_line import call
 
 

@@ -9,11 +9,11 @@ import numpy as np
 
 from benchmarks.scene import HIGH, LOW, MID, PAPER_CAMERA, Cell, Noise, make_cell
 from calibrate.geometry import Array, difference, perturb, pose, random_rotation
-from calibrate.pnp import solve_pnp
+from calibrate.handeye.solution import Solution
+from calibrate.lens.pnp import solve_pnp
 from calibrate.projection import project_pixels
-from calibrate.solution import Solution
 from calibrate.views import ImageView, ViewSet
-from recordings.messages import CameraModel, Mount
+from recordings.schema.messages import CameraModel, Mount
 
 __all__ = [
     "HIGH",

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.calibration import FramePose, write_calibration
+from calibrate.files.calibration import FramePose, write_calibration
 from calibrate.geometry import Transform, perturb
 from calibrate.pipeline import SolvedRecording, solve_recording
 from tests.calibrate.sessions import Scene, write_session

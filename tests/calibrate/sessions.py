@@ -9,9 +9,9 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from calibrate.board import board_points
+from calibrate.boards.model import board_points
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp
-from recordings.messages import (
+from recordings.schema.messages import (
     BoardKind,
     BoardSpec,
     CameraIdentity,

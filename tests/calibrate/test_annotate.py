@@ -11,8 +11,8 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from calibrate.annotate import AnnotateError, annotate
-from calibrate.calibration import Calibration, FramePose, Rejected, read_calibration
 from calibrate.cli import main
+from calibrate.files.calibration import Calibration, FramePose, Rejected, read_calibration
 from recordings.reader import open_recording
 from tests.command_line import call
 

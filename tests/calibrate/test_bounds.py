@@ -15,8 +15,8 @@ import numpy as np
 import pytest
 
 from calibrate.bounds import SolveLimitError, bounded
-from calibrate.calibration import read_calibration, write_calibration
 from calibrate.errors import CalibrationError
+from calibrate.files.calibration import read_calibration, write_calibration
 from calibrate.pipeline import SolvedRecording
 
 PROGRAM = (sys.executable, "-m", "calibrate.cli", "solve")

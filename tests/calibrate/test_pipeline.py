@@ -11,16 +11,17 @@ import numpy as np
 import pytest
 import yaml
 
-from calibrate.calibration import encode_calibration
 from calibrate.errors import BadViewsError, CalibrationError, TooFewViewsError
+from calibrate.files.calibration import encode_calibration
 from calibrate.geometry import Array, difference
 from calibrate.handeye.poses import pose_views
 from calibrate.handeye.readings import Reading, explain_recording
 from calibrate.load import load_views
-from calibrate.pipeline import JobOptions, SolvedRecording, prepare_views, solve_recording
-from recordings.importer import import_folder
-from recordings.messages import BoardKind, BoardSpec, CameraModel
+from calibrate.options import JobOptions
+from calibrate.pipeline import SolvedRecording, prepare_views, solve_recording
+from recordings.importers.folder import import_folder
 from recordings.reader import open_recording
+from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
 from tests.calibrate.sessions import CAMERA, SYMMETRIC_BOARD, X_TRUE, Scene, write_session
 
 
@@ -110,7 +111,7 @@ def test_three_views_are_too_few(tmp_path: Path) -> None:
 
 def test_turns_about_one_axis_are_refused_with_the_missing_direction(tmp_path: Path) -> None:
     """Fault 41: the camera only rolls about its own axis."""
-    from calibrate.board import board_points
+    from calibrate.boards.model import board_points
     from calibrate.geometry import pose, rotation_exp
     from tests.calibrate.sessions import PAPER_BOARD
 

@@ -11,7 +11,7 @@ from calibrate.projection import (
     project,
     with_intrinsics_vector,
 )
-from recordings.messages import CameraModel
+from recordings.schema.messages import CameraModel
 
 PLAIN = CameraModel(
     1280,

@@ -14,9 +14,9 @@ from typing import Any
 
 import pytest
 
-from station.config import RobotConfig
+from station.cell.config import RobotConfig
+from station.cell.errors import RobotError
 from station.devices.ur import UrRobot
-from station.errors import RobotError
 from station.simulation.admin import AdminClient
 from station.simulation.camera import RenderedCamera
 from station.simulation.cell import make_cell, write_truth

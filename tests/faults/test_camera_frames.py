@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from station.cell.errors import CameraError
 from station.devices.frames import LAST_FRAME_ID, FrameCounter, next_frame_id
-from station.errors import CameraError
 from station.simulation.camera import RenderedCamera
 
 

@@ -15,10 +15,10 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from recordings.messages import Picture
-from station.config import CameraConfig
+from recordings.schema.messages import Picture
+from station.cell.config import CameraConfig
+from station.cell.errors import CameraError
 from station.devices.aravis import AravisCamera
-from station.errors import CameraError
 from station.simulation import genicam
 from station.simulation.gige import numbered_picture
 from station.simulation.gige_launch import SimulatedGige, start_gige
@@ -167,7 +167,7 @@ async def test_an_unplugged_camera_is_gone_and_comes_back_by_its_serial(server: 
 
 _LOST_AND_FORGOTTEN = """
 import gc, sys, time
-from station.config import CameraConfig
+from station.cell.config import CameraConfig
 from station.devices.aravis_device import GenicamDevice
 from station.simulation.gige_launch import start_gige
 

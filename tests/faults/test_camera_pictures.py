@@ -7,11 +7,11 @@ from typing import Any
 import msgspec
 import pytest
 
-from calibrate.detect import detect
-from recordings.messages import BoardKind, BoardSpec
-from station.config import PAPER_BOARD
-from station.errors import CameraError
-from station.exposure import assess
+from calibrate.boards.detect import detect
+from recordings.schema.messages import BoardKind, BoardSpec
+from station.analysis.exposure import assess
+from station.cell.config import PAPER_BOARD
+from station.cell.errors import CameraError
 from station.simulation.camera import RenderedCamera
 
 pytestmark = pytest.mark.process

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from station.picture_motion import picture_motion
+from station.analysis.picture_motion import picture_motion
 from station.simulation.camera import RenderedCamera
 from station.simulation.cell import make_cell
 

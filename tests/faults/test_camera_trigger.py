@@ -7,10 +7,10 @@ from collections.abc import AsyncIterator, Iterator
 
 import pytest
 
-from station.config import TriggerConfig
+from station.cell.config import TriggerConfig
+from station.cell.errors import TriggerError
 from station.devices import serial_trigger
 from station.devices.serial_trigger import SerialTrigger
-from station.errors import TriggerError
 from station.simulation.trigger import SimulatedTriggerBox
 
 

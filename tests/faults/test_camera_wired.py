@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from station.cell import Cell
-from station.errors import CameraError
+from station.cell.errors import CameraError
+from station.devices.cell import Cell
 from station.simulation.camera import RenderedCamera
 from station.simulation.launch_cell import SimulationOptions, simulated_cell
 

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
-from station.config import RobotConfig
+from station.cell.config import RobotConfig
+from station.cell.errors import RobotError, SafetyStopError, StaleStateError
 from station.devices.ur import UrRobot
-from station.errors import RobotError, SafetyStopError, StaleStateError
 from station.simulation.launch import SimulatedController
 
 pytestmark = pytest.mark.process

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from station.errors import RobotError
+from station.cell.errors import RobotError
 from station.simulation.launch import SimulatedController
 
 pytestmark = pytest.mark.process

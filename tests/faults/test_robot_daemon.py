@@ -13,14 +13,14 @@ from typing import Any
 
 import pytest
 
-from station.errors import RobotError
+from station.cell.errors import RobotError
 
 pytestmark = pytest.mark.process
 
 DRIVER = """
 import asyncio, sys
 from pathlib import Path
-from station.config import RobotConfig
+from station.cell.config import RobotConfig
 from station.devices.ur import UrRobot
 
 async def main(host, folder):

@@ -9,8 +9,8 @@ from typing import Any
 
 import pytest
 
+from station.cell.errors import RobotError, SafetyStopError, StaleStateError
 from station.devices.ur_child import ControlChild
-from station.errors import RobotError, SafetyStopError, StaleStateError
 
 pytestmark = pytest.mark.process
 

@@ -11,13 +11,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from station.config import RobotConfig
+from station.cell.config import RobotConfig
+from station.cell.errors import LimitError, RefusedError
+from station.cell.plan import Plan, PlannedPose
+from station.cell.status import StationState as S
 from station.devices.ur import UrRobot
-from station.errors import LimitError, RefusedError
-from station.plan.model import Plan, PlannedPose
 from station.simulation.admin import AdminClient
 from station.simulation.launch import SimulatedController
-from station.status import StationState as S
 from tests.station.session_rig import TRUTH, Rig
 
 pytestmark = pytest.mark.process

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
+from station.cell.errors import RobotError
 from station.devices import ur_moves
-from station.errors import RobotError
 
 pytestmark = pytest.mark.process
 

@@ -12,9 +12,9 @@ from typing import Any
 
 import pytest
 
+from station.cell.errors import RobotError, SafetyStopError
 from station.devices.ur import LEFTOVER_WAIT_NS, UrRobot
 from station.devices.ur_child import END_S, HEARD_S
-from station.errors import RobotError, SafetyStopError
 
 pytestmark = pytest.mark.process
 

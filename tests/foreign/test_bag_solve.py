@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from rosbags.highlevel import AnyReader
 
-from calibrate.calibration import read_calibration
 from calibrate.cli import main as calibrate
+from calibrate.files.calibration import read_calibration
 from recordings.cli import main as recordings
 from tests.command_line import call
 from tests.foreign.judges import JUDGES

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import pytest
 
-from recordings.excerpt import write_excerpt
-from recordings.export import Target, export_recording
-from recordings.messages import CaptureEvent, Stamps
+from recordings.exporters.excerpt import write_excerpt
+from recordings.exporters.folder import Target, export_recording
 from recordings.reader import open_recording
 from recordings.recover import recover
+from recordings.schema.messages import CaptureEvent, Stamps
 from recordings.writer import RecordingWriter
 from tests.foreign.judges import JUDGES
 from tests.recordings.small_recording import START_NS, make_info, make_picture, make_state, make_view

@@ -15,8 +15,8 @@ from recordings.errors import RecordingError
 from recordings.importers import Limits, Wanted, import_bag
 from recordings.importers.stops import JOINT_SPEED_RAD_S, LEAST_SAMPLES
 from recordings.reader import open_recording
-from station.config import StillnessConfig
-from station.stillness import LEAST_SAMPLES as STATION_LEAST_SAMPLES
+from station.cell.config import StillnessConfig
+from station.cell.stillness import LEAST_SAMPLES as STATION_LEAST_SAMPLES
 from tests.command_line import call
 from tests.foreign.bags import (
     START_NS,

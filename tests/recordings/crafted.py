@@ -10,9 +10,9 @@ from pathlib import Path
 import msgspec
 
 from recordings.mcap.records import MAGIC, Opcode, with_crc
-from recordings.messages import SessionInfo
-from recordings.schema import FORMATS
-from recordings.topics import Topic, schema_bytes, schema_name
+from recordings.schema.definitions import FORMATS
+from recordings.schema.messages import SessionInfo
+from recordings.schema.topics import Topic, schema_bytes, schema_name
 from tests.recordings.small_recording import make_info
 
 

@@ -17,11 +17,11 @@ from mcap.records import Chunk, Message
 from mcap.stream_reader import StreamReader, breakup_chunk
 
 from recordings.errors import RecordingError
-from recordings.messages import View
 from recordings.reader import open_recording
 from recordings.recover import recover
-from recordings.schema import decode
-from recordings.topics import Topic
+from recordings.schema.definitions import decode
+from recordings.schema.messages import View
+from recordings.schema.topics import Topic
 from tests.recordings.small_recording import write_small
 
 SAMPLE = Path(__file__).parents[2] / "recordings" / "samples" / "paper-640.mcap"

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from recordings.messages import (
+from recordings.schema.messages import (
     BoardKind,
     BoardSpec,
     CameraModel,

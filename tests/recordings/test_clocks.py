@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from recordings.clocks import ClockEstimator, ClockFit, monotonic_from_wall_ns
+from recordings.schema.clocks import ClockEstimator, ClockFit, monotonic_from_wall_ns
 
 OFFSET_NS = 5_000_000_000_000
 
@@ -141,7 +141,7 @@ def test_a_thread_held_up_between_two_clocks_never_stamps_too_early(
         now_ns += held_up_ns
         return now_ns + offset_ns
 
-    monkeypatch.setattr("recordings.clocks.time.monotonic_ns", lambda: read(0))
-    monkeypatch.setattr("recordings.clocks.time.time_ns", lambda: read(OFFSET_NS))
+    monkeypatch.setattr("recordings.schema.clocks.time.monotonic_ns", lambda: read(0))
+    monkeypatch.setattr("recordings.schema.clocks.time.time_ns", lambda: read(OFFSET_NS))
     arrived_ns = now_ns - 300_000
     assert arrived_ns <= monotonic_from_wall_ns(arrived_ns + OFFSET_NS) <= arrived_ns + held_up_ns

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import msgspec
 
-from recordings.messages import Stamps
+from recordings.schema.messages import Stamps
 from recordings.writer import RecordingWriter
 from tests.recordings.small_recording import START_NS, make_info, make_state
 

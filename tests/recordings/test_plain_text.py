@@ -11,14 +11,14 @@ import pytest
 from rich.table import Table
 from rich.text import Text
 
-from calibrate.calibration import CalibrationFileError, decode_calibration
+from calibrate.files.calibration import CalibrationFileError, decode_calibration
 from recordings.cli import main as recordings_main
-from recordings.console import plain_console
-from recordings.dataset import Dataset
+from recordings.cli.console import plain_console
 from recordings.errors import RecordingError, printed
+from recordings.importers.dataset import Dataset
 from recordings.plain_text import plain_data, plain_text
 from recordings.strict_yaml import StrictYamlError, load, load_plain
-from station import client
+from station.protocol import client
 from tests.command_line import call
 
 HOSTILE = "a\x1b[31mb\x1b]0;title\x07c\x9b2Jd\x7fe\u202ef"

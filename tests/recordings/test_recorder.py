@@ -12,10 +12,10 @@ import pytest
 
 from recordings import recorder as recorder_module
 from recordings.errors import RecordingError
-from recordings.messages import CaptureEvent, Stamps
 from recordings.reader import open_recording
 from recordings.recorder import Recorder
-from recordings.schema import encode
+from recordings.schema.definitions import encode
+from recordings.schema.messages import CaptureEvent, Stamps
 from recordings.writer import RecordingWriter
 from tests.recordings.small_recording import make_info, make_picture, make_state, make_view
 

@@ -11,9 +11,9 @@ import msgspec
 import numpy as np
 import pytest
 
-from recordings.messages import CameraModel, Stamps
 from recordings.reader import open_recording
 from recordings.recorder import Recorder
+from recordings.schema.messages import CameraModel, Stamps
 from tests.recordings.small_recording import make_info, make_picture, make_state
 
 WIDTH, HEIGHT, FRAMES_A_SECOND, STATES_A_SECOND = 1280, 1024, 75, 500

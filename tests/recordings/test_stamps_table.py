@@ -10,11 +10,11 @@ import zstandard
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from recordings.messages import Stamps
 from recordings.reader import open_recording
-from recordings.schema import encode
+from recordings.schema.definitions import encode
+from recordings.schema.messages import Stamps
+from recordings.schema.topics import Topic
 from recordings.stream_quality import Steps
-from recordings.topics import Topic
 from tests.recordings.crafted import Counts, channel, chunk, message, schema, sealed, session_metadata
 from tests.recordings.small_recording import make_state
 

@@ -9,10 +9,10 @@ from typing import Any
 import pytest
 
 from recordings.errors import RecordingError
-from station.plan.model import Plan
+from station.cell.plan import Plan
+from station.cell.status import StationState
 from station.plan.planner import make_plan
 from station.session.recording import SessionRecording
-from station.status import StationState
 from tests.station.session_rig import POSES, TRUTH, HeldDisk, NewRig, Rig, memory_config
 
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from calibrate.board import board_points
-from calibrate.calibration import (
+from calibrate.boards.model import board_points
+from calibrate.files.calibration import (
     FORMAT,
     Calibration,
     FramePose,
@@ -17,10 +17,10 @@ from calibrate.calibration import (
     Views,
 )
 from calibrate.geometry import Array, Transform, inverse, perturb
-from calibrate.lens import project
+from calibrate.lens.model import project
 from calibrate.views import ImageView
-from recordings.messages import CameraIdentity, RobotIdentity
-from station.config import PointerConfig
+from recordings.schema.messages import CameraIdentity, RobotIdentity
+from station.cell.config import PointerConfig
 from station.simulation.cell import CellTruth
 
 SIGMA_M, SIGMA_RAD = 5e-5, 1e-4

@@ -11,21 +11,21 @@ from typing import Any
 import msgspec
 import numpy as np
 
-from calibrate.board import board_points
+from calibrate.boards.model import board_points
 from calibrate.geometry import rotation_log
 from calibrate.kinematics import MODELS, forward
-from recordings.messages import CameraIdentity, Picture, RobotIdentity, RobotState, Stamps
 from recordings.reader import Recording, open_recording
-from station.analysis import Sighting, sight
-from station.cell import Cell
-from station.config import StationConfig
+from recordings.schema.messages import CameraIdentity, Picture, RobotIdentity, RobotState, Stamps
+from station.analysis.worker import Sighting, sight
+from station.cell.config import StationConfig
+from station.cell.errors import CameraError, RobotError, StaleStateError
+from station.cell.status import DetectionStatus, StationState
 from station.devices.base import Robot
+from station.devices.cell import Cell
 from station.devices.frames import CameraCounts
-from station.errors import CameraError, RobotError, StaleStateError
 from station.session import Session
 from station.simulation.cell import make_cell
 from station.simulation.scenes import cell_config
-from station.status import DetectionStatus, StationState
 
 TRUTH = make_cell()
 POSES = 4

@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from station.cell import Cell
 from station.daemon import Daemon
+from station.devices.cell import Cell
 from tests.station.session_rig import ArmInMemory, CameraInMemory, WorkerInThisProcess, memory_config
 
 

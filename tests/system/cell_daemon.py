@@ -14,8 +14,8 @@ from pathlib import Path
 
 import msgspec
 
-from station.cell import Cell
-from station.cli_serve import serve_cell
+from station.cli.serve import serve_cell
+from station.devices.cell import Cell
 from station.devices.ur import UrRobot
 from station.simulation.camera import RenderedCamera
 from station.simulation.cell import read_truth

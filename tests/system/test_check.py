@@ -7,7 +7,7 @@ import sys
 
 import pytest
 
-from station.status import StationState as S
+from station.cell.status import StationState as S
 from tests.system.conftest import SystemRig, status_when
 
 pytestmark = pytest.mark.process

@@ -14,10 +14,10 @@ from pathlib import Path
 import pytest
 
 from recordings.reader import open_recording
-from station.client import Client, DaemonGoneError
-from station.plan.model import Plan
-from station.status import StationState as S
-from station.stop_client import Outcome, stop
+from station.cell.plan import Plan
+from station.cell.status import StationState as S
+from station.protocol.client import Client, DaemonGoneError
+from station.protocol.stop_client import Outcome, stop
 from tests.system.conftest import SystemRig, go, status_when
 
 pytestmark = pytest.mark.process

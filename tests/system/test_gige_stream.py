@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 
 from benchmarks.daemon_stream import HEADER, measure, row
-from station.config import CameraConfig
+from station.cell.config import CameraConfig
+from station.cell.errors import StationError
 from station.devices.aravis_device import GenicamDevice
-from station.errors import StationError
 from station.simulation.netns import isolated_thread
 
 pytestmark = pytest.mark.process

@@ -8,11 +8,11 @@ import msgspec
 import pytest
 
 from recordings.reader import open_recording
-from station.attend import carry_out, wait_until_idle
-from station.client import Client
-from station.demo import simulated_daemon
+from station.cli.demo import simulated_daemon
 from station.devices.frames import frames_between
+from station.operate.attend import carry_out, wait_until_idle
 from station.plan.planner import make_plan
+from station.protocol.client import Client
 from station.simulation.cell import make_cell
 from station.simulation.scenes import cell_config
 

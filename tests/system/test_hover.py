@@ -9,21 +9,21 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.board import board_points
-from calibrate.calibration import Touch, read_calibration, write_calibration
+from calibrate.boards.model import board_points
+from calibrate.files.calibration import Touch, read_calibration, write_calibration
+from calibrate.files.verification import agrees, note_in_file
 from calibrate.geometry import Array, inverse, pose
 from calibrate.kinematics import MODELS, forward
-from calibrate.verification import agrees, note_in_file
-from recordings.messages import CameraIdentity, Matrix4, RobotIdentity
-from station.client import Client
-from station.limits import point_speed_m_s
+from recordings.schema.messages import CameraIdentity, Matrix4, RobotIdentity
+from station.cell.limits import point_speed_m_s
+from station.cell.status import HoverOffer, StationStatus
+from station.cell.status import StationState as S
+from station.operate.touching import read_offset_mm, tip_on_board_m
 from station.plan.hover import SPEED_M_S, board_from_tip, hover_geometry
+from station.protocol.client import Client
 from station.simulation.cell import CellTruth, write_truth
 from station.simulation.placement import board_centre
 from station.simulation.scenes import cell_config
-from station.status import HoverOffer, StationStatus
-from station.status import StationState as S
-from station.touching import read_offset_mm, tip_on_board_m
 from tests.station.hover_cell import POINTER, SIGMA_M, SIGMA_RAD, calibration_of
 from tests.system.conftest import TRUTH, SystemRig, status_when
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from calibrate.sweep import sweep_time_offset
+from calibrate.quality.sweep import sweep_time_offset
 from recordings.reader import open_recording
 from station.simulation.camera_process import READOUT_NS
 from station.simulation.cell import read_truth

@@ -18,11 +18,11 @@ from pathlib import Path
 import pytest
 
 import recordings
-from calibrate.calibration import read_calibration
+from calibrate.files.calibration import read_calibration
 from recordings.reader import open_recording
-from station.client import Client
-from station.plan.model import Plan
-from station.status import StationState as S
+from station.cell.plan import Plan
+from station.cell.status import StationState as S
+from station.protocol.client import Client
 from tests.system.conftest import SystemRig, go, status_when
 from tests.system.machine import CHECKOUT, VENV, CannotBootError, Machine
 from tests.tui.terminal import KEYS, Glass

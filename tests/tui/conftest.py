@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from textual.pilot import Pilot
 
-from station.status import (
+from station.cell.status import (
     CameraStatus,
     GoSummary,
     PoseStatus,

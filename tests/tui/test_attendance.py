@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from textual import events
 
-from station.status import Lease, StationState, StationStatus
+from station.cell.status import Lease, StationState, StationStatus
 from station.tui import attendance
 from tests.tui.conftest import FakeLink, idle, until
 from tests.tui.test_keys import app_on, text_of

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from station.status import RecorderStatus, RobotStatus, StationState, StationStatus
+from station.cell.status import RecorderStatus, RobotStatus, StationState, StationStatus
 from station.tui.widgets.bar import bar_line
 from tests.tui.conftest import FakeLink, idle, until
 from tests.tui.test_keys import app_on, text_of

@@ -9,10 +9,10 @@ import msgspec
 import pytest
 from textual.pilot import Pilot
 
-from calibrate.calibration import write_calibration
-from calibrate.install import install
-from station.errors import RefusedError
-from station.status import StationState, StationStatus
+from calibrate.files.calibration import write_calibration
+from calibrate.files.install import install
+from station.cell.errors import RefusedError
+from station.cell.status import StationState, StationStatus
 from station.tui import offline
 from station.tui.app import StationApp
 from station.tui.confirm import ConfirmGo

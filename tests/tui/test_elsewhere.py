@@ -9,10 +9,10 @@ import pytest
 from textual.pilot import Pilot
 from textual.widgets import DataTable
 
-from calibrate.calibration import write_calibration
-from calibrate.generations import add_generation, calibrations_folder, locked, who
-from calibrate.install import install, load_installed, rollback
-from station.errors import StationError
+from calibrate.files.calibration import write_calibration
+from calibrate.files.generations import add_generation, calibrations_folder, locked, who
+from calibrate.files.install import install, load_installed, rollback
+from station.cell.errors import StationError
 from station.tui import result, sessions
 from station.tui.app import StationApp
 from station.tui.confirm import Confirm

@@ -11,11 +11,11 @@ import pytest
 from textual.pilot import Pilot
 from textual.widgets import Input, OptionList, Static
 
-from calibrate.calibration import Override, Touch, write_calibration
-from calibrate.formats import FORMATS
-from calibrate.install import InstallError, install
-from calibrate.verification import note_installed
-from recordings.messages import CameraIdentity, RobotIdentity
+from calibrate.files.calibration import Override, Touch, write_calibration
+from calibrate.files.exports import FORMATS
+from calibrate.files.install import InstallError, install
+from calibrate.files.verification import note_installed
+from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.tui import offline
 from station.tui.confirm import Confirm
 from station.tui.installed import Installed, local

@@ -7,8 +7,8 @@ import pytest
 from textual.app import App
 from textual.widgets import Static
 
-from station.errors import RefusedError
-from station.status import Lease, StationState, StationStatus
+from station.cell.errors import RefusedError
+from station.cell.status import Lease, StationState, StationStatus
 from station.tui.app import StationApp
 from station.tui.commands import PLAN_ANSWER_S
 from station.tui.confirm import Confirm, ConfirmGo

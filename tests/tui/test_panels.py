@@ -5,7 +5,7 @@ from __future__ import annotations
 import msgspec
 import pytest
 
-from station.status import EstimateStatus, Event, StationState, StationStatus
+from station.cell.status import EstimateStatus, Event, StationState, StationStatus
 from station.tui.widgets.events import event_text
 from station.tui.widgets.panels import device_lines, estimate_lines, progress_lines
 from tests.tui.conftest import idle

@@ -11,7 +11,7 @@ import pytest
 from textual.widgets import DataTable
 
 from calibrate.geometry import pose as pose_of
-from station.status import EstimateStatus, PoseStatus
+from station.cell.status import EstimateStatus, PoseStatus
 from station.tui.live import LiveScreen
 from station.tui.plan import PLANNING
 from station.tui.widgets.panels import estimate_lines, pose_map_lines, progress_lines

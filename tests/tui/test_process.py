@@ -11,9 +11,9 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from calibrate.install import load_installed
+from calibrate.files.install import load_installed
 from recordings.reader import open_recording
-from station.plan.model import Plan
+from station.cell.plan import Plan
 from station.plan.planner import make_plan
 from station.simulation.cell import write_truth
 from station.simulation.launch import SimulatedController

@@ -10,8 +10,8 @@ from textual.widgets import DataTable
 import recordings
 from recordings.pictures import encode_png
 from recordings.writer import RecordingWriter
-from station.errors import RefusedError, StationError
-from station.status import StationState
+from station.cell.errors import RefusedError, StationError
+from station.cell.status import StationState
 from station.tui.app import ReplayApp
 from station.tui.replay import ReplayLink
 from station.tui.replay_screen import ReplayScreen

@@ -6,8 +6,8 @@ import msgspec
 import pytest
 from textual.widgets import DataTable
 
-from station.client import DaemonGoneError
-from station.status import Event, StationState
+from station.cell.status import Event, StationState
+from station.protocol.client import DaemonGoneError
 from station.tui import link as link_module
 from station.tui.app import StationApp
 from station.tui.commands import STOP_UNHEARD

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from textual.widgets import DataTable
 
-from station.status import StationState
+from station.cell.status import StationState
 from station.tui.app import StationApp
 from station.tui.checklist import ChecklistScreen
 from station.tui.help import Help

@@ -10,13 +10,13 @@ import pytest
 from textual.pilot import Pilot
 from textual.widgets import Input, OptionList, Static
 
-from calibrate.calibration import read_calibration, write_calibration
+from calibrate.files.calibration import read_calibration, write_calibration
+from calibrate.files.install import install, load_installed
 from calibrate.geometry import inverse
-from calibrate.install import install, load_installed
-from recordings.messages import CameraIdentity, RobotIdentity
-from station.errors import RefusedError
+from recordings.schema.messages import CameraIdentity, RobotIdentity
+from station.cell.errors import RefusedError
+from station.cell.status import HoverOffer, RobotStatus, StationState, StationStatus
 from station.plan.hover import outer_corners
-from station.status import HoverOffer, RobotStatus, StationState, StationStatus
 from station.tui.confirm import ConfirmGo
 from station.tui.verify import ChooseCorner, Touching
 from tests.station.hover_cell import calibration_of

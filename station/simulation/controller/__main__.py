@@ -10,7 +10,7 @@ import signal
 import sys
 from pathlib import Path
 
-from station.errors import StationError
+from station.cell.errors import StationError
 from station.simulation.controller.admin import AdminServer
 from station.simulation.controller.kinematics import TABLES
 from station.simulation.controller.machine import Machine

@@ -6,8 +6,8 @@ from rich.text import Text
 from textual.reactive import reactive
 from textual.widgets import Static
 
-from station.states import RUNNING
-from station.status import StationState, StationStatus
+from station.cell.status import StationState, StationStatus
+from station.protocol.states import RUNNING
 from station.tui.words import STATE_WORDS, duration, size
 
 _ALARM = {StationState.STOPPED, StationState.FAULT, StationState.DISCONNECTED}

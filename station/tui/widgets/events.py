@@ -8,7 +8,7 @@ from rich.text import Text
 from textual.reactive import reactive
 from textual.widgets import Static
 
-from station.status import Event, StationStatus
+from station.cell.status import Event, StationStatus
 from station.tui.words import clock
 
 _STYLES = {"debug": "dim", "info": "", "warning": "bold", "error": "bold reverse"}

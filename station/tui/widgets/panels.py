@@ -10,7 +10,7 @@ from rich.text import Text
 from textual.reactive import reactive
 from textual.widgets import Static
 
-from station.status import SessionStatus, StationState, StationStatus
+from station.cell.status import SessionStatus, StationState, StationStatus
 from station.tui.words import POSE_MARKS, degrees, duration, mm
 
 CLOCKS_POOR_MS = 20.0

@@ -5,8 +5,8 @@ from __future__ import annotations
 from rich.text import Text
 from textual.widgets import Static
 
-from recordings.messages import Matrix4
-from station.status import StationStatus
+from recordings.schema.messages import Matrix4
+from station.cell.status import StationStatus
 from station.tui.words import POSE_MARKS
 
 Point = tuple[float, float, str]

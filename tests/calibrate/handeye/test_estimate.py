@@ -6,13 +6,13 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.assess import distance_in_sigmas
 from calibrate.geometry import difference
+from calibrate.handeye.axxb.pairs import all_pairs
+from calibrate.handeye.axxb.robust import solve_global
+from calibrate.handeye.metrics import distance_in_sigmas
 from calibrate.handeye.priors import BoardTolerance
-from calibrate.pairs import all_pairs
+from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.projection import intrinsics_vector
-from calibrate.robust import solve_global
-from calibrate.solve import SolveOptions, solve_views
 from tests.calibrate.cells import (
     LENSES,
     LOW,

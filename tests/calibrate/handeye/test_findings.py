@@ -6,11 +6,11 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.gates import GateInputs, judge
 from calibrate.handeye.findings import Finding
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.readings import Reading
-from calibrate.solve import SolveOptions, solve_views
+from calibrate.handeye.solve import SolveOptions, solve_views
+from calibrate.quality.gates import GateInputs, judge
 from tests.calibrate.cells import (
     LENSES,
     LOW,

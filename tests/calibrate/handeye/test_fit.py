@@ -5,10 +5,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrate.gates import GateInputs, judge
 from calibrate.geometry import inverse, perturb
 from calibrate.handeye.readings import Reading
-from calibrate.solve import SolveOptions, solve_views
+from calibrate.handeye.solve import SolveOptions, solve_views
+from calibrate.quality.gates import GateInputs, judge
 from tests.calibrate.cells import MID, error_mm_deg, inside, make_cell, with_flange
 
 OPTIONS = SolveOptions(holdout=True, folds=True)

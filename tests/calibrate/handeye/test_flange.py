@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from calibrate.geometry import difference, perturb, pose, random_rotation
 from calibrate.handeye.flange import flange_derivatives, flange_residuals, implied_flange
 from calibrate.handeye.observations import Observations, State
-from recordings.messages import CameraModel
+from recordings.schema.messages import CameraModel
 
 
 def anywhere(rng, count=None):

@@ -5,16 +5,15 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrate import profile_robust
-from calibrate.gates import GateInputs, judge
 from calibrate.geometry import perturb
-from calibrate.handeye import folds
+from calibrate.handeye import folds, profile_robust
 from calibrate.handeye.estimate import estimate
 from calibrate.handeye.fit import fit_cell
 from calibrate.handeye.folds import cross_validate
+from calibrate.handeye.held_out import HELD_OUT
 from calibrate.handeye.priors import LensPrior, Priors
-from calibrate.held_out import HELD_OUT
-from calibrate.solve import SolveOptions, solve_views
+from calibrate.handeye.solve import SolveOptions, solve_views
+from calibrate.quality.gates import GateInputs, judge
 from tests.calibrate.cells import LOW, MID, make_cell, nudged
 
 VIEWS = 20

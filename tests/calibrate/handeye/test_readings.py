@@ -7,7 +7,6 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from calibrate.errors import PosesDisagreeError
-from calibrate.gates import GateInputs, judge
 from calibrate.geometry import (
     inverse,
     matrix_from_quaternion,
@@ -18,8 +17,9 @@ from calibrate.geometry import (
 )
 from calibrate.handeye.poses import pose_views
 from calibrate.handeye.readings import Reading, explain_recording
+from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.projection import project_pixels
-from calibrate.solve import SolveOptions, solve_views
+from calibrate.quality.gates import GateInputs, judge
 from tests.calibrate.cells import HIGH, LOW, MID, changed, make_cell, seen_through, with_flange, with_focal
 
 MOUNTS = pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])

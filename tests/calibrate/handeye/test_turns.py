@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from calibrate.geometry import pose, rotation_exp, transform_points
-from calibrate.solve import SolveOptions, solve_views
+from calibrate.handeye.solve import SolveOptions, solve_views
 from tests.calibrate.cells import MID, changed, make_cell
 
 QUICK = SolveOptions(holdout=False, folds=False)

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recordings.messages import Picture
-from station.config import CameraConfig
+from recordings.schema.messages import Picture
+from station.cell.config import CameraConfig
+from station.cell.errors import CameraError
 from station.devices.aravis import AravisCamera
 from station.devices.base import TriggerPulse
 from station.devices.frames import mid_exposure, next_frame_id
 from station.devices.pixels import decode, encode
-from station.errors import CameraError
 from station.simulation import genicam
 from station.simulation.gige import numbered_picture
 from station.simulation.gige_launch import SimulatedGige, start_gige

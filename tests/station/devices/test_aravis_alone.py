@@ -9,14 +9,14 @@ from typing import Any
 
 import pytest
 
-from station.config import CameraConfig
+from station.cell.config import CameraConfig
+from station.cell.errors import CameraError
 from station.devices import aravis_device
 from station.devices.aravis import AravisCamera
 from station.devices.aravis_device import GenicamDevice
 from station.devices.aravis_settings import apply_settings, require_settings
 from station.devices.base import TriggerPulse
 from station.devices.frames import DeviceClock
-from station.errors import CameraError
 
 REGION = (0, 0, 1280, 1024)
 

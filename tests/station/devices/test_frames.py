@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from recordings.clocks import UNFITTED_DRIFT
+from recordings.schema.clocks import UNFITTED_DRIFT
 from station.devices.frames import LAST_FRAME_ID, DeviceClock, FrameCounter, mid_exposure
 
 MS = 1_000_000

@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 import pytest
 
+from station.cell.errors import CameraError
 from station.devices.pixels import FORMATS, decode, encode
-from station.errors import CameraError
 
 GREY = np.random.default_rng(1).integers(0, 256, (6, 8), np.uint8)
 

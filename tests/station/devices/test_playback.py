@@ -12,7 +12,8 @@ import pytest
 
 from calibrate.geometry import difference, pose_from_rotvec
 from calibrate.kinematics import MODELS, forward
-from recordings.messages import (
+from recordings.pictures import encode_png
+from recordings.schema.messages import (
     CameraIdentity,
     CameraModel,
     Picture,
@@ -21,11 +22,10 @@ from recordings.messages import (
     Stamps,
     View,
 )
-from recordings.pictures import encode_png
 from recordings.writer import RecordingWriter
-from station.config import PAPER_BOARD, CameraConfig
+from station.cell.config import PAPER_BOARD, CameraConfig
+from station.cell.errors import CameraError, RobotError, StaleStateError
 from station.devices.playback import PlaybackCamera, PlaybackRobot
-from station.errors import CameraError, RobotError, StaleStateError
 
 STARTS = [(0.1 * i, -1.5, -1.5, -1.6, 1.57, 0.2 * i) for i in range(3)]
 TCP = (0.0, 0.0, 0.1, 0.0, 0.0, 0.3)

@@ -10,11 +10,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from station.config import TriggerConfig
+from station.cell.config import TriggerConfig
+from station.cell.errors import TriggerError
 from station.devices import serial_trigger
 from station.devices.serial_trigger import SerialTrigger
 from station.devices.trigger_lines import LINE_LIMIT, LineReader, checksum, frame
-from station.errors import TriggerError
 from station.simulation.trigger import SimulatedTriggerBox
 
 

@@ -13,10 +13,10 @@ from typing import Any
 
 import pytest
 
+from station.cell.errors import RobotError
 from station.devices import ur_child
 from station.devices.ur_child import ControlChild
 from station.devices.ur_control import BEAT_FRESH_NS, WATCHDOG_HZ, ControlServer
-from station.errors import RobotError
 from station.simulation.launch import SimulatedController
 
 GOAL = [0.0, -1.5, 1.5, -1.5, -1.5, 0.0]

@@ -6,10 +6,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from recordings.clocks import ClockFit
-from recordings.messages import RobotState, Stamps
+from recordings.schema.clocks import ClockFit
+from recordings.schema.messages import RobotState, Stamps
+from station.cell.errors import StaleStateError
 from station.devices.ur_history import state_at
-from station.errors import StaleStateError
 from tests.station.devices.test_ur_moves import STATE
 
 HOST_S, WALL_S = 500.0, 9_000.0

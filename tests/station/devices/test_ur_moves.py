@@ -7,10 +7,10 @@ from typing import Any
 import msgspec
 import pytest
 
-from recordings.messages import RobotState, Stamps, Vector6
+from recordings.schema.messages import RobotState, Stamps, Vector6
+from station.cell.errors import RobotError, SafetyStopError, StaleStateError
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode, SafetyStatus
 from station.devices.ur_moves import MoveWatch, check_goal
-from station.errors import RobotError, SafetyStopError, StaleStateError
 
 START = (0.0,) * 6
 GOAL = (0.5, 0.0, 0.0, 0.0, 0.0, 0.0)

@@ -12,11 +12,11 @@ from typing import Any
 
 import pytest
 
-from recordings.messages import RobotState
-from station.config import RobotConfig
+from recordings.schema.messages import RobotState
+from station.cell.config import RobotConfig
+from station.cell.errors import StationError
 from station.devices.ur_link import UrLink
 from station.devices.ur_state import StateReader
-from station.errors import StationError
 from station.simulation.launch import SimulatedController
 
 pytestmark = pytest.mark.process

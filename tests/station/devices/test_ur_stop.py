@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from station.config import RobotConfig
+from station.cell.config import RobotConfig
 from station.devices import ur
 from station.devices.ur import UrRobot
 from station.devices.ur_dashboard import STOP

@@ -8,7 +8,8 @@ import pytest
 
 from calibrate.geometry import pose_from_rotvec, rotation_log
 from calibrate.kinematics import MODELS, DhDeltas, RobotModel, forward
-from recordings.messages import RobotState, Vector6
+from recordings.schema.messages import RobotState, Vector6
+from station.cell.errors import RobotError
 from station.devices.ur_primary import (
     PACKED_HEADER_BYTES,
     DhParameters,
@@ -18,7 +19,6 @@ from station.devices.ur_primary import (
     read_state,
 )
 from station.devices.ur_tool import TcpCheck
-from station.errors import RobotError
 
 UR10 = MODELS["UR10"]
 NO_TOOL: Vector6 = (0.0,) * 6

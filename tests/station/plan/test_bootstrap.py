@@ -8,7 +8,7 @@ import pytest
 
 from calibrate.geometry import difference, inverse, pose, rotation_exp, transform_points
 from calibrate.kinematics import MODELS, forward
-from station.errors import ConfigError, LimitError
+from station.cell.errors import ConfigError, LimitError
 from station.plan.belief import Glimpse, believe, improved_config
 from station.plan.bootstrap import MOVES_MAX, MOVES_MIN, next_move
 from station.plan.planner import make_plan

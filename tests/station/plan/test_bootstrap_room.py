@@ -8,18 +8,18 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.board import board_points
+from calibrate.boards.model import board_points
 from calibrate.geometry import inverse, pose, rotation_exp, transform_points
 from calibrate.kinematics import MODELS, forward, inverse_nearest, link_frames
-from recordings.messages import CameraModel
-from station.collision import margins
-from station.config import PAPER_BOARD, CameraConfig, LimitsConfig, Plane, RobotConfig, StationConfig
-from station.errors import LimitError
-from station.limits import check_path
+from recordings.schema.messages import CameraModel
+from station.cell.collision import margins
+from station.cell.config import PAPER_BOARD, CameraConfig, LimitsConfig, Plane, RobotConfig, StationConfig
+from station.cell.errors import LimitError
+from station.cell.limits import check_path
+from station.cell.scene import geometry_of
 from station.plan import bootstrap
 from station.plan.belief import Glimpse
 from station.plan.bootstrap import as_taught, next_move
-from station.plan.scene import geometry_of
 from station.plan.standing import geometry_from
 from station.plan.visibility import outline
 from station.simulation.placement import guess_of

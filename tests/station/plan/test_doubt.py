@@ -10,10 +10,10 @@ import pytest
 
 from calibrate.geometry import perturb
 from calibrate.kinematics import forward
-from station.collision import margins
-from station.errors import LimitError
+from station.cell.collision import margins
+from station.cell.errors import LimitError
+from station.cell.scene import cell_geometry, scene_of
 from station.plan.planner import make_plan
-from station.plan.scene import cell_geometry, scene_of
 from station.plan.visibility import outline, uncertain_pixels
 from station.simulation.placement import guess_of
 from station.simulation.scenes import build_cell, cell_config

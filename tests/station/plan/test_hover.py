@@ -8,15 +8,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.board import board_points
-from calibrate.board_now import locate_board, offset_covariance
+from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
 from calibrate.kinematics import MODELS, forward
-from recordings.messages import CameraIdentity, Mount, RobotIdentity
-from station.config import PointerConfig
-from station.errors import LimitError
-from station.limits import sample_path
+from calibrate.quality.board_now import locate_board, offset_covariance
+from recordings.schema.messages import CameraIdentity, Mount, RobotIdentity
+from station.cell.config import PointerConfig
+from station.cell.errors import LimitError
+from station.cell.limits import sample_path
 from station.plan.hover import (
     CLEARANCE_M,
     SPEED_M_S,

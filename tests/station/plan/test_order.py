@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from calibrate.kinematics import MODELS, forward
-from station.collision import CellGeometry
-from station.config import Capsule, LimitsConfig, Plane
-from station.limits import check_path
+from station.cell.collision import CellGeometry
+from station.cell.config import Capsule, LimitsConfig, Plane
+from station.cell.limits import check_path
 from station.plan.order import BLOCKED, move_times, path_time, short_order, time_matrix
 
 REST = np.deg2rad([0.0, -100.0, -100.0, -70.0, 90.0, 0.0])

@@ -12,9 +12,9 @@ import recordings
 from calibrate.geometry import quaternion_from_matrix
 from calibrate.kinematics import MODELS, forward
 from recordings.reader import open_recording
-from station.errors import ConfigError
+from station.cell.errors import ConfigError
+from station.cell.plan import ExpectedView, Plan, PlannedPose, plan_sha256
 from station.plan.files import import_list, load_plan, parse_plan, save_plan, taught_plan
-from station.plan.model import ExpectedView, Plan, PlannedPose, plan_sha256
 
 SAMPLE = Path(recordings.__file__).parent / "samples" / "paper-640.mcap"
 Q = (0.1, -1.7, -1.6, -1.3, 1.5, 0.2)

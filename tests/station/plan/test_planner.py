@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.board import board_points
+from calibrate.boards.model import board_points
 from calibrate.geometry import (
     inverse,
     matrix_from_quaternion,
@@ -19,16 +19,16 @@ from calibrate.geometry import (
     rotation_angle,
     rotation_exp,
 )
-from calibrate.information import Noise
+from calibrate.handeye.information import Noise
 from calibrate.kinematics import MODELS, forward
-from station.errors import ConfigError, LimitError
-from station.limits import SPEED_CAP_M_S, check_plan
+from station.cell.errors import ConfigError, LimitError
+from station.cell.limits import SPEED_CAP_M_S, check_plan
+from station.cell.scene import cell_geometry, scene_of
 from station.plan import planner
 from station.plan.candidates import branch_of, find_candidates
 from station.plan.choose import choose, informations, objective_for
 from station.plan.planner import PlanOptions, make_plan, plan_scene
 from station.plan.predict import forecast_views
-from station.plan.scene import cell_geometry, scene_of
 from station.plan.view_range import ViewRange, view_range
 from station.plan.visibility import blind_share, lens_radius, visible
 from station.simulation.scenes import build_cell, cell_config

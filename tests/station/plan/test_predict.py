@@ -8,15 +8,15 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.information import Noise
+from calibrate.handeye.information import Noise
 from calibrate.kinematics import forward
-from station.config import CaptureConfig
-from station.estimation import next_best_text
-from station.limits import check_path
-from station.plan.model import PlannedPose
+from station.analysis.estimation import next_best_text
+from station.cell.config import CaptureConfig
+from station.cell.limits import check_path
+from station.cell.plan import PlannedPose
+from station.cell.scene import scene_of
 from station.plan.planner import make_plan
 from station.plan.predict import AdviceOptions, advise, forecast_views, with_forecast
-from station.plan.scene import scene_of
 from station.simulation.scenes import build_cell, cell_config
 
 

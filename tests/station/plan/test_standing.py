@@ -7,11 +7,11 @@ import pytest
 
 from calibrate.geometry import inverse, pose
 from calibrate.kinematics import forward, link_frames
-from station.analysis import check_run
-from station.collision import margins
+from station.analysis.worker import check_run
+from station.cell.collision import margins
+from station.cell.plan import Plan
+from station.cell.scene import cell_geometry
 from station.plan.bootstrap import next_move
-from station.plan.model import Plan
-from station.plan.scene import cell_geometry
 from station.plan.standing import geometry_from
 from tests.station.plan.test_bootstrap_room import ARM, GLIMPSE, TAUGHT, WRONG, X, config
 

@@ -10,11 +10,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrate.detect import detect
+from calibrate.boards.detect import detect
 from calibrate.geometry import inverse
-from recordings.messages import Picture
+from recordings.schema.messages import Picture
+from station.cell.errors import CameraError
 from station.devices import frames
-from station.errors import CameraError
 from station.simulation.admin import AdminClient
 from station.simulation.camera import RenderedCamera
 from station.simulation.cell import CellTruth, make_cell, write_truth

@@ -7,11 +7,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from calibrate.board import board_points
+from calibrate.boards.model import board_points
 from calibrate.geometry import inverse, is_rigid, rotation_angle, transform_points
 from calibrate.kinematics import MODELS, forward
-from station.config import BLOG_BOARD, PAPER_BOARD
-from station.errors import ConfigError
+from station.cell.config import BLOG_BOARD, PAPER_BOARD
+from station.cell.errors import ConfigError
 from station.plan.planner import make_plan
 from station.simulation.cell import CellTruth, make_cell, read_truth, write_truth
 from station.simulation.placement import board_centre

@@ -8,7 +8,7 @@ import time
 import numpy as np
 import pytest
 
-from station.errors import RobotError
+from station.cell.errors import RobotError
 from station.simulation.admin import AdminClient
 
 pytestmark = pytest.mark.process

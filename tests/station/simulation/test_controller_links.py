@@ -8,8 +8,8 @@ from itertools import pairwise
 
 import pytest
 
+from station.cell.errors import RobotError
 from station.devices.rtde import PacketType
-from station.errors import RobotError
 from station.simulation.controller.dashboard import GREETING
 
 pytestmark = pytest.mark.process

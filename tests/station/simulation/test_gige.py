@@ -10,10 +10,10 @@ from xml.etree import ElementTree
 
 import pytest
 
-from calibrate.detect import detect
-from station.config import CameraConfig
+from calibrate.boards.detect import detect
+from station.cell.config import CameraConfig
+from station.cell.errors import CameraError
 from station.devices.aravis import AravisCamera
-from station.errors import CameraError
 from station.simulation import genicam
 from station.simulation.cell import make_cell, write_truth
 from station.simulation.gige_launch import start_gige

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 
-from station.errors import RobotError
+from station.cell.errors import RobotError
 from station.simulation.launch import start_controller
 
 pytestmark = pytest.mark.process

@@ -6,11 +6,11 @@ import cv2
 import numpy as np
 import pytest
 
-from calibrate.board import board_points, looks_same_turns
-from calibrate.detect import detect
+from calibrate.boards.detect import detect
+from calibrate.boards.model import board_points, looks_same_turns
 from calibrate.geometry import Array, pose, rotation_exp
-from recordings.messages import BoardKind, BoardSpec, CameraModel
-from station.config import PAPER_BOARD
+from recordings.schema.messages import BoardKind, BoardSpec, CameraModel
+from station.cell.config import PAPER_BOARD
 from station.simulation.board_print import board_print
 from station.simulation.placement import seen_from
 from station.simulation.renderer import BLACK_LEVEL, Light, render, scaled

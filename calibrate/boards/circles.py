@@ -1,0 +1,127 @@
+"""Circle grids, symmetric and asymmetric.
+
+A tilted circle's picture is an ellipse whose centre is not the picture of the circle's centre. How far apart
+the two are follows from the board's plane and the circles' radius, which is measured in the picture.
+J. Heikkilä, "Geometric camera calibration using circular control points" (2000).
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import cv2
+import numpy as np
+
+from calibrate.boards.corners import Grey
+from calibrate.boards.model import board_points
+from calibrate.geometry import Array
+from recordings.schema.messages import BoardKind, BoardSpec
+
+_CELLS = 16
+"""Samples from the middle of a circle to the edge of its patch."""
+_GUESSED_PX = 1.5
+"""Farther than this from the middle of the ink a centre was guessed, not found."""
+
+
+def find_circles(grey: Grey, spec: BoardSpec) -> Array | None:
+    """All centres in board order, (rows·columns, 2) pixels, or None; dark on light or light on dark."""
+    kind = (
+        cv2.CALIB_CB_ASYMMETRIC_GRID
+        if spec.kind is BoardKind.ASYMMETRIC_CIRCLES
+        else cv2.CALIB_CB_SYMMETRIC_GRID
+    )
+    largest = grey.size / (spec.columns * spec.rows)
+    for picture in (grey, cv2.bitwise_not(grey)):
+        for clustering in (0, cv2.CALIB_CB_CLUSTERING):
+            found, centres = cv2.findCirclesGrid(
+                picture,
+                (spec.columns, spec.rows),
+                flags=kind | clustering,
+                blobDetector=_blobs(largest),
+            )
+            if found:
+                ordered = _best_order(np.asarray(centres, dtype=float).reshape(-1, 2), spec)
+                return None if ordered is None else true_centres(grey, ordered, spec)
+    return None
+
+
+def true_centres(grey: Grey, ellipses: Array, spec: BoardSpec) -> Array:
+    """Where the circles' own centres are seen, (n, 2), from the centres of their ellipses in board order.
+
+    The dual conic of a circle round c with radius r is c cᵀ - r² diag(1, 1, 0); the plane's homography H
+    takes it to H (…) Hᵀ, whose last column is the ellipse's centre. The lens's bend within one circle is
+    left out of this small correction. A centre that lies off its own circle (OpenCV guesses those that it
+    does not find) is replaced by the middle of the ink.
+    """
+    plane = board_points(spec)[:, :2] / spec.square_m
+    c = np.concatenate([plane, np.ones((len(plane), 1))], axis=1)
+    centres = ellipses
+    for _ in range(2):  # the plane itself was fitted to ellipses first
+        found: Any = cv2.findHomography(plane, centres, 0)
+        H = found[0]
+        if H is None:
+            return ellipses
+        seen = c @ H.T
+        radius, middles = _ink(grey, H, centres - seen[:, :2] / seen[:, 2:], spec)
+        shown = seen * seen[:, 2:] - radius**2 * (H[:, :2] @ H[2, :2])
+        centres = ellipses - (shown[:, :2] / shown[:, 2:] - seen[:, :2] / seen[:, 2:])
+        guessed = np.linalg.norm(centres - middles, axis=1) > _GUESSED_PX
+        centres[guessed] = middles[guessed]
+    return np.asarray(centres)
+
+
+def _ink(grey: Grey, H: Array, bend: Array, spec: BoardSpec) -> tuple[float, Array]:
+    """Radius of the circles over the pitch, and the middle of each (n, 2) px, seen at right angles.
+
+    bend: (n, 2) px from where H shows a circle to where it is.
+    """
+    reach = 0.6 if spec.kind is BoardKind.ASYMMETRIC_CIRCLES else 0.5
+    side = 2 * _CELLS + 1
+    v, u = np.mgrid[-reach : reach : side * 1j, -reach : reach : side * 1j]
+    centres = board_points(spec)[:, :2] / spec.square_m
+    plane = centres[:, None, None] + np.stack([u, v], axis=-1)
+    pixels = cv2.perspectiveTransform(plane.reshape(-1, 1, 2), H).reshape(len(plane) * side, side, 2)
+    places = (pixels + np.repeat(bend, side, axis=0)[:, None]).astype(np.float32)
+    patches = cv2.remap(
+        grey, places[..., 0], places[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE
+    )
+    patches = patches.reshape(-1, side, side)
+    edge = np.concatenate([patches[:, 0], patches[:, -1], patches[:, :, 0], patches[:, :, -1]], axis=1)
+    paper = np.median(edge, axis=1)[:, None, None]
+    middle = patches[:, _CELLS - 1 : _CELLS + 2, _CELLS - 1 : _CELLS + 2].mean(axis=(1, 2), keepdims=True)
+    contrast = np.where(np.abs(middle - paper) < 1.0, np.inf, middle - paper)
+    share = np.clip((patches - paper) / contrast, 0.0, 1.0)
+    radius = float(np.sqrt(np.median(share.sum(axis=(1, 2))) / np.pi) * reach / _CELLS)
+    share *= u * u + v * v < (1.4 * radius) ** 2  # the sheet may end beyond
+    area = np.maximum(share.sum(axis=(1, 2)), 1e-9)
+    offset = np.stack([(share * u).sum(axis=(1, 2)), (share * v).sum(axis=(1, 2))], axis=-1) / area[:, None]
+    middles: Any = cv2.perspectiveTransform((centres + offset).reshape(-1, 1, 2), H).reshape(-1, 2)
+    return radius, middles + bend
+
+
+def _blobs(largest_area_px: float) -> cv2.SimpleBlobDetector:
+    parameters = cv2.SimpleBlobDetector.Params()
+    parameters.minArea = 12.0
+    parameters.maxArea = largest_area_px
+    parameters.minDistBetweenBlobs = 4.0
+    return cv2.SimpleBlobDetector.create(parameters)
+
+
+def _best_order(centres: Array, spec: BoardSpec) -> Array | None:
+    """The order whose plane fits: right-handed, and for asymmetric grids with the offset rows in place."""
+    grid = centres.reshape(spec.rows, spec.columns, 2)
+    turns = (0, 1, 2, 3) if spec.columns == spec.rows and spec.kind is BoardKind.CIRCLES else (0, 2)
+    points = board_points(spec)[:, :2]
+    best, best_miss = None, np.inf
+    for mirrored in (grid, grid[:, ::-1]):
+        for turn in turns:
+            candidate = np.rot90(mirrored, turn).reshape(-1, 2)
+            H, _ = cv2.findHomography(points, candidate, 0)
+            if H is None or np.linalg.det(H[:2, :2] - np.outer(H[:2, 2], H[2, :2]) / H[2, 2]) <= 0:
+                continue
+            shown = cv2.perspectiveTransform(points.reshape(-1, 1, 2), H).reshape(-1, 2)
+            miss = float(np.linalg.norm(shown - candidate, axis=1).max())
+            # Equal fits are the turns that look the same: keep the first, so that the answer is stable.
+            if miss < best_miss * 0.9:
+                best, best_miss = candidate, miss
+    return best

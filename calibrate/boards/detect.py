@@ -1,0 +1,165 @@
+"""One picture in, the board's points out; says why when there are none."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.boards.chessboard import find_chessboard, other_size
+from calibrate.boards.circles import find_circles
+from calibrate.boards.corners import Grey, to_grey
+from calibrate.boards.markers import find_april_grid, find_charuco
+from calibrate.boards.model import board_points, check_board, describe_board, fixes_a_plane
+from calibrate.boards.tags import find_tag
+from calibrate.geometry import Array
+from recordings.schema.messages import SINGLE_TAGS, BoardKind, BoardSpec
+
+FEWEST_POINTS = 6
+"""Fewer corners of a partial board do not give a trustworthy pose."""
+_SATURATED_GREY = 252
+
+
+@dataclass(frozen=True, eq=False)
+class Detection:
+    """What one picture shows of the board."""
+
+    found: bool
+    reason: str
+    """Empty when found; otherwise a sentence for people."""
+    indices: NDArray[np.intp]
+    """(k,) rows of `board_points`"""
+    pixels: Array
+    """(k, 2)"""
+    expected: int
+    """Points of the whole board."""
+    width: int
+    height: int
+    sharpness: float
+    """Mean squared Laplacian over the variance of the grey values, on the board (whole picture if none); NaN
+    when not asked for."""
+    saturated: float
+    """Share of pixels at the upper end of the scale there, 0 … 1; NaN when not asked for."""
+    coverage: float
+    """Share of the picture inside the outline of the points, 0 … 1."""
+    seen_instead: tuple[int, int] | None = None
+    """Inner corners (columns, rows) of another chessboard that is seen; looked for where none is found."""
+    squares_counted: bool = False
+    """The other chessboard is one smaller each way: the squares were declared, not the inner corners."""
+    mirrored: bool = False
+    """The board's markers are seen in the mirror image of the picture only."""
+
+    @property
+    def corners(self) -> int:
+        return len(self.indices)
+
+
+def detect(
+    image: NDArray[Any], spec: BoardSpec, thorough: bool = True, with_quality: bool = True
+) -> Detection:
+    """Finds the board to sub-pixel accuracy.
+
+    image: (h, w) uint8 or uint16, or (h, w, 3) BGR. `thorough=False` leaves out the slow attempts and the
+    search for the reason (previews), `with_quality=False` the sharpness and the saturation. Raises BoardError
+    for an impossible board; a picture without a board is an answer, not an error.
+    """
+    check_board(spec)
+    grey = to_grey(image)
+    expected = len(board_points(spec))
+    indices, pixels = _find(grey, spec, thorough)
+    height, width = grey.shape
+    fewest = min(FEWEST_POINTS, expected)
+    whole = len(indices) == expected
+    found = whole or (len(indices) >= fewest and fixes_a_plane(board_points(spec)[indices]))
+    reason, instead = ("", None) if found else _reason(grey, spec, len(indices), fewest, thorough)
+    if not found:
+        indices, pixels = indices[:0], pixels[:0]
+    mirrored = not found and thorough and _seen_in_a_mirror(grey, spec)
+    if mirrored:
+        reason = "the board is seen in the mirror image only: the camera or its driver mirrors the pictures"
+    sharpness, saturated = _picture_quality(grey, pixels) if with_quality else (np.nan, np.nan)
+    area = cv2.contourArea(cv2.convexHull(pixels.astype(np.float32))) if found else 0.0
+    return Detection(
+        found,
+        reason,
+        indices,
+        pixels,
+        expected,
+        width,
+        height,
+        sharpness,
+        saturated,
+        area / (width * height),
+        instead,
+        instead == (spec.columns - 1, spec.rows - 1),
+        mirrored,
+    )
+
+
+def _find(grey: Grey, spec: BoardSpec, thorough: bool) -> tuple[NDArray[np.intp], Array]:
+    if spec.kind is BoardKind.CHARUCO:
+        return find_charuco(grey, spec, thorough)
+    if spec.kind is BoardKind.APRIL_GRID:
+        return find_april_grid(grey, spec)
+    if spec.kind in SINGLE_TAGS:
+        return find_tag(grey, spec, thorough)
+    if spec.kind is BoardKind.CHESSBOARD:
+        pixels = find_chessboard(grey, spec, thorough)
+    else:
+        pixels = find_circles(grey, spec)
+    if pixels is None:
+        return np.zeros(0, dtype=np.intp), np.zeros((0, 2))
+    return np.arange(len(pixels)), pixels
+
+
+def _reason(
+    grey: Grey, spec: BoardSpec, count: int, fewest: int, thorough: bool
+) -> tuple[str, tuple[int, int] | None]:
+    """A sentence for people, and the other chessboard that is seen."""
+    if count >= fewest:
+        return f"the {count} corners of the board that are seen lie in a line: they fix no pose", None
+    if count:
+        return f"only {count} corners of the board are seen, {fewest} are needed", None
+    level = float(grey.mean())
+    if level < 12.0:
+        return f"the picture is too dark (mean grey {level:.0f})", None
+    if float((grey >= _SATURATED_GREY).mean()) > 0.5:
+        return "the picture is over-exposed: more than half of it is saturated", None
+    if float(grey.std()) < 3.0:
+        return f"the picture is empty (grey {level:.0f}, no contrast)", None
+    if thorough and spec.kind is BoardKind.CHESSBOARD:
+        seen = other_size(grey, spec)
+        if seen is not None and sorted(seen) != sorted((spec.columns, spec.rows)):
+            why = "partly hidden, or another board"
+            if seen == (spec.columns - 1, spec.rows - 1):
+                why = "were squares counted?"
+            text = (
+                f"board {spec.columns}×{spec.rows} expected, {seen[0]}×{seen[1]} seen (inner corners; {why})"
+            )
+            return text, seen
+    return f"no {describe_board(spec)} found", None
+
+
+def _seen_in_a_mirror(grey: Grey, spec: BoardSpec) -> bool:
+    """Only markers tell: a chessboard looks right in a mirror."""
+    if spec.kind not in (BoardKind.CHARUCO, BoardKind.APRIL_GRID, *SINGLE_TAGS):
+        return False
+    indices, _ = _find(np.ascontiguousarray(grey[:, ::-1]), spec, thorough=False)
+    return len(indices) >= min(FEWEST_POINTS, len(board_points(spec)))
+
+
+def _picture_quality(grey: Grey, pixels: Array) -> tuple[float, float]:
+    if len(pixels):
+        x0, y0 = np.maximum(np.floor(pixels.min(axis=0)).astype(int), 0)
+        x1, y1 = np.ceil(pixels.max(axis=0)).astype(int) + 1
+        region = grey[y0:y1, x0:x1]
+    else:
+        region = grey
+    laplacian = cv2.Laplacian(region, cv2.CV_16S)
+    energy = cv2.norm(laplacian, cv2.NORM_L2SQR) / region.size
+    _, spread = cv2.meanStdDev(region)
+    saturated = cv2.countNonZero(cv2.inRange(region, _SATURATED_GREY, 255)) / region.size
+    return energy / (float(spread[0, 0]) ** 2 + 1e-6), saturated

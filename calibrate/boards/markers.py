@@ -1,0 +1,182 @@
+"""Boards that carry square markers: ChArUco and AprilGrid. Partial views are welcome."""
+
+from __future__ import annotations
+
+from functools import lru_cache
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.boards.corners import Grey, equalise, local_spacing, refine, sample
+from calibrate.boards.model import board_points, dictionary_id, tag_dictionary
+from calibrate.geometry import Array
+from recordings.schema.messages import BoardSpec
+
+_FEW_MARKERS = 0.7
+"""Of those of the board."""
+_SMALL_MARKER_PX, _ENLARGED, _LARGEST_SIDE_PX = 20.0, 3.0, 6000
+"""Markers with shorter sides are read in an enlarged picture, unless that would be larger than this."""
+_SMALLEST_PERIMETER = 0.03
+"""Of a marker, over the longer side of the picture; OpenCV's own."""
+_NEAR_SHARE, _FAR_MOVES = 0.025, 4.0
+"""A corner ran away where the refinement moves it farther from the prediction than this share of the spacing
+and than so many times the middle one."""
+Indices = NDArray[np.intp]
+NOTHING = (np.zeros(0, dtype=np.intp), np.zeros((0, 2)))
+
+
+@lru_cache(maxsize=8)
+def charuco_board(spec: BoardSpec) -> Any:
+    """OpenCV's description of the board; also what draws it."""
+    dictionary = cv2.aruco.getPredefinedDictionary(dictionary_id(spec.dictionary or ""))
+    board = cv2.aruco.CharucoBoard((spec.columns, spec.rows), spec.square_m, spec.marker_m or 0.0, dictionary)
+    board.setLegacyPattern(spec.legacy)
+    return board
+
+
+def find_charuco(grey: Grey, spec: BoardSpec, thorough: bool = True) -> tuple[Indices, Array]:
+    """Point indices (k,) and pixels (k, 2) of the chessboard corners that were found.
+
+    `thorough`: where few markers are seen, the dark parts of the picture are brightened; where those are
+    small or none, it is enlarged.
+    """
+    board = charuco_board(spec)
+    plane_of = dict(zip(board.getIds().ravel().tolist(), board.getObjPoints(), strict=True))
+    seen = _markers(grey, spec, plane_of)
+    few = _FEW_MARKERS * len(plane_of)
+    if thorough and len(seen) < few:
+        seen = max(seen, _markers(equalise(grey), spec, plane_of), key=len)
+    if thorough and len(seen) < few and _small(seen) and _ENLARGED * max(grey.shape) <= _LARGEST_SIDE_PX:
+        seen = max(seen, _markers_enlarged(grey, spec, plane_of), key=len)
+    if len(seen) < 2:
+        return NOTHING
+    # OpenCV's sub-pixel step needs both markers of a corner; ours takes every corner the plane predicts.
+    plane = np.concatenate([corners[:, :2] for corners, _ in seen]).astype(float)
+    pixels = np.concatenate([marker.reshape(4, 2) for _, marker in seen]).astype(float)
+    points = board_points(spec)[:, :2] + spec.square_m  # OpenCV counts from the outer edge
+    return _snap_to_corners(grey, spec, plane, pixels, points)
+
+
+def _markers(
+    grey: Grey, spec: BoardSpec, plane_of: dict[int, Any], smallest: float = _SMALLEST_PERIMETER
+) -> list[tuple[Any, Any]]:
+    """Corners on the board and in the picture of every marker of the board that is seen."""
+    markers, ids, _ = marker_detector(spec.dictionary or "", 1, smallest).detectMarkers(grey)
+    found = [] if ids is None else ids.ravel().tolist()
+    return [(plane_of[i], marker) for i, marker in zip(found, markers, strict=False) if i in plane_of]
+
+
+def _markers_enlarged(grey: Grey, spec: BoardSpec, plane_of: dict[int, Any]) -> list[tuple[Any, Any]]:
+    large: Any = cv2.resize(grey, None, fx=_ENLARGED, fy=_ENLARGED, interpolation=cv2.INTER_CUBIC)
+    seen = _markers(large, spec, plane_of, _SMALLEST_PERIMETER / _ENLARGED)
+    return [(corners, (marker + 0.5) / _ENLARGED - 0.5) for corners, marker in seen]
+
+
+def _small(seen: list[tuple[Any, Any]]) -> bool:
+    sides = [np.linalg.norm(np.diff(marker.reshape(4, 2), axis=0), axis=1) for _, marker in seen]
+    return not sides or float(np.median(sides)) < _SMALL_MARKER_PX
+
+
+def _snap_to_corners(
+    grey: Grey, spec: BoardSpec, plane: Array, pixels: Array, points: Array
+) -> tuple[Indices, Array]:
+    """Predicts the chessboard corners from marker corners near them, refines, keeps what is a true saddle."""
+    from_corner = np.linalg.norm(plane[None] - points[:, None], axis=-1)
+    found: Any = cv2.findHomography(plane, pixels, cv2.RANSAC, 6.0)
+    H = found[0]
+    if H is None:
+        return NOTHING
+    predicted = _apply(H, points)
+    shown = _apply(H, plane)
+    # The lens bends the plane: shift each prediction by what its nearest markers missed.
+    weight = np.exp(-0.5 * (from_corner / spec.square_m) ** 2)
+    known = weight.sum(axis=1) > 0.3
+    miss = (weight @ (pixels - shown)) / np.maximum(weight.sum(axis=1, keepdims=True), 1e-9)
+    predicted += miss
+    spacing = local_spacing(predicted.reshape(spec.rows - 1, spec.columns - 1, 2)).ravel()
+    height, width = grey.shape
+    margin = np.maximum(spacing * 0.4, 4.0)
+    inside = (
+        (predicted[:, 0] > margin)
+        & (predicted[:, 0] < width - 1 - margin)
+        & (predicted[:, 1] > margin)
+        & (predicted[:, 1] < height - 1 - margin)
+    )
+    chosen = np.flatnonzero(known & inside & (spacing > 5.0))
+    if len(chosen) == 0:
+        return NOTHING
+    # No edge of a marker may come into the window: they run beside the corner, not through it.
+    margin_share = 0.5 * (1.0 - (spec.marker_m or 0.0) / spec.square_m)
+    across, down = (
+        _apply(H, points[chosen] + half) - _apply(H, points[chosen] - half)
+        for half in np.eye(2) * spec.square_m / 2
+    )
+    # A tilt about the diagonal brings the markers' corners nearer than any neighbour.
+    diagonals = [np.linalg.norm(d, axis=1) / np.sqrt(2) for d in (across + down, across - down)]
+    room = np.minimum.reduce([spacing[chosen], *diagonals])
+    corners = refine(grey, predicted[chosen], min(0.8, 2.8 * margin_share) * room)
+    radius = (np.clip(min(0.25, 1.2 * margin_share) * room, 2.0, 12.0) / room)[:, None]
+    good = is_saddle(grey, corners, radius * across, radius * down)
+    moved = np.linalg.norm(corners - predicted[chosen], axis=1)
+    if good.any():
+        good &= moved <= np.maximum(_NEAR_SHARE * room, _FAR_MOVES * np.median(moved[good]))
+    return chosen[good], corners[good]
+
+
+def is_saddle(grey: Grey, corners: Array, across: Array, down: Array) -> NDArray[np.bool_]:
+    """A chessboard corner: round it bright and dark alternate twice, opposite sides alike.
+
+    corners, across, down: (n, 2); the ring is a circle on the board, and these its half axes in the picture.
+    """
+    angles = np.arange(16) * (2 * np.pi / 16)
+    circle = np.cos(angles)[:, None] * across[:, None] + np.sin(angles)[:, None] * down[:, None]
+    ring = sample(grey, corners[:, None] + circle)
+    ring -= ring.mean(axis=1, keepdims=True)
+    spectrum = np.abs(np.fft.rfft(ring, axis=1)) ** 2
+    share = spectrum[:, 2] / np.maximum(spectrum[:, 1:].sum(axis=1), 1e-9)
+    return np.asarray((share > 0.6) & (ring.std(axis=1) > 4.0))
+
+
+def _apply(H: Array, points: Array) -> Array:
+    moved = np.concatenate([points, np.ones((len(points), 1))], axis=1) @ H.T
+    return np.asarray(moved[:, :2] / moved[:, 2:])
+
+
+@lru_cache(maxsize=8)
+def marker_detector(dictionary: str, border_bits: int, smallest: float = _SMALLEST_PERIMETER) -> Any:
+    parameters = cv2.aruco.DetectorParameters()
+    parameters.minMarkerPerimeterRate = smallest
+    parameters.markerBorderBits = border_bits
+    parameters.cornerRefinementMethod = cv2.aruco.CORNER_REFINE_SUBPIX
+    return cv2.aruco.ArucoDetector(cv2.aruco.getPredefinedDictionary(dictionary_id(dictionary)), parameters)
+
+
+def find_april_grid(grey: Grey, spec: BoardSpec) -> tuple[Indices, Array]:
+    """Four corners of every tag that is seen. Printed borders of one and of two bits (Kalibr) are tried."""
+    best = NOTHING
+    for border_bits in (2, 1):
+        found = _tags(grey, spec, border_bits)
+        if len(found[0]) > len(best[0]):
+            best = found
+    return best
+
+
+def _tags(grey: Grey, spec: BoardSpec, border_bits: int) -> tuple[Indices, Array]:
+    detector = marker_detector(tag_dictionary(spec), border_bits)
+    markers, ids, _ = detector.detectMarkers(grey)
+    if ids is None:
+        return NOTHING
+    numbers, count = ids.ravel().tolist(), spec.columns * spec.rows
+    # A tag that is seen twice is on two boards, and nobody knows on which of them.
+    tags = [(i, m) for i, m in zip(numbers, markers, strict=True) if i < count and numbers.count(i) == 1]
+    if not tags:
+        return NOTHING
+    # OpenCV goes clockwise from the top left, Kalibr counter-clockwise from the bottom left.
+    corners = np.concatenate([m.reshape(4, 2)[[3, 2, 1, 0]] for _, m in tags]).astype(float)
+    sides = np.repeat([np.linalg.norm(np.diff(m.reshape(4, 2), axis=0), axis=1).min() for _, m in tags], 4)
+    gap_share = (spec.marker_m or spec.square_m) / spec.square_m
+    refined = refine(grey, corners, sides * min(1.0, gap_share))
+    indices = np.concatenate([np.arange(4 * i, 4 * i + 4) for i, _ in tags])
+    return indices.astype(np.intp), refined

@@ -1,0 +1,202 @@
+"""What a board looks like: its points, how many there are, and in which turns it looks the same.
+
+Board frame: origin in the first point, x along a row, y down the columns, z into the board.
+"""
+
+from __future__ import annotations
+
+from functools import lru_cache
+
+import cv2
+import numpy as np
+
+from calibrate.errors import CalibrationError
+from calibrate.geometry import Array, pose, rotation_exp
+from recordings.schema.messages import (
+    LARGEST_FLATNESS_M,
+    LARGEST_TOLERANCE,
+    SINGLE_TAGS,
+    BoardKind,
+    BoardSpec,
+)
+
+APRIL_DICTIONARY = "DICT_APRILTAG_36h11"
+_LARGEST_SIDE = 200
+
+
+class BoardError(CalibrationError):
+    """The description of a board cannot be right."""
+
+    exit_code = 2
+
+
+def dictionary_id(name: str) -> int:
+    """OpenCV's number of a marker dictionary such as DICT_6X6_250; BoardError when there is none."""
+    value = getattr(cv2.aruco, name, None)
+    if not name.startswith("DICT_") or not isinstance(value, int):
+        raise BoardError(
+            f"board: dictionary {name!r} is not one of OpenCV's; write for example DICT_6X6_250."
+        )
+    return value
+
+
+def _require_markers(spec: BoardSpec, dictionary: str, count: int) -> None:
+    held = len(cv2.aruco.getPredefinedDictionary(dictionary_id(dictionary)).bytesList)
+    if count > held:
+        raise BoardError(
+            f"board: {spec.columns} × {spec.rows} needs {count} markers, {dictionary} holds {held}. "
+            "Fewer columns and rows, or a larger dictionary."
+        )
+
+
+def check_board(spec: BoardSpec) -> None:
+    """Raises BoardError where the numbers cannot belong to a real board."""
+    smallest = 1 if spec.kind in (BoardKind.APRIL_GRID, *SINGLE_TAGS) else 2
+    if not all(smallest <= side <= _LARGEST_SIDE for side in (spec.columns, spec.rows)):
+        raise BoardError(
+            f"board: {spec.columns} × {spec.rows} is impossible; columns and rows must be {smallest} … "
+            f"{_LARGEST_SIDE}. A chessboard counts inner corners, a charuco board counts squares."
+        )
+    if not 1e-4 <= spec.square_m <= 10.0:
+        raise BoardError(f"board: square_m = {spec.square_m} is not a size in metres (25 mm is 0.025).")
+    if spec.square_tolerance is not None and not 0 < spec.square_tolerance <= LARGEST_TOLERANCE:
+        raise BoardError(
+            f"board: square_tolerance = {spec.square_tolerance} is not a relative tolerance (0.3 % is 0.003)."
+        )
+    if spec.flatness_m is not None and not 0 < spec.flatness_m <= LARGEST_FLATNESS_M:
+        raise BoardError(f"board: flatness_m = {spec.flatness_m} is not in metres (1 mm is 0.001).")
+    if spec.kind in SINGLE_TAGS:
+        _check_tag(spec)
+    elif spec.kind is BoardKind.CHARUCO:
+        _require_markers(spec, spec.dictionary or "", spec.columns * spec.rows // 2)
+        if spec.marker_m is None or not 0 < spec.marker_m < spec.square_m:
+            raise BoardError("board: a charuco board needs marker_m, smaller than square_m.")
+    elif spec.kind is BoardKind.APRIL_GRID:
+        _require_markers(spec, spec.dictionary or APRIL_DICTIONARY, spec.columns * spec.rows)
+        if spec.marker_m is None or not 0 < spec.marker_m < spec.square_m:
+            raise BoardError(
+                "board: an april-grid needs marker_m, the gap between tags, smaller than square_m."
+            )
+    elif spec.columns * spec.rows < 4:
+        raise BoardError("board: fewer than 4 points do not fix a pose.")
+
+
+def _check_tag(spec: BoardSpec) -> None:
+    if (spec.columns, spec.rows) != (1, 1):
+        raise BoardError("board: a single tag has no columns and rows; leave them out.")
+    if spec.kind is BoardKind.ARUCO and not spec.dictionary:
+        raise BoardError("board: an aruco tag needs its dictionary, for example DICT_4X4_50.")
+    held = len(cv2.aruco.getPredefinedDictionary(dictionary_id(tag_dictionary(spec))).bytesList)
+    if not 0 <= spec.tag_id < held:
+        raise BoardError(f"board: id {spec.tag_id} is not in {tag_dictionary(spec)} (0 … {held - 1}).")
+
+
+def tag_dictionary(spec: BoardSpec) -> str:
+    """Dictionary of a board of tags; AprilTags have a usual one."""
+    return spec.dictionary or APRIL_DICTIONARY
+
+
+def grid_shape(spec: BoardSpec) -> tuple[int, int]:
+    """Columns and rows of points (not for april-grid, whose points come four to a tag)."""
+    if spec.kind is BoardKind.CHARUCO:
+        return spec.columns - 1, spec.rows - 1
+    if spec.kind in SINGLE_TAGS:
+        return 2, 2
+    return spec.columns, spec.rows
+
+
+@lru_cache(maxsize=32)
+def board_points(spec: BoardSpec) -> Array:
+    """All points of the board in `board`, (n, 3) metres, z = 0; the row number is the point's identity.
+
+    Asymmetric circles: `square_m` is the distance of neighbouring rows, half that of circles in a row
+    (OpenCV's convention). april-grid: corners of tag 0, 1 … row by row from the bottom left as Kalibr counts,
+    each tag's four from its bottom left, counter-clockwise as printed. A single tag: the corners of its black
+    square, row by row from its top left.
+    """
+    if spec.kind is BoardKind.APRIL_GRID:
+        points = _april_points(spec)
+    else:
+        columns, rows = grid_shape(spec)
+        j, i = np.meshgrid(np.arange(columns, dtype=float), np.arange(rows, dtype=float))
+        if spec.kind is BoardKind.ASYMMETRIC_CIRCLES:
+            j = 2 * j + i % 2
+        points = np.stack([j.ravel(), i.ravel(), np.zeros(i.size)], axis=1) * spec.square_m
+    points.flags.writeable = False
+    return points
+
+
+def _april_points(spec: BoardSpec) -> Array:
+    pitch = spec.square_m + (spec.marker_m or 0.0)
+    row, column = np.divmod(np.arange(spec.columns * spec.rows), spec.columns)
+    corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1]]) * spec.square_m
+    plane = np.stack([column, row], axis=1)[:, None, :] * pitch + corners
+    plane[..., 1] *= -1  # Kalibr counts upwards, y points down
+    return np.concatenate([plane.reshape(-1, 2), np.zeros((4 * len(row), 1))], axis=1)
+
+
+def looks_same_turns(spec: BoardSpec) -> tuple[int, ...]:
+    """Turns about the normal, in quarters, after which the board looks exactly as before; always with 0.
+
+    A chessboard's colours decide when columns + rows is odd. Square markers always decide; the three dots of
+    a radon board are not read.
+    """
+    columns, rows = spec.columns, spec.rows
+    if spec.kind in (BoardKind.CHARUCO, BoardKind.APRIL_GRID, *SINGLE_TAGS):
+        return (0,)
+    if spec.kind is BoardKind.CHESSBOARD:
+        if (columns + rows) % 2:
+            return (0,)
+        return (0, 1, 2, 3) if columns == rows and columns % 2 == 0 else (0, 2)
+    if spec.kind is BoardKind.CIRCLES:
+        return (0, 1, 2, 3) if columns == rows else (0, 2)
+    return (0,) if rows % 2 else (0, 2)
+
+
+def board_from_turned(spec: BoardSpec, quarters: int) -> Array:
+    """(4, 4): the board frame turned by `quarters` of 90° about the centre of its points."""
+    points = board_points(spec)
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    R = np.round(rotation_exp([0.0, 0.0, quarters * np.pi / 2]))
+    return pose(R, centre - R @ centre)
+
+
+def fixes_a_plane(points: Array) -> bool:
+    """Do these points of a board (n, 3) tell its plane in a picture? Not where all but one lie in a line."""
+    xy = points[:, :2] - points[:, :2].mean(axis=0)
+    xy = xy / max(float(np.abs(xy).max()), 1e-12)
+    x, y, one = xy[:, 0], xy[:, 1], np.ones(len(xy))
+    zero = np.zeros_like(one)
+    by_homography = np.concatenate(
+        [
+            np.stack([x, y, one, zero, zero, zero, -x * x, -x * y, -x], axis=1),
+            np.stack([zero, zero, zero, x, y, one, -x * y, -y * y, -y], axis=1),
+        ]
+    )
+    singular = np.linalg.svd(by_homography, compute_uv=False)
+    return len(singular) > 7 and bool(singular[7] > 1e-6 * singular[0])
+
+
+def ambiguity_text(spec: BoardSpec) -> str:
+    """One sentence for people when the board can be mistaken for itself turned; empty otherwise."""
+    turns = looks_same_turns(spec)
+    if len(turns) == 1:
+        return ""
+    angle = "by 90°" if len(turns) == 4 else "by 180°"
+    return (
+        f"The {describe_board(spec)} looks the same when turned {angle}; its orientation is decided by the "
+        "agreement of all views with the robot's motion. A board whose columns + rows is odd avoids this."
+    )
+
+
+def describe_board(spec: BoardSpec) -> str:
+    """'chessboard 7×6, 25 mm'"""
+    if spec.kind in SINGLE_TAGS:
+        return f"{spec.kind.value} {spec.tag_id} of {tag_dictionary(spec)}, {spec.square_m * 1000:g} mm"
+    text = f"{spec.kind.value} {spec.columns}×{spec.rows}, {spec.square_m * 1000:g} mm"
+    if spec.kind is BoardKind.CHARUCO:
+        layout = ", legacy layout" if spec.legacy else ""
+        text += f", markers {(spec.marker_m or 0) * 1000:g} mm {spec.dictionary}{layout}"
+    elif spec.kind is BoardKind.APRIL_GRID:
+        text += f", gap {(spec.marker_m or 0) * 1000:g} mm"
+    return text

@@ -1,0 +1,132 @@
+"""`calibrate batch`: solve many recordings again."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from calibrate.batch.cluster import Cluster, cluster_solver
+from calibrate.batch.run import BatchResult, Solver, run_batch
+from calibrate.batch.trends import Cell, cells, trends_text
+from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
+from calibrate.cli.job import GatesFile, MemoryLimit, Profile, ProfileName, Seed, TimeLimit
+from calibrate.cli.output import AsJson, OutputError, err, out
+from calibrate.files.calibration import write_output
+from calibrate.options import JobOptions
+from calibrate.quality.gates import GateLimits, read_limits
+from recordings.cli.terminal import examples
+
+DONE_WITH_LOSS = 3
+
+
+def register(app: typer.Typer) -> None:
+    app.command(
+        "batch",
+        epilog=examples(
+            "calibrate batch monday.mcap tuesday.mcap -o results",
+            "calibrate batch sessions/* -o results --workers 2  # each worker needs the memory of a solve",
+        ),
+    )(batch)
+
+
+def batch(
+    recordings: Annotated[list[Path], typer.Argument(help="Recordings or session folders")],
+    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the results")] = Path("batch"),
+    workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core")] = None,
+    profile: Profile = ProfileName.robust,
+    seed: Seed = 0,
+    gates: GatesFile = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(
+            help="Solve on this Dask cluster, tcp://HOST:PORT or tls://HOST:PORT, not in processes here. Its "
+            "workers see the recordings under the same paths. Whoever reaches a tcp:// scheduler can run "
+            "code on it: use tls:// outside a closed network"
+        ),
+    ] = None,
+    tls_ca: Annotated[Path | None, typer.Option(help="The cluster's certificate authority, PEM")] = None,
+    tls_cert: Annotated[Path | None, typer.Option(help="Your certificate, PEM")] = None,
+    tls_key: Annotated[Path | None, typer.Option(help="Your private key, PEM")] = None,
+    time_limit_s: TimeLimit = TIME_LIMIT_S,
+    memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
+    as_json: AsJson = False,
+) -> None:
+    """Solve many recordings; resumable. Exit 3: done, but some recordings could not be solved.
+
+    OUTPUT then holds a calibration each, results.jsonl, results.csv, and what moved: trends.html, trends.txt.
+    The limits are those of one solve in a process here; on a cluster the workers' own hold.
+    """
+    from calibrate.batch.page import fleet_page  # matplotlib is slow to load
+
+    if output.exists() and not output.is_dir():
+        raise OutputError(f"{output} is a file; the results need a folder.")
+    gate_limits = GateLimits() if gates is None else read_limits(gates)
+    options = JobOptions(profile=profile.value, seed=seed, limits=gate_limits)
+    solver = _solver(scheduler, workers, tls_ca, tls_cert, tls_key)
+    with ExitStack() as stack:
+        results = run_batch(
+            recordings,
+            output,
+            options,
+            workers,
+            _progress(stack),
+            solver,
+            Limits(time_limit_s, memory_limit_mib),
+        )
+    found = cells(results)
+    _write(output / "trends.txt", trends_text(found))
+    _write(output / "trends.html", fleet_page(results, found))
+    if as_json:
+        for result in results:
+            typer.echo(msgspec.json.encode(result).decode())
+    else:
+        _tell(results, found, output)
+    if not all(result.solved for result in results):
+        raise typer.Exit(DONE_WITH_LOSS)
+
+
+def _tell(results: list[BatchResult], found: tuple[Cell, ...], output: Path) -> None:
+    good = sum(result.passed for result in results)
+    failed = [result for result in results if not result.solved]
+    out.print(
+        f"{len(results)} recordings: {good} good, {len(results) - good - len(failed)} below a gate, "
+        f"{len(failed)} not solved. {output}/results.csv, results.jsonl, trends.html, trends.txt"
+    )
+    for cell in found:
+        for finding in cell.findings:
+            out.print(f"{cell.name}: {finding}", soft_wrap=True)
+    for result in failed:
+        named = result.error.startswith(result.recording)
+        err.print(result.error if named else f"{result.recording}: {result.error}", soft_wrap=True)
+
+
+def _solver(
+    scheduler: str | None, workers: int | None, ca: Path | None, cert: Path | None, key: Path | None
+) -> Solver | None:
+    """None: the process pool."""
+    if scheduler is not None:
+        if workers is not None:
+            raise OutputError("--workers counts processes here; a cluster has as many as were started there.")
+        return cluster_solver(Cluster(scheduler, ca, cert, key))
+    if ca or cert or key:
+        raise OutputError("--tls-ca, --tls-cert and --tls-key belong to --scheduler tls://HOST:PORT.")
+    return None
+
+
+def _write(path: Path, text: str) -> None:
+    write_output(path, text.encode())
+
+
+def _progress(stack: ExitStack) -> Callable[[int, int, BatchResult], None] | None:
+    if not err.is_terminal:
+        return None
+    columns = (TextColumn("solving"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    bar = stack.enter_context(Progress(*columns, console=err, transient=True))
+    task = bar.add_task("", total=None)
+    return lambda done, total, result: bar.update(task, completed=done, total=total)

@@ -1,0 +1,76 @@
+"""`calibrate board`: a board to print at true scale."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from calibrate.boards.model import ambiguity_text, describe_board
+from calibrate.boards.printing import PAPER_MM, board_sheet
+from calibrate.boards.vector import pdf, svg
+from calibrate.cli.files import read_board
+from calibrate.cli.output import OutputError, check_folder, err, out
+from calibrate.files.calibration import write_output
+from recordings.cli.terminal import examples
+from recordings.schema.messages import SINGLE_TAGS, BoardKind, BoardSpec
+
+
+def register(app: typer.Typer) -> None:
+    app.command(
+        "board",
+        epilog=examples(
+            "calibrate board -o board.pdf --paper A4",
+            "calibrate board --kind charuco --columns 12 --rows 9 --square-mm 30 --marker-mm 22 -o board.svg",
+            "calibrate board --kind april-tag --id 3 --square-mm 120 -o tag.pdf",
+        ),
+    )(board)
+
+
+def board(
+    output: Annotated[Path, typer.Option("-o", "--output", help="NAME.pdf or NAME.svg")] = Path("board.pdf"),
+    board_file: Annotated[
+        Path | None,
+        typer.Option("--board", help="YAML with a board: dataset.yaml, a station's configuration"),
+    ] = None,
+    kind: Annotated[BoardKind, typer.Option(help="Of the pattern")] = BoardKind.CHESSBOARD,
+    columns: Annotated[int, typer.Option(help="Inner corners; circles; tags; charuco: squares")] = 7,
+    rows: Annotated[int, typer.Option(help="As columns")] = 6,
+    square_mm: Annotated[float, typer.Option(help="Square; circle distance; side of a tag")] = 25.0,
+    marker_mm: Annotated[float | None, typer.Option(help="charuco: marker; april-grid: gap")] = None,
+    dictionary: Annotated[str | None, typer.Option(help="Of markers, such as DICT_6X6_250")] = None,
+    tag_id: Annotated[int, typer.Option("--id", help="aruco, april-tag: number of the tag")] = 0,
+    legacy: Annotated[bool, typer.Option(help="charuco: layout before OpenCV 4.6")] = False,
+    paper: Annotated[
+        str | None, typer.Option(help=f"{', '.join(PAPER_MM)}; default: as large as needed")
+    ] = None,
+) -> None:
+    """Write a printable board (PDF or SVG, true scale). Without options: 8 × 7 squares of 25 mm.
+
+    With a bar to measure on the paper, and the lines for the station's configuration.
+    """
+    if output.suffix.lower() not in (".pdf", ".svg"):
+        raise OutputError(f"{output}: the name must end in .pdf or .svg.")
+    check_folder(output)
+    marker_m = None if marker_mm is None else marker_mm / 1000
+    if marker_m is None and kind in (BoardKind.CHARUCO, BoardKind.APRIL_GRID):
+        marker_m = square_mm / 1000 * (0.75 if kind is BoardKind.CHARUCO else 0.3)
+    if dictionary is None and kind is BoardKind.CHARUCO:
+        dictionary = "DICT_6X6_250"
+    if kind in SINGLE_TAGS:
+        columns = rows = 1
+    if dictionary is None and kind is BoardKind.ARUCO:
+        dictionary = "DICT_4X4_50"
+    spec = BoardSpec(kind, columns, rows, square_mm / 1000, marker_m, dictionary, legacy, tag_id=tag_id)
+    if board_file is not None:
+        spec = read_board(board_file)
+    sheet = board_sheet(spec, paper)
+    content = pdf(sheet) if output.suffix.lower() == ".pdf" else svg(sheet).encode()
+    write_output(output, content)
+    out.print(f"written: {output} ({describe_board(spec)}, {sheet.width_mm:.0f} × {sheet.height_mm:.0f} mm)")
+    out.print(
+        "print at 100 % (no fitting to the page), glue it on something flat, measure the bar and one square"
+    )
+    if warning := ambiguity_text(spec):
+        err.print(warning, style="yellow")

@@ -1,0 +1,112 @@
+"""Boards and cameras that a person names on the command line."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, TypeVar, get_args
+
+import msgspec
+import numpy as np
+
+from calibrate.boards.model import check_board
+from calibrate.errors import CalibrationError
+from calibrate.files.calibration import FORMAT, read_calibration
+from calibrate.lens.intrinsics import LensModel
+from calibrate.lens.model import distortion
+from calibrate.projection import camera_matrix
+from recordings import strict_yaml
+from recordings.schema.messages import BoardSpec, CameraModel
+
+_LIMIT_BYTES = strict_yaml.LIMIT_BYTES
+T = TypeVar("T")
+
+
+class InputFileError(CalibrationError):
+    """A file named on the command line cannot be used."""
+
+    exit_code = 2
+
+
+def read_board(path: Path) -> BoardSpec:
+    """A board's fields, or any YAML with `board:` in it (dataset.yaml, a station's configuration)."""
+    board = _strictly(path, BoardSpec, "board")
+    check_board(board)
+    return board
+
+
+def read_camera(path: Path) -> CameraModel:
+    """A calibration file, ROS camera_info YAML, or the fields of a camera (width, height, matrix …)."""
+    plain = _read(path, "a calibration file, a camera_info file or a camera's width, height and matrix")
+    if plain.get("format") == FORMAT:
+        return read_calibration(path).intrinsics.model
+    if "camera_matrix" in plain:
+        camera = _camera_info(path, plain)
+    else:
+        camera = _strictly(path, CameraModel, "camera")
+    if camera.width < 1 or camera.height < 1:
+        raise InputFileError(f"{path}: {camera.width}×{camera.height} is no picture size.")
+    camera_matrix(camera)
+    distortion(camera)
+    return camera
+
+
+def read_lens_sigma(path: Path) -> dict[str, float]:
+    """1σ of each parameter of the lens, as a calibration file states them; empty for other files."""
+    plain = _read(path, "a calibration file, a camera_info file or a camera's width, height and matrix")
+    return dict(read_calibration(path).intrinsics.sigma) if plain.get("format") == FORMAT else {}
+
+
+def read_cell_serials(path: Path) -> tuple[str, str]:
+    """(robot's, camera's) serial number of a station's configuration; empty where it names none."""
+    plain = _read(path, "a station's configuration")
+    robot, camera = plain.get("robot"), plain.get("camera")
+    if not isinstance(robot, dict) or not isinstance(camera, dict):
+        raise InputFileError(f"{path}: no station configuration, robot and camera are missing.")
+    return str(robot.get("serial") or ""), str(camera.get("serial") or "")
+
+
+def _camera_info(path: Path, plain: dict[str, Any]) -> CameraModel:
+    model = plain.get("distortion_model", "plumb_bob")
+    if model not in get_args(LensModel):
+        known = ", ".join(get_args(LensModel))
+        raise InputFileError(f"{path}: distortion_model {model!r} is not known here; known are {known}.")
+    try:
+        fields = {
+            "width": plain["image_width"],
+            "height": plain["image_height"],
+            "matrix": np.array(plain["camera_matrix"]["data"], float).reshape(3, 3).tolist(),
+            # one by one: PyYAML takes 1e-05 for a text
+            "distortion": [float(value) for value in plain["distortion_coefficients"]["data"]],
+            "distortion_model": model,
+        }
+        return msgspec.convert(fields, CameraModel)
+    except (KeyError, TypeError, ValueError) as problem:
+        raise InputFileError(f"{path}: not a whole camera_info file ({problem!r}).") from None
+
+
+def _strictly(path: Path, kind: type[T], under: str) -> T:
+    try:
+        return strict_yaml.load(_content(path), kind, under)
+    except strict_yaml.StrictYamlError as error:
+        raise InputFileError(f"{path}: {'; '.join(map(str, error.problems))}.") from None
+
+
+def _content(path: Path) -> bytes:
+    try:
+        with path.open("rb") as file:
+            content = file.read(_LIMIT_BYTES + 1)
+    except OSError as problem:
+        raise InputFileError(f"{path}: {problem.strerror or problem}.") from None
+    if len(content) > _LIMIT_BYTES:
+        raise InputFileError(f"{path}: larger than {_LIMIT_BYTES // 1024} kB. Is it the right file?")
+    return content
+
+
+def _read(path: Path, wanted: str) -> dict[str, Any]:
+    try:
+        plain = strict_yaml.load_plain(_content(path))
+    except strict_yaml.StrictYamlError as problem:
+        raise InputFileError(f"{path}: {problem}.") from None
+    if not isinstance(plain, dict):
+        raise InputFileError(f"{path}: {wanted} is needed, and no fields are in it.")
+    return plain

@@ -1,0 +1,147 @@
+"""The options that every command which solves shares, written once."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from dataclasses import replace
+from enum import StrEnum
+from functools import wraps
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from calibrate.cli.files import read_board, read_camera, read_lens_sigma
+from calibrate.cli.output import OutputError
+from calibrate.options import JobOptions
+from calibrate.quality.gates import GateLimits, read_limits
+
+
+class ProfileName(StrEnum):
+    robust = "robust"
+    paper = "paper"
+
+
+class LensName(StrEnum):
+    plumb_bob = "plumb_bob"
+    rational = "rational_polynomial"
+    fisheye = "equidistant"
+
+
+Profile = Annotated[
+    ProfileName, typer.Option(help="robust: the station's; paper: the published method, exactly")
+]
+Seed = Annotated[int, typer.Option(min=0, help="Of every random draw")]
+BoardFile = Annotated[
+    Path | None, typer.Option("--board", help="YAML of another board than the recorded one")
+]
+SquareMm = Annotated[float | None, typer.Option("--square-mm", help="Another square size")]
+CameraFile = Annotated[
+    Path | None, typer.Option("--camera", help="Known lens: camera_info YAML or a calibration file")
+]
+Find = Annotated[
+    bool,
+    typer.Option(
+        "--estimate-intrinsics",
+        "--find-intrinsics",
+        help="Estimate the intrinsics from these pictures, even where some are recorded",
+    ),
+]
+AcceptMove = Annotated[
+    bool,
+    typer.Option("--accept-move", help="Use both parts of a session in which camera or board was moved"),
+]
+LensKind = Annotated[LensName, typer.Option("--lens", help="Model of a lens that has to be found")]
+GatesFile = Annotated[Path | None, typer.Option("--gates", help="YAML of other limits")]
+Without = Annotated[
+    str | None, typer.Option(help="Numbers of poses to leave out, such as 3,7; the file says so")
+]
+Threads = Annotated[
+    int | None, typer.Option(min=1, help="For finding boards; the result does not depend on it")
+]
+Distance = Annotated[
+    float | None, typer.Option("--working-distance-mm", min=1.0, max=1e5, help="Where the error is stated")
+]
+
+TimeLimit = Annotated[
+    float, typer.Option(min=0.0, max=1e6, help="A solve ends with an error after so long; 0: no limit")
+]
+MemoryLimit = Annotated[
+    int, typer.Option(min=0, max=2**30, help="… when its process needs so much; 0: no limit")
+]
+
+
+def takes(build: Callable[..., JobOptions]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
+    """The command offers `build`'s options instead of its parameter `options`, and gets what they make."""
+    offered = inspect.signature(build, eval_str=True).parameters
+
+    def decorate(command: Callable[..., Any]) -> Callable[..., Any]:
+        own = inspect.signature(command, eval_str=True)
+        rest = [p for name, p in own.parameters.items() if name != "options"]
+        needed = [p for p in rest if p.default is p.empty]
+        optional = [p for p in rest if p.default is not p.empty]
+
+        @wraps(command)
+        def run(**given: Any) -> Any:
+            chosen = {name: given.pop(name) for name in offered if name in given}
+            return command(options=build(**chosen), **given)
+
+        run.__signature__ = own.replace(  # type: ignore[attr-defined]
+            parameters=[*needed, *offered.values(), *optional]
+        )
+        run.__annotations__ = {p.name: p.annotation for p in [*rest, *offered.values()]}
+        return run
+
+    return decorate
+
+
+def picture_options(
+    seed: Seed = 0,
+    board: BoardFile = None,
+    square_mm: SquareMm = None,
+    camera: CameraFile = None,
+    find_intrinsics: Find = False,
+    lens: LensKind = LensName.plumb_bob,
+    without: Without = None,
+    threads: Threads = None,
+) -> JobOptions:
+    """How pictures are read."""
+    if camera is not None and find_intrinsics:
+        raise OutputError("--camera gives the lens, --estimate-intrinsics finds it: choose one of them.")
+    return JobOptions(
+        seed=seed,
+        board=None if board is None else read_board(board),
+        square_m=None if square_mm is None else square_mm / 1000,
+        camera=None if camera is None else read_camera(camera),
+        camera_sigma={} if camera is None else read_lens_sigma(camera),
+        lens_model=lens.value,
+        find_intrinsics=find_intrinsics,
+        without=() if without is None else _numbers(without),
+        threads=threads,
+    )
+
+
+def _numbers(words: str) -> tuple[int, ...]:
+    try:
+        return tuple(sorted({int(word) for word in words.split(",")}))
+    except ValueError:
+        raise typer.BadParameter(f"--without {words}: give numbers of poses, such as 3,7") from None
+
+
+@takes(picture_options)
+def job_options(
+    options: JobOptions,
+    profile: Profile = ProfileName.robust,
+    gates: GatesFile = None,
+    accept_move: AcceptMove = False,
+    working_distance_mm: Distance = None,
+) -> JobOptions:
+    """And how they are solved and judged."""
+    return replace(
+        options,
+        profile=profile.value,
+        limits=GateLimits() if gates is None else read_limits(gates),
+        accept_move=accept_move,
+        working_distance_m=None if working_distance_mm is None else working_distance_mm / 1000,
+    )

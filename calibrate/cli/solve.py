@@ -1,0 +1,242 @@
+"""`calibrate solve | compare | report`: from a recording to a calibration."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+import typer
+from rich.table import Table
+
+from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, bounded
+from calibrate.cli.install import Root, history_rows
+from calibrate.cli.job import MemoryLimit, TimeLimit, job_options, picture_options, takes
+from calibrate.cli.output import (
+    AsJson,
+    OutputError,
+    check_page,
+    check_target,
+    detection_progress,
+    out,
+    print_json,
+)
+from calibrate.errors import CalibrationError
+from calibrate.files.calibration import Touch, write_calibration
+from calibrate.files.install import install_line, load_installed
+from calibrate.files.summary import summary
+from calibrate.frames import camera_frames
+from calibrate.geometry import rotation_log
+from calibrate.handeye.solution import PeerResult
+from calibrate.options import JobOptions
+from calibrate.pipeline import SolvedRecording, prepare_views, solve_recording, solver_options
+from recordings.cli.terminal import examples
+
+Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session folder", show_default=False)]
+GATE_FAILED = 4
+
+
+def register(app: typer.Typer) -> None:
+    app.command(
+        "solve",
+        epilog=examples(
+            "calibrate solve session.mcap -o cell.yaml --report cell.html",
+            "calibrate solve session.mcap -o cell.yaml --without 3,7",
+        ),
+    )(solve)
+    app.command(
+        "compare",
+        epilog=examples(
+            "calibrate compare session.mcap", "calibrate compare session.mcap --camera cell.yaml"
+        ),
+    )(compare)
+    app.command("report", epilog=examples("calibrate report session.mcap -o cell.html"))(report_file)
+
+
+@takes(job_options)
+def solve(
+    recording: Rec,
+    options: JobOptions,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Default: NAME.calibration.yaml in this folder")
+    ] = None,
+    as_json: AsJson = False,
+    report: Annotated[Path | None, typer.Option(help="Also write the report (HTML)")] = None,
+    time_limit_s: TimeLimit = TIME_LIMIT_S,
+    memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
+) -> None:
+    """Solve a recording and write the calibration file. Exit 4: written, but a gate failed.
+
+    Next: look at the report, then `calibrate install`.
+    """
+    target = output or Path(f"{recording.name.removesuffix('.mcap')}.calibration.yaml")
+    check_target(target)
+    if report is not None:
+        check_page(report)
+        if report.resolve() == target.resolve():
+            raise OutputError(f"{target} cannot be calibration and report; give --report another name.")
+    with bounded(time_limit_s, memory_limit_mib), detection_progress() as progress:
+        job = solve_recording(recording, options, progress)
+    write_calibration(job.calibration, target)
+    if report is not None:
+        _write_report(job, report, options)
+    if as_json:
+        print_json(solve_json(job))
+    else:
+        out.print(summary(job.calibration))
+        out.print(f"written: {target}" + ("" if report is None else f"  report: {report}"), soft_wrap=True)
+        if job.passed:
+            out.print(f"next: {install_line(job.calibration.source, target)}", soft_wrap=True)
+    if not job.passed:
+        raise typer.Exit(GATE_FAILED)
+
+
+def solve_json(job: SolvedRecording) -> dict[str, Any]:
+    """The contract of `calibrate solve --json`."""
+    plain = msgspec.to_builtins(job.calibration)
+    views, quality, lens = plain["views"], plain["quality"], plain["intrinsics"]
+    holdout = quality.get("holdout")
+    proof = quality["certificate"]
+    return {
+        "mount": plain["mount"],
+        "result": plain["result"],
+        "sigma": plain["sigma"],
+        "covariance": plain["covariance"],
+        "views": {
+            "used": views["used"],
+            "rejected": [
+                {"index": r["index"], "reason": r["reason"], "kind": r.get("kind", "")}
+                for r in views.get("rejected", [])
+            ],
+            "weights": [{"index": i, "weight": w} for i, w in job.solution.weights.items()],
+        },
+        "intrinsics": {key: lens[key] for key in ("width", "height", "matrix", "distortion", "rms_px")},
+        "holdout": None if holdout is None else {"e_t_m": holdout["e_t_m"], "e_R": holdout["e_R"]},
+        "certificate": {
+            key: proof[key] for key in ("certified", "relative_gap", "objective", "distance_sigma")
+        },
+        "gates": quality["gates"],
+        "verdict": "pass" if job.passed else "fail",
+        "warnings": [
+            {"code": code, "text": text}
+            for code, text in zip(quality.get("warning_codes", []), quality.get("warnings", []), strict=True)
+        ],
+        "cross_validation": quality.get("cross_validation"),
+        "board": quality.get("board"),
+        "session": quality.get("session"),
+        "arm": quality.get("arm"),
+        "solve_ms": sum(job.stage_ms.values()),
+    }
+
+
+@takes(job_options)
+def report_file(
+    recording: Rec,
+    options: JobOptions,
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="Default: NAME.report.html in this folder")
+    ] = None,
+    root: Root = None,
+    time_limit_s: TimeLimit = TIME_LIMIT_S,
+    memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
+) -> None:
+    """Solve a recording again and write its report: one HTML file. With the history of what is installed.
+
+    It opens in any browser, without a network.
+    """
+    target = output or Path(f"{recording.name.removesuffix('.mcap')}.report.html")
+    check_page(target)
+    with bounded(time_limit_s, memory_limit_mib), detection_progress() as progress:
+        job = solve_recording(recording, options, progress)
+    _write_report(job, target, options, root)
+    out.print(f"written: {target}", soft_wrap=True)
+
+
+def _write_report(job: SolvedRecording, target: Path, options: JobOptions, root: Path | None = None) -> None:
+    from calibrate.handeye.peers import compare_all  # like matplotlib, slow to load
+    from calibrate.report import write_report
+
+    try:
+        peers = compare_all(job.views, solver_options(options, job))
+    except CalibrationError:  # the report stands without the comparison
+        peers = []
+    write_report(job, target, peers, history_rows(root), _touches(job, root))
+
+
+def _touches(job: SolvedRecording, root: Path | None) -> list[Touch]:
+    """What was found by hand with the installed calibration, when it is of this recording."""
+    try:
+        installed = load_installed(root, allow_simulated=True)
+    except CalibrationError:
+        return []
+    same = installed.provenance.recording_sha256 == job.calibration.provenance.recording_sha256
+    return installed.verification if same else []
+
+
+@takes(picture_options)
+def compare(
+    recording: Rec,
+    options: JobOptions,
+    as_json: AsJson = False,
+) -> None:
+    """Every method side by side on the same views. Nothing is written.
+
+    e_t, e_R: how far views that took no part are missed; spread: how far apart the views see the board; px:
+    how far the corners are missed; σ from ours: distance to what `solve` finds, in its own sigmas.
+    """
+    from calibrate.handeye.peers import compare_all
+
+    with bounded(), detection_progress() as progress:
+        prepared = prepare_views(recording, options, progress)
+        results = compare_all(prepared.views, solver_options(options, prepared))
+    if as_json:
+        print_json(
+            {
+                "mount": prepared.views.mount,
+                "views": [view.index for view in prepared.views],
+                "methods": [peer_plain(peer) for peer in results],
+            }
+        )
+        return
+    table = Table("method", "e_t mm", "e_R", "spread mm", "spread °", "px", "σ from ours", "ms", "", box=None)
+    for peer in results:
+        table.add_row(
+            peer.name,
+            _number(peer.e_t_m, 1e3, 3),
+            _number(peer.e_R, 1, 5),
+            _number(peer.board_spread_m, 1e3, 3),
+            _number(peer.board_spread_rad, float(np.degrees(1)), 4),
+            _number(peer.reprojection_px, 1, 3),
+            _number(peer.distance_sigma, 1, 1),
+            _number(peer.time_ms, 1, 1),
+            peer.note,
+        )
+    out.print(table)
+    out.print(f"\nX, {' from '.join(camera_frames(prepared.views.mount))}:")
+    out.print(_table_of_X(results))
+
+
+def _table_of_X(results: list[PeerResult]) -> Table:
+    """Translation, and rotation as axis times angle."""
+    table = Table("method", "x mm", "y mm", "z mm", "rx °", "ry °", "rz °", box=None)
+    for peer in results:
+        if peer.matrix is None:
+            table.add_row(peer.name, "-")
+            continue
+        turn = [f"{v:.4f}" for v in np.degrees(rotation_log(peer.matrix[:3, :3]))] if peer.rigid else ["-"]
+        table.add_row(peer.name, *(f"{1e3 * v:.3f}" for v in peer.matrix[:3, 3]), *turn)
+    return table
+
+
+def peer_plain(peer: Any) -> dict[str, Any]:
+    plain = {
+        key: value.tolist() if isinstance(value, np.ndarray) else value
+        for key, value in vars(peer).items()
+        if not key.startswith("samples_")
+    }
+    return {key: float(value) if isinstance(value, np.floating) else value for key, value in plain.items()}
+
+
+def _number(value: float | None, factor: float, digits: int) -> str:
+    return "-" if value is None else f"{value * factor:.{digits}f}"

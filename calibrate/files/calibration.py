@@ -1,0 +1,390 @@
+"""The calibration file, `format: handeye-calibration/1`: what it holds, writing, and reading it with proof.
+
+Field by field in docs/calibration-file.md. Metres and radians unless the name says otherwise; covariances are
+of `geometry.perturb`'s delta.
+"""
+# ruff: noqa: N815  (e_t and e_R are written as the paper writes them)
+
+from __future__ import annotations
+
+import hashlib
+import shlex
+from pathlib import Path
+from typing import Any, Literal
+
+import msgspec
+import numpy as np
+import yaml
+
+from calibrate.errors import CalibrationError
+from calibrate.geometry import Transform, is_rigid, matrix_from_quaternion
+from recordings import strict_yaml
+from recordings.files import ASKED_FOR, write_atomically
+from recordings.mcap.records import MAGIC
+from recordings.schema.messages import (
+    BoardSpec,
+    CameraIdentity,
+    CameraModel,
+    Matrix4,
+    Mount,
+    RobotIdentity,
+    Source,
+)
+
+FORMAT: Literal["handeye-calibration/1"] = "handeye-calibration/1"
+_LIMIT_BYTES = 4 * 1024 * 1024
+Vector3 = tuple[float, float, float]
+
+
+class CalibrationFileError(CalibrationError):
+    """A calibration file is missing, damaged, or of another format."""
+
+
+class FramePose(msgspec.Struct, frozen=True):
+    """parent_from_child: maps points of `child_frame` (metres) into `parent_frame`."""
+
+    parent_frame: str
+    child_frame: str
+    translation_m: Vector3
+    rotation_xyzw: tuple[float, float, float, float]
+    matrix: Matrix4
+
+    @classmethod
+    def of(cls, transform: Transform) -> FramePose:
+        return cls(
+            transform.parent,
+            transform.child,
+            tuple(transform.translation_m.tolist()),
+            tuple(transform.quaternion_xyzw.tolist()),
+            tuple(tuple(row) for row in transform.matrix.tolist()),
+        )
+
+    @property
+    def transform(self) -> Transform:
+        return Transform(self.parent_frame, self.child_frame, np.array(self.matrix))
+
+
+class Sigma(msgspec.Struct, frozen=True):
+    translation_mm: float
+    """Root mean squared length of the translation's error."""
+    rotation_deg: float
+
+
+class Rejected(msgspec.Struct, frozen=True, omit_defaults=True):
+    index: int
+    name: str
+    reason: str
+    kind: str = ""
+    """The cause as a code, where the views name one."""
+
+
+class ViewWeight(msgspec.Struct, frozen=True):
+    index: int
+    weight: float
+
+
+class Views(msgspec.Struct, frozen=True, omit_defaults=True):
+    used: list[int]
+    rejected: list[Rejected] = []
+    turned: list[int] = []
+    weights: list[ViewWeight] = []
+    """Of the views that count for less than 1."""
+
+
+class Lens(msgspec.Struct, frozen=True, omit_defaults=True):
+    width: int
+    height: int
+    matrix: tuple[tuple[float, float, float], ...]
+    distortion: tuple[float, ...]
+    distortion_model: Literal["plumb_bob", "rational_polynomial", "equidistant"]
+    rms_px: float | None
+    found: Literal["from these pictures", "given"]
+    sigma: dict[str, float] = {}
+    held: list[str] = []
+
+    @property
+    def model(self) -> CameraModel:
+        return CameraModel(self.width, self.height, self.matrix, self.distortion, self.distortion_model)
+
+
+class Holdout(msgspec.Struct, frozen=True, omit_defaults=True):
+    e_t_m: float
+    e_R: float
+    samples_e_t_m: list[float]
+    samples_e_R: list[float]
+    pairs: list[tuple[int, int]]
+    fitted_views: int
+    note: str = ""
+
+
+class Proof(msgspec.Struct, frozen=True):
+    certified: bool
+    relative_gap: float
+    objective: float
+    distance_sigma: float | None
+    problem: str
+
+
+class ViewQuality(msgspec.Struct, frozen=True, omit_defaults=True):
+    index: int
+    rms_px: float | None = None
+    robot_mm: float | None = None
+    robot_deg: float | None = None
+
+
+class BoardFound(msgspec.Struct, frozen=True):
+    """What the views say of the board's shape."""
+
+    scale: float
+    """True over stated size, minus 1."""
+    anisotropy: float
+    bend_m: Vector3
+    sigma: tuple[float, float, float, float, float]
+
+
+class Folds(msgspec.Struct, frozen=True):
+    """Left-out views against what was claimed of them."""
+
+    rms_mm: float
+    rms_deg: float
+    claimed_mm: float
+    folds: int
+
+
+class Session(msgspec.Struct, frozen=True):
+    """How the recording as a whole has to be read."""
+
+    hypothesis: str
+    text: str
+
+
+class TableError(msgspec.Struct, frozen=True):
+    """One error of the arm's kinematic table, true minus nominal, metres or radians."""
+
+    parameter: str
+    value: float
+    sigma: float
+
+
+class Arm(msgspec.Struct, frozen=True):
+    applied: bool
+    """The evidence for errors of the table is clear."""
+    log_bayes: float
+    size_mm: float
+    table: list[TableError]
+
+
+class Quality(msgspec.Struct, frozen=True, omit_defaults=True):
+    gates: list[Gate]
+    certificate: Proof
+    holdout: Holdout | None = None
+    rms_px: float | None = None
+    views: list[ViewQuality] = []
+    board_spread_mm: float | None = None
+    board_spread_deg: float | None = None
+    predicted_error_mm: float | None = None
+    working_distance_m: float | None = None
+    projection_sigma_px: dict[str, float] = {}
+    """centre, corner, worst: 1σ by which a lens found here may show a fixed direction wrongly; else empty."""
+    noise: dict[str, float] = {}
+    """corner_px, robot_mm, robot_deg"""
+    error_shares: dict[str, float] = {}
+    weakest: str = ""
+    board_scale: float | None = None
+    """True over stated size."""
+    board: BoardFound | None = None
+    cross_validation: Folds | None = None
+    session: Session | None = None
+    arm: Arm | None = None
+    robot_systematics: str = ""
+    """Of files from before version 0.2; see `arm`."""
+    warnings: list[str] = []
+    warning_codes: list[str] = []
+    """One for each of `warnings`."""
+
+    @property
+    def failed(self) -> list[Gate]:
+        return [gate for gate in self.gates if not gate.passed]
+
+
+class Provenance(msgspec.Struct, frozen=True, omit_defaults=True):
+    recording: str
+    """File name only."""
+    recording_sha256: str
+    session: str
+    software: dict[str, str]
+    profile: str
+    seed: int
+    options: dict[str, Any] = {}
+    recorded_wall_ns: int = 0
+    plan_sha256: str = ""
+
+
+class Override(msgspec.Struct, frozen=True):
+    """A person installed in spite of something; written when installing."""
+
+    reason: str
+    who: str
+    overridden: list[str]
+
+
+class Touch(msgspec.Struct, frozen=True, omit_defaults=True):
+    """The tip was brought down by hand where the calibration says that a corner is."""
+
+    corner: int
+    """Row of `board.board_points`."""
+    corner_mm: tuple[float, float]
+    """x, y on the board."""
+    offset_mm: tuple[float, float]
+    """Tip minus true corner along the board's x and y, when the tip is lowered straight down."""
+    sigma_mm: tuple[float, float]
+    """1 sigma of it that calibration, picture and robot predict."""
+    found: Literal["told by a person", "read from the arm"]
+    who: str
+    wall: str
+    pointer: str = ""
+    standoff_mm: float = 0.0
+    note: str = ""
+
+
+class Gate(msgspec.Struct, frozen=True, omit_defaults=True):
+    name: str
+    passed: bool
+    value: float | None
+    """In the unit of the limit of its name in `GateLimits`; None in a file where it was no finite number."""
+    limit: float | None
+    text: str
+    """What was found and, where it failed, what to do."""
+
+
+class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):
+    format: Literal["handeye-calibration/1"]
+    created: str
+    """UTC; the only field that two runs on one recording differ in, and not part of the hash."""
+    source: Source
+    mount: Mount
+    result: FramePose
+    sigma: Sigma
+    covariance: tuple[tuple[float, ...], ...]
+    confidence_threshold: float
+    board_place: FramePose
+    intrinsics: Lens
+    board: BoardSpec
+    robot: RobotIdentity
+    camera: CameraIdentity
+    views: Views
+    quality: Quality
+    provenance: Provenance
+    override: Override | None = None
+    verification: list[Touch] = []
+    """Checks by hand, oldest first; see `verification`."""
+
+    @property
+    def transform(self) -> Transform:
+        """flange_from_camera or base_from_camera."""
+        return self.result.transform
+
+
+def content_sha256(plain: dict[str, Any]) -> str:
+    """Over everything but `sha256` and `created`, independent of layout."""
+    content = {key: value for key, value in plain.items() if key not in ("sha256", "created")}
+    return hashlib.sha256(msgspec.json.encode(content, order="deterministic")).hexdigest()
+
+
+def encode_calibration(calibration: Calibration) -> bytes:
+    """YAML text of the file, hash included."""
+    plain = msgspec.json.decode(msgspec.json.encode(calibration))
+    # The hash stands where people see it first.
+    head = {"format": plain.pop("format"), "sha256": "", "created": plain.pop("created")}
+    ordered = head | plain
+    ordered["sha256"] = content_sha256(ordered)
+    text: str = yaml.dump(
+        ordered,
+        Dumper=yaml.CSafeDumper,
+        sort_keys=False,
+        default_flow_style=None,
+        width=120,
+        allow_unicode=True,
+    )
+    return text.encode()
+
+
+def decode_calibration(content: bytes, where: str) -> Calibration:
+    """Proves and parses a file's bytes; CalibrationFileError says what is wrong."""
+    if content.startswith(MAGIC):
+        solve = f"calibrate solve {shlex.quote(where)}"
+        raise CalibrationFileError(f"{where} is a recording, no calibration file. First run: {solve}")
+    if len(content) > _LIMIT_BYTES:
+        raise CalibrationFileError(f"{where}: larger than any calibration file ({len(content)} bytes).")
+    try:
+        plain = strict_yaml.load_plain(content)
+    except strict_yaml.StrictYamlError as problem:
+        raise CalibrationFileError(f"{where}: damaged, or no calibration file: {problem}.") from None
+    if not isinstance(plain, dict) or plain.get("format") != FORMAT:
+        found = plain.get("format") if isinstance(plain, dict) else None
+        raise CalibrationFileError(
+            f"{where}: not a calibration file: format is {found!r}, expected {FORMAT!r}. Give one that "
+            "`calibrate solve` wrote."
+        )
+    try:
+        hash_now = content_sha256(plain)
+    except (TypeError, ValueError) as problem:
+        raise CalibrationFileError(f"{where}: damaged ({problem}).") from None
+    if plain.pop("sha256", None) != hash_now:
+        raise CalibrationFileError(
+            f"{where}: the content does not fit its hash. It was edited by hand or damaged; use the "
+            "original, or solve the recording again."
+        )
+    try:
+        calibration = msgspec.convert(plain, Calibration)
+    except msgspec.ValidationError as problem:
+        raise CalibrationFileError(f"{where}: {problem}.") from None
+    _check_result(calibration, where)
+    return calibration
+
+
+def _check_result(calibration: Calibration, where: str) -> None:
+    result, matrix = calibration.result, np.array(calibration.result.matrix)
+    parent = "flange" if calibration.mount == "eye-in-hand" else "base"
+    if (result.parent_frame, result.child_frame) != (parent, "camera"):
+        raise CalibrationFileError(
+            f"{where}: {calibration.mount} must give {parent}_from_camera, not "
+            f"{result.parent_frame}_from_{result.child_frame}."
+        )
+    quaternion = np.array(result.rotation_xyzw)
+    if matrix.shape != (4, 4) or not is_rigid(matrix) or abs(np.linalg.norm(quaternion) - 1) > 1e-6:
+        raise CalibrationFileError(f"{where}: the result is not a rigid transform.")
+    if (
+        np.abs(matrix_from_quaternion(quaternion) - matrix[:3, :3]).max() > 1e-9
+        or np.abs(matrix[:3, 3] - np.array(result.translation_m)).max() > 1e-12
+    ):
+        raise CalibrationFileError(f"{where}: matrix, translation and quaternion do not agree.")
+    covariance = np.array(calibration.covariance)
+    if covariance.shape != (6, 6) or not np.isfinite(covariance).all():
+        raise CalibrationFileError(f"{where}: the covariance is not 6 × 6 finite numbers.")
+    rounding = 1e-9 * float(np.abs(covariance).max())
+    if np.abs(covariance - covariance.T).max() > rounding or np.linalg.eigvalsh(covariance).min() < -rounding:
+        raise CalibrationFileError(f"{where}: the covariance is not symmetric and positive.")
+
+
+def read_calibration(path: Path) -> Calibration:
+    """Reads and verifies a calibration file. Raises CalibrationFileError."""
+    try:
+        with path.open("rb") as file:
+            content = file.read(_LIMIT_BYTES + 1)
+    except OSError as problem:
+        raise CalibrationFileError(f"{path}: {problem.strerror or problem}.") from None
+    return decode_calibration(content, str(path))
+
+
+def write_calibration(calibration: Calibration, path: Path) -> None:
+    """In one durable step. Raises CalibrationFileError."""
+    write_output(path, encode_calibration(calibration))
+
+
+def write_output(path: Path, content: bytes) -> None:
+    """A file for whoever asked for it, in one durable step. Raises CalibrationFileError."""
+    try:
+        write_atomically(path, content, ASKED_FOR)
+    except OSError as problem:
+        raise CalibrationFileError(f"{path} cannot be written: {problem.strerror or problem}.") from None

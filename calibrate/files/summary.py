@@ -1,0 +1,123 @@
+"""A calibration in the terminal: the verdict first, then what a person needs to trust it."""
+
+from __future__ import annotations
+
+import numpy as np
+from rich.console import Group, RenderableType
+from rich.table import Table
+from rich.text import Text
+from scipy.spatial.transform import Rotation
+
+from calibrate.boards.model import describe_board
+from calibrate.files.calibration import Calibration, Override
+from calibrate.files.cell_text import cell_sentences
+from calibrate.files.verification import agrees, touch_text
+from calibrate.geometry import difference
+
+_STAMPS = {
+    "simulated": "SIMULATED: made without a robot or a camera",
+    "playback": "PLAYBACK: the pictures were played back",
+    "imported": "IMPORTED: pictures and poses of unknown origin",
+}
+
+
+def source_stamp(calibration: Calibration) -> str:
+    """What must stand on everything that shows a calibration which did not come from a real cell."""
+    return _STAMPS.get(calibration.source, "")
+
+
+def verdict(calibration: Calibration) -> tuple[bool, str]:
+    failed = calibration.quality.failed
+    if not failed:
+        return True, f"PASS: {len(calibration.quality.gates)} of {len(calibration.quality.gates)} gates"
+    names = ", ".join(gate.name for gate in failed)
+    return False, f"FAIL: {names} ({len(failed)} of {len(calibration.quality.gates)} gates)"
+
+
+def override_text(override: Override) -> str:
+    return f"installed although refused, by {override.who}: {override.reason}"
+
+
+def pose_text(calibration: Calibration) -> str:
+    """Position in mm, then roll, pitch, yaw about fixed axes in degrees."""
+    x, y, z = (v * 1000 for v in calibration.result.translation_m)
+    roll, pitch, yaw = Rotation.from_quat(calibration.result.rotation_xyzw).as_euler("xyz", degrees=True)
+    return f"{x:.3f}  {y:.3f}  {z:.3f} mm,  roll {roll:.4f}°  pitch {pitch:.4f}°  yaw {yaw:.4f}°"
+
+
+def summary(calibration: Calibration) -> RenderableType:
+    """For a rich console, 80 columns and more."""
+    good, sentence = verdict(calibration)
+    parts: list[RenderableType] = [Text(sentence, style="bold green" if good else "bold red")]
+    if source_stamp(calibration):
+        parts.append(Text(source_stamp(calibration), style="bold yellow"))
+    if calibration.override is not None:
+        parts.append(Text(override_text(calibration.override), style="bold yellow"))
+    parts += [_result_table(calibration), _gate_table(calibration)]
+    for touch in calibration.verification:
+        style = "green" if agrees(touch) else "bold red"
+        parts.append(Text(f"checked by hand, {touch.wall}, {touch.who}: {touch_text(touch)}", style=style))
+    parts += [Text(sentence) for sentence in cell_sentences(calibration)]
+    parts += [Text(f"! {warning}", style="yellow") for warning in calibration.quality.warnings]
+    for view in calibration.views.rejected:
+        parts.append(Text(f"- view {view.index + 1} ({view.name}) left out: {view.reason}"))
+    return Group(*parts)
+
+
+def _result_table(calibration: Calibration) -> Table:
+    result, quality = calibration.result, calibration.quality
+    table = Table.grid(padding=(0, 2))
+    position, rotation = pose_text(calibration).split(",", 1)
+    table.add_row(f"{result.parent_frame}_from_{result.child_frame}", position)
+    table.add_row("rotation", f"{rotation.strip()}  (fixed axes)")
+    table.add_row("1σ", f"{calibration.sigma.translation_mm:.3f} mm  {calibration.sigma.rotation_deg:.4f}°")
+    if quality.predicted_error_mm is not None:
+        table.add_row(
+            "expected error",
+            f"{quality.predicted_error_mm:.3f} mm (1σ) at {(quality.working_distance_m or 0) * 1000:.0f} mm",
+        )
+    if quality.holdout is not None:
+        table.add_row(
+            "hold-out", f"e_t {quality.holdout.e_t_m * 1000:.4f} mm   e_R {quality.holdout.e_R:.6f}"
+        )
+    if quality.board_spread_mm is not None:
+        spread_deg = quality.board_spread_deg or 0.0
+        table.add_row("board spread", f"{quality.board_spread_mm:.3f} mm  {spread_deg:.4f}°")
+    lens = calibration.intrinsics
+    fx, cx = lens.matrix[0][0], lens.matrix[0][2]
+    fy, cy = lens.matrix[1][1], lens.matrix[1][2]
+    rms = "" if lens.rms_px is None else f"  rms {lens.rms_px:.3f} px"
+    table.add_row("lens", f"f {fx:.1f} {fy:.1f}  c {cx:.1f} {cy:.1f} px{rms}  ({lens.found})")
+    if quality.error_shares:
+        shares = sorted(quality.error_shares.items(), key=lambda item: -item[1])
+        text = ", ".join(f"{name.replace('_', ' ')} {share:.0%}" for name, share in shares if share > 0.005)
+        table.add_row("error comes from", text)
+    used, rejected = len(calibration.views.used), len(calibration.views.rejected)
+    table.add_row("views", f"{used} used, {rejected} left out")
+    table.add_row("board", describe_board(calibration.board))
+    robot, camera = calibration.robot, calibration.camera
+    table.add_row(
+        "robot, camera",
+        f"{robot.model} {robot.serial}".strip() + f", {camera.model} {camera.serial}".rstrip(),
+    )
+    table.add_row("session", f"{calibration.provenance.session}, solved {calibration.created}")
+    return table
+
+
+def _gate_table(calibration: Calibration) -> Table:
+    table = Table(box=None, padding=(0, 2, 0, 0), show_header=False)
+    for gate in calibration.quality.gates:
+        mark = Text("✓", style="green") if gate.passed else Text("✗", style="bold red")
+        table.add_row(mark, gate.name, Text(gate.text))
+    return table
+
+
+def pose_difference(first: Calibration, second: Calibration) -> tuple[float, float, float]:
+    """(mm, degrees, sigmas) between two results of the same frames.
+
+    Sigmas: Mahalanobis distance with the sum of both covariances, as if the two were independent.
+    """
+    delta = difference(second.transform.matrix, first.transform.matrix)
+    covariance = np.array(first.covariance) + np.array(second.covariance)
+    sigmas = float(np.sqrt(delta @ np.linalg.pinv(covariance, hermitian=True) @ delta))
+    return float(np.linalg.norm(delta[:3]) * 1e3), float(np.degrees(np.linalg.norm(delta[3:]))), sigmas

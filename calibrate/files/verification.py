@@ -1,0 +1,82 @@
+"""What a person found by hand: the tip brought over a corner of the board, and how far off it stood.
+
+The station puts the tip above the place where the calibration says a corner is; a person guides it down and
+tells the offset. The entries live in the calibration file.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from scipy import stats
+
+from calibrate.files.calibration import Calibration, Touch, read_calibration, write_calibration
+from calibrate.files.generations import (
+    Generation,
+    InstallError,
+    add_generation,
+    calibrations_folder,
+    generations,
+    locked,
+)
+
+HAND_MM = 0.3
+"""1 sigma per axis of reading an offset or meeting a corner by hand and eye."""
+CONFIDENCE = 0.99
+"""Of one corner; several share the error of X, so that few of them alarm by chance."""
+
+
+def touch_sigmas(touch: Touch) -> float:
+    """How far off the corner, in sigmas of prediction and hand together: √Σ o² / (σ² + `HAND_MM`²)."""
+    offset, sigma = np.array(touch.offset_mm), np.array(touch.sigma_mm)
+    return float(np.sqrt(np.square(offset / np.hypot(sigma, HAND_MM)).sum()))
+
+
+def agrees(touch: Touch) -> bool:
+    """Whether the offset is within what was predicted (two numbers, χ²(2): 3.03 sigmas for 99 %)."""
+    return touch_sigmas(touch) <= float(np.sqrt(stats.chi2.ppf(CONFIDENCE, 2)))
+
+
+def touch_text(touch: Touch) -> str:
+    """'corner 0: 0.31 mm off (x +0.21, y -0.23), 0.9 sigmas'"""
+    x, y = touch.offset_mm
+    far = float(np.hypot(x, y))
+    text = (
+        f"corner {touch.corner}: {far:.2f} mm off (x {x:+.2f}, y {y:+.2f}), {touch_sigmas(touch):.1f} sigmas"
+    )
+    return text if agrees(touch) else f"{text}: MORE than the calibration claims"
+
+
+def objections(calibration: Calibration) -> list[str]:
+    """Why hands speak against it."""
+    bad = [touch for touch in calibration.verification if not agrees(touch)]
+    return [f"Checked by hand, it is off at {touch_text(touch)}." for touch in bad]
+
+
+def note_in_file(path: Path, touches: Sequence[Touch]) -> Calibration:
+    """Adds them to a calibration file, atomically; nothing else in it changes. CalibrationFileError."""
+    calibration = _with_touches(read_calibration(path), touches)
+    write_calibration(calibration, path)
+    return calibration
+
+
+def note_installed(root: Path | None, touches: Sequence[Touch]) -> Generation:
+    """Adds them to the installed calibration: a new generation, for generations never change.
+
+    Raises InstallError where no whole calibration is installed, or the folder or the disk does not allow it.
+    """
+    folder = calibrations_folder(root)
+    with locked(folder):
+        current = next((g for g in generations(root) if g.current), None)
+        if current is None or current.calibration is None:
+            raise InstallError(f"{folder}: no whole calibration is installed; nothing was noted.")
+        calibration = _with_touches(current.calibration, touches)
+        found = "; ".join(touch_text(touch) for touch in touches)
+        return add_generation(root, calibration, "verify", found)
+
+
+def _with_touches(calibration: Calibration, touches: Sequence[Touch]) -> Calibration:
+    return msgspec.structs.replace(calibration, verification=[*calibration.verification, *touches])

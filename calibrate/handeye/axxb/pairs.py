@@ -1,0 +1,106 @@
+"""Relative motions: from poses of the arm and of the board to pairs with A X = X B.
+
+One convention for both mounts. With H = base_from_flange (eye-in-hand) or H = (base_from_flange)⁻¹
+(eye-to-hand), C = camera_from_board and Y constant, H_i X C_i = Y for every view, so that
+A = H_j⁻¹ H_i and B = C_j C_i⁻¹ (paper eqs. 1-3 and 21; the blog's two derivations).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.geometry import Array, inverse, rotation_log
+from recordings.schema.messages import Mount
+
+Places = NDArray[np.intp]
+
+MAX_PAIRS = 20_000
+"""More pairs than this are thinned evenly: bounded memory and time with thousands of views."""
+
+
+@dataclass(frozen=True, eq=False)
+class Pairs:
+    A: Array
+    """(n, 4, 4) motion of the mount."""
+    B: Array
+    """(n, 4, 4) motion of the camera."""
+    first: Places
+    """(n,) place of the earlier view i."""
+    second: Places
+    """(n,) place of the later view j."""
+
+    def __len__(self) -> int:
+        return len(self.A)
+
+    @cached_property
+    def alpha(self) -> Array:
+        """(n, 3) logarithms of A's rotations (eq. 12), rad."""
+        return _logarithms(self.A[:, :3, :3])
+
+    @cached_property
+    def beta(self) -> Array:
+        """(n, 3) logarithms of B's rotations, rad."""
+        return _logarithms(self.B[:, :3, :3])
+
+    def select(self, places: Places | NDArray[np.bool_] | slice) -> Pairs:
+        return Pairs(self.A[places], self.B[places], self.first[places], self.second[places])
+
+
+def mount_poses(base_from_flange: Array, mount: Mount) -> Array:
+    """H (n, 4, 4) of the one convention above."""
+    return base_from_flange if mount == "eye-in-hand" else inverse(base_from_flange)
+
+
+def make_pairs(H: Array, camera_from_board: Array, first: Places, second: Places) -> Pairs:
+    """Pairs (first → second) of views; H and camera_from_board (n, 4, 4)."""
+    A = inverse(H[second]) @ H[first]
+    B = camera_from_board[second] @ inverse(camera_from_board[first])
+    return Pairs(A, B, first, second)
+
+
+def consecutive_pairs(H: Array, camera_from_board: Array) -> Pairs:
+    """Each view with its successor (eq. 21): n - 1 pairs."""
+    first = np.arange(len(H) - 1)
+    return make_pairs(H, camera_from_board, first, first + 1)
+
+
+def all_pairs(H: Array, camera_from_board: Array, limit: int = MAX_PAIRS) -> Pairs:
+    """Every view with every later one, n(n-1)/2 pairs; above `limit`, each with evenly spread others."""
+    n = len(H)
+    if n * (n - 1) // 2 <= limit:
+        first, second = np.triu_indices(n, 1)
+    else:
+        steps = np.unique(np.linspace(1, n // 2, max(1, limit // n)).astype(int))
+        i = np.repeat(np.arange(n), len(steps))
+        j = (i + np.tile(steps, n)) % n
+        first, second = np.minimum(i, j), np.maximum(i, j)
+    return make_pairs(H, camera_from_board, first, second)
+
+
+def _logarithms(R: Array) -> Array:
+    """rotation_log at a tenth of its cost: atan2 on the skew part, the general map only beyond 170°."""
+    v = np.stack([R[:, 2, 1] - R[:, 1, 2], R[:, 0, 2] - R[:, 2, 0], R[:, 1, 0] - R[:, 0, 1]], axis=1)
+    sine = np.sqrt(np.einsum("ni,ni->n", v, v))
+    angle = np.arctan2(sine, R[:, 0, 0] + R[:, 1, 1] + R[:, 2, 2] - 1.0)
+    log = v * np.where(sine < 1e-10, 0.5, angle / np.maximum(sine, 1e-10))[:, None]
+    far = np.flatnonzero(angle > 2.97)
+    if len(far):
+        log[far] = rotation_log(R[far])
+    return np.asarray(log)
+
+
+def screw_invariants(motion: Array) -> tuple[Array, Array]:
+    """Rotation angle (n,) rad and translation along the axis (n,) m of motions (n, 4, 4).
+
+    Both are the same for A and B of a right pair, whatever X is (Chen 1991). The pitch of a motion that
+    does not rotate is its length.
+    """
+    log = _logarithms(motion[:, :3, :3])
+    angle = np.linalg.norm(log, axis=1)
+    axis = log / np.maximum(angle, 1e-12)[:, None]
+    along = np.einsum("ni,ni->n", axis, motion[:, :3, 3])
+    return angle, np.where(angle > 1e-9, along, np.linalg.norm(motion[:, :3, 3], axis=1))

@@ -1,0 +1,96 @@
+"""What a set of views can tell: information of X, board pose, lens and board shape from geometry alone.
+
+The model is the estimate's own (`handeye.linear`): corner noise, and on every robot pose an independent error
+that is a nuisance of its own view. Parameter order: δX (6), δY (6), the lens (`projection.intrinsics_names`),
+the board's shape (`handeye.observations.SHAPE`). Deltas are those of `geometry.perturb`.
+X = flange_from_camera, Y = base_from_board (eye-in-hand), or X = base_from_camera, Y = flange_from_board
+(eye-to-hand).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibrate.geometry import Array, inverse
+from calibrate.handeye.linear import Linear
+from calibrate.handeye.observations import SHAPE, Layout, Observations, State, extent_of
+from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
+from calibrate.projection import camera_matrix
+from recordings.schema.messages import CameraModel, Mount
+
+_FOCAL_SHARE = 0.05
+"""The lens is known beforehand to about this share of its focal length: few views are not hopeless."""
+_POSE_PRECISION = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
+"""A metre and three radians: no knowledge, only so that the first few views have a finite sigma."""
+
+
+@dataclass(frozen=True)
+class Noise:
+    """Standard deviations per axis."""
+
+    pixel_px: float = 0.15
+    robot_m: float = 0.0001
+    robot_rad: float = 0.00017
+
+
+def view_information(
+    mount: Mount,
+    camera: CameraModel,
+    base_from_flange: Array,
+    X: Array,
+    Y: Array,
+    board_points: Array,
+    noise: Noise,
+) -> Array:
+    """Information of each view (n, p, p), the whole board (k, 3) seen from each flange pose (n, 4, 4).
+
+    The view's own robot error is marginalised, so views simply add.
+    """
+    n, k = len(base_from_flange), len(board_points)
+    if mount == "eye-in-hand":
+        C = inverse(base_from_flange @ X) @ Y
+    else:
+        C = inverse(X) @ base_from_flange @ Y
+    observed = Observations(
+        mount,
+        base_from_flange,
+        np.broadcast_to(board_points, (n, k, 3)),
+        np.zeros((n, k, 2)),
+        np.ones((n, k)),
+        extent=extent_of(board_points),
+    )
+    state = State(X, Y, C, camera, np.zeros(len(SHAPE)), np.zeros(0))
+    linear = Linear.at(observed, state, observed.present, information=1.0)
+    robot = np.repeat([noise.robot_m, noise.robot_rad], 3) ** 2
+    W = np.linalg.inv(noise.pixel_px**2 * linear.B + np.diag(robot))
+    J_t = np.swapaxes(linear.J, 1, 2)
+    information = J_t @ W @ linear.J
+    if linear.modes is not None:
+        shared = linear.modes.shared
+        information[:, shared, shared] += linear.modes.information / noise.pixel_px**2
+    return np.asarray(information)
+
+
+def prior_information(camera: CameraModel, lens_known: bool, board: BoardTolerance) -> Array:
+    """(p, p) of what is known before any view: lens (`LensPrior`) and board's tolerance."""
+    state = State(np.eye(4), np.eye(4), np.zeros((0, 4, 4)), camera, np.zeros(len(SHAPE)), np.zeros(0))
+    lens = LensPrior.given(camera) if lens_known else LensPrior.unknown(camera)
+    N = Priors(lens, board).linearise(state, 0.0).N
+    at = Layout.of(state)
+    N[np.arange(12), np.arange(12)] += np.tile(_POSE_PRECISION, 2)
+    N[at.lens.start, at.lens.start] += (_FOCAL_SHARE * camera_matrix(camera)[0, 0]) ** -2.0
+    return N
+
+
+def covariance_of(information: Array, prior: Array | None = None) -> Array:
+    """Information (..., p, p) → covariance (..., p, p), scaled inside so that metres and pixels do not clash.
+
+    `prior` (p, p) is added. Directions without information get a huge variance.
+    """
+    M = information if prior is None else information + prior
+    scale = 1.0 / np.sqrt(np.maximum(np.diagonal(M, axis1=-2, axis2=-1), 1e-12))
+    scaled = M * scale[..., :, None] * scale[..., None, :]
+    scaled = scaled + 1e-12 * np.eye(M.shape[-1])
+    return np.asarray(np.linalg.inv(scaled) * scale[..., :, None] * scale[..., None, :])

@@ -1,0 +1,160 @@
+"""How good is an X: hold-out errors of the paper, board spread, what the motions can and cannot show."""
+
+# ruff: noqa: N815  (e_t and e_R are written as the paper writes them)
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from calibrate.errors import DegenerateMotionError
+from calibrate.geometry import Array, difference, pose, project_to_rotation, rotation_angle, skew
+from calibrate.handeye.axxb.pairs import Pairs, screw_invariants
+
+_MIN_SECOND_AXIS_RAD = np.radians(0.3)
+"""Root mean square rotation about the second axis below which no X is worth the name."""
+
+
+@dataclass(frozen=True, eq=False)
+class HoldoutScore:
+    """Equations 24 to 26 of the paper on pairs that took no part in the fit."""
+
+    e_t_m: float
+    """Mean translation error."""
+    e_R: float
+    """Mean spectral norm of the rotation error."""
+    samples_e_t_m: Array
+    """(m,) per held-out pair."""
+    samples_e_R: Array
+    pairs: tuple[tuple[int, int], ...]
+    """Pose numbers (earlier, later) of the held-out pairs."""
+    fitted_views: int
+    note: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Observability:
+    weakest_direction: Array
+    """(6,) unit [δt, δφ] in X's parent frame, rotation weighed at the working distance."""
+    weakest_text: str
+    weakest_sigma_m: float
+    """1σ along it, as metres at the working distance."""
+    largest_angle_rad: float
+    """Largest rotation between any two views."""
+    axis_spread: float
+    """0: all rotations about one axis; 1: axes in all directions alike (second over first singular value)."""
+
+
+def motion_errors(X: Array, pairs: Pairs) -> tuple[Array, Array]:
+    """Equations 24-26 per pair: e_t (n,) metres and e_R (n,), the spectral norm of the difference."""
+    estimated = X @ pairs.B @ np.linalg.inv(X)  # raw 4×4: peers may return what is not rigid
+    e_t = np.linalg.norm(estimated[:, :3, 3] - pairs.A[:, :3, 3], axis=1)
+    e_R = np.linalg.norm(estimated[:, :3, :3] - pairs.A[:, :3, :3], ord=2, axis=(1, 2))
+    return e_t, e_R
+
+
+def score_holdout(
+    X: Array, pairs: Pairs, indices: list[int], fitted_views: int, note: str = ""
+) -> HoldoutScore:
+    """Score held-out `pairs`; `indices` are the pose numbers of the view places that pairs speak of."""
+    e_t, e_R = motion_errors(X, pairs)
+    named = tuple(
+        (indices[i], indices[j]) for i, j in zip(pairs.first.tolist(), pairs.second.tolist(), strict=True)
+    )
+    return HoldoutScore(float(e_t.mean()), float(e_R.mean()), e_t, e_R, named, fitted_views, note)
+
+
+def mean_pose(poses: Array) -> Array:
+    """Mean translation and chordal mean rotation of poses (n, 4, 4) → (4, 4)."""
+    return pose(project_to_rotation(poses[:, :3, :3].mean(axis=0)), poses[:, :3, 3].mean(axis=0))
+
+
+def board_places(H: Array, camera_from_board: Array, X: Array) -> Array:
+    """Where each view puts the board: H_i X C_i (n, 4, 4), all equal in a perfect world."""
+    return np.asarray(H @ X @ camera_from_board)
+
+
+def board_spread(H: Array, camera_from_board: Array, X: Array) -> tuple[float, float]:
+    """Root mean square deviation of those places from their mean: metres (board origin), radians."""
+    places = board_places(H, camera_from_board, X)
+    mean = mean_pose(places)
+    distance2 = ((places[:, :3, 3] - mean[:3, 3]) ** 2).sum(axis=1)
+    angle = rotation_angle(mean[:3, :3].T @ places[:, :3, :3])
+    return float(np.sqrt(distance2.mean())), float(np.sqrt((angle**2).mean()))
+
+
+def axis_spread(pairs: Pairs) -> tuple[Array, Array]:
+    """Singular values (3,) of the rotation vectors α of A (rms, rad), and their directions (3, 3) by row."""
+    _, singular, directions = np.linalg.svd(pairs.alpha, full_matrices=False)
+    return np.asarray(singular / np.sqrt(len(pairs))), np.asarray(directions)
+
+
+def require_motion(pairs: Pairs) -> None:
+    """Raise DegenerateMotionError, naming what is missing, unless the arm turns about two axes."""
+    angle_A, _ = screw_invariants(pairs.A)
+    singular, directions = axis_spread(pairs)
+    needed = _MIN_SECOND_AXIS_RAD
+    if singular[0] < needed:
+        raise DegenerateMotionError(
+            f"The poses hardly turn: {np.degrees(angle_A.max()):.2f}° at most between any two views. "
+            "Record views that turn by 20° or more about two axes."
+        )
+    if singular[1] < needed:
+        axis = ", ".join(f"{v:+.2f}" for v in directions[0])
+        raise DegenerateMotionError(
+            f"All rotations are about one axis ({axis} in the moving frame): {np.degrees(singular[1]):.2f}° "
+            f"rms about any other, {np.degrees(needed):.2f}° needed. Record views that also tilt about a "
+            "second axis by 20° or more."
+        )
+
+
+def observe(pairs: Pairs, covariance: Array, distance_m: float, parent: str) -> Observability:
+    """Which direction of X is known worst, rotations weighed as metres at `distance_m`.
+
+    covariance: (6, 6) of X; parent: the name of X's parent frame, for the sentence.
+    """
+    scale = np.array([1.0, 1.0, 1.0, distance_m, distance_m, distance_m])
+    eigenvalues, vectors = np.linalg.eigh(covariance * np.outer(scale, scale))
+    worst = vectors[:, -1]
+    worst = worst * np.sign(worst[np.argmax(np.abs(worst))])
+    sigma = float(np.sqrt(max(eigenvalues[-1], 0.0)))
+    shift, turn = worst[:3], worst[3:]
+    kind, direction = (
+        ("shift along", shift) if np.linalg.norm(shift) >= np.linalg.norm(turn) else ("turn about", turn)
+    )
+    direction = direction / np.linalg.norm(direction)
+    text = f"{kind} ({', '.join(f'{v:+.2f}' for v in direction)}) in {parent}: 1σ {sigma * 1e3:.3f} mm" + (
+        f" at {distance_m:.2f} m" if kind == "turn about" else ""
+    )
+    singular, _ = axis_spread(pairs)
+    return Observability(
+        weakest_direction=worst,
+        weakest_text=text,
+        weakest_sigma_m=sigma,
+        largest_angle_rad=float(screw_invariants(pairs.A)[0].max()),
+        axis_spread=float(singular[1] / max(singular[0], 1e-300)),
+    )
+
+
+def point_error_m(X: Array, covariance: Array, distance_m: float) -> float:
+    """Root mean squared error, in X's parent, of a point on the camera's axis at `distance_m` (1σ).
+
+    X (4, 4), covariance C (6, 6). p = R z + t moves by δt + δφ × R z, so J = [1, -[R z]×]: √trace(J C Jᵀ).
+    """
+    lever = X[:3, :3] @ np.array([0.0, 0.0, distance_m])
+    J = np.concatenate([np.eye(3), -skew(lever)], axis=1)
+    return float(np.sqrt(np.trace(J @ covariance @ J.T)))
+
+
+def median_distance_m(camera_from_board: Array) -> float:
+    """From the camera to the board's origin, over poses (n, 4, 4)."""
+    return float(np.median(np.linalg.norm(camera_from_board[:, :3, 3], axis=1)))
+
+
+def distance_in_sigmas(X: Array, reference: Array, covariance: Array) -> float:
+    """Largest number of sigmas between two X (4, 4) over all directions: the Mahalanobis norm of their delta.
+
+    covariance: (6, 6) of that delta.
+    """
+    delta = difference(X, reference)
+    return float(np.sqrt(max(0.0, float(delta @ np.linalg.pinv(covariance, 1e-14, hermitian=True) @ delta))))

@@ -1,0 +1,208 @@
+"""What the solver is asked and what it answers: plain values, no files, no gates.
+
+Lengths in metres, angles in radians; every sigma and covariance is of `geometry.perturb`'s delta
+[δt, δφ] in the parent frame of X.
+"""
+
+# ruff: noqa: N815  (e_t and e_R are written as the paper writes them)
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+
+from calibrate.geometry import Array, Transform
+from calibrate.handeye.axxb.certificate import Certificate
+from calibrate.handeye.findings import Finding
+from calibrate.handeye.folds import CrossValidation
+from calibrate.handeye.metrics import HoldoutScore, Observability
+from calibrate.handeye.priors import BoardTolerance
+from calibrate.handeye.readings import Explanation, Reading
+from calibrate.views import ImageView
+from recordings.schema.messages import CameraModel, Mount
+
+Profile = Literal["robust", "paper"]
+
+
+@dataclass(frozen=True)
+class SolveOptions:
+    profile: Profile = "robust"
+    seed: int = 0
+    intrinsics_from_same_pictures: bool = False
+    """The camera model was fitted to these very pictures: nothing is known of the lens beforehand."""
+    lens_sigma: tuple[float, ...] | None = None
+    """1σ of a given lens in the order of `projection.intrinsics_names`; None: the usual 0.2 %."""
+    board: BoardTolerance = field(default_factory=BoardTolerance)
+    model_arm: bool = True
+    """Allow for errors of the arm's kinematic table where its model is known."""
+    accept_move: bool = False
+    """Where camera or board was moved half-way, model the move instead of refusing the recording."""
+    working_distance_m: float | None = None
+    """Where the predicted error is stated, along the camera's axis; None = median board distance."""
+    holdout: bool = True
+    folds: bool = True
+    """Cross-validate."""
+
+
+@dataclass(frozen=True)
+class RejectedView:
+    index: int
+    """Pose number of the session."""
+    name: str
+    reason: str
+    """One sentence for people."""
+    kind: Literal["wrong-pose", "wrong-number", "inconsistent", "corners", "unreadable-picture", "by-hand"]
+    wrong_number: int | None = None
+    """Place in [δt, δφ] of the only wrong number of its recorded pose."""
+
+
+@dataclass(frozen=True)
+class Remark:
+    """Something that is doubtful, as a code for programs and a sentence for people."""
+
+    code: str
+    text: str
+
+
+@dataclass(frozen=True)
+class NoiseScales:
+    """Standard deviations that the residuals show (restricted maximum likelihood)."""
+
+    corner_px: float
+    """Of what moves a board's pose: corner errors are smooth over a board."""
+    robot_m: float
+    robot_rad: float
+
+
+@dataclass(frozen=True)
+class BoardShape:
+    """What the views say of the board, with 1σ each; see `handeye.observations.SHAPE`."""
+
+    scale: float
+    """True over stated size, minus 1."""
+    anisotropy: float
+    """x against y of the print."""
+    bend_m: tuple[float, float, float]
+    sigma: tuple[float, float, float, float, float]
+
+
+@dataclass(frozen=True)
+class ArmTable:
+    """Systematic errors of the robot: of the arm's kinematic table, and of a bracket that bends."""
+
+    log_bayes: float
+    """Log evidence for any errors against none."""
+    size_mm: float
+    """Their 1σ, mm and mrad."""
+    errors: dict[str, tuple[float, float]]
+    """Name → value and 1σ, metres or radians. Only their sum at the flange is known well, not each one."""
+    arm_known: bool = True
+    """False: the arm's model is not known, only the bracket is modelled."""
+
+    @property
+    def detected(self) -> bool:
+        return self.log_bayes > 3.0
+
+
+@dataclass(frozen=True, eq=False)
+class Solution:
+    """X and everything that says how good it is."""
+
+    mount: Mount
+    profile: Profile
+    parent_from_child: Transform
+    """flange_from_camera (eye-in-hand) or base_from_camera (eye-to-hand)."""
+    covariance: Array
+    """(6, 6)"""
+    confidence_threshold: float
+    """δᵀ C⁻¹ δ below this holds the truth in 95 % of cases: 6·F(6, ν), ν = 3N - 6."""
+    board_place: Transform
+    """base_from_board or flange_from_board."""
+    camera: CameraModel
+    """Final intrinsics."""
+    rms_px: float | None
+    """Corners against the model with the robot's poses adjusted within their noise; None without pixels."""
+    used: tuple[int, ...]
+    """Pose numbers."""
+    rejected: tuple[RejectedView, ...]
+    certificate: Certificate
+    observability: Observability
+    holdout: HoldoutScore | None = None
+    kept: tuple[ImageView, ...] = ()
+    """The used views as the solver read them, boards turned where that was needed."""
+    turned: tuple[int, ...] = ()
+    """Views whose corner order was turned by 180° to agree with the others, and kept."""
+    weights: dict[int, float] = field(default_factory=dict)
+    """Pose number → what the view counts for, 1 fully … 0."""
+    in_doubt: dict[int, float] = field(default_factory=dict)
+    """Used views that count in part, by pose number: the chance that they are wrong."""
+    session: Explanation = field(default_factory=lambda: Explanation(Reading.AS_RECORDED, 0.0))
+    """How the recording as a whole has to be read."""
+    move_accepted: bool = False
+    """The move that `session` names is modelled: X is that after it."""
+    cross_validation: CrossValidation | None = None
+    lens_finding: Finding | None = None
+    """None where no lens was given."""
+    lens_covariance: Array | None = None
+    """(p, p) of `projection.intrinsics_names`."""
+    board: BoardShape | None = None
+    board_finding: Finding | None = None
+    noise: NoiseScales | None = None
+    error_shares: dict[str, float] = field(default_factory=dict)
+    arm: ArmTable | None = None
+    predicted_error_m: float | None = None
+    """1σ (root of the mean squared length) of a point at the working distance on the camera's axis."""
+    working_distance_m: float | None = None
+    board_spread_m: float | None = None
+    """Root mean square distance of the board's origin in base (or flange), view by view, from its mean."""
+    board_spread_rad: float | None = None
+    residual_px: dict[int, float] = field(default_factory=dict)
+    """Pose number → rms of its corners."""
+    residual_robot: dict[int, tuple[float, float]] = field(default_factory=dict)
+    """Pose number → (metres, radians) between the recorded and the modelled flange."""
+    on_box: tuple[str, ...] = ()
+    """Paper profile: components of X that lie on the box of equation 22."""
+    warnings: tuple[Remark, ...] = ()
+    stage_ms: dict[str, float] = field(default_factory=dict)
+    solve_ms: float = 0.0
+    seed: int = 0
+
+    @property
+    def matrix(self) -> Array:
+        return self.parent_from_child.matrix
+
+    @property
+    def sigma_translation_m(self) -> float:
+        """Root mean squared length of the translation's error."""
+        return float(np.sqrt(np.trace(self.covariance[:3, :3])))
+
+    @property
+    def sigma_rotation_rad(self) -> float:
+        """Root mean squared angle of the rotation's error."""
+        return float(np.sqrt(np.trace(self.covariance[3:, 3:])))
+
+
+@dataclass(frozen=True, eq=False)
+class PeerResult:
+    """One row of `calibrate compare`: the same views through another method."""
+
+    name: str
+    matrix: Array | None
+    """(4, 4); None where the method failed (see `note`)."""
+    e_t_m: float | None = None
+    e_R: float | None = None
+    samples_e_t_m: Array | None = None
+    samples_e_R: Array | None = None
+    board_spread_m: float | None = None
+    board_spread_rad: float | None = None
+    reprojection_px: float | None = None
+    """Root mean square with the robot's poses taken as exact and the best board place for this X."""
+    distance_sigma: float | None = None
+    """Distance from ours, sigmas of ours."""
+    time_ms: float = 0.0
+    note: str = ""
+    on_box: tuple[str, ...] = ()
+    """The paper's method: components of X on the box of equation 22. Such an X is wrong."""
+    rigid: bool = True
+    """False where the method's raw matrix is not a rigid transform."""

@@ -1,0 +1,162 @@
+"""Board poses from pictures, with every pose that the picture alone cannot tell apart."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.boards.model import board_from_turned, looks_same_turns
+from calibrate.errors import BadViewsError
+from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
+from calibrate.handeye.corners import corner_residuals, linearise_corners
+from calibrate.handeye.observations import Observations, observe_views
+from calibrate.lens.model import project, undistort
+from calibrate.lens.orientation import choose_candidates
+from calibrate.projection import camera_matrix
+from calibrate.views import ImageView, ViewSet
+from recordings.schema.messages import BoardSpec, CameraModel
+
+_STEPS = 20
+_SETTLED = 1e-6
+"""Relative gain after which the next step, by far smaller, is not worth taking: a hundredth of a sigma."""
+_JUDGED_AFTER = 4
+"""Steps after which a tilt that is far from credible is not followed any further: it has no minimum there."""
+_DAMPING, _LARGEST_DAMPING = 1e-6, 1e6
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """One reading of a picture."""
+
+    camera_from_board: Array
+    turn: int
+    """Quarters by which the board's frame is turned against the detected order."""
+
+
+def solve_pnp(views: ViewSet, board: BoardSpec | None = None) -> ViewSet:
+    """The views with `camera_from_board`, and their points relabelled where a turned reading fits better.
+
+    Two things are ambiguous in one picture: which way round a symmetric board lies (only when `board` is
+    given) and, for a small board far away, towards which side it is tilted. All views together decide, by
+    their agreement with the robot's motion. Raises BadViewsError when a view has no pose at all.
+    """
+    candidates = _candidates(views, board)
+    if all(len(c) == 1 for c in candidates):
+        chosen = [0] * len(candidates)
+    else:
+        chosen = choose_candidates(
+            [np.array([c.camera_from_board for c in each]) for each in candidates],
+            views.base_from_flange,
+            views.mount,
+        )
+    solved = []
+    for view, options, k in zip(views, candidates, chosen, strict=True):
+        points = view.board_points
+        if board is not None and options[k].turn:
+            points = transform_points(inverse(board_from_turned(board, options[k].turn)), points)
+        solved.append(replace(view, camera_from_board=options[k].camera_from_board, board_points=points))
+    return replace(views, views=tuple(solved))
+
+
+def candidate_poses(view: ImageView, camera: CameraModel, board: BoardSpec | None) -> list[Candidate]:
+    """Poses that explain the picture equally well, best first, each in every turn that looks the same."""
+    return _candidates(ViewSet("eye-in-hand", (view,), camera), board)[0]
+
+
+def _candidates(views: ViewSet, board: BoardSpec | None) -> list[list[Candidate]]:
+    turned = [(0, np.eye(4))]
+    if board is not None:
+        turned = [(turn, board_from_turned(board, turn)) for turn in looks_same_turns(board)]
+    return [
+        [Candidate(tilt @ matrix, turn) for turn, matrix in turned for tilt in tilts]
+        for tilts in _planar_poses(views)
+    ]
+
+
+def _planar_poses(views: ViewSet) -> list[list[Array]]:
+    """T. Collins, A. Bartoli: "Infinitesimal plane-based pose estimation" (2014), then least squares."""
+    starts = [_tilts(view, views.camera) for view in views]
+    owner = np.repeat(np.arange(len(views)), [len(each) for each in starts])
+    poses, rms_px = _least_squares(views, owner, np.concatenate(starts))
+    in_front = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(rms_px) & (poses[:, 2, 3] > 0)
+    found = []
+    for i, view in enumerate(views):
+        own = np.flatnonzero(in_front & (owner == i))
+        if not len(own):
+            raise BadViewsError(
+                f"view {view.name}: the corners do not fix a board pose in front of the camera"
+            )
+        own = own[np.argsort(rms_px[own], kind="stable")]
+        limit_px = _credible_px(rms_px[own[0]])
+        found.append([poses[k] for k in own if rms_px[k] <= limit_px])
+    return found
+
+
+def _credible_px(best_px: Array) -> Array:
+    """The largest rms of a pose that explains a picture as well as the best one does."""
+    return np.maximum(1.5 * best_px, best_px + 0.05)
+
+
+def _tilts(view: ImageView, camera: CameraModel) -> Array:
+    """(1 or 2, 4, 4)"""
+    K = camera_matrix(camera)
+    points = np.ascontiguousarray(view.board_points)
+    pixels = np.ascontiguousarray(undistort(camera, view.pixels))
+    try:
+        count, turns, shifts, _ = cv2.solvePnPGeneric(points, pixels, K, None, flags=cv2.SOLVEPNP_IPPE)
+    except cv2.error as problem:
+        raise BadViewsError(
+            f"view {view.name}: the corners do not fix a board pose ({problem.err})"
+        ) from None
+    return pose(
+        rotation_exp(np.reshape(turns, (-1, 3))[:count]), np.reshape(shifts, (-1, 3))[:count]
+    ).reshape(-1, 4, 4)
+
+
+def _least_squares(views: ViewSet, owner: NDArray[np.intp], poses: Array) -> tuple[Array, Array]:
+    """Poses (m, 4, 4) of views `owner` (m,), each by itself to its own minimum; and rms distances (m,), px.
+
+    Levenberg-Marquardt on all of them at once.
+    """
+    everything = observe_views(views)
+    poses, damping = poses.copy(), np.full(len(poses), _DAMPING)
+    square = _squares(everything, views.camera, owner, poses)
+    going = np.flatnonzero(np.isfinite(square))
+    count = everything.present[owner].sum(axis=1)
+    for step in range(_STEPS):
+        if step == _JUDGED_AFTER:
+            best = np.full(len(views), np.inf)
+            np.fmin.at(best, owner, square)
+            limit = 2 * _credible_px(np.sqrt(best[owner] / count))
+            going = going[np.sqrt(square / count)[going] <= limit[going]]
+        if not len(going):
+            break
+        observed = everything.part(owner[going])
+        blocks = linearise_corners(observed, views.camera, poses[going], observed.present)
+        V = blocks.LL
+        np.einsum("nii->ni", V)[:] *= 1 + damping[going, None]
+        V += 1e-9 * np.eye(6)
+        trial = perturb(poses[going], np.linalg.solve(V, blocks.Lr[..., None])[..., 0])
+        ahead = _squares(everything, views.camera, owner[going], trial)
+        before = square[going]
+        better = ahead <= before
+        poses[going[better]], square[going[better]] = trial[better], ahead[better]
+        damping[going] = np.where(better, np.maximum(damping[going] / 10, _DAMPING), damping[going] * 30)
+        settled = better & (before - ahead <= _SETTLED * before)
+        going = going[~settled & (damping[going] < _LARGEST_DAMPING)]
+    return poses, np.sqrt(square / count)
+
+
+def _squares(everything: Observations, camera: CameraModel, owner: NDArray[np.intp], poses: Array) -> Array:
+    """(m,) sums of squared distances, px²."""
+    misses = corner_residuals(everything.part(owner), camera, poses)
+    return np.asarray((misses**2).sum(axis=(1, 2)))
+
+
+def view_rms_px(view: ImageView, camera: CameraModel, camera_from_board: Array) -> float:
+    """Root mean square distance of the corners from where the pose shows them."""
+    miss = project(camera, camera_from_board, view.board_points) - view.pixels
+    return float(np.sqrt(np.square(miss).sum(axis=1).mean()))

@@ -1,0 +1,125 @@
+"""Where the board is now, by a calibration and one picture, and how well a tip sent to a corner will meet it.
+
+Eye-in-hand: base_from_board = base_from_flange · X · camera_from_board; eye-to-hand: X · camera_from_board,
+the board lying free in the fixed camera's view.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calibrate.boards.model import board_points
+from calibrate.errors import BadViewsError
+from calibrate.files.calibration import Calibration
+from calibrate.geometry import Array, difference, inverse, perturb, transform_points
+from calibrate.handeye.corners import bent_points
+from calibrate.handeye.observations import observe_views
+from calibrate.lens.pnp import Candidate, candidate_poses
+from calibrate.quality.drift import Noise, pnp_covariance, with_found_shape
+from calibrate.views import ImageView, ViewSet
+from recordings.schema.messages import BoardSpec
+
+_SAME_PLACE_M, _SAME_PLACE_RAD = 0.01, 0.03
+"""Nearer than this the board was not moved since it was calibrated."""
+_SAME_TILT_RAD = 0.01
+"""Two starts of the pose estimate may end in one pose; further apart they are two readings of a picture."""
+_STEP = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class BoardNow:
+    base_from_board: Array
+    """(4, 4)"""
+    camera_from_board: Array
+    outward: Array
+    """(3,) unit normal in `board`, towards the camera."""
+    moved_m: float
+    """Of the board's origin against its place in the calibration; eye-in-hand only, else 0."""
+    moved_rad: float
+
+
+def locate_board(calibration: Calibration, view: ImageView, board: BoardSpec) -> BoardNow:
+    """BadViewsError where the picture leaves it open, or shows the board on the flange (eye-to-hand)."""
+    camera, X, E = calibration.intrinsics.model, calibration.transform.matrix, view.base_from_flange
+    in_hand = calibration.mount == "eye-in-hand"
+    place = np.array(calibration.board_place.matrix)
+    readings = [_shaped(reading, view, calibration) for reading in candidate_poses(view, camera, board)]
+    at = [E @ X @ r.camera_from_board if in_hand else X @ r.camera_from_board for r in readings]
+    misses = [difference(each if in_hand else inverse(E) @ each, place) for each in at]
+    same = [k for k, miss in enumerate(misses) if _is_small(miss)]
+    if same and not in_hand:
+        raise BadViewsError(
+            "The board is still on the flange: take it off, lay it into the camera's view, fix the pointer "
+            "to the flange, and start again."
+        )
+    tilts = [r.camera_from_board for r in readings if r.turn == readings[0].turn]
+    if not same and any(np.linalg.norm(difference(t, tilts[0])[3:]) > _SAME_TILT_RAD for t in tilts):
+        raise BadViewsError(
+            "From here the picture leaves open to which side the board is tilted: bring the camera nearer or "
+            "look at the board from more to the side."
+        )
+    best = same[0] if same else 0
+    seen = readings[best].camera_from_board
+    towards_camera = float(np.sign(inverse(seen)[2, 3]))
+    return BoardNow(
+        np.asarray(at[best]),
+        seen,
+        np.array([0.0, 0.0, towards_camera]),
+        float(np.linalg.norm(misses[best][:3])) if in_hand else 0.0,
+        float(np.linalg.norm(misses[best][3:])) if in_hand else 0.0,
+    )
+
+
+def _shaped(reading: Candidate, view: ImageView, calibration: Calibration) -> Candidate:
+    """The same reading, with the board's shape that the calibration found."""
+    placed = replace(view, camera_from_board=reading.camera_from_board)
+    views = ViewSet(calibration.mount, (placed,), calibration.intrinsics.model)
+    return replace(reading, camera_from_board=with_found_shape(views, calibration).camera_from_board[0])
+
+
+def found_points(calibration: Calibration, board: BoardSpec) -> Array:
+    """(k, 3) of the board, in its own frame: as the calibration found them where it is the same board."""
+    points = board_points(board)
+    found = calibration.quality.board
+    if found is None or board != calibration.board:
+        return points
+    whole = ImageView(0, "", np.eye(4), points, np.zeros((len(points), 2)))
+    observed = observe_views(ViewSet(calibration.mount, (whole,), calibration.intrinsics.model))
+    shape = np.array([found.scale, found.anisotropy, *found.bend_m])
+    return np.asarray(bent_points(observed, shape)[0])
+
+
+def _is_small(miss: Array) -> bool:
+    return bool(np.linalg.norm(miss[:3]) < _SAME_PLACE_M and np.linalg.norm(miss[3:]) < _SAME_PLACE_RAD)
+
+
+def offset_covariance(
+    calibration: Calibration, view: ImageView, now: BoardNow, corner_m: ArrayLike, tip_m: ArrayLike
+) -> Array:
+    """(3, 3) of tip minus corner, in `board`, m², when the arm is sent to put the tip on the corner.
+
+    First order in the errors of X, of the board's pose in this one picture, and of the robot in the picture's
+    pose (eye-in-hand) and at the corner; the robot's scatter is the one that the calibration found.
+    `tip_m` (3,) in `flange`. Raises BadViewsError for a calibration that does not know its noise.
+    """
+    noise = Noise.of(calibration)
+    corner, X, C = np.asarray(corner_m), calibration.transform.matrix, now.camera_from_board
+    in_hand = calibration.mount == "eye-in-hand"
+    E = view.base_from_flange if in_hand else np.eye(4)
+    steps = _STEP * np.eye(6)
+    robot = np.diag([noise.robot_m**2] * 3 + [noise.robot_rad**2] * 3)
+    pnp = noise.corner_px**2 * pnp_covariance(view.board_points, calibration.intrinsics.model, C)
+    parts = [(E @ perturb(X, steps) @ C, np.array(calibration.covariance)), (E @ X @ perturb(C, steps), pnp)]
+    if in_hand:
+        parts.append((perturb(E, steps) @ X @ C, robot))
+    here = transform_points(E @ X @ C, corner)
+    lever2 = float(np.square(tip_m).sum())
+    total = (noise.robot_m**2 + noise.robot_rad**2 * lever2) * np.eye(3)  # the tip itself
+    for moved, covariance in parts:
+        J = (moved[:, :3, :3] @ corner + moved[:, :3, 3] - here).T / _STEP
+        total = total + J @ covariance @ J.T
+    R = now.base_from_board[:3, :3]
+    return np.asarray(R.T @ total @ R)

@@ -1,0 +1,107 @@
+"""The history of drift checks, one line each, and whether it shows a trend."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import msgspec
+import numpy as np
+from scipy import stats
+
+from calibrate.files.generations import InstallError, calibrations_folder
+from calibrate.files.lines import append_line, read_lines
+from calibrate.quality.drift import DriftCheck
+
+_FEWEST_FOR_TREND = 5
+_TREND_P = 0.01
+
+
+class CheckEntry(msgspec.Struct, frozen=True):
+    wall_s: float
+    generation: int
+    recording: str
+    passed: bool
+    shift: tuple[float, ...]
+    """δt (m), δφ (rad)"""
+    covariance: tuple[tuple[float, ...], ...]
+    """Of `shift`, the installed calibration's own part included."""
+    statistic: float
+    threshold: float
+
+    @classmethod
+    def of(cls, check: DriftCheck, wall_s: float, generation: int, recording: str) -> CheckEntry:
+        return cls(
+            wall_s,
+            generation,
+            recording,
+            check.passed,
+            tuple(check.shift.tolist()),
+            tuple(tuple(row) for row in check.covariance.tolist()),
+            check.statistic,
+            check.threshold,
+        )
+
+
+def append_check(entry: CheckEntry, root: Path | None = None) -> None:
+    """Raises InstallError when the state folder cannot be written."""
+    folder = calibrations_folder(root)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        append_line(folder / "checks.jsonl", entry)
+    except OSError as problem:
+        raise InstallError(f"{folder}: the check cannot be noted: {problem.strerror}.") from None
+
+
+def read_checks(root: Path | None = None) -> list[CheckEntry]:
+    """Oldest first."""
+    return read_lines(calibrations_folder(root) / "checks.jsonl", CheckEntry)
+
+
+def earlier_text(history: Sequence[CheckEntry], generation: int) -> str:
+    """How the checks of this generation went so far, else empty: one alarm alone may be chance."""
+    earlier = [entry.passed for entry in history if entry.generation == generation]
+    if not earlier:
+        return ""
+    return f"Earlier checks of generation {generation}: {len(earlier)}, it held in {sum(earlier)} of them."
+
+
+def trend_text(history: Sequence[CheckEntry], generation: int) -> str:
+    """A warning when the checks of this generation wander with time, else empty.
+
+    Six straight lines through the shifts, weighted by their covariance; the installed calibration's own error
+    is the same in every check and moves the lines, not their slopes. Slopes are judged by χ² with 6 degrees
+    of freedom at 1 %.
+    """
+    entries = [entry for entry in history if entry.generation == generation]
+    if len(entries) < _FEWEST_FOR_TREND:
+        return ""
+    days = np.array([entry.wall_s for entry in entries]) / 86400
+    if np.ptp(days) <= 0:
+        return ""
+    span = float(np.ptp(days))
+    days = days - days.mean()
+    shifts = np.array([entry.shift for entry in entries])
+    weights = np.linalg.inv(np.array([entry.covariance for entry in entries]))
+    design = np.stack([np.ones_like(days), days], axis=1)
+    normal = np.einsum("na,nb,nij->aibj", design, design, weights).reshape(12, 12)
+    right = np.einsum("na,nij,nj->ai", design, weights, shifts).ravel()
+    covariance = np.linalg.inv(normal)
+    slope = (covariance @ right)[6:]
+    statistic = float(slope @ np.linalg.solve(covariance[6:, 6:], slope))
+    if stats.chi2.sf(statistic, 6) > _TREND_P:
+        return ""
+    millimetres = float(np.linalg.norm(slope[:3]) * 1e3 * span)
+    degrees = float(np.degrees(np.linalg.norm(slope[3:])) * span)
+    again = "calibrate again before it fails" if entries[-1].passed else "then calibrate again"
+    return (
+        f"The last {len(entries)} checks wander: by about {millimetres:.2f} mm and {degrees:.3f}° "
+        f"{_within(span)}. Look for a loosening mount; {again}."
+    )
+
+
+def _within(days: float) -> str:
+    """Only the time that was looked at: minutes say nothing about a month."""
+    if days >= 2:
+        return f"in {days:.0f} days"
+    return f"in {days * 24:.0f} hours" if days * 24 >= 2 else f"in {max(days * 1440, 1):.0f} min"

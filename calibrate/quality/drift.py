@@ -1,0 +1,244 @@
+"""Does the installed calibration still hold? A few new views, one statistical test, its power stated.
+
+The shift δX of the camera is fitted to the new views together with the board's place (the board may have been
+moved since). If nothing changed, δX is normal with covariance S = S_fit + S_installed, so δᵀ S⁻¹ δ follows
+6·F(6, ν), ν the degrees of freedom that the noise scales were estimated with. δ as in `geometry.perturb`.
+"""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from calibrate.boards.model import board_points
+from calibrate.errors import BadViewsError, TooFewViewsError
+from calibrate.files.calibration import Calibration
+from calibrate.geometry import Array, difference, inverse, perturb
+from calibrate.handeye.corners import bent_points, boards_by_corners
+from calibrate.handeye.observations import extent_of, observe_views
+from calibrate.handeye.validate_views import require_no_copies
+from calibrate.lens.model import project
+from calibrate.views import ViewSet
+from recordings.schema.messages import CameraModel
+
+FEWEST_VIEWS = 3
+FALSE_ALARM = 0.05
+POWER = 0.95
+"""How surely a check should notice `SHIFT_M` and `TURN_RAD` before nobody needs to take more views."""
+SHIFT_M, TURN_RAD = 0.5e-3, float(np.radians(0.1))
+_MOST_VIEWS = 30
+"""Whoever needs more for a check should calibrate."""
+_STEP = 1e-6
+_ITERATIONS = 4
+_SMALLEST_EIGENVALUE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class DriftCheck:
+    passed: bool
+    shift: Array
+    """(6,) [δt (m), δφ (rad)] in X's parent frame: where the camera is now against where it was installed."""
+    covariance: Array
+    """(6, 6) of `shift` if nothing changed."""
+    statistic: float
+    threshold: float
+    p_value: float
+    power_translation: float
+    """Probability to notice a shift of `SHIFT_M` in the direction that is hardest to see."""
+    power_rotation: float
+    """… a turn of `TURN_RAD`."""
+    views_needed: int | None
+    """About how many views like these give both a probability of 95 %; None where not even 30 do."""
+    disagreement: float
+    """Misfit after the best shift, per degree of freedom: about 1 when the noise is as it was."""
+    views: int
+
+    @property
+    def power(self) -> float:
+        """The lower of the two."""
+        return min(self.power_translation, self.power_rotation)
+
+    @property
+    def shift_mm(self) -> float:
+        return float(np.linalg.norm(self.shift[:3]) * 1e3)
+
+    @property
+    def shift_deg(self) -> float:
+        return float(np.degrees(np.linalg.norm(self.shift[3:])))
+
+
+@dataclass(frozen=True, eq=False)
+class Noise:
+    """Standard deviations per axis."""
+
+    corner_px: float
+    robot_m: float
+    robot_rad: float
+    degrees_of_freedom: float
+
+    @classmethod
+    def of(cls, calibration: Calibration) -> Noise:
+        noise = calibration.quality.noise
+        if not noise:
+            raise BadViewsError(
+                "The calibration does not say how noisy its robot and corners were (paper profile); "
+                "solve its recording again with --profile robust and install that."
+            )
+        return cls(
+            max(noise["corner_px"], 0.02),
+            noise["robot_mm"] / 1e3,
+            float(np.radians(noise["robot_deg"])),
+            max(3.0 * len(calibration.views.used) - 6.0, 3.0),
+        )
+
+
+def check_drift(views: ViewSet, calibration: Calibration) -> DriftCheck:
+    """Tests the calibration on views (3 or more) with board poses from its own lens.
+
+    Raises TooFewViewsError, or BadViewsError where the views do not determine a shift or one is there twice.
+    """
+    require_no_copies(views)
+    views = with_found_shape(views, calibration)
+    return judge_shift(
+        views, calibration.transform.matrix, np.array(calibration.covariance), Noise.of(calibration)
+    )
+
+
+def with_found_shape(views: ViewSet, calibration: Calibration) -> ViewSet:
+    """The views with the board as the calibration found it, board poses refined to it."""
+    found = calibration.quality.board
+    if found is None:
+        return views
+    observed = replace(observe_views(views), extent=extent_of(board_points(calibration.board)))
+    shape = np.array([found.scale, found.anisotropy, *found.bend_m])
+    C = boards_by_corners(observed, views.camera, views.camera_from_board, shape)
+    points = bent_points(observed, shape)
+    shaped = [
+        replace(view, board_points=points[i, : len(view.pixels)], camera_from_board=C[i])
+        for i, view in enumerate(views)
+    ]
+    return replace(views, views=tuple(shaped))
+
+
+def judge_shift(views: ViewSet, installed: Array, covariance: Array, noise: Noise) -> DriftCheck:
+    """The test itself. installed: (4, 4) X; covariance: (6, 6) of it. Raises as `check_drift` does.
+
+    δX and the board's place P by Gauss-Newton: each picture shows the board by r off from where X and P put
+    it, and r has the covariance of PnP plus that of the robot's pose, carried over to r.
+    """
+    if len(views) < FEWEST_VIEWS:
+        raise TooFewViewsError(f"{len(views)} views are too few for a check: {FEWEST_VIEWS} to 5 are needed.")
+    flanges, in_hand = views.base_from_flange, views.mount == "eye-in-hand"
+    seen = views.camera_from_board
+    pnp = np.array(
+        [pnp_covariance(v.board_points, views.camera, c) for v, c in zip(views, seen, strict=True)]
+    )
+    pnp *= noise.corner_px**2
+    robot = np.diag([noise.robot_m**2] * 3 + [noise.robot_rad**2] * 3)
+    X = installed.copy()
+    P = (flanges[0] if in_hand else inverse(flanges[0])) @ installed @ seen[0]
+    for _ in range(_ITERATIONS):
+        information, gradient, misfit = _normal_equations(flanges, in_hand, seen, X, P, robot, pnp)
+        fitted_all = _inverse(information)
+        step = -fitted_all @ gradient
+        fitted = fitted_all[:6, :6]
+        X, P = perturb(X, step[:6]), perturb(P, step[6:])
+    _, _, misfit = _normal_equations(flanges, in_hand, seen, X, P, robot, pnp)
+    shift = difference(X, installed)
+    total = fitted + covariance
+    statistic = float(shift @ np.linalg.solve(total, shift))
+    nu = noise.degrees_of_freedom
+    threshold = float(6 * stats.f.ppf(1 - FALSE_ALARM, 6, nu))
+    power_translation, power_rotation = powers(total, nu)
+    enough = min(power_translation, power_rotation) >= POWER
+    return DriftCheck(
+        passed=statistic <= threshold,
+        shift=shift,
+        covariance=total,
+        statistic=statistic,
+        threshold=threshold,
+        p_value=float(stats.f.sf(statistic / 6, 6, nu)),
+        power_translation=power_translation,
+        power_rotation=power_rotation,
+        views_needed=len(views) if enough else _views_needed(fitted, covariance, len(views), nu),
+        disagreement=float(misfit / max(6 * len(views) - 12, 1)),
+        views=len(views),
+    )
+
+
+def _inverse(information: Array) -> Array:
+    """BadViewsError where a direction is not determined: eigenvalues are of the matrix scaled to ones."""
+    scale = 1.0 / np.sqrt(np.maximum(np.diag(information), 1e-300))
+    values, vectors = np.linalg.eigh(information * scale * scale[:, None])
+    if not values[0] > _SMALLEST_EIGENVALUE:
+        raise BadViewsError(
+            "These views do not tell a shift of the camera: they turn about one axis only, or too little. "
+            "Take views that tilt by 20° and more about different axes."
+        )
+    root = scale[:, None] * vectors / np.sqrt(values)
+    return np.asarray(root @ root.T)
+
+
+def powers(covariance: Array, nu: float) -> tuple[float, float]:
+    """To notice `SHIFT_M` and `TURN_RAD`, each in the worst direction; covariance S: (6, 6) of a shift.
+
+    After a true shift d, δᵀ S⁻¹ δ / 6 follows the non-central F(6, nu) of noncentrality dᵀ S⁻¹ d.
+    """
+    weight: Any = np.linalg.inv(covariance)
+    threshold = stats.f.ppf(1 - FALSE_ALARM, 6, nu)
+
+    def power(block: Array, size: float) -> float:
+        noncentrality = size**2 * float(np.linalg.eigvalsh(block)[0])
+        if noncentrality < 1e-6:  # where SciPy's ncf is not to be trusted
+            return FALSE_ALARM
+        return float(stats.ncf.sf(threshold, 6, nu, noncentrality))
+
+    return power(weight[:3, :3], SHIFT_M), power(weight[3:, 3:], TURN_RAD)
+
+
+def _views_needed(fitted: Array, installed: Array, views: int, nu: float) -> int | None:
+    """If further views tell as much as these did on average."""
+    counts = range(views, max(views, _MOST_VIEWS) + 1)
+    place = bisect_left(counts, POWER, key=lambda n: min(powers(fitted * views / n + installed, nu)))
+    return counts[place] if place < len(counts) else None
+
+
+def _normal_equations(
+    flanges: Array, in_hand: bool, seen: Array, X: Array, P: Array, robot: Array, pnp: Array
+) -> tuple[Array, Array, float]:
+    """(12, 12) information of [δX, δP], (12,) gradient, and the misfit r'Wr.
+
+    flanges: base_from_flange; for eye-to-hand P is flange_from_board. `robot` (6, 6) is the covariance of the
+    deltas of base_from_flange for both: the robot turns its flange about the flange.
+    """
+    steps = _STEP * np.eye(6)[:, None]
+
+    def miss(F: Array, X: Array, P: Array) -> Array:
+        H = F if in_hand else inverse(F)
+        return difference(seen, inverse(H @ X) @ P)
+
+    def slope(moved: Array, r: Array) -> Array:
+        """(6, n, 6) misses after each step → (n, 6, 6) Jacobians."""
+        return np.moveaxis((moved - r) / _STEP, 0, 2)
+
+    r = miss(flanges, X, P)
+    J_X = slope(miss(flanges, perturb(X, steps), P), r)
+    J_P = slope(miss(flanges, X, perturb(P, steps)), r)
+    J_F = slope(miss(perturb(flanges, steps), X, P), r)
+    W = np.linalg.inv(J_F @ robot @ np.swapaxes(J_F, 1, 2) + pnp)
+    J = np.concatenate([J_X, J_P], axis=2)
+    information = np.einsum("nia,nij,njb->ab", J, W, J)
+    gradient = np.einsum("nia,nij,nj->a", J, W, r)
+    return information, gradient, float(np.einsum("ni,nij,nj->", r, W, r))
+
+
+def pnp_covariance(points: Array, camera: CameraModel, camera_from_board: Array) -> Array:
+    """(6, 6) of the board's pose in `camera`, of its points (n, 3): (JᵀJ)⁻¹, for noise of 1 px per axis."""
+    base = project(camera, camera_from_board, points)
+    moved = perturb(camera_from_board, _STEP * np.eye(6))
+    J = np.stack([(project(camera, m, points) - base).ravel() / _STEP for m in moved], axis=1)
+    return np.asarray(np.linalg.inv(J.T @ J))

@@ -1,0 +1,138 @@
+"""A sweep: the arm moved slowly while the camera ran freely. What was the time between the two?
+
+Robot states and pictures are placed by the controller's and the camera's own clocks, each tied to the host's
+by its quickest messages: a busy computer delays arrivals, and never advances one. The offset that is found
+therefore holds the exposure, readout and transport of the quickest picture.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+from scipy.optimize import linprog
+
+from calibrate.boards.detect import detect
+from calibrate.boards.model import board_points
+from calibrate.errors import BadViewsError, TooFewViewsError
+from calibrate.geometry import Array, pose_from_rotvec, rotation_angle
+from calibrate.lens.pnp import candidate_poses
+from calibrate.quality.time_offset import FEWEST_PICTURES, TimeOffset, estimate_time_offset
+from calibrate.views import ImageView
+from recordings.errors import BadPictureError
+from recordings.reader import Recording
+from recordings.schema.messages import CameraModel, Picture
+
+UNSEEN_DELAY_S = 1e-4
+"""1 sigma of the controller's shortest delay: no arrival shows it, so it stays in the offset."""
+
+_LARGEST_STAMP_S = 1e12
+_STILL_RAD_S = math.radians(0.5)
+"""A sweep turns ten times faster and more."""
+_MOMENT_S = 0.05
+
+
+def sweep_time_offset(recording: Recording, camera: CameraModel | None = None) -> TimeOffset:
+    """Of every picture in the recording, whether it belongs to a stop of the arm or not.
+
+    A picture that cannot be decoded is left out, and told of in `lost`.
+    `camera`: the lens, needed where the recording does not know it. Raises CalibrationError.
+    """
+    camera = camera or recording.info.camera
+    if camera.matrix is None:
+        raise BadViewsError(
+            f"{recording.path} does not know its lens, and a sweep cannot find it: calibrate from stops "
+            "first, and give that calibration (calibrate sweep --calibration FILE)"
+        )
+    robot_s, flange = _robot(recording)
+    lost: list[str] = []
+    seen = list(_seen(recording, camera, lost))
+    if len(robot_s) < 2 or len(seen) < FEWEST_PICTURES:
+        raise TooFewViewsError(
+            f"{recording.path}: {len(seen)} pictures with the board and {len(robot_s)} robot states are too "
+            f"few for a time offset; {FEWEST_PICTURES} pictures are needed"
+        )
+    times, poses = (np.array(column) for column in zip(*seen, strict=True))
+    if _median_turning_rad_s(robot_s, flange, times) < _STILL_RAD_S:
+        raise BadViewsError(
+            f"{recording.path} is no sweep: the arm stood still at most of its pictures, so they say "
+            "nothing of the time. Take one with: station capture --sweep"
+        )
+    found = estimate_time_offset(robot_s, flange, times, poses)
+    return replace(found, sigma_s=math.hypot(found.sigma_s, UNSEEN_DELAY_S), lost=tuple(lost))
+
+
+def _robot(recording: Recording) -> tuple[Array, Array]:
+    """Host times (n,) s and base_from_tcp (n, 4, 4): any frame on the flange turns as the flange does."""
+    states = list(recording.robot_states())
+    arrivals = np.array([s.stamps.host_monotonic_ns for s in states]) / 1e9
+    times = on_host(np.array([s.stamps.controller_s for s in states]), arrivals)
+    tcp = np.array([s.tcp_pose for s in states]).reshape(-1, 6)
+    # Arrivals may coincide where there is no controller clock; the first of them is the one on time.
+    fresh = np.diff(times, prepend=-np.inf) > 0
+    return times[fresh], pose_from_rotvec(tcp[fresh, :3], tcp[fresh, 3:])
+
+
+def _median_turning_rad_s(robot_s: Array, poses: Array, times: Array) -> float:
+    """How fast the arm turned when the pictures were taken; about 0 in a capture with stops."""
+    last = len(robot_s) - 1
+    before = np.clip(np.searchsorted(robot_s, times - _MOMENT_S), 0, last - 1)
+    after = np.clip(np.searchsorted(robot_s, times + _MOMENT_S), before + 1, last)
+    R = poses[:, :3, :3]
+    turned = rotation_angle(np.swapaxes(R[before], -1, -2) @ R[after])
+    return float(np.median(turned / (robot_s[after] - robot_s[before])))
+
+
+def on_host(device_s: Array, arrivals_s: Array) -> Array:
+    """Host times of device times, both (n,) s: the nearest straight line that lies under all arrivals.
+
+    A linear program in offset and drift. The arrivals themselves where the device has no clock. Raises
+    BadViewsError for what is no time.
+    """
+    if not (np.abs(device_s) < _LARGEST_STAMP_S).all():
+        raise BadViewsError("a clock of this recording gives times that are none: take the sweep again")
+    if len(device_s) < 2 or np.ptp(device_s) == 0:
+        return arrivals_s
+    since_s = device_s - device_s[0]
+    gap_s = arrivals_s - arrivals_s[0] - since_s
+    under = np.column_stack([np.ones_like(since_s), since_s])
+    line = linprog(-under.mean(axis=0), under, gap_s, bounds=(None, None), method="highs").x
+    return np.asarray(arrivals_s[0] + since_s + under @ line)
+
+
+def _seen(recording: Recording, camera: CameraModel, lost: list[str]) -> Iterator[tuple[float, Array]]:
+    """Time of the start of exposure and camera_from_board of each picture that shows the board.
+
+    `lost` takes what is said of pictures that cannot be decoded.
+    """
+    board = recording.info.board
+    stamps = [facts.stamps for part in recording.parts for facts in part.picture_facts()]
+    taken_s = on_host(
+        np.array([s.device_ns for s in stamps]) / 1e9, np.array([s.host_monotonic_ns for s in stamps]) / 1e9
+    )
+    for picture, time_s in zip(_pictures(recording), taken_s, strict=True):
+        if isinstance(picture, BadPictureError):
+            lost.append(str(picture))
+            continue
+        found = detect(picture.image, board, thorough=False)
+        if not found.found:
+            continue
+        view = ImageView(
+            picture.sequence,
+            str(picture.sequence),
+            np.eye(4),
+            board_points(board)[found.indices],
+            found.pixels,
+        )
+        yield float(time_s), candidate_poses(view, camera, None)[0].camera_from_board
+
+
+def _pictures(recording: Recording) -> Iterator[Picture | BadPictureError]:
+    for part in recording.parts:
+        for sequence in part.picture_sequences():
+            try:
+                yield part.picture(sequence)
+            except BadPictureError as problem:
+                yield problem

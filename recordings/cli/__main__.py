@@ -1,0 +1,3 @@
+from recordings.cli import main
+
+main()

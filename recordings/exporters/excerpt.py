@@ -1,0 +1,45 @@
+"""A smaller recording of the same session: the views that count, and robot states only around them."""
+
+from __future__ import annotations
+
+from bisect import bisect_left
+from pathlib import Path
+
+import msgspec
+
+from recordings.reader import Recording
+from recordings.schema.messages import RobotState
+from recordings.writer import derived_recording
+
+_NS = 1_000_000_000
+
+
+def write_excerpt(recording: Recording, output: Path, window_s: float = 0.5) -> Path:
+    """Writes `output` (.mcap) with lossless PNG pictures; it solves like the whole. RecordingError.
+
+    Robot states stay when they lie within `window_s` of a view by the host's monotonic clock.
+    """
+    views = recording.views()
+    kept_ns = sorted(view.stamps.host_monotonic_ns for view in views)
+    note = f"excerpt: robot states within {window_s:g} s of the pictures"
+    said = recording.info.note.replace(note, "").strip()  # of an excerpt's excerpt: once is enough
+    note = " ".join([*filter(None, [said]), note, *recording.losses])
+    info = msgspec.structs.replace(recording.info, part=1, note=note)
+    with derived_recording(output, info, lossless_png=True) as writer:
+        for name, content in recording.attachments().items():
+            writer.attach(name, recording.media_types()[name], content)
+        for state in recording.robot_states():
+            if _near(state, kept_ns, window_s):
+                writer.robot_state(state)
+        for sequence, (view, picture) in enumerate(recording.pictures()):
+            writer.picture(msgspec.structs.replace(picture, sequence=sequence))
+            writer.view(msgspec.structs.replace(view, picture_sequence=sequence, part=1))
+        for event in recording.events():
+            writer.event(event)
+        return writer.finish()
+
+
+def _near(state: RobotState, kept_ns: list[int], window_s: float) -> bool:
+    time_ns = state.stamps.host_monotonic_ns
+    place = bisect_left(kept_ns, time_ns)
+    return any(abs(kept - time_ns) <= window_s * _NS for kept in kept_ns[max(0, place - 1) : place + 1])

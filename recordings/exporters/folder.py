@@ -1,0 +1,158 @@
+"""A recording → a folder that `import` reads, CSV tables, or a ROS 2 bag. The recording is not changed."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from enum import StrEnum
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from recordings.errors import RecordingError
+from recordings.exporters import write_ros2
+from recordings.files import sync_folder
+from recordings.importers.dataset import DATASET_FILE, POSES_FILE
+from recordings.importers.poses import HEADER, JOINTS
+from recordings.pictures import encode_png
+from recordings.reader import Recording
+from recordings.schema.messages import Stamps, View
+from recordings.schema.viewing import quaternion_xyzw
+
+_EXTENSIONS = {"png": "png", "jpeg": "jpg"}
+_JOINTS = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
+_STAMPS = list(Stamps.__struct_fields__)
+
+
+class Target(StrEnum):
+    FOLDER = "folder"
+    CSV = "csv"
+    ROS2 = "ros2"
+
+
+def export_recording(recording: Recording, output: Path, target: Target) -> Path:
+    """Writes the folder `output`, which must not exist; nothing is left when it fails. RecordingError."""
+    write: Callable[[Recording, Path], None] = {
+        Target.FOLDER: _write_folder,
+        Target.CSV: _write_tables,
+        Target.ROS2: write_ros2,
+    }[target]
+    with _new_folder(output) as folder:
+        write(recording, folder)
+    return output
+
+
+@contextmanager
+def _new_folder(output: Path) -> Iterator[Path]:
+    """Appears under its name when it is complete."""
+    if output.exists() or output.is_symlink():
+        raise RecordingError(f"{output} exists already; choose another name")
+    if not output.absolute().parent.is_dir():
+        raise RecordingError(f"the folder {output.absolute().parent} does not exist; create it first")
+    temporary = output.with_name(output.name + ".part")
+    try:
+        temporary.mkdir()
+        try:
+            yield temporary
+            temporary.rename(output)
+            sync_folder(output.parent)
+        except BaseException:
+            shutil.rmtree(temporary, ignore_errors=True)
+            raise
+    except OSError as error:
+        raise RecordingError(f"cannot write {output}: {error.strerror}") from error
+
+
+def _write_folder(recording: Recording, folder: Path) -> None:
+    info = recording.info
+    (folder / "images").mkdir()
+    rows = [_write_picture(recording, view, folder) for view in recording.views()]
+    header = HEADER
+    if any(view.joints_rad is not None for view in recording.views()):
+        header = HEADER + JOINTS
+        joints = (view.joints_rad or ("",) * len(JOINTS) for view in recording.views())
+        rows = [[*row, *six] for row, six in zip(rows, joints, strict=True)]
+    _write_csv(folder / POSES_FILE, header, rows)
+    described = {
+        "mount": info.mount,
+        "board": msgspec.to_builtins(info.board),
+        "camera": msgspec.to_builtins(info.camera),
+        "robot": msgspec.to_builtins(info.robot),
+        "note": info.note or f"exported from session {info.name} ({info.source})",
+    }
+    (folder / DATASET_FILE).write_bytes(msgspec.yaml.encode(described))
+
+
+def _write_picture(recording: Recording, view: View, folder: Path) -> list[Any]:
+    """The stored file where there is one, else a lossless PNG; returns the pose's row."""
+    picture = recording.picture(view)
+    stored = recording.stored_picture(view)
+    extension, data = ("png", encode_png(picture.image)) if stored is None else stored
+    name = f"images/{view.index:03d}.{_EXTENSIONS.get(extension, extension)}"
+    (folder / name).write_bytes(data)
+    T = view.base_from_flange
+    return [name, T[0][3], T[1][3], T[2][3], *quaternion_xyzw(T)]
+
+
+def _write_tables(recording: Recording, folder: Path) -> None:
+    """One CSV per kind of message, raw values in SI units, pictures only as their facts."""
+    states = (
+        [
+            *_values(state.stamps),
+            *state.joints_rad,
+            *state.joint_speeds_rad_s,
+            *state.tcp_pose,
+            state.robot_mode,
+            state.safety_mode,
+            state.speed_scaling,
+        ]
+        for state in recording.robot_states()
+    )
+    pose = ["tcp_x_m", "tcp_y_m", "tcp_z_m", "tcp_rx_rad", "tcp_ry_rad", "tcp_rz_rad"]
+    joints = [f"{joint}_rad" for joint in _JOINTS] + [f"{joint}_rad_s" for joint in _JOINTS]
+    header = [*_STAMPS, *joints, *pose, "robot_mode", "safety_mode", "speed_scaling"]
+    _write_csv(folder / "robot_states.csv", header, states)
+    facts = [fact for part in recording.parts for fact in part.picture_facts()]
+    columns = ["sequence", "frame_id", "width", "height", "exposure_us", "gain_db", "pixel_format"]
+    rows = ([*_values(fact.stamps), *(getattr(fact, column) for column in columns)] for fact in facts)
+    _write_csv(folder / "pictures.csv", [*_STAMPS, *columns], rows)
+    _write_views(recording, folder)
+    events = ([*_values(e.stamps), e.level, e.kind, e.pose_index, e.detail] for e in recording.events())
+    _write_csv(folder / "events.csv", [*_STAMPS, "level", "kind", "pose_index", "detail"], events)
+
+
+def _write_views(recording: Recording, folder: Path) -> None:
+    """Every attempt; the last column tells which ones count."""
+    counted = recording.views()
+    header = [
+        "index",
+        "attempt",
+        "part",
+        "name",
+        "picture_sequence",
+        *HEADER[1:],
+        *_STAMPS,
+        "time_bound_s",
+        "used",
+    ]
+    rows = []
+    for view in (view for part in recording.parts for view in part.views):
+        T = view.base_from_flange
+        pose = [T[0][3], T[1][3], T[2][3], *quaternion_xyzw(T)]
+        place = [view.index, view.attempt, view.part, view.name, view.picture_sequence]
+        rows.append([*place, *pose, *_values(view.stamps), view.time_bound_s, int(view in counted)])
+    _write_csv(folder / "views.csv", header, rows)
+
+
+def _values(stamps: Stamps) -> list[Any]:
+    return [getattr(stamps, name) for name in _STAMPS]
+
+
+def _write_csv(path: Path, header: list[str], rows: Iterable[list[Any]]) -> None:
+    with path.open("w", newline="", encoding="utf-8") as file:
+        writer = csv.writer(file, lineterminator="\n")
+        writer.writerow(header)
+        writer.writerows(rows)

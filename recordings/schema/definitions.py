@@ -1,0 +1,211 @@
+"""The project's own messages in protobuf: one message per struct of `messages`, derived from its fields.
+
+int → int64, float → double, str → string, tuple of floats → repeated double (a matrix row by row),
+struct → message, `| None` → optional. Field numbers are the order of the struct's fields, so a new field goes
+at the end with a default; `tests/recordings/test_schema.py` freezes the numbers. The schema
+travels inside every file, and the reader refuses one that says something else than these.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import msgspec
+from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
+from google.protobuf.message import DecodeError
+from msgspec import inspect
+
+from recordings.schema.messages import CaptureEvent, RobotState, Stamps, Stillness, View
+
+FORMATS = ("station-recording/1", "station-recording/2")
+"""What is read, oldest first; the newest is written."""
+SESSION_RECORDS = ("session", "session-copy")
+"""Metadata records with the SessionInfo: twice, because nothing can be saved from a file without it."""
+RECOVERY_RECORD = "recovery"
+"""Metadata record of a rebuilt file: what was lost."""
+PACKAGE = "station"
+_FILE = "station/recording.proto"
+_MATRIX_COLUMNS = 4
+
+
+class PictureFacts(msgspec.Struct, frozen=True, omit_defaults=True):
+    """What a foxglove image message has no place for; written right before its image, same sequence."""
+
+    stamps: Stamps
+    frame_id: int
+    sequence: int
+    width: int
+    height: int
+    exposure_us: float = 0.0
+    gain_db: float = 0.0
+    pixel_format: str = "Mono8"
+    trigger_count: int | None = None
+
+
+class SchemaError(ValueError):
+    """Bytes that are not the message they should be."""
+
+
+S = TypeVar("S", bound=msgspec.Struct)
+_Descriptor = descriptor_pb2.FieldDescriptorProto
+_FILLED_IN_BY_READER = {(View, "part")}
+
+
+@dataclass(frozen=True)
+class _Field:
+    name: str
+    kind: str
+    """scalar, vector, matrix or message"""
+    proto_type: int
+    optional: bool
+    struct: type[msgspec.Struct] | None = None
+
+
+def _field(field: inspect.Field) -> _Field:
+    node: Any = field.type
+    optional = isinstance(node, inspect.UnionType)
+    if optional:
+        node = next(t for t in node.types if not isinstance(t, inspect.NoneType))
+    if isinstance(node, inspect.StructType):
+        return _Field(field.name, "message", _Descriptor.TYPE_MESSAGE, optional, node.cls)
+    if isinstance(node, inspect.TupleType):
+        return _Field(field.name, "vector", _Descriptor.TYPE_DOUBLE, optional)
+    if isinstance(node, inspect.VarTupleType):
+        kind = "matrix" if isinstance(node.item_type, inspect.VarTupleType) else "vector"
+        return _Field(field.name, kind, _Descriptor.TYPE_DOUBLE, optional)
+    scalar: dict[Any, int] = {
+        inspect.IntType: _Descriptor.TYPE_INT64,
+        inspect.FloatType: _Descriptor.TYPE_DOUBLE,
+        inspect.StrType: _Descriptor.TYPE_STRING,
+        inspect.LiteralType: _Descriptor.TYPE_STRING,
+    }
+    return _Field(field.name, "scalar", scalar[type(node)], optional)
+
+
+def _fields(struct: type[msgspec.Struct]) -> list[_Field]:
+    node = inspect.type_info(struct)
+    assert isinstance(node, inspect.StructType)
+    return [_field(f) for f in node.fields if (struct, f.name) not in _FILLED_IN_BY_READER]
+
+
+_STRUCTS: tuple[type[msgspec.Struct], ...] = (
+    Stamps,
+    Stillness,
+    RobotState,
+    PictureFacts,
+    View,
+    CaptureEvent,
+)
+_PLAN = {struct: _fields(struct) for struct in _STRUCTS}
+
+
+def _file_descriptor() -> descriptor_pb2.FileDescriptorProto:
+    file = descriptor_pb2.FileDescriptorProto(name=_FILE, package=PACKAGE, syntax="proto3")
+    for struct in _STRUCTS:
+        message = file.message_type.add(name=struct.__name__)
+        for number, field in enumerate(_PLAN[struct], start=1):
+            repeated = field.kind in ("vector", "matrix")
+            label = _Descriptor.LABEL_REPEATED if repeated else _Descriptor.LABEL_OPTIONAL
+            proto = message.field.add(name=field.name, number=number, label=label, type=field.proto_type)
+            if field.struct is not None:
+                proto.type_name = f".{PACKAGE}.{field.struct.__name__}"
+            if field.kind == "scalar" and field.optional:  # proto3 spells `optional` as a one-member oneof
+                proto.proto3_optional = True
+                proto.oneof_index = len(message.oneof_decl)
+                message.oneof_decl.add(name=f"_{field.name}")
+    return file
+
+
+_POOL = descriptor_pool.DescriptorPool()
+_POOL.Add(_file_descriptor())
+_CLASSES: dict[type[msgspec.Struct], Any] = {
+    struct: message_factory.GetMessageClass(_POOL.FindMessageTypeByName(f"{PACKAGE}.{struct.__name__}"))
+    for struct in _STRUCTS
+}
+
+
+def message_class(struct: type[msgspec.Struct]) -> Any:
+    """The protobuf class of a struct."""
+    return _CLASSES[struct]
+
+
+def encode(value: msgspec.Struct) -> bytes:
+    """Any of the structs above → protobuf bytes."""
+    return bytes(_to_proto(value).SerializeToString())
+
+
+def _to_proto(value: msgspec.Struct) -> Any:
+    struct = type(value)
+    arguments: dict[str, Any] = {}
+    for field in _PLAN[struct]:
+        content = getattr(value, field.name)
+        if content is None:
+            continue
+        if field.kind == "message":
+            content = _to_proto(content)
+        elif field.kind == "matrix":
+            content = [number for row in content for number in row]
+        arguments[field.name] = content
+    return _CLASSES[struct](**arguments)
+
+
+def decode(struct: type[S], data: bytes) -> S:
+    """Protobuf bytes → struct, every type, length and literal checked. Raises SchemaError."""
+    try:
+        return msgspec.convert(_from_proto(struct, _CLASSES[struct].FromString(data)), struct)
+    except (DecodeError, msgspec.ValidationError, UnicodeDecodeError) as error:
+        raise SchemaError(f"not a {PACKAGE}.{struct.__name__}: {error}") from error
+
+
+def _from_proto(struct: type[msgspec.Struct], message: Any) -> dict[str, Any]:
+    content: dict[str, Any] = {}
+    for field in _PLAN[struct]:
+        value = getattr(message, field.name)
+        if field.kind == "message":
+            if field.optional and not message.HasField(field.name):
+                continue
+            assert field.struct is not None
+            content[field.name] = _from_proto(field.struct, value)
+        elif field.kind == "scalar":
+            if not field.optional or message.HasField(field.name):
+                content[field.name] = value
+        elif value or not field.optional:
+            content[field.name] = _rows(value) if field.kind == "matrix" else tuple(value)
+    return content
+
+
+def _rows(numbers: Any) -> tuple[tuple[float, ...], ...]:
+    flat = tuple(numbers)
+    return tuple(flat[i : i + _MATRIX_COLUMNS] for i in range(0, len(flat), _MATRIX_COLUMNS))
+
+
+def schema_difference(ours: bytes, theirs: bytes) -> str:
+    """What a stored FileDescriptorSet says differently from ours; '' when ours can read it without loss.
+
+    An older schema lacks fields at the end: allowed. Unknown, renamed or retyped fields are not.
+    """
+    if ours == theirs:
+        return ""
+    known, stored = _field_table(ours), _field_table(theirs)
+    for key, meaning in stored.items():
+        if key not in known:
+            return f"unknown field {key[0]}.{meaning[0]} (a newer version wrote this file)"
+        if known[key][0] == meaning[0] and known[key] != meaning:
+            return f"{key[0]} field {key[1]} '{meaning[0]}' has another type"
+        if known[key] != meaning:
+            return f"{key[0]} field {key[1]} is '{meaning[0]}', expected '{known[key][0]}'"
+    return ""
+
+
+def _field_table(descriptor_set: bytes) -> dict[tuple[str, int], tuple[Any, ...]]:
+    try:
+        files = descriptor_pb2.FileDescriptorSet.FromString(descriptor_set)
+    except DecodeError as error:
+        raise SchemaError("the stored schema is not a protobuf FileDescriptorSet") from error
+    table: dict[tuple[str, int], tuple[Any, ...]] = {}
+    for file in files.file:
+        for message in file.message_type:
+            for f in message.field:
+                table[f"{file.package}.{message.name}", f.number] = (f.name, f.type, f.label, f.type_name)
+    return table

@@ -1,0 +1,212 @@
+"""What a recording is made of: one type per kind of message, in metres, radians and seconds.
+
+These are the types that every room shares. How they lie in the file is `schema`'s business.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Any, Literal
+
+import msgspec
+from numpy.typing import NDArray
+
+Mount = Literal["eye-in-hand", "eye-to-hand"]
+Source = Literal["real", "simulated", "playback", "imported"]
+"""Where the pictures and poses came from; anything but `real` never installs on a real cell."""
+
+Vector6 = tuple[float, float, float, float, float, float]
+Matrix4 = tuple[tuple[float, ...], ...]
+"""4×4, row major"""
+
+
+class BoardKind(StrEnum):
+    CHESSBOARD = "chessboard"
+    CHARUCO = "charuco"
+    CIRCLES = "circles"
+    ASYMMETRIC_CIRCLES = "asymmetric-circles"
+    APRIL_GRID = "april-grid"
+    ARUCO = "aruco"
+    """One ArUco tag."""
+    APRIL_TAG = "april-tag"
+    """One AprilTag."""
+
+
+SINGLE_TAGS = (BoardKind.ARUCO, BoardKind.APRIL_TAG)
+
+
+class BoardSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """A calibration board as its owner would describe it."""
+
+    kind: BoardKind
+    columns: int = 1
+    """Inner corners (chessboard), circles, tags, or squares (charuco, as OpenCV counts); a single tag: 1."""
+    rows: int = 1
+    square_m: float = 0.0
+    """Side of a square; distance of neighbouring circles; side of a tag's black square. Must be given."""
+    marker_m: float | None = None
+    """charuco: side of a marker. april-grid: the gap between tags."""
+    dictionary: str | None = None
+    legacy: bool = False
+    radon_marker: bool = False
+    """A chessboard with OpenCV's three-dot marker."""
+    tag_id: int = msgspec.field(default=0, name="id")
+    """Number of a single tag in its dictionary."""
+    square_tolerance: float | None = None
+    """Relative standard uncertainty of `square_m`; None: the solver's default."""
+    flatness_m: float | None = None
+    """Standard deviation of the board's points from a plane; None: the solver's default."""
+
+
+LARGEST_TOLERANCE = 0.1
+"""Relative; a square known worse than this is not known."""
+LARGEST_FLATNESS_M = 0.05
+
+
+class RobotIdentity(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    model: str = "unknown"
+    serial: str = ""
+    controller_version: str = ""
+    tcp_offset: Vector6 = (0.0,) * 6
+    """flange_from_tcp as on the pendant: x y z [m], rotation vector [rad]. Kept beside, never mixed in."""
+    payload_kg: float = 0.0
+    safety_checksum: str = ""
+
+
+class CameraIdentity(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    vendor: str = ""
+    model: str = "unknown"
+    serial: str = ""
+    driver: str = ""
+    """aravis, playback, rendered, imported"""
+
+
+class CameraModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Intrinsics. Pixel (0, 0) is the centre of the top left pixel, as in OpenCV."""
+
+    width: int
+    height: int
+    matrix: tuple[tuple[float, float, float], ...] | None = None
+    distortion: tuple[float, ...] = ()
+    """OpenCV order: k1 k2 p1 p2 k3 [k4 k5 k6]; fisheye: k1…k4."""
+    distortion_model: Literal["plumb_bob", "rational_polynomial", "equidistant"] = "plumb_bob"
+
+
+class SessionInfo(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Written first, as metadata: everything needed to re-solve with nothing else at hand."""
+
+    name: str
+    mount: Mount
+    source: Source
+    board: BoardSpec
+    camera: CameraModel
+    robot: RobotIdentity = RobotIdentity()
+    camera_identity: CameraIdentity = CameraIdentity()
+    part: int = 1
+    """A resumed session continues in part 2, 3 …"""
+    created_wall_ns: int = 0
+    plan_sha256: str = ""
+    config_sha256: str = ""
+    software: dict[str, str] = {}
+    """Package → version."""
+    note: str = ""
+
+
+class Stamps(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Every clock that saw the event; zero = that clock did not."""
+
+    host_monotonic_ns: int = 0
+    host_wall_ns: int = 0
+    controller_s: float = 0.0
+    device_ns: int = 0
+
+
+class RobotState(msgspec.Struct, frozen=True):
+    """One sample of the controller, at its full rate. Joint order: base … wrist 3, rad."""
+
+    stamps: Stamps
+    joints_rad: Vector6
+    joint_speeds_rad_s: Vector6
+    target_joints_rad: Vector6
+    tcp_pose: Vector6
+    """base_from_tcp as the controller reports it: x y z [m], rotation vector [rad]; raw."""
+    robot_mode: int
+    safety_mode: int
+    safety_status_bits: int
+    runtime_state: int
+    robot_status_bits: int
+    speed_scaling: float
+    target_speed_fraction: float
+
+
+class Picture(msgspec.Struct, frozen=True, eq=False):
+    """One frame as the camera gave it."""
+
+    image: NDArray[Any]
+    """(height, width) uint8 or uint16, or (height, width, 3) uint8 BGR"""
+    stamps: Stamps
+    """device_ns: the camera's clock at the start of exposure; host: first packet received."""
+    frame_id: int
+    sequence: int
+    """Counts from 0 in this recording, never wraps."""
+    exposure_us: float = 0.0
+    gain_db: float = 0.0
+    pixel_format: str = "Mono8"
+    """As GenICam names it."""
+    trigger_count: int | None = None
+
+
+class Stillness(msgspec.Struct, frozen=True, omit_defaults=True):
+    """How still the arm was over the window before the picture."""
+
+    window_s: float
+    max_joint_speed_rad_s: float
+    position_scatter_m: float
+    rotation_scatter_rad: float
+    image_motion_px: float | None = None
+
+
+class View(msgspec.Struct, frozen=True, omit_defaults=True):
+    """The index entry that makes a picture and a robot pose belong together. Written after both."""
+
+    index: int
+    """Pose number in the plan (from 0)."""
+    name: str
+    picture_sequence: int
+    base_from_flange: Matrix4
+    """Flange pose at mid-exposure."""
+    joints_rad: Vector6 | None = None
+    """Joints at mid-exposure; None where no joints are known (imported)."""
+    attempt: int = 1
+    """A retake of the same pose supersedes lower attempts."""
+    stamps: Stamps = Stamps()
+    """Of mid-exposure."""
+    time_bound_s: float | None = None
+    """95 % bound of the pose's time against the picture's."""
+    stillness: Stillness | None = None
+    source_file: str = ""
+    note: str = ""
+    part: int = 1
+    """The part of the session that holds the picture; filled in by the reader."""
+
+
+class CaptureEvent(msgspec.Struct, frozen=True, omit_defaults=True):
+    """What happened, for people and for replay: kind is a short word, detail is a sentence."""
+
+    stamps: Stamps
+    kind: str
+    pose_index: int | None = None
+    detail: str = ""
+    level: Literal["debug", "info", "warning", "error"] = "info"
+
+
+def matrix_from_quaternion(position_m: list[float], quaternion_xyzw: list[float]) -> Matrix4:
+    """Unit quaternion and position → 4×4."""
+    x, y, z, w = quaternion_xyzw
+    px, py, pz = position_m
+    return (
+        (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w), px),
+        (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w), py),
+        (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y), pz),
+        (0.0, 0.0, 0.0, 1.0),
+    )

@@ -1,0 +1,92 @@
+"""What lies on which topic of a recording."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Any
+
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from foxglove_schemas_protobuf.SceneUpdate_pb2 import SceneUpdate
+from google.protobuf.descriptor_pb2 import FileDescriptorSet
+from google.protobuf.message import DecodeError
+from mcap_protobuf.schema import build_file_descriptor_set
+
+from recordings.schema.definitions import PictureFacts, message_class
+from recordings.schema.messages import CaptureEvent, RobotState, View
+
+
+class Topic(StrEnum):
+    ROBOT_STATE = "/robot/state"
+    PICTURE_FACTS = "/camera/frame"
+    RAW_IMAGE = "/camera/image"
+    COMPRESSED_IMAGE = "/camera/image/compressed"
+    CAMERA_CALIBRATION = "/camera/calibration"
+    VIEW = "/session/view"
+    EVENT = "/session/event"
+    TRANSFORM = "/tf"
+    FIXED_TRANSFORM = "/tf_static"
+    JOINTS = "/joint_states"
+    ANNOTATIONS = "/camera/annotations"
+    SCENE = "/scene"
+    DRAWN_IMAGE = "/camera/annotated"
+    LOG = "/log"
+
+
+_MESSAGES: dict[Topic, Any] = {
+    Topic.ROBOT_STATE: message_class(RobotState),
+    Topic.PICTURE_FACTS: message_class(PictureFacts),
+    Topic.RAW_IMAGE: RawImage,
+    Topic.COMPRESSED_IMAGE: CompressedImage,
+    Topic.CAMERA_CALIBRATION: CameraCalibration,
+    Topic.VIEW: message_class(View),
+    Topic.EVENT: message_class(CaptureEvent),
+    Topic.TRANSFORM: FrameTransform,
+    Topic.FIXED_TRANSFORM: FrameTransform,
+    Topic.JOINTS: JointStates,
+    Topic.ANNOTATIONS: ImageAnnotations,
+    Topic.SCENE: SceneUpdate,
+    Topic.DRAWN_IMAGE: CompressedImage,
+    Topic.LOG: Log,
+}
+
+
+def schema_name(topic: Topic) -> str:
+    """Full protobuf name of the topic's message."""
+    return str(_MESSAGES[topic].DESCRIPTOR.full_name)
+
+
+def schema_bytes(topic: Topic) -> bytes:
+    """The FileDescriptorSet that goes into the file."""
+    descriptors: FileDescriptorSet = build_file_descriptor_set(_MESSAGES[topic])
+    return bytes(descriptors.SerializeToString())
+
+
+def identify(samples: list[bytes]) -> tuple[str, str, str, bytes] | None:
+    """Messages of one channel → its topic, schema name, encoding and schema; None unless exactly one fits.
+
+    For files whose declarations are lost: a message fits a topic when every byte of it is a field that the
+    topic's message has, and it says again the same number of bytes.
+    """
+    fitting = [topic for topic in Topic if all(_fits(topic, data) for data in samples)]
+    for twin in (Topic.FIXED_TRANSFORM, Topic.DRAWN_IMAGE):  # of /tf and of pictures; only annotated copies
+        if len(fitting) > 1 and twin in fitting:
+            fitting.remove(twin)
+    if len(fitting) != 1 or not samples:
+        return None
+    return fitting[0].value, schema_name(fitting[0]), "protobuf", schema_bytes(fitting[0])
+
+
+def _fits(topic: Topic, data: bytes) -> bool:
+    try:
+        message = _MESSAGES[topic].FromString(data)
+    except (DecodeError, UnicodeDecodeError):
+        return False
+    size = message.ByteSize()
+    message.DiscardUnknownFields()
+    return bool(data) and size == message.ByteSize() == len(data)

@@ -1,0 +1,240 @@
+"""The published foxglove messages that make a recording open in Foxglove, Lichtblick and rerun unaided."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.ImageAnnotations_pb2 import ImageAnnotations
+from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
+from foxglove_schemas_protobuf.Log_pb2 import Log
+from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from numpy.typing import NDArray
+
+from recordings.mcap.writer import Piece
+from recordings.pictures import raw_encoding
+from recordings.schema.messages import (
+    CameraModel,
+    CaptureEvent,
+    Matrix4,
+    RobotState,
+    Vector6,
+    matrix_from_quaternion,
+)
+
+CAMERA_FRAME = "camera"
+JOINT_NAMES = [
+    f"{joint}_joint" for joint in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+]
+"""As the UR ROS driver names them."""
+DETECTED = (0.1, 0.9, 0.2)
+"""Colour of corners as they were detected."""
+_NS = 1_000_000_000
+_LEVELS = {"debug": Log.DEBUG, "info": Log.INFO, "warning": Log.WARNING, "error": Log.ERROR}
+_FISHEYE = {"equidistant": "kannala_brandt"}
+"""Foxglove's name for OpenCV's fisheye model."""
+_OURS: dict[str, Any] = {
+    "kannala_brandt": "equidistant",
+    "equidistant": "equidistant",
+    "fisheye": "equidistant",
+    "rational_polynomial": "rational_polynomial",
+}
+
+
+def _stamp(message: Any, time_ns: int) -> None:
+    message.timestamp.seconds, message.timestamp.nanos = divmod(time_ns, _NS)
+
+
+def raw_image(image: NDArray[Any], pixel_format: str, time_ns: int) -> list[Piece]:
+    """A picture as it came: the message in pieces, the pixels not copied. PictureError for odd arrays."""
+    encoding = raw_encoding(image, pixel_format)
+    pixels = np.ascontiguousarray(image).data.cast("B")
+    height, width = image.shape[:2]
+    message = RawImage(
+        frame_id=CAMERA_FRAME, width=width, height=height, encoding=encoding, step=len(pixels) // height
+    )
+    _stamp(message, time_ns)
+    return _with_data(message, pixels)
+
+
+def compressed_image(data: bytes, format: str, time_ns: int) -> list[Piece]:
+    """A picture file: the message in pieces."""
+    message = CompressedImage(frame_id=CAMERA_FRAME, format=format)
+    _stamp(message, time_ns)
+    return _with_data(message, data)
+
+
+def _with_data(message: Any, data: Piece) -> list[Piece]:
+    """The message's bytes with its `data` field behind the others, where protobuf allows it to stand."""
+    tag = message.DESCRIPTOR.fields_by_name["data"].number << 3 | 2
+    length, rest = bytearray(), len(data)
+    while rest > 127:
+        length.append(rest & 127 | 128)
+        rest >>= 7
+    length.append(rest)
+    return [message.SerializeToString() + bytes([tag]) + length, data]
+
+
+def camera_calibration(model: CameraModel, time_ns: int) -> Any:
+    """Intrinsics; a camera that is not calibrated has an all-zero K, as viewers expect."""
+    message = CameraCalibration(
+        frame_id=CAMERA_FRAME,
+        width=model.width,
+        height=model.height,
+        distortion_model=_FISHEYE.get(model.distortion_model, model.distortion_model),
+        D=model.distortion,
+    )
+    K = [number for row in model.matrix for number in row] if model.matrix else [0.0] * 9
+    message.K.extend(K)
+    message.R.extend(np.eye(3).ravel())
+    message.P.extend([*K[:3], 0.0, *K[3:6], 0.0, *K[6:], 0.0])
+    _stamp(message, time_ns)
+    return message
+
+
+def camera_model_of(message: Any) -> CameraModel:
+    """The intrinsics of a `foxglove.CameraCalibration`."""
+    return intrinsics(message.width, message.height, message.K, message.D, message.distortion_model)
+
+
+def intrinsics(width: int, height: int, K: Any, D: Any, distortion_model: str) -> CameraModel:
+    """As Foxglove and ROS write them; a K of zeros means that nobody knows them."""
+    k = [float(number) for number in K]
+    if len(k) != 9 or not k[0] > 0:
+        return CameraModel(width, height)
+    return CameraModel(
+        width,
+        height,
+        ((k[0], k[1], k[2]), (k[3], k[4], k[5]), (k[6], k[7], k[8])),
+        tuple(float(number) for number in D),
+        _OURS.get(distortion_model, "plumb_bob"),
+    )
+
+
+def matrix_of(message: Any) -> Matrix4:
+    """parent_from_child of a `foxglove.FrameTransform`."""
+    t, q = message.translation, message.rotation
+    return matrix_from_quaternion([t.x, t.y, t.z], [q.x, q.y, q.z, q.w])
+
+
+def frame_transform(parent: str, child: str, T: Matrix4, time_ns: int) -> Any:
+    """parent_from_child, so that a 3D panel knows where things are."""
+    x, y, z, w = quaternion_xyzw(T)
+    message = FrameTransform(parent_frame_id=parent, child_frame_id=child)
+    message.translation.x, message.translation.y, message.translation.z = T[0][3], T[1][3], T[2][3]
+    message.rotation.x, message.rotation.y, message.rotation.z, message.rotation.w = x, y, z, w
+    _stamp(message, time_ns)
+    return message
+
+
+def base_from_flange(tcp_pose: Vector6, tcp_offset: Vector6) -> Matrix4:
+    """The controller's tool pose without the tool: base_from_tcp and flange_from_tcp → base_from_flange."""
+    base_from_tcp, flange_from_tcp = _pose(tcp_pose), _pose(tcp_offset)
+    R = base_from_tcp[:3, :3] @ flange_from_tcp[:3, :3].T
+    t = base_from_tcp[:3, 3] - R @ flange_from_tcp[:3, 3]
+    return (*((*map(float, row), float(at)) for row, at in zip(R, t, strict=True)), (0.0, 0.0, 0.0, 1.0))
+
+
+def _pose(pose: Vector6) -> NDArray[np.float64]:
+    T = np.eye(4)
+    T[:3, :3] = cv2.Rodrigues(np.array(pose[3:], float))[0]
+    T[:3, 3] = pose[:3]
+    return T
+
+
+def joint_states(state: RobotState, time_ns: int) -> Any:
+    message = JointStates()
+    for name, position, velocity in zip(JOINT_NAMES, state.joints_rad, state.joint_speeds_rad_s, strict=True):
+        message.joints.add(name=name, position=position, velocity=velocity)
+    _stamp(message, time_ns)
+    return message
+
+
+@dataclass(frozen=True, eq=False)
+class Marks:
+    """Points that are drawn over a picture, joined in pairs where `ends` is given."""
+
+    points: NDArray[np.float64]
+    """(n, 2), pixels; (0, 0) is the centre of the top left pixel."""
+    colour: tuple[float, float, float]
+    """Red, green, blue, each 0…1."""
+    ends: NDArray[np.float64] | None = None
+    """(n, 2): a line leads from each point to its end."""
+    thickness_px: float = 4.0
+
+
+def image_annotations(marks: Sequence[Marks], text: str, time_ns: int) -> Any:
+    """`text` stands in the upper left corner. Viewers count from a pixel's corner: half a pixel is added."""
+    message = ImageAnnotations()
+    _stamp(message, time_ns)
+    for mark in marks:
+        kind = PointsAnnotation.POINTS if mark.ends is None else PointsAnnotation.LINE_LIST
+        drawn = message.points.add(type=kind, thickness=mark.thickness_px)
+        _stamp(drawn, time_ns)
+        _paint(drawn.outline_color, mark.colour)
+        points = mark.points if mark.ends is None else np.stack([mark.points, mark.ends], 1).reshape(-1, 2)
+        for x, y in points + 0.5:
+            drawn.points.add(x=x, y=y)
+    if text:
+        label = message.texts.add(text=text, font_size=24)
+        _stamp(label, time_ns)
+        label.position.x, label.position.y = 10, 34
+        _paint(label.text_color, marks[-1].colour if marks else (1.0, 1.0, 1.0))
+        label.background_color.a = 0.6
+    return message
+
+
+def drawn(image: NDArray[Any], marks: Sequence[Marks], text: str) -> bytes:
+    """The picture as JPEG with marks and text in its pixels."""
+    if image.dtype == np.uint16:
+        image = np.asarray(image / max(1, int(image.max()) >> 8), np.uint8)
+    canvas = image.copy() if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)
+    for mark in marks:
+        colour = [255 * part for part in mark.colour[::-1]]
+        fixed = np.rint(mark.points * 16).astype(int)
+        if mark.ends is None:
+            for x, y in fixed.tolist():
+                cv2.circle(canvas, (x, y), 80, colour, 2, cv2.LINE_AA, 4)
+        else:
+            for start, end in zip(fixed.tolist(), np.rint(mark.ends * 16).astype(int).tolist(), strict=True):
+                cv2.line(canvas, start, end, colour, 3, cv2.LINE_AA, 4)
+    colour = [255 * part for part in marks[0].colour[::-1]] if marks else [255, 255, 255]
+    text = text.encode("ascii", "replace").decode()  # OpenCV's letters
+    cv2.putText(canvas, text, (12, 32), cv2.FONT_HERSHEY_SIMPLEX, 0.8, colour, 2, cv2.LINE_AA)
+    return bytes(cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, 90])[1].tobytes())
+
+
+def _paint(colour: Any, rgb: tuple[float, float, float]) -> None:
+    colour.r, colour.g, colour.b, colour.a = *rgb, 1.0
+
+
+def log_line(event: CaptureEvent, time_ns: int) -> Any:
+    text = event.detail or event.kind
+    if event.pose_index is not None:
+        text = f"pose {event.pose_index + 1}: {text}"
+    message = Log(level=_LEVELS[event.level], message=text, name=event.kind)
+    _stamp(message, time_ns)
+    return message
+
+
+def quaternion_xyzw(transform: Matrix4) -> tuple[float, float, float, float]:
+    """Of a rigid transform, w ≥ 0: the eigenvector of Bar-Itzhack's K (2000), good at any angle."""
+    R = np.array(transform)
+    K = np.array(
+        [
+            [R[0, 0] - R[1, 1] - R[2, 2], R[1, 0] + R[0, 1], R[2, 0] + R[0, 2], R[2, 1] - R[1, 2]],
+            [R[1, 0] + R[0, 1], R[1, 1] - R[0, 0] - R[2, 2], R[2, 1] + R[1, 2], R[0, 2] - R[2, 0]],
+            [R[2, 0] + R[0, 2], R[2, 1] + R[1, 2], R[2, 2] - R[0, 0] - R[1, 1], R[1, 0] - R[0, 1]],
+            [R[2, 1] - R[1, 2], R[0, 2] - R[2, 0], R[1, 0] - R[0, 1], R[0, 0] + R[1, 1] + R[2, 2]],
+        ]
+    )
+    q = np.linalg.eigh(K)[1][:, -1]
+    x, y, z, w = (q if q[3] >= 0 else -q).tolist()
+    return x, y, z, w

@@ -1,0 +1,161 @@
+"""The running estimate: a quick look at X after each pose, and how sure it is. Never the final one."""
+
+from __future__ import annotations
+
+import contextlib
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+
+import cv2
+import msgspec
+import numpy as np
+from numpy.typing import NDArray
+
+from calibrate.boards.model import board_points
+from calibrate.errors import CalibrationError
+from calibrate.geometry import Array, inverse, pose
+from calibrate.handeye.information import Noise, covariance_of, prior_information, view_information
+from calibrate.handeye.priors import BoardTolerance
+from calibrate.lens.intrinsics import calibrate_intrinsics
+from calibrate.lens.pnp import solve_pnp
+from calibrate.views import ImageView, ViewSet
+from recordings.schema.messages import BoardSpec, CameraModel, Mount
+from station.cell.config import StationConfig
+from station.cell.errors import StationError
+from station.cell.scene import scene_of
+from station.cell.status import EstimateStatus
+from station.plan.predict import Advice, AdviceOptions, advise
+
+FEWEST_VIEWS = 4
+FEWEST_FOR_LENS = 6
+COVERAGE_ROWS, COVERAGE_COLUMNS = 4, 6
+
+Seen = tuple[int, Array, NDArray[np.intp], Array]
+"""Pose number, base_from_flange (4, 4), rows of `board_points` (k,), pixels (k, 2)."""
+
+
+def running_estimate(
+    mount: Mount,
+    camera: CameraModel,
+    lens_is_known: bool,
+    board: BoardSpec,
+    seen: Sequence[Seen],
+    goal_m: float,
+) -> EstimateStatus:
+    """Few views or degenerate motion give an answer without numbers and with advice."""
+    coverage = image_coverage(camera, [pixels for _, _, _, pixels in seen])
+    blank = EstimateStatus(len(seen), goal_mm=1000 * goal_m, image_coverage=coverage)
+    if len(seen) < FEWEST_VIEWS:
+        return msgspec.structs.replace(blank, advice="too few views yet")
+    try:
+        views, X, Y = solve_quickly(mount, camera, lens_is_known, board, seen)
+    except (CalibrationError, cv2.error, np.linalg.LinAlgError):
+        return msgspec.structs.replace(blank, advice="the motion says too little yet")
+    free_lens = not lens_is_known
+    sigma_m, sigma_rad = quick_sigma(views, board, X, Y, free_lens)
+    x, y, z = (float(v) for v in 1000 * X[:3, 3])
+    return msgspec.structs.replace(
+        blank,
+        translation_mm=(round(x, 2), round(y, 2), round(z, 2)),
+        sigma_translation_mm=round(1000 * sigma_m, 3),
+        sigma_rotation_deg=round(math.degrees(sigma_rad), 4),
+        enough=sigma_m <= goal_m,
+        advice=f"enough for {1000 * goal_m:.2g} mm: you may finish"
+        if sigma_m <= goal_m
+        else "go on: every pose still helps",
+    )
+
+
+def next_best(
+    config: StationConfig,
+    base_from_flange: Array,
+    joints_now_rad: Sequence[float],
+    onward_rad: Sequence[float] | None,
+) -> Advice:
+    """Which pose would help most after those captured (n, 4, 4), whether or not these are enough.
+
+    Free to reach from here, and from it the pose that is next (`onward_rad`). By forecast from the configured
+    guesses; ConfigError where these are missing.
+    """
+    return advise(
+        scene_of(config), base_from_flange, 0.0, joints_now_rad, AdviceOptions(onward_rad=onward_rad)
+    )
+
+
+def next_best_text(config: StationConfig, base_from_flange: Array, joints_now_rad: Sequence[float]) -> str:
+    """Which pose would help most and how many are missing for `capture.goal_m`; empty when none is, or none
+    helps, or the guesses are missing."""
+    goal_m = config.capture.goal_m
+    try:
+        advice = advise(scene_of(config), base_from_flange, goal_m, joints_now_rad)
+    except StationError:
+        return ""
+    if advice.next_pose is None:
+        return ""
+    missing = f"at best {advice.poses_missing} more" if advice.poses_missing else "many more poses"
+    return f"{missing} for {1000 * goal_m:.2g} mm; the next best: {advice.next_pose.why}"
+
+
+def image_coverage(camera: CameraModel, pixels: Sequence[Array]) -> tuple[tuple[int, ...], ...]:
+    """How many corners fell into each part of the picture, COVERAGE_ROWS × COVERAGE_COLUMNS."""
+    points = np.concatenate([np.zeros((0, 2)), *pixels])
+    counts, _, _ = np.histogram2d(
+        points[:, 1],
+        points[:, 0],
+        bins=(COVERAGE_ROWS, COVERAGE_COLUMNS),
+        range=((0, camera.height), (0, camera.width)),
+    )
+    return tuple(tuple(int(n) for n in row) for row in counts)
+
+
+def solve_quickly(
+    mount: Mount, camera: CameraModel, lens_is_known: bool, board: BoardSpec, seen: Sequence[Seen]
+) -> tuple[ViewSet, Array, Array]:
+    """Views with the lens they were read by, X and Y.
+
+    CalibrationError, cv2.error or LinAlgError when the views are degenerate.
+    """
+    views = _views(mount, camera, lens_is_known, board, seen)
+    return views, *_quick_solution(views)
+
+
+def _views(
+    mount: Mount, camera: CameraModel, lens_is_known: bool, board: BoardSpec, seen: Sequence[Seen]
+) -> ViewSet:
+    points = board_points(board)
+    found = tuple(
+        ImageView(index, f"p{index}", flange, points[rows], pixels) for index, flange, rows, pixels in seen
+    )
+    views = ViewSet(mount, found, camera)
+    if not lens_is_known and len(found) >= FEWEST_FOR_LENS:
+        with contextlib.suppress(CalibrationError):  # the rough lens will do
+            views = replace(views, camera=calibrate_intrinsics(views).camera)
+    return solve_pnp(views, board)
+
+
+def _quick_solution(views: ViewSet) -> tuple[Array, Array]:
+    """X and Y in closed form (Park & Martin 1994, by OpenCV), from all views."""
+    flange, board = views.base_from_flange, views.camera_from_board
+    gripper = flange if views.mount == "eye-in-hand" else np.array([inverse(E) for E in flange])
+    R, t = cv2.calibrateHandEye(
+        list(gripper[:, :3, :3]),
+        list(gripper[:, :3, 3]),
+        list(board[:, :3, :3]),
+        list(board[:, :3, 3]),
+        method=cv2.CALIB_HAND_EYE_PARK,
+    )
+    X = pose(np.asarray(R), np.asarray(t).ravel())
+    if not np.isfinite(X).all():
+        raise np.linalg.LinAlgError("no finite solution")
+    return X, np.asarray(gripper[0] @ X @ board[0])
+
+
+def quick_sigma(views: ViewSet, board: BoardSpec, X: Array, Y: Array, free_lens: bool) -> tuple[float, float]:
+    """1σ of X: translation (m) and rotation (rad), roots of the summed variances."""
+    points = board_points(board)
+    flange = views.base_from_flange
+    information = view_information(views.mount, views.camera, flange, X, Y, points, Noise()).sum(axis=0)
+    prior = prior_information(views.camera, not free_lens, BoardTolerance.of(board))
+    variances = np.diag(covariance_of(information, prior))
+    return float(np.sqrt(variances[:3].sum())), float(np.sqrt(variances[3:6].sum()))

@@ -1,0 +1,151 @@
+"""Planning the poses that are left anew, from what the captured ones show of mount and board.
+
+The better estimate decides where to look from. What is kept clear of stays as the configuration has it, so
+that no check becomes weaker; the new way must be free by the better estimate too.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import cv2
+import msgspec
+import numpy as np
+
+from calibrate.boards.model import board_points
+from calibrate.errors import CalibrationError
+from calibrate.geometry import (
+    Array,
+    difference,
+    inverse,
+    perturb,
+    pose_from_quaternion,
+)
+from calibrate.handeye.information import Noise
+from calibrate.projection import project
+from station.analysis.estimation import FEWEST_FOR_LENS, Seen, quick_sigma, solve_quickly
+from station.cell.config import PoseGuess, StationConfig
+from station.cell.errors import LimitError, RefusedError
+from station.cell.limits import check_plan
+from station.cell.plan import Plan
+from station.cell.scene import Scene, cell_geometry, flange_poses, scene_of
+from station.plan.belief import guess_from
+from station.plan.choose import informations, objective_for, sigma_of
+from station.plan.planner import PlanOptions, plan_scene
+from station.plan.standing import geometry_from
+from station.plan.visibility import outline, visible
+
+FEWEST_VIEWS = FEWEST_FOR_LENS
+FEWEST_LEFT = 3
+_LEAST_M, _LEAST_RAD = 0.001, 0.003
+"""No quick estimate is trusted further than this (1 sigma per axis)."""
+_CONTRADICTION = 5.0
+"""So many sigmas from the configured guess: something was moved, or the guess is another cell's."""
+
+
+@dataclass(frozen=True)
+class Worth:
+    """What the poses that are left would bring, by the better estimate."""
+
+    sigma_m: float
+    """Expected sigma of X at the end, translation."""
+    cut: int
+    """Poses from which the board would not be wholly in the picture."""
+    margin_px: float
+    """Widest strip along an edge of the picture in which no corner comes to lie, captured ones included."""
+
+
+@dataclass(frozen=True)
+class Improvement:
+    plan: Plan
+    """The poses in place of those left."""
+    before: Worth
+    after: Worth
+    sigma_m: float
+    """1 sigma per axis of the mount it was made from."""
+    sigma_rad: float
+
+
+def improve(
+    config: StationConfig,
+    lens_is_known: bool,
+    seen: Sequence[Seen],
+    left: Plan,
+    here_rad: Sequence[float],
+    seed: int = 0,
+) -> Improvement:
+    """As many poses as are `left`, from where the arm is. Runs in a worker; seconds.
+
+    RefusedError when the pictures say too little or contradict the guess, LimitError when there are no such
+    poses.
+    """
+    better = better_guesses(config, lens_is_known, seen)
+    guess = better.camera_guess
+    assert guess is not None
+    scene = scene_of(better)
+    captured = np.array([flange for _, flange, _, _ in seen])
+    options = PlanOptions(count=len(left.poses), seed=seed, free_intrinsics=not lens_is_known)
+    known = msgspec.structs.replace(config, board_guess=config.board_guess or better.board_guess)
+    wary = replace(scene, geometry=geometry_from(known, here_rad))
+    plan = plan_scene(wary, options, here_rad, captured=captured)
+    if problems := check_plan(plan, here_rad, cell_geometry(better)).problems:
+        raise LimitError(f"by what the pictures show the new way would not be free: {problems[0]}")
+    before, after = (_worth(scene, seen, poses, not lens_is_known) for poses in (left, plan))
+    return Improvement(plan, before, after, guess.sigma_m, guess.sigma_rad)
+
+
+def better_guesses(config: StationConfig, lens_is_known: bool, seen: Sequence[Seen]) -> StationConfig:
+    """The configuration with mount, board and lens as the captured pictures show them."""
+    camera, guess = config.camera.model, config.camera_guess
+    if camera is None or camera.matrix is None or guess is None:
+        raise RefusedError("the configuration holds no camera_guess and rough lens to improve on")
+    if len(seen) < FEWEST_VIEWS:
+        raise RefusedError(f"{len(seen)} pictures say too little yet: take at least {FEWEST_VIEWS}")
+    try:
+        views, X, _ = solve_quickly(config.mount, camera, lens_is_known, config.board, seen)
+    except (CalibrationError, cv2.error, np.linalg.LinAlgError):
+        raise RefusedError("the motion so far says too little of the mount: take more poses first") from None
+    flange = views.base_from_flange
+    gripper = flange if config.mount == "eye-in-hand" else np.array([inverse(E) for E in flange])
+    places = gripper @ X @ views.camera_from_board
+    apart = difference(places, places[0])
+    Y = perturb(places[0], apart.mean(axis=0))
+    scatter = np.sqrt(((apart - apart.mean(axis=0)) ** 2).reshape(-1, 2, 3).mean(axis=(0, 2)))
+    counted = quick_sigma(views, config.board, X, Y, not lens_is_known)
+    least = (_LEAST_M, _LEAST_RAD)
+    sigma_m, sigma_rad = (max(float(a), b, c) for a, b, c in zip(scatter, counted, least, strict=True))
+    _require_agreement(guess, X)
+    return msgspec.structs.replace(
+        config,
+        camera=msgspec.structs.replace(config.camera, model=views.camera),
+        camera_guess=guess_from(X, sigma_m, sigma_rad),
+        board_guess=guess_from(Y, sigma_m, sigma_rad),
+    )
+
+
+def _require_agreement(guess: PoseGuess, X: Array) -> None:
+    off = difference(X, pose_from_quaternion(guess.translation_m, guess.rotation_xyzw))
+    sigmas = np.repeat([guess.sigma_m, guess.sigma_rad], 3)
+    if (np.abs(off) <= _CONTRADICTION * sigmas).all():
+        return
+    raise RefusedError(
+        f"the pictures put the camera {1000 * np.linalg.norm(off[:3]):.0f} mm and "
+        f"{np.rad2deg(np.linalg.norm(off[3:])):.1f}° from camera_guess, far beyond its sigmas: look whether "
+        "camera or board were moved, and correct the guess; the plan stays as it is"
+    )
+
+
+def _worth(scene: Scene, seen: Sequence[Seen], left: Plan, free_lens: bool) -> Worth:
+    flange = flange_poses(scene, left)
+    captured = np.array([pose for _, pose, _, _ in seen])
+    everything = informations(scene, np.concatenate([captured, flange]), Noise()).sum(axis=0)
+    sigma_m = sigma_of(everything, objective_for(scene, "A", free_lens))[0]
+    whole = visible(scene.camera, scene.seen(flange, outline(scene.board)), 0.0)
+    points = scene.seen(flange[whole], board_points(scene.board))
+    pixels = np.concatenate(
+        [*(p for _, _, _, p in seen), project(scene.camera, points).pixels.reshape(-1, 2)]
+    )
+    size = np.array([scene.camera.width, scene.camera.height]) - 1
+    margin_px = float(max(pixels.min(axis=0).max(), (size - pixels.max(axis=0)).max()))
+    return Worth(sigma_m, int((~whole).sum()), margin_px)

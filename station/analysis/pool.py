@@ -1,0 +1,90 @@
+"""One worker process for everything that would hold up the daemon's loop. It is disposable."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+import threading
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures.process import BrokenProcessPool
+from multiprocessing import get_context
+from multiprocessing.process import BaseProcess
+from typing import Any, TypeVar
+
+from station.analysis.worker import start_worker, warm_up
+from station.cell.errors import StationError
+
+log = logging.getLogger(__name__)
+
+R = TypeVar("R")
+START_S = 60.0
+REAP_S = 5.0
+
+
+class WorkerError(StationError):
+    """The worker died or took too long; it is replaced, and what it was asked is not answered."""
+
+
+class Workers:
+    """Calls run one after the other, in the order they were made."""
+
+    def __init__(self) -> None:
+        self._pool: ProcessPoolExecutor | None = None
+        self._turn = asyncio.Lock()
+        self._closed = False
+        self.waiting = 0
+        """Calls under way: a preview is not worth queueing for."""
+
+    async def start(self) -> None:
+        """Returns when the worker has loaded what it needs (about a second)."""
+        await self.call(warm_up)
+
+    async def call(self, function: Callable[..., R], *args: Any, timeout_s: float = 60.0) -> R:
+        """The function's result or exception. WorkerError when the process fails or is too slow.
+
+        `timeout_s`: from when its turn comes and the worker is there, so that no call ends another one.
+        """
+        self.waiting += 1
+        try:
+            async with self._turn:
+                if self._closed:
+                    raise WorkerError("the station is ending")
+                pool = self._pool
+                if pool is None:
+                    pool = self._pool = ProcessPoolExecutor(1, get_context("spawn"), initializer=start_worker)
+                    await self._ask(pool, START_S, warm_up)
+                return await self._ask(pool, timeout_s, function, *args)
+        finally:
+            self.waiting -= 1
+
+    async def _ask(
+        self, pool: ProcessPoolExecutor, timeout_s: float, function: Callable[..., R], *args: Any
+    ) -> R:
+        try:
+            async with asyncio.timeout(timeout_s):
+                return await asyncio.wrap_future(pool.submit(function, *args))
+        except (BrokenProcessPool, TimeoutError) as error:
+            self._discard(pool)
+            what = "took too long" if isinstance(error, TimeoutError) else "died"
+            raise WorkerError(f"the worker process {what} in {function.__name__}; it is replaced") from error
+
+    def close(self) -> None:
+        self._closed = True
+        if self._pool is not None:
+            self._discard(self._pool)
+
+    def _discard(self, pool: ProcessPoolExecutor) -> None:
+        if self._pool is pool:
+            self._pool = None
+        processes = list((pool._processes or {}).values())
+        pool.shutdown(wait=False, cancel_futures=True)
+        for process in processes:
+            process.kill()
+        # In a thread: the loop that beats the arm's heart waits for no process to end.
+        threading.Thread(target=_reap, args=(processes,), name="worker reaper", daemon=True).start()
+
+
+def _reap(processes: list[BaseProcess]) -> None:
+    for process in processes:
+        process.join(REAP_S)

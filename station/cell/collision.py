@@ -1,0 +1,253 @@
+"""Coarse solids of arm, tool, camera and board, and how far they are from each other and from walls.
+
+Everything is a capsule (a segment with a radius), so one formula serves all. Radii are generous; a
+margin of zero means "touching after the wanted clearance was taken off".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from calibrate.geometry import Array, transform_points
+from calibrate.kinematics import RobotModel, link_frames
+from recordings.schema.messages import Mount
+from station.cell.config import Capsule, LimitsConfig
+
+ARM_BODIES = ("base column", "shoulder", "upper arm", "forearm", "wrist 1", "wrist 2", "wrist 3")
+_SELF_PAIRS = (
+    *((0, b) for b in (3, 4, 5, 6)),
+    *((1, b) for b in (3, 4, 5, 6)),
+    *((2, b) for b in (4, 5, 6)),
+    (3, 6),
+)
+_SELF_BODIES_FOR_TOOL = (0, 1, 2, 3, 4)
+"""Arm bodies that a solid on the flange may run into; the last two wrists are its neighbours."""
+
+_SIDEWAYS_M = {
+    "UR3": (0.1198, 0.0273),
+    "UR5": (0.1359, 0.0165),
+    "UR10": (0.2209, 0.0490),
+    "UR3e": (0.1200, 0.0270),
+    "UR5e": (0.1380, 0.0070),
+    "UR10e": (0.1762, 0.0393),
+    "UR16e": (0.1760, 0.0390),
+}
+"""Upper arm and forearm stand this far beside the plane of the first DH frames (maker's visual model)."""
+
+
+@dataclass(frozen=True, eq=False)
+class CellGeometry:
+    """What the checks need to know of a cell. Frames: `base` for obstacles, `flange` for solids."""
+
+    model: RobotModel
+    limits: LimitsConfig
+    solids: tuple[Capsule, ...] = ()
+    """On the flange, in `flange`: tool, camera, board on the flange."""
+    obstacles: tuple[Capsule, ...] = ()
+    """Fixed, in `base`: the board, a fixed camera."""
+    obstacle_clearance_m: float = 0.10
+    watched_m: tuple[tuple[float, float, float], ...] = ()
+    """Further points in `flange` (camera centre, board corners) that speed and workspace limits hold for."""
+    mount: Mount | None = None
+    """What a plan must be made for; None: not known."""
+    body_names: tuple[str, ...] = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "body_names", ARM_BODIES + tuple(s.name for s in self.solids))
+
+
+def body_segments(geometry: CellGeometry, joints_rad: Array) -> tuple[Array, Array, Array]:
+    """Joints (n, 6) → segment starts and ends (n, bodies, 3) in `base`, and radii (bodies,), metres."""
+    model = geometry.model
+    frames = link_frames(model, joints_rad)
+    o, z = frames[:, :, :3, 3], frames[:, :, :3, 2]
+    upper, fore = _SIDEWAYS_M.get(model.name, (1.2 * model.d_m[3], 0.2 * model.d_m[3]))
+    fore_end = o[:, 3] + fore * z[:, 2]
+    starts = [
+        o[:, 0],
+        o[:, 1],
+        o[:, 1] + upper * z[:, 1],
+        o[:, 2] + fore * z[:, 2],
+        fore_end,
+        o[:, 4],
+        o[:, 5],
+    ]
+    ends = [
+        o[:, 1],
+        o[:, 1] + upper * z[:, 1],
+        o[:, 2] + upper * z[:, 2],
+        fore_end,
+        o[:, 4],
+        o[:, 5],
+        o[:, 6],
+    ]
+    radii = list(np.asarray(model.link_radius_m)[[0, 0, 1, 2, 3, 4, 5]])
+    for solid in geometry.solids:
+        points = transform_points(frames[:, 6], np.array([solid.from_m, solid.to_m]))
+        starts.append(points[:, 0])
+        ends.append(points[:, 1])
+        radii.append(solid.radius_m)
+    return np.stack(starts, axis=1), np.stack(ends, axis=1), np.array(radii)
+
+
+def gap_to_arm(geometry: CellGeometry, joints_rad: Array, starts: Array, ends: Array) -> Array:
+    """(n,) distance from the arm in one posture (6,) to segments on its flange, (n, 3) each in `base`."""
+    first, last, radii = body_segments(geometry, joints_rad[None])
+    bodies = list(_SELF_BODIES_FOR_TOOL)
+    gap = segment_distance(first[:, bodies], last[:, bodies], starts[:, None], ends[:, None])
+    return np.asarray((gap - radii[bodies]).min(axis=1))
+
+
+_JOINTS_BEHIND = (0, 1, 2, 3, 4, 5, 6)
+"""How many joints move each of ARM_BODIES; solids on the flange move with all six."""
+
+
+def surface_speeds(geometry: CellGeometry, joints_rad: Array, joint_speeds_rad_s: Array) -> Array:
+    """(n, 6) and (n, 6) or (6,) → (n, k) m/s: the fastest point of every body's surface at both of its ends.
+
+    Between them no point is faster. A point of a rigid body has v = ω × p − Σ ω_j × o_j; of all points at a
+    distance r from p the fastest has √(v∥² + (v⊥ + r·|ω|)²), parts along and across ω.
+    """
+    starts, ends, radii = body_segments(geometry, joints_rad)
+    frames = link_frames(geometry.model, joints_rad)
+    turns = frames[:, :6, :3, 2] * np.broadcast_to(joint_speeds_rad_s, joints_rad.shape)[:, :, None]
+    none = np.zeros_like(turns[:, :1])
+    turning = np.concatenate([none, np.cumsum(turns, axis=1)], axis=1)
+    carried = np.concatenate([none, np.cumsum(np.cross(turns, frames[:, :6, :3, 3]), axis=1)], axis=1)
+    behind = list(_JOINTS_BEHIND) + [6] * len(geometry.solids)
+    points, by, radius = [starts, ends], behind * 2, [radii, radii]
+    if geometry.watched_m:
+        points.append(transform_points(frames[:, 6], np.array(geometry.watched_m)))
+        by = by + [6] * len(geometry.watched_m)
+        radius.append(np.zeros(len(geometry.watched_m)))
+    omega, r = turning[:, by], np.concatenate(radius)
+    v = np.cross(omega, np.concatenate(points, axis=1)) - carried[:, by]
+    rate = np.linalg.norm(omega, axis=-1)
+    along = np.einsum("...i,...i->...", v, omega) / np.maximum(rate, _TINY)
+    across = np.sqrt(np.maximum(np.einsum("...i,...i->...", v, v) - along**2, 0.0))
+    return np.asarray(np.hypot(along, across + r * rate))
+
+
+def moving_points(geometry: CellGeometry, joints_rad: Array) -> Array:
+    """(n, 6) → points (n, k, 3) in `base` whose way counts: ends of every body beyond the shoulder."""
+    starts, ends, _ = body_segments(geometry, joints_rad)
+    points = [starts[:, 2:], ends[:, 2:]]
+    if geometry.watched_m:
+        base_from_flange = link_frames(geometry.model, joints_rad)[:, 6]
+        points.append(transform_points(base_from_flange, np.array(geometry.watched_m)))
+    return np.concatenate(points, axis=1)
+
+
+_TINY = 1e-24
+"""Square of a length that is a point."""
+
+
+def segment_distance(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
+    """Shortest distance between segments a0–a1 and b0–b1, broadcast over (..., 3).
+
+    Source: C. Ericson, "Real-Time Collision Detection" (2005), section 5.1.9.
+    """
+    d1, d2, r = a1 - a0, b1 - b0, a0 - b0
+    a = np.maximum(np.einsum("...i,...i->...", d1, d1), _TINY)
+    e = np.maximum(np.einsum("...i,...i->...", d2, d2), _TINY)
+    b = np.einsum("...i,...i->...", d1, d2)
+    c = np.einsum("...i,...i->...", d1, r)
+    f = np.einsum("...i,...i->...", d2, r)
+    parallel = a * e - b * b
+    s = np.where(
+        parallel > 1e-9 * a * e, np.clip((b * f - c * e) / np.maximum(parallel, _TINY**2), 0.0, 1.0), 0.0
+    )
+    t = (b * s + f) / e
+    s = np.where(t < 0, np.clip(-c / a, 0, 1), np.where(t > 1, np.clip((b - c) / a, 0, 1), s))
+    t = np.clip(t, 0.0, 1.0)
+    gap = r + s[..., None] * d1 - t[..., None] * d2
+    return np.asarray(np.sqrt(np.einsum("...i,...i->...", gap, gap)))
+
+
+def margins(geometry: CellGeometry, joints_rad: Array) -> tuple[Array, tuple[str, ...]]:
+    """Joints (n, 6) → margins (n, m) in metres, negative = violated, and the m names of what they are."""
+    joints_rad = np.asarray(joints_rad, dtype=float).reshape(-1, 6)
+    starts, ends, radii = body_segments(geometry, joints_rad)
+    columns: list[Array] = []
+    names: list[str] = []
+    for gap, labels in (
+        _self_margins(geometry, starts, ends, radii),
+        _obstacle_margins(geometry, starts, ends, radii),
+        _plane_margins(geometry, starts, ends, radii),
+        _workspace_margins(geometry, joints_rad),
+    ):
+        if labels:
+            columns.append(gap)
+            names += labels
+    return np.concatenate(columns, axis=1), tuple(names)
+
+
+def _self_margins(
+    geometry: CellGeometry, starts: Array, ends: Array, radii: Array
+) -> tuple[Array, list[str]]:
+    solids = range(len(ARM_BODIES), len(geometry.body_names))
+    pairs = [*_SELF_PAIRS, *((body, solid) for solid in solids for body in _SELF_BODIES_FOR_TOOL)]
+    first, second = (list(side) for side in zip(*pairs, strict=True))
+    gap = segment_distance(starts[:, first], ends[:, first], starts[:, second], ends[:, second])
+    labels = [f"{geometry.body_names[a]} against {geometry.body_names[b]}" for a, b in pairs]
+    return gap - radii[first] - radii[second], labels
+
+
+def _obstacle_margins(
+    geometry: CellGeometry, starts: Array, ends: Array, radii: Array
+) -> tuple[Array, list[str]]:
+    if not geometry.obstacles:
+        return np.zeros((len(starts), 0)), []
+    o0 = np.array([o.from_m for o in geometry.obstacles])
+    o1 = np.array([o.to_m for o in geometry.obstacles])
+    thickness = np.array([o.radius_m for o in geometry.obstacles])
+    movers = slice(2, None)
+    gap = segment_distance(starts[:, movers, None], ends[:, movers, None], o0, o1) - thickness
+    gap = gap.min(axis=2) - radii[movers] - geometry.obstacle_clearance_m
+    name = geometry.obstacles[0].name
+    return gap, [f"{body} against the {name}" for body in geometry.body_names[movers]]
+
+
+def _plane_margins(
+    geometry: CellGeometry, starts: Array, ends: Array, radii: Array
+) -> tuple[Array, list[str]]:
+    columns, labels = [], []
+    movers = slice(2, None)
+    for plane in geometry.limits.planes:
+        normal = np.array(plane.normal) / np.linalg.norm(plane.normal)
+        height = np.minimum((starts - plane.point_m) @ normal, (ends - plane.point_m) @ normal)
+        # The upper arm's near end is the shoulder, which stands where it was bolted down.
+        height[:, 2] = (ends[:, 2] - plane.point_m) @ normal
+        columns.append(height[:, movers] - radii[movers] - geometry.limits.clearance_m)
+        labels += [f"{body} against {plane.name}" for body in geometry.body_names[movers]]
+    return np.concatenate(columns, axis=1) if columns else np.zeros((len(starts), 0)), labels
+
+
+def _workspace_margins(geometry: CellGeometry, joints_rad: Array) -> tuple[Array, list[str]]:
+    low, high = geometry.limits.workspace_min_m, geometry.limits.workspace_max_m
+    if low is None and high is None:
+        return np.zeros((len(joints_rad), 0)), []
+    watched = np.array([(0.0, 0.0, 0.0), *geometry.watched_m])
+    points = transform_points(link_frames(geometry.model, joints_rad)[:, 6], watched)
+    columns, labels = [], []
+    for sign, bound, word in ((1.0, low, "below its minimum"), (-1.0, high, "above its maximum")):
+        if bound is not None:
+            columns.append((sign * (points - bound)).min(axis=1))
+            labels += [f"flange or camera outside the workspace box, {axis} {word}" for axis in "xyz"]
+    return np.concatenate(columns, axis=1), labels
+
+
+def plate(name: str, frame: Array, low_m: Array, high_m: Array, rods: int = 5) -> tuple[Capsule, ...]:
+    """A flat plate low…high (2,) in the xy plane of `frame` (4, 4), as parallel capsules that cover it."""
+    spacing = float(high_m[1] - low_m[1]) / rods
+    ys = low_m[1] + spacing * (np.arange(rods) + 0.5)
+    ends = np.array([[(low_m[0], y, 0.0), (high_m[0], y, 0.0)] for y in ys])
+    placed = transform_points(frame, ends.reshape(-1, 3)).reshape(-1, 2, 3)
+    return tuple(Capsule(name, as_point(a), as_point(b), radius_m=max(spacing / 2, 0.005)) for a, b in placed)
+
+
+def as_point(point: Array) -> tuple[float, float, float]:
+    """(3,) as the configuration writes it."""
+    return float(point[0]), float(point[1]), float(point[2])

@@ -1,0 +1,171 @@
+"""The station's configuration: strict types, every unit in the name. Loading is `load_config`'s job."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import msgspec
+
+from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount, Vector6
+
+Vector3 = tuple[float, float, float]
+
+
+class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
+    """Base of every section: immutable, unknown keys are errors."""
+
+
+class PoseGuess(Section, frozen=True):
+    """A rough rigid transform, good to `sigma_m` and `sigma_rad`."""
+
+    translation_m: Vector3
+    rotation_xyzw: tuple[float, float, float, float]
+    sigma_m: float = 0.02
+    sigma_rad: float = 0.1
+
+
+class KinematicsDeltas(Section, frozen=True):
+    """Factory-calibrated DH corrections of this very arm."""
+
+    a_m: Vector6 = (0.0,) * 6
+    d_m: Vector6 = (0.0,) * 6
+    alpha_rad: Vector6 = (0.0,) * 6
+    theta_rad: Vector6 = (0.0,) * 6
+
+
+class RobotConfig(Section, frozen=True):
+    model: str = "UR10"
+    host: str = ""
+    serial: str = ""
+    """When given, another arm is refused."""
+    kinematics: KinematicsDeltas | None = None
+
+
+class CameraConfig(Section, frozen=True):
+    driver: Literal["aravis", "playback", "rendered"] = "aravis"
+    device: str = ""
+    """aravis: serial, IP address or name. playback: a folder, video or recording."""
+    trigger: Literal["software", "hardware", "free-running"] = "software"
+    pixel_format: str = "Mono8"
+    frame_rate_hz: float | None = None
+    """free-running: None = the camera's own"""
+    exposure_us: float = 10_000.0
+    gain_db: float = 0.0
+    region: tuple[int, int, int, int] | None = None
+    """x, y, width, height"""
+    packet_size: int | None = None
+    """None = negotiated"""
+    playback_pace: float = 0.0
+    """playback: 0 = as fast as asked, 1 = at its own pace."""
+    model: CameraModel | None = None
+    """Known intrinsics; None = found from the session's pictures."""
+    model_is_rough: bool = False
+    """`model` is only good enough to plan with; the lens is found from the session's pictures."""
+
+
+class TriggerConfig(Section, frozen=True):
+    port: str
+    mode: Literal["box", "rts", "dtr"] = "box"
+    pulse_us: int = 1000
+    light_level: float | None = None
+
+
+class Capsule(Section, frozen=True):
+    """A solid on the flange (tool, camera, cable guard): the segment from–to, thickened."""
+
+    name: str
+    from_m: Vector3
+    to_m: Vector3
+    radius_m: float
+
+
+class Plane(Section, frozen=True):
+    """A table, wall or ceiling in `base`; the arm stays on the side the normal points to."""
+
+    name: str
+    point_m: Vector3
+    normal: Vector3
+
+
+class LimitsConfig(Section, frozen=True):
+    speed_m_s: float = 0.25
+    """Of any modelled point of arm, tool or camera; code caps it at 0.25."""
+    joint_speed_rad_s: float = 0.6
+    joint_acceleration_rad_s2: float = 1.0
+    joint_step_rad: float = 3.2
+    """Largest turn of one joint between neighbouring poses."""
+    joints_min_rad: Vector6 | None = None
+    joints_max_rad: Vector6 | None = None
+    workspace_min_m: Vector3 | None = None
+    workspace_max_m: Vector3 | None = None
+    """Box in `base` that flange and camera stay inside."""
+    planes: tuple[Plane, ...] = ()
+    solids: tuple[Capsule, ...] = ()
+    """On the flange, in `flange`."""
+    clearance_m: float = 0.03
+    board_clearance_m: float = 0.10
+
+
+class PointerConfig(Section, frozen=True):
+    """A rod or tool on the flange whose tip a person brings onto a corner (`station verify`); in `flange`."""
+
+    tip_m: Vector3
+    along: Vector3 = (0.0, 0.0, 1.0)
+    """Where it points to."""
+    radius_m: float = 0.01
+
+
+class StillnessConfig(Section, frozen=True):
+    window_s: float = 0.3
+    joint_speed_rad_s: float = 0.002
+    position_m: float = 0.00005
+    rotation_rad: float = 0.00005
+    image_motion_px: float = 0.3
+    timeout_s: float = 5.0
+
+
+class CaptureConfig(Section, frozen=True):
+    lossless_png: bool = False
+    time_bound_s: float = 0.02
+    """A pose whose time bound is worse is refused. The arm is at rest: at the stillness limit of 2 mrad/s
+    this is 0.04 mm at one metre."""
+    free_space_bytes: int = 2_000_000_000
+    retries: int = 2
+    goal_m: float = 0.0005
+    """The session is good enough when the expected error of X (1 sigma of its translation) is below this."""
+
+
+class ApprovalConfig(Section, frozen=True):
+    """Users by their names; who may connect at all is the socket's group."""
+
+    persons: tuple[str, ...] = ()
+    """Who may approve motion at a terminal; empty: everybody who may connect."""
+    services: tuple[str, ...] = ()
+    """Whose programs may approve a plan by its hash, with no terminal."""
+
+
+class StationConfig(Section, frozen=True):
+    robot: RobotConfig
+    camera: CameraConfig
+    board: BoardSpec
+    mount: Mount = "eye-in-hand"
+    format: Literal["station-config/1"] = "station-config/1"
+    name: str = "cell"
+    trigger: TriggerConfig | None = None
+    camera_guess: PoseGuess | None = None
+    """flange_from_camera (eye-in-hand) or base_from_camera (eye-to-hand)"""
+    board_guess: PoseGuess | None = None
+    """base_from_board (eye-in-hand) or flange_from_board (eye-to-hand)"""
+    limits: LimitsConfig = LimitsConfig()
+    stillness: StillnessConfig = StillnessConfig()
+    capture: CaptureConfig = CaptureConfig()
+    approval: ApprovalConfig = ApprovalConfig()
+    working_distance_m: float = 0.5
+    pointer: PointerConfig | None = None
+    """None = the pendant's tool centre point, along its z axis."""
+
+
+PAPER_BOARD = BoardSpec(kind=BoardKind.CHESSBOARD, columns=7, rows=6, square_m=0.025)
+"""The paper's 8×7 squares of 25 mm."""
+BLOG_BOARD = BoardSpec(kind=BoardKind.CHESSBOARD, columns=9, rows=6, square_m=0.030)
+"""The blog's 10×7 squares of 30 mm."""

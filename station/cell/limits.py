@@ -1,0 +1,289 @@
+"""Limits before motion: whole paths are checked and their speeds capped before anything moves.
+
+A joint move is straight in joint space with all joints in step, as the controller's moveJ runs it; speed
+and acceleration are those of the leading joint. The caps below are code: no configuration raises them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+from numpy.typing import ArrayLike
+
+from calibrate.geometry import Array, difference
+from calibrate.kinematics import JOINT_NAMES, forward
+from station.cell.collision import CellGeometry, margins, moving_points, surface_speeds
+from station.cell.plan import Plan, PlannedPose
+
+SPEED_CAP_M_S = 0.25
+JOINT_SPEED_CAP_RAD_S = 1.05
+JOINT_ACCELERATION_CAP_RAD_S2 = 1.4
+_SPEED_RESERVE = 0.97
+"""Between samples a point may be a little faster than at them."""
+SPACING_M = 0.01
+"""No modelled point moves further between two checked samples; margins are reduced by half of it."""
+_TURN_RAD = 0.05
+"""No joint turns further between two of them: surfaces are fast where centre lines hardly move."""
+_PIECES = 48
+"""A move is first looked at in so many, to find how dense its samples must be."""
+_LONGEST_TURN_RAD = 4 * np.pi
+"""From one end of a joint's range to the other; whatever turns further is out of range."""
+_LEAVING_SLACK_M = 0.001
+_FLANGE_TOLERANCE_M, _FLANGE_TOLERANCE_RAD = 0.002, 0.005
+
+
+@dataclass(frozen=True)
+class Problem:
+    """One broken limit. `str()` is the sentence for people."""
+
+    pose: str
+    limit: str
+    text: str
+    joint: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.pose}: {self.text}"
+
+
+@dataclass(frozen=True)
+class MoveCheck:
+    """One joint move, checked along its whole path."""
+
+    name: str
+    problems: tuple[Problem, ...]
+    joint_speed_rad_s: float
+    """Of the leading joint: with it no modelled point exceeds the speed limit."""
+    joint_acceleration_rad_s2: float
+    duration_s: float
+    path_m: float
+    """Length of the flange's path."""
+    step_rad: float
+    """Turn of the leading joint."""
+    top_speed_m_s: float
+    """Of the fastest modelled point, with the trapezoid's true peak."""
+    margin_m: float
+    """Smallest distance to any limit along the way."""
+
+
+@dataclass(frozen=True)
+class PlanCheck:
+    moves: tuple[MoveCheck, ...]
+    problems: tuple[Problem, ...]
+    """All of them: of the moves, and of the plan as such."""
+
+    @property
+    def duration_s(self) -> float:
+        return sum(move.duration_s for move in self.moves)
+
+    @property
+    def path_m(self) -> float:
+        return sum(move.path_m for move in self.moves)
+
+    @property
+    def largest_step_rad(self) -> float:
+        return max((move.step_rad for move in self.moves), default=0.0)
+
+    @property
+    def top_speed_m_s(self) -> float:
+        return max((move.top_speed_m_s for move in self.moves), default=0.0)
+
+
+def trapezoid(step_rad: ArrayLike, speed_rad_s: ArrayLike, acceleration_rad_s2: float) -> tuple[Array, Array]:
+    """Duration (s) and peak speed (rad/s) of a move of the leading joint by `step_rad`, from rest to rest."""
+    step, speed = np.abs(step_rad), np.asarray(speed_rad_s, dtype=float)
+    peak = np.minimum(speed, np.sqrt(step * acceleration_rad_s2))
+    cruise = np.maximum(step - peak**2 / acceleration_rad_s2, 0.0)
+    return 2 * peak / acceleration_rad_s2 + cruise / np.maximum(peak, 1e-9), peak
+
+
+def joint_bounds(geometry: CellGeometry) -> tuple[Array, Array]:
+    """Lowest and highest joint angles (6,), rad: the arm's own and the configuration's."""
+    own, limits = geometry.model.joint_limit_rad, geometry.limits
+    low = np.maximum(-own, limits.joints_min_rad or (-own,) * 6)
+    high = np.minimum(own, limits.joints_max_rad or (own,) * 6)
+    return low, high
+
+
+def point_speed_m_s(geometry: CellGeometry, joints_rad: ArrayLike, joint_speeds_rad_s: ArrayLike) -> float:
+    """Speed of the fastest point on the surface of arm, tool or camera, now."""
+    q, dq = np.asarray(joints_rad, dtype=float), np.asarray(joint_speeds_rad_s, dtype=float)
+    return float(surface_speeds(geometry, q[None], dq).max())
+
+
+def sample_path(geometry: CellGeometry, from_rad: Array, to_rad: Array, spacing_m: float) -> Array:
+    """Joints (m, 6) along the move, so dense that no modelled point moves more than `spacing_m` between."""
+    coarse = from_rad + np.linspace(0, 1, _PIECES + 1)[:, None] * (to_rad - from_rad)
+    steps = np.linalg.norm(np.diff(moving_points(geometry, coarse), axis=0), axis=-1)
+    # An arc is longer than its chord, and speed changes along it: 10 % covers both in a piece this short.
+    count = int(np.ceil(1.1 * _PIECES * steps.max() / spacing_m)) + 1
+    turns = int(np.ceil(np.abs(to_rad - from_rad).max() / _TURN_RAD)) + 1
+    return np.asarray(from_rad + np.linspace(0, 1, max(count, turns, 3))[:, None] * (to_rad - from_rad))
+
+
+def check_path(
+    geometry: CellGeometry, from_joints_rad: ArrayLike, to_joints_rad: ArrayLike, name: str = "move"
+) -> MoveCheck:
+    """Everything that can be wrong with one move, and the speed it may be driven at."""
+    start, target = (np.asarray(q, dtype=float) for q in (from_joints_rad, to_joints_rad))
+    if start.shape != (6,) or target.shape != (6,) or not np.isfinite([start, target]).all():
+        return _refused(name, [Problem(name, "joints", "six finite joint angles in radians are needed")])
+    problems = _joint_problems(geometry, start, target, name)
+    if np.abs(target - start).max() > _LONGEST_TURN_RAD:
+        return _refused(name, problems)
+    samples = sample_path(geometry, start, target, SPACING_M)
+    gaps, labels = margins(geometry, samples)
+    problems += _margin_problems(leaving(gaps - SPACING_M / 2), labels, name)
+    speed, acceleration, duration, peak = allowed_speed(geometry, samples)
+    flange = forward(geometry.model, samples)[:, :3, 3]
+    return MoveCheck(
+        name=name,
+        problems=tuple(problems),
+        joint_speed_rad_s=speed,
+        joint_acceleration_rad_s2=acceleration,
+        duration_s=duration,
+        path_m=float(np.linalg.norm(np.diff(flange, axis=0), axis=1).sum()),
+        step_rad=float(np.abs(target - start).max()),
+        top_speed_m_s=peak,
+        margin_m=float(gaps.min()),
+    )
+
+
+def _refused(name: str, problems: list[Problem]) -> MoveCheck:
+    """A move that is not worth sampling; speed zero."""
+    return MoveCheck(name, tuple(problems), 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -np.inf)
+
+
+def allowed_speed(geometry: CellGeometry, samples: Array) -> tuple[float, float, float, float]:
+    """Samples (m, 6) evenly along one move → leading joint's speed and acceleration, duration, top speed."""
+    limits = geometry.limits
+    step_rad = float(np.abs(samples[-1] - samples[0]).max())
+    acceleration = min(limits.joint_acceleration_rad_s2, JOINT_ACCELERATION_CAP_RAD_S2)
+    speed = min(limits.joint_speed_rad_s, JOINT_SPEED_CAP_RAD_S)
+    if step_rad < 1e-9:
+        return speed, acceleration, 0.0, 0.0
+    metres_per_rad = float(surface_speeds(geometry, samples, (samples[-1] - samples[0]) / step_rad).max())
+    speed = min(speed, _SPEED_RESERVE * min(limits.speed_m_s, SPEED_CAP_M_S) / max(metres_per_rad, 1e-9))
+    duration, peak = trapezoid(step_rad, speed, acceleration)
+    return float(speed), acceleration, float(duration), float(peak * metres_per_rad)
+
+
+def _joint_problems(geometry: CellGeometry, start: Array, target: Array, name: str) -> list[Problem]:
+    low, high = joint_bounds(geometry)
+    problems = []
+    for i, joint in enumerate(JOINT_NAMES):
+        if not low[i] - 1e-9 <= target[i] <= high[i] + 1e-9:
+            problems.append(
+                Problem(
+                    name,
+                    "joint range",
+                    f"{joint} would stand at {np.rad2deg(target[i]):.1f}°, allowed is "
+                    f"{np.rad2deg(low[i]):.0f}° to {np.rad2deg(high[i]):.0f}°",
+                    joint,
+                )
+            )
+        turn = abs(target[i] - start[i])
+        if turn > geometry.limits.joint_step_rad + 1e-9:
+            problems.append(
+                Problem(
+                    name,
+                    "joint step",
+                    f"{joint} would turn {np.rad2deg(turn):.0f}° in one move, allowed is "
+                    f"{np.rad2deg(geometry.limits.joint_step_rad):.0f}° (limits.joint_step_rad); "
+                    "put a pose in between or choose the same arm branch",
+                    joint,
+                )
+            )
+    return problems
+
+
+def leaving(gaps: Array) -> Array:
+    """Margins (..., samples, c) along paths, where an arm that already stands too close may move away.
+
+    A margin that starts negative counts as zero for as long as it only grows, and grows fast enough to be
+    gone at the end of the way: sliding along a wall is no retreat.
+    """
+    growing = np.diff(gaps, axis=-2, prepend=gaps[..., :1, :]) > -1e-4
+    left = 1.0 - np.linspace(0.0, 1.0, gaps.shape[-2])[:, None]
+    fast = gaps >= gaps[..., :1, :] * left - _LEAVING_SLACK_M
+    excused = np.cumprod(growing & fast & (gaps < 0), axis=-2).astype(bool)
+    excused[..., -1, :] = False
+    return np.where(excused, 0.0, gaps)
+
+
+def _margin_problems(gaps: Array, labels: Sequence[str], name: str) -> list[Problem]:
+    problems = []
+    for label in dict.fromkeys(labels):
+        alike = [column for column, other in enumerate(labels) if other == label]  # a plate is several rods
+        gap = gaps[:, alike].min(axis=1)
+        at = int(np.argmin(gap))
+        if gap[at] >= 0:
+            continue
+        where = "at the target" if at == len(gaps) - 1 else f"after {at / (len(gaps) - 1):.0%} of the way"
+        problems.append(
+            Problem(
+                name,
+                "clearance",
+                f"{label}, {-1000 * gap[at]:.0f} mm too close {where}",
+                label.split(" against ")[0],
+            )
+        )
+    return problems
+
+
+def check_plan(plan: Plan, start_joints_rad: ArrayLike | None, geometry: CellGeometry) -> PlanCheck:
+    """The whole plan from where the arm is now (None: from its first pose), move by move."""
+    problems = list(_plan_problems(plan, geometry))
+    if not any(problem.limit == "speed" for problem in problems):
+        geometry = with_plan_speeds(geometry, plan)
+    before = start_joints_rad
+    moves = []
+    for number, pose in enumerate(plan.poses, start=1):
+        name = f"pose {number} ({pose.name})"
+        problems += _flange_problems(geometry, pose, name)
+        origin = pose.joints_rad if before is None else before
+        moves.append(check_path(geometry, origin, pose.joints_rad, name))
+        before = pose.joints_rad
+    return PlanCheck(tuple(moves), (*problems, *(p for move in moves for p in move.problems)))
+
+
+def with_plan_speeds(geometry: CellGeometry, plan: Plan) -> CellGeometry:
+    """The plan may ask for slower joints than the configuration, never for faster ones."""
+    limits = geometry.limits
+    slower = msgspec.structs.replace(
+        limits,
+        joint_speed_rad_s=min(limits.joint_speed_rad_s, plan.joint_speed_rad_s),
+        joint_acceleration_rad_s2=min(limits.joint_acceleration_rad_s2, plan.joint_acceleration_rad_s2),
+    )
+    return replace(geometry, limits=slower)
+
+
+def _plan_problems(plan: Plan, geometry: CellGeometry) -> list[Problem]:
+    problems = []
+    if not plan.poses:
+        problems.append(Problem("plan", "poses", "it has no poses"))
+    if not (plan.joint_speed_rad_s > 0 and plan.joint_acceleration_rad_s2 > 0):
+        problems.append(Problem("plan", "speed", "its joint speed and acceleration must be above zero"))
+    if plan.robot != geometry.model.name:
+        text = f"it was made for a {plan.robot}, the cell has a {geometry.model.name}; make a new plan"
+        problems.append(Problem("plan", "robot", text))
+    if geometry.mount not in (None, plan.mount):
+        text = f"it was made for {plan.mount}, the cell is {geometry.mount}; make a new plan"
+        problems.append(Problem("plan", "mount", text))
+    return problems
+
+
+def _flange_problems(geometry: CellGeometry, pose: PlannedPose, name: str) -> list[Problem]:
+    if pose.base_from_flange is None or len(pose.joints_rad) != 6:
+        return []
+    delta = difference(forward(geometry.model, pose.joints_rad), np.array(pose.base_from_flange))
+    off_m, off_rad = float(np.linalg.norm(delta[:3])), float(np.linalg.norm(delta[3:]))
+    if off_m <= _FLANGE_TOLERANCE_M and off_rad <= _FLANGE_TOLERANCE_RAD:
+        return []
+    text = (
+        f"joints and expected flange pose differ by {1000 * off_m:.1f} mm and {np.rad2deg(off_rad):.2f}°; "
+        "was one of them edited, or is the plan for another arm model?"
+    )
+    return [Problem(name, "flange pose", text)]

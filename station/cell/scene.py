@@ -1,0 +1,198 @@
+"""What the planner believes of a cell: camera mount, board place and solids, from the configuration."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from calibrate.boards.model import board_points
+from calibrate.geometry import Array, inverse, pose_from_quaternion, transform_points
+from calibrate.kinematics import MODELS, DhDeltas, RobotModel, forward
+from recordings.schema.messages import BoardSpec, CameraModel, Mount
+from station.cell.collision import CellGeometry, as_point, plate
+from station.cell.config import Capsule, PoseGuess, StationConfig
+from station.cell.errors import ConfigError, LimitError
+from station.cell.plan import Plan
+
+_CAMERA_BODY_M, _CAMERA_RADIUS_M = 0.05, 0.035
+_DOUBT = 3.0
+"""What hangs on a guess is thickened by so many sigmas: nothing else keeps a wrong mount off the arm."""
+_MOST_DOUBT_M = 0.03
+"""A camera thicker than this could not stand beside any wrist; bootstrap is for guesses that are worse."""
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A guess of the cell, good to the sigmas it carries."""
+
+    mount: Mount
+    camera: CameraModel
+    board: BoardSpec
+    X: Array
+    """flange_from_camera (eye-in-hand) or base_from_camera (eye-to-hand), (4, 4)"""
+    Y: Array
+    """base_from_board (eye-in-hand) or flange_from_board (eye-to-hand), (4, 4)"""
+    geometry: CellGeometry
+    x_sigma: tuple[float, float] = (0.0, 0.0)
+    """Per axis: metres, radians."""
+    y_sigma: tuple[float, float] = (0.0, 0.0)
+    working_distance_m: float = 0.5
+
+    def camera_from_board(self, base_from_flange: Array) -> Array:
+        """(..., 4, 4) → (..., 4, 4)"""
+        if self.mount == "eye-in-hand":
+            return np.asarray(inverse(base_from_flange @ self.X) @ self.Y)
+        return np.asarray(inverse(self.X) @ base_from_flange @ self.Y)
+
+    def base_from_flange(self, camera_from_board: Array) -> Array:
+        """The flange pose that shows the board so."""
+        if self.mount == "eye-in-hand":
+            return np.asarray(self.Y @ inverse(self.X @ camera_from_board))
+        return np.asarray(self.X @ camera_from_board @ inverse(self.Y))
+
+    def seen(self, base_from_flange: Array, points: Array) -> Array:
+        """Board points (k, 3) in `camera`, (n, k, 3)."""
+        return transform_points(self.camera_from_board(base_from_flange), points)
+
+
+def flange_poses(scene: Scene, plan: Plan) -> Array:
+    """(n, 4, 4) base_from_flange of the plan's joints."""
+    joints = np.array([pose.joints_rad for pose in plan.poses]).reshape(-1, 6)
+    return np.asarray(forward(scene.geometry.model, joints))
+
+
+def board_extent(board: BoardSpec) -> tuple[Array, Array]:
+    """Corners (2,) of the printed area in the board's plane, one square beyond the outermost points."""
+    points = board_points(board)[:, :2]
+    return points.min(axis=0) - board.square_m, points.max(axis=0) + board.square_m
+
+
+def scene_of(config: StationConfig) -> Scene:
+    """The scene that the configuration describes. ConfigError names what is missing."""
+    if config.robot.model not in MODELS:
+        raise ConfigError(f"robot.model '{config.robot.model}' is unknown; known are {', '.join(MODELS)}")
+    camera, mount_guess, place_guess = config.camera.model, config.camera_guess, config.board_guess
+    if camera is None or camera.matrix is None:
+        raise ConfigError(
+            "planning needs a rough lens: give camera.model with width, height and matrix "
+            "(focal length in pixels = lens mm / pixel size mm; the centre = half the picture)"
+        )
+    if mount_guess is None or place_guess is None:
+        missing = "camera_guess" if mount_guess is None else "board_guess"
+        raise ConfigError(
+            f"planning needs {missing} in the configuration; or let `station bootstrap` find it"
+        )
+    X, Y = (pose_from_quaternion(g.translation_m, g.rotation_xyzw) for g in (mount_guess, place_guess))
+    return Scene(
+        config.mount,
+        camera,
+        config.board,
+        X,
+        Y,
+        cell_geometry(config),
+        _sigmas(mount_guess),
+        _sigmas(place_guess),
+        config.working_distance_m,
+    )
+
+
+def _sigmas(guess: PoseGuess) -> tuple[float, float]:
+    return guess.sigma_m, guess.sigma_rad
+
+
+def cell_geometry(config: StationConfig) -> CellGeometry:
+    """Geometry for checks before motion; uses the guesses where there are any, and their sigmas."""
+    guesses = config.camera_guess, config.board_guess
+    X, Y = (None if g is None else pose_from_quaternion(g.translation_m, g.rotation_xyzw) for g in guesses)
+    camera_m, board_m = (0.0 if g is None else g.sigma_m for g in guesses)
+    return geometry_of(config, X, Y, camera_m, board_m)
+
+
+def arm_model(config: StationConfig) -> RobotModel:
+    """The configured arm, with its factory calibration where it is given."""
+    model = MODELS[config.robot.model]
+    if (deltas := config.robot.kinematics) is not None:
+        model = model.calibrated(DhDeltas(deltas.a_m, deltas.d_m, deltas.alpha_rad, deltas.theta_rad))
+    return model
+
+
+def geometry_of(
+    config: StationConfig,
+    X: Array | None,
+    Y: Array | None,
+    camera_doubt_m: float = 0.0,
+    board_doubt_m: float = 0.0,
+) -> CellGeometry:
+    """Solids and obstacles of a cell, for a camera and a board that may be off by so much (one sigma).
+
+    What is on the flange gets thicker by three sigmas, 30 mm at most; clearance to what stands in the cell
+    grows by two. Solids that the configuration draws on the flange are taken as they are.
+    """
+    low, high = board_extent(config.board)
+    limits = config.limits
+    solids = limits.solids
+    obstacles: tuple[Capsule, ...] = ()
+    watched: tuple[tuple[float, float, float], ...] = ()
+    clearance = limits.clearance_m
+    if config.mount == "eye-in-hand":
+        if X is not None:
+            watched = (as_point(X[:3, 3]),)
+            solids = solids or (camera_body("camera", X, camera_radius_m(camera_doubt_m)),)
+        if Y is not None:
+            obstacles = plate("board", Y, low, high)
+            clearance = limits.board_clearance_m + 2 * board_doubt_m
+    else:
+        if Y is not None:
+            thicker_m = _thicker_m(board_doubt_m)
+            solids += tuple(
+                msgspec.structs.replace(rod, radius_m=rod.radius_m + thicker_m)
+                for rod in plate("board", Y, low, high)
+            )
+            corners = np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
+            watched = tuple(as_point(p) for p in transform_points(Y, corners))
+        if X is not None:
+            obstacles = (camera_body("camera", X),)
+            clearance = limits.clearance_m + 2 * camera_doubt_m
+    model = arm_model(config)
+    return CellGeometry(model, limits, solids, obstacles, clearance, watched, config.mount)
+
+
+def _thicker_m(sigma_m: float) -> float:
+    return min(_DOUBT * sigma_m, _MOST_DOUBT_M)
+
+
+def require_kept_clear(config: StationConfig) -> None:
+    """LimitError when what hangs on a guess may well be (1 sigma) where no check keeps clear of."""
+    name = "camera_guess" if config.mount == "eye-in-hand" else "board_guess"
+    guess: PoseGuess | None = getattr(config, name)
+    drawn = config.mount == "eye-in-hand" and config.limits.solids
+    if guess is None or drawn or guess.sigma_m <= _MOST_DOUBT_M:
+        return
+    raise LimitError(
+        f"{name} is known to {1000 * guess.sigma_m:.0f} mm only (sigma_m), and the checks keep clear of "
+        f"{1000 * _MOST_DOUBT_M:.0f} mm: moves of a plan might touch something. Let `station bootstrap` find "
+        "it, or measure it better"
+    )
+
+
+def covers_its_doubt(guess: PoseGuess) -> bool:
+    """Whether what hangs on the flange gets as much thicker as it may be off."""
+    return _DOUBT * guess.sigma_m <= _MOST_DOUBT_M
+
+
+def camera_radius_m(sigma_m: float) -> float:
+    """Of a camera on the flange whose place is known to `sigma_m`."""
+    return _CAMERA_RADIUS_M + _thicker_m(sigma_m)
+
+
+def camera_ends(parent_from_camera: Array) -> Array:
+    """(..., 4, 4) → (..., 2, 3): the camera's body, from the optical centre back."""
+    return transform_points(parent_from_camera, np.array([[0.0, 0.0, 0.0], [0.0, 0.0, -_CAMERA_BODY_M]]))
+
+
+def camera_body(name: str, parent_from_camera: Array, radius_m: float = _CAMERA_RADIUS_M) -> Capsule:
+    """A camera as it stands behind its optical centre."""
+    ends = camera_ends(parent_from_camera)
+    return Capsule(name, as_point(ends[0]), as_point(ends[1]), radius_m)

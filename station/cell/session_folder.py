@@ -1,0 +1,133 @@
+"""Where sessions lie on the disk, and what of a session outlives the daemon.
+
+ROOT/sessions/20260131-101500-cell/   session.mcap, session-2.mcap … one file a part
+                                      session.json  poses and their state, written after every pose
+ROOT/active                           names the session that runs; still there after a crash
+"""
+
+from __future__ import annotations
+
+import os
+import time
+from pathlib import Path
+
+import msgspec
+
+from recordings.files import PART_SUFFIX, session_name_from, sync_folder, write_atomically
+from recordings.schema.messages import Source
+from station.cell.errors import StationError
+from station.cell.plan import Plan
+from station.cell.status import PoseStatus
+
+STATE_FILE = "session.json"
+CALIBRATION_FILE = "calibration.yaml"
+_ACTIVE = "active"
+_NAME_ATTEMPTS = 100
+_LISTED = 200
+
+
+class SessionState(msgspec.Struct, frozen=True, omit_defaults=True):
+    """`session.json`."""
+
+    name: str
+    source: Source
+    plan: Plan
+    poses: tuple[PoseStatus, ...]
+    parts: int = 1
+    elapsed_s: float = 0.0
+    """Of all its runs."""
+    check: bool = False
+    """A drift check of the installed calibration."""
+    sealed: bool = False
+    recording: str = ""
+
+
+def default_root() -> Path:
+    """systemd's state folder, else the user's (XDG)."""
+    if state := os.environ.get("STATE_DIRECTORY", "").split(":")[0]:
+        return Path(state)
+    base = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
+    return Path(base) / "calibration-station"
+
+
+def new_session_folder(root: Path, cell: str) -> Path:
+    """A new folder whose name sorts by time; two in one second get different ones. Raises StationError."""
+    sessions = root / "sessions"
+    stamp = time.strftime("%Y%m%d-%H%M%S")
+    try:
+        sessions.mkdir(parents=True, exist_ok=True)
+        for attempt in range(1, _NAME_ATTEMPTS):
+            suffix = "" if attempt == 1 else f"-{attempt}"
+            folder = sessions / f"{session_name_from(f'{stamp}-{cell}')[: 40 - len(suffix)]}{suffix}"
+            try:
+                folder.mkdir()
+            except FileExistsError:
+                continue
+            return folder
+    except OSError as error:
+        raise StationError(f"cannot make a folder in {sessions}: {error.strerror}; give --root") from error
+    raise StationError(f"{sessions} holds too many sessions of this second; try again")
+
+
+def part_path(folder: Path, part: int) -> Path:
+    return folder / ("session.mcap" if part == 1 else f"session-{part}.mcap")
+
+
+def write_state(folder: Path, state: SessionState) -> None:
+    write_atomically(folder / STATE_FILE, msgspec.json.encode(state))
+
+
+def read_state(folder: Path) -> SessionState | None:
+    """None where it is missing or not ours."""
+    try:
+        return msgspec.json.decode((folder / STATE_FILE).read_bytes(), type=SessionState)
+    except (OSError, msgspec.DecodeError, UnicodeDecodeError):
+        return None
+
+
+def mark_active(root: Path, folder: Path) -> None:
+    sync_folder(folder.parent)  # the folder's own name, before anything points to it
+    write_atomically(root / _ACTIVE, folder.name.encode())
+
+
+def clear_active(root: Path) -> None:
+    (root / _ACTIVE).unlink(missing_ok=True)
+
+
+def interrupted_session(root: Path) -> tuple[Path, SessionState] | None:
+    """The session that was running when the daemon last ended without sealing it."""
+    try:
+        name = (root / _ACTIVE).read_text()
+    except (OSError, UnicodeDecodeError):
+        return None
+    if session_name_from(name) != name:
+        return None
+    folder = root / "sessions" / name
+    state = read_state(folder)
+    return None if state is None or state.sealed else (folder, state)
+
+
+def list_sessions(root: Path) -> list[dict[str, object]]:
+    """The newest first, for the screen."""
+    try:
+        folders = sorted((f for f in (root / "sessions").iterdir() if f.is_dir()), reverse=True)
+    except OSError:
+        return []
+    return [_described(folder) for folder in folders[:_LISTED]]
+
+
+def _described(folder: Path) -> dict[str, object]:
+    state = read_state(folder)
+    files = [*folder.glob("*.mcap"), *folder.glob(f"*.mcap{PART_SUFFIX}")]
+    sealed = bool(files) and not any(file.name.endswith(PART_SUFFIX) for file in files)
+    calibration = folder / CALIBRATION_FILE
+    return {
+        "name": folder.name,
+        "folder": str(folder),
+        "recording": str(files[0] if len(files) == 1 else folder) if files else "",
+        "source": state.source if state else "",
+        "views": sum(pose.counts for pose in state.poses) if state else 0,
+        "bytes": sum(file.stat().st_size for file in files),
+        "sealed": sealed,
+        "calibration": str(calibration) if calibration.is_file() else "",
+    }

@@ -1,0 +1,127 @@
+"""Where the daemon's sockets lie, and whose they must be. Loads nothing large: STOP from a shell needs it.
+
+In a folder that somebody else may write to, anyone can put a socket that answers in the daemon's place.
+"""
+
+from __future__ import annotations
+
+import os
+import stat
+from pathlib import Path
+
+from station.cell.errors import StationError
+
+ROOT = 0
+_OTHERS_WRITE = stat.S_IWGRP | stat.S_IWOTH
+
+
+class UntrustedFolderError(StationError):
+    """Somebody else could have put the sockets there."""
+
+
+def default_socket() -> Path:
+    """Where systemd puts it, when it is there; else the user's own runtime or state folder."""
+    if runtime := os.environ.get("RUNTIME_DIRECTORY", "").split(":")[0]:
+        return Path(runtime) / "control.sock"
+    system = Path("/run/station/control.sock")
+    if system.exists():
+        return system
+    runtime = os.environ.get("XDG_RUNTIME_DIR", "")
+    if runtime and _is_own(Path(runtime)):  # after `su` it is still the other user's
+        return Path(runtime) / "station-control.sock"
+    state = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
+    return Path(state) / "calibration-station" / "run" / "control.sock"
+
+
+def _is_own(folder: Path) -> bool:
+    try:
+        return folder.stat().st_uid == os.getuid()
+    except OSError:
+        return False
+
+
+def stop_socket(control: Path) -> Path:
+    """Beside the control socket: every datagram that is sent there is STOP."""
+    return control.with_suffix(".stop")
+
+
+def motion_page(control: Path) -> Path:
+    """Beside the control socket: the STOP and motion state (`station.protocol.motion_page`)."""
+    return control.with_suffix(".motion")
+
+
+def make_folder(folder: Path) -> None:
+    """Creates the daemon's folder for this user alone, or takes one that only its owner may write to.
+
+    Raises UntrustedFolderError, and StationError where it cannot be made.
+    """
+    try:
+        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
+    except OSError as error:
+        raise StationError(f"{folder}: the sockets' folder cannot be made ({error.strerror}).") from None
+    owner = folder_owner(folder)
+    if owner != os.getuid() and os.getuid() != ROOT:
+        raise UntrustedFolderError(
+            f"{folder} belongs to {user_name(owner)}: name another place for the socket with --socket."
+        )
+
+
+def folder_owner(folder: Path) -> int:
+    """The user who alone, beside root, can put a socket there.
+
+    This user, root, or an account for which root made the folder. Raises UntrustedFolderError when anybody
+    else could have made the folder, or can write to it or to what leads there.
+    """
+    try:
+        # Not `resolve`: a link on the way must be seen.
+        return _owner(Path(os.path.realpath(folder)), Path(os.path.abspath(folder)))  # noqa: PTH100
+    except OSError as error:
+        raise UntrustedFolderError(f"{folder}: {error.strerror}.") from None
+
+
+def _owner(real: Path, named: Path) -> int:
+    for part in (*reversed(named.parents), named):
+        if (status := os.lstat(part)) and stat.S_ISLNK(status.st_mode):
+            _require(status.st_uid in (ROOT, os.getuid()), part, status.st_uid)
+    owner, made_by_root = ROOT, True
+    for part in (*reversed(real.parents), real):
+        status = os.lstat(part)
+        if status.st_uid not in (ROOT, os.getuid(), owner):
+            _require(made_by_root, part, status.st_uid)
+        owner = status.st_uid
+        open_to_others = bool(status.st_mode & _OTHERS_WRITE) and not _own_group_only(status)
+        if open_to_others and not (status.st_mode & stat.S_ISVTX and part != real):
+            raise UntrustedFolderError(f"{part} can be written to by other users: `chmod go-w {part}`.")
+        made_by_root = owner == ROOT and not open_to_others
+    return owner
+
+
+def _require(good: bool, part: Path, owner: int) -> None:
+    if not good:
+        raise UntrustedFolderError(f"{part} was made by {user_name(owner)}, not by you or the system.")
+
+
+def _own_group_only(status: os.stat_result) -> bool:
+    """Many systems give each user a group of their own, and write permission to it."""
+    if status.st_mode & stat.S_IWOTH:
+        return False
+    import grp  # both rarely needed
+    import pwd
+
+    try:
+        user, group = pwd.getpwuid(status.st_uid), grp.getgrgid(status.st_gid)
+    except KeyError:
+        return False
+    return (
+        user.pw_gid == group.gr_gid and set(group.gr_mem) <= {user.pw_name} and user.pw_name == group.gr_name
+    )
+
+
+def user_name(uid: int) -> str:
+    """'anna', or 'uid 1003' when nobody knows the name."""
+    import pwd
+
+    try:
+        return pwd.getpwuid(uid).pw_name
+    except KeyError:
+        return f"uid {uid}"

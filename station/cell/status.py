@@ -1,0 +1,269 @@
+"""What every watcher of the daemon sees: one immutable snapshot; full on connect, then changed sections."""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from typing import Literal
+
+import msgspec
+
+from recordings.schema.messages import Matrix4, Mount, Source, Vector6
+
+
+class StationState(StrEnum):
+    DISCONNECTED = "disconnected"
+    IDLE = "idle"
+    CHECKING = "checking"
+    MOVING = "moving"
+    SETTLING = "settling"
+    CAPTURING = "capturing"
+    WRITING = "writing"
+    SEALING = "sealing"
+    PAUSED = "paused"
+    STOPPED = "stopped"
+    """Latched until a person acknowledges."""
+    FAULT = "fault"
+    FREE_DRIVE = "free-drive"
+
+
+PoseState = Literal["planned", "moving", "settling", "capturing", "writing", "done", "skipped", "failed"]
+
+
+class PoseStatus(msgspec.Struct, frozen=True, omit_defaults=True):
+    index: int
+    name: str
+    state: PoseState = "planned"
+    reason: str = ""
+    why: str = ""
+    """Why the planner put it there."""
+    attempt: int = 0
+    corners: int | None = None
+    predicted_sigma_mm: float | None = None
+    coverage: float | None = None
+    base_from_flange: Matrix4 | None = None
+    """Where the flange is expected to be."""
+    kept: bool = False
+    """To be taken again: the picture it has counts until another takes its place."""
+
+    @property
+    def counts(self) -> bool:
+        """The recording has a picture of it that is used."""
+        return self.state == "done" or self.kept
+
+
+class RobotStatus(msgspec.Struct, frozen=True, omit_defaults=True):
+    connected: bool = False
+    model: str = ""
+    serial: str = ""
+    controller_version: str = ""
+    host: str = ""
+    rate_hz: float = 0.0
+    age_ms: float = 0.0
+    """Of the newest state."""
+    safety: str = ""
+    """NORMAL, PROTECTIVE STOP, EMERGENCY STOP … in words"""
+    held: str = ""
+    """What holds the arm (a stop, no power, brakes) and what to do at the pendant; empty: nothing"""
+    mode: str = ""
+    remote: bool | None = None
+    program: str = ""
+    """stopped, playing, paused"""
+    control: bool = False
+    """A control child lives."""
+    speed_m_s: float = 0.0
+    """Fastest modelled point, now."""
+    speed_limit_m_s: float = 0.25
+    slider: float = 1.0
+    joints_rad: Vector6 | None = None
+    base_from_flange: Matrix4 | None = None
+    still: bool = False
+
+
+class CameraStatus(msgspec.Struct, frozen=True, omit_defaults=True):
+    connected: bool = False
+    model: str = ""
+    serial: str = ""
+    driver: str = ""
+    width: int = 0
+    height: int = 0
+    frames: int = 0
+    dropped: int = 0
+    """Frames that were due and did not come whole"""
+    fps: float = 0.0
+    lost_packets: int = 0
+    resent_packets: int = 0
+    exposure_us: float = 0.0
+    gain_db: float = 0.0
+
+
+class DetectionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Of the newest preview or captured picture."""
+
+    found: bool = False
+    reason: str = ""
+    corners: int = 0
+    expected: int = 0
+    sharpness: float = 0.0
+    saturated: float = 0.0
+    """Share of pixels, 0…1"""
+    coverage: float = 0.0
+    tilt_rad: float | None = None
+    distance_m: float | None = None
+    advice: str = ""
+    """What is wrong with the light or the focus and what to set; empty = nothing."""
+
+
+class RecorderStatus(msgspec.Struct, frozen=True, omit_defaults=True):
+    recording: bool = False
+    path: str = ""
+    bytes: int = 0
+    drops: int = 0
+    sync_ms: float = 0.0
+    free_bytes: int | None = None
+    """On the sessions' disk; None: not known."""
+    error: str = ""
+
+
+class ClockStatus(msgspec.Struct, frozen=True, omit_defaults=True):
+    """Offset of each clock against the host's monotonic one, with its 95 % bound."""
+
+    controller_offset_ms: float | None = None
+    controller_bound_ms: float | None = None
+    controller_drift_ppm: float | None = None
+    camera_offset_ms: float | None = None
+    camera_bound_ms: float | None = None
+    camera_drift_ppm: float | None = None
+
+
+class TriggerStatus(msgspec.Struct, frozen=True, omit_defaults=True):
+    present: bool = False
+    identity: str = ""
+    pulses: int = 0
+    frames: int = 0
+    light: float | None = None
+
+
+class EstimateStatus(msgspec.Struct, frozen=True, omit_defaults=True):
+    """The running estimate after each pose; never the final one."""
+
+    views: int = 0
+    translation_mm: tuple[float, float, float] | None = None
+    sigma_translation_mm: float | None = None
+    sigma_rotation_deg: float | None = None
+    goal_mm: float | None = None
+    enough: bool = False
+    advice: str = ""
+    improve: str = ""
+    """Why and how the poses that are left should be planned anew; empty = no need."""
+    image_coverage: tuple[tuple[int, ...], ...] = ()
+    """Corners seen so far in each part of the picture, rows from the top."""
+
+
+class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
+    name: str = ""
+    folder: str = ""
+    plan_sha256: str = ""
+    poses: tuple[PoseStatus, ...] = ()
+    current: int | None = None
+    captured: int = 0
+    elapsed_s: float = 0.0
+    remaining_s: float | None = None
+    recording: str = ""
+    """Path of the sealed recording, once there is one."""
+    calibration: str = ""
+    """Path of the calibration file that was made of it, once there is one."""
+    check: bool = False
+    """A drift check: to be compared with what is installed, not to be solved."""
+    source: Source = "real"
+
+
+class Lease(msgspec.Struct, frozen=True, omit_defaults=True):
+    holder: str = ""
+    """'anna on tty1 (pid 4711)'; empty = free"""
+    client_id: int | None = None
+    since_wall_ns: int = 0
+
+
+class Event(msgspec.Struct, frozen=True, omit_defaults=True):
+    wall_ns: int
+    level: Literal["debug", "info", "warning", "error"]
+    text: str
+    pose_index: int | None = None
+
+
+class GoSummary(msgspec.Struct, frozen=True, omit_defaults=True):
+    """What a person confirms before anything moves. `token` is for one use."""
+
+    token: str
+    purpose: str
+    """'run plan', 'retake pose 7', 'drift check of the installed calibration' …"""
+    plan_sha256: str
+    poses: int
+    path_m: float
+    """Length of the flange's path."""
+    largest_step_rad: float
+    top_speed_m_s: float
+    duration_s: float
+    first_move: str
+    """'84 mm and 22° to pose 1'"""
+    changes: tuple[str, ...] = ()
+    """What this go would change in the plan, and what that brings."""
+    warnings: tuple[str, ...] = ()
+    start_joints_rad: Vector6 | None = None
+
+
+class HoverOffer(msgspec.Struct, frozen=True, omit_defaults=True):
+    """A way that puts the pointer's tip over a corner of the board, waiting for its go."""
+
+    go: GoSummary
+    corner: int
+    """Row of `calibrate.boards.model.board_points`."""
+    corner_m: tuple[float, float]
+    """x, y on the board."""
+    standoff_m: float
+    tip_m: tuple[float, float, float]
+    """In `flange`."""
+    base_from_board: Matrix4
+    """By the calibration and the picture."""
+    sigma_m: tuple[float, float]
+    """1 sigma of tip minus corner along the board's x and y."""
+    board_moved_m: float = 0.0
+    """Since it was calibrated with; eye-in-hand only."""
+    pointer: str = ""
+
+
+class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):
+    state: StationState = StationState.DISCONNECTED
+    reason: str = ""
+    """Why stopped, paused or at fault, and what to do: the sentence for the top bar."""
+    pending: str = ""
+    """What comes after the pose under way: a pause or the end."""
+    simulated: bool = False
+    playback: bool = False
+    cell: str = ""
+    mount: Mount = "eye-in-hand"
+    software: str = ""
+    robot: RobotStatus = RobotStatus()
+    camera: CameraStatus = CameraStatus()
+    trigger: TriggerStatus = TriggerStatus()
+    detection: DetectionStatus = DetectionStatus()
+    recorder: RecorderStatus = RecorderStatus()
+    clock: ClockStatus = ClockStatus()
+    session: SessionStatus = SessionStatus()
+    estimate: EstimateStatus = EstimateStatus()
+    lease: Lease = Lease()
+    go: GoSummary | None = None
+    """A go that waits for a person's confirmation."""
+    loop_lag_ms: float = 0.0
+    """How late the daemon's working loop came, worst of the last second."""
+    events: tuple[Event, ...] = ()
+    """The newest, at most 100."""
+
+
+def changed_sections(old: StationStatus, new: StationStatus) -> dict[str, object]:
+    """Top-level fields that differ: what a watcher is sent after the first full status."""
+    return {
+        name: getattr(new, name)
+        for name in StationStatus.__struct_fields__
+        if getattr(old, name) != getattr(new, name)
+    }

@@ -1,0 +1,170 @@
+""" "At rest", measured: joint speed and scatter of the flange's pose over a window, image motion beside them.
+
+Nobody sleeps for a fixed time: a pose is taken when the arm is still, or skipped with the reason why not.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import math
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import msgspec
+import numpy as np
+
+from calibrate.geometry import rotation_angle
+from calibrate.kinematics import JOINT_NAMES, RobotModel, forward
+from recordings.schema.messages import RobotState, Stillness
+from station.cell.config import StillnessConfig
+from station.cell.errors import StationError
+
+POLL_S = 0.02
+FIND_SHAKE = "Look for what shakes the arm or the camera, or take this pose again later"
+UNSEEN = "the joints rest, but the camera gave no pictures to see by whether it does"
+CHECK_CAMERA = "Check the camera's cable and power, or take this pose again later"
+LEAST_SAMPLES = 8
+KEPT_SAMPLES = 4096
+
+
+@dataclass(frozen=True)
+class Look:
+    """What the pictures say: how far they move, px; None where that cannot be measured."""
+
+    motion_px: float | None
+
+
+class NotStillError(StationError):
+    """The arm did not come to rest in time; the message says what still moved, and by how much."""
+
+
+class StillnessMonitor:
+    """Subscribe `add` to the robot; ask `measure` whenever needed. `window_s` of states is kept."""
+
+    def __init__(self, model: RobotModel, limits: StillnessConfig) -> None:
+        self._model = model
+        self._limits = limits
+        self._states: deque[RobotState] = deque(maxlen=KEPT_SAMPLES)
+
+    def add(self, state: RobotState) -> None:
+        """One sample, in order; quick, from any one thread."""
+        states = self._states
+        now_s = state.stamps.controller_s
+        if states and now_s <= states[-1].stamps.controller_s:
+            states.clear()  # the controller restarted
+        states.append(state)
+        while states[0].stamps.controller_s < now_s - 1.5 * self._limits.window_s:
+            states.popleft()
+
+    def measure(self, image_motion_px: float | None = None) -> Stillness | None:
+        """Over the newest window; None while there are too few states or a hole among them.
+
+        Position scatter: largest distance of the flange from its mean place; rotation scatter: largest angle
+        to the newest orientation; joint speed: the fastest joint in any sample.
+        """
+        kept = list(self._states.copy())
+        if not kept:
+            return None
+        begin_s = kept[-1].stamps.controller_s - self._limits.window_s
+        window = [s for s in kept if s.stamps.controller_s >= begin_s - 1e-9]
+        times = np.array([s.stamps.controller_s for s in window])
+        covered = kept[0].stamps.controller_s <= begin_s + 0.1 * self._limits.window_s
+        if len(window) < LEAST_SAMPLES or not covered or np.diff(times).max() > self._limits.window_s / 3:
+            return None
+        base_from_flange = forward(self._model, [s.joints_rad for s in window])
+        places = base_from_flange[:, :3, 3]
+        R = base_from_flange[:, :3, :3]
+        return Stillness(
+            window_s=float(times[-1] - times[0]),
+            max_joint_speed_rad_s=float(np.abs([s.joint_speeds_rad_s for s in window]).max()),
+            position_scatter_m=float(np.linalg.norm(places - places.mean(axis=0), axis=1).max()),
+            rotation_scatter_rad=float(rotation_angle(np.swapaxes(R, -1, -2) @ R[-1]).max()),
+            image_motion_px=image_motion_px,
+        )
+
+    def unrest(self, found: Stillness) -> str:
+        """What is not still, in words; empty = at rest."""
+        limits = self._limits
+        parts = []
+        if found.max_joint_speed_rad_s > limits.joint_speed_rad_s:
+            speeds = np.abs([s.joint_speeds_rad_s for s in self._states.copy()]).max(axis=0)
+            parts.append(
+                f"joint {JOINT_NAMES[int(speeds.argmax())]} moves at "
+                f"{math.degrees(found.max_joint_speed_rad_s):.2f}°/s "
+                f"(limit {math.degrees(limits.joint_speed_rad_s):.2f})"
+            )
+        if found.position_scatter_m > limits.position_m:
+            parts.append(
+                f"the flange scatters by {found.position_scatter_m * 1000:.3f} mm "
+                f"(limit {limits.position_m * 1000:.3f})"
+            )
+        if found.rotation_scatter_rad > limits.rotation_rad:
+            parts.append(
+                f"the flange turns by {math.degrees(found.rotation_scatter_rad):.4f}° "
+                f"(limit {math.degrees(limits.rotation_rad):.4f})"
+            )
+        if found.image_motion_px is not None and found.image_motion_px > limits.image_motion_px:
+            parts.append(
+                f"the picture moves by {found.image_motion_px:.2f} px (limit {limits.image_motion_px:.2f})"
+            )
+        return ", ".join(parts)
+
+    @property
+    def at_rest(self) -> bool:
+        """By the joints alone; asked often, so an arm in motion costs next to nothing."""
+        states = self._states.copy()
+        if not states or max(map(abs, states[-1].joint_speeds_rad_s)) > self._limits.joint_speed_rad_s:
+            return False
+        found = self.measure()
+        return found is not None and not self.unrest(found)
+
+    async def settle(
+        self,
+        alive: Callable[[], object],
+        look: Callable[[int], Look | None] = lambda since_ns: Look(None),
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> Stillness:
+        """Returns as soon as everything is at rest. `alive` raises when the robot is lost; False: old news.
+
+        `look`: at pictures exposed since this host time, when the joints came to rest; None = not yet.
+        NotStillError after the configured time-out, with what still moved.
+        """
+        give_up_s = now_s() + self._limits.timeout_s
+        resting_since_ns: int | None = None
+        while True:
+            old = alive() is False
+            found = self.measure() if not old else None
+            unrest = self.unrest(found) if found is not None else "too few robot states"
+            unrest, remedy = "no fresh news of the robot" if old else unrest, FIND_SHAKE
+            if found is None or unrest:
+                resting_since_ns = None
+            else:
+                resting_since_ns = resting_since_ns or self._window_begin_ns(found)
+                seen = look(resting_since_ns)
+                if seen is None:
+                    unrest, remedy = UNSEEN, CHECK_CAMERA
+                else:
+                    found = msgspec.structs.replace(found, image_motion_px=seen.motion_px)
+                    unrest = self.unrest(found)
+                    if not unrest:
+                        return found
+            if now_s() >= give_up_s:
+                raise NotStillError(f"not at rest within {self._limits.timeout_s:g} s: {unrest}. {remedy}")
+            await asyncio.sleep(POLL_S)
+
+    def require_rest(self, state: RobotState) -> None:
+        """NotStillError when the arm moved at that moment: rest before a picture is no rest during it."""
+        speeds, limit = np.abs(state.joint_speeds_rad_s), self._limits.joint_speed_rad_s
+        joint = int(speeds.argmax())
+        if speeds[joint] > limit:
+            raise NotStillError(
+                f"the arm was moved while the picture was taken: joint {JOINT_NAMES[joint]} at "
+                f"{math.degrees(speeds[joint]):.2f}°/s (limit {math.degrees(limit):.2f}). "
+                "Leave it at rest, and take this pose again"
+            )
+
+    def _window_begin_ns(self, found: Stillness) -> int:
+        """Host monotonic time."""
+        return self._states[-1].stamps.host_monotonic_ns - round(found.window_s * 1e9)

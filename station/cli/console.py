@@ -1,0 +1,17 @@
+"""What the commands share: results go to stdout, everything else to stderr; their common options."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from recordings.cli.console import plain_console
+
+# What stands out does so by `style` or a Text.
+out = plain_console(soft_wrap=True)
+err = plain_console(stderr=True, soft_wrap=True)
+
+Socket = Annotated[Path | None, typer.Option(help="The daemon's control socket.")]
+AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout and nothing else.")]

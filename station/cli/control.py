@@ -1,0 +1,221 @@
+"""The small commands: state, STOP, pause, finish, retake, skip, doctor."""
+
+from __future__ import annotations
+
+import asyncio
+import shlex
+import sys
+from collections.abc import Awaitable, Callable
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import typer
+from rich.text import Text
+
+from recordings.cli.terminal import examples
+from station.cell.errors import StationError
+from station.cell.socket_folder import default_socket
+from station.cell.status import StationState, StationStatus
+from station.cli.console import AsJson, Socket, out
+from station.protocol.client import Client, ask
+from station.protocol.messages import Verb
+from station.protocol.stop_client import stop_and_tell
+
+app = typer.Typer()
+
+PoseNumber = Annotated[int, typer.Argument(min=1, help="Pose number, from 1.")]
+_MARKS = {
+    "ok": Text("ok", "green"),
+    "warning": Text("WARN", "yellow"),
+    "failed": Text("MISSING", "red"),
+    "skipped": Text("-"),
+}
+
+
+def status_now(socket: Path | None) -> StationStatus:
+    async def first() -> StationStatus:
+        async with await Client.connect(socket or default_socket()) as client:
+            async for status in client.statuses():
+                return status
+        raise StationError("the daemon ended before it told its status")
+
+    return asyncio.run(first())
+
+
+@app.command("status", epilog=examples("station status", "station status --json"))
+def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
+    """What the station is doing. --json: every figure, the unit in its name.
+
+    Needs no control, and works beside any screen.
+    """
+    status = status_now(socket)
+    if as_json:
+        print(msgspec.json.encode(status).decode())
+        return
+    _print_state(status)
+    robot, session = status.robot, status.session
+    words = [f"{robot.model} {robot.safety or 'not connected'}", f"slider {100 * robot.slider:.0f} %"]
+    if session.poses:
+        words.append(f"{session.captured} of {len(session.poses)} poses")
+    if session.name:
+        words.append(session.name)
+    if status.lease.holder:
+        words.append(f"commanded by {status.lease.holder}")
+    out.print(", ".join(words))
+    out.print(camera_words(status))
+    if session.recording:
+        out.print(f"recording {session.recording}")
+
+
+def _print_state(status: StationStatus) -> None:
+    marks = " SIMULATED" if status.simulated else " PLAYBACK" if status.playback else ""
+    out.print(Text.assemble((status.state.value, "bold"), f"{marks}  {status.reason}"))
+
+
+def camera_words(status: StationStatus) -> str:
+    """What camera and trigger box did, in one line."""
+    camera, trigger = status.camera, status.trigger
+    if not camera.connected:
+        return "camera not connected"
+    words = [f"{camera.model} {camera.fps:.1f} fps", f"{camera.dropped} frames dropped"]
+    if camera.lost_packets or camera.resent_packets:
+        words.append(f"{camera.lost_packets} packets lost, {camera.resent_packets} sent again")
+    if trigger.present:
+        words.append(f"trigger {trigger.pulses} pulses, {trigger.frames} frames")
+    return ", ".join(words)
+
+
+@app.command("stop", epilog=examples("station stop"))
+def stop_command(socket: Socket = None) -> None:
+    """STOP the arm now. The pendant's emergency stop is the safety device.
+
+    Anyone may, at any time. Latched: next look at the cell, then `station acknowledge`.
+
+    Exit codes: 0 the station confirmed it and the arm rests; 1 not confirmed: press the emergency stop.
+    """
+    raise typer.Exit(stop_and_tell(socket or default_socket()))
+
+
+@app.command("acknowledge", epilog=examples("station acknowledge"))
+def acknowledge_command(socket: Socket = None) -> None:
+    """Leave `stopped` or `fault` after looking at the cell. Nothing moves.
+
+    Next: `station resume` goes on with the session, `station finish` seals it.
+    """
+    ask(socket or default_socket(), "acknowledge")
+    status = status_now(socket)
+    _print_state(status)
+    if status.state is StationState.PAUSED:
+        out.print("next: `station resume` goes on, `station finish` seals")
+
+
+@app.command("pause", epilog=examples("station pause"))
+def pause_command(socket: Socket = None) -> None:
+    """Pause after the pose that is being taken.
+
+    Anyone may. Next: `station resume`, `improve`, `best` or `finish`.
+    """
+    ask(socket or default_socket(), "pause")
+    out.print("pauses after this pose; then `station resume`, `improve`, `best` or `finish`")
+
+
+@app.command("finish", epilog=examples("station finish"))
+def finish_command(socket: Socket = None) -> None:
+    """Seal what is recorded (a pose under way is taken first).
+
+    Next: `calibrate solve RECORDING`; `station status` names it.
+    """
+    _command(socket, "finish")
+    status = status_now(socket)
+    _print_state(status)
+    if status.session.recording:
+        out.print(f"recording {status.session.recording}")
+
+
+@app.command("retake", epilog=examples("station retake 7  # then: station resume"))
+def retake_command(pose: PoseNumber, socket: Socket = None) -> None:
+    """Plan a pose once more; it is taken at the next go."""
+    _command(socket, "retake", index=pose - 1)
+    out.print(f"pose {pose}: {_why(socket, pose)}. Next: `station resume`")
+
+
+@app.command("skip", epilog=examples("station skip 7"))
+def skip_command(pose: PoseNumber, socket: Socket = None) -> None:
+    """Leave a pose out, in later runs of this plan too, until it is retaken.
+
+    Of one that has a picture and was to be taken again only that is left out: its picture counts.
+    """
+    _command(socket, "skip", index=pose - 1)
+    out.print(f"pose {pose}: {_why(socket, pose)}; `station retake {pose}` plans it")
+
+
+def _why(socket: Path | None, pose: int) -> str:
+    """What became of a pose, as the daemon says it."""
+    return next((p.reason for p in status_now(socket).session.poses if p.index == pose - 1), "")
+
+
+@app.command(
+    "doctor",
+    epilog=examples("station doctor --example > station.yaml", "station doctor --config station.yaml"),
+)
+def doctor_command(
+    socket: Socket = None,
+    as_json: AsJson = False,
+    config: Annotated[Path | None, typer.Option(help="Only check this configuration; no daemon.")] = None,
+    example: Annotated[bool, typer.Option("--example", help="Print a configuration to start from.")] = False,
+) -> None:
+    """Look at everything a capture needs; each missing thing with its remedy. Nothing moves.
+
+    Without options it asks the daemon. For a new cell: print an example, write the cell into it, check it,
+    then `station serve --config station.yaml`.
+
+    Exit codes: 0 all is there, 1 something is missing, 2 the configuration is wrong.
+    """
+    if example:
+        print((Path(__file__).parent / "example.yaml").read_text(), end="")
+        return
+    if config is not None:
+        from station.cell.config_file import load_config
+
+        found, _ = load_config(config)
+        out.print(f"{config}: good; {found.robot.model} at {found.robot.host}, {found.mount}")
+        out.print(f"next: station serve --config {shlex.quote(str(config))}, then station doctor beside it")
+        return
+    checks: list[dict[str, Any]] = ask(socket or default_socket(), "doctor")
+    good = all(check["state"] != "failed" for check in checks)
+    if as_json:
+        print(msgspec.json.encode({"ok": good, "checks": checks}).decode())
+    else:
+        from rich.table import Table
+
+        table = Table(box=None, show_header=False, pad_edge=False)
+        for check in checks:
+            remedy = f"\n→ {check['remedy']}" if check.get("remedy") and check["state"] != "ok" else ""
+            table.add_row(_MARKS[check["state"]], check["name"], f"{check['text']}{remedy}")
+        out.print(table)
+    if not good:
+        raise typer.Exit(1)
+
+
+PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
+
+
+@app.command("board", context_settings=PASSED_ON)
+def board_command(context: typer.Context) -> None:
+    """Make a printable calibration board (`calibrate board`)."""
+    import subprocess
+
+    done = subprocess.run([sys.executable, "-m", "calibrate.cli", "board", *context.args])
+    raise typer.Exit(done.returncode)
+
+
+def _command(socket: Path | None, verb: Verb, **args: Any) -> None:
+    """A command of the lease's holder: takes it when it is free, and gives it back."""
+
+    async def once(work: Callable[[Client], Awaitable[Any]]) -> None:
+        async with await Client.connect(socket or default_socket()) as client:
+            await client.request("lease", action="take")
+            await work(client)
+
+    asyncio.run(once(lambda client: client.request(verb, **args)))

@@ -1,0 +1,177 @@
+"""`station demo`: the whole job with no hardware, through the daemon, compared with the truth."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import shutil
+import sys
+import tempfile
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+
+from calibrate.geometry import difference
+from recordings.reader import open_recording
+from station.cell.errors import StationError
+from station.cell.session_folder import CALIBRATION_FILE
+from station.operate.attend import Outcome, carry_out, wait_until_idle
+from station.operate.progress import SessionProgress
+from station.protocol.client import Client
+from station.simulation.cell import CellTruth
+
+START_TIMEOUT_S = 120.0
+"""It took 70 s on a computer at load 14. A daemon that ends says so at once."""
+END_TIMEOUT_S = 15.0
+SOLVE_TIMEOUT_S = 300.0
+_GATE_FAILED = 4
+
+
+@dataclass(frozen=True)
+class DemoOptions:
+    out: Path
+    seed: int = 0
+    scene: str = "paper"
+    mount: str = "eye-in-hand"
+    noise: str = "low"
+    poses: int = 25
+    time_scale: float = 1.0
+    gige: bool = False
+    """The camera over GigE Vision; this process must be in a network namespace with only `lo`."""
+
+    @property
+    def serve_arguments(self) -> list[str]:
+        return [
+            *("--seed", str(self.seed), "--scene", self.scene, "--mount", self.mount, "--noise", self.noise),
+            *("--time-scale", str(self.time_scale)),
+            *(["--gige"] if self.gige else []),
+        ]
+
+
+class DemoError(StationError):
+    """A step of the demonstration failed; the message is that step's own."""
+
+
+async def run_demo(options: DemoOptions, progress: SessionProgress) -> dict[str, Any]:
+    """What `--json` prints, and `gates_passed`. Raises StationError."""
+    options.out.mkdir(parents=True, exist_ok=True)
+    progress.say(f"starting a simulated {options.scene} cell, seed {options.seed}")
+    outcome = await _capture(options, progress)
+    if not outcome.recording:
+        raise DemoError(f"no recording: {outcome.status.reason or outcome.status.state.value}")
+    recording = Path(outcome.recording)
+    folder = Path(outcome.status.session.folder)
+    calibration, report = folder / CALIBRATION_FILE, folder / "report.html"
+    progress.say("solving the recording, in a process of its own")
+    solved = await _solve(recording, calibration, report)
+    translation_mm, rotation_deg = truth_error(recording, solved["result"]["matrix"])
+    return {
+        "truth_error": {"translation_mm": translation_mm, "rotation_deg": rotation_deg},
+        "sigma": solved["sigma"],
+        "poses": {"planned": outcome.planned, "captured": outcome.captured},
+        "recording": str(recording),
+        "calibration": str(calibration),
+        "report": str(report),
+        "seed": options.seed,
+        "scene": options.scene,
+        "mount": options.mount,
+        "noise": options.noise,
+        "holdout": solved["holdout"],
+        "gates_passed": all(gate["passed"] for gate in solved["gates"]),
+    }
+
+
+async def _capture(options: DemoOptions, progress: SessionProgress) -> Outcome:
+    async with (
+        simulated_daemon(options.out, options.serve_arguments) as socket,
+        await Client.connect(socket, "the demo") as client,
+    ):
+        await wait_until_idle(client)
+        await client.request("lease", action="take")
+        progress.say(f"planning {options.poses} poses")
+        await client.request("make_plan", poses=options.poses, seed=options.seed, timeout_s=120.0)
+        with progress:
+            return await carry_out(
+                client,
+                "run",
+                confirm=lambda summary: True,
+                watch=progress,
+                finish_with_loss=True,
+                headless=True,
+            )
+
+
+@asynccontextmanager
+async def simulated_daemon(root: Path, arguments: list[str]) -> AsyncIterator[Path]:
+    """`station serve --simulate` as a child; its socket. It ends with the block, or with this process."""
+    place = Path(tempfile.mkdtemp(prefix="station-demo-"))
+    socket, log = place / "control.sock", root / "daemon.log"
+    command = [sys.executable, "-m", "station.cli", "serve", "--simulate", "--end-with-stdin"]
+    command += ["--root", str(root), "--socket", str(socket), *arguments]
+    with log.open("ab") as words:
+        child = await asyncio.create_subprocess_exec(
+            *command,
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=words,
+            start_new_session=True,
+        )
+    assert child.stdin is not None and child.stdout is not None
+    try:
+        try:
+            async with asyncio.timeout(START_TIMEOUT_S):
+                said = await child.stdout.readline()
+        except TimeoutError:
+            said = b""
+        if not said:
+            tail = "\n".join(log.read_text(errors="replace").splitlines()[-3:])
+            raise DemoError(f"the simulated daemon did not start; {log} ends with:\n{tail}")
+        yield socket
+    finally:
+        child.stdin.close()
+        try:
+            async with asyncio.timeout(END_TIMEOUT_S):
+                await child.wait()
+        except TimeoutError:
+            child.kill()
+            await child.wait()
+        shutil.rmtree(place, ignore_errors=True)
+
+
+async def _solve(recording: Path, calibration: Path, report: Path) -> dict[str, Any]:
+    """`calibrate solve` in a process of its own, as an operator's laptop would run it."""
+    command = [sys.executable, "-m", "calibrate.cli", "solve", str(recording), "--json"]
+    command += ["--output", str(calibration), "--report", str(report)]
+    child = await asyncio.create_subprocess_exec(
+        *command, stdout=asyncio.subprocess.PIPE, stderr=asyncio.subprocess.PIPE
+    )
+    try:
+        async with asyncio.timeout(SOLVE_TIMEOUT_S):
+            out, words = await child.communicate()
+    except BaseException:
+        with contextlib.suppress(ProcessLookupError):
+            child.kill()
+        raise
+    if child.returncode not in (0, _GATE_FAILED):
+        said = words.decode(errors="replace").strip().removeprefix("calibrate: ")
+        raise DemoError(said or f"calibrate ended with {child.returncode}")
+    result: dict[str, Any] = json.loads(out)
+    return result
+
+
+def truth_error(recording: Path, found: list[list[float]]) -> tuple[float, float]:
+    """Distance (mm) and angle (deg) of the found X from the truth that rides in a simulated recording."""
+    attachment = open_recording(recording).attachments().get("truth.json")
+    if attachment is None:
+        raise DemoError(f"{recording} holds no truth.json: it is not of a simulated cell")
+    truth = msgspec.json.decode(attachment, type=CellTruth)
+    delta = difference(np.array(found), np.array(truth.camera_mount))
+    translation_mm = 1000 * float(np.linalg.norm(delta[:3]))
+    rotation_deg = float(np.degrees(np.linalg.norm(delta[3:])))
+    return round(translation_mm, 4), round(rotation_deg, 5)

@@ -1,0 +1,243 @@
+"""`station plan`: makes, imports, checks and shows pose plans. The arm is never touched."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import numpy as np
+import typer
+from rich.progress import BarColumn, Progress, TextColumn
+from rich.table import Table
+from rich.text import Text
+
+from station.cell.config import StationConfig
+from station.cell.config_file import load_config
+from station.cell.errors import ConfigError, LimitError
+from station.cell.limits import PlanCheck, check_plan
+from station.cell.plan import Plan, plan_sha256
+from station.cell.scene import Scene, cell_geometry, scene_of
+from station.cli.console import AsJson, err, out
+from station.plan.choose import Criterion
+from station.plan.files import import_list, load_plan, save_plan, taught_plan
+from station.plan.foxglove import save_scene
+from station.plan.planner import make_plan
+from station.plan.predict import with_forecast
+from station.plan.preview import save_picture
+from station.plan.sketch import sketch
+from station.plan.standing import geometry_from
+
+_NOTHING_KNOWN_M = 0.05
+"""A larger expected error says no more than that there are too few poses yet."""
+
+
+def plan_command(
+    config: Annotated[
+        Path | None, typer.Option(help="The cell's configuration; none: a simulated cell.")
+    ] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Where plan.yaml goes.")] = None,
+    check: Annotated[Path | None, typer.Option(help="Check this plan instead of making one.")] = None,
+    from_list: Annotated[Path | None, typer.Option(help="CSV of joints or flange poses instead.")] = None,
+    taught: Annotated[
+        Path | None, typer.Option(help="Recording whose poses, guided by hand say, become the plan.")
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option(help="Joints where the arm stands, degrees: 0,-90,90,…")
+    ] = None,
+    poses: Annotated[int, typer.Option(min=3, max=200, help="How many.")] = 25,
+    seed: Annotated[int, typer.Option(help="The same seed gives the same plan.")] = 0,
+    scene: Annotated[str, typer.Option(help="Simulated cell: paper or blog.")] = "paper",
+    d_optimal: Annotated[
+        bool, typer.Option("--d-optimal", help="Smallest error ellipsoid, not smallest error.")
+    ] = False,
+    picture: Annotated[Path | None, typer.Option(help="Save a picture of the plan (png, svg, pdf).")] = None,
+    foxglove: Annotated[Path | None, typer.Option(help="Save a scene for Foxglove (mcap).")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make a pose plan, or check one. Nothing moves.
+
+    The file holds radians and metres and may be edited; then `--check` it. Next: `station capture --plan
+    plan.yaml`.
+
+    Exit codes: 0 it may be run, 1 the check lists what is wrong, 2 usage or configuration.
+    """
+    if output is not None and check is None:
+        _require_replaceable(output)
+    cell, standing = _cell(config, scene, start)
+    criterion: Criterion = "D" if d_optimal else "A"
+    plan = _given(cell, standing, check, from_list, taught)
+    plan = plan or _made(cell, standing, poses, seed, criterion, quiet=as_json)
+    geometry = cell_geometry(cell) if standing is None else geometry_from(cell, standing)
+    outcome = check_plan(plan, standing, geometry)
+    shown = _scene(cell, needed=picture is not None or foxglove is not None)
+    told, cut = (plan, ()) if shown is None else with_forecast(shown, plan)
+    if check is None:
+        plan = told
+        if output is not None:
+            save_plan(plan, output)
+    if shown is not None and picture is not None:
+        save_picture(shown, plan, picture)
+    if shown is not None and foxglove is not None:
+        save_scene(shown, plan, foxglove)
+    if as_json:
+        typer.echo(json.dumps(_summary(plan, told, outcome)))
+    else:
+        drawn = sketch(shown, told) if shown is not None else ""
+        _show(told, outcome, drawn, cut, output if check is None else None, cell.capture.goal_m)
+    if outcome.problems:
+        raise typer.Exit(LimitError.exit_code)
+
+
+def _require_replaceable(output: Path) -> None:
+    """A plan may be replaced; anything else that stands there, the configuration say, is left alone."""
+    if output.exists():
+        try:
+            load_plan(output)
+        except ConfigError:
+            raise ConfigError(f"{output} exists and is no plan; give another name with -o") from None
+
+
+def _cell(config: Path | None, scene: str, start: str | None) -> tuple[StationConfig, list[float] | None]:
+    """The cell to plan for, and where its arm stands."""
+    standing = _joints(start) if start is not None else None
+    if config is not None:
+        return load_config(config)[0], standing
+    # Simulation is loaded only where it is wanted.
+    from station.simulation.scenes import build_cell, cell_config
+
+    truth = build_cell(scene, 0, "low", "eye-in-hand")  # type: ignore[arg-type]
+    return cell_config(truth), standing or list(truth.start_joints_rad)
+
+
+def _scene(cell: StationConfig, needed: bool) -> Scene | None:
+    """What can be drawn and forecast. Checking needs none: None where the configuration says too little."""
+    try:
+        return scene_of(cell)
+    except ConfigError:
+        if needed:
+            raise
+        return None
+
+
+def _joints(text: str) -> list[float]:
+    try:
+        degrees = [float(part) for part in text.replace(";", ",").split(",")]
+    except ValueError:
+        degrees = []
+    if len(degrees) != 6 or not np.isfinite(degrees).all():
+        raise ConfigError(
+            f"--start {text!r}: six joint angles in degrees are needed, e.g. 0,-90,90,-90,-90,0"
+        )
+    return [float(np.deg2rad(angle)) for angle in degrees]
+
+
+def _given(
+    cell: StationConfig,
+    standing: list[float] | None,
+    check: Path | None,
+    from_list: Path | None,
+    taught: Path | None,
+) -> Plan | None:
+    """The plan that is there already; None when one is to be made."""
+    if sum(path is not None for path in (check, from_list, taught)) > 1:
+        raise ConfigError("--check, --from-list and --taught exclude each other; give one of them")
+    if check is not None:
+        return load_plan(check)
+    if from_list is not None:
+        return import_list(from_list, cell.robot.model, cell.mount, standing)
+    return None if taught is None else taught_plan(taught, cell.robot.model, cell.mount)
+
+
+def _made(
+    cell: StationConfig,
+    standing: list[float] | None,
+    poses: int,
+    seed: int,
+    criterion: Criterion,
+    quiet: bool,
+) -> Plan:
+    with Progress(
+        TextColumn("{task.description}"), BarColumn(), console=err, transient=True, disable=quiet
+    ) as bar:
+        task = bar.add_task("planning", total=1.0)
+
+        def report(text: str, done: float) -> None:
+            bar.update(task, description=text, completed=done)
+
+        return make_plan(
+            cell, start_joints_rad=standing, seed=seed, count=poses, criterion=criterion, progress=report
+        )
+
+
+def _summary(plan: Plan, told: Plan, outcome: PlanCheck) -> dict[str, Any]:
+    """`told`: the plan with its forecast."""
+    last = told.poses[-1].predicted_sigma_m
+    return {
+        "plan_sha256": plan_sha256(plan),
+        "poses": len(plan.poses),
+        "robot": plan.robot,
+        "mount": plan.mount,
+        "duration_s": round(outcome.duration_s, 3),
+        "path_m": round(outcome.path_m, 4),
+        "largest_step_rad": round(outcome.largest_step_rad, 4),
+        "top_speed_m_s": round(outcome.top_speed_m_s, 4),
+        "expected_sigma_mm": None if last is None else round(1000 * last, 4),
+        "note": plan.note,
+        "problems": [msgspec.to_builtins(vars(problem)) for problem in outcome.problems],
+    }
+
+
+def _goal_text(plan: Plan, goal_m: float) -> str:
+    """When the goal of accuracy should be reached; empty for plans that expect nothing."""
+    sigmas = [pose.predicted_sigma_m for pose in plan.poses]
+    if not sigmas or sigmas[-1] is None:
+        return ""
+    reached = (n for n, sigma in enumerate(sigmas, start=1) if sigma is not None and sigma <= goal_m)
+    number = next(reached, None)
+    goal = f"goal of {1000 * goal_m:.2g} mm (capture.goal_m)"
+    if number is not None:
+        return f"enough for the {goal} after pose {number}, if corners and arm are as good as assumed"
+    if sigmas[-1] >= _NOTHING_KNOWN_M:
+        return f"not enough for the {goal}: so few poses, or so much alike, say next to nothing of the mount"
+    more = int(np.ceil(len(sigmas) * (sigmas[-1] / goal_m) ** 2))
+    return f"not enough for the {goal}: about {more} poses would be (--poses), or a better camera or arm"
+
+
+def _show(
+    plan: Plan, outcome: PlanCheck, picture: str, cut: tuple[str, ...], output: Path | None, goal_m: float
+) -> None:
+    table = Table(box=None, pad_edge=False)
+    for heading in ("pose", "move s", "turn °", "margin mm", "σ mm"):
+        table.add_column(heading, justify="left" if heading == "pose" else "right", no_wrap=True)
+    table.add_column("why")
+    for pose, move in zip(plan.poses, outcome.moves, strict=True):
+        known = pose.predicted_sigma_m is not None and pose.predicted_sigma_m < _NOTHING_KNOWN_M
+        sigma = f"{1000 * (pose.predicted_sigma_m or 0):.2f}" if known else "–"
+        table.add_row(
+            pose.name,
+            f"{move.duration_s:.1f}",
+            f"{np.rad2deg(move.step_rad):.0f}",
+            f"{1000 * move.margin_m:.0f}",
+            sigma,
+            pose.why,
+        )
+    out.print(table)
+    if picture:
+        out.print(picture)
+    out.print(
+        f"{len(plan.poses)} poses, {outcome.duration_s:.0f} s of motion over {outcome.path_m:.1f} m, "
+        f"at most {outcome.top_speed_m_s:.2f} m/s and {np.rad2deg(outcome.largest_step_rad):.0f}° in one move"
+    )
+    if expected := _goal_text(plan, goal_m):
+        out.print(expected)
+    if cut:
+        out.print(f"by the guesses these do not show the whole board: {', '.join(cut)}")
+    if plan.note:
+        out.print(f"note: {plan.note}")
+    for problem in outcome.problems:
+        out.print(Text.assemble(("✗", "red"), f" {problem}"))
+    if output is not None:
+        out.print(f"written to {output}")
+    out.print("check: " + ("FAILED, nothing may move" if outcome.problems else "passed"))

@@ -1,0 +1,326 @@
+"""The commands that move an arm: `capture`, `resume`, `check`, and the demonstration of all of it."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Iterator
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import msgspec
+import typer
+from rich.table import Table
+from rich.text import Text
+
+from station.cell.errors import ConfigError, RefusedError, StationError
+from station.cell.plan import Plan
+from station.cell.session_folder import default_root
+from station.cell.socket_folder import default_socket
+from station.cell.status import GoSummary, StationStatus
+from station.cli.console import AsJson, Socket, err, out
+from station.cli.demo import DemoOptions, run_demo
+from station.cli.serve import require_choices
+from station.operate.attend import Confirm, Outcome, carry_out, wait_until_idle
+from station.operate.drift_check import (
+    PLAN_ANSWER_S,
+    POSES,
+    SEED,
+    check_arguments,
+    never_run,
+    require_installed,
+)
+from station.operate.progress import SessionProgress
+from station.plan.files import load_plan
+from station.plan.sweep import sweep_plan
+from station.protocol.client import Client
+from station.simulation.netns import is_isolated, isolated_command
+
+Headless = Annotated[bool, typer.Option("--headless", help="Nobody is asked; no progress bar.")]
+Approve = Annotated[str, typer.Option("--approve", help="Hash of the plan that a person approved.")]
+OldApprove = Annotated[str, typer.Option("--go", hidden=True)]
+
+
+def demo_command(
+    seed: Annotated[int, typer.Option(help="Another seed: another mount, board place, lens, noise.")] = 0,
+    output: Annotated[Path | None, typer.Option("--out", help="Folder for everything it makes.")] = None,
+    scene: Annotated[str, typer.Option(help="paper, blog or paper-binned (640×512)")] = "paper",
+    mount: Annotated[str, typer.Option(help="eye-in-hand or eye-to-hand")] = "eye-in-hand",
+    noise: Annotated[str, typer.Option(help="low, mid or high")] = "low",
+    poses: Annotated[int, typer.Option(min=4, max=200)] = 25,
+    gige: Annotated[bool, typer.Option("--gige", help="The camera over GigE Vision.")] = False,
+    headless: Headless = False,
+    as_json: AsJson = False,
+    time_scale: Annotated[float, typer.Option(hidden=True)] = 1.0,
+) -> None:
+    """The whole job with no hardware: simulated UR10 and camera to a calibration, compared with the truth.
+
+    Takes about a minute, and ends with the paths of recording, calibration and report (open that in a
+    browser). The same cell to play with: `station`.
+
+    Exit codes: 0 done, 1 failed, 3 done with fewer poses than planned, 4 a gate failed.
+    """
+    require_choices(scene=scene, noise=noise, mount=mount)
+    if output is not None and output.exists() and not output.is_dir():
+        raise ConfigError(f"--out {output} is a file: name a folder for what the demo makes")
+    if gige and not is_isolated():
+        # Discovery broadcasts on every network: the same command again, where there is only loopback.
+        command = isolated_command([sys.executable, "-m", "station.cli", *sys.argv[1:]])
+        os.execv(command[0], command)
+    folder = output or default_root() / "demo" / time.strftime("%Y%m%d-%H%M%S")
+    options = DemoOptions(folder, seed, scene, mount, noise, poses, time_scale, gige)
+    started_s = time.monotonic()
+    result = asyncio.run(run_demo(options, SessionProgress(err, quiet=headless or as_json)))
+    if as_json:
+        print(json.dumps(result))
+    else:
+        _show_demo(result, time.monotonic() - started_s)
+    captured, planned = result["poses"]["captured"], result["poses"]["planned"]
+    if not result["gates_passed"]:
+        raise typer.Exit(4)
+    if captured < planned:
+        raise typer.Exit(3)
+
+
+def _show_demo(result: dict[str, Any], duration_s: float) -> None:
+    error, sigma, poses = result["truth_error"], result["sigma"], result["poses"]
+    table = Table(title=f"SIMULATED cell, seed {result['seed']}: {result['mount']}, {result['scene']} scene")
+    for heading in ("", "translation", "rotation"):
+        table.add_column(heading, justify="left" if not heading else "right")
+    for name, value in (("error against the truth", error), ("claimed sigma", sigma)):
+        table.add_row(name, f"{value['translation_mm']:.3f} mm", f"{value['rotation_deg']:.4f}°")
+    out.print(table)
+    verdict = "all gates passed" if result["gates_passed"] else ("a gate FAILED", "red")
+    taken = f"{poses['captured']} of {poses['planned']} poses, "
+    out.print(Text.assemble(taken, verdict, f", {duration_s:.0f} s in all"))
+    for name in ("recording", "calibration", "report"):
+        out.print(f"{name:<12} {result[name]}")
+
+
+def capture_command(
+    plan: Annotated[Path | None, typer.Option(help="The pose plan.")] = None,
+    sweep: Annotated[
+        bool, typer.Option("--sweep", help="Swing slowly about where the arm stands, camera running.")
+    ] = False,
+    headless: Headless = False,
+    approve: Approve = "",
+    go: OldApprove = "",
+    socket: Socket = None,
+    as_json: AsJson = False,
+) -> None:
+    """One session: load the plan, check it, ask, go, watch, seal. Ctrl-C is STOP.
+
+    `station plan` makes the plan. Next: `calibrate solve RECORDING`. Nobody there:
+    `--headless --approve HASH`, with the hash (12 digits and more) that `station plan --json` prints, as a
+    user that the configuration names in approval.services.
+
+    With --sweep no poses are taken: the arm swings slowly where it stands, with the board in view, and
+    `calibrate sweep RECORDING` tells the time between camera and robot.
+
+    Exit codes: 0 all poses, sealed; 1 failed or stopped; 2 usage; 3 sealed with fewer poses than planned.
+    """
+    if (plan is None) != sweep:
+        raise ConfigError("say what to do, one of: --plan FILE (poses), --sweep (the clocks)")
+    if plan is None:
+        before = load_sweep
+    else:
+        before = partial(load_into, plan=load_plan(plan))
+    outcome = asyncio.run(attended_session(socket, "run", headless, approve or go, as_json, before))
+    if sweep and outcome.recording and not as_json:
+        out.print(f"next: calibrate sweep {outcome.recording}")
+    _finish(outcome, as_json)
+
+
+def resume_command(
+    headless: Headless = False,
+    approve: Approve = "",
+    go: OldApprove = "",
+    socket: Socket = None,
+    as_json: AsJson = False,
+) -> None:
+    """Go on with a paused or interrupted session, from where the arm is. Ctrl-C is STOP.
+
+    Shows what would move and asks. After STOP or a fault first `station acknowledge`.
+
+    Exit codes: as of `station capture`.
+    """
+    _finish(asyncio.run(attended_session(socket, "resume", headless, approve or go, as_json, None)), as_json)
+
+
+def improve_command(headless: Headless = False, socket: Socket = None, as_json: AsJson = False) -> None:
+    """Plan the poses that are left of a paused session anew, from what its pictures show; then go on.
+
+    Says what would change and asks; without a yes the session stays as it is. Ctrl-C is STOP.
+    """
+    _finish(asyncio.run(attended_session(socket, "improve", headless, "", as_json, None)), as_json)
+
+
+def best_command(headless: Headless = False, socket: Socket = None) -> None:
+    """Add the pose that would help most to a paused session, and take it.
+
+    Says where it is and what it brings, and asks; the way is checked as for any pose. Then the session is
+    paused as before, or sealed when nothing else was left. Ctrl-C is STOP.
+
+    Exit codes: 0 it was taken, 1 it was not.
+    """
+    outcome = asyncio.run(attended_session(socket, "best", headless, "", False, None))
+    added = max(outcome.status.session.poses, key=lambda pose: pose.index)
+    out.print(f"pose {added.index + 1}: {added.state}{f', {added.reason}' if added.reason else ''}")
+    _say_state(outcome.status, outcome.status.reason or outcome.recording)
+    raise typer.Exit(0 if added.state == "done" else 1)
+
+
+def check_command(
+    poses: Annotated[int, typer.Option(min=4, max=50, help="How many to take")] = POSES,
+    headless: Headless = False,
+    approve: Approve = "",
+    go: OldApprove = "",
+    socket: Socket = None,
+) -> None:
+    """Does the installed calibration still hold? A few poses, then `calibrate check` on them.
+
+    The board may lie elsewhere by now. Eight poses notice a shift of 0.5 mm or 0.1° on a usual cell, five on
+    a quiet one; where they do not, it says how many more would. Ctrl-C is STOP.
+
+    Exit codes: 0 it holds, 4 it does not, 1 no recording or nothing installed, 2 usage.
+    """
+    asyncio.run(_require_installed(socket or default_socket()))  # or the arm would move for nothing
+    outcome = asyncio.run(
+        attended_session(socket, "check", headless, approve or go, False, lambda c: _make(c, poses))
+    )
+    if not outcome.recording:
+        _finish(outcome, False)
+    what = check_arguments(outcome.recording, outcome.status.session.folder)
+    done = subprocess.run([sys.executable, "-m", "calibrate.cli", *what])
+    raise typer.Exit(done.returncode)
+
+
+async def _require_installed(socket: Path) -> None:
+    async with await Client.connect(socket) as client:
+        assert client.root is not None
+        require_installed(client.root)
+
+
+async def load_into(client: Client, plan: Plan) -> None:
+    await client.request("load_plan", plan=msgspec.to_builtins(plan))
+
+
+async def load_sweep(client: Client) -> None:
+    """A sweep about where the arm stands now."""
+    status = await wait_until_idle(client)
+    if status.robot.joints_rad is None:
+        raise RefusedError("the robot's joints are not known: `station doctor` says why")
+    await load_into(client, sweep_plan(status.robot.model, status.mount, status.robot.joints_rad))
+
+
+async def _make(client: Client, poses: int) -> None:
+    if lost := never_run(await _status(client)):
+        err.print(f"the check takes the place of the loaded plan of {lost} poses, which was never run")
+    await client.request("make_plan", poses=poses, seed=SEED, lens_known=True, timeout_s=PLAN_ANSWER_S)
+
+
+async def attended_session(
+    socket: Path | None,
+    purpose: str,
+    headless: bool,
+    approved: str,
+    quiet: bool,
+    before: Callable[..., Any] | None,
+) -> Outcome:
+    """One session as `purpose` says, approved by a person here or by the hash of what was approved."""
+    path = socket or default_socket()
+    interactive = not headless and sys.stdin.isatty()
+    async with await Client.connect(path) as client:
+        await wait_until_idle(client)
+        await client.request("lease", action="take")
+        if before is not None:
+            await before(client)
+        standing = await _status(client)
+        progress = SessionProgress(err, quiet=headless or quiet)
+        progress.skip(standing)
+        confirm = _confirmation(approved, interactive, standing.simulated)
+        with progress:
+            # One pose more never ends a session that has others left.
+            to_the_end = headless and purpose != "best"
+            return await carry_out(
+                client,
+                purpose,
+                confirm=confirm,
+                watch=progress,
+                finish_with_loss=to_the_end,
+                headless=not interactive,
+            )
+
+
+async def _status(client: Client) -> StationStatus:
+    async for status in client.statuses():
+        return status
+    raise StationError("the daemon ended")
+
+
+def _confirmation(approved: str, interactive: bool, simulated: bool) -> Confirm:
+    """Who says yes: the approved hash, the person, or, for a simulated cell only, nobody."""
+
+    def confirm(summary: GoSummary) -> bool:
+        if approved:
+            if not summary.plan_sha256.startswith(approved) or len(approved) < 12:
+                raise RefusedError(f"--approve {approved} is not the hash of this plan: nothing moved")
+            return True
+        if interactive:
+            return ask_person(summary)
+        if simulated:
+            return True
+        raise RefusedError("Nobody is asked here. A person must review and approve the plan (docs: Safety).")
+
+    return confirm
+
+
+def ask_person(summary: GoSummary) -> bool:
+    many = "1 pose" if summary.poses == 1 else f"{summary.poses} poses"
+    err.print(Text.assemble(("\nThe arm will move", "bold"), f": {summary.purpose}, {many}"))
+    err.print(f"first {summary.first_move}; {summary.path_m:.2f} m, up to {summary.top_speed_m_s:.2f} m/s")
+    err.print(f"about {summary.duration_s:.0f} s, plan {summary.plan_sha256[:12]}")
+    for change in summary.changes:
+        err.print(change)
+    for warning in summary.warnings:
+        err.print(warning, style="yellow")
+    err.print("The emergency stop on the pendant is the safety device. Ctrl-C stops too.")
+    try:
+        with ctrl_c_at_once():
+            return typer.confirm("Is everybody out of the arm's reach? Move?", default=False, err=True)
+    except typer.Abort:
+        err.print()  # after the terminal's ^C
+        return False
+
+
+@contextlib.contextmanager
+def ctrl_c_at_once() -> Iterator[None]:
+    """At a question: the event loop, which waits for the answer too, would hear of Ctrl-C only after it."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def _finish(outcome: Outcome, as_json: bool) -> None:
+    if as_json:
+        poses = {"planned": outcome.planned, "captured": outcome.captured}
+        state = outcome.status.state.value
+        print(json.dumps({"state": state, "poses": poses, "recording": outcome.recording}))
+    elif outcome.recording:
+        out.print(f"{outcome.captured} of {outcome.planned} poses, sealed: {outcome.recording}")
+    else:
+        _say_state(outcome.status, outcome.status.reason)
+    raise typer.Exit(outcome.exit_code)
+
+
+def _say_state(status: StationStatus, why: str) -> None:
+    err.print(Text.assemble((status.state.value, "bold"), f": {why}"))

@@ -1,0 +1,49 @@
+"""A cell: the devices that one configuration describes, behind their protocols."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import msgspec
+
+from recordings.schema.messages import CameraModel, Source
+from station.cell.config import StationConfig
+from station.cell.plan import Plan
+from station.devices.base import Camera, Robot, Trigger
+
+
+@dataclass(frozen=True)
+class Cell:
+    config: StationConfig
+    robot: Robot
+    camera: Camera
+    source: Source
+    """`real` only when arm and camera both are."""
+    trigger: Trigger | None = None
+    config_text: bytes = b""
+    """As it was read, for the recording."""
+    attachments: dict[str, bytes] = field(default_factory=dict)
+    """More for every recording of this cell: a simulated one's truth."""
+    plan: Plan | None = None
+    """Loaded at the start: what a played-back cell can show."""
+    ended: Callable[[], None] = lambda: None
+    """Called once the devices are closed: ends child processes of a simulated cell."""
+
+    @property
+    def simulated(self) -> bool:
+        return self.source == "simulated"
+
+    @property
+    def config_sha256(self) -> str:
+        return hashlib.sha256(self.config_yaml).hexdigest()
+
+    @property
+    def config_yaml(self) -> bytes:
+        return self.config_text or msgspec.yaml.encode(self.config)
+
+    @property
+    def camera_model(self) -> CameraModel | None:
+        """Trustworthy intrinsics only; None where they are to be found from the pictures."""
+        return None if self.config.camera.model_is_rough else self.config.camera.model

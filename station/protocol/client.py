@@ -1,0 +1,228 @@
+"""The way every screen and command talks to the daemon: one Unix socket, JSON lines."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import getpass
+import os
+import re
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import msgspec
+
+from recordings.plain_text import plain_data
+from station.cell.errors import RefusedError, StationError
+from station.cell.status import StationStatus
+from station.protocol.messages import LINE_LIMIT_BYTES, PIECE_BYTES, REQUEST_LIMIT_BYTES, Reply, Request, Verb
+from station.protocol.stop_client import send_stop
+
+CONNECT_S = 5.0
+ANSWER_S = 30.0
+_ANSWER_LIMIT_BYTES = 8 * 1024 * 1024
+"""The daemon is trusted more than its clients are: a preview is larger than any request."""
+
+
+_SUSPECT = re.compile(
+    rb"\\(u00[01]|[bfr])|\x7f|\xc2[\x80-\x9f]|\xe2(\x80[\x8e\x8f\xaa-\xae]|\x81[\xa6-\xa9])"
+)
+"""How orders to a terminal look in JSON; where none can be, nothing is looked through."""
+
+
+class DaemonGoneError(StationError):
+    """No daemon answers on the socket, or it went away."""
+
+
+class NoAnswerError(StationError):
+    """The daemon holds the connection and says nothing: it hangs, or its computer is far too busy."""
+
+
+def who_am_i() -> str:
+    """'anna on tty1': what others read as the holder of the lease."""
+    try:
+        terminal = " on " + os.ttyname(0).removeprefix("/dev/")
+    except OSError:
+        terminal = ""
+    try:
+        return getpass.getuser() + terminal
+    except (OSError, KeyError):
+        return f"uid {os.getuid()}{terminal}"
+
+
+class _Incoming(msgspec.Struct):
+    """Any line from the daemon."""
+
+    id: int | None = None
+    ok: bool = False
+    result: Any = None
+    error: str = ""
+    status: dict[str, Any] | None = None
+    changes: dict[str, Any] | None = None
+
+
+class Client:
+    """A connection. Losing it loses the lease: the daemon then decelerates the arm and pauses."""
+
+    def __init__(self, path: Path, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        self._path, self._reader, self._writer = path, reader, writer
+        self._next_id = 1
+        self._waiting: dict[int, asyncio.Future[Reply]] = {}
+        self._plain_status: dict[str, Any] | None = None
+        self._outdated = False
+        self._fresh = asyncio.Event()
+        self._gone = False
+        self.root: Path | None = None
+        """Below which the daemon keeps sessions and what is installed."""
+        self._one_at_a_time = asyncio.Lock()
+        """Pieces of two long requests must not mix."""
+        self._task = asyncio.create_task(self._read(), name="client-read")
+
+    @classmethod
+    async def connect(cls, path: Path, who: str = "", timeout_s: float = CONNECT_S) -> Client:
+        """Raises DaemonGoneError with the remedy when nobody serves there."""
+        try:
+            async with asyncio.timeout(timeout_s):
+                reader, writer = await asyncio.open_unix_connection(str(path), limit=_ANSWER_LIMIT_BYTES)
+        except (FileNotFoundError, ConnectionRefusedError):
+            raise DaemonGoneError(
+                f"No station daemon serves {path}. Start one: `station serve --config FILE`, or "
+                "`station serve --simulate` for a cell without hardware."
+            ) from None
+        except PermissionError:
+            raise DaemonGoneError(
+                f"{path}: not allowed. Operators are members of the group station-operator "
+                "(log in again after being added)."
+            ) from None
+        except (OSError, TimeoutError) as error:
+            raise DaemonGoneError(f"{path}: the daemon does not answer ({error or 'timeout'}).") from None
+        client = cls(path, reader, writer)
+        try:
+            who = who or who_am_i()
+            hello = await client.request("hello", who=who, timeout_s=timeout_s)
+        except StationError:
+            await client.close()
+            raise
+        if root := hello.get("root"):
+            client.root = Path(root)
+        return client
+
+    async def request(self, verb: Verb, *, timeout_s: float = ANSWER_S, **args: Any) -> Any:
+        """The daemon's result as plain data. RefusedError with its reason; DaemonGoneError; NoAnswerError."""
+        if verb == "stop":
+            send_stop(self._path)  # the way that nobody can hold up; the request brings the answer
+        if self._gone:
+            raise DaemonGoneError(f"The station daemon at {self._path} is gone; nothing was sent to the arm.")
+        request = Request(self._next_id, verb, args)
+        self._next_id += 1
+        line = msgspec.json.encode(request) + b"\n"
+        if len(line) > LINE_LIMIT_BYTES:
+            return await self._request_in_pieces(verb, line, timeout_s)
+        answer: asyncio.Future[Reply] = asyncio.get_running_loop().create_future()
+        self._waiting[request.id] = answer
+        try:
+            self._writer.write(line)
+            await self._writer.drain()
+            async with asyncio.timeout(timeout_s):
+                reply = await answer
+        except TimeoutError:
+            raise NoAnswerError(
+                f"{verb}: no answer from the daemon within {timeout_s:.0f} s. If the arm moves use the "
+                "emergency stop; `systemctl status station` or the daemon's log says more."
+            ) from None
+        except OSError:
+            raise self._gone_error() from None
+        finally:
+            self._waiting.pop(request.id, None)
+        if not reply.ok:
+            raise RefusedError(reply.error)
+        return reply.result
+
+    async def _request_in_pieces(self, verb: Verb, whole: bytes, timeout_s: float) -> Any:
+        if len(whole) > REQUEST_LIMIT_BYTES:
+            raise RefusedError(
+                f"{verb}: {len(whole) / 1e6:.1f} MB are more than the daemon takes "
+                f"({REQUEST_LIMIT_BYTES / 1e6:.1f} MB): make a plan of fewer poses, or shorten its notes."
+            )
+        async with self._one_at_a_time:
+            for start in range(0, len(whole), PIECE_BYTES):
+                piece = base64.b64encode(whole[start : start + PIECE_BYTES]).decode()
+                await self.request("part", base64=piece)
+            return await self.request("whole", timeout_s=timeout_s)
+
+    async def statuses(self) -> AsyncIterator[StationStatus]:
+        """The status now and after every change (slow readers see the newest only)."""
+        await self.request("watch")
+        if self._plain_status is not None and not self._outdated:
+            self._fresh.set()  # watched before: what is known is the start
+        while True:
+            await self._fresh.wait()
+            self._fresh.clear()
+            if self._plain_status is not None and not self._outdated:
+                yield msgspec.convert(self._plain_status, StationStatus)
+            if self._gone:
+                return
+
+    def outdate(self) -> None:
+        """What is known is older than what was just asked: `statuses` begins with the next change."""
+        self._outdated = True
+        self._fresh.clear()
+
+    async def close(self) -> None:
+        self._task.cancel()
+        self._writer.close()
+        await asyncio.gather(self._task, return_exceptions=True)
+
+    async def __aenter__(self) -> Client:
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        await self.close()
+
+    async def _read(self) -> None:
+        decoder = msgspec.json.Decoder(_Incoming)
+        try:
+            while line := await self._reader.readline():
+                message = decoder.decode(line)
+                if _SUSPECT.search(line):
+                    message = msgspec.convert(plain_data(msgspec.to_builtins(message)), _Incoming)
+                self._take(message)
+        except (OSError, ValueError, msgspec.DecodeError):
+            pass  # A daemon that speaks nonsense is as good as gone.
+        finally:
+            self._gone = True
+            for answer in self._waiting.values():
+                if not answer.done():
+                    answer.set_exception(self._gone_error())
+            self._fresh.set()
+
+    def _take(self, message: _Incoming) -> None:
+        if message.id is not None:
+            answer = self._waiting.get(message.id)
+            if answer is not None and not answer.done():
+                answer.set_result(Reply(message.id, message.ok, message.result, message.error))
+            return
+        if message.status is not None:
+            self._plain_status = message.status
+        elif message.changes is not None and self._plain_status is not None:
+            self._plain_status = self._plain_status | message.changes
+        self._outdated = False
+        self._fresh.set()
+
+    def _gone_error(self) -> DaemonGoneError:
+        """While it was asked: it may have done what it was asked for, and then have gone."""
+        return DaemonGoneError(
+            f"The station daemon at {self._path} is gone and did not answer: whether it heard this is not "
+            "known. Look at the cell."
+        )
+
+
+def ask(path: Path, verb: Verb, **args: Any) -> Any:
+    """One question from a plain program, no event loop needed. Raises as `Client.request` does."""
+
+    async def once() -> Any:
+        async with await Client.connect(path) as client:
+            return await client.request(verb, **args)
+
+    return asyncio.run(once())

@@ -1,0 +1,325 @@
+"""The control socket: anyone in the group may watch and STOP; whoever holds the lease may command.
+
+A client that is slow, hostile or stuck costs a bounded amount of memory and is dropped, never waited for.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import contextlib
+import logging
+import os
+import socket
+import struct
+from collections import defaultdict, deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import msgspec
+
+from recordings.errors import RecordingError
+from station.cell.errors import StationError
+from station.cell.socket_folder import make_folder
+from station.cell.status import StationStatus, changed_sections
+from station.protocol.messages import (
+    CLIENT_LIMIT,
+    LINE_LIMIT_BYTES,
+    REQUEST_LIMIT_BYTES,
+    USER_CLIENT_LIMIT,
+    Notice,
+    Reply,
+    Request,
+)
+
+log = logging.getLogger(__name__)
+UNSENT_LIMIT_BYTES = 4 * 1024 * 1024
+OPEN_REQUESTS_LIMIT = 8
+HANG_UP_S = 1.0
+ACCEPT_BATCH = 32
+ACCEPT_PAUSE_S = 0.01
+"""Between batches: a flood of connections costs the working loop no more than that."""
+NEW_PER_S = 200
+"""Connections that one user may open within a second."""
+
+
+@dataclass(frozen=True)
+class Peer:
+    """Who is at the other end, by the kernel's word."""
+
+    client_id: int
+    pid: int
+    uid: int
+    gid: int
+
+
+class Handler(Protocol):
+    """What the daemon does with requests."""
+
+    def stop_now(self, peer: Peer) -> Any:
+        """STOP, from anyone: under way when it returns, should the client leave. May return an awaitable."""
+
+    async def handle(self, peer: Peer, verb: str, args: dict[str, Any]) -> Any:
+        """The result; StationError or RecordingError becomes the reply's sentence."""
+
+    def gone(self, peer: Peer) -> None:
+        """The connection ended; if it held the lease, the arm must decelerate now."""
+
+
+class ControlServer:
+    """Serves until `close`. `publish` sends every watcher what changed."""
+
+    def __init__(
+        self, path: Path, handler: Handler, newest: Callable[[], StationStatus] | None = None
+    ) -> None:
+        """`newest`: what a watcher that has just come is told; what was published may be a moment older."""
+        self._path, self._handler = path, handler
+        self._status = StationStatus()
+        self._newest = newest or (lambda: self._status)
+        self._listening: socket.socket | None = None
+        self._connections: set[_Connection] = set()
+        self._serving: dict[asyncio.Task[None], int] = {}
+        """Connections, and whose they are."""
+        self._next_client_id = 1
+        self._opened: dict[int, deque[float]] = defaultdict(lambda: deque(maxlen=NEW_PER_S))
+        """When each user's newest connections were opened."""
+
+    async def start(self) -> None:
+        """Binds with mode 0660; a stale socket is replaced.
+
+        StationError when another daemon serves here, or when others could put a socket in its place.
+        """
+        make_folder(self._path.parent)
+        _remove_stale(self._path)
+        listening = socket.socket(socket.AF_UNIX, socket.SOCK_STREAM | socket.SOCK_NONBLOCK)
+        old = os.umask(0o117)
+        try:
+            listening.bind(str(self._path))
+            listening.listen(ACCEPT_BATCH)
+        except OSError as error:
+            listening.close()
+            raise StationError(f"{self._path}: the control socket cannot be made ({error}).") from None
+        finally:
+            os.umask(old)
+        self._listening = listening
+        self._listen()
+
+    def publish(self, status: StationStatus) -> None:
+        changes = changed_sections(self._status, status)
+        self._status = status
+        if changes:
+            line = msgspec.json.encode(Notice(changes=changes)) + b"\n"
+            for connection in list(self._connections):
+                if connection.watching:
+                    connection.send(line)
+
+    async def close(self) -> None:
+        if self._listening is not None:
+            asyncio.get_running_loop().remove_reader(self._listening)
+            self._listening.close()
+            self._listening = None
+        for connection in list(self._connections):
+            connection.drop("the daemon ends")
+        await asyncio.gather(*self._serving, return_exceptions=True)
+        self._path.unlink(missing_ok=True)
+
+    def _listen(self) -> None:
+        if self._listening is not None:
+            asyncio.get_running_loop().add_reader(self._listening, self._accept)
+
+    def _accept(self) -> None:
+        assert self._listening is not None
+        loop = asyncio.get_running_loop()
+        for _ in range(ACCEPT_BATCH):
+            try:
+                link, _ = self._listening.accept()
+            except BlockingIOError:
+                return
+            except OSError as error:  # no descriptors left, for one
+                log.warning("a client could not be let in: %s", error)
+                break
+            link.setblocking(False)
+            peer = _peer_of(link, self._next_client_id)
+            if why := self._full_for(peer.uid):
+                with link, contextlib.suppress(OSError):
+                    link.send(msgspec.json.encode(Reply(0, False, error=why)) + b"\n")
+                continue
+            self._next_client_id += 1
+            self._opened[peer.uid].append(loop.time())
+            serving = loop.create_task(self._serve(link, peer))
+            self._serving[serving] = peer.uid
+            serving.add_done_callback(self._serving.pop)
+        loop.remove_reader(self._listening)
+        loop.call_later(ACCEPT_PAUSE_S, self._listen)
+
+    def _full_for(self, uid: int) -> str:
+        """Why this user is not let in now; empty: there is room."""
+        if len(self._serving) >= CLIENT_LIMIT:
+            return f"{CLIENT_LIMIT} clients are connected already: close one (`station stop` needs none)."
+        if list(self._serving.values()).count(uid) >= USER_CLIENT_LIMIT:
+            return f"{USER_CLIENT_LIMIT} clients of this user are connected already: close one."
+        newest = self._opened[uid]
+        if len(newest) == NEW_PER_S and asyncio.get_running_loop().time() - newest[0] < 1.0:
+            return f"this user opened {NEW_PER_S} connections within a second: wait a moment."
+        return ""
+
+    async def _serve(self, link: socket.socket, peer: Peer) -> None:
+        loop = asyncio.get_running_loop()
+        reader = asyncio.StreamReader(limit=LINE_LIMIT_BYTES)
+        protocol = asyncio.StreamReaderProtocol(reader)
+        transport, _ = await loop.connect_accepted_socket(lambda: protocol, link)
+        writer = asyncio.StreamWriter(transport, protocol, reader, loop)
+        connection = _Connection(peer, reader, writer, self._handler, self._full_status)
+        self._connections.add(connection)
+        try:
+            await connection.run()
+        finally:
+            self._connections.discard(connection)
+            self._handler.gone(peer)
+
+    def _full_status(self) -> bytes:
+        # Published first, so that the next changes start from exactly what this watcher was told.
+        self.publish(self._newest())
+        plain: dict[str, Any] = msgspec.to_builtins(self._status)
+        return msgspec.json.encode(Notice(status=plain)) + b"\n"
+
+
+class _Connection:
+    """One client: its lines in, its answers and notices out."""
+
+    def __init__(
+        self,
+        peer: Peer,
+        reader: asyncio.StreamReader,
+        writer: asyncio.StreamWriter,
+        handler: Handler,
+        full_status: Any,
+    ) -> None:
+        self.peer = peer
+        self.watching = False
+        self._reader, self._writer, self._handler = reader, writer, handler
+        self._full_status = full_status
+        self._tasks: set[asyncio.Task[None]] = set()
+        self._pieces = bytearray()
+        """Of a request that is longer than a line."""
+
+    async def run(self) -> None:
+        decoder = msgspec.json.Decoder(Request)
+        try:
+            while line := await self._reader.readline():
+                try:
+                    self._take(decoder.decode(line))
+                except (ValueError, RecursionError) as error:  # msgspec's, base64's
+                    self.reply(Reply(0, False, error=f"not a request: {error}"))
+                await asyncio.sleep(0)  # readline gives lines that wait without a pause: STOP of others first
+        except ValueError:  # readline: the line is longer than the limit
+            self.drop(f"a line of more than {LINE_LIMIT_BYTES} bytes")
+        except OSError:
+            pass
+        finally:
+            for task in self._tasks:
+                task.cancel()
+            self.hang_up()
+
+    def _take(self, request: Request) -> None:
+        if request.verb == "stop":
+            # In this very call: no limit holds it up, and nothing that is read later comes before it.
+            stopping = self._handler.stop_now(self.peer)
+            self._spawn(self._answer_stop(request.id, stopping))
+        elif request.verb == "part":
+            self._take_piece(request)
+        elif request.verb == "whole":
+            whole, self._pieces = bytes(self._pieces), bytearray()
+            inner = msgspec.json.decode(whole, type=Request)
+            self._take(Request(request.id, inner.verb, inner.args))
+        elif len(self._tasks) >= OPEN_REQUESTS_LIMIT:
+            self.reply(Reply(request.id, False, error="too many requests at once: wait for the answers."))
+        else:
+            self._spawn(self._answer(request))
+
+    def _take_piece(self, request: Request) -> None:
+        piece = base64.b64decode(str(request.args.get("base64", "")), validate=True)
+        if len(self._pieces) + len(piece) > REQUEST_LIMIT_BYTES:
+            self._pieces.clear()
+            text = f"more than {REQUEST_LIMIT_BYTES} bytes in one request: nothing of it is kept."
+            self.reply(Reply(request.id, False, error=text))
+            return
+        self._pieces += piece
+        self.reply(Reply(request.id, True, {}))
+
+    def _spawn(self, work: Any) -> None:
+        task = asyncio.create_task(work)
+        self._tasks.add(task)
+        task.add_done_callback(self._tasks.discard)
+
+    async def _answer_stop(self, request_id: int, stopping: Any) -> None:
+        if stopping is not None:
+            await stopping
+        self.reply(Reply(request_id, True, {}))
+
+    async def _answer(self, request: Request) -> None:
+        try:
+            result = await self._handler.handle(self.peer, request.verb, request.args)
+            self.reply(Reply(request.id, True, result))
+            if request.verb == "watch" and not self.watching:
+                self.send(self._full_status())
+                self.watching = True
+        except (StationError, RecordingError) as error:
+            self.reply(Reply(request.id, False, error=str(error)))
+        except (msgspec.ValidationError, KeyError, TypeError, ValueError) as error:
+            log.exception("%s from client %d", request.verb, self.peer.client_id)
+            self.reply(Reply(request.id, False, error=f"{request.verb}: wrong arguments ({error})."))
+        except Exception as error:
+            log.exception("%s from client %d", request.verb, self.peer.client_id)
+            self.reply(
+                Reply(request.id, False, error=f"{request.verb}: internal error ({error!r}); see the log")
+            )
+
+    def reply(self, reply: Reply) -> None:
+        self.send(msgspec.json.encode(reply) + b"\n")
+
+    def send(self, line: bytes) -> None:
+        if self._writer.is_closing():
+            return
+        self._writer.write(line)
+        if self._writer.transport.get_write_buffer_size() > UNSENT_LIMIT_BYTES:
+            log.warning("client %d (pid %d) does not read: dropped", self.peer.client_id, self.peer.pid)
+            self._writer.transport.abort()
+
+    def drop(self, why: str) -> None:
+        log.warning("client %d (pid %d) is dropped: %s", self.peer.client_id, self.peer.pid, why)
+        with contextlib.suppress(OSError):
+            self._writer.write(msgspec.json.encode(Reply(0, False, error=f"dropped: {why}")) + b"\n")
+        self.hang_up()
+
+    def hang_up(self) -> None:
+        """A client that does not read would hold a polite close open for ever."""
+        self._writer.close()
+        asyncio.get_running_loop().call_later(HANG_UP_S, self._writer.transport.abort)
+
+
+def _peer_of(link: socket.socket, client_id: int) -> Peer:
+    raw = link.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, 12)
+    pid, uid, gid = struct.unpack("3i", raw)
+    log.debug("client %d: pid %d, uid %d, gid %d", client_id, pid, uid, gid)
+    return Peer(client_id, pid, uid, gid)
+
+
+def _remove_stale(path: Path) -> None:
+    """A socket that nobody serves is what a crash leaves behind."""
+    if not path.is_socket():
+        if path.exists():
+            raise StationError(f"{path} is in the way and is not a socket: move it.")
+        return
+    with socket.socket(socket.AF_UNIX) as probe:
+        probe.settimeout(1.0)
+        try:
+            probe.connect(str(path))
+        except (ConnectionRefusedError, FileNotFoundError):
+            path.unlink(missing_ok=True)
+            return
+        except OSError as error:
+            raise StationError(f"{path}: {error}.") from None
+    raise StationError(f"Another station daemon already serves {path}: stop it first, or use its socket.")

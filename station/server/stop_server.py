@@ -1,0 +1,178 @@
+"""STOP's own socket: every datagram that comes is STOP, whatever it says and whoever sent it.
+
+So the queue can be filled with nothing but STOPs: a flood from one user stops the arm for all, and holds up
+nobody's. It needs no connection, no control and no answer; what came of it stands on the motion page.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import logging
+import os
+import socket
+import struct
+import time
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+from station.cell.errors import StationError
+from station.cell.socket_folder import make_folder, motion_page, stop_socket
+from station.protocol.motion_page import Motion, Page, create_page, write_page
+
+log = logging.getLogger(__name__)
+
+BATCH = 32
+PAUSE_S = 0.02
+"""The first datagram is read at once, the next ones together after a pause: so little does a flood cost."""
+REPEAT_S = 0.1
+"""A latched STOP is repeated to an arm that rests no more often than this."""
+RESTING_RAD_S = 0.01
+SETTLE_S = 0.05
+"""An arm counts as resting only so long after STOP: a move may just have begun."""
+_CREDENTIALS = struct.Struct("3i")
+_ANCILLARY_BYTES = socket.CMSG_SPACE(_CREDENTIALS.size)
+
+
+@dataclass(frozen=True)
+class Sender:
+    """Who sent a STOP, by the kernel's word."""
+
+    pid: int
+    uid: int
+
+
+class StopServer:
+    """`stop` is called at once, in the working loop. `latched`: STOP holds. `speed_rad_s`: of the fastest
+    joint, None where it is not known."""
+
+    def __init__(
+        self,
+        control: Path,
+        stop: Callable[[Sender], None],
+        latched: Callable[[], bool],
+        speed_rad_s: Callable[[], float | None],
+    ) -> None:
+        self._socket_path, self._page_path = stop_socket(control), motion_page(control)
+        self._stop, self._latched, self._speed_rad_s = stop, latched, speed_rad_s
+        self._link: socket.socket | None = None
+        self._stops = 0
+        self._latched_s = self._repeated_s = float("-inf")
+        """When STOP was latched, and when it was last carried out."""
+        self._descriptor = -1
+        self._said = self._page()
+        self._writer = ThreadPoolExecutor(1, thread_name_prefix="motion-page")
+        """A disk that hangs must not hold the working loop."""
+        self._writing: Future[None] | None = None
+
+    def start(self) -> None:
+        """The caller has made sure that no other daemon serves here. Raises StationError."""
+        make_folder(self._socket_path.parent)
+        link = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
+        old = os.umask(0o117)
+        try:
+            link.setsockopt(socket.SOL_SOCKET, socket.SO_PASSCRED, 1)
+            self._socket_path.unlink(missing_ok=True)
+            self._descriptor = create_page(self._page_path, self._said)
+            link.bind(str(self._socket_path))
+        except OSError as error:
+            link.close()
+            raise StationError(
+                f"{self._socket_path}: the socket for STOP cannot be made ({error})."
+            ) from None
+        finally:
+            os.umask(old)
+        self._link = link
+        self._listen()
+
+    def round(self) -> None:
+        """Once in every round of the working loop, before anything else."""
+        if self._link is not None:
+            self._read()
+            self._tell()
+
+    def close(self) -> None:
+        if self._link is not None:
+            asyncio.get_running_loop().remove_reader(self._link)
+            self._link.close()
+            self._link = None
+        self._writer.shutdown(wait=False)
+        if self._descriptor >= 0:
+            for path in (self._socket_path, self._page_path):
+                with contextlib.suppress(OSError):
+                    path.unlink()
+
+    def _listen(self) -> None:
+        if self._link is not None:
+            asyncio.get_running_loop().add_reader(self._link, self._woken)
+
+    def _woken(self) -> None:
+        assert self._link is not None
+        loop = asyncio.get_running_loop()
+        loop.remove_reader(self._link)
+        loop.call_later(PAUSE_S, self._listen)
+        self._read()
+
+    def _read(self) -> None:
+        assert self._link is not None
+        sender, number = None, 0
+        while number < BATCH:
+            try:
+                _, ancillary, _, _ = self._link.recvmsg(1, _ANCILLARY_BYTES)
+            except BlockingIOError:
+                break
+            except OSError as error:
+                log.error("STOP's socket: %s", error)
+                break
+            number += 1
+            sender = sender or _sender(ancillary)
+        if number:
+            self._carry_out(sender or Sender(0, -1))
+
+    def _carry_out(self, sender: Sender) -> None:
+        now_s = time.monotonic()
+        self._stops += 1
+        if not self._latched():
+            self._latched_s = now_s
+        elif not self._moves() and now_s - self._repeated_s < REPEAT_S:
+            return  # the page is brought up to date in the next round
+        self._repeated_s = now_s
+        self._stop(sender)
+        self._tell()
+
+    def _page(self) -> Page:
+        return Page(os.getpid(), self._motion(), self._stops)
+
+    def _motion(self) -> Motion:
+        if self._speed_rad_s() is None:
+            return Motion.UNKNOWN
+        just_stopped = time.monotonic() - self._latched_s < SETTLE_S
+        return Motion.MOVES if self._moves() or just_stopped else Motion.RESTS
+
+    def _moves(self) -> bool:
+        speed_rad_s = self._speed_rad_s()
+        return speed_rad_s is not None and speed_rad_s > RESTING_RAD_S
+
+    def _tell(self) -> None:
+        """Writes the page when it changed; what is being written now goes first."""
+        if self._writing is not None and not self._writing.done():
+            return
+        if (page := self._page()) != self._said:
+            self._said = page
+            self._writing = self._writer.submit(self._write, page)
+
+    def _write(self, page: Page) -> None:
+        try:
+            write_page(self._descriptor, page)
+        except OSError as error:
+            log.error("%s: %s; `station stop` cannot be confirmed", self._page_path, error)
+
+
+def _sender(ancillary: list[tuple[int, int, bytes]]) -> Sender | None:
+    for level, kind, data in ancillary:
+        if (level, kind) == (socket.SOL_SOCKET, socket.SCM_CREDENTIALS):
+            pid, uid, _ = _CREDENTIALS.unpack(data[: _CREDENTIALS.size])
+            return Sender(pid, uid)
+    return None

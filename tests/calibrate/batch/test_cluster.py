@@ -1,0 +1,166 @@
+"""A batch on a real Dask scheduler, on loopback, with workers in processes of their own."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+
+import pytest
+
+from calibrate.batch.cluster import Cluster, ClusterError, cluster_solver
+from calibrate.batch.run import BatchError, BatchResult, Solved, Task, read_results, run_batch
+from calibrate.options import JobOptions
+from tests.calibrate.batch.test_run import in_this_process
+
+needs_distributed = pytest.mark.skipif(
+    shutil.which("dask", path=str(Path(sys.executable).parent)) is None,
+    reason="the optional extra `cluster` (dask distributed) is not installed",
+)
+
+
+def free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def listening_inodes(pid: int) -> set[str]:
+    """Sockets on which a process listens, by inode."""
+    mine = set()
+    for link in Path(f"/proc/{pid}/fd").iterdir():
+        with suppress(FileNotFoundError):  # closed meanwhile
+            mine.add(str(link.readlink()).removeprefix("socket:[").removesuffix("]"))
+    rows = [
+        line.split()
+        for name in ("tcp", "tcp6")
+        for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]
+    ]
+    return {row[9] for row in rows if row[3] == "0A"} & mine
+
+
+@contextmanager
+def dask_cluster(folder: Path, workers: int, tls: list[str] | None = None) -> Iterator[tuple[str, list[int]]]:
+    """(address, pids of the scheduler and the workers); ended with everything it started."""
+    dask = str(Path(sys.executable).parent / "dask")
+    address = f"{'tls' if tls else 'tcp'}://127.0.0.1:{free_port()}"
+    common = [*(tls or []), "--no-dashboard"]
+    place = ["--host", address.rpartition(":")[0], "--port", address.rpartition(":")[2]]
+    with ExitStack() as stack:
+        log = stack.enter_context((folder / "dask.log").open("wb"))
+
+        def start(*words: str) -> subprocess.Popen[bytes]:
+            environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parents[3])}
+            process = subprocess.Popen([dask, *words], stdout=log, stderr=log, cwd=folder, env=environment)
+            stack.callback(process.wait, 10)
+            stack.callback(process.kill)
+            return process
+
+        scheduler = start("scheduler", *place, *common).pid
+        alone = ["--no-nanny", "--nthreads", "1", "--host", "127.0.0.1", "--local-directory", str(folder)]
+        yield address, [scheduler, *(start("worker", address, *alone, *common).pid for _ in range(workers))]
+
+
+@pytest.fixture
+def recordings(session_file: Path, tmp_path: Path) -> list[Path]:
+    return [Path(shutil.copy(session_file, tmp_path / f"cell-{k}.mcap")) for k in range(4)]
+
+
+@needs_distributed
+@pytest.mark.process
+def test_a_killed_worker_loses_nothing_and_the_bits_are_the_pools(
+    recordings: list[Path], tmp_path: Path
+) -> None:
+    pool = run_batch(recordings, tmp_path / "pool", workers=2)
+    before = listening_inodes(os.getpid())
+    opened: set[str] = set()
+    with dask_cluster(tmp_path, workers=2) as (address, pids):
+
+        def kill_one(done: int, total: int, result: BatchResult) -> None:
+            if done == 1:
+                os.kill(pids[1], signal.SIGKILL)
+            opened.update(listening_inodes(os.getpid()) - before)
+
+        solver = cluster_solver(Cluster(address))
+        spread = run_batch(recordings, tmp_path / "dask", progress=kill_one, solver=solver)
+    assert [result.error for result in spread] == [""] * 4
+    assert [r.content_sha256 for r in spread] == [r.content_sha256 for r in pool]
+    assert not opened, "the client listens on a port of its own"
+    for result in spread:
+        assert (tmp_path / "dask" / result.calibration).is_file()
+
+
+@needs_distributed
+@pytest.mark.process
+def test_a_lost_scheduler_is_said_and_finished_results_are_kept(
+    recordings: list[Path], tmp_path: Path
+) -> None:
+    with dask_cluster(tmp_path, workers=1) as (address, pids):
+
+        def kill_scheduler(done: int, total: int, result: BatchResult) -> None:
+            os.kill(pids[0], signal.SIGKILL)
+
+        begun_s = time.monotonic()
+        with pytest.raises(BatchError, match=r"connection to tcp://.* is lost.*run the same command again"):
+            solver = cluster_solver(Cluster(address))
+            run_batch(recordings, tmp_path / "out", progress=kill_scheduler, solver=solver)
+        assert time.monotonic() - begun_s < 60
+    kept = [result.recording for result in read_results(tmp_path / "out") if result.solved]
+    assert kept
+    asked: list[str] = []
+
+    def counted(todo: Sequence[Task], options: JobOptions) -> Iterator[Solved]:
+        asked.extend(recording for recording, _ in todo)
+        return in_this_process(todo, options)
+
+    results = run_batch(recordings, tmp_path / "out", solver=counted)
+    assert all(result.solved for result in results)
+    assert not set(asked) & set(kept)
+
+
+@needs_distributed
+@pytest.mark.process
+@pytest.mark.skipif(shutil.which("openssl") is None, reason="no openssl to make certificates with")
+def test_over_tls_and_without_the_key_nobody_answers(recordings: list[Path], tmp_path: Path) -> None:
+    cert, key = tmp_path / "cert.pem", tmp_path / "key.pem"
+    make = "openssl req -x509 -newkey ec -pkeyopt ec_paramgen_curve:P-256 -nodes -days 2 -subj /CN=test"
+    subprocess.run([*make.split(), "-keyout", key, "-out", cert], check=True, capture_output=True)
+    tls = [f"--tls-ca-file={cert}", f"--tls-cert={cert}", f"--tls-key={key}"]
+    with dask_cluster(tmp_path, 1, tls) as (address, _):
+        there = Cluster(address, cert, cert, key)
+        solved = run_batch(recordings[:1], tmp_path / "tls", solver=cluster_solver(there))
+        assert [result.error for result in solved] == [""]
+        plain = Cluster(address.replace("tls", "tcp"))
+        with pytest.raises(BatchError, match="no scheduler answers"):
+            run_batch(recordings[1:2], tmp_path / "plain", solver=cluster_solver(plain))
+
+
+def test_what_cannot_be_meant_is_refused_with_the_next_step(tmp_path: Path) -> None:
+    for address in ("somewhere", "http://a:1", "tcp://host"):
+        with pytest.raises(ClusterError, match="tcp://HOST:PORT or tls://HOST:PORT"):
+            Cluster(address).check()
+    with pytest.raises(ClusterError, match="needs --tls-ca, --tls-cert and --tls-key"):
+        Cluster("tls://host:8786", tls_ca=tmp_path).check()
+    with pytest.raises(ClusterError, match="takes none of them"):
+        Cluster("tcp://host:8786", tmp_path, tmp_path, tmp_path).check()
+    with pytest.raises(ClusterError, match="does not exist"):
+        Cluster("tls://host:8786", *[tmp_path / "no.pem"] * 3).check()
+
+
+def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "distributed", None)
+    with pytest.raises(ClusterError, match=r"calibration-station\[cluster\]"):
+        cluster_solver(Cluster("tcp://127.0.0.1:8786"))
+
+
+def test_nothing_left_to_solve_needs_no_cluster(recordings: list[Path], tmp_path: Path) -> None:
+    run_batch(recordings[:1], tmp_path / "out", solver=in_this_process)
+    nobody = cluster_solver(Cluster("tcp://127.0.0.1:9")) if shutil.which("dask") else in_this_process
+    assert run_batch(recordings[:1], tmp_path / "out", solver=nobody)[0].solved

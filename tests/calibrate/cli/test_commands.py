@@ -1,0 +1,209 @@
+"""The command line's contract: JSON objects, exit codes, one-paragraph errors, nothing half-written."""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from calibrate.files.calibration import read_calibration, write_calibration
+from recordings.exporters.excerpt import write_excerpt
+from recordings.reader import open_recording
+from tests.calibrate.calling import refused, run
+from tests.calibrate.sessions import Scene, write_session
+
+
+def test_solve_json_is_exactly_the_contract(session_file: Path, tmp_path: Path) -> None:
+    done = run("solve", session_file, "-o", tmp_path / "c.yaml", "--json", cwd=tmp_path)
+    assert done.returncode in (0, 4), done.stderr
+    assert done.stdout.count("\n") == 1
+    answer = json.loads(done.stdout)
+    assert list(answer) == [
+        "mount", "result", "sigma", "covariance", "views", "intrinsics", "holdout", "certificate", "gates",
+        "verdict", "warnings", "cross_validation", "board", "session", "arm", "solve_ms",
+    ]  # fmt: skip
+    assert set(answer["result"]) == {
+        "parent_frame",
+        "child_frame",
+        "translation_m",
+        "rotation_xyzw",
+        "matrix",
+    }
+    assert set(answer["sigma"]) == {"translation_mm", "rotation_deg"}
+    assert set(answer["views"]) == {"used", "rejected", "weights"}
+    assert [view["index"] for view in answer["views"]["weights"]] == answer["views"]["used"]
+    assert set(answer["intrinsics"]) == {"width", "height", "matrix", "distortion", "rms_px"}
+    assert answer["holdout"] is None or set(answer["holdout"]) == {"e_t_m", "e_R"}
+    assert set(answer["certificate"]) == {"certified", "relative_gap", "objective", "distance_sigma"}
+    assert all(set(gate) == {"name", "passed", "value", "limit", "text"} for gate in answer["gates"])
+    assert answer["verdict"] == ("pass" if all(gate["passed"] for gate in answer["gates"]) else "fail")
+    assert all(set(warning) == {"code", "text"} for warning in answer["warnings"])
+    assert set(answer["cross_validation"]) == {"rms_mm", "rms_deg", "claimed_mm", "folds"}
+    assert set(answer["board"]) == {"scale", "anisotropy", "bend_m", "sigma"}
+    assert answer["session"]["hypothesis"] == "as-recorded"
+    assert answer["arm"] is None or set(answer["arm"]) == {"applied", "log_bayes", "size_mm", "table"}
+    assert np.array(answer["covariance"]).shape == (6, 6)
+    assert np.array(answer["result"]["matrix"]).shape == (4, 4)
+    assert done.returncode == (0 if all(gate["passed"] for gate in answer["gates"]) else 4)
+    written = read_calibration(tmp_path / "c.yaml")
+    assert written.result.translation_m == tuple(answer["result"]["translation_m"])
+
+
+def test_a_failed_gate_is_exit_4_and_the_file_is_written_and_will_not_install(
+    real_session_file: Path, tmp_path: Path
+) -> None:
+    (tmp_path / "gates.yaml").write_text("views: 20\n")
+    done = run("solve", real_session_file, "-o", "c.yaml", "--gates", "gates.yaml", cwd=tmp_path)
+    assert done.returncode == 4
+    assert "14 views were used" in done.stdout
+    refused(run("install", "c.yaml", cwd=tmp_path), 4, "not installed", "--override")
+    assert run("install", "c.yaml", "--override", "trial", cwd=tmp_path).returncode == 0
+    shown = run("show", "--json", cwd=tmp_path)
+    assert json.loads(shown.stdout)["override"]["reason"] == "trial"
+    for command in ("show", "list"):
+        assert "installed although refused" in " ".join(run(command, cwd=tmp_path).stdout.split())
+
+
+def test_solve_install_check_diff_rollback(real_session_file: Path, real_file: Path, tmp_path: Path) -> None:
+    """The operator's round: two calibrations, a look at each, a check, and back."""
+    second = tmp_path / "second.yaml"
+    calibration = read_calibration(real_file)
+    moved = np.array(calibration.result.matrix)
+    moved[0, 3] += 0.02
+    result = msgspec.structs.replace(
+        calibration.result,
+        matrix=tuple(map(tuple, moved.tolist())),
+        translation_m=tuple(moved[:3, 3].tolist()),
+    )
+    write_calibration(msgspec.structs.replace(calibration, result=result), second)
+    assert run("install", real_file, cwd=tmp_path).returncode == 0
+    own = run("check", real_session_file, cwd=tmp_path)
+    assert own.returncode == 1, own.stdout + own.stderr
+    assert own.stdout.startswith("PROVES NOTHING") and "HOLDS" not in own.stdout
+    answer = json.loads(run("check", real_session_file, "--json", cwd=tmp_path).stdout)
+    assert answer["own_views"] is True and answer["passed"] is False
+    excerpt = write_excerpt(open_recording(real_session_file), tmp_path / "excerpt.mcap")
+    assert run("check", excerpt, cwd=tmp_path).stdout.startswith("PROVES NOTHING")
+    later = Scene(views=6, seed=5)
+    new = write_session(tmp_path / "new.mcap", later, known_lens=True, source="real", name="later")
+    holds = run("check", new, "--json", cwd=tmp_path)
+    assert holds.returncode == 0, holds.stdout + holds.stderr
+    assert json.loads(holds.stdout)["passed"] is True and json.loads(holds.stdout)["own_views"] is False
+    installed = run("install", second, "--json", cwd=tmp_path)
+    assert json.loads(installed.stdout)["generation"] == 2
+    drifted = run("check", real_session_file, cwd=tmp_path)
+    assert drifted.returncode == 4
+    assert "DOES NOT HOLD" in drifted.stdout
+    apart = json.loads(run("diff", real_file, "--json", cwd=tmp_path).stdout)
+    assert apart["translation_mm"] == pytest.approx(20.0, abs=1e-6)
+    assert run("rollback", "--reason", "moved", cwd=tmp_path).returncode == 0
+    listed = json.loads(run("list", "--json", cwd=tmp_path).stdout)
+    assert [(row["generation"], row["current"]) for row in listed] == [(1, True), (2, False)]
+    session = calibration.provenance.session
+    assert [row["session"] for row in listed] == [session, session]
+    assert run("list", cwd=tmp_path).stdout.count(session) == 2
+    assert f"{session}, solved {calibration.created}" in run("show", cwd=tmp_path).stdout
+    text = run("export", "--to", "urdf", cwd=tmp_path)
+    assert text.stdout.count("<joint") == 2
+
+
+def test_simulated_never_installs_on_a_real_cell(session_file: Path, tmp_path: Path) -> None:
+    run("solve", session_file, "-o", "c.yaml", cwd=tmp_path)
+    refused(run("install", "c.yaml", "--override", "x", cwd=tmp_path), 1, "is simulated and is not installed")
+    refused(run("install", "c.yaml", "--cell", "simulated", cwd=tmp_path), 2, "name its place with --root")
+    assert not list((tmp_path / "state").rglob("*.yaml")), "the real cell's place is untouched"
+
+
+@pytest.mark.process
+def test_the_same_bits_in_two_processes(session_file: Path, tmp_path: Path) -> None:
+    """The lens is found from the pictures too; only the date may differ."""
+    for name in ("a.yaml", "b.yaml"):
+        command = [
+            sys.executable,
+            "-m",
+            "calibrate.cli",
+            "solve",
+            str(session_file),
+            "-o",
+            str(tmp_path / name),
+        ]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=100, check=False)
+        assert done.returncode in (0, 4), done.stderr
+    first, second = ((tmp_path / name).read_text().splitlines() for name in ("a.yaml", "b.yaml"))
+    different = [a for a, b in zip(first, second, strict=True) if a != b]
+    assert all(line.startswith("created:") for line in different), different
+
+
+def test_lenses_of_different_picture_sizes_are_not_compared(real_file: Path, tmp_path: Path) -> None:
+    calibration = read_calibration(real_file)
+    lens = msgspec.structs.replace(calibration.intrinsics, width=2 * calibration.intrinsics.width)
+    write_calibration(msgspec.structs.replace(calibration, intrinsics=lens), tmp_path / "wide.yaml")
+    said = run("diff", real_file, "wide.yaml", cwd=tmp_path).stdout
+    assert "pictures of different sizes" in said and "camera matrix differs" not in said
+    plain = json.loads(run("diff", real_file, "wide.yaml", "--json", cwd=tmp_path).stdout)
+    assert plain["lens_matrix_px"] is None
+
+
+def test_names_are_printed_as_they_are(real_file: Path, tmp_path: Path) -> None:
+    """Brackets and colons are no markup: the command that is offered next must work as it stands."""
+    name = "c[red]:bug:.yaml"
+    shutil.copy(real_file, tmp_path / name)
+    assert name in run("diff", name, real_file, cwd=tmp_path).stdout
+    board = run("board", "-o", "b[a]:bug:.pdf", cwd=tmp_path)
+    assert board.stdout.startswith("written: b[a]:bug:.pdf (")
+
+
+def test_the_board_prints(tmp_path: Path) -> None:
+    done = run("board", "-o", "b.pdf", "--paper", "A4", cwd=tmp_path)
+    assert done.returncode == 0
+    assert (tmp_path / "b.pdf").read_bytes().startswith(b"%PDF-")
+    warned = run("board", "-o", "b.svg", "--columns", 11, "--rows", 9, cwd=tmp_path)
+    assert "looks the same when turned by 180°" in " ".join(warned.stderr.split())
+    refused(run("board", "-o", "b.png", cwd=tmp_path), 2, ".pdf or .svg")
+
+
+def test_batch_solves_the_rest_and_goes_on_where_it_was(session_file: Path, tmp_path: Path) -> None:
+    recordings = [shutil.copy(session_file, tmp_path / f"r{k}.mcap") for k in range(2)]
+    cut = tmp_path / "cut.mcap"
+    cut.write_bytes(session_file.read_bytes()[:-5000])
+    done = run("batch", *recordings, cut, "-o", "out", "--json", cwd=tmp_path)
+    assert done.returncode == 3, done.stderr
+    rows = [json.loads(line) for line in done.stdout.splitlines()]
+    assert [row["solved"] for row in rows] == [True, True, False]
+    assert "recordings recover" in rows[2]["error"]
+    assert rows[0]["translation_m"] == rows[1]["translation_m"]
+    with (tmp_path / "out/results.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == 3
+    before = (tmp_path / "out/results.jsonl").read_text().splitlines()
+    again = run("batch", *recordings, "-o", "out", "--json", cwd=tmp_path)
+    assert again.returncode == 0
+    assert (tmp_path / "out/results.jsonl").read_text().splitlines() == before
+    assert "No camera moved" in (tmp_path / "out/trends.txt").read_text()
+    assert "No camera moved" in (tmp_path / "out/trends.html").read_text()
+    alone = run("solve", recordings[0], "-o", "alone.yaml", cwd=tmp_path)
+    assert alone.returncode in (0, 4)
+    pooled = read_calibration(tmp_path / "out" / rows[0]["calibration"])
+    assert pooled.result == read_calibration(tmp_path / "alone.yaml").result
+
+
+def test_the_report_is_one_page_with_no_network(session_file: Path, tmp_path: Path) -> None:
+    done = run("report", session_file, "-o", "r.html", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    page = (tmp_path / "r.html").read_text()
+    body = page.replace("http://www.w3.org/", "")
+    assert "http://" not in body.replace("http://purl.org/", "").replace("http://creativecommons.org/", "")
+    assert "https://" not in body
+    assert "<script" not in body
+    first = page.index('class="verdict')
+    assert first < page.index("Gates")
+    assert "SIMULATED" in page[: first + 200]
+    assert page.count("data:image/jpeg") == 10
+    for heading in ("Where the error comes from", "Residuals", "Every method", "Lens", "Where it comes from"):
+        assert heading in page

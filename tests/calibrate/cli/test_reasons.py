@@ -1,0 +1,73 @@
+"""A person's reason is words; going back leads to another solve; what speaks against one is told before."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from calibrate.files.calibration import Touch, read_calibration
+from calibrate.files.generations import InstallError, before_current, generations
+from calibrate.files.install import install, load_installed, objections_beside, reason_problem, rollback
+from calibrate.files.verification import note_installed
+
+MakeFile = Callable[..., Path]
+HAND = Touch(0, (0.0, 0.0), (9.0, 0.0), (0.1, 0.1), "told by a person", "anna", "2026-01-01T00:00:00+00:00")
+
+
+@pytest.mark.parametrize("said", ["", "x", "ok", "...", "aaaaaaaaaa", "12345678", "test"])
+def test_a_keypress_is_no_reason(said: str) -> None:
+    assert "in words" in reason_problem(said)
+
+
+@pytest.mark.parametrize("said", ["line is down, checked with a pointer", "trial", "标定板移动了"])
+def test_words_are_one_in_any_script(said: str) -> None:
+    assert reason_problem(said) == ""
+
+
+def test_who_overrules_or_takes_back_says_it_in_words(make_file: MakeFile, tmp_path: Path) -> None:
+    install(make_file(), tmp_path)
+    doubted = make_file(0.001, verification=[HAND])
+    with pytest.raises(InstallError, match="in words"):
+        install(doubted, tmp_path, override="x")
+    assert install(doubted, tmp_path, override="the board was bent").number == 2
+    with pytest.raises(InstallError, match="in words"):
+        rollback(tmp_path, reason="x")
+    assert [g.current for g in generations(tmp_path)] == [False, True]
+    rollback(tmp_path)  # nobody must say why he goes back
+
+
+def test_going_back_passes_the_checks_by_hand_of_the_same_solve(make_file: MakeFile, tmp_path: Path) -> None:
+    """Who finds it off by hand and goes back must not get the same one without the finding."""
+    first = make_file()
+    install(first, tmp_path)
+    install(make_file(0.001), tmp_path)
+    note_installed(tmp_path, [HAND])
+    assert [g.number for g in generations(tmp_path)] == [1, 2, 3]
+    assert rollback(tmp_path).number == 1
+    assert load_installed(tmp_path).result == read_calibration(first).result
+
+
+def test_a_check_by_hand_alone_is_nothing_to_go_back_to(make_file: MakeFile, tmp_path: Path) -> None:
+    install(make_file(), tmp_path)
+    note_installed(tmp_path, [HAND])
+    assert before_current(generations(tmp_path)) is None
+    with pytest.raises(InstallError, match="no older"):
+        rollback(tmp_path)
+
+
+def test_what_speaks_against_it_beside_its_gates_is_known_before(make_file: MakeFile, tmp_path: Path) -> None:
+    install(make_file(), tmp_path)
+    now = load_installed(tmp_path)
+    assert objections_beside(now, tmp_path) == []
+    assert objections_beside(now, tmp_path / "empty") == []
+    error_mm = now.quality.predicted_error_mm
+    assert error_mm is not None
+    quality = msgspec.structs.replace(now.quality, predicted_error_mm=3 * error_mm)
+    (worse,) = objections_beside(msgspec.structs.replace(now, quality=quality), tmp_path)
+    assert "no worse" in worse
+    robot = msgspec.structs.replace(now.robot, serial="2099999999")
+    (other,) = objections_beside(msgspec.structs.replace(now, robot=robot), tmp_path)
+    assert "2099999999" in other

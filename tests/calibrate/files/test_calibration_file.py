@@ -1,0 +1,147 @@
+"""A calibration file reads back whole, or says what is wrong with it."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import yaml
+
+from calibrate.files.calibration import (
+    CalibrationFileError,
+    decode_calibration,
+    encode_calibration,
+    read_calibration,
+    write_calibration,
+    write_output,
+)
+from calibrate.geometry import FrameMismatchError, Transform
+from calibrate.pipeline import SolvedRecording
+
+
+def test_everything_reads_back_as_it_was(solved_real: SolvedRecording, tmp_path: Path) -> None:
+    path = tmp_path / "c.yaml"
+    write_calibration(solved_real.calibration, path)
+    assert msgspec.json.encode(read_calibration(path)) == msgspec.json.encode(solved_real.calibration)
+    assert [p.name for p in tmp_path.iterdir()] == ["c.yaml"]
+
+
+def test_the_format_stands_first_and_is_plain_yaml(real_file: Path) -> None:
+    lines = real_file.read_text().splitlines()
+    assert lines[0] == "format: handeye-calibration/1"
+    plain = yaml.safe_load(real_file.read_text())
+    assert len(plain["covariance"]) == 6
+    assert plain["provenance"]["recording_sha256"]
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("translation_m:", "translation_m: "),
+        ("eye-in-hand", "eye-to-hand"),
+        ("passed: true", "passed: false"),
+    ],
+)
+def test_any_edit_is_noticed(real_file: Path, old: str, new: str) -> None:
+    """Fault 49. Layout may change, content may not."""
+    text = real_file.read_text()
+    assert old in text
+    edited = text.replace(old, new, 1)
+    if yaml.safe_load(edited) == yaml.safe_load(text):
+        decode_calibration(edited.encode(), "x")
+    else:
+        with pytest.raises(CalibrationFileError, match="does not fit its hash"):
+            decode_calibration(edited.encode(), "x")
+
+
+def test_no_flipped_digit_of_the_result_passes(real_file: Path) -> None:
+    lines = real_file.read_text().splitlines(keepends=True)
+    place = next(k for k, line in enumerate(lines) if "translation_m" in line)
+    for column, letter in enumerate(lines[place]):
+        if not letter.isdigit() or lines[place][:column].count("[") == 0:
+            continue
+        changed = lines[place][:column] + str((int(letter) + 1) % 10) + lines[place][column + 1 :]
+        if yaml.safe_load(changed) == yaml.safe_load(lines[place]):
+            continue
+        with pytest.raises(CalibrationFileError):
+            decode_calibration("".join([*lines[:place], changed, *lines[place + 1 :]]).encode(), "x")
+
+
+def test_a_cut_file_is_refused_at_every_length(real_file: Path) -> None:
+    content = real_file.read_bytes()
+    for size in range(0, len(content) - 1, max(1, len(content) // 97)):
+        with pytest.raises(CalibrationFileError):
+            decode_calibration(content[:size], "cut")
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        b"",
+        b"\xff\xfe\x00",
+        b"[" * 5000,
+        b"format: handeye-calibration/2\n",
+        b"a: &a [1]\nformat: handeye-calibration/1\nb: *a\n",
+        b"format: handeye-calibration/1\nsha256: 0\n",
+        b"- 1\n",
+    ],
+)
+def test_other_files_are_refused_in_words(content: bytes) -> None:
+    with pytest.raises(CalibrationFileError, match=r"here\.yaml"):
+        decode_calibration(content, "here.yaml")
+
+
+def test_a_result_that_contradicts_itself_is_refused_even_with_a_right_hash(
+    solved_real: SolvedRecording,
+) -> None:
+    good = solved_real.calibration
+    moved = msgspec.structs.replace(good.result, translation_m=(0.0, 0.0, 0.0))
+    swapped = msgspec.structs.replace(good.result, parent_frame="camera", child_frame="flange")
+    skewed = msgspec.structs.replace(
+        good.result, matrix=tuple(tuple(2.0 * v for v in row) for row in good.result.matrix)
+    )
+    for result, text in ((moved, "do not agree"), (swapped, "flange_from_camera"), (skewed, "rigid")):
+        content = encode_calibration(msgspec.structs.replace(good, result=result))
+        with pytest.raises(CalibrationFileError, match=text):
+            decode_calibration(content, "x")
+
+
+@pytest.mark.parametrize(("row", "column", "value"), [(0, 0, -1e-6), (0, 1, 1e-6), (2, 2, float("inf"))])
+def test_a_covariance_that_is_none_is_refused_even_with_a_right_hash(
+    solved_real: SolvedRecording, row: int, column: int, value: float
+) -> None:
+    """Negative along a direction, not symmetric, not finite."""
+    good = solved_real.calibration
+    rows = [list(line) for line in good.covariance]
+    rows[row][column] = value
+    wrong = msgspec.structs.replace(good, covariance=tuple(tuple(line) for line in rows))
+    with pytest.raises(CalibrationFileError, match="covariance"):
+        decode_calibration(encode_calibration(wrong), "x")
+
+
+def test_frames_that_do_not_touch_are_refused(real_file: Path) -> None:
+    """Fault 43: the loaded transform knows its frames."""
+    flange_from_camera = read_calibration(real_file).transform
+    camera_from_board = Transform("camera", "board", np.eye(4))
+    assert (flange_from_camera @ camera_from_board).parent == "flange"
+    with pytest.raises(FrameMismatchError):
+        camera_from_board @ flange_from_camera
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_scraps(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path = tmp_path / "c.yaml"
+    path.write_bytes(b"old")
+
+    def fail(descriptor: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(os, "fsync", fail)
+    with pytest.raises(CalibrationFileError, match="No space left"):
+        write_output(path, b"new")
+    assert path.read_bytes() == b"old"
+    assert [p.name for p in tmp_path.iterdir()] == ["c.yaml"]

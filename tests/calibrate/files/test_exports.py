@@ -1,0 +1,283 @@
+"""Every export reads back, by its reader's own rule, as the transform and the lens it came from."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import re
+import shlex
+import sys
+import types
+import xml.etree.ElementTree as ElementTree
+from pathlib import Path
+from typing import Any
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+import yaml
+from scipy.spatial.transform import Rotation
+
+from calibrate.files.calibration import Calibration, FramePose
+from calibrate.files.exports import FORMATS, ExportError, export
+from calibrate.files.exports.frames import FrameNames
+from calibrate.geometry import Array, Transform, pose, pose_from_rotvec, rotation_exp
+from calibrate.pipeline import SolvedRecording
+
+
+@pytest.fixture(params=["eye-in-hand", "eye-to-hand"])
+def calibration(request: pytest.FixtureRequest, solved_real: SolvedRecording) -> Calibration:
+    """A result with nothing symmetric in it."""
+    parent = "flange" if request.param == "eye-in-hand" else "base"
+    X = pose(rotation_exp([0.4, -2.1, 1.3]), [0.123456789, -0.5, 1.75])
+    return msgspec.structs.replace(
+        solved_real.calibration, mount=request.param, result=FramePose.of(Transform(parent, "camera", X))
+    )
+
+
+def parent_of(calibration: Calibration) -> str:
+    return "tool0" if calibration.mount == "eye-in-hand" else "base"
+
+
+def same(found: Array, calibration: Calibration, tolerance: float = 1e-12) -> None:
+    assert np.abs(found - calibration.transform.matrix).max() < tolerance
+
+
+def static_transform(arguments: list[str]) -> tuple[str, str, Array]:
+    """tf2_ros's rule: named options, quaternion."""
+    parser = argparse.ArgumentParser()
+    for name in ("x", "y", "z", "qx", "qy", "qz", "qw"):
+        parser.add_argument(f"--{name}", type=float, required=True)
+    parser.add_argument("--frame-id", required=True)
+    parser.add_argument("--child-frame-id", required=True)
+    got = parser.parse_args(arguments)
+    R = Rotation.from_quat([got.qx, got.qy, got.qz, got.qw]).as_matrix()
+    return got.frame_id, got.child_frame_id, pose(R, [got.x, got.y, got.z])
+
+
+def test_static_transform_publisher(calibration: Calibration) -> None:
+    line = export(calibration, "ros-static-transform").splitlines()[-1]
+    words = shlex.split(line)
+    assert words[:4] == ["ros2", "run", "tf2_ros", "static_transform_publisher"]
+    parent, child, X = static_transform(words[4:])
+    assert (parent, child) == (parent_of(calibration), "camera_optical_frame")
+    same(X, calibration)
+
+
+def launched(text: str, monkeypatch: pytest.MonkeyPatch) -> dict[str, Any]:
+    """The one node that a launch file makes, as `ros2 launch` would be told of it."""
+    made: list[dict[str, Any]] = []
+    actions = types.ModuleType("launch_ros.actions")
+    actions.Node = lambda **options: made.append(options)  # type: ignore[attr-defined]
+    launch = types.ModuleType("launch")
+    launch.LaunchDescription = list  # type: ignore[attr-defined]
+    for name, module in (
+        ("launch", launch),
+        ("launch_ros", types.ModuleType("launch_ros")),
+        ("launch_ros.actions", actions),
+    ):
+        monkeypatch.setitem(sys.modules, name, module)
+    space: dict[str, Any] = {}
+    exec(compile(text, "cell.launch.py", "exec"), space)
+    space["generate_launch_description"]()
+    (node,) = made
+    return node
+
+
+def test_launch_file_runs_and_publishes_the_same(
+    calibration: Calibration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    node = launched(export(calibration, "ros-launch"), monkeypatch)
+    assert (node["package"], node["executable"]) == ("tf2_ros", "static_transform_publisher")
+    parent, child, X = static_transform(node["arguments"])
+    assert (parent, child) == (parent_of(calibration), "camera_optical_frame")
+    same(X, calibration)
+
+
+def test_frame_names_of_any_kind_stay_names(
+    calibration: Calibration, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In Python and in a shell; a node's name may hold letters, digits and underscores only."""
+    odd = FrameNames(camera='cell 1/cam\'s "eye"')
+    node = launched(export(calibration, "ros-launch", odd), monkeypatch)
+    assert static_transform(node["arguments"])[1] == odd.camera
+    assert re.fullmatch(r"[A-Za-z]\w*", node["name"], re.ASCII)
+    line = export(calibration, "ros-static-transform", odd).splitlines()[-1]
+    assert static_transform(shlex.split(line)[4:])[1] == odd.camera
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_a_session_name_never_leaves_the_comment(calibration: Calibration, name: str) -> None:
+    evil = msgspec.structs.replace(calibration.provenance, session="x\nimport os\n")
+    text = export(msgspec.structs.replace(calibration, provenance=evil), name)
+    assert "import os" not in text.splitlines()
+
+
+def urdf_origin(joint: ElementTree.Element) -> Array:
+    """URDF's rule: rpy about fixed axes, R = Rz Ry Rx."""
+    origin = joint.find("origin")
+    assert origin is not None
+    xyz = [float(v) for v in origin.attrib["xyz"].split()]
+    r, p, y = (float(v) for v in origin.attrib["rpy"].split())
+    R = rotation_exp([0, 0, y]) @ rotation_exp([0, p, 0]) @ rotation_exp([r, 0, 0])
+    return pose(R, xyz)
+
+
+def test_a_name_with_hyphens_does_not_end_the_urdfs_comment(calibration: Calibration) -> None:
+    named = msgspec.structs.replace(calibration.provenance, session="a--b---c----")
+    text = export(msgspec.structs.replace(calibration, provenance=named), "urdf")
+    assert len(ElementTree.fromstring(f"<robot name='x'>{text}</robot>")) == 4
+    assert "a- -b- - -c- - - -" in text
+
+
+def test_urdf_chain_ends_in_the_optical_frame(calibration: Calibration) -> None:
+    tree = ElementTree.fromstring(f"<robot name='x'>{export(calibration, 'urdf')}</robot>")
+    first, second = tree.findall("joint")
+    assert first.find("parent").attrib["link"] == parent_of(calibration)  # type: ignore[union-attr]
+    assert first.find("child").attrib["link"] == second.find("parent").attrib["link"] == "camera_link"  # type: ignore[union-attr]
+    assert second.find("child").attrib["link"] == "camera_optical_frame"  # type: ignore[union-attr]
+    body, optical = urdf_origin(first), urdf_origin(second)
+    same(body @ optical, calibration)
+    # REP-103: what the optical frame has ahead (z), the body has along x; optical right (x) is body -y.
+    assert optical[:3, :3] @ [0, 0, 1] == pytest.approx([1, 0, 0])
+    assert optical[:3, :3] @ [1, 0, 0] == pytest.approx([0, -1, 0])
+
+
+@pytest.mark.parametrize("off_rad", [0.0, 1e-9, 1e-7])
+@pytest.mark.parametrize("roll_rad", [0.0, np.pi, -2.3])
+def test_urdf_of_a_camera_that_looks_straight_along_the_flange(
+    calibration: Calibration, off_rad: float, roll_rad: float
+) -> None:
+    """The usual mount: its body frame is pitched by 90°, where roll and yaw turn about the same axis."""
+    R = rotation_exp([0.0, 0.0, roll_rad]) @ rotation_exp([0.6 * off_rad, -0.8 * off_rad, 0.0])
+    transform = Transform(calibration.result.parent_frame, "camera", pose(R, [0.0, 0.0, 0.1]))
+    straight = msgspec.structs.replace(calibration, result=FramePose.of(transform))
+    tree = ElementTree.fromstring(f"<robot name='x'>{export(straight, 'urdf')}</robot>")
+    body, optical = (urdf_origin(joint) for joint in tree.findall("joint"))
+    same(body @ optical, straight)
+
+
+def test_easy_handeye2(calibration: Calibration) -> None:
+    plain = yaml.safe_load(export(calibration, "easy-handeye2"))
+    kind, parent_key = {
+        "eye-in-hand": ("eye_in_hand", "robot_effector_frame"),
+        "eye-to-hand": ("eye_on_base", "robot_base_frame"),
+    }[calibration.mount]
+    parameters = plain["parameters"]
+    assert parameters["calibration_type"] == kind
+    assert parameters[parent_key] == parent_of(calibration)
+    assert parameters["tracking_base_frame"] == "camera_optical_frame"
+    assert set(parameters) == {
+        "name", "calibration_type", "tracking_base_frame", "tracking_marker_frame", "robot_base_frame",
+        "robot_effector_frame", "freehand_robot_movement", "move_group_namespace", "move_group",
+    }  # fmt: skip
+    assert parameters["freehand_robot_movement"] is True  # no MoveIt is asked for
+    t, q = plain["transform"]["translation"], plain["transform"]["rotation"]
+    R = Rotation.from_quat([q["x"], q["y"], q["z"], q["w"]]).as_matrix()
+    same(pose(R, [t["x"], t["y"], t["z"]]), calibration)
+
+
+def test_camera_info(calibration: Calibration) -> None:
+    text = export(calibration, "ros-camera-info")
+    plain = yaml.safe_load(text)
+    order = [
+        "image_width", "image_height", "camera_name", "camera_matrix", "distortion_model",
+        "distortion_coefficients", "rectification_matrix", "projection_matrix",
+    ]  # fmt: skip
+    assert list(plain) == order
+    camera = calibration.intrinsics
+    assert (plain["image_width"], plain["image_height"]) == (camera.width, camera.height)
+    assert np.array(plain["camera_matrix"]["data"]).reshape(3, 3).tolist() == [list(r) for r in camera.matrix]
+    assert plain["distortion_model"] == "plumb_bob"
+    assert plain["distortion_coefficients"] == {"rows": 1, "cols": 5, "data": list(camera.distortion)}
+    assert plain["camera_name"] == "camera"
+    assert plain["rectification_matrix"] == {"rows": 3, "cols": 3, "data": np.eye(3).ravel().tolist()}
+    P = np.array(plain["projection_matrix"]["data"]).reshape(3, 4)
+    assert P[:, :3].tolist() == [list(r) for r in camera.matrix]
+    assert not P[:, 3].any()
+
+
+@pytest.mark.parametrize(
+    ("model", "given", "named", "count"),
+    [
+        ("equidistant", 4, "equidistant", 4),
+        ("rational_polynomial", 8, "rational_polynomial", 8),
+        ("plumb_bob", 8, "rational_polynomial", 8),  # ROS's plumb_bob has five
+        ("plumb_bob", 4, "plumb_bob", 5),
+    ],
+)
+def test_camera_info_of_other_lenses(
+    calibration: Calibration, model: str, given: int, named: str, count: int
+) -> None:
+    lens = msgspec.structs.replace(
+        calibration.intrinsics, distortion_model=model, distortion=tuple(0.01 * k for k in range(given))
+    )
+    plain = yaml.safe_load(export(msgspec.structs.replace(calibration, intrinsics=lens), "ros-camera-info"))
+    found = plain["distortion_coefficients"]
+    assert (plain["distortion_model"], found["cols"]) == (named, count)
+    assert found["data"] == [*lens.distortion, *[0.0] * (count - given)]
+
+
+def test_camera_info_is_named_by_the_body_frame(calibration: Calibration) -> None:
+    for body, name in (("left_eye_link", "left_eye"), ("_link", "camera")):
+        assert (
+            yaml.safe_load(export(calibration, "ros-camera-info", FrameNames(body=body)))["camera_name"]
+            == name
+        )
+
+
+def test_opencv_file_storage(calibration: Calibration, tmp_path: Path) -> None:
+    path = tmp_path / "c.yml"
+    path.write_text(export(calibration, "opencv"))
+    assert path.read_text().startswith("%YAML:1.0")
+    storage = cv2.FileStorage(str(path), cv2.FILE_STORAGE_READ)
+    result = calibration.result
+    same(storage.getNode(f"{result.parent_frame}_from_camera").mat(), calibration, 1e-15)
+    K = storage.getNode("camera_matrix").mat()
+    assert K.tolist() == [list(r) for r in calibration.intrinsics.matrix]
+    assert storage.getNode("distortion_coefficients").mat().shape == (1, 5)
+    assert storage.getNode("mount").string() == calibration.mount
+    assert storage.getNode("source").string() == calibration.source
+    assert storage.getNode("distortion_model").string() == "plumb_bob"
+    size = (storage.getNode("image_width").real(), storage.getNode("image_height").real())
+    assert size == (calibration.intrinsics.width, calibration.intrinsics.height)
+    np.testing.assert_array_equal(storage.getNode("covariance").mat(), calibration.covariance)
+    assert calibration.provenance.session in path.read_text()
+
+
+def test_json(calibration: Calibration) -> None:
+    plain = json.loads(export(calibration, "json"))
+    same(np.array(plain["result"]["matrix"]), calibration)
+    assert msgspec.convert(plain, Calibration) == calibration
+
+
+def test_ur_tool_by_the_pendants_rule(calibration: Calibration) -> None:
+    """Typed: mm and a rotation vector. In URScript: metres."""
+    text = export(calibration, "ur-tool")
+    typed = {name: float(v) for name, v in re.findall(r"^(X|Y|Z|RX|RY|RZ) +(-?[\d.]+)", text, re.MULTILINE)}
+    X = pose_from_rotvec([typed[k] / 1000 for k in "XYZ"], [typed[k] for k in ("RX", "RY", "RZ")])
+    same(X, calibration, 2e-6)
+    numbers = re.search(r"p\[([^\]]+)\]", text)
+    assert numbers is not None
+    values = [float(v) for v in numbers[1].split(",")]
+    same(pose_from_rotvec(values[:3], values[3:]), calibration, 1e-9)
+    assert ("set_tcp(" in text) == (calibration.mount == "eye-in-hand")
+    assert ("Installation > TCP: " in text) == (calibration.mount == "eye-in-hand")
+    assert ("Installation > Features: " in text) == (calibration.mount == "eye-to-hand")
+
+
+@pytest.mark.parametrize("name", FORMATS)
+def test_simulated_is_stamped_in_every_format(calibration: Calibration, name: str) -> None:
+    text = export(msgspec.structs.replace(calibration, source="simulated"), name)
+    assert "simulated" in text.lower()
+
+
+def test_other_frame_names_and_unknown_formats(calibration: Calibration) -> None:
+    text = export(
+        calibration, "ros-static-transform", FrameNames(base="cell_base", flange="flange_b", camera="cam")
+    )
+    parent = "flange_b" if calibration.mount == "eye-in-hand" else "cell_base"
+    assert f"--frame-id {parent} --child-frame-id cam" in text
+    with pytest.raises(ExportError, match="there is no format 'nix'"):
+        export(calibration, "nix")

@@ -1,0 +1,152 @@
+"""What lies in the folder of installed calibrations, what reaches the disk when, and what does not fit."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from calibrate.files import generations as module
+from calibrate.files.calibration import CalibrationFileError, FramePose, read_calibration, write_calibration
+from calibrate.files.generations import InstallError, generations, read_log
+from calibrate.files.install import change_text, install, load_installed, rollback
+from calibrate.geometry import Transform, perturb
+from calibrate.pipeline import SolvedRecording
+from tests.durability import disk_order
+
+
+def test_nothing_points_to_a_calibration_before_it_is_on_the_disk(  # type: ignore[no-untyped-def]
+    make_file, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """After a power loss at any moment there is the old one or the new one, and its log."""
+    root, path = tmp_path / "s", make_file()
+    with disk_order(monkeypatch) as order:
+        made = install(path, root).path.name
+    temporary = order[0].removeprefix("sync ")
+    assert order == [
+        f"sync {temporary}",
+        f"rename {temporary} {made}",
+        "sync gen",
+        "rename current.new current",
+        "sync calibrations",
+        "sync log.jsonl",
+    ]
+
+
+def test_a_calibration_file_is_whole_before_it_has_its_name(
+    solved_real: SolvedRecording, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with disk_order(monkeypatch) as order:
+        write_calibration(solved_real.calibration, tmp_path / "c.yaml")
+    temporary = order[0].removeprefix("sync ")
+    assert order == [f"sync {temporary}", f"rename {temporary} c.yaml", f"sync {tmp_path.name}"]
+
+
+@pytest.mark.parametrize("what", ["generation", "current"])
+def test_what_does_not_read_back_as_written_is_not_installed(  # type: ignore[no-untyped-def]
+    make_file, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, what: str
+) -> None:
+    """A disk that says yes and keeps something else."""
+    root, old, new = tmp_path / "s", make_file(), make_file(0.001)
+    install(old, root)
+    if what == "generation":
+        write = module.write_atomically
+        monkeypatch.setattr(module, "write_atomically", lambda path, content: write(path, content[:-40]))
+        with pytest.raises(CalibrationFileError):
+            install(new, root)
+        assert load_installed(root) == read_calibration(old)
+    else:
+        read = Path.read_bytes
+        monkeypatch.setattr(
+            Path, "read_bytes", lambda self: read(self)[: -1 if self.name == "current" else None]
+        )
+        with pytest.raises(InstallError, match="does not read back"):
+            install(new, root)
+    assert len(read_log(root)) == 1
+
+
+@pytest.mark.parametrize(
+    ("fails", "says"), [("write_atomically", "Nothing was switched"), ("append_line", "0002-")]
+)
+def test_a_full_disk_says_what_is_installed_now(  # type: ignore[no-untyped-def]
+    make_file, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails: str, says: str
+) -> None:
+    """The log is written last: when that fails, the switch has been made."""
+    install(make_file(0.0), tmp_path / "root")
+
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(f"calibrate.files.generations.{fails}", full)
+    with pytest.raises(InstallError, match=f"No space left on device. {says}"):
+        install(make_file(1e-4), tmp_path / "root")
+    current = next(g.number for g in generations(tmp_path / "root") if g.current)
+    assert current == (1 if fails == "write_atomically" else 2)
+
+
+def test_files_of_others_beside_the_generations_are_left_alone(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    root = tmp_path / "s"
+    install(make_file(), root)
+    (root / "calibrations/gen/0009-notes.yaml").write_text("mine")
+    assert [g.number for g in generations(root)] == [1]
+    assert install(make_file(0.001), root).number == 2
+
+
+def test_rollback_passes_over_a_damaged_generation(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    root = tmp_path / "s"
+    for k in range(3):
+        install(make_file(0.0001 * k), root)
+    middle = generations(root)[1]
+    middle.path.write_bytes(middle.path.read_bytes()[:-40])
+    assert rollback(root).number == 1
+    with pytest.raises(InstallError, match="generation 2 is damaged"):
+        rollback(root, to=2)
+    assert [(g.number, g.current, bool(g.problem)) for g in generations(root)] == [
+        (1, True, False),
+        (2, False, True),
+        (3, False, False),
+    ]
+
+
+def test_a_change_is_told_in_millimetres_and_degrees(solved_real: SolvedRecording) -> None:
+    before = solved_real.calibration
+    delta = [0.0, 0.0003, -0.0004, np.radians(0.03), 0.0, np.radians(0.04)]
+    moved = Transform("flange", "camera", perturb(before.transform.matrix, np.array(delta)))
+    after = msgspec.structs.replace(before, result=FramePose.of(moved))
+    assert change_text(before, after) == "0.500 mm, 0.0500° from the one before"
+    assert change_text(None, after) == ""
+    fixed = FramePose.of(Transform("base", "camera", moved.matrix))
+    assert change_text(before, msgspec.structs.replace(after, mount="eye-to-hand", result=fixed)) == ""
+
+
+def test_what_was_configured_for_the_cell_is_held_against_the_file(  # type: ignore[no-untyped-def]
+    make_file, solved_real: SolvedRecording, tmp_path: Path
+) -> None:
+    robot, camera = solved_real.calibration.robot, solved_real.calibration.camera
+    with pytest.raises(InstallError, match=f"of camera {camera.serial}, the cell has 4712"):
+        install(make_file(), tmp_path / "s", camera_serial="4712")
+    with pytest.raises(InstallError, match=f"of robot {robot.serial}, the cell has 4711"):
+        install(make_file(), tmp_path / "s", robot_serial="4711")
+    unknown = make_file(robot=msgspec.structs.replace(robot, serial=""))
+    with pytest.raises(InstallError, match="of robot unknown, the cell has 4711"):
+        install(unknown, tmp_path / "s", robot_serial="4711")
+    assert generations(tmp_path / "s") == []
+    install(make_file(), tmp_path / "s", robot_serial=robot.serial, camera_serial=camera.serial)
+
+
+@pytest.mark.parametrize("part", ["robot", "camera"])
+def test_another_model_with_the_same_serial_is_another_device(  # type: ignore[no-untyped-def]
+    make_file, solved_real: SolvedRecording, tmp_path: Path, part: str
+) -> None:
+    install(make_file(), tmp_path / "s")
+    other = msgspec.structs.replace(getattr(solved_real.calibration, part), model="other")
+    with pytest.raises(InstallError, match=f"of {part} other"):
+        install(make_file(**{part: other}), tmp_path / "s")
+
+
+def test_another_mount_does_not_follow(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    install(make_file(), tmp_path / "s")
+    with pytest.raises(InstallError, match="It is eye-to-hand, the installed one eye-in-hand"):
+        install(make_file(mount="eye-to-hand"), tmp_path / "s")

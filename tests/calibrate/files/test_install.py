@@ -1,0 +1,301 @@
+"""Old or new, never neither; and only what belongs on this cell."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from calibrate.cli import main
+from calibrate.files.calibration import (
+    Calibration,
+    CalibrationFileError,
+    Gate,
+    Touch,
+    read_calibration,
+)
+from calibrate.files.generations import InstallError, generations, read_log
+from calibrate.files.install import InstallGateError, install, install_line, load_installed, rollback
+from calibrate.pipeline import SolvedRecording
+from tests.command_line import call
+
+
+def test_the_next_step_of_a_solve_is_one_that_works() -> None:
+    assert install_line("real", Path("c.yaml")) == "calibrate install c.yaml"
+    assert install_line("real", Path("my c.yaml")) == "calibrate install 'my c.yaml'"
+    assert install_line("playback", Path("c.yaml")) == (
+        "calibrate install --cell simulated --root FOLDER c.yaml"
+    )
+
+
+def test_install_list_rollback(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    root = tmp_path / "state"
+    first, second = make_file(), make_file(0.001)
+    install(first, root)
+    install(second, root)
+    assert load_installed(root).result == read_calibration(second).result
+    assert [(g.number, g.current) for g in generations(root)] == [(1, False), (2, True)]
+    rollback(root)
+    assert load_installed(root).result == read_calibration(first).result
+    rollback(root, to=2)
+    assert load_installed(root).result == read_calibration(second).result
+    assert [entry.action for entry in read_log(root)] == ["install", "install", "rollback", "rollback"]
+    assert read_log(root)[1].change.startswith("1.000 mm, 0.0000°")
+    assert (root / "calibrations/current").is_symlink()
+
+
+def test_nothing_installed_and_nothing_older_are_said(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    with pytest.raises(InstallError, match="nothing is installed"):
+        load_installed(tmp_path)
+    install(make_file(), tmp_path)
+    with pytest.raises(InstallError, match="no older"):
+        rollback(tmp_path)
+    with pytest.raises(InstallError, match="no generation 9; there are: 1"):
+        rollback(tmp_path, to=9)
+
+
+@pytest.mark.parametrize("source", ["simulated", "playback", "imported"])
+def test_nothing_unreal_installs_on_a_real_cell_whatever_the_reason(  # type: ignore[no-untyped-def]
+    make_file, tmp_path: Path, source: str
+) -> None:
+    path = make_file(source=source)
+    with pytest.raises(InstallError, match=f"is {source} and is not installed on a real cell"):
+        install(path, tmp_path / "s", override="I insist")
+    assert not (tmp_path / "s/calibrations/current").exists()
+
+
+def test_kinds_of_cells_do_not_mix(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    root = tmp_path / "s"
+    install(make_file(), root)
+    with pytest.raises(InstallError, match="does not follow a real calibration"):
+        install(make_file(source="simulated"), root, cell="simulated")
+    simulated = tmp_path / "simulated"
+    install(make_file(source="simulated"), simulated, cell="simulated")
+    with pytest.raises(InstallError, match="not of a real cell"):
+        load_installed(simulated)
+    assert load_installed(simulated, allow_simulated=True).source == "simulated"
+
+
+def test_a_failed_gate_needs_a_persons_reason_which_goes_into_the_file(  # type: ignore[no-untyped-def]
+    make_file, solved_real: SolvedRecording, tmp_path: Path
+) -> None:
+    bad = Gate("hold-out", False, 0.1, 0.005, "predicted to 100 mm")
+    path = make_file(quality=msgspec.structs.replace(solved_real.calibration.quality, gates=[bad]))
+    with pytest.raises(InstallGateError, match="predicted to 100 mm") as refused:
+        install(path, tmp_path / "s")
+    assert refused.value.exit_code == 4
+    with pytest.raises(InstallGateError):
+        install(path, tmp_path / "s", override="   ")
+    install(path, tmp_path / "s", override="line is down, checked with a pointer")
+    override = load_installed(tmp_path / "s").override
+    assert override is not None
+    assert override.reason == "line is down, checked with a pointer"
+    assert "hold-out" in override.overridden[0]
+
+
+def test_another_robot_or_camera_is_refused(make_file, solved_real: SolvedRecording, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    """Fault 47."""
+    root = tmp_path / "s"
+    install(make_file(), root)
+    before = (root / "calibrations/current").read_bytes()
+    robot = msgspec.structs.replace(solved_real.calibration.robot, serial="2099999999")
+    camera = msgspec.structs.replace(solved_real.calibration.camera, serial="99")
+    for changes, text in (({"robot": robot}, "robot UR10 2099999999"), ({"camera": camera}, "camera MER 99")):
+        with pytest.raises(InstallError, match=text):
+            install(make_file(**changes), root)
+    with pytest.raises(InstallError, match="the cell has 4711"):
+        install(make_file(), tmp_path / "t", robot_serial="4711")
+    assert (root / "calibrations/current").read_bytes() == before
+
+
+def test_a_damaged_file_is_not_installed_and_a_damaged_generation_not_used(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    root = tmp_path / "s"
+    good, broken = make_file(), tmp_path / "broken.yaml"
+    broken.write_bytes(good.read_bytes()[:-40])
+    with pytest.raises(CalibrationFileError):
+        install(broken, root)
+    install(good, root)
+    install(make_file(0.001), root)
+    generation = generations(root)[0].path
+    generation.chmod(0o600)
+    generation.write_bytes(generation.read_bytes().replace(b"eye-in-hand", b"eye-to-hand"))
+    assert "hash" in generations(root)[0].problem
+    with pytest.raises(InstallError, match="no older"):
+        rollback(root)
+    with pytest.raises(InstallError, match="damaged"):
+        rollback(root, to=1)
+
+
+def test_identity_is_still_checked_when_the_current_file_is_damaged(  # type: ignore[no-untyped-def]
+    make_file, solved_real: SolvedRecording, tmp_path: Path
+) -> None:
+    root = tmp_path / "s"
+    install(make_file(), root)
+    install(make_file(0.001), root)
+    current = (root / "calibrations/current").resolve()
+    current.chmod(0o600)
+    current.write_bytes(b"garbage")
+    robot = msgspec.structs.replace(solved_real.calibration.robot, serial="2099999999")
+    with pytest.raises(InstallError, match="2099999999"):
+        install(make_file(robot=robot), root)
+    install(make_file(0.002), root)
+    assert load_installed(root).result.translation_m[0] == pytest.approx(
+        solved_real.calibration.result.translation_m[0] + 0.002
+    )
+
+
+def test_an_unwritable_place_is_said(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    (tmp_path / "file").write_text("")
+    with pytest.raises(InstallError, match="--root"):
+        install(make_file(), tmp_path / "file")
+
+
+@pytest.mark.parametrize("look", [generations, read_log, load_installed])
+def test_a_place_that_may_not_be_looked_into_is_said(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, look: Callable[[Path], object]
+) -> None:
+    def refused(path: Path) -> bool:
+        raise PermissionError(13, "Permission denied", str(path))
+
+    monkeypatch.setattr(Path, "exists", refused)  # who runs the tests may be root
+    with pytest.raises(InstallError, match=r"calibrations: Permission denied\. Name another"):
+        look(tmp_path)
+
+
+def test_trouble_that_no_other_error_names_is_one_sentence(
+    real_file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("calibrate.cli.install.print_json", full)
+    done = call(main, "show", real_file, "--json")
+    assert (done.returncode, done.stderr) == (1, "calibrate: the output: No space left on device\n")
+
+
+INSTALL = """
+import sys
+from pathlib import Path
+from calibrate.files.install import install
+install(Path(sys.argv[1]), Path(sys.argv[2]))
+"""
+NOTE = """
+import sys
+from pathlib import Path
+from calibrate.files.calibration import read_calibration
+from calibrate.files.verification import note_installed
+note_installed(Path(sys.argv[2]), read_calibration(Path(sys.argv[1])).verification)
+"""
+TOUCH = Touch(
+    0, (0.0, 0.0), (0.3, -0.2), (0.15, 0.15), "told by a person", "anna", "2026-11-21T12:00:00+00:00"
+)
+_SYSCALLS = "openat,write,fsync,rename,renameat,renameat2,symlink,symlinkat,unlink,unlinkat,mkdir,close,flock"
+
+
+@pytest.mark.process
+@pytest.mark.timeout(300)  # strace stops every system call of a dozen starts of Python
+@pytest.mark.skipif(shutil.which("strace") is None, reason="strace is not installed")
+@pytest.mark.parametrize("program", [INSTALL, NOTE], ids=["install", "note what hands found"])
+@pytest.mark.parametrize("points", [5, pytest.param(1000, marks=pytest.mark.soak)])
+def test_a_kill_at_any_system_call_leaves_old_or_new(  # type: ignore[no-untyped-def]
+    make_file, tmp_path: Path, program: str, points: int
+) -> None:
+    """Fault 46: SIGKILL on entry to file system calls between the first and the last touch of the root."""
+    old, new = make_file(), make_file(0.001 if program is INSTALL else 0.0, verification=[TOUCH])
+    template = tmp_path / "template"
+    install(old, template)
+    results = {name: read_calibration(path) for name, path in (("old", old), ("new", new))}
+    calls = _touching_calls(program, new, template, tmp_path)
+    assert len(calls) >= 12
+    chosen = {*np.linspace(0, len(calls) - 1, points).astype(int)}
+    chosen |= {k for k, (name, _) in enumerate(calls) if name.startswith(("rename", "symlink", "unlink"))}
+    calls = [calls[k] for k in sorted(chosen)]
+    seen = []
+    for name, place in calls:
+        root = tmp_path / "kill"
+        shutil.copytree(template, root, symlinks=True)
+        inject = ("-o", "/dev/null", "-e", f"inject={name}:signal=KILL:when={place}")
+        assert _traced(program, new, root, *inject) != 0, f"{name} {place} was not reached"
+        found = load_installed(root)
+        assert found in results.values(), (name, place)
+        seen.append("new" if found == results["new"] else "old")
+        assert all(not g.problem for g in generations(root)), (name, place)
+        install(new, root)  # what a person does next works
+        assert load_installed(root) == results["new"]
+        shutil.rmtree(root)
+    assert seen == sorted(seen, reverse=True), "it went back"
+    assert {"old", "new"} == set(seen)
+
+
+def _traced(program: str, new: Path, root: Path, *options: str) -> int:
+    command = ["strace", "-f", "-qq", *options, sys.executable, "-c", program, str(new), str(root)]
+    return subprocess.run(command, capture_output=True, timeout=60, check=False).returncode
+
+
+def _touching_calls(program: str, new: Path, template: Path, tmp_path: Path) -> list[tuple[str, int]]:
+    """(system call, its how-manieth) for every call of an undisturbed run after it first touches the root."""
+    root, trace = tmp_path / "traced", tmp_path / "trace"
+    shutil.copytree(template, root, symlinks=True)
+    assert _traced(program, new, root, "-o", str(trace), "-e", f"trace={_SYSCALLS}") == 0
+    counts: dict[str, int] = {}
+    found: list[tuple[str, int]] = []
+    begun = False
+    lines = trace.read_text().splitlines()
+    last = max(k for k, line in enumerate(lines) if "log.jsonl" in line)
+    for line in lines[: last + 4]:
+        match = re.match(r"\d+ +(\w+)\(", line)
+        if match is None:
+            continue
+        name = match[1]
+        counts[name] = counts.get(name, 0) + 1
+        begun = begun or f"{root}/calibrations/lock" in line
+        if begun and (name != "close" or len(found) % 3 == 0):
+            found.append((name, counts[name]))
+    shutil.rmtree(root)
+    return found
+
+
+def test_consumers_get_frames_in_the_name(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    install(make_file(), tmp_path)
+    calibration: Calibration = load_installed(tmp_path)
+    assert (calibration.transform.parent, calibration.transform.child) == ("flange", "camera")
+    assert calibration.intrinsics.model.width == 480
+    assert (tmp_path / "calibrations/current").readlink().parts[0] == "gen"
+
+
+def test_a_much_less_certain_one_replaces_no_better_one_without_a_reason(  # type: ignore[no-untyped-def]
+    make_file, solved_real: SolvedRecording, tmp_path: Path
+) -> None:
+    quality = solved_real.calibration.quality
+    assert quality.predicted_error_mm is not None
+    worse = msgspec.structs.replace(quality, predicted_error_mm=2.0 * quality.predicted_error_mm)
+    hardly = msgspec.structs.replace(quality, predicted_error_mm=1.3 * quality.predicted_error_mm)
+    root = tmp_path / "s"
+    install(make_file(quality=worse), root)  # nothing to compare with
+    install(make_file(), root)
+    install(make_file(quality=hardly), root)
+    with pytest.raises(InstallGateError, match=r"gate no worse: a point at \d+ mm is expected to be off by"):
+        install(make_file(quality=worse), root)
+    assert len(generations(root)) == 3
+    made = install(make_file(quality=worse), root, override="the old lens is broken")
+    assert made.calibration is not None and made.calibration.override is not None
+    assert "no worse" in made.calibration.override.overridden[0]
+    rollback(root)
+    assert load_installed(root).quality == hardly
+
+
+def test_without_a_predicted_error_the_sigmas_are_compared(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
+    root = tmp_path / "s"
+    install(make_file(), root)
+    sigma = load_installed(root).sigma
+    quality = msgspec.structs.replace(load_installed(root).quality, predicted_error_mm=None)
+    vague = msgspec.structs.replace(sigma, translation_mm=3 * sigma.translation_mm)
+    with pytest.raises(InstallGateError, match="camera's position is uncertain"):
+        install(make_file(quality=quality, sigma=vague), root)

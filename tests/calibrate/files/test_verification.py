@@ -1,0 +1,106 @@
+"""What hands found is kept in the file, survives installing, and is said."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import pytest
+from rich.console import Console
+
+from calibrate.files.calibration import CalibrationFileError, Touch, read_calibration, write_calibration
+from calibrate.files.generations import InstallError, generations, read_log
+from calibrate.files.install import install, load_installed, rollback
+from calibrate.files.summary import summary
+from calibrate.files.verification import agrees, note_in_file, note_installed, touch_sigmas, touch_text
+from calibrate.pipeline import SolvedRecording
+from calibrate.report.page import report_page
+
+GOOD = Touch(
+    0, (0.0, 0.0), (0.3, -0.2), (0.15, 0.15), "told by a person", "anna", "2026-11-21T12:00:00+00:00"
+)
+BAD = msgspec.structs.replace(GOOD, corner=41, corner_mm=(150.0, 125.0), offset_mm=(2.1, -0.4))
+
+
+@pytest.fixture
+def file(solved_real: SolvedRecording, tmp_path: Path) -> Path:
+    path = tmp_path / "cell.yaml"
+    write_calibration(solved_real.calibration, path)
+    return path
+
+
+def test_an_offset_is_judged_by_prediction_and_hand_together() -> None:
+    assert agrees(GOOD)
+    assert not agrees(BAD)
+    assert "0.36 mm off" in touch_text(GOOD)
+    assert "MORE than the calibration claims" in touch_text(BAD)
+    vague = msgspec.structs.replace(BAD, sigma_mm=(1.0, 1.0))
+    assert agrees(vague)
+
+
+def test_a_corner_alarms_beyond_three_sigmas_of_both_together() -> None:
+    """0.4 mm predicted and 0.3 mm by hand are 0.5 mm; of two numbers 1 % lies beyond 3.03 sigmas."""
+    touch = msgspec.structs.replace(GOOD, sigma_mm=(0.4, 0.4), offset_mm=(0.3, -0.4))
+    assert touch_sigmas(touch) == pytest.approx(1.0)
+    near, far = (msgspec.structs.replace(touch, offset_mm=(0.0, 0.5 * sigmas)) for sigmas in (3.02, 3.05))
+    assert agrees(near) and not agrees(far)
+
+
+def test_entries_go_into_a_file_and_stay_when_it_is_installed(file: Path, tmp_path: Path) -> None:
+    before = read_calibration(file)
+    note_in_file(file, [GOOD])
+    note_in_file(file, [GOOD])
+    after = read_calibration(file)
+    assert after.verification == [GOOD, GOOD]
+    assert msgspec.structs.replace(after, verification=[]) == before
+    install(file, tmp_path / "s")
+    assert load_installed(tmp_path / "s").verification == [GOOD, GOOD]
+
+
+def test_entries_for_the_installed_one_make_a_new_generation(file: Path, tmp_path: Path) -> None:
+    root = tmp_path / "s"
+    with pytest.raises(InstallError, match="nothing was noted"):
+        note_installed(root, [GOOD])
+    install(file, root)
+    note_installed(root, [GOOD])
+    assert load_installed(root).verification == [GOOD]
+    assert [g.number for g in generations(root)] == [1, 2]
+    assert read_log(root)[-1].action == "verify"
+    rollback(root, to=1)  # by its number: going back alone leads to another solve
+    assert load_installed(root).verification == []
+
+
+def test_hands_that_disagree_keep_it_from_being_installed(file: Path, tmp_path: Path) -> None:
+    note_in_file(file, [GOOD, BAD])
+    with pytest.raises(InstallError, match=r"Checked by hand, it is off at corner 41: 2\.14 mm"):
+        install(file, tmp_path / "s")
+    made = install(file, tmp_path / "s", override="the board was bent there")
+    assert made.calibration is not None and made.calibration.override is not None
+
+
+def test_an_edited_entry_is_noticed(file: Path) -> None:
+    note_in_file(file, [BAD])
+    file.write_text(file.read_text().replace("2.1", "0.1"))
+    with pytest.raises(CalibrationFileError, match="does not fit its hash"):
+        read_calibration(file)
+
+
+def test_they_are_shown_in_the_terminal_and_in_the_report(solved_real: SolvedRecording) -> None:
+    calibration = msgspec.structs.replace(solved_real.calibration, verification=[GOOD, BAD])
+    console = Console(record=True, width=150)
+    console.print(summary(calibration))
+    text = console.export_text()
+    assert "checked by hand" in text and "MORE than" in text
+    page = report_page(solved_real, touches=[GOOD, BAD])
+    assert "Checked by hand" in page and "corner 41" in page
+    assert "Checked by hand" not in report_page(solved_real)
+
+
+def test_a_picture_of_a_view_in_doubt_says_so_in_the_report(solved_real: SolvedRecording) -> None:
+    index = solved_real.solution.used[3]
+    doubted = replace(solved_real, solution=replace(solved_real.solution, in_doubt={index: 0.37}))
+    said = "in doubt: wrong with a chance of 37%"
+    captions = [line for line in report_page(doubted).splitlines() if said in line]
+    assert len(captions) == 1 and f"pose {index + 1}" in captions[0]
+    assert said not in report_page(solved_real)

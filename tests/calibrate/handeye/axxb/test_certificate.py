@@ -1,0 +1,78 @@
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from calibrate.geometry import perturb, pose, random_rotation, rotation_exp
+from calibrate.handeye.axxb.certificate import TOLERANCE, _constraints, certify
+from calibrate.handeye.axxb.objective import build_objective
+from calibrate.handeye.axxb.pairs import all_pairs
+from calibrate.handeye.axxb.robust import solve_global
+from tests.calibrate.cells import exact_motions
+
+
+def problem(seed: int, views: int, sigma: float):
+    rng = np.random.default_rng(seed)
+    X = pose(random_rotation(rng), 0.2 * rng.normal(size=3))
+    H, C = exact_motions(rng, views, X)
+    return all_pairs(perturb(H, sigma * rng.normal(size=(views, 6))), C), X
+
+
+def test_the_twenty_constraints_hold_on_rotations_and_only_there():
+    C = _constraints()
+    assert C.shape == (20, 10, 10)
+    z = np.append(random_rotation(np.random.default_rng(0)).ravel(), 1.0)
+    np.testing.assert_allclose(np.einsum("kij,i,j->k", C, z, z), 0, atol=1e-12)
+    mirrored = np.append(np.diag([1.0, 1.0, -1.0]).ravel(), 1.0)
+    assert np.abs(np.einsum("kij,i,j->k", C, mirrored, mirrored)).max() > 0.1
+
+
+@given(seed=st.integers(0, 10_000), views=st.integers(3, 12), sigma=st.sampled_from([0.0, 1e-4, 1e-2, 0.1]))
+@settings(max_examples=25, deadline=None)
+def test_any_mount_at_any_noise_is_solved_and_proven(seed, views, sigma):
+    pairs, X = problem(seed, views, sigma)
+    result = solve_global(pairs, seed=0)
+    assert result.certificate.certified
+    assert (
+        result.certificate.lower_bound
+        <= result.certificate.objective + 1e-9 * abs(result.objective.gram).max()
+    )
+    if sigma == 0.0:
+        np.testing.assert_allclose(result.X, X, atol=1e-9)
+
+
+@pytest.mark.parametrize("sigma", [0.0, 1e-3])
+def test_a_corrupted_X_is_not_certified(sigma):
+    pairs, _ = problem(1, 10, sigma)
+    X = solve_global(pairs, seed=0).X
+    for axis in np.eye(3):
+        turned = perturb(X, [0, 0, 0, *(1e-4 * axis)])
+        certificate = certify(build_objective(pairs, centre=turned)).certificate
+        assert not certificate.certified
+        assert certificate.relative_gap > 10 * TOLERANCE
+
+
+def test_a_local_minimum_far_away_is_not_certified():
+    pairs, _ = problem(2, 10, 1e-3)
+    X = solve_global(pairs, seed=0).X
+    flipped = X.copy()
+    flipped[:3, :3] = X[:3, :3] @ rotation_exp([np.pi, 0, 0])
+    assert not certify(build_objective(pairs, centre=flipped)).certificate.certified
+
+
+def test_one_axis_is_certified_but_not_unique():
+    rng = np.random.default_rng(3)
+    X = pose(random_rotation(rng), rng.normal(size=3))
+    R = rotation_exp(np.linspace(0, 2, 8)[:, None] * np.array([0.0, 0.0, 1.0]))
+    H = pose(R, rng.normal(size=(8, 3)) * [1, 1, 0])
+    C = np.linalg.inv(X) @ np.linalg.inv(H) @ pose(random_rotation(rng), rng.normal(size=3))
+    assert not solve_global(all_pairs(H, C), seed=0).certificate.unique
+
+
+def test_the_bound_is_below_the_value_everywhere():
+    pairs, _ = problem(4, 6, 0.05)
+    result = solve_global(pairs, seed=0)
+    rng = np.random.default_rng(0)
+    R = np.array([random_rotation(rng) for _ in range(500)])
+    values = result.objective.values(R, result.objective.best_translation(R))
+    assert (values >= result.certificate.lower_bound).all()

@@ -1,0 +1,123 @@
+"""The paper's evolution: what it promises, and that the collapsed form changes nothing in it."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from calibrate.geometry import difference, perturb
+from calibrate.handeye.axxb.evolution import (
+    EvolutionSettings,
+    _partners,
+    evolve,
+    rotations_from_quaternions,
+    rotations_from_vectors,
+)
+from calibrate.handeye.axxb.pairs import consecutive_pairs
+from calibrate.handeye.axxb.paper import BOX, SETTINGS, solve_paper
+from tests.calibrate.cells import LOW, make_cell
+
+ROOT = Path(__file__).parents[4]
+
+
+def paper_pairs(seed: int):
+    cell = make_cell(np.random.default_rng(seed), 19, LOW)
+    return consecutive_pairs(cell.views.base_from_flange, cell.views.camera_from_board), cell
+
+
+def pair_loop_objective(pairs):
+    """f of eq. 16 by loops, with rotations by the general map: the reference."""
+    alpha = [Rotation.from_matrix(A[:3, :3]).as_rotvec() for A in pairs.A]
+    beta = [Rotation.from_matrix(B[:3, :3]).as_rotvec() for B in pairs.B]
+
+    def evaluate(x):
+        values = np.zeros(len(x))
+        for k, row in enumerate(x):
+            R, b = Rotation.from_rotvec(row[:3]).as_matrix(), row[3:]
+            for A, B, a, c in zip(pairs.A, pairs.B, alpha, beta, strict=True):
+                shift = A[:3, :3] @ b + A[:3, 3] - R @ B[:3, 3] - b
+                turn = a - R @ c
+                values[k] += turn @ turn + shift @ shift
+        return values
+
+    return evaluate
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_same_seed_gives_the_same_X_by_form_and_by_pair_loops(seed):
+    pairs, _ = paper_pairs(seed)
+    by_form = solve_paper(pairs, seed)
+    rng = np.random.default_rng(seed)
+    by_loops = evolve(pair_loop_objective(pairs), -BOX, BOX, rng, SETTINGS)
+    np.testing.assert_allclose(by_form.vector, by_loops.best, rtol=0, atol=1e-12)
+
+
+def test_two_processes_give_the_same_bits():
+    program = (
+        "import sys; sys.path.insert(0, '.')\n"
+        "from tests.calibrate.handeye.axxb.test_evolution import paper_pairs\n"
+        "from calibrate.handeye.axxb.paper import solve_paper\n"
+        "print(solve_paper(paper_pairs(3)[0], 11).vector.tobytes().hex())"
+    )
+    runs = [
+        subprocess.run(
+            [sys.executable, "-c", program], capture_output=True, text=True, check=True, cwd=ROOT
+        ).stdout
+        for _ in range(2)
+    ]
+    assert runs[0] == runs[1] != ""
+    assert runs[0].strip() == solve_paper(paper_pairs(3)[0], 11).vector.tobytes().hex()
+
+
+def test_it_comes_close_to_the_camera_of_the_paper():
+    pairs, cell = paper_pairs(4)
+    result = solve_paper(pairs, 0)
+    assert result.on_box == ()
+    miss = difference(result.X, cell.X)
+    assert np.linalg.norm(miss[:3]) < 2e-3
+    assert np.degrees(np.linalg.norm(miss[3:])) < 0.2
+
+
+def test_a_camera_outside_the_box_is_told():
+    cell = make_cell(np.random.default_rng(0), 19, LOW, X=perturb(np.eye(4), [0, 0, 0, 0, 0, 3.0]))
+    pairs = consecutive_pairs(cell.views.base_from_flange, cell.views.camera_from_board)
+    assert "rotation z" in solve_paper(pairs, 0).on_box
+
+
+def test_partners_are_three_different_others():
+    chosen = _partners(np.random.default_rng(0), 200, 7)
+    i = np.arange(7)
+    for a, b in ((0, 1), (0, 2), (1, 2)):
+        assert (chosen[:, a] != chosen[:, b]).all()
+    assert (chosen != i).all()
+    counts = np.bincount(chosen[:, :, 0].ravel(), minlength=7)
+    assert counts[0] == 0
+    assert (abs(counts[1:] - 100) < 45).all()  # uniform over the other six
+
+
+def test_mutants_are_rounded_to_the_box_and_ties_are_accepted():
+    seen = []
+
+    def flat(x):
+        seen.append(x.copy())
+        return np.zeros(len(x))
+
+    lower, upper = -np.ones(2), np.ones(2)
+    setting = EvolutionSettings(population=10, factor=2.0, crossover=1.0, generations=5)
+    evolved = evolve(flat, lower, upper, np.random.default_rng(0), setting)
+    everything = np.concatenate(seen)
+    assert np.abs(everything).max() == 1.0
+    np.testing.assert_array_equal(evolved.population, seen[-1])  # f equal: the trial replaces its parent
+
+
+def test_rotation_maps_agree_with_the_general_ones():
+    rng = np.random.default_rng(0)
+    gamma = np.vstack([rng.normal(size=(20, 3)), np.zeros((1, 3)), 1e-9 * np.ones((1, 3))])
+    np.testing.assert_allclose(
+        rotations_from_vectors(gamma), Rotation.from_rotvec(gamma).as_matrix(), atol=1e-14
+    )
+    q = rng.normal(size=(20, 4))
+    np.testing.assert_allclose(rotations_from_quaternions(q), Rotation.from_quat(q).as_matrix(), atol=1e-14)

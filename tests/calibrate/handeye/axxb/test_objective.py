@@ -1,0 +1,78 @@
+"""The collapsed form against plain loops over pairs, which the paper's equations are copied into."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from calibrate.geometry import difference, perturb, pose, random_rotation
+from calibrate.handeye.axxb.objective import build_objective
+from calibrate.handeye.axxb.pairs import Pairs, all_pairs
+from tests.calibrate.cells import exact_motions
+
+
+def noisy_pairs(seed: int, views: int, sigma: float = 1e-3) -> tuple[Pairs, np.ndarray]:
+    rng = np.random.default_rng(seed)
+    X = pose(random_rotation(rng), 0.2 * rng.normal(size=3))
+    H, C = exact_motions(rng, views, X)
+    return all_pairs(perturb(H, sigma * rng.normal(size=(views, 6))), C), X
+
+
+def by_loop(pairs: Pairs, X: np.ndarray, form: str, weight: float) -> float:
+    """Equations 13, 14 and 16, pair by pair."""
+    total = 0.0
+    for A, B in zip(pairs.A, pairs.B, strict=True):
+        R_A, R_B, R = A[:3, :3], B[:3, :3], X[:3, :3]
+        if form == "log":
+            alpha = Rotation.from_matrix(R_A).as_rotvec()
+            beta = Rotation.from_matrix(R_B).as_rotvec()
+            total += ((alpha - R @ beta) ** 2).sum()
+        else:
+            total += ((R_A @ R - R @ R_B) ** 2).sum() / 2
+        total += weight * ((R_A @ X[:3, 3] + A[:3, 3] - R @ B[:3, 3] - X[:3, 3]) ** 2).sum()
+    return total
+
+
+@pytest.mark.parametrize("form", ["log", "chordal"])
+@given(seed=st.integers(0, 10_000), views=st.integers(3, 8), weight=st.sampled_from([0.1, 1.0, 10.0]))
+@settings(max_examples=15, deadline=None)
+def test_the_form_equals_the_sum_over_pairs_anywhere(form, seed, views, weight):
+    pairs, X = noisy_pairs(seed, views)
+    objective = build_objective(pairs, form, weight)
+    rng = np.random.default_rng(seed)
+    for candidate in (X, pose(random_rotation(rng), rng.normal(size=3))):
+        assert objective.value(candidate) == pytest.approx(by_loop(pairs, candidate, form, weight), rel=1e-9)
+
+
+@pytest.mark.parametrize("form", ["log", "chordal"])
+def test_nothing_cancels_near_the_optimum_of_clean_data(form):
+    """A plain moment matrix is wrong by 1e-16 of its trace; the recentred form keeps the digits."""
+    rng = np.random.default_rng(5)
+    X = pose(random_rotation(rng), rng.normal(size=3))
+    pairs = all_pairs(*exact_motions(rng, 20, X))
+    objective = build_objective(pairs, form)
+    near = perturb(X, 1e-9 * np.ones(6))
+    assert objective.value(near) == pytest.approx(by_loop(pairs, near, form, 1.0), rel=1e-4)
+
+
+def test_eliminating_the_translation_keeps_the_minimum():
+    pairs, X = noisy_pairs(7, 6)
+    objective = build_objective(pairs)
+    R = X[None, :3, :3]
+    b = objective.best_translation(R)
+    z = np.append((R[0] - objective.R0).ravel(), 1.0)
+    lowest = objective.values(R, b)[0]
+    assert z @ objective.reduced() @ z == pytest.approx(lowest, rel=1e-9)
+    for step in 1e-4 * np.vstack([np.eye(3), -np.eye(3)]):
+        assert objective.values(R, b + step)[0] > lowest
+
+
+def test_curvature_is_the_second_derivative():
+    pairs, X = noisy_pairs(8, 6, sigma=0.0)
+    objective = build_objective(pairs, centre=X)
+    delta = 1e-4 * np.random.default_rng(0).normal(size=6)
+    assert objective.value(perturb(X, delta)) == pytest.approx(
+        delta @ objective.curvature(X) @ delta, rel=1e-3
+    )
+    np.testing.assert_allclose(difference(perturb(X, delta), X), delta, atol=1e-12)

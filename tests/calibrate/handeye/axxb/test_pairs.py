@@ -1,0 +1,49 @@
+import numpy as np
+import pytest
+
+from calibrate.geometry import inverse, pose, random_rotation
+from calibrate.handeye.axxb.pairs import all_pairs, consecutive_pairs, mount_poses, screw_invariants
+from tests.calibrate.cells import exact_motions, make_cell
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_pairs_follow_the_published_equations_for_each_mount(mount):
+    cell = make_cell(np.random.default_rng(0), 6, mount=mount)
+    F, C = cell.views.base_from_flange, cell.views.camera_from_board
+    pairs = consecutive_pairs(mount_poses(F, mount), C)
+    for n in range(5):
+        if mount == "eye-in-hand":  # the paper, eq. 21
+            A = np.linalg.inv(F[n + 1]) @ F[n]
+        else:  # the blog's eye-to-hand derivation
+            A = F[n + 1] @ np.linalg.inv(F[n])
+        np.testing.assert_allclose(pairs.A[n], A, atol=1e-12)
+        np.testing.assert_allclose(pairs.B[n], C[n + 1] @ np.linalg.inv(C[n]), atol=1e-12)
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_the_true_camera_solves_every_pair(mount):
+    cell = make_cell(np.random.default_rng(1), 8, mount=mount)
+    pairs = all_pairs(mount_poses(cell.flange, mount), cell.C)
+    assert len(pairs) == 28
+    np.testing.assert_allclose(pairs.A @ cell.X, cell.X @ pairs.B, atol=1e-12)
+
+
+def test_thousands_of_views_give_a_bounded_number_of_pairs_that_reaches_every_view():
+    rng = np.random.default_rng(2)
+    H, C = exact_motions(rng, 3000, pose(random_rotation(rng), rng.normal(size=3)))
+    pairs = all_pairs(H, C)
+    assert len(pairs) <= 20_000
+    assert set(pairs.first) | set(pairs.second) == set(range(3000))
+    assert (pairs.first < pairs.second).all()
+
+
+def test_screw_invariants_do_not_depend_on_the_camera():
+    rng = np.random.default_rng(3)
+    X = pose(random_rotation(rng), rng.normal(size=3))
+    pairs = all_pairs(*exact_motions(rng, 10, X))
+    for of_A, of_B in zip(screw_invariants(pairs.A), screw_invariants(pairs.B), strict=True):
+        np.testing.assert_allclose(of_A, of_B, atol=1e-6)
+    angle, along = screw_invariants(pairs.A)
+    again_angle, again_along = screw_invariants(X @ pairs.A @ inverse(X))
+    np.testing.assert_allclose(angle, again_angle, atol=1e-6)
+    np.testing.assert_allclose(along, again_along, atol=1e-6)

@@ -1,0 +1,149 @@
+import numpy as np
+import pytest
+
+from calibrate.errors import DegenerateMotionError
+from calibrate.geometry import perturb, pose, random_rotation, rotation_angle, rotation_exp
+from calibrate.handeye.axxb.pair_covariance import pair_covariance
+from calibrate.handeye.axxb.pairs import Pairs, all_pairs, consecutive_pairs
+from calibrate.handeye.axxb.robust import solve_global
+from calibrate.handeye.metrics import (
+    axis_spread,
+    board_spread,
+    distance_in_sigmas,
+    median_distance_m,
+    motion_errors,
+    observe,
+    point_error_m,
+    require_motion,
+    score_holdout,
+)
+from tests.calibrate.cells import LOW, exact_motions, make_cell
+
+
+def test_motion_errors_vanish_at_the_truth_and_measure_a_turn():
+    rng = np.random.default_rng(0)
+    X = pose(random_rotation(rng), [0.1, 0.2, 0.3])
+    pairs = all_pairs(*exact_motions(rng, 6, X))
+    e_t, e_R = motion_errors(X, pairs)
+    assert e_t.max() < 1e-12
+    assert e_R.max() < 1e-12
+    wrong = perturb(X, [0, 0, 0, 0.01, 0, 0])
+    _, e_R = motion_errors(wrong, pairs)
+    estimated = wrong @ pairs.B @ np.linalg.inv(wrong)
+    angle = rotation_angle(np.swapaxes(pairs.A[:, :3, :3], 1, 2) @ estimated[:, :3, :3])
+    np.testing.assert_allclose(e_R, 2 * np.sin(angle / 2), atol=1e-12)  # the spectral norm of R1 - R2
+
+
+def test_the_holdout_is_the_mean_over_its_pairs_named_by_their_poses():
+    rng = np.random.default_rng(5)
+    X = pose(random_rotation(rng), [0.1, 0.2, 0.3])
+    pairs = consecutive_pairs(*exact_motions(rng, 3, X))
+    score = score_holdout(perturb(X, [0.01, 0, 0, 0, 0.02, 0]), pairs, [4, 7, 9], 19)
+    e_t, e_R = motion_errors(perturb(X, [0.01, 0, 0, 0, 0.02, 0]), pairs)
+    assert (score.e_t_m, score.e_R) == pytest.approx(((e_t[0] + e_t[1]) / 2, (e_R[0] + e_R[1]) / 2))
+    assert score.pairs == ((4, 7), (7, 9))
+
+
+def turns(first_deg, second_deg, misfit_deg=0.0):
+    """Pairs that turn about x and about y by these angles (rms over all); B turns by `misfit_deg` more."""
+    signs = np.tile([1.0, -1.0], 10)
+    axes = np.repeat(np.eye(3)[:2], 10, axis=0)
+    angles = np.radians(np.repeat([first_deg, second_deg], 10) * np.sqrt(2))
+    A, B = (
+        pose(rotation_exp((signs * (angles + more))[:, None] * axes), np.zeros(3))
+        for more in (0.0, np.radians(misfit_deg))
+    )
+    return Pairs(A, B, np.arange(20), np.arange(1, 21))
+
+
+def test_the_axes_are_those_that_were_turned_about():
+    spread, directions = axis_spread(turns(20, 5))
+    assert np.degrees(spread) == pytest.approx([20, 5, 0])
+    np.testing.assert_allclose(np.abs(directions), np.eye(3), atol=1e-9)
+    seen = observe(turns(20, 5), np.eye(6), 0.5, "flange")
+    assert seen.axis_spread == pytest.approx(0.25)
+    assert np.degrees(seen.largest_angle_rad) == pytest.approx(20 * np.sqrt(2))
+
+
+@pytest.mark.parametrize("misfit_deg", [0.0, 5.0])
+def test_turns_that_no_robot_means_are_none(misfit_deg):
+    """Whatever the noise: how much a small turn tells is the estimate's own matter."""
+    require_motion(turns(20, 0.31, misfit_deg))
+    with pytest.raises(DegenerateMotionError, match=r"\(.?1\.00, .?0\.00, .?0\.00"):  # the one axis
+        require_motion(turns(20, 0.29, misfit_deg))
+    with pytest.raises(DegenerateMotionError):
+        require_motion(turns(0.29, 0.03, misfit_deg))
+
+
+def test_board_spread_of_a_known_scatter():
+    rng = np.random.default_rng(1)
+    X = pose(random_rotation(rng), [0.1, 0, 0])
+    H, C = exact_motions(rng, 4000, X)
+    scattered = perturb(np.eye(4), rng.normal(size=(4000, 6)) * np.repeat([1e-3, 2e-3], 3)) @ H
+    spread_m, spread_rad = board_spread(scattered, C, X)
+    Y = (H @ X @ C)[0]
+    expected = np.sqrt(3e-6 + 2 * 4e-6 * (Y[:3, 3] @ Y[:3, 3]))  # the turn swings the board's lever too
+    assert spread_m == pytest.approx(expected, rel=0.05)
+    assert spread_rad == pytest.approx(2e-3 * np.sqrt(3), rel=0.05)
+
+
+def test_the_weakest_direction_is_the_covariances_own():
+    rng = np.random.default_rng(2)
+    pairs = all_pairs(*exact_motions(rng, 6, pose(random_rotation(rng), [0, 0, 0.1])))
+    covariance = np.diag([1e-8, 1e-8, 4e-6, 1e-10, 1e-10, 1e-10])
+    seen = observe(pairs, covariance, 0.5, "flange")
+    np.testing.assert_allclose(np.abs(seen.weakest_direction), np.eye(6)[2], atol=1e-9)
+    assert seen.weakest_sigma_m == pytest.approx(2e-3)
+    assert seen.weakest_text == "shift along (+0.00, +0.00, +1.00) in flange: 1σ 2.000 mm"
+    turned = observe(pairs, np.diag([1e-8, 1e-8, 1e-8, 1e-10, 1e-4, 1e-10]), 0.5, "flange")
+    assert turned.weakest_text == "turn about (+0.00, +1.00, +0.00) in flange: 1σ 5.000 mm at 0.50 m"
+    assert turned.weakest_sigma_m == pytest.approx(5e-3)
+
+
+@pytest.mark.parametrize("direction", range(6))
+def test_each_direction_is_weighed_as_metres_where_the_board_is(direction):
+    pairs = all_pairs(*exact_motions(np.random.default_rng(2), 6, np.eye(4)))
+    variance = np.full(6, 1e-10)
+    variance[direction] = 4e-6
+    seen = observe(pairs, np.diag(variance), 0.5, "flange")
+    np.testing.assert_allclose(seen.weakest_direction, np.eye(6)[direction], atol=1e-9)
+    assert seen.weakest_sigma_m == pytest.approx(2e-3 if direction < 3 else 1e-3)
+
+
+def test_point_error_grows_with_distance_by_the_rotation_alone():
+    X = pose(random_rotation(np.random.default_rng(3)), [0, 0, 0])
+    covariance = np.diag([0, 0, 0, 1e-6, 1e-6, 1e-6])
+    assert point_error_m(X, covariance, 0.0) == 0.0
+    assert point_error_m(X, covariance, 2.0) == pytest.approx(2.0 * np.sqrt(2e-6))
+
+
+def test_a_turn_and_a_shift_that_come_together_move_the_point_as_they_do():
+    """Of the only error there is, the variance is its square: signs between shift and turn count."""
+    rng = np.random.default_rng(6)
+    X = pose(random_rotation(rng), [0.1, 0.2, 0.3])
+    delta = rng.normal(size=6) * np.repeat([1e-6, 2e-6], 3)
+    point = np.array([0.0, 0.0, 0.5, 1.0])
+    moved = np.linalg.norm((perturb(X, delta) @ point - X @ point)[:3])
+    assert point_error_m(X, np.outer(delta, delta), 0.5) == pytest.approx(moved, rel=1e-4)
+
+
+def test_the_usual_distance_is_the_median():
+    assert median_distance_m(pose(np.eye(3), [[0, 0, 9], [0.6, 0, 0.8], [0, 0, 2.0]])) == pytest.approx(2.0)
+
+
+def test_distance_in_sigmas():
+    covariance = np.diag([1e-6] * 3 + [1e-4] * 3)
+    X = pose(random_rotation(np.random.default_rng(4)), [1, 2, 3])
+    assert distance_in_sigmas(perturb(X, [3e-3, 0, 0, 0, 0.04, 0]), X, covariance) == pytest.approx(5.0)
+
+
+def test_pair_covariance_is_the_scatter_of_the_pair_solution():
+    """Pairs share views: counting them as independent would claim a third of the true error."""
+    squares = []
+    for seed in range(40):
+        cell = make_cell(np.random.default_rng(seed), 25, LOW)
+        pairs = all_pairs(cell.views.base_from_flange, cell.views.camera_from_board)
+        result = solve_global(pairs, 0)
+        covariance = pair_covariance(result.objective, pairs, result.X)
+        squares.append(distance_in_sigmas(result.X, cell.X, covariance) ** 2)
+    assert 4 < np.median(squares) < 9  # χ²(6) has its median at 5.35

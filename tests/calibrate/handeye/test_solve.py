@@ -1,0 +1,248 @@
+"""The solver's door: bad input is named, results are reproducible and complete, for profiles and mounts."""
+
+import subprocess
+import sys
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from calibrate.errors import BadViewsError, CalibrationError, DegenerateMotionError, TooFewViewsError
+from calibrate.geometry import (
+    Array,
+    inverse,
+    perturb,
+    pose,
+    pose_from_quaternion,
+    random_rotation,
+    rotation_exp,
+)
+from calibrate.handeye.solve import SolveOptions, solve_views
+from calibrate.views import ImageView, ViewSet
+from recordings.schema.messages import CameraModel
+from tests.calibrate.cells import LOW, MID, error_mm_deg, exact_motions, make_cell, with_flange
+
+ROOT = Path(__file__).parents[3]
+BOTH = pytest.mark.parametrize("profile", ["robust", "paper"])
+
+
+def poses_only(H: Array, C: Array, mount="eye-in-hand") -> ViewSet:
+    empty = np.zeros((0, 3)), np.zeros((0, 2))
+    flange = H if mount == "eye-in-hand" else inverse(H)
+    return ViewSet(
+        mount,
+        tuple(
+            ImageView(i, f"v{i}", F, *empty, None, c) for i, (F, c) in enumerate(zip(flange, C, strict=True))
+        ),
+        CameraModel(640, 480, ((600.0, 0.0, 320.0), (0.0, 600.0, 240.0), (0.0, 0.0, 1.0)), (0.0,) * 5),
+    )
+
+
+def in_front(H: Array, X: Array, rng: np.random.Generator) -> ViewSet:
+    """Exact views of a camera that sees the board in front of it, from the mount's poses H."""
+    C = inverse(X) @ inverse(H) @ pose(random_rotation(rng), rng.normal(size=3))
+    C[:, 2, 3] = np.abs(C[:, 2, 3]) + 0.1
+    return poses_only(H, C)
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_the_blogs_equations_hold_through_the_same_code_for_both_mounts(mount):
+    X = pose(rotation_exp([0, np.radians(-15), 0]), [0.1, 0, 0])
+    cell = make_cell(np.random.default_rng(0), 12, LOW, scene="blog", mount=mount, X=X)
+    solution = solve_views(cell.views)
+    assert error_mm_deg(solution.matrix, X)[0] < 0.3
+    assert error_mm_deg(solution.matrix, X)[1] < 0.05
+    expected = ("flange", "camera") if mount == "eye-in-hand" else ("base", "camera")
+    assert (solution.parent_from_child.parent, solution.parent_from_child.child) == expected
+    assert error_mm_deg(solution.board_place.matrix, cell.Y)[0] < 1.5
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_any_mount_is_found(seed):
+    rng = np.random.default_rng(seed)
+    X = pose(random_rotation(rng), 0.5 * rng.normal(size=3))
+    solution = solve_views(make_cell(rng, 15, LOW, X=X).views)
+    assert solution.certificate.certified
+    assert error_mm_deg(solution.matrix, X)[0] < 0.6
+
+
+def test_the_papers_split_and_score():
+    cell = make_cell(np.random.default_rng(0), 25, LOW)
+    solution = solve_views(cell.views, SolveOptions(profile="paper"))
+    score = solution.holdout
+    assert score.pairs == tuple((n, n + 1) for n in range(18, 24))
+    assert score.fitted_views == 19
+    assert "share a pose" in score.note
+    A, B = (
+        inverse(M[1:]) @ M[:-1] for M in (cell.views.base_from_flange, inverse(cell.views.camera_from_board))
+    )
+    X = solution.matrix
+    for n, (e_t, e_R) in enumerate(zip(score.samples_e_t_m, score.samples_e_R, strict=True), start=18):
+        estimate = X @ B[n] @ np.linalg.inv(X)
+        assert e_t == pytest.approx(np.linalg.norm(estimate[:3, 3] - A[n, :3, 3]))
+        assert e_R == pytest.approx(np.linalg.norm(estimate[:3, :3] - A[n, :3, :3], 2))
+    assert score.e_t_m == pytest.approx(score.samples_e_t_m.mean())
+
+
+def test_the_paper_profile_warns_on_the_box():
+    cell = make_cell(np.random.default_rng(0), 25, LOW, X=pose(rotation_exp([0, 0, 3.1]), [0, 0, 0.1]))
+    solution = solve_views(cell.views, SolveOptions(profile="paper"))
+    assert solution.on_box
+    assert "on-box" in {remark.code for remark in solution.warnings}
+    assert not solution.certificate.certified
+
+
+def test_the_holdout_of_the_robust_profile_knows_nothing_of_its_views():
+    """Spoiling the held-out views' robot poses a little changes the score, not the fit behind it."""
+    cell = make_cell(np.random.default_rng(0), 25, MID, refit_camera=True)
+    options = SolveOptions(intrinsics_from_same_pictures=True)
+    score = solve_views(cell.views, options).holdout
+    assert score.fitted_views == 19
+    assert len(score.pairs) == 15
+    assert min(i for pair in score.pairs for i in pair) == 19
+    flange = cell.views.base_from_flange.copy()
+    moved = flange @ pose(np.eye(3), [1e-4, 0, 0])
+    flange[19:] = moved[19:]
+    again = solve_views(with_flange(cell.views, flange), options).holdout
+    assert 0 < abs(again.e_t_m - score.e_t_m) < 1e-3
+
+
+@BOTH
+def test_two_processes_give_the_same_bits(profile):
+    program = (
+        "import sys; sys.path.insert(0, '.')\n"
+        "import numpy as np\n"
+        "from tests.calibrate.cells import MID, make_cell\n"
+        "from calibrate.handeye.solve import SolveOptions, solve_views\n"
+        "views = make_cell(np.random.default_rng(5), 12, MID).views\n"
+        f"s = solve_views(views, SolveOptions(profile='{profile}', seed=3))\n"
+        "print(s.matrix.tobytes().hex(), s.covariance.tobytes().hex())"
+    )
+    runs = [subprocess.check_output([sys.executable, "-c", program], text=True, cwd=ROOT) for _ in range(2)]
+    assert runs[0] == runs[1] != ""
+
+
+@BOTH
+def test_too_few_views(profile):
+    cell = make_cell(np.random.default_rng(0), 3, LOW)
+    for count in (1, 2, 3):
+        with pytest.raises(TooFewViewsError, match="at least 4"):
+            solve_views(cell.views.select(list(range(count))), SolveOptions(profile=profile))
+
+
+@BOTH
+def test_no_rotation_no_result(profile):
+    rng = np.random.default_rng(0)
+    X = pose(random_rotation(rng), [0.1, 0, 0])
+    H = pose(np.broadcast_to(random_rotation(rng), (10, 3, 3)), rng.normal(size=(10, 3)))
+    with pytest.raises(DegenerateMotionError, match="hardly turn"):
+        solve_views(in_front(H, X, rng), SolveOptions(profile=profile))
+
+
+@BOTH
+def test_one_axis_is_refused_and_named(profile):
+    rng = np.random.default_rng(1)
+    X = pose(random_rotation(rng), [0.1, 0, 0])
+    R = rotation_exp(np.linspace(0, 1.5, 10)[:, None] * np.array([0, 0, 1.0]))
+    H = pose(R, rng.normal(size=(10, 3)) * 0.2)
+    C = inverse(X) @ inverse(H) @ pose(rotation_exp([0, 0, 0.3]), [0, 0, 1.0])
+    C[:, 2, 3] = np.abs(C[:, 2, 3])
+    with pytest.raises((DegenerateMotionError, BadViewsError), match=r"one axis|agree"):
+        solve_views(poses_only(H, C), SolveOptions(profile=profile))
+
+
+def test_identical_views_are_refused():
+    view = make_cell(np.random.default_rng(0), 1, LOW).views.views[0]
+    with pytest.raises(CalibrationError, match="identical"):
+        cell = make_cell(np.random.default_rng(0), 1, LOW)
+        solve_views(replace(cell.views, views=(view,) * 8))
+
+
+@pytest.mark.parametrize("with_pixels", [True, False])
+def test_a_view_counts_once(with_pixels):
+    """Ten views given twice would claim an error smaller by the root of two."""
+    views = make_cell(np.random.default_rng(0), 10, LOW).views
+    if not with_pixels:
+        bare = (replace(v, pixels=v.pixels[:0], board_points=v.board_points[:0]) for v in views)
+        views = replace(views, views=tuple(bare))
+    with pytest.raises(BadViewsError, match=r"Views 1 \(view 0\) and 1 \(view 0\) are one"):
+        solve_views(views.select([*range(10), 0]))
+
+
+def broken(field, value):
+    cell = make_cell(np.random.default_rng(0), 8, LOW)
+    views = list(cell.views.views)
+    fields = ("pixels", "board_points") if field == "both" else (field,)
+    views[3] = replace(views[3], **{name: value(np.array(getattr(views[3], name))) for name in fields})
+    return replace(cell.views, views=tuple(views))
+
+
+def mirrored(C):
+    return C @ np.diag([1.0, 1.0, -1.0, 1.0])
+
+
+@BOTH
+@pytest.mark.parametrize(
+    ("field", "value", "says"),
+    [
+        ("base_from_flange", lambda F: F * np.nan, "not a rigid transform"),
+        ("base_from_flange", lambda F: F * 2, "not a rigid transform"),
+        ("camera_from_board", mirrored, "mirrored"),
+        ("camera_from_board", lambda C: C @ pose(np.eye(3), [0, 0, -9.0]), "behind"),
+        ("pixels", lambda p: p * np.nan, "NaN"),
+        ("pixels", lambda p: p[:-1], "pixels for"),
+        ("both", lambda p: p[:3], "3 corners, at least 4"),
+    ],
+)
+def test_a_broken_view_is_named(profile, field, value, says):
+    with pytest.raises(BadViewsError, match=f"View 4.*{says}"):
+        solve_views(broken(field, value), SolveOptions(profile=profile))
+
+
+@pytest.mark.parametrize("entry", [0.0, np.nan, -5.0])
+def test_a_singular_camera_matrix_is_refused(entry):
+    cell = make_cell(np.random.default_rng(0), 8, LOW)
+    (_, *rest), second, third = cell.camera.matrix
+    camera = msgspec.structs.replace(cell.camera, matrix=((entry, *rest), second, third))
+    with pytest.raises(BadViewsError, match="camera matrix"):
+        solve_views(replace(cell.views, camera=camera))
+
+
+def test_ten_thousand_views_end_in_bounded_time():
+    rng = np.random.default_rng(0)
+    X = pose(random_rotation(rng), 0.1 * rng.normal(size=3))
+    H, C = exact_motions(rng, 10_000, X)
+    keep = C[:, 2, 3] > 0.05
+    H = perturb(H, 1e-4 * rng.normal(size=(10_000, 6)))
+    start = time.perf_counter()
+    solution = solve_views(poses_only(H[keep], C[keep]), SolveOptions(holdout=False))
+    assert time.perf_counter() - start < 60
+    assert error_mm_deg(solution.matrix, X)[0] < 0.05
+    with pytest.raises(BadViewsError, match="at most"):
+        solve_views(poses_only(np.repeat(H[:5], 5000, axis=0), np.repeat(C[:5], 5000, axis=0)))
+
+
+def test_a_covariance_is_positive_and_predicts_the_error_at_work():
+    cell = make_cell(np.random.default_rng(0), 15, MID)
+    solution = solve_views(cell.views, SolveOptions(working_distance_m=0.5))
+    assert (np.linalg.eigvalsh(solution.covariance) > 0).all()
+    assert solution.working_distance_m == 0.5
+    rng = np.random.default_rng(1)
+    deltas = rng.multivariate_normal(np.zeros(6), solution.covariance, size=4000)
+    point = np.array([0, 0, 0.5, 1.0])
+    moved = (perturb(solution.matrix, deltas) @ point)[:, :3] - (solution.matrix @ point)[:3]
+    assert solution.predicted_error_m == pytest.approx(np.sqrt((moved**2).sum(axis=1).mean()), rel=0.05)
+    assert solution.observability.weakest_text
+    assert 0 < solution.observability.axis_spread <= 1
+
+
+def test_real_pose_pairs_give_the_camera_that_others_found(datasets):
+    rows = np.loadtxt(datasets / "pose-pairs" / "moveit50.csv", delimiter=",", skiprows=1)
+    F = pose_from_quaternion(rows[:, :3], rows[:, 3:7])
+    C = pose_from_quaternion(rows[:, 7:10], rows[:, 10:14])
+    solution = solve_views(poses_only(inverse(F), C, "eye-to-hand"))
+    np.testing.assert_allclose(solution.matrix[:3, 3], [0.659, -0.249, 0.830], rtol=0.01)
+    assert solution.certificate.certified

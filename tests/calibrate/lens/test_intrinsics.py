@@ -1,0 +1,152 @@
+"""The lens from the pictures: right, honest about what it cannot know, and not fooled by one bad view."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from calibrate.boards.model import board_points
+from calibrate.errors import BadViewsError, TooFewViewsError
+from calibrate.geometry import Array, pose, rotation_exp
+from calibrate.lens.intrinsics import LensModel, calibrate_intrinsics
+from calibrate.lens.model import project, undistort
+from calibrate.views import ImageView, ViewSet
+from recordings.schema.messages import CameraModel
+from tests.calibrate.sessions import CAMERA, PAPER_BOARD, looking
+
+FISHEYE = CameraModel(
+    640, 480, ((300.0, 0, 322.0), (0, 301.0, 241.0), (0, 0, 1)), (0.05, -0.01, 0.003, 0.0), "equidistant"
+)
+
+
+def views_of(camera: CameraModel, poses: list[Array], noise_px: float = 0.1, seed: int = 0) -> ViewSet:
+    rng = np.random.default_rng(seed)
+    points = board_points(PAPER_BOARD)
+    found = tuple(
+        ImageView(
+            k,
+            f"view-{k}",
+            np.eye(4),
+            points,
+            project(camera, p, points) + rng.normal(size=(42, 2)) * noise_px,
+        )
+        for k, p in enumerate(poses)
+    )
+    return ViewSet("eye-in-hand", found, CameraModel(camera.width, camera.height))
+
+
+def around(count: int, seed: int = 1, distance_m: float = 0.32) -> list[Array]:
+    rng = np.random.default_rng(seed)
+    return [looking(PAPER_BOARD, rng, (0.2, 0.7), distance_m) for _ in range(count)]
+
+
+def test_parameters_lie_within_their_stated_uncertainty() -> None:
+    """Over 20 draws of noise: errors over sigmas have unit scale, so the sigmas are honest."""
+    ratios = []
+    for seed in range(20):
+        found = calibrate_intrinsics(views_of(CAMERA, around(12, seed), 0.1, seed))
+        K, truth = np.array(found.camera.matrix), np.array(CAMERA.matrix)
+        errors = {"fx": K[0, 0] - truth[0, 0], "cx": K[0, 2] - truth[0, 2], "cy": K[1, 2] - truth[1, 2]}
+        ratios += [errors[name] / found.sigma[name] for name in errors]
+    assert 0.6 < float(np.sqrt(np.mean(np.square(ratios)))) < 1.6
+
+
+def test_what_the_pictures_cannot_tell_stays_near_its_usual_value_with_a_wide_sigma() -> None:
+    small_and_central = [
+        pose(rotation_exp([0.3 * np.cos(a), 0.3 * np.sin(a), 0]), [-0.075, -0.06, 1.5])
+        for a in np.linspace(0, 6, 8)
+    ]
+    found = calibrate_intrinsics(views_of(CAMERA, small_and_central, 0.2))
+    assert abs(found.camera.distortion[4]) < 1.0
+    assert 5.0 < found.sigma["k3"] <= 10.0
+
+
+def nearly_frontal(tilt_rad: float, distance_m: float) -> list[Array]:
+    return [
+        pose(rotation_exp([tilt_rad * np.cos(a), tilt_rad * np.sin(a), 0]), [-0.075, -0.06, distance_m])
+        for a in np.linspace(0, 6, 8)
+    ]
+
+
+@pytest.mark.parametrize("model", ["plumb_bob", "rational_polynomial"])
+def test_pictures_that_face_the_board_fix_no_principal_point(model: LensModel) -> None:
+    """It stays near the middle, and its sigma says how little is known."""
+    found = calibrate_intrinsics(views_of(CAMERA, nearly_frontal(0.15, 1.0), 0.3), model)
+    K = np.array(found.camera.matrix)
+    for name, centre, middle in (("cx", K[0, 2], 239.5), ("cy", K[1, 2], 191.5)):
+        assert 10.0 < found.sigma[name] < 0.2 * 480
+        assert abs(centre - middle) < 2 * found.sigma[name]
+    well = calibrate_intrinsics(views_of(CAMERA, around(25), 0.02), model)
+    assert well.sigma["cx"] < 1.0
+
+
+def test_one_view_with_wrong_corners_is_left_out_and_named() -> None:
+    views = views_of(CAMERA, around(10))
+    bad = replace(
+        views.views[4], pixels=views.views[4].pixels[::-1] + np.random.default_rng(0).normal(0, 8, (42, 2))
+    )
+    broken = replace(views, views=(*views.views[:4], bad, *views.views[5:]))
+    found = calibrate_intrinsics(broken)
+    assert set(found.dropped) == {4}
+    assert "the median is" in found.dropped[4]
+    assert np.array(found.camera.matrix)[0, 0] == pytest.approx(620.0, rel=0.01)
+
+
+def test_worse_views_do_not_hide_the_less_bad_ones() -> None:
+    """Each round of leaving out lowers the median, by which the next are found: here in the third."""
+    noise_px = np.repeat([0.0, 0.6, 2.5, 12.0, 60.0], [5, 2, 3, 3, 2])
+    views = views_of(CAMERA, around(15), 0.05)
+    rng = np.random.default_rng(0)
+    shaken = (
+        replace(v, pixels=v.pixels + rng.normal(0, s, (42, 2))) for v, s in zip(views, noise_px, strict=True)
+    )
+    found = calibrate_intrinsics(replace(views, views=tuple(shaken)))
+    assert set(found.dropped) == set(range(5, 15))
+    assert set(found.view_rms_px) == set(range(5))
+    assert found.rms_px < 0.1
+
+
+def test_fisheye_and_rational_lenses() -> None:
+    rng = np.random.default_rng(3)
+    near = [looking(PAPER_BOARD, rng, (0.2, 0.8), 0.16) for _ in range(14)]
+    fisheye = calibrate_intrinsics(views_of(FISHEYE, near, 0.05), "equidistant")
+    assert np.array(fisheye.camera.matrix)[0, 0] == pytest.approx(300.0, rel=0.01)
+    assert fisheye.rms_px < 0.1
+    rational = calibrate_intrinsics(views_of(CAMERA, around(14), 0.05), "rational_polynomial")
+    assert len(rational.camera.distortion) == 8
+    assert rational.rms_px < 0.1
+
+
+@pytest.mark.parametrize("camera", [CAMERA, FISHEYE])
+def test_undistort_is_the_inverse_of_project(camera: CameraModel) -> None:
+    seen = around(1)[0]
+    points = board_points(PAPER_BOARD)
+    straight = replace_distortion(camera)
+    assert (
+        np.abs(undistort(camera, project(camera, seen, points)) - project(straight, seen, points)).max()
+        < 1e-5
+    )
+
+
+def replace_distortion(camera: CameraModel) -> CameraModel:
+    return CameraModel(camera.width, camera.height, camera.matrix)
+
+
+def test_too_few_and_impossible_views_are_refused() -> None:
+    with pytest.raises(TooFewViewsError, match="at least 3"):
+        calibrate_intrinsics(views_of(CAMERA, around(2)))
+    noise = views_of(CAMERA, around(6), 120.0)
+    with pytest.raises(BadViewsError, match=r"columns and rows|board's size"):
+        calibrate_intrinsics(noise)
+
+
+@pytest.mark.filterwarnings("error")
+def test_corners_that_are_none_are_refused_in_a_sentence() -> None:
+    for seed in range(12):
+        rng = np.random.default_rng(seed)
+        views = views_of(CAMERA, around(6, seed))
+        anywhere = tuple(replace(v, pixels=rng.uniform(0, 480, v.pixels.shape)) for v in views)
+        with pytest.raises(BadViewsError, match="corners"):
+            calibrate_intrinsics(replace(views, views=anywhere))

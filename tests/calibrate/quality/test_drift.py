@@ -1,0 +1,284 @@
+"""The check notices what it promises to, and cries wolf no more often than it says."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from scipy import stats
+
+from calibrate.boards.model import board_points
+from calibrate.cli.check import check_text
+from calibrate.errors import BadViewsError, TooFewViewsError
+from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp
+from calibrate.lens.model import project
+from calibrate.lens.pnp import solve_pnp
+from calibrate.pipeline import SolvedRecording
+from calibrate.quality.checks import CheckEntry, append_check, earlier_text, read_checks, trend_text
+from calibrate.quality.drift import POWER, DriftCheck, Noise, judge_shift, pnp_covariance, powers
+from calibrate.views import ImageView, ViewSet
+from recordings.schema.messages import CameraModel, Mount
+from tests.calibrate.sessions import PAPER_BOARD, X_TRUE, looking
+
+CAMERA = CameraModel(1280, 1024, ((1667.0, 0, 639.5), (0, 1667.0, 511.5), (0, 0, 1)), (0.0,) * 5)
+NOISE = Noise(corner_px=0.1, robot_m=0.00005, robot_rad=float(np.radians(0.005)), degrees_of_freedom=69)
+INSTALLED_COVARIANCE = np.diag([(0.03e-3) ** 2] * 3 + [float(np.radians(0.0035)) ** 2] * 3)
+BOARD = pose(rotation_exp([np.pi - 0.2, 0.1, 0.4]), [0.6, 0.1, 0.0])
+
+
+def few_views(rng: np.random.Generator, X: Array, count: int = 5, mount: Mount = "eye-in-hand") -> ViewSet:
+    """New views of a cell whose camera is truly at X."""
+    found = []
+    for k in range(count):
+        seen = looking(PAPER_BOARD, rng, (0.25, 0.6), 0.45, 1.2)
+        flange = BOARD @ inverse(X @ seen) if mount == "eye-in-hand" else X @ seen @ inverse(BOARD)
+        error = np.r_[rng.normal(size=3) * NOISE.robot_m, rng.normal(size=3) * NOISE.robot_rad]
+        pixels = project(CAMERA, seen, board_points(PAPER_BOARD)) + rng.normal(size=(42, 2)) * NOISE.corner_px
+        found.append(ImageView(k, str(k), perturb(flange, error), board_points(PAPER_BOARD), pixels))
+    return solve_pnp(ViewSet(mount, tuple(found), CAMERA))
+
+
+def checks(
+    count: int, shift_m: float, shift_rad: float, seed: int, mount: Mount = "eye-in-hand"
+) -> list[DriftCheck]:
+    """As after an installation with its own error, and a shift in a random direction since."""
+    rng = np.random.default_rng(seed)
+    root = np.linalg.cholesky(INSTALLED_COVARIANCE)
+    found = []
+    for _ in range(count):
+        way = rng.normal(size=(2, 3))
+        way /= np.linalg.norm(way, axis=1, keepdims=True)
+        moved = perturb(X_TRUE, np.r_[way[0] * shift_m, way[1] * shift_rad])
+        installed = perturb(X_TRUE, root @ rng.normal(size=6))
+        found.append(judge_shift(few_views(rng, moved, mount=mount), installed, INSTALLED_COVARIANCE, NOISE))
+    return found
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_false_alarms_and_detections(mount: Mount) -> None:
+    """Few trials; `make soak` runs 400. Limits allow for the chance of so few."""
+    quiet = checks(60, 0, 0, 1, mount)
+    assert sum(not c.passed for c in quiet) <= stats.binom.ppf(0.999, 60, 0.05)
+    assert np.mean([c.disagreement for c in quiet]) == pytest.approx(1.0, abs=0.2)
+    assert sum(not c.passed for c in checks(30, 0.5e-3, 0, 2, mount)) >= 27
+    assert sum(not c.passed for c in checks(30, 0, float(np.radians(0.1)), 3, mount)) >= 27
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_the_promise_in_400_trials_each(mount: Mount) -> None:
+    assert sum(not c.passed for c in checks(400, 0, 0, 11, mount)) <= stats.binom.ppf(0.99, 400, 0.05)
+    assert sum(not c.passed for c in checks(400, 0.5e-3, 0, 12, mount)) >= 380
+    assert sum(not c.passed for c in checks(400, 0, float(np.radians(0.1)), 13, mount)) >= 380
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_where_the_robots_base_has_its_origin_changes_nothing(mount: Mount) -> None:
+    """A robot's error turns the flange about the flange, however far away the base is."""
+    views = few_views(np.random.default_rng(15), X_TRUE, mount=mount)
+    away = pose(np.eye(3), [0.0, 2.0, -3.0])
+    moved = replace(
+        views,
+        views=tuple(replace(v, base_from_flange=away @ v.base_from_flange) for v in views),
+    )
+    X = away @ X_TRUE if mount == "eye-to-hand" else X_TRUE
+    here = judge_shift(views, X_TRUE, INSTALLED_COVARIANCE, NOISE)
+    there = judge_shift(moved, X, INSTALLED_COVARIANCE, NOISE)
+    assert there.statistic == pytest.approx(here.statistic, rel=1e-3)
+    np.testing.assert_allclose(there.covariance, here.covariance, rtol=1e-3, atol=1e-12)
+
+
+def test_the_noise_of_a_calibration_comes_in_metres_and_radians(solved_real: SolvedRecording) -> None:
+    calibration = solved_real.calibration
+    quality = msgspec.structs.replace(
+        calibration.quality, noise={"corner_px": 0.12, "robot_mm": 0.05, "robot_deg": 0.02}
+    )
+    noise = Noise.of(msgspec.structs.replace(calibration, quality=quality))
+    assert (noise.corner_px, noise.robot_m) == (0.12, 0.00005)
+    assert noise.robot_rad == pytest.approx(np.radians(0.02))
+    assert noise.degrees_of_freedom == 3 * len(calibration.views.used) - 6
+    exact = msgspec.structs.replace(quality, noise={"corner_px": 0.0, "robot_mm": 0.0, "robot_deg": 0.0})
+    assert Noise.of(msgspec.structs.replace(calibration, quality=exact)).corner_px == 0.02  # no corner is
+    silent = msgspec.structs.replace(quality, noise={})
+    with pytest.raises(BadViewsError, match="--profile robust"):
+        Noise.of(msgspec.structs.replace(calibration, quality=silent))
+
+
+def test_the_verdict_is_that_of_the_p_value_at_five_percent() -> None:
+    for check in checks(12, 0.2e-3, 0, 21):
+        assert check.passed == (check.p_value >= 0.05) == (check.statistic <= check.threshold)
+        assert check.p_value == pytest.approx(1 - stats.f.cdf(check.statistic / 6, 6, 69))
+        assert stats.f.sf(check.threshold / 6, 6, 69) == pytest.approx(0.05)
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_twice_the_noise_everywhere_is_twice_the_doubt(mount: Mount) -> None:
+    views = few_views(np.random.default_rng(23), X_TRUE, mount=mount)
+    doubled = Noise(2 * NOISE.corner_px, 2 * NOISE.robot_m, 2 * NOISE.robot_rad, NOISE.degrees_of_freedom)
+    once = judge_shift(views, X_TRUE, INSTALLED_COVARIANCE, NOISE)
+    twice = judge_shift(views, X_TRUE, 4 * INSTALLED_COVARIANCE, doubled)
+    np.testing.assert_allclose(twice.covariance, 4 * once.covariance, rtol=1e-6, atol=1e-15)
+    np.testing.assert_allclose(twice.shift, once.shift, rtol=1e-6, atol=1e-12)
+    assert twice.statistic == pytest.approx(once.statistic / 4)
+    assert twice.disagreement == pytest.approx(once.disagreement / 4)
+
+
+def test_the_power_is_that_of_half_a_millimetre_and_a_tenth_of_a_degree() -> None:
+    """In the worst direction, by the non-central F distribution, for what else is unknown too."""
+    covariance = np.diag([1e-4, 2e-4, 1e-4, 4e-4, 2e-4, 2e-4]) ** 2
+    limit = stats.f.ppf(0.95, 6, 69)
+    by_shift, by_turn = (
+        stats.ncf.sf(limit, 6, 69, (size / sigma) ** 2)
+        for size, sigma in ((0.0005, 2e-4), (np.pi / 1800, 4e-4))
+    )
+    assert powers(covariance, 69) == pytest.approx((by_shift, by_turn))
+
+
+def test_a_shift_is_told_in_millimetres_and_degrees() -> None:
+    (check,) = checks(1, 0, 0, 5)
+    moved = replace(check, shift=np.r_[3e-4, 0.0, -4e-4, np.radians([0.0, 0.03, 0.04])])
+    assert (moved.shift_mm, moved.shift_deg) == pytest.approx((0.5, 0.05))
+    assert replace(check, power_translation=0.9, power_rotation=0.8).power == 0.8
+
+
+def test_the_shift_is_named_and_the_stated_power_is_a_lower_bound() -> None:
+    found = checks(40, 2e-3, 0, 4)
+    assert np.median([c.shift_mm for c in found]) == pytest.approx(2.0, abs=0.3)
+    stated = np.mean([c.power_translation for c in checks(20, 0, 0, 5)])
+    noticed = np.mean([not c.passed for c in checks(40, 0.5e-3, 0, 6)])
+    assert 0.5 < stated <= noticed + 0.05
+
+
+MID = Noise(corner_px=0.15, robot_m=0.0001, robot_rad=float(np.radians(0.01)), degrees_of_freedom=69)
+
+
+def test_it_says_how_many_views_would_do() -> None:
+    rng = np.random.default_rng(17)
+    weak = judge_shift(few_views(rng, X_TRUE, 5), X_TRUE, 4 * INSTALLED_COVARIANCE, MID)
+    assert weak.power < POWER and weak.views_needed is not None and weak.views_needed > 5
+    views = few_views(rng, X_TRUE, weak.views_needed + 4)
+    enough = judge_shift(views, X_TRUE, 4 * INSTALLED_COVARIANCE, MID)
+    assert enough.power >= POWER and enough.views_needed == len(views)
+    blind_to_turns = INSTALLED_COVARIANCE * np.repeat([1.0, 100.0], 3)
+    half = judge_shift(views, X_TRUE, blind_to_turns, MID)
+    assert half.power_translation >= POWER > half.power_rotation and half.views_needed is None
+    hopeless = judge_shift(few_views(rng, X_TRUE, 5), X_TRUE, 100 * INSTALLED_COVARIANCE, MID)
+    assert hopeless.views_needed is None
+
+
+def test_what_a_weak_check_says(solved_real: SolvedRecording) -> None:
+    check = checks(1, 0, 0, 5)[0]
+    strong = replace(check, passed=True, power_translation=0.97, power_rotation=0.99)
+    weak = replace(strong, power_translation=0.6, views_needed=8)
+    assert check_text(strong, solved_real.calibration).startswith("HOLDS: flange_from_camera fits 5")
+    text = check_text(weak, solved_real.calibration)
+    assert text.startswith("HOLDS, as far as these views can tell") and "Take 3 more" in text
+    assert "calibrate again" in check_text(replace(weak, views_needed=None), solved_real.calibration)
+    moved = check_text(replace(weak, passed=False, p_value=1e-6), solved_real.calibration)
+    assert "DOES NOT HOLD" in moved and "more" not in moved
+    doubtful = check_text(replace(weak, passed=False, p_value=0.02), solved_real.calibration)
+    assert "one check in 50" in doubtful and "check once more" in doubtful
+
+
+@pytest.mark.parametrize("rounding", [-1e-9, 0.0, 1e-9])
+def test_views_that_say_nothing_have_no_power(rounding: float) -> None:
+    blind = np.diag([1e12] * 6)
+    blind[0, 1] = blind[1, 0] = 1e12 * (1 - 1e-8 + rounding)
+    assert powers(blind, 69) == pytest.approx((0.05, 0.05), abs=1e-3)
+
+
+def test_noisier_views_are_said_to_disagree() -> None:
+    rng = np.random.default_rng(7)
+    quiet = replace(NOISE, corner_px=0.02, robot_m=0.00001, robot_rad=0.00001)
+    result = judge_shift(few_views(rng, X_TRUE), X_TRUE, INSTALLED_COVARIANCE, quiet)
+    assert result.disagreement > 3
+
+
+def test_too_few_or_untelling_views_are_refused() -> None:
+    rng = np.random.default_rng(8)
+    with pytest.raises(TooFewViewsError, match="3 to 5"):
+        judge_shift(few_views(rng, X_TRUE, 2), X_TRUE, INSTALLED_COVARIANCE, NOISE)
+    views = few_views(rng, X_TRUE, 3)
+    same = replace(views, views=(views.views[0],) * 3)
+    with pytest.raises(BadViewsError, match="tilt"):
+        judge_shift(same, X_TRUE, INSTALLED_COVARIANCE, NOISE)
+
+
+def test_the_pose_covariance_is_that_of_many_repetitions() -> None:
+    rng = np.random.default_rng(9)
+    seen = looking(PAPER_BOARD, rng, (0.4, 0.41), 0.45)
+    points = board_points(PAPER_BOARD)
+    exact = project(CAMERA, seen, points)
+    errors = []
+    for _ in range(300):
+        view = ImageView(0, "", np.eye(4), points, exact + rng.normal(size=exact.shape) * 0.1)
+        got = solve_pnp(ViewSet("eye-in-hand", (view,), CAMERA)).camera_from_board[0]
+        errors.append(np.r_[got[:3, 3] - seen[:3, 3]])
+    measured = np.cov(np.array(errors).T)
+    predicted = pnp_covariance(points, CAMERA, seen)[:3, :3] * 0.01
+    assert np.sqrt(np.diag(measured)) == pytest.approx(np.sqrt(np.diag(predicted)), rel=0.15)
+
+
+def entry(day: float, shift_mm: float, generation: int = 1, turn_deg: float = 0.0) -> CheckEntry:
+    """1σ is 0.05 mm and 1e-5 rad."""
+    covariance = np.diag([(0.05e-3) ** 2] * 3 + [1e-10] * 3)
+    rows = tuple(tuple(row) for row in covariance.tolist())
+    shift = (shift_mm / 1e3, 0.0, 0.0, 0.0, float(np.radians(turn_deg)), 0.0)
+    return CheckEntry(day * 86400, generation, "r", True, shift, rows, 1.0, 13.0)
+
+
+def test_a_trend_is_warned_of_before_a_check_fails(tmp_path: Path) -> None:
+    for day in range(8):
+        append_check(entry(day, 0.05 * day), tmp_path)
+    warning = trend_text(read_checks(tmp_path), 1)
+    assert "by about 0.35 mm and 0.000° in 7 days" in warning
+    assert "before it fails" in warning
+    assert trend_text(read_checks(tmp_path), 2) == ""
+    steady = [entry(day, 0.1) for day in range(8)]
+    assert trend_text(steady, 1) == ""
+    assert trend_text(steady[:3], 1) == ""
+    failed = msgspec.structs.replace(steady[0], passed=False)
+    assert "generation 1: 4, it held in 3" in earlier_text([*steady[:3], failed], 1)
+    assert earlier_text(steady, 2) == ""
+
+
+def test_a_trend_is_told_from_chance_at_one_percent() -> None:
+    """The slope of eight days has a variance of σ² / 42; its square follows χ²(6)."""
+    slope_mm = 0.05 * np.sqrt(stats.chi2.ppf(0.99, 6) / 42)
+    for factor in (0.99, 1.01):
+        wandering = trend_text([entry(day, 0.3 + factor * slope_mm * day) for day in range(8)], 1)
+        assert bool(wandering) == (factor > 1)
+
+
+def test_four_checks_or_one_moment_are_no_trend() -> None:
+    strong = [entry(day, 1.0 * day) for day in range(5)]
+    assert "4.00 mm" in trend_text(strong, 1)
+    assert trend_text(strong[:4], 1) == ""
+    assert trend_text([entry(3.0, 1.0 * k) for k in range(5)], 1) == ""
+
+
+@pytest.mark.parametrize(
+    ("days", "said"),
+    [(2.0, "in 2 days"), (1.9, "in 46 hours"), (2.1 / 24, "in 2 hours"), (1.9 / 24, "in 114 min")],
+)
+def test_a_turning_camera_is_told_in_degrees_and_in_a_time_that_people_read(days: float, said: str) -> None:
+    turning = [entry(100 + days * k / 4, 0.0, turn_deg=0.05 * k) for k in range(5)]
+    assert f"by about 0.00 mm and 0.200° {said}." in trend_text(turning, 1)
+
+
+def test_a_trend_over_minutes_is_not_stretched_to_a_month() -> None:
+    minutes = [entry(k / 1440, 0.05 * k) for k in range(8)]
+    minutes[-1] = msgspec.structs.replace(minutes[-1], passed=False)
+    warning = trend_text(minutes, 1)
+    assert "0.35 mm and 0.000° in 7 min" in warning
+    assert "then calibrate again" in warning
+
+
+def test_a_cut_history_line_is_skipped(tmp_path: Path) -> None:
+    append_check(entry(1, 0.0), tmp_path)
+    path = tmp_path / "calibrations/checks.jsonl"
+    path.write_bytes(path.read_bytes() + b'{"wall_s": 12')
+    assert len(read_checks(tmp_path)) == 1

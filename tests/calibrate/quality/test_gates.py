@@ -1,0 +1,177 @@
+"""Each gate closes for its own reason, and says so in words."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import replace
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from calibrate.files.calibration import Gate
+from calibrate.handeye.findings import Finding
+from calibrate.handeye.folds import CrossValidation
+from calibrate.handeye.readings import Explanation, Reading
+from calibrate.handeye.solution import HoldoutScore, NoiseScales, Remark, Solution
+from calibrate.pipeline import SolvedRecording
+from calibrate.quality.gates import GateInputs, GateLimits, GatesError, judge, read_limits
+
+GOOD = GateInputs(0.6, 0.001)
+NAMES = [
+    "session", "weight", "views", "rotation", "axes", "view residual", "hold-out", "cross-validation",
+    "predicted error", "lens coverage", "clocks", "lens", "board", "robot position", "robot orientation",
+]  # fmt: skip
+
+
+@pytest.fixture
+def solution(solved_real: SolvedRecording) -> Solution:
+    """One that every gate lets through."""
+    found = solved_real.solution
+    holdout = HoldoutScore(0.0005, 0.001, np.array([0.0005]), np.array([0.001]), ((0, 1),), 12)
+    noise = NoiseScales(0.1, 0.0001, 0.0002)
+    return replace(
+        found,
+        holdout=holdout,
+        noise=noise,
+        weights=dict.fromkeys(found.used, 1.0),
+        session=Explanation(Reading.AS_RECORDED, 0.0),
+        cross_validation=CrossValidation(0.0005, 0.001, 0.0004, 1.5, 5, {}),
+        lens_finding=Finding(2.0, 0.0001),
+        board_finding=Finding(2.0, 0.0001),
+        predicted_error_m=0.0005,
+        working_distance_m=0.5,
+        residual_px=dict.fromkeys(found.used, 0.2),
+        observability=replace(found.observability, largest_angle_rad=1.2, axis_spread=0.6),
+    )
+
+
+def failed(gates: tuple[Gate, ...]) -> list[str]:
+    return [gate.name for gate in gates if not gate.passed]
+
+
+def test_a_good_solution_passes_every_gate(solution: Solution) -> None:
+    gates = judge(solution, GOOD)
+    assert failed(gates) == []
+    assert [gate.name for gate in gates] == NAMES
+
+
+def spoiled(solution: Solution, name: str) -> tuple[Solution, GateInputs]:
+    seen, folds = solution.observability, solution.cross_validation
+    assert solution.holdout is not None and folds is not None
+    other = Explanation(Reading.SHIFTED, 90.0, 1)
+    changed = {
+        "views": replace(solution, used=solution.used[:5]),
+        "rotation": replace(solution, observability=replace(seen, largest_angle_rad=0.2)),
+        "axes": replace(solution, observability=replace(seen, axis_spread=0.01)),
+        "session": replace(solution, session=other, warnings=(Remark(other.reading.value, "Move them."),)),
+        "weight": replace(solution, weights=dict.fromkeys(solution.used, 0.79)),
+        "cross-validation": replace(solution, cross_validation=replace(folds, rms_m=0.00061)),
+        "lens": replace(solution, lens_finding=Finding(8.0, 0.0011)),
+        "board": replace(solution, board_finding=Finding(8.0, 0.0011)),
+        "view residual": replace(solution, residual_px={3: 9.0}),
+        "hold-out": replace(solution, holdout=replace(solution.holdout, e_t_m=0.02)),
+        "predicted error": replace(solution, predicted_error_m=0.003),
+        "robot position": replace(solution, noise=NoiseScales(0.1, 0.01, 0.0)),
+        "robot orientation": replace(solution, noise=NoiseScales(0.1, 0.0, 0.02)),
+    }
+    evidence = {
+        "lens coverage": replace(GOOD, coverage=0.05),
+        "clocks": replace(GOOD, clock_bound_s=0.05),
+    }
+    return changed.get(name, solution), evidence.get(name, GOOD)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_each_gate_closes_alone_and_says_why(solution: Solution, name: str) -> None:
+    bad, evidence = spoiled(solution, name)
+    gates = judge(bad, evidence)
+    assert failed(gates) == [name]
+    assert next(gate.text for gate in gates if gate.name == name)
+
+
+def test_values_and_limits_are_in_the_units_of_the_file_of_limits(solution: Solution) -> None:
+    gates = {gate.name: (gate.value, gate.limit) for gate in judge(solution, GOOD)}
+    assert gates["rotation"] == pytest.approx((np.degrees(1.2), 30))
+    assert gates["hold-out"] == pytest.approx((0.0005, 0.01 * 0.5))
+    assert gates["cross-validation"] == pytest.approx((0.0005 / 0.0004 / 1.5, 1.0))
+    assert gates["robot orientation"] == pytest.approx((np.degrees(0.0002), 0.3))
+    assert gates["lens"] == gates["board"] == (0.0, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("sigmas", "pull_m", "closed"),
+    [
+        (3.9, 0.1, False),  # the tolerance explains it, whatever it does to X
+        (1e6, 0.0004, False),  # a clear contradiction that costs less than the predicted error
+        (1e6, 0.0006, True),
+        (8.0, 0.0009, False),  # half of it is explained
+        (8.0, 0.0011, True),
+        (8.0, float("nan"), True),
+    ],
+)
+def test_a_statement_closes_its_gate_by_what_its_tolerance_leaves_unexplained(
+    solution: Solution, sigmas: float, pull_m: float, closed: bool
+) -> None:
+    for name in ("lens", "board"):
+        told = replace(solution, **{f"{name}_finding": Finding(sigmas, pull_m)})
+        assert failed(judge(told, GOOD)) == [name] * closed
+
+
+def test_an_accepted_move_opens_the_session_gate(solution: Solution) -> None:
+    moved = replace(solution, session=Explanation(Reading.BOARD_MOVED, 90.0, 7))
+    assert failed(judge(moved, GOOD)) == ["session"]
+    assert failed(judge(replace(moved, move_accepted=True), GOOD)) == []
+
+
+def test_the_certificate_informs_and_closes_nothing(solution: Solution) -> None:
+    bad = replace(solution.certificate, certified=False, distance_sigma=40.0)
+    old_file = GateLimits(certificate=True, agreement_sigma=6.0, board_scale=0.01)
+    assert failed(judge(replace(solution, certificate=bad), GOOD, old_file)) == []
+
+
+def test_what_cannot_be_judged_is_left_out(solution: Solution) -> None:
+    bare = replace(solution, noise=None, holdout=None, predicted_error_m=None, cross_validation=None)
+    names = [gate.name for gate in judge(bare, GateInputs())]
+    assert names == ["session", "weight", "views", "rotation", "axes", "view residual"]
+
+
+def test_limits_come_from_a_file_and_null_switches_a_gate_off(solution: Solution, tmp_path: Path) -> None:
+    path = tmp_path / "gates.yaml"
+    path.write_text("views: 3\nview_rms_px: null\n")
+    limits = read_limits(path)
+    bad, _ = spoiled(solution, "view residual")
+    assert failed(judge(bad, GOOD, limits)) == []
+    assert limits.views == 3
+    assert limits.rotation_deg == GateLimits().rotation_deg
+
+
+@pytest.mark.parametrize("content", ["view: 3\n", "views: many\n", "views: [", "views: 3\nviews: 4\n"])
+def test_wrong_limits_are_refused_with_the_file(tmp_path: Path, content: str) -> None:
+    path = tmp_path / "gates.yaml"
+    path.write_text(content)
+    with pytest.raises(GatesError, match=r"gates\.yaml"):
+        read_limits(path)
+    with pytest.raises(GatesError, match=r"none\.yaml"):
+        read_limits(tmp_path / "none.yaml")
+
+
+def test_the_documented_defaults_are_those_in_force() -> None:
+    text = (Path(__file__).parents[3] / "docs" / "calibration-file.md").read_text()
+    table = text[text.index("## Gates") : text.index("Installing asks one gate more")]
+    documented: dict[str, str] = {}
+    for row in re.findall(r"^\| (`[^|]+) \| ([^|]+) \|", table, re.MULTILINE):
+        documented |= zip(re.findall(r"`(\w+)`", row[0]), row[1].strip().split(", "), strict=True)
+    defaults = {k: v for k, v in msgspec.structs.asdict(GateLimits()).items() if v is not None}
+    assert documented == {name: f"{v}".lower() if v is True else f"{v:g}" for name, v in defaults.items()}
+
+
+def test_the_pose_to_retake_is_numbered_as_on_the_screen(solution: Solution) -> None:
+    """From 1, as `station retake` takes it."""
+    bad = solution.used[3]
+    residual_px = {**solution.residual_px, bad: 9.0}
+    (gate,) = (
+        g for g in judge(replace(solution, residual_px=residual_px), GOOD) if g.name == "view residual"
+    )
+    assert f"pose {bad + 1}, fits to 9.00 px" in gate.text and f"Retake pose {bad + 1}," in gate.text

@@ -1,0 +1,266 @@
+"""`recordings` as people and scripts meet it: words, exit codes, one JSON object."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from pathlib import Path
+from subprocess import CompletedProcess
+
+import msgspec
+import pytest
+
+from recordings.cli import main
+from recordings.info import recording_info
+from recordings.manifest import enter_part
+from recordings.reader import open_recording
+from recordings.schema.messages import CaptureEvent, Stamps
+from recordings.writer import RecordingWriter
+from tests.command_line import call
+from tests.recordings.small_recording import (
+    START_NS,
+    make_info,
+    make_picture,
+    make_state,
+    make_view,
+    write_small,
+)
+
+
+def run(*arguments: object) -> CompletedProcess[str]:
+    return call(main, *arguments)
+
+
+def write_with_clocks(path: Path, drift_ppm: float, missing: range) -> Path:
+    """6 s of robot states at 500 Hz by the controller, whose clock is `drift_ppm` slow against the host.
+
+    Three of four arrive late, and later and later: what a straight line through all would take for drift.
+    """
+    with RecordingWriter(path, make_info()) as writer:
+        for count in range(3000):
+            if count in missing:
+                continue
+            controller_s = 50 + count * 0.002
+            late_ns = count * 100 if count % 4 else 0
+            host_ns = round(7e9 + count * 0.002e9 * (1 + drift_ppm * 1e-6)) + late_ns
+            stamps = Stamps(host_ns, START_NS + host_ns, controller_s)
+            writer.robot_state(msgspec.structs.replace(make_state(0), stamps=stamps))
+        for sequence, frame_id in enumerate([65534, 65535, 1, 2, 5]):
+            writer.picture(msgspec.structs.replace(make_picture(sequence), frame_id=frame_id))
+            writer.view(make_view(sequence % 4, sequence, 1 + sequence // 4))
+        return writer.finish()
+
+
+def test_info_measures_rate_gaps_drift_and_lost_frames(tmp_path: Path) -> None:
+    path = write_with_clocks(tmp_path / "a.mcap", drift_ppm=40, missing=range(500, 510))
+    info = recording_info(open_recording(path))
+    states = info["robot_states"]
+    assert states["rate_hz"] == pytest.approx(500)
+    assert (states["count"], states["gaps"]) == (2990, 1)
+    assert states["largest_gap_s"] == pytest.approx(0.022)
+    assert info["clocks"]["controller"]["drift_ppm"] == pytest.approx(40, abs=0.01)
+    assert info["clocks"]["controller"]["spread_max_ms"] == pytest.approx(0.3, abs=0.001)
+    assert info["clocks"]["controller"]["spread_p95_ms"] == pytest.approx(0.28, abs=0.01)
+    assert info["pictures"]["frame_id_jumps"] == 1  # 65535 → 1 is a wrap, 2 → 5 is a loss
+    assert info["views"] == {"poses": 4, "attempts": 5, "names": [f"pose-{i}" for i in range(4)]}
+    assert info["size_bytes"] == path.stat().st_size
+
+
+def test_info_for_people_says_the_same(tmp_path: Path) -> None:
+    path = write_with_clocks(tmp_path / "a.mcap", drift_ppm=40, missing=range(500, 510))
+    result = run("info", path)
+    assert result.returncode == 0
+    text = " ".join(result.stdout.split())
+    for words in (
+        "simulated eye-in-hand",
+        "chessboard 7×6, 25 mm",
+        "4 poses, 1 retaken",
+        "2990 at 500.0 Hz, 1 gap, largest 22 ms",
+        "5, Mono8, 10000 µs, 1.5 dB, frame ids jump 1 time",
+        "drift +40.0 ppm",
+    ):
+        assert words in text, f"'{words}' is missing in: {text}"
+
+
+def test_info_of_clocks_that_go_back_or_are_no_time(tmp_path: Path) -> None:
+    """Whatever a robot or a hostile file says: no traceback, and JSON that a strict reader takes."""
+    stamps_s = [50.0, 50.002, 50.004, 50.001, 50.003, float("nan"), float("inf"), -1e308, 1e308]
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        for controller_s in stamps_s:
+            stamps = Stamps(1, START_NS, controller_s)
+            writer.robot_state(msgspec.structs.replace(make_state(0), stamps=stamps))
+        writer.picture(
+            msgspec.structs.replace(make_picture(0), exposure_us=float("nan"), gain_db=float("inf"))
+        )
+        path = writer.finish()
+    result = run("info", path)
+    assert "9 at 500.0 Hz, no gap, controller time goes back 1 time" in " ".join(result.stdout.split())
+    plain = run("info", path, "--json").stdout
+    assert json.loads(plain, parse_constant=lambda word: pytest.fail(f"{word} is no JSON"))
+    with RecordingWriter(tmp_path / "b.mcap", make_info()) as writer:
+        for count in reversed(range(5)):
+            writer.robot_state(make_state(count))
+        path = writer.finish()
+    assert recording_info(open_recording(path))["robot_states"]["backward"] == 4
+
+
+def test_info_json_is_one_object(small: Path) -> None:
+    result = run("info", small, "--json")
+    assert json.loads(result.stdout)["name"] == "test-cell"
+
+
+def test_info_of_an_empty_recording(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        path = writer.finish()
+    result = run("info", path)
+    assert result.returncode == 0, result.stderr
+    assert recording_info(open_recording(path))["robot_states"] is None
+
+
+def test_a_full_disk_behind_the_output_is_one_sentence_and_1(
+    small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("recordings.cli.print_info", full)
+    result = run("info", small)
+    assert (result.returncode, result.stderr) == (1, "recordings: the output: No space left on device\n")
+
+
+@pytest.mark.parametrize("command", ["info", "recover"])
+def test_a_missing_file_is_one_sentence_and_1(tmp_path: Path, command: str) -> None:
+    result = run(command, tmp_path / "none.mcap")
+    assert result.returncode == 1
+    assert result.stderr == f"recordings: cannot open {tmp_path}/none.mcap: No such file or directory\n"
+
+
+@pytest.mark.parametrize(
+    ("content", "command", "words"),
+    [
+        (b"", "info", "is empty: it was never written, or its copy failed. Copy it again"),
+        (b"hello", "info", "does not begin like an MCAP file, perhaps another one was meant"),
+        (b"hello", "recover", "nothing can be saved from .* The file is unchanged; look for another copy"),
+        (b"\x89MCAP0", "info", "was not finished or is cut (only 6 bytes)"),
+    ],
+)
+def test_a_file_that_is_none_is_named_as_such(
+    tmp_path: Path, content: bytes, command: str, words: str
+) -> None:
+    path = tmp_path / "a.mcap"
+    path.write_bytes(content)
+    result = run(command, path)
+    assert result.returncode == 1
+    assert re.search(words.replace("(", "\\(").replace(")", "\\)"), result.stderr), result.stderr
+    assert path.read_bytes() == content
+
+
+def test_the_command_that_is_offered_works_for_any_name(small: Path, tmp_path: Path) -> None:
+    path = tmp_path / "cut it.mcap"
+    path.write_bytes(small.read_bytes()[:-9000])
+    offered = run("info", path).stderr.strip().partition("recordings recover ")[2]
+    assert shlex.split(offered) == [str(path)]
+
+
+def test_a_name_is_printed_as_it_is(small: Path, tmp_path: Path) -> None:
+    path = tmp_path / "a[red]:bug:.mcap"
+    path.write_bytes(small.read_bytes())
+    assert path.name in "".join(run("info", path).stdout.split())
+
+
+def test_a_recording_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "a.mcap", make_info()):
+        result = run("recover", tmp_path / "a.mcap.part")
+        assert result.returncode == 1
+        assert "is in use by another process; wait until it has finished" in result.stderr
+        assert "never finished" in run("info", tmp_path / "a.mcap").stderr
+
+
+def test_an_export_into_a_folder_that_is_not_there_says_so(small: Path, tmp_path: Path) -> None:
+    result = run("export", small, "--to", "csv", "-o", tmp_path / "none" / "out")
+    assert result.returncode == 1
+    assert f"the folder {tmp_path}/none does not exist; create it first" in result.stderr
+
+
+def test_recover_of_a_whole_file_says_that_no_output_was_made(small: Path, tmp_path: Path) -> None:
+    result = run("recover", small, "-o", tmp_path / "b.mcap")
+    assert result.returncode == 0
+    assert "b.mcap was not written: there was nothing to repair" in "".join(result.stdout)
+
+
+def test_a_device_or_a_pipe_is_no_recording() -> None:
+    assert run("info", "/dev/zero").returncode == 1
+
+
+def test_recover_ends_with_3_when_it_had_to_rebuild_and_with_0_when_not(tmp_path: Path) -> None:
+    path = write_small(tmp_path / "a.mcap")
+    assert run("recover", path).returncode == 0
+    path.write_bytes(path.read_bytes()[:-9000])
+    refused = run("info", path)
+    assert refused.returncode == 1
+    assert "recordings recover" in refused.stderr
+    result = run("recover", path)
+    assert result.returncode == 3
+    assert "saved 3 poses" in result.stdout
+    assert "a.mcap.damaged" in "".join(result.stdout.split())
+    assert run("info", path).returncode == 0
+
+
+def test_recover_json_lists_what_was_lost(tmp_path: Path) -> None:
+    path = write_small(tmp_path / "a.mcap")
+    data = bytearray(path.read_bytes())
+    data[14_000] ^= 1
+    path.write_bytes(data)
+    result = run("recover", path, "--json")
+    assert result.returncode == 3
+    (report,) = json.loads(result.stdout)
+    assert report["lost_bytes"] > 0
+    assert report["losses"][0].startswith("bytes ")
+
+
+def test_a_missing_part_is_shown_by_info_and_given_up_by_recover(tmp_path: Path) -> None:
+    for part in (1, 2):
+        write_small(tmp_path / f"session-{part}.mcap", info=make_info(part=part))
+        enter_part(tmp_path, "test-cell", part, f"session-{part}.mcap")
+    (tmp_path / "session-2.mcap").unlink()
+    shown = run("info", tmp_path)
+    assert shown.returncode == 3
+    assert "MISSING" in shown.stdout
+    assert "lacks part 2 (session-2.mcap)" in " ".join(shown.stdout.split())
+    assert "3 poses" in shown.stdout
+    assert json.loads(run("info", tmp_path, "--json").stdout)["missing"] != []
+    refused = run("excerpt", tmp_path, "-o", tmp_path / "b.mcap")
+    assert refused.returncode == 1
+    assert f"recordings recover {tmp_path}" in refused.stderr
+    given_up = run("recover", tmp_path)
+    assert given_up.returncode == 3
+    assert "session-2.mcap: part 2 of the session is not in the folder" in given_up.stdout
+    assert "damaged file is kept" not in given_up.stdout
+    assert "part 2 of the session is not in the folder" in run("recover", tmp_path).stdout
+    afterwards = run("info", tmp_path)
+    assert afterwards.returncode == 0
+    assert "part 2 of the session was lost" in afterwards.stdout
+
+
+def test_the_time_between_two_parts_is_no_gap_and_no_lost_frame(tmp_path: Path) -> None:
+    for part in (1, 2):
+        with RecordingWriter(tmp_path / f"session-{part}.mcap", make_info(part=part)) as writer:
+            for count in range(5):
+                stamps = Stamps(1, START_NS + count * 2_000_000, 1000 * part + count * 0.002)
+                writer.robot_state(msgspec.structs.replace(make_state(0), stamps=stamps))
+                writer.picture(msgspec.structs.replace(make_picture(count), frame_id=50 * part + count))
+            writer.event(CaptureEvent(Stamps(1, START_NS), "started"))
+            writer.event(CaptureEvent(Stamps(1, START_NS + 1), "finished"))
+            writer.finish()
+    info = recording_info(open_recording(tmp_path))
+    assert (info["robot_states"]["count"], info["robot_states"]["gaps"]) == (10, 0)
+    assert (info["pictures"]["count"], info["pictures"]["frame_id_jumps"]) == (10, 0)
+    rates = {topic["topic"]: topic["rate_hz"] for topic in info["topics"]}
+    assert rates["/camera/frame"] == pytest.approx(2.0)
+    assert rates["/session/event"] is None
+
+
+def test_unknown_options_and_no_arguments_are_usage_errors() -> None:
+    assert run("info").returncode == 2
+    assert run("export", "a", "--to", "bag", "-o", "b").returncode == 2

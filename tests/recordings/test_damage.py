@@ -1,0 +1,145 @@
+"""No damage passes silently: every cut, every flipped bit, every crafted lie is refused with its place."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from recordings.errors import CorruptRecordingError, RecordingError, UnsealedRecordingError
+from recordings.reader import Recording, open_recording
+from recordings.recover import recover
+from recordings.schema.messages import RobotState, View
+from recordings.schema.topics import Topic
+from tests.recordings.small_recording import make_state, make_view, write_small
+
+SAMPLED_EVERY = 43
+"""Prime to 8, so that a sample meets every bit position. `make soak` takes every one."""
+
+
+def flips(data: bytes, every: int) -> Iterator[bytearray]:
+    for bit in range(0, len(data) * 8, every):
+        flipped = bytearray(data)
+        flipped[bit // 8] ^= 1 << (bit % 8)
+        yield flipped
+
+
+def check_every_flip(path: Path, every: int) -> int:
+    data = path.read_bytes()
+    damaged = path.with_name("damaged.mcap")
+    count = 0
+    for flipped in flips(data, every):
+        damaged.write_bytes(flipped)
+        with pytest.raises(RecordingError, match=r"recordings recover|cannot be used"):
+            open_recording(damaged)
+        count += 1
+    return count
+
+
+def test_a_flipped_bit_is_never_silent(small: Path) -> None:
+    assert check_every_flip(small, SAMPLED_EVERY) > 4_000
+
+
+@pytest.mark.soak
+def test_no_flipped_bit_at_all_is_silent(small: Path) -> None:
+    assert check_every_flip(small, 1) == small.stat().st_size * 8
+
+
+def check_every_cut(path: Path, every: int) -> None:
+    data = path.read_bytes()
+    cut = path.with_name("cut.mcap")
+    for length in range(0, len(data), every):
+        cut.write_bytes(data[:length])
+        refused = (UnsealedRecordingError, CorruptRecordingError)
+        with pytest.raises(refused, match=r"recordings recover|is empty"):
+            open_recording(cut)
+
+
+def test_a_cut_file_is_refused_and_names_recover(small: Path) -> None:
+    check_every_cut(small, 7)
+
+
+@pytest.mark.soak
+def test_a_file_cut_at_any_byte_is_refused(small: Path) -> None:
+    check_every_cut(small, 1)
+
+
+def assert_part_of_the_original(recording: Recording) -> tuple[int, int]:
+    """Whatever was saved is exactly what was written."""
+    views: list[View] = recording.views()
+    assert views == [make_view(view.index) for view in views]
+    states: list[RobotState] = list(recording.robot_states())
+    assert all(state in [make_state(i) for i in range(9)] for state in states)
+    for view, picture in recording.pictures():
+        assert picture.sequence == view.picture_sequence
+    return len(views), len(states)
+
+
+def check_recovery_of_cuts(path: Path, every: int) -> None:
+    """Each finished pose whose bytes are in the file comes back; more bytes never save less."""
+    data = path.read_bytes()
+    cut, output = path.with_name("cut.mcap.part"), path.with_name("saved.mcap")
+    saved_before = (0, 0)
+    for length in range(0, len(data), every):
+        cut.write_bytes(data[:length])
+        try:
+            (result,) = recover(cut, output)
+        except RecordingError as error:
+            assert "nothing can be saved" in str(error)
+            assert saved_before == (0, 0)
+            continue
+        saved = assert_part_of_the_original(open_recording(output))
+        assert (result.poses, result.robot_states) == saved
+        assert saved >= saved_before
+        saved_before = saved
+        output.unlink()
+    assert saved_before == (3, 9)
+
+
+def test_recovery_of_a_cut_file_saves_every_pose_that_is_in_it(small: Path) -> None:
+    check_recovery_of_cuts(small, 149)
+
+
+@pytest.mark.soak
+def test_recovery_of_a_file_cut_at_any_byte(small: Path) -> None:
+    check_recovery_of_cuts(small, 1)
+
+
+def check_recovery_of_flips(path: Path, every: int) -> None:
+    data = path.read_bytes()
+    damaged, output = path.with_name("damaged.mcap"), path.with_name("saved.mcap")
+    whole = 0
+    for flipped in flips(data, every):
+        damaged.write_bytes(flipped)
+        (result,) = recover(damaged, output)
+        views, states = assert_part_of_the_original(open_recording(output))
+        assert views >= 2
+        assert (views, states) == (3, 9) or result.lost_bytes > 0
+        whole += (views, states) == (3, 9)
+        output.unlink()
+    assert whole > 0
+
+
+def test_recovery_never_saves_a_changed_message(small: Path) -> None:
+    check_recovery_of_flips(small, 1009)
+
+
+@pytest.mark.soak
+def test_recovery_from_any_flipped_bit_never_saves_a_changed_message(small: Path) -> None:
+    check_recovery_of_flips(small, 7)
+
+
+def test_one_damaged_pose_costs_only_that_pose(tmp_path: Path) -> None:
+    path = write_small(tmp_path / "a.mcap", poses=6)
+    data = bytearray(path.read_bytes())
+    offset = open_recording(path).parts[0].messages(Topic.RAW_IMAGE).addresses[3]
+    data[offset + 100] ^= 0xFF
+    path.write_bytes(data)
+    with pytest.raises(CorruptRecordingError, match="checksum"):
+        open_recording(path)
+    (result,) = recover(path)
+    assert [view.index for view in open_recording(path).views()] == [0, 1, 2, 4, 5]
+    assert any("pose 4 (" in loss for loss in result.losses)
+    assert result.kept_original == path.with_name("a.mcap.damaged")
+    assert result.kept_original.read_bytes() == data

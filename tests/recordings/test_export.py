@@ -1,0 +1,271 @@
+"""Exports come back through other readers' own rules: import, csv, rosbags, rerun."""
+
+from __future__ import annotations
+
+import csv
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+import yaml
+from rosbags.highlevel import AnyReader
+from scipy.spatial.transform import Rotation
+
+from recordings.cli import main
+from recordings.errors import RecordingError
+from recordings.exporters.excerpt import write_excerpt
+from recordings.exporters.folder import Target, export_recording
+from recordings.importers.folder import import_folder
+from recordings.reader import open_recording
+from recordings.schema.messages import CameraModel, Stamps
+from recordings.schema.viewing import quaternion_xyzw
+from recordings.writer import RecordingWriter
+from tests.command_line import call
+from tests.recordings.small_recording import (
+    HEIGHT,
+    START_NS,
+    TURNED,
+    WIDTH,
+    make_image,
+    make_info,
+    make_picture,
+    make_state,
+    make_view,
+    write_small,
+)
+
+
+def test_a_folder_export_imports_as_the_same_views(small: Path, tmp_path: Path) -> None:
+    original = open_recording(small)
+    folder = export_recording(original, tmp_path / "out", Target.FOLDER)
+    again = open_recording(import_folder(folder, tmp_path / "again.mcap").path)
+    assert (again.info.board, again.info.mount, again.info.camera) == (
+        original.info.board,
+        original.info.mount,
+        original.info.camera,
+    )
+    for (a, picture_a), (b, picture_b) in zip(original.pictures(), again.pictures(), strict=True):
+        np.testing.assert_allclose(a.base_from_flange, b.base_from_flange, atol=1e-12)
+        np.testing.assert_array_equal(picture_a.image, picture_b.image)
+
+
+def test_an_imported_file_is_exported_byte_for_byte(folder: Path, tmp_path: Path) -> None:
+    recording = open_recording(import_folder(folder, tmp_path / "a.mcap").path)
+    out = export_recording(recording, tmp_path / "out", Target.FOLDER)
+    for index in range(3):
+        assert (out / f"images/{index:03d}.png").read_bytes() == (folder / f"images/{index}.png").read_bytes()
+
+
+def test_tables_hold_every_value_in_full_precision(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        for count in range(4):
+            writer.robot_state(make_state(count))
+        for sequence, attempt in enumerate([1, 2]):
+            writer.picture(make_picture(sequence))
+            writer.view(make_view(0, sequence, attempt))
+        recording = open_recording(writer.finish())
+    out = export_recording(recording, tmp_path / "out", Target.CSV)
+    tables = {path.stem: list(csv.DictReader(path.open())) for path in out.iterdir()}
+    assert {name: len(rows) for name, rows in tables.items()} == {
+        "robot_states": 4,
+        "pictures": 2,
+        "views": 2,
+        "events": 0,
+    }
+    state = tables["robot_states"][3]
+    assert float(state["shoulder_rad"]) == make_state(3).joints_rad[1]
+    assert int(state["host_monotonic_ns"]) == make_state(3).stamps.host_monotonic_ns
+    assert [row["used"] for row in tables["views"]] == ["0", "1"]
+    assert float(tables["views"][0]["z"]) == TURNED[2][3]
+
+
+def test_nothing_is_overwritten_and_nothing_left_behind(small: Path, tmp_path: Path) -> None:
+    taken = tmp_path / "taken"
+    taken.mkdir()
+    with pytest.raises(RecordingError, match="exists already"):
+        export_recording(open_recording(small), taken, Target.CSV)
+    with pytest.raises(RecordingError, match="does not exist; create it first"):
+        export_recording(open_recording(small), tmp_path / "no" / "out", Target.CSV)
+    assert list(taken.iterdir()) == []
+    assert not (tmp_path / "no").exists()
+
+
+def test_an_export_that_fails_halfway_leaves_nothing(small: Path, tmp_path: Path) -> None:
+    recording = open_recording(small)
+    (tmp_path / "out.part").mkdir()
+    with pytest.raises(RecordingError, match="cannot write"):
+        export_recording(recording, tmp_path / "out", Target.FOLDER)
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_excerpt_keeps_the_views_and_the_states_around_them(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        writer.attach("plan.yaml", "application/yaml", b"poses: 2\n")
+        for count in range(1000):  # 2 s at 500 Hz
+            writer.robot_state(make_state(count))
+        for sequence, (index, attempt, at_s) in enumerate([(0, 1, 0.2), (0, 2, 0.5), (1, 1, 1.5)]):
+            writer.picture(make_picture(sequence))
+            stamps = Stamps(host_monotonic_ns=round(at_s * 1e9), host_wall_ns=START_NS)
+            writer.view(msgspec.structs.replace(make_view(index, sequence, attempt), stamps=stamps))
+        original = open_recording(writer.finish())
+    excerpt = open_recording(write_excerpt(original, tmp_path / "b.mcap", window_s=0.1))
+    assert [(v.index, v.attempt) for v in excerpt.views()] == [(0, 2), (1, 1)]
+    np.testing.assert_array_equal(excerpt.picture(excerpt.views()[0]).image, make_image(1))
+    kept_s = [state.stamps.host_monotonic_ns / 1e9 for state in excerpt.robot_states()]
+    assert kept_s == pytest.approx(
+        [0.4 + 0.002 * i for i in range(101)] + [1.4 + 0.002 * i for i in range(101)]
+    )
+    assert excerpt.attachments() == original.attachments()
+
+
+@pytest.mark.parametrize("make", ["import", "excerpt"])
+def test_a_full_disk_leaves_no_half_of_a_recording_that_can_be_made_again(
+    small: Path, folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make: str
+) -> None:
+    recording, real_write = open_recording(small), os.writev
+
+    def write(descriptor: int, pieces: list[memoryview]) -> int:
+        if os.fstat(descriptor).st_size > 2000:
+            raise OSError(28, "No space left on device")
+        return real_write(descriptor, pieces)
+
+    monkeypatch.setattr("recordings.mcap.writer.os.writev", write)
+    output = tmp_path / "out.mcap"
+    with pytest.raises(RecordingError, match=r"No space left on device.*nothing is left of it.*try again"):
+        import_folder(folder, output) if make == "import" else write_excerpt(recording, output)
+    assert not list(tmp_path.glob("out*"))
+
+
+@pytest.mark.parametrize("target", ["folder", "csv", "ros2"])
+def test_the_command_line_writes_each_target(small: Path, tmp_path: Path, target: str) -> None:
+    result = call(main, "export", small, "--to", target, "-o", tmp_path / "out")
+    assert result.returncode == 0, result.stderr
+    assert (tmp_path / "out").is_dir()
+
+
+def test_quaternions_of_any_rotation_turn_back() -> None:
+    rotations = [
+        *Rotation.random(50, random_state=2),
+        Rotation.from_rotvec([np.pi, 0, 0]),
+        Rotation.identity(),
+    ]
+    for rotation in rotations:
+        T = np.eye(4)
+        T[:3, :3] = rotation.as_matrix()
+        q = quaternion_xyzw(tuple(map(tuple, T.tolist())))
+        assert q[3] >= 0
+        np.testing.assert_allclose(Rotation.from_quat(q).as_matrix(), T[:3, :3], atol=1e-12)
+
+
+def test_the_bag_has_the_profile_and_counts_that_ros_wants(small: Path, tmp_path: Path) -> None:
+    out = export_recording(open_recording(small), tmp_path / "bag", Target.ROS2)
+    described = yaml.safe_load((out / "metadata.yaml").read_text())["rosbag2_bagfile_information"]
+    counts = {t["topic_metadata"]["name"]: t["message_count"] for t in described["topics_with_message_count"]}
+    assert counts == {"/camera/camera_info": 3, "/joint_states": 9, "/camera/image_raw": 3, "/tf": 5}
+    assert described["message_count"] == 20
+    assert described["starting_time"] == {"nanoseconds_since_epoch": START_NS}
+    assert described["duration"] == {"nanoseconds": 16_000_000}, "a picture has the time of its view"
+    assert (out / described["relative_file_paths"][0]).read_bytes()[17:25] == b"\x04\0\0\0ros2"
+
+
+def read_bag(bag: Path) -> dict[str, list[Any]]:
+    """Topic → messages, each topic declared once and each message at the time that its header says."""
+    found: dict[str, list[Any]] = {}
+    with AnyReader([bag]) as reader:
+        assert len({c.topic for c in reader.connections}) == len(reader.connections)
+        for connection, time_ns, raw in reader.messages():
+            message = reader.deserialize(raw, connection.msgtype)
+            header = message.transforms[0].header if connection.topic == "/tf" else message.header
+            assert header.stamp.sec * 10**9 + header.stamp.nanosec == time_ns
+            found.setdefault(connection.topic, []).append(message)
+    return found
+
+
+def test_a_bag_holds_the_pose_that_counts_and_no_lens_that_nobody_knows(tmp_path: Path) -> None:
+    """A retaken pose's first attempt is not in /tf. ROS knows an uncalibrated camera by a K of zeros."""
+    first = ((1.0, 0.0, 0.0, 9.0), (0.0, 1.0, 0.0, 9.0), (0.0, 0.0, 1.0, 9.0), (0.0, 0.0, 0.0, 1.0))
+    with RecordingWriter(tmp_path / "a.mcap", make_info(camera=CameraModel(WIDTH, HEIGHT))) as writer:
+        writer.picture(make_picture(0))
+        writer.view(msgspec.structs.replace(make_view(0), base_from_flange=first))
+        writer.picture(make_picture(1))
+        writer.view(make_view(0, 1, attempt=2))
+        recording = open_recording(writer.finish())
+    found = read_bag(export_recording(recording, tmp_path / "bag", Target.ROS2))
+    assert [message.transforms[0].transform.translation.z for message in found["/tf"]] == [TURNED[2][3]]
+    camera = found["/camera/camera_info"][1]
+    assert (camera.k.tolist(), len(camera.d), camera.p.tolist()) == ([0.0] * 9, 0, [0.0] * 12)
+    assert camera.r.tolist() == np.eye(3).ravel().tolist()
+
+
+def test_a_short_list_of_distortion_is_filled_up_as_ros_expects_it(tmp_path: Path) -> None:
+    camera = CameraModel(WIDTH, HEIGHT, ((900.0, 0, 16), (0, 900, 12), (0, 0, 1)), (0.1,))
+    with RecordingWriter(tmp_path / "a.mcap", make_info(camera=camera)) as writer:
+        writer.picture(make_picture(0))
+        recording = open_recording(writer.finish())
+    (info,) = read_bag(export_recording(recording, tmp_path / "bag", Target.ROS2))["/camera/camera_info"]
+    assert info.d.tolist() == [0.1, 0.0, 0.0, 0.0, 0.0]
+
+
+def test_times_that_ros_cannot_hold_are_said(tmp_path: Path) -> None:
+    late = Stamps(1, 2**62)
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        writer.robot_state(msgspec.structs.replace(make_state(0), stamps=late))
+        recording = open_recording(writer.finish())
+    with pytest.raises(RecordingError, match="ROS 2 ends in 2038"):
+        export_recording(recording, tmp_path / "bag", Target.ROS2)
+    assert not list(tmp_path.glob("bag*"))
+
+
+@pytest.mark.parametrize("lossless_png", [False, True])
+def test_rosbags_reads_the_bag_back(tmp_path: Path, lossless_png: bool) -> None:
+    """By the `rosbags` package; ROS itself was not available to try."""
+    with RecordingWriter(tmp_path / "a.mcap", make_info(), lossless_png=lossless_png) as writer:
+        for index in range(3):
+            writer.robot_state(make_state(index))
+            writer.picture(make_picture(index))
+            writer.view(make_view(index))
+        path = writer.finish()
+    found = read_bag(export_recording(open_recording(path), tmp_path / "bag", Target.ROS2))
+    joints = found["/joint_states"][2]
+    np.testing.assert_array_equal(joints.position, make_state(2).joints_rad)
+    assert joints.header.stamp.sec * 10**9 + joints.header.stamp.nanosec == make_state(2).stamps.host_wall_ns
+    assert joints.name == [
+        *("shoulder_pan_joint", "shoulder_lift_joint", "elbow_joint"),
+        *("wrist_1_joint", "wrist_2_joint", "wrist_3_joint"),
+    ]
+    transform = found["/tf"][0].transforms[0]
+    assert (transform.header.frame_id, transform.child_frame_id) == ("base", "flange")
+    assert transform.transform.translation.z == TURNED[2][3]
+    camera = found["/camera/camera_info"][0]
+    assert (camera.width, camera.distortion_model, camera.k[0]) == (WIDTH, "plumb_bob", 900.0)
+    if lossless_png:
+        assert [m.format for m in found["/camera/image_raw/compressed"]] == ["png"] * 3
+        return
+    image = found["/camera/image_raw"][1]
+    assert (image.encoding, image.height, image.step) == ("mono8", HEIGHT, WIDTH)
+    np.testing.assert_array_equal(image.data.reshape(HEIGHT, WIDTH), make_image(1))
+
+
+def test_rerun_opens_the_recording_without_a_plugin(tmp_path: Path) -> None:
+    """Runs where the `rerun` program (package rerun-sdk) is installed: with 100 MB it is no dependency."""
+    rerun = shutil.which("rerun", path=f"{Path(sys.executable).parent}{os.pathsep}{os.environ['PATH']}")
+    if rerun is None:
+        pytest.skip("the rerun program (package rerun-sdk) is not installed")
+    path = write_small(tmp_path / "a.mcap")
+
+    def run(*arguments: str) -> str:
+        done = subprocess.run([rerun, *arguments], capture_output=True, text=True, check=True, timeout=60)
+        return done.stdout + done.stderr
+
+    run("mcap", "check", str(path))
+    run("mcap", "convert", str(path), "-o", str(tmp_path / "a.rrd"))
+    shown = run("rrd", "print", str(tmp_path / "a.rrd"))
+    for column in ("Image:buffer", "Pinhole:image_from_camera", "Transform3D:translation", "TextLog:text"):
+        assert column in shown, f"rerun shows no {column}"
+    assert "station.RobotState" in shown

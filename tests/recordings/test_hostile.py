@@ -1,0 +1,299 @@
+"""Files made to mislead: right checksums everywhere and one lie. All are refused in little memory."""
+
+from __future__ import annotations
+
+import resource
+import struct
+import time
+from dataclasses import replace
+from pathlib import Path
+
+import lz4.frame
+import msgspec
+import pytest
+import zstandard
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from recordings.errors import CorruptRecordingError, RecordingError
+from recordings.mcap.records import Opcode
+from recordings.reader import open_recording
+from recordings.recover import recover
+from recordings.schema.definitions import encode
+from recordings.schema.messages import RobotState
+from recordings.schema.topics import Topic
+from tests.recordings.crafted import (
+    Counts,
+    attachment,
+    channel,
+    chunk,
+    message,
+    metadata,
+    record,
+    schema,
+    sealed,
+    session_metadata,
+    text,
+    write,
+)
+from tests.recordings.small_recording import (
+    make_info,
+    make_state,
+    make_view,
+)
+
+STATE_SCHEMA = schema(1, Topic.ROBOT_STATE)
+STATE_CHANNEL = channel(1, 1, "/robot/state")
+DECLARED = STATE_SCHEMA + STATE_CHANNEL
+STATE = message(1, encode(make_state(0)))
+ONE = Counts(messages=1, schemas=1, channels=1, chunks=1, per_channel={1: 1})
+SESSION = session_metadata()
+BOMB_BYTES = 900 * 1024 * 1024
+
+
+def test_the_control_without_a_lie_opens(tmp_path: Path) -> None:
+    data = SESSION + chunk(DECLARED + STATE)
+    recording = open_recording(write(tmp_path, sealed(data, ONE, DECLARED)))
+    assert list(recording.robot_states()) == [make_state(0)]
+
+
+UNUSUAL = {
+    "zstd": lambda: packed_chunk("zstd", DECLARED + STATE),
+    "lz4": lambda: packed_chunk("lz4", DECLARED + STATE),
+    "chunk checksum not computed": lambda: with_chunk(DECLARED + STATE, crc=0),
+    "data and summary checksum not computed": lambda: without_checksums(with_chunk(DECLARED + STATE)),
+    "no chunk at all": lambda: sealed(SESSION + DECLARED + STATE, replace(ONE, chunks=0), DECLARED),
+    "no summary": lambda: without_summary(with_chunk(DECLARED + STATE)),
+    "summary that repeats nothing": lambda: sealed(SESSION + chunk(DECLARED + STATE), ONE),
+    "declared again": lambda: sealed(SESSION + chunk(DECLARED + DECLARED + STATE), ONE, DECLARED),
+    "metadata name twice": lambda: sealed(SESSION * 2 + chunk(DECLARED + STATE), replace(ONE, metadata=2)),
+    "another profile": lambda: sealed(SESSION + chunk(DECLARED + STATE), ONE, DECLARED, profile="ros2"),
+    "private record": lambda: after_session(record(0x80, b"x")),
+    "record of a later specification": lambda: after_session(record(0x42, b"x")),
+    "field of a later specification": lambda: sealed(
+        SESSION + chunk(STATE_SCHEMA + record(Opcode.CHANNEL, STATE_CHANNEL[9:] + b"!") + STATE),
+        ONE,
+        DECLARED,
+    ),
+}
+"""Allowed by the specification, and written by other programs."""
+
+
+@pytest.mark.parametrize("name", UNUSUAL)
+def test_what_the_specification_allows_is_read(tmp_path: Path, name: str) -> None:
+    recording = open_recording(write(tmp_path, UNUSUAL[name]()))
+    assert list(recording.robot_states()) == [make_state(0)]
+
+
+def test_foreign_topics_are_ignored_but_listed(tmp_path: Path) -> None:
+    records = DECLARED + schema(2, Topic.LOG) + channel(2, 2, "/theirs") + STATE + message(2, b"x") * 3
+    counts = Counts(messages=4, chunks=1, per_channel={1: 1, 2: 3})
+    recording = open_recording(write(tmp_path, sealed(SESSION + chunk(records), counts, DECLARED)))
+    assert list(recording.robot_states()) == [make_state(0)]
+    assert {topic: len(index) for topic, index in recording.parts[0].foreign.items()} == {"/theirs": 3}
+
+
+def without_checksums(content: bytes) -> bytes:
+    """Data section and summary with 0 instead of a checksum, as other writers leave them."""
+    changed = bytearray(content)
+    summary_start = struct.unpack_from("<Q", content, len(content) - 28)[0]
+    changed[summary_start - 4 : summary_start] = bytes(4)
+    changed[-12:-8] = bytes(4)
+    return bytes(changed)
+
+
+def without_summary(content: bytes) -> bytes:
+    summary_start = struct.unpack_from("<Q", content, len(content) - 28)[0]
+    return content[:summary_start] + record(Opcode.FOOTER, bytes(20)) + content[-8:]
+
+
+def with_chunk(records: bytes, **lies: object) -> bytes:
+    return sealed(SESSION + chunk(records, **lies), ONE, DECLARED)  # type: ignore[arg-type]
+
+
+def packed_chunk(compression: str, records: bytes, **lies: object) -> bytes:
+    stored = zstandard.compress(records) if compression == "zstd" else lz4.frame.compress(records)
+    return with_chunk(records, compression=compression, stored=stored, **lies)
+
+
+def after_session(data: bytes) -> bytes:
+    return sealed(SESSION + data + chunk(DECLARED + STATE), ONE, DECLARED)
+
+
+def counted(**wrong: object) -> bytes:
+    counts = Counts(messages=1, schemas=1, channels=1, chunks=1, per_channel={1: 1})
+    for name, value in wrong.items():
+        setattr(counts, name, value)
+    return sealed(SESSION + chunk(DECLARED + STATE), counts, DECLARED)
+
+
+def bomb(compression: str) -> bytes:
+    zeros = bytes(1024 * 1024)
+    if compression == "zstd":
+        packer = zstandard.ZstdCompressor(level=3).compressobj()
+        packed = b"".join(packer.compress(zeros) for _ in range(BOMB_BYTES >> 20)) + packer.flush()
+    else:
+        frame = lz4.frame.LZ4FrameCompressor()
+        packed = (
+            frame.begin() + b"".join(frame.compress(zeros) for _ in range(BOMB_BYTES >> 20)) + frame.flush()
+        )
+    return with_chunk(b"", compression=compression, stored=packed, size=BOMB_BYTES)
+
+
+def future_session() -> bytes:
+    described = msgspec.json.encode({**msgspec.to_builtins(make_info()), "gravity": 9.81}).decode()
+    return metadata("session", {"format": "station-recording/1", "session": described})
+
+
+OTHER_CHANNEL = channel(1, 1, "/session/view")
+LIES: dict[str, tuple[bytes, str]] = {
+    "unknown compression": (with_chunk(DECLARED + STATE, compression="lzma"), "'lzma' is unknown"),
+    "not compressed at all": (with_chunk(DECLARED + STATE, compression="zstd"), "cannot be unpacked"),
+    "unpacks to less": (packed_chunk("zstd", DECLARED + STATE, size=5000), "says it unpacks to 5000"),
+    "unpacks to more": (packed_chunk("lz4", DECLARED + STATE, size=50), "it gives more"),
+    "checksum of what was packed": (packed_chunk("zstd", DECLARED + STATE, crc=1), "chunk's checksum"),
+    "nested chunk": (with_chunk(DECLARED + chunk(STATE)), "0x06 inside a chunk"),
+    "attachment in a chunk": (with_chunk(DECLARED + STATE + attachment("a", b"")), "0x09 inside a chunk"),
+    "channel redeclared": (with_chunk(DECLARED + OTHER_CHANNEL + STATE), "channel 1 is declared twice"),
+    "schema redeclared": (with_chunk(DECLARED + schema(1, Topic.VIEW) + STATE), "schema 1 is declared twice"),
+    "schema 0": (with_chunk(schema(0, Topic.VIEW)), "schema 0"),
+    "unknown channel": (with_chunk(DECLARED + message(7, b"")), "channel 7, which was not declared"),
+    "unknown schema": (
+        with_chunk(STATE_SCHEMA + channel(1, 9, "/robot/state")),
+        "schema 9, which is unknown",
+    ),
+    "message too short": (with_chunk(DECLARED + record(Opcode.MESSAGE, bytes(21))), "21 bytes has no head"),
+    "message longer than its chunk": (
+        with_chunk(DECLARED + struct.pack("<BQ", Opcode.MESSAGE, 500) + bytes(100)),
+        "says it has 500 bytes, 100 are left",
+    ),
+    "record head cut in a chunk": (with_chunk(DECLARED + b"\x05\x00"), "head is cut"),
+    "chunk size": (with_chunk(DECLARED + STATE, size=7), "says it has 7 bytes"),
+    "chunk size 2^62": (with_chunk(DECLARED + STATE, size=2**62), "says it has 4611686018427387904"),
+    "chunk checksum": (with_chunk(DECLARED + STATE, crc=1), "chunk's checksum"),
+    "record length 2^63": (
+        after_session(struct.pack("<BQ", Opcode.CHUNK, 2**63)),
+        "says it has 9223372036854775808",
+    ),
+    "record kind 0": (after_session(record(0, b"")), "0x00 does not belong"),
+    "footer in the data": (after_session(record(Opcode.FOOTER, bytes(20))), "0x02 does not belong"),
+    "not UTF-8": (after_session(metadata("x", {}).replace(text("x"), text(b"\xff"))), "not valid UTF-8"),
+    "metadata key twice": (
+        after_session(record(Opcode.METADATA, text("x") + text(text("a") + text("") + text("a") + text("")))),
+        "'a' stands twice",
+    ),
+    "map too long": (
+        after_session(record(Opcode.METADATA, text("x") + struct.pack("<I", 99))),
+        "over the end",
+    ),
+    "attachment checksum": (
+        after_session(attachment("a.txt", b"x", crc=3)),
+        "checksum of attachment 'a.txt'",
+    ),
+    "attachment named a path": (
+        sealed(SESSION + attachment("../../etc/x", b""), Counts(attachments=1)),
+        "attachment is named '../../etc/x'",
+    ),
+    "attachment named NUL": (sealed(SESSION + attachment("a\0b", b""), Counts(attachments=1)), "is named"),
+    "too many channels": (
+        with_chunk(STATE_SCHEMA + b"".join(channel(n, 1, f"/{n}") for n in range(1, 2000))),
+        "more than 1024 channels",
+    ),
+    "a topic of ours with somebody else's content": (
+        sealed(SESSION + chunk(schema(1, Topic.LOG) + STATE_CHANNEL + STATE), ONE),
+        "topic /robot/state holds foxglove.Log",
+    ),
+    "message count": (counted(messages=2), "messages = 2, the file has 1"),
+    "channel's count": (counted(per_channel={1: 5}), "channel_messages"),
+    "chunk count": (counted(chunks=3), "chunks = 3, the file has 1"),
+    "metadata count": (counted(metadata=0), "metadata = 0"),
+    "attachment count": (counted(attachments=9), "attachments = 9"),
+    "summary that says something else": (
+        sealed(SESSION + chunk(DECLARED + STATE), ONE, OTHER_CHANNEL),
+        "channel 1 is declared twice",
+    ),
+    "no session": (sealed(b"", Counts(metadata=0)), "no recording of this station"),
+    "a format of the future": (
+        sealed(session_metadata(file_format="station-recording/3"), Counts()),
+        "written by newer software (format 3, this version reads up to 2)",
+    ),
+    "a session changed without its checksum": (
+        sealed(SESSION.replace(b"eye-in-hand", b"eye-to-hand"), Counts()),
+        "checksum of a metadata record",
+    ),
+    "a session description of the future": (
+        sealed(future_session(), Counts()),
+        "description does not fit this version: Object contains unknown field `gravity`",
+    ),
+    "session named a path": (
+        sealed(session_metadata(make_info(name="../x")), Counts()),
+        "session name '../x'",
+    ),
+    "session is no JSON": (
+        sealed(metadata("session", {"format": "station-recording/1", "session": "[" * 9000}), Counts()),
+        "description does not fit",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", LIES)
+def test_one_lie_is_enough(tmp_path: Path, name: str) -> None:
+    content, reason = LIES[name]
+    with pytest.raises(CorruptRecordingError, match=r"byte \d+|cannot be used") as caught:
+        open_recording(write(tmp_path, content))
+    assert reason in str(caught.value)
+
+
+@pytest.mark.parametrize("compression", ["zstd", "lz4"])
+def test_a_decompression_bomb_is_refused_at_once(tmp_path: Path, compression: str) -> None:
+    path = write(tmp_path, bomb(compression))
+    start_s = time.perf_counter()
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(CorruptRecordingError, match="more than is read here"):
+        open_recording(path)
+    assert time.perf_counter() - start_s < 0.5
+    path.write_bytes(path.read_bytes().replace(struct.pack("<Q", BOMB_BYTES), struct.pack("<Q", 4_000_000)))
+    with pytest.raises(CorruptRecordingError, match="gives more"):
+        open_recording(path)
+    recover(path)
+    assert time.perf_counter() - start_s < 1.0
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100 * 1024
+
+
+def test_messages_that_are_wrong_in_themselves_name_their_place(tmp_path: Path) -> None:
+    for data in (b"\xff\xff\xff", b"", encode(make_view(0))):
+        records = DECLARED + message(1, data)
+        recording = open_recording(write(tmp_path, sealed(SESSION + chunk(records), ONE, DECLARED)))
+        with pytest.raises(CorruptRecordingError, match=r"byte \d+ \(/robot/state\)"):
+            list(recording.robot_states())
+
+
+@pytest.mark.parametrize("name", ["record length 2^63", "chunk size 2^62", "map too long"])
+def test_lies_about_size_cost_no_memory(tmp_path: Path, name: str) -> None:
+    path = write(tmp_path, LIES[name][0])
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    with pytest.raises(CorruptRecordingError):
+        open_recording(path)
+    assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 8 * 1024
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(st.data())
+def test_any_bytes_give_a_recording_or_a_recording_error(small: Path, data: st.DataObject) -> None:
+    """Random edits of a good file: cut, repeat, overwrite. Recovery keeps to the same contract."""
+    content = bytearray(small.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        at = data.draw(st.integers(0, len(content)))
+        length = data.draw(st.integers(0, 300))
+        piece = data.draw(st.one_of(st.binary(max_size=64), st.just(bytes(content[at : at + length]))))
+        content[at : at + data.draw(st.sampled_from([0, len(piece), length]))] = piece
+    damaged, saved = small.with_name("edited.mcap"), small.with_name("saved.mcap")
+    damaged.write_bytes(content)
+    saved.unlink(missing_ok=True)
+    for read in (lambda: damaged, lambda: recover(damaged, saved)[0].path):
+        try:
+            recording = open_recording(read())
+        except RecordingError:
+            continue
+        assert all(isinstance(state, RobotState) for state in recording.robot_states())
+        assert all(view == make_view(view.index) for view in recording.views())

@@ -1,0 +1,125 @@
+"""Pictures made to mislead in a file that is right: checked before they are decoded, in little memory."""
+
+from __future__ import annotations
+
+import struct
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+
+from recordings.errors import CorruptRecordingError
+from recordings.reader import open_recording
+from recordings.schema.definitions import PictureFacts, encode
+from recordings.schema.messages import CameraModel
+from recordings.schema.topics import Topic
+from recordings.writer import RecordingWriter
+from tests.recordings.crafted import Counts, channel, chunk, message, schema, sealed, session_metadata, write
+from tests.recordings.small_recording import (
+    HEIGHT,
+    WIDTH,
+    make_image,
+    make_info,
+    make_picture,
+    make_state,
+    make_view,
+)
+
+
+def picture_file(tmp_path: Path, image: object, topic: Topic, **facts: object) -> Path:
+    settings_: dict[str, object] = {"width": WIDTH, "height": HEIGHT} | facts
+    described = PictureFacts(stamps=make_state(0).stamps, frame_id=1, sequence=0, **settings_)  # type: ignore[arg-type]
+    names = [Topic.PICTURE_FACTS, topic, Topic.VIEW]
+    declared = b"".join(schema(n, t) + channel(n, n, t.value) for n, t in enumerate(names, start=1))
+    data = chunk(
+        declared
+        + message(1, encode(described))
+        + message(2, image.SerializeToString())  # type: ignore[attr-defined]
+        + message(3, encode(make_view(0)))
+    )
+    counts = Counts(messages=3, schemas=3, channels=3, chunks=1, per_channel={1: 1, 2: 1, 3: 1})
+    return write(tmp_path, sealed(session_metadata() + data, counts, declared))
+
+
+def png(width: int = WIDTH, height: int = HEIGHT) -> bytes:
+    return cv2.imencode(".png", make_image(1, width, height))[1].tobytes()
+
+
+def huge_png() -> bytes:
+    data = bytearray(png())
+    data[16:24] = struct.pack(">II", 30000, 30000)
+    return bytes(data)
+
+
+PICTURES: dict[str, tuple[object, Topic, str]] = {
+    "header of 30000×30000": (CompressedImage(data=huge_png()), Topic.COMPRESSED_IMAGE, "impossible size"),
+    "another size": (CompressedImage(data=png(40, 30)), Topic.COMPRESSED_IMAGE, "is 40×30, expected 32×24"),
+    "cut": (CompressedImage(data=png()[:-30]), Topic.COMPRESSED_IMAGE, "the PNG is cut"),
+    "not a picture": (CompressedImage(data=b"hello"), Topic.COMPRESSED_IMAGE, "neither PNG"),
+    "raw too short": (
+        RawImage(width=WIDTH, height=HEIGHT, encoding="mono8", data=b"x"),
+        Topic.RAW_IMAGE,
+        "holds 1 bytes where 32×24 mono8 needs 768",
+    ),
+    "raw of another size": (
+        RawImage(width=1, height=1, encoding="mono8", data=b"x"),
+        Topic.RAW_IMAGE,
+        "is 1×1, expected 32×24",
+    ),
+    "raw of unknown layout": (
+        RawImage(width=WIDTH, height=HEIGHT, encoding="yuv422", data=bytes(WIDTH * HEIGHT * 2)),
+        Topic.RAW_IMAGE,
+        "unknown raw layout 'yuv422'",
+    ),
+}
+
+
+@pytest.mark.parametrize("name", PICTURES)
+def test_a_picture_is_checked_before_it_is_decoded(tmp_path: Path, name: str) -> None:
+    image, topic, reason = PICTURES[name]
+    recording = open_recording(picture_file(tmp_path, image, topic))
+    with pytest.raises(CorruptRecordingError, match="picture 0") as caught:
+        recording.picture(recording.views()[0])
+    assert reason in str(caught.value)
+
+
+def test_facts_of_another_size_than_the_camera(tmp_path: Path) -> None:
+    raw = RawImage(width=1, height=1, encoding="mono8", data=b"x")
+    recording = open_recording(picture_file(tmp_path, raw, Topic.RAW_IMAGE, width=1, height=1))
+    with pytest.raises(CorruptRecordingError, match="is 1×1, the camera 32×24"):
+        recording.picture(recording.views()[0])
+
+
+def test_memory_stays_below_256_mib_for_the_largest_allowed_picture(tmp_path: Path) -> None:
+    """A process of its own reads a 36 MB picture, raw and compressed, and reports its peak."""
+    program = textwrap.dedent(
+        """
+        import sys
+        from pathlib import Path
+        import numpy as np
+        from recordings.reader import open_recording
+        for name in sys.argv[1:]:
+            recording = open_recording(Path(name))
+            for _, picture in recording.pictures():
+                assert picture.image.nbytes == 36_000_000
+        status = Path("/proc/self/status").read_text()  # ru_maxrss would begin at the parent's
+        print(status.split("VmHWM:")[1].split()[0])
+        """
+    )
+    paths = []
+    noise = np.random.default_rng(0).integers(0, 8, (3000, 4000, 3), np.uint8)
+    for lossless in (False, True):
+        info = make_info(camera=CameraModel(4000, 3000))
+        with RecordingWriter(tmp_path / f"{lossless}.mcap", info, lossless_png=lossless) as writer:
+            for index in range(2):
+                writer.picture(make_picture(index, noise))
+                writer.view(make_view(index))
+            paths.append(str(writer.finish()))
+    done = subprocess.run([sys.executable, "-c", program, *paths], capture_output=True, text=True, check=True)
+    assert int(done.stdout) < 256 * 1024

@@ -1,0 +1,220 @@
+"""Recovery: in place or to a new name, never over anything, only when nobody writes, and verified."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recordings.errors import RecordingError
+from recordings.files import create_exclusively
+from recordings.reader import open_recording
+from recordings.recover import recover
+from recordings.schema.messages import CameraModel
+from recordings.schema.topics import Topic
+from recordings.writer import RecordingWriter
+from tests.recordings.small_recording import make_info, make_picture, make_view, write_small
+
+
+def write_unfinished(path: Path, poses: int = 2, part: int = 1) -> Path:
+    with RecordingWriter(path, make_info(part=part)) as writer:
+        writer.attach("plan.yaml", "application/yaml", b"poses: 2\n")
+        for index in range(poses):
+            writer.picture(make_picture(index))
+            writer.view(make_view(index))
+        writer.flush()
+    return writer.part_path
+
+
+def test_an_unfinished_file_takes_its_name_and_the_damaged_one_is_kept(tmp_path: Path) -> None:
+    part = write_unfinished(tmp_path / "a.mcap")
+    before = part.read_bytes()
+    (result,) = recover(part)
+    assert result.rebuilt
+    assert (result.poses, result.pictures, result.lost_bytes) == (2, 2, 0)
+    recording = open_recording(tmp_path / "a.mcap")
+    assert recording.info == make_info()
+    assert recording.attachments() == {"plan.yaml": b"poses: 2\n"}
+    assert result.kept_original is not None
+    assert result.kept_original.read_bytes() == before
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.mcap", "a.mcap.part.damaged"]
+
+
+def test_with_an_output_the_original_is_untouched(tmp_path: Path) -> None:
+    part = write_unfinished(tmp_path / "a.mcap")
+    (result,) = recover(part, tmp_path / "b.mcap")
+    assert result.kept_original == part
+    assert len(open_recording(tmp_path / "b.mcap").views()) == 2
+
+
+def test_a_whole_file_that_only_missed_its_rename_is_renamed(small: Path) -> None:
+    part = small.rename(small.with_name("small.mcap.part"))
+    (result,) = recover(part)
+    assert not result.rebuilt
+    assert result.path == small
+    assert len(open_recording(small).views()) == 3
+
+
+def test_a_whole_file_is_left_alone(small: Path) -> None:
+    before = small.read_bytes()
+    (result,) = recover(small)
+    assert not result.rebuilt
+    assert small.read_bytes() == before
+
+
+def test_a_file_that_is_being_written_is_refused(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        writer.picture(make_picture(0))
+        with pytest.raises(RecordingError, match="in use by another process"):
+            recover(writer.part_path)
+
+
+def test_nothing_is_overwritten(tmp_path: Path) -> None:
+    part = write_unfinished(tmp_path / "a.mcap")
+    taken = write_small(tmp_path / "b.mcap")
+    before = taken.read_bytes()
+    with pytest.raises(RecordingError, match="exists already"):
+        recover(part, taken)
+    assert taken.read_bytes() == before
+
+
+def test_a_picture_without_its_view_and_a_view_without_its_picture(tmp_path: Path) -> None:
+    """The chunk of pose 1's picture is cut out: its view must go too, the others stay."""
+    path = write_small(tmp_path / "a.mcap", poses=3)
+    part = open_recording(path).parts[0]
+    offset = part.messages(Topic.RAW_IMAGE).addresses[1]
+    data = bytearray(path.read_bytes())
+    data[offset + 50] ^= 1
+    path.write_bytes(data)
+    (result,) = recover(path)
+    assert [view.index for view in open_recording(path).views()] == [0, 2]
+    assert any("pose 2 (" in loss and "lost its picture" in loss for loss in result.losses)
+
+
+@pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"hello" * 100, bytes(5000), b"\x06" * 5000])
+def test_a_file_with_nothing_in_it_says_so_and_leaves_nothing(tmp_path: Path, content: bytes) -> None:
+    part = tmp_path / "a.mcap.part"
+    part.write_bytes(content)
+    with pytest.raises(RecordingError, match="nothing can be saved"):
+        recover(part)
+    assert list(tmp_path.iterdir()) == [part]
+
+
+def test_a_folder_is_recovered_file_by_file(tmp_path: Path) -> None:
+    write_small(tmp_path / "part-1.mcap")
+    write_unfinished(tmp_path / "part-2.mcap", part=2)
+    results = recover(tmp_path)
+    assert [result.rebuilt for result in results] == [False, True]
+    assert [(v.index, v.part) for v in open_recording(tmp_path).views()] == [(0, 2), (1, 2), (2, 1)]
+
+
+def test_what_an_earlier_recovery_kept_is_kept(tmp_path: Path) -> None:
+    for _ in range(3):
+        path = tmp_path / "a.mcap"
+        path.unlink(missing_ok=True)
+        recover(write_unfinished(path))
+    names = {p.name for p in tmp_path.iterdir()}
+    assert names == {"a.mcap", "a.mcap.part.damaged", "a.mcap.part.damaged-2", "a.mcap.part.damaged-3"}
+
+
+def test_a_lost_dark_picture_does_not_make_recovery_slow(tmp_path: Path) -> None:
+    """Its bytes look like record heads everywhere; each must be dismissed without reading what it claims."""
+    pattern = np.array([6, 0, 0, 8, 0, 0, 0, 0, 0], np.uint8)  # "a chunk of 512 KiB starts here"
+    dark = np.resize(pattern, (1000, 1000))
+    with RecordingWriter(tmp_path / "a.mcap", make_info(camera=CameraModel(1000, 1000))) as writer:
+        for index in range(3):
+            writer.picture(make_picture(index, dark))
+            writer.view(make_view(index))
+        path = writer.finish()
+    data = bytearray(path.read_bytes())
+    data[open_recording(path).parts[0].messages(Topic.RAW_IMAGE).addresses[1] - 40] ^= 1
+    path.write_bytes(data)
+    start_s = time.perf_counter()
+    recover(path)
+    assert time.perf_counter() - start_s < 8
+    assert [view.index for view in open_recording(path).views()] == [0, 2]
+
+
+def test_after_a_destroyed_record_head_the_search_finds_the_next_whole_chunk(tmp_path: Path) -> None:
+    path = write_small(tmp_path / "a.mcap", poses=4)
+    data = bytearray(path.read_bytes())
+    at = open_recording(path).parts[0].messages(Topic.RAW_IMAGE).addresses[1]
+    head = data.rindex(b"\x06", 0, at - 700)  # of pose 1's chunk, or a byte before it
+    data[head : head + 9] = b"\xff" * 9
+    path.write_bytes(data)
+    recover(path)
+    assert {0, 2, 3} <= {view.index for view in open_recording(path).views()}
+
+
+def test_what_a_killed_recovery_left_is_no_obstacle(small: Path) -> None:
+    data = small.read_bytes()
+    small.write_bytes(data[:-9000])
+    leftover = small.with_name("small.mcap.recovering")
+    leftover.write_bytes(b"half")
+    (result,) = recover(small)
+    assert result.poses == 3
+    assert not leftover.exists()
+
+
+@pytest.mark.parametrize("unfinished", [True, False], ids=["unfinished", "damaged"])
+def test_a_recovery_killed_between_its_renames_can_be_done_again(tmp_path: Path, unfinished: bool) -> None:
+    program = (
+        "import os, pathlib, signal, sys\n"
+        "from recordings.recover import recover\n"
+        "left = int(sys.argv[2])\n"
+        "def mortal(call):\n"
+        "    def made(*given, **named):\n"
+        "        global left\n"
+        "        if not left:\n"
+        "            os.kill(os.getpid(), signal.SIGKILL)\n"
+        "        left -= 1\n"
+        "        return call(*given, **named)\n"
+        "    return made\n"
+        "os.link, os.replace, os.rename = map(mortal, (os.link, os.replace, os.rename))\n"
+        "recover(pathlib.Path(sys.argv[1]))\n"
+    )
+    kills = 0
+    while True:
+        folder = tmp_path / str(kills)
+        folder.mkdir()
+        path = write_unfinished(folder / "a.mcap") if unfinished else write_small(folder / "a.mcap", poses=3)
+        if not unfinished:
+            path.write_bytes(path.read_bytes()[:-9000])
+        done = subprocess.run([sys.executable, "-c", program, path, str(kills)], check=False)
+        (result,) = recover(folder)
+        assert (result.path, result.poses) == (folder / "a.mcap", 2 if unfinished else 3)
+        assert list(folder.glob("*.damaged"))
+        if done.returncode == 0:
+            break
+        kills += 1
+    assert kills >= 2
+
+
+def test_where_files_have_one_name_only_they_are_recovered_too(
+    small: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def refused(*_: Path) -> None:
+        raise PermissionError(1, "Operation not permitted")
+
+    data = small.read_bytes()[:-9000]
+    small.write_bytes(data)
+    monkeypatch.setattr(os, "link", refused)
+    (result,) = recover(small)
+    assert result.kept_original is not None
+    assert result.kept_original.read_bytes() == data
+    assert len(open_recording(small).views()) == result.poses
+
+
+def test_a_recovery_that_still_runs_is_not_disturbed(small: Path) -> None:
+    data = small.read_bytes()
+    small.write_bytes(data[:-9000])
+    other = create_exclusively(small.with_name("small.mcap.recovering"))
+    with pytest.raises(RecordingError, match=r"recovering is in use by another process"):
+        recover(small)
+    os.close(other)
+    assert small.read_bytes() == data[:-9000]

@@ -1,0 +1,185 @@
+"""What goes into a recording comes out of it unchanged, and other programs can read it too."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_protobuf.decoder import DecoderFactory
+
+from recordings.errors import RecordingError
+from recordings.pictures import encode_png
+from recordings.reader import open_recording
+from recordings.schema.messages import CameraModel, CaptureEvent, Picture, Stamps
+from recordings.writer import RecordingWriter
+from tests.recordings.small_recording import (
+    HEIGHT,
+    START_NS,
+    TURNED,
+    WIDTH,
+    make_image,
+    make_info,
+    make_picture,
+    make_state,
+    make_view,
+    write_small,
+)
+
+
+def test_everything_comes_back_as_it_was(small: Path) -> None:
+    recording = open_recording(small)
+    assert recording.info == make_info()
+    assert recording.views() == [make_view(i) for i in range(3)]
+    assert list(recording.robot_states()) == [make_state(i) for i in range(9)]
+    assert [e.kind for e in recording.events()] == ["started", "finished"]
+    assert list(recording.events())[1] == CaptureEvent(
+        Stamps(2, START_NS + 1), "finished", pose_index=2, level="warning"
+    )
+    assert recording.attachments() == {"plan.yaml": b"poses: 3\n"}
+    assert recording.sha256 == hashlib.sha256(small.read_bytes()).hexdigest()
+
+
+def test_pictures_are_identical_to_the_bit_and_carry_their_facts(small: Path) -> None:
+    for view, picture in open_recording(small).pictures():
+        expected = make_picture(view.picture_sequence)
+        np.testing.assert_array_equal(picture.image, expected.image)
+        for name in (
+            "stamps",
+            "frame_id",
+            "sequence",
+            "exposure_us",
+            "gain_db",
+            "pixel_format",
+            "trigger_count",
+        ):
+            assert getattr(picture, name) == getattr(expected, name)
+
+
+@pytest.mark.parametrize("lossless_png", [False, True])
+@pytest.mark.parametrize(
+    ("shape", "kind", "pixel_format"),
+    [
+        ((HEIGHT, WIDTH), np.uint8, "Mono8"),
+        ((HEIGHT, WIDTH), np.uint8, "BayerRG8"),
+        ((HEIGHT, WIDTH), np.uint16, "Mono12"),
+        ((HEIGHT, WIDTH, 3), np.uint8, "BGR8"),
+    ],
+)
+def test_every_kind_of_picture_is_lossless(
+    tmp_path: Path, shape: tuple[int, ...], kind: type, pixel_format: str, lossless_png: bool
+) -> None:
+    image = np.random.default_rng(1).integers(0, np.iinfo(kind).max, shape).astype(kind)
+    with RecordingWriter(tmp_path / "a.mcap", make_info(), lossless_png=lossless_png) as writer:
+        writer.picture(Picture(image, Stamps(), 0, 0, pixel_format=pixel_format))
+        writer.view(make_view(0))
+        recording = open_recording(writer.finish())
+    picture = recording.picture(recording.views()[0])
+    np.testing.assert_array_equal(picture.image, image)
+    assert picture.image.dtype == kind
+    assert picture.pixel_format == pixel_format
+
+
+def test_a_retake_supersedes_the_first_attempt(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        for sequence, index, attempt in [(0, 0, 1), (1, 1, 1), (2, 0, 2), (3, 2, 1)]:
+            writer.picture(make_picture(sequence))
+            writer.view(make_view(index, sequence, attempt))
+        recording = open_recording(writer.finish())
+    assert [(v.index, v.attempt, v.picture_sequence) for v in recording.views()] == [
+        (0, 2, 2),
+        (1, 1, 1),
+        (2, 1, 3),
+    ]
+
+
+def test_compressed_bytes_are_kept_as_they_were(tmp_path: Path) -> None:
+    image = make_image(5)
+    data = encode_png(image)
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        writer.picture(make_picture(0, image), encoded=data)
+        recording = open_recording(writer.finish())
+    assert recording.parts[0].stored_picture(0) == ("png", data)
+
+
+def test_the_reference_library_reads_the_file_with_published_schemas(small: Path) -> None:
+    with small.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        messages = [
+            (schema.name, channel.topic, body) for schema, channel, _, body in reader.iter_decoded_messages()
+        ]
+    by_topic = {topic: body for _, topic, body in messages}
+    assert {name for name, _, _ in messages} >= {
+        "foxglove.RawImage",
+        "foxglove.CameraCalibration",
+        "foxglove.FrameTransform",
+        "foxglove.Log",
+        "station.RobotState",
+        "station.View",
+    }
+    image = by_topic["/camera/image"]
+    assert (image.width, image.height, image.encoding, image.step) == (WIDTH, HEIGHT, "mono8", WIDTH)
+    assert image.timestamp.seconds == START_NS // 10**9 + 1
+    assert list(by_topic["/camera/calibration"].K[:3]) == [900.0, 0, 16]
+    transform = by_topic["/tf"]
+    assert (transform.parent_frame_id, transform.child_frame_id) == ("base", "flange")
+    assert [transform.translation.x, transform.translation.y, transform.translation.z] == pytest.approx(
+        [row[3] for row in TURNED[:3]]
+    )
+    rotation = [transform.rotation.x, transform.rotation.y, transform.rotation.z, transform.rotation.w]
+    assert rotation == pytest.approx(
+        [0, -np.sin(0.25), 0, np.cos(0.25)], abs=1e-9
+    )  # the states' 0.5 rad about -y
+    assert list(by_topic["/robot/state"].joints_rad) == pytest.approx(make_state(8).joints_rad)
+
+
+def test_large_pictures_go_out_uncopied_and_are_identical_for_other_readers_too(tmp_path: Path) -> None:
+    """Above 32 kB the pixels never pass through protobuf; turned and cut arrays are laid out first."""
+    full = np.random.default_rng(3).integers(0, 256, (1024, 1280), np.uint8)
+    images = [full, full[::-1], np.ascontiguousarray(full.T).T, np.random.default_rng(4).permutation(full)]
+    with RecordingWriter(tmp_path / "a.mcap", make_info(camera=CameraModel(1280, 1024))) as writer:
+        for sequence, image in enumerate(images):
+            writer.robot_state(make_state(sequence))
+            writer.picture(make_picture(sequence, image))
+        path = writer.finish()
+    part = open_recording(path).parts[0]
+    with path.open("rb") as file:
+        reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
+        theirs = [body for *_, body in reader.iter_decoded_messages(topics=["/camera/image"])]
+    assert len(theirs) == len(images)
+    for sequence, (image, body) in enumerate(zip(images, theirs, strict=True)):
+        np.testing.assert_array_equal(part.picture(sequence).image, image)
+        assert (body.encoding, body.width, body.height, body.step) == ("mono8", 1280, 1024, 1280)
+        np.testing.assert_array_equal(np.frombuffer(body.data, np.uint8).reshape(1024, 1280), image)
+
+
+def test_a_view_never_points_at_nothing(tmp_path: Path) -> None:
+    with (
+        RecordingWriter(tmp_path / "a.mcap", make_info()) as writer,
+        pytest.raises(RecordingError, match="picture 4"),
+    ):
+        writer.view(make_view(4))
+
+
+def test_pictures_of_another_size_or_a_sequence_used_twice_are_refused(tmp_path: Path) -> None:
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        writer.picture(make_picture(0))
+        with pytest.raises(RecordingError, match="recorded before"):
+            writer.picture(make_picture(0))
+        with pytest.raises(RecordingError, match="one size"):
+            writer.picture(make_picture(1, make_image(1, 40, 30)))
+        with pytest.raises(RecordingError, match="cannot be recorded"):
+            writer.picture(make_picture(2, np.zeros((HEIGHT, WIDTH), np.float32)))
+
+
+def test_an_unfinished_camera_model_is_written_as_uncalibrated(tmp_path: Path) -> None:
+    path = write_small(tmp_path / "a.mcap", info=make_info(camera=CameraModel(WIDTH, HEIGHT)))
+    assert open_recording(path).info.camera.matrix is None
+    with RecordingWriter(tmp_path / "b.mcap", make_info(camera=CameraModel(WIDTH, HEIGHT))) as writer:
+        writer.camera_model(CameraModel(WIDTH, HEIGHT))
+        path = writer.finish()
+    with path.open("rb") as file:
+        (message,) = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
+    assert list(message.decoded_message.K) == [0.0] * 9

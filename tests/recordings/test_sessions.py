@@ -1,0 +1,122 @@
+"""A session of several parts reads like one recording; parts of something else, or too few, are refused."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from recordings.errors import CorruptRecordingError, MissingPartError, RecordingError
+from recordings.reader import open_recording
+from recordings.recover import recover
+from recordings.schema.messages import CameraIdentity, CameraModel
+from recordings.writer import RecordingWriter
+from tests.recordings.small_recording import (
+    make_image,
+    make_info,
+    make_picture,
+    make_state,
+    make_view,
+    write_small,
+)
+
+
+def write_part(path: Path, poses: list[tuple[int, int]], **changes: object) -> Path:
+    """Poses are (index, attempt); every part numbers its pictures from 0."""
+    with RecordingWriter(path, make_info(**changes)) as writer:
+        for sequence, (index, attempt) in enumerate(poses):
+            writer.robot_state(make_state(sequence))
+            writer.picture(make_picture(sequence, make_image(100 * index + attempt)))
+            writer.view(make_view(index, sequence, attempt))
+        writer.attach("plan.yaml", "application/yaml", path.name.encode())
+        return writer.finish()
+
+
+def test_a_resumed_session_is_one_recording(tmp_path: Path) -> None:
+    write_part(tmp_path / "session.mcap", [(0, 1), (1, 1)])
+    write_part(tmp_path / "session-2.mcap", [(1, 2), (2, 1)], part=2)
+    recording = open_recording(tmp_path)
+    assert [(v.index, v.attempt, v.part) for v in recording.views()] == [(0, 1, 1), (1, 2, 2), (2, 1, 2)]
+    for view, picture in recording.pictures():
+        np.testing.assert_array_equal(picture.image, make_image(100 * view.index + view.attempt))
+    assert len(list(recording.robot_states())) == 4
+    assert recording.attachments() == {"plan.yaml": b"session-2.mcap"}
+    assert len(recording.sha256) == 64
+
+
+def test_the_session_of_one_part_has_the_hash_of_its_file(tmp_path: Path) -> None:
+    path = write_part(tmp_path / "session.mcap", [(0, 1)])
+    assert open_recording(tmp_path).sha256 == open_recording(path).sha256
+
+
+def test_a_pose_taken_again_after_a_resume_supersedes_whatever_its_attempt(tmp_path: Path) -> None:
+    write_part(tmp_path / "session.mcap", [(0, 1), (0, 2), (0, 3)])
+    write_part(tmp_path / "session-2.mcap", [(0, 1)], part=2)
+    assert [(v.part, v.attempt) for v in open_recording(tmp_path).views()] == [(2, 1)]
+
+
+def test_a_gap_between_parts_is_noticed_without_a_list(tmp_path: Path) -> None:
+    write_part(tmp_path / "session.mcap", [(0, 1)])
+    write_part(tmp_path / "session-3.mcap", [(2, 1)], part=3)
+    with pytest.raises(MissingPartError, match=r"lacks part 2 of session 'test-cell'.*recordings recover"):
+        open_recording(tmp_path)
+
+
+def test_a_lone_second_part_is_noticed_as_folder_and_as_file(tmp_path: Path) -> None:
+    path = write_part(tmp_path / "session-2.mcap", [(0, 1)], part=2)
+    with pytest.raises(MissingPartError, match="lacks part 1"):
+        open_recording(tmp_path)
+    with pytest.raises(MissingPartError, match=r"is part 2 of at least 2 .* give the session's folder"):
+        open_recording(path)
+
+
+def test_the_same_part_twice_is_noticed(tmp_path: Path) -> None:
+    write_part(tmp_path / "a.mcap", [(0, 1)])
+    write_part(tmp_path / "b.mcap", [(0, 1)])
+    with pytest.raises(CorruptRecordingError, match="both part 1"):
+        open_recording(tmp_path)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"name": "another"},
+        {"mount": "eye-to-hand"},
+        {"source": "real"},
+        {"camera": CameraModel(32, 24)},
+        {"camera_identity": CameraIdentity(serial="4711")},
+    ],
+)
+def test_parts_of_different_sessions_do_not_mix(tmp_path: Path, changes: dict[str, object]) -> None:
+    write_part(tmp_path / "session.mcap", [(0, 1)])
+    write_part(tmp_path / "session-2.mcap", [(1, 1)], part=2, **changes)
+    with pytest.raises(RecordingError, match=r"different sessions|another camera"):
+        open_recording(tmp_path)
+
+
+def test_an_empty_folder_says_so(tmp_path: Path) -> None:
+    with pytest.raises(RecordingError, match="holds no recording"):
+        open_recording(tmp_path)
+
+
+def test_a_part_that_never_got_anything_is_set_aside_and_the_session_goes_on(tmp_path: Path) -> None:
+    write_part(tmp_path / "session.mcap", [(0, 1)])
+    (tmp_path / "session-2.mcap.part").write_bytes(b"\x89MCAP0\r\n")
+    write_part(tmp_path / "session-3.mcap", [(1, 1)], part=3)
+    results = recover(tmp_path)
+    assert {result.path.name: result.poses for result in results} == {
+        "session.mcap": 1,
+        "session-2.mcap.part": 0,
+        "session-3.mcap": 1,
+    }
+    assert [view.index for view in open_recording(tmp_path).views()] == [0, 1]
+
+
+def test_a_session_that_is_still_written_is_refused(tmp_path: Path) -> None:
+    write_small(tmp_path / "session.mcap")
+    with (
+        RecordingWriter(tmp_path / "session-2.mcap", make_info(part=2)),
+        pytest.raises(RecordingError, match="never finished"),
+    ):
+        open_recording(tmp_path)

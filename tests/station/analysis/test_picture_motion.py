@@ -1,0 +1,176 @@
+"""The picture has a say in what rests: a pose whose camera still rings is not captured."""
+
+from __future__ import annotations
+
+import asyncio
+import gc
+from collections.abc import Callable
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from recordings.reader import open_recording
+from station.analysis.picture_motion import board_box, picture_motion
+from station.cell.config import StillnessConfig
+from station.cell.errors import CameraError
+from station.cell.plan import ExpectedView
+from station.cell.status import StationState as S
+from station.cell.stillness import StillnessMonitor
+from station.session.picture_watch import GLIMPSE_TRIES, PictureWatch
+from station.session.queue import PoseQueue
+from station.simulation.camera import RenderedCamera
+from station.simulation.cell import write_truth
+from station.simulation.launch import SimulatedController
+from tests.station.session_rig import POSES, TRUTH, Rig
+
+SCENE = cv2.GaussianBlur(np.random.default_rng(4).normal(128, 150, (600, 760)), (0, 0), 1.5)
+
+
+def seen(right_px: float = 0.0, noise: float = 0.0, seed: int = 0) -> np.ndarray:
+    """A window of one scene, 640 × 480, shifted and noisy."""
+    shift = np.array([[1.0, 0.0, -60.0 + right_px], [0.0, 1.0, -60.0]])
+    picture = cv2.warpAffine(SCENE, shift, (640, 480), flags=cv2.INTER_CUBIC)
+    noisy = picture + np.random.default_rng(seed).normal(0, noise, picture.shape) if noise else picture
+    return np.clip(noisy, 0, 255).astype(np.uint8)
+
+
+@pytest.mark.parametrize("shift_px", [0.0, 0.3, 1.0, 7.5, 40.0])
+def test_the_shift_between_noisy_pictures_is_measured(shift_px: float) -> None:
+    pictures = [seen(0.0, 7.0, 1), seen(0.0, 7.0, 2), seen(shift_px, 7.0, 3)]
+    motion_px = picture_motion(pictures)
+    assert motion_px == pytest.approx(shift_px, abs=0.3 if shift_px else 0.05)
+    assert picture_motion(pictures, full_width=1280) == pytest.approx(2 * (motion_px or 0))
+
+
+def test_a_ringing_that_fits_one_gap_shows_in_the_other() -> None:
+    assert picture_motion([seen(3.0), seen(0.0), seen(0.0)]) == pytest.approx(3.0, abs=0.15)
+    assert picture_motion([seen(0.0), seen(3.0), seen(0.0)]) == pytest.approx(3.0, abs=0.15)
+
+
+@pytest.mark.parametrize("kind", ["colour", "16 bit"])
+def test_every_kind_of_picture_is_understood(kind: str) -> None:
+    pair = [seen(0.0), seen(5.0)]
+    if kind == "colour":
+        pair = [cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR) for picture in pair]
+    else:
+        pair = [picture.astype(np.uint16) << 8 for picture in pair]
+    assert picture_motion(pair) == pytest.approx(5.0, abs=0.15)
+
+
+def test_a_flat_picture_says_nothing() -> None:
+    noise = np.random.default_rng(5).normal(90, 2, (2, 480, 640)).clip(0, 255).astype(np.uint8)
+    assert picture_motion(list(noise)) is None
+
+
+def test_a_board_that_swings_before_a_resting_wall_is_seen_where_it_should_be() -> None:
+    pair = [seen(), seen()]
+    for x, picture in zip((200, 206), pair, strict=True):
+        picture[160:280, x : x + 160] = 255 - seen()[160:280, 200:360] // 2
+    box = board_box(ExpectedView(0.8, 0.0, 0.0, (280.0, 220.0), 120 * 160 / (640 * 480)), 640, 480)
+    assert picture_motion(pair, 640, box) == pytest.approx(6.0, abs=0.8)
+
+
+async def recorded(rig: Rig) -> list[float | None]:
+    """Image motion of every pose of a whole session."""
+    await rig.give_go()
+    await rig.until(S.IDLE, S.PAUSED, S.FAULT)
+    views = open_recording(Path(rig.session.store.status.session.recording)).views()
+    return [view.stillness.image_motion_px for view in views if view.stillness is not None]
+
+
+async def test_every_pose_is_recorded_with_its_pictures_motion(rig: Rig) -> None:
+    assert await recorded(rig) == [0.0] * POSES
+    assert rig.camera.glimpses == 3 * POSES
+
+
+async def test_a_moving_picture_is_not_captured_although_the_joints_rest(rig: Rig) -> None:
+    rig.camera.jumps = 3
+    await rig.give_go()
+    await rig.until(S.PAUSED)
+    assert rig.camera.taken == 0 and "done" not in rig.pose_states
+    reason = rig.session.store.status.session.poses[0].reason
+    assert "the picture moves by 46.96 px (limit 0.30)" in reason
+
+
+async def test_it_is_captured_as_soon_as_the_picture_rests(rig: Rig) -> None:
+    rig.camera.jumps = 3
+    await rig.give_go()
+    await rig.until_true(lambda: rig.camera.glimpses > 3)
+    assert rig.camera.taken == 0
+    rig.camera.jumps = 0
+    await rig.until(S.IDLE)
+    assert rig.pose_states == ["done"] * POSES
+
+
+@pytest.mark.parametrize("why", ["played", "failing"])
+async def test_what_cannot_be_looked_at_is_recorded_as_not_measured(rig: Rig, why: str) -> None:
+    rig.camera.blind = why == "played"
+    if why == "failing":
+        rig.camera.glimpse_fails = ["no frame"] * GLIMPSE_TRIES * POSES
+    assert await recorded(rig) == [None] * POSES
+    told = [e.text for e in rig.session.store.status.events if "motion is not measured" in e.text]
+    assert len(told) == (POSES if why == "failing" else 0)
+
+
+async def test_one_bad_glimpse_is_looked_at_again(rig: Rig) -> None:
+    rig.camera.glimpse_fails = ["incomplete"]
+    assert await recorded(rig) == [0.0] * POSES
+
+
+async def test_stop_leaves_the_camera_free(rig: Rig) -> None:
+    rig.camera.jumps = 3
+    await rig.give_go()
+    await rig.until(S.SETTLING)
+    await rig.session.stop("bert")
+    seen_before = rig.camera.glimpses
+    await asyncio.sleep(0.1)
+    assert rig.camera.glimpses == seen_before and rig.state is S.STOPPED
+
+
+async def test_a_camera_that_fails_when_nobody_looks_any_more_is_no_traceback(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    given_up, logged = asyncio.Event(), []
+
+    async def hangs() -> None:
+        await given_up.wait()
+        raise CameraError("no answer")
+
+    asyncio.get_running_loop().set_exception_handler(lambda loop, context: logged.append(context))
+    monkeypatch.setattr(rig.camera, "glimpse", hangs)
+    async with PictureWatch(rig.session.bench, 0):
+        await asyncio.sleep(0.01)
+        asyncio.get_running_loop().call_later(0.05, given_up.set)  # the pose ends before that
+    gc.collect()
+    await asyncio.sleep(0)
+    assert logged == []
+
+
+@pytest.mark.process
+async def test_a_ringing_bracket_is_waited_for(
+    rig: Rig, controller: Callable[..., SimulatedController], tmp_path: Path
+) -> None:
+    write_truth(TRUTH, tmp_path / "truth.json")
+    rendered = RenderedCamera(TRUTH, controller(truth=tmp_path / "truth.json").host)
+    await rendered.open()
+    bench = rig.session.bench
+    bench.queue = PoseQueue(bench.require_queue().plan)
+    bench.stillness = StillnessMonitor(bench.geometry.model, StillnessConfig(timeout_s=20.0))
+    rig.arm.subscribe(bench.stillness.add)
+    rig.arm.rest()
+    object.__setattr__(bench.cell, "camera", rendered)
+    await rendered.inject("ringing", {"amplitude_rad": 0.01, "frequency_hz": 6.3})
+    async with PictureWatch(bench, 0) as watch:
+        settling = asyncio.ensure_future(bench.stillness.settle(lambda: None, watch.look))
+        look = None
+        while look is None:
+            await asyncio.sleep(0.02)
+            look = watch.look(0)
+        assert look.motion_px is not None and look.motion_px > 0.5 and not settling.done()
+        await rendered.inject("ringing")
+        motion_px = (await settling).image_motion_px
+        assert motion_px is not None and motion_px < 0.3
+    assert await rendered.capture()  # the camera is free
+    await rendered.close()

@@ -1,0 +1,49 @@
+"""What previews tell the screen: the exposure assistant's advice, distance and tilt."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import recordings
+from recordings.reader import open_recording
+from station.analysis.worker import seen_before, sight
+from station.cell.config import PAPER_BOARD
+from station.cell.status import StationStatus
+from station.simulation.placement import seen_from
+from station.simulation.renderer import Light, render, scaled
+from station.simulation.scenes import build_cell
+from station.tui.widgets.panels import detection_lines
+
+
+def test_a_picture_too_bright_says_what_to_set_on_the_screen() -> None:
+    camera = build_cell("paper", 0, "low", "eye-in-hand").camera
+    view = seen_from(PAPER_BOARD, 0.5)
+    for light, words in ((1.0, ""), (4.0, "too bright")):
+        picture = render(camera, PAPER_BOARD, view, Light(illumination=light), np.random.default_rng(0))
+        status = sight(picture, PAPER_BOARD, None, False, (10_000.0, 0.0)).status
+        assert status.advice.startswith(words) and bool(status.advice) == bool(words)
+        shown = "\n".join(detection_lines(StationStatus(detection=status)))
+        assert words in shown
+    assert sight(picture, PAPER_BOARD, None, False).status.advice == ""
+
+
+@pytest.mark.parametrize("factor", [1.0, 0.5])
+def test_the_distance_is_the_same_in_a_preview_of_half_the_size(factor: float) -> None:
+    camera = build_cell("paper", 0, "low", "eye-in-hand").camera
+    view = seen_from(PAPER_BOARD, 0.5)
+    picture = render(scaled(camera, factor), PAPER_BOARD, view, Light(), np.random.default_rng(0))
+    status = sight(picture, PAPER_BOARD, camera, False).status
+    assert status.distance_m == pytest.approx(0.5, abs=0.005)
+
+
+def test_the_pictures_of_a_recording_are_seen_again_with_their_poses() -> None:
+    path = Path(recordings.__file__).parent / "samples" / "paper-640.mcap"
+    recording = open_recording(path)
+    found = seen_before(path, recording.info.board, None)
+    assert [index for index, _, _ in found] == [view.index for view in recording.views()]
+    for (_, flange, seen), view in zip(found, recording.views(), strict=True):
+        assert np.array_equal(flange, view.base_from_flange)
+        assert seen.status.corners == len(seen.pixels) == 42

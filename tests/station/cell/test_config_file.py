@@ -1,0 +1,155 @@
+"""The configuration: what an owner may write, and what is said when it is wrong."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+import station
+from station.cell.config_file import load_config
+from station.cell.errors import ConfigError
+from station.devices.factory import configured_cell
+
+GOOD = """\
+robot: {model: UR10, host: 192.0.2.10}
+camera: {driver: aravis, device: KJ001}
+board: {kind: chessboard, columns: 7, rows: 6, square_m: 0.025}
+limits:
+  speed_m_s: 0.2
+  planes: [{name: table, point_m: [0, 0, 0], normal: [0, 0, 1]}]
+"""
+TOOL = "{name: tool, from_m: [0, 0, 0], to_m: [0, 0, 0.1]"
+PLACE = "translation_m: [0, 0, 0.1], rotation_xyzw: [0, 0, 0, 1]"
+
+
+def test_a_good_file_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "station.yaml"
+    path.write_text(GOOD)
+    config, content = load_config(path)
+    assert config.limits.speed_m_s == 0.2
+    assert content == GOOD.encode()
+
+
+def test_a_missing_file_says_what_to_do(tmp_path: Path) -> None:
+    with pytest.raises(ConfigError, match="Write one with") as caught:
+        load_config(tmp_path / "station.yaml")
+    assert caught.value.exit_code == 2
+
+
+@pytest.mark.parametrize(
+    ("old", "new", "said"),
+    [
+        ("speed_m_s: 0.2", "speed_m_s: 0.3", "at most 0.25"),
+        ("model: UR10", "model: UR11", "UR10e"),
+        ("normal: [0, 0, 1]", "normal: [0, 0, 0]", "'table' is zero"),
+        ("device: KJ001", "device: KJ001, trigger: hardware", "section 'trigger'"),
+        ("host: 192.0.2.10", "host: ''", "robot.host"),
+        ("square_m: 0.025", "square_m: 25", "lengths are in metres"),
+        ("speed_m_s: 0.2", "speed_mm_s: 200", "did you mean 'speed_m_s'"),
+        ("speed_m_s: 0.2", "board_clearance_m: -0.1", "limits.board_clearance_m: -0.1 must be above 0"),
+        ("speed_m_s: 0.2", "clearance_m: 0.0", "limits.clearance_m: 0.0 must be above 0"),
+        ("speed_m_s: 0.2", f"solids: [{TOOL}, radius_m: -0.04}}]", "'tool': radius_m must be above 0"),
+        ("speed_m_s: 0.2", f"solids: [{TOOL}, radius_m: 40}}]", "'tool' reaches further than 5.0 m"),
+        (
+            "speed_m_s: 0.2",
+            "joints_min_rad: [1, 0, 0, 0, 0, 0]\n  joints_max_rad: [0, 1, 1, 1, 1, 1]",
+            "must not be above",
+        ),
+        (
+            "speed_m_s: 0.2",
+            "workspace_min_m: [-1, -1, 0.5]\n  workspace_max_m: [1, 1, 0.5]",
+            "workspace_min_m must be below workspace_max_m",
+        ),
+        ("square_m: 0.025", "square_m: 0", "board: square_m = 0"),
+        ("rows: 6", "rows: 1", "board: 7 × 1"),
+        ("limits:", "working_distance_m: 600\nlimits:", "working_distance_m: 600.0 is out of reach"),
+        (
+            "limits:",
+            "camera_guess: {translation_m: [0, 0, 60], rotation_xyzw: [0, 0, 0, 1]}\nlimits:",
+            "further than",
+        ),
+        (
+            "limits:",
+            "camera_guess: {translation_m: [0, 0, 0], rotation_xyzw: [0, 0, 1, 1]}\nlimits:",
+            "must be 1",
+        ),
+        ("limits:", f"camera_guess: {{{PLACE}, sigma_m: -0.02}}\nlimits:", "must not be below 0"),
+        ("limits:", f"board_guess: {{{PLACE}, sigma_rad: -0.1}}\nlimits:", "must not be below 0"),
+        (
+            "limits:",
+            "pointer: {tip_m: [0, 0, 0.2], along: [0, 0, 0]}\nlimits:",
+            "pointer.along: its length is",
+        ),
+        ("limits:", "pointer: {tip_m: [0, 0, 0.2], radius_m: -0.01}\nlimits:", "pointer.radius_m"),
+        ("limits:", "pointer: {tip_m: [0, 0, 200]}\nlimits:", "pointer.tip_m: further than"),
+        ("limits:", "stillness: {timeout_s: 0}\nlimits:", "stillness.timeout_s"),
+        ("limits:", "capture: {retries: -1}\nlimits:", "capture.retries: -1 must not be below 0"),
+        ("limits:", "trigger: {port: /dev/ttyUSB0, pulse_us: -5}\nlimits:", "trigger.pulse_us"),
+    ],
+)
+def test_what_cannot_be_is_said(tmp_path: Path, old: str, new: str, said: str) -> None:
+    path = tmp_path / "station.yaml"
+    path.write_text(GOOD.replace(old, new))
+    with pytest.raises(ConfigError) as caught:
+        load_config(path)
+    assert said in str(caught.value)
+    assert "station.yaml" in str(caught.value)
+
+
+def test_equal_limits_of_a_joint_hold_it_and_open_sides_of_the_box_are_fine(tmp_path: Path) -> None:
+    path = tmp_path / "station.yaml"
+    held = "joints_min_rad: [0, -2, -3, -3, -3, -3]\n  joints_max_rad: [0, 2, 3, 3, 3, 3]"
+    box = "workspace_min_m: [-1, -1, 0]\n  workspace_max_m: [1, 1, 1.5]"
+    for more in (held, box, "joints_min_rad: [1, 1, 1, 1, 1, 1]", "workspace_max_m: [-1, -1, -1]"):
+        path.write_text(GOOD.replace("speed_m_s: 0.2", more))
+        load_config(path)
+
+
+def test_every_trap_of_yaml_is_named_in_one_report_with_its_line(tmp_path: Path) -> None:
+    path = tmp_path / "station.yaml"
+    path.write_text(
+        "robot: {model: UR10, host: 192.0.2.10}\n"
+        "camera: {driver: aravis, gain_db: .nan, exposure_us: 12:30:45}\n"
+        "board: {kind: chessboard, columns: 7, rows: 010, square_m: 25, radon_marker: no}\n"
+        "capture: {lossless_png: no}\n"
+        "name: one\n"
+        "name: two\n"
+    )
+    with pytest.raises(ConfigError) as caught:
+        load_config(path)
+    said = str(caught.value)
+    for line in (2, 3, 4, 6):
+        assert f"line {line}: " in said, said
+    assert said.count("\n") >= 6
+
+
+def test_aliases_that_could_explode_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "station.yaml"
+    path.write_text(GOOD + "name: &n cell\nstillness: {window_s: *n}\n")
+    with pytest.raises(ConfigError, match="line 7: anchors"):
+        load_config(path)
+
+
+def test_the_example_is_good() -> None:
+    example = Path(station.__file__).parent / "example.yaml"
+    config, _ = load_config(example)
+    assert config.camera.model_is_rough
+
+
+def test_the_configuration_is_read_once(tmp_path: Path) -> None:
+    path = tmp_path / "station.yaml"
+    path.write_text(GOOD)
+    cell = configured_cell(*load_config(path), tmp_path)
+    before = cell.config_sha256
+    path.write_text(GOOD.replace("0.2\n", "0.1\n"))
+    assert cell.config_sha256 == before
+    assert cell.config_yaml == GOOD.encode()
+    assert cell.config.limits.speed_m_s == 0.2
+
+
+def test_pictures_that_are_not_real_never_stand_beside_a_real_arm(tmp_path: Path) -> None:
+    path = tmp_path / "station.yaml"
+    path.write_text(GOOD.replace("driver: aravis", "driver: rendered"))
+    with pytest.raises(ConfigError, match="beside a real arm"):
+        configured_cell(*load_config(path), tmp_path)

@@ -1,0 +1,227 @@
+"""Whole-path checks: what is refused, how it is named, and how fast a move may be."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from calibrate.geometry import rotation_exp
+from calibrate.kinematics import MODELS, forward
+from station.cell.collision import CellGeometry, margins, moving_points, plate
+from station.cell.config import Capsule, LimitsConfig, Plane
+from station.cell.limits import (
+    JOINT_ACCELERATION_CAP_RAD_S2,
+    JOINT_SPEED_CAP_RAD_S,
+    SPACING_M,
+    SPEED_CAP_M_S,
+    check_path,
+    check_plan,
+    leaving,
+    point_speed_m_s,
+    sample_path,
+    trapezoid,
+)
+from station.cell.plan import Plan, PlannedPose
+
+REST = np.deg2rad([0.0, -100.0, -100.0, -70.0, 90.0, 0.0])
+FREE = CellGeometry(MODELS["UR10"], LimitsConfig(), watched_m=((0.0, -0.06, 0.087),))
+
+
+def plan_of(*joints, robot="UR10", **extra):
+    poses = tuple(PlannedPose(f"p{i}", tuple(float(a) for a in q)) for i, q in enumerate(joints))
+    return Plan(robot=robot, mount="eye-in-hand", poses=poses, **extra)
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_no_modelled_point_is_faster_than_the_cap_when_the_move_is_driven_as_allowed(seed):
+    """Drives the trapezoid in 2 ms steps and measures the speed of every point by itself."""
+    rng = np.random.default_rng(seed)
+    start, target = REST, REST + rng.uniform(-0.8, 0.8, 6)
+    move = check_path(FREE, start, target)
+    step = np.abs(target - start).max()
+    speed, acceleration = move.joint_speed_rad_s, move.joint_acceleration_rad_s2
+    time = np.arange(0, move.duration_s, 0.002)
+    ramp = min(speed, np.sqrt(step * acceleration)) / acceleration
+    rate = np.clip(np.minimum(time, move.duration_s - time) / ramp, 0, 1) * ramp * acceleration
+    share = np.concatenate([[0.0], np.cumsum((rate[1:] + rate[:-1]) / 2 * 0.002)]) / step
+    assert share[-1] == pytest.approx(1.0, abs=0.01)
+    points = moving_points(FREE, start + share[:, None] * (target - start))
+    fastest = np.linalg.norm(np.diff(points, axis=0), axis=-1).max() / 0.002
+    assert fastest <= SPEED_CAP_M_S
+    assert fastest <= move.top_speed_m_s * 1.03
+    assert move.top_speed_m_s <= SPEED_CAP_M_S
+
+
+def test_no_configuration_raises_the_caps():
+    wild = LimitsConfig(speed_m_s=5.0, joint_speed_rad_s=9.0, joint_acceleration_rad_s2=99.0)
+    geometry = CellGeometry(MODELS["UR10"], wild)
+    sweep = check_path(geometry, REST, REST + np.array([0.8, 0, 0, 0, 0, 0]))
+    assert sweep.top_speed_m_s <= SPEED_CAP_M_S
+    assert sweep.joint_acceleration_rad_s2 == JOINT_ACCELERATION_CAP_RAD_S2
+    turn = check_path(geometry, REST, REST + np.array([0, 0, 0, 0, 0, 2.0]))
+    assert turn.joint_speed_rad_s == JOINT_SPEED_CAP_RAD_S
+
+
+def test_a_plan_may_be_slower_than_the_configuration_but_not_faster():
+    there = REST + np.array([0, 0, 0, 0, 0, 2.0])
+    usual = check_plan(plan_of(there), REST, FREE).moves[0]
+    slow = check_plan(plan_of(there, joint_speed_rad_s=0.1), REST, FREE).moves[0]
+    fast = check_plan(plan_of(there, joint_speed_rad_s=9.0), REST, FREE).moves[0]
+    assert slow.joint_speed_rad_s == 0.1
+    assert fast.joint_speed_rad_s == usual.joint_speed_rad_s == FREE.limits.joint_speed_rad_s
+    soft = check_plan(plan_of(there, joint_acceleration_rad_s2=0.2), REST, FREE).moves[0]
+    hard = check_plan(plan_of(there, joint_acceleration_rad_s2=9.0), REST, FREE).moves[0]
+    assert soft.joint_acceleration_rad_s2 == 0.2
+    assert hard.joint_acceleration_rad_s2 == FREE.limits.joint_acceleration_rad_s2
+
+
+def test_an_obstacle_between_two_good_poses_is_found():
+    left, right = REST + np.array([0.5, 0, 0, 0, 0, 0]), REST - np.array([0.5, 0, 0, 0, 0, 0])
+    at = forward(MODELS["UR10"], REST)[:3, 3]
+    post = Capsule("post", (at[0], at[1], 0.0), (at[0], at[1], float(at[2])), 0.01)
+    geometry = CellGeometry(MODELS["UR10"], LimitsConfig(), obstacles=(post,), obstacle_clearance_m=0.02)
+    assert margins(geometry, np.array([left, right]))[0].min() > 0
+    problems = check_path(geometry, left, right, "pose 7").problems
+    assert problems
+    assert all(p.pose == "pose 7" and p.limit == "clearance" for p in problems)
+    assert any("wrist 3 against the post" in str(p) and "of the way" in str(p) for p in problems)
+
+
+def test_a_plate_of_several_rods_is_one_problem():
+    """A board on the flange, driven into the table."""
+    board = plate("board", np.eye(4), np.array([-0.1, -0.1]), np.array([0.1, 0.1]))
+    limits = LimitsConfig(planes=(Plane("table", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),))
+    cell = CellGeometry(MODELS["UR10"], limits, solids=board)
+    down = (0.0, -0.4, 1.4, -2.6, -1.57, 0.0)
+    gaps, labels = margins(cell, np.array([down]))
+    worst_m = min(gap for gap, label in zip(gaps[0], labels, strict=True) if label == "board against table")
+    [told] = [p.text for p in check_path(cell, down, down).problems if "board against table" in p.text]
+    assert told.startswith(f"board against table, {-1000 * (worst_m - SPACING_M / 2):.0f} mm too close")
+
+
+def test_samples_lie_as_dense_as_promised():
+    samples = sample_path(FREE, REST, REST + np.array([1.5, 0.3, -0.4, 0.5, 1.0, 2.5]), 0.01)
+    travel = np.linalg.norm(np.diff(moving_points(FREE, samples), axis=0), axis=-1)
+    assert travel.max() <= 0.01
+
+
+@pytest.mark.parametrize("turn", [1.0, LimitsConfig().joint_step_rad, 2 * np.pi])
+def test_samples_lie_as_dense_when_every_joint_turns_far(turn):
+    """Joints that turn against each other bend the way: a chord over an eighth of it is too short."""
+    rng = np.random.default_rng(0)
+    for _ in range(60):
+        start = rng.uniform(-6.2, 6.2, 6)
+        target = start + rng.choice([-1, 1], 6) * rng.uniform(0.3, 1.0, 6) * turn
+        travel = np.diff(moving_points(FREE, sample_path(FREE, start, target, SPACING_M)), axis=0)
+        assert np.linalg.norm(travel, axis=-1).max() <= SPACING_M
+
+
+def test_a_plan_for_the_other_mount_is_refused():
+    cell = CellGeometry(MODELS["UR10"], LimitsConfig(), mount="eye-to-hand")
+    [problem] = check_plan(plan_of(REST), REST, cell).problems
+    assert problem.limit == "mount"
+    assert "made for eye-in-hand, the cell is eye-to-hand; make a new plan" in str(problem)
+
+
+def test_joint_range_and_step_name_the_joint():
+    limits = LimitsConfig(joints_max_rad=(6.28, 6.28, 6.28, 6.28, 6.28, 0.5), joint_step_rad=0.3)
+    problems = check_path(
+        CellGeometry(MODELS["UR10"], limits), REST, REST + np.array([0, 0, 0, 0, 0, 0.6])
+    ).problems
+    assert {(p.limit, p.joint) for p in problems} == {("joint range", "wrist 3"), ("joint step", "wrist 3")}
+    limits = LimitsConfig(joints_min_rad=(-0.2, *(-6.28,) * 5))
+    below = check_path(CellGeometry(MODELS["UR10"], limits), REST, REST - np.array([0.3, 0, 0, 0, 0, 0]))
+    assert [(p.limit, p.joint) for p in below.problems] == [("joint range", "base")]
+    beyond = check_path(FREE, REST, REST + np.array([6.4, 0, 0, 0, 0, 0])).problems
+    assert ("joint range", "base") in {(p.limit, p.joint) for p in beyond}
+
+
+@pytest.mark.parametrize("bad", [[np.nan] * 6, [0.0] * 5, [np.inf, 0, 0, 0, 0, 0]])
+def test_joints_that_are_no_joints_are_a_problem_not_a_crash(bad):
+    move = check_path(FREE, REST, bad)
+    assert [p.limit for p in move.problems] == ["joints"]
+    assert move.joint_speed_rad_s == 0.0
+
+
+def test_degrees_in_place_of_radians_are_refused_at_once():
+    move = check_path(FREE, REST, np.rad2deg(REST) * 1e6)
+    assert {p.limit for p in move.problems} == {"joint range", "joint step"}
+    assert move.joint_speed_rad_s == 0.0
+
+
+def test_an_arm_that_stands_too_close_may_leave_but_not_come_nearer():
+    table = Plane("table", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
+
+    def cell(clearance_m):
+        return CellGeometry(MODELS["UR10"], LimitsConfig(planes=(table,), clearance_m=clearance_m))
+
+    gaps, labels = margins(cell(1e-9), REST)
+    lowest = min(gap for gap, label in zip(gaps[0], labels, strict=True) if "table" in label)
+    near = cell(float(lowest) + 0.03)
+    up, down = REST + np.array([0, 0.3, 0, 0, 0, 0]), REST - np.array([0, 0.05, 0, 0, 0, 0])
+    assert [gap.min() > 0 for gap in margins(near, np.array([REST, up, down]))[0]] == [False, True, False]
+    assert check_path(near, REST, up).problems == ()
+    assert check_path(near, REST, down).problems
+
+
+def test_leaving_excuses_only_an_unbroken_retreat_that_ends_outside():
+    retreat = np.array([[-0.03], [-0.02], [-0.01], [0.02]])
+    assert leaving(retreat).min() == 0.0
+    assert leaving(np.array([[-0.03], [-0.02], [-0.025], [0.02]])).min() < 0
+    assert leaving(np.array([[-0.03], [0.02], [-0.01], [0.02]])).min() < 0
+    assert leaving(np.array([[-0.03], [-0.02], [-0.01]])).min() < 0
+
+
+def test_sliding_along_a_wall_is_no_retreat():
+    slide = np.array([[-0.03]] * 9 + [[0.02]])
+    assert leaving(slide).min() < 0
+    assert leaving(slide + np.linspace(0, 0.005, 10)[:, None]).min() < 0
+
+
+def test_check_plan_names_pose_robot_and_edited_flange():
+    good = check_plan(plan_of(REST + 0.1, REST), REST, FREE)
+    assert good.problems == ()
+    assert len(good.moves) == 2
+    assert good.duration_s > 0 and good.path_m > 0
+    wrong = check_plan(plan_of(REST, robot="UR5"), REST, FREE)
+    assert any("UR5" in str(p) and "UR10" in str(p) for p in wrong.problems)
+    assert check_plan(plan_of(), REST, FREE).problems[0].limit == "poses"
+    flange = forward(MODELS["UR10"], REST)
+    flange[0, 3] += 0.02
+    edited = msgspec.structs.replace(
+        plan_of(REST).poses[0], base_from_flange=tuple(map(tuple, flange.tolist()))
+    )
+    problems = check_plan(msgspec.structs.replace(plan_of(), poses=(edited,)), REST, FREE).problems
+    assert [p.limit for p in problems] == ["flange pose"]
+    assert "pose 1 (p0)" in str(problems[0]) and "20.0 mm" in str(problems[0])
+
+
+@pytest.mark.parametrize(("by_m", "by_rad", "refused"), [(0.0018, 0.0045, 0), (0.0022, 0, 1), (0, 0.0055, 1)])
+def test_an_expected_flange_may_differ_by_its_rounding_only(by_m, by_rad, refused):
+    flange = forward(MODELS["UR10"], REST)
+    flange[1, 3] += by_m
+    flange[:3, :3] = flange[:3, :3] @ rotation_exp([0.0, by_rad, 0.0])
+    pose = PlannedPose("p0", tuple(REST), base_from_flange=tuple(map(tuple, flange.tolist())))
+    assert len(check_plan(Plan("UR10", "eye-in-hand", (pose,)), REST, FREE).problems) == refused
+
+
+def test_the_first_move_starts_where_the_arm_is():
+    far = REST + np.array([1.2, 0, 0, 0, 0, 0])
+    assert check_plan(plan_of(REST), far, FREE).moves[0].step_rad == pytest.approx(1.2)
+    assert check_plan(plan_of(REST), None, FREE).moves[0].step_rad == 0.0
+
+
+def test_trapezoid_times():
+    duration, peak = trapezoid(1.0, 0.5, 1.0)
+    assert (float(duration), float(peak)) == pytest.approx((2.5, 0.5))
+    duration, peak = trapezoid(0.01, 0.5, 4.0)
+    assert (float(duration), float(peak)) == pytest.approx((0.1, 0.2))
+
+
+def test_point_speed_of_a_turning_base():
+    still = point_speed_m_s(FREE, REST, np.zeros(6))
+    turning = point_speed_m_s(FREE, REST, [0.3, 0, 0, 0, 0, 0])
+    points = moving_points(FREE, REST[None])[0]
+    assert still == 0.0
+    assert turning == pytest.approx(0.3 * np.hypot(points[:, 0], points[:, 1]).max(), rel=1e-6)

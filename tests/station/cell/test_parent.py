@@ -1,0 +1,53 @@
+"""A helper process goes with the one that started it, even where that one cannot say so any more."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+CHILD = (
+    "import os, signal, sys, time\n"
+    "from station.cell.parent import die_with_parent\n"
+    "die_with_parent(int(sys.argv[1]))\n"
+    "print(os.getpid(), flush=True)\n"
+    "time.sleep(60)\n"
+)
+PARENT = (
+    "import os, subprocess, sys\n"
+    "subprocess.run([sys.executable, '-c', sys.argv[1], str(os.getpid())], stdin=subprocess.DEVNULL)\n"
+)
+
+
+def gone(pid: int) -> bool:
+    """Ended, though perhaps nobody asked for its exit code yet."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
+    except OSError:
+        return True
+
+
+def test_a_stopped_child_dies_with_its_killed_parent() -> None:
+    """It reads nothing and answers nothing: only the kernel can end it."""
+    with subprocess.Popen([sys.executable, "-c", PARENT, CHILD], stdout=subprocess.PIPE, text=True) as parent:
+        assert parent.stdout is not None
+        child = int(parent.stdout.readline())
+        try:
+            os.kill(child, signal.SIGSTOP)
+            parent.kill()
+            give_up_s = time.monotonic() + 5.0
+            while not gone(child):
+                assert time.monotonic() < give_up_s, "it outlives its parent"
+                time.sleep(0.01)
+        finally:
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(child, signal.SIGKILL)
+
+
+def test_a_child_whose_parent_is_gone_already_does_nothing() -> None:
+    done = subprocess.run([sys.executable, "-c", CHILD, "1"], capture_output=True, timeout=30)
+    assert (done.returncode, done.stdout) == (1, b"")

@@ -1,0 +1,98 @@
+"""The solids of a cell, worked out by hand: what hangs on the flange, what stands beside it, how thick."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from calibrate.geometry import pose, rotation_exp, transform_points
+from recordings.schema.messages import BoardKind, BoardSpec, Mount
+from station.cell.collision import segment_distance
+from station.cell.config import Capsule, PoseGuess
+from station.cell.errors import LimitError
+from station.cell.scene import cell_geometry, geometry_of, require_kept_clear
+from station.simulation.cell import make_cell
+from station.simulation.scenes import cell_config
+
+BOARD = BoardSpec(BoardKind.CHESSBOARD, 4, 3, 0.02)
+LOW, HIGH = (-0.02, -0.02), (0.08, 0.06)
+"""Of its printed area: one square around the points (0…0.06, 0…0.04)."""
+X = pose(rotation_exp([0.1, -0.2, 0.7]), [0.01, -0.06, 0.09])
+Y = pose(rotation_exp([np.pi, 0.1, 0.2]), [0.5, 0.1, -0.02])
+
+
+def config_of(mount: Mount, **changes: Any) -> Any:
+    config = msgspec.structs.replace(cell_config(make_cell(mount=mount)), board=BOARD, mount=mount)
+    limits = msgspec.structs.replace(config.limits, clearance_m=0.03, board_clearance_m=0.1, solids=())
+    return msgspec.structs.replace(config, **({"limits": limits} | changes))
+
+
+def covers(rods: tuple[Capsule, ...], place: Any) -> bool:
+    """The whole printed area lies inside of the rods."""
+    x, y = np.meshgrid(np.linspace(LOW[0], HIGH[0], 30), np.linspace(LOW[1], HIGH[1], 30))
+    points = transform_points(place, np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3))
+    gaps = [segment_distance(points, points, np.array(r.from_m), np.array(r.to_m)) - r.radius_m for r in rods]
+    return bool(np.min(gaps, axis=0).max() <= 1e-9)
+
+
+def test_a_camera_on_the_flange_and_a_board_in_the_cell() -> None:
+    cell = geometry_of(config_of("eye-in-hand"), X, Y, camera_doubt_m=0.004, board_doubt_m=0.02)
+    [camera] = cell.solids
+    assert camera.from_m == pytest.approx(X[:3, 3])
+    assert camera.to_m == pytest.approx(X[:3, 3] - 0.05 * X[:3, 2])
+    assert camera.radius_m == pytest.approx(0.035 + 3 * 0.004)
+    assert cell.watched_m == (pytest.approx(X[:3, 3]),)
+    assert covers(cell.obstacles, Y)
+    assert cell.obstacle_clearance_m == pytest.approx(0.1 + 2 * 0.02)
+    assert cell.mount == "eye-in-hand"
+
+
+def test_a_board_on_the_flange_and_a_camera_in_the_cell() -> None:
+    tool = Capsule("tool", (0.0, 0.0, 0.0), (0.0, 0.0, 0.1), 0.03)
+    limits = msgspec.structs.replace(config_of("eye-to-hand").limits, solids=(tool,))
+    cell = geometry_of(
+        config_of("eye-to-hand", limits=limits), Y, X, camera_doubt_m=0.02, board_doubt_m=0.004
+    )
+    assert cell.solids[0] == tool, "what is drawn stays"
+    assert covers(cell.solids[1:], X)
+    thin = geometry_of(config_of("eye-to-hand"), Y, X)
+    assert cell.solids[1].radius_m == pytest.approx(thin.solids[0].radius_m + 3 * 0.004)
+    corners = [(x, y, 0.0) for x in (LOW[0], HIGH[0]) for y in (LOW[1], HIGH[1])]
+    np.testing.assert_allclose(cell.watched_m, transform_points(X, np.array(corners)), atol=1e-12)
+    [camera] = cell.obstacles
+    assert camera.from_m == pytest.approx(Y[:3, 3]) and camera.radius_m == 0.035
+    assert cell.obstacle_clearance_m == pytest.approx(0.03 + 2 * 0.02)
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_without_guesses_nothing_is_made_up(mount: Mount) -> None:
+    config = config_of(mount, camera_guess=None, board_guess=None)
+    cell = cell_geometry(config)
+    assert (cell.solids, cell.obstacles, cell.watched_m) == ((), (), ())
+    assert cell.obstacle_clearance_m == config.limits.clearance_m
+
+
+def test_a_drawn_camera_is_taken_as_it_is_but_watched_where_it_is_guessed() -> None:
+    drawn = Capsule("camera and bracket", (0.0, 0.0, 0.0), (0.0, -0.1, 0.1), 0.06)
+    limits = msgspec.structs.replace(config_of("eye-in-hand").limits, solids=(drawn,))
+    cell = geometry_of(config_of("eye-in-hand", limits=limits), X, Y, camera_doubt_m=0.004)
+    assert cell.solids == (drawn,)
+    assert cell.watched_m == (pytest.approx(X[:3, 3]),)
+
+
+def test_nothing_on_the_flange_gets_thicker_than_thirty_millimetres_more() -> None:
+    cell = geometry_of(config_of("eye-in-hand"), X, None, camera_doubt_m=0.5)
+    assert cell.solids[0].radius_m == pytest.approx(0.035 + 0.03)
+
+
+@pytest.mark.parametrize(("mount", "name"), [("eye-in-hand", "camera_guess"), ("eye-to-hand", "board_guess")])
+def test_a_guess_that_no_thickness_covers_is_no_ground_for_a_plan(mount: Mount, name: str) -> None:
+    def guessed(sigma_m: float) -> Any:
+        return config_of(mount, **{name: PoseGuess((0.0, 0.0, 0.1), (0.0, 0.0, 0.0, 1.0), sigma_m)})
+
+    require_kept_clear(guessed(0.03))
+    with pytest.raises(LimitError, match=f"{name} is known to 31 mm only"):
+        require_kept_clear(guessed(0.031))

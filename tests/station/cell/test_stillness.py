@@ -1,0 +1,206 @@
+"""At rest is measured: by speed, by the flange's scatter and by the picture, never by waiting."""
+
+from __future__ import annotations
+
+import asyncio
+import math
+
+import msgspec
+import pytest
+
+from calibrate.kinematics import MODELS
+from recordings.schema.messages import RobotState, Stamps
+from station.cell.config import StillnessConfig
+from station.cell.errors import StaleStateError
+from station.cell.stillness import NotStillError, StillnessMonitor
+
+HOME = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
+REST = RobotState(
+    stamps=Stamps(),
+    joints_rad=HOME,
+    joint_speeds_rad_s=(0.0,) * 6,
+    target_joints_rad=HOME,
+    tcp_pose=(0.0,) * 6,
+    robot_mode=7,
+    safety_mode=1,
+    safety_status_bits=1,
+    runtime_state=2,
+    robot_status_bits=3,
+    speed_scaling=1.0,
+    target_speed_fraction=1.0,
+)
+
+
+def state(at_s: float, joint_rad: float = 0.0, speed_rad_s: float = 0.0) -> RobotState:
+    """Joint 2 displaced and moving."""
+    return msgspec.structs.replace(
+        REST,
+        stamps=Stamps(controller_s=at_s),
+        joints_rad=(HOME[0], HOME[1] + joint_rad, *HOME[2:]),
+        joint_speeds_rad_s=(0.0, speed_rad_s, 0.0, 0.0, 0.0, 0.0),
+    )
+
+
+def monitor(**limits: float) -> StillnessMonitor:
+    return StillnessMonitor(MODELS["UR10"], StillnessConfig(**limits))
+
+
+def shake(found: StillnessMonitor, seconds: float, amplitude_rad: float, frequency_hz: float = 8.0) -> None:
+    for i in range(int(seconds * 125)):
+        phase = 2 * math.pi * frequency_hz * i * 0.008
+        speed = amplitude_rad * 2 * math.pi * frequency_hz * math.cos(phase)
+        found.add(state(i * 0.008, amplitude_rad * math.sin(phase), speed))
+
+
+def test_a_resting_arm_is_still() -> None:
+    m = monitor()
+    shake(m, 0.5, 0.0)
+    found = m.measure()
+    assert found is not None and m.unrest(found) == ""
+    assert m.at_rest
+    assert found.window_s == pytest.approx(0.3, abs=0.01)
+    assert found.position_scatter_m < 1e-12 and found.max_joint_speed_rad_s == 0.0
+
+
+def test_a_shaking_arm_is_measured() -> None:
+    m = monitor()
+    shake(m, 0.5, 0.001)
+    found = m.measure()
+    assert found is not None
+    assert found.max_joint_speed_rad_s == pytest.approx(0.001 * 2 * math.pi * 8, rel=0.02)
+    radius_m = math.hypot(0.5723 + 0.1157, 0.612)  # of the flange about the shoulder, roughly
+    assert found.position_scatter_m == pytest.approx(0.001 * radius_m, rel=0.5)
+    assert "shoulder moves at 2.8" in m.unrest(found) and "scatters by" in m.unrest(found)
+    assert not m.at_rest
+    m.add(state(1.0))
+    assert not m.at_rest  # it rests now, but not for long enough
+
+
+def test_a_slow_creep_is_no_rest_although_no_speed_is_reported() -> None:
+    m = monitor()
+    for i in range(60):
+        m.add(state(i * 0.008, joint_rad=0.001 * i * 0.008))
+    found = m.measure()
+    assert found is not None and "scatters" in m.unrest(found)
+    assert not m.at_rest
+
+
+def test_a_flange_that_only_turns_on_the_spot_is_no_rest() -> None:
+    m = monitor()
+    for i in range(60):
+        turned = msgspec.structs.replace(state(i * 0.008), joints_rad=(*HOME[:5], 0.001 * i * 0.008))
+        m.add(turned)
+    found = m.measure()
+    assert found is not None and found.position_scatter_m < 1e-9
+    assert found.rotation_scatter_rad == pytest.approx(0.001 * found.window_s)
+    assert m.unrest(found) == "the flange turns by 0.0170° (limit 0.0029)"
+
+
+def test_a_shift_of_the_flange_is_told_in_millimetres() -> None:
+    m = monitor()
+    shake(m, 0.5, 0.0)
+    found = m.measure()
+    assert found is not None
+    shifted = msgspec.structs.replace(found, position_scatter_m=0.00025)
+    assert m.unrest(shifted) == "the flange scatters by 0.250 mm (limit 0.050)"
+
+
+def test_the_picture_has_a_say() -> None:
+    m = monitor()
+    shake(m, 0.5, 0.0)
+    found = m.measure(image_motion_px=1.5)
+    assert found is not None and m.unrest(found) == "the picture moves by 1.50 px (limit 0.30)"
+
+
+@pytest.mark.parametrize("seconds", [0.0, 0.1, 0.25])
+def test_a_short_look_is_no_measurement(seconds: float) -> None:
+    m = monitor()
+    shake(m, seconds, 0.0)
+    assert m.measure() is None
+
+
+def test_a_hole_in_the_stream_is_no_measurement() -> None:
+    m = monitor()
+    for i in range(60):
+        if not 40 < i < 56:
+            m.add(state(i * 0.008))
+    assert m.measure() is None
+
+
+def test_a_controller_restart_begins_a_new_window() -> None:
+    m = monitor()
+    shake(m, 0.5, 0.0)
+    m.add(state(0.008))
+    assert m.measure() is None
+
+
+async def test_settling_returns_as_soon_as_the_arm_rests() -> None:
+    m = monitor(timeout_s=5.0)
+    shake(m, 0.5, 0.01)
+    polls = 0
+
+    def alive() -> None:
+        nonlocal polls
+        polls += 1
+        for i in range(10):  # 80 ms of rest between two looks
+            m.add(state(0.5 + polls * 0.08 + i * 0.008))
+
+    assert (await m.settle(alive)).max_joint_speed_rad_s == 0.0
+    assert 3 <= polls <= 7
+
+
+async def test_an_arm_that_never_rests_is_given_up_with_the_reason() -> None:
+    m = monitor(timeout_s=5.0)
+    shake(m, 0.5, 0.01)
+    clock = iter([0.0, 1.0, 5.1])
+    with pytest.raises(NotStillError, match=r"not at rest within 5 s: joint shoulder moves at"):
+        await m.settle(lambda: None, now_s=lambda: next(clock))
+
+
+async def test_waiting_for_rest_leaves_the_loop_to_heartbeat_and_stop() -> None:
+    m = monitor(timeout_s=5.0)
+    shake(m, 0.5, 0.01)
+    clock = iter([0.0, 1.0, 5.1])
+    settling = asyncio.ensure_future(m.settle(lambda: None, now_s=lambda: next(clock)))
+    await asyncio.sleep(0)
+    assert not settling.done()
+    settling.cancel()
+
+
+async def test_old_news_of_an_arm_at_rest_are_no_rest() -> None:
+    m = monitor(timeout_s=5.0)
+    shake(m, 0.5, 0.0)
+    news = iter([False, False, True])
+    asked: list[bool] = []
+
+    def alive() -> bool:
+        asked.append(next(news))
+        return asked[-1]
+
+    await m.settle(alive)
+    assert asked == [False, False, True]
+
+
+async def test_news_that_stay_away_are_the_reason() -> None:
+    m = monitor(timeout_s=5.0)
+    shake(m, 0.5, 0.0)
+    clock = iter([0.0, 1.0, 5.1])
+    with pytest.raises(NotStillError, match="no fresh news of the robot"):
+        await m.settle(lambda: False, now_s=lambda: next(clock))
+
+
+async def test_a_camera_that_shows_nothing_is_not_called_a_shake() -> None:
+    m = monitor(timeout_s=5.0)
+    shake(m, 0.5, 0.0)
+    clock = iter([0.0, 1.0, 5.1])
+    with pytest.raises(NotStillError, match="Check the camera") as told:
+        await m.settle(lambda: True, lambda since_ns: None, now_s=lambda: next(clock))
+    assert "shakes" not in str(told.value)
+
+
+async def test_a_lost_robot_ends_the_waiting() -> None:
+    def dead() -> None:
+        raise StaleStateError("no news")
+
+    with pytest.raises(StaleStateError):
+        await monitor().settle(dead)

@@ -1,0 +1,204 @@
+"""The shell's contract: exit codes, one JSON object, errors in words; and the daemon behind it."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from station.cell.errors import RefusedError
+from station.cell.plan import plan_sha256
+from station.cell.status import GoSummary
+from station.cli import main
+from station.cli import session as cli_session
+from station.cli.serve import tell_what_goes_on
+from station.operate import attend
+from station.plan.files import load_plan
+from station.protocol.client import NoAnswerError
+from station.protocol.states import RUNNING
+from tests.command_line import call
+from tests.system.conftest import short_folder
+
+pytestmark = pytest.mark.process
+__all__ = ["short_folder"]
+
+
+class Shell:
+    """The command line in this process, beside a daemon that is another."""
+
+    def __init__(self, socket: Path) -> None:
+        self.socket = socket
+
+    def __call__(self, *args: str) -> tuple[int, str, str]:
+        """Exit code, standard output, standard error."""
+        done = call(main, *args)
+        return done.returncode, done.stdout, done.stderr
+
+    def ask(self, *args: str) -> tuple[int, str, str]:
+        return self(*args, "--socket", str(self.socket))
+
+    def state(self) -> dict[str, Any]:
+        state: dict[str, Any] = json.loads(self.ask("status", "--json")[1])
+        return state
+
+
+@pytest.fixture
+def shell(short_folder: Path, tmp_path: Path) -> Iterator[Shell]:
+    """Beside a simulated daemon, faster than real time."""
+    socket = short_folder / "s"
+    command = [sys.executable, "-m", "station.cli", "serve", "--simulate", "--end-with-stdin"]
+    command += ["--socket", str(socket), "--root", str(tmp_path), "--time-scale", "4"]
+    with (tmp_path / "log").open("wb") as words:
+        daemon = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=words)
+    assert daemon.stdin is not None and daemon.stdout is not None
+    try:
+        assert json.loads(daemon.stdout.readline())["ready"]
+        yield Shell(socket)
+    finally:
+        daemon.stdin.close()
+        daemon.wait(15)
+        daemon.stdout.close()
+
+
+def test_one_pose_more_leaves_the_session_open(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Where nobody is there to say how it goes on, every other command seals what it got."""
+    asked: dict[str, bool] = {}
+
+    async def carry_out(_: object, purpose: str, *, finish_with_loss: bool, **more: object) -> None:
+        asked[purpose] = finish_with_loss
+        raise RefusedError("seen enough")
+
+    monkeypatch.setattr(cli_session, "carry_out", carry_out)
+    for command in ("best", "improve", "resume"):
+        assert "seen enough" in shell.ask(command, "--headless")[2]
+    assert asked == {"best": False, "improve": True, "resume": True}
+
+
+def test_a_session_from_the_shell(shell: Shell, tmp_path: Path) -> None:
+    plan = tmp_path / "plan.yaml"
+    assert shell("plan", "--poses", "4", "-o", str(plan), "--json")[0] == 0
+
+    code, _, err = shell.ask("capture", "--plan", str(plan), "--headless", "--go", "ab" * 32)
+    assert code == 1
+    assert "is not the hash of this plan" in err and "nothing moved" in err
+
+    sha = plan_sha256(load_plan(plan))
+    code, out, err = shell.ask("capture", "--plan", str(plan), "--headless", "--approve", sha[:12], "--json")
+    assert code in (0, 3), out + err
+    result = json.loads(out)
+    assert result["poses"]["planned"] == 4
+    assert Path(result["recording"]).is_file()
+
+    status = shell.state()
+    assert status["state"] == "idle" and status["simulated"]
+    assert "SIMULATED" in shell.ask("status")[1]
+    code, out, _ = shell.ask("doctor", "--json")
+    assert code == 0 and json.loads(out)["ok"]
+    code, _, err = shell.ask("pause")
+    assert code == 1 and "no session is running" in err
+    assert shell.ask("stop")[0] == 0
+    assert shell.state()["state"] == "stopped"
+    code, out, _ = shell.ask("acknowledge")
+    assert code == 0 and out.startswith("idle SIMULATED")
+    assert shell.ask("retake", "9")[0] == 1
+    assert "pose 2: to be taken again; the picture it has counts until then" in shell.ask("retake", "2")[1]
+    assert "pose 2: not taken again: the picture it has counts" in shell.ask("skip", "2")[1]
+
+
+def test_ctrl_c_is_stop(shell: Shell, tmp_path: Path) -> None:
+    plan = tmp_path / "plan.yaml"
+    assert shell("plan", "--poses", "8", "-o", str(plan), "--json")[0] == 0
+    command = [sys.executable, "-m", "station.cli", "capture", "--plan", str(plan), "--headless"]
+    capture = subprocess.Popen(
+        [*command, "--socket", str(shell.socket)], stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
+    )
+    give_up_s = time.monotonic() + 60
+    while shell.state()["state"] not in RUNNING:
+        assert time.monotonic() < give_up_s
+    capture.send_signal(signal.SIGINT)
+    said = capture.communicate(timeout=20)[1]
+    assert capture.returncode == 130
+    assert "STOP: the arm was stopped" in said and "station acknowledge" in said
+    status = shell.state()
+    assert status["state"] == "stopped"
+    assert "STOP by" in status["reason"]
+
+
+async def test_ctrl_c_without_an_answer_says_what_to_do(capsys: pytest.CaptureFixture[str]) -> None:
+    class Hanging:
+        async def request(self, verb: str, *, timeout_s: float) -> None:
+            raise NoAnswerError(f"{verb}: no answer from the daemon within {timeout_s:.0f} s.")
+
+    await attend.stop_and_say(Hanging())  # type: ignore[arg-type]
+    said = capsys.readouterr().err
+    assert "STOP was not answered" in said and "use the emergency stop" in said
+
+
+def test_ctrl_c_at_the_question_is_a_no_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    def pressed(*_: object, **__: object) -> bool:
+        try:
+            signal.raise_signal(signal.SIGINT)
+        except KeyboardInterrupt:
+            raise typer.Abort from None
+        return True
+
+    summary = GoSummary("t", "run plan", "ab" * 32, 4, 1.0, 0.5, 0.2, 30.0, "84 mm and 22° to pose 1")
+    monkeypatch.setattr(typer, "confirm", pressed)
+
+    async def ask() -> bool:  # below an event loop's own handler of Ctrl-C
+        return cli_session.ask_person(summary)
+
+    before = signal.getsignal(signal.SIGINT)
+    assert asyncio.run(ask()) is False
+    assert signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.parametrize(
+    ("args", "code", "said"),
+    [
+        (("serve",), 2, "--simulate"),
+        (("serve", "--simulate", "--scene", "moon"), 2, "paper, blog"),
+        (("serve", "--config", "absent.yaml"), 2, "absent.yaml"),
+        (("status", "--socket", "/nowhere/s"), 1, "station serve"),
+        (("capture", "--plan", "absent.yaml"), 2, "absent.yaml"),
+        (("tui",), 1, "needs a terminal"),
+        (("dance",), 2, "No such command"),
+        (("demo", "--out", __file__), 2, "is a file: name a folder"),
+        (("serve", "--simulate", "--root", __file__), 1, f"{__file__}"),
+        (("retake", "0"), 2, "greater than or equal to 1"),
+    ],
+)
+def test_what_a_user_can_cause_has_words_and_a_code(args: tuple[str, ...], code: int, said: str) -> None:
+    done = call(main, *args)
+    assert done.returncode == code
+    assert said in " ".join(done.stderr.replace("│", " ").split())
+    assert done.stdout == ""
+
+
+def test_the_command_line_loads_no_screen_and_no_driver() -> None:
+    foreign = ("textual", "gi", "serial", "rtde_control")
+    program = f"import sys, station.cli; print([m for m in {foreign} if m in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"
+
+
+def test_closing_the_screen_tells_what_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "control.sock"
+    tell_what_goes_on(path)
+    assert capsys.readouterr().out == ""  # none serves there
+    with socket.socket(socket.AF_UNIX) as daemon:
+        daemon.bind(str(path))
+        daemon.listen()
+        tell_what_goes_on(path)
+    assert f"`kill {os.getpid()}` ends it" in capsys.readouterr().out

@@ -1,0 +1,116 @@
+"""Names that look like rich's markup are printed as they are: brackets and colons belong to the name."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import msgspec
+import pytest
+import typer
+from rich.console import Console
+
+from station.cell.plan import Plan, PlannedPose
+from station.cell.status import Event, GoSummary, PoseStatus, SessionStatus, StationStatus
+from station.cli import control as cli_control
+from station.cli import main
+from station.cli import session as cli_session
+from station.operate.attend import Outcome
+from station.operate.progress import SessionProgress
+from station.plan.files import save_plan
+from station.simulation.scenes import build_cell, cell_config
+from tests.command_line import call
+
+NAMES = ("[red]x[/]", "[/]", "a :bug: [bold]", "end\\")
+ALL = " ".join(NAMES)
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    """A folder whose path, with what stands in it, reads like a closing tag: `…/[/]…`."""
+    (tmp_path / "[red]" / "[").mkdir(parents=True)
+    return tmp_path / "[red]" / "["
+
+
+def test_a_configuration(folder: Path) -> None:
+    file = folder / "].yaml"
+    cell = cell_config(build_cell("paper", 0, "low", "eye-in-hand"), "127.0.0.1")
+    file.write_bytes(msgspec.yaml.encode(cell))
+    assert call(main, "doctor", "--config", file).stdout.startswith(f"{file}: good; ")
+
+
+def test_a_plan_and_its_poses(folder: Path) -> None:
+    start = build_cell("paper", 0, "low", "eye-in-hand").start_joints_rad
+    joints = [tuple(q + 0.02 * k for q in start) for k in range(len(NAMES))]
+    poses = tuple(PlannedPose(name, q, why=f"why {name}") for name, q in zip(NAMES, joints, strict=True))
+    made, shown = folder / "].yaml", folder / "]shown.yaml"
+    save_plan(Plan("UR10", "eye-in-hand", poses, note=ALL), made)
+    done = call(main, "plan", "--check", made)
+    for name in NAMES:
+        assert f"why {name}" in done.stdout
+    assert f"note: {ALL}" in done.stdout
+    list_file = folder / "].csv"
+    rows = [[f"j{i}_rad" for i in range(1, 7)], *([str(v) for v in q] for q in joints)]
+    list_file.write_text("\n".join(",".join(row) for row in rows))
+    assert f"written to {shown}" in call(main, "plan", "--from-list", list_file, "-o", shown).stdout
+
+
+def test_a_plan_that_breaks_a_limit(folder: Path) -> None:
+    """Its problems name the pose."""
+    low = (0.0, -0.17, 0.7, -2.1, -1.57, 0.0)
+    save_plan(Plan("UR10", "eye-in-hand", (PlannedPose("[/]", low),)), folder / "].yaml")
+    done = call(main, "plan", "--check", folder / "].yaml")
+    assert done.returncode == 1
+    assert "✗ pose 1 ([/])" in done.stdout
+
+
+def test_what_the_daemon_tells(monkeypatch: pytest.MonkeyPatch) -> None:
+    session = SessionStatus(name=ALL, recording=f"/sessions/{ALL}", poses=(PoseStatus(0, "[/]"),))
+    status = StationStatus(reason=ALL, session=session)
+    monkeypatch.setattr(cli_control, "status_now", lambda socket: status)
+    said = call(main, "status").stdout
+    assert said.count(ALL) == 3
+    checks = [{"state": "failed", "name": "[/]", "text": "[red]x[/]", "remedy": "[/]"}]
+    monkeypatch.setattr(cli_control, "ask", lambda socket, verb: checks)
+    said = call(main, "doctor").stdout
+    assert "MISSING" in said and "[red]x[/]" in said and "→ [/]" in said
+
+
+def test_a_question(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(typer, "confirm", lambda *told, **more: True)
+    told = {"purpose": f"p {ALL}", "first_move": f"f {ALL}", "changes": (f"c {ALL}",), "warnings": (ALL,)}
+    numbers = {"poses": 1, "path_m": 1, "largest_step_rad": 1, "top_speed_m_s": 0.1, "duration_s": 1}
+    go = msgspec.convert({"token": "", "plan_sha256": "", **told, **numbers}, GoSummary)
+    assert cli_session.ask_person(go)
+    said = capsys.readouterr().err
+    assert said.count(ALL) == 4
+    assert "The arm will move: p" in said
+
+
+@pytest.mark.parametrize("recording", ["", f"/sessions/{ALL}"])
+def test_how_a_session_ended(recording: str, capsys: pytest.CaptureFixture[str]) -> None:
+    status = StationStatus(reason=ALL, session=SessionStatus(recording=recording))
+    with pytest.raises(typer.Exit):
+        cli_session._finish(Outcome(status), as_json=False)
+    assert ALL in "".join(capsys.readouterr())
+
+
+def test_events_of_a_session() -> None:
+    words = io.StringIO()
+    with SessionProgress(Console(file=words, width=200), quiet=False) as progress:
+        progress.say(f"say {ALL}")
+        progress(StationStatus(events=(Event(1, "warning", f"event {ALL}"),)))
+    assert f"say {ALL}" in words.getvalue()
+    assert f"event {ALL}" in words.getvalue()
+
+
+def test_no_command_makes_a_console_of_its_own() -> None:
+    """`plain_console` reads no markup and obeys no foreign text; the screen is Textual's."""
+    room = Path(main.__code__.co_filename).parent
+    files = {
+        file
+        for file in room.rglob("*.py")
+        if "tui" not in file.parts
+        and ("Console(" in file.read_text() or "plain_console(" in file.read_text())
+    }
+    assert files == {room / "console.py"}

@@ -1,0 +1,66 @@
+"""Every verb asks the table of states and the lease before it does anything."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import pytest
+
+from station.cell.errors import RefusedError
+from station.cell.plan import Plan
+from station.cell.status import StationState as S
+from station.protocol.states import VERB_STATES
+from station.server.control import Peer
+from station.server.dispatch import SessionDispatcher
+from tests.station.session_rig import POSES, Rig
+
+ANNA, BERT = Peer(1, 100, 0, 0), Peer(2, 101, 0, 0)
+ARGUMENTS: dict[str, dict[str, Any]] = {
+    "acknowledge": {}, "load_plan": {}, "make_plan": {}, "prepare": {}, "hover": {}, "go": {"token": "t"},
+    "pause": {}, "finish": {}, "retake": {"index": 0}, "skip": {"index": 1},
+    "reorder": {"order": [1, 0, *range(2, POSES)]}, "add": {}, "drop": {"index": 1},
+    "free_drive": {"on": True}, "record": {},
+}  # fmt: skip
+FOR_ANYBODY = {"acknowledge", "pause"}
+"""They only ever make the arm do less, or nothing."""
+
+
+def arguments(verb: str, plan: Plan) -> dict[str, Any]:
+    made = {"load_plan": {"plan": plan}, "add": {"pose": plan.poses[0]}}
+    return made.get(verb, ARGUMENTS[verb])
+
+
+def test_every_verb_that_depends_on_a_state_is_tried_here() -> None:
+    assert set(ARGUMENTS) == {verb for verb, states in VERB_STATES.items() if states != frozenset(S)}
+
+
+@pytest.mark.parametrize("verb", ARGUMENTS)
+async def test_a_verb_out_of_its_state_is_refused_and_changes_nothing(
+    rig: Rig, small_plan: Plan, monkeypatch: pytest.MonkeyPatch, verb: str
+) -> None:
+    monkeypatch.setattr(rig.session.guard, "_look", lambda: None)  # it would correct the state
+    dispatcher, store = SessionDispatcher(rig.session), rig.session.store
+    calm, done = store.status, list(rig.arm.log)
+    for state in set(S) - VERB_STATES[verb]:  # type: ignore[index]
+        store._status = msgspec.structs.replace(calm, state=state)
+        with pytest.raises(RefusedError, match="is not possible now"):
+            await dispatcher.handle(ANNA, verb, arguments(verb, small_plan))
+        assert store.status == msgspec.structs.replace(calm, state=state)
+    assert rig.arm.log == done
+    assert not (rig.session.bench.pause_wanted or rig.session.bench.finish_wanted)
+    store._status = calm
+
+
+@pytest.mark.parametrize("verb", sorted(set(ARGUMENTS) - FOR_ANYBODY))
+async def test_whoever_does_not_hold_the_lease_commands_nothing(
+    rig: Rig, small_plan: Plan, verb: str
+) -> None:
+    dispatcher, calm = SessionDispatcher(rig.session), rig.session.store.status.session
+    with pytest.raises(RefusedError, match="you may watch and STOP"):
+        await dispatcher.handle(BERT, verb, arguments(verb, small_plan))
+    await rig.session.release_lease(1)
+    with pytest.raises(RefusedError, match="take the lease first"):
+        await dispatcher.handle(ANNA, verb, arguments(verb, small_plan))
+    assert rig.session.store.status.session == calm
+    assert rig.state is S.IDLE and "move" not in rig.arm.log

@@ -1,0 +1,94 @@
+"""The state table, every pair of it: what a person's safety rests on is stated here once more."""
+
+from __future__ import annotations
+
+import itertools
+from typing import get_args
+
+import pytest
+
+from station.cell.status import StationState as S
+from station.cell.status import StationStatus
+from station.protocol.messages import Verb
+from station.protocol.states import RUNNING, TRANSITIONS, VERB_STATES, TransitionError, refusal
+from station.session.store import StatusStore
+
+PAIRS = list(itertools.product(S, S))
+VERBS: tuple[Verb, ...] = get_args(Verb)
+
+
+@pytest.mark.parametrize(("old", "new"), PAIRS)
+def test_the_status_follows_the_table_and_nothing_else(old: S, new: S) -> None:
+    store = StatusStore(StationStatus(state=old))
+    if new is old or new in TRANSITIONS[old]:
+        store.enter(new)
+        assert store.state is new
+    else:
+        with pytest.raises(TransitionError):
+            store.enter(new)
+        assert store.state is old
+
+
+def before(state: S) -> set[S]:
+    return {old for old in S if state in TRANSITIONS[old]}
+
+
+def test_every_state_has_a_row() -> None:
+    assert set(TRANSITIONS) == set(S)
+    assert set(VERB_STATES) == set(VERBS)
+
+
+def test_motion_begins_only_behind_a_check_and_a_check_only_from_rest() -> None:
+    assert before(S.MOVING) == {S.CHECKING, S.SETTLING, S.CAPTURING, S.WRITING}
+    assert before(S.CHECKING) == {S.IDLE, S.PAUSED}
+
+
+def test_stop_and_fault_are_reached_from_everywhere_in_one_step() -> None:
+    assert before(S.STOPPED) == set(S) - {S.STOPPED}
+    assert before(S.FAULT) == set(S) - {S.STOPPED, S.FAULT}
+
+
+@pytest.mark.parametrize("latched", [S.STOPPED, S.FAULT])
+def test_what_is_latched_leads_to_rest_only(latched: S) -> None:
+    assert TRANSITIONS[latched] - {S.STOPPED} == {S.IDLE, S.PAUSED, S.DISCONNECTED}
+
+
+def test_no_state_is_a_trap() -> None:
+    for start in S:
+        reached, frontier = {start}, [start]
+        while frontier:
+            for new in TRANSITIONS[frontier.pop()] - reached:
+                reached.add(new)
+                frontier.append(new)
+        assert S.IDLE in reached
+
+
+@pytest.mark.parametrize(("verb", "state"), list(itertools.product(VERBS, S)))
+def test_a_verb_is_allowed_or_its_refusal_has_words(verb: Verb, state: S) -> None:
+    allowed = state in VERB_STATES[verb]
+    assert (refusal(verb, state) == "") is allowed
+    if not allowed:
+        assert len(refusal(verb, state).split()) > 5
+
+
+def test_stop_is_always_possible_and_a_go_only_at_rest() -> None:
+    assert VERB_STATES["stop"] == frozenset(S)
+    assert VERB_STATES["go"] == VERB_STATES["prepare"] == {S.IDLE, S.PAUSED}
+    assert not RUNNING & VERB_STATES["go"]
+    assert VERB_STATES["acknowledge"] == {S.STOPPED, S.FAULT}
+
+
+def test_a_watcher_that_ends_itself_while_another_changes_the_status_ends_nothing_else() -> None:
+    store = StatusStore(StationStatus())
+    store.watch(lambda: store.update(reason="two"))
+    calls: list[str] = []
+
+    def once() -> None:
+        calls.append(store.status.reason)
+        end()
+
+    end = store.watch(once)
+    store.update(reason="one")
+    assert calls == ["two", "two"], "the inner change first, then the one that was under way"
+    store.update(reason="three")
+    assert len(calls) == 2

@@ -1,0 +1,309 @@
+"""The control socket among friendly, slow, hostile and stuck clients."""
+
+from __future__ import annotations
+
+import asyncio
+import base64
+import contextlib
+import json
+import os
+import socket
+import stat
+import sys
+from collections.abc import AsyncIterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from station.cell.errors import RefusedError, StationError
+from station.cell.status import StationState, StationStatus
+from station.protocol.client import Client, DaemonGoneError
+from station.protocol.messages import (
+    LINE_LIMIT_BYTES,
+    PIECE_BYTES,
+    REQUEST_LIMIT_BYTES,
+    USER_CLIENT_LIMIT,
+    Reply,
+)
+from station.server.control import OPEN_REQUESTS_LIMIT, ControlServer, Peer
+
+
+class RecordingHandler:
+    """Remembers what arrived; `slow` answers when told to."""
+
+    def __init__(self) -> None:
+        self.order: list[str] = []
+        self.lost: list[int] = []
+        self.release = asyncio.Event()
+
+    def stop_now(self, peer: Peer) -> None:
+        self.order.append("stop")
+
+    async def handle(self, peer: Peer, verb: str, args: dict[str, Any]) -> Any:
+        if verb == "make_plan":
+            await self.release.wait()
+        if verb == "go":
+            raise RefusedError("take the lease first")
+        if verb == "skip":
+            return {"index": int(args["index"])}
+        self.order.append(verb)
+        return {"pid": peer.pid}
+
+    def gone(self, peer: Peer) -> None:
+        self.lost.append(peer.client_id)
+
+
+@pytest.fixture
+async def handler() -> RecordingHandler:
+    return RecordingHandler()
+
+
+@pytest.fixture
+async def server(tmp_path: Path, handler: RecordingHandler) -> AsyncIterator[tuple[ControlServer, Path]]:
+    path = tmp_path / "control.sock"
+    control = ControlServer(path, handler)
+    await control.start()
+    yield control, path
+    await control.close()
+
+
+Served = tuple[ControlServer, Path]
+
+
+async def raw(path: Path, *lines: bytes) -> list[dict[str, Any]]:
+    reader, writer = await asyncio.open_unix_connection(str(path), limit=1 << 20)
+    writer.write(b"".join(lines))
+    writer.write_eof()
+    answers = [json.loads(line) async for line in reader]
+    writer.close()
+    return answers
+
+
+async def test_the_socket_is_the_groups_and_knows_its_peer(server: Served) -> None:
+    _, path = server
+    assert stat.S_IMODE(path.stat().st_mode) == 0o660
+    async with await Client.connect(path) as client:
+        assert (await client.request("doctor"))["pid"] == os.getpid()
+
+
+async def test_stop_passes_everything_that_is_queued(server: Served, handler: RecordingHandler) -> None:
+    _, path = server
+    async with await Client.connect(path) as busy, await Client.connect(path) as other:
+        planning = asyncio.create_task(busy.request("make_plan", poses=25))
+        await asyncio.sleep(0)
+        await busy.request("stop")
+        await other.request("stop")
+        assert handler.order.count("stop") == 2
+        assert "make_plan" not in handler.order
+        handler.release.set()
+        await planning
+
+
+async def test_refusals_keep_their_words(server: Served) -> None:
+    _, path = server
+    async with await Client.connect(path) as client:
+        with pytest.raises(RefusedError, match="take the lease first"):
+            await client.request("go", token="x")
+
+
+async def test_watchers_get_everything_once_then_only_changes(server: Served) -> None:
+    control, path = server
+    async with await Client.connect(path) as client:
+        statuses = client.statuses()
+        assert (await anext(statuses)).state is StationState.DISCONNECTED
+        control.publish(StationStatus(state=StationState.IDLE, cell="lab"))
+        assert (await anext(statuses)).cell == "lab"
+        control.publish(StationStatus(state=StationState.PAUSED, cell="lab"))
+        newest = await anext(statuses)
+        assert (newest.state, newest.cell) == (StationState.PAUSED, "lab")
+
+
+@pytest.mark.parametrize(
+    ("line", "said"),
+    [
+        (b"not json\n", "not a request"),
+        (b'{"id": 1, "verb": "__class__"}\n', "Invalid enum value"),
+        (b'{"id": 1, "verb": "hello", "extra": 1}\n', "unknown field"),
+        (b'{"id": "x", "verb": "hello"}\n', "Expected `int`"),
+        (b"[" * 5000 + b"\n", "not a request"),
+        (b'{"id": 1, "verb": "skip", "args": {"index": NaN}}\n', "not a request"),
+        (b'{"id": 1, "verb": "skip", "args": {}}\n', "wrong arguments"),
+        (b"x" * (LINE_LIMIT_BYTES + 1) + b"\n", "dropped"),
+    ],
+)
+async def test_nonsense_is_answered_and_others_are_served(server: Served, line: bytes, said: str) -> None:
+    _, path = server
+    answers = await raw(path, line)
+    assert said in answers[0]["error"]
+    async with await Client.connect(path) as client:
+        assert await client.request("doctor")
+
+
+async def test_an_endless_line_costs_no_memory(server: Served) -> None:
+    _, path = server
+    _, writer = await asyncio.open_unix_connection(str(path))
+    sent = 0
+    with pytest.raises(OSError):
+        while sent < 1_000_000_000:
+            writer.write(b"x" * 65536)
+            await asyncio.wait_for(writer.drain(), 5)
+            sent += 65536
+    assert sent < 10_000_000
+
+
+async def test_of_too_many_questions_at_once_the_last_are_turned_away_but_never_a_stop(
+    server: Served, handler: RecordingHandler
+) -> None:
+    _, path = server
+    waiting = [
+        json.dumps({"id": k, "verb": "make_plan", "args": {}}).encode() + b"\n"
+        for k in range(OPEN_REQUESTS_LIMIT + 1)
+    ]
+    reader, writer = await asyncio.open_unix_connection(str(path))
+    writer.write(b"".join(waiting) + b'{"id": 99, "verb": "stop", "args": {}}\n')
+    async with asyncio.timeout(5):
+        first, second = [json.loads(await reader.readline()) for _ in range(2)]
+    assert first["id"] == OPEN_REQUESTS_LIMIT and "too many requests" in first["error"]
+    assert (second["id"], second["ok"]) == (99, True)
+    assert handler.order == ["stop"]
+    handler.release.set()
+    answers = [json.loads(await reader.readline()) for _ in range(OPEN_REQUESTS_LIMIT)]
+    assert all(answer["ok"] for answer in answers)
+    writer.close()
+
+
+async def test_a_flood_of_lines_holds_up_neither_stop_nor_the_heartbeat(
+    server: Served, handler: RecordingHandler, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Lines that lie there already are read without a pause: a quarter of a megabyte took a second."""
+    answered: list[Reply] = []
+    monkeypatch.setattr("station.server.control._Connection.reply", lambda _, reply: answered.append(reply))
+    _, path = server
+    with socket.socket(socket.AF_UNIX) as flood, socket.socket(socket.AF_UNIX) as other:
+        for link, lines in ((flood, b"\n" * 50_000), (other, b'{"id": 1, "verb": "stop"}\n')):
+            link.setblocking(False)
+            link.connect(str(path))
+            assert link.send(lines) == len(lines)
+        async with asyncio.timeout(5):
+            while "stop" not in handler.order:
+                await asyncio.sleep(0)
+    assert len(answered) < 100
+
+
+async def test_a_long_request_goes_in_pieces_and_stop_passes_between_them(
+    server: Served, handler: RecordingHandler
+) -> None:
+    _, path = server
+    long = {"note": "ü" * 200_000, "index": 7}
+    async with await Client.connect(path) as client, await Client.connect(path) as other:
+        twice = await asyncio.gather(client.request("skip", **long), client.request("skip", **long))
+        assert twice == [{"index": 7}, {"index": 7}]
+        await client.request("part", base64=base64.b64encode(b'{"id": 1, "verb"').decode())
+        await other.request("stop")
+        await client.request("stop")
+        assert handler.order.count("stop") == 2
+        with pytest.raises(RefusedError, match=r"MB are more than the daemon takes.*fewer poses"):
+            await client.request("skip", note="x" * REQUEST_LIMIT_BYTES)
+
+
+async def test_pieces_without_end_or_sense_are_answered_in_words(server: Served) -> None:
+    _, path = server
+    piece = base64.b64encode(bytes(PIECE_BYTES)).decode()
+    lines = [json.dumps({"id": i, "verb": "part", "args": {"base64": piece}}).encode() for i in range(70)]
+    answers = await raw(path, b"\n".join(lines) + b"\n")
+    assert sum(not answer["ok"] for answer in answers) == 1
+    assert "nothing of it is kept" in next(answer["error"] for answer in answers if not answer["ok"])
+    nonsense = (b'{"id": 1, "verb": "part", "args": {"base64": "%"}}\n', b'{"id": 2, "verb": "whole"}\n')
+    for answer in await raw(path, *nonsense):
+        assert "not a request" in answer["error"]
+
+
+async def test_a_client_that_does_not_read_is_dropped(server: Served, handler: RecordingHandler) -> None:
+    control, path = server
+    stuck = socket.socket(socket.AF_UNIX)
+    stuck.setblocking(False)
+    stuck.connect(str(path))
+    stuck.send(b'{"id": 1, "verb": "watch"}\n')
+    async with await Client.connect(path) as client:
+        for i in range(200):
+            control.publish(StationStatus(reason=str(i) * 50_000))
+            await asyncio.sleep(0)
+        assert await client.request("doctor")
+        assert len(handler.lost) == 1
+    stuck.close()
+
+
+async def test_more_clients_than_seats_are_told(server: Served) -> None:
+    _, path = server
+    clients = [await Client.connect(path) for _ in range(USER_CLIENT_LIMIT)]
+    answers = await raw(path)
+    assert "connected already" in answers[0]["error"]
+    for client in clients:
+        await client.close()
+
+
+async def test_a_lost_connection_is_told_to_the_handler(server: Served, handler: RecordingHandler) -> None:
+    _, path = server
+    client = await Client.connect(path)
+    await client.close()
+    async with asyncio.timeout(2):
+        while not handler.lost:
+            await asyncio.sleep(0.01)
+
+
+async def test_a_stale_socket_is_replaced_a_living_one_is_not(server: Served, tmp_path: Path) -> None:
+    _, path = server
+    with pytest.raises(StationError, match="already serves"):
+        await ControlServer(path, RecordingHandler()).start()
+    stale = tmp_path / "stale.sock"
+    left_over = socket.socket(socket.AF_UNIX)
+    left_over.bind(str(stale))
+    left_over.close()
+    replacement = ControlServer(stale, RecordingHandler())
+    await replacement.start()
+    await replacement.close()
+
+
+async def test_without_a_daemon_the_remedy_is_named(tmp_path: Path) -> None:
+    with pytest.raises(DaemonGoneError, match="station serve"):
+        await Client.connect(tmp_path / "none.sock")
+
+
+async def test_a_dying_daemon_ends_requests_and_statuses(server: Served) -> None:
+    control, path = server
+    client = await Client.connect(path)
+    statuses = client.statuses()
+    await anext(statuses)
+    planning = asyncio.create_task(client.request("make_plan"))
+    await asyncio.sleep(0.05)
+    await control.close()
+    with pytest.raises(DaemonGoneError, match=r"not known\. Look at the cell"):
+        await planning
+    with pytest.raises(DaemonGoneError, match="nothing was sent"):
+        await client.request("go", token="")
+    async with asyncio.timeout(2):
+        assert len([s async for s in statuses]) <= 1
+    await client.close()
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can become somebody else")
+async def test_a_user_outside_the_group_is_refused(server: Served) -> None:
+    _, path = server
+    for folder in (path.parent, *path.parent.parents[:3]):
+        with contextlib.suppress(OSError):
+            folder.chmod(folder.stat().st_mode | 0o011)
+    program = (
+        "import os, socket, sys; os.setgroups([]); os.setgid(65534); os.setuid(65534)\n"
+        "socket.socket(socket.AF_UNIX).connect(sys.argv[1])"
+    )
+
+    async def knock() -> bytes:
+        stranger = await asyncio.create_subprocess_exec(
+            sys.executable, "-c", program, str(path), stderr=asyncio.subprocess.PIPE
+        )
+        return (await stranger.communicate())[1]
+
+    assert b"PermissionError" in await knock()
+    path.chmod(0o666)
+    assert await knock() == b""  # it was the socket's mode that refused, not a folder's

@@ -1,0 +1,328 @@
+"""Verbs over the socket: typed arguments, who may, and the rule for arms that are real."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import dataclasses
+import os
+import pty
+import subprocess
+import sys
+import time
+from collections.abc import AsyncIterator, Callable
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from recordings.reader import open_recording
+from station.cell.config import ApprovalConfig
+from station.cell.errors import RefusedError
+from station.cell.plan import Plan, plan_sha256
+from station.cell.socket_folder import user_name
+from station.cell.status import StationState
+from station.protocol.client import Client
+from station.server import dispatch
+from station.server.approval import Process, process
+from station.server.control import ControlServer, Peer
+from station.server.dispatch import SessionDispatcher
+from tests.station.session_rig import POSES, NewRig, Rig
+
+See = Callable[[int], Process | None]
+
+
+class Served:
+    def __init__(self, rig: Rig, path: Path, see: See = process) -> None:
+        self.rig, self.path = rig, path
+        self.control = ControlServer(path, SessionDispatcher(rig.session, see))
+
+    async def client(self) -> Client:
+        return await Client.connect(self.path, "tty1")
+
+
+@pytest.fixture
+async def served(new_rig: NewRig, tmp_path: Path) -> AsyncIterator[Served]:
+    rig = await new_rig(with_plan=False)
+    await rig.until(StationState.IDLE)
+    made = Served(rig, tmp_path / "s")
+    await made.control.start()
+    yield made
+    await made.control.close()
+
+
+async def test_a_capture_over_the_socket(served: Served, small_plan: Plan) -> None:
+    async with await served.client() as anna:
+        lease = await anna.request("lease", action="take")
+        assert "tty1" in lease["holder"] and "pid" in lease["holder"]
+        answer = await anna.request("load_plan", plan=msgspec.to_builtins(small_plan))
+        assert answer["sha256"] == plan_sha256(small_plan)
+        summary = await anna.request("prepare", purpose="run")
+        assert summary["poses"] == POSES
+        assert any("SIMULATED" in warning for warning in summary["warnings"])
+        await anna.request("go", token=summary["token"])
+        await served.rig.until_true(lambda: bool(served.rig.session.store.status.session.recording))
+        sessions = await anna.request("sessions")
+        assert sessions[0]["sealed"] and sessions[0]["views"] == POSES
+        checks = {check["name"]: check for check in await anna.request("doctor")}
+        assert checks["robot"]["state"] == checks["disk"]["state"] == "ok"
+        preview = await anna.request("preview", width=160, height=128)
+        assert (preview["width"], preview["height"]) == (160, 128)
+        assert all(0 <= x <= 1 and 0 <= y <= 1 for x, y in preview["corners"])
+
+
+async def test_poses_of_a_check_are_planned_for_a_known_lens(
+    served: Served, small_plan: Plan, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[object] = []
+
+    async def call(function: object, *args: object, timeout_s: float) -> Plan:
+        asked.append(args[-1])
+        return small_plan
+
+    monkeypatch.setattr(served.rig.session.bench.workers, "call", call)
+    async with await served.client() as anna:
+        await anna.request("lease", action="take")
+        await anna.request("make_plan", poses=6, lens_known=True)
+        await anna.request("make_plan", poses=25)
+    assert asked == [True, False]
+
+
+async def test_the_second_operator_may_watch_pause_and_stop_only(served: Served, small_plan: Plan) -> None:
+    async with await served.client() as anna, await served.client() as bert:
+        await anna.request("lease", action="take")
+        for verb, args in (
+            ("lease", {"action": "take"}),
+            ("load_plan", {"plan": msgspec.to_builtins(small_plan)}),
+            ("prepare", {}),
+            ("finish", {}),
+            ("skip", {"index": 0}),
+            ("free_drive", {"on": True}),
+        ):
+            with pytest.raises(RefusedError, match=r"held by .*tty1"):
+                await bert.request(verb, **args)
+        await bert.request("stop")
+        assert served.rig.state is StationState.STOPPED
+        await anna.request("lease", action="release")
+        await bert.request("lease", action="take")
+
+
+async def test_a_screen_at_which_nobody_is_may_say_that_it_is_lost(served: Served, small_plan: Plan) -> None:
+    async with await served.client() as anna:
+        await anna.request("lease", action="take")
+        await anna.request("load_plan", plan=msgspec.to_builtins(small_plan))
+        served.rig.arm.slow = True
+        offer = await anna.request("prepare")
+        await anna.request("go", token=offer["token"], plan_sha256=offer["plan_sha256"])
+        await served.rig.until(StationState.MOVING)
+        await anna.request("lease", action="lost")
+        assert served.rig.state is StationState.PAUSED
+        assert "tty1" in served.rig.session.store.status.reason
+        assert "was lost" in served.rig.session.store.status.reason
+        assert served.rig.session.store.status.lease.holder == ""
+
+
+@pytest.mark.parametrize(
+    ("verb", "args"),
+    [
+        ("skip", {"index": "one"}),
+        ("skip", {"index": 0, "now": True}),
+        ("go", {}),
+        ("make_plan", {"poses": 1_000_000}),
+        ("reorder", {"order": [0, 0]}),
+        ("load_plan", {"plan": {"robot": "UR10"}}),
+        ("lease", {"action": "steal"}),
+        ("prepare", {"purpose": "dance"}),
+    ],
+)
+async def test_arguments_that_do_not_fit_are_refused_in_words(
+    served: Served, verb: str, args: dict[str, object]
+) -> None:
+    async with await served.client() as anna:
+        await anna.request("lease", action="take")
+        with pytest.raises(RefusedError) as caught:
+            await anna.request(verb, **args)  # type: ignore[arg-type]
+        assert len(str(caught.value).split()) > 3
+
+
+async def real_cell(new_rig: NewRig, folder: Path, see: See, approval: ApprovalConfig) -> Served:
+    rig = await new_rig(with_plan=False, source="real")
+    cell = rig.session.bench.cell
+    config = msgspec.structs.replace(cell.config, approval=approval)
+    rig.session.bench.cell = dataclasses.replace(cell, config=config)
+    await rig.until(StationState.IDLE)
+    served = Served(rig, folder / "r", see)
+    await served.control.start()
+    return served
+
+
+def at_a_terminal(pid: int) -> Process:
+    return Process(os.getuid(), 77, "pts/3")
+
+
+def with_none(pid: int) -> Process:
+    return Process(os.getuid(), 77, "")
+
+
+ME = user_name(os.getuid())
+
+
+async def offered(client: Client, plan: Plan) -> dict[str, Any]:
+    await client.request("lease", action="take")
+    await client.request("load_plan", plan=msgspec.to_builtins(plan))
+    answer: dict[str, Any] = await client.request("prepare")
+    return answer
+
+
+@pytest.mark.parametrize("approval", [ApprovalConfig(), ApprovalConfig(services=("somebody",))])
+async def test_a_program_cannot_approve_motion_of_a_real_arm_whatever_it_says(
+    new_rig: NewRig, small_plan: Plan, tmp_path: Path, approval: ApprovalConfig
+) -> None:
+    served = await real_cell(new_rig, tmp_path, with_none, approval)
+    async with await served.client() as program:
+        with pytest.raises(RefusedError):
+            await program.request("hello", who="tty1", interactive=True)
+        for named in ({}, {"plan_sha256": plan_sha256(small_plan)}):
+            summary = await offered(program, small_plan)
+            with pytest.raises(RefusedError) as refused:
+                await program.request("go", token=summary["token"], **named)
+            said = str(refused.value)
+            assert summary["token"] not in said and plan_sha256(small_plan)[:12] not in said
+        with pytest.raises(RefusedError, match="terminal"):
+            await program.request("prepare", purpose="improve")
+    assert "move" not in served.rig.arm.log and "start control" not in served.rig.arm.log
+    await served.control.close()
+
+
+async def test_a_named_service_approves_by_the_plans_hash_and_is_written_down(
+    new_rig: NewRig, small_plan: Plan, tmp_path: Path
+) -> None:
+    served = await real_cell(new_rig, tmp_path, with_none, ApprovalConfig(services=(ME,)))
+    session = served.rig.session
+    async with await served.client() as program:
+        for wrong in ({}, {"plan_sha256": "ab" * 32}):
+            summary = await offered(program, small_plan)
+            with pytest.raises(RefusedError):
+                await program.request("go", token=summary["token"], **wrong)
+        assert "move" not in served.rig.arm.log
+        with pytest.raises(RefusedError, match="terminal"):
+            await program.request("prepare", purpose="best")
+        summary = await offered(program, small_plan)
+        await program.request("go", token=summary["token"], plan_sha256=plan_sha256(small_plan))
+        await served.rig.until_true(lambda: bool(session.store.status.session.recording))
+    told = [event.text for event in session.store.status.events if "approved by" in event.text]
+    recording = open_recording(Path(session.store.status.session.recording))
+    recorded = [event.detail for event in recording.events() if "approved by" in event.detail]
+    for texts in (told, recorded):
+        assert len(texts) == 1 and ME in texts[0] and f"pid {os.getpid()}" in texts[0]
+        assert "service" in texts[0] and plan_sha256(small_plan)[:12] in texts[0]
+    await served.control.close()
+
+
+@pytest.mark.parametrize(
+    ("persons", "see", "may"),
+    [
+        ((), at_a_terminal, True),
+        ((ME,), at_a_terminal, True),
+        (("somebody",), at_a_terminal, False),
+        ((), lambda pid: None, False),
+        ((), lambda pid: Process(os.getuid() + 1, 77, "pts/3"), False),
+    ],
+)
+async def test_a_person_at_a_terminal_approves_when_the_configuration_lets_them(
+    new_rig: NewRig, small_plan: Plan, tmp_path: Path, persons: tuple[str, ...], see: See, may: bool
+) -> None:
+    served = await real_cell(new_rig, tmp_path, see, ApprovalConfig(persons=persons))
+    async with await served.client() as anna:
+        summary = await offered(anna, small_plan)
+        if not may:
+            with pytest.raises(RefusedError):
+                await anna.request("go", token=summary["token"])
+            assert "start control" not in served.rig.arm.log
+        else:
+            await anna.request("go", token=summary["token"])
+            assert any("at pts/3" in event.text for event in served.rig.session.store.status.events)
+    await served.control.close()
+
+
+async def test_another_process_with_the_same_number_is_nobody_s_terminal(
+    new_rig: NewRig, small_plan: Plan, tmp_path: Path
+) -> None:
+    began = iter(range(100))
+    served = await real_cell(
+        new_rig, tmp_path, lambda pid: Process(os.getuid(), next(began), "pts/3"), ApprovalConfig()
+    )
+    async with await served.client() as anna:
+        summary = await offered(anna, small_plan)
+        with pytest.raises(RefusedError):
+            await anna.request("go", token=summary["token"])
+    await served.control.close()
+
+
+async def test_watchers_are_not_told_the_token(served: Served, small_plan: Plan) -> None:
+    async with await served.client() as anna:
+        summary = await offered(anna, small_plan)
+        shown = served.rig.session.store.status.go
+    assert shown is not None and summary["token"] and not shown.token
+
+
+def test_a_process_is_seen_at_its_terminal_only_in_the_foreground() -> None:
+    program = (
+        "import os, signal, sys\nfrom station.server.approval import process\n"
+        "print(process(os.getpid()).terminal == os.ttyname(0)[len('/dev/'):], flush=True)\n"
+        "signal.signal(signal.SIGTTOU, signal.SIG_IGN)\nif os.fork() == 0:\n"
+        "    os.setpgid(0, 0)\n    print('<' + process(os.getpid()).terminal + '>', flush=True)\n"
+        "    os._exit(0)\nos.wait()\n"
+    )
+    pid, terminal = pty.fork()
+    if pid == 0:
+        os.execv(sys.executable, [sys.executable, "-c", program])
+    said = b""
+    with contextlib.suppress(OSError):  # its end
+        while piece := os.read(terminal, 1000):
+            said += piece
+    os.waitpid(pid, 0)
+    os.close(terminal)
+    assert said.split() == [b"True", b"<>"]
+    alone = (
+        "import os; from station.server.approval import process; print(repr(process(os.getpid()).terminal))"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", alone], start_new_session=True, capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "''"
+
+
+async def test_neither_a_long_list_of_sessions_nor_a_slow_name_holds_the_loop_up(
+    served: Served, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def slow(_: object) -> Any:
+        time.sleep(0.4)
+        return []
+
+    monkeypatch.setattr(dispatch, "list_sessions", slow)
+    monkeypatch.setattr(dispatch, "user_name", lambda uid: str(slow(uid)))
+    async with await served.client() as anna:
+        assert await anna.request("sessions") == []
+        await anna.request("stop")
+        await asyncio.sleep(0.1)  # a frozen loop shows in the round after
+    assert served.rig.session.guard.lag_ms() < 300
+
+
+async def test_who_is_turned_away_is_not_kept(served: Served) -> None:
+    dispatcher = SessionDispatcher(served.rig.session)
+    await dispatcher.stop_now(Peer(client_id=99, pid=1, uid=0, gid=0))
+    assert not dispatcher._callers and "uid 0 (pid 1)" in served.rig.session.store.status.reason
+
+
+async def test_leaving_voids_the_go(served: Served, small_plan: Plan) -> None:
+    async with await served.client() as anna:
+        await anna.request("lease", action="take")
+        await anna.request("load_plan", plan=msgspec.to_builtins(small_plan))
+        summary = await anna.request("prepare")
+    async with await served.client() as bert:
+        await served.rig.until_true(lambda: not served.rig.session.store.status.lease.holder)
+        await bert.request("lease", action="take")
+        with pytest.raises(RefusedError, match="not valid"):
+            await bert.request("go", token=summary["token"])

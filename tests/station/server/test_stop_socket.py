@@ -1,0 +1,386 @@
+"""STOP without a connection: what `station stop` may be believed, and that nobody can take it away."""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import socket
+import stat
+import subprocess
+import sys
+import time
+from collections.abc import AsyncIterator
+from pathlib import Path
+
+import pytest
+
+from station.cell.errors import RefusedError, StationError
+from station.cell.socket_folder import (
+    UntrustedFolderError,
+    default_socket,
+    folder_owner,
+    make_folder,
+    motion_page,
+    stop_socket,
+)
+from station.protocol.client import Client, DaemonGoneError
+from station.protocol.messages import USER_CLIENT_LIMIT
+from station.protocol.motion_page import Motion, Page, create_page, open_page, read_page, write_page
+from station.protocol.stop_client import Outcome, main, send_stop, stop
+from station.server import stop_server
+from station.server.control import ControlServer
+from station.server.stop_server import BATCH, Sender, StopServer
+from tests.station.server.test_control import RecordingHandler
+
+NOBODY = 65534
+ONLY_ROOT = pytest.mark.skipif(os.getuid() != 0, reason="only root can become somebody else")
+
+
+class Station:
+    """A stop server without an arm; `speed_rad_s` is what the arm would say."""
+
+    def __init__(self, control: Path) -> None:
+        self.control = control
+        self.heard: list[Sender] = []
+        self.latched = False
+        self.speed_rad_s: float | None = 0.0
+        self.server = StopServer(control, self._stop, lambda: self.latched, lambda: self.speed_rad_s)
+        self._beating: asyncio.Task[None] | None = None
+
+    def _stop(self, sender: Sender) -> None:
+        self.heard.append(sender)
+        self.latched = True
+
+    def start(self) -> None:
+        self.server.start()
+        self._beating = asyncio.create_task(self._beat())
+
+    async def _beat(self) -> None:
+        while True:
+            self.server.round()
+            await asyncio.sleep(0.01)
+
+    async def close(self) -> None:
+        if self._beating is not None:
+            self._beating.cancel()
+            await asyncio.gather(self._beating, return_exceptions=True)
+        self.server.close()
+
+
+@pytest.fixture
+async def station(tmp_path: Path) -> AsyncIterator[Station]:
+    tmp_path.chmod(0o700)
+    made = Station(tmp_path / "c.sock")
+    made.start()
+    yield made
+    await made.close()
+
+
+async def stopped(control: Path) -> Outcome:
+    return (await asyncio.to_thread(stop, control))[0]
+
+
+async def test_stop_is_confirmed_when_the_arm_rests(station: Station) -> None:
+    assert await stopped(station.server.control) is Outcome.RESTS
+    assert station.heard == [Sender(os.getpid(), os.getuid())]
+
+
+@pytest.mark.parametrize("payload", [b"", b"\0" * 9, b'{"verb": "go"}', b"x" * 60_000])
+async def test_whatever_a_datagram_says_it_is_stop(station: Station, payload: bytes) -> None:
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link:
+        link.sendto(payload, str(stop_socket(station.server.control)))
+    async with asyncio.timeout(2):
+        while not station.heard:
+            await asyncio.sleep(0)
+
+
+@pytest.mark.parametrize(("speed_rad_s", "outcome"), [(0.4, Outcome.MOVES), (None, Outcome.UNKNOWN)])
+async def test_an_arm_that_is_not_seen_to_rest_is_not_called_stopped(
+    station: Station, speed_rad_s: float | None, outcome: Outcome, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("station.protocol.stop_client.REST_S", 0.2)
+    station.speed_rad_s = speed_rad_s
+    assert await stopped(station.server.control) is outcome
+    assert station.heard
+
+
+async def test_rest_is_not_believed_before_a_move_could_show(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The newest state may be of before a move that had just begun."""
+    monkeypatch.setattr(stop_server, "SETTLE_S", 60.0)
+    monkeypatch.setattr("station.protocol.stop_client.REST_S", 0.2)
+    assert await stopped(station.server.control) is Outcome.MOVES
+
+
+async def test_of_a_flood_only_so_much_reaches_the_loop_and_another_stop_is_confirmed(
+    station: Station,
+) -> None:
+    flooding = True
+
+    def flood() -> None:
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link:
+            link.setblocking(False)
+            while flooding:
+                try:
+                    link.sendto(b"x", str(stop_socket(station.server.control)))
+                except BlockingIOError:
+                    time.sleep(0.0005)
+
+    flooder = asyncio.create_task(asyncio.to_thread(flood))
+    await asyncio.sleep(0.3)
+    begun_s, before = time.monotonic(), len(station.heard)
+    assert await stopped(station.server.control) is Outcome.RESTS
+    repeated = (len(station.heard) - before) / (time.monotonic() - begun_s + stop_server.REPEAT_S)
+    flooding = False
+    await flooder
+    assert repeated <= 2 / stop_server.REPEAT_S
+
+
+async def test_a_stop_after_an_acknowledgement_is_carried_out_however_soon_it_comes(station: Station) -> None:
+    assert await stopped(station.server.control) is Outcome.RESTS
+    station.latched = False
+    assert send_stop(station.server.control)
+    async with asyncio.timeout(2):
+        while len(station.heard) < 2:
+            await asyncio.sleep(0)
+
+
+async def test_one_waking_reads_a_bounded_number(station: Station, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert station.server._link is not None
+
+    class Endless:
+        reads = 0
+
+        def recvmsg(self, *_: int) -> tuple[bytes, list[object], int, None]:
+            Endless.reads += 1
+            return b"x", [], 0, None
+
+    with monkeypatch.context() as patch:
+        patch.setattr(station.server, "_link", Endless())
+        station.server._read()
+    assert Endless.reads == BATCH
+
+
+async def test_a_daemon_that_hangs_is_not_believed_and_the_answer_comes_within_a_second(
+    tmp_path: Path,
+) -> None:
+    tmp_path.chmod(0o700)
+    hung = Station(tmp_path / "c.sock")
+    hung.server.start()  # and nobody reads
+    begun_s = time.monotonic()
+    assert stop(hung.control)[0] is Outcome.SILENT
+    assert time.monotonic() - begun_s < 1.0
+    hung.server.close()
+
+
+def test_without_a_daemon_it_is_said_at_once(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    tmp_path.chmod(0o700)
+    begun_s = time.monotonic()
+    for control in (tmp_path / "c.sock", tmp_path / "none" / "c.sock"):
+        assert stop(control)[0] is Outcome.NO_DAEMON
+        assert main(["--socket", str(control)]) == 1
+    left_over = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+    left_over.bind(str(stop_socket(tmp_path / "c.sock")))
+    left_over.close()
+    assert stop(tmp_path / "c.sock")[0] is Outcome.NO_DAEMON
+    assert time.monotonic() - begun_s < 1.0
+    assert str(tmp_path) in capsys.readouterr().err
+
+
+def test_other_arguments_are_left_to_the_whole_command_line() -> None:
+    assert main(["--help"]) is None and main(["--socket"]) is None and main(["--socket", "--help"]) is None
+
+
+def test_stop_loads_nothing_large(tmp_path: Path) -> None:
+    """0.03 s of processor time against 0.29 s; an import that creeps in shows here."""
+    program = (
+        "import sys; sys.argv = ['station', 'stop', '--socket', sys.argv[1]]\nfrom station.cli import main\n"
+        "try: main()\nexcept SystemExit: print([m for m in sys.modules if m.split('.')[0] in "
+        "('asyncio', 'typer', 'rich', 'msgspec', 'numpy', 'json', 'logging', 'subprocess')])"
+    )
+    said = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path / "c.sock")], capture_output=True, text=True, timeout=30
+    )
+    assert said.stdout.strip() == "[]"
+
+
+# -- whose folder it is ------------------------------------------------------------------------------------
+
+
+def as_nobody(program: str, *arguments: object) -> subprocess.Popen[bytes]:
+    become = f"import os, sys; os.setgroups([]); os.setgid({NOBODY}); os.setuid({NOBODY})\n"
+    command = [sys.executable, "-c", become + program, *map(str, arguments)]
+    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+
+
+FAKE = """
+import socket, struct, time
+link = socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM)
+link.bind(sys.argv[1])
+page = open(sys.argv[2], "wb", buffering=0)
+stops = 0
+page.write(struct.pack("<8sIIQ", b"STATION1", 1, 2, stops))
+print("ready", flush=True)
+while True:
+    link.recv(100); stops += 1; page.seek(0)
+    page.write(struct.pack("<8sIIQ", b"STATION1", 1, 2, stops))
+"""
+
+
+@ONLY_ROOT
+def test_a_fake_daemon_in_a_strangers_folder_is_not_believed(tmp_path: Path) -> None:
+    shared = tmp_path / "shared"
+    for folder in (tmp_path, *tmp_path.parents[:3]):
+        folder.chmod(folder.stat().st_mode | 0o011)
+    shared.mkdir()
+    shared.chmod(0o1777)
+    folder = shared / "station-0"
+    folder.mkdir(mode=0o755)
+    os.chown(folder, NOBODY, NOBODY)
+    control = folder / "c.sock"
+    fake = as_nobody(FAKE, stop_socket(control), motion_page(control))
+    try:
+        assert fake.stdout is not None and fake.stdout.readline()
+        begun_s = time.monotonic()
+        outcome, reason = stop(control)
+        assert outcome is Outcome.UNTRUSTED and str(folder) in reason
+        assert time.monotonic() - begun_s < 1.0
+        with pytest.raises(UntrustedFolderError):
+            make_folder(folder)
+        # Even in a good folder: the page is the stranger's.
+        folder.chmod(0o755)
+        os.chown(folder, 0, 0)
+        assert stop(control)[0] is Outcome.UNTRUSTED
+    finally:
+        fake.kill()
+        fake.communicate()
+
+
+@ONLY_ROOT
+def test_the_folder_that_root_made_for_the_daemons_account_is_believed(tmp_path: Path) -> None:
+    """As /run/station, which belongs to the user station."""
+    folder = Path("/run") / f"station-test-{os.getpid()}"
+    folder.mkdir(mode=0o755)
+    try:
+        os.chown(folder, NOBODY, NOBODY)
+        assert folder_owner(folder) == NOBODY
+        folder.chmod(0o770)
+        with pytest.raises(UntrustedFolderError):
+            folder_owner(folder)
+    finally:
+        folder.rmdir()
+
+
+@ONLY_ROOT
+def test_a_strangers_link_to_a_good_folder_is_not_followed(tmp_path: Path) -> None:
+    good = tmp_path / "good"
+    good.mkdir(mode=0o700)
+    link = tmp_path / "link"
+    link.symlink_to(good)
+    assert folder_owner(link) == 0
+    os.chown(link, NOBODY, NOBODY, follow_symlinks=False)
+    with pytest.raises(UntrustedFolderError):
+        folder_owner(link)
+
+
+@pytest.mark.parametrize("mode", [0o777, 0o1777, 0o772])
+def test_a_folder_that_others_may_write_to_is_refused(tmp_path: Path, mode: int) -> None:
+    folder = tmp_path / "open"
+    folder.mkdir()
+    folder.chmod(mode)
+    with pytest.raises(UntrustedFolderError):
+        make_folder(folder)
+    inside = folder / "inside"
+    inside.mkdir(mode=0o700)
+    if mode == 0o1777:  # as below /tmp: what lies there belongs to who made it
+        assert folder_owner(inside) == os.getuid()
+    else:
+        with pytest.raises(UntrustedFolderError):
+            folder_owner(inside)
+
+
+async def test_a_daemon_does_not_serve_where_others_may_write(tmp_path: Path) -> None:
+    (tmp_path / "open").mkdir()
+    (tmp_path / "open").chmod(0o777)
+    with pytest.raises(StationError):
+        await ControlServer(tmp_path / "open" / "c.sock", RecordingHandler()).start()
+
+
+def test_a_new_folder_is_this_users_alone(tmp_path: Path) -> None:
+    make_folder(tmp_path / "a" / "run")
+    assert stat.S_IMODE((tmp_path / "a" / "run").stat().st_mode) == 0o700
+
+
+def test_without_a_runtime_folder_the_socket_lies_where_nobody_else_can_be_first(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.delenv("RUNTIME_DIRECTORY", raising=False)
+    monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
+    monkeypatch.setenv("XDG_RUNTIME_DIR", str(tmp_path))
+    if Path("/run/station/control.sock").exists():
+        pytest.skip("a station serves on this computer")
+    assert default_socket().parent == tmp_path
+    monkeypatch.setenv("XDG_RUNTIME_DIR", "/proc/1/none")
+    assert (tmp_path / "state") in default_socket().parents
+    monkeypatch.delenv("XDG_RUNTIME_DIR")
+    assert (tmp_path / "state") in default_socket().parents
+
+
+# -- the page, the modes, the places ------------------------------------------------------------------------
+
+
+def test_the_page_is_read_as_it_was_written_and_nothing_else_is_taken_for_one(tmp_path: Path) -> None:
+    path = tmp_path / "c.motion"
+    written = create_page(path, Page(7, Motion.MOVES, 3))
+    read = open_page(path, {os.getuid()})
+    assert read_page(read) == Page(7, Motion.MOVES, 3)
+    write_page(written, Page(7, Motion.RESTS, 4))
+    assert read_page(read) == Page(7, Motion.RESTS, 4)
+    os.pwrite(written, b"\xff" * 24, 0)
+    assert read_page(read) is None
+    os.ftruncate(written, 5)
+    assert read_page(read) is None
+    os.close(written)
+    os.close(read)
+    with pytest.raises(PermissionError):
+        open_page(path, {os.getuid() + 1})
+
+
+async def test_socket_and_page_are_the_groups(station: Station) -> None:
+    assert stat.S_IMODE(stop_socket(station.server.control).stat().st_mode) == 0o660
+    assert stat.S_IMODE(motion_page(station.server.control).stat().st_mode) == 0o640
+
+
+async def test_a_disk_that_is_full_costs_the_confirmation_never_the_stop(
+    station: Station, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def full(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(stop_server, "write_page", full)
+    assert await stopped(station.server.control) is Outcome.SILENT
+    assert station.heard
+
+
+async def test_one_user_s_connections_are_counted_and_stop_needs_none(tmp_path: Path) -> None:
+    tmp_path.chmod(0o700)
+    control = ControlServer(tmp_path / "c.sock", RecordingHandler())
+    await control.start()
+    station = Station(tmp_path / "c.sock")
+    station.start()
+    clients = [await Client.connect(tmp_path / "c.sock") for _ in range(USER_CLIENT_LIMIT)]
+    with pytest.raises((DaemonGoneError, RefusedError)):
+        await Client.connect(tmp_path / "c.sock")
+    assert await stopped(tmp_path / "c.sock") is Outcome.RESTS
+    await clients.pop().close()
+    async with asyncio.timeout(2):
+        while len(clients) < USER_CLIENT_LIMIT:
+            try:
+                clients.append(await Client.connect(tmp_path / "c.sock"))
+            except StationError:
+                await asyncio.sleep(0.01)
+    for client in clients:
+        await client.close()
+    await station.close()
+    await control.close()

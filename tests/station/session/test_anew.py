@@ -1,0 +1,50 @@
+"""The same plan run again after its session was sealed: what stays shown until the go, what begins anew."""
+
+from __future__ import annotations
+
+from station.cell.status import StationState as S
+from tests.station.session_rig import POSES, Rig, sealed
+
+
+async def _sealed_session(rig: Rig) -> None:
+    await rig.give_go()
+    await rig.until_true(lambda: bool(rig.session.store.status.session.recording))
+    await rig.until(S.IDLE)
+
+
+async def test_the_sealed_session_stays_shown_until_the_go(rig: Rig) -> None:
+    await _sealed_session(rig)
+    before = rig.session.store.status.session
+    summary = await rig.session.prepare(1, "run")
+    assert summary.poses == POSES
+    assert rig.session.store.status.session == before  # the answer may be no
+    rig.arm.slow = True
+    rig.session.go(1, summary.token)
+    begun = rig.session.store.status.session
+    assert (begun.captured, begun.elapsed_s, begun.recording) == (0, 0.0, "")
+    assert set(rig.pose_states) == {"planned"}
+
+
+async def test_a_pose_that_was_left_out_stays_left_out(rig: Rig) -> None:
+    """Before the first run, and in the next one."""
+    await rig.session.edit(1, "skip", lambda queue: queue.skip(1))
+    for _ in range(2):
+        assert (await rig.session.prepare(1, "run")).poses == POSES - 1
+        await _sealed_session(rig)
+        assert rig.pose_states == ["done", "skipped", *["done"] * (POSES - 2)]
+    assert len(list(sealed(rig).views())) == POSES - 1
+
+
+async def test_pictures_by_hand_after_a_sealed_session_are_a_session_of_their_own(rig: Rig) -> None:
+    await _sealed_session(rig)
+    for pictures in (1, 2):
+        await rig.session.switch_free_drive(1, True, auto=False)
+        begun = rig.session.store.status.session
+        assert (begun.captured, begun.elapsed_s, begun.recording) == (0, 0.0, "")
+        assert set(rig.pose_states) == {"planned"} and len(rig.pose_states) == POSES
+        for _ in range(pictures):
+            await rig.session.record(1)
+        assert rig.session.store.status.session.captured == pictures
+        await rig.session.switch_free_drive(1, False, auto=False)
+        await rig.session.finish(1)
+        assert len(list(sealed(rig).views())) == pictures

@@ -1,0 +1,255 @@
+"""How pictures, runs and helpers end when several things happen at once."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+import pytest
+
+from station.analysis.estimation import running_estimate
+from station.analysis.pool import WorkerError, Workers
+from station.cell.errors import RefusedError, RobotError
+from station.cell.session_folder import SessionState
+from station.cell.status import StationState as S
+from station.operate.attend import STOP_ANSWER_S
+from station.session import session
+from station.session.recording import SessionRecording
+from tests.station.session_rig import POSES, HeldDisk, Rig
+
+
+@pytest.fixture
+async def guided(bare_rig: Rig) -> Rig:
+    """In free drive, at a place where no picture was taken yet."""
+    bare_rig.arm.rest()
+    await bare_rig.session.switch_free_drive(1, True, auto=False)
+    return bare_rig
+
+
+@asynccontextmanager
+async def picture_under_way(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> AsyncIterator[None]:
+    """A hand-guided picture that comes at the end of the block."""
+    comes, capture = asyncio.Event(), rig.camera.capture
+
+    async def slow(timeout_s: float = 5.0) -> Any:
+        await comes.wait()
+        return await capture(timeout_s)
+
+    monkeypatch.setattr(rig.camera, "capture", slow)
+    taking = asyncio.ensure_future(rig.session.record(1))
+    await rig.until(S.CAPTURING)
+    yield
+    comes.set()
+    await taking
+
+
+async def test_finish_during_a_hand_guided_picture_takes_it_and_seals(
+    guided: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with picture_under_way(guided, monkeypatch):
+        finishing = asyncio.ensure_future(guided.session.finish(1))
+        await asyncio.sleep(0.02)
+        assert not finishing.done()
+    await finishing
+    assert guided.state is S.IDLE and guided.pose_states == ["done"]
+    assert guided.session.store.status.session.recording
+
+
+async def test_pause_during_a_hand_guided_picture_ends_free_drive(
+    guided: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async with picture_under_way(guided, monkeypatch):
+        guided.session.pause("bert")
+    assert guided.state is S.PAUSED and guided.pose_states == ["done"]
+
+
+async def test_free_drive_switched_on_twice_watches_once(guided: Rig) -> None:
+    def watchers() -> int:
+        return sum("FreeDrive._watch" in str(task.get_coro()) for task in asyncio.all_tasks())
+
+    for _ in range(3):
+        await guided.session.switch_free_drive(1, True, auto=True)
+    await asyncio.sleep(0)
+    assert watchers() == 1
+    await guided.session.switch_free_drive(1, True, auto=False)
+    await asyncio.sleep(0)
+    assert watchers() == 0
+
+
+async def test_control_has_ended_before_the_recording_is_sealed(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    seal = SessionRecording.seal
+
+    async def noted(self: SessionRecording, queue: Any) -> Any:
+        rig.arm.log.append("seal")
+        return await seal(self, queue)
+
+    monkeypatch.setattr(SessionRecording, "seal", noted)
+    await rig.give_go()
+    await rig.until(S.IDLE)
+    assert rig.arm.log.index("end control") < rig.arm.log.index("seal")
+
+
+async def test_a_disk_that_fails_after_stop_is_told_and_stop_stays_latched(
+    rig: Rig, held_disk: HeldDisk
+) -> None:
+    held_disk.fails = True
+    await rig.give_go()
+    await rig.until(S.WRITING)
+    stopping = asyncio.ensure_future(rig.session.stop("bert"))
+    await rig.until(S.STOPPED)
+    held_disk.set()
+    await stopping
+    assert rig.state is S.STOPPED
+    assert "STOP by bert" in rig.session.store.status.reason
+    assert "no space left" in rig.session.store.status.reason
+    assert any("no space left" in e.text and e.level == "error" for e in rig.session.store.status.events)
+    assert rig.session.bench.require_recording().recorder is None
+    assert "done" not in rig.pose_states
+
+
+async def test_a_picture_being_written_outlives_every_halt(rig: Rig, held_disk: HeldDisk) -> None:
+    await rig.give_go()
+    await rig.until(S.WRITING)
+    run = rig.session._run
+    assert run is not None
+    for _ in range(3):
+        run.cancel()
+        await asyncio.sleep(0.01)
+    assert not run.done()
+    held_disk.set()
+    await asyncio.wait({run})
+    assert rig.pose_states[0] == "done"
+
+
+async def test_stop_is_answered_before_a_slow_disk_has_the_picture(rig: Rig, held_disk: HeldDisk) -> None:
+    await rig.give_go()
+    await rig.until(S.WRITING)
+    await asyncio.wait_for(rig.session.stop("bert"), STOP_ANSWER_S)  # else `station capture` says: no answer
+    assert "stop" in rig.arm.log
+    held_disk.set()
+    await rig.until_true(lambda: "done" in rig.pose_states)
+
+
+async def test_of_two_states_of_a_session_the_newer_one_stays_on_the_disk(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await rig.go_until_it_moves()
+    recording, queue = rig.session.bench.require_recording(), rig.session.bench.require_queue()
+    disk, begun, written = threading.Event(), [], []
+
+    def slow(self: SessionRecording, state: SessionState) -> None:
+        begun.append(1)
+        if len(begun) == 1:
+            disk.wait(5)
+        written.append(len(state.poses))
+
+    monkeypatch.setattr(SessionRecording, "_write_state", slow)
+    older = asyncio.create_task(recording.save_state(queue))
+    await asyncio.sleep(0.01)
+    older.cancel()  # as STOP does
+    queue.drop(POSES - 1)
+    newer = asyncio.create_task(recording.save_state(queue))
+    await asyncio.sleep(0.05)
+    disk.set()
+    await asyncio.wait({older, newer})
+    assert written == [POSES, POSES - 1]
+
+
+class HeldSeal(asyncio.Event):
+    """A recording that is not sealed before this is set; `begun` counts."""
+
+    begun = 0
+
+
+@pytest.fixture
+def held_seal(monkeypatch: pytest.MonkeyPatch) -> HeldSeal:
+    held, seal = HeldSeal(), SessionRecording.seal
+
+    async def slow(recording: SessionRecording, queue: Any) -> Any:
+        held.begun += 1
+        await held.wait()
+        return await seal(recording, queue)
+
+    monkeypatch.setattr(SessionRecording, "seal", slow)
+    return held
+
+
+@pytest.mark.parametrize("by", ["the run's end", "finish"])
+async def test_nothing_begins_beside_a_sealing_that_stop_came_into(
+    rig: Rig, held_seal: HeldSeal, monkeypatch: pytest.MonkeyPatch, by: str
+) -> None:
+    monkeypatch.setattr(session, "END_RUN_S", 0.05)
+    monkeypatch.setattr(session, "STOP_WAIT_S", 0.05)
+    finishing: asyncio.Future[None] | None = None
+    if by == "finish":
+        await rig.go_until_it_moves()
+        await rig.pause_after_this_pose("anna")
+        finishing = asyncio.ensure_future(rig.session.finish(1))
+    else:
+        await rig.give_go()
+    await rig.until(S.SEALING)
+    for _ in range(2):
+        await rig.session.stop("bert")
+        rig.session.acknowledge("anna")
+        with pytest.raises(RefusedError, match="still ending"):
+            await rig.session.prepare(1, "resume")
+        with pytest.raises(RefusedError, match="still ending"):
+            await rig.session.finish(1)
+    moves = rig.arm.log.count("move")
+    held_seal.set()
+    await rig.until(S.IDLE)
+    if finishing is not None:
+        await finishing
+    assert held_seal.begun == 1 and rig.session.store.status.session.recording
+    assert rig.arm.log.count("move") == moves
+
+
+async def test_a_fault_between_moves_stops_the_arm_by_both_ways(rig: Rig, held_disk: HeldDisk) -> None:
+    await rig.give_go()
+    await rig.until(S.WRITING)
+    rig.arm.trouble = RobotError("the program was stopped")
+    held_disk.set()
+    await rig.until(S.FAULT)
+    await rig.until_true(lambda: "end control" in rig.arm.log)
+    assert "stop" in rig.arm.log
+
+
+async def test_a_defect_in_the_estimate_costs_one_estimate(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    call, asked = rig.worker.call, []
+
+    async def broken(function: Any, *args: Any, timeout_s: float = 60.0) -> Any:
+        if function is running_estimate:
+            asked.append(1)
+            raise IndexError("a defect")
+        return await call(function, *args, timeout_s=timeout_s)
+
+    monkeypatch.setattr(rig.worker, "call", broken)
+    await rig.give_go()
+    await rig.until(S.IDLE)
+    await rig.until_true(lambda: len(asked) > 1)
+    assert rig.pose_states == ["done"] * POSES
+
+
+def _hang(seconds: float) -> None:
+    time.sleep(seconds)
+
+
+async def test_a_worker_that_hangs_is_ended_without_holding_up_the_loop(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    workers = Workers()
+    await workers.call(_hang, 0.0)
+    assert workers._pool is not None
+    for process in workers._pool._processes.values():
+        monkeypatch.setattr(process, "join", _hang)  # a process that takes its time to end
+    begun_s = time.monotonic()
+    with pytest.raises(WorkerError):
+        await workers.call(_hang, 30.0, timeout_s=0.1)
+    assert time.monotonic() - begun_s < 0.6
+    workers.close()

@@ -1,0 +1,156 @@
+"""What fails in a session: pictures, poses, arm, disk, the daemon itself."""
+
+from __future__ import annotations
+
+import asyncio
+
+import msgspec
+import pytest
+
+from recordings.errors import MissingPartError, RecordingError
+from recordings.reader import open_recording
+from station.cell.errors import RefusedError, RobotError, SafetyStopError
+from station.cell.status import StationState as S
+from station.session.recording import SessionRecording
+from tests.station.session_rig import POSES, NewRig, Rig, crash, sealed
+
+
+async def test_a_bad_picture_is_taken_again_and_then_the_pose_fails_alone(rig: Rig) -> None:
+    rig.camera.fail = ["frame lost", "frame lost"]
+    await rig.give_go()
+    await rig.until(S.IDLE)
+    assert rig.pose_states == ["done"] * POSES
+    rig.camera.fail = ["gone"] * 3
+    await rig.give_go()
+    await rig.until(S.PAUSED)
+    assert rig.pose_states == ["failed", "done", "done", "done"]
+    assert "pose 1 failed (no good picture" in rig.session.store.status.reason
+    await rig.session.finish(1)
+    assert [view.index for view in sealed(rig).views()] == [1, 2, 3]
+
+
+async def test_a_picture_without_the_board_does_not_count(rig: Rig) -> None:
+    shown = rig.worker.sees
+    hidden = msgspec.structs.replace(shown.status, found=False, corners=0, reason="board half hidden")
+    rig.worker.sees = type(shown)(hidden, shown.indices[:0], shown.pixels[:0])
+    await rig.give_go()
+    await rig.until(S.PAUSED)
+    status = rig.session.store.status
+    assert rig.pose_states == ["failed"] * 3 + ["planned"]
+    assert status.session.poses[0].reason == "board half hidden"
+    assert "3 poses in a row failed (board half hidden)" in status.reason
+    assert status.session.captured == 0
+
+
+async def test_an_arm_that_does_not_rest_fails_the_pose(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(rig.session.bench.stillness, "unrest", lambda found: "wrist 2 moves at 0.5°/s")
+    await rig.give_go()
+    await rig.until(S.PAUSED)
+    assert "wrist 2 moves" in rig.session.store.status.session.poses[0].reason
+
+
+async def test_a_protective_stop_stops_and_sends_nothing(rig: Rig) -> None:
+    await rig.go_until_it_moves()
+    rig.arm.trouble = SafetyStopError("protective stop: find what the arm ran into")
+    rig.arm.arrive.set()
+    await rig.until(S.STOPPED)
+    assert "protective stop" in rig.session.store.status.reason
+    await rig.until_true(lambda: not rig.arm.control)
+    assert set(rig.arm.log) <= {"start control", "move", "end control"}
+    rig.session.acknowledge("anna")
+    with pytest.raises(SafetyStopError):
+        await rig.session.prepare(1, "resume")
+
+
+async def test_a_tcp_changed_on_the_pendant_is_a_fault(rig: Rig) -> None:
+    await rig.go_until_the_second_move()
+    rig.arm.slow = False
+    rig.arm.trouble = RobotError("TCP mix-up: the TCP offset on the pendant was changed")
+    rig.arm.arrive.set()
+    await rig.until(S.FAULT)
+    assert "TCP" in rig.session.store.status.reason
+    assert rig.pose_states.count("done") == 1
+
+
+async def test_a_disk_that_fails_is_a_fault_and_never_a_pose(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    async def full(self: SessionRecording) -> None:
+        raise RecordingError("no space left on the device: free 4 GB")
+
+    monkeypatch.setattr(SessionRecording, "sync", full)
+    await rig.give_go()
+    await rig.until(S.FAULT)
+    assert "free 4 GB" in rig.session.store.status.reason
+    assert "done" not in rig.pose_states
+
+
+async def test_a_full_disk_is_noticed_before_the_pose(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    def none_left(self: SessionRecording) -> None:
+        raise RecordingError("only 0.1 GB are free")
+
+    monkeypatch.setattr(SessionRecording, "require_space", none_left)
+    await rig.give_go()
+    await rig.until(S.FAULT)
+    assert "move" not in rig.arm.log
+
+
+async def test_a_full_disk_is_told_before_anybody_is_asked(rig: Rig) -> None:
+    cell = rig.session.bench.cell
+    capture = msgspec.structs.replace(cell.config.capture, free_space_bytes=10**18)
+    object.__setattr__(cell, "config", msgspec.structs.replace(cell.config, capture=capture))
+    with pytest.raises(RefusedError, match=r"free \d+\.\d GB and go on\. Nothing moved"):
+        await rig.session.prepare(1, "run")
+
+
+async def test_a_jogged_arm_is_named_and_its_go_is_void(rig: Rig) -> None:
+    await rig.go_until_it_moves()
+    await rig.pause_after_this_pose("anna")
+    summary = await rig.session.prepare(1, "resume")
+    await asyncio.sleep(0.3)
+    rig.arm.joints = (*rig.arm.joints[:5], rig.arm.joints[5] + 0.3)
+    store = rig.session.store
+    await rig.until_true(lambda: any("was moved by 0 mm and 17°" in e.text for e in store.status.events))
+    with pytest.raises(RefusedError, match="not valid"):
+        rig.session.go(1, summary.token)
+    again = await rig.session.prepare(1, "resume")
+    assert any("was moved" in warning for warning in again.warnings)
+
+
+async def test_a_robot_that_is_lost_at_rest_comes_back(rig: Rig) -> None:
+    rig.arm.stale = True
+    await rig.until(S.DISCONNECTED)
+    with pytest.raises(RefusedError, match="not connected"):
+        await rig.session.prepare(1, "run")
+    rig.arm.stale = False
+    await rig.until(S.IDLE)
+
+
+async def test_a_session_cut_by_a_crash_waits_for_a_person_and_goes_on_in_a_new_part(
+    new_rig: NewRig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = await new_rig()
+    await first.go_until_it_moves()
+    first.arm.arrive.set()
+    await first.until(S.WRITING)
+    await first.until(S.MOVING)
+    crash(first)
+
+    second = await new_rig(with_plan=False)
+    assert second.state is S.STOPPED
+    assert "look at the arm" in second.session.store.status.reason.lower()
+    assert second.pose_states == ["done", "planned", "planned", "planned"]
+    await asyncio.sleep(0.1)
+    assert second.state is S.STOPPED
+    second.session.take_lease(1, "anna")
+    second.session.acknowledge("anna")
+    assert second.state is S.PAUSED
+    await second.give_go("resume")
+    await second.until(S.IDLE)
+    recording = sealed(second)
+    assert [view.index for view in recording.views()] == list(range(POSES))
+    assert second.arm.log.count("move") == POSES - 1
+    assert recording.missing == ()
+    (recording.path / "session-2.mcap").unlink()
+    with pytest.raises(MissingPartError, match=r"lacks part 2 \(session-2\.mcap\)"):
+        open_recording(recording.path)

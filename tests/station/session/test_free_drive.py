@@ -1,0 +1,184 @@
+"""The operator guides the arm by hand, the station only records."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+
+import pytest
+
+from recordings.errors import RecordingError
+from recordings.schema.messages import Picture
+from station.cell.errors import RefusedError, TriggerError
+from station.cell.status import StationState as S
+from station.cell.stillness import StillnessMonitor
+from station.session import free_drive
+from station.session.queue import PoseQueue
+from station.session.recording import SessionRecording
+from tests.station.session_rig import POSES, Rig, sealed
+
+
+async def test_a_free_hand_records_without_control(bare_rig: Rig) -> None:
+    await bare_rig.session.switch_free_drive(1, True, auto=False)
+    assert bare_rig.state is S.FREE_DRIVE
+    for turn in (0.0, 0.2):
+        bare_rig.arm.joints = (*bare_rig.arm.joints[:5], bare_rig.arm.joints[5] + turn)
+        bare_rig.arm.rest()
+        await bare_rig.session.record(1)
+    await bare_rig.session.switch_free_drive(1, False, auto=False)
+    await bare_rig.session.finish(1)
+    assert [view.name for view in sealed(bare_rig).views()] == ["hand-01", "hand-02"]
+    assert "start control" not in bare_rig.arm.log
+
+
+async def test_a_dropped_pose_does_not_take_the_name_of_the_next_picture(rig: Rig) -> None:
+    await rig.session.switch_free_drive(1, True, auto=False)
+    await rig.session.record(1)
+    await rig.session.switch_free_drive(1, False, auto=False)
+    await rig.session.edit(1, "drop", lambda queue: queue.drop(POSES - 1))
+    await rig.session.switch_free_drive(1, True, auto=False)
+    assert await rig.session.record(1) == POSES + 1
+    names = [pose.name for pose in rig.session.store.status.session.poses]
+    assert names[-2:] == [f"hand-{POSES + 1:02d}", f"hand-{POSES + 2:02d}"]
+
+
+async def test_auto_record_takes_a_new_place_once(bare_rig: Rig) -> None:
+    bare_rig.arm.rest()
+    await bare_rig.session.switch_free_drive(1, True, auto=True)
+    await bare_rig.until_true(lambda: bare_rig.session.store.status.session.captured == 1)
+    await asyncio.sleep(0.3)
+    assert bare_rig.session.store.status.session.captured == 1
+    bare_rig.arm.joints = (*bare_rig.arm.joints[:5], bare_rig.arm.joints[5] + 0.2)
+    bare_rig.arm.rest()
+    await bare_rig.until_true(lambda: bare_rig.session.store.status.session.captured == 2)
+    await bare_rig.session.stop("anna")
+    assert bare_rig.state is S.STOPPED
+
+
+async def test_auto_record_waits_for_an_arm_that_is_still_guided(
+    bare_rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig = bare_rig
+    monkeypatch.setattr(StillnessMonitor, "at_rest", False)
+    monkeypatch.setattr(free_drive, "WATCH_PERIOD_S", 0.005)
+    await rig.session.switch_free_drive(1, True, auto=True)
+    await asyncio.sleep(0.05)
+    assert rig.state is S.FREE_DRIVE and rig.pose_states == []
+    rig.arm.rest()
+    monkeypatch.setattr(StillnessMonitor, "at_rest", True)
+    await rig.until_true(lambda: rig.session.store.status.session.captured == 1)
+
+
+async def test_auto_record_outlives_a_moment_without_news(bare_rig: Rig) -> None:
+    bare_rig.arm.rest()
+    await bare_rig.session.switch_free_drive(1, True, auto=True)
+    await bare_rig.until_true(lambda: bare_rig.session.store.status.session.captured == 1)
+    bare_rig.arm.stale = True
+    bare_rig.arm.joints = (*bare_rig.arm.joints[:5], bare_rig.arm.joints[5] + 0.2)
+    await asyncio.sleep(0.25)  # two rounds of its watch
+    bare_rig.arm.stale = False
+    bare_rig.arm.rest()
+    await bare_rig.until_true(lambda: bare_rig.session.store.status.session.captured == 2)
+
+
+@pytest.mark.parametrize("broken", [TriggerError("the trigger box is gone"), ZeroDivisionError("a defect")])
+async def test_a_picture_that_ends_oddly_leaves_no_state_of_work(
+    bare_rig: Rig, monkeypatch: pytest.MonkeyPatch, broken: Exception
+) -> None:
+    bare_rig.arm.rest()
+    await bare_rig.session.switch_free_drive(1, True, auto=False)
+
+    async def capture(timeout_s: float = 5.0) -> None:
+        raise broken
+
+    monkeypatch.setattr(bare_rig.camera, "capture", capture)
+    with contextlib.suppress(type(broken)):
+        await bare_rig.session.record(1)
+    assert bare_rig.state is S.FAULT
+    assert str(broken.args[0]) in bare_rig.session.store.status.reason
+    assert bare_rig.pose_states == ["planned"]
+
+
+async def _begins(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> tuple[asyncio.Event, asyncio.Future[None]]:
+    """Free drive, for as long as its recording is not opened: until the event is set."""
+    opened, settings = asyncio.Event(), rig.camera.settings
+
+    async def slow() -> dict[str, object]:
+        await opened.wait()
+        return await settings()
+
+    monkeypatch.setattr(rig.camera, "settings", slow)
+    beginning = asyncio.ensure_future(rig.session.switch_free_drive(1, True, auto=False))
+    await asyncio.sleep(0.02)
+    return opened, beginning
+
+
+async def test_stop_while_free_drive_begins_stays_latched(
+    bare_rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    opened, beginning = await _begins(bare_rig, monkeypatch)
+    await bare_rig.session.stop("bert")
+    opened.set()
+    with pytest.raises(RefusedError, match="STOP is latched"):
+        await beginning
+    assert bare_rig.state is S.STOPPED and bare_rig.session.bench.halting
+
+
+async def test_no_go_is_given_while_free_drive_begins(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    opened, beginning = await _begins(rig, monkeypatch)
+    with pytest.raises(RefusedError, match="free drive"):
+        await rig.session.prepare(1, "run")
+    opened.set()
+    await beginning
+    assert rig.state is S.FREE_DRIVE
+
+
+async def test_free_drive_does_not_begin_beside_a_picture_that_a_lost_lease_left(
+    bare_rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    rig, comes, capture = bare_rig, asyncio.Event(), bare_rig.camera.capture
+
+    async def slow(timeout_s: float = 5.0) -> Picture:
+        await comes.wait()
+        return await capture(timeout_s)
+
+    monkeypatch.setattr(rig.camera, "capture", slow)
+    await rig.session.switch_free_drive(1, True, auto=False)
+    taking = asyncio.ensure_future(rig.session.record(1))
+    await rig.until(S.CAPTURING)
+    await rig.session.lease_lost(1)
+    rig.session.take_lease(1, "anna")
+    with pytest.raises(RefusedError, match="still ending"):
+        await rig.session.switch_free_drive(1, True, auto=False)
+    comes.set()
+    await taking
+    await rig.session.switch_free_drive(1, True, auto=False)
+    assert rig.state is S.FREE_DRIVE
+
+
+@pytest.mark.parametrize("fails", [False, True])
+async def test_stop_while_free_drive_opens_the_recording_leaves_a_way_on(
+    bare_rig: Rig, monkeypatch: pytest.MonkeyPatch, fails: bool
+) -> None:
+    rig, disk, opening = bare_rig, asyncio.Event(), SessionRecording.open
+
+    async def slow(recording: SessionRecording, queue: PoseQueue, picture: Picture | None = None) -> None:
+        await disk.wait()
+        if fails:
+            raise RecordingError("no space left on device")
+        await opening(recording, queue, picture)
+
+    monkeypatch.setattr(SessionRecording, "open", slow)
+    beginning = asyncio.ensure_future(rig.session.switch_free_drive(1, True, auto=False))
+    await rig.until(S.FREE_DRIVE)
+    await rig.session.stop("bert")
+    rig.session.acknowledge("anna")
+    disk.set()
+    with pytest.raises(RecordingError if fails else RefusedError):
+        await beginning
+    assert (rig.state, rig.session.bench.recording is None) == (
+        (S.IDLE, True) if fails else (S.PAUSED, False)
+    )
+    if not fails:
+        await rig.session.finish(1)  # in idle it was refused, and so was every plan
+        assert rig.state is S.IDLE

@@ -1,0 +1,118 @@
+"""What a session keeps: what a restart finds again, what the recording tells, what a person was told."""
+
+from __future__ import annotations
+
+import errno
+import os
+
+import pytest
+
+from recordings.errors import RecordingError
+from station.cell.status import StationState as S
+from tests.durability import disk_order
+from tests.station.session_rig import POSES, NewRig, Rig, crash, sealed
+
+
+def under_way(rig: Rig, moves: int) -> bool:
+    return rig.arm.under_way and rig.arm.log.count("move") == moves
+
+
+async def test_a_pose_that_failed_is_known_after_a_crash(new_rig: NewRig) -> None:
+    first = await new_rig()
+    first.camera.fail = ["frame lost"] * 3
+    first.arm.slow = True
+    await first.give_go()
+    await first.until_true(lambda: under_way(first, 1))
+    first.arm.arrive.set()
+    await first.until_true(lambda: under_way(first, 2))
+    crash(first)
+    second = await new_rig(with_plan=False)
+    assert second.pose_states == ["failed", "planned", "planned", "planned"]
+    assert "frame lost" in second.session.store.status.session.poses[0].reason
+
+
+async def test_a_plan_that_was_changed_in_a_pause_is_known_after_a_crash(new_rig: NewRig) -> None:
+    first = await new_rig()
+    await first.go_until_it_moves()
+    await first.pause_after_this_pose("anna")
+    await first.session.edit(1, "skip", lambda queue: queue.skip(2))
+    crash(first)
+    second = await new_rig(with_plan=False)
+    assert second.pose_states == ["done", "planned", "skipped", "planned"]
+
+
+async def test_a_change_that_the_disk_does_not_take_is_told_to_who_asked(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await rig.go_until_it_moves()
+    await rig.pause_after_this_pose("anna")
+
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr("station.session.recording.write_state", full)
+    with pytest.raises(RecordingError, match=r"a restart would forget it.*No space left"):
+        await rig.session.edit(1, "skip", lambda queue: queue.skip(2))
+    assert rig.pose_states == ["done", "planned", "skipped", "planned"]
+
+
+async def test_a_drift_check_is_still_one_after_a_crash(new_rig: NewRig) -> None:
+    first = await new_rig()
+    first.arm.slow = True
+    await first.give_go("check")
+    await first.until(S.MOVING)
+    await first.pause_after_this_pose("anna")
+    crash(first)
+    second = await new_rig(with_plan=False)
+    assert second.session.store.status.session.check
+    second.session.acknowledge("anna")
+    second.session.take_lease(1, "anna")
+    await second.session.finish(1)
+    await second.give_go()
+    assert not second.session.store.status.session.check
+
+
+async def test_a_picture_counts_until_its_pose_was_taken_again(rig: Rig) -> None:
+    await rig.go_until_it_moves()
+    await rig.pause_after_this_pose("anna")
+    await rig.session.edit(1, "retake", lambda queue: queue.retake(0))
+    assert rig.session.store.status.session.captured == 1
+    await rig.session.finish(1)
+    assert len(list(sealed(rig).views())) == rig.session.store.status.session.captured
+
+
+async def test_an_arm_that_stands_at_its_pose_is_not_moved(rig: Rig) -> None:
+    await rig.go_until_it_moves()
+    await rig.pause_after_this_pose("anna")
+    summary = await rig.session.prepare(1, "retake", 0)
+    rig.session.go(1, summary.token)
+    poses = rig.session.store
+    await rig.until_true(lambda: rig.state is S.PAUSED and poses.status.session.poses[0].attempt == 2)
+    assert rig.pose_states[0] == "done"
+    assert rig.arm.log.count("move") == 1
+
+
+@pytest.mark.parametrize("trouble", [(), ("frame lost",)])
+async def test_what_people_were_told_is_in_the_recording(rig: Rig, trouble: tuple[str, ...]) -> None:
+    rig.camera.fail = list(trouble)
+    await rig.give_go()
+    await rig.until(S.IDLE)
+    recording = sealed(rig)
+    told = [event.text for event in rig.session.store.status.events]
+    assert any("approved by anna" in text and "run plan" in text for text in told)
+    assert f"sealed with {POSES} of {POSES} poses: {recording.path}" in told
+    written = [event.detail for event in recording.events()]
+    assert any(text.startswith("recording to ") for text in written)
+    assert sum("frame lost" in text for text in written) == len(trouble)
+
+
+async def test_the_name_of_a_sessions_folder_is_on_the_disk_before_its_first_pose_counts(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Data that no name leads to after a power loss would be lost with it."""
+    with disk_order(monkeypatch) as order:
+        await rig.give_go()
+        await rig.until_true(lambda: rig.pose_states[0] == "done")
+        until_then = list(order)
+        await rig.until(S.IDLE)
+    assert {"sync sessions", f"sync {rig.session.bench.root.name}"} <= set(until_then)

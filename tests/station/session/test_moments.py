@@ -1,0 +1,163 @@
+"""Odd moments of a run: what is asked of it while control starts, a way is checked, or it still writes."""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+from typing import Any
+
+import pytest
+
+from station.cell import limits
+from station.cell.errors import RefusedError
+from station.cell.plan import Plan
+from station.cell.status import StationState as S
+from station.session import run, session
+from tests.station.session_rig import POSES, HeldDisk, Rig
+
+
+class HeldStart:
+    """Control is starting until `go_on` is set."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.go_on = asyncio.Event()
+        self._start = rig.arm.start_control
+        rig.arm.start_control = self._held  # type: ignore[method-assign]
+
+    async def _held(self) -> None:
+        await self._start()
+        await self.go_on.wait()
+
+
+async def test_a_pose_dropped_while_control_starts_is_not_driven(rig: Rig) -> None:
+    held = HeldStart(rig)
+    await rig.give_go()
+    await rig.until_true(lambda: rig.arm.control)
+    await rig.session.edit(1, "drop", lambda queue: queue.drop(1))
+    held.go_on.set()
+    await rig.until(S.IDLE, S.FAULT)
+    assert rig.state is S.IDLE, rig.session.store.status.reason
+    assert rig.pose_states == ["done"] * (POSES - 1)
+
+
+async def test_finish_while_control_starts_seals_without_a_move(rig: Rig) -> None:
+    held = HeldStart(rig)
+    await rig.give_go()
+    await rig.until_true(lambda: rig.arm.control)
+    await rig.session.finish(1)
+    held.go_on.set()
+    await rig.until(S.IDLE, S.FAULT)
+    assert rig.state is S.IDLE, rig.session.store.status.reason
+    assert "move" not in rig.arm.log and rig.session.store.status.session.recording
+
+
+async def test_a_lost_lease_before_anything_is_recorded_leaves_no_paused_session(
+    rig: Rig, small_plan: Plan
+) -> None:
+    HeldStart(rig)
+    await rig.give_go()
+    await rig.until_true(lambda: rig.arm.control)
+    await rig.session.lease_lost(1)
+    assert rig.state is S.IDLE and "stop" in rig.arm.log
+    assert "connection" in rig.session.store.status.reason
+    rig.session.take_lease(1, "anna")
+    rig.session.load_plan(1, small_plan)  # neither finish nor resume would have had anything to do
+
+
+async def test_finish_before_a_way_that_is_not_free_seals(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refused(geometry: Any, here: Any, there: Any, name: str) -> Any:
+        rig.session.bench.finish_wanted = True  # a person asked while the way was looked at
+        return limits._refused(name, [limits.Problem(name, "clearance", "forearm against table")])
+
+    monkeypatch.setattr(run, "check_path", refused)
+    await rig.give_go()
+    await rig.until(S.IDLE, S.FAULT)
+    assert rig.state is S.IDLE, rig.session.store.status.reason
+    assert "move" not in rig.arm.log
+
+
+class SlowCheck:
+    """Looks at a way until `go_on` is set."""
+
+    def __init__(self, monkeypatch: pytest.MonkeyPatch) -> None:
+        self.go_on, self.looks = threading.Event(), threading.Event()
+        self._check = run.check_path
+        monkeypatch.setattr(run, "check_path", self)
+
+    def __call__(self, *args: Any) -> Any:
+        self.looks.set()
+        assert self.go_on.wait(5.0)
+        return self._check(*args)
+
+
+async def test_neither_heartbeat_nor_stop_waits_for_the_check_of_a_way(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slow = SlowCheck(monkeypatch)
+    await rig.give_go()
+    await rig.until_true(slow.looks.is_set)
+    before = rig.arm.beats
+    await rig.until_true(lambda: rig.arm.beats > before + 3)
+    await rig.session.stop("bert")
+    slow.go_on.set()
+    await rig.until_true(lambda: rig.arm.log[-1:] == ["end control"])
+    assert rig.state is S.STOPPED and "move" not in rig.arm.log
+
+
+async def test_an_arm_that_moved_while_its_way_was_checked_is_not_driven(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    slow = SlowCheck(monkeypatch)
+    await rig.give_go()
+    await rig.until_true(slow.looks.is_set)
+    first, *rest = rig.arm.joints
+    rig.arm.joints = (first + 0.02, *rest)  # type: ignore[assignment]
+    logs: list[list[str]] = []
+
+    def look() -> None:
+        """The next pose's way begins where the arm is, and may be driven at once."""
+        if rig.pose_states[0] == "failed":
+            logs.append(list(rig.arm.log))
+
+    rig.session.store.watch(look)
+    slow.go_on.set()
+    await rig.until_true(lambda: bool(logs))
+    failed = rig.session.store.status.session.poses[0]
+    assert "moved by 1.1° while its way was checked" in failed.reason
+    assert "move" not in logs[0]
+
+
+async def test_a_run_that_cannot_be_made_leaves_the_station_at_rest(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    summary = await rig.session.prepare(1, "run")
+
+    def broken(*_: object) -> None:
+        raise ZeroDivisionError("a defect")
+
+    monkeypatch.setattr(run, "geometry_from", broken)
+    with pytest.raises(ZeroDivisionError):
+        rig.session.go(1, summary.token)
+    assert rig.state is S.IDLE and rig.session.store.status.go is None
+
+
+async def test_nothing_new_begins_beside_a_run_that_does_not_end(
+    rig: Rig, held_disk: HeldDisk, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(session, "END_RUN_S", 0.05)
+    await rig.give_go()
+    await rig.until(S.WRITING)
+    await rig.session.stop("bert")
+    rig.session.acknowledge("anna")
+    assert rig.state is S.PAUSED
+    for what in (
+        lambda: rig.session.switch_free_drive(1, True, auto=False),
+        lambda: rig.session.prepare(1, "resume"),
+        lambda: rig.session.finish(1),
+    ):
+        with pytest.raises(RefusedError, match="still ending"):
+            await what()
+    assert rig.session.bench.halting
+    held_disk.set()
+    await rig.until_true(lambda: rig.session._run is not None and rig.session._run.done())
+    assert rig.arm.log.count("move") == 1

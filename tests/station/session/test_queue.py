@@ -1,0 +1,151 @@
+"""The poses of a session: numbers stay, refusals say why, a copy begins where it should."""
+
+from __future__ import annotations
+
+import pytest
+
+from station.cell.errors import RefusedError
+from station.cell.plan import Plan, PlannedPose
+from station.cell.status import PoseState
+from station.session import queue as module
+from station.session.queue import BUSY, GUIDED, PoseQueue
+
+
+def queue_of(count: int = 4) -> PoseQueue:
+    poses = tuple(PlannedPose(f"p{i}", (0.1 * i, 0.0, 0.0, 0.0, 0.0, 0.0)) for i in range(count))
+    return PoseQueue(Plan("UR10", "eye-in-hand", poses))
+
+
+def pose(name: str, why: str = "") -> PlannedPose:
+    return PlannedPose(name, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0), why=why)
+
+
+@pytest.mark.parametrize("state", sorted(BUSY))
+def test_a_pose_that_is_being_taken_is_left_alone(state: PoseState) -> None:
+    queue = queue_of()
+    queue.mark(1, state)
+    for change in (queue.retake, queue.skip, queue.drop):
+        with pytest.raises(RefusedError, match="pose 2 "):
+            change(1)
+    assert queue.status(1).state == state
+
+
+def test_a_pose_that_counts_is_retaken_but_never_left_out() -> None:
+    queue = queue_of()
+    queue.mark(1, "done")
+    with pytest.raises(RefusedError, match="pose 2 is done: only a pose that waits or failed"):
+        queue.skip(1)
+    queue.retake(1)
+    assert queue.open == (0, 1, 2, 3)
+
+
+def test_its_picture_counts_until_another_takes_its_place() -> None:
+    queue = queue_of()
+    queue.mark(1, "done")
+    queue.retake(1)
+    assert (queue.done, queue.status(1).kept) == (1, True)
+    assert "counts until then" in queue.status(1).reason
+    queue.mark(1, "moving")
+    assert PoseQueue(queue.plan, queue.statuses).done == 1  # after a crash on the way
+    queue.mark(1, "failed", "too dark")
+    assert queue.done == 1
+    queue.mark(1, "done")
+    assert (queue.done, queue.status(1).kept) == (1, False)
+
+
+def test_what_is_not_taken_again_after_all_keeps_its_picture() -> None:
+    """The recording has it: left out would be a lie."""
+    queue = queue_of()
+    queue.mark(1, "done")
+    queue.retake(1)
+    queue.skip(1)
+    assert (queue.status(1).state, queue.open) == ("done", (0, 2, 3))
+    assert "not taken again" in queue.status(1).reason
+
+
+def test_a_pose_that_was_tried_is_not_forgotten_and_the_last_one_stays() -> None:
+    queue = queue_of(2)
+    assert queue.start_attempt(0) == 1
+    assert queue.start_attempt(0) == 2
+    with pytest.raises(RefusedError, match="already tried: skip it instead"):
+        queue.drop(0)
+    queue.drop(1)
+    with pytest.raises(RefusedError, match="already tried"):
+        queue.drop(0)
+    with pytest.raises(RefusedError, match="last pose cannot be dropped"):
+        queue_of(1).drop(0)
+
+
+def test_numbers_are_never_given_twice() -> None:
+    queue = queue_of(2)
+    assert queue.add(pose("a")) == 2
+    queue.drop(2)
+    assert queue.add(pose("b")) == 3
+    assert [status.index for status in queue.statuses] == [0, 1, 3]
+    with pytest.raises(RefusedError, match="no pose 3"):
+        queue.status(2)
+
+
+def test_names_are_told_apart_and_there_is_an_end(monkeypatch: pytest.MonkeyPatch) -> None:
+    queue = queue_of(2)
+    with pytest.raises(RefusedError, match="already a pose named 'p1'"):
+        queue.add(pose("p1"))
+    monkeypatch.setattr(module, "POSE_LIMIT", 3)
+    queue.add(pose("a"))
+    with pytest.raises(RefusedError, match="at most 3 poses"):
+        queue.add(pose("b"))
+    assert len(queue.statuses) == 3
+
+
+@pytest.mark.parametrize("order", [[0, 1, 2], [0, 1, 2, 2], [0, 1, 2, 3, 4], [4, 3, 2, 1]])
+def test_an_order_names_every_pose_once(order: list[int]) -> None:
+    queue = queue_of()
+    before = queue.sha256
+    with pytest.raises(RefusedError, match="each of the 4 poses exactly once"):
+        queue.reorder(order)
+    assert queue.sha256 == before
+    queue.reorder([3, 2, 1, 0])
+    assert queue.sha256 != before and queue.open == (3, 2, 1, 0)
+
+
+@pytest.mark.parametrize("state", ["done", "skipped", "failed", "moving", "settling", "capturing", "writing"])
+def test_after_a_restart_only_what_ended_counts(state: PoseState) -> None:
+    queue = queue_of()
+    queue.mark(2, state, "because")
+    again = PoseQueue(queue.plan, queue.statuses)
+    assert again.status(2).state == (state if state in ("done", "skipped", "failed") else "planned")
+    assert again.sha256 == queue.sha256
+
+
+def test_another_session_leaves_out_what_was_left_out_and_on_wish_what_a_hand_found() -> None:
+    queue = queue_of()
+    queue.add(pose("hand-01", why=GUIDED))
+    queue.mark(0, "done")
+    queue.start_attempt(0)
+    queue.skip(2)
+    again = queue.anew()
+    assert [status.state for status in again.statuses] == [
+        "planned",
+        "planned",
+        "skipped",
+        "planned",
+        "planned",
+    ]
+    assert again.status(0).attempt == 0
+    assert [status.index for status in queue.anew(guided=False).statuses] == [0, 1, 2, 3]
+
+
+def test_new_poses_take_the_place_of_fresh_ones_only() -> None:
+    queue = queue_of()
+    queue.start_attempt(0)
+    queue.mark(0, "done")
+    queue.start_attempt(1)
+    placed = queue.with_fresh([pose("x"), pose("y")])
+    assert queue.fresh == (2, 3)
+    assert [p.name for p in placed.plan.poses] == ["p0", "p1", "p03 anew", "p04 anew"]
+    assert placed.status(0).state == "done" and placed.status(2).attempt == 0
+    fewer = queue.with_fresh([pose("x")])
+    assert [status.index for status in fewer.statuses] == [0, 1, 2]
+    more, index = queue.with_more(pose("z"))
+    assert (index, more.plan.poses[-1].name) == (4, "p05 more")
+    assert len(queue.statuses) == 4

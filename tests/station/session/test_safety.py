@@ -1,0 +1,347 @@
+"""Odd moments: what changes while something else is under way never costs a stop, a latch or the truth."""
+
+from __future__ import annotations
+
+import asyncio
+import socket
+import time
+from pathlib import Path
+from typing import Any
+
+import msgspec
+import pytest
+
+from recordings.recorder import Recorder
+from station.analysis.pool import WorkerError, Workers
+from station.cell.errors import LimitError, RefusedError, StationError
+from station.cell.plan import Plan
+from station.cell.status import StationState as S
+from station.server.control import ControlServer
+from station.server.dispatch import SessionDispatcher
+from station.session import guard, keeper, monitor
+from station.session.recording import SessionRecording
+from tests.station.session_rig import POSES, HeldDisk, NewRig, Rig
+
+
+class Gate:
+    """Holds every worker call of a rig until it is opened."""
+
+    def __init__(self, rig: Rig) -> None:
+        self.open = asyncio.Event()
+        self.entered = asyncio.Event()
+        self._call = rig.worker.call
+        rig.worker.call = self._held  # type: ignore[method-assign]
+
+    async def _held(self, function: Any, *args: Any, timeout_s: float = 60.0) -> Any:
+        self.entered.set()
+        await self.open.wait()
+        return await self._call(function, *args, timeout_s=timeout_s)
+
+
+async def test_an_unforeseen_error_stops_the_arm_and_is_a_fault(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def broken(self: SessionRecording) -> None:
+        raise ZeroDivisionError("a defect")
+
+    monkeypatch.setattr(SessionRecording, "require_space", broken)
+    await rig.give_go()
+    await rig.until(S.FAULT)
+    assert "a defect" in rig.session.store.status.reason
+    assert "stop" in rig.arm.log
+    await rig.until_true(lambda: rig.arm.log[-1:] == ["end control"])
+    assert "move" not in rig.arm.log
+
+
+async def test_a_watcher_that_fails_does_not_come_between_stop_and_the_arm(rig: Rig) -> None:
+    def fails() -> None:
+        raise ZeroDivisionError("a defect")
+
+    await rig.go_until_it_moves()
+    end = rig.session.store.watch(fails)
+    await rig.session.stop("bert")
+    end()
+    assert rig.state is S.STOPPED and "stop" in rig.arm.log
+
+
+@pytest.mark.parametrize("change", ["stop", "edit", "lease", "prepare"])
+async def test_what_changes_while_the_way_is_checked_leaves_no_go(rig: Rig, change: str) -> None:
+    gate = Gate(rig)
+    preparing = asyncio.ensure_future(rig.session.prepare(1, "run"))
+    await gate.entered.wait()
+    if change == "stop":
+        await rig.session.stop("bert")
+        rig.session.acknowledge("anna")
+    elif change == "edit":
+        await rig.session.edit(1, "reorder", lambda queue: queue.reorder([1, 0, *range(2, POSES)]))
+    elif change == "lease":
+        await rig.session.release_lease(1)
+        rig.session.take_lease(1, "anna")
+    else:
+        later = asyncio.ensure_future(rig.session.prepare(1, "run"))
+        await asyncio.sleep(0)
+    gate.open.set()
+    with pytest.raises(RefusedError, match="again"):
+        await preparing
+    if change == "prepare":
+        assert (await later).poses == POSES
+    else:
+        assert rig.session.store.status.go is None
+
+
+async def test_a_robot_that_was_lost_voids_the_go(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(guard, "LOST_ROUNDS", 2)
+    summary = await rig.session.prepare(1, "run")
+    rig.arm.stale = True
+    await rig.until(S.DISCONNECTED)
+    rig.arm.stale = False
+    await rig.until(S.IDLE)
+    assert rig.session.store.status.go is None
+    with pytest.raises(RefusedError, match="not valid"):
+        rig.session.go(1, summary.token)
+
+
+async def test_an_arm_moved_while_control_started_is_not_driven(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    start = rig.arm.start_control
+
+    async def jogged() -> None:
+        await start()
+        first, *rest = rig.arm.joints
+        rig.arm.joints = (first + 0.05, *rest)  # type: ignore[assignment]
+
+    monkeypatch.setattr(rig.arm, "start_control", jogged)
+    await rig.give_go()
+    await rig.until_true(lambda: rig.arm.log[-1:] == ["end control"])
+    assert rig.state is S.IDLE
+    assert "moved" in rig.session.store.status.reason
+    assert "move" not in rig.arm.log
+
+
+async def test_stop_while_an_interrupted_session_is_closed_stays_latched(
+    new_rig: NewRig, rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await rig.go_until_it_moves()
+    await rig.session.stop("bert")
+    recorder = rig.session.bench.require_recording().recorder
+    assert recorder is not None
+    recorder.close()
+    rig.session.bench.recording = None  # as after a crash
+    other = await new_rig(with_plan=False)
+    other.session.take_lease(1, "anna")
+    other.session.acknowledge("anna")
+    await other.until(S.PAUSED)
+    gate = Gate(other)
+    finishing = asyncio.ensure_future(other.session.finish(1))
+    await gate.entered.wait()
+    await other.session.stop("bert")
+    gate.open.set()
+    await finishing
+    assert other.state is S.STOPPED
+
+
+async def test_finish_waits_for_what_is_being_written(rig: Rig, held_disk: HeldDisk) -> None:
+    await rig.give_go()
+    await rig.until(S.WRITING)
+    losing = asyncio.ensure_future(rig.session.lease_lost(1))
+    await rig.until(S.PAUSED)
+    rig.session.take_lease(2, "bert")
+    finishing = asyncio.ensure_future(rig.session.finish(2))
+    await asyncio.sleep(0.02)
+    assert not finishing.done()
+    held_disk.set()
+    await asyncio.gather(losing, finishing)
+    assert rig.state is S.IDLE
+    assert rig.pose_states[0] == "done"
+    assert "move" not in rig.arm.log[2:]
+
+
+@pytest.mark.parametrize("verb", ["stop", "lease"])
+async def test_a_client_that_leaves_at_once_is_served_to_the_end(rig: Rig, tmp_path: Path, verb: str) -> None:
+    control = ControlServer(tmp_path / "s", SessionDispatcher(rig.session))
+    await control.start()
+    stop = rig.arm.stop
+
+    async def slow_stop(reason: str) -> None:
+        await stop(reason)
+        await asyncio.sleep(0.05)
+
+    rig.arm.stop = slow_stop  # type: ignore[method-assign]
+    await rig.go_until_it_moves()
+    with socket.socket(socket.AF_UNIX) as client:
+        client.setblocking(False)
+        await asyncio.get_running_loop().sock_connect(client, str(tmp_path / "s"))
+        if verb == "lease":
+            rig.session.leases.lease = msgspec.structs.replace(rig.session.leases.lease, client_id=1)
+        args = {"action": "release"} if verb == "lease" else {}
+        client.send(msgspec.json.encode({"id": 1, "verb": verb, "args": args}) + b"\n")
+        await rig.until_true(lambda: "stop" in rig.arm.log)
+    await asyncio.sleep(0.15)
+    assert rig.pose_states == ["planned"] * POSES
+    await control.close()
+
+
+async def test_the_guard_outlives_an_error_in_what_it_shows(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def gone(path: object) -> None:
+        raise OSError("the disk was pulled out")
+
+    monkeypatch.setattr(monitor, "DISK_PERIOD_S", 0.0)
+    monkeypatch.setattr(monitor.shutil, "disk_usage", gone)
+    await asyncio.sleep(0.15)
+    rounds = len(rig.session.guard.lags_s)
+    await asyncio.sleep(0.1)
+    assert len(rig.session.guard.lags_s) > rounds
+    assert rig.session.store.status.recorder.free_bytes is None
+
+
+async def test_an_open_session_keeps_its_plan(rig: Rig, small_plan: Plan) -> None:
+    await rig.go_until_it_moves()
+    await rig.session.stop("bert")
+    rig.arm.stale = True
+    rig.session.acknowledge("anna")
+    assert rig.state is S.DISCONNECTED
+    with pytest.raises(RefusedError, match="finish it"):
+        await rig.session.make_plan(1, POSES, 4)
+    rig.arm.stale = False
+
+
+async def test_a_session_of_a_simulated_cell_is_not_gone_on_with_by_a_real_arm(
+    new_rig: NewRig, rig: Rig
+) -> None:
+    await rig.go_until_it_moves()
+    await rig.session.stop("bert")
+    real = await new_rig(with_plan=False, source="real")
+    await real.until(S.IDLE)
+    assert real.session.bench.recording is None
+    assert any("simulated" in event.text for event in real.session.store.status.events)
+
+
+async def test_a_disk_that_hangs_does_not_hang_the_station(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
+    from recordings.errors import RecordingError
+
+    async def no_sync(self: SessionRecording) -> None:
+        raise RecordingError("the disk did not take the data")
+
+    close = Recorder.close
+
+    def slow_close(self: Recorder) -> None:
+        time.sleep(0.5)
+        close(self)
+
+    monkeypatch.setattr(SessionRecording, "sync", no_sync)
+    monkeypatch.setattr(Recorder, "close", slow_close)
+    await rig.give_go()
+    await rig.until(S.FAULT)
+    await asyncio.sleep(0.1)  # a frozen loop shows in the round after
+    assert rig.session.guard.lag_ms() < 300
+
+
+@pytest.mark.parametrize("speeds", [{"joint_speed_rad_s": -0.5}, {"joint_acceleration_rad_s2": 0.0}])
+async def test_speeds_that_are_none_are_refused_before_a_go(
+    rig: Rig, small_plan: Plan, speeds: dict[str, float]
+) -> None:
+    rig.session.load_plan(1, msgspec.structs.replace(small_plan, **speeds))
+    with pytest.raises(LimitError, match="speed"):
+        await rig.session.prepare(1, "run")
+
+
+async def test_a_call_that_hangs_costs_its_own_answer_only() -> None:
+    workers = Workers()
+    try:
+        await workers.start()
+        slow = asyncio.ensure_future(workers.call(time.sleep, 1.0))
+        hanging = asyncio.ensure_future(workers.call(time.sleep, 30.0, timeout_s=0.5))
+        # Neither the calls before it nor the worker that starts anew count as its own time.
+        behind = asyncio.ensure_future(workers.call(time.sleep, 0.0, timeout_s=0.5))
+        results = await asyncio.gather(slow, hanging, behind, return_exceptions=True)
+        assert results[0] is None and results[2] is None
+        assert isinstance(results[1], WorkerError) and "too long" in str(results[1])
+    finally:
+        workers.close()
+
+
+async def test_a_call_that_waits_when_the_station_ends_starts_no_worker() -> None:
+    workers = Workers()
+    await workers.start()
+    running = asyncio.ensure_future(workers.call(time.sleep, 30.0))
+    behind = asyncio.ensure_future(workers.call(time.sleep, 0.0))
+    await asyncio.sleep(0.05)
+    workers.close()
+    results = await asyncio.gather(running, behind, return_exceptions=True)
+    assert [type(result) for result in results] == [WorkerError] * 2
+    assert workers._pool is None
+
+
+async def test_an_error_nobody_foresaw_is_answered(rig: Rig, tmp_path: Path) -> None:
+    from station.protocol.client import Client
+
+    control = ControlServer(tmp_path / "s", SessionDispatcher(rig.session))
+    await control.start()
+    await rig.session.release_lease(1)
+    rig.session.bench.queue = None
+    async with await Client.connect(tmp_path / "s", "tty1") as anna:
+        await anna.request("lease", action="take")
+        async with asyncio.timeout(3):
+            with pytest.raises(StationError):
+                await anna.request("go", token="made up")
+    await control.close()
+
+
+async def test_stop_while_a_hand_guided_pose_is_taken_leaves_it_to_be_skipped(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    await rig.session.switch_free_drive(1, True, False)
+    taken = asyncio.Event()
+    capture = rig.camera.capture
+
+    async def slow_capture(timeout_s: float = 5.0) -> Any:
+        await taken.wait()
+        return await capture(timeout_s)
+
+    monkeypatch.setattr(rig.camera, "capture", slow_capture)
+    recording = asyncio.ensure_future(rig.session.record(1))
+    await rig.until(S.CAPTURING)
+    await rig.session.stop("bert")
+    taken.set()
+    await recording
+    assert rig.state is S.STOPPED
+    assert rig.pose_states == ["planned"] * (POSES + 1)
+
+
+async def test_an_arm_that_still_brakes_was_not_moved_by_anybody(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    state = rig.arm._state
+    speed = 0.3
+
+    def braking() -> Any:
+        return msgspec.structs.replace(state(), joint_speeds_rad_s=(speed, *(0.0,) * 5))
+
+    monkeypatch.setattr(rig.arm, "_state", braking)
+    await rig.go_until_it_moves()
+    await rig.session.lease_lost(1)
+    await asyncio.sleep(0.15)
+    first, *rest = rig.arm.joints
+    rig.arm.joints = (first + 0.05, *rest)  # type: ignore[assignment]
+    speed = 0.0
+    await asyncio.sleep(0.25)
+    assert not any("was moved" in event.text for event in rig.session.store.status.events)
+
+
+async def test_a_device_that_fails_in_an_unforeseen_way_is_named_and_tried_again(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tries = []
+
+    async def failing() -> None:
+        tries.append(1)
+        if len(tries) < 3:
+            raise OSError("no such bus")
+
+    monkeypatch.setattr(keeper, "RETRY_S", 0.01)
+    await rig.session._keeper._until_open("camera", failing)
+    assert len(tries) == 3
+    assert any("no such bus" in event.text for event in rig.session.store.status.events)

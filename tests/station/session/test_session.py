@@ -1,0 +1,276 @@
+"""A whole session with devices in memory: what it promises the operator, step by step."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from recordings.reader import open_recording
+from station.cell.errors import LimitError, RefusedError, RobotError
+from station.cell.plan import Plan
+from station.cell.status import StationState as S
+from tests.station.session_rig import POSES, HeldDisk, Rig, sealed
+
+WHOLE_POSE = [S.MOVING, S.SETTLING, S.CAPTURING, S.WRITING]
+
+
+async def test_a_go_takes_every_pose_and_seals(rig: Rig, small_plan: Plan) -> None:
+    await rig.give_go()
+    await rig.until(S.IDLE)
+    assert rig.states == [S.IDLE, S.CHECKING, *WHOLE_POSE * POSES, S.SEALING, S.IDLE]
+    assert rig.pose_states == ["done"] * POSES
+    recording = sealed(rig)
+    views = recording.views()
+    assert [view.index for view in views] == list(range(POSES))
+    for view, pose in zip(views, small_plan.poses, strict=True):
+        np.testing.assert_allclose(view.base_from_flange, pose.base_from_flange, atol=1e-9)
+        assert recording.picture(view).sequence == view.picture_sequence
+        assert view.stillness is not None
+    assert set(recording.attachments()) == {"plan.yaml", "config.yaml", "camera.json", "truth.json"}
+    assert recording.info.source == "simulated"
+    assert any("saved" in event.detail for event in recording.events())
+    assert sum(1 for _ in recording.robot_states()) > POSES * 50
+
+
+async def test_control_lives_only_for_a_go(rig: Rig) -> None:
+    assert "start control" not in rig.arm.log
+    await rig.session.prepare(1, "run")
+    assert "start control" not in rig.arm.log
+    await rig.give_go()
+    await rig.until(S.IDLE)
+    await rig.until_true(lambda: rig.arm.log[-1] == "end control")
+    assert rig.arm.log.count("start control") == 1
+    assert not rig.arm.control
+
+
+async def test_the_heart_beats_only_while_a_go_is_carried_out(rig: Rig) -> None:
+    await asyncio.sleep(0.1)
+    assert rig.arm.beats == 0
+    await rig.go_until_it_moves()
+    await rig.until_true(lambda: rig.arm.beats > 3)
+    await rig.session.stop("anna")
+    beats = rig.arm.beats
+    await asyncio.sleep(0.1)
+    assert rig.arm.beats == beats
+
+
+async def test_a_pose_counts_only_once_it_is_on_the_disk(rig: Rig, held_disk: HeldDisk) -> None:
+    await rig.give_go()
+    await rig.until_true(lambda: held_disk.asked > 0 or rig.session.store.status.session.captured > 0)
+    assert rig.state is S.WRITING
+    assert rig.pose_states[0] == "writing"
+    assert rig.session.store.status.session.captured == 0
+    held_disk.set()
+    await rig.until(S.IDLE)
+    assert rig.pose_states == ["done"] * POSES
+
+
+async def test_pause_is_after_this_pose_and_going_on_needs_a_new_go(rig: Rig) -> None:
+    await rig.go_until_it_moves()
+    await rig.pause_after_this_pose("bert")
+    assert rig.pose_states == ["done", "planned", "planned", "planned"]
+    assert "bert" in rig.session.store.status.reason
+    await asyncio.sleep(0.05)
+    assert rig.arm.log.count("move") == 1
+    rig.arm.slow = False
+    await rig.give_go("resume")
+    await rig.until(S.IDLE)
+    assert len(sealed(rig).views()) == POSES
+
+
+async def test_stop_is_latched_and_the_go_is_gone(rig: Rig) -> None:
+    await rig.go_until_it_moves()
+    await rig.session.stop("bert")
+    assert rig.state is S.STOPPED
+    assert "stop" in rig.arm.log
+    assert rig.pose_states == ["planned"] * POSES
+    for forbidden in (rig.give_go("resume"), rig.session.prepare(1, "run"), rig.session.finish(1)):
+        with pytest.raises(RefusedError, match="STOP is latched"):
+            await forbidden
+    rig.session.acknowledge("anna")
+    assert rig.state is S.PAUSED
+    moves = rig.arm.log.count("move")
+    await asyncio.sleep(0.05)
+    assert rig.arm.log.count("move") == moves
+    rig.arm.slow = False
+    await rig.give_go("resume")
+    await rig.until(S.IDLE)
+    assert len(sealed(rig).views()) == POSES
+
+
+async def test_stop_voids_a_go_that_waits(rig: Rig) -> None:
+    summary = await rig.session.prepare(1, "run")
+    await rig.session.stop("bert")
+    rig.session.acknowledge("anna")
+    with pytest.raises(RefusedError, match="not valid"):
+        rig.session.go(1, summary.token)
+    assert rig.session.store.status.go is None
+
+
+@pytest.mark.parametrize("phase", [S.SETTLING, S.CAPTURING, S.WRITING, S.SEALING])
+async def test_stop_in_every_phase_keeps_what_was_taken(rig: Rig, phase: S) -> None:
+    stopped = asyncio.Event()
+
+    def press() -> None:
+        if rig.state is phase and not stopped.is_set():
+            stopped.set()
+            presses.append(asyncio.ensure_future(rig.session.stop("anna")))
+
+    presses: list[asyncio.Future[None]] = []
+    rig.session.store.watch(press)
+    await rig.give_go()
+    await stopped.wait()
+    await asyncio.gather(*presses)
+    assert rig.state is S.STOPPED
+    assert "stop" in rig.arm.log
+    assert not {"moving", "settling", "capturing", "writing"} & set(rig.pose_states)
+    rig.session.acknowledge("anna")
+    if phase is S.SEALING:
+        assert rig.state is S.IDLE
+    else:
+        await rig.give_go("resume")
+        await rig.until(S.IDLE)
+    assert len(sealed(rig).views()) == POSES
+
+
+async def test_a_lost_commander_stops_the_arm_at_once(rig: Rig) -> None:
+    await rig.go_until_it_moves()
+    await rig.session.lease_lost(2)
+    assert rig.state is S.MOVING
+    await rig.session.lease_lost(1)
+    assert rig.state is S.PAUSED
+    assert "stop" in rig.arm.log
+    assert "connection of anna" in rig.session.store.status.reason
+    with pytest.raises(RefusedError, match="take the lease"):
+        await rig.session.prepare(1, "resume")
+    rig.session.take_lease(2, "bert")
+    rig.arm.slow = False
+    summary = await rig.session.prepare(2, "resume")
+    rig.session.go(2, summary.token)
+    await rig.until(S.IDLE)
+    assert len(sealed(rig).views()) == POSES
+
+
+async def test_who_lets_go_in_mid_move_stops_the_arm_and_is_named(rig: Rig) -> None:
+    await rig.go_until_it_moves()
+    with pytest.raises(RefusedError, match=r"held by anna.*F4 on their screen.*STOP"):
+        rig.session.take_lease(2, "bert")
+    await rig.session.release_lease(1)
+    assert rig.state is S.PAUSED
+    assert "stop" in rig.arm.log
+    assert rig.session.store.status.reason == "anna let go of control: give a new go to go on"
+    rig.session.take_lease(2, "bert")
+
+
+async def test_finish_seals_what_is_there(rig: Rig) -> None:
+    await rig.go_until_it_moves()
+    await rig.session.finish(1)
+    rig.arm.arrive.set()
+    await rig.until(S.IDLE)
+    assert len(sealed(rig).views()) == 1
+
+
+async def test_a_retake_supersedes(rig: Rig) -> None:
+    rig.arm.slow = True
+    await rig.give_go()
+    for _ in range(2):
+        await rig.until(S.MOVING)
+        rig.arm.arrive.set()
+        await rig.until(S.WRITING)
+    rig.session.pause("anna")
+    await rig.until(S.PAUSED, S.MOVING)
+    rig.arm.arrive.set()
+    await rig.until(S.PAUSED)
+    rig.arm.slow = False
+    done = rig.pose_states.count("done")
+    summary = await rig.session.prepare(1, "retake", 0)
+    assert summary.purpose == "retake pose 1"
+    assert summary.poses == 1
+    rig.session.go(1, summary.token)
+    store = rig.session.store
+    await rig.until_true(lambda: rig.state is S.PAUSED and store.status.session.poses[0].attempt == 2)
+    assert rig.pose_states.count("done") == done
+    await rig.session.finish(1)
+    assert sealed(rig).views()[0].attempt == 2
+
+
+async def test_plans_can_be_changed_and_a_waiting_go_is_void_then(rig: Rig, small_plan: Plan) -> None:
+    session = rig.session
+    summary = await session.prepare(1, "run")
+    await session.edit(1, "skip", lambda queue: queue.skip(1))
+    with pytest.raises(RefusedError, match="not valid"):
+        session.go(1, summary.token)
+    await session.edit(1, "reorder", lambda queue: queue.reorder([3, 2, 1, 0]))
+    await session.edit(1, "drop", lambda queue: queue.drop(0))
+    extra = msgspec.structs.replace(small_plan.poses[0], name="again")
+    assert await session.edit(1, "add", lambda queue: queue.add(extra)) == POSES
+    with pytest.raises(RefusedError, match="no pose 1"):
+        await session.edit(1, "retake", lambda queue: queue.retake(0))
+    assert [pose.index for pose in session.store.status.session.poses] == [3, 2, 1, 4]
+    with pytest.raises(RefusedError, match="watch and STOP"):
+        await session.edit(2, "skip", lambda queue: queue.skip(2))
+
+
+async def test_a_plan_that_leaves_its_limits_is_refused_whole(rig: Rig, small_plan: Plan) -> None:
+    far = (*small_plan.poses[2].joints_rad[:5], 7.5)
+    poses = list(small_plan.poses)
+    poses[2] = msgspec.structs.replace(poses[2], joints_rad=far, base_from_flange=None)
+    rig.session.load_plan(1, msgspec.structs.replace(small_plan, poses=tuple(poses)))
+    with pytest.raises(LimitError, match="wrist 3"):
+        await rig.session.prepare(1, "run")
+    assert "move" not in rig.arm.log
+
+
+async def test_a_refused_control_leaves_everything_as_it_was(rig: Rig, tmp_path: Path) -> None:
+    rig.arm.refuse_control = RobotError("the robot is in local control: switch the pendant to Remote")
+    await rig.give_go()
+    await rig.until(S.IDLE)
+    assert "switch the pendant" in rig.session.store.status.reason
+    assert not list(tmp_path.rglob("*.part"))
+    rig.arm.refuse_control = None
+    await rig.give_go()
+    await rig.until_true(lambda: bool(rig.session.store.status.session.recording))
+
+
+async def test_the_end_of_the_daemon_stops_then_seals(rig: Rig) -> None:
+    await rig.go_until_the_second_move()
+    folder = Path(rig.session.store.status.session.folder)
+    await rig.session.close()
+    assert rig.arm.log.index("stop") < rig.arm.log.index("close")
+    assert len(open_recording(folder).views()) == 1
+
+
+async def test_the_log_is_in_the_recording_too(rig: Rig) -> None:
+    await rig.go_until_it_moves()
+    logging.getLogger("station.devices.ur").warning("a path of the stop failed")
+    rig.arm.slow = False
+    rig.arm.arrive.set()
+    await rig.until(S.IDLE)
+    logged = [event.detail for event in sealed(rig).events() if event.kind == "log"]
+    assert "station.devices.ur: a path of the stop failed" in logged
+    assert rig.session.store.status.camera.frames == POSES
+
+
+async def test_a_notice_of_the_arm_is_shown_while_it_moves(rig: Rig) -> None:
+    rig.arm.slow = True
+    rig.arm.notice = "speed slider at 5 %"
+    await rig.give_go()
+    await rig.until_true(lambda: rig.session.store.status.reason == "speed slider at 5 %")
+    rig.arm.slow = False
+    rig.arm.arrive.set()
+    await rig.until(S.IDLE)
+    assert rig.session.store.status.reason == ""
+
+
+@pytest.mark.parametrize("purpose", ["resume", "retake"])
+async def test_a_sealed_session_is_not_added_to(rig: Rig, purpose: str) -> None:
+    await rig.give_go()
+    await rig.until_true(lambda: bool(rig.session.store.status.session.recording))
+    await rig.until(S.IDLE)
+    with pytest.raises(RefusedError, match="no session is open"):
+        await rig.session.prepare(1, purpose, 0)

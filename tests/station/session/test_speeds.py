@@ -1,0 +1,45 @@
+"""What the arm is asked for is what its way was checked for: its end, its speed, its acceleration."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import msgspec
+import numpy as np
+import pytest
+
+from station.cell.limits import SPEED_CAP_M_S, check_path, point_speed_m_s, sample_path, with_plan_speeds
+from station.cell.plan import Plan
+from station.cell.status import StationState as S
+from station.plan.standing import geometry_from
+from tests.station.session_rig import POSES, TRUTH, Rig
+
+
+@pytest.mark.parametrize("joint_speed_rad_s", [10.0, 0.2])
+async def test_no_modelled_point_is_driven_faster_than_the_cap_nor_a_joint_than_its_plan(
+    rig: Rig, small_plan: Plan, monkeypatch: pytest.MonkeyPatch, joint_speed_rad_s: float
+) -> None:
+    plan = msgspec.structs.replace(small_plan, joint_speed_rad_s=joint_speed_rad_s)
+    rig.session.load_plan(1, plan)
+    moves: list[tuple[Any, Any, float, float]] = []
+    move = rig.arm.move
+
+    async def noted(joints_rad: Any, speed_rad_s: float, acceleration_rad_s2: float) -> None:
+        moves.append((rig.arm.joints, joints_rad, speed_rad_s, acceleration_rad_s2))
+        await move(joints_rad, speed_rad_s, acceleration_rad_s2)
+
+    monkeypatch.setattr(rig.arm, "move", noted)
+    await rig.give_go()
+    await rig.until(S.IDLE)
+    assert len(moves) == POSES
+    config = rig.session.bench.cell.config
+    geometry = with_plan_speeds(geometry_from(config, TRUTH.start_joints_rad), plan)
+    for start, target, speed_rad_s, acceleration_rad_s2 in moves:
+        checked = check_path(geometry, start, target)
+        asked = (speed_rad_s, acceleration_rad_s2)
+        assert asked == pytest.approx((checked.joint_speed_rad_s, checked.joint_acceleration_rad_s2))
+        assert speed_rad_s <= joint_speed_rad_s
+        way = np.subtract(target, start)
+        joint_speeds = way / np.abs(way).max() * speed_rad_s
+        samples = sample_path(geometry, np.array(start), np.array(target), 0.02)
+        assert max(point_speed_m_s(geometry, q, joint_speeds) for q in samples) <= SPEED_CAP_M_S

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from recordings.errors import CodedError
 
-class CalibrationError(Exception):
-    """Something a person can act on. `str()` says what, where and what to do next.
 
-    `exit_code`: 1 failed, 2 usage or configuration, 4 a quality gate failed.
-    """
+class CalibrationError(CodedError):
+    """No calibration, or none that may be used."""
 
-    exit_code = 1
+    code = "calibration"
     hypothesis: str = ""
     """The cause as a word for programs, where it is known."""
 

@@ -1,26 +1,67 @@
-"""The one family of errors this room raises for anything a person or a file can cause."""
+"""Errors as data: what a person, a file or a device can cause, with a code that programs decide on.
+
+`CodedError` is the base of every such error in `recordings`, `calibrate` and `station`.
+"""
 
 from __future__ import annotations
 
 import shlex
 from pathlib import Path
 
+import msgspec
+
 from recordings.plain_text import plain_text
 
+Value = str | float | int | bool | None
 
-class RecordingError(Exception):
-    """Something is wrong with a recording, a folder or a disk. `str()` says what, where and what to do next.
 
-    `exit_code`: 1 failed, 2 usage or configuration (the command line's contract).
+class ErrorData(msgspec.Struct, frozen=True, omit_defaults=True):
+    """An error on the wire, in a status and in `--json`."""
+
+    code: str
+    """For programs: kebab-case, the same for the same cause, whatever the text says."""
+    text: str
+    """What happened and where, for a person."""
+    remedy: str = ""
+    """What to do next, for a person."""
+    values: dict[str, Value] = {}
+    """Measured figures and limits; each name ends in its unit."""
+
+
+class CodedError(Exception):
+    """An error that a person can act on: code, values and remedy beside what happened.
+
+    `exit_code`: 1 failed, 2 usage or configuration, 3 done with loss, 4 a quality gate failed.
     """
 
+    code = "failed"
+    """Of every error of the class that was not given its own."""
     exit_code = 1
+
+    def __init__(self, text: str, *, code: str = "", remedy: str = "", **values: Value) -> None:
+        super().__init__(text)
+        self.text, self.remedy, self.values = text, remedy, values
+        if code:
+            self.code = code
+
+    def __str__(self) -> str:
+        return f"{self.text.rstrip('.')}. {self.remedy}" if self.remedy else self.text
+
+    @property
+    def data(self) -> ErrorData:
+        return ErrorData(self.code, self.text, self.remedy, dict(self.values))
 
 
 def printed(problem: Exception) -> str:
     """An error as all commands print it: without a full stop at its end."""
     said = plain_text(str(problem))
     return said[:-1] if said.endswith(".") and not said.endswith((" .", "/.", "..")) else said
+
+
+class RecordingError(CodedError):
+    """Something is wrong with a recording, a folder or a disk."""
+
+    code = "recording"
 
 
 class UnsealedRecordingError(RecordingError):

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
+from recordings.errors import CodedError
 
-class StationError(Exception):
-    """Something a person can act on. `str()` says what, where and what to do next.
 
-    `exit_code`: 1 failed, 2 usage or configuration, 3 done with loss.
-    """
+class StationError(CodedError):
+    """A person, a device or a file of the station is in the way."""
 
-    exit_code = 1
+    code = "station"
 
 
 class ConfigError(StationError):

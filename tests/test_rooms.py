@@ -1,28 +1,77 @@
-"""Offline work loads no hardware and no screen."""
+"""Offline work loads nothing of the station, and every import contract breaks when it is broken."""
 
 from __future__ import annotations
 
+import re
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
-FOREIGN = (
-    "textual",
-    "serial",
-    "rtde_control",
-    "rtde_receive",
-    "rtde_io",
-    "dashboard_client",
-    "gi",
+ROOT = Path(__file__).parents[1]
+OF_THE_STATION = (
+    *("textual", "serial", "rtde_control", "rtde_receive", "rtde_io", "dashboard_client", "gi"),
     "station",
 )
 
 
-@pytest.mark.parametrize("module", ["calibrate", "calibrate.cli", "recordings", "recordings.cli"])
+@pytest.mark.parametrize("module", ["calibrate.cli.app", "calibrate.pipeline", "recordings.cli.app"])
 def test_offline_rooms_load_nothing_of_the_station(module: str) -> None:
-    program = f"import sys, {module}; print([m for m in {FOREIGN!r} if m in sys.modules])"
+    program = f"import sys, {module}; print([m for m in {OF_THE_STATION!r} if m in sys.modules])"
     loaded = subprocess.run(
         [sys.executable, "-c", program], capture_output=True, text=True, check=True
     ).stdout
     assert loaded.strip() == "[]"
+
+
+PLANTS = [
+    ("recordings/mcap", "calibrate.views"),
+    ("recordings/mcap", "recordings.reader"),
+    ("recordings/schema", "rosbags"),
+    ("calibrate/files", "station.cell"),
+    ("calibrate/handeye", "calibrate.files"),
+    ("calibrate/boards", "calibrate.pipeline"),
+    ("calibrate/quality", "serial"),
+    ("calibrate/quality", "mcap"),
+    ("station/analysis", "textual"),
+    ("station/cell", "station.protocol"),
+    ("station/devices", "station.plan"),
+    ("station/operate", "station.session"),
+    ("station/session", "serial"),
+    ("station/session", "station.protocol.client"),
+    ("station/server", "rtde_control"),
+    ("station/simulation", "station.session"),
+    ("station/tui", "station.devices"),
+    ("station/cli", "gi"),
+]
+"""A room, and an import that is forbidden in it."""
+
+
+@pytest.fixture(scope="module")
+def verdict(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The linter's report on a copy in which every plant grows."""
+    copy = tmp_path_factory.mktemp("planted")
+    for package in ("recordings", "calibrate", "station"):
+        shutil.copytree(ROOT / package, copy / package, ignore=shutil.ignore_patterns("*.mcap"))
+    shutil.copy(ROOT / "pyproject.toml", copy)
+    for number, (room, module) in enumerate(PLANTS):
+        (copy / room / f"planted_{number}.py").write_text(f"import {module}\n")
+    linter = Path(sys.executable).parent / "lint-imports"
+    done = subprocess.run([linter, "--no-cache"], cwd=copy, capture_output=True, text=True)
+    assert done.returncode == 1, done.stderr
+    return done.stdout
+
+
+def test_every_contract_breaks_when_it_is_broken(verdict: str) -> None:
+    assert (
+        f"Contracts: 0 kept, {(ROOT / 'pyproject.toml').read_text().count('importlinter.contracts')} broken"
+        in verdict
+    )
+
+
+@pytest.mark.parametrize(("number", "room", "module"), [(n, *plant) for n, plant in enumerate(PLANTS)])
+def test_a_forbidden_import_is_found(number: int, room: str, module: str, verdict: str) -> None:
+    importer = f"{room.replace('/', '.')}.planted_{number}"
+    assert re.search(rf"{re.escape(importer)} -> {re.escape(module)}\b", verdict)

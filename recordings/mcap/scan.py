@@ -201,7 +201,8 @@ class _Scan:
         room = self._data_limit - position - RECORD_HEAD.size
         if room < 0:
             raise BadRecordError("a record head is cut")
-        opcode, length = RECORD_HEAD.unpack_from(self._block, self._at(position, RECORD_HEAD.size))
+        at = self._at(position, RECORD_HEAD.size)  # may load another block: before `_block` is named
+        opcode, length = RECORD_HEAD.unpack_from(self._block, at)
         if length > room:
             raise BadRecordError(f"a record says it has {length} bytes, {room} are left")
         if length > CHUNK_LIMIT_BYTES:

@@ -183,3 +183,16 @@ def test_an_unfinished_camera_model_is_written_as_uncalibrated(tmp_path: Path) -
     with path.open("rb") as file:
         (message,) = make_reader(file, decoder_factories=[DecoderFactory()]).iter_decoded_messages()
     assert list(message.decoded_message.K) == [0.0] * 9
+
+
+def test_a_record_may_begin_anywhere_in_a_block_that_is_read(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A head of nine bytes that lay across the end of a block was read from the block before."""
+    path = write_small(tmp_path / "a.mcap")
+    whole = open_recording(path).parts[0]
+    monkeypatch.setattr("recordings.mcap.scan._AHEAD_BYTES", 0)
+    for block_bytes in range(200, 500):
+        monkeypatch.setattr("recordings.mcap.scan._BLOCK_BYTES", block_bytes)
+        part = open_recording(path).parts[0]
+        assert (part.sha256, list(part.robot_states())) == (whole.sha256, list(whole.robot_states()))

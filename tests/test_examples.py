@@ -10,13 +10,13 @@ import pytest
 import typer
 
 import recordings.cli.app
-import station.cli.app
 from calibrate.cli.app import app as calibrate_app
+from station.cli.app import STATION
 
 PROGRAMS = {
     "calibrate": typer.main.get_command(calibrate_app),
     "recordings": typer.main.get_command(recordings.cli.app.app),
-    "station": typer.main.get_command(station.cli.app.command_line([])),
+    "station": STATION,
 }
 HANDED_ON = ("station", "board")
 """Its help is that of `calibrate board`."""
@@ -47,7 +47,8 @@ def parse(line: str) -> str:
 
 @pytest.mark.parametrize(("program", "name"), COMMANDS)
 def test_every_command_ends_its_help_with_examples_that_parse(program: str, name: str) -> None:
-    command = PROGRAMS[program].commands[name]  # type: ignore[attr-defined]
+    group = PROGRAMS[program]
+    command = group.resolve_command(typer.Context(group), [name])[1]  # type: ignore[attr-defined]
     given = examples_in(command.epilog)
     assert given
     for line in given:

@@ -26,8 +26,8 @@ from station.cell.config_file import load_config
 from station.cell.errors import ConfigError, LimitError, StationError
 from station.cell.plan import Plan, PlannedPose
 from station.cell.socket_folder import default_socket
-from station.cli.console import Socket, err, out
-from station.cli.session import Headless, attended_session, load_into
+from station.cli.console import Headless, Socket, err, out
+from station.cli.session import attended_session, load_into
 from station.operate.attend import wait_until_idle
 from station.plan.belief import Glimpse, believe, improved_config
 from station.plan.bootstrap import MOVES_MAX, MOVES_MIN, next_move
@@ -51,7 +51,9 @@ def bootstrap_command(
     headless: Headless = False,
     socket: Socket = None,
 ) -> None:
-    """Find mount and board by 3 to 5 small moves from a taught view; each is asked for. Ctrl-C is STOP.
+    """Find camera pose and board pose by 3 to 5 small moves.
+
+    Each move starts at a taught view and is asked for. Ctrl-C stops the arm.
 
     First jog the arm to where the camera sees the whole board in the middle of its picture: that is the
     taught view. The configuration holds `camera_guess`, good to about 30° and 100 mm, and `camera.model`.

@@ -14,4 +14,5 @@ out = plain_console(soft_wrap=True)
 err = plain_console(stderr=True, soft_wrap=True)
 
 Socket = Annotated[Path | None, typer.Option(help="The daemon's control socket.")]
+Headless = Annotated[bool, typer.Option("--headless", help="Never prompt, no progress bar")]
 AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout and nothing else.")]

@@ -13,7 +13,6 @@ import msgspec
 import typer
 from rich.text import Text
 
-from recordings.cli.terminal import examples
 from station.cell.errors import StationError
 from station.cell.socket_folder import default_socket
 from station.cell.status import StationState, StationStatus
@@ -21,8 +20,6 @@ from station.cli.console import AsJson, Socket, out
 from station.protocol.client import Client, ask
 from station.protocol.messages import Verb
 from station.protocol.stop_client import stop_and_tell
-
-app = typer.Typer()
 
 PoseNumber = Annotated[int, typer.Argument(min=1, help="Pose number, from 1.")]
 _MARKS = {
@@ -43,11 +40,10 @@ def status_now(socket: Path | None) -> StationStatus:
     return asyncio.run(first())
 
 
-@app.command("status", epilog=examples("station status", "station status --json"))
 def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
-    """What the station is doing. --json: every figure, the unit in its name.
+    """Show what the station is doing.
 
-    Needs no control, and works beside any screen.
+    Needs no control and works beside any screen. --json: every figure, the unit in its name.
     """
     status = status_now(socket)
     if as_json:
@@ -86,45 +82,42 @@ def camera_words(status: StationStatus) -> str:
     return ", ".join(words)
 
 
-@app.command("stop", epilog=examples("station stop"))
 def stop_command(socket: Socket = None) -> None:
-    """STOP the arm now. The pendant's emergency stop is the safety device.
+    """Stop the arm now (STOP).
 
-    Anyone may, at any time. Latched: next look at the cell, then `station acknowledge`.
+    The emergency stop on the pendant is the safety device. Anyone may stop, at any time. Latched: next look
+    at the cell, then `station acknowledge`.
 
     Exit codes: 0 the station confirmed it and the arm rests; 1 not confirmed: press the emergency stop.
     """
     raise typer.Exit(stop_and_tell(socket or default_socket()))
 
 
-@app.command("acknowledge", epilog=examples("station acknowledge"))
 def acknowledge_command(socket: Socket = None) -> None:
     """Leave `stopped` or `fault` after looking at the cell. Nothing moves.
 
-    Next: `station resume` goes on with the session, `station finish` seals it.
+    Next: `station resume` continues the session, `station finish` finishes it.
     """
     ask(socket or default_socket(), "acknowledge")
     status = status_now(socket)
     _print_state(status)
     if status.state is StationState.PAUSED:
-        out.print("next: `station resume` goes on, `station finish` seals")
+        out.print("Next: `station resume` continues, `station finish` finishes")
 
 
-@app.command("pause", epilog=examples("station pause"))
 def pause_command(socket: Socket = None) -> None:
-    """Pause after the pose that is being taken.
+    """Pause after the pose under way.
 
-    Anyone may. Next: `station resume`, `improve`, `best` or `finish`.
+    Anyone may. Next: `station resume`, `replan`, `next-pose` or `finish`.
     """
     ask(socket or default_socket(), "pause")
-    out.print("pauses after this pose; then `station resume`, `improve`, `best` or `finish`")
+    out.print("Pauses after this pose. Next: `station resume`, `replan`, `next-pose` or `finish`")
 
 
-@app.command("finish", epilog=examples("station finish"))
 def finish_command(socket: Socket = None) -> None:
-    """Seal what is recorded (a pose under way is taken first).
+    """Finish the recording with the poses captured so far.
 
-    Next: `calibrate solve RECORDING`; `station status` names it.
+    A pose under way is captured first. Next: `calibrate solve RECORDING`; `station status` names it.
     """
     _command(socket, "finish")
     status = status_now(socket)
@@ -133,18 +126,16 @@ def finish_command(socket: Socket = None) -> None:
         out.print(f"recording {status.session.recording}")
 
 
-@app.command("retake", epilog=examples("station retake 7  # then: station resume"))
 def retake_command(pose: PoseNumber, socket: Socket = None) -> None:
-    """Plan a pose once more; it is taken at the next go."""
+    """Mark a pose to be captured again by the next run."""
     _command(socket, "retake", index=pose - 1)
     out.print(f"pose {pose}: {_why(socket, pose)}. Next: `station resume`")
 
 
-@app.command("skip", epilog=examples("station skip 7"))
 def skip_command(pose: PoseNumber, socket: Socket = None) -> None:
-    """Leave a pose out, in later runs of this plan too, until it is retaken.
+    """Leave a pose out, in later runs of the plan too.
 
-    Of one that has a picture and was to be taken again only that is left out: its picture counts.
+    `station retake` brings it back. A pose that has a view keeps it: only its retake is left out.
     """
     _command(socket, "skip", index=pose - 1)
     out.print(f"pose {pose}: {_why(socket, pose)}; `station retake {pose}` plans it")
@@ -155,20 +146,16 @@ def _why(socket: Path | None, pose: int) -> str:
     return next((p.reason for p in status_now(socket).session.poses if p.index == pose - 1), "")
 
 
-@app.command(
-    "doctor",
-    epilog=examples("station doctor --example > station.yaml", "station doctor --config station.yaml"),
-)
 def doctor_command(
     socket: Socket = None,
     as_json: AsJson = False,
     config: Annotated[Path | None, typer.Option(help="Only check this configuration; no daemon.")] = None,
     example: Annotated[bool, typer.Option("--example", help="Print a configuration to start from.")] = False,
 ) -> None:
-    """Look at everything a capture needs; each missing thing with its remedy. Nothing moves.
+    """Check everything a capture needs; say how to mend what is missing.
 
-    Without options it asks the daemon. For a new cell: print an example, write the cell into it, check it,
-    then `station serve --config station.yaml`.
+    Nothing moves. Without options it asks the daemon. For a new cell: print an example, write the cell into
+    it, check it, then `station serve --config station.yaml`.
 
     Exit codes: 0 all is there, 1 something is missing, 2 the configuration is wrong.
     """
@@ -198,10 +185,6 @@ def doctor_command(
         raise typer.Exit(1)
 
 
-PASSED_ON = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
-
-
-@app.command("board", context_settings=PASSED_ON)
 def board_command(context: typer.Context) -> None:
     """Make a printable calibration board (`calibrate board`)."""
     import subprocess

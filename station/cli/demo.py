@@ -1,30 +1,38 @@
-"""`station demo`: the whole job with no hardware, through the daemon, compared with the truth."""
+"""`station demo`: the whole job on a simulated cell, through the daemon, compared with the truth."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import json
+import os
 import shutil
 import sys
 import tempfile
+import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import msgspec
 import numpy as np
+import typer
+from rich.table import Table
+from rich.text import Text
 
 from calibrate.geometry import difference
 from recordings.reader import open_recording
-from station.cell.errors import StationError
-from station.cell.session_folder import CALIBRATION_FILE
+from station.cell.errors import ConfigError, StationError
+from station.cell.session_folder import CALIBRATION_FILE, default_root
+from station.cli.console import AsJson, Headless, err, out
+from station.cli.serve import require_choices
 from station.operate.attend import Outcome, carry_out, wait_until_idle
 from station.operate.progress import SessionProgress
 from station.protocol.client import Client
 from station.simulation.cell import CellTruth
+from station.simulation.netns import is_isolated, isolated_command
 
 START_TIMEOUT_S = 120.0
 """It took 70 s on a computer at load 14. A daemon that ends says so at once."""
@@ -56,6 +64,62 @@ class DemoOptions:
 
 class DemoError(StationError):
     """A step of the demonstration failed; the message is that step's own."""
+
+
+def demo_command(
+    seed: Annotated[int, typer.Option(help="Another seed: another mount, board place, lens, noise.")] = 0,
+    output: Annotated[Path | None, typer.Option("--out", help="Folder for everything it makes.")] = None,
+    scene: Annotated[str, typer.Option(help="paper, blog or paper-binned (640×512)")] = "paper",
+    mount: Annotated[str, typer.Option(help="eye-in-hand or eye-to-hand")] = "eye-in-hand",
+    noise: Annotated[str, typer.Option(help="low, mid or high")] = "low",
+    poses: Annotated[int, typer.Option(min=4, max=200)] = 25,
+    gige: Annotated[bool, typer.Option("--gige", help="The camera over GigE Vision.")] = False,
+    headless: Headless = False,
+    as_json: AsJson = False,
+    time_scale: Annotated[float, typer.Option(hidden=True)] = 1.0,
+) -> None:
+    """Run the whole job on a simulated cell and compare with the truth.
+
+    Takes about a minute, and ends with the paths of recording, calibration and report (open that in a
+    browser). The same cell to play with: `station`.
+
+    Exit codes: 0 done, 1 failed, 3 done with fewer poses than planned, 4 a gate failed.
+    """
+    require_choices(scene=scene, noise=noise, mount=mount)
+    if output is not None and output.exists() and not output.is_dir():
+        raise ConfigError(f"--out {output} is a file: name a folder for what the demo makes")
+    if gige and not is_isolated():
+        # Discovery broadcasts on every network: the same command again, where there is only loopback.
+        command = isolated_command([sys.executable, "-m", "station.cli", *sys.argv[1:]])
+        os.execv(command[0], command)
+    folder = output or default_root() / "demo" / time.strftime("%Y%m%d-%H%M%S")
+    options = DemoOptions(folder, seed, scene, mount, noise, poses, time_scale, gige)
+    started_s = time.monotonic()
+    result = asyncio.run(run_demo(options, SessionProgress(err, quiet=headless or as_json)))
+    if as_json:
+        print(json.dumps(result))
+    else:
+        _show_demo(result, time.monotonic() - started_s)
+    captured, planned = result["poses"]["captured"], result["poses"]["planned"]
+    if not result["gates_passed"]:
+        raise typer.Exit(4)
+    if captured < planned:
+        raise typer.Exit(3)
+
+
+def _show_demo(result: dict[str, Any], duration_s: float) -> None:
+    error, sigma, poses = result["truth_error"], result["sigma"], result["poses"]
+    table = Table(title=f"SIMULATED cell, seed {result['seed']}: {result['mount']}, {result['scene']} scene")
+    for heading in ("", "translation", "rotation"):
+        table.add_column(heading, justify="left" if not heading else "right")
+    for name, value in (("error against the truth", error), ("claimed sigma", sigma)):
+        table.add_row(name, f"{value['translation_mm']:.3f} mm", f"{value['rotation_deg']:.4f}°")
+    out.print(table)
+    verdict = "all gates passed" if result["gates_passed"] else ("a gate FAILED", "red")
+    taken = f"{poses['captured']} of {poses['planned']} poses, "
+    out.print(Text.assemble(taken, verdict, f", {duration_s:.0f} s in all"))
+    for name in ("recording", "calibration", "report"):
+        out.print(f"{name:<12} {result[name]}")
 
 
 async def run_demo(options: DemoOptions, progress: SessionProgress) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""`station serve`, and starting a daemon for a screen that finds none."""
+"""`station serve`: the daemon of a real, simulated or replayed cell."""
 
 from __future__ import annotations
 
@@ -6,27 +6,20 @@ import asyncio
 import json
 import logging
 import os
-import struct
-import subprocess
 import sys
-import time
 from pathlib import Path
-from socket import AF_UNIX, SO_PEERCRED, SOL_SOCKET
-from socket import socket as connection
 from typing import Annotated, get_args
 
 import typer
 
 from recordings.schema.messages import Mount
-from station.cell.errors import ConfigError, StationError
+from station.cell.errors import ConfigError
 from station.cell.priority import DAEMON_NICENESS, go_before_others
 from station.cell.session_folder import default_root
 from station.cell.socket_folder import default_socket
 from station.devices.cell import Cell
-from station.protocol.client import DaemonGoneError, ask
 from station.simulation.cell import NoiseLevel, SceneName
 
-START_WAIT_S = 30.0
 _RANGES = {"scene": SceneName, "noise": NoiseLevel, "mount": Mount}
 
 
@@ -53,9 +46,10 @@ def serve_command(
     time_scale: Annotated[float, typer.Option(hidden=True)] = 1.0,
     end_with_stdin: Annotated[bool, typer.Option("--end-with-stdin", hidden=True)] = False,
 ) -> None:
-    """Own the cell and serve it on a Unix socket. Nothing moves without a person's go.
+    """Own the cell and serve it on a Unix socket.
 
-    It runs until Ctrl-C (or SIGTERM): that stops the arm, seals what is recorded, and ends.
+    Nothing moves without a person's approval. Runs until Ctrl-C or SIGTERM, which stop the arm, finish the
+    recording, and end the daemon.
     """
     if [simulate, config is not None, replay is not None].count(True) != 1:
         raise ConfigError(
@@ -122,64 +116,3 @@ def _log_format() -> str:
     """The journal has its own clock."""
     stamp = "" if "JOURNAL_STREAM" in os.environ else "%(asctime)s "
     return f"{stamp}%(levelname)s %(name)s: %(message)s"
-
-
-def find_config() -> Path | None:
-    """$STATION_CONFIG, the user's, or the system's; None where there is none."""
-    home = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
-    places = [home / "calibration-station" / "station.yaml", Path("/etc/station/station.yaml")]
-    if named := os.environ.get("STATION_CONFIG"):
-        places.insert(0, Path(named))
-    return next((place for place in places if place.is_file()), None)
-
-
-def ensure_daemon(socket: Path) -> Path:
-    """The socket of a daemon that answers; starts one where none does. StationError when that fails."""
-    if _answers(socket):
-        return socket
-    root = default_root()
-    config = find_config()
-    what = ["--simulate"] if config is None else ["--config", str(config)]
-    cell = "a SIMULATED cell (no configuration found)" if config is None else f"the cell of {config}"
-    print(f"no daemon serves {socket}: starting one for {cell} …", file=sys.stderr)
-    root.mkdir(parents=True, exist_ok=True)
-    log = root / "daemon.log"
-    with log.open("ab") as words:
-        child = subprocess.Popen(
-            [sys.executable, "-m", "station.cli", "serve", *what, "--socket", str(socket)],
-            stdin=subprocess.DEVNULL,
-            stdout=subprocess.DEVNULL,
-            stderr=words,
-            start_new_session=True,
-        )
-    give_up_s = time.monotonic() + START_WAIT_S
-    while time.monotonic() < give_up_s and child.poll() is None:
-        if _answers(socket):
-            return socket
-        time.sleep(0.2)
-    tail = "\n".join(log.read_text(errors="replace").splitlines()[-3:])
-    raise StationError(f"the daemon did not start; {log} ends with:\n{tail}")
-
-
-def tell_what_goes_on(socket: Path) -> None:
-    """Who closed the screen is told that the daemon has not ended, and how to end it."""
-    with connection(AF_UNIX) as link:
-        try:
-            link.connect(str(socket))
-        except OSError:
-            return
-        credentials = link.getsockopt(SOL_SOCKET, SO_PEERCRED, struct.calcsize("3i"))
-    pid, user, _ = struct.unpack("3i", credentials)
-    own = pid and user == os.getuid()
-    ends = f"; `kill {pid}` ends it: the arm stops first, and what is recorded is sealed" if own else ""
-    print(f"The station goes on without this screen. `station` opens it again{ends}.")
-
-
-def _answers(socket: Path) -> bool:
-    try:
-        ask(socket, "plan")
-    except DaemonGoneError:
-        return False
-    except StationError:
-        return True
-    return True

@@ -1,15 +1,13 @@
-"""The commands that move an arm: `capture`, `resume`, `check`, and the demonstration of all of it."""
+"""The commands of a session: `capture`, `resume`, `replan`, `next-pose` and `drift-check`."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
 import json
-import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
@@ -17,17 +15,13 @@ from typing import Annotated, Any
 
 import msgspec
 import typer
-from rich.table import Table
 from rich.text import Text
 
 from station.cell.errors import ConfigError, RefusedError, StationError
 from station.cell.plan import Plan
-from station.cell.session_folder import default_root
 from station.cell.socket_folder import default_socket
 from station.cell.status import GoSummary, StationStatus
-from station.cli.console import AsJson, Socket, err, out
-from station.cli.demo import DemoOptions, run_demo
-from station.cli.serve import require_choices
+from station.cli.console import AsJson, Headless, Socket, err, out
 from station.operate.attend import Confirm, Outcome, carry_out, wait_until_idle
 from station.operate.drift_check import (
     PLAN_ANSWER_S,
@@ -41,67 +35,8 @@ from station.operate.progress import SessionProgress
 from station.plan.files import load_plan
 from station.plan.sweep import sweep_plan
 from station.protocol.client import Client
-from station.simulation.netns import is_isolated, isolated_command
 
-Headless = Annotated[bool, typer.Option("--headless", help="Nobody is asked; no progress bar.")]
 Approve = Annotated[str, typer.Option("--approve", help="Hash of the plan that a person approved.")]
-OldApprove = Annotated[str, typer.Option("--go", hidden=True)]
-
-
-def demo_command(
-    seed: Annotated[int, typer.Option(help="Another seed: another mount, board place, lens, noise.")] = 0,
-    output: Annotated[Path | None, typer.Option("--out", help="Folder for everything it makes.")] = None,
-    scene: Annotated[str, typer.Option(help="paper, blog or paper-binned (640×512)")] = "paper",
-    mount: Annotated[str, typer.Option(help="eye-in-hand or eye-to-hand")] = "eye-in-hand",
-    noise: Annotated[str, typer.Option(help="low, mid or high")] = "low",
-    poses: Annotated[int, typer.Option(min=4, max=200)] = 25,
-    gige: Annotated[bool, typer.Option("--gige", help="The camera over GigE Vision.")] = False,
-    headless: Headless = False,
-    as_json: AsJson = False,
-    time_scale: Annotated[float, typer.Option(hidden=True)] = 1.0,
-) -> None:
-    """The whole job with no hardware: simulated UR10 and camera to a calibration, compared with the truth.
-
-    Takes about a minute, and ends with the paths of recording, calibration and report (open that in a
-    browser). The same cell to play with: `station`.
-
-    Exit codes: 0 done, 1 failed, 3 done with fewer poses than planned, 4 a gate failed.
-    """
-    require_choices(scene=scene, noise=noise, mount=mount)
-    if output is not None and output.exists() and not output.is_dir():
-        raise ConfigError(f"--out {output} is a file: name a folder for what the demo makes")
-    if gige and not is_isolated():
-        # Discovery broadcasts on every network: the same command again, where there is only loopback.
-        command = isolated_command([sys.executable, "-m", "station.cli", *sys.argv[1:]])
-        os.execv(command[0], command)
-    folder = output or default_root() / "demo" / time.strftime("%Y%m%d-%H%M%S")
-    options = DemoOptions(folder, seed, scene, mount, noise, poses, time_scale, gige)
-    started_s = time.monotonic()
-    result = asyncio.run(run_demo(options, SessionProgress(err, quiet=headless or as_json)))
-    if as_json:
-        print(json.dumps(result))
-    else:
-        _show_demo(result, time.monotonic() - started_s)
-    captured, planned = result["poses"]["captured"], result["poses"]["planned"]
-    if not result["gates_passed"]:
-        raise typer.Exit(4)
-    if captured < planned:
-        raise typer.Exit(3)
-
-
-def _show_demo(result: dict[str, Any], duration_s: float) -> None:
-    error, sigma, poses = result["truth_error"], result["sigma"], result["poses"]
-    table = Table(title=f"SIMULATED cell, seed {result['seed']}: {result['mount']}, {result['scene']} scene")
-    for heading in ("", "translation", "rotation"):
-        table.add_column(heading, justify="left" if not heading else "right")
-    for name, value in (("error against the truth", error), ("claimed sigma", sigma)):
-        table.add_row(name, f"{value['translation_mm']:.3f} mm", f"{value['rotation_deg']:.4f}°")
-    out.print(table)
-    verdict = "all gates passed" if result["gates_passed"] else ("a gate FAILED", "red")
-    taken = f"{poses['captured']} of {poses['planned']} poses, "
-    out.print(Text.assemble(taken, verdict, f", {duration_s:.0f} s in all"))
-    for name in ("recording", "calibration", "report"):
-        out.print(f"{name:<12} {result[name]}")
 
 
 def capture_command(
@@ -111,11 +46,10 @@ def capture_command(
     ] = False,
     headless: Headless = False,
     approve: Approve = "",
-    go: OldApprove = "",
     socket: Socket = None,
     as_json: AsJson = False,
 ) -> None:
-    """One session: load the plan, check it, ask, go, watch, seal. Ctrl-C is STOP.
+    """Capture all poses of a plan into a recording. Ctrl-C stops the arm.
 
     `station plan` makes the plan. Next: `calibrate solve RECORDING`. Nobody there:
     `--headless --approve HASH`, with the hash (12 digits and more) that `station plan --json` prints, as a
@@ -132,7 +66,7 @@ def capture_command(
         before = load_sweep
     else:
         before = partial(load_into, plan=load_plan(plan))
-    outcome = asyncio.run(attended_session(socket, "run", headless, approve or go, as_json, before))
+    outcome = asyncio.run(attended_session(socket, "run", headless, approve, as_json, before))
     if sweep and outcome.recording and not as_json:
         out.print(f"next: calibrate sweep {outcome.recording}")
     _finish(outcome, as_json)
@@ -141,32 +75,31 @@ def capture_command(
 def resume_command(
     headless: Headless = False,
     approve: Approve = "",
-    go: OldApprove = "",
     socket: Socket = None,
     as_json: AsJson = False,
 ) -> None:
-    """Go on with a paused or interrupted session, from where the arm is. Ctrl-C is STOP.
+    """Continue a paused or interrupted session. Ctrl-C stops the arm.
 
     Shows what would move and asks. After STOP or a fault first `station acknowledge`.
 
     Exit codes: as of `station capture`.
     """
-    _finish(asyncio.run(attended_session(socket, "resume", headless, approve or go, as_json, None)), as_json)
+    _finish(asyncio.run(attended_session(socket, "resume", headless, approve, as_json, None)), as_json)
 
 
-def improve_command(headless: Headless = False, socket: Socket = None, as_json: AsJson = False) -> None:
-    """Plan the poses that are left of a paused session anew, from what its pictures show; then go on.
+def replan_command(headless: Headless = False, socket: Socket = None, as_json: AsJson = False) -> None:
+    """Replan the remaining poses of a paused session from its images.
 
-    Says what would change and asks; without a yes the session stays as it is. Ctrl-C is STOP.
+    Shows what would change and asks; then goes on with the session. Ctrl-C stops the arm.
     """
     _finish(asyncio.run(attended_session(socket, "improve", headless, "", as_json, None)), as_json)
 
 
-def best_command(headless: Headless = False, socket: Socket = None) -> None:
-    """Add the pose that would help most to a paused session, and take it.
+def next_pose_command(headless: Headless = False, socket: Socket = None) -> None:
+    """Add the most useful pose to a paused session and capture it.
 
-    Says where it is and what it brings, and asks; the way is checked as for any pose. Then the session is
-    paused as before, or sealed when nothing else was left. Ctrl-C is STOP.
+    Shows the pose and its gain, and asks; its path is checked as any other. Then the session is paused as
+    before, or finished when no other pose was left. Ctrl-C stops the arm.
 
     Exit codes: 0 it was taken, 1 it was not.
     """
@@ -177,23 +110,22 @@ def best_command(headless: Headless = False, socket: Socket = None) -> None:
     raise typer.Exit(0 if added.state == "done" else 1)
 
 
-def check_command(
+def drift_check_command(
     poses: Annotated[int, typer.Option(min=4, max=50, help="How many to take")] = POSES,
     headless: Headless = False,
     approve: Approve = "",
-    go: OldApprove = "",
     socket: Socket = None,
 ) -> None:
-    """Does the installed calibration still hold? A few poses, then `calibrate check` on them.
+    """Check on a few new poses whether the installed calibration holds.
 
-    The board may lie elsewhere by now. Eight poses notice a shift of 0.5 mm or 0.1° on a usual cell, five on
-    a quiet one; where they do not, it says how many more would. Ctrl-C is STOP.
+    The board may lie elsewhere by now. Eight poses detect a shift of 0.5 mm or 0.1° on a usual cell, five on
+    a quiet one; where they do not, it says how many more would. Ctrl-C stops the arm.
 
     Exit codes: 0 it holds, 4 it does not, 1 no recording or nothing installed, 2 usage.
     """
     asyncio.run(_require_installed(socket or default_socket()))  # or the arm would move for nothing
     outcome = asyncio.run(
-        attended_session(socket, "check", headless, approve or go, False, lambda c: _make(c, poses))
+        attended_session(socket, "check", headless, approve, False, lambda c: _make(c, poses))
     )
     if not outcome.recording:
         _finish(outcome, False)

@@ -1,4 +1,4 @@
-"""`station verify`: the tip over corners of the board, then a person's hand and eye; the answers are kept."""
+"""`station touch-test`: the tip over corners of the board, then a person's hand; the offsets are kept."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ from station.plan.hover import outer_corners
 from station.protocol.client import Client
 
 
-def verify_command(
+def touch_test_command(
     calibration: Annotated[
         Path | None, typer.Argument(help="A calibration file; default: the installed one", show_default=False)
     ] = None,
@@ -53,7 +53,7 @@ def verify_command(
     socket: Socket = None,
     as_json: AsJson = False,
 ) -> None:
-    """Check a calibration by hand: the tip hovers over corners; you lower it and tell the offset.
+    """Test a calibration by touching corners of the board by hand.
 
     The board must be in the camera's view at the start. Every move is asked for: at most 0.05 m/s, 50 mm
     and more from the board. Down to the board it goes by your hand only (free-drive on the pendant). The

@@ -1,0 +1,90 @@
+"""Command groups that import a command's module only when it runs or shows its own help."""
+
+from __future__ import annotations
+
+import importlib
+import sys
+from collections.abc import Mapping
+from typing import Any, NamedTuple, cast
+
+import typer
+from typer.core import TyperCommand, TyperGroup
+from typer.main import get_command
+
+from recordings.cli.terminal import examples, print_what_it_can
+from recordings.errors import CodedError, printed
+from recordings.plain_text import plain_text
+
+_HELP_KEYS = {"help_option_names": ["-h", "--help"]}
+
+
+class LazyCommand(NamedTuple):
+    """One command of a group."""
+
+    where: str
+    """`module:function`; the function is declared as typer declares it."""
+    help: str
+    """The first line of the function's docstring: a test compares them."""
+    examples: tuple[str, ...] = ()
+    """Command lines as a person types them, a remark behind `#`."""
+    old_options: Mapping[str, str] = {}
+    """Options by their names of the last release, and what they are called now."""
+    passes_on: bool = False
+    """All arguments are another program's, `--help` too."""
+
+    def load(self, name: str) -> TyperCommand:
+        """Import the module and declare the command."""
+        module, _, function = self.where.partition(":")
+        app = typer.Typer(add_completion=False, rich_markup_mode="markdown")
+        free = {"allow_extra_args": True, "ignore_unknown_options": True, "help_option_names": []}
+        app.command(
+            name,
+            epilog=examples(*self.examples) if self.examples else None,
+            context_settings=free if self.passes_on else None,
+        )(getattr(importlib.import_module(module), function))
+        return cast(TyperCommand, get_command(app))
+
+
+class LazyGroup(TyperGroup):
+    """A command line of `LazyCommand`s; `aliases` are hidden former names."""
+
+    def __init__(
+        self, commands: Mapping[str, LazyCommand], help: str, epilog: str, aliases: Mapping[str, str] = {}
+    ) -> None:
+        stubs = {name: TyperCommand(name, help=command.help) for name, command in commands.items()}
+        super().__init__(
+            commands=dict(stubs),
+            help=help,
+            epilog=epilog,
+            no_args_is_help=True,
+            rich_markup_mode="markdown",
+            context_settings=_HELP_KEYS,
+        )
+        self._lazy, self._aliases = commands, aliases
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The loaded command in place of its line in the group's help."""
+        name, _, rest = super().resolve_command(ctx, [self._aliases.get(args[0], args[0]), *args[1:]])
+        if name is None:
+            return None, None, rest
+        command = self._lazy[name]
+        return name, command.load(name), [_renamed(word, command.old_options) for word in rest]
+
+
+def _renamed(word: str, old_options: Mapping[str, str]) -> str:
+    option, equals, value = word.partition("=")
+    return old_options.get(option, option) + equals + value
+
+
+def run(name: str, group: LazyGroup) -> None:
+    """Call a command line; what a person, a file or a device can cause ends in one line and an exit code."""
+    print_what_it_can()
+    try:
+        group(prog_name=name)
+    except CodedError as problem:
+        print(f"{name}: {printed(problem)}", file=sys.stderr)
+        sys.exit(problem.exit_code)
+    except OSError as problem:  # a folder that may not be written, a full disk behind stdout
+        where = problem.filename or "the output"
+        print(plain_text(f"{name}: {where}: {problem.strerror or problem}"), file=sys.stderr)
+        sys.exit(1)

@@ -1,0 +1,110 @@
+"""`station` and `station tui`: the operator screen, and a daemon for it where none runs."""
+
+from __future__ import annotations
+
+import os
+import struct
+import subprocess
+import sys
+import time
+from pathlib import Path
+from socket import AF_UNIX, SO_PEERCRED, SOL_SOCKET
+from socket import socket as connection
+from typing import Annotated
+
+import typer
+
+from station.cell.errors import StationError
+from station.cell.session_folder import default_root
+from station.cell.socket_folder import default_socket
+from station.cli.console import Socket
+from station.protocol.client import DaemonGoneError, ask
+
+START_WAIT_S = 30.0
+
+
+def tui_command(
+    socket: Socket = None,
+    replay: Annotated[Path | None, typer.Option(help="Play this recording on the live screen")] = None,
+) -> None:
+    """Open the operator screen; start a daemon if none runs.
+
+    The daemon gets a simulated cell where there is no configuration. With --socket none is started: the
+    screen waits for the one that serves there.
+    """
+    if not sys.stdout.isatty() or not sys.stdin.isatty():
+        raise StationError(
+            "The operator screen needs a terminal",
+            code="no-terminal",
+            remedy="Without one use `station capture` or `station demo`.",
+        )
+    from station.tui.app import run, run_replay
+
+    if replay is not None:
+        run_replay(replay)
+        return
+    # A socket that is named belongs to somebody: on a cell's console a second daemon would be a wrong one.
+    served = socket or ensure_daemon(default_socket())
+    run(served)
+    tell_what_goes_on(served)
+
+
+def find_config() -> Path | None:
+    """$STATION_CONFIG, the user's, or the system's; None where there is none."""
+    home = Path(os.environ.get("XDG_CONFIG_HOME") or Path.home() / ".config")
+    places = [home / "calibration-station" / "station.yaml", Path("/etc/station/station.yaml")]
+    if named := os.environ.get("STATION_CONFIG"):
+        places.insert(0, Path(named))
+    return next((place for place in places if place.is_file()), None)
+
+
+def ensure_daemon(socket: Path) -> Path:
+    """The socket of a daemon that answers; starts one where none does. StationError when that fails."""
+    if _answers(socket):
+        return socket
+    root = default_root()
+    config = find_config()
+    what = ["--simulate"] if config is None else ["--config", str(config)]
+    cell = "a SIMULATED cell (no configuration found)" if config is None else f"the cell of {config}"
+    print(f"no daemon serves {socket}: starting one for {cell} …", file=sys.stderr)
+    root.mkdir(parents=True, exist_ok=True)
+    log = root / "daemon.log"
+    with log.open("ab") as words:
+        child = subprocess.Popen(
+            [sys.executable, "-m", "station.cli", "serve", *what, "--socket", str(socket)],
+            stdin=subprocess.DEVNULL,
+            stdout=subprocess.DEVNULL,
+            stderr=words,
+            start_new_session=True,
+        )
+    give_up_s = time.monotonic() + START_WAIT_S
+    while time.monotonic() < give_up_s and child.poll() is None:
+        if _answers(socket):
+            return socket
+        time.sleep(0.2)
+    tail = "\n".join(log.read_text(errors="replace").splitlines()[-3:])
+    raise StationError(f"the daemon did not start; {log} ends with:\n{tail}")
+
+
+def tell_what_goes_on(socket: Path) -> None:
+    """Who closed the screen is told that the daemon has not ended, and how to end it."""
+    with connection(AF_UNIX) as link:
+        try:
+            link.connect(str(socket))
+        except OSError:
+            return
+        credentials = link.getsockopt(SOL_SOCKET, SO_PEERCRED, struct.calcsize("3i"))
+    pid, user, _ = struct.unpack("3i", credentials)
+    own = pid and user == os.getuid()
+    ends = f"; `kill {pid}` ends it: the arm stops first, and what is recorded is sealed" if own else ""
+    print(f"The station goes on without this screen. `station` opens it again{ends}.")
+
+
+def _answers(socket: Path) -> bool:
+    try:
+        ask(socket, "plan")
+    except DaemonGoneError:
+        return False
+    except StationError:
+        return True
+    return True

@@ -17,13 +17,13 @@ from benchmarks.random_cells import random_cell
 from benchmarks.trials import share_spread, table, trials
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp
-from calibrate.handeye.information import Noise as PlanNoise
+from calibrate.handeye.information import MeasurementNoise as PlanNoise
 from calibrate.handeye.information import prior_information, view_information
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.lens.model import project
 from calibrate.lens.pnp import solve_pnp
 from calibrate.quality.drift import SHIFT_M, TURN_RAD, DriftCheck, Noise, judge_shift
-from calibrate.views import ImageView, ViewSet
+from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
 from station.plan.choose import Objective, choose
 from station.plan.planner import make_plan
@@ -193,7 +193,7 @@ def _views(noise: Noise, poses: _Set, mount: Mount, X: Array, rng: np.random.Gen
     for k, seen in enumerate(poses.seen):
         error = np.r_[rng.normal(size=3) * noise.robot_m, rng.normal(size=3) * noise.robot_rad]
         pixels = project(_CAMERA, seen, points) + rng.normal(size=(len(points), 2)) * noise.corner_px
-        found.append(ImageView(k, str(k), perturb(_flange(seen, mount, X, poses.Y), error), points, pixels))
+        found.append(BoardView(k, str(k), perturb(_flange(seen, mount, X, poses.Y), error), points, pixels))
     return solve_pnp(ViewSet(mount, tuple(found), _CAMERA), _BOARD)
 
 

@@ -15,7 +15,7 @@ from benchmarks.scene import LEVELS, Cell, Noise, make_cell
 from benchmarks.trials import rms, rms_spread, share_spread, table, trials
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array, difference
-from calibrate.handeye.information import Noise as ViewNoise
+from calibrate.handeye.information import MeasurementNoise as ViewNoise
 from calibrate.handeye.information import covariance_of, view_information
 from calibrate.handeye.observations import SHAPE
 from calibrate.handeye.priors import BoardTolerance

@@ -18,7 +18,7 @@ from calibrate.kinematics import MODELS, DhDeltas, forward, inverse_nearest
 from calibrate.lens.intrinsics import LensModel, calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
 from calibrate.projection import project_pixels
-from calibrate.views import ImageView, ViewSet
+from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
 
 BOARD = BoardSpec(BoardKind.CHESSBOARD, 9, 7, 0.025)
@@ -124,7 +124,7 @@ def imperfect_cell(
     sigma = np.repeat([noise.robot_m, noise.robot_rad], 3)
     flange = perturb(placed.flange, sigma * rng.normal(size=(views, 6)))
     seen = tuple(
-        ImageView(i, f"view {i}", flange[i], stated, pixels[i], placed.joints[i] if known.joints else None)
+        BoardView(i, f"view {i}", flange[i], stated, pixels[i], placed.joints[i] if known.joints else None)
         for i in range(views)
     )
     told = _told(rng, wrong, lens) if known.lens else CameraModel(lens.width, lens.height)

@@ -20,7 +20,7 @@ from calibrate.handeye.solve import solve_views
 from calibrate.lens.pnp import solve_pnp
 from calibrate.pipeline import single_threaded_opencv
 from calibrate.quality.gates import GateInputs, judge
-from calibrate.views import ImageView, ViewSet
+from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import Mount
 
 TRIALS = 60
@@ -190,7 +190,7 @@ def line(name: str, share: float, mount: Mount, found: Sequence[Trial]) -> list[
     ]
 
 
-def _views_wrong(cell: ImperfectCell, bad: Places, changed: Sequence[ImageView], kind: str) -> Spoilt:
+def _views_wrong(cell: ImperfectCell, bad: Places, changed: Sequence[BoardView], kind: str) -> Spoilt:
     views = list(cell.views.views)
     for place, view in zip(bad, changed, strict=True):
         views[place] = view

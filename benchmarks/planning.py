@@ -33,7 +33,7 @@ from benchmarks.trials import trials
 from calibrate.geometry import Array, difference, perturb, pose, rotation_exp
 from calibrate.handeye.corners import bent_points
 from calibrate.handeye.estimate import estimate
-from calibrate.handeye.information import Noise
+from calibrate.handeye.information import MeasurementNoise
 from calibrate.handeye.observations import SHAPE, Observations, State, extent_of
 from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.kinematics import forward
@@ -51,7 +51,7 @@ from station.plan.view_range import ViewRange
 from station.simulation.placement import guess_of
 
 CELLS = 200
-NOISE = Noise(MID.corner_px, MID.robot_m, MID.robot_rad)
+NOISE = MeasurementNoise(MID.corner_px, MID.robot_m, MID.robot_rad)
 MODERATE = ViewRange((0.38, 0.60), (0.0, np.deg2rad(30)), roll_rad=np.pi / 4, doubt=0.0)
 WIDE = ViewRange((0.34, 0.75), (0.0, np.deg2rad(50)), roll_rad=np.pi / 2, off_centre=0.8, doubt=0.0)
 AHEAD_M = 0.5

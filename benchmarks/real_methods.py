@@ -20,7 +20,7 @@ from calibrate.handeye.solve import solve_views
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
 from calibrate.pipeline import single_threaded_opencv
-from calibrate.views import ImageView, ViewSet
+from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import BoardSpec, CameraModel
 
 FAILURES = (CalibrationError, cv2.error, np.linalg.LinAlgError, ValueError, RuntimeError)
@@ -144,7 +144,7 @@ def calibration_rs(views: ViewSet, board: BoardSpec) -> dict[str, Answer]:
     return {CALIBRATION_RS: Answer(X if in_hand else inverse(X), centre, camera)}
 
 
-def _observation(view: ImageView) -> rs.SingleCamHandeyeView:
+def _observation(view: BoardView) -> rs.SingleCamHandeyeView:
     F = view.base_from_flange
     pose = rs.Pose(tuple(quaternion_from_matrix(F[:3, :3]).tolist()), tuple(F[:3, 3].tolist()))
     points = [tuple(point) for point in view.board_points.tolist()]
@@ -164,7 +164,7 @@ def board_centre(board: BoardSpec, views: ViewSet) -> Array:
     return np.asarray((points.min(axis=0) + points.max(axis=0)) / 2)
 
 
-def predicted_centre(view: ImageView, answer: Answer, in_hand: bool, centre: Array) -> Array:
+def predicted_centre(view: BoardView, answer: Answer, in_hand: bool, centre: Array) -> Array:
     """(3,) where X, the robot's pose and the view's own PnP put the board centre."""
     C = view_pnp(view, answer)
     F = view.base_from_flange
@@ -172,7 +172,7 @@ def predicted_centre(view: ImageView, answer: Answer, in_hand: bool, centre: Arr
     return np.asarray((chain @ np.append(answer.shape(centre[None])[0], 1.0))[:3])
 
 
-def view_pnp(view: ImageView, answer: Answer) -> Array:
+def view_pnp(view: BoardView, answer: Answer) -> Array:
     """camera_from_board of one view by its own corners: the better of the plane's two poses, refined."""
     points = answer.shape(view.board_points)
     K, D = np.array(answer.camera.matrix), np.array(answer.camera.distortion)

@@ -24,7 +24,7 @@ from calibrate.geometry import (
 )
 from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.projection import camera_matrix, project
-from calibrate.views import ImageView, ViewSet
+from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import CameraModel, Mount
 
 
@@ -117,7 +117,7 @@ def view_set(
     C = camera_from_board
     if C is None:
         C = np.array([pnp(board, seen, camera) for seen in pixels])
-    found = [ImageView(i, f"view {i}", flange[i], board, pixels[i], None, C[i]) for i in range(len(flange))]
+    found = [BoardView(i, f"view {i}", flange[i], board, pixels[i], None, C[i]) for i in range(len(flange))]
     return ViewSet(mount, tuple(found), camera)
 
 

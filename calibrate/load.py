@@ -15,7 +15,7 @@ from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, MirroredPicturesError, SquaresCountedError, TooFewViewsError
 from calibrate.geometry import is_rigid
 from calibrate.handeye.solution import RejectedView
-from calibrate.views import ImageView, ViewSet
+from calibrate.views import BoardView, ViewSet
 from recordings.errors import BadPictureError
 from recordings.reader import Recording
 from recordings.schema.messages import BoardSpec, CameraModel, View
@@ -59,7 +59,7 @@ def load_views(
     info = recording.info
     spec = board or info.board
     model = camera or info.camera
-    views: list[ImageView] = []
+    views: list[BoardView] = []
     missing: list[RejectedView] = []
     seen: dict[int, Detection] = {}
     for view, detection in _detect_all(recording, spec, model, progress, threads):
@@ -181,14 +181,14 @@ def _check_size(view: View, width: int, height: int, camera: CameraModel) -> Non
         )
 
 
-def _image_view(view: View, detection: Detection, spec: BoardSpec) -> ImageView:
+def _image_view(view: View, detection: Detection, spec: BoardSpec) -> BoardView:
     base_from_flange = np.array(view.base_from_flange, dtype=float)
     if base_from_flange.shape != (4, 4) or not is_rigid(base_from_flange, 1e-5):
         raise BadViewsError(
             f"view {view.index + 1} ({view.name}): base_from_flange is not a rigid transform. Record it "
             "again, or leave the view out of the folder and import again."
         )
-    return ImageView(
+    return BoardView(
         index=view.index,
         name=view.name,
         base_from_flange=base_from_flange,

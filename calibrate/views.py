@@ -1,4 +1,4 @@
-"""The solver's input: views, each a robot pose with the board's points seen in one picture."""
+"""Views: a robot pose with the board's points seen in one image. The solver's input."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from recordings.schema.messages import CameraModel, Mount
 
 
 @dataclass(frozen=True, eq=False)
-class ImageView:
-    """One stop of the arm with its detected board."""
+class BoardView:
+    """One image of the board: robot pose, detected corners, and the board pose once it is known."""
 
     index: int
     """Pose number in the session, as people see it."""
@@ -35,7 +35,7 @@ class ViewSet:
     """All views of a session, in capture order, of one camera and one board."""
 
     mount: Mount
-    views: tuple[ImageView, ...]
+    views: tuple[BoardView, ...]
     camera: CameraModel
     """matrix is None until intrinsics are known."""
     robot_model: str = "unknown"
@@ -43,7 +43,7 @@ class ViewSet:
     def __len__(self) -> int:
         return len(self.views)
 
-    def __iter__(self) -> Iterator[ImageView]:
+    def __iter__(self) -> Iterator[BoardView]:
         return iter(self.views)
 
     def select(self, positions: list[int]) -> ViewSet:

@@ -13,7 +13,7 @@ import numpy as np
 
 from calibrate.geometry import Array
 from calibrate.handeye.estimate import Estimate, corner_weights
-from calibrate.handeye.linear import Linear, Solved
+from calibrate.handeye.linear import Linear, LinearSolution
 from calibrate.handeye.observations import Observations
 from calibrate.handeye.priors import Priors
 
@@ -67,7 +67,7 @@ def allow_for_table(observed: Observations, plain: Estimate, priors: Priors) -> 
     return WithTable(estimate, found - float(log_evidence[0]), estimate.scales.table)
 
 
-def _posterior(solutions: list[Solved]) -> Array:
+def _posterior(solutions: list[LinearSolution]) -> Array:
     log = np.array([s.log_evidence for s in solutions]) + np.log(_BEFOREHAND)
     chances = np.exp(log - log.max())
     return np.asarray(chances / chances.sum())

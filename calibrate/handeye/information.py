@@ -27,7 +27,7 @@ _POSE_PRECISION = np.array([1.0, 1.0, 1.0, 0.1, 0.1, 0.1])
 
 
 @dataclass(frozen=True)
-class Noise:
+class MeasurementNoise:
     """Standard deviations per axis."""
 
     pixel_px: float = 0.15
@@ -42,7 +42,7 @@ def view_information(
     X: Array,
     Y: Array,
     board_points: Array,
-    noise: Noise,
+    noise: MeasurementNoise,
 ) -> Array:
     """Information of each view (n, p, p), the whole board (k, 3) seen from each flange pose (n, 4, 4).
 

@@ -72,7 +72,7 @@ def first_scales(linear: Linear, wide: float = WIDE) -> Scales:
 
 
 @dataclass(frozen=True, eq=False)
-class Solved:
+class LinearSolution:
     """A solution of the linearised posterior."""
 
     step: Array
@@ -204,7 +204,7 @@ class Linear:
         J[..., modes.shared] = -A @ modes.by_shared
         return cls(H, A, m + (A @ modes.to_optimum[..., None])[..., 0], J, modes)
 
-    def solve(self, prior: Quadratic, scales: Scales, fit: Fit = "all") -> Solved:
+    def solve(self, prior: Quadratic, scales: Scales, fit: Fit = "all") -> LinearSolution:
         """The step, and the noise scales that are to be fitted, by rounds of expectation and maximisation."""
         residual = self.m
         for _ in range(1 if fit == "nothing" else _ROUNDS):
@@ -231,7 +231,7 @@ class Linear:
         )
         if self.modes is not None:
             evidence += self.modes.gain(step) / scales.lambda_px**2
-        return Solved(step, N, scales, chances, residual, z, evidence)
+        return LinearSolution(step, N, scales, chances, residual, z, evidence)
 
     def _noise(self, scales: Scales) -> tuple[Array, Array]:
         """Covariances (n, K, 6, 6) of m by class, and their inverses."""
@@ -276,7 +276,7 @@ class Linear:
         noise = scales.tau_px**2 * self.B + np.diag(scales.classes[0])
         return np.asarray(noise + self.J @ covariance @ np.swapaxes(self.J, 1, 2))
 
-    def board_step(self, solved: Solved) -> Array:
+    def board_step(self, solved: LinearSolution) -> Array:
         """(n, 6) step of the board poses that belongs to the step of the shared unknowns."""
         pull = np.einsum("nk,nki->ni", solved.chances, solved.z)
         by_robot = np.einsum("nij,nkj,nk->ni", self.H, self.A, pull, optimize=True)
@@ -289,7 +289,7 @@ class Linear:
         """(n, 4, 4) the board poses C, each moved to its own corners' optimum."""
         return C if self.modes is None else perturb(C, self.modes.to_optimum)
 
-    def lost(self, solved: Solved) -> Array:
+    def lost(self, solved: LinearSolution) -> Array:
         """(G, G) information that not knowing the views' classes costs (Louis 1982)."""
         mean = np.einsum("nk,nki->ni", solved.chances, solved.z)
         spread = np.einsum("nk,nki,nkj->nij", solved.chances, solved.z, solved.z, optimize=True)
@@ -304,7 +304,7 @@ class Linear:
         spread = root @ inner @ np.swapaxes(root, 1, 2)
         return np.asarray(np.einsum("nia,nij,njb->ab", self.J, spread, self.J, optimize=True))
 
-    def noise_parts(self, solved: Solved, covariance: Array) -> Array:
+    def noise_parts(self, solved: LinearSolution, covariance: Array) -> Array:
         """(3,) whitened variance of X that corners, robot translation and robot rotation make."""
         _, S_inverse = self._noise(solved.scales)
         gain = covariance[:6] @ np.swapaxes(self.J, 1, 2)
@@ -320,7 +320,7 @@ class Linear:
             parts.append(float(np.einsum("xy,nyi,nij,nxj->", whiten, G, np.broadcast_to(noise, G.shape), G)))
         return np.array(parts)
 
-    def covariance(self, solved: Solved) -> Array:
+    def covariance(self, solved: LinearSolution) -> Array:
         """(G, G) of the posterior, doubts about the views' classes included."""
         return inverse_of(solved.precision - self.lost(solved))
 

@@ -14,7 +14,7 @@ from calibrate.geometry import Array, difference, inverse, perturb
 from calibrate.handeye.axxb.pairs import mount_poses
 from calibrate.handeye.corners import linearise_corners
 from calibrate.handeye.flange import flange_derivatives, implied_flange
-from calibrate.handeye.linear import CornerModes, Linear, Scales, Solved, first_scales
+from calibrate.handeye.linear import CornerModes, Linear, LinearSolution, Scales, first_scales
 from calibrate.handeye.observations import Moved, Places, observe_views
 from calibrate.handeye.priors import Quadratic
 from calibrate.handeye.start import BoardPoses, agreed_start, central_pose
@@ -84,7 +84,7 @@ class PoseFit:
     """(m, 4, 4), m = 2 where the board was moved."""
     factors: Array
     """(p,) as in `BoardPoses`."""
-    solved: Solved
+    solved: LinearSolution
 
     @property
     def log_evidence(self) -> float:

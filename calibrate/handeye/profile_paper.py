@@ -9,7 +9,7 @@ from scipy import stats
 from calibrate.frames import board_frames, camera_frames
 from calibrate.geometry import Array, Transform
 from calibrate.handeye.axxb.certificate import Certificate, certify
-from calibrate.handeye.axxb.objective import Objective, build_objective
+from calibrate.handeye.axxb.objective import QuadraticObjective, build_objective
 from calibrate.handeye.axxb.pair_covariance import pair_covariance
 from calibrate.handeye.axxb.pairs import consecutive_pairs, mount_poses
 from calibrate.handeye.axxb.paper import solve_paper
@@ -79,7 +79,7 @@ def solve_paper_profile(views: ViewSet, options: SolveOptions) -> Solution:
     )
 
 
-def _of_returned(objective: Objective, X: Array, pairs: int) -> Certificate:
+def _of_returned(objective: QuadraticObjective, X: Array, pairs: int) -> Certificate:
     """The bound of the relaxation against the value at the X that is returned, translation included.
 
     `certify` itself judges the rotation, with the best translation for it.

@@ -19,7 +19,7 @@ from calibrate.handeye.folds import CrossValidation
 from calibrate.handeye.metrics import HoldoutScore, Observability
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.readings import Explanation, Reading
-from calibrate.views import ImageView
+from calibrate.views import BoardView
 from recordings.schema.messages import CameraModel, Mount
 
 Profile = Literal["robust", "paper"]
@@ -129,7 +129,7 @@ class Solution:
     certificate: Certificate
     observability: Observability
     holdout: HoldoutScore | None = None
-    kept: tuple[ImageView, ...] = ()
+    kept: tuple[BoardView, ...] = ()
     """The used views as the solver read them, boards turned where that was needed."""
     turned: tuple[int, ...] = ()
     """Views whose corner order was turned by 180° to agree with the others, and kept."""

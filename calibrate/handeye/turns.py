@@ -8,7 +8,7 @@ import numpy as np
 
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
 from calibrate.handeye.axxb.pairs import mount_poses
-from calibrate.views import ImageView, ViewSet
+from calibrate.views import BoardView, ViewSet
 
 _LEVER_M = 0.5
 _NEARER = 0.2
@@ -35,7 +35,7 @@ def _distance(found: Array, expected: Array) -> float:
     return float(np.linalg.norm(delta[:3]) + _LEVER_M * np.linalg.norm(delta[3:]))
 
 
-def _turns(view: ImageView) -> list[Array]:
+def _turns(view: BoardView) -> list[Array]:
     """Rigid maps of the board onto itself: half a turn, and quarter turns where it is square."""
     if not len(view.board_points):
         return []
@@ -49,7 +49,7 @@ def _turns(view: ImageView) -> list[Array]:
     return turns
 
 
-def _turned(view: ImageView, turn: Array) -> ImageView:
+def _turned(view: BoardView, turn: Array) -> BoardView:
     return replace(
         view,
         board_points=transform_points(turn, view.board_points),

@@ -7,7 +7,7 @@ import numpy as np
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import is_rigid
 from calibrate.projection import camera_matrix
-from calibrate.views import ImageView, ViewSet
+from calibrate.views import BoardView, ViewSet
 
 MIN_VIEWS = 4
 FEWEST_CORNERS = 4
@@ -46,7 +46,7 @@ def _require_camera(views: ViewSet) -> None:
         raise BadViewsError("The lens distortion contains NaN or infinity.")
 
 
-def _require_view(view: ImageView, fewest_corners: int) -> None:
+def _require_view(view: BoardView, fewest_corners: int) -> None:
     where = f"View {view.index + 1} ({view.name})"
     if not is_rigid(np.asarray(view.base_from_flange)):
         raise BadViewsError(
@@ -73,7 +73,7 @@ def _require_view(view: ImageView, fewest_corners: int) -> None:
 
 def require_no_copies(views: ViewSet) -> None:
     """BadViewsError for a view that is in the set twice: it tells nothing, and halves the stated variance."""
-    first: dict[bytes, ImageView] = {}
+    first: dict[bytes, BoardView] = {}
     for view in views:
         seen = view.pixels if len(view.pixels) else np.asarray(view.camera_from_board)
         key = view.base_from_flange.tobytes() + seen.tobytes()

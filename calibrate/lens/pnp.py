@@ -16,7 +16,7 @@ from calibrate.handeye.observations import Observations, observe_views
 from calibrate.lens.model import project, undistort
 from calibrate.lens.orientation import choose_candidates
 from calibrate.projection import camera_matrix
-from calibrate.views import ImageView, ViewSet
+from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import BoardSpec, CameraModel
 
 _STEPS = 20
@@ -61,7 +61,7 @@ def solve_pnp(views: ViewSet, board: BoardSpec | None = None) -> ViewSet:
     return replace(views, views=tuple(solved))
 
 
-def candidate_poses(view: ImageView, camera: CameraModel, board: BoardSpec | None) -> list[Candidate]:
+def candidate_poses(view: BoardView, camera: CameraModel, board: BoardSpec | None) -> list[Candidate]:
     """Poses that explain the picture equally well, best first, each in every turn that looks the same."""
     return _candidates(ViewSet("eye-in-hand", (view,), camera), board)[0]
 
@@ -100,7 +100,7 @@ def _credible_px(best_px: Array) -> Array:
     return np.maximum(1.5 * best_px, best_px + 0.05)
 
 
-def _tilts(view: ImageView, camera: CameraModel) -> Array:
+def _tilts(view: BoardView, camera: CameraModel) -> Array:
     """(1 or 2, 4, 4)"""
     K = camera_matrix(camera)
     points = np.ascontiguousarray(view.board_points)
@@ -156,7 +156,7 @@ def _squares(everything: Observations, camera: CameraModel, owner: NDArray[np.in
     return np.asarray((misses**2).sum(axis=(1, 2)))
 
 
-def view_rms_px(view: ImageView, camera: CameraModel, camera_from_board: Array) -> float:
+def view_rms_px(view: BoardView, camera: CameraModel, camera_from_board: Array) -> float:
     """Root mean square distance of the corners from where the pose shows them."""
     miss = project(camera, camera_from_board, view.board_points) - view.pixels
     return float(np.sqrt(np.square(miss).sum(axis=1).mean()))

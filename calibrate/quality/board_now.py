@@ -19,7 +19,7 @@ from calibrate.handeye.corners import bent_points
 from calibrate.handeye.observations import observe_views
 from calibrate.lens.pnp import Candidate, candidate_poses
 from calibrate.quality.drift import Noise, pnp_covariance, with_found_shape
-from calibrate.views import ImageView, ViewSet
+from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import BoardSpec
 
 _SAME_PLACE_M, _SAME_PLACE_RAD = 0.01, 0.03
@@ -41,7 +41,7 @@ class BoardNow:
     moved_rad: float
 
 
-def locate_board(calibration: Calibration, view: ImageView, board: BoardSpec) -> BoardNow:
+def locate_board(calibration: Calibration, view: BoardView, board: BoardSpec) -> BoardNow:
     """BadViewsError where the picture leaves it open, or shows the board on the flange (eye-to-hand)."""
     camera, X, E = calibration.intrinsics.model, calibration.transform.matrix, view.base_from_flange
     in_hand = calibration.mount == "eye-in-hand"
@@ -73,7 +73,7 @@ def locate_board(calibration: Calibration, view: ImageView, board: BoardSpec) ->
     )
 
 
-def _shaped(reading: Candidate, view: ImageView, calibration: Calibration) -> Candidate:
+def _shaped(reading: Candidate, view: BoardView, calibration: Calibration) -> Candidate:
     """The same reading, with the board's shape that the calibration found."""
     placed = replace(view, camera_from_board=reading.camera_from_board)
     views = ViewSet(calibration.mount, (placed,), calibration.intrinsics.model)
@@ -86,7 +86,7 @@ def found_points(calibration: Calibration, board: BoardSpec) -> Array:
     found = calibration.quality.board
     if found is None or board != calibration.board:
         return points
-    whole = ImageView(0, "", np.eye(4), points, np.zeros((len(points), 2)))
+    whole = BoardView(0, "", np.eye(4), points, np.zeros((len(points), 2)))
     observed = observe_views(ViewSet(calibration.mount, (whole,), calibration.intrinsics.model))
     shape = np.array([found.scale, found.anisotropy, *found.bend_m])
     return np.asarray(bent_points(observed, shape)[0])
@@ -97,7 +97,7 @@ def _is_small(miss: Array) -> bool:
 
 
 def offset_covariance(
-    calibration: Calibration, view: ImageView, now: BoardNow, corner_m: ArrayLike, tip_m: ArrayLike
+    calibration: Calibration, view: BoardView, now: BoardNow, corner_m: ArrayLike, tip_m: ArrayLike
 ) -> Array:
     """(3, 3) of tip minus corner, in `board`, m², when the arm is sent to put the tip on the corner.
 

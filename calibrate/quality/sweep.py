@@ -20,7 +20,7 @@ from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import Array, pose_from_rotvec, rotation_angle
 from calibrate.lens.pnp import candidate_poses
 from calibrate.quality.time_offset import FEWEST_PICTURES, TimeOffset, estimate_time_offset
-from calibrate.views import ImageView
+from calibrate.views import BoardView
 from recordings.errors import BadPictureError
 from recordings.reader import Recording
 from recordings.schema.messages import CameraModel, Picture
@@ -119,7 +119,7 @@ def _seen(recording: Recording, camera: CameraModel, lost: list[str]) -> Iterato
         found = detect(picture.image, board, thorough=False)
         if not found.found:
             continue
-        view = ImageView(
+        view = BoardView(
             picture.sequence,
             str(picture.sequence),
             np.eye(4),

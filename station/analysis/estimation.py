@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from calibrate.boards.model import board_points
 from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, inverse, pose
-from calibrate.handeye.information import Noise, covariance_of, prior_information, view_information
+from calibrate.handeye.information import MeasurementNoise, covariance_of, prior_information, view_information
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
-from calibrate.views import ImageView, ViewSet
+from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
 from station.cell.config import StationConfig
 from station.cell.errors import StationError
@@ -125,7 +125,7 @@ def _views(
 ) -> ViewSet:
     points = board_points(board)
     found = tuple(
-        ImageView(index, f"p{index}", flange, points[rows], pixels) for index, flange, rows, pixels in seen
+        BoardView(index, f"p{index}", flange, points[rows], pixels) for index, flange, rows, pixels in seen
     )
     views = ViewSet(mount, found, camera)
     if not lens_is_known and len(found) >= FEWEST_FOR_LENS:
@@ -155,7 +155,7 @@ def quick_sigma(views: ViewSet, board: BoardSpec, X: Array, Y: Array, free_lens:
     """1σ of X: translation (m) and rotation (rad), roots of the summed variances."""
     points = board_points(board)
     flange = views.base_from_flange
-    information = view_information(views.mount, views.camera, flange, X, Y, points, Noise()).sum(axis=0)
+    each = view_information(views.mount, views.camera, flange, X, Y, points, MeasurementNoise())
     prior = prior_information(views.camera, not free_lens, BoardTolerance.of(board))
-    variances = np.diag(covariance_of(information, prior))
+    variances = np.diag(covariance_of(each.sum(axis=0), prior))
     return float(np.sqrt(variances[:3].sum())), float(np.sqrt(variances[3:6].sum()))

@@ -22,7 +22,7 @@ from calibrate.geometry import (
     perturb,
     pose_from_quaternion,
 )
-from calibrate.handeye.information import Noise
+from calibrate.handeye.information import MeasurementNoise
 from calibrate.projection import project
 from station.analysis.estimation import FEWEST_FOR_LENS, Seen, quick_sigma, solve_quickly
 from station.cell.config import PoseGuess, StationConfig
@@ -139,7 +139,7 @@ def _require_agreement(guess: PoseGuess, X: Array) -> None:
 def _worth(scene: Scene, seen: Sequence[Seen], left: Plan, free_lens: bool) -> Worth:
     flange = flange_poses(scene, left)
     captured = np.array([pose for _, pose, _, _ in seen])
-    everything = informations(scene, np.concatenate([captured, flange]), Noise()).sum(axis=0)
+    everything = informations(scene, np.concatenate([captured, flange]), MeasurementNoise()).sum(axis=0)
     sigma_m = sigma_of(everything, objective_for(scene, "A", free_lens))[0]
     whole = visible(scene.camera, scene.seen(flange, outline(scene.board)), 0.0)
     points = scene.seen(flange[whole], board_points(scene.board))

@@ -10,7 +10,7 @@ import numpy as np
 
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array
-from calibrate.handeye.information import Noise, covariance_of, prior_information, view_information
+from calibrate.handeye.information import MeasurementNoise, covariance_of, prior_information, view_information
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.projection import intrinsics_names
 from station.cell.scene import Scene
@@ -62,7 +62,7 @@ class Objective:
         return np.asarray(np.linalg.slogdet(covariance[..., self.lens, self.lens])[1])
 
 
-def informations(scene: Scene, base_from_flange: Array, noise: Noise) -> Array:
+def informations(scene: Scene, base_from_flange: Array, noise: MeasurementNoise) -> Array:
     """(n, p, p) information of each pose by the scene's guess."""
     points = board_points(scene.board)
     return view_information(scene.mount, scene.camera, base_from_flange, scene.X, scene.Y, points, noise)

@@ -18,7 +18,7 @@ from calibrate.files.calibration import Calibration
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
 from calibrate.kinematics import RobotModel, forward, inverse_all, jacobian
 from calibrate.quality.board_now import found_points, locate_board, offset_covariance
-from calibrate.views import ImageView
+from calibrate.views import BoardView
 from recordings.schema.messages import BoardSpec, Vector6
 from station.cell.collision import CellGeometry, as_point, margins, plate
 from station.cell.config import Capsule, PointerConfig, StationConfig
@@ -278,7 +278,7 @@ class HoverAnswer:
 
 
 def answer_hover(
-    config: StationConfig, calibration: Calibration, view: ImageView, question: HoverQuestion
+    config: StationConfig, calibration: Calibration, view: BoardView, question: HoverQuestion
 ) -> HoverAnswer:
     """From one picture of the board to a checked way. LimitError, BadViewsError."""
     now = locate_board(calibration, view, config.board)

@@ -11,7 +11,7 @@ import numpy as np
 
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array
-from calibrate.handeye.information import Noise
+from calibrate.handeye.information import MeasurementNoise
 from calibrate.kinematics import forward
 from station.cell.config import StationConfig
 from station.cell.errors import LimitError
@@ -41,7 +41,7 @@ class PlanOptions:
     count: int = 25
     seed: int = 0
     criterion: Criterion = "A"
-    noise: Noise = field(default_factory=Noise)
+    noise: MeasurementNoise = field(default_factory=MeasurementNoise)
     free_intrinsics: bool = True
     """The lens is calibrated from the same pictures."""
     view: ViewRange | None = None

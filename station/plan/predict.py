@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array
-from calibrate.handeye.information import Noise
+from calibrate.handeye.information import MeasurementNoise
 from calibrate.kinematics import forward
 from station.cell.limits import check_path
 from station.cell.plan import Plan, PlannedPose
@@ -47,7 +47,7 @@ class Advice:
 
 @dataclass(frozen=True)
 class AdviceOptions:
-    noise: Noise = field(default_factory=Noise)
+    noise: MeasurementNoise = field(default_factory=MeasurementNoise)
     free_intrinsics: bool = True
     view: ViewRange | None = None
     """None = by the lens and the board's size."""
@@ -66,7 +66,7 @@ def with_forecast(scene: Scene, plan: Plan) -> tuple[Plan, tuple[str, ...]]:
     cut = tuple(pose.name for pose, seen in zip(plan.poses, _whole(scene, flange), strict=True) if not seen)
     if all(pose.predicted_sigma_m is not None for pose in plan.poses):
         return plan, cut
-    expected = forecast_views(scene, flange, Noise())
+    expected = forecast_views(scene, flange, MeasurementNoise())
     poses = tuple(
         msgspec.structs.replace(pose, predicted_sigma_m=after.sigma_m)
         for pose, after in zip(plan.poses, expected, strict=True)
@@ -75,7 +75,7 @@ def with_forecast(scene: Scene, plan: Plan) -> tuple[Plan, tuple[str, ...]]:
 
 
 def forecast_views(
-    scene: Scene, base_from_flange: Array, noise: Noise, free_intrinsics: bool = True
+    scene: Scene, base_from_flange: Array, noise: MeasurementNoise, free_intrinsics: bool = True
 ) -> list[Forecast]:
     """Expected sigma after each of the views taken from these flange poses (n, 4, 4).
 

@@ -19,7 +19,7 @@ from calibrate.files.calibration import Calibration, read_calibration
 from calibrate.files.install import load_installed
 from calibrate.geometry import pose_from_rotvec
 from calibrate.kinematics import forward
-from calibrate.views import ImageView
+from calibrate.views import BoardView
 from recordings.schema.messages import Vector6
 from station.analysis.worker import sight
 from station.cell.config import PointerConfig
@@ -57,7 +57,7 @@ class HoverRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 class _Look:
     """The board as last seen."""
 
-    view: ImageView
+    view: BoardView
     place: str
     """Which calibration it was seen by."""
     at_s: float
@@ -168,7 +168,7 @@ class HoverDesk:
             raise RefusedError(f"{reason}: jog the arm or lay the board so that the camera sees it whole")
         flange = flange_pose(state, bench.cell.robot.identity.tcp_offset)
         points = board_points(board)[sighting.indices]
-        view = ImageView(0, "verification", flange, points, sighting.pixels)
+        view = BoardView(0, "verification", flange, points, sighting.pixels)
         self._look = _Look(view, place, time.monotonic())
         return self._look
 

@@ -12,7 +12,7 @@ from calibrate.geometry import Array, difference, perturb, pose, random_rotation
 from calibrate.handeye.solution import Solution
 from calibrate.lens.pnp import solve_pnp
 from calibrate.projection import project_pixels
-from calibrate.views import ImageView, ViewSet
+from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import CameraModel, Mount
 
 __all__ = [
@@ -126,7 +126,7 @@ def nudged(views: ViewSet, places: list[int], deltas: Array) -> ViewSet:
 
 def changed(views: ViewSet, places: list[int], **fields) -> ViewSet:  # type: ignore[no-untyped-def]
     """The views, at these places with fields replaced by functions of the old view."""
-    out: list[ImageView] = list(views.views)
+    out: list[BoardView] = list(views.views)
     for i in places:
         out[i] = replace(out[i], **{name: make(out[i]) for name, make in fields.items()})
     return replace(views, views=tuple(out))

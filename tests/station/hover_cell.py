@@ -18,7 +18,7 @@ from calibrate.files.calibration import (
 )
 from calibrate.geometry import Array, Transform, inverse, perturb
 from calibrate.lens.model import project
-from calibrate.views import ImageView
+from calibrate.views import BoardView
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.cell.config import PointerConfig
 from station.simulation.cell import CellTruth
@@ -79,7 +79,7 @@ def seen_from(
     base_from_board: Array,
     rng: np.random.Generator | None = None,
     told: Array | None = None,
-) -> ImageView:
+) -> BoardView:
     """Corners of a board that lies there; noisy when `rng` is given. `told`: the pose the robot reports."""
     X = np.array(truth.camera_mount)
     base_from_camera = base_from_flange @ X if truth.mount == "eye-in-hand" else X
@@ -87,4 +87,4 @@ def seen_from(
     pixels = project(truth.camera, inverse(base_from_camera) @ base_from_board, points)
     if rng is not None:
         pixels = pixels + rng.normal(0, CORNER_PX, pixels.shape)
-    return ImageView(0, "now", base_from_flange if told is None else told, points, pixels)
+    return BoardView(0, "now", base_from_flange if told is None else told, points, pixels)

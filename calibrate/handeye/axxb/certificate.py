@@ -20,7 +20,7 @@ import numpy as np
 from scipy import sparse
 
 from calibrate.geometry import Array, project_to_rotation
-from calibrate.handeye.axxb.objective import Objective
+from calibrate.handeye.axxb.objective import QuadraticObjective
 
 TOLERANCE = 1e-6
 FLOOR = 1e-8
@@ -55,13 +55,13 @@ class Certificate:
 
 
 @dataclass(frozen=True, eq=False)
-class Proof:
+class CertifiedRotation:
     certificate: Certificate
     relaxed_rotation: Array
     """(3, 3) the relaxation's own minimiser, rounded: the global optimum wherever the relaxation is tight."""
 
 
-def certify(objective: Objective, problem: str = "") -> Proof:
+def certify(objective: QuadraticObjective, problem: str = "") -> CertifiedRotation:
     """Certify the centre of `objective` (recentred at the candidate, see `build_objective`)."""
     S = _in_candidate_frame(objective)
     scale = max(float(np.trace(S)), 1e-300)
@@ -85,10 +85,10 @@ def certify(objective: Objective, problem: str = "") -> Proof:
         problem=problem,
         pairs=objective.pairs,
     )
-    return Proof(certificate, project_to_rotation(moment[:9, 9].reshape(3, 3)) @ objective.R0)
+    return CertifiedRotation(certificate, project_to_rotation(moment[:9, 9].reshape(3, 3)) @ objective.R0)
 
 
-def _in_candidate_frame(objective: Objective) -> Array:
+def _in_candidate_frame(objective: QuadraticObjective) -> Array:
     """The reduced form in [vec Q; 1] with R = Q R0, so that the candidate is Q = I. (10, 10)"""
     T = np.eye(10)
     T[:9, :9] = np.kron(np.eye(3), objective.R0.T)

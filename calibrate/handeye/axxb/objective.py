@@ -21,7 +21,7 @@ _I3 = np.eye(3)
 
 
 @dataclass(frozen=True, eq=False)
-class Objective:
+class QuadraticObjective:
     """f(R, b) = Σ rotation error² + λ Σ translation error² (eq. 16)."""
 
     gram: Array
@@ -76,7 +76,7 @@ _REST = [0, 1, 2, 3, 4, 5, 6, 7, 8, 12]
 
 def build_objective(
     pairs: Pairs, form: Form = "chordal", weight: float = 1.0, centre: Array | None = None
-) -> Objective:
+) -> QuadraticObjective:
     """Collapse pairs into the quadratic form. `weight` is λ, rad²/m²; `centre` an X (4, 4) near the optimum,
     where one is known (default: Procrustes on the logarithms).
 
@@ -106,7 +106,7 @@ def build_objective(
     G[12, 12] += weight * (residual_t**2).sum()
     G[9:12, :9] = G[:9, 9:12].T
     G[12, :12] = G[:12, 12]
-    return Objective(G, R0, b0, len(pairs))
+    return QuadraticObjective(G, R0, b0, len(pairs))
 
 
 def _add_chordal(G: Array, R_A: Array, R_B: Array, R0: Array) -> None:

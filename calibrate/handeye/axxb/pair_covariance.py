@@ -9,14 +9,14 @@ from __future__ import annotations
 import numpy as np
 
 from calibrate.geometry import Array, skew
-from calibrate.handeye.axxb.objective import Objective
+from calibrate.handeye.axxb.objective import QuadraticObjective
 from calibrate.handeye.axxb.pairs import Pairs
 
 _FEWEST_VIEWS = 10
 """With fewer the scores do not span six directions: pairs then count as independent, variance times n/2."""
 
 
-def pair_covariance(objective: Objective, pairs: Pairs, X: Array) -> Array:
+def pair_covariance(objective: QuadraticObjective, pairs: Pairs, X: Array) -> Array:
     """(6, 6) of `geometry.perturb`'s delta at the optimum X of the chordal objective over `pairs`."""
     H_inverse = np.linalg.pinv(objective.curvature(X), hermitian=True)
     views, first = np.unique(np.concatenate([pairs.first, pairs.second]), return_inverse=True)

@@ -8,7 +8,7 @@ import numpy as np
 
 from calibrate.geometry import Array, pose
 from calibrate.handeye.axxb.evolution import Evaluate, EvolutionSettings, evolve, rotations_from_vectors
-from calibrate.handeye.axxb.objective import Objective, build_objective
+from calibrate.handeye.axxb.objective import QuadraticObjective, build_objective
 from calibrate.handeye.axxb.pairs import Pairs
 
 BOX = np.array([np.pi / 2] * 3 + [1.0] * 3)
@@ -27,7 +27,7 @@ class PaperResult:
     vector: Array
     """(6,) [γ; b] (eq. 15)"""
     value: float
-    objective: Objective
+    objective: QuadraticObjective
     on_box: tuple[str, ...]
     """Components on the box: the true camera is probably outside it."""
 
@@ -48,11 +48,11 @@ def on_box(vector: Array) -> tuple[str, ...]:
     )
 
 
-def paper_evaluate(objective: Objective) -> Evaluate:
+def paper_evaluate(objective: QuadraticObjective) -> Evaluate:
     """Candidates [γ; b] (m, 6) → f (m,) on the collapsed form, in a dozen array operations.
 
     With the unit quaternion q of γ, vec R is linear in the 16 products of q's entries; so the recentred
-    variables of `Objective` are linear in [q ⊗ q; b; 1].
+    variables of `QuadraticObjective` are linear in [q ⊗ q; b; 1].
     """
     to_centred = np.zeros((20, 13))
     to_centred[:16, :9] = _PRODUCTS_TO_ROTATION

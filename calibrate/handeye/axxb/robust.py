@@ -18,7 +18,7 @@ from calibrate.handeye.axxb.evolution import (
     rotations_from_quaternions,
     rotations_from_vectors,
 )
-from calibrate.handeye.axxb.objective import Objective, build_objective
+from calibrate.handeye.axxb.objective import QuadraticObjective, build_objective
 from calibrate.handeye.axxb.pairs import Pairs
 
 SETTINGS = EvolutionSettings(population=30, generations=40)
@@ -33,7 +33,7 @@ _GENERATORS = skew(np.eye(3))
 class GlobalResult:
     X: Array
     """(4, 4)"""
-    objective: Objective
+    objective: QuadraticObjective
     """Recentred at X."""
     certificate: Certificate
 
@@ -61,7 +61,7 @@ def solve_global(pairs: Pairs, seed: int, problem: str = "") -> GlobalResult:
     return GlobalResult(X, centred, replace(proof.certificate, restarts=restarts))
 
 
-def _evolve_rotations(objective: Objective, rng: np.random.Generator) -> Array:
+def _evolve_rotations(objective: QuadraticObjective, rng: np.random.Generator) -> Array:
     """Last generation over quaternions (M, 3, 3)."""
     S, centre = objective.reduced(), objective.R0.reshape(9)
 
@@ -74,13 +74,13 @@ def _evolve_rotations(objective: Objective, rng: np.random.Generator) -> Array:
     return rotations_from_quaternions(evolved.population)
 
 
-def _best_of(objective: Objective, starts: Array) -> tuple[Array, float]:
+def _best_of(objective: QuadraticObjective, starts: Array) -> tuple[Array, float]:
     R, values = polish(objective, starts)
     best = int(np.argmin(values))
     return R[best], float(values[best])
 
 
-def polish(objective: Objective, R: Array) -> tuple[Array, Array]:
+def polish(objective: QuadraticObjective, R: Array) -> tuple[Array, Array]:
     """Damped Newton on SO(3) for many rotations at once, (m, 3, 3) → minima (m, 3, 3) and values (m,).
 
     With R ← Exp(δ) R, Γ = ½ ∂f/∂R and P the derivative of vec R, half the Hessian is

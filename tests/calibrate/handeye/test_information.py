@@ -7,7 +7,7 @@ import pytest
 
 from calibrate.boards.model import board_points
 from calibrate.geometry import inverse, perturb, pose, random_rotation, rotation_exp, transform_points
-from calibrate.handeye.information import Noise, covariance_of, prior_information, view_information
+from calibrate.handeye.information import MeasurementNoise, covariance_of, prior_information, view_information
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.projection import intrinsics_vector, project, with_intrinsics_vector
@@ -19,7 +19,7 @@ LENS = CameraModel(
     1280, 1024, ((1667.0, 0, 640), (0, 1660.0, 512), (0, 0, 1)), (-0.1, 0.12, 1e-3, -5e-4, 0.02)
 )
 PRIOR = prior_information(LENS, True, BoardTolerance())
-NOISE = Noise(0.2, 3e-4, 5e-4)
+NOISE = MeasurementNoise(0.2, 3e-4, 5e-4)
 
 
 def scene(mount, n=12, seed=3):
@@ -40,7 +40,7 @@ def test_the_predicted_sigma_is_the_one_that_the_solver_states(mount):
     """25 views of a simulated cell: their geometry alone says what the estimate will claim."""
     cell = make_cell(np.random.default_rng(4), 25, MID, mount=mount)
     solution = solve_views(cell.views, SolveOptions(holdout=False, folds=False))
-    noise = Noise(MID.corner_px, MID.robot_m, MID.robot_rad)
+    noise = MeasurementNoise(MID.corner_px, MID.robot_m, MID.robot_rad)
     points = cell.views.views[0].board_points
     each = view_information(mount, cell.camera, cell.flange, cell.X, cell.Y, points, noise)
     prior = prior_information(cell.camera, True, BoardTolerance())
@@ -67,7 +67,7 @@ def test_information_is_that_of_finite_differences(mount):
 
     h = 1e-6
     J = np.stack([(pixels(d) - pixels(-d)) / (2 * h) for d in h * np.eye(26)], axis=1)
-    found = view_information(mount, LENS, E, X, Y, BOARD, Noise(0.5, 0.0, 0.0))[0]
+    found = view_information(mount, LENS, E, X, Y, BOARD, MeasurementNoise(0.5, 0.0, 0.0))[0]
     scale = np.linalg.norm(J, axis=0) / 0.5
     np.testing.assert_allclose(
         found / np.outer(scale, scale), J.T @ J / 0.25 / np.outer(scale, scale), atol=1e-5
@@ -79,7 +79,8 @@ def test_more_views_never_hurt_and_robot_noise_always_does():
     each = view_information("eye-in-hand", LENS, E, X, Y, BOARD, NOISE).cumsum(axis=0)
     spread = np.trace(covariance_of(each[4:], PRIOR)[:, :6, :6], axis1=1, axis2=2)
     assert (np.diff(spread) < 0).all()
-    worse = view_information("eye-in-hand", LENS, E, X, Y, BOARD, Noise(0.2, 1e-3, 2e-3)).sum(axis=0)
+    noisier = MeasurementNoise(0.2, 1e-3, 2e-3)
+    worse = view_information("eye-in-hand", LENS, E, X, Y, BOARD, noisier).sum(axis=0)
     assert (np.diag(covariance_of(worse, PRIOR)) > np.diag(covariance_of(each[-1], PRIOR))).all()
 
 

@@ -21,7 +21,7 @@ from calibrate.geometry import (
     rotation_exp,
 )
 from calibrate.handeye.solve import SolveOptions, solve_views
-from calibrate.views import ImageView, ViewSet
+from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import CameraModel
 from tests.calibrate.cells import LOW, MID, error_mm_deg, exact_motions, make_cell, with_flange
 
@@ -35,7 +35,7 @@ def poses_only(H: Array, C: Array, mount="eye-in-hand") -> ViewSet:
     return ViewSet(
         mount,
         tuple(
-            ImageView(i, f"v{i}", F, *empty, None, c) for i, (F, c) in enumerate(zip(flange, C, strict=True))
+            BoardView(i, f"v{i}", F, *empty, None, c) for i, (F, c) in enumerate(zip(flange, C, strict=True))
         ),
         CameraModel(640, 480, ((600.0, 0.0, 320.0), (0.0, 600.0, 240.0), (0.0, 0.0, 1.0)), (0.0,) * 5),
     )

@@ -12,7 +12,7 @@ from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import Array, pose, rotation_exp
 from calibrate.lens.intrinsics import LensModel, calibrate_intrinsics
 from calibrate.lens.model import project, undistort
-from calibrate.views import ImageView, ViewSet
+from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import CameraModel
 from tests.calibrate.sessions import CAMERA, PAPER_BOARD, looking
 
@@ -25,7 +25,7 @@ def views_of(camera: CameraModel, poses: list[Array], noise_px: float = 0.1, see
     rng = np.random.default_rng(seed)
     points = board_points(PAPER_BOARD)
     found = tuple(
-        ImageView(
+        BoardView(
             k,
             f"view-{k}",
             np.eye(4),

@@ -20,7 +20,7 @@ from calibrate.geometry import (
 from calibrate.lens.orientation import choose_candidates
 from calibrate.lens.pnp import candidate_poses, solve_pnp
 from calibrate.projection import project_pixels
-from calibrate.views import ImageView, ViewSet
+from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
 from tests.calibrate.sessions import looking
 
@@ -94,7 +94,7 @@ def test_pictures_counted_from_different_corners_are_counted_alike(mount: Mount)
     points = board_points(FOUR_WAYS)
     turns = [k % 4 for k in range(8)]
     views = [
-        ImageView(k, str(k), F, points, project_pixels(CAMERA, _moved(C, _turned(turn, points))))
+        BoardView(k, str(k), F, points, project_pixels(CAMERA, _moved(C, _turned(turn, points))))
         for k, (C, F, turn) in enumerate(zip(seen, flanges, turns, strict=True))
     ]
     solved = solve_pnp(ViewSet(mount, tuple(views), CAMERA), FOUR_WAYS)
@@ -116,7 +116,7 @@ def test_one_sure_picture_does_not_decide_for_the_doubtful_ones() -> None:
         far = len(views) >= 8
         C = looking(MARKED, rng, (0.1, 0.25) if far else (0.3, 0.6), 4.0 if far else 0.4, np.pi)
         pixels = project_pixels(CAMERA, _moved(C, points)) + rng.normal(size=(len(points), 2)) * 0.3
-        view = ImageView(len(views), "", P @ inverse(X @ C), points, pixels)
+        view = BoardView(len(views), "", P @ inverse(X @ C), points, pixels)
         readings = [found.camera_from_board for found in candidate_poses(view, CAMERA, MARKED)]
         off = [float(rotation_angle(found[:3, :3].T @ C[:3, :3])) for found in readings]
         if far and not (len(off) == 2 and off[0] > 0.15 > 3 * off[1]):

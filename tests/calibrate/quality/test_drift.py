@@ -19,7 +19,7 @@ from calibrate.lens.pnp import solve_pnp
 from calibrate.pipeline import SolvedRecording
 from calibrate.quality.checks import CheckEntry, append_check, earlier_text, read_checks, trend_text
 from calibrate.quality.drift import POWER, DriftCheck, Noise, judge_shift, pnp_covariance, powers
-from calibrate.views import ImageView, ViewSet
+from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import CameraModel, Mount
 from tests.calibrate.sessions import PAPER_BOARD, X_TRUE, looking
 
@@ -37,7 +37,7 @@ def few_views(rng: np.random.Generator, X: Array, count: int = 5, mount: Mount =
         flange = BOARD @ inverse(X @ seen) if mount == "eye-in-hand" else X @ seen @ inverse(BOARD)
         error = np.r_[rng.normal(size=3) * NOISE.robot_m, rng.normal(size=3) * NOISE.robot_rad]
         pixels = project(CAMERA, seen, board_points(PAPER_BOARD)) + rng.normal(size=(42, 2)) * NOISE.corner_px
-        found.append(ImageView(k, str(k), perturb(flange, error), board_points(PAPER_BOARD), pixels))
+        found.append(BoardView(k, str(k), perturb(flange, error), board_points(PAPER_BOARD), pixels))
     return solve_pnp(ViewSet(mount, tuple(found), CAMERA))
 
 
@@ -214,7 +214,7 @@ def test_the_pose_covariance_is_that_of_many_repetitions() -> None:
     exact = project(CAMERA, seen, points)
     errors = []
     for _ in range(300):
-        view = ImageView(0, "", np.eye(4), points, exact + rng.normal(size=exact.shape) * 0.1)
+        view = BoardView(0, "", np.eye(4), points, exact + rng.normal(size=exact.shape) * 0.1)
         got = solve_pnp(ViewSet("eye-in-hand", (view,), CAMERA)).camera_from_board[0]
         errors.append(np.r_[got[:3, 3] - seen[:3, 3]])
     measured = np.cov(np.array(errors).T)

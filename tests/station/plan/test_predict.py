@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.handeye.information import Noise
+from calibrate.handeye.information import MeasurementNoise
 from calibrate.kinematics import forward
 from station.analysis.estimation import next_best_text
 from station.cell.config import CaptureConfig
@@ -52,9 +52,9 @@ def test_a_pose_that_cuts_the_board_is_named_and_expected_to_bring_nothing():
 
 def test_a_known_lens_and_less_noise_make_it_better():
     scene, _, flange = world()
-    usual = forecast_views(scene, flange, Noise())[-1].sigma_m
-    assert forecast_views(scene, flange, Noise(), free_intrinsics=False)[-1].sigma_m < usual
-    half = Noise(0.075, 5e-5, 8.5e-5)
+    usual = forecast_views(scene, flange, MeasurementNoise())[-1].sigma_m
+    assert forecast_views(scene, flange, MeasurementNoise(), free_intrinsics=False)[-1].sigma_m < usual
+    half = MeasurementNoise(0.075, 5e-5, 8.5e-5)
     assert forecast_views(scene, flange, half)[-1].sigma_m == pytest.approx(usual / 2, rel=0.05)
 
 
@@ -74,7 +74,7 @@ def test_the_next_best_pose_helps_and_is_free_to_reach():
     assert advice.next_pose is not None
     assert check_path(scene.geometry, here, advice.next_pose.joints_rad).problems == ()
     more = np.concatenate([flange[:8], forward(scene.geometry.model, advice.next_pose.joints_rad)[None]])
-    found = forecast_views(scene, more, Noise())[-1].sigma_m
+    found = forecast_views(scene, more, MeasurementNoise())[-1].sigma_m
     assert found < advice.now.sigma_m
     assert found == pytest.approx(advice.next_pose.predicted_sigma_m, rel=1e-6)
     assert advice.poses_missing is not None and 1 < advice.poses_missing < 25

@@ -21,6 +21,14 @@ DECLARE_AGAIN_BYTES = 16 * 1024 * 1024
 """What lies between two copies of the declarations: a scan that lost one meets the next."""
 LIBRARY = "calibration-station"
 _LARGE_BYTES = 32 * 1024
+_MESSAGE = struct.Struct("<BQHIQQ")
+_CHUNK = struct.Struct("<BQQQQIIQ")
+"""A chunk's record without compression, up to its records."""
+_CHUNK_INDEX_END = struct.Struct("<QIQQ")
+_MESSAGE_INDEX = struct.Struct("<BQHI")
+_PLACE = struct.Struct("<HQ")
+_MESSAGE_OPCODE, _CHUNK_OPCODE = int(Opcode.MESSAGE), int(Opcode.CHUNK)
+_MESSAGE_INDEX_OPCODE = int(Opcode.MESSAGE_INDEX)
 Piece = bytes | bytearray | memoryview
 
 
@@ -79,13 +87,9 @@ class McapFile:
         """
         if self._declared_at is None or self.size_bytes - self._declared_at > DECLARE_AGAIN_BYTES:
             self._declare()
-        length = MESSAGE_HEAD.size + sum(map(len, pieces))
-        self._chunk.note(channel, time_ns)
-        head = RECORD_HEAD.pack(Opcode.MESSAGE, length)
-        self._chunk.add(head + MESSAGE_HEAD.pack(channel, sequence & 0xFFFFFFFF, time_ns, time_ns))
-        for piece in pieces:
-            self._chunk.add(piece)
-        if self._chunk.size_bytes > CHUNK_BYTES and not more:
+        chunk = self._chunk
+        chunk.message(channel, pieces, time_ns, sequence & 0xFFFFFFFF)
+        if chunk.size_bytes > CHUNK_BYTES and not more:
             self.end_chunk()
 
     def _declare(self) -> None:
@@ -117,27 +121,32 @@ class McapFile:
 
     def end_chunk(self) -> None:
         """Hands the open chunk to the operating system, with the indexes of its messages."""
-        chunk, self._chunk = self._chunk, _Chunk()
-        if not chunk.pieces:
+        chunk = self._chunk
+        if not chunk.size_bytes:
             return
-        start, crc = self.size_bytes, chunk.crc()
-        head = chunk.head(crc)
-        index_start = start + len(head) + chunk.size_bytes
+        self._chunk = _Chunk()
+        start, size, crc, pieces = self.size_bytes, chunk.size_bytes, 0, chunk.pieces()
+        for piece in pieces:
+            crc = checksum.crc32(piece, crc)
+        first, last = chunk.span_ns
+        head = _CHUNK.pack(
+            *(_CHUNK_OPCODE, _CHUNK.size - RECORD_HEAD.size + size, first, last, size, crc, 0, size)
+        )
+        index_start = start + len(head) + size
         places, index = b"", b""
         for channel, entries in chunk.entries.items():
-            self._per_channel[channel] = self._per_channel.get(channel, 0) + len(entries)
-            places += struct.pack("<HQ", channel, index_start + len(index))
-            packed = b"".join(struct.pack("<QQ", *entry) for entry in entries)
-            index += _record(Opcode.MESSAGE_INDEX, struct.pack("<H", channel) + _sized(packed))
-        file_crc = checksum.joined_crc(checksum.crc32(head, self._crc), crc, chunk.size_bytes)
-        self._put([head, *chunk.pieces, index], checksum.crc32(index, file_crc))
-        first, last = chunk.span_ns
+            self._per_channel[channel] = self._per_channel.get(channel, 0) + len(entries) // 2
+            places += _PLACE.pack(channel, index_start + len(index))
+            length = 8 * len(entries)
+            index += _MESSAGE_INDEX.pack(_MESSAGE_INDEX_OPCODE, 6 + length, channel, length)
+            index += struct.pack(f"<{len(entries)}Q", *entries)
+        file_crc = checksum.joined_crc(checksum.crc32(head, self._crc), crc, size)
+        self._put([head, *pieces, index], checksum.crc32(index, file_crc))
         if chunk.entries:
             earliest, latest = self._span_ns or (first, last)
             self._span_ns = (min(earliest, first), max(latest, last))
         content = struct.pack("<QQQQ", first, last, start, index_start - start) + _sized(places)
-        content += struct.pack("<Q", len(index)) + _text("")
-        content += struct.pack("<QQ", chunk.size_bytes, chunk.size_bytes)
+        content += _CHUNK_INDEX_END.pack(len(index), 0, size, size)
         self._indexes.append(_record(Opcode.CHUNK_INDEX, content))
         self._counts["chunks"] += 1
 
@@ -174,59 +183,77 @@ class McapFile:
 
     def _put(self, pieces: Sequence[Piece], crc: int | None = None) -> None:
         """Everything, however often the kernel takes only a part. `crc`: the file's so far, when known."""
-        rest = [memoryview(piece) for piece in pieces if len(piece)]
         if crc is None:
             crc = self._crc
-            for piece in rest:
+            for piece in pieces:
                 crc = checksum.crc32(piece, crc)
         self._crc = crc
+        done = os.writev(self.descriptor, pieces)
+        self.size_bytes += done
+        if done < sum(map(len, pieces)):
+            self._put_rest([memoryview(piece) for piece in pieces], done)
+
+    def _put_rest(self, rest: list[memoryview], done: int) -> None:
+        """`done`: bytes of it that the kernel has."""
         while rest:
-            done = os.writev(self.descriptor, rest)
-            self.size_bytes += done
             while rest and done >= len(rest[0]):
                 done -= len(rest.pop(0))
-            if done:
+            if rest:
                 rest[0] = rest[0][done:]
+                done = os.writev(self.descriptor, rest)
+                self.size_bytes += done
 
 
 class _Chunk:
-    """Records on their way: small ones gathered, large pieces referred to."""
+    """Records on their way: small ones gathered in one buffer, large pieces referred to."""
+
+    __slots__ = ("_buffer", "_large", "entries", "size_bytes", "span_ns")
 
     def __init__(self) -> None:
-        self.pieces: list[Piece] = []
         self.size_bytes = 0
-        self.entries: dict[int, list[tuple[int, int]]] = {}
-        """Channel → (time, offset) of its messages."""
+        self.span_ns = (0, 0)
+        self.entries: dict[int, list[int]] = {}
+        """Channel → time, offset, time, offset … of its messages."""
+        self._buffer = bytearray()
+        self._large: list[tuple[int, Piece]] = []
+        """(where in the buffer it belongs, piece)."""
 
-    def add(self, piece: Piece) -> None:
-        self.size_bytes += len(piece)
-        if len(piece) >= _LARGE_BYTES:
-            self.pieces.append(piece)
-        elif self.pieces and isinstance(self.pieces[-1], bytearray):
-            self.pieces[-1] += piece
-        else:
-            self.pieces.append(bytearray(piece))
+    def add(self, record: bytes) -> None:
+        self.size_bytes += len(record)
+        self._buffer += record
 
-    def note(self, channel: int, time_ns: int) -> None:
-        """A message starts here."""
-        self.entries.setdefault(channel, []).append((time_ns, self.size_bytes))
+    def message(self, channel: int, pieces: Sequence[Piece], time_ns: int, sequence: int) -> None:
+        first, last = self.span_ns if self.entries else (time_ns, time_ns)
+        if not first < time_ns < last:
+            self.span_ns = (min(first, time_ns), max(last, time_ns))
+        entries = self.entries.get(channel)
+        if entries is None:
+            entries = self.entries[channel] = []
+        entries += (time_ns, self.size_bytes)
+        length = MESSAGE_HEAD.size
+        for piece in pieces:
+            length += len(piece)
+        buffer = self._buffer
+        buffer += _MESSAGE.pack(_MESSAGE_OPCODE, length, channel, sequence, time_ns, time_ns)
+        for piece in pieces:
+            if len(piece) >= _LARGE_BYTES:
+                self._large.append((len(buffer), piece))
+            else:
+                buffer += piece
+        self.size_bytes += RECORD_HEAD.size + length
 
-    @property
-    def span_ns(self) -> tuple[int, int]:
-        times = [time_ns for entries in self.entries.values() for time_ns, _ in entries]
-        return (min(times), max(times)) if times else (0, 0)
-
-    def crc(self) -> int:
-        crc = 0
-        for piece in self.pieces:
-            crc = checksum.crc32(piece, crc)
-        return crc
-
-    def head(self, crc: int) -> bytes:
-        """The chunk record up to its records."""
-        content = struct.pack("<QQQI", *self.span_ns, self.size_bytes, crc) + _text("")
-        content += struct.pack("<Q", self.size_bytes)
-        return RECORD_HEAD.pack(Opcode.CHUNK, len(content) + self.size_bytes) + content
+    def pieces(self) -> list[Piece]:
+        """Everything in its order; nothing may be added from now on."""
+        small, start = memoryview(self._buffer), 0
+        found: list[Piece] = []
+        for end, piece in self._large:
+            if end > start:
+                found.append(small[start:end])
+            found.append(piece)
+            start = end
+        if len(small) > start:
+            found.append(small[start:])
+        return found
 
 
 def _record(opcode: int, content: bytes) -> bytes:

@@ -12,8 +12,8 @@ import time
 from collections import deque
 from collections.abc import Callable
 from concurrent.futures import Future
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,8 +40,7 @@ _STATE_BYTES = 400
 _SMALL_BYTES = 1000
 
 
-@dataclass(frozen=True)
-class _Item:
+class _Item(NamedTuple):
     write: Callable[[], object]
     size_bytes: int
     done: Future[None] | None = None
@@ -215,9 +214,9 @@ class Recorder:
 
     def _work(self) -> None:
         flushed_s = synced_s = self._clock()
-        while (item := self._next()) is not None or not self._ended:
-            if item is not None:
-                self._write(item)
+        while (items := self._next()) or not self._ended:
+            if items:
+                self._write(items)
             now_s = self._clock()
             if now_s - synced_s >= SYNC_PERIOD_S:
                 self._writer.begin_sync()
@@ -228,23 +227,30 @@ class Recorder:
         if self._finished is not None and not self._finished.done():
             self._finished.set_result(self._writer.finish())
 
-    def _next(self) -> _Item | None:
-        """The oldest item; None when there is none for a flush period, or when there will be no more."""
+    def _next(self) -> list[_Item]:
+        """The oldest items: states up to the first thing that is none, which may be large or waited for.
+
+        Empty when there are none for a flush period, or when there will be no more.
+        """
+        items: list[_Item] = []
         with self._wake:
             if not self._queue and not self._ended:
                 self._wake.wait(FLUSH_PERIOD_S)
-            if not self._queue:
-                return None
-            item = self._queue.popleft()
-            self._queued_bytes -= item.size_bytes
-            return item
+            while self._queue:
+                item = self._queue.popleft()
+                self._queued_bytes -= item.size_bytes
+                items.append(item)
+                if item.size_bytes != _STATE_BYTES:
+                    break
+        return items
 
-    def _write(self, item: _Item) -> None:
-        self._awaited = item.done
-        item.write()
-        if item.done is not None:
+    def _write(self, items: list[_Item]) -> None:
+        self._awaited = items[-1].done
+        for item in items:
+            item.write()
+        if self._awaited is not None:
             self._writer.sync()
-            item.done.set_result(None)
+            self._awaited.set_result(None)
         self._awaited = None
 
     def _fail(self, error: RecordingError) -> None:

@@ -11,6 +11,7 @@ import os
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -70,8 +71,7 @@ class RecordingWriter:
         self.error: RecordingError | None = None
         self._lossless_png = lossless_png
         self._start_ns = info.created_wall_ns or time.time_ns()
-        self._channels: dict[Topic, int] = {}
-        self._sequences: dict[Topic, int] = {}
+        self._channels: dict[Topic, _Channel] = {}
         self._pictures: dict[int, int] = {}
         """Sequence → time in the file."""
         self._shown_ns = 0
@@ -265,35 +265,52 @@ class RecordingWriter:
     def _add(
         self, topic: Topic, pieces: list[Piece], time_ns: int, sequence: int | None = None, more: bool = False
     ) -> None:
+        channel = self._channels.get(topic) or self._channel(topic)
         if sequence is None:
-            sequence = self._sequences.get(topic, 0)
-            self._sequences[topic] = sequence + 1
-        with self._disk():
-            self._file.message(self._channel(topic), pieces, time_ns, sequence, more=more)
+            sequence = channel.messages
+            channel.messages += 1
+        self._check_usable()
+        try:
+            self._file.message(channel.number, pieces, time_ns, sequence, more=more)
+        except OSError as error:
+            raise self._failed(error) from error
 
-    def _channel(self, topic: Topic) -> int:
+    def _channel(self, topic: Topic) -> _Channel:
         if topic not in self._channels:
             schema = (schema_name(topic), "protobuf", schema_bytes(topic))
-            self._channels[topic] = self._file.register(topic.value, "protobuf", schema)
+            self._channels[topic] = _Channel(self._file.register(topic.value, "protobuf", schema))
         return self._channels[topic]
 
     @contextmanager
     def _disk(self) -> Iterator[None]:
         """Around everything that writes: refuses after an error, and makes the first error the last."""
+        self._check_usable()
+        try:
+            yield
+        except OSError as error:
+            raise self._failed(error) from error
+
+    def _check_usable(self) -> None:
         if self.error is not None:
             raise self.error
         if self._file.closed:
             raise RecordingError(f"{self.path} is closed")
-        try:
-            yield
-        except OSError as error:
-            # A writer that failed once cannot be trusted again: what it holds in memory is thrown away.
-            self.error = RecordingError(
-                f"writing {self.part_path} failed ({error.strerror}); everything synced before is safe. "
-                f"Free space or replace the disk, then: {recover_line(self.part_path)}"
-            )
-            self._file.close()
-            raise self.error from error
+
+    def _failed(self, error: OSError) -> RecordingError:
+        """A writer that failed once cannot be trusted again: what it holds in memory is thrown away."""
+        self.error = RecordingError(
+            f"writing {self.part_path} failed ({error.strerror}); everything synced before is safe. "
+            f"Free space or replace the disk, then: {recover_line(self.part_path)}"
+        )
+        self._file.close()
+        return self.error
+
+
+@dataclass(slots=True)
+class _Channel:
+    number: int
+    messages: int = 0
+    """Written so far, where the caller does not number them."""
 
 
 @contextmanager

@@ -72,7 +72,8 @@ class Recorder:
         self._queue: deque[_Item] = deque()
         self._queued_bytes = 0
         self._dropped_pictures: set[int] = set()
-        self._wake = threading.Condition()
+        self._lock = threading.RLock()
+        self._wake = threading.Condition(self._lock)
         self._awaited: Future[None] | None = None
         """Of the item that is being written."""
         self._finished: Future[Path] | None = None
@@ -150,7 +151,7 @@ class Recorder:
 
     def finish(self) -> Future[Path]:
         """Seals the file after all that was handed over before; the future is its path. Idempotent."""
-        with self._wake:
+        with self._lock:
             if self._finished is None:
                 self._finished = Future()
                 self._finished.set_running_or_notify_cancel()
@@ -164,19 +165,19 @@ class Recorder:
 
     def close(self) -> None:
         """Stops the thread without sealing, after what is queued; the `.part` file stays. Idempotent."""
-        with self._wake:
+        with self._lock:
             self._closing = True
             self._wake.notify()
         self._thread.join()
 
     def _offer(self, write: Callable[[], object], size_bytes: int) -> bool:
-        with self._wake:
+        with self._lock:
+            if self._ended:
+                return False
             full = (
                 self._queued_bytes + size_bytes > self._queue_limit_bytes
                 or len(self._queue) >= QUEUE_LIMIT_MESSAGES
             )
-            if self._ended:
-                return False
             if full or self.error is not None:
                 self.dropped += 1
                 return False
@@ -186,7 +187,7 @@ class Recorder:
             return True
 
     def _put(self, item: _Item) -> None:
-        with self._wake:
+        with self._lock:
             if self.error is not None:
                 raise self.error
             if self._ended:
@@ -233,7 +234,7 @@ class Recorder:
         Empty when there are none for a flush period, or when there will be no more.
         """
         items: list[_Item] = []
-        with self._wake:
+        with self._lock:
             if not self._queue and not self._ended:
                 self._wake.wait(FLUSH_PERIOD_S)
             while self._queue:
@@ -254,7 +255,7 @@ class Recorder:
         self._awaited = None
 
     def _fail(self, error: RecordingError) -> None:
-        with self._wake:
+        with self._lock:
             self.error = error
             futures = [self._awaited, *(item.done for item in self._queue)]
             self._queue.clear()

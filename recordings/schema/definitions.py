@@ -176,16 +176,22 @@ def encode_robot_state(state: RobotState) -> bytes:
 def _to_proto(value: msgspec.Struct) -> Any:
     struct = type(value)
     arguments: dict[str, Any] = {}
-    for field in _PLAN[struct]:
-        content = getattr(value, field.name)
-        if content is None:
-            continue
-        if field.kind == "message":
-            content = _to_proto(content)
-        elif field.kind == "matrix":
-            content = [number for row in content for number in row]
-        arguments[field.name] = content
+    for name, convert in _CONVERSIONS[struct]:
+        content = getattr(value, name)
+        if content is not None:
+            arguments[name] = content if convert is None else convert(content)
     return _CLASSES[struct](**arguments)
+
+
+def _flat(matrix: Any) -> list[float]:
+    return [number for row in matrix for number in row]
+
+
+_CONVERSIONS = {
+    struct: [(field.name, {"message": _to_proto, "matrix": _flat}.get(field.kind)) for field in fields]
+    for struct, fields in _PLAN.items()
+}
+"""Struct → its fields' names, and what turns their content into protobuf's."""
 
 
 def decode(struct: type[S], data: bytes) -> S:

@@ -124,7 +124,7 @@ def test_a_full_disk_behind_the_output_is_one_sentence_and_1(
     def full(_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("recordings.cli.print_info", full)
+    monkeypatch.setattr("recordings.cli.app.print_info", full)
     result = run("info", small)
     assert (result.returncode, result.stderr) == (1, "recordings: the output: No space left on device\n")
 

@@ -144,9 +144,18 @@ def plan_hover(
         refused = refused or check
     where = f"corner {corner} with the tip {1000 * standoff_m:.0f} mm above it"
     if refused is None:
-        raise LimitError(f"{where} is out of the arm's reach; choose another corner, or move the board")
+        raise LimitError(
+            f"{where} is out of the arm's reach",
+            code="corner-out-of-reach",
+            remedy="Choose another corner, or move the board.",
+            corner=corner,
+        )
     problems = "\n".join(str(problem) for problem in refused.problems[:4])
-    raise LimitError(f"no way to {where} is free; nothing moved. The shortest one:\n{problems}")
+    raise LimitError(
+        f"No path to {where} is free. Nothing moved; the shortest one:\n{problems}",
+        code="corner-path-blocked",
+        corner=corner,
+    )
 
 
 def hover_geometry(

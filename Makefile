@@ -13,8 +13,11 @@ help:  ## list the commands
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
 $(READY): pyproject.toml constraints.txt
+	@command -v $(PYTHON) >/dev/null || { echo "$(PYTHON) is missing. Debian, Ubuntu: apt install python3 python3-venv"; exit 2; }
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 		{ echo "python3 >= 3.11 is needed; $(PYTHON) is older. Set PYTHON=/path/to/python3.11"; exit 2; }
+	@$(PYTHON) -c 'import ensurepip' 2>/dev/null || \
+		{ echo "$(PYTHON) cannot make a venv. Debian, Ubuntu: apt install python3-venv"; exit 2; }
 	$(PYTHON) -m venv $(VENV_FLAGS) $(VENV)
 	@$(BIN)/python -m pip --disable-pip-version-check install --quiet -c constraints.txt -e '.[dev]'
 	@$(if $(SYSTEM_PYTHON),,echo "GenICam cameras: apt install python3-gi gir1.2-aravis-0.8, then rm -r $(VENV) and make again.")
@@ -86,7 +89,9 @@ install-files:  # the part of install that needs no network
 		install -D -m 644 systemd/station.env $(DESTDIR)$(SYSCONFDIR)/station/station.env
 	install -d $(DESTDIR)$(DOC) && install -m 644 docs/*.md $(DESTDIR)$(DOC)
 
-uninstall:  ## remove what install put there; configuration, recordings and calibrations stay
+uninstall:  ## stop the services and remove what install put there; configuration and data stay
+	$(if $(DESTDIR),,-systemctl disable --now station.service 'station-tui@.service' 2>/dev/null)
+	$(if $(DESTDIR),,-systemctl stop 'station-tui@*' 'calibrate@*' 2>/dev/null)
 	rm -rf $(DESTDIR)$(APP) $(DESTDIR)$(DOC)
 	rm -f $(addprefix $(DESTDIR)$(PREFIX)/bin/,station calibrate recordings)
 	rm -f $(addprefix $(DESTDIR)$(SYSCONFDIR)/systemd/system/,$(UNITS))

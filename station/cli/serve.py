@@ -56,7 +56,7 @@ def serve_command(
             "say what to serve, one of: --config FILE (a real cell), --simulate, --replay RECORDING"
         )
     require_choices(scene=scene, noise=noise, mount=mount)
-    logging.basicConfig(level=logging.INFO, format=_log_format(), stream=sys.stderr)
+    log_to_stderr()
     place = root or default_root()
     # What only one kind of cell needs is loaded only for it.
     if config is not None:
@@ -112,7 +112,20 @@ async def serve_cell(cell: Cell, root: Path, socket: Path, end_with_stdin: bool)
         cell.ended()
 
 
-def _log_format() -> str:
-    """The journal has its own clock."""
-    stamp = "" if "JOURNAL_STREAM" in os.environ else "%(asctime)s "
-    return f"{stamp}%(levelname)s %(name)s: %(message)s"
+class JournalFormatter(logging.Formatter):
+    """Lines with syslog's priority in front (sd-daemon(3)); the journal has its own clock."""
+
+    _PRIORITIES = ((logging.ERROR, 3), (logging.WARNING, 4), (logging.INFO, 6))
+
+    def format(self, record: logging.LogRecord) -> str:
+        priority = next((p for level, p in self._PRIORITIES if record.levelno >= level), 7)
+        return "\n".join(f"<{priority}>{line}" for line in super().format(record).splitlines())
+
+
+def log_to_stderr() -> None:
+    handler = logging.StreamHandler()
+    if "JOURNAL_STREAM" in os.environ:
+        handler.setFormatter(JournalFormatter("%(name)s: %(message)s"))
+    else:
+        handler.setFormatter(logging.Formatter("%(asctime)s %(levelname)s %(name)s: %(message)s"))
+    logging.basicConfig(level=logging.INFO, handlers=[handler])

@@ -7,14 +7,13 @@ daemon that was killed. CELL_TOLD: another truth, that the configuration is made
 from __future__ import annotations
 
 import asyncio
-import logging
 import os
 import sys
 from pathlib import Path
 
 import msgspec
 
-from station.cli.serve import serve_cell
+from station.cli.serve import log_to_stderr, serve_cell
 from station.devices.cell import Cell
 from station.devices.ur import UrRobot
 from station.simulation.camera import RenderedCamera
@@ -24,7 +23,7 @@ from station.simulation.scenes import cell_config
 
 def main() -> None:
     host, truth_file, root, socket = sys.argv[1:5]
-    logging.basicConfig(level=logging.INFO, stream=sys.stderr)
+    log_to_stderr()
     truth = read_truth(Path(truth_file))
     config = cell_config(read_truth(Path(os.environ.get("CELL_TOLD", truth_file))), host)
     capture = msgspec.structs.replace(config.capture, free_space_bytes=1)

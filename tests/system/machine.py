@@ -64,8 +64,12 @@ class Machine:
         (self.root / "etc/machine-id").touch()
         make = ["make", "-C", str(REPOSITORY), "install-files", f"DESTDIR={self.root}", f"PREFIX={PREFIX}"]
         subprocess.run(make, check=True, capture_output=True)
+        self.furnish_programs()
+
+    def furnish_programs(self) -> None:
+        """Stand-ins for the installed programs, which run this checkout."""
         programs = self.root / PREFIX.relative_to("/") / "bin"
-        programs.mkdir(parents=True)
+        programs.mkdir(parents=True, exist_ok=True)
         for name in ("station", "calibrate"):
             words = f'#!/bin/sh\nPYTHONPATH={CHECKOUT} exec {VENV}/bin/python -m {name}.cli "$@"\n'
             (programs / name).write_text(words)

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import importlib
+import os
 import sys
 from collections.abc import Mapping
-from typing import Any, NamedTuple, cast
+from typing import Annotated, Any, NamedTuple, cast
 
 import typer
 from typer.core import TyperCommand, TyperGroup
@@ -16,6 +17,15 @@ from recordings.errors import CodedError, printed
 from recordings.plain_text import plain_text
 
 _HELP_KEYS = {"help_option_names": ["-h", "--help"]}
+_EXTRAS = {
+    "distributed": "cluster",
+    "matplotlib": "report",
+    "rosbags": "ros",
+    "rtde_control": "station",
+    "serial": "station",
+    "textual": "station",
+}
+"""Packages that only some commands need, and the extra that brings each."""
 
 
 class LazyCommand(NamedTuple):
@@ -59,6 +69,7 @@ class LazyGroup(TyperGroup):
             no_args_is_help=True,
             rich_markup_mode="markdown",
             context_settings=_HELP_KEYS,
+            params=_group_options(),
         )
         self._lazy, self._aliases = commands, aliases
 
@@ -71,6 +82,29 @@ class LazyGroup(TyperGroup):
         return name, command.load(name), [_renamed(word, command.old_options) for word in rest]
 
 
+def _print_version(asked: bool) -> None:
+    if asked:
+        from importlib.metadata import version
+
+        print(version("calibration-station"))
+        raise typer.Exit
+
+
+def _options(
+    version: Annotated[
+        bool, typer.Option("--version", is_eager=True, callback=_print_version, help="Print the version.")
+    ] = False,
+) -> None:
+    pass
+
+
+def _group_options() -> list[Any]:
+    """`--version`, and the options that install a shell's completion."""
+    app = typer.Typer()
+    app.callback()(_options)
+    return list(get_command(app).params)
+
+
 def _renamed(word: str, old_options: Mapping[str, str]) -> str:
     option, equals, value = word.partition("=")
     return old_options.get(option, option) + equals + value
@@ -79,8 +113,19 @@ def _renamed(word: str, old_options: Mapping[str, str]) -> str:
 def run(name: str, group: LazyGroup) -> None:
     """Call a command line; what a person, a file or a device can cause ends in one line and an exit code."""
     print_what_it_can()
+    if f"_{name.upper()}_COMPLETE" in os.environ:
+        from typer import completion
+
+        completion.completion_init()  # type: ignore[attr-defined]
     try:
         group(prog_name=name)
+    except ModuleNotFoundError as missing:
+        package = (missing.name or "").partition(".")[0]
+        if package not in _EXTRAS:
+            raise
+        extra = f"pip install 'calibration-station[{_EXTRAS[package]}]'"
+        print(f"{name}: this command needs the package {package}: {extra}", file=sys.stderr)
+        sys.exit(2)
     except CodedError as problem:
         print(f"{name}: {printed(problem)}", file=sys.stderr)
         sys.exit(problem.exit_code)

@@ -1,0 +1,40 @@
+"""What every command line has beside its commands: version, completion, the extra that is missing."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from importlib.metadata import version
+
+import pytest
+
+
+def run(program: str, *arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-c", program, *arguments]
+    return subprocess.run(command, capture_output=True, text=True, env=os.environ | environment)
+
+
+@pytest.mark.parametrize("package", ["station"])
+def test_the_version_is_that_of_the_package(package: str) -> None:
+    done = run(f"from {package}.cli import main; main()", "--version")
+    assert (done.returncode, done.stdout) == (0, version("calibration-station") + "\n")
+
+
+@pytest.mark.parametrize(
+    ("words", "place", "found"), [("station cap", "1", "capture"), ("station capture --pl", "2", "--plan")]
+)
+def test_a_shell_completes_commands_and_options(words: str, place: str, found: str) -> None:
+    asked = {"_STATION_COMPLETE": "complete_bash", "COMP_WORDS": words, "COMP_CWORD": place}
+    assert run("from station.cli import main; main()", **asked).stdout.split() == [found]
+
+
+def test_a_missing_extra_is_named_in_one_line() -> None:
+    done = run(
+        "import sys; sys.modules['textual'] = None\n"
+        "from recordings.cli.lazy import LazyCommand, LazyGroup, run\n"
+        "sys.argv = ['x', 'screen']\n"
+        "run('x', LazyGroup({'screen': LazyCommand('textual.app:App', '')}, '', ''))"
+    )
+    assert done.returncode == 2
+    assert "calibration-station[station]" in done.stderr and len(done.stderr.splitlines()) == 1

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 import time
 from pathlib import Path
+from typing import Literal
 
 import msgspec
 
@@ -40,6 +41,21 @@ class SessionState(msgspec.Struct, frozen=True, omit_defaults=True):
     """A drift check of the installed calibration."""
     sealed: bool = False
     recording: str = ""
+
+
+class SessionSummary(msgspec.Struct, frozen=True):
+    """A session on the disk, for a list of them."""
+
+    name: str
+    folder: str
+    recording: str
+    """The file, or the folder where there are several; empty: nothing was recorded."""
+    source: Source | Literal[""]
+    views: int
+    bytes: int
+    sealed: bool
+    calibration: str
+    """Path of the file that was made of it; empty: none."""
 
 
 def default_root() -> Path:
@@ -107,8 +123,8 @@ def interrupted_session(root: Path) -> tuple[Path, SessionState] | None:
     return None if state is None or state.sealed else (folder, state)
 
 
-def list_sessions(root: Path) -> list[dict[str, object]]:
-    """The newest first, for the screen."""
+def list_sessions(root: Path) -> list[SessionSummary]:
+    """The newest sessions first."""
     try:
         folders = sorted((f for f in (root / "sessions").iterdir() if f.is_dir()), reverse=True)
     except OSError:
@@ -116,18 +132,17 @@ def list_sessions(root: Path) -> list[dict[str, object]]:
     return [_described(folder) for folder in folders[:_LISTED]]
 
 
-def _described(folder: Path) -> dict[str, object]:
+def _described(folder: Path) -> SessionSummary:
     state = read_state(folder)
     files = [*folder.glob("*.mcap"), *folder.glob(f"*.mcap{PART_SUFFIX}")]
-    sealed = bool(files) and not any(file.name.endswith(PART_SUFFIX) for file in files)
     calibration = folder / CALIBRATION_FILE
-    return {
-        "name": folder.name,
-        "folder": str(folder),
-        "recording": str(files[0] if len(files) == 1 else folder) if files else "",
-        "source": state.source if state else "",
-        "views": sum(pose.counts for pose in state.poses) if state else 0,
-        "bytes": sum(file.stat().st_size for file in files),
-        "sealed": sealed,
-        "calibration": str(calibration) if calibration.is_file() else "",
-    }
+    return SessionSummary(
+        name=folder.name,
+        folder=str(folder),
+        recording=str(files[0] if len(files) == 1 else folder) if files else "",
+        source=state.source if state else "",
+        views=sum(pose.counts for pose in state.poses) if state else 0,
+        bytes=sum(file.stat().st_size for file in files),
+        sealed=bool(files) and not any(file.name.endswith(PART_SUFFIX) for file in files),
+        calibration=str(calibration) if calibration.is_file() else "",
+    )

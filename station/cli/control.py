@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import shlex
 import sys
-from collections.abc import Awaitable, Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -18,8 +17,8 @@ from station.cell.socket_folder import default_socket
 from station.cell.status import StationState, StationStatus
 from station.cli.console import AsJson, Socket, out
 from station.protocol.client import Client, ask
-from station.protocol.messages import Verb
 from station.protocol.stop_client import stop_and_tell
+from station.protocol.verbs import Acknowledge, Doctor, Finish, Lease, Pause, Retake, Skip, Verb
 
 PoseNumber = Annotated[int, typer.Argument(min=1, help="Pose number, from 1.")]
 _MARKS = {
@@ -98,7 +97,7 @@ def acknowledge_command(socket: Socket = None) -> None:
 
     Next: `station resume` continues the session, `station finish` finishes it.
     """
-    ask(socket or default_socket(), "acknowledge")
+    ask(socket or default_socket(), Acknowledge())
     status = status_now(socket)
     _print_state(status)
     if status.state is StationState.PAUSED:
@@ -110,7 +109,7 @@ def pause_command(socket: Socket = None) -> None:
 
     Anyone may. Next: `station resume`, `replan`, `next-pose` or `finish`.
     """
-    ask(socket or default_socket(), "pause")
+    ask(socket or default_socket(), Pause())
     out.print("Pauses after this pose. Next: `station resume`, `replan`, `next-pose` or `finish`")
 
 
@@ -119,7 +118,7 @@ def finish_command(socket: Socket = None) -> None:
 
     A pose under way is captured first. Next: `calibrate solve RECORDING`; `station status` names it.
     """
-    _command(socket, "finish")
+    _command(socket, Finish())
     status = status_now(socket)
     _print_state(status)
     if status.session.recording:
@@ -128,7 +127,7 @@ def finish_command(socket: Socket = None) -> None:
 
 def retake_command(pose: PoseNumber, socket: Socket = None) -> None:
     """Mark a pose to be captured again by the next run."""
-    _command(socket, "retake", index=pose - 1)
+    _command(socket, Retake(pose - 1))
     out.print(f"pose {pose}: {_why(socket, pose)}. Next: `station resume`")
 
 
@@ -137,7 +136,7 @@ def skip_command(pose: PoseNumber, socket: Socket = None) -> None:
 
     `station retake` brings it back. A pose that has a view keeps it: only its retake is left out.
     """
-    _command(socket, "skip", index=pose - 1)
+    _command(socket, Skip(pose - 1))
     out.print(f"pose {pose}: {_why(socket, pose)}; `station retake {pose}` plans it")
 
 
@@ -169,8 +168,8 @@ def doctor_command(
         out.print(f"{config}: good; {found.robot.model} at {found.robot.host}, {found.mount}")
         out.print(f"next: station serve --config {shlex.quote(str(config))}, then station doctor beside it")
         return
-    checks: list[dict[str, Any]] = ask(socket or default_socket(), "doctor")
-    good = all(check["state"] != "failed" for check in checks)
+    checks = ask(socket or default_socket(), Doctor())
+    good = all(check.state != "failed" for check in checks)
     if as_json:
         print(msgspec.json.encode({"ok": good, "checks": checks}).decode())
     else:
@@ -178,8 +177,8 @@ def doctor_command(
 
         table = Table(box=None, show_header=False, pad_edge=False)
         for check in checks:
-            remedy = f"\n→ {check['remedy']}" if check.get("remedy") and check["state"] != "ok" else ""
-            table.add_row(_MARKS[check["state"]], check["name"], f"{check['text']}{remedy}")
+            remedy = f"\n→ {check.remedy}" if check.remedy and check.state != "ok" else ""
+            table.add_row(_MARKS[check.state], check.name, f"{check.text}{remedy}")
         out.print(table)
     if not good:
         raise typer.Exit(1)
@@ -193,12 +192,12 @@ def board_command(context: typer.Context) -> None:
     raise typer.Exit(done.returncode)
 
 
-def _command(socket: Path | None, verb: Verb, **args: Any) -> None:
-    """A command of the lease's holder: takes it when it is free, and gives it back."""
+def _command(socket: Path | None, verb: Verb[Any]) -> None:
+    """A command of whoever has control: takes it when it is free, and gives it back."""
 
-    async def once(work: Callable[[Client], Awaitable[Any]]) -> None:
+    async def once() -> None:
         async with await Client.connect(socket or default_socket()) as client:
-            await client.request("lease", action="take")
-            await work(client)
+            await client.call(Lease("take"))
+            await client.call(verb)
 
-    asyncio.run(once(lambda client: client.request(verb, **args)))
+    asyncio.run(once())

@@ -19,6 +19,7 @@ from station.cell.session_folder import default_root
 from station.cell.socket_folder import default_socket
 from station.cli.console import Socket
 from station.protocol.client import DaemonGoneError, ask
+from station.protocol.verbs import GetPlan
 
 START_WAIT_S = 30.0
 
@@ -102,7 +103,7 @@ def tell_what_goes_on(socket: Path) -> None:
 
 def _answers(socket: Path) -> bool:
     try:
-        ask(socket, "plan")
+        ask(socket, GetPlan())
     except DaemonGoneError:
         return False
     except StationError:

@@ -1,4 +1,4 @@
-"""The way every screen and command talks to the daemon: one Unix socket, JSON lines."""
+"""The connection of every screen and command to the daemon: one Unix socket, JSON lines."""
 
 from __future__ import annotations
 
@@ -9,15 +9,19 @@ import os
 import re
 from collections.abc import AsyncIterator
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
+from recordings.errors import ErrorData
 from recordings.plain_text import plain_data
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import StationStatus
-from station.protocol.messages import LINE_LIMIT_BYTES, PIECE_BYTES, REQUEST_LIMIT_BYTES, Reply, Request, Verb
+from station.protocol.messages import LINE_LIMIT_BYTES, PIECE_BYTES, REQUEST_LIMIT_BYTES, Reply, Request
 from station.protocol.stop_client import send_stop
+from station.protocol.verbs import Hello, Verb
+
+R = TypeVar("R")
 
 CONNECT_S = 5.0
 ANSWER_S = 30.0
@@ -34,13 +38,17 @@ _SUSPECT = re.compile(
 class DaemonGoneError(StationError):
     """No daemon answers on the socket, or it went away."""
 
+    code = "no-daemon"
+
 
 class NoAnswerError(StationError):
     """The daemon holds the connection and says nothing: it hangs, or its computer is far too busy."""
 
+    code = "no-answer"
+
 
 def who_am_i() -> str:
-    """'anna on tty1': what others read as the holder of the lease."""
+    """Return 'anna on tty1', which others read as who has control."""
     try:
         terminal = " on " + os.ttyname(0).removeprefix("/dev/")
     except OSError:
@@ -58,6 +66,7 @@ class _Incoming(msgspec.Struct):
     ok: bool = False
     result: Any = None
     error: str = ""
+    problem: ErrorData | None = None
     status: dict[str, Any] | None = None
     changes: dict[str, Any] | None = None
 
@@ -87,29 +96,36 @@ class Client:
                 reader, writer = await asyncio.open_unix_connection(str(path), limit=_ANSWER_LIMIT_BYTES)
         except (FileNotFoundError, ConnectionRefusedError):
             raise DaemonGoneError(
-                f"No station daemon serves {path}. Start one: `station serve --config FILE`, or "
-                "`station serve --simulate` for a cell without hardware."
+                f"No station daemon serves {path}.",
+                remedy="Start one: `station serve --config FILE`, or `station serve --simulate` for a cell "
+                "without hardware.",
             ) from None
         except PermissionError:
             raise DaemonGoneError(
-                f"{path}: not allowed. Operators are members of the group station-operator "
-                "(log in again after being added)."
+                f"{path}: not allowed.",
+                code="not-allowed",
+                remedy="Operators are members of the group station-operator; log in again after being added.",
             ) from None
         except (OSError, TimeoutError) as error:
             raise DaemonGoneError(f"{path}: the daemon does not answer ({error or 'timeout'}).") from None
         client = cls(path, reader, writer)
         try:
             who = who or who_am_i()
-            hello = await client.request("hello", who=who, timeout_s=timeout_s)
+            hello = await client.call(Hello(who), timeout_s=timeout_s)
         except StationError:
             await client.close()
             raise
-        if root := hello.get("root"):
-            client.root = Path(root)
+        client.root = Path(hello.root)
         return client
 
-    async def request(self, verb: Verb, *, timeout_s: float = ANSWER_S, **args: Any) -> Any:
-        """The daemon's result as plain data. RefusedError with its reason; DaemonGoneError; NoAnswerError."""
+    async def call(self, verb: Verb[R], *, timeout_s: float = ANSWER_S) -> R:
+        """The verb's result. Raises RefusedError with the daemon's code, DaemonGoneError, NoAnswerError."""
+        answer = await self.request(verb.verb(), timeout_s=timeout_s, **msgspec.to_builtins(verb))
+        result: R = msgspec.convert(answer, verb.result())
+        return result
+
+    async def request(self, verb: str, *, timeout_s: float = ANSWER_S, **args: Any) -> Any:
+        """As `call`, by the verb's name; the result as plain data."""
         if verb == "stop":
             send_stop(self._path)  # the way that nobody can hold up; the request brings the answer
         if self._gone:
@@ -128,22 +144,28 @@ class Client:
                 reply = await answer
         except TimeoutError:
             raise NoAnswerError(
-                f"{verb}: no answer from the daemon within {timeout_s:.0f} s. If the arm moves use the "
-                "emergency stop; `systemctl status station` or the daemon's log says more."
+                f"{verb}: no answer from the daemon within {timeout_s:.0f} s.",
+                remedy="If the arm moves use the emergency stop; `systemctl status station` or the daemon's "
+                "log says more.",
+                timeout_s=timeout_s,
             ) from None
         except OSError:
             raise self._gone_error() from None
         finally:
             self._waiting.pop(request.id, None)
         if not reply.ok:
-            raise RefusedError(reply.error)
+            raise _refused(reply)
         return reply.result
 
-    async def _request_in_pieces(self, verb: Verb, whole: bytes, timeout_s: float) -> Any:
+    async def _request_in_pieces(self, verb: str, whole: bytes, timeout_s: float) -> Any:
         if len(whole) > REQUEST_LIMIT_BYTES:
             raise RefusedError(
                 f"{verb}: {len(whole) / 1e6:.1f} MB are more than the daemon takes "
-                f"({REQUEST_LIMIT_BYTES / 1e6:.1f} MB): make a plan of fewer poses, or shorten its notes."
+                f"({REQUEST_LIMIT_BYTES / 1e6:.1f} MB).",
+                code="request-too-long",
+                remedy="Make a plan of fewer poses, or shorten its notes.",
+                size_bytes=len(whole),
+                limit_bytes=REQUEST_LIMIT_BYTES,
             )
         async with self._one_at_a_time:
             for start in range(0, len(whole), PIECE_BYTES):
@@ -201,7 +223,9 @@ class Client:
         if message.id is not None:
             answer = self._waiting.get(message.id)
             if answer is not None and not answer.done():
-                answer.set_result(Reply(message.id, message.ok, message.result, message.error))
+                answer.set_result(
+                    Reply(message.id, message.ok, message.result, message.error, message.problem)
+                )
             return
         if message.status is not None:
             self._plain_status = message.status
@@ -214,15 +238,22 @@ class Client:
         """While it was asked: it may have done what it was asked for, and then have gone."""
         return DaemonGoneError(
             f"The station daemon at {self._path} is gone and did not answer: whether it heard this is not "
-            "known. Look at the cell."
+            "known.",
+            code="unanswered",
+            remedy="Look at the cell.",
         )
 
 
-def ask(path: Path, verb: Verb, **args: Any) -> Any:
-    """One question from a plain program, no event loop needed. Raises as `Client.request` does."""
+def _refused(reply: Reply) -> RefusedError:
+    problem = reply.problem or ErrorData("refused", reply.error)
+    return RefusedError(problem.text, code=problem.code, remedy=problem.remedy, **problem.values)
 
-    async def once() -> Any:
+
+def ask(path: Path, verb: Verb[R]) -> R:
+    """One question from a plain program, no event loop needed. Raises as `Client.call` does."""
+
+    async def once() -> R:
         async with await Client.connect(path) as client:
-            return await client.request(verb, **args)
+            return await client.call(verb)
 
     return asyncio.run(once())

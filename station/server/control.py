@@ -20,8 +20,8 @@ from typing import Any, Protocol
 
 import msgspec
 
-from recordings.errors import RecordingError
-from station.cell.errors import StationError
+from recordings.errors import CodedError
+from station.cell.errors import RefusedError, StationError
 from station.cell.socket_folder import make_folder
 from station.cell.status import StationStatus, changed_sections
 from station.protocol.messages import (
@@ -33,6 +33,7 @@ from station.protocol.messages import (
     Reply,
     Request,
 )
+from station.protocol.verbs import VERBS
 
 log = logging.getLogger(__name__)
 UNSENT_LIMIT_BYTES = 4 * 1024 * 1024
@@ -62,7 +63,7 @@ class Handler(Protocol):
         """STOP, from anyone: under way when it returns, should the client leave. May return an awaitable."""
 
     async def handle(self, peer: Peer, verb: str, args: dict[str, Any]) -> Any:
-        """The result; StationError or RecordingError becomes the reply's sentence."""
+        """The result; what a person can act on (CodedError) becomes the reply's problem."""
 
     def gone(self, peer: Peer) -> None:
         """The connection ended; if it held the lease, the arm must decelerate now."""
@@ -100,7 +101,8 @@ class ControlServer:
             listening.listen(ACCEPT_BATCH)
         except OSError as error:
             listening.close()
-            raise StationError(f"{self._path}: the control socket cannot be made ({error}).") from None
+            text = f"{self._path}: the control socket cannot be made ({error})."
+            raise StationError(text, code="socket") from None
         finally:
             os.umask(old)
         self._listening = listening
@@ -142,9 +144,9 @@ class ControlServer:
                 break
             link.setblocking(False)
             peer = _peer_of(link, self._next_client_id)
-            if why := self._full_for(peer.uid):
+            if (full := self._full_for(peer.uid)) is not None:
                 with link, contextlib.suppress(OSError):
-                    link.send(msgspec.json.encode(Reply(0, False, error=why)) + b"\n")
+                    link.send(msgspec.json.encode(Reply.refused(0, full)) + b"\n")
                 continue
             self._next_client_id += 1
             self._opened[peer.uid].append(loop.time())
@@ -154,16 +156,16 @@ class ControlServer:
         loop.remove_reader(self._listening)
         loop.call_later(ACCEPT_PAUSE_S, self._listen)
 
-    def _full_for(self, uid: int) -> str:
-        """Why this user is not let in now; empty: there is room."""
+    def _full_for(self, uid: int) -> RefusedError | None:
+        """Why this user is not let in now; None: there is room."""
         if len(self._serving) >= CLIENT_LIMIT:
-            return f"{CLIENT_LIMIT} clients are connected already: close one (`station stop` needs none)."
+            return _full(f"{CLIENT_LIMIT} clients are connected already", CLIENT_LIMIT)
         if list(self._serving.values()).count(uid) >= USER_CLIENT_LIMIT:
-            return f"{USER_CLIENT_LIMIT} clients of this user are connected already: close one."
+            return _full(f"{USER_CLIENT_LIMIT} clients of this user are connected already", USER_CLIENT_LIMIT)
         newest = self._opened[uid]
         if len(newest) == NEW_PER_S and asyncio.get_running_loop().time() - newest[0] < 1.0:
-            return f"this user opened {NEW_PER_S} connections within a second: wait a moment."
-        return ""
+            return _full(f"this user opened {NEW_PER_S} connections within a second", NEW_PER_S)
+        return None
 
     async def _serve(self, link: socket.socket, peer: Peer) -> None:
         loop = asyncio.get_running_loop()
@@ -212,7 +214,7 @@ class _Connection:
                 try:
                     self._take(decoder.decode(line))
                 except (ValueError, RecursionError) as error:  # msgspec's, base64's
-                    self.reply(Reply(0, False, error=f"not a request: {error}"))
+                    self.refuse(0, RefusedError(f"not a request: {error}", code="not-a-request"))
                 await asyncio.sleep(0)  # readline gives lines that wait without a pause: STOP of others first
         except ValueError:  # readline: the line is longer than the limit
             self.drop(f"a line of more than {LINE_LIMIT_BYTES} bytes")
@@ -234,8 +236,16 @@ class _Connection:
             whole, self._pieces = bytes(self._pieces), bytearray()
             inner = msgspec.json.decode(whole, type=Request)
             self._take(Request(request.id, inner.verb, inner.args))
+        elif request.verb not in VERBS:
+            self.refuse(request.id, RefusedError(f"there is no verb '{request.verb}'", code="unknown-verb"))
         elif len(self._tasks) >= OPEN_REQUESTS_LIMIT:
-            self.reply(Reply(request.id, False, error="too many requests at once: wait for the answers."))
+            busy = RefusedError(
+                "too many requests at once",
+                code="too-many-requests",
+                remedy="Wait for the answers.",
+                limit=OPEN_REQUESTS_LIMIT,
+            )
+            self.refuse(request.id, busy)
         else:
             self._spawn(self._answer(request))
 
@@ -243,8 +253,9 @@ class _Connection:
         piece = base64.b64decode(str(request.args.get("base64", "")), validate=True)
         if len(self._pieces) + len(piece) > REQUEST_LIMIT_BYTES:
             self._pieces.clear()
-            text = f"more than {REQUEST_LIMIT_BYTES} bytes in one request: nothing of it is kept."
-            self.reply(Reply(request.id, False, error=text))
+            text = f"more than {REQUEST_LIMIT_BYTES} bytes in one request: nothing of it is kept"
+            limit = REQUEST_LIMIT_BYTES
+            self.refuse(request.id, RefusedError(text, code="request-too-long", limit_bytes=limit))
             return
         self._pieces += piece
         self.reply(Reply(request.id, True, {}))
@@ -266,16 +277,15 @@ class _Connection:
             if request.verb == "watch" and not self.watching:
                 self.send(self._full_status())
                 self.watching = True
-        except (StationError, RecordingError) as error:
-            self.reply(Reply(request.id, False, error=str(error)))
-        except (msgspec.ValidationError, KeyError, TypeError, ValueError) as error:
-            log.exception("%s from client %d", request.verb, self.peer.client_id)
-            self.reply(Reply(request.id, False, error=f"{request.verb}: wrong arguments ({error})."))
+        except CodedError as error:
+            self.refuse(request.id, error)
         except Exception as error:
             log.exception("%s from client %d", request.verb, self.peer.client_id)
-            self.reply(
-                Reply(request.id, False, error=f"{request.verb}: internal error ({error!r}); see the log")
-            )
+            text = f"{request.verb}: internal error ({error!r})"
+            self.refuse(request.id, StationError(text, code="internal", remedy="See the daemon's log."))
+
+    def refuse(self, request_id: int, error: CodedError) -> None:
+        self.reply(Reply.refused(request_id, error))
 
     def reply(self, reply: Reply) -> None:
         self.send(msgspec.json.encode(reply) + b"\n")
@@ -291,13 +301,20 @@ class _Connection:
     def drop(self, why: str) -> None:
         log.warning("client %d (pid %d) is dropped: %s", self.peer.client_id, self.peer.pid, why)
         with contextlib.suppress(OSError):
-            self._writer.write(msgspec.json.encode(Reply(0, False, error=f"dropped: {why}")) + b"\n")
+            dropped = Reply.refused(0, RefusedError(f"dropped: {why}", code="dropped"))
+            self._writer.write(msgspec.json.encode(dropped) + b"\n")
         self.hang_up()
 
     def hang_up(self) -> None:
         """A client that does not read would hold a polite close open for ever."""
         self._writer.close()
         asyncio.get_running_loop().call_later(HANG_UP_S, self._writer.transport.abort)
+
+
+def _full(text: str, limit: int) -> RefusedError:
+    return RefusedError(
+        text, code="house-full", remedy="Close one, or wait a moment; `station stop` needs none.", limit=limit
+    )
 
 
 def _peer_of(link: socket.socket, client_id: int) -> Peer:
@@ -311,7 +328,7 @@ def _remove_stale(path: Path) -> None:
     """A socket that nobody serves is what a crash leaves behind."""
     if not path.is_socket():
         if path.exists():
-            raise StationError(f"{path} is in the way and is not a socket: move it.")
+            raise StationError(f"{path} is not a socket.", code="socket", remedy="Move it.")
         return
     with socket.socket(socket.AF_UNIX) as probe:
         probe.settimeout(1.0)
@@ -321,5 +338,9 @@ def _remove_stale(path: Path) -> None:
             path.unlink(missing_ok=True)
             return
         except OSError as error:
-            raise StationError(f"{path}: {error}.") from None
-    raise StationError(f"Another station daemon already serves {path}: stop it first, or use its socket.")
+            raise StationError(f"{path}: {error}.", code="socket") from None
+    raise StationError(
+        f"Another station daemon already serves {path}.",
+        code="already-served",
+        remedy="Stop it first, or use its socket.",
+    )

@@ -5,25 +5,16 @@ from __future__ import annotations
 import asyncio
 import shutil
 
-import msgspec
-
 from calibrate.boards.model import BoardError, check_board, describe_board
 from recordings.files import bytes_text
 from station.cell.errors import CameraError, RobotError
 from station.cell.status import StationState
 from station.devices.ur_condition import mode_word, not_powered, safety_stop, safety_word
 from station.devices.ur_probe import probe
+from station.protocol.verbs import Check
 from station.session.bench import Bench
 
 CLOCK_BOUND_S = 0.005
-
-
-class Check(msgspec.Struct, frozen=True):
-    name: str
-    state: str
-    """ok, warning, failed or skipped"""
-    text: str
-    remedy: str = ""
 
 
 async def checklist(bench: Bench, troubles: dict[str, str]) -> list[Check]:

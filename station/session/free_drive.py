@@ -13,7 +13,7 @@ from station.cell.errors import RefusedError, RobotError, StaleStateError, Stati
 from station.cell.plan import Plan, PlannedPose
 from station.cell.status import StationState
 from station.cell.stillness import NotStillError
-from station.protocol.states import refusal
+from station.protocol.verbs import Record
 from station.session.bench import Bench
 from station.session.capture import PoseFailedError, take_pose
 from station.session.queue import GUIDED, PoseQueue
@@ -54,8 +54,8 @@ class FreeDrive:
                 if store.state in (StationState.FREE_DRIVE, StationState.PAUSED):
                     store.enter(bench.resting)
                 raise
-        if reason := refusal("record", store.state):
-            raise RefusedError(reason)  # STOP, or the end of free drive, came in between
+        if (refusal := Record.refusal(store.state)) is not None:
+            raise refusal  # STOP, or the end of free drive, came in between
         store.enter(StationState.FREE_DRIVE, _GUIDE)
         bench.show_poses()
         self._last_place = None

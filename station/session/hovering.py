@@ -10,7 +10,6 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-import msgspec
 import numpy as np
 
 from calibrate.boards.model import board_points
@@ -28,6 +27,7 @@ from station.cell.plan import plan_sha256
 from station.cell.status import GoSummary, HoverOffer, StationState
 from station.cell.stillness import NotStillError
 from station.plan.hover import Hover, HoverAnswer, HoverQuestion, answer_hover, least_standoff_m
+from station.protocol import verbs
 from station.session.bench import Bench
 from station.session.capture import flange_pose, matrix4
 from station.session.guard import JOGGED_RAD, displacement
@@ -40,17 +40,6 @@ VIEW_LIFETIME_S = 900.0
 _SIGHT_S, _PLAN_S = 20.0, 60.0
 _SAME_PLACE_RAD = 1e-3
 """The arm stands where the picture was taken: a board seen from elsewhere lies elsewhere."""
-
-
-class HoverRequest(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    calibration: str = ""
-    """A calibration file; empty = what is installed below the daemon's root."""
-    corner: int = 0
-    standoff_m: float = 0.08
-    pointer_m: float | None = None
-    """Length of a pointer along the flange's z axis; None = the configured one, or the pendant's tool."""
-    new_picture: bool = True
-    """False: the board as it was last seen for this calibration."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -70,7 +59,7 @@ class HoverDesk:
         self._bench = bench
         self._look: _Look | None = None
 
-    async def prepare(self, request: HoverRequest) -> tuple[Hover, HoverOffer]:
+    async def prepare(self, request: verbs.Hover) -> tuple[Hover, HoverOffer]:
         """RefusedError, LimitError, RobotError and CameraError say what is in the way. Nothing moves."""
         bench = self._bench
         robot, config = bench.cell.robot, bench.cell.config
@@ -99,7 +88,7 @@ class HoverDesk:
         summary = self._summary(answer, start, look, words)
         return answer.hover, _offer(answer, summary, bench, pointer, words)
 
-    def _calibration(self, request: HoverRequest) -> Calibration:
+    def _calibration(self, request: verbs.Hover) -> Calibration:
         """Of this very cell, and good: a wrong one would put the board somewhere else."""
         cell = self._bench.cell
         try:
@@ -125,7 +114,7 @@ class HoverDesk:
             raise RefusedError(f"the calibration failed its gates ({names}): nothing is driven by it")
         return found
 
-    def _pointer(self, request: HoverRequest) -> tuple[PointerConfig, str]:
+    def _pointer(self, request: verbs.Hover) -> tuple[PointerConfig, str]:
         """The pointer and its words: as asked for, as configured, or the tool set on the pendant."""
         configured = self._bench.cell.config.pointer
         if request.pointer_m is not None:
@@ -145,7 +134,7 @@ class HoverDesk:
         x, y, z = (float(v) for v in along)
         return PointerConfig(tip, (x, y, z)), f"the pendant's tool, tip at {_mm(tip)} mm in the flange"
 
-    async def _seen(self, request: HoverRequest, calibration: Calibration) -> _Look:
+    async def _seen(self, request: verbs.Hover, calibration: Calibration) -> _Look:
         bench, place = self._bench, calibration.provenance.recording_sha256
         if not request.new_picture:
             look = self._look

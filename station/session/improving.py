@@ -17,6 +17,7 @@ from station.analysis.improvement import FEWEST_LEFT, FEWEST_VIEWS, Improvement,
 from station.cell.errors import RefusedError
 from station.cell.status import EstimateStatus
 from station.plan.predict import Advice
+from station.protocol.verbs import Purpose
 from station.session.bench import Bench
 from station.session.interrupted import look_back
 from station.session.patience import RestingCheck
@@ -51,7 +52,7 @@ class ImproveDesk:
             f"then `station improve` (p on the plan screen) plans the {len(queue.fresh)} that are left anew"
         )
 
-    async def replan(self, purpose: str) -> Replanned | None:
+    async def replan(self, purpose: Purpose) -> Replanned | None:
         """The poses that this purpose would put in place of the session's; None when it changes none.
 
         Nothing moves, and nothing is changed yet; what a restart forgot is read again first. RefusedError
@@ -59,7 +60,7 @@ class ImproveDesk:
         """
         bench = self._bench
         await look_back(bench)
-        if purpose not in ("improve", "best"):
+        if purpose not in (Purpose.REPLAN, Purpose.NEXT_POSE):
             return None
         if bench.recording is None or bench.queue is None:
             raise RefusedError("no session is open: run the plan, and pause after its first pictures")
@@ -71,7 +72,7 @@ class ImproveDesk:
                 f"plan as it is (`station resume`), and ask again after {FEWEST_VIEWS} more"
             )
         await RestingCheck(bench.cell.robot.check).news()
-        return await (self._anew(bench.queue) if purpose == "improve" else self._one_more(bench.queue))
+        return await (self._anew(bench.queue) if purpose is Purpose.REPLAN else self._one_more(bench.queue))
 
     async def _anew(self, queue: PoseQueue) -> Replanned:
         """The poses with those left planned anew."""
@@ -89,7 +90,7 @@ class ImproveDesk:
         if not is_worth_it(found):
             raise RefusedError(f"nothing to gain, go on with the plan as it is ({'; '.join(changes(found))})")
         better = queue.with_fresh(found.plan.poses)
-        return Replanned("improve", better, better.open, queue.sha256, changes(found))
+        return Replanned(Purpose.REPLAN, better, better.open, queue.sha256, changes(found))
 
     async def _one_more(self, queue: PoseQueue) -> Replanned:
         """The poses and the one that would help most after those captured."""
@@ -105,7 +106,7 @@ class ImproveDesk:
         if found.next_pose is None:
             raise RefusedError(found.text)
         more, index = queue.with_more(found.next_pose)
-        return Replanned("best", more, (index,), queue.sha256, what_it_brings(found, index))
+        return Replanned(Purpose.NEXT_POSE, more, (index,), queue.sha256, what_it_brings(found, index))
 
     def adopt(self, found: Replanned) -> None:
         """A person said yes: these are the poses now, and the recording says so."""
@@ -114,7 +115,7 @@ class ImproveDesk:
         bench.show_poses()
         if recording is None:
             return  # the loaded plan, for a session that begins
-        if found.purpose == "improve":
+        if found.purpose is Purpose.REPLAN:
             self._improved = recording.name
         bench.store.event("; ".join(found.changes))
         with contextlib.suppress(RecordingError):  # a disk that fails is told by the next picture

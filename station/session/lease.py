@@ -12,6 +12,7 @@ from recordings.schema.messages import Vector6
 from station.cell.errors import RefusedError
 from station.cell.status import GoSummary, Lease
 from station.plan.hover import Hover
+from station.protocol.verbs import Purpose
 from station.session.queue import Replanned
 
 GO_LIFETIME_S = 120.0
@@ -64,6 +65,8 @@ class Go:
     """Pose numbers it covers, in order; more may not be driven to with it."""
     again: bool = False
     """Nobody is there to be asked: poses that do not come to rest are tried once more at the end."""
+    purpose: Purpose | None = None
+    """None: a hover."""
     replanned: Replanned | None = None
     """Poses that take the place of the session's with this go."""
     hover: Hover | None = None
@@ -100,13 +103,16 @@ class GoDesk:
         client_id: int,
         poses: tuple[int, ...],
         hover: Hover | None = None,
+        purpose: Purpose | None = None,
         replanned: Replanned | None = None,
     ) -> Go:
         """From where the summary begins. An older one is void."""
         start = summary.start_joints_rad
         assert start is not None
         expires_s = self._clock() + GO_LIFETIME_S
-        self._waiting = Go(summary, client_id, expires_s, start, poses, hover=hover, replanned=replanned)
+        self._waiting = Go(
+            summary, client_id, expires_s, start, poses, purpose=purpose, hover=hover, replanned=replanned
+        )
         return self._waiting
 
     def void(self) -> bool:

@@ -16,6 +16,7 @@ from station.analysis.pool import WorkerError
 from station.analysis.worker import Sighting, sight
 from station.cell.errors import CameraError
 from station.cell.status import StationState
+from station.protocol.verbs import PreviewImage
 from station.session.bench import Bench
 
 PERIOD_S = 0.2
@@ -36,13 +37,13 @@ class Previewer:
         self._taken_s = 0.0
         self._count = 0
 
-    async def preview(self, width: int, height: int) -> dict[str, Any] | None:
-        """A JPEG that fits into width × height, corners as shares of its sides; None without a picture."""
+    async def preview(self, width: int, height: int) -> PreviewImage:
+        """A JPEG that fits into width × height, px; empty without a picture."""
         async with self._taking:
             if time.monotonic() - self._taken_s >= PERIOD_S:
                 await self._take()
         if self._picture is None:
-            return None
+            return PreviewImage()
         low, high = SIDES
         width, height = min(max(width, low), high), min(max(height, low), high)
         return await asyncio.to_thread(self._encode, self._picture.image, self._sighting, width, height)
@@ -73,7 +74,7 @@ class Previewer:
 
     def _encode(
         self, image: NDArray[Any], sighting: Sighting | None, width: int, height: int
-    ) -> dict[str, Any] | None:
+    ) -> PreviewImage:
         scale = min(width / image.shape[1], height / image.shape[0], 1.0)
         size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
         if image.dtype != np.uint8:
@@ -83,12 +84,8 @@ class Previewer:
             ok, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])
             if ok and len(jpeg) <= JPEG_LIMIT_BYTES:
                 sides = image.shape[1::-1]
-                corners = [] if sighting is None else ((sighting.pixels + 0.5) / sides).round(4).tolist()
-                return {
-                    "jpeg_base64": base64.b64encode(jpeg.tobytes()).decode(),
-                    "width": size[0],
-                    "height": size[1],
-                    "corners": corners,
-                    "sequence": self._count,
-                }
-        return None
+                pixels = np.zeros((0, 2)) if sighting is None else (sighting.pixels + 0.5) / sides
+                corners = tuple((float(x), float(y)) for x, y in pixels.round(4))
+                data = base64.b64encode(jpeg.tobytes()).decode()
+                return PreviewImage(data, *size, corners, self._count)
+        return PreviewImage()

@@ -10,6 +10,7 @@ import msgspec
 from station.cell.errors import RefusedError
 from station.cell.plan import Plan, PlannedPose, plan_sha256
 from station.cell.status import PoseState, PoseStatus
+from station.protocol.verbs import Purpose
 
 OPEN: frozenset[PoseState] = frozenset({"planned"})
 BUSY: frozenset[PoseState] = frozenset({"moving", "settling", "capturing", "writing"})
@@ -25,7 +26,7 @@ NOT_AGAIN = "not taken again: the picture it has counts"
 class Replanned:
     """Poses that wait for a person's yes to take the place of the session's."""
 
-    purpose: str
+    purpose: Purpose
     queue: PoseQueue
     poses: tuple[int, ...]
     """Those that the go covers, in order."""

@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import msgspec
 
@@ -25,12 +25,14 @@ from station.cell.scene import cell_geometry
 from station.cell.status import GoSummary, HoverOffer, Lease, StationState, StationStatus
 from station.cell.stillness import StillnessMonitor
 from station.devices.cell import Cell
-from station.protocol.states import RUNNING, refusal
+from station.protocol import verbs
+from station.protocol.states import RUNNING
+from station.protocol.verbs import Purpose, Verb
 from station.session.bench import Bench
 from station.session.estimate import Estimator
 from station.session.free_drive import FreeDrive
 from station.session.guard import Guard
-from station.session.hovering import HoverDesk, HoverRequest
+from station.session.hovering import HoverDesk
 from station.session.improving import ImproveDesk
 from station.session.interrupted import close_or_seal, find_interrupted
 from station.session.keeper import Keeper
@@ -41,8 +43,9 @@ from station.session.queue import PoseQueue
 from station.session.run import unmark_busy
 from station.session.runs import run_for
 from station.session.store import StatusStore
-from station.session.summary import DRIFT_CHECK, begun_anew, poses_to_drive, summarise
+from station.session.summary import begun_anew, poses_to_drive, summarise
 
+R = TypeVar("R")
 END_RUN_S = 10.0
 STOP_WAIT_S = 1.0
 """The answer to STOP waits no longer for what still goes to the disk: the arm stands."""
@@ -150,7 +153,7 @@ class Session:
 
     def acknowledge(self, who: str) -> None:
         """A person looked. What still holds the arm is told when the next go is given."""
-        self._require("acknowledge")
+        self._require_state(verbs.Acknowledge)
         try:
             self.bench.cell.robot.latest()
             resting = self.bench.resting
@@ -161,10 +164,9 @@ class Session:
 
     # -- the way to a motion -----------------------------------------------------------------------------
 
-    async def prepare(self, client_id: int, purpose: str, index: int | None = None) -> GoSummary:
+    async def prepare(self, client_id: int, purpose: Purpose, index: int | None = None) -> GoSummary:
         """Checks the whole way from where the arm is and offers a one-use go for it."""
-        self.leases.require(client_id)
-        self._require("prepare")
+        self.permit(verbs.Prepare, client_id)
         await self._run_ended()  # it is sealed and shown; its control process may take a moment more
         self._void_go()
         voids = self._goes.voids
@@ -173,14 +175,13 @@ class Session:
         queue, changes = (found.queue, found.changes) if found else (self.bench.require_queue(), ())
         summary = await summarise(self.bench, purpose, queue, poses, self._notes, changes)
         self._require_unchanged(client_id, voids)
-        self._goes.offer(summary, client_id, poses, replanned=found)
+        self._goes.offer(summary, client_id, poses, purpose=purpose, replanned=found)
         self._show_go(summary)
         return summary
 
-    async def prepare_hover(self, client_id: int, request: HoverRequest) -> HoverOffer:
+    async def prepare_hover(self, client_id: int, request: verbs.Hover) -> HoverOffer:
         """Offers a one-use go for a slow way to a place over a corner of the board."""
-        self.leases.require(client_id)
-        self._require("hover")
+        self.permit(verbs.Hover, client_id)
         self._require_no_session()
         await self._run_ended()
         self._void_go()
@@ -197,8 +198,7 @@ class Session:
 
     def _require_unchanged(self, client_id: int, voids: int) -> None:
         """RefusedError when something happened while the way was checked."""
-        self._require("prepare")
-        self.leases.require(client_id)
+        self.permit(verbs.Prepare, client_id)
         if self._goes.voids != voids:
             raise RefusedError("something changed while the way was checked: prepare again")
 
@@ -212,8 +212,7 @@ class Session:
 
         `approval`: who gave it and how, for log and recording. `again`: see Go.
         """
-        self.leases.require(client_id)
-        self._require("go")
+        self.permit(verbs.Go, client_id)
         self._require_run_ended()
         if self.free_drive.taking:
             raise RefusedError("free drive is still ending: try again in a moment")
@@ -228,7 +227,7 @@ class Session:
         self.bench.halting = False
         self.bench.pause_wanted, self.bench.finish_wanted = "", False
         if self.bench.recording is None and go.hover is None:
-            self.bench.forget_session(check=go.summary.purpose == DRIFT_CHECK)
+            self.bench.forget_session(check=go.purpose is Purpose.DRIFT_CHECK)
         if go.replanned is not None:
             self._improver.adopt(go.replanned)
         run = run_for(self.bench, go)
@@ -238,14 +237,13 @@ class Session:
 
     def pause(self, who: str) -> None:
         """After this pose. Anyone may: it only ever makes the arm do less."""
-        self._require("pause")
+        self._require_state(verbs.Pause)
         self.bench.pause_wanted = who
         self.store.event(f"{who} asks to pause after this pose")
 
     async def finish(self, client_id: int) -> None:
         """Seals what is there; a pose under way is taken first."""
-        self.leases.require(client_id)
-        self._require("finish")
+        self.permit(verbs.Finish, client_id)
         self._void_go()
         if self.store.state in RUNNING and not self.free_drive.taking:
             self.bench.finish_wanted = True
@@ -254,7 +252,7 @@ class Session:
         if self.bench.recording is None:
             raise RefusedError("nothing is recorded yet: there is nothing to finish")
         await asyncio.gather(self._run_ended(), self.free_drive.last_picture())
-        self._require("finish")
+        self._require_state(verbs.Finish)
         self._run = closing = asyncio.create_task(close_or_seal(self.bench))  # nothing new begins beside it
         await asyncio.wait({closing})
         if not closing.cancelled():
@@ -284,15 +282,13 @@ class Session:
     # -- the plan ----------------------------------------------------------------------------------------
 
     def load_plan(self, client_id: int, plan: Plan) -> None:
-        self.leases.require(client_id)
-        self._require("load_plan")
+        self.permit(verbs.LoadPlan, client_id)
         self._require_no_session()
         self._replace_plan(plan)
 
     async def make_plan(self, client_id: int, poses: int, seed: int, lens_known: bool = False) -> Plan:
         """Made in the worker. ConfigError and LimitError say what is missing or in the way."""
-        self.leases.require(client_id)
-        self._require("make_plan")
+        self.permit(verbs.MakePlan, client_id)
         self._require_no_session()
         try:
             start = self.bench.cell.robot.latest().joints_rad
@@ -302,8 +298,7 @@ class Session:
         plan = await self.bench.workers.call(
             plan_poses, self.bench.cell.config, start, seed, poses, lens_known, timeout_s=PLAN_TIMEOUT_S
         )
-        self.leases.require(client_id)
-        self._require("make_plan")
+        self.permit(verbs.MakePlan, client_id)
         self._require_no_session()
         self._replace_plan(plan)
         return plan
@@ -319,10 +314,9 @@ class Session:
         self.bench.show_poses()
         self.store.event(f"plan of {len(plan.poses)} poses loaded")
 
-    async def edit(self, client_id: int, verb: Any, change: Callable[[PoseQueue], object]) -> object:
+    async def edit(self, verb: type[Verb[Any]], client_id: int, change: Callable[[PoseQueue], R]) -> R:
         """Retake, skip, reorder, add, drop: voids a waiting go. RecordingError: done, but not on the disk."""
-        self.leases.require(client_id)
-        self._require(verb)
+        self.permit(verb, client_id)
         if self.bench.queue is None:
             raise RefusedError("no plan is loaded: load or make one first")
         result = change(self.bench.queue)
@@ -338,8 +332,7 @@ class Session:
     # -- without control --------------------------------------------------------------------------------
 
     async def switch_free_drive(self, client_id: int, on: bool, auto: bool) -> None:
-        self.leases.require(client_id)
-        self._require("free_drive")
+        self.permit(verbs.FreeDrive, client_id)
         self._void_go()
         if on:
             await self._run_ended()
@@ -348,8 +341,7 @@ class Session:
             self.free_drive.end()
 
     async def record(self, client_id: int) -> int:
-        self.leases.require(client_id)
-        self._require("record")
+        self.permit(verbs.Record, client_id)
         return await self.free_drive.record()
 
     @property
@@ -358,9 +350,15 @@ class Session:
 
     # -- inside ------------------------------------------------------------------------------------------
 
-    def _require(self, verb: Any) -> None:
-        if reason := refusal(verb, self.store.state):
-            raise RefusedError(reason)
+    def permit(self, verb: type[Verb[Any]], client_id: int) -> None:
+        """RefusedError unless the table of verbs allows it to this client now."""
+        if verb.control:
+            self.leases.require(client_id)
+        self._require_state(verb)
+
+    def _require_state(self, verb: type[Verb[Any]]) -> None:
+        if (refusal := verb.refusal(self.store.state)) is not None:
+            raise refusal
 
     def _void_go(self) -> None:
         self._goes.void()

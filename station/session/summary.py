@@ -10,6 +10,7 @@ from station.analysis.worker import check_run
 from station.cell.errors import LimitError, RefusedError
 from station.cell.limits import PlanCheck
 from station.cell.status import GoSummary
+from station.protocol.verbs import Purpose
 from station.session.bench import Bench
 from station.session.guard import displacement
 from station.session.lease import GoDesk
@@ -18,39 +19,34 @@ from station.session.queue import PoseQueue, Replanned
 
 POSE_OVERHEAD_S = 0.8
 """Settle, expose, look, write: what a stop takes beside the move."""
-DRIFT_CHECK = "drift check of the installed calibration"
 _PROBLEMS_SHOWN = 12
 _SLOW_SLIDER = 0.99
 
 
-def begun_anew(bench: Bench, purpose: str) -> Replanned | None:
+def begun_anew(bench: Bench, purpose: Purpose) -> Replanned | None:
     """The loaded plan for a session that begins with this go; until then the last session stays shown."""
     queue = bench.queue
-    if purpose != "run" or bench.recording is not None or queue is None:
+    if purpose is not Purpose.RUN or bench.recording is not None or queue is None:
         return None
     again = queue.anew()
     return Replanned(purpose, again, _open(again), queue.sha256, ())
 
 
-def poses_to_drive(bench: Bench, purpose: str, index: int | None) -> tuple[int, ...]:
+def poses_to_drive(bench: Bench, purpose: Purpose, index: int | None) -> tuple[int, ...]:
     """The poses a go for this purpose covers. RefusedError when there are none."""
     queue = bench.queue
     if queue is None:
         raise RefusedError("no plan is loaded: load or make one first")
-    if purpose in ("retake", "resume") and bench.recording is None:
+    if purpose in (Purpose.RETAKE, Purpose.RESUME) and bench.recording is None:
         raise RefusedError("no session is open: run the plan to begin one")
-    if purpose == "retake":
+    if purpose is Purpose.RETAKE:
         if index is None:
             raise RefusedError("say which pose to retake")
         if queue.status(index).state != "planned":
             queue.retake(index)
         return (index,)
-    if purpose == "check" and bench.recording is not None:
+    if purpose is Purpose.DRIFT_CHECK and bench.recording is not None:
         raise RefusedError("a session is open: finish it first, then check")
-    if purpose not in ("run", "check", "resume"):
-        raise RefusedError(
-            f"unknown purpose '{purpose}'; known are run, check, resume, retake, improve, best"
-        )
     return _open(queue)
 
 
@@ -62,7 +58,7 @@ def _open(queue: PoseQueue) -> tuple[int, ...]:
 
 async def summarise(
     bench: Bench,
-    purpose: str,
+    purpose: Purpose,
     queue: PoseQueue,
     poses: tuple[int, ...],
     notes: tuple[str, ...],
@@ -104,18 +100,18 @@ def _problem_text(check: PlanCheck) -> str:
     return "the plan is refused, nothing moved:\n" + "\n".join([*shown, *tail])
 
 
-def _purpose_words(bench: Bench, purpose: str, poses: tuple[int, ...]) -> str:
-    if purpose == "retake":
+def _purpose_words(bench: Bench, purpose: Purpose, poses: tuple[int, ...]) -> str:
+    if purpose is Purpose.RETAKE:
         return f"retake pose {poses[0] + 1}"
     if bench.queue is not None and bench.queue.plan.motion == "sweep":
         return f"sweep: {len(poses)} slow swings without a stop, the camera running"
-    if purpose == "check":
-        return DRIFT_CHECK
+    if purpose is Purpose.DRIFT_CHECK:
+        return "drift check of the installed calibration"
     if bench.recording is None:
         return "run plan"
-    if purpose == "best":
+    if purpose is Purpose.NEXT_POSE:
         return f"one pose more for session {bench.recording.name}"
-    if purpose == "improve":
+    if purpose is Purpose.REPLAN:
         return f"go on with session {bench.recording.name}, the poses that are left planned anew"
     return f"go on with session {bench.recording.name}"
 

@@ -12,8 +12,8 @@ from textual.reactive import reactive
 
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import GoSummary, SessionStatus, StationState, StationStatus
-from station.protocol.messages import Verb
-from station.protocol.states import RUNNING, refusal
+from station.protocol.states import RUNNING
+from station.protocol.verbs import Finish
 from station.tui.confirm import Confirm, ConfirmGo
 from station.tui.link import Link
 from station.tui.replay_screen import ReplayScreen
@@ -49,7 +49,7 @@ class Commands(App[None]):
     busy = ""
     """What the daemon is at work on for this screen; empty: nothing that takes long."""
 
-    async def ask(self, verb: Verb, **args: Any) -> Any:
+    async def ask(self, verb: str, **args: Any) -> Any:
         """The daemon's answer, or None after a notice that says why not."""
         if verb != "stop" and any(isinstance(screen, ReplayScreen) for screen in self.screen_stack):
             self.notify("This is the PLAYBACK of a recording: Escape leaves it. F12 still stops the arm.")
@@ -74,11 +74,11 @@ class Commands(App[None]):
         return None
 
     @work(group="command", exit_on_error=False)
-    async def send(self, verb: Verb, **args: Any) -> None:
+    async def send(self, verb: str, **args: Any) -> None:
         """A wish of one of the screens; control of the arm is taken with it."""
         await self.ask_with_control(verb, **args)
 
-    async def ask_with_control(self, verb: Verb, **args: Any) -> Any:
+    async def ask_with_control(self, verb: str, **args: Any) -> Any:
         """As `ask`, for what only the holder of the lease may."""
         return await self.ask(verb, **args) if await self.take_control() else None
 
@@ -93,7 +93,7 @@ class Commands(App[None]):
         holder = None if self.status is None else self.status.lease.client_id
         return holder is not None and holder == self._own_id
 
-    async def ask_long(self, words: str, verb: Verb, **args: Any) -> Any:
+    async def ask_long(self, words: str, verb: str, **args: Any) -> Any:
         """As `ask_with_control`, for what takes seconds or, on a busy computer, minutes.
 
         `words` stand on every screen for as long as it does.
@@ -154,8 +154,8 @@ class Commands(App[None]):
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_finish(self) -> None:
-        if self.status is not None and (reason := refusal("finish", self.status.state)):
-            self.notify(reason, severity="warning")
+        if self.status is not None and (refusal := Finish.refusal(self.status.state)) is not None:
+            self.notify(str(refusal), severity="warning")
             return
         session = SessionStatus() if self.status is None else self.status.session
         question = f"{session.captured} of {len(session.poses)} poses are captured. {CLOSES}"

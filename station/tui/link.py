@@ -10,7 +10,6 @@ from typing import Any, Protocol
 
 from station.cell.errors import RefusedError
 from station.cell.status import StationStatus
-from station.protocol.messages import Verb
 
 
 class Link(Protocol):
@@ -19,7 +18,7 @@ class Link(Protocol):
     root: Path | None
     """Below which the daemon keeps sessions and what is installed."""
 
-    async def request(self, verb: Verb, **args: Any) -> Any:
+    async def request(self, verb: str, **args: Any) -> Any:
         """The daemon's result. RefusedError with the daemon's reason; StationError when it is gone."""
 
     def statuses(self) -> AsyncIterator[StationStatus]:

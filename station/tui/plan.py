@@ -12,7 +12,6 @@ from textual.containers import Horizontal, Vertical
 from textual.widgets import DataTable, Static
 
 from station.cell.status import PoseStatus, StationStatus
-from station.protocol.messages import Verb
 from station.tui.screen import StationScreen
 from station.tui.widgets.rows import Rows
 from station.tui.widgets.sketch import PlanSketch
@@ -129,7 +128,7 @@ class PlanScreen(StationScreen):
             return None
         return status.session.poses[self.table.cursor_row].index
 
-    def action_pose(self, verb: Verb) -> None:
+    def action_pose(self, verb: str) -> None:
         index = self._selected()
         if index is not None:
             self.station.send(verb, index=index)

@@ -18,7 +18,6 @@ from recordings.errors import RecordingError
 from recordings.schema.messages import View
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import DetectionStatus, StationStatus
-from station.protocol.messages import Verb
 from station.tui.timeline import END_TEXT, Timeline
 from station.tui.words import duration
 
@@ -49,7 +48,7 @@ class ReplayLink:
         self._answer: dict[str, Any] | None = None
         self._closed = False
 
-    async def request(self, verb: Verb, **args: Any) -> Any:
+    async def request(self, verb: str, **args: Any) -> Any:
         """Looking is answered; RefusedError for everything else."""
         if verb == "preview":
             return await self._preview(int(args["width"]), int(args["height"]))

@@ -16,6 +16,7 @@ from station.cell.errors import LimitError, RefusedError
 from station.cell.plan import Plan, PlannedPose
 from station.cell.status import StationState as S
 from station.devices.ur import UrRobot
+from station.protocol.verbs import Purpose
 from station.simulation.admin import AdminClient
 from station.simulation.launch import SimulatedController
 from tests.station.session_rig import TRUTH, Rig
@@ -57,7 +58,7 @@ async def test_07_an_arm_jogged_while_paused_voids_the_go(cell: tuple[Rig, Admin
     rig.session.pause("anna")
     await rig.until(S.PAUSED)
     await rig.until_true(lambda: rig.session._run is not None and rig.session._run.done())
-    summary = await rig.session.prepare(1, "resume")
+    summary = await rig.session.prepare(1, Purpose.RESUME)
     await asyncio.sleep(0.3)  # it was seen at rest
     state = np.array(admin.ask("state")["joints_rad"])
     begun_s = time.monotonic()
@@ -77,6 +78,6 @@ async def test_an_unreachable_pose_is_refused_before_anything_is_sent(cell: tupl
     far = tuple((HOME + np.array([0, 0, 7.0, 0, 0, 0])).tolist())
     rig.session.load_plan(1, msgspec.structs.replace(PLAN, poses=(*PLAN.poses, PlannedPose("far", far))))
     with pytest.raises(LimitError, match=r"pose 5 \(far\): elbow would"):
-        await rig.session.prepare(1, "run")
+        await rig.session.prepare(1, Purpose.RUN)
     assert admin.ask("log")["counts"].get("upload: rtde_control", 0) == 0
     assert np.abs(np.array(admin.ask("state")["joints_rad"]) - HOME).max() < 1e-3

@@ -23,6 +23,7 @@ from station.cell.status import DetectionStatus, StationState
 from station.devices.base import Robot
 from station.devices.cell import Cell
 from station.devices.frames import CameraCounts
+from station.protocol.verbs import Purpose
 from station.session import Session
 from station.simulation.cell import make_cell
 from station.simulation.scenes import cell_config
@@ -269,7 +270,7 @@ class Rig:
             while not condition():
                 await asyncio.sleep(0.002)
 
-    async def give_go(self, purpose: str = "run") -> None:
+    async def give_go(self, purpose: Purpose = Purpose.RUN) -> None:
         summary = await self.session.prepare(1, purpose)
         self.session.go(1, summary.token)
 

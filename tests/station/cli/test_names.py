@@ -18,6 +18,7 @@ from station.cli import session as cli_session
 from station.operate.attend import Outcome
 from station.operate.progress import SessionProgress
 from station.plan.files import save_plan
+from station.protocol.verbs import Check
 from station.simulation.scenes import build_cell, cell_config
 from tests.command_line import call
 
@@ -70,7 +71,7 @@ def test_what_the_daemon_tells(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cli_control, "status_now", lambda socket: status)
     said = call(main, "status").stdout
     assert said.count(ALL) == 3
-    checks = [{"state": "failed", "name": "[/]", "text": "[red]x[/]", "remedy": "[/]"}]
+    checks = [Check("[/]", "failed", "[red]x[/]", "[/]")]
     monkeypatch.setattr(cli_control, "ask", lambda socket, verb: checks)
     said = call(main, "doctor").stdout
     assert "MISSING" in said and "[red]x[/]" in said and "→ [/]" in said

@@ -16,6 +16,7 @@ from typing import Any
 
 import pytest
 
+from recordings.errors import ErrorData
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import StationState, StationStatus
 from station.protocol.client import Client, DaemonGoneError
@@ -26,6 +27,7 @@ from station.protocol.messages import (
     USER_CLIENT_LIMIT,
     Reply,
 )
+from station.protocol.verbs import Go
 from station.server.control import OPEN_REQUESTS_LIMIT, ControlServer, Peer
 
 
@@ -44,11 +46,11 @@ class RecordingHandler:
         if verb == "make_plan":
             await self.release.wait()
         if verb == "go":
-            raise RefusedError("take the lease first")
+            raise RefusedError("no", code="no-control", remedy="Take it.", holder="anna")
         if verb == "skip":
             return {"index": int(args["index"])}
         self.order.append(verb)
-        return {"pid": peer.pid}
+        return {"version": "0", "pid": peer.pid, "root": "/"}
 
     def gone(self, peer: Peer) -> None:
         self.lost.append(peer.client_id)
@@ -100,11 +102,12 @@ async def test_stop_passes_everything_that_is_queued(server: Served, handler: Re
         await planning
 
 
-async def test_refusals_keep_their_words(server: Served) -> None:
+async def test_refusals_keep_their_code_values_and_remedy(server: Served) -> None:
     _, path = server
     async with await Client.connect(path) as client:
-        with pytest.raises(RefusedError, match="take the lease first"):
-            await client.request("go", token="x")
+        with pytest.raises(RefusedError) as refused:
+            await client.call(Go("x"))
+    assert refused.value.data == ErrorData("no-control", "no", "Take it.", {"holder": "anna"})
 
 
 async def test_watchers_get_everything_once_then_only_changes(server: Served) -> None:
@@ -120,22 +123,21 @@ async def test_watchers_get_everything_once_then_only_changes(server: Served) ->
 
 
 @pytest.mark.parametrize(
-    ("line", "said"),
+    ("line", "code"),
     [
-        (b"not json\n", "not a request"),
-        (b'{"id": 1, "verb": "__class__"}\n', "Invalid enum value"),
-        (b'{"id": 1, "verb": "hello", "extra": 1}\n', "unknown field"),
-        (b'{"id": "x", "verb": "hello"}\n', "Expected `int`"),
-        (b"[" * 5000 + b"\n", "not a request"),
-        (b'{"id": 1, "verb": "skip", "args": {"index": NaN}}\n', "not a request"),
-        (b'{"id": 1, "verb": "skip", "args": {}}\n', "wrong arguments"),
+        (b"not json\n", "not-a-request"),
+        (b'{"id": 1, "verb": "__class__"}\n', "unknown-verb"),
+        (b'{"id": 1, "verb": "hello", "extra": 1}\n', "not-a-request"),
+        (b'{"id": "x", "verb": "hello"}\n', "not-a-request"),
+        (b"[" * 5000 + b"\n", "not-a-request"),
+        (b'{"id": 1, "verb": "skip", "args": {"index": NaN}}\n', "not-a-request"),
         (b"x" * (LINE_LIMIT_BYTES + 1) + b"\n", "dropped"),
     ],
 )
-async def test_nonsense_is_answered_and_others_are_served(server: Served, line: bytes, said: str) -> None:
+async def test_nonsense_is_answered_and_others_are_served(server: Served, line: bytes, code: str) -> None:
     _, path = server
     answers = await raw(path, line)
-    assert said in answers[0]["error"]
+    assert answers[0]["problem"]["code"] == code and answers[0]["error"]
     async with await Client.connect(path) as client:
         assert await client.request("doctor")
 
@@ -164,7 +166,7 @@ async def test_of_too_many_questions_at_once_the_last_are_turned_away_but_never_
     writer.write(b"".join(waiting) + b'{"id": 99, "verb": "stop", "args": {}}\n')
     async with asyncio.timeout(5):
         first, second = [json.loads(await reader.readline()) for _ in range(2)]
-    assert first["id"] == OPEN_REQUESTS_LIMIT and "too many requests" in first["error"]
+    assert first["id"] == OPEN_REQUESTS_LIMIT and first["problem"]["code"] == "too-many-requests"
     assert (second["id"], second["ok"]) == (99, True)
     assert handler.order == ["stop"]
     handler.release.set()
@@ -203,8 +205,9 @@ async def test_a_long_request_goes_in_pieces_and_stop_passes_between_them(
         await other.request("stop")
         await client.request("stop")
         assert handler.order.count("stop") == 2
-        with pytest.raises(RefusedError, match=r"MB are more than the daemon takes.*fewer poses"):
+        with pytest.raises(RefusedError) as refused:
             await client.request("skip", note="x" * REQUEST_LIMIT_BYTES)
+        assert refused.value.values["limit_bytes"] == REQUEST_LIMIT_BYTES
 
 
 async def test_pieces_without_end_or_sense_are_answered_in_words(server: Served) -> None:
@@ -212,11 +215,11 @@ async def test_pieces_without_end_or_sense_are_answered_in_words(server: Served)
     piece = base64.b64encode(bytes(PIECE_BYTES)).decode()
     lines = [json.dumps({"id": i, "verb": "part", "args": {"base64": piece}}).encode() for i in range(70)]
     answers = await raw(path, b"\n".join(lines) + b"\n")
-    assert sum(not answer["ok"] for answer in answers) == 1
-    assert "nothing of it is kept" in next(answer["error"] for answer in answers if not answer["ok"])
+    refused = [answer["problem"]["code"] for answer in answers if not answer["ok"]]
+    assert refused == ["request-too-long"]
     nonsense = (b'{"id": 1, "verb": "part", "args": {"base64": "%"}}\n', b'{"id": 2, "verb": "whole"}\n')
     for answer in await raw(path, *nonsense):
-        assert "not a request" in answer["error"]
+        assert answer["problem"]["code"] == "not-a-request"
 
 
 async def test_a_client_that_does_not_read_is_dropped(server: Served, handler: RecordingHandler) -> None:
@@ -238,7 +241,7 @@ async def test_more_clients_than_seats_are_told(server: Served) -> None:
     _, path = server
     clients = [await Client.connect(path) for _ in range(USER_CLIENT_LIMIT)]
     answers = await raw(path)
-    assert "connected already" in answers[0]["error"]
+    assert answers[0]["problem"]["code"] == "house-full"
     for client in clients:
         await client.close()
 
@@ -254,8 +257,9 @@ async def test_a_lost_connection_is_told_to_the_handler(server: Served, handler:
 
 async def test_a_stale_socket_is_replaced_a_living_one_is_not(server: Served, tmp_path: Path) -> None:
     _, path = server
-    with pytest.raises(StationError, match="already serves"):
+    with pytest.raises(StationError) as refused:
         await ControlServer(path, RecordingHandler()).start()
+    assert refused.value.code == "already-served"
     stale = tmp_path / "stale.sock"
     left_over = socket.socket(socket.AF_UNIX)
     left_over.bind(str(stale))
@@ -266,8 +270,9 @@ async def test_a_stale_socket_is_replaced_a_living_one_is_not(server: Served, tm
 
 
 async def test_without_a_daemon_the_remedy_is_named(tmp_path: Path) -> None:
-    with pytest.raises(DaemonGoneError, match="station serve"):
+    with pytest.raises(DaemonGoneError) as gone:
         await Client.connect(tmp_path / "none.sock")
+    assert "station serve" in gone.value.remedy
 
 
 async def test_a_dying_daemon_ends_requests_and_statuses(server: Served) -> None:
@@ -278,10 +283,12 @@ async def test_a_dying_daemon_ends_requests_and_statuses(server: Served) -> None
     planning = asyncio.create_task(client.request("make_plan"))
     await asyncio.sleep(0.05)
     await control.close()
-    with pytest.raises(DaemonGoneError, match=r"not known\. Look at the cell"):
+    with pytest.raises(DaemonGoneError) as gone:
         await planning
-    with pytest.raises(DaemonGoneError, match="nothing was sent"):
+    assert gone.value.code == "unanswered"
+    with pytest.raises(DaemonGoneError) as gone:
         await client.request("go", token="")
+    assert gone.value.code == "no-daemon"
     async with asyncio.timeout(2):
         assert len([s async for s in statuses]) <= 1
     await client.close()

@@ -81,14 +81,14 @@ async def stopped(control: Path) -> Outcome:
 
 
 async def test_stop_is_confirmed_when_the_arm_rests(station: Station) -> None:
-    assert await stopped(station.server.control) is Outcome.RESTS
+    assert await stopped(station.control) is Outcome.RESTS
     assert station.heard == [Sender(os.getpid(), os.getuid())]
 
 
 @pytest.mark.parametrize("payload", [b"", b"\0" * 9, b'{"verb": "go"}', b"x" * 60_000])
 async def test_whatever_a_datagram_says_it_is_stop(station: Station, payload: bytes) -> None:
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link:
-        link.sendto(payload, str(stop_socket(station.server.control)))
+        link.sendto(payload, str(stop_socket(station.control)))
     async with asyncio.timeout(2):
         while not station.heard:
             await asyncio.sleep(0)
@@ -100,7 +100,7 @@ async def test_an_arm_that_is_not_seen_to_rest_is_not_called_stopped(
 ) -> None:
     monkeypatch.setattr("station.protocol.stop_client.REST_S", 0.2)
     station.speed_rad_s = speed_rad_s
-    assert await stopped(station.server.control) is outcome
+    assert await stopped(station.control) is outcome
     assert station.heard
 
 
@@ -110,7 +110,7 @@ async def test_rest_is_not_believed_before_a_move_could_show(
     """The newest state may be of before a move that had just begun."""
     monkeypatch.setattr(stop_server, "SETTLE_S", 60.0)
     monkeypatch.setattr("station.protocol.stop_client.REST_S", 0.2)
-    assert await stopped(station.server.control) is Outcome.MOVES
+    assert await stopped(station.control) is Outcome.MOVES
 
 
 async def test_of_a_flood_only_so_much_reaches_the_loop_and_another_stop_is_confirmed(
@@ -123,14 +123,14 @@ async def test_of_a_flood_only_so_much_reaches_the_loop_and_another_stop_is_conf
             link.setblocking(False)
             while flooding:
                 try:
-                    link.sendto(b"x", str(stop_socket(station.server.control)))
+                    link.sendto(b"x", str(stop_socket(station.control)))
                 except BlockingIOError:
                     time.sleep(0.0005)
 
     flooder = asyncio.create_task(asyncio.to_thread(flood))
     await asyncio.sleep(0.3)
     begun_s, before = time.monotonic(), len(station.heard)
-    assert await stopped(station.server.control) is Outcome.RESTS
+    assert await stopped(station.control) is Outcome.RESTS
     repeated = (len(station.heard) - before) / (time.monotonic() - begun_s + stop_server.REPEAT_S)
     flooding = False
     await flooder
@@ -138,9 +138,9 @@ async def test_of_a_flood_only_so_much_reaches_the_loop_and_another_stop_is_conf
 
 
 async def test_a_stop_after_an_acknowledgement_is_carried_out_however_soon_it_comes(station: Station) -> None:
-    assert await stopped(station.server.control) is Outcome.RESTS
+    assert await stopped(station.control) is Outcome.RESTS
     station.latched = False
-    assert send_stop(station.server.control)
+    assert send_stop(station.control)
     async with asyncio.timeout(2):
         while len(station.heard) < 2:
             await asyncio.sleep(0)
@@ -246,7 +246,7 @@ def test_a_fake_daemon_in_a_strangers_folder_is_not_believed(tmp_path: Path) -> 
         outcome, reason = stop(control)
         assert outcome is Outcome.UNTRUSTED and str(folder) in reason
         assert time.monotonic() - begun_s < 1.0
-        with pytest.raises(UntrustedFolderError):
+        with pytest.raises(StationError):
             make_folder(folder)
         # Even in a good folder: the page is the stranger's.
         folder.chmod(0o755)
@@ -289,7 +289,7 @@ def test_a_folder_that_others_may_write_to_is_refused(tmp_path: Path, mode: int)
     folder = tmp_path / "open"
     folder.mkdir()
     folder.chmod(mode)
-    with pytest.raises(UntrustedFolderError):
+    with pytest.raises(StationError):
         make_folder(folder)
     inside = folder / "inside"
     inside.mkdir(mode=0o700)
@@ -348,8 +348,8 @@ def test_the_page_is_read_as_it_was_written_and_nothing_else_is_taken_for_one(tm
 
 
 async def test_socket_and_page_are_the_groups(station: Station) -> None:
-    assert stat.S_IMODE(stop_socket(station.server.control).stat().st_mode) == 0o660
-    assert stat.S_IMODE(motion_page(station.server.control).stat().st_mode) == 0o640
+    assert stat.S_IMODE(stop_socket(station.control).stat().st_mode) == 0o660
+    assert stat.S_IMODE(motion_page(station.control).stat().st_mode) == 0o640
 
 
 async def test_a_disk_that_is_full_costs_the_confirmation_never_the_stop(
@@ -359,7 +359,7 @@ async def test_a_disk_that_is_full_costs_the_confirmation_never_the_stop(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(stop_server, "write_page", full)
-    assert await stopped(station.server.control) is Outcome.SILENT
+    assert await stopped(station.control) is Outcome.SILENT
     assert station.heard
 
 

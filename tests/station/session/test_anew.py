@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from station.cell.status import StationState as S
+from station.protocol.verbs import Purpose, Skip
 from tests.station.session_rig import POSES, Rig, sealed
 
 
@@ -15,7 +16,7 @@ async def _sealed_session(rig: Rig) -> None:
 async def test_the_sealed_session_stays_shown_until_the_go(rig: Rig) -> None:
     await _sealed_session(rig)
     before = rig.session.store.status.session
-    summary = await rig.session.prepare(1, "run")
+    summary = await rig.session.prepare(1, Purpose.RUN)
     assert summary.poses == POSES
     assert rig.session.store.status.session == before  # the answer may be no
     rig.arm.slow = True
@@ -27,9 +28,9 @@ async def test_the_sealed_session_stays_shown_until_the_go(rig: Rig) -> None:
 
 async def test_a_pose_that_was_left_out_stays_left_out(rig: Rig) -> None:
     """Before the first run, and in the next one."""
-    await rig.session.edit(1, "skip", lambda queue: queue.skip(1))
+    await rig.session.edit(Skip, 1, lambda queue: queue.skip(1))
     for _ in range(2):
-        assert (await rig.session.prepare(1, "run")).poses == POSES - 1
+        assert (await rig.session.prepare(1, Purpose.RUN)).poses == POSES - 1
         await _sealed_session(rig)
         assert rig.pose_states == ["done", "skipped", *["done"] * (POSES - 2)]
     assert len(list(sealed(rig).views())) == POSES - 1

@@ -8,7 +8,8 @@ import msgspec
 import pytest
 
 from station.devices.ur_dashboard import Dashboard, DashboardError
-from station.session.checklist import Check, checklist
+from station.protocol.verbs import Check
+from station.session.checklist import checklist
 from station.simulation.launch import SimulatedController
 from tests.station.session_rig import Rig
 

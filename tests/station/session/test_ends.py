@@ -17,6 +17,7 @@ from station.cell.errors import RefusedError, RobotError
 from station.cell.session_folder import SessionState
 from station.cell.status import StationState as S
 from station.operate.attend import STOP_ANSWER_S
+from station.protocol.verbs import Purpose
 from station.session import session
 from station.session.recording import SessionRecording
 from tests.station.session_rig import POSES, HeldDisk, Rig
@@ -198,7 +199,7 @@ async def test_nothing_begins_beside_a_sealing_that_stop_came_into(
         await rig.session.stop("bert")
         rig.session.acknowledge("anna")
         with pytest.raises(RefusedError, match="still ending"):
-            await rig.session.prepare(1, "resume")
+            await rig.session.prepare(1, Purpose.RESUME)
         with pytest.raises(RefusedError, match="still ending"):
             await rig.session.finish(1)
     moves = rig.arm.log.count("move")

@@ -11,6 +11,7 @@ from recordings.errors import MissingPartError, RecordingError
 from recordings.reader import open_recording
 from station.cell.errors import RefusedError, RobotError, SafetyStopError
 from station.cell.status import StationState as S
+from station.protocol.verbs import Purpose
 from station.session.recording import SessionRecording
 from tests.station.session_rig import POSES, NewRig, Rig, crash, sealed
 
@@ -59,7 +60,7 @@ async def test_a_protective_stop_stops_and_sends_nothing(rig: Rig) -> None:
     assert set(rig.arm.log) <= {"start control", "move", "end control"}
     rig.session.acknowledge("anna")
     with pytest.raises(SafetyStopError):
-        await rig.session.prepare(1, "resume")
+        await rig.session.prepare(1, Purpose.RESUME)
 
 
 async def test_a_tcp_changed_on_the_pendant_is_a_fault(rig: Rig) -> None:
@@ -100,20 +101,20 @@ async def test_a_full_disk_is_told_before_anybody_is_asked(rig: Rig) -> None:
     capture = msgspec.structs.replace(cell.config.capture, free_space_bytes=10**18)
     object.__setattr__(cell, "config", msgspec.structs.replace(cell.config, capture=capture))
     with pytest.raises(RefusedError, match=r"free \d+\.\d GB and go on\. Nothing moved"):
-        await rig.session.prepare(1, "run")
+        await rig.session.prepare(1, Purpose.RUN)
 
 
 async def test_a_jogged_arm_is_named_and_its_go_is_void(rig: Rig) -> None:
     await rig.go_until_it_moves()
     await rig.pause_after_this_pose("anna")
-    summary = await rig.session.prepare(1, "resume")
+    summary = await rig.session.prepare(1, Purpose.RESUME)
     await asyncio.sleep(0.3)
     rig.arm.joints = (*rig.arm.joints[:5], rig.arm.joints[5] + 0.3)
     store = rig.session.store
     await rig.until_true(lambda: any("was moved by 0 mm and 17°" in e.text for e in store.status.events))
     with pytest.raises(RefusedError, match="not valid"):
         rig.session.go(1, summary.token)
-    again = await rig.session.prepare(1, "resume")
+    again = await rig.session.prepare(1, Purpose.RESUME)
     assert any("was moved" in warning for warning in again.warnings)
 
 
@@ -121,7 +122,7 @@ async def test_a_robot_that_is_lost_at_rest_comes_back(rig: Rig) -> None:
     rig.arm.stale = True
     await rig.until(S.DISCONNECTED)
     with pytest.raises(RefusedError, match="not connected"):
-        await rig.session.prepare(1, "run")
+        await rig.session.prepare(1, Purpose.RUN)
     rig.arm.stale = False
     await rig.until(S.IDLE)
 
@@ -145,7 +146,7 @@ async def test_a_session_cut_by_a_crash_waits_for_a_person_and_goes_on_in_a_new_
     second.session.take_lease(1, "anna")
     second.session.acknowledge("anna")
     assert second.state is S.PAUSED
-    await second.give_go("resume")
+    await second.give_go(Purpose.RESUME)
     await second.until(S.IDLE)
     recording = sealed(second)
     assert [view.index for view in recording.views()] == list(range(POSES))

@@ -12,6 +12,7 @@ from recordings.schema.messages import Picture
 from station.cell.errors import RefusedError, TriggerError
 from station.cell.status import StationState as S
 from station.cell.stillness import StillnessMonitor
+from station.protocol.verbs import Drop, Purpose
 from station.session import free_drive
 from station.session.queue import PoseQueue
 from station.session.recording import SessionRecording
@@ -35,7 +36,7 @@ async def test_a_dropped_pose_does_not_take_the_name_of_the_next_picture(rig: Ri
     await rig.session.switch_free_drive(1, True, auto=False)
     await rig.session.record(1)
     await rig.session.switch_free_drive(1, False, auto=False)
-    await rig.session.edit(1, "drop", lambda queue: queue.drop(POSES - 1))
+    await rig.session.edit(Drop, 1, lambda queue: queue.drop(POSES - 1))
     await rig.session.switch_free_drive(1, True, auto=False)
     assert await rig.session.record(1) == POSES + 1
     names = [pose.name for pose in rig.session.store.status.session.poses]
@@ -126,8 +127,8 @@ async def test_stop_while_free_drive_begins_stays_latched(
 
 async def test_no_go_is_given_while_free_drive_begins(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     opened, beginning = await _begins(rig, monkeypatch)
-    with pytest.raises(RefusedError, match="free drive"):
-        await rig.session.prepare(1, "run")
+    with pytest.raises(RefusedError, match="freedrive"):
+        await rig.session.prepare(1, Purpose.RUN)
     opened.set()
     await beginning
     assert rig.state is S.FREE_DRIVE

@@ -17,16 +17,16 @@ from station.cell.errors import LimitError, RefusedError, RobotError
 from station.cell.status import DetectionStatus, HoverOffer
 from station.cell.status import StationState as S
 from station.plan.hover import SPEED_M_S, board_from_tip
-from station.session.hovering import HoverRequest
+from station.protocol.verbs import Hover
 from tests.station.hover_cell import POINTER, calibration_of, seen_from
 from tests.station.session_rig import TRUTH, Rig
 
 BOARD = np.array(TRUTH.board_place)
 
 
-def request(path: Path, corner: int = 0, **more: object) -> HoverRequest:
+def request(path: Path, corner: int = 0, **more: object) -> Hover:
     return msgspec.convert(
-        {"calibration": str(path), "corner": corner, "pointer_m": POINTER.tip_m[2], **more}, HoverRequest
+        {"calibration": str(path), "corner": corner, "pointer_m": POINTER.tip_m[2], **more}, Hover
     )
 
 
@@ -167,9 +167,9 @@ async def test_what_is_not_fit_to_drive_by_is_refused(
     with pytest.raises(RefusedError, match="OTHER"):
         await rig.session.prepare_hover(1, request(tmp_path / "other.yaml"))
     with pytest.raises(RefusedError, match="nothing is installed"):
-        await rig.session.prepare_hover(1, HoverRequest())
+        await rig.session.prepare_hover(1, Hover())
     with pytest.raises(RefusedError, match="knows no pointer"):
-        await rig.session.prepare_hover(1, HoverRequest(str(calibration)))
+        await rig.session.prepare_hover(1, Hover(str(calibration)))
     with pytest.raises(RefusedError, match="corners 0 to 41"):
         await rig.session.prepare_hover(1, request(calibration, 42))
     with pytest.raises(RefusedError, match="not looked at lately"):
@@ -208,11 +208,11 @@ async def test_a_calibration_of_another_cell_or_one_that_failed_is_not_driven_by
 async def test_not_within_an_open_session(rig: Rig, tmp_path: Path) -> None:
     await rig.go_until_it_moves()
     with pytest.raises(RefusedError, match="hover is not possible now"):
-        await rig.session.prepare_hover(1, HoverRequest())
+        await rig.session.prepare_hover(1, Hover())
     await rig.session.stop("anna")
     rig.session.acknowledge("anna")
     with pytest.raises(RefusedError, match="finish it first"):
-        await rig.session.prepare_hover(1, HoverRequest())
+        await rig.session.prepare_hover(1, Hover())
 
 
 async def test_pause_keeps_the_tip_high(hover_rig: Rig, calibration: Path) -> None:

@@ -23,6 +23,7 @@ from station.cell.plan import Plan, PlannedPose
 from station.cell.scene import cell_geometry
 from station.cell.status import StationState as S
 from station.plan.planner import make_plan
+from station.protocol.verbs import Purpose, Skip
 from station.session.queue import PoseQueue
 from tests.station.session_rig import TRUTH, NewRig, Rig, WorkerInThisProcess, crash, memory_config, sealed
 
@@ -79,17 +80,17 @@ async def test_the_remaining_poses_are_planned_anew_only_by_a_go(half_way: Rig, 
     rig = half_way
     await rig.until_true(lambda: "station improve" in rig.session.store.status.estimate.improve)
     before, moves = queue_of(rig).sha256, rig.arm.log.count("move")
-    summary = await rig.session.prepare(1, "improve")
+    summary = await rig.session.prepare(1, Purpose.REPLAN)
     assert summary.poses == POSES - BEFORE
     assert any("expected error at the end" in line for line in summary.changes)
     assert queue_of(rig).sha256 == before != summary.plan_sha256
-    old = await rig.session.prepare(1, "resume")
+    old = await rig.session.prepare(1, Purpose.RESUME)
     assert old.plan_sha256 == before
     with pytest.raises(RefusedError, match="not valid"):
         rig.session.go(1, summary.token)  # the later question made it void
     assert rig.arm.log.count("move") == moves
 
-    summary = await rig.session.prepare(1, "improve")
+    summary = await rig.session.prepare(1, Purpose.REPLAN)
     rig.session.go(1, summary.token)
     assert queue_of(rig).sha256 == summary.plan_sha256
     await rig.until(S.IDLE)
@@ -106,7 +107,7 @@ async def test_a_crash_before_the_first_of_them_is_saved_finds_what_was_agreed_t
     half_way: Rig, new_rig: NewRig
 ) -> None:
     half_way.arm.slow = True
-    summary = await half_way.session.prepare(1, "improve")
+    summary = await half_way.session.prepare(1, Purpose.REPLAN)
     half_way.session.go(1, summary.token)
     await half_way.until(S.MOVING)
     crash(half_way)
@@ -117,7 +118,7 @@ async def test_a_crash_before_the_first_of_them_is_saved_finds_what_was_agreed_t
     again.session.take_lease(1, "anna")
     again.session.acknowledge("anna")
     with pytest.raises(RefusedError, match="before the daemon's restart"):
-        await again.session.prepare(1, "improve")
+        await again.session.prepare(1, Purpose.REPLAN)
 
 
 class WorkerThatLooksBack(WorkerInThisProcess):
@@ -149,11 +150,11 @@ async def test_after_a_crash_the_pictures_before_it_count_in_the_estimate_and_th
     again.session.bench.workers = WorkerThatLooksBack(half_way)  # type: ignore[assignment]
     again.session.take_lease(1, "anna")
     again.session.acknowledge("anna")
-    summary = await again.session.prepare(1, "best")
+    summary = await again.session.prepare(1, Purpose.NEXT_POSE)
     assert any("expected error" in change for change in summary.changes)
     await again.until_true(lambda: again.session.store.status.estimate.views == BEFORE)
     assert again.session.store.status.estimate.translation_mm == known.estimate.translation_mm
-    await again.give_go("resume")
+    await again.give_go(Purpose.RESUME)
     await again.until(S.IDLE)
     assert again.session.store.status.session.elapsed_s > known.session.elapsed_s
     assert [view.index for view in sealed(again).views()] == list(range(POSES))
@@ -166,7 +167,7 @@ async def test_nothing_moves_by_poses_that_the_disk_did_not_take(
         raise OSError(28, "No space left on device")
 
     moves = half_way.arm.log.count("move")
-    summary = await half_way.session.prepare(1, "improve")
+    summary = await half_way.session.prepare(1, Purpose.REPLAN)
     monkeypatch.setattr("station.session.recording.write_state", full)
     half_way.session.go(1, summary.token)
     await half_way.until_true(lambda: "No space left" in half_way.session.store.status.reason)
@@ -175,8 +176,8 @@ async def test_nothing_moves_by_poses_that_the_disk_did_not_take(
 
 
 async def test_it_is_void_when_the_poses_change_meanwhile(half_way: Rig) -> None:
-    summary = await half_way.session.prepare(1, "improve")
-    await half_way.session.edit(1, "skip", lambda queue: queue.skip(BEFORE + 1))
+    summary = await half_way.session.prepare(1, Purpose.REPLAN)
+    await half_way.session.edit(Skip, 1, lambda queue: queue.skip(BEFORE + 1))
     with pytest.raises(RefusedError, match="not valid"):
         half_way.session.go(1, summary.token)
     assert "p09" in [status.name for status in queue_of(half_way).statuses]
@@ -191,7 +192,7 @@ async def test_too_early_is_told(rig: Rig, purpose: str) -> None:
 async def test_the_pose_that_helps_most_is_added_and_taken_by_its_own_go(half_way: Rig, plan: Plan) -> None:
     rig = half_way
     before, moves = queue_of(rig), rig.arm.log.count("move")
-    summary = await rig.session.prepare(1, "best")
+    summary = await rig.session.prepare(1, Purpose.NEXT_POSE)
     assert summary.poses == 1
     assert f"added as pose {POSES + 1}" in summary.changes[0] and "expected error" in summary.changes[1]
     assert queue_of(rig) is before  # until a person says yes
@@ -205,7 +206,7 @@ async def test_the_pose_that_helps_most_is_added_and_taken_by_its_own_go(half_wa
     assert rig.session.store.status.session.elapsed_s >= elapsed_s > 0  # of the session, not of this run
     driven = queue_of(rig).pose(POSES).joints_rad
     assert min(np.abs(np.subtract(driven, pose.joints_rad)).max() for pose in plan.poses) > 0.01
-    await rig.give_go("resume")
+    await rig.give_go(Purpose.RESUME)
     await rig.until(S.IDLE)
     assert len(sealed(rig).views()) == POSES + 1
 
@@ -222,7 +223,7 @@ async def test_a_pose_that_helps_is_checked_like_any(half_way: Rig) -> None:
 
     half_way.session.bench.workers = WorkerThatFolds(half_way)  # type: ignore[assignment]
     with pytest.raises(LimitError, match="refused, nothing moved"):
-        await half_way.session.prepare(1, "best")
+        await half_way.session.prepare(1, Purpose.NEXT_POSE)
     assert queue_of(half_way) is before and half_way.session.store.status.go is None
 
 

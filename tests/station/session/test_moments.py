@@ -12,6 +12,7 @@ from station.cell import limits
 from station.cell.errors import RefusedError
 from station.cell.plan import Plan
 from station.cell.status import StationState as S
+from station.protocol.verbs import Drop, Purpose
 from station.session import run, session
 from tests.station.session_rig import POSES, HeldDisk, Rig
 
@@ -33,7 +34,7 @@ async def test_a_pose_dropped_while_control_starts_is_not_driven(rig: Rig) -> No
     held = HeldStart(rig)
     await rig.give_go()
     await rig.until_true(lambda: rig.arm.control)
-    await rig.session.edit(1, "drop", lambda queue: queue.drop(1))
+    await rig.session.edit(Drop, 1, lambda queue: queue.drop(1))
     held.go_on.set()
     await rig.until(S.IDLE, S.FAULT)
     assert rig.state is S.IDLE, rig.session.store.status.reason
@@ -130,7 +131,7 @@ async def test_an_arm_that_moved_while_its_way_was_checked_is_not_driven(
 async def test_a_run_that_cannot_be_made_leaves_the_station_at_rest(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    summary = await rig.session.prepare(1, "run")
+    summary = await rig.session.prepare(1, Purpose.RUN)
 
     def broken(*_: object) -> None:
         raise ZeroDivisionError("a defect")
@@ -152,7 +153,7 @@ async def test_nothing_new_begins_beside_a_run_that_does_not_end(
     assert rig.state is S.PAUSED
     for what in (
         lambda: rig.session.switch_free_drive(1, True, auto=False),
-        lambda: rig.session.prepare(1, "resume"),
+        lambda: rig.session.prepare(1, Purpose.RESUME),
         lambda: rig.session.finish(1),
     ):
         with pytest.raises(RefusedError, match="still ending"):

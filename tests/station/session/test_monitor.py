@@ -9,6 +9,7 @@ import pytest
 
 from station.cell.status import StationState as S
 from station.devices.rtde import RobotMode, SafetyMode
+from station.protocol.verbs import Purpose
 from station.session import monitor
 from tests.station.session_rig import NewRig, Rig
 
@@ -21,7 +22,7 @@ async def test_a_wish_that_waits_for_the_pose_is_told_until_it_is_carried_out(ri
     rig.arm.arrive.set()
     await rig.until(S.PAUSED)
     await rig.until_true(lambda: rig.session.store.status.pending == "")
-    await rig.give_go("resume")
+    await rig.give_go(Purpose.RESUME)
     await rig.until(S.MOVING)
     await rig.session.finish(1)
     await rig.until_true(lambda: rig.session.store.status.pending == monitor.FINISHES)
@@ -66,13 +67,13 @@ async def test_a_session_is_told_as_solved_while_its_calibration_is_there(
 
 async def test_the_question_says_that_a_playback_moves_nothing(new_rig: NewRig) -> None:
     rig = await new_rig(source="playback")
-    summary = await rig.session.prepare(1, "run")
+    summary = await rig.session.prepare(1, Purpose.RUN)
     assert summary.warnings == ("PLAYBACK of a recording: no arm moves",)
     assert rig.session.store.status.robot.held == ""
 
 
 async def test_a_drift_check_is_told_as_one_until_the_next_run(rig: Rig) -> None:
-    await rig.give_go("check")
+    await rig.give_go(Purpose.DRIFT_CHECK)
     await rig.until_true(lambda: bool(rig.session.store.status.session.recording))
     assert rig.session.store.status.session.check
     rig.arm.slow = True

@@ -16,6 +16,7 @@ from station.analysis.pool import WorkerError, Workers
 from station.cell.errors import LimitError, RefusedError, StationError
 from station.cell.plan import Plan
 from station.cell.status import StationState as S
+from station.protocol.verbs import Purpose, Reorder
 from station.server.control import ControlServer
 from station.server.dispatch import SessionDispatcher
 from station.session import guard, keeper, monitor
@@ -67,18 +68,18 @@ async def test_a_watcher_that_fails_does_not_come_between_stop_and_the_arm(rig: 
 @pytest.mark.parametrize("change", ["stop", "edit", "lease", "prepare"])
 async def test_what_changes_while_the_way_is_checked_leaves_no_go(rig: Rig, change: str) -> None:
     gate = Gate(rig)
-    preparing = asyncio.ensure_future(rig.session.prepare(1, "run"))
+    preparing = asyncio.ensure_future(rig.session.prepare(1, Purpose.RUN))
     await gate.entered.wait()
     if change == "stop":
         await rig.session.stop("bert")
         rig.session.acknowledge("anna")
     elif change == "edit":
-        await rig.session.edit(1, "reorder", lambda queue: queue.reorder([1, 0, *range(2, POSES)]))
+        await rig.session.edit(Reorder, 1, lambda queue: queue.reorder([1, 0, *range(2, POSES)]))
     elif change == "lease":
         await rig.session.release_lease(1)
         rig.session.take_lease(1, "anna")
     else:
-        later = asyncio.ensure_future(rig.session.prepare(1, "run"))
+        later = asyncio.ensure_future(rig.session.prepare(1, Purpose.RUN))
         await asyncio.sleep(0)
     gate.open.set()
     with pytest.raises(RefusedError, match="again"):
@@ -91,7 +92,7 @@ async def test_what_changes_while_the_way_is_checked_leaves_no_go(rig: Rig, chan
 
 async def test_a_robot_that_was_lost_voids_the_go(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(guard, "LOST_ROUNDS", 2)
-    summary = await rig.session.prepare(1, "run")
+    summary = await rig.session.prepare(1, Purpose.RUN)
     rig.arm.stale = True
     await rig.until(S.DISCONNECTED)
     rig.arm.stale = False
@@ -245,7 +246,7 @@ async def test_speeds_that_are_none_are_refused_before_a_go(
 ) -> None:
     rig.session.load_plan(1, msgspec.structs.replace(small_plan, **speeds))
     with pytest.raises(LimitError, match="speed"):
-        await rig.session.prepare(1, "run")
+        await rig.session.prepare(1, Purpose.RUN)
 
 
 async def test_a_call_that_hangs_costs_its_own_answer_only() -> None:

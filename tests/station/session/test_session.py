@@ -14,6 +14,7 @@ from recordings.reader import open_recording
 from station.cell.errors import LimitError, RefusedError, RobotError
 from station.cell.plan import Plan
 from station.cell.status import StationState as S
+from station.protocol.verbs import Add, Drop, Purpose, Reorder, Retake, Skip
 from tests.station.session_rig import POSES, HeldDisk, Rig, sealed
 
 WHOLE_POSE = [S.MOVING, S.SETTLING, S.CAPTURING, S.WRITING]
@@ -39,7 +40,7 @@ async def test_a_go_takes_every_pose_and_seals(rig: Rig, small_plan: Plan) -> No
 
 async def test_control_lives_only_for_a_go(rig: Rig) -> None:
     assert "start control" not in rig.arm.log
-    await rig.session.prepare(1, "run")
+    await rig.session.prepare(1, Purpose.RUN)
     assert "start control" not in rig.arm.log
     await rig.give_go()
     await rig.until(S.IDLE)
@@ -78,7 +79,7 @@ async def test_pause_is_after_this_pose_and_going_on_needs_a_new_go(rig: Rig) ->
     await asyncio.sleep(0.05)
     assert rig.arm.log.count("move") == 1
     rig.arm.slow = False
-    await rig.give_go("resume")
+    await rig.give_go(Purpose.RESUME)
     await rig.until(S.IDLE)
     assert len(sealed(rig).views()) == POSES
 
@@ -89,7 +90,8 @@ async def test_stop_is_latched_and_the_go_is_gone(rig: Rig) -> None:
     assert rig.state is S.STOPPED
     assert "stop" in rig.arm.log
     assert rig.pose_states == ["planned"] * POSES
-    for forbidden in (rig.give_go("resume"), rig.session.prepare(1, "run"), rig.session.finish(1)):
+    resume, run = rig.give_go(Purpose.RESUME), rig.session.prepare(1, Purpose.RUN)
+    for forbidden in (resume, run, rig.session.finish(1)):
         with pytest.raises(RefusedError, match="STOP is latched"):
             await forbidden
     rig.session.acknowledge("anna")
@@ -98,13 +100,13 @@ async def test_stop_is_latched_and_the_go_is_gone(rig: Rig) -> None:
     await asyncio.sleep(0.05)
     assert rig.arm.log.count("move") == moves
     rig.arm.slow = False
-    await rig.give_go("resume")
+    await rig.give_go(Purpose.RESUME)
     await rig.until(S.IDLE)
     assert len(sealed(rig).views()) == POSES
 
 
 async def test_stop_voids_a_go_that_waits(rig: Rig) -> None:
-    summary = await rig.session.prepare(1, "run")
+    summary = await rig.session.prepare(1, Purpose.RUN)
     await rig.session.stop("bert")
     rig.session.acknowledge("anna")
     with pytest.raises(RefusedError, match="not valid"):
@@ -133,7 +135,7 @@ async def test_stop_in_every_phase_keeps_what_was_taken(rig: Rig, phase: S) -> N
     if phase is S.SEALING:
         assert rig.state is S.IDLE
     else:
-        await rig.give_go("resume")
+        await rig.give_go(Purpose.RESUME)
         await rig.until(S.IDLE)
     assert len(sealed(rig).views()) == POSES
 
@@ -147,10 +149,10 @@ async def test_a_lost_commander_stops_the_arm_at_once(rig: Rig) -> None:
     assert "stop" in rig.arm.log
     assert "connection of anna" in rig.session.store.status.reason
     with pytest.raises(RefusedError, match="take the lease"):
-        await rig.session.prepare(1, "resume")
+        await rig.session.prepare(1, Purpose.RESUME)
     rig.session.take_lease(2, "bert")
     rig.arm.slow = False
-    summary = await rig.session.prepare(2, "resume")
+    summary = await rig.session.prepare(2, Purpose.RESUME)
     rig.session.go(2, summary.token)
     await rig.until(S.IDLE)
     assert len(sealed(rig).views()) == POSES
@@ -188,7 +190,7 @@ async def test_a_retake_supersedes(rig: Rig) -> None:
     await rig.until(S.PAUSED)
     rig.arm.slow = False
     done = rig.pose_states.count("done")
-    summary = await rig.session.prepare(1, "retake", 0)
+    summary = await rig.session.prepare(1, Purpose.RETAKE, 0)
     assert summary.purpose == "retake pose 1"
     assert summary.poses == 1
     rig.session.go(1, summary.token)
@@ -201,19 +203,19 @@ async def test_a_retake_supersedes(rig: Rig) -> None:
 
 async def test_plans_can_be_changed_and_a_waiting_go_is_void_then(rig: Rig, small_plan: Plan) -> None:
     session = rig.session
-    summary = await session.prepare(1, "run")
-    await session.edit(1, "skip", lambda queue: queue.skip(1))
+    summary = await session.prepare(1, Purpose.RUN)
+    await session.edit(Skip, 1, lambda queue: queue.skip(1))
     with pytest.raises(RefusedError, match="not valid"):
         session.go(1, summary.token)
-    await session.edit(1, "reorder", lambda queue: queue.reorder([3, 2, 1, 0]))
-    await session.edit(1, "drop", lambda queue: queue.drop(0))
+    await session.edit(Reorder, 1, lambda queue: queue.reorder([3, 2, 1, 0]))
+    await session.edit(Drop, 1, lambda queue: queue.drop(0))
     extra = msgspec.structs.replace(small_plan.poses[0], name="again")
-    assert await session.edit(1, "add", lambda queue: queue.add(extra)) == POSES
+    assert await session.edit(Add, 1, lambda queue: queue.add(extra)) == POSES
     with pytest.raises(RefusedError, match="no pose 1"):
-        await session.edit(1, "retake", lambda queue: queue.retake(0))
+        await session.edit(Retake, 1, lambda queue: queue.retake(0))
     assert [pose.index for pose in session.store.status.session.poses] == [3, 2, 1, 4]
     with pytest.raises(RefusedError, match="watch and STOP"):
-        await session.edit(2, "skip", lambda queue: queue.skip(2))
+        await session.edit(Skip, 2, lambda queue: queue.skip(2))
 
 
 async def test_a_plan_that_leaves_its_limits_is_refused_whole(rig: Rig, small_plan: Plan) -> None:
@@ -222,7 +224,7 @@ async def test_a_plan_that_leaves_its_limits_is_refused_whole(rig: Rig, small_pl
     poses[2] = msgspec.structs.replace(poses[2], joints_rad=far, base_from_flange=None)
     rig.session.load_plan(1, msgspec.structs.replace(small_plan, poses=tuple(poses)))
     with pytest.raises(LimitError, match="wrist 3"):
-        await rig.session.prepare(1, "run")
+        await rig.session.prepare(1, Purpose.RUN)
     assert "move" not in rig.arm.log
 
 

@@ -17,6 +17,7 @@ from station.cell.errors import CameraError, RefusedError
 from station.cell.status import DetectionStatus
 from station.cell.status import StationState as S
 from station.plan.sweep import SWINGS, sweep_plan
+from station.protocol.verbs import Drop, Purpose, Skip
 from tests.station.session_rig import TRUTH, CameraInMemory, Rig, sealed
 
 
@@ -38,7 +39,7 @@ async def swing_to_the_end(rig: Rig) -> None:
 
 async def test_it_swings_takes_pictures_and_comes_back(sweeping: Rig) -> None:
     sweeping.arm.slow = True
-    summary = await sweeping.session.prepare(1, "run")
+    summary = await sweeping.session.prepare(1, Purpose.RUN)
     assert "sweep: 8 slow swings" in summary.purpose and sweeping.arm.log == []
     sweeping.session.go(1, summary.token)
     await sweeping.until(S.MOVING)
@@ -178,9 +179,9 @@ async def test_a_full_disk_stops_a_stream_and_the_arm(
 async def test_a_swing_that_a_person_leaves_out_or_drops_is_not_driven(sweeping: Rig) -> None:
     rig = sweeping
     await rig.go_until_it_moves()
-    await rig.session.edit(1, "skip", lambda queue: queue.skip(1))
+    await rig.session.edit(Skip, 1, lambda queue: queue.skip(1))
     for index in range(2, SWINGS - 1):
-        await rig.session.edit(1, "drop", lambda queue, index=index: queue.drop(index))
+        await rig.session.edit(Drop, 1, lambda queue, index=index: queue.drop(index))
     for number in (1, 2):
         await rig.until_true(lambda n=number: rig.arm.log.count("move") == n)
         rig.arm.arrive.set()

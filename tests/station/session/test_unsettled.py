@@ -8,6 +8,7 @@ import pytest
 
 from recordings.reader import open_recording
 from station.cell.status import StationState as S
+from station.protocol.verbs import Purpose, Retake
 from tests.station.session_rig import POSES, Rig
 
 SHAKY = 1
@@ -35,7 +36,7 @@ def shaken(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
 
 async def give_headless_go(rig: Rig) -> None:
-    summary = await rig.session.prepare(1, "run")
+    summary = await rig.session.prepare(1, Purpose.RUN)
     rig.session.go(1, summary.token, again=True)
 
 
@@ -65,9 +66,9 @@ async def test_a_person_is_asked(rig: Rig, shaken: list[int]) -> None:
     assert rig.pose_states == ["done", "failed", "done", "done"]
     assert "pose 2 did not come to rest" in rig.session.store.status.reason
     moves = rig.arm.log.count("move")
-    await rig.session.edit(1, "retake", lambda queue: queue.retake(SHAKY))
+    await rig.session.edit(Retake, 1, lambda queue: queue.retake(SHAKY))
     assert rig.arm.log.count("move") == moves
-    await rig.give_go("resume")
+    await rig.give_go(Purpose.RESUME)
     await rig.until(S.IDLE)
     assert rig.pose_states == ["done"] * POSES
 

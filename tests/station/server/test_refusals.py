@@ -10,7 +10,7 @@ import pytest
 from station.cell.errors import RefusedError
 from station.cell.plan import Plan
 from station.cell.status import StationState as S
-from station.protocol.states import VERB_STATES
+from station.protocol.verbs import VERBS
 from station.server.control import Peer
 from station.server.dispatch import SessionDispatcher
 from tests.station.session_rig import POSES, Rig
@@ -32,7 +32,7 @@ def arguments(verb: str, plan: Plan) -> dict[str, Any]:
 
 
 def test_every_verb_that_depends_on_a_state_is_tried_here() -> None:
-    assert set(ARGUMENTS) == {verb for verb, states in VERB_STATES.items() if states != frozenset(S)}
+    assert set(ARGUMENTS) == {name for name, verb in VERBS.items() if verb.states != frozenset(S)}
 
 
 @pytest.mark.parametrize("verb", ARGUMENTS)
@@ -42,10 +42,11 @@ async def test_a_verb_out_of_its_state_is_refused_and_changes_nothing(
     monkeypatch.setattr(rig.session.guard, "_look", lambda: None)  # it would correct the state
     dispatcher, store = SessionDispatcher(rig.session), rig.session.store
     calm, done = store.status, list(rig.arm.log)
-    for state in set(S) - VERB_STATES[verb]:  # type: ignore[index]
+    for state in set(S) - VERBS[verb].states:
         store._status = msgspec.structs.replace(calm, state=state)
-        with pytest.raises(RefusedError, match="is not possible now"):
+        with pytest.raises(RefusedError) as refused:
             await dispatcher.handle(ANNA, verb, arguments(verb, small_plan))
+        assert (refused.value.code, refused.value.values["state"]) == ("wrong-state", state)
         assert store.status == msgspec.structs.replace(calm, state=state)
     assert rig.arm.log == done
     assert not (rig.session.bench.pause_wanted or rig.session.bench.finish_wanted)

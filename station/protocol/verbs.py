@@ -1,0 +1,324 @@
+"""The one table of what a client may ask of the daemon: each class here is a verb.
+
+Its fields are the arguments, its type parameter the result, its docstring the line of help; `states` says in
+which states it is allowed, `control` whether only the client that has control may ask. Dispatch, client,
+`--json` and docs/protocol.md follow from it.
+"""
+
+from __future__ import annotations
+
+import re
+from enum import StrEnum
+from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar, get_args
+
+import msgspec
+
+from station.cell import status
+from station.cell.errors import RefusedError
+from station.cell.plan import Plan, PlannedPose
+from station.cell.session_folder import SessionSummary
+from station.cell.status import GoSummary, HoverOffer
+from station.cell.status import StationState as S
+from station.protocol.states import LATCHED, RESTING, RUNNING
+
+R = TypeVar("R", covariant=True)
+_ANY = frozenset(S)
+_LOADING = frozenset({S.IDLE, S.DISCONNECTED})
+
+
+class Verb(msgspec.Struct, Generic[R], frozen=True, forbid_unknown_fields=True):
+    """A request with its arguments; `R`: the type of its result."""
+
+    states: ClassVar[frozenset[S]] = _ANY
+    control: ClassVar[bool] = True
+    spoken: ClassVar[str] = ""
+    """What it asks for, where its name is the program's own."""
+    wire: ClassVar[str] = ""
+    """Its name on the wire, where that is not the class's (`LoadPlan`: load_plan)."""
+
+    @classmethod
+    def verb(cls) -> str:
+        return cls.wire or re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).lower()
+
+    @classmethod
+    def result(cls) -> Any:
+        """The type of its result."""
+        return get_args(cls.__orig_bases__[0])[0]  # type: ignore[attr-defined]
+
+    @classmethod
+    def help(cls) -> str:
+        return (cls.__doc__ or "").split("\n")[0]
+
+    @classmethod
+    def refusal(cls, state: S) -> RefusedError | None:
+        """Why it is not possible in this state; None where it is."""
+        if state in cls.states:
+            return None
+        why, remedy = _NOT_NOW.get(state, (f"the session is {state.value}", "Pause or stop it first."))
+        if cls is Acknowledge:
+            why, remedy = "nothing is stopped", ""
+        said = cls.spoken or cls.verb().replace("_", " ")
+        return RefusedError(
+            f"{said} is not possible now: {why}",
+            code="wrong-state",
+            remedy=remedy,
+            verb=cls.verb(),
+            state=state.value,
+        )
+
+
+_NOT_NOW: dict[S, tuple[str, str]] = {
+    S.DISCONNECTED: ("the robot is not connected", "`station doctor` says why."),
+    S.STOPPED: ("STOP is latched", "Look at the cell, then acknowledge."),
+    S.FAULT: ("there is a fault", "Read it, look at the cell, then acknowledge."),
+    S.SEALING: ("the recording is being finished", "Wait a moment."),
+    S.IDLE: ("no session is running", ""),
+    S.PAUSED: ("the session is paused", ""),
+    S.FREE_DRIVE: ("the arm is in freedrive", "End it first."),
+}
+
+
+class Done(msgspec.Struct, frozen=True):
+    """It is done, and there is nothing to tell."""
+
+
+class Welcome(msgspec.Struct, frozen=True):
+    version: str
+    pid: int
+    root: str
+    """Folder of the sessions and of what is installed."""
+
+
+class LoadedPlan(msgspec.Struct, frozen=True, omit_defaults=True):
+    plan: Plan | None = None
+    """None: there is none."""
+    sha256: str = ""
+
+
+class PlanFacts(msgspec.Struct, frozen=True):
+    poses: int
+    sha256: str
+
+
+class PoseNumber(msgspec.Struct, frozen=True):
+    index: int
+
+
+class PreviewImage(msgspec.Struct, frozen=True, omit_defaults=True):
+    jpeg_base64: str = ""
+    """Empty: the camera shows nothing."""
+    width: int = 0
+    height: int = 0
+    corners: tuple[tuple[float, float], ...] = ()
+    """Of the board, as shares of the image's sides."""
+    sequence: int = 0
+
+
+class Check(msgspec.Struct, frozen=True):
+    """One line of the preflight check."""
+
+    name: str
+    state: Literal["ok", "warning", "failed", "skipped"]
+    text: str
+    remedy: str = ""
+
+
+class Purpose(StrEnum):
+    """What a motion is prepared for."""
+
+    RUN = "run"
+    DRIFT_CHECK = "check"
+    RESUME = "resume"
+    RETAKE = "retake"
+    REPLAN = "improve"
+    NEXT_POSE = "best"
+
+
+class Hello(Verb[Welcome], frozen=True):
+    """Introduce the client."""
+
+    control = False
+    who: str = ""
+
+
+class Watch(Verb[Done], frozen=True):
+    """Send the whole status now, then every change."""
+
+    control = False
+
+
+class Lease(Verb[status.Lease], frozen=True):
+    """Take or release control; `lost`: nobody is at the screen that has it."""
+
+    control = False
+    action: Literal["take", "release", "lost"] = "take"
+
+
+class Stop(Verb[Done], frozen=True):
+    """Stop the arm now, from any client."""
+
+    control = False
+
+
+class Acknowledge(Verb[Done], frozen=True):
+    """Leave `stopped` or `fault` after a person looked."""
+
+    states = LATCHED
+    control = False
+
+
+class GetPlan(Verb[LoadedPlan], frozen=True):
+    """Return the loaded plan."""
+
+    wire = "plan"
+    control = False
+
+
+class LoadPlan(Verb[PlanFacts], frozen=True):
+    """Load a plan, checked; refused with all its problems."""
+
+    states = _LOADING
+    spoken = "another plan"
+    plan: Plan
+
+
+class MakePlan(Verb[PlanFacts], frozen=True):
+    """Make a plan in a worker process and load it."""
+
+    states = _LOADING
+    spoken = "a new plan"
+    poses: Annotated[int, msgspec.Meta(ge=4, le=200)] = 25
+    seed: int = 0
+    lens_known: bool = False
+
+
+class Prepare(Verb[GoSummary], frozen=True):
+    """Check the whole path from where the arm is and offer its approval."""
+
+    states = RESTING
+    spoken = "a motion"
+    purpose: Purpose = Purpose.RUN
+    index: int | None = None
+    """Of the pose to retake."""
+
+
+class Hover(Verb[HoverOffer], frozen=True):
+    """Check a slow path over a corner of the board and offer its approval."""
+
+    states = RESTING
+    calibration: str = ""
+    """A calibration file; empty: what is installed below the daemon's root."""
+    corner: int = 0
+    standoff_m: float = 0.08
+    pointer_m: float | None = None
+    """Length of a pointer along the flange's z axis; None: the configured one, or the pendant's tool."""
+    new_picture: bool = True
+    """False: the board as it was last seen for this calibration."""
+
+
+class Go(Verb[Done], frozen=True):
+    """Approve exactly the motion that was offered, once."""
+
+    states = RESTING
+    token: str
+    plan_sha256: str = ""
+    headless: bool = False
+    """Nobody will be asked: poses that do not come to rest are tried once more."""
+
+
+class Pause(Verb[Done], frozen=True):
+    """Pause after this pose."""
+
+    states = RUNNING
+    control = False
+
+
+class Finish(Verb[Done], frozen=True):
+    """Finish the recording with what is there; a pose under way is taken first."""
+
+    states = RUNNING | {S.PAUSED, S.FREE_DRIVE}
+
+
+class Retake(Verb[Done], frozen=True):
+    """Plan a pose once more."""
+
+    states = RUNNING | RESTING
+    index: int
+
+
+class Skip(Verb[Done], frozen=True):
+    """Leave a pose out."""
+
+    states = RUNNING | RESTING
+    index: int
+
+
+class Reorder(Verb[Done], frozen=True):
+    """Change the order of the poses; each number once."""
+
+    states = RESTING
+    order: tuple[int, ...]
+
+
+class Add(Verb[PoseNumber], frozen=True):
+    """Add a pose at the end."""
+
+    states = RESTING
+    pose: PlannedPose
+
+
+class Drop(Verb[Done], frozen=True):
+    """Remove a pose that was never tried."""
+
+    states = RUNNING | RESTING
+    index: int
+
+
+class FreeDrive(Verb[Done], frozen=True):
+    """Begin or end capture by hand; `auto`: an image whenever the arm rests anew."""
+
+    states = RESTING | {S.FREE_DRIVE}
+    on: bool
+    auto: bool = False
+
+
+class Record(Verb[PoseNumber], frozen=True):
+    """Capture here and now (freedrive)."""
+
+    states = frozenset({S.FREE_DRIVE})
+
+
+class Preview(Verb[PreviewImage], frozen=True):
+    """Return the newest image that fits into width × height, px."""
+
+    control = False
+    width: int = 480
+    height: int = 384
+
+
+class Doctor(Verb[list[Check]], frozen=True):
+    """Run the preflight check."""
+
+    control = False
+
+
+class Sessions(Verb[list[SessionSummary]], frozen=True):
+    """List the sessions on the disk, newest first."""
+
+    control = False
+
+
+class Part(Verb[Done], frozen=True):
+    """Send the next piece of a request that is longer than a line."""
+
+    control = False
+    base64: str = ""
+
+
+class Whole(Verb[Any], frozen=True):
+    """Carry out the request whose pieces were sent, and return its result."""
+
+    control = False
+
+
+VERBS: dict[str, type[Verb[Any]]] = {kind.verb(): kind for kind in Verb.__subclasses__()}

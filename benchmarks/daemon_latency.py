@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from recordings.recorder import Recorder
-from recordings.schema.messages import Picture, SessionInfo, Stamps
+from recordings.schema.messages import Image, SessionInfo, Stamps
 from station.cell.status import StationState
 from station.cli.demo import simulated_daemon
 from station.protocol.client import Client
@@ -110,6 +110,6 @@ def _pictures(recorder: Recorder, width: int, height: int, ended: threading.Even
     begun_s, number = time.monotonic(), 0
     while not ended.is_set():
         stamps = Stamps(time.monotonic_ns(), time.time_ns(), device_ns=time.monotonic_ns())
-        recorder.picture(Picture(image, stamps, frame_id=number % 65535 + 1, sequence=number))
+        recorder.image(Image(image, stamps, frame_id=number % 65535 + 1, sequence=number))
         number += 1
         time.sleep(max(0.0, begun_s + number / FPS - time.monotonic()))

@@ -23,8 +23,8 @@ import msgspec
 import numpy as np
 
 from benchmarks.processes import DaemonUsage, daemon_of_this_process, put_before_others, step_behind_others
-from recordings.part import RecordingPart
 from recordings.reader import open_recording
+from recordings.segment import RecordingSegment
 from station.cell.plan import Plan, PlannedPose
 from station.cell.status import StationState, StationStatus
 from station.cli.demo import simulated_daemon
@@ -127,7 +127,7 @@ def verify(path: Path) -> Checked:
     """Reads the recording strictly, compares everything, deletes it."""
     recording = open_recording(path)
     truth = msgspec.json.decode(recording.attachments()["truth.json"], type=CellTruth)
-    checked = _pictures(recording.parts[0], still_picture(truth))
+    checked = _pictures(recording.segments[0], still_picture(truth))
     times = np.array([s.stamps.controller_s for s in recording.robot_states()])
     steps = np.round(np.diff(times) / STATE_PERIOD_S).astype(int)
     checked.states, checked.states_s = len(times), float(np.ptp(times))
@@ -136,15 +136,15 @@ def verify(path: Path) -> Checked:
     return checked
 
 
-def _pictures(part: RecordingPart, still: np.ndarray) -> Checked:
+def _pictures(part: RecordingSegment, still: np.ndarray) -> Checked:
     checked = Checked()
     last: tuple[int, int] | None = None
     first_ns = 0
-    for sequence in part.picture_sequences():
-        picture = part.picture(sequence)
-        number = int.from_bytes(picture.image.reshape(-1)[:8].tobytes(), "little")
-        height, width = picture.image.shape
-        same = np.array_equal(picture.image, numbered_picture(number, width, height, still))
+    for sequence in part.image_sequences():
+        picture = part.image(sequence)
+        number = int.from_bytes(picture.pixels.reshape(-1)[:8].tobytes(), "little")
+        height, width = picture.pixels.shape
+        same = np.array_equal(picture.pixels, numbered_picture(number, width, height, still))
         if last is None:
             first_ns = picture.stamps.device_ns
         else:

@@ -20,7 +20,7 @@ from recordings.reader import open_recording
 from recordings.schema.messages import (
     CameraIdentity,
     CameraModel,
-    Picture,
+    Image,
     RobotIdentity,
     SessionInfo,
     Stamps,
@@ -97,7 +97,7 @@ def make_recording(path: Path, views: int = 25, factor: float = 1.0, seed: int =
         for k in range(views):
             image, seen = scene(truth.board, Case(tilt_deg=25.0), 1000 * seed + k, camera)
             stamps = Stamps(k * 10**9, 10**18 + k * 10**9)
-            writer.picture(Picture(image, stamps, frame_id=k, sequence=k))
+            writer.image(Image(image, stamps, frame_id=k, sequence=k))
             flange = P @ np.linalg.inv(seen) @ np.linalg.inv(X)
             writer.view(View(k, f"pose-{k}", k, tuple(tuple(row) for row in flange.tolist()), stamps=stamps))
         return writer.finish()
@@ -108,8 +108,8 @@ def _opencv_ms(path: Path) -> float:
     start = time.perf_counter()
     recording = open_recording(path)
     board = recording.info.board
-    for _, picture in recording.pictures():
-        found, corners = cv2.findChessboardCorners(picture.image, (board.columns, board.rows))
+    for _, picture in recording.images():
+        found, corners = cv2.findChessboardCorners(picture.pixels, (board.columns, board.rows))
         if found:
-            cv2.cornerSubPix(picture.image, corners, (11, 11), (-1, -1), (3, 30, 1e-3))
+            cv2.cornerSubPix(picture.pixels, corners, (11, 11), (-1, -1), (3, 30, 1e-3))
     return (time.perf_counter() - start) * 1000

@@ -26,7 +26,7 @@ from recordings.schema.messages import (
     BoardKind,
     BoardSpec,
     CameraModel,
-    Picture,
+    Image,
     RobotState,
     SessionInfo,
     Stamps,
@@ -115,7 +115,7 @@ def _written(
             while states < index * states_a_frame:
                 writer.robot_state(_state(states))
                 states += 1
-            writer.picture(Picture(images[index % len(images)], Stamps(), index, index))
+            writer.image(Image(images[index % len(images)], Stamps(), index, index))
         written()
         writer.finish()
 
@@ -138,7 +138,7 @@ def _recorded(path: Path, images: list[NDArray[np.uint8]], written: Written) -> 
             states += 1
         while recorder.queued_bytes > 64 * 1024 * 1024:
             time.sleep(0.001)
-        if not recorder.picture(Picture(images[index % len(images)], Stamps(), index, index)):
+        if not recorder.image(Image(images[index % len(images)], Stamps(), index, index)):
             raise RuntimeError("a picture was dropped")
     while recorder.queued_bytes:
         time.sleep(0.001)

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from calibrate.geometry import difference
 from calibrate.kinematics import MODELS, forward
-from recordings.schema.messages import Picture
+from recordings.schema.messages import Image
 from station.cell.config import RobotConfig
 from station.devices.frames import mid_exposure
 from station.devices.ur import UrRobot
@@ -118,7 +118,7 @@ async def one(
     )
 
 
-def true_middle_ns(picture: Picture, truth: CellTruth) -> int:
+def true_middle_ns(picture: Image, truth: CellTruth) -> int:
     """By the truth of the camera's clock, which no estimate may look at."""
     rate = 1 + truth.camera_clock_drift_ppm * 1e-6
     start_ns = (picture.stamps.device_ns - truth.camera_clock_offset_ns) / rate

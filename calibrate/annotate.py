@@ -77,13 +77,13 @@ def annotate(
         for place in (calibration.result, calibration.board_place):
             T: Matrix4 = tuple(tuple(map(float, row)) for row in place.transform.matrix)
             writer.frame(place.parent_frame, place.child_frame, T)
-        for sequence, (view, picture) in enumerate(recording.pictures()):
-            stored = recording.stored_picture(view)
-            writer.picture(msgspec.structs.replace(picture, sequence=sequence), stored[1] if stored else None)
+        for sequence, (view, picture) in enumerate(recording.images()):
+            stored = recording.stored_image(view)
+            writer.image(msgspec.structs.replace(picture, sequence=sequence), stored[1] if stored else None)
             writer.view(msgspec.structs.replace(view, picture_sequence=sequence, part=1))
             text = _text(found[sequence])
             writer.marks(sequence, marks[sequence], text)
-            writer.drawn_picture(sequence, drawn(picture.image, marks[sequence], text))
+            writer.drawn_image(sequence, drawn(picture.pixels, marks[sequence], text))
         pairs = zip(recording.views(), found, strict=True)
         cameras = [_camera_entity(calibration, camera, view, residual) for view, residual in pairs]
         writer.scene(0, [_board_entity(calibration), *cameras])

@@ -16,7 +16,7 @@ from calibrate.errors import BadViewsError, MirroredPicturesError, SquaresCounte
 from calibrate.geometry import is_rigid
 from calibrate.handeye.solution import RejectedView
 from calibrate.views import BoardView, ViewSet
-from recordings.errors import BadPictureError
+from recordings.errors import BadImageError
 from recordings.reader import Recording
 from recordings.schema.messages import BoardSpec, CameraModel, View
 
@@ -63,7 +63,7 @@ def load_views(
     missing: list[RejectedView] = []
     seen: dict[int, Detection] = {}
     for view, detection in _detect_all(recording, spec, model, progress, threads):
-        if isinstance(detection, BadPictureError):
+        if isinstance(detection, BadImageError):
             missing.append(RejectedView(view.index, view.name, str(detection), "unreadable-picture"))
             continue
         seen[view.index] = detection
@@ -124,7 +124,7 @@ def _detect_all(
     camera: CameraModel,
     progress: Progress | None,
     threads: int | None,
-) -> Iterator[tuple[View, Detection | BadPictureError]]:
+) -> Iterator[tuple[View, Detection | BadImageError]]:
     """In the order of the views, with at most a few pictures in memory."""
     workers = threads or _available_cores()
     total = len(recording.views())
@@ -151,20 +151,20 @@ def _detect_all(
 
 def _finished(
     waiting: deque[tuple[View, Future[Detection]]],
-) -> tuple[View, Detection | BadPictureError]:
+) -> tuple[View, Detection | BadImageError]:
     view, future = waiting.popleft()
     try:
         return view, future.result()
-    except BadPictureError as problem:
+    except BadImageError as problem:
         return view, problem
     except ValueError as problem:
         raise BadViewsError(f"view {view.index + 1} ({view.name}): {problem}") from None
 
 
 def _decode_and_detect(recording: Recording, view: View, spec: BoardSpec, camera: CameraModel) -> Detection:
-    picture = recording.picture(view)
-    _check_size(view, picture.image.shape[1], picture.image.shape[0], camera)
-    return detect(picture.image, spec, with_quality=False)
+    picture = recording.image(view)
+    _check_size(view, picture.pixels.shape[1], picture.pixels.shape[0], camera)
+    return detect(picture.pixels, spec, with_quality=False)
 
 
 def _available_cores() -> int:

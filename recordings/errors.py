@@ -64,11 +64,11 @@ class RecordingError(CodedError):
     code = "recording"
 
 
-class UnsealedRecordingError(RecordingError):
+class UnfinishedRecordingError(RecordingError):
     """The file was never finished or is cut; `recordings recover` can help."""
 
 
-class MissingPartError(RecordingError):
+class MissingSegmentError(RecordingError):
     """The session has more parts than are here."""
 
 
@@ -76,12 +76,12 @@ class CorruptRecordingError(RecordingError):
     """The file breaks a rule of the format; the message names the byte offset."""
 
 
-class BadPictureError(CorruptRecordingError):
+class BadImageError(CorruptRecordingError):
     """One picture cannot be decoded; the rest of the recording is proven and can be used without it."""
 
 
-class ImportFolderError(RecordingError):
-    """A folder to import is wrong; the message names file, row and remedy."""
+class ImportSourceError(RecordingError):
+    """What is to be imported lacks something or is wrong."""
 
 
 def recover_line(path: Path) -> str:

@@ -6,10 +6,10 @@ import math
 from typing import Any
 
 from recordings.mcap import MessageIndex
-from recordings.part import RecordingPart
 from recordings.reader import Recording
 from recordings.schema.messages import SINGLE_TAGS, BoardSpec
 from recordings.schema.topics import Topic
+from recordings.segment import RecordingSegment
 from recordings.stream_quality import Arrivals, Steps
 
 _SHORTEST_SPAN_S = 0.01
@@ -23,25 +23,25 @@ _FRAME_ID_WRAP = 65535
 def recording_info(recording: Recording) -> dict[str, Any]:
     """Everything `recordings info` says, one JSON-ready object. Times in seconds, sizes in bytes."""
     info = recording.info
-    arrivals = {part: Arrivals() for part in recording.parts}
+    arrivals = {part: Arrivals() for part in recording.segments}
     steps = Steps()
-    for part in recording.parts:
+    for part in recording.segments:
         steps.begin()
         for table in part.state_stamps():
             steps.add(table.controller_s)
             arrivals[part].add(table.controller_s, table.host_monotonic_ns)
-    longest = max(recording.parts, key=lambda part: len(part.messages(Topic.ROBOT_STATE)))
-    attempts = sum(len(part.views) for part in recording.parts)
+    longest = max(recording.segments, key=lambda part: len(part.messages(Topic.ROBOT_STATE)))
+    attempts = sum(len(part.views) for part in recording.segments)
     views = recording.views()
     return {
         "path": str(recording.path),
         "name": info.name,
         "source": info.source,
         "mount": info.mount,
-        "parts": len(recording.parts),
+        "parts": len(recording.segments),
         "missing": list(recording.missing),
         "losses": list(recording.losses),
-        "size_bytes": sum(part.size_bytes for part in recording.parts),
+        "size_bytes": sum(part.size_bytes for part in recording.segments),
         "sha256": recording.sha256,
         "created_wall_ns": info.created_wall_ns,
         "board": _board_text(info.board),
@@ -72,9 +72,9 @@ def _board_text(board: BoardSpec) -> str:
 
 def _topics(recording: Recording) -> list[dict[str, Any]]:
     """Known topics first; `foreign` ones are of other programs, and ignored."""
-    known = {topic.value: [part.messages(topic) for part in recording.parts] for topic in Topic}
+    known = {topic.value: [part.messages(topic) for part in recording.segments] for topic in Topic}
     foreign: dict[str, list[MessageIndex]] = {}
-    for part in recording.parts:
+    for part in recording.segments:
         for name, index in part.foreign.items():
             foreign.setdefault(name, []).append(index)
     return [
@@ -119,9 +119,9 @@ def _picture_stream(recording: Recording) -> dict[str, Any] | None:
     exposures: set[float] = set()
     gains: set[float] = set()
     formats: set[str] = set()
-    for part in recording.parts:
+    for part in recording.segments:
         before: int | None = None
-        for fact in part.picture_facts():
+        for fact in part.image_facts():
             count += 1
             if before is not None:
                 step = fact.frame_id - before
@@ -142,8 +142,8 @@ def _picture_stream(recording: Recording) -> dict[str, Any] | None:
     }
 
 
-def _camera_clock(part: RecordingPart) -> dict[str, float | None] | None:
+def _camera_clock(part: RecordingSegment) -> dict[str, float | None] | None:
     arrivals = Arrivals()
-    for table in part.picture_stamps():
+    for table in part.image_stamps():
         arrivals.add(table.device_ns / 1e9, table.host_monotonic_ns)
     return arrivals.fit()

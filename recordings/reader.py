@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 
-from recordings.errors import MissingPartError, RecordingError, UnsealedRecordingError, recover_line
+from recordings.errors import MissingSegmentError, RecordingError, UnfinishedRecordingError, recover_line
 from recordings.files import PART_SUFFIX
-from recordings.part import RecordingPart
-from recordings.schema.messages import CaptureEvent, Picture, RobotState, SessionInfo, View
+from recordings.schema.messages import CaptureEvent, Image, RobotState, SessionInfo, View
+from recordings.segment import RecordingSegment
 from recordings.session_parts import parts_of_file, parts_of_folder
 
 
@@ -20,79 +20,79 @@ class Recording:
     def __init__(
         self,
         path: Path,
-        parts: list[RecordingPart],
+        segments: list[RecordingSegment],
         missing: tuple[str, ...] = (),
         losses: tuple[str, ...] = (),
     ) -> None:
         self.path = path
-        self.parts = parts
+        self.segments = segments
         """In the order they were recorded."""
         self.missing = missing
         """A sentence for each part of the session that should be there and is not."""
         self.losses = losses
         """A sentence for everything that recovery could not save, or that nobody can rule out."""
-        self._by_number = {part.info.part: part for part in parts}
+        self._by_number = {part.info.part: part for part in segments}
 
     @property
     def info(self) -> SessionInfo:
         """Of the first part."""
-        return self.parts[0].info
+        return self.segments[0].info
 
     @property
     def sha256(self) -> str:
         """Of the file; of the parts' hashes, one after the other, when there are several."""
-        if len(self.parts) == 1:
-            return self.parts[0].sha256
-        return hashlib.sha256("".join(part.sha256 for part in self.parts).encode()).hexdigest()
+        if len(self.segments) == 1:
+            return self.segments[0].sha256
+        return hashlib.sha256("".join(part.sha256 for part in self.segments).encode()).hexdigest()
 
     def views(self) -> list[View]:
         """The latest attempt of every pose, in the order of their index."""
         latest: dict[int, View] = {}
-        for view in chain.from_iterable(part.views for part in self.parts):
+        for view in chain.from_iterable(part.views for part in self.segments):
             before = latest.get(view.index)
             if before is None or (view.part, view.attempt) >= (before.part, before.attempt):
                 latest[view.index] = view
         return [latest[index] for index in sorted(latest)]
 
-    def picture(self, view: View) -> Picture:
+    def image(self, view: View) -> Image:
         """The view's picture; its array is read-only."""
         try:
-            return self._by_number[view.part].picture(view.picture_sequence)
+            return self._by_number[view.part].image(view.picture_sequence)
         except KeyError as error:
             raise RecordingError(f"{self.path} has no picture for view {view.index}") from error
 
-    def stored_picture(self, view: View) -> tuple[str, bytes] | None:
+    def stored_image(self, view: View) -> tuple[str, bytes] | None:
         """(format, file bytes) of a picture that is kept compressed; None when it is kept raw."""
-        return self._by_number[view.part].stored_picture(view.picture_sequence)
+        return self._by_number[view.part].stored_image(view.picture_sequence)
 
-    def pictures(self) -> Iterator[tuple[View, Picture]]:
+    def images(self) -> Iterator[tuple[View, Image]]:
         """One at a time, in the order of `views`."""
         for view in self.views():
-            yield view, self.picture(view)
+            yield view, self.image(view)
 
     def robot_states(self) -> Iterator[RobotState]:
-        return chain.from_iterable(part.robot_states() for part in self.parts)
+        return chain.from_iterable(part.robot_states() for part in self.segments)
 
     def events(self) -> Iterator[CaptureEvent]:
-        return chain.from_iterable(part.events() for part in self.parts)
+        return chain.from_iterable(part.events() for part in self.segments)
 
     def attachments(self) -> dict[str, bytes]:
         """Of all parts; the latest part's where a name is in several."""
         merged: dict[str, bytes] = {}
-        for part in self.parts:
+        for part in self.segments:
             merged.update(part.attachments)
         return merged
 
     def media_types(self) -> dict[str, str]:
         """Of the attachments."""
-        return {name: kind for part in self.parts for name, kind in part.media_types.items()}
+        return {name: kind for part in self.segments for name, kind in part.media_types.items()}
 
 
 def open_recording(path: Path, *, incomplete: bool = False) -> Recording:
     """Reads and proves the whole recording. At most 256 MiB of memory, whatever the file says.
 
-    Raises UnsealedRecordingError for one that was never finished or is cut, CorruptRecordingError for one
-    that breaks a rule of the format, MissingPartError when parts of the session are not there (unless
+    Raises UnfinishedRecordingError for one that was never finished or is cut, CorruptRecordingError for one
+    that breaks a rule of the format, MissingSegmentError when parts of the session are not there (unless
     `incomplete`: then `missing` names them), RecordingError when there is none.
     """
     path = Path(path)
@@ -104,13 +104,13 @@ def open_recording(path: Path, *, incomplete: bool = False) -> Recording:
         found = parts_of_file(path)
         remedy = f"If the other parts are lost for good: {recover_line(path.parent)}"
     if found.missing and not incomplete:
-        raise MissingPartError(f"{'; '.join(found.missing)}. {remedy}")
+        raise MissingSegmentError(f"{'; '.join(found.missing)}. {remedy}")
     return Recording(path, found.parts, found.missing, found.losses)
 
 
 def _require_finished(path: Path) -> None:
     unfinished = path if path.name.endswith(PART_SUFFIX) else path.with_name(path.name + PART_SUFFIX)
     if unfinished.is_file() and (unfinished == path or not path.exists()):
-        raise UnsealedRecordingError(
+        raise UnfinishedRecordingError(
             f"{path} was never finished. Save what is whole: {recover_line(unfinished)}"
         )

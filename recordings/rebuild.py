@@ -12,10 +12,10 @@ from recordings.errors import RecordingError
 from recordings.mcap.records import MESSAGE_HEAD, Opcode, with_crc
 from recordings.mcap.salvage import Salvage, salvage
 from recordings.mcap.writer import McapFile
-from recordings.part import RecordingPart
 from recordings.schema.definitions import RECOVERY_RECORD, SESSION_RECORDS, SchemaError, decode
 from recordings.schema.messages import View
 from recordings.schema.topics import Topic, identify
+from recordings.segment import RecordingSegment
 
 
 class NothingToSaveError(RecordingError):
@@ -24,7 +24,7 @@ class NothingToSaveError(RecordingError):
 
 @dataclass(frozen=True)
 class Rebuilt:
-    part: RecordingPart
+    part: RecordingSegment
     """Of the new file, read strictly."""
     lost_bytes: int
     losses: tuple[str, ...]
@@ -55,9 +55,9 @@ def rebuild(descriptor: int, source: Path, target: Path) -> Rebuilt:
     return Rebuilt(_verified(target, source), found.lost_bytes, losses)
 
 
-def _verified(temporary: Path, source: Path) -> RecordingPart:
+def _verified(temporary: Path, source: Path) -> RecordingSegment:
     try:
-        return RecordingPart(temporary)
+        return RecordingSegment(temporary)
     except RecordingError as error:
         reason = str(error).replace(str(temporary), "what was saved")
         raise RecordingError(f"{source} cannot be recovered and is unchanged: {reason}") from error

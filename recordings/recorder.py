@@ -22,8 +22,8 @@ from recordings.errors import RecordingError
 from recordings.schema.messages import (
     CameraModel,
     CaptureEvent,
+    Image,
     Matrix4,
-    Picture,
     RobotState,
     SessionInfo,
     View,
@@ -105,9 +105,9 @@ class Recorder:
         """False when it was dropped, or came after the end."""
         return self._offer(lambda: self._writer.robot_state(state), _STATE_BYTES)
 
-    def picture(self, picture: Picture) -> bool:
+    def image(self, picture: Image) -> bool:
         """False when it was dropped: take it again. The array must not be changed afterwards."""
-        kept = self._offer(lambda: self._writer.picture(picture), picture.image.nbytes)
+        kept = self._offer(lambda: self._writer.image(picture), picture.pixels.nbytes)
         if not kept:
             self._dropped_pictures.add(picture.sequence)
         return kept

@@ -8,14 +8,14 @@ from pathlib import Path
 
 import msgspec
 
-from recordings.errors import CorruptRecordingError, RecordingError, UnsealedRecordingError
+from recordings.errors import CorruptRecordingError, RecordingError, UnfinishedRecordingError
 from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, discard_leftover, lock, rename_new, sync_folder
 from recordings.manifest import MANIFEST_FILE, give_up_parts, missing_parts, read_manifest
 from recordings.mcap.scan import open_file
-from recordings.part import RecordingPart
 from recordings.rebuild import NothingToSaveError, rebuild
 from recordings.schema.messages import SessionInfo
 from recordings.schema.topics import Topic
+from recordings.segment import RecordingSegment
 
 DAMAGED_SUFFIX = ".damaged"
 
@@ -119,14 +119,14 @@ def _recover_file(source: Path, output: Path | None) -> tuple[Recovery, SessionI
         if final != source and os.path.lexists(final):
             raise RecordingError(f"{final} exists already; name another output with -o")
         try:
-            return _nothing_lost(RecordingPart(source), source, final)
-        except (UnsealedRecordingError, CorruptRecordingError):
+            return _nothing_lost(RecordingSegment(source), source, final)
+        except (UnfinishedRecordingError, CorruptRecordingError):
             return _rebuild(descriptor, source, final, in_place=output is None)
     finally:
         os.close(descriptor)
 
 
-def _nothing_lost(part: RecordingPart, source: Path, final: Path) -> tuple[Recovery, SessionInfo]:
+def _nothing_lost(part: RecordingSegment, source: Path, final: Path) -> tuple[Recovery, SessionInfo]:
     """A file that is whole; at most its last rename was missing."""
     if source.name.endswith(PART_SUFFIX):
         rename_new(source, final)
@@ -136,13 +136,13 @@ def _nothing_lost(part: RecordingPart, source: Path, final: Path) -> tuple[Recov
 
 
 def _report(
-    path: Path, part: RecordingPart, original: Path | None, lost_bytes: int, losses: tuple[str, ...]
+    path: Path, part: RecordingSegment, original: Path | None, lost_bytes: int, losses: tuple[str, ...]
 ) -> tuple[Recovery, SessionInfo]:
     done = Recovery(
         path=path,
         kept_original=original,
         poses=len({view.index for view in part.views}),
-        pictures=len(part.picture_sequences()),
+        pictures=len(part.image_sequences()),
         robot_states=len(part.messages(Topic.ROBOT_STATE)),
         lost_bytes=lost_bytes,
         losses=losses,

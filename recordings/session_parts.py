@@ -5,17 +5,17 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from recordings.errors import CorruptRecordingError, RecordingError, UnsealedRecordingError, recover_line
+from recordings.errors import CorruptRecordingError, RecordingError, UnfinishedRecordingError, recover_line
 from recordings.files import PART_SUFFIX
 from recordings.manifest import PARTS_LIMIT, Manifest, missing_parts, read_manifest
-from recordings.part import RecordingPart
+from recordings.segment import RecordingSegment
 
 
 @dataclass(frozen=True)
 class SessionParts:
     """What of a session was found, in the order it was recorded."""
 
-    parts: list[RecordingPart]
+    parts: list[RecordingSegment]
     missing: tuple[str, ...] = ()
     """A sentence for each part that must be there and is not."""
     losses: tuple[str, ...] = ()
@@ -24,7 +24,7 @@ class SessionParts:
 
 def parts_of_file(path: Path) -> SessionParts:
     """One file that is the whole session, or says of which session it is a part."""
-    part = RecordingPart(path)
+    part = RecordingSegment(path)
     info = part.info
     manifest = read_manifest(path.parent)
     if manifest is not None and (manifest.session, manifest.parts.get(info.part)) != (info.name, path.name):
@@ -45,7 +45,7 @@ def parts_of_folder(folder: Path) -> SessionParts:
         raise RecordingError(f"cannot open {folder}: {error.strerror}") from error
     unsealed = [name for name in names if name.endswith(".mcap" + PART_SUFFIX)]
     if unsealed:
-        raise UnsealedRecordingError(
+        raise UnfinishedRecordingError(
             f"{folder / unsealed[0]} was never finished. Save what is whole: {recover_line(folder)}"
         )
     files = [name for name in names if name.endswith(".mcap")]
@@ -56,7 +56,7 @@ def parts_of_folder(folder: Path) -> SessionParts:
         raise RecordingError(
             f"{folder} holds {len(files)} recordings: name one of them, or one session's folder"
         )
-    parts = sorted((RecordingPart(folder / name) for name in files), key=lambda part: part.info.part)
+    parts = sorted((RecordingSegment(folder / name) for name in files), key=lambda part: part.info.part)
     _check_one_session(parts, manifest)
     missing = missing_parts(folder, manifest, {part.info.part for part in parts})
     session = parts[0].info.name
@@ -74,7 +74,7 @@ def _no_files_text(folder: Path, manifest: Manifest | None) -> str:
     return f"{folder} holds none of the parts of session '{manifest.session}': copy back {files}"
 
 
-def _check_one_session(parts: list[RecordingPart], manifest: Manifest | None) -> None:
+def _check_one_session(parts: list[RecordingSegment], manifest: Manifest | None) -> None:
     first = parts[0].info
     if manifest is not None and manifest.session != first.name:
         raise RecordingError(
@@ -100,7 +100,7 @@ def _check_one_session(parts: list[RecordingPart], manifest: Manifest | None) ->
             )
 
 
-def _losses(parts: list[RecordingPart], manifest: Manifest | None) -> tuple[str, ...]:
+def _losses(parts: list[RecordingSegment], manifest: Manifest | None) -> tuple[str, ...]:
     found = [
         f"{part.path.name} was cut or damaged: {part.lost_bytes} bytes were lost when it was recovered"
         for part in parts

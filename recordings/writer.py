@@ -27,17 +27,17 @@ from recordings.files import (
     rename_new,
     sync_folder,
 )
+from recordings.images import ImageError, encode_png, read_header
 from recordings.mcap.records import with_crc
 from recordings.mcap.writer import McapFile, Piece
-from recordings.pictures import PictureError, encode_png, read_header
 from recordings.scene import Entity, scene_update
 from recordings.schema import viewing
 from recordings.schema.definitions import FORMATS, SESSION_RECORDS, PictureFacts, encode, encode_robot_state
 from recordings.schema.messages import (
     CameraModel,
     CaptureEvent,
+    Image,
     Matrix4,
-    Picture,
     RobotState,
     SessionInfo,
     Stamps,
@@ -105,11 +105,11 @@ class RecordingWriter:
             self._show(Topic.TRANSFORM, viewing.frame_transform("base", "flange", T, time_ns), time_ns)
             self._show(Topic.JOINTS, viewing.joint_states(state, time_ns), time_ns)
 
-    def picture(self, picture: Picture, encoded: bytes | None = None) -> None:
+    def image(self, picture: Image, encoded: bytes | None = None) -> None:
         """`encoded`: the same picture's PNG or JPEG bytes, stored instead of the array (imported files)."""
         if picture.sequence in self._pictures or picture.sequence < 0:
             raise RecordingError(f"picture {picture.sequence} was recorded before; sequences count up from 0")
-        height, width = picture.image.shape[:2]
+        height, width = picture.pixels.shape[:2]
         camera = self.info.camera
         if (width, height) != (camera.width, camera.height):
             raise RecordingError(
@@ -130,7 +130,7 @@ class RecordingWriter:
         time_ns = self._time_ns(picture.stamps, picture.sequence)
         try:
             topic, image = self._image(picture, encoded, time_ns)
-        except PictureError as error:
+        except ImageError as error:
             raise RecordingError(f"picture {picture.sequence}: {error}") from error
         for part_of_it in (Topic.PICTURE_FACTS, topic):  # declared first: the two lie in one chunk
             self._channel(part_of_it)
@@ -139,11 +139,11 @@ class RecordingWriter:
         self._pictures[picture.sequence] = time_ns
         self.flush()
 
-    def _image(self, picture: Picture, encoded: bytes | None, time_ns: int) -> tuple[Topic, list[Piece]]:
+    def _image(self, picture: Image, encoded: bytes | None, time_ns: int) -> tuple[Topic, list[Piece]]:
         if encoded is None and self._lossless_png:
-            encoded = encode_png(picture.image)
+            encoded = encode_png(picture.pixels)
         if encoded is None:
-            return Topic.RAW_IMAGE, viewing.raw_image(picture.image, picture.pixel_format, time_ns)
+            return Topic.RAW_IMAGE, viewing.raw_image(picture.pixels, picture.pixel_format, time_ns)
         return Topic.COMPRESSED_IMAGE, viewing.compressed_image(encoded, read_header(encoded).format, time_ns)
 
     def view(self, view: View) -> None:
@@ -165,7 +165,7 @@ class RecordingWriter:
         if (time_ns := self._pictures.get(sequence)) is not None:
             self._show(Topic.ANNOTATIONS, viewing.image_annotations(marks, text, time_ns), time_ns)
 
-    def drawn_picture(self, sequence: int, jpeg: bytes) -> None:
+    def drawn_image(self, sequence: int, jpeg: bytes) -> None:
         """A recorded picture with something drawn into it, for viewers that draw nothing over pictures."""
         time_ns = self._pictures[sequence]
         self._add(Topic.DRAWN_IMAGE, viewing.compressed_image(jpeg, "jpeg", time_ns), time_ns)

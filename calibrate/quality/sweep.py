@@ -21,9 +21,9 @@ from calibrate.geometry import Array, pose_from_rotvec, rotation_angle
 from calibrate.lens.pnp import candidate_poses
 from calibrate.quality.time_offset import FEWEST_PICTURES, TimeOffset, estimate_time_offset
 from calibrate.views import BoardView
-from recordings.errors import BadPictureError
+from recordings.errors import BadImageError
 from recordings.reader import Recording
-from recordings.schema.messages import CameraModel, Picture
+from recordings.schema.messages import CameraModel, Image
 
 UNSEEN_DELAY_S = 1e-4
 """1 sigma of the controller's shortest delay: no arrival shows it, so it stays in the offset."""
@@ -108,15 +108,15 @@ def _seen(recording: Recording, camera: CameraModel, lost: list[str]) -> Iterato
     `lost` takes what is said of pictures that cannot be decoded.
     """
     board = recording.info.board
-    stamps = [facts.stamps for part in recording.parts for facts in part.picture_facts()]
+    stamps = [facts.stamps for part in recording.segments for facts in part.image_facts()]
     taken_s = on_host(
         np.array([s.device_ns for s in stamps]) / 1e9, np.array([s.host_monotonic_ns for s in stamps]) / 1e9
     )
     for picture, time_s in zip(_pictures(recording), taken_s, strict=True):
-        if isinstance(picture, BadPictureError):
+        if isinstance(picture, BadImageError):
             lost.append(str(picture))
             continue
-        found = detect(picture.image, board, thorough=False)
+        found = detect(picture.pixels, board, thorough=False)
         if not found.found:
             continue
         view = BoardView(
@@ -129,10 +129,10 @@ def _seen(recording: Recording, camera: CameraModel, lost: list[str]) -> Iterato
         yield float(time_s), candidate_poses(view, camera, None)[0].camera_from_board
 
 
-def _pictures(recording: Recording) -> Iterator[Picture | BadPictureError]:
-    for part in recording.parts:
-        for sequence in part.picture_sequences():
+def _pictures(recording: Recording) -> Iterator[Image | BadImageError]:
+    for part in recording.segments:
+        for sequence in part.image_sequences():
             try:
-                yield part.picture(sequence)
-            except BadPictureError as problem:
+                yield part.image(sequence)
+            except BadImageError as problem:
                 yield problem

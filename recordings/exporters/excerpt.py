@@ -31,8 +31,8 @@ def write_excerpt(recording: Recording, output: Path, window_s: float = 0.5) -> 
         for state in recording.robot_states():
             if _near(state, kept_ns, window_s):
                 writer.robot_state(state)
-        for sequence, (view, picture) in enumerate(recording.pictures()):
-            writer.picture(msgspec.structs.replace(picture, sequence=sequence))
+        for sequence, (view, picture) in enumerate(recording.images()):
+            writer.image(msgspec.structs.replace(picture, sequence=sequence))
             writer.view(msgspec.structs.replace(view, picture_sequence=sequence, part=1))
         for event in recording.events():
             writer.event(event)

@@ -15,9 +15,9 @@ import msgspec
 from recordings.errors import RecordingError
 from recordings.exporters import write_ros2
 from recordings.files import sync_folder
+from recordings.images import encode_png
 from recordings.importers.dataset import DATASET_FILE, POSES_FILE
 from recordings.importers.poses import HEADER, JOINTS
-from recordings.pictures import encode_png
 from recordings.reader import Recording
 from recordings.schema.messages import Stamps, View
 from recordings.schema.viewing import quaternion_xyzw
@@ -88,9 +88,9 @@ def _write_folder(recording: Recording, folder: Path) -> None:
 
 def _write_picture(recording: Recording, view: View, folder: Path) -> list[Any]:
     """The stored file where there is one, else a lossless PNG; returns the pose's row."""
-    picture = recording.picture(view)
-    stored = recording.stored_picture(view)
-    extension, data = ("png", encode_png(picture.image)) if stored is None else stored
+    picture = recording.image(view)
+    stored = recording.stored_image(view)
+    extension, data = ("png", encode_png(picture.pixels)) if stored is None else stored
     name = f"images/{view.index:03d}.{_EXTENSIONS.get(extension, extension)}"
     (folder / name).write_bytes(data)
     T = view.base_from_flange
@@ -115,7 +115,7 @@ def _write_tables(recording: Recording, folder: Path) -> None:
     joints = [f"{joint}_rad" for joint in _JOINTS] + [f"{joint}_rad_s" for joint in _JOINTS]
     header = [*_STAMPS, *joints, *pose, "robot_mode", "safety_mode", "speed_scaling"]
     _write_csv(folder / "robot_states.csv", header, states)
-    facts = [fact for part in recording.parts for fact in part.picture_facts()]
+    facts = [fact for part in recording.segments for fact in part.image_facts()]
     columns = ["sequence", "frame_id", "width", "height", "exposure_us", "gain_db", "pixel_format"]
     rows = ([*_values(fact.stamps), *(getattr(fact, column) for column in columns)] for fact in facts)
     _write_csv(folder / "pictures.csv", [*_STAMPS, *columns], rows)
@@ -139,7 +139,7 @@ def _write_views(recording: Recording, folder: Path) -> None:
         "used",
     ]
     rows = []
-    for view in (view for part in recording.parts for view in part.views):
+    for view in (view for part in recording.segments for view in part.views):
         T = view.base_from_flange
         pose = [T[0][3], T[1][3], T[2][3], *quaternion_xyzw(T)]
         place = [view.index, view.attempt, view.part, view.name, view.picture_sequence]

@@ -14,12 +14,12 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 
 from recordings.errors import RecordingError
-from recordings.part import RecordingPart
-from recordings.pictures import raw_encoding
+from recordings.images import raw_encoding
 from recordings.reader import Recording
 from recordings.schema.messages import CameraModel, Matrix4, View
 from recordings.schema.topics import Topic
 from recordings.schema.viewing import CAMERA_FRAME, JOINT_NAMES, base_from_flange, quaternion_xyzw
+from recordings.segment import RecordingSegment
 
 FRAME_PERIOD_NS = 10_000_000
 _NS = 1_000_000_000
@@ -47,7 +47,7 @@ def write_ros2(recording: Recording, folder: Path) -> None:
     inner = folder / recording.info.name
     with Writer(inner, version=_BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as writer:
         connections: dict[str, Any] = {}
-        for part in recording.parts:
+        for part in recording.segments:
             for entry in _entries(messages, recording, part):
                 kind = entry.message.__msgtype__
                 if entry.topic not in connections:
@@ -64,7 +64,7 @@ def write_ros2(recording: Recording, folder: Path) -> None:
     inner.rmdir()
 
 
-def _entries(messages: _Messages, recording: Recording, part: RecordingPart) -> Iterator[_Entry]:
+def _entries(messages: _Messages, recording: Recording, part: RecordingSegment) -> Iterator[_Entry]:
     """In time order."""
     counted = {view.picture_sequence: view for view in recording.views() if view.part == part.info.part}
     stored = {message.sequence: message.time_ns for message in part.stored(Topic.PICTURE_FACTS)}
@@ -84,14 +84,14 @@ def _mid_exposure_ns(view: View | None, recorded_ns: int) -> int:
     return (view.stamps.host_wall_ns if view else 0) or recorded_ns
 
 
-def _fixed_frames(messages: _Messages, part: RecordingPart, time_ns: int) -> Iterator[_Entry]:
+def _fixed_frames(messages: _Messages, part: RecordingSegment, time_ns: int) -> Iterator[_Entry]:
     """What the recording knows of camera and board; all in one message, as ROS expects it."""
     if part.fixed_frames:
         frames = [messages.transform(*names, T, time_ns) for names, T in part.fixed_frames.items()]
         yield _Entry(time_ns, "/tf_static", messages.make("tf2_msgs/msg/TFMessage", frames))
 
 
-def _arm(messages: _Messages, part: RecordingPart) -> Iterator[_Entry]:
+def _arm(messages: _Messages, part: RecordingSegment) -> Iterator[_Entry]:
     shown_ns = -FRAME_PERIOD_NS
     for stored, state in zip(part.stored(Topic.ROBOT_STATE), part.robot_states(), strict=True):
         time_ns = stored.time_ns
@@ -112,7 +112,7 @@ def _arm(messages: _Messages, part: RecordingPart) -> Iterator[_Entry]:
 
 def _pictures(
     messages: _Messages,
-    part: RecordingPart,
+    part: RecordingSegment,
     times: dict[int, int],
     counted: dict[int, View],
     camera: CameraModel,
@@ -124,17 +124,17 @@ def _pictures(
         yield _picture(messages, part, sequence, time_ns)
 
 
-def _picture(messages: _Messages, part: RecordingPart, sequence: int, time_ns: int) -> _Entry:
+def _picture(messages: _Messages, part: RecordingSegment, sequence: int, time_ns: int) -> _Entry:
     header = messages.header(time_ns, CAMERA_FRAME)
-    stored = part.stored_picture(sequence)
+    stored = part.stored_image(sequence)
     if stored is not None:
         file = np.frombuffer(stored[1], np.uint8)
         message = messages.make("sensor_msgs/msg/CompressedImage", header, stored[0], file)
         return _Entry(time_ns, "/camera/image_raw/compressed", message)
-    picture = part.picture(sequence)
-    height, width = picture.image.shape[:2]
-    data = np.ascontiguousarray(picture.image).view(np.uint8).ravel()
-    encoding = raw_encoding(picture.image, picture.pixel_format)
+    picture = part.image(sequence)
+    height, width = picture.pixels.shape[:2]
+    data = np.ascontiguousarray(picture.pixels).view(np.uint8).ravel()
+    encoding = raw_encoding(picture.pixels, picture.pixel_format)
     message = messages.make(
         "sensor_msgs/msg/Image", header, height, width, encoding, 0, len(data) // height, data
     )

@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
+from recordings.errors import ImportSourceError
 from recordings.importers.bag import PAIR_WITHIN_S, BagPlan, import_bag
 from recordings.importers.selection import Wanted
 from recordings.importers.stops import POSITION_M, ROTATION_RAD, Limits
-from recordings.importers.values import ImportSourceError
 
 __all__ = [
     "PAIR_WITHIN_S",

@@ -19,18 +19,19 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
+from recordings.errors import ImportSourceError
 from recordings.files import session_name_from
+from recordings.images import ImageError, decode_image, encode_png, read_header
 from recordings.importers.bags import CountedBag, open_bag
 from recordings.importers.dataset import DATASET_FILE, BagDescription, read_description
 from recordings.importers.selection import Selection, Wanted, select
 from recordings.importers.stops import Limits, Stop, find_stops
-from recordings.importers.values import Array, Bag, Image, ImportSourceError, Joints, Progress
-from recordings.pictures import PictureError, decode_picture, encode_png, read_header
+from recordings.importers.values import Array, Bag, ImageMessage, Joints, Progress
 from recordings.schema.messages import (
     CameraIdentity,
     CameraModel,
+    Image,
     Matrix4,
-    Picture,
     RobotState,
     SessionInfo,
     Stamps,
@@ -198,7 +199,7 @@ def _write(
         return writer.finish().stat().st_size
 
 
-def _chain(first: Image, rest: Iterator[Image]) -> Iterator[Image]:
+def _chain(first: ImageMessage, rest: Iterator[ImageMessage]) -> Iterator[ImageMessage]:
     yield first
     yield from rest
 
@@ -257,12 +258,12 @@ def _joints_at(
 
 
 def _write_view(
-    writer: RecordingWriter, index: int, stop: Stop, image: Image, joints_rad: Vector6 | None
+    writer: RecordingWriter, index: int, stop: Stop, image: ImageMessage, joints_rad: Vector6 | None
 ) -> None:
     pixels, encoded = _pixels(image, stop.place)
     pixel_format = "BGR8" if pixels.ndim == 3 else "Mono8" if pixels.itemsize == 1 else "Mono16"
     stamps = Stamps(host_wall_ns=stop.stamp_ns, device_ns=stop.stamp_ns)
-    writer.picture(Picture(pixels, stamps, stop.place, index, pixel_format=pixel_format), encoded)
+    writer.image(Image(pixels, stamps, stop.place, index, pixel_format=pixel_format), encoded)
     T: Matrix4 = tuple(tuple(map(float, row)) for row in stop.base_from_flange)
     writer.view(
         View(
@@ -278,29 +279,29 @@ def _write_view(
     )
 
 
-def _size(image: Image) -> tuple[int, int]:
+def _size(image: ImageMessage) -> tuple[int, int]:
     if image.encoding != "compressed":
         return image.width, image.height
     try:
         header = read_header(image.data)
-    except PictureError as error:
+    except ImageError as error:
         raise ImportSourceError(f"the first picture {error}") from error
     return header.width, header.height
 
 
-def _pixels(image: Image, place: int) -> tuple[NDArray[Any], bytes | None]:
+def _pixels(image: ImageMessage, place: int) -> tuple[NDArray[Any], bytes | None]:
     """(array as recordings hold it, file bytes to keep). ImportSourceError for what no camera here writes."""
     try:
         if image.encoding == "compressed":
             header = read_header(image.data)
-            decoded = decode_picture(image.data, header.width, header.height)
+            decoded = decode_image(image.data, header.width, header.height)
             return decoded, image.data if header.format in _KEPT_AS_THEY_ARE else encode_png(decoded)
         if image.encoding not in _LAYOUTS:
-            raise PictureError(f"is encoded as '{image.encoding}' (known: {', '.join(_LAYOUTS)}, PNG, JPEG)")
+            raise ImageError(f"is encoded as '{image.encoding}' (known: {', '.join(_LAYOUTS)}, PNG, JPEG)")
         channels, kind, conversion = _LAYOUTS[image.encoding]
         row = image.width * channels * np.dtype(kind).itemsize
         if image.step < row or len(image.data) < image.step * image.height or not image.height:
-            raise PictureError(f"has {len(image.data)} bytes where {image.width}×{image.height} needs more")
+            raise ImageError(f"has {len(image.data)} bytes where {image.width}×{image.height} needs more")
         rows = np.frombuffer(image.data, np.uint8, image.step * image.height).reshape(
             image.height, image.step
         )
@@ -308,5 +309,5 @@ def _pixels(image: Image, place: int) -> tuple[NDArray[Any], bytes | None]:
         if channels > 1:
             pixels = pixels.reshape(image.height, image.width, channels)
         return (pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))), None
-    except PictureError as error:
+    except ImageError as error:
         raise ImportSourceError(f"picture {place + 1} {error}") from error

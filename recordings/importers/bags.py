@@ -8,10 +8,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, TypeVar
 
-from recordings.errors import RecordingError
+from recordings.errors import ImportSourceError, RecordingError
 from recordings.importers import foxglove_messages, ros_messages
 from recordings.importers.ros_messages import RosDecoder
-from recordings.importers.values import Bag, Image, ImportSourceError, Kind, Progress, Topic, Value
+from recordings.importers.values import Bag, ImageMessage, Kind, Progress, Topic, Value
 from recordings.mcap import Contents, Message, Source, open_file, scan_file
 from recordings.schema.definitions import SESSION_RECORDS
 
@@ -124,17 +124,17 @@ class McapBag:
                 else:
                     message = source.message(address)
                     image = foxglove_messages.value(schema, message.data, message.time_ns)
-                    assert isinstance(image, Image)
+                    assert isinstance(image, ImageMessage)
                     yield image.stamp_ns
 
-    def images(self, topic: str, places: list[int]) -> Iterator[Image]:
+    def images(self, topic: str, places: list[int]) -> Iterator[ImageMessage]:
         encoding, schema = self._encodings[topic]
         first, wanted = 0, list(places)
         for source, addresses in self._addresses(topic):
             while wanted and wanted[0] < first + len(addresses):
                 message = source.message(addresses[wanted.pop(0) - first])
                 image = self._decoded(encoding, schema, message)
-                assert isinstance(image, Image)
+                assert isinstance(image, ImageMessage)
                 yield image
             first += len(addresses)
 
@@ -189,12 +189,12 @@ class SqliteBag:
         for _, time_ns, data in self._messages(topic):
             yield ros_messages.image_stamp_ns(data, time_ns)
 
-    def images(self, topic: str, places: list[int]) -> Iterator[Image]:
+    def images(self, topic: str, places: list[int]) -> Iterator[ImageMessage]:
         wanted = set(places)
         for place, (schema, time_ns, data) in enumerate(self._messages(topic)):
             if place in wanted:
                 image = self._decoder.value(schema, data, time_ns)
-                assert isinstance(image, Image)
+                assert isinstance(image, ImageMessage)
                 yield image
 
 
@@ -216,7 +216,7 @@ class CountedBag:
     def image_stamps(self, topic: str) -> Iterator[int]:
         return self._counted(self._bag.image_stamps(topic))
 
-    def images(self, topic: str, places: list[int]) -> Iterator[Image]:
+    def images(self, topic: str, places: list[int]) -> Iterator[ImageMessage]:
         return self._counted(self._bag.images(topic, places))
 
     def _counted(self, messages: Iterator[T]) -> Iterator[T]:

@@ -9,8 +9,8 @@ import msgspec
 import numpy as np
 
 from recordings import strict_yaml
-from recordings.errors import ImportFolderError
-from recordings.pictures import SIDE_LIMIT_PX
+from recordings.errors import ImportSourceError
+from recordings.images import SIDE_LIMIT_PX
 from recordings.schema.messages import (
     LARGEST_FLATNESS_M,
     LARGEST_TOLERANCE,
@@ -51,29 +51,29 @@ class BagDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
 
 
 def read_description(path: Path) -> tuple[BagDescription, bytes]:
-    """(description, the file's bytes). Raises ImportFolderError with file, place and remedy."""
+    """(description, the file's bytes). Raises ImportSourceError with file, place and remedy."""
     content = read_small_file(path, strict_yaml.LIMIT_BYTES)
     try:
         described = strict_yaml.load(content, BagDescription)
     except strict_yaml.StrictYamlError as error:
-        raise ImportFolderError(f"{path}: {'; '.join(map(str, error.problems))} (see {_HELP})") from None
+        raise ImportSourceError(f"{path}: {'; '.join(map(str, error.problems))} (see {_HELP})") from None
     problem = _board_problem(described.board) or (described.camera and _camera_problem(described.camera))
     if problem:
-        raise ImportFolderError(f"{path}: {problem}. See {_HELP}")
+        raise ImportSourceError(f"{path}: {problem}. See {_HELP}")
     return described, content
 
 
 def read_dataset(folder: Path) -> tuple[Dataset, bytes]:
-    """(description, the file's bytes). Raises ImportFolderError with file, place and remedy."""
+    """(description, the file's bytes). Raises ImportSourceError with file, place and remedy."""
     path = folder / DATASET_FILE
     content = read_small_file(path, strict_yaml.LIMIT_BYTES)
     try:
         dataset = strict_yaml.load(content, Dataset)
     except strict_yaml.StrictYamlError as error:
-        raise ImportFolderError(f"{path}: {'; '.join(map(str, error.problems))} (see {_HELP})") from None
+        raise ImportSourceError(f"{path}: {'; '.join(map(str, error.problems))} (see {_HELP})") from None
     problem = _board_problem(dataset.board) or _camera_problem(dataset.camera)
     if problem:
-        raise ImportFolderError(f"{path}: {problem}. See {_HELP}")
+        raise ImportSourceError(f"{path}: {problem}. See {_HELP}")
     return dataset, content
 
 
@@ -124,16 +124,16 @@ def _camera_problem(camera: CameraModel) -> str:
 
 
 def read_small_file(path: Path, limit_bytes: int) -> bytes:
-    """The whole file. ImportFolderError when it is missing, unreadable or too large to be right."""
+    """The whole file. ImportSourceError when it is missing, unreadable or too large to be right."""
     if not path.is_file():
-        raise ImportFolderError(
+        raise ImportSourceError(
             f"{path} is missing; a folder to import has {DATASET_FILE}, {POSES_FILE} and pictures"
         )
     try:
         with path.open("rb") as file:
             content = file.read(limit_bytes + 1)
     except OSError as error:
-        raise ImportFolderError(f"cannot read {path}: {error.strerror}") from error
+        raise ImportSourceError(f"cannot read {path}: {error.strerror}") from error
     if len(content) > limit_bytes:
-        raise ImportFolderError(f"{path} is larger than {limit_bytes // 1024} kB; is it the right file?")
+        raise ImportSourceError(f"{path} is larger than {limit_bytes // 1024} kB; is it the right file?")
     return content

@@ -8,23 +8,23 @@ from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
 
-from recordings.errors import ImportFolderError, RecordingError
+from recordings.errors import ImportSourceError, RecordingError
 from recordings.files import session_name_from
-from recordings.importers.dataset import DATASET_FILE, POSES_FILE, Dataset, read_dataset
-from recordings.importers.poses import PoseRow, read_poses
-from recordings.importers.values import Progress
-from recordings.pictures import (
-    PICTURE_LIMIT_BYTES,
-    PictureError,
-    PictureHeader,
-    decode_picture,
+from recordings.images import (
+    IMAGE_LIMIT_BYTES,
+    ImageError,
+    ImageHeader,
+    decode_image,
     encode_png,
     read_header,
 )
+from recordings.importers.dataset import DATASET_FILE, POSES_FILE, Dataset, read_dataset
+from recordings.importers.poses import PoseRow, read_poses
+from recordings.importers.values import Progress
 from recordings.schema.messages import (
     CameraIdentity,
     CaptureEvent,
-    Picture,
+    Image,
     RobotIdentity,
     SessionInfo,
     Stamps,
@@ -52,10 +52,10 @@ def import_folder(
     `output` None: checks everything and writes nothing.
 
     PNG and JPEG files keep their bytes. Everything is checked before the file is begun, and nothing is left
-    behind when a picture turns out bad. Raises ImportFolderError (file, row, remedy) or RecordingError.
+    behind when a picture turns out bad. Raises ImportSourceError (file, row, remedy) or RecordingError.
     """
     if not folder.is_dir():
-        raise ImportFolderError(f"{folder} is not a folder; give the one that holds {DATASET_FILE}")
+        raise ImportSourceError(f"{folder} is not a folder; give the one that holds {DATASET_FILE}")
     dataset, dataset_bytes = read_dataset(folder)
     rows, poses_bytes = read_poses(folder)
     for row in rows:
@@ -93,7 +93,7 @@ def _session_info(folder: Path, dataset: Dataset) -> SessionInfo:
     )
 
 
-def _check_picture(folder: Path, row: PoseRow, dataset: Dataset) -> PictureHeader:
+def _check_picture(folder: Path, row: PoseRow, dataset: Dataset) -> ImageHeader:
     path = folder / row.image
     try:
         if path.exists() and not path.is_file():  # a pipe would never be read to its end
@@ -104,7 +104,7 @@ def _check_picture(folder: Path, row: PoseRow, dataset: Dataset) -> PictureHeade
             header = read_header(file.read(_HEADER_BYTES))
     except OSError as error:
         raise _wrong(folder, row, f"cannot be read ({error.strerror}); add it or delete the line") from error
-    except PictureError as error:
+    except ImageError as error:
         raise _wrong(folder, row, f"is no usable picture: {error}; save it as PNG") from error
     camera = dataset.camera
     if (header.width, header.height) != (camera.width, camera.height):
@@ -121,17 +121,17 @@ def _write_view(writer: RecordingWriter, folder: Path, index: int, row: PoseRow,
     header = _check_picture(folder, row, dataset)
     try:
         with (folder / row.image).open("rb") as file:
-            data = file.read(PICTURE_LIMIT_BYTES + 1)
-        if len(data) > PICTURE_LIMIT_BYTES:
-            raise PictureError(f"is larger than {PICTURE_LIMIT_BYTES >> 20} MiB")
-        image = decode_picture(data, header.width, header.height)
+            data = file.read(IMAGE_LIMIT_BYTES + 1)
+        if len(data) > IMAGE_LIMIT_BYTES:
+            raise ImageError(f"is larger than {IMAGE_LIMIT_BYTES >> 20} MiB")
+        image = decode_image(data, header.width, header.height)
     except OSError as error:
         raise _wrong(folder, row, f"cannot be read ({error.strerror})") from error
-    except PictureError as error:
+    except ImageError as error:
         raise _wrong(folder, row, f"{error}; replace it or delete the line") from error
     pixel_format = "BGR8" if image.ndim == 3 else "Mono8" if image.itemsize == 1 else "Mono16"
-    picture = Picture(image, Stamps(), frame_id=index, sequence=index, pixel_format=pixel_format)
-    writer.picture(picture, encoded=data if header.format in _KEPT_AS_THEY_ARE else encode_png(image))
+    picture = Image(image, Stamps(), frame_id=index, sequence=index, pixel_format=pixel_format)
+    writer.image(picture, encoded=data if header.format in _KEPT_AS_THEY_ARE else encode_png(image))
     writer.view(
         View(
             index=index,
@@ -145,4 +145,4 @@ def _write_view(writer: RecordingWriter, folder: Path, index: int, row: PoseRow,
 
 
 def _wrong(folder: Path, row: PoseRow, reason: str) -> RecordingError:
-    return ImportFolderError(f"{folder / POSES_FILE} line {row.line}: picture {row.image} {reason}")
+    return ImportSourceError(f"{folder / POSES_FILE} line {row.line}: picture {row.image} {reason}")

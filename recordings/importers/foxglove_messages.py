@@ -13,7 +13,8 @@ from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 
-from recordings.importers.values import Camera, Frame, Image, ImportSourceError, Joints, Kind, Value
+from recordings.errors import ImportSourceError
+from recordings.importers.values import Camera, Frame, ImageMessage, Joints, Kind, Value
 from recordings.schema.viewing import camera_model_of
 
 _MESSAGES: dict[str, tuple[Any, Kind]] = {
@@ -41,7 +42,7 @@ def value(schema: str, data: bytes, time_ns: int) -> Value:
         return [_frame(message, time_ns)]
     stamp_ns = _stamp(message, time_ns)
     if schema == "foxglove.RawImage":
-        return Image(
+        return ImageMessage(
             stamp_ns,
             message.frame_id,
             message.width,
@@ -51,7 +52,7 @@ def value(schema: str, data: bytes, time_ns: int) -> Value:
             message.data,
         )
     if schema == "foxglove.CompressedImage":
-        return Image(stamp_ns, message.frame_id, 0, 0, "compressed", 0, message.data)
+        return ImageMessage(stamp_ns, message.frame_id, 0, 0, "compressed", 0, message.data)
     if schema == "foxglove.CameraCalibration":
         return Camera(message.frame_id, camera_model_of(message))
     if schema == "foxglove.JointStates":

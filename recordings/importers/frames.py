@@ -10,7 +10,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from recordings.importers.values import Array, Frame, ImportSourceError
+from recordings.errors import ImportSourceError
+from recordings.importers.values import Array, Frame
 
 SAMPLES_LIMIT = 4_000_000
 """Of all frames together: 64 bytes each."""

@@ -8,7 +8,7 @@ import math
 from dataclasses import dataclass
 from pathlib import Path
 
-from recordings.errors import ImportFolderError
+from recordings.errors import ImportSourceError
 from recordings.importers.dataset import POSES_FILE, read_small_file
 from recordings.schema.messages import Matrix4, Vector6, matrix_from_quaternion
 
@@ -33,36 +33,36 @@ class PoseRow:
 
 
 def read_poses(folder: Path) -> tuple[list[PoseRow], bytes]:
-    """(rows, the file's bytes). Raises ImportFolderError with file, row and remedy."""
+    """(rows, the file's bytes). Raises ImportSourceError with file, row and remedy."""
     path = folder / POSES_FILE
     content = read_small_file(path, _CSV_LIMIT_BYTES)
     try:
         text = content.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise ImportFolderError(f"{path} is not UTF-8 text; save it as plain CSV") from error
+        raise ImportSourceError(f"{path} is not UTF-8 text; save it as plain CSV") from error
     reader = csv.reader(io.StringIO(text, newline=""), strict=True)
     try:
         lines = [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]
     except csv.Error as error:
-        raise ImportFolderError(f"{path} line {reader.line_num}: {error}") from error
+        raise ImportSourceError(f"{path} line {reader.line_num}: {error}") from error
     header = [cell.strip() for cell in lines[0][1]] if lines else []
     if header not in (HEADER, HEADER + JOINTS):
         found = ",".join(lines[0][1])[:100] if lines else "nothing"
-        raise ImportFolderError(
+        raise ImportSourceError(
             f"{path} line 1: the header is '{found}', it must be '{','.join(HEADER)}' "
             f"(base_from_flange: metres and a unit quaternion, w last), with or without ,{','.join(JOINTS)} "
             "(radians)"
         )
     rows = [_pose_row(path, line, header, [cell.strip() for cell in cells]) for line, cells in lines[1:]]
     if not rows:
-        raise ImportFolderError(f"{path} has a header but no poses; add one line per picture")
+        raise ImportSourceError(f"{path} has a header but no poses; add one line per picture")
     _check_unique(path, rows)
     return rows, content
 
 
 def _pose_row(path: Path, line: int, header: list[str], cells: list[str]) -> PoseRow:
-    def wrong(reason: str) -> ImportFolderError:
-        return ImportFolderError(f"{path} line {line}: {reason}")
+    def wrong(reason: str) -> ImportSourceError:
+        return ImportSourceError(f"{path} line {line}: {reason}")
 
     if len(cells) != len(header):
         raise wrong(f"{len(cells)} values where {len(header)} are needed ({','.join(header)})")
@@ -107,7 +107,7 @@ def _check_unique(path: Path, rows: list[PoseRow]) -> None:
     first: dict[str, int] = {}
     for row in rows:
         if row.image in first:
-            raise ImportFolderError(
+            raise ImportSourceError(
                 f"{path} line {row.line}: {row.image} stands already in line {first[row.image]}; "
                 "each picture has one pose"
             )

@@ -5,7 +5,8 @@ from __future__ import annotations
 import struct
 from typing import Any
 
-from recordings.importers.values import Camera, Frame, Image, ImportSourceError, Joints, Kind, Value
+from recordings.errors import ImportSourceError
+from recordings.importers.values import Camera, Frame, ImageMessage, Joints, Kind, Value
 from recordings.schema.viewing import intrinsics
 
 KINDS = {
@@ -66,7 +67,7 @@ def _value(schema: str, message: Any, time_ns: int) -> Value:
     if schema == "sensor_msgs/msg/Image":
         if message.is_bigendian and "16" in message.encoding:
             raise ImportSourceError("its 16 bit pictures are big-endian; record them little-endian")
-        return Image(
+        return ImageMessage(
             stamp_ns,
             frame,
             message.width,
@@ -76,7 +77,7 @@ def _value(schema: str, message: Any, time_ns: int) -> Value:
             message.data.tobytes(),
         )
     if schema == "sensor_msgs/msg/CompressedImage":
-        return Image(stamp_ns, frame, 0, 0, "compressed", 0, message.data.tobytes())
+        return ImageMessage(stamp_ns, frame, 0, 0, "compressed", 0, message.data.tobytes())
     if schema == "sensor_msgs/msg/CameraInfo":
         return Camera(
             frame, intrinsics(message.width, message.height, message.k, message.d, message.distortion_model)

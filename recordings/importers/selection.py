@@ -7,8 +7,9 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from recordings.errors import ImportSourceError
 from recordings.importers.frames import FrameTree, Track
-from recordings.importers.values import Array, Bag, Camera, Frame, ImportSourceError, Joints, Kind, Topic
+from recordings.importers.values import Array, Bag, Camera, Frame, Joints, Kind, Topic
 from recordings.schema.messages import CameraModel, Vector6
 
 _UR_ORDER = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")

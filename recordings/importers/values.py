@@ -10,16 +10,11 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from recordings.errors import RecordingError
 from recordings.schema.messages import CameraModel
 
 Array = NDArray[np.float64]
 Progress = Callable[[str, int, int], None]
 """Is told what is being done, how much of it is, and of how much."""
-
-
-class ImportSourceError(RecordingError):
-    """A bag to import lacks something or is wrong; the message names it and the remedy."""
 
 
 class Kind(Enum):
@@ -33,7 +28,7 @@ class Kind(Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class Image:
+class ImageMessage:
     stamp_ns: int
     frame: str
     width: int
@@ -70,7 +65,7 @@ class Frame:
     rotation_xyzw: tuple[float, float, float, float]
 
 
-Value = Image | Camera | Joints | list[Frame]
+Value = ImageMessage | Camera | Joints | list[Frame]
 
 
 @dataclass(frozen=True)
@@ -96,7 +91,7 @@ class Bag(Protocol):
         """Of every image, without its pixels being decoded."""
         ...
 
-    def images(self, topic: str, places: list[int]) -> Iterator[Image]:
+    def images(self, topic: str, places: list[int]) -> Iterator[ImageMessage]:
         """Those at these places (ascending) of the topic."""
         ...
 

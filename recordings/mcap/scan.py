@@ -16,7 +16,7 @@ from array import array
 from collections.abc import Callable
 from pathlib import Path
 
-from recordings.errors import CorruptRecordingError, RecordingError, UnsealedRecordingError, recover_line
+from recordings.errors import CorruptRecordingError, RecordingError, UnfinishedRecordingError, recover_line
 from recordings.mcap import checksum
 from recordings.mcap.contents import Contents
 from recordings.mcap.records import (
@@ -59,7 +59,7 @@ def scan_file(
     """Proves the open file → (what it holds, where to read it, its SHA-256).
 
     `rescue`: the command that saves what is whole, where it is not `recordings recover`. Raises
-    UnsealedRecordingError or CorruptRecordingError, naming the byte.
+    UnfinishedRecordingError or CorruptRecordingError, naming the byte.
     """
     scan = _Scan(Source(descriptor), path, rescue or recover_line(path), progress)
     try:
@@ -136,8 +136,8 @@ class _Scan:
             f"Use the original, or save what is whole: {self._rescue}"
         )
 
-    def _unsealed(self, reason: str) -> UnsealedRecordingError:
-        return UnsealedRecordingError(
+    def _unsealed(self, reason: str) -> UnfinishedRecordingError:
+        return UnfinishedRecordingError(
             f"{self._path} was not finished or is cut ({reason}). Save what is whole: {self._rescue}"
         )
 

@@ -139,10 +139,10 @@ class RobotState(msgspec.Struct, frozen=True):
     target_speed_fraction: float
 
 
-class Picture(msgspec.Struct, frozen=True, eq=False):
+class Image(msgspec.Struct, frozen=True, eq=False):
     """One frame as the camera gave it."""
 
-    image: NDArray[Any]
+    pixels: NDArray[Any]
     """(height, width) uint8 or uint16, or (height, width, 3) uint8 BGR"""
     stamps: Stamps
     """device_ns: the camera's clock at the start of exposure; host: first packet received."""

@@ -19,8 +19,8 @@ from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from numpy.typing import NDArray
 
+from recordings.images import raw_encoding
 from recordings.mcap.writer import Piece
-from recordings.pictures import raw_encoding
 from recordings.schema.messages import (
     CameraModel,
     CaptureEvent,

@@ -105,7 +105,7 @@ def seen_before(
     found = []
     for view in recording.views():
         with contextlib.suppress(RecordingError):
-            seen = sight(recording.picture(view).image, board, camera)
+            seen = sight(recording.image(view).pixels, board, camera)
             found.append((view.index, np.array(view.base_from_flange), seen))
     return [entry for entry in found if entry[2].status.found]
 

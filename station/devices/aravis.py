@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from recordings.schema.clocks import ClockFit
-from recordings.schema.messages import CameraIdentity, Picture
+from recordings.schema.messages import CameraIdentity, Image
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices.aravis_device import GenicamDevice
@@ -40,7 +40,7 @@ class AravisCamera:
         self._worker: ThreadPoolExecutor | None = None
         self._busy = asyncio.Lock()
         self._clock = DeviceClock()
-        self._newest: Picture | None = None
+        self._newest: Image | None = None
         self._identity = CameraIdentity(driver="aravis")
         self.counter = FrameCounter()
 
@@ -67,17 +67,17 @@ class AravisCamera:
         async with self._busy:
             return await self._run(lambda: self._live().settings())
 
-    async def capture(self, timeout_s: float = 5.0) -> Picture:
+    async def capture(self, timeout_s: float = 5.0) -> Image:
         async with self._busy:
             self._newest = await self._one(timeout_s, sequenced=True)
             return self._newest
 
-    async def glimpse(self) -> Picture | None:
+    async def glimpse(self) -> Image | None:
         """Triggered as every picture is, by the box too."""
         async with self._busy:
             return await self._one(_GLIMPSE_S, sequenced=False)
 
-    async def _one(self, timeout_s: float, *, sequenced: bool) -> Picture:
+    async def _one(self, timeout_s: float, *, sequenced: bool) -> Image:
         exposure_us, gain_db = await self._run(self._prepare)
         pulse = None
         if self._config.trigger == "hardware":
@@ -93,7 +93,7 @@ class AravisCamera:
             picture, sequence=sequence, exposure_us=exposure_us, gain_db=gain_db, trigger_count=pulse
         )
 
-    async def preview(self) -> Picture | None:
+    async def preview(self) -> Image | None:
         """A fresh picture where the camera is idle and can be triggered by software, else the newest one."""
         if self._busy.locked() or self._config.trigger == "hardware":
             return self._newest
@@ -108,7 +108,7 @@ class AravisCamera:
     def free_running(self) -> bool:
         return self._config.trigger == "free-running"
 
-    async def stream(self, callback: Callable[[Picture], None], stop: threading.Event) -> None:
+    async def stream(self, callback: Callable[[Image], None], stop: threading.Event) -> None:
         """Free-running: every frame, in order, from the worker's thread, until `stop` is set."""
         async with self._busy:
             await self._run(partial(self._stream_frames, callback, stop))
@@ -151,7 +151,7 @@ class AravisCamera:
         device.latch(self._clock)
         return device.check_settings()
 
-    def _take(self, timeout_s: float) -> Picture:
+    def _take(self, timeout_s: float) -> Image:
         device = self._live()
         if self.free_running:
             self.counter.restart()
@@ -167,7 +167,7 @@ class AravisCamera:
             )
         return picture
 
-    def _stream_frames(self, callback: Callable[[Picture], None], stop: threading.Event) -> None:
+    def _stream_frames(self, callback: Callable[[Image], None], stop: threading.Event) -> None:
         device = self._live()
         self.counter.restart()
         device.drain()

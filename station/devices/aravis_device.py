@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from recordings.schema.clocks import monotonic_from_wall_ns
-from recordings.schema.messages import CameraIdentity, Picture, Stamps
+from recordings.schema.messages import CameraIdentity, Image, Stamps
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices.aravis_settings import Region, apply_settings, read_settings, require_settings
@@ -192,7 +192,7 @@ class GenicamDevice:
         with self._explained("triggering the camera"):
             self._camera.software_trigger()
 
-    def frame(self, timeout_s: float) -> Picture | None:
+    def frame(self, timeout_s: float) -> Image | None:
         """The next frame, complete; None when none comes in time."""
         end_s = time.monotonic() + timeout_s
         buffer = None
@@ -208,7 +208,7 @@ class GenicamDevice:
         finally:
             self._stream.push_buffer(buffer)
 
-    def fresh_frame(self, timeout_s: float) -> Picture | None:
+    def fresh_frame(self, timeout_s: float) -> Image | None:
         """Free-running: the next complete one of those that were not there when it was asked for."""
         self.drain()
         end_s = time.monotonic() + timeout_s
@@ -220,7 +220,7 @@ class GenicamDevice:
                     raise
         return None
 
-    def _picture(self, buffer: Any) -> Picture:
+    def _picture(self, buffer: Any) -> Image:
         if buffer.get_status() != self._aravis.BufferStatus.SUCCESS:
             raise CameraError(
                 f"frame {buffer.get_frame_id()} came incomplete ({buffer.get_status().value_nick}): packets "
@@ -234,8 +234,8 @@ class GenicamDevice:
             )
         wall_ns = buffer.get_system_timestamp()
         image = decode(buffer.get_data(), width, height, self._config.pixel_format)
-        return Picture(
-            image=image,
+        return Image(
+            pixels=image,
             stamps=Stamps(
                 host_monotonic_ns=monotonic_from_wall_ns(wall_ns),
                 host_wall_ns=wall_ns,

@@ -9,7 +9,7 @@ from typing import Any, Protocol, runtime_checkable
 import msgspec
 
 from recordings.schema.clocks import ClockFit
-from recordings.schema.messages import CameraIdentity, Picture, RobotIdentity, RobotState
+from recordings.schema.messages import CameraIdentity, Image, RobotIdentity, RobotState
 from station.devices.frames import CameraCounts
 
 
@@ -74,7 +74,7 @@ class Camera(Protocol):
     async def open(self) -> CameraIdentity:
         """Raises CameraError with the remedy."""
 
-    async def capture(self, timeout_s: float = 5.0) -> Picture:
+    async def capture(self, timeout_s: float = 5.0) -> Image:
         """One trigger, one frame. Raises CameraError; never returns an older frame."""
 
     @property
@@ -90,13 +90,13 @@ class Camera(Protocol):
         `region`, where it has one: x, y, width, height of its pictures.
         """
 
-    async def glimpse(self) -> Picture | None:
+    async def glimpse(self) -> Image | None:
         """A picture exposed after this call, of any size, that takes no number and is never recorded.
 
         None where there is no such thing (played pictures). Raises CameraError within about a second.
         """
 
-    async def preview(self) -> Picture | None:
+    async def preview(self) -> Image | None:
         """A recent picture for the screen; None when there is none. Never recorded."""
 
     async def close(self) -> None: ...
@@ -110,7 +110,7 @@ class StreamingCamera(Protocol):
     def free_running(self) -> bool:
         """It does so; else every picture is triggered."""
 
-    async def stream(self, callback: Callable[[Picture], None], stop: threading.Event) -> None:
+    async def stream(self, callback: Callable[[Image], None], stop: threading.Event) -> None:
         """Every frame, in order, from a thread of its own, until `stop` is set. Raises CameraError."""
 
 

@@ -21,7 +21,7 @@ from recordings.reader import Recording, open_recording
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import (
     CameraIdentity,
-    Picture,
+    Image,
     RobotIdentity,
     RobotState,
     Stamps,
@@ -61,7 +61,7 @@ class PlaybackCamera:
         self._config = config
         self._robot = robot
         self._source: Source | None = None
-        self._newest: Picture | None = None
+        self._newest: Image | None = None
         self._frame_id = 0
         self._taken = 0
         self._start_s: float | None = None
@@ -85,7 +85,7 @@ class PlaybackCamera:
         self._start_s = None
         return self._identity
 
-    async def capture(self, timeout_s: float = 5.0) -> Picture:
+    async def capture(self, timeout_s: float = 5.0) -> Image:
         """The next picture; CameraError at the end, or when it is not due within `timeout_s`."""
         async with self._busy:
             if self._source is None:
@@ -114,11 +114,11 @@ class PlaybackCamera:
     async def settings(self) -> dict[str, Any]:
         return {"device": self._config.device, "pace": self._config.playback_pace}
 
-    async def glimpse(self) -> Picture | None:
+    async def glimpse(self) -> Image | None:
         """None: a played picture was taken once, how it moved then cannot be seen in it."""
         return None
 
-    async def preview(self) -> Picture | None:
+    async def preview(self) -> Image | None:
         """The newest picture; with a robot, what it looks at now."""
         if self._robot is not None and self._source is not None:
             try:
@@ -189,13 +189,13 @@ class PlaybackRobot:
         )
         return Plan(self.identity.model, self._recording.info.mount, poses, note="playback")
 
-    def picture(self) -> Picture:
+    def picture(self) -> Image:
         """Of the view the arm stands at; CameraError between two, or when it cannot be decoded."""
         view, moving = self._standing()
         if moving:
             raise CameraError("playback has pictures only from where the recorded arm stood")
         try:
-            return self._recording.picture(view)
+            return self._recording.image(view)
         except RecordingError as error:
             raise CameraError(str(error)) from error
 

@@ -10,7 +10,7 @@ import cv2
 
 from recordings.errors import RecordingError
 from recordings.reader import open_recording
-from recordings.schema.messages import CameraIdentity, Picture, Stamps
+from recordings.schema.messages import CameraIdentity, Image, Stamps
 from station.cell.errors import CameraError
 
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
@@ -20,7 +20,7 @@ FOLDER_RATE_HZ = 10.0
 
 
 class Played(NamedTuple):
-    picture: Picture
+    picture: Image
     at_s: float
     """When it was taken, counted from the first."""
 
@@ -62,7 +62,7 @@ def _folder(files: list[Path]) -> Iterator[Played]:
             image = cv2.cvtColor(image, cv2.COLOR_BGRA2BGR)
         wide = "Mono16" if image.dtype.itemsize == 2 else "Mono8"
         pixel_format = "BGR8" if image.ndim == 3 else wide
-        yield Played(Picture(image, Stamps(), 0, number, pixel_format=pixel_format), number / FOLDER_RATE_HZ)
+        yield Played(Image(image, Stamps(), 0, number, pixel_format=pixel_format), number / FOLDER_RATE_HZ)
 
 
 def _video(path: Path, capture: cv2.VideoCapture) -> Iterator[Played]:
@@ -73,7 +73,7 @@ def _video(path: Path, capture: cv2.VideoCapture) -> Iterator[Played]:
             good, image = capture.read()
             if not good:
                 break
-            yield Played(Picture(image, Stamps(), 0, number, pixel_format="BGR8"), number / rate_hz)
+            yield Played(Image(image, Stamps(), 0, number, pixel_format="BGR8"), number / rate_hz)
             number += 1
     finally:
         capture.release()
@@ -91,7 +91,7 @@ def _recording(path: Path) -> Source:
     def frames() -> Iterator[Played]:
         first_ns: int | None = None
         try:
-            for _, picture in recording.pictures():
+            for _, picture in recording.images():
                 taken_ns = picture.stamps.host_monotonic_ns
                 first_ns = taken_ns if first_ns is None else first_ns
                 yield Played(picture, max(0.0, (taken_ns - first_ns) / 1e9))

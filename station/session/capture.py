@@ -10,7 +10,7 @@ import msgspec
 import numpy as np
 
 from calibrate.geometry import Array, inverse, pose_from_rotvec
-from recordings.schema.messages import Matrix4, Picture, RobotState, Stamps, Stillness, Vector6, View
+from recordings.schema.messages import Image, Matrix4, RobotState, Stamps, Stillness, Vector6, View
 from station.analysis.pool import WorkerError
 from station.analysis.worker import Sighting, sight
 from station.cell.errors import CameraError, StaleStateError, StationError
@@ -61,7 +61,7 @@ def _phase(bench: Bench, index: int, state: StationState, pose_state: PoseState)
     bench.show_poses(index)
 
 
-async def take_picture(bench: Bench, index: int | None = None) -> Picture:
+async def take_picture(bench: Bench, index: int | None = None) -> Image:
     """Of a pose, or of none. PoseFailedError once the configured retries are used up."""
     tries = 1 + bench.cell.config.capture.retries
     camera = bench.cell.camera
@@ -80,8 +80,8 @@ async def take_picture(bench: Bench, index: int | None = None) -> Picture:
     raise PoseFailedError(f"no good picture in {tries} tries: {last}")
 
 
-def show_frame(bench: Bench, picture: Picture) -> None:
-    height, width = picture.image.shape[:2]
+def show_frame(bench: Bench, picture: Image) -> None:
+    height, width = picture.pixels.shape[:2]
     shown = msgspec.structs.replace(
         bench.store.status.camera,
         connected=True,
@@ -119,7 +119,7 @@ def _view(
     bench: Bench,
     index: int,
     attempt: int,
-    picture: Picture,
+    picture: Image,
     state: RobotState,
     still: Stillness,
     camera_bound_s: float,
@@ -154,7 +154,7 @@ def _require_bound(bench: Bench, view: View) -> None:
         )
 
 
-async def _write(bench: Bench, index: int, picture: Picture, view: View) -> None:
+async def _write(bench: Bench, index: int, picture: Image, view: View) -> None:
     """Disk and detection side by side; the view is written, and the pose counted, only with a board in it."""
     recording, queue = bench.require_recording(), bench.require_queue()
     recording.picture(picture)
@@ -180,12 +180,12 @@ async def _write(bench: Bench, index: int, picture: Picture, view: View) -> None
     bench.store.event(f"saved{corners}", pose_index=index)
 
 
-async def _sighting(bench: Bench, picture: Picture, index: int) -> Sighting | None:
+async def _sighting(bench: Bench, picture: Image, index: int) -> Sighting | None:
     """None when the worker could not say: the data are kept, the offline stage looks again."""
     config = bench.cell.config
     try:
         return await bench.workers.call(
-            sight, picture.image, config.board, config.camera.model, timeout_s=SIGHT_TIMEOUT_S
+            sight, picture.pixels, config.board, config.camera.model, timeout_s=SIGHT_TIMEOUT_S
         )
     except WorkerError as error:
         bench.store.event(f"the picture was not looked at: {error}", "warning", index)

@@ -77,7 +77,7 @@ async def _camera_check(bench: Bench, troubles: dict[str, str]) -> Check:
         remedy = "check its cable and power, then take one by hand (F3, F2 on the screen)"
         return Check("camera", "warning", f"{camera.identity.model}: no picture", remedy)
     # A preview may be smaller than what is captured.
-    height, width = picture.image.shape[:2]
+    height, width = picture.pixels.shape[:2]
     width, height = settings.get("region", (0, 0, width, height))[2:]
     return Check("camera", "ok", f"{camera.identity.model} {camera.identity.serial}, {width}×{height}")
 

@@ -150,7 +150,7 @@ class HoverDesk:
             raise RefusedError("the arm was moved while the picture was taken: leave it at rest, then again")
         board = bench.cell.config.board
         sighting = await bench.workers.call(
-            sight, picture.image, board, calibration.intrinsics.model, timeout_s=_SIGHT_S
+            sight, picture.pixels, board, calibration.intrinsics.model, timeout_s=_SIGHT_S
         )
         if not sighting.status.found:
             reason = sighting.status.reason or "no board in the picture"

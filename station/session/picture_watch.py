@@ -11,7 +11,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from recordings.schema.messages import Picture
+from recordings.schema.messages import Image
 from station.analysis.picture_motion import board_box, picture_motion
 from station.cell.errors import CameraError, StationError
 from station.cell.stillness import Look
@@ -39,7 +39,7 @@ class PictureWatch:
         """With the time before which none of its pictures began."""
         self._blind = False
         self._again = asyncio.Event()
-        self._glimpsing: asyncio.Task[Picture | None] | None = None
+        self._glimpsing: asyncio.Task[Image | None] | None = None
         self._task: asyncio.Task[None] | None = None
         model = bench.cell.config.camera.model
         self._width = model.width if model is not None else 0
@@ -102,7 +102,7 @@ class PictureWatch:
                     raise
                 continue
             if picture is not None:
-                self._pictures.append((asked_ns, picture.image))
+                self._pictures.append((asked_ns, picture.pixels))
             return picture is not None
         return False
 

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from recordings.schema.messages import Picture
+from recordings.schema.messages import Image
 from station.analysis.pool import WorkerError
 from station.analysis.worker import Sighting, sight
 from station.cell.errors import CameraError
@@ -32,7 +32,7 @@ class Previewer:
     def __init__(self, bench: Bench) -> None:
         self._bench = bench
         self._taking = asyncio.Lock()
-        self._picture: Picture | None = None
+        self._picture: Image | None = None
         self._sighting: Sighting | None = None
         self._taken_s = 0.0
         self._count = 0
@@ -46,7 +46,7 @@ class Previewer:
             return PreviewImage()
         low, high = SIDES
         width, height = min(max(width, low), high), min(max(height, low), high)
-        return await asyncio.to_thread(self._encode, self._picture.image, self._sighting, width, height)
+        return await asyncio.to_thread(self._encode, self._picture.pixels, self._sighting, width, height)
 
     async def _take(self) -> None:
         bench = self._bench
@@ -63,7 +63,7 @@ class Previewer:
         try:
             exposure = (picture.exposure_us, picture.gain_db) if picture.exposure_us else None
             sighting = await bench.workers.call(
-                sight, picture.image, config.board, config.camera.model, False, exposure, timeout_s=5.0
+                sight, picture.pixels, config.board, config.camera.model, False, exposure, timeout_s=5.0
             )
         except WorkerError:
             sighting = None

@@ -23,7 +23,7 @@ from recordings.recorder import Recorder
 from recordings.schema.messages import (
     CameraModel,
     CaptureEvent,
-    Picture,
+    Image,
     RobotState,
     SessionInfo,
     Stamps,
@@ -138,7 +138,7 @@ class SessionRecording:
     def name(self) -> str:
         return self.folder.name
 
-    async def open(self, queue: PoseQueue, first_picture: Picture | None = None) -> None:
+    async def open(self, queue: PoseQueue, first_picture: Image | None = None) -> None:
         """Creates the file with everything needed to re-solve it. Raises RecordingError."""
         try:
             settings = await self._cell.camera.settings()
@@ -148,7 +148,7 @@ class SessionRecording:
         await self.save_state(queue)
 
     def _open(
-        self, plan: Plan, plan_sha256: str, first_picture: Picture | None, settings: dict[str, Any]
+        self, plan: Plan, plan_sha256: str, first_picture: Image | None, settings: dict[str, Any]
     ) -> None:
         config = self._cell.config
         require_free_space(self.folder, config.capture.free_space_bytes)
@@ -189,12 +189,12 @@ class SessionRecording:
                 recorder.frame(parent, child, matrix_from_quaternion(at, turn))
         self.recorder = recorder
 
-    def _session_camera(self, picture: Picture | None) -> CameraModel:
+    def _session_camera(self, picture: Image | None) -> CameraModel:
         """Known intrinsics, or at least the size of the pictures."""
         if (known := self._cell.camera_model) is not None:
             return known
         if picture is not None:
-            height, width = picture.image.shape[:2]
+            height, width = picture.pixels.shape[:2]
             return CameraModel(width=width, height=height)
         rough = self._cell.config.camera.model
         return CameraModel(width=rough.width if rough else 0, height=rough.height if rough else 0)
@@ -210,9 +210,9 @@ class SessionRecording:
             stamps = Stamps(host_monotonic_ns=time.monotonic_ns(), host_wall_ns=event.wall_ns)
             self.recorder.event(CaptureEvent(stamps, "station", event.pose_index, event.text, event.level))
 
-    def number(self, picture: Picture) -> Picture:
+    def number(self, picture: Image) -> Image:
         """The same picture with its number in this session."""
-        numbered = msgspec.structs.replace(picture, sequence=self._sequence, image=_own(picture.image))
+        numbered = msgspec.structs.replace(picture, sequence=self._sequence, pixels=_own(picture.pixels))
         self._sequence += 1
         return numbered
 
@@ -224,10 +224,10 @@ class SessionRecording:
         self._plans += 1
         self._require().attach(f"plan-{self._plans}.json", "application/json", msgspec.json.encode(plan))
 
-    def picture(self, picture: Picture) -> None:
+    def picture(self, picture: Image) -> None:
         """Hands it to the writer. Raises RecordingError when the disk cannot keep up or has failed."""
         recorder = self._require()
-        if not recorder.picture(picture):
+        if not recorder.image(picture):
             raise recorder.error or RecordingError("the disk cannot keep up: a picture was dropped")
 
     def view(self, view: View) -> None:

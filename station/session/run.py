@@ -13,7 +13,7 @@ import numpy as np
 
 from recordings.errors import RecordingError
 from recordings.recover import recover
-from recordings.schema.messages import Picture, Vector6
+from recordings.schema.messages import Image, Vector6
 from station.cell.errors import (
     LimitError,
     RefusedError,
@@ -118,7 +118,7 @@ class Run:
         recording = bench.recording
         if recording is not None and recording.recorder is not None:
             return
-        first: Picture | None = None
+        first: Image | None = None
         if bench.cell.config.camera.model is None:
             first = await bench.cell.camera.capture()
         if recording is not None:

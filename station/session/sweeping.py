@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import threading
 
-from recordings.schema.messages import Picture
+from recordings.schema.messages import Image
 from station.analysis.worker import sight
 from station.cell.errors import CameraError, LimitError
 from station.cell.status import StationState
@@ -34,7 +34,7 @@ class SweepRun(Run):
         bench, config = self._bench, self._bench.cell.config
         picture = await take_picture(bench)
         seen = await bench.workers.call(
-            sight, picture.image, config.board, config.camera.model, timeout_s=SIGHT_TIMEOUT_S
+            sight, picture.pixels, config.board, config.camera.model, timeout_s=SIGHT_TIMEOUT_S
         )
         if not seen.status.found:
             raise CameraError(
@@ -98,7 +98,7 @@ class SweepRun(Run):
             else:
                 failures = 0
 
-    def _keep(self, recording: SessionRecording, picture: Picture) -> Picture:
+    def _keep(self, recording: SessionRecording, picture: Image) -> Image:
         """Numbered and handed to the recorder; RecordingError when that cannot keep up."""
         numbered = recording.number(picture)
         recording.picture(numbered)
@@ -107,9 +107,9 @@ class SweepRun(Run):
 
     async def _stream(self, camera: StreamingCamera, recording: SessionRecording) -> None:
         """Every frame, straight from the camera's thread; what is shown of them comes from the loop."""
-        newest: list[Picture] = []
+        newest: list[Image] = []
 
-        def keep(picture: Picture) -> None:
+        def keep(picture: Image) -> None:
             if not self._ended.is_set():  # the arm stopped while it was on its way
                 newest[:] = [self._keep(recording, picture)]
 

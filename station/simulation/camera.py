@@ -13,7 +13,7 @@ import msgspec
 import numpy as np
 
 from recordings.schema.clocks import ClockFit
-from recordings.schema.messages import CameraIdentity, Picture, Stamps
+from recordings.schema.messages import CameraIdentity, Image, Stamps
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices.base import Trigger
@@ -45,8 +45,8 @@ class RenderedCamera:
         self._gain_db = truth.gain_db if config is None else config.gain_db
         self._process: asyncio.subprocess.Process | None = None
         self._reader: asyncio.Task[None] | None = None
-        self._frames: asyncio.Queue[Picture | CameraError] = asyncio.Queue()
-        self._answers: asyncio.Queue[Picture | dict[str, Any] | CameraError] = asyncio.Queue()
+        self._frames: asyncio.Queue[Image | CameraError] = asyncio.Queue()
+        self._answers: asyncio.Queue[Image | dict[str, Any] | CameraError] = asyncio.Queue()
         self._asking = asyncio.Lock()
         self._device_clock = DeviceClock()
         self.counter = FrameCounter()
@@ -101,7 +101,7 @@ class RenderedCamera:
             raise
         return self.identity
 
-    async def capture(self, timeout_s: float = 5.0) -> Picture:
+    async def capture(self, timeout_s: float = 5.0) -> Image:
         """One trigger, one frame; a frame that was there before the trigger is an error, not the answer."""
         async with self._asking:
             await self._read_clock()
@@ -133,13 +133,13 @@ class RenderedCamera:
             "gain_db": self._gain_db,
         }
 
-    async def glimpse(self) -> Picture | None:
+    async def glimpse(self) -> Image | None:
         """At half the size, rendered anew."""
         picture = await self._ask({"cmd": "preview"}, _ANSWER_S)
-        assert isinstance(picture, Picture)
+        assert isinstance(picture, Image)
         return picture
 
-    async def preview(self) -> Picture | None:
+    async def preview(self) -> Image | None:
         try:
             return await self.glimpse()
         except CameraError:
@@ -168,7 +168,7 @@ class RenderedCamera:
                 await self._reader
             self._reader = None
 
-    def _check_settings(self, frame: Picture) -> None:
+    def _check_settings(self, frame: Image) -> None:
         if (frame.exposure_us, frame.gain_db) != (self._exposure_us, self._gain_db):
             raise CameraError(
                 f"the camera exposed {frame.exposure_us:g} µs at {frame.gain_db:g} dB, set were "
@@ -188,11 +188,11 @@ class RenderedCamera:
         if isinstance(answer, dict):
             self._device_clock.reading(answer["device_ns"], asked_ns, time.monotonic_ns())
 
-    async def _ask(self, request: dict[str, Any], timeout_s: float) -> Picture | dict[str, Any]:
+    async def _ask(self, request: dict[str, Any], timeout_s: float) -> Image | dict[str, Any]:
         async with self._asking:
             return await self._ask_locked(request, timeout_s)
 
-    async def _ask_locked(self, request: dict[str, Any], timeout_s: float) -> Picture | dict[str, Any]:
+    async def _ask_locked(self, request: dict[str, Any], timeout_s: float) -> Image | dict[str, Any]:
         while not self._answers.empty():
             self._answers.get_nowait()  # an answer that came after its deadline
         self._write(request)
@@ -232,10 +232,10 @@ class RenderedCamera:
         self._answers.put_nowait(gone)
 
 
-async def _picture(stream: asyncio.StreamReader, header: dict[str, Any]) -> Picture:
+async def _picture(stream: asyncio.StreamReader, header: dict[str, Any]) -> Image:
     data = await stream.readexactly(header["bytes"])
-    return Picture(
-        image=np.frombuffer(data, np.uint8).reshape(header["height"], header["width"]),
+    return Image(
+        pixels=np.frombuffer(data, np.uint8).reshape(header["height"], header["width"]),
         stamps=Stamps(
             host_monotonic_ns=header["arrival_monotonic_ns"],
             host_wall_ns=time.time_ns() - (time.monotonic_ns() - header["arrival_monotonic_ns"]),

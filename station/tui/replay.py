@@ -108,7 +108,7 @@ class ReplayLink:
 
     def _look(self, view: View, width: int, height: int) -> dict[str, Any] | None:
         try:
-            image = self._timeline.recording.picture(view).image
+            image = self._timeline.recording.image(view).pixels
         except RecordingError as error:
             self._seen = DetectionStatus(reason=str(error))
             return None

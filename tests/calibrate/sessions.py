@@ -16,8 +16,8 @@ from recordings.schema.messages import (
     BoardSpec,
     CameraIdentity,
     CameraModel,
+    Image,
     Mount,
-    Picture,
     RobotIdentity,
     SessionInfo,
     Stamps,
@@ -106,7 +106,7 @@ def write_session(path: Path, scene: Scene | None = None, known_lens: bool = Fal
         for k, seen in enumerate(scene.camera_from_board()):
             stamps = Stamps(k * 10**9, 1_700_000_000_000_000_000 + k * 10**9)
             image = render(scene.camera, scene.board, seen, LIGHT, rng)
-            writer.picture(Picture(image, stamps, frame_id=k, sequence=k))
+            writer.image(Image(image, stamps, frame_id=k, sequence=k))
             matrix = tuple(tuple(row) for row in recorded[k].tolist())
             writer.view(View(k, f"pose-{k}", k, matrix, stamps=stamps, time_bound_s=0.001))
         return writer.finish()

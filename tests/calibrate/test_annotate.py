@@ -38,7 +38,7 @@ def test_the_command_writes_the_result_beside_the_pictures(tmp_path: Path, solve
     result = call(main, "annotate", SAMPLE, solved, "-o", path)
     assert result.returncode == 0, result.stderr
     calibration = read_calibration(solved)
-    part = open_recording(path).parts[0]
+    part = open_recording(path).segments[0]
     assert part.camera_model == calibration.intrinsics.model
     np.testing.assert_allclose(
         part.fixed_frames["flange", "camera"], calibration.transform.matrix, atol=1e-12
@@ -53,8 +53,8 @@ def test_the_command_writes_the_result_beside_the_pictures(tmp_path: Path, solve
     assert len(scene.entities) == 26, "the board, and where the camera was in each view"
     again, original = open_recording(path), open_recording(SAMPLE)
     assert list(again.robot_states()) == list(original.robot_states())
-    for (_, ours), (_, theirs) in zip(again.pictures(), original.pictures(), strict=True):
-        np.testing.assert_array_equal(ours.image, theirs.image)
+    for (_, ours), (_, theirs) in zip(again.images(), original.images(), strict=True):
+        np.testing.assert_array_equal(ours.pixels, theirs.pixels)
 
 
 def test_a_wrong_calibration_is_seen(tmp_path: Path, solved: Path) -> None:

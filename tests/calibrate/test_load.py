@@ -13,9 +13,9 @@ from calibrate.errors import BadViewsError, SquaresCountedError, TooFewViewsErro
 from calibrate.load import load_views, without_views
 from calibrate.pipeline import solve_recording
 from calibrate.report.page import report_page
-from recordings.errors import CorruptRecordingError, MissingPartError
+from recordings.errors import CorruptRecordingError, MissingSegmentError
+from recordings.images import encode_png
 from recordings.manifest import enter_part
-from recordings.pictures import encode_png
 from recordings.reader import Recording, open_recording
 from recordings.recover import recover
 from recordings.writer import RecordingWriter
@@ -28,11 +28,11 @@ def copied(
 ) -> Path:
     """Some poses in a part of their own, as PNG; the bytes of some pictures changed on the way."""
     with RecordingWriter(path, msgspec.structs.replace(source.info, part=part)) as writer:
-        for sequence, (view, picture) in enumerate(source.pictures()):
+        for sequence, (view, picture) in enumerate(source.images()):
             if sequence not in poses:
                 continue
-            encoded = (damaged or {}).get(sequence, bytes)(encode_png(picture.image))
-            writer.picture(picture, encoded=encoded)
+            encoded = (damaged or {}).get(sequence, bytes)(encode_png(picture.pixels))
+            writer.image(picture, encoded=encoded)
             writer.view(msgspec.structs.replace(view, part=1))
         return writer.finish()
 
@@ -90,9 +90,9 @@ def test_a_board_declared_in_squares_is_named_with_its_inner_corners(source: Rec
 def test_a_picture_of_impossible_size_is_refused_before_decoding(source: Recording, tmp_path: Path) -> None:
     """Fault 36. The writer refuses such bytes, so the header is changed after it looked."""
     path = copied(source, tmp_path / "a.mcap", range(3))
-    original = encode_png(next(source.pictures())[1].image)
+    original = encode_png(next(source.images())[1].pixels)
     recording = open_recording(path)
-    part = recording.parts[0]
+    part = recording.segments[0]
     stored = part._image_message
 
     def lying(*place: object) -> object:
@@ -122,7 +122,7 @@ def test_a_lost_part_is_never_passed_over(source: Recording, tmp_path: Path) -> 
     assert solve_recording(tmp_path).calibration.quality.warnings == []
     (tmp_path / "session-2.mcap").unlink()
     for path in (tmp_path, tmp_path / "session-1.mcap"):
-        with pytest.raises(MissingPartError, match=f"recordings recover {tmp_path}"):
+        with pytest.raises(MissingSegmentError, match=f"recordings recover {tmp_path}"):
             solve_recording(path)
     recover(tmp_path)
     job = solve_recording(tmp_path)

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from recordings.schema.messages import Picture
+from recordings.schema.messages import Image
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices.aravis import AravisCamera
@@ -43,7 +43,7 @@ async def test_18_an_incomplete_frame_is_refused_and_the_next_one_good(server: S
         with pytest.raises(CameraError, match=r"came incomplete|no picture within"):
             await camera.capture(timeout_s=2.0)
         server.inject("packet-loss", 0.0)
-        assert (await camera.capture()).image.shape == (1024, 1280)
+        assert (await camera.capture()).pixels.shape == (1024, 1280)
         assert camera.counter.missing == 1
         server.inject("packet-loss", 0.03)
         with pytest.raises(CameraError, match="came incomplete"):
@@ -69,10 +69,10 @@ async def test_18_lost_packets_are_sent_again_and_counted(
             counts = camera.counts().stream
         finally:
             await camera.close()
-    numbers = [int.from_bytes(p.image.reshape(-1)[:8].tobytes(), "little") for p in pictures]
+    numbers = [int.from_bytes(p.pixels.reshape(-1)[:8].tobytes(), "little") for p in pictures]
     assert numbers == list(range(1, 21))
     assert all(
-        np.array_equal(p.image, numbered_picture(n, 1280, 1024))
+        np.array_equal(p.pixels, numbered_picture(n, 1280, 1024))
         for n, p in zip(numbers, pictures, strict=True)
     )
     assert wire.lost > 20 and counts.incomplete == counts.missing_packets == 0
@@ -122,8 +122,8 @@ async def test_23_a_stream_ends_when_settings_are_changed_and_passes_no_picture_
     )
     sizes: list[tuple[int, ...]] = []
 
-    def keep(picture: Picture) -> None:
-        sizes.append(picture.image.shape)
+    def keep(picture: Image) -> None:
+        sizes.append(picture.pixels.shape)
         if len(sizes) == 5:
             server.inject("register", [genicam.WIDTH, 640])
 
@@ -159,7 +159,7 @@ async def test_an_unplugged_camera_is_gone_and_comes_back_by_its_serial(server: 
         assert beats > 50, "the daemon's loop goes on while Aravis waits"
         beating.cancel()
         with start_gige(numbered=True, serial="KJ0042"):
-            assert (await camera.capture()).image.shape == (1024, 1280)
+            assert (await camera.capture()).pixels.shape == (1024, 1280)
             assert camera.identity.serial == "KJ0042"
     finally:
         await camera.close()
@@ -209,6 +209,6 @@ async def test_a_frozen_camera_is_noticed_and_used_again_after_it_thaws(server: 
                 break
             except CameraError:
                 await asyncio.sleep(1.0)
-        assert picture.image.shape == (1024, 1280)
+        assert picture.pixels.shape == (1024, 1280)
     finally:
         await camera.close()

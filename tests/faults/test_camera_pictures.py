@@ -36,9 +36,9 @@ async def test_23_a_camera_that_changes_its_exposure_is_refused(camera: Rendered
 async def test_26_a_hidden_or_wrong_board_is_not_found_and_the_reason_is_said(
     camera: RenderedCamera, fault: str, value: Any, words: str
 ) -> None:
-    assert detect((await camera.capture()).image, PAPER_BOARD).found
+    assert detect((await camera.capture()).pixels, PAPER_BOARD).found
     await camera.inject(fault, value)
-    seen = detect((await camera.capture()).image, PAPER_BOARD)
+    seen = detect((await camera.capture()).pixels, PAPER_BOARD)
     assert not seen.found and words in seen.reason
 
 
@@ -47,9 +47,9 @@ async def test_26_over_and_under_exposure_are_named_with_what_to_set(
     camera: RenderedCamera, light: float, words: str
 ) -> None:
     good = await camera.capture()
-    assert assess(good.image, None, good.exposure_us, good.gain_db).warnings == ()
+    assert assess(good.pixels, None, good.exposure_us, good.gain_db).warnings == ()
     await camera.inject("illumination", light)
     bad = await camera.capture()
-    advice = assess(bad.image, None, bad.exposure_us, bad.gain_db)
+    advice = assess(bad.pixels, None, bad.exposure_us, bad.gain_db)
     assert any(words in warning for warning in advice.warnings)
     assert (advice.exposure_us < bad.exposure_us) == (light > 1)

@@ -13,7 +13,7 @@ pytestmark = pytest.mark.process
 
 async def motion_px(camera: RenderedCamera) -> float:
     looks = [await camera.glimpse() for _ in range(3)]
-    found = picture_motion([look.image for look in looks if look is not None], make_cell().camera.width)
+    found = picture_motion([look.pixels for look in looks if look is not None], make_cell().camera.width)
     assert found is not None
     return found
 

@@ -36,7 +36,7 @@ UNTIL_IT_IS_FULL = textwrap.dedent(
     try:
         for index in itertools.count():
             recorder.robot_state(make_state(index))
-            if not recorder.picture(make_picture(index)):
+            if not recorder.image(make_picture(index)):
                 raise recorder.error
             recorder.view(make_view(index))
             recorder.sync().result()

@@ -30,7 +30,7 @@ def fresh(folder: Path) -> Path:
                     writer.flush()
             now_ns = (index + 1) * STATES_A_POSE * 2_000_000
             stamps = Stamps(now_ns, START_NS + now_ns, device_ns=now_ns)
-            writer.picture(_at(make_picture(index), stamps))
+            writer.image(_at(make_picture(index), stamps))
             writer.view(_at(make_view(index), Stamps(now_ns, START_NS + now_ns - 5_000_000)))
             writer.event(CaptureEvent(stamps, "captured", pose_index=index))
         return writer.finish()

@@ -88,10 +88,10 @@ def test_the_stops_come_with_their_picture_and_the_right_pose(
     recording = open_recording(tmp_path / "out.mcap")
     assert recording.info.source == "imported"
     np.testing.assert_array_equal(np.ravel(recording.info.camera.matrix), K)
-    for number, (view, image) in enumerate(recording.pictures()):
+    for number, (view, image) in enumerate(recording.images()):
         time_s = (view.stamps.host_wall_ns - START_NS) / 1e9
         assert 2 * number + 0.3 < time_s < 2 * number + 1, "the last picture of the stop"
-        assert np.unique(image.image) == 10 + 40 * number
+        assert np.unique(image.pixels) == 10 + 40 * number
         position, _ = pose(2.0 * number)
         np.testing.assert_allclose(np.array(view.base_from_flange)[:3, 3], position, atol=1e-9)
         assert view.time_bound_s is not None

@@ -57,7 +57,7 @@ def seeds(corpus: Path) -> None:
 def write_encoded(path: Path, extension: str) -> None:
     with RecordingWriter(path, make_info()) as writer:
         picture = make_picture(0)
-        writer.picture(picture, encoded=cv2.imencode(extension, picture.image)[1].tobytes())
+        writer.image(picture, encoded=cv2.imencode(extension, picture.pixels)[1].tobytes())
         writer.view(make_view(0))
         writer.finish()
 
@@ -69,7 +69,7 @@ def read_all(path: Path) -> None:
     for _ in recording.events():
         pass
     for view in recording.views():
-        recording.picture(view)
+        recording.image(view)
     recording.attachments()
 
 

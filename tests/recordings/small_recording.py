@@ -11,7 +11,7 @@ from recordings.schema.messages import (
     BoardSpec,
     CameraModel,
     CaptureEvent,
-    Picture,
+    Image,
     RobotState,
     SessionInfo,
     Stamps,
@@ -61,9 +61,9 @@ def make_image(sequence: int, width: int = WIDTH, height: int = HEIGHT) -> np.nd
     return np.random.default_rng(sequence).integers(0, 256, (height, width), np.uint8)
 
 
-def make_picture(sequence: int, image: np.ndarray | None = None) -> Picture:
-    return Picture(
-        image=make_image(sequence) if image is None else image,
+def make_picture(sequence: int, image: np.ndarray | None = None) -> Image:
+    return Image(
+        pixels=make_image(sequence) if image is None else image,
         stamps=Stamps(sequence * 500_000_000, START_NS + sequence * 500_000_000, 0.0, sequence * 499_999_000),
         frame_id=sequence + 1,
         sequence=sequence,
@@ -95,7 +95,7 @@ def write_small(path: Path, poses: int = 3, info: SessionInfo | None = None) -> 
         for index in range(poses):
             for count in range(3):
                 writer.robot_state(make_state(3 * index + count))
-            writer.picture(make_picture(index))
+            writer.image(make_picture(index))
             writer.view(make_view(index))
         writer.event(CaptureEvent(Stamps(2, START_NS + 1), "finished", pose_index=2, level="warning"))
         return writer.finish()

@@ -47,7 +47,7 @@ def write_with_clocks(path: Path, drift_ppm: float, missing: range) -> Path:
             stamps = Stamps(host_ns, START_NS + host_ns, controller_s)
             writer.robot_state(msgspec.structs.replace(make_state(0), stamps=stamps))
         for sequence, frame_id in enumerate([65534, 65535, 1, 2, 5]):
-            writer.picture(msgspec.structs.replace(make_picture(sequence), frame_id=frame_id))
+            writer.image(msgspec.structs.replace(make_picture(sequence), frame_id=frame_id))
             writer.view(make_view(sequence % 4, sequence, 1 + sequence // 4))
         return writer.finish()
 
@@ -90,9 +90,7 @@ def test_info_of_clocks_that_go_back_or_are_no_time(tmp_path: Path) -> None:
         for controller_s in stamps_s:
             stamps = Stamps(1, START_NS, controller_s)
             writer.robot_state(msgspec.structs.replace(make_state(0), stamps=stamps))
-        writer.picture(
-            msgspec.structs.replace(make_picture(0), exposure_us=float("nan"), gain_db=float("inf"))
-        )
+        writer.image(msgspec.structs.replace(make_picture(0), exposure_us=float("nan"), gain_db=float("inf")))
         path = writer.finish()
     result = run("info", path)
     assert "9 at 500.0 Hz, no gap, controller time goes back 1 time" in " ".join(result.stdout.split())
@@ -249,7 +247,7 @@ def test_the_time_between_two_parts_is_no_gap_and_no_lost_frame(tmp_path: Path) 
             for count in range(5):
                 stamps = Stamps(1, START_NS + count * 2_000_000, 1000 * part + count * 0.002)
                 writer.robot_state(msgspec.structs.replace(make_state(0), stamps=stamps))
-                writer.picture(msgspec.structs.replace(make_picture(count), frame_id=50 * part + count))
+                writer.image(msgspec.structs.replace(make_picture(count), frame_id=50 * part + count))
             writer.event(CaptureEvent(Stamps(1, START_NS), "started"))
             writer.event(CaptureEvent(Stamps(1, START_NS + 1), "finished"))
             writer.finish()

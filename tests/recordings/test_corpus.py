@@ -26,4 +26,4 @@ def test_a_kept_input_gives_a_recording_or_a_recording_error(
         with suppress(RecordingError):
             recording = open_recording(read())
             list(recording.robot_states())
-            list(recording.pictures())
+            list(recording.images())

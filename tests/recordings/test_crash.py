@@ -34,7 +34,7 @@ WRITER = textwrap.dedent(
         for index in itertools.count():
             for count in range(20):
                 recorder.robot_state(make_state(20 * index + count))
-            if not recorder.picture(make_picture(index)):
+            if not recorder.image(make_picture(index)):
                 raise recorder.error
             recorder.view(make_view(index))
             recorder.sync().result()
@@ -68,9 +68,9 @@ def check_what_is_left(part: Path, acknowledged: list[int]) -> None:
     views = recording.views()
     assert [view.index for view in views] == list(range(len(views)))
     assert len(acknowledged) <= len(views) <= len(acknowledged) + 1
-    assert len(recording.parts[0].picture_sequences()) <= len(acknowledged) + 1
-    for view, picture in recording.pictures():
-        np.testing.assert_array_equal(picture.image, make_image(view.index))
+    assert len(recording.segments[0].image_sequences()) <= len(acknowledged) + 1
+    for view, picture in recording.images():
+        np.testing.assert_array_equal(picture.pixels, make_image(view.index))
     assert len(list(recording.robot_states())) >= 20 * len(views)
 
 

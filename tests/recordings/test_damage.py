@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from recordings.errors import CorruptRecordingError, RecordingError, UnsealedRecordingError
+from recordings.errors import CorruptRecordingError, RecordingError, UnfinishedRecordingError
 from recordings.reader import Recording, open_recording
 from recordings.recover import recover
 from recordings.schema.messages import RobotState, View
@@ -51,7 +51,7 @@ def check_every_cut(path: Path, every: int) -> None:
     cut = path.with_name("cut.mcap")
     for length in range(0, len(data), every):
         cut.write_bytes(data[:length])
-        refused = (UnsealedRecordingError, CorruptRecordingError)
+        refused = (UnfinishedRecordingError, CorruptRecordingError)
         with pytest.raises(refused, match=r"recordings recover|is empty"):
             open_recording(cut)
 
@@ -71,7 +71,7 @@ def assert_part_of_the_original(recording: Recording) -> tuple[int, int]:
     assert views == [make_view(view.index) for view in views]
     states: list[RobotState] = list(recording.robot_states())
     assert all(state in [make_state(i) for i in range(9)] for state in states)
-    for view, picture in recording.pictures():
+    for view, picture in recording.images():
         assert picture.sequence == view.picture_sequence
     return len(views), len(states)
 
@@ -133,7 +133,7 @@ def test_recovery_from_any_flipped_bit_never_saves_a_changed_message(small: Path
 def test_one_damaged_pose_costs_only_that_pose(tmp_path: Path) -> None:
     path = write_small(tmp_path / "a.mcap", poses=6)
     data = bytearray(path.read_bytes())
-    offset = open_recording(path).parts[0].messages(Topic.RAW_IMAGE).addresses[3]
+    offset = open_recording(path).segments[0].messages(Topic.RAW_IMAGE).addresses[3]
     data[offset + 100] ^= 0xFF
     path.write_bytes(data)
     with pytest.raises(CorruptRecordingError, match="checksum"):

@@ -37,7 +37,7 @@ def test_format_1_stays_readable() -> None:
     assert recording.info == make_info()
     assert recording.views() == [make_view(index) for index in range(6)]
     assert list(recording.robot_states()) == [make_state(count) for count in range(18)]
-    assert [picture.sequence for _, picture in recording.pictures()] == list(range(6))
+    assert [picture.sequence for _, picture in recording.images()] == list(range(6))
 
 
 def test_every_declaration_of_an_unsealed_file_may_be_lost(tmp_path: Path) -> None:

@@ -50,9 +50,9 @@ def test_a_folder_export_imports_as_the_same_views(small: Path, tmp_path: Path) 
         original.info.mount,
         original.info.camera,
     )
-    for (a, picture_a), (b, picture_b) in zip(original.pictures(), again.pictures(), strict=True):
+    for (a, picture_a), (b, picture_b) in zip(original.images(), again.images(), strict=True):
         np.testing.assert_allclose(a.base_from_flange, b.base_from_flange, atol=1e-12)
-        np.testing.assert_array_equal(picture_a.image, picture_b.image)
+        np.testing.assert_array_equal(picture_a.pixels, picture_b.pixels)
 
 
 def test_an_imported_file_is_exported_byte_for_byte(folder: Path, tmp_path: Path) -> None:
@@ -67,7 +67,7 @@ def test_tables_hold_every_value_in_full_precision(tmp_path: Path) -> None:
         for count in range(4):
             writer.robot_state(make_state(count))
         for sequence, attempt in enumerate([1, 2]):
-            writer.picture(make_picture(sequence))
+            writer.image(make_picture(sequence))
             writer.view(make_view(0, sequence, attempt))
         recording = open_recording(writer.finish())
     out = export_recording(recording, tmp_path / "out", Target.CSV)
@@ -110,13 +110,13 @@ def test_an_excerpt_keeps_the_views_and_the_states_around_them(tmp_path: Path) -
         for count in range(1000):  # 2 s at 500 Hz
             writer.robot_state(make_state(count))
         for sequence, (index, attempt, at_s) in enumerate([(0, 1, 0.2), (0, 2, 0.5), (1, 1, 1.5)]):
-            writer.picture(make_picture(sequence))
+            writer.image(make_picture(sequence))
             stamps = Stamps(host_monotonic_ns=round(at_s * 1e9), host_wall_ns=START_NS)
             writer.view(msgspec.structs.replace(make_view(index, sequence, attempt), stamps=stamps))
         original = open_recording(writer.finish())
     excerpt = open_recording(write_excerpt(original, tmp_path / "b.mcap", window_s=0.1))
     assert [(v.index, v.attempt) for v in excerpt.views()] == [(0, 2), (1, 1)]
-    np.testing.assert_array_equal(excerpt.picture(excerpt.views()[0]).image, make_image(1))
+    np.testing.assert_array_equal(excerpt.image(excerpt.views()[0]).pixels, make_image(1))
     kept_s = [state.stamps.host_monotonic_ns / 1e9 for state in excerpt.robot_states()]
     assert kept_s == pytest.approx(
         [0.4 + 0.002 * i for i in range(101)] + [1.4 + 0.002 * i for i in range(101)]
@@ -191,9 +191,9 @@ def test_a_bag_holds_the_pose_that_counts_and_no_lens_that_nobody_knows(tmp_path
     """A retaken pose's first attempt is not in /tf. ROS knows an uncalibrated camera by a K of zeros."""
     first = ((1.0, 0.0, 0.0, 9.0), (0.0, 1.0, 0.0, 9.0), (0.0, 0.0, 1.0, 9.0), (0.0, 0.0, 0.0, 1.0))
     with RecordingWriter(tmp_path / "a.mcap", make_info(camera=CameraModel(WIDTH, HEIGHT))) as writer:
-        writer.picture(make_picture(0))
+        writer.image(make_picture(0))
         writer.view(msgspec.structs.replace(make_view(0), base_from_flange=first))
-        writer.picture(make_picture(1))
+        writer.image(make_picture(1))
         writer.view(make_view(0, 1, attempt=2))
         recording = open_recording(writer.finish())
     found = read_bag(export_recording(recording, tmp_path / "bag", Target.ROS2))
@@ -206,7 +206,7 @@ def test_a_bag_holds_the_pose_that_counts_and_no_lens_that_nobody_knows(tmp_path
 def test_a_short_list_of_distortion_is_filled_up_as_ros_expects_it(tmp_path: Path) -> None:
     camera = CameraModel(WIDTH, HEIGHT, ((900.0, 0, 16), (0, 900, 12), (0, 0, 1)), (0.1,))
     with RecordingWriter(tmp_path / "a.mcap", make_info(camera=camera)) as writer:
-        writer.picture(make_picture(0))
+        writer.image(make_picture(0))
         recording = open_recording(writer.finish())
     (info,) = read_bag(export_recording(recording, tmp_path / "bag", Target.ROS2))["/camera/camera_info"]
     assert info.d.tolist() == [0.1, 0.0, 0.0, 0.0, 0.0]
@@ -228,7 +228,7 @@ def test_rosbags_reads_the_bag_back(tmp_path: Path, lossless_png: bool) -> None:
     with RecordingWriter(tmp_path / "a.mcap", make_info(), lossless_png=lossless_png) as writer:
         for index in range(3):
             writer.robot_state(make_state(index))
-            writer.picture(make_picture(index))
+            writer.image(make_picture(index))
             writer.view(make_view(index))
         path = writer.finish()
     found = read_bag(export_recording(open_recording(path), tmp_path / "bag", Target.ROS2))

@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recordings.errors import RecordingError, UnsealedRecordingError
+from recordings.errors import RecordingError, UnfinishedRecordingError
 from recordings.files import (
     ASKED_FOR,
     bytes_text,
@@ -36,7 +36,7 @@ NEW = b"new" * 1000
 def test_the_name_is_there_only_after_finish(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, make_info()) as writer:
-        writer.picture(make_picture(0))
+        writer.image(make_picture(0))
         assert not path.exists()
         assert writer.part_path.stat().st_size == writer.bytes_written > 0
         writer.finish()
@@ -60,7 +60,7 @@ def test_content_name_and_folder_reach_the_disk_in_this_order(
         return real_rename(source, target)
 
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
-        writer.picture(make_picture(0))
+        writer.image(make_picture(0))
         monkeypatch.setattr(os, "fsync", fsync)
         monkeypatch.setattr(Path, "rename", rename)
         writer.finish()
@@ -69,9 +69,9 @@ def test_content_name_and_folder_reach_the_disk_in_this_order(
 
 def test_an_unfinished_file_names_recover(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
-        writer.picture(make_picture(0))
+        writer.image(make_picture(0))
     for place in (writer.part_path, writer.path, tmp_path):
-        with pytest.raises(UnsealedRecordingError, match=r"recordings recover /.*"):
+        with pytest.raises(UnfinishedRecordingError, match=r"recordings recover /.*"):
             open_recording(place)
 
 

@@ -85,7 +85,7 @@ def test_a_picture_is_checked_before_it_is_decoded(tmp_path: Path, name: str) ->
     image, topic, reason = PICTURES[name]
     recording = open_recording(picture_file(tmp_path, image, topic))
     with pytest.raises(CorruptRecordingError, match="picture 0") as caught:
-        recording.picture(recording.views()[0])
+        recording.image(recording.views()[0])
     assert reason in str(caught.value)
 
 
@@ -93,7 +93,7 @@ def test_facts_of_another_size_than_the_camera(tmp_path: Path) -> None:
     raw = RawImage(width=1, height=1, encoding="mono8", data=b"x")
     recording = open_recording(picture_file(tmp_path, raw, Topic.RAW_IMAGE, width=1, height=1))
     with pytest.raises(CorruptRecordingError, match="is 1×1, the camera 32×24"):
-        recording.picture(recording.views()[0])
+        recording.image(recording.views()[0])
 
 
 def test_memory_stays_below_256_mib_for_the_largest_allowed_picture(tmp_path: Path) -> None:
@@ -106,8 +106,8 @@ def test_memory_stays_below_256_mib_for_the_largest_allowed_picture(tmp_path: Pa
         from recordings.reader import open_recording
         for name in sys.argv[1:]:
             recording = open_recording(Path(name))
-            for _, picture in recording.pictures():
-                assert picture.image.nbytes == 36_000_000
+            for _, picture in recording.images():
+                assert picture.pixels.nbytes == 36_000_000
         status = Path("/proc/self/status").read_text()  # ru_maxrss would begin at the parent's
         print(status.split("VmHWM:")[1].split()[0])
         """
@@ -118,7 +118,7 @@ def test_memory_stays_below_256_mib_for_the_largest_allowed_picture(tmp_path: Pa
         info = make_info(camera=CameraModel(4000, 3000))
         with RecordingWriter(tmp_path / f"{lossless}.mcap", info, lossless_png=lossless) as writer:
             for index in range(2):
-                writer.picture(make_picture(index, noise))
+                writer.image(make_picture(index, noise))
                 writer.view(make_view(index))
             paths.append(str(writer.finish()))
     done = subprocess.run([sys.executable, "-c", program, *paths], capture_output=True, text=True, check=True)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from recordings.cli import main
-from recordings.errors import ImportFolderError, RecordingError
+from recordings.errors import ImportSourceError, RecordingError
 from recordings.exporters.folder import Target, export_recording
 from recordings.importers.folder import import_folder
 from recordings.importers.poses import read_poses
@@ -47,9 +47,9 @@ def test_a_good_folder_becomes_a_recording(folder: Path, tmp_path: Path) -> None
     np.testing.assert_allclose(
         turned, [[0, -1, 0, 0.1], [1, 0, 0, 0.2], [0, 0, 1, 0.3], [0, 0, 0, 1]], atol=1e-12
     )
-    for view, picture in recording.pictures():
-        np.testing.assert_array_equal(picture.image, make_image(view.index))
-    stored = recording.parts[0].stored_picture(0)
+    for view, picture in recording.images():
+        np.testing.assert_array_equal(picture.pixels, make_image(view.index))
+    stored = recording.segments[0].stored_image(0)
     assert stored == ("png", (folder / "images/0.png").read_bytes())
     assert set(recording.attachments()) == {"dataset.yaml", "poses.csv"}
     assert done.pictures == 3
@@ -64,10 +64,10 @@ def test_other_formats_and_colour_are_stored_without_loss(folder: Path, tmp_path
     text = (folder / "poses.csv").read_text()
     (folder / "poses.csv").write_text(text.replace("0.png", "0.bmp").replace("1.png", "1.pgm"))
     recording = open_recording(import_folder(folder, tmp_path / "out.mcap").path)
-    for (_, picture), expected in zip(recording.pictures(), [colour, make_image(1), deep], strict=True):
-        np.testing.assert_array_equal(picture.image, expected)
-        assert picture.image.dtype == expected.dtype
-    assert [picture.pixel_format for _, picture in recording.pictures()] == ["BGR8", "Mono8", "Mono16"]
+    for (_, picture), expected in zip(recording.images(), [colour, make_image(1), deep], strict=True):
+        np.testing.assert_array_equal(picture.pixels, expected)
+        assert picture.pixels.dtype == expected.dtype
+    assert [picture.pixel_format for _, picture in recording.images()] == ["BGR8", "Mono8", "Mono16"]
 
 
 def test_a_byte_order_mark_spaces_and_crlf_are_fine(folder: Path, tmp_path: Path) -> None:
@@ -273,7 +273,7 @@ BAD: dict[str, tuple[Change, str]] = {
 def test_a_bad_folder_says_what_where_and_what_to_do(folder: Path, tmp_path: Path, name: str) -> None:
     change, message = BAD[name]
     change(folder)
-    with pytest.raises(ImportFolderError, match=message):
+    with pytest.raises(ImportSourceError, match=message):
         import_folder(folder, tmp_path / "out.mcap")
     assert [p.name for p in tmp_path.iterdir()] == ["pictures"], "something half-written was left behind"
 
@@ -318,7 +318,7 @@ def test_every_real_dataset_imports(datasets: Path, tmp_path: Path) -> None:
         recording = open_recording(done.path)
         camera = recording.info.camera
         assert len(recording.views()) == done.pictures == len((source / "poses.csv").read_text().split()) - 1
-        assert recording.picture(recording.views()[0]).image.shape[:2] == (camera.height, camera.width)
+        assert recording.image(recording.views()[0]).pixels.shape[:2] == (camera.height, camera.width)
 
 
 DOCUMENT = Path(__file__).parent.parent.parent / "docs/recording-format.md"

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recordings.errors import CorruptRecordingError, MissingPartError, RecordingError
+from recordings.errors import CorruptRecordingError, MissingSegmentError, RecordingError
 from recordings.exporters.excerpt import write_excerpt
 from recordings.manifest import MANIFEST_FILE, Manifest, enter_part, read_manifest
 from recordings.reader import open_recording
@@ -43,7 +43,7 @@ def test_the_list_names_every_part(session: Path) -> None:
 @pytest.mark.parametrize("name", ["session.mcap", "session-2.mcap", "session-3.mcap"])
 def test_any_missing_part_is_noticed_also_the_last(session: Path, name: str) -> None:
     (session / name).unlink()
-    with pytest.raises(MissingPartError, match=rf"lacks part \d \({name}\) .* recordings recover {session}"):
+    with pytest.raises(MissingSegmentError, match=rf"lacks part \d \({name}\) .* recover {session}"):
         open_recording(session)
     (missing,) = open_recording(session, incomplete=True).missing
     assert name in missing
@@ -51,7 +51,7 @@ def test_any_missing_part_is_noticed_also_the_last(session: Path, name: str) -> 
 
 def test_one_file_of_several_is_not_the_session(session: Path) -> None:
     for name in ("session.mcap", "session-3.mcap"):
-        with pytest.raises(MissingPartError, match=rf"is part \d of 3 .* \({session}\) instead of the file"):
+        with pytest.raises(MissingSegmentError, match=rf"is part \d of 3 .* \({session}\) instead"):
             open_recording(session / name)
 
 
@@ -74,7 +74,7 @@ def test_recover_gives_a_missing_part_up_and_every_reader_says_so(session: Path,
     assert "part 3 of the session was lost" in open_recording(excerpt).info.note
     kept.rename(session / "session-3.mcap")
     assert open_recording(session).losses == ()
-    assert len(open_recording(session).parts) == 3
+    assert len(open_recording(session).segments) == 3
 
 
 def test_recover_makes_the_list_where_there_was_none(tmp_path: Path) -> None:
@@ -88,7 +88,7 @@ def test_a_part_that_held_nothing_is_not_missing(session: Path) -> None:
     (session / "session-2.mcap").unlink()
     (session / "session-2.mcap.part").write_bytes(b"\x89MCAP0\r\n")
     recover(session)
-    assert [part.info.part for part in open_recording(session).parts] == [1, 3]
+    assert [part.info.part for part in open_recording(session).segments] == [1, 3]
 
 
 def test_a_sealed_part_of_which_nothing_is_left_is_missing(session: Path) -> None:
@@ -116,7 +116,7 @@ def test_what_a_first_recovery_lost_is_not_forgotten_by_a_second(tmp_path: Path)
     data = path.read_bytes()
     path.write_bytes(data[:-3])
     recover(path)
-    assert open_recording(path).parts[0].lost_bytes >= first.lost_bytes > 0
+    assert open_recording(path).segments[0].lost_bytes >= first.lost_bytes > 0
 
 
 def test_the_list_of_another_session_does_not_speak_for_a_file_beside_it(session: Path) -> None:

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recordings.pictures import PictureError, PictureHeader, decode_picture, encode_png, read_header
+from recordings.images import ImageError, ImageHeader, decode_image, encode_png, read_header
 from tests.recordings.small_recording import HEIGHT, WIDTH, make_image
 
 COLOUR = np.random.default_rng(3).integers(0, 256, (HEIGHT, WIDTH, 3), np.uint8)
@@ -22,18 +22,18 @@ def encoded(extension: str, image: np.ndarray, *options: int) -> bytes:
 
 
 FILES = {
-    "png grey": (encoded(".png", make_image(0)), PictureHeader("png", WIDTH, HEIGHT, 1, 1)),
-    "png colour": (encoded(".png", COLOUR), PictureHeader("png", WIDTH, HEIGHT, 3, 1)),
-    "png 16 bit": (encoded(".png", DEEP), PictureHeader("png", WIDTH, HEIGHT, 1, 2)),
-    "jpeg grey": (encoded(".jpg", make_image(0)), PictureHeader("jpeg", WIDTH, HEIGHT, 1, 1)),
-    "jpeg colour": (encoded(".jpg", COLOUR), PictureHeader("jpeg", WIDTH, HEIGHT, 3, 1)),
+    "png grey": (encoded(".png", make_image(0)), ImageHeader("png", WIDTH, HEIGHT, 1, 1)),
+    "png colour": (encoded(".png", COLOUR), ImageHeader("png", WIDTH, HEIGHT, 3, 1)),
+    "png 16 bit": (encoded(".png", DEEP), ImageHeader("png", WIDTH, HEIGHT, 1, 2)),
+    "jpeg grey": (encoded(".jpg", make_image(0)), ImageHeader("jpeg", WIDTH, HEIGHT, 1, 1)),
+    "jpeg colour": (encoded(".jpg", COLOUR), ImageHeader("jpeg", WIDTH, HEIGHT, 3, 1)),
     "jpeg progressive": (
         encoded(".jpg", COLOUR, cv2.IMWRITE_JPEG_PROGRESSIVE, 1),
-        PictureHeader("jpeg", WIDTH, HEIGHT, 3, 1),
+        ImageHeader("jpeg", WIDTH, HEIGHT, 3, 1),
     ),
-    "bmp": (encoded(".bmp", COLOUR), PictureHeader("bmp", WIDTH, HEIGHT, 3, 1)),
-    "pgm": (encoded(".pgm", make_image(0)), PictureHeader("pgm", WIDTH, HEIGHT, 1, 1)),
-    "pgm 16 bit": (encoded(".pgm", DEEP), PictureHeader("pgm", WIDTH, HEIGHT, 1, 2)),
+    "bmp": (encoded(".bmp", COLOUR), ImageHeader("bmp", WIDTH, HEIGHT, 3, 1)),
+    "pgm": (encoded(".pgm", make_image(0)), ImageHeader("pgm", WIDTH, HEIGHT, 1, 1)),
+    "pgm 16 bit": (encoded(".pgm", DEEP), ImageHeader("pgm", WIDTH, HEIGHT, 1, 2)),
 }
 
 
@@ -41,22 +41,22 @@ FILES = {
 def test_the_header_says_what_decoding_gives(name: str) -> None:
     data, header = FILES[name]
     assert read_header(data) == header
-    image = decode_picture(data, WIDTH, HEIGHT)
+    image = decode_image(data, WIDTH, HEIGHT)
     assert image.shape == ((HEIGHT, WIDTH) if header.channels == 1 else (HEIGHT, WIDTH, 3))
     assert image.itemsize == header.bytes_per_sample
 
 
 def test_a_16_bit_colour_png_becomes_8_bit() -> None:
     deep = COLOUR.astype(np.uint16) * 257
-    np.testing.assert_array_equal(decode_picture(encode_png(deep), WIDTH, HEIGHT), COLOUR)
+    np.testing.assert_array_equal(decode_image(encode_png(deep), WIDTH, HEIGHT), COLOUR)
 
 
 @pytest.mark.parametrize("name", [name for name in FILES if not name.startswith("bmp")])
 def test_a_cut_file_is_refused_wherever_it_is_cut(name: str) -> None:
     data, _ = FILES[name]
     for length in range(0, len(data) - 1, 7):
-        with pytest.raises(PictureError):
-            decode_picture(data[:length], WIDTH, HEIGHT)
+        with pytest.raises(ImageError):
+            decode_image(data[:length], WIDTH, HEIGHT)
 
 
 def test_a_flipped_bit_in_a_png_is_refused() -> None:
@@ -64,8 +64,8 @@ def test_a_flipped_bit_in_a_png_is_refused() -> None:
     for bit in range(64, (len(data) - 12) * 8, 29):
         flipped = bytearray(data)
         flipped[bit // 8] ^= 1 << bit % 8
-        with pytest.raises(PictureError):
-            decode_picture(bytes(flipped), WIDTH, HEIGHT)
+        with pytest.raises(ImageError):
+            decode_image(bytes(flipped), WIDTH, HEIGHT)
 
 
 @pytest.mark.parametrize("size", [(30000, 30000), (0, 10), (16384, 16384)])
@@ -79,8 +79,8 @@ def test_an_impossible_size_is_refused_before_decoding(
         raise AssertionError("it was decoded")
 
     monkeypatch.setattr(cv2, "imdecode", never)
-    with pytest.raises(PictureError, match=r"impossible size|more than the 38 MB allowed"):
-        decode_picture(bytes(data), *size)
+    with pytest.raises(ImageError, match=r"impossible size|more than the 38 MB allowed"):
+        decode_image(bytes(data), *size)
 
 
 @given(st.sampled_from(sorted(FILES)), st.data())
@@ -88,11 +88,11 @@ def test_any_edit_decodes_to_the_right_size_or_is_refused(name: str, draw: st.Da
     data = bytearray(FILES[name][0])
     at = draw.draw(st.integers(0, len(data) - 1))
     data[at : at + draw.draw(st.integers(0, 8))] = draw.draw(st.binary(max_size=8))
-    with suppress(PictureError):
-        assert decode_picture(bytes(data), WIDTH, HEIGHT).shape[:2] == (HEIGHT, WIDTH)
+    with suppress(ImageError):
+        assert decode_image(bytes(data), WIDTH, HEIGHT).shape[:2] == (HEIGHT, WIDTH)
 
 
 @given(st.binary(max_size=100), st.sampled_from([b"", b"\xff\xd8", b"\x89PNG\r\n\x1a\n", b"BM", b"P5 "]))
 def test_any_bytes_have_a_header_or_none(data: bytes, start: bytes) -> None:
-    with suppress(PictureError):
+    with suppress(ImageError):
         assert read_header(start + data).width > 0

@@ -52,7 +52,7 @@ def test_a_session_from_several_threads_comes_back_complete(tmp_path: Path) -> N
     robot = threading.Thread(target=send_states)
     robot.start()
     for index in range(10):
-        assert recorder.picture(make_picture(index))
+        assert recorder.image(make_picture(index))
         recorder.view(make_view(index))
         recorder.sync().result(TIMEOUT_S)
     robot.join()
@@ -80,7 +80,7 @@ def test_sync_resolves_only_after_fdatasync_of_what_came_before(
     monkeypatch.setattr(os, "fdatasync", fdatasync)
     monkeypatch.setattr(RecordingWriter, "view", view)
     recorder = Recorder(tmp_path / "a.mcap", make_info(), clock=lambda: 0.0)
-    recorder.picture(make_picture(0))
+    recorder.image(make_picture(0))
     recorder.view(make_view(0))
     recorder.sync().result(TIMEOUT_S)
     size = recorder.part_path.stat().st_size
@@ -134,8 +134,8 @@ def test_pictures_go_on_while_the_disk_syncs(tmp_path: Path, monkeypatch: pytest
     size, sequence = recorder.part_path.stat().st_size, 0
     for sequence in range(3):
         now_s += recorder_module.SYNC_PERIOD_S * 1.01
-        recorder.picture(make_picture(sequence))
-    wait_until(lambda: recorder.part_path.stat().st_size > size + 3 * make_picture(0).image.nbytes)
+        recorder.image(make_picture(sequence))
+    wait_until(lambda: recorder.part_path.stat().st_size > size + 3 * make_picture(0).pixels.nbytes)
     recorder.view(make_view(2))
     acknowledged = recorder.sync()
     assert not acknowledged.done()
@@ -172,11 +172,11 @@ def test_a_slow_disk_costs_counted_pictures_and_never_a_view(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     gate = Gate(monkeypatch)
-    size = make_picture(0).image.nbytes
+    size = make_picture(0).pixels.nbytes
     recorder = Recorder(tmp_path / "a.mcap", make_info(), queue_limit_bytes=3 * size + 500)
     recorder.event(event())
     assert gate.reached.wait(TIMEOUT_S)
-    kept = [recorder.picture(make_picture(sequence)) for sequence in range(5)]
+    kept = [recorder.image(make_picture(sequence)) for sequence in range(5)]
     assert kept == [True, True, True, False, False]
     assert recorder.queued_bytes >= 3 * size
     assert recorder.dropped == 2
@@ -185,7 +185,7 @@ def test_a_slow_disk_costs_counted_pictures_and_never_a_view(
         recorder.view(make_view(4))
     gate.opened.set()
     recording = open_recording(recorder.finish().result(TIMEOUT_S))
-    assert recording.parts[0].picture_sequences() == [0, 1, 2]
+    assert recording.segments[0].image_sequences() == [0, 1, 2]
     assert [view.index for view in recording.views()] == [0]
 
 
@@ -223,17 +223,17 @@ def test_the_first_write_error_is_final_and_said_to_everyone(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     recorder = Recorder(tmp_path / "a.mcap", make_info())
-    recorder.picture(make_picture(0))
+    recorder.image(make_picture(0))
     recorder.view(make_view(0))
     recorder.sync().result(TIMEOUT_S)
     safe = recorder.part_path.read_bytes()
     break_disk_after(monkeypatch, 0)
-    recorder.picture(make_picture(1))
+    recorder.image(make_picture(1))
     with pytest.raises(RecordingError, match=r"No space left on device.*recordings recover"):
         recorder.sync().result(TIMEOUT_S)
     assert recorder.error is not None
     monkeypatch.undo()  # space is free again, and still nothing more is written
-    assert not recorder.picture(make_picture(2))
+    assert not recorder.image(make_picture(2))
     for call in (lambda: recorder.view(make_view(2)), lambda: recorder.event(event())):
         with pytest.raises(RecordingError, match="No space left"):
             call()
@@ -252,7 +252,7 @@ def test_waiting_syncs_fail_with_the_error_and_nobody_hangs(
     recorder = Recorder(tmp_path / "a.mcap", make_info())
     recorder.event(event())
     assert gate.reached.wait(TIMEOUT_S)
-    recorder.picture(make_picture(0))
+    recorder.image(make_picture(0))
     waiting = [recorder.sync() for _ in range(3)]
     finishing = recorder.finish()
     break_disk_after(monkeypatch, 0)
@@ -267,7 +267,7 @@ def test_an_error_of_the_sync_itself_is_as_final(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: str
 ) -> None:
     recorder = Recorder(tmp_path / "a.mcap", make_info(), clock=lambda: 0.0)
-    recorder.picture(make_picture(0))
+    recorder.image(make_picture(0))
 
     def fail(descriptor: int) -> None:
         raise OSError(5, "Input/output error")
@@ -290,8 +290,8 @@ async def test_a_task_that_stops_waiting_does_not_harm_the_recording(
     waiting = asyncio.wrap_future(recorder.sync())
     waiting.cancel()
     gate.opened.set()
-    recorder.picture(make_picture(0))
-    assert open_recording(await asyncio.wrap_future(recorder.finish())).parts[0].picture_sequences() == [0]
+    recorder.image(make_picture(0))
+    assert open_recording(await asyncio.wrap_future(recorder.finish())).segments[0].image_sequences() == [0]
 
 
 def test_what_comes_after_the_end_is_not_kept_and_not_counted_as_lost(tmp_path: Path) -> None:
@@ -304,7 +304,7 @@ def test_what_comes_after_the_end_is_not_kept_and_not_counted_as_lost(tmp_path: 
 
 def test_closing_leaves_the_part_file_for_recovery(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "a.mcap", make_info())
-    recorder.picture(make_picture(0))
+    recorder.image(make_picture(0))
     recorder.close()
     recorder.close()
     assert recorder.part_path.exists()
@@ -321,14 +321,14 @@ def test_finishing_what_was_closed_is_refused_at_once(tmp_path: Path) -> None:
 
 def test_lossless_png_is_smaller_and_the_same(tmp_path: Path) -> None:
     smooth = make_picture(0)
-    smooth.image[:] = 7
+    smooth.pixels[:] = 7
     sizes = []
     for lossless in (False, True):
         recorder = Recorder(tmp_path / f"{lossless}.mcap", make_info(), lossless_png=lossless)
-        recorder.picture(smooth)
+        recorder.image(smooth)
         recorder.view(make_view(0))
         path = recorder.finish().result(TIMEOUT_S)
-        ((_, picture),) = open_recording(path).pictures()
-        assert (picture.image == 7).all()
+        ((_, picture),) = open_recording(path).images()
+        assert (picture.pixels == 7).all()
         sizes.append(path.stat().st_size)
     assert sizes[1] < sizes[0]

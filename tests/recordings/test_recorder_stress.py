@@ -16,7 +16,7 @@ from mcap.stream_reader import StreamReader
 from recordings.reader import open_recording
 from recordings.recorder import Recorder
 from recordings.schema.definitions import encode
-from recordings.schema.messages import CameraModel, CaptureEvent, Picture, RobotState, Stamps, View
+from recordings.schema.messages import CameraModel, CaptureEvent, Image, RobotState, Stamps, View
 from recordings.schema.topics import Topic
 from tests.recordings.small_recording import START_NS, make_info, make_picture, make_state, make_view
 
@@ -30,7 +30,7 @@ def state_at(count: int) -> RobotState:
     return msgspec.structs.replace(make_state(count), **modes)
 
 
-def picture_at(sequence: int) -> Picture:
+def picture_at(sequence: int) -> Image:
     """In memory of its own, as from a camera, which is free again as soon as nobody refers to it."""
     image = SCENES[sequence % len(SCENES)].copy()
     image[0, :8] = np.frombuffer(sequence.to_bytes(8, "little"), np.uint8)
@@ -56,7 +56,7 @@ def test_what_two_threads_record_comes_back_bit_for_bit(
         threading.Thread(target=at_rate, args=(rate, number, send))
         for rate, number, send in (
             (STATES_A_SECOND, states, lambda count: recorder.robot_state(state_at(count))),
-            (pictures_a_second, pictures, lambda sequence: recorder.picture(picture_at(sequence))),
+            (pictures_a_second, pictures, lambda sequence: recorder.image(picture_at(sequence))),
         )
     ]
     for thread in threads:
@@ -73,14 +73,14 @@ def test_what_two_threads_record_comes_back_bit_for_bit(
     path = recorder.finish().result(20)
     assert recorder.dropped == 0
 
-    part = open_recording(path).parts[0]
+    part = open_recording(path).segments[0]
     assert [state == state_at(count) for count, state in enumerate(part.robot_states())] == [True] * states
     assert part.views == views
     assert [event.pose_index for event in part.events()] == list(range(1, len(views) + 1))
-    assert part.picture_sequences() == list(range(pictures))
+    assert part.image_sequences() == list(range(pictures))
     for sequence in range(pictures):
-        image = part.picture(sequence).image
-        assert image.tobytes() == picture_at(sequence).image.tobytes()
+        image = part.image(sequence).pixels
+        assert image.tobytes() == picture_at(sequence).pixels.tobytes()
     compare_with_another_reader(path, states, pictures)
     path.unlink()
 
@@ -99,5 +99,5 @@ def compare_with_another_reader(path: Path, states: int, pictures: int) -> None:
                 if topic == Topic.ROBOT_STATE:
                     assert record.data == encode(state_at(count))
                 elif topic == Topic.RAW_IMAGE:
-                    assert picture_at(count).image.tobytes() in record.data
+                    assert picture_at(count).pixels.tobytes() in record.data
     assert (found[Topic.ROBOT_STATE], found[Topic.RAW_IMAGE]) == (states - 1, pictures - 1)

@@ -25,7 +25,7 @@ def write_unfinished(path: Path, poses: int = 2, part: int = 1) -> Path:
     with RecordingWriter(path, make_info(part=part)) as writer:
         writer.attach("plan.yaml", "application/yaml", b"poses: 2\n")
         for index in range(poses):
-            writer.picture(make_picture(index))
+            writer.image(make_picture(index))
             writer.view(make_view(index))
         writer.flush()
     return writer.part_path
@@ -69,7 +69,7 @@ def test_a_whole_file_is_left_alone(small: Path) -> None:
 
 def test_a_file_that_is_being_written_is_refused(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
-        writer.picture(make_picture(0))
+        writer.image(make_picture(0))
         with pytest.raises(RecordingError, match="in use by another process"):
             recover(writer.part_path)
 
@@ -86,7 +86,7 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
 def test_a_picture_without_its_view_and_a_view_without_its_picture(tmp_path: Path) -> None:
     """The chunk of pose 1's picture is cut out: its view must go too, the others stay."""
     path = write_small(tmp_path / "a.mcap", poses=3)
-    part = open_recording(path).parts[0]
+    part = open_recording(path).segments[0]
     offset = part.messages(Topic.RAW_IMAGE).addresses[1]
     data = bytearray(path.read_bytes())
     data[offset + 50] ^= 1
@@ -128,11 +128,11 @@ def test_a_lost_dark_picture_does_not_make_recovery_slow(tmp_path: Path) -> None
     dark = np.resize(pattern, (1000, 1000))
     with RecordingWriter(tmp_path / "a.mcap", make_info(camera=CameraModel(1000, 1000))) as writer:
         for index in range(3):
-            writer.picture(make_picture(index, dark))
+            writer.image(make_picture(index, dark))
             writer.view(make_view(index))
         path = writer.finish()
     data = bytearray(path.read_bytes())
-    data[open_recording(path).parts[0].messages(Topic.RAW_IMAGE).addresses[1] - 40] ^= 1
+    data[open_recording(path).segments[0].messages(Topic.RAW_IMAGE).addresses[1] - 40] ^= 1
     path.write_bytes(data)
     start_s = time.perf_counter()
     recover(path)
@@ -143,7 +143,7 @@ def test_a_lost_dark_picture_does_not_make_recovery_slow(tmp_path: Path) -> None
 def test_after_a_destroyed_record_head_the_search_finds_the_next_whole_chunk(tmp_path: Path) -> None:
     path = write_small(tmp_path / "a.mcap", poses=4)
     data = bytearray(path.read_bytes())
-    at = open_recording(path).parts[0].messages(Topic.RAW_IMAGE).addresses[1]
+    at = open_recording(path).segments[0].messages(Topic.RAW_IMAGE).addresses[1]
     head = data.rindex(b"\x06", 0, at - 700)  # of pose 1's chunk, or a byte before it
     data[head : head + 9] = b"\xff" * 9
     path.write_bytes(data)

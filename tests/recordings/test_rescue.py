@@ -18,7 +18,7 @@ from tests.recordings.small_recording import make_info, make_picture, make_view,
 
 def write_unfinished(path: Path) -> Path:
     with RecordingWriter(path, make_info()) as writer:
-        writer.picture(make_picture(0))
+        writer.image(make_picture(0))
         writer.view(make_view(0))
         writer.flush()
     return writer.part_path
@@ -27,7 +27,7 @@ def write_unfinished(path: Path) -> Path:
 def broken_chunk(path: Path, pose: int, whole_head: bool = True) -> None:
     """The chunk with this pose's picture gets a wrong head, or a wrong byte in the picture."""
     data = bytearray(path.read_bytes())
-    at = open_recording(path).parts[0].messages(Topic.RAW_IMAGE).addresses[pose]
+    at = open_recording(path).segments[0].messages(Topic.RAW_IMAGE).addresses[pose]
     if whole_head:
         head = data.rindex(b"\x06", 0, at - 700)
         data[head : head + 9] = b"\xff" * 9
@@ -39,7 +39,7 @@ def broken_chunk(path: Path, pose: int, whole_head: bool = True) -> None:
 def test_what_was_attached_behind_a_destroyed_record_is_found_again(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
         for index in range(2):
-            writer.picture(make_picture(index))
+            writer.image(make_picture(index))
             writer.view(make_view(index))
             writer.flush()
             writer.attach(f"plan-{index}.json", "application/json", b"{}" * 50)
@@ -62,7 +62,7 @@ def test_the_first_picture_takes_nothing_with_it_that_the_end_of_the_file_repeat
 def test_a_folder_with_parts_of_two_sessions_is_recovered_but_nothing_is_given_up(tmp_path: Path) -> None:
     for name, part in (("one", 1), ("two", 3)):
         with RecordingWriter(tmp_path / f"{name}.mcap", make_info(name=name, part=part)) as writer:
-            writer.picture(make_picture(0))
+            writer.image(make_picture(0))
             writer.view(make_view(0))
             writer.flush()
     results = recover(tmp_path)

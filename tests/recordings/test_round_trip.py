@@ -11,9 +11,9 @@ from mcap.reader import make_reader
 from mcap_protobuf.decoder import DecoderFactory
 
 from recordings.errors import RecordingError
-from recordings.pictures import encode_png
+from recordings.images import encode_png
 from recordings.reader import open_recording
-from recordings.schema.messages import CameraModel, CaptureEvent, Picture, Stamps
+from recordings.schema.messages import CameraModel, CaptureEvent, Image, Stamps
 from recordings.writer import RecordingWriter
 from tests.recordings.small_recording import (
     HEIGHT,
@@ -43,9 +43,9 @@ def test_everything_comes_back_as_it_was(small: Path) -> None:
 
 
 def test_pictures_are_identical_to_the_bit_and_carry_their_facts(small: Path) -> None:
-    for view, picture in open_recording(small).pictures():
+    for view, picture in open_recording(small).images():
         expected = make_picture(view.picture_sequence)
-        np.testing.assert_array_equal(picture.image, expected.image)
+        np.testing.assert_array_equal(picture.pixels, expected.pixels)
         for name in (
             "stamps",
             "frame_id",
@@ -73,19 +73,19 @@ def test_every_kind_of_picture_is_lossless(
 ) -> None:
     image = np.random.default_rng(1).integers(0, np.iinfo(kind).max, shape).astype(kind)
     with RecordingWriter(tmp_path / "a.mcap", make_info(), lossless_png=lossless_png) as writer:
-        writer.picture(Picture(image, Stamps(), 0, 0, pixel_format=pixel_format))
+        writer.image(Image(image, Stamps(), 0, 0, pixel_format=pixel_format))
         writer.view(make_view(0))
         recording = open_recording(writer.finish())
-    picture = recording.picture(recording.views()[0])
-    np.testing.assert_array_equal(picture.image, image)
-    assert picture.image.dtype == kind
+    picture = recording.image(recording.views()[0])
+    np.testing.assert_array_equal(picture.pixels, image)
+    assert picture.pixels.dtype == kind
     assert picture.pixel_format == pixel_format
 
 
 def test_a_retake_supersedes_the_first_attempt(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
         for sequence, index, attempt in [(0, 0, 1), (1, 1, 1), (2, 0, 2), (3, 2, 1)]:
-            writer.picture(make_picture(sequence))
+            writer.image(make_picture(sequence))
             writer.view(make_view(index, sequence, attempt))
         recording = open_recording(writer.finish())
     assert [(v.index, v.attempt, v.picture_sequence) for v in recording.views()] == [
@@ -99,9 +99,9 @@ def test_compressed_bytes_are_kept_as_they_were(tmp_path: Path) -> None:
     image = make_image(5)
     data = encode_png(image)
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
-        writer.picture(make_picture(0, image), encoded=data)
+        writer.image(make_picture(0, image), encoded=data)
         recording = open_recording(writer.finish())
-    assert recording.parts[0].stored_picture(0) == ("png", data)
+    assert recording.segments[0].stored_image(0) == ("png", data)
 
 
 def test_the_reference_library_reads_the_file_with_published_schemas(small: Path) -> None:
@@ -142,15 +142,15 @@ def test_large_pictures_go_out_uncopied_and_are_identical_for_other_readers_too(
     with RecordingWriter(tmp_path / "a.mcap", make_info(camera=CameraModel(1280, 1024))) as writer:
         for sequence, image in enumerate(images):
             writer.robot_state(make_state(sequence))
-            writer.picture(make_picture(sequence, image))
+            writer.image(make_picture(sequence, image))
         path = writer.finish()
-    part = open_recording(path).parts[0]
+    part = open_recording(path).segments[0]
     with path.open("rb") as file:
         reader = make_reader(file, validate_crcs=True, decoder_factories=[DecoderFactory()])
         theirs = [body for *_, body in reader.iter_decoded_messages(topics=["/camera/image"])]
     assert len(theirs) == len(images)
     for sequence, (image, body) in enumerate(zip(images, theirs, strict=True)):
-        np.testing.assert_array_equal(part.picture(sequence).image, image)
+        np.testing.assert_array_equal(part.image(sequence).pixels, image)
         assert (body.encoding, body.width, body.height, body.step) == ("mono8", 1280, 1024, 1280)
         np.testing.assert_array_equal(np.frombuffer(body.data, np.uint8).reshape(1024, 1280), image)
 
@@ -165,13 +165,13 @@ def test_a_view_never_points_at_nothing(tmp_path: Path) -> None:
 
 def test_pictures_of_another_size_or_a_sequence_used_twice_are_refused(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
-        writer.picture(make_picture(0))
+        writer.image(make_picture(0))
         with pytest.raises(RecordingError, match="recorded before"):
-            writer.picture(make_picture(0))
+            writer.image(make_picture(0))
         with pytest.raises(RecordingError, match="one size"):
-            writer.picture(make_picture(1, make_image(1, 40, 30)))
+            writer.image(make_picture(1, make_image(1, 40, 30)))
         with pytest.raises(RecordingError, match="cannot be recorded"):
-            writer.picture(make_picture(2, np.zeros((HEIGHT, WIDTH), np.float32)))
+            writer.image(make_picture(2, np.zeros((HEIGHT, WIDTH), np.float32)))
 
 
 def test_an_unfinished_camera_model_is_written_as_uncalibrated(tmp_path: Path) -> None:
@@ -190,9 +190,9 @@ def test_a_record_may_begin_anywhere_in_a_block_that_is_read(
 ) -> None:
     """A head of nine bytes that lay across the end of a block was read from the block before."""
     path = write_small(tmp_path / "a.mcap")
-    whole = open_recording(path).parts[0]
+    whole = open_recording(path).segments[0]
     monkeypatch.setattr("recordings.mcap.scan._AHEAD_BYTES", 0)
     for block_bytes in range(200, 500):
         monkeypatch.setattr("recordings.mcap.scan._BLOCK_BYTES", block_bytes)
-        part = open_recording(path).parts[0]
+        part = open_recording(path).segments[0]
         assert (part.sha256, list(part.robot_states())) == (whole.sha256, list(whole.robot_states()))

@@ -21,9 +21,9 @@ def test_every_shipped_sample_opens_and_says_that_it_is_simulated() -> None:
         camera = recording.info.camera
         views = recording.views()
         assert len(views) == 25
-        for view, picture in recording.pictures():
-            assert picture.image.shape == (camera.height, camera.width)
-            stored = recording.stored_picture(view)
+        for view, picture in recording.images():
+            assert picture.pixels.shape == (camera.height, camera.width)
+            stored = recording.stored_image(view)
             assert stored is not None
             assert stored[0] == "png"
         assert recording_info(recording)["robot_states"]["count"] > 25

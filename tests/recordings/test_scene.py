@@ -30,7 +30,7 @@ def test_the_arm_is_shown_at_25_hz_without_its_tool(tmp_path: Path) -> None:
         for count in range(500):
             pose = (1.0, 2.0, 3.0, np.pi / 2, 0.0, 0.0)
             writer.robot_state(msgspec.structs.replace(make_state(count), tcp_pose=pose))
-        writer.picture(make_picture(0))
+        writer.image(make_picture(0))
         writer.view(make_view(0))
         path = writer.finish()
     frames = shown(path, "/tf")
@@ -46,7 +46,7 @@ def test_the_arm_is_shown_at_25_hz_without_its_tool(tmp_path: Path) -> None:
 
 def test_without_robot_states_the_views_show_where_the_flange_is(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
-        writer.picture(make_picture(0))
+        writer.image(make_picture(0))
         writer.view(make_view(0))
         path = writer.finish()
     ((_, frame),) = shown(path, "/tf")
@@ -66,7 +66,7 @@ def test_corners_and_frames_reach_the_file(tmp_path: Path) -> None:
     recorder = Recorder(tmp_path / "a.mcap", make_info())
     recorder.frame("flange", "camera", TURNED)
     stamps = Stamps(5, START_NS + 5)
-    recorder.picture(msgspec.structs.replace(make_picture(0), stamps=stamps))
+    recorder.image(msgspec.structs.replace(make_picture(0), stamps=stamps))
     recorder.corners(0, np.array([[3.0, 4.0], [5.0, 6.0]]))
     path = recorder.finish().result()
     ((time_ns, marks),) = shown(path, "/camera/annotations")
@@ -78,7 +78,7 @@ def test_corners_and_frames_reach_the_file(tmp_path: Path) -> None:
 
 def test_residuals_are_lines(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
-        writer.picture(make_picture(0))
+        writer.image(make_picture(0))
         writer.marks(0, [Marks(np.zeros((2, 2)), DETECTED, np.ones((2, 2)))], "pose 1: 0.1 px")
         path = writer.finish()
     ((_, marks),) = shown(path, "/camera/annotations")

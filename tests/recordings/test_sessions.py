@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recordings.errors import CorruptRecordingError, MissingPartError, RecordingError
+from recordings.errors import CorruptRecordingError, MissingSegmentError, RecordingError
 from recordings.reader import open_recording
 from recordings.recover import recover
 from recordings.schema.messages import CameraIdentity, CameraModel
@@ -27,7 +27,7 @@ def write_part(path: Path, poses: list[tuple[int, int]], **changes: object) -> P
     with RecordingWriter(path, make_info(**changes)) as writer:
         for sequence, (index, attempt) in enumerate(poses):
             writer.robot_state(make_state(sequence))
-            writer.picture(make_picture(sequence, make_image(100 * index + attempt)))
+            writer.image(make_picture(sequence, make_image(100 * index + attempt)))
             writer.view(make_view(index, sequence, attempt))
         writer.attach("plan.yaml", "application/yaml", path.name.encode())
         return writer.finish()
@@ -38,8 +38,8 @@ def test_a_resumed_session_is_one_recording(tmp_path: Path) -> None:
     write_part(tmp_path / "session-2.mcap", [(1, 2), (2, 1)], part=2)
     recording = open_recording(tmp_path)
     assert [(v.index, v.attempt, v.part) for v in recording.views()] == [(0, 1, 1), (1, 2, 2), (2, 1, 2)]
-    for view, picture in recording.pictures():
-        np.testing.assert_array_equal(picture.image, make_image(100 * view.index + view.attempt))
+    for view, picture in recording.images():
+        np.testing.assert_array_equal(picture.pixels, make_image(100 * view.index + view.attempt))
     assert len(list(recording.robot_states())) == 4
     assert recording.attachments() == {"plan.yaml": b"session-2.mcap"}
     assert len(recording.sha256) == 64
@@ -59,15 +59,15 @@ def test_a_pose_taken_again_after_a_resume_supersedes_whatever_its_attempt(tmp_p
 def test_a_gap_between_parts_is_noticed_without_a_list(tmp_path: Path) -> None:
     write_part(tmp_path / "session.mcap", [(0, 1)])
     write_part(tmp_path / "session-3.mcap", [(2, 1)], part=3)
-    with pytest.raises(MissingPartError, match=r"lacks part 2 of session 'test-cell'.*recordings recover"):
+    with pytest.raises(MissingSegmentError, match=r"lacks part 2 of session 'test-cell'.*recordings recover"):
         open_recording(tmp_path)
 
 
 def test_a_lone_second_part_is_noticed_as_folder_and_as_file(tmp_path: Path) -> None:
     path = write_part(tmp_path / "session-2.mcap", [(0, 1)], part=2)
-    with pytest.raises(MissingPartError, match="lacks part 1"):
+    with pytest.raises(MissingSegmentError, match="lacks part 1"):
         open_recording(tmp_path)
-    with pytest.raises(MissingPartError, match=r"is part 2 of at least 2 .* give the session's folder"):
+    with pytest.raises(MissingSegmentError, match=r"is part 2 of at least 2 .* give the session's folder"):
         open_recording(path)
 
 

@@ -35,7 +35,7 @@ def test_every_stamp_comes_back(tmp_path: Path, wanted: list[Stamps], packed: bo
     counts = Counts(messages=len(states), chunks=1, per_channel={1: len(states)})
     path = tmp_path / "a.mcap"
     path.write_bytes(sealed(session_metadata() + chunk(records, **stored), counts))
-    part = open_recording(path).parts[0]
+    part = open_recording(path).segments[0]
     assert [state.stamps for state in part.robot_states()] == wanted
     tables = list(part.state_stamps())
     found = [

@@ -15,7 +15,7 @@ from calibrate.boards.model import board_points
 from calibrate.geometry import rotation_log
 from calibrate.kinematics import MODELS, forward
 from recordings.reader import Recording, open_recording
-from recordings.schema.messages import CameraIdentity, Picture, RobotIdentity, RobotState, Stamps
+from recordings.schema.messages import CameraIdentity, Image, RobotIdentity, RobotState, Stamps
 from station.analysis.worker import Sighting, sight
 from station.cell.config import StationConfig
 from station.cell.errors import CameraError, RobotError, StaleStateError
@@ -169,13 +169,13 @@ class CameraInMemory:
     def counts(self) -> CameraCounts:
         return CameraCounts(frames=self.taken + self.glimpses)
 
-    async def capture(self, timeout_s: float = 5.0) -> Picture:
+    async def capture(self, timeout_s: float = 5.0) -> Image:
         if self.fail:
             raise CameraError(self.fail.pop(0))
         self.taken += 1
         shape = (TRUTH.camera.height, TRUTH.camera.width)
-        return Picture(
-            image=np.full(shape, 90, np.uint8),
+        return Image(
+            pixels=np.full(shape, 90, np.uint8),
             stamps=Stamps(time.monotonic_ns(), time.time_ns(), device_ns=time.monotonic_ns()),
             frame_id=self.taken,
             sequence=0,
@@ -185,7 +185,7 @@ class CameraInMemory:
     async def settings(self) -> dict[str, object]:
         return {"exposure_us": 1000.0}
 
-    async def glimpse(self) -> Picture | None:
+    async def glimpse(self) -> Image | None:
         """A small picture that jumps by `jumps` rows between two looks."""
         self.glimpses += 1
         if self.blind:
@@ -193,9 +193,9 @@ class CameraInMemory:
         if self.glimpse_fails:
             raise CameraError(self.glimpse_fails.pop(0))
         image = np.roll(GLIMPSED, self.jumps * (self.glimpses % 2), axis=0)
-        return Picture(image, Stamps(), 0, 0)
+        return Image(image, Stamps(), 0, 0)
 
-    async def preview(self) -> Picture | None:
+    async def preview(self) -> Image | None:
         return await self.capture()
 
     async def close(self) -> None:

@@ -35,7 +35,7 @@ async def test_every_pose_has_the_picture_of_its_own_pulse(lonely_network: None,
     assert ended.captured == POSES, ended.status.reason
     box = ended.status.trigger
     assert box.identity == "calibration-trigger SIM1" and box.pulses == box.frames > POSES, "glimpses too"
-    pictures = [picture for _, picture in open_recording(Path(ended.recording)).pictures()]
+    pictures = [picture for _, picture in open_recording(Path(ended.recording)).images()]
     ids, counts = [p.frame_id for p in pictures], [p.trigger_count or 0 for p in pictures]
     assert counts[0] > 0 and counts == sorted(set(counts))
     # One frame for one pulse, glimpses included: ids and counts go on together.

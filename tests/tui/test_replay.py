@@ -8,7 +8,7 @@ import pytest
 from textual.widgets import DataTable
 
 import recordings
-from recordings.pictures import encode_png
+from recordings.images import encode_png
 from recordings.writer import RecordingWriter
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import StationState
@@ -43,7 +43,7 @@ def test_the_arm_stands_where_it_stood_when_each_picture_was_taken() -> None:
 
 def test_a_picture_that_cannot_be_decoded_is_said_in_its_place(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
-        writer.picture(make_picture(0), encode_png(make_picture(0).image)[:-20])
+        writer.image(make_picture(0), encode_png(make_picture(0).pixels)[:-20])
         writer.view(make_view(0))
         writer.finish()
     link = ReplayLink(tmp_path / "a.mcap", 0.0)

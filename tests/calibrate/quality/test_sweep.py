@@ -16,9 +16,9 @@ from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import Array, inverse, rotation_log
 from calibrate.kinematics import MODELS, forward
 from calibrate.quality.sweep import on_host, sweep_time_offset
-from recordings.pictures import encode_png
+from recordings.images import encode_png
 from recordings.reader import open_recording
-from recordings.schema.messages import CameraModel, Picture, RobotState, SessionInfo, Stamps
+from recordings.schema.messages import CameraModel, Image, RobotState, SessionInfo, Stamps
 from recordings.writer import RecordingWriter
 from station.cell.config import PAPER_BOARD
 from station.simulation.cell import make_cell
@@ -57,7 +57,7 @@ def record(path: Path, pictures: int, lens: CameraModel = LENS, broken: int | No
                 start_ns + round((t + LATENCY_S) * 1e9), 10**18, device_ns=DEVICE_EPOCH_NS + round(t * 1e9)
             )
             cut = encode_png(image)[:-2000] if k == broken else None
-            writer.picture(Picture(image, stamps, k + 1, k), cut)
+            writer.image(Image(image, stamps, k + 1, k), cut)
         return writer.finish()
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from recordings.schema.messages import Picture
+from recordings.schema.messages import Image
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices.aravis import AravisCamera
@@ -55,8 +55,8 @@ class Opened:
         await self._camera.close()
 
 
-def number_of(picture: Picture) -> int:
-    return int.from_bytes(picture.image.reshape(-1)[:8].tobytes(), "little")
+def number_of(picture: Image) -> int:
+    return int.from_bytes(picture.pixels.reshape(-1)[:8].tobytes(), "little")
 
 
 @pytest.mark.parametrize("device", ["", "KJ0042", "127.0.0.1", "MER-131-75GM"])
@@ -77,7 +77,7 @@ async def test_settings_are_made_and_read_back(server: SimulatedGige) -> None:
     )
     async with Opened(config) as camera:
         picture = await camera.capture()
-        assert picture.image.shape == (512, 640) and picture.exposure_us == 5000.0 and picture.gain_db == 3.0
+        assert picture.pixels.shape == (512, 640) and picture.exposure_us == 5000.0 and picture.gain_db == 3.0
         assert await camera.settings() == {
             "pixel_format": "Mono8",
             "region": [64, 32, 640, 512],
@@ -113,7 +113,7 @@ async def test_one_trigger_gives_one_picture_to_the_bit_over_the_wrap_of_the_ids
     assert 65_535 in ids and all(b == next_frame_id(a) for a, b in pairwise(ids))
     assert [p.sequence for p in pictures] == list(range(140))
     assert [number_of(p) for p in pictures] == list(range(140))
-    assert all(np.array_equal(p.image, numbered_picture(n, 1280, 1024)) for n, p in enumerate(pictures))
+    assert all(np.array_equal(p.pixels, numbered_picture(n, 1280, 1024)) for n, p in enumerate(pictures))
 
 
 @pytest.mark.parametrize("name", list(genicam.PIXEL_FORMATS))
@@ -122,7 +122,7 @@ async def test_every_pixel_format_arrives(server: SimulatedGige, name: str) -> N
     async with Opened(config) as camera:
         picture = await camera.capture()
     sent = encode(np.ascontiguousarray(numbered_picture(0, 320, 240)), name)
-    assert np.array_equal(picture.image, decode(sent, 320, 240, name))
+    assert np.array_equal(picture.pixels, decode(sent, 320, 240, name))
     assert picture.pixel_format == ("BGR8" if name.startswith(("Bayer", "RGB")) else name)
 
 
@@ -194,11 +194,11 @@ async def test_free_running_frames_come_in_order_and_complete(server: SimulatedG
     config = CameraConfig(
         device="127.0.0.1", trigger="free-running", frame_rate_hz=75.0, packet_size=8996, gain_db=2.0
     )
-    pictures: list[Picture] = []
+    pictures: list[Image] = []
     async with Opened(config) as camera:
         stop = threading.Event()
 
-        def keep(picture: Picture) -> None:
+        def keep(picture: Image) -> None:
             pictures.append(picture)
             if len(pictures) == 60:
                 stop.set()

@@ -12,11 +12,11 @@ import pytest
 
 from calibrate.geometry import difference, pose_from_rotvec
 from calibrate.kinematics import MODELS, forward
-from recordings.pictures import encode_png
+from recordings.images import encode_png
 from recordings.schema.messages import (
     CameraIdentity,
     CameraModel,
-    Picture,
+    Image,
     RobotIdentity,
     SessionInfo,
     Stamps,
@@ -67,14 +67,14 @@ def record(path: Path, *, joints: bool, cut: int | None = None) -> Path:
     for i, start in enumerate(STARTS):
         stamps = Stamps(host_monotonic_ns=10**9 + i * 200_000_000, host_wall_ns=10**18, device_ns=5)
         encoded = encode_png(image(i))[:-20] if i == cut else None
-        writer.picture(Picture(image(i), stamps, frame_id=i + 1, sequence=i), encoded)
+        writer.image(Image(image(i), stamps, frame_id=i + 1, sequence=i), encoded)
         flange = forward(MODELS["UR10"], start)
         matrix = tuple(tuple(float(x) for x in row) for row in flange)
         writer.view(View(i, f"pose {i}", i, matrix, joints_rad=start if joints else None, stamps=stamps))
     return writer.finish()
 
 
-async def played(path: Path, pace: float = 0.0) -> list[Picture]:
+async def played(path: Path, pace: float = 0.0) -> list[Image]:
     camera = PlaybackCamera(config(path, pace))
     await camera.open()
     pictures = [await camera.capture() for _ in range(3)]
@@ -86,7 +86,7 @@ async def played(path: Path, pace: float = 0.0) -> list[Picture]:
 
 async def test_a_folder_plays_in_the_order_of_its_names(folder: Path) -> None:
     pictures = await played(folder)
-    assert all(np.array_equal(p.image, image(i)) for i, p in enumerate(pictures))
+    assert all(np.array_equal(p.pixels, image(i)) for i, p in enumerate(pictures))
     assert [p.sequence for p in pictures] == [0, 1, 2] and [p.frame_id for p in pictures] == [1, 2, 3]
     assert all(p.pixel_format == "Mono8" for p in pictures)
     assert pictures[0].stamps.host_monotonic_ns < pictures[2].stamps.host_monotonic_ns
@@ -99,13 +99,13 @@ async def test_a_video_plays_every_frame(tmp_path: Path) -> None:
         writer.write(cv2.cvtColor(image(number), cv2.COLOR_GRAY2BGR))
     writer.release()
     pictures = await played(path)
-    assert [round(float(p.image.mean()), -1) for p in pictures] == [40, 50, 60]
-    assert pictures[0].image.shape == (24, 32, 3) and pictures[0].pixel_format == "BGR8"
+    assert [round(float(p.pixels.mean()), -1) for p in pictures] == [40, 50, 60]
+    assert pictures[0].pixels.shape == (24, 32, 3) and pictures[0].pixel_format == "BGR8"
 
 
 async def test_a_recording_plays_its_views_and_keeps_the_cameras_name(recording: Path) -> None:
     pictures = await played(recording)
-    assert all(np.array_equal(p.image, image(i)) for i, p in enumerate(pictures))
+    assert all(np.array_equal(p.pixels, image(i)) for i, p in enumerate(pictures))
     camera = PlaybackCamera(config(recording))
     identity = await camera.open()
     assert (identity.model, identity.serial, identity.driver) == ("MER-131-75GM", "KJ1", "playback")
@@ -159,7 +159,7 @@ async def test_robot_and_camera_stand_where_the_recorded_ones_stood(recording: P
         base_from_tcp = pose_from_rotvec(state.tcp_pose[:3], state.tcp_pose[3:])
         expected = forward(MODELS["UR10"], STARTS[number]) @ pose_from_rotvec(TCP[:3], TCP[3:])
         assert np.abs(difference(base_from_tcp, expected)).max() < 1e-9
-        assert np.array_equal((await camera.capture()).image, image(number))
+        assert np.array_equal((await camera.capture()).pixels, image(number))
     await robot.close()
 
 
@@ -173,7 +173,7 @@ async def test_a_recorded_picture_that_cannot_be_decoded_is_the_cameras_error(tm
     with pytest.raises(CameraError, match="picture 1 the PNG is cut"):
         await camera.capture()
     await robot.move(STARTS[2], 0.6, 1.0)
-    assert np.array_equal((await camera.capture()).image, image(2))
+    assert np.array_equal((await camera.capture()).pixels, image(2))
     await robot.close()
 
 

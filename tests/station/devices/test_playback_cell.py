@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from calibrate.kinematics import MODELS, forward
-from recordings.schema.messages import CameraModel, Picture, RobotIdentity, SessionInfo, Stamps, View
+from recordings.schema.messages import CameraModel, Image, RobotIdentity, SessionInfo, Stamps, View
 from recordings.writer import RecordingWriter
 from station.cell.config import PAPER_BOARD, CameraConfig, RobotConfig, StationConfig
 from station.cell.errors import ConfigError, RobotError
@@ -31,7 +31,7 @@ def record(path: Path, config: bytes | None, *, joints: bool = True) -> Path:
     writer = RecordingWriter(path, info)
     for i in range(2):
         start = (0.1 * i, -1.5, -1.5, -1.6, 1.57, 0.0)
-        writer.picture(Picture(np.full((24, 32), 50 + i, np.uint8), Stamps(10**9 + i), i + 1, i))
+        writer.image(Image(np.full((24, 32), 50 + i, np.uint8), Stamps(10**9 + i), i + 1, i))
         matrix = tuple(tuple(float(x) for x in row) for row in forward(MODELS["UR10"], start))
         writer.view(View(i, f"pose {i}", i, matrix, joints_rad=start if joints else None))
     if config is not None:
@@ -46,7 +46,7 @@ async def test_it_plays_the_recorded_poses_and_can_reach_no_hardware(tmp_path: P
     assert cell.config.trigger is None and cell.trigger is None and cell.config.name == "playback"
     assert cell.plan is not None and len(cell.plan.poses) == 2
     assert (await cell.camera.open()).driver == "playback"
-    assert (await cell.camera.capture()).image[0, 0] == 50, "the arm stands at the first pose"
+    assert (await cell.camera.capture()).pixels[0, 0] == 50, "the arm stands at the first pose"
 
 
 def test_what_cannot_be_replayed_says_why(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ import asyncio
 import msgspec
 import pytest
 
-from recordings.errors import MissingPartError, RecordingError
+from recordings.errors import MissingSegmentError, RecordingError
 from recordings.reader import open_recording
 from station.cell.errors import RefusedError, RobotError, SafetyStopError
 from station.cell.status import StationState as S
@@ -153,5 +153,5 @@ async def test_a_session_cut_by_a_crash_waits_for_a_person_and_goes_on_in_a_new_
     assert second.arm.log.count("move") == POSES - 1
     assert recording.missing == ()
     (recording.path / "session-2.mcap").unlink()
-    with pytest.raises(MissingPartError, match=r"lacks part 2 \(session-2\.mcap\)"):
+    with pytest.raises(MissingSegmentError, match=r"lacks part 2 \(session-2\.mcap\)"):
         open_recording(recording.path)

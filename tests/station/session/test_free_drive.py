@@ -8,7 +8,7 @@ import contextlib
 import pytest
 
 from recordings.errors import RecordingError
-from recordings.schema.messages import Picture
+from recordings.schema.messages import Image
 from station.cell.errors import RefusedError, TriggerError
 from station.cell.status import StationState as S
 from station.cell.stillness import StillnessMonitor
@@ -139,7 +139,7 @@ async def test_free_drive_does_not_begin_beside_a_picture_that_a_lost_lease_left
 ) -> None:
     rig, comes, capture = bare_rig, asyncio.Event(), bare_rig.camera.capture
 
-    async def slow(timeout_s: float = 5.0) -> Picture:
+    async def slow(timeout_s: float = 5.0) -> Image:
         await comes.wait()
         return await capture(timeout_s)
 
@@ -163,7 +163,7 @@ async def test_stop_while_free_drive_opens_the_recording_leaves_a_way_on(
 ) -> None:
     rig, disk, opening = bare_rig, asyncio.Event(), SessionRecording.open
 
-    async def slow(recording: SessionRecording, queue: PoseQueue, picture: Picture | None = None) -> None:
+    async def slow(recording: SessionRecording, queue: PoseQueue, picture: Image | None = None) -> None:
         await disk.wait()
         if fails:
             raise RecordingError("no space left on device")

@@ -8,7 +8,7 @@ import pytest
 
 from calibrate.geometry import pose_from_rotvec, rotation_log
 from calibrate.kinematics import MODELS, forward
-from recordings.schema.messages import Picture, RobotIdentity, RobotState, Stamps, Vector6
+from recordings.schema.messages import Image, RobotIdentity, RobotState, Stamps, Vector6
 from station.cell.errors import RobotError
 from station.cell.status import StationState as S
 from station.devices.frames import mid_exposure
@@ -39,11 +39,11 @@ async def test_a_tool_on_the_pendant_is_not_in_the_pose(rig: Rig, monkeypatch: p
 
 async def test_it_is_the_pose_of_mid_exposure(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     """Not the newest one, and not the one when the picture came."""
-    pictures: list[Picture] = []
+    pictures: list[Image] = []
     capture, latest = rig.camera.capture, rig.arm.latest
     turned: dict[int, float] = {}
 
-    async def noted(timeout_s: float = 5.0) -> Picture:
+    async def noted(timeout_s: float = 5.0) -> Image:
         pictures.append(await capture(timeout_s))
         return pictures[-1]
 
@@ -93,7 +93,7 @@ async def test_what_speaks_against_the_pose_during_the_picture_counts(
     """A TCP that is changed, or a stop, between the last look at the arm and the picture."""
     capture = rig.camera.capture
 
-    async def meanwhile(timeout_s: float = 5.0) -> Picture:
+    async def meanwhile(timeout_s: float = 5.0) -> Image:
         rig.arm.trouble = RobotError("TCP mix-up: the TCP offset on the pendant was changed")
         return await capture(timeout_s)
 

@@ -30,7 +30,7 @@ async def test_a_go_takes_every_pose_and_seals(rig: Rig, small_plan: Plan) -> No
     assert [view.index for view in views] == list(range(POSES))
     for view, pose in zip(views, small_plan.poses, strict=True):
         np.testing.assert_allclose(view.base_from_flange, pose.base_from_flange, atol=1e-9)
-        assert recording.picture(view).sequence == view.picture_sequence
+        assert recording.image(view).sequence == view.picture_sequence
         assert view.stillness is not None
     assert set(recording.attachments()) == {"plan.yaml", "config.yaml", "camera.json", "truth.json"}
     assert recording.info.source == "simulated"

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from recordings.reader import Recording
-from recordings.schema.messages import Picture
+from recordings.schema.messages import Image
 from station.analysis.worker import Sighting
 from station.cell.errors import CameraError, RefusedError
 from station.cell.status import DetectionStatus
@@ -48,7 +48,7 @@ async def test_it_swings_takes_pictures_and_comes_back(sweeping: Rig) -> None:
     assert sweeping.arm.joints == pytest.approx(TRUTH.start_joints_rad)
     assert sweeping.pose_states == ["done"] * SWINGS
     recording: Recording = sealed(sweeping)
-    assert len(recording.parts[0].picture_sequences()) > 2 * SWINGS
+    assert len(recording.segments[0].image_sequences()) > 2 * SWINGS
     assert list(recording.views()) == []
 
 
@@ -113,11 +113,11 @@ class StreamingInMemory(CameraInMemory):
         super().__init__()
         self.streams = 0
 
-    async def stream(self, callback: Callable[[Picture], None], stop: threading.Event) -> None:
+    async def stream(self, callback: Callable[[Image], None], stop: threading.Event) -> None:
         self.streams += 1
         await asyncio.to_thread(self._send, callback, stop)
 
-    def _send(self, callback: Callable[[Picture], None], stop: threading.Event) -> None:
+    def _send(self, callback: Callable[[Image], None], stop: threading.Event) -> None:
         while not stop.is_set():
             if self.fail:
                 raise CameraError(self.fail.pop(0))
@@ -140,8 +140,8 @@ async def test_every_frame_of_a_streaming_camera_is_recorded(streaming: Rig) -> 
     await streaming.give_go()
     await swing_to_the_end(streaming)
     assert streaming.camera.streams == 1
-    part = sealed(streaming).parts[0]
-    ids = [facts.frame_id for facts in part.picture_facts()]
+    part = sealed(streaming).segments[0]
+    ids = [facts.frame_id for facts in part.image_facts()]
     assert ids == list(range(2, 2 + len(ids))), "all that follow the first look at the board"
     assert len(ids) == streaming.camera.taken - 2 > 2 * SWINGS, "but for that look and the one that came late"
 

@@ -7,7 +7,7 @@ import time
 
 import pytest
 
-from recordings.schema.messages import Picture
+from recordings.schema.messages import Image
 from station.cell.errors import CameraError, TriggerError
 from station.cell.status import StationState as S
 from tests.station.session_rig import Rig
@@ -18,7 +18,7 @@ async def test_a_lost_trigger_box_is_a_fault_of_the_session_until_the_next_go(ri
     capture = rig.camera.capture
     gone = [TriggerError("trigger box lost: /dev/ttyACM0 is gone")]
 
-    async def with_box(timeout_s: float = 5.0) -> Picture:
+    async def with_box(timeout_s: float = 5.0) -> Image:
         if gone:
             raise gone.pop()
         return await capture(timeout_s)
@@ -47,7 +47,7 @@ async def test_17_a_camera_that_loses_the_first_frame_after_a_pause_is_woken(
         awake_until_s = time.monotonic() + 0.2
         return was_awake
 
-    async def dozing_capture(timeout_s: float = 5.0) -> Picture:
+    async def dozing_capture(timeout_s: float = 5.0) -> Image:
         nonlocal lost
         if lost and triggered():
             return await capture(timeout_s)
@@ -55,7 +55,7 @@ async def test_17_a_camera_that_loses_the_first_frame_after_a_pause_is_woken(
         await asyncio.sleep(0.3)
         raise CameraError("no picture within 0.3 s of its trigger")
 
-    async def dozing_glimpse() -> Picture | None:
+    async def dozing_glimpse() -> Image | None:
         if not triggered():
             raise CameraError("no picture")
         return await glimpse()

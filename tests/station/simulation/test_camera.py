@@ -12,7 +12,7 @@ import pytest
 
 from calibrate.boards.detect import detect
 from calibrate.geometry import inverse
-from recordings.schema.messages import Picture
+from recordings.schema.messages import Image
 from station.cell.errors import CameraError
 from station.devices import frames
 from station.simulation.admin import AdminClient
@@ -23,7 +23,7 @@ from station.simulation.launch import SimulatedController
 pytestmark = pytest.mark.process
 
 
-def mid_exposure(picture: Picture, camera: RenderedCamera) -> tuple[int, float]:
+def mid_exposure(picture: Image, camera: RenderedCamera) -> tuple[int, float]:
     stamps = picture.stamps
     return frames.mid_exposure(stamps.device_ns, stamps.host_monotonic_ns, picture.exposure_us, camera.clock)
 
@@ -53,13 +53,13 @@ async def test_pictures_show_the_board_from_the_true_pose_at_mid_exposure(
     camera: RenderedCamera, arm: SimulatedController, cell: CellTruth
 ) -> None:
     picture = await camera.capture()
-    assert picture.image.shape == (1024, 1280) and picture.image.dtype == np.uint8
+    assert picture.pixels.shape == (1024, 1280) and picture.pixels.dtype == np.uint8
     middle_ns, bound_s = mid_exposure(picture, camera)
     assert 0 < bound_s < 0.02
     with AdminClient(arm.host) as admin:
         flange = np.array(admin.ask("truth", at_monotonic_ns=middle_ns)["base_from_flange"])
     view = inverse(flange @ np.array(cell.camera_mount)) @ np.array(cell.board_place)
-    seen = detect(picture.image, cell.board)
+    seen = detect(picture.pixels, cell.board)
     assert seen.found, seen.reason
     ray = view[:3, 3]
     assert cell.camera.matrix is not None
@@ -90,7 +90,7 @@ async def test_frames_are_numbered_over_the_wrap_and_stamped_by_the_cameras_own_
 
 async def test_preview_is_smaller_and_never_counts_as_a_frame(camera: RenderedCamera) -> None:
     preview = await camera.preview()
-    assert preview is not None and preview.image.shape == (512, 640)
+    assert preview is not None and preview.pixels.shape == (512, 640)
     assert (await camera.capture()).sequence == 0
 
 
@@ -127,7 +127,7 @@ async def test_a_closed_camera_is_refused_and_can_be_opened_again(camera: Render
     with pytest.raises(CameraError, match="not open"):
         await camera.capture()
     await camera.open()
-    assert (await camera.capture()).image.mean() > 10
+    assert (await camera.capture()).pixels.mean() > 10
 
 
 async def test_an_unknown_fault_is_refused(camera: RenderedCamera) -> None:

@@ -41,9 +41,9 @@ async def test_its_pictures_show_the_board_from_where_the_arm_stands(
         await camera.open()
         try:
             picture = await camera.capture()
-            assert detect(picture.image, cell.board).found
+            assert detect(picture.pixels, cell.board).found
             simulator.inject("cover", 1.0)
-            assert (await camera.capture()).image.max() < 60
+            assert (await camera.capture()).pixels.max() < 60
         finally:
             await camera.close()
 

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from recordings.mcap import checksum
 
-PICTURE_LIMIT_BYTES = 36 * 1024 * 1024
+IMAGE_LIMIT_BYTES = 36 * 1024 * 1024
 """Decoded size above which no picture is read or written: bounds the reader's memory."""
 SIDE_LIMIT_PX = 16384
 
@@ -23,12 +23,12 @@ _JPEG_SIZES = {0xC0, 0xC1, 0xC2}
 _BAYER = re.compile(r"Bayer(RG|BG|GB|GR)8$")
 
 
-class PictureError(ValueError):
+class ImageError(ValueError):
     """Bytes that are not the picture they should be; says why."""
 
 
 @dataclass(frozen=True)
-class PictureHeader:
+class ImageHeader:
     format: str
     """png, jpeg, bmp or pgm"""
     width: int
@@ -42,7 +42,7 @@ class PictureHeader:
         return self.width * self.height * self.channels * self.bytes_per_sample
 
 
-def read_header(data: bytes) -> PictureHeader:
+def read_header(data: bytes) -> ImageHeader:
     """Size and depth from the first bytes, nothing decoded. Raises PictureError."""
     if data.startswith(_PNG_MAGIC):
         header = _png_header(data)
@@ -50,31 +50,31 @@ def read_header(data: bytes) -> PictureHeader:
         header = _jpeg_header(data)
     elif data.startswith(b"BM") and len(data) >= 30:
         width, height, _, bits = struct.unpack_from("<iiHH", data, 18)
-        header = PictureHeader("bmp", abs(width), abs(height), 1 if bits <= 8 else 3, 1)
+        header = ImageHeader("bmp", abs(width), abs(height), 1 if bits <= 8 else 3, 1)
     elif match := re.match(rb"P5\s+(\d{1,6})\s+(\d{1,6})\s+(\d{1,5})\s", data[:64]):
         width, height, top = (int(g) for g in match.groups())
-        header = PictureHeader("pgm", width, height, 1, 1 if top < 256 else 2)
+        header = ImageHeader("pgm", width, height, 1, 1 if top < 256 else 2)
     else:
-        raise PictureError("neither PNG, JPEG, BMP nor PGM")
+        raise ImageError("neither PNG, JPEG, BMP nor PGM")
     if not (0 < header.width <= SIDE_LIMIT_PX and 0 < header.height <= SIDE_LIMIT_PX):
-        raise PictureError(f"impossible size {header.width}×{header.height}")
-    if header.decoded_bytes > PICTURE_LIMIT_BYTES:
-        raise PictureError(
+        raise ImageError(f"impossible size {header.width}×{header.height}")
+    if header.decoded_bytes > IMAGE_LIMIT_BYTES:
+        raise ImageError(
             f"{header.width}×{header.height} decodes to {header.decoded_bytes / 1e6:.0f} MB, "
-            f"more than the {PICTURE_LIMIT_BYTES / 1e6:.0f} MB allowed"
+            f"more than the {IMAGE_LIMIT_BYTES / 1e6:.0f} MB allowed"
         )
     return header
 
 
-def _png_header(data: bytes) -> PictureHeader:
+def _png_header(data: bytes) -> ImageHeader:
     if len(data) < 33 or data[12:16] != b"IHDR":
-        raise PictureError("the PNG has no header")
+        raise ImageError("the PNG has no header")
     width, height, depth, colour = struct.unpack_from(">IIBB", data, 16)
     channels = 1 if colour in (0, 4) else 3
-    return PictureHeader("png", width, height, channels, 2 if depth == 16 else 1)
+    return ImageHeader("png", width, height, channels, 2 if depth == 16 else 1)
 
 
-def _jpeg_header(data: bytes) -> PictureHeader:
+def _jpeg_header(data: bytes) -> ImageHeader:
     position = 2
     while position + 10 <= len(data):
         if data[position] != 0xFF:
@@ -85,19 +85,19 @@ def _jpeg_header(data: bytes) -> PictureHeader:
             continue
         if marker in _JPEG_SIZES:
             height, width, components = struct.unpack_from(">HHB", data, position + 5)
-            return PictureHeader("jpeg", width, height, 1 if components == 1 else 3, 1)
+            return ImageHeader("jpeg", width, height, 1 if components == 1 else 3, 1)
         position += 2 + int(struct.unpack_from(">H", data, position + 2)[0])
-    raise PictureError("the JPEG has no frame header")
+    raise ImageError("the JPEG has no frame header")
 
 
-def check_complete(data: bytes, header: PictureHeader) -> None:
+def check_complete(data: bytes, header: ImageHeader) -> None:
     """Raises PictureError for a cut or damaged file: decoders fill what is missing with grey."""
     if header.format == "png":
         _check_png_chunks(data)
     elif header.format == "jpeg" and b"\xff\xd9" not in data[-64:]:
-        raise PictureError("the JPEG is cut (no end marker)")
+        raise ImageError("the JPEG is cut (no end marker)")
     elif header.format == "pgm" and len(data) < header.decoded_bytes:
-        raise PictureError("the PGM is cut")
+        raise ImageError("the PGM is cut")
 
 
 def _check_png_chunks(data: bytes) -> None:
@@ -108,29 +108,29 @@ def _check_png_chunks(data: bytes) -> None:
         if end + 4 > len(data):
             break
         if checksum.crc32(memoryview(data)[position + 4 : end]) != struct.unpack_from(">I", data, end)[0]:
-            raise PictureError(f"the PNG is damaged (checksum of the block at byte {position})")
+            raise ImageError(f"the PNG is damaged (checksum of the block at byte {position})")
         if data[position + 4 : position + 8] == b"IEND":
             return
         position = end + 4
-    raise PictureError("the PNG is cut (no end block)")
+    raise ImageError("the PNG is cut (no end block)")
 
 
-def decode_picture(data: bytes, width: int, height: int) -> NDArray[Any]:
+def decode_image(data: bytes, width: int, height: int) -> NDArray[Any]:
     """Compressed bytes → (height, width) uint8/uint16 or (height, width, 3) uint8 BGR, as stored.
 
     The size in the header must be the expected one before anything is decoded. Raises PictureError.
     """
     header = read_header(data)
     if (header.width, header.height) != (width, height):
-        raise PictureError(f"is {header.width}×{header.height}, expected {width}×{height}")
+        raise ImageError(f"is {header.width}×{header.height}, expected {width}×{height}")
     check_complete(data, header)
     flags = cv2.IMREAD_ANYCOLOR | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         image = cv2.imdecode(np.frombuffer(data, np.uint8), flags)
     except cv2.error as error:
-        raise PictureError(f"cannot be decoded ({error.err})") from error
+        raise ImageError(f"cannot be decoded ({error.err})") from error
     if image is None or image.shape[:2] != (height, width):
-        raise PictureError("cannot be decoded")
+        raise ImageError("cannot be decoded")
     decoded: NDArray[Any] = np.asarray(image)
     if decoded.ndim == 3 and decoded.dtype == np.uint16:
         return np.asarray(np.right_shift(decoded, 8), np.uint8)
@@ -142,7 +142,7 @@ def encode_png(image: NDArray[Any]) -> bytes:
     options = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
     done, data = cv2.imencode(".png", image, options)
     if not done:
-        raise PictureError("could not be compressed")
+        raise ImageError("could not be compressed")
     return data.tobytes()
 
 
@@ -159,7 +159,7 @@ def raw_encoding(image: NDArray[Any], pixel_format: str) -> str:
         return "mono16"
     if image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8:
         return "bgr8"
-    raise PictureError(f"a picture of shape {image.shape} and type {image.dtype} cannot be recorded")
+    raise ImageError(f"a picture of shape {image.shape} and type {image.dtype} cannot be recorded")
 
 
 def raw_array(data: bytes, encoding: str, width: int, height: int) -> NDArray[Any]:
@@ -169,8 +169,8 @@ def raw_array(data: bytes, encoding: str, width: int, height: int) -> NDArray[An
     if encoding == "bgr8":
         shape = (height, width, 3)
     elif encoding not in ("mono8", "mono16") and not encoding.startswith("bayer_"):
-        raise PictureError(f"unknown raw layout '{encoding}'")
+        raise ImageError(f"unknown raw layout '{encoding}'")
     expected = int(np.prod(shape)) * kind.itemsize
     if len(data) != expected:
-        raise PictureError(f"holds {len(data)} bytes where {width}×{height} {encoding} needs {expected}")
+        raise ImageError(f"holds {len(data)} bytes where {width}×{height} {encoding} needs {expected}")
     return np.frombuffer(data, kind).reshape(shape)

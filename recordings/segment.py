@@ -16,14 +16,14 @@ from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
 from numpy.typing import NDArray
 
-from recordings.errors import BadPictureError, CorruptRecordingError
+from recordings.errors import BadImageError, CorruptRecordingError
 from recordings.files import is_attachment_name, is_session_name
+from recordings.images import ImageError, decode_image, raw_array
 from recordings.manifest import PARTS_LIMIT
 from recordings.mcap import Message, MessageIndex, open_file, scan_file
 from recordings.mcap.contents import joined
 from recordings.mcap.records import BadRecordError, require_crc
 from recordings.mcap.source import ShortFileError
-from recordings.pictures import PictureError, decode_picture, raw_array
 from recordings.schema.definitions import (
     FORMATS,
     RECOVERY_RECORD,
@@ -36,8 +36,8 @@ from recordings.schema.definitions import (
 from recordings.schema.messages import (
     CameraModel,
     CaptureEvent,
+    Image,
     Matrix4,
-    Picture,
     RobotState,
     SessionInfo,
     View,
@@ -51,11 +51,11 @@ _RIGID_TOLERANCE = 1e-6
 S = TypeVar("S", bound=msgspec.Struct)
 
 
-class RecordingPart:
+class RecordingSegment:
     """A file that passed the strict scan. Raises CorruptRecordingError where a message is wrong in itself."""
 
     def __init__(self, path: Path) -> None:
-        """Raises UnsealedRecordingError, CorruptRecordingError or RecordingError."""
+        """Raises UnfinishedRecordingError, CorruptRecordingError or RecordingError."""
         self.path = path
         self._descriptor = -1
         self._descriptor = open_file(path)
@@ -97,7 +97,7 @@ class RecordingPart:
         """The clocks of all robot states, many at once."""
         return self._stamps(Topic.ROBOT_STATE, RobotState)
 
-    def picture_stamps(self) -> Iterator[StampsTable]:
+    def image_stamps(self) -> Iterator[StampsTable]:
         """The clocks of all pictures, many at once."""
         return self._stamps(Topic.PICTURE_FACTS, PictureFacts)
 
@@ -133,15 +133,15 @@ class RecordingPart:
     def events(self) -> Iterator[CaptureEvent]:
         return self._decoded(Topic.EVENT, CaptureEvent)
 
-    def picture_facts(self) -> Iterator[PictureFacts]:
+    def image_facts(self) -> Iterator[PictureFacts]:
         return self._decoded(Topic.PICTURE_FACTS, PictureFacts)
 
-    def picture_sequences(self) -> list[int]:
+    def image_sequences(self) -> list[int]:
         """Of all pictures, in file order."""
         return list(self._facts)
 
-    def picture(self, sequence: int) -> Picture:
-        """Decoded; its array is read-only. BadPictureError when it cannot be; KeyError when there is none."""
+    def image(self, sequence: int) -> Image:
+        """Decoded; its array is read-only. BadImageError when it cannot be; KeyError when there is none."""
         facts = self._message(Topic.PICTURE_FACTS, self._facts[sequence], PictureFacts)
         compressed = sequence in self._compressed
         topic = Topic.COMPRESSED_IMAGE if compressed else Topic.RAW_IMAGE
@@ -149,14 +149,14 @@ class RecordingPart:
         size = (self.info.camera.width, self.info.camera.height)
         try:
             if (facts.width, facts.height) != size:
-                raise PictureError(f"is {facts.width}×{facts.height}, the camera {size[0]}×{size[1]}")
+                raise ImageError(f"is {facts.width}×{facts.height}, the camera {size[0]}×{size[1]}")
             image = self._decoded_image(topic, address, *size)
-        except PictureError as error:
+        except ImageError as error:
             place = self._source.place(address)
-            raise BadPictureError(f"{self.path} at byte {place}: picture {sequence} {error}") from error
+            raise BadImageError(f"{self.path} at byte {place}: picture {sequence} {error}") from error
         image.flags.writeable = False
-        return Picture(
-            image=image,
+        return Image(
+            pixels=image,
             stamps=facts.stamps,
             frame_id=facts.frame_id,
             sequence=facts.sequence,
@@ -171,12 +171,12 @@ class RecordingPart:
         data = message.data
         if topic is Topic.COMPRESSED_IMAGE:
             del message  # it holds a second copy of the bytes
-            return decode_picture(data, width, height)
+            return decode_image(data, width, height)
         if (message.width, message.height) != (width, height):
-            raise PictureError(f"is {message.width}×{message.height}, expected {width}×{height}")
+            raise ImageError(f"is {message.width}×{message.height}, expected {width}×{height}")
         return raw_array(data, message.encoding, width, height)
 
-    def stored_picture(self, sequence: int) -> tuple[str, bytes] | None:
+    def stored_image(self, sequence: int) -> tuple[str, bytes] | None:
         """(format, file bytes) of a picture that is kept compressed; None when it is kept raw."""
         if sequence not in self._compressed:
             return None

@@ -30,7 +30,7 @@ from station.cell.status import StationState, StationStatus
 from station.cli.demo import simulated_daemon
 from station.devices.frames import frames_between
 from station.operate.attend import carry_out, wait_until_idle
-from station.plan.sweep import sweep_plan
+from station.plan.files import sweep_plan
 from station.protocol.client import Client
 from station.simulation.cell import CellTruth
 from station.simulation.gige import numbered_picture, still_picture

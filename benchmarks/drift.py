@@ -27,7 +27,7 @@ from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount
 from station.plan.choose import Objective, choose
 from station.plan.planner import make_plan
-from station.simulation.scenes import build_cell, cell_config
+from station.simulation.scenes import cell_config, make_cell
 
 TRIALS = 400
 SETS, POOL = 20, 200
@@ -145,7 +145,7 @@ def _planned(views: int, seed: int, mount: Mount) -> _Set:
         cell, _ = random_cell(seed)
         config, start, X, Y = cell.config, cell.start, cell.X, cell.Y
     else:
-        truth = build_cell("paper", 1 + seed, "mid", mount)  # seed 0 is the published place
+        truth = make_cell("paper", 1 + seed, "mid", mount)  # seed 0 is the published place
         config, start = cell_config(truth), np.array(truth.start_joints_rad)
         X, Y = np.array(truth.camera_mount), np.array(truth.board_place)
     plan = make_plan(config, start_joints_rad=start.tolist(), count=views, lens_known=True)

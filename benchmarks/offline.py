@@ -27,8 +27,9 @@ from recordings.schema.messages import (
     View,
 )
 from recordings.writer import RecordingWriter
-from station.simulation.cell import CellTruth, make_cell
+from station.simulation.cell import CellTruth
 from station.simulation.renderer import scaled
+from station.simulation.scenes import make_cell
 
 REPEATS = 15
 _PEAK = """

@@ -42,13 +42,12 @@ from station.analysis.worker import check_run
 from station.cell.errors import LimitError
 from station.cell.limits import allowed_speed, check_plan, sample_path
 from station.cell.plan import Plan, PlannedPose
-from station.cell.scene import Scene, scene_of
+from station.cell.scene import Scene, guess_from, scene_of
 from station.plan.belief import Glimpse, improved_config
 from station.plan.bootstrap import next_move
 from station.plan.choose import choose, informations, objective_for
 from station.plan.planner import PlanOptions, candidate_pool, plan_scene
-from station.plan.view_range import ViewRange
-from station.simulation.placement import guess_of
+from station.plan.visibility import ViewRange
 
 CELLS = 200
 NOISE = MeasurementNoise(MID.corner_px, MID.robot_m, MID.robot_rad)
@@ -195,7 +194,7 @@ def _bootstrap(cell: RandomCell, result: CellResult, rng: np.random.Generator, s
         return np.asarray(v / np.linalg.norm(v))
 
     wrong = pose(rotation_exp(unit() * np.deg2rad(30)) @ cell.X[:3, :3], cell.X[:3, 3] + 0.1 * unit())
-    config = msgspec.structs.replace(cell.config, camera_guess=guess_of(wrong, 0.06, 0.3), board_guess=None)
+    config = msgspec.structs.replace(cell.config, camera_guess=guess_from(wrong, 0.06, 0.3), board_guess=None)
 
     def glimpse(joints: Sequence[float]) -> Glimpse:
         C = cell.camera_from_board(forward(ARM, joints))

@@ -28,7 +28,7 @@ from station.cell.config import (
     RobotConfig,
     StationConfig,
 )
-from station.simulation.placement import guess_of
+from station.cell.scene import guess_from
 
 ARM = MODELS["UR10"]
 CAMERA = CameraModel(
@@ -53,7 +53,7 @@ class RandomCell:
     def exact(self) -> StationConfig:
         """The same cell with perfect guesses."""
         return msgspec.structs.replace(
-            self.config, camera_guess=guess_of(self.X, 0.0, 0.0), board_guess=guess_of(self.Y, 0.0, 0.0)
+            self.config, camera_guess=guess_from(self.X, 0.0, 0.0), board_guess=guess_from(self.Y, 0.0, 0.0)
         )
 
     def camera_from_board(self, flange: Array) -> Array:
@@ -200,7 +200,7 @@ def _spheres(joints: Array, X: Array) -> tuple[Array, Array, Array]:
 def roughly(T: Array, rng: np.random.Generator, sigma_m: float, sigma_rad: float) -> PoseGuess:
     """A guess of T (4, 4) that is wrong by its sigmas."""
     wrong = pose(T[:3, :3] @ rotation_exp(rng.normal(0, sigma_rad, 3)), T[:3, 3] + rng.normal(0, sigma_m, 3))
-    return guess_of(wrong, sigma_m, sigma_rad)
+    return guess_from(wrong, sigma_m, sigma_rad)
 
 
 def _config(X: Array, Y: Array, rng: np.random.Generator) -> StationConfig:

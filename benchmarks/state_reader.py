@@ -20,8 +20,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from station.devices.ur_state import StateReader
-from station.simulation.cell import make_cell, write_truth
+from station.simulation.cell import write_truth
 from station.simulation.launch import start_controller
+from station.simulation.scenes import make_cell
 
 SECONDS = 60.0
 DRIFT_PPM = 50.0

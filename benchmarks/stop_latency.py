@@ -23,11 +23,10 @@ from benchmarks.trials import table, trials
 from recordings.schema.messages import RobotState
 from station.cell.config import RobotConfig
 from station.cell.errors import RobotError
-from station.cell.priority import DAEMON_NICENESS, go_before_others
+from station.cell.process import DAEMON_NICENESS, go_before_others
 from station.devices.ur import UrRobot
 from station.devices.ur_dashboard import STOP
-from station.simulation.admin import AdminClient
-from station.simulation.launch import start_controller
+from station.simulation.launch import AdminClient, start_controller
 
 TRIALS = 200
 CRUISE_RAD_S = 0.5

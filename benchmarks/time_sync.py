@@ -23,10 +23,10 @@ from recordings.schema.messages import Image
 from station.cell.config import RobotConfig
 from station.devices.frames import mid_exposure
 from station.devices.ur import UrRobot
-from station.simulation.admin import AdminClient
 from station.simulation.camera import RenderedCamera
-from station.simulation.cell import CellTruth, make_cell, write_truth
-from station.simulation.launch import start_controller
+from station.simulation.cell import CellTruth, write_truth
+from station.simulation.launch import AdminClient, start_controller
+from station.simulation.scenes import make_cell
 
 SHARE = float(os.environ.get("BENCH_SHARE", "1"))
 PICTURES = max(20, round(400 * SHARE))

@@ -12,8 +12,7 @@ from typing import Any
 import pytest
 
 from station.cell.errors import StationError
-from station.simulation.admin import AdminClient
-from station.simulation.launch import SimulatedController, start_controller
+from station.simulation.launch import AdminClient, SimulatedController, start_controller
 from station.simulation.netns import isolated_thread
 
 DATASETS = Path(os.environ.get("STATION_DATASETS", Path(__file__).parents[2] / "shared" / "datasets"))

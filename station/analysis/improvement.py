@@ -29,11 +29,9 @@ from station.cell.config import PoseGuess, StationConfig
 from station.cell.errors import LimitError, RefusedError
 from station.cell.limits import check_plan
 from station.cell.plan import Plan
-from station.cell.scene import Scene, cell_geometry, flange_poses, scene_of
-from station.plan.belief import guess_from
+from station.cell.scene import Scene, cell_geometry, flange_poses, geometry_from, guess_from, scene_of
 from station.plan.choose import informations, objective_for, sigma_of
 from station.plan.planner import PlanOptions, plan_scene
-from station.plan.standing import geometry_from
 from station.plan.visibility import outline, visible
 
 FEWEST_VIEWS = FEWEST_FOR_LENS

@@ -25,11 +25,11 @@ from recordings.schema.messages import BoardSpec, CameraModel, Vector6
 from station.analysis.exposure import assess
 from station.cell.config import StationConfig
 from station.cell.limits import PlanCheck, check_plan
-from station.cell.parent import die_with_parent
 from station.cell.plan import Plan
+from station.cell.process import die_with_parent
+from station.cell.scene import geometry_from
 from station.cell.status import DetectionStatus
 from station.plan.planner import make_plan
-from station.plan.standing import geometry_from
 
 _NICENESS = 5
 

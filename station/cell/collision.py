@@ -13,7 +13,7 @@ import numpy as np
 from calibrate.geometry import Array, transform_points
 from calibrate.kinematics import RobotModel, link_frames
 from recordings.schema.messages import Mount
-from station.cell.config import Capsule, LimitsConfig
+from station.cell.config import Capsule, LimitsConfig, vector3
 
 ARM_BODIES = ("base column", "shoulder", "upper arm", "forearm", "wrist 1", "wrist 2", "wrist 3")
 _SELF_PAIRS = (
@@ -245,9 +245,4 @@ def plate(name: str, frame: Array, low_m: Array, high_m: Array, rods: int = 5) -
     ys = low_m[1] + spacing * (np.arange(rods) + 0.5)
     ends = np.array([[(low_m[0], y, 0.0), (high_m[0], y, 0.0)] for y in ys])
     placed = transform_points(frame, ends.reshape(-1, 3)).reshape(-1, 2, 3)
-    return tuple(Capsule(name, as_point(a), as_point(b), radius_m=max(spacing / 2, 0.005)) for a, b in placed)
-
-
-def as_point(point: Array) -> tuple[float, float, float]:
-    """(3,) as the configuration writes it."""
-    return float(point[0]), float(point[1]), float(point[2])
+    return tuple(Capsule(name, vector3(a), vector3(b), radius_m=max(spacing / 2, 0.005)) for a, b in placed)

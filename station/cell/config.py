@@ -2,13 +2,31 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from typing import Literal
 
 import msgspec
 
-from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount, Vector6
+from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Matrix4, Mount, Vector6
 
 Vector3 = tuple[float, float, float]
+
+
+def vector3(values: Iterable[float]) -> Vector3:
+    """Three numbers, an array's too, as files and messages take them."""
+    x, y, z = (float(value) for value in values)
+    return x, y, z
+
+
+def vector6(values: Iterable[float]) -> Vector6:
+    """Six numbers, likewise."""
+    a, b, c, d, e, f = (float(value) for value in values)
+    return a, b, c, d, e, f
+
+
+def matrix4(rows: Iterable[Iterable[float]]) -> Matrix4:
+    """A 4×4 matrix, likewise."""
+    return tuple(tuple(float(value) for value in row) for row in rows)
 
 
 class Section(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):

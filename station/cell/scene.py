@@ -6,14 +6,23 @@ from dataclasses import dataclass
 
 import msgspec
 import numpy as np
+from numpy.typing import ArrayLike
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import Array, inverse, pose_from_quaternion, transform_points
+from calibrate.geometry import (
+    Array,
+    inverse,
+    perturb,
+    pose_from_quaternion,
+    quaternion_from_matrix,
+    transform_points,
+)
 from calibrate.kinematics import MODELS, DhDeltas, RobotModel, forward
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
-from station.cell.collision import CellGeometry, as_point, plate
-from station.cell.config import Capsule, PoseGuess, StationConfig
+from station.cell.collision import CellGeometry, gap_to_arm, plate
+from station.cell.config import Capsule, PoseGuess, StationConfig, vector3
 from station.cell.errors import ConfigError, LimitError
+from station.cell.limits import SPACING_M
 from station.cell.plan import Plan
 
 _CAMERA_BODY_M, _CAMERA_RADIUS_M = 0.05, 0.035
@@ -21,6 +30,7 @@ _DOUBT = 3.0
 """What hangs on a guess is thickened by so many sigmas: nothing else keeps a wrong mount off the arm."""
 _MOST_DOUBT_M = 0.03
 """A camera thicker than this could not stand beside any wrist; bootstrap is for guesses that are worse."""
+_DRAWS = 2000
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,6 +112,13 @@ def _sigmas(guess: PoseGuess) -> tuple[float, float]:
     return guess.sigma_m, guess.sigma_rad
 
 
+def guess_from(matrix: Array, sigma_m: float, sigma_rad: float) -> PoseGuess:
+    """A transform (4, 4) as the configuration writes it."""
+    quaternion = quaternion_from_matrix(matrix[:3, :3])
+    x, y, z, w = (float(value) for value in quaternion)
+    return PoseGuess(vector3(matrix[:3, 3]), (x, y, z, w), sigma_m, sigma_rad)
+
+
 def cell_geometry(config: StationConfig) -> CellGeometry:
     """Geometry for checks before motion; uses the guesses where there are any, and their sigmas."""
     guesses = config.camera_guess, config.board_guess
@@ -138,7 +155,7 @@ def geometry_of(
     clearance = limits.clearance_m
     if config.mount == "eye-in-hand":
         if X is not None:
-            watched = (as_point(X[:3, 3]),)
+            watched = (vector3(X[:3, 3]),)
             solids = solids or (camera_body("camera", X, camera_radius_m(camera_doubt_m)),)
         if Y is not None:
             obstacles = plate("board", Y, low, high)
@@ -151,7 +168,7 @@ def geometry_of(
                 for rod in plate("board", Y, low, high)
             )
             corners = np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
-            watched = tuple(as_point(p) for p in transform_points(Y, corners))
+            watched = tuple(vector3(p) for p in transform_points(Y, corners))
         if X is not None:
             obstacles = (camera_body("camera", X),)
             clearance = limits.clearance_m + 2 * camera_doubt_m
@@ -195,4 +212,33 @@ def camera_ends(parent_from_camera: Array) -> Array:
 def camera_body(name: str, parent_from_camera: Array, radius_m: float = _CAMERA_RADIUS_M) -> Capsule:
     """A camera as it stands behind its optical centre."""
     ends = camera_ends(parent_from_camera)
-    return Capsule(name, as_point(ends[0]), as_point(ends[1]), radius_m)
+    return Capsule(name, vector3(ends[0]), vector3(ends[1]), radius_m)
+
+
+def geometry_from(config: StationConfig, standing_rad: ArrayLike) -> CellGeometry:
+    """Geometry for checks of a motion that begins where the arm stands, joints (6,).
+
+    A rough guess can put the camera where a part of the arm is. Then the guess is wrong, since the arm stands
+    there: the nearest mount by its sigmas that has room takes its place, as thick as the guessed one was. A
+    guess that is sharp enough for its thickness to cover its doubt is taken as it is.
+    """
+    guess, place = config.camera_guess, config.board_guess
+    cell = cell_geometry(config)
+    if guess is None or config.mount != "eye-in-hand" or config.limits.solids or covers_its_doubt(guess):
+        return cell
+    draws = np.random.default_rng(0).normal(size=(_DRAWS, 6))
+    draws[0] = 0.0
+    nearest = draws[np.argsort((draws**2).sum(axis=1))] * np.repeat([guess.sigma_m, guess.sigma_rad], 3)
+    mounts = perturb(pose_from_quaternion(guess.translation_m, guess.rotation_xyzw), nearest)
+    room_m = _room_m(cell, np.asarray(standing_rad, dtype=float), mounts, camera_radius_m(guess.sigma_m))
+    roomy = np.flatnonzero(room_m >= SPACING_M)
+    if room_m[0] >= SPACING_M / 2 or len(roomy) == 0:  # what the check of a path wants
+        return cell
+    Y = None if place is None else pose_from_quaternion(place.translation_m, place.rotation_xyzw)
+    return geometry_of(config, mounts[roomy[0]], Y, guess.sigma_m, 0.0 if place is None else place.sigma_m)
+
+
+def _room_m(cell: CellGeometry, standing_rad: Array, mounts: Array, radius_m: float) -> Array:
+    """(n,) distance from the arm where it stands to a camera at each mount (n, 4, 4)."""
+    ends = camera_ends(forward(cell.model, standing_rad) @ mounts)
+    return gap_to_arm(cell, standing_rad, ends[:, 0], ends[:, 1]) - radius_m

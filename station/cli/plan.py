@@ -18,16 +18,13 @@ from station.cell.config_file import load_config
 from station.cell.errors import ConfigError, LimitError
 from station.cell.limits import PlanCheck, check_plan
 from station.cell.plan import Plan, plan_sha256
-from station.cell.scene import Scene, cell_geometry, scene_of
+from station.cell.scene import Scene, cell_geometry, geometry_from, scene_of
 from station.cli.console import AsJson, err, out
 from station.plan.choose import Criterion
 from station.plan.files import import_list, load_plan, save_plan, taught_plan
-from station.plan.foxglove import save_scene
 from station.plan.planner import make_plan
 from station.plan.predict import with_forecast
-from station.plan.preview import save_picture
-from station.plan.sketch import sketch
-from station.plan.standing import geometry_from
+from station.plan.preview import save_picture, save_scene, sketch
 
 _NOTHING_KNOWN_M = 0.05
 """A larger expected error says no more than that there are too few poses yet."""
@@ -105,9 +102,9 @@ def _cell(config: Path | None, scene: str, start: str | None) -> tuple[StationCo
     if config is not None:
         return load_config(config)[0], standing
     # Simulation is loaded only where it is wanted.
-    from station.simulation.scenes import build_cell, cell_config
+    from station.simulation.scenes import cell_config, make_cell
 
-    truth = build_cell(scene, 0, "low", "eye-in-hand")  # type: ignore[arg-type]
+    truth = make_cell(scene, 0, "low", "eye-in-hand")  # type: ignore[arg-type]
     return cell_config(truth), standing or list(truth.start_joints_rad)
 
 

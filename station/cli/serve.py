@@ -14,7 +14,7 @@ import typer
 
 from recordings.schema.messages import Mount
 from station.cell.errors import ConfigError
-from station.cell.priority import DAEMON_NICENESS, go_before_others
+from station.cell.process import DAEMON_NICENESS, go_before_others
 from station.cell.session_folder import default_root
 from station.cell.socket_folder import default_socket
 from station.devices.cell import Cell
@@ -62,7 +62,7 @@ def serve_command(
     if config is not None:
         cell = _real_cell(config, place)
     elif replay is not None:
-        from station.devices.playback_cell import playback_cell
+        from station.devices.playback import playback_cell
 
         cell = playback_cell(replay)
     else:
@@ -92,7 +92,7 @@ def require_choices(**chosen: str) -> None:
 
 def _real_cell(config: Path, root: Path) -> Cell:
     from station.cell.config_file import load_config
-    from station.devices.factory import configured_cell
+    from station.devices.cell import configured_cell
 
     loaded, text = load_config(config)
     return configured_cell(loaded, text, root)

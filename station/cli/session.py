@@ -32,8 +32,7 @@ from station.operate.drift_check import (
     require_installed,
 )
 from station.operate.progress import SessionProgress
-from station.plan.files import load_plan
-from station.plan.sweep import sweep_plan
+from station.plan.files import load_plan, sweep_plan
 from station.protocol.client import Client
 
 Approve = Annotated[str, typer.Option("--approve", help="Hash of the plan that a person approved.")]

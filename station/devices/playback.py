@@ -8,14 +8,16 @@ from __future__ import annotations
 import asyncio
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import cv2
 import msgspec
 import numpy as np
 
-from calibrate.geometry import Array, interpolate, pose_from_rotvec, rotation_log
+from calibrate.geometry import interpolate, pose_from_rotvec, rotation_log
+from recordings import strict_yaml
 from recordings.errors import RecordingError
 from recordings.reader import Recording, open_recording
 from recordings.schema.clocks import ClockFit
@@ -28,11 +30,11 @@ from recordings.schema.messages import (
     Vector6,
     View,
 )
-from station.cell.config import CameraConfig
-from station.cell.errors import CameraError, RobotError, StaleStateError
+from station.cell.config import CameraConfig, StationConfig, vector6
+from station.cell.errors import CameraError, ConfigError, RobotError, StaleStateError
 from station.cell.plan import Plan, PlannedPose
+from station.devices.cell import Cell
 from station.devices.frames import CameraCounts, next_frame_id
-from station.devices.playback_source import Played, Source, open_source
 
 STATE_RATE_HZ = 100.0
 MOVE_S = 0.2
@@ -49,6 +51,95 @@ _HOST_CLOCK = ClockFit(
     span_s=0.0,
 )
 """Played pictures are stamped by the host's own clock."""
+PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
+VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".mpg", ".mpeg")
+FOLDER_RATE_HZ = 10.0
+"""A folder's own pace: its files say nothing of time."""
+CONFIG_NAME = "config.yaml"
+
+
+class Played(NamedTuple):
+    picture: Image
+    at_s: float
+    """When it was taken, counted from the first."""
+
+
+class Source(NamedTuple):
+    name: str
+    identity: CameraIdentity
+    frames: Iterator[Played]
+    """In order; raises CameraError at a picture that cannot be read."""
+
+
+def open_source(path: Path) -> Source:
+    """Raises CameraError with the remedy."""
+    if not path.exists():
+        raise CameraError(f"nothing to play at {path}: camera.device names a folder, a video or a recording")
+    if path.is_dir() and not any(path.glob("*.mcap")):
+        files = sorted(p for p in path.iterdir() if p.suffix.lower() in PICTURE_SUFFIXES)
+        if not files:
+            raise CameraError(f"no pictures in {path} ({', '.join(PICTURE_SUFFIXES)})")
+        return Source(path.name, _identity("folder", path), _folder(files))
+    if path.suffix.lower() in VIDEO_SUFFIXES:
+        capture = cv2.VideoCapture(str(path))
+        if not capture.isOpened():
+            raise CameraError(f"{path} is not a video that OpenCV can read")
+        return Source(path.name, _identity("video", path), _video(path, capture))
+    return _recording(path)
+
+
+def _identity(kind: str, path: Path) -> CameraIdentity:
+    return CameraIdentity(vendor="playback", model=kind, serial=path.name, driver="playback")
+
+
+def _folder(files: list[Path]) -> Iterator[Played]:
+    for number, file in enumerate(files):
+        image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
+        if image is None:
+            raise CameraError(f"{file} is not a picture that OpenCV can read; repair or remove it")
+        if image.ndim == 3 and image.shape[2] == 4:
+            image = cv2.cvtColor(image, cv2.COLOR_BGRA2BGR)
+        wide = "Mono16" if image.dtype.itemsize == 2 else "Mono8"
+        pixel_format = "BGR8" if image.ndim == 3 else wide
+        yield Played(Image(image, Stamps(), 0, number, pixel_format=pixel_format), number / FOLDER_RATE_HZ)
+
+
+def _video(path: Path, capture: cv2.VideoCapture) -> Iterator[Played]:
+    rate_hz = capture.get(cv2.CAP_PROP_FPS) or FOLDER_RATE_HZ
+    number = 0
+    try:
+        while True:
+            good, image = capture.read()
+            if not good:
+                break
+            yield Played(Image(image, Stamps(), 0, number, pixel_format="BGR8"), number / rate_hz)
+            number += 1
+    finally:
+        capture.release()
+    if number == 0:
+        raise CameraError(f"{path} has no readable frame")
+
+
+def _recording(path: Path) -> Source:
+    try:
+        recording = open_recording(path)
+        info = recording.info
+    except RecordingError as error:
+        raise CameraError(f"{path} cannot be played: {error}") from error
+
+    def frames() -> Iterator[Played]:
+        first_ns: int | None = None
+        try:
+            for _, picture in recording.images():
+                taken_ns = picture.stamps.host_monotonic_ns
+                first_ns = taken_ns if first_ns is None else first_ns
+                yield Played(picture, max(0.0, (taken_ns - first_ns) / 1e9))
+        except RecordingError as error:
+            raise CameraError(f"{path} cannot be played further: {error}") from error
+
+    camera = info.camera_identity
+    identity = CameraIdentity(camera.vendor, camera.model, camera.serial, "playback")
+    return Source(info.name, identity, frames())
 
 
 class PlaybackCamera:
@@ -227,10 +318,10 @@ class PlaybackRobot:
                 host_wall_ns=time.time_ns() - round(age_s * 1e9),
                 controller_s=host_monotonic_ns / 1e9,
             ),
-            joints_rad=_vector6(a + fraction * (b - a)),
-            joint_speeds_rad_s=_vector6(speed),
+            joints_rad=vector6(a + fraction * (b - a)),
+            joint_speeds_rad_s=vector6(speed),
             target_joints_rad=_joints(after),
-            tcp_pose=_vector6(np.concatenate([tool[:3, 3], rotation_log(tool[:3, :3])])),
+            tcp_pose=vector6(np.concatenate([tool[:3, 3], rotation_log(tool[:3, :3])])),
             robot_mode=7,
             safety_mode=1,
             safety_status_bits=1,
@@ -299,6 +390,34 @@ def _joints(view: View) -> Vector6:
     return view.joints_rad
 
 
-def _vector6(values: Array) -> Vector6:
-    a, b, c, d, e, f = (float(x) for x in values)
-    return a, b, c, d, e, f
+def playback_cell(recording: Path) -> Cell:
+    """Everything is marked as playback; its plan is the recorded poses.
+
+    RobotError or ConfigError for a recording that is damaged, has no joints or no configuration in it.
+    """
+    robot = PlaybackRobot(recording)
+    try:
+        content = open_recording(recording).attachments().get(CONFIG_NAME, b"")
+        recorded = strict_yaml.load(content, StationConfig)
+    except (RecordingError, strict_yaml.StrictYamlError) as error:
+        raise ConfigError(
+            f"{recording} holds no usable {CONFIG_NAME} of a station ({error}): it cannot be replayed as a "
+            "cell. `calibrate solve` and Foxglove need none"
+        ) from error
+    camera = msgspec.structs.replace(
+        recorded.camera, driver="playback", device=str(recording), trigger="software", playback_pace=0.0
+    )
+    config = msgspec.structs.replace(
+        recorded,
+        name="playback",
+        camera=camera,
+        trigger=None,
+        robot=msgspec.structs.replace(recorded.robot, host="", serial=""),
+    )
+    return Cell(
+        config=config,
+        robot=robot,
+        camera=PlaybackCamera(camera, robot),
+        source="playback",
+        plan=robot.plan(),
+    )

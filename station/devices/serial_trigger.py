@@ -10,13 +10,12 @@ import termios
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from functools import partial
+from functools import partial, reduce
 from typing import Any, TypeVar
 
 from station.cell.config import TriggerConfig
 from station.cell.errors import TriggerError
 from station.devices.base import TriggerPulse
-from station.devices.trigger_lines import BAUD, PRODUCT, PROTOCOL, LineReader, frame
 
 T = TypeVar("T")
 ANSWER_TIMEOUT_S = 1.0
@@ -24,6 +23,65 @@ HANDSHAKE_TIMEOUT_S = 3.0
 """Many boards restart when their port is opened, and take two seconds for it."""
 BAD_LINES_LIMIT = 50
 _COUNTS = 1 << 32
+LINE_LIMIT = 120
+"""Bytes; a longer line is garbage."""
+BAUD = 115_200
+PRODUCT = "calibration-trigger"
+PROTOCOL = "1"
+
+
+def checksum(text: str) -> str:
+    """XOR of all bytes as two hexadecimal digits, as in NMEA 0183."""
+    return f"{reduce(lambda a, b: a ^ b, text.encode('ascii'), 0):02X}"
+
+
+def frame(text: str) -> bytes:
+    return f"{text}*{checksum(text)}\n".encode("ascii")
+
+
+class LineReader:
+    """Bytes in, good lines out. Whatever else comes is counted and skipped up to the next newline."""
+
+    def __init__(self) -> None:
+        self.bad_lines = 0
+        self._pending = bytearray()
+        self._overlong = False
+
+    def feed(self, data: bytes) -> list[str]:
+        """Contents of the complete good lines, without checksum. Never raises; memory is bounded."""
+        good = []
+        *ended_pieces, rest = data.split(b"\n")
+        for piece, ended in [*((p, True) for p in ended_pieces), (rest, False)]:
+            if len(self._pending) + len(piece) > LINE_LIMIT:
+                self._overlong = True
+                self._pending.clear()
+            elif not self._overlong:
+                self._pending += piece
+            if not ended:
+                continue
+            text = None if self._overlong else _checked(bytes(self._pending))
+            self._pending.clear()
+            self._overlong = False
+            if text is None:
+                self.bad_lines += 1
+            else:
+                good.append(text)
+        return good
+
+    def restart(self) -> None:
+        """Forgets a line that has only begun: what comes next starts a new one."""
+        self.bad_lines += bool(self._pending) or self._overlong
+        self._pending.clear()
+        self._overlong = False
+
+
+def _checked(line: bytes) -> str | None:
+    try:
+        # A space is under the checksum; a carriage return stands behind it.
+        text, _, given = line.decode("ascii").rstrip("\r").rpartition("*")
+    except UnicodeDecodeError:
+        return None
+    return text if text and given == checksum(text) else None
 
 
 class SerialTrigger:

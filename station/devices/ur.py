@@ -10,7 +10,9 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import Coroutine, Sequence
+from collections import deque
+from collections.abc import Callable, Coroutine, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +29,6 @@ from station.devices.ur_condition import (
     watchdog_cause,
 )
 from station.devices.ur_dashboard import STOP, Dashboard, came
-from station.devices.ur_heart import Heart, longest_gap_s
 from station.devices.ur_link import UrLink, link_lost_words
 from station.devices.ur_moves import STALE_S, MoveWatch, check_goal
 
@@ -43,6 +44,25 @@ PROGRAM_START_NS = 200_000_000
 LEFTOVER_WAIT_NS = 2_000_000_000
 CLOSE_WAIT_S = 0.5
 LOCAL_CONTROL = "the robot is in local control: switch the pendant to Remote (top right), then give a new go"
+KEPT = 64
+
+
+class Heart:
+    def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._now_s = now_s
+        self._beats_s: deque[float] = deque(maxlen=KEPT)
+
+    def beat(self) -> None:
+        self._beats_s.append(self._now_s())
+
+    def worst_s(self, since_s: float) -> float:
+        """Longest pause that began after `since_s` (host monotonic), ended or not; 0 when there is none."""
+        return longest_gap_s([*self._beats_s, self._now_s()], since_s)
+
+
+def longest_gap_s(moments_s: Sequence[float], since_s: float) -> float:
+    """Longest time between neighbours that began after `since_s`; 0 when there is none."""
+    return max((b - a for a, b in pairwise(moments_s) if a > since_s), default=0.0)
 
 
 class UrRobot(UrLink):

@@ -24,8 +24,7 @@ import sys
 import time
 from typing import Any, NoReturn
 
-from station.cell.parent import die_with_parent
-from station.cell.priority import DAEMON_NICENESS, go_before_others
+from station.cell.process import DAEMON_NICENESS, die_with_parent, go_before_others
 
 BEAT_FRESH_NS = 100_000_000
 WATCHDOG_HZ = 5.0

@@ -18,11 +18,9 @@ from station.cell.config import RobotConfig
 from station.cell.errors import RobotError, StaleStateError, StationError
 from station.devices.ur_condition import safety_stop
 from station.devices.ur_dashboard import Dashboard, DashboardError
-from station.devices.ur_history import state_at
-from station.devices.ur_lock import RobotLock
 from station.devices.ur_primary import Installation, PrimaryReader
-from station.devices.ur_probe import SCRIPT_PORT, ProbeResult, check_port, identify, lock_name
-from station.devices.ur_state import Payload, Sample, StateReader
+from station.devices.ur_probe import SCRIPT_PORT, ProbeResult, RobotLock, check_port, identify, lock_name
+from station.devices.ur_state import Payload, Sample, StateReader, state_at
 from station.devices.ur_tool import TcpCheck, check_payload
 
 log = logging.getLogger(__name__)

@@ -15,13 +15,12 @@ from calibrate.geometry import (
     inverse,
     perturb,
     pose_from_quaternion,
-    quaternion_from_matrix,
 )
 from calibrate.kinematics import forward
 from recordings.schema.messages import Mount
-from station.cell.config import PoseGuess, StationConfig
+from station.cell.config import StationConfig
 from station.cell.errors import ConfigError
-from station.cell.scene import arm_model
+from station.cell.scene import arm_model, guess_from
 
 GOOD_M, GOOD_RAD = 0.006, 0.02
 """A belief this sharp (1 sigma per axis) is enough to plan from."""
@@ -143,13 +142,6 @@ def _prior(config: StationConfig) -> tuple[Array, Array]:
         raise ConfigError("bootstrap needs camera_guess: a rough mount, good to about 30° and 100 mm")
     X = pose_from_quaternion(guess.translation_m, guess.rotation_xyzw)
     return X, np.repeat([guess.sigma_m, guess.sigma_rad], 3)
-
-
-def guess_from(matrix: Array, sigma_m: float, sigma_rad: float) -> PoseGuess:
-    """A transform (4, 4) as the configuration writes it."""
-    x, y, z = (float(v) for v in matrix[:3, 3])
-    qx, qy, qz, qw = (float(v) for v in quaternion_from_matrix(matrix[:3, :3]))
-    return PoseGuess((x, y, z), (qx, qy, qz, qw), sigma_m, sigma_rad)
 
 
 def _misfit(place: Array, reference: Array) -> Array:

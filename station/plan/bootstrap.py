@@ -25,12 +25,10 @@ from station.cell.config import StationConfig
 from station.cell.errors import LimitError
 from station.cell.limits import SPACING_M, Problem, check_path, joint_bounds
 from station.cell.plan import PlannedPose
-from station.cell.scene import Scene, arm_model, geometry_of
+from station.cell.scene import Scene, arm_model, geometry_from, geometry_of
 from station.plan.belief import Belief, Glimpse, believe, board_place, expected_after, seen_from, spread_of
-from station.plan.describe import planned_pose
 from station.plan.order import move_times
-from station.plan.standing import geometry_from
-from station.plan.visibility import outline, visible
+from station.plan.visibility import outline, planned_pose, visible
 
 MOVES_MIN, MOVES_MAX = 3, 5
 _SAMPLES, _FEWEST, _DRAWS = 40, 20, 400

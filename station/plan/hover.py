@@ -20,8 +20,8 @@ from calibrate.kinematics import RobotModel, forward, inverse_all, jacobian
 from calibrate.quality.board_now import found_points, locate_board, offset_covariance
 from calibrate.views import BoardView
 from recordings.schema.messages import BoardSpec, Vector6
-from station.cell.collision import CellGeometry, as_point, margins, plate
-from station.cell.config import Capsule, PointerConfig, StationConfig
+from station.cell.collision import CellGeometry, margins, plate
+from station.cell.config import Capsule, PointerConfig, StationConfig, matrix4, vector3, vector6
 from station.cell.errors import LimitError
 from station.cell.limits import PlanCheck, check_plan
 from station.cell.plan import Plan, PlannedPose
@@ -171,7 +171,7 @@ def hover_geometry(
         others = cell.obstacles
     along = np.array(pointer.along) / np.linalg.norm(pointer.along)
     end = np.array(pointer.tip_m) - pointer.radius_m * along
-    rod = Capsule("pointer", (0.0, 0.0, 0.0), as_point(end), pointer.radius_m)
+    rod = Capsule("pointer", (0.0, 0.0, 0.0), vector3(end), pointer.radius_m)
     limits = config.limits
     slow = msgspec.structs.replace(
         limits,
@@ -246,9 +246,7 @@ def _refined(model: RobotModel, target: Array, joints: Array) -> Array | None:
 
 def _plan(config: StationConfig, model: RobotModel, corner: int, high: Array, low: Array) -> Plan:
     def stop(name: str, joints: Array, why: str) -> PlannedPose:
-        a, b, c, d, e, f = (float(angle) for angle in joints)
-        flange = tuple(tuple(float(x) for x in row) for row in forward(model, joints))
-        return PlannedPose(name, (a, b, c, d, e, f), base_from_flange=flange, why=why)
+        return PlannedPose(name, vector6(joints), matrix4(forward(model, joints)), why=why)
 
     poses = (
         stop("approach", high, f"high over corner {corner}"),

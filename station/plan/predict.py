@@ -18,9 +18,7 @@ from station.cell.plan import Plan, PlannedPose
 from station.cell.scene import Scene, flange_poses
 from station.plan.candidates import find_candidates
 from station.plan.choose import informations, objective_for, sigma_of
-from station.plan.describe import planned_pose
-from station.plan.view_range import ViewRange, view_range
-from station.plan.visibility import visible
+from station.plan.visibility import ViewRange, planned_pose, view_range, visible
 
 _FURTHER_POSES = 60
 _TRIES = 12

@@ -9,16 +9,26 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
+from calibrate.boards.model import board_points
 from calibrate.geometry import Array, transform_points
-from calibrate.projection import camera_matrix
+from calibrate.projection import camera_matrix, project
+from recordings.scene import Colour, Entity, Line, write_scene
 from station.cell.collision import body_segments
 from station.cell.errors import ConfigError
+from station.cell.limits import check_plan
 from station.cell.plan import Plan
 from station.cell.scene import Scene, board_extent, flange_poses
-from station.plan.sketch import expected_pixels
 
 _FRUSTUM_M = 0.06
 _SHOWN_ARMS = 3
+_SHADES = " ░▒▓█"
+_BARS = "▁▂▃▄▅▆▇█"
+_WIDTH, _ROWS = 78, 11
+_ARM: Colour = (0.6, 0.6, 0.65, 0.8)
+_CAMERA: Colour = (0.1, 0.4, 0.9, 1.0)
+_BOARD: Colour = (0.1, 0.1, 0.1, 1.0)
+_WAY: Colour = (1.0, 0.5, 0.0, 1.0)
+_STEPS_PER_MOVE = 10
 
 
 def save_picture(scene: Scene, plan: Plan, path: Path) -> None:
@@ -107,3 +117,114 @@ def _draw_error(axes: Any, plan: Plan) -> None:
         axes.set_ylim(0.7 * sigmas[-1], 1.5 * sigmas[min(2, len(sigmas) - 1)])
         axes.annotate(f"{sigmas[-1]:.2f} mm", (len(sigmas), 1.4 * sigmas[-1]), ha="right", va="bottom")
     axes.grid(True, which="both", alpha=0.3)
+
+
+def expected_pixels(scene: Scene, plan: Plan) -> Array:
+    """Where every board point is expected in every picture, (n, k, 2) pixels; NaN behind the camera."""
+    points = board_points(scene.board)
+    seen = scene.seen(flange_poses(scene, plan), points)
+    pixels = project(scene.camera, np.maximum(seen.reshape(-1, 3), [-np.inf, -np.inf, 1e-3])).pixels
+    pixels[seen.reshape(-1, 3)[:, 2] <= 1e-3] = np.nan
+    return pixels.reshape(len(seen), len(points), 2)
+
+
+def coverage_grid(scene: Scene, plan: Plan, columns: int, rows: int) -> Array:
+    """How many board points fall into each cell of the picture, (rows, columns)."""
+    pixels = expected_pixels(scene, plan).reshape(-1, 2)
+    pixels = pixels[np.isfinite(pixels).all(axis=1)]
+    size = scene.camera.width, scene.camera.height
+    edges = [
+        np.linspace(-0.5, side - 0.5, cells + 1) for side, cells in zip(size, (columns, rows), strict=True)
+    ]
+    counts = np.histogram2d(pixels[:, 0], pixels[:, 1], bins=edges)[0]
+    return np.asarray(counts.T)
+
+
+def board_from_cameras(scene: Scene, plan: Plan) -> Array:
+    """Camera centres in `board`, (n, 3) metres; the viewer's side is z < 0."""
+    seen = scene.camera_from_board(flange_poses(scene, plan))
+    return np.asarray(-np.einsum("nji,nj->ni", seen[:, :3, :3], seen[:, :3, 3]))
+
+
+def sketch(scene: Scene, plan: Plan) -> str:
+    """Three small panels as lines of text, at most 78 wide."""
+    left, right = _picture_panel(scene, plan), _camera_panel(scene, plan)
+    lines = [f"{a:<40}{b}"[:_WIDTH] for a, b in zip(left, right, strict=True)]
+    sigmas = [pose.predicted_sigma_m for pose in plan.poses]
+    known = [s for s in sigmas if s is not None]
+    if known:
+        bars = "".join(_bar(s, known) for s in known)
+        lines.append(
+            f"expected error of X  {bars}  {1000 * known[-1]:.2f} mm after {len(plan.poses)} poses"[:_WIDTH]
+        )
+    return "\n".join(lines)
+
+
+def _picture_panel(scene: Scene, plan: Plan) -> list[str]:
+    columns, rows = 34, _ROWS
+    counts = coverage_grid(scene, plan, columns, rows)
+    top = max(float(counts.max()), 1.0)
+    shade = np.ceil((len(_SHADES) - 1) * counts / top).astype(int)
+    body = ["│" + "".join(_SHADES[s] for s in row) + "│" for row in shade]
+    empty = int((coverage_grid(scene, plan, 4, 4) == 0).sum())
+    title = f"board points in the picture, {16 - empty}/16 filled"
+    return [title, "┌" + "─" * columns + "┐", *body, "└" + "─" * columns + "┘"]
+
+
+def _camera_panel(scene: Scene, plan: Plan) -> list[str]:
+    columns, rows = 33, _ROWS
+    """Camera centres over the board plane, numbered in order of visit."""
+    centres = board_from_cameras(scene, plan)
+    middle = transform_points(np.eye(4), board_points(scene.board)).mean(axis=0)
+    offset = centres[:, :2] - middle[:2]
+    reach = max(float(np.abs(offset).max()), 0.05)
+    cells = [[" "] * columns for _ in range(rows)]
+    cells[rows // 2][columns // 2] = "#"
+    for number, (x, y) in enumerate(offset):
+        row = round((y / reach + 1) / 2 * (rows - 1))
+        column = round((x / reach + 1) / 2 * (columns - 2))
+        for k, letter in enumerate(f"{number + 1}"):
+            cells[row][min(column + k, columns - 1)] = letter
+    title = f"camera over the board (#), ±{1000 * reach:.0f} mm"
+    body = ["│" + "".join(row) + "│" for row in cells]
+    return [title, "┌" + "─" * columns + "┐", *body, "└" + "─" * columns + "┘"]
+
+
+def _bar(value: float, values: list[float]) -> str:
+    low, high = np.log(min(values)), np.log(max(values))
+    share = (np.log(value) - low) / max(high - low, 1e-9)
+    return _BARS[round(float(share) * (len(_BARS) - 1))]
+
+
+def save_scene(scene: Scene, plan: Plan, path: Path) -> None:
+    """Writes an MCAP in which the planned motion plays at its planned pace. RecordingError when it cannot."""
+    steps: list[tuple[float, list[Entity]]] = [(0.0, _fixed(scene, plan))]
+    seconds = 0.0
+    moves = check_plan(plan, None, scene.geometry).moves
+    for number, pose in enumerate(plan.poses):
+        before = plan.poses[max(number - 1, 0)].joints_rad
+        for share in np.linspace(0, 1, _STEPS_PER_MOVE + 1)[1:]:
+            joints = np.array(before) + share * (np.array(pose.joints_rad) - before)
+            now = seconds + share * moves[number].duration_s
+            steps.append((now, _moving(scene, joints, f"{number + 1} {pose.why}")))
+        seconds += moves[number].duration_s + 0.5
+    write_scene(path, steps)
+
+
+def _fixed(scene: Scene, plan: Plan) -> list[Entity]:
+    flange = flange_poses(scene, plan)
+    cameras = flange @ scene.X if scene.mount == "eye-in-hand" else scene.X[None]
+    boards = scene.Y[None] if scene.mount == "eye-in-hand" else flange @ scene.Y
+    frusta = tuple(Line(edge, _CAMERA, 0.001) for camera in cameras for edge in camera_frustum(scene, camera))
+    outlines = tuple(Line(printed_outline(scene, board), _BOARD, 0.002) for board in boards)
+    way = (cameras if len(cameras) > 1 else boards)[:, :3, 3]
+    return [Entity("plan", "base", (*frusta, *outlines, Line(way, _WAY, 0.002)))]
+
+
+def _moving(scene: Scene, joints: Array, text: str) -> list[Entity]:
+    starts, ends, radii = body_segments(scene.geometry, joints[None])
+    arm = tuple(
+        Line(np.stack([a, b]), _ARM, float(2 * r)) for a, b, r in zip(starts[0], ends[0], radii, strict=True)
+    )
+    x, y, z = (float(v) for v in ends[0, 6] + [0.0, 0.0, 0.15])
+    return [Entity("arm", "base", arm, text, (x, y, z))]

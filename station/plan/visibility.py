@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,11 +14,50 @@ from calibrate.kinematics import forward
 from calibrate.projection import camera_matrix, project
 from recordings.schema.messages import BoardSpec, CameraModel
 from station.cell.collision import ARM_BODIES, body_segments, segment_distance
-from station.cell.scene import Scene
-from station.plan.view_range import ViewRange
+from station.cell.config import matrix4, vector6
+from station.cell.plan import ExpectedView, PlannedPose
+from station.cell.scene import Scene, board_extent
 
 _ON_THE_WAY = 7
 """Pictures looked at along a move."""
+
+
+@dataclass(frozen=True)
+class ViewRange:
+    """From where the board may be looked at."""
+
+    distance_m: tuple[float, float] = (0.38, 0.60)
+    tilt_rad: tuple[float, float] = (0.0, 0.70)
+    roll_rad: float = 0.80
+    """Either way from `roll_centre_rad`."""
+    roll_centre_rad: float = 0.0
+    off_centre: float = 0.35
+    """Share of half the picture that the board's centre may be away from the picture's centre."""
+    border_px: float = 12.0
+    doubt: float = 3.5
+    """So many standard deviations of its pixels, as the guesses' sigmas make them, every corner of the board
+    keeps from the picture's edge beyond `border_px`."""
+    smallest_singular: float = 0.03
+
+
+_NEAR_FILL, _FAR_FILL = 0.64, 0.40
+"""Share of the picture's width or height that the board's outline fills, at the nearest and farthest."""
+_FOCUS = (0.6, 1.6)
+"""Pictures are sharp within these multiples of the working distance."""
+
+
+def view_range(scene: Scene) -> ViewRange:
+    """Distances at which the board fills the picture well, as far as they lie near the working distance."""
+    K = camera_matrix(scene.camera)
+    points = board_points(scene.board)
+    size_m = (points.max(axis=0) - points.min(axis=0))[:2] + scene.board.square_m
+    picture = np.array([scene.camera.width, scene.camera.height])
+    full_m = float((np.diag(K)[:2] * size_m / picture).max())
+    focus = np.array(_FOCUS) * scene.working_distance_m
+    near, far = (float(d) for d in np.clip([full_m / _NEAR_FILL, full_m / _FAR_FILL], *focus))
+    if far < 1.2 * near:
+        near, far = full_m / _NEAR_FILL, full_m / _FAR_FILL
+    return ViewRange(distance_m=(near, far))
 
 
 def visible(camera: CameraModel, points: Array, border_px: float) -> NDArray[np.bool_]:
@@ -105,3 +147,55 @@ def sees_past_the_arm(scene: Scene, joints_rad: Array, base_from_flange: Array) 
         board = transform_points(base_from_flange @ scene.Y, outline(scene.board))
     gap = segment_distance(eye[:, :, None], board[:, :, None], starts[:, None, links], ends[:, None, links])
     return np.asarray((gap > radii[links]).all(axis=(1, 2)))
+
+
+def expected_view(scene: Scene, base_from_flange: Array) -> ExpectedView:
+    """How the board should look from a flange pose (4, 4), by the scene's guess."""
+    camera_from_board = scene.camera_from_board(base_from_flange)
+    points = board_points(scene.board)
+    low, high = board_extent(scene.board)
+    outline = np.array(
+        [[low[0], low[1], 0], [high[0], low[1], 0], [high[0], high[1], 0], [low[0], high[1], 0]]
+    )
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2
+    R, t = camera_from_board[:3, :3], camera_from_board[:3, 3]
+    seen = np.vstack([centre, outline]) @ R.T + t
+    pixels = project(scene.camera, np.maximum(seen, [-np.inf, -np.inf, 0.02])).pixels
+    area = abs(float(cv2.contourArea(pixels[1:].astype(np.float32))))
+    return ExpectedView(
+        distance_m=float(np.linalg.norm(seen[0])),
+        tilt_rad=float(np.arccos(np.clip(R[2, 2], -1, 1))),
+        # About the optical axis, after the tilt's shortest turn is taken off.
+        roll_rad=float(np.arctan2(R[1, 0] - R[0, 1], R[0, 0] + R[1, 1])),
+        centre_px=(float(pixels[0, 0]), float(pixels[0, 1])),
+        coverage=min(1.0, area / (scene.camera.width * scene.camera.height)),
+    )
+
+
+def planned_pose(
+    scene: Scene, number: int, joints_rad: Array, base_from_flange: Array, sigma_m: float | None
+) -> PlannedPose:
+    """A pose of the plan with its expected view and the reason in a few words."""
+    view = expected_view(scene, base_from_flange)
+    return PlannedPose(
+        name=f"p{number + 1:02d}",
+        joints_rad=vector6(joints_rad),
+        base_from_flange=matrix4(base_from_flange),
+        view=view,
+        why=_why(scene, view),
+        predicted_sigma_m=sigma_m,
+    )
+
+
+def _why(scene: Scene, view: ExpectedView) -> str:
+    half = np.array([scene.camera.width, scene.camera.height]) / 2
+    x, y = (np.array(view.centre_px) - half) / half
+    side = " ".join(
+        word
+        for word, on in (("up", y < -0.1), ("down", y > 0.1), ("left", x < -0.1), ("right", x > 0.1))
+        if on
+    )
+    return (
+        f"{1000 * view.distance_m:.0f} mm, tilt {np.rad2deg(view.tilt_rad):.0f}°, "
+        f"roll {np.rad2deg(view.roll_rad):+.0f}°, board {side or 'centred'}"
+    )

@@ -10,9 +10,10 @@ import msgspec
 import numpy as np
 
 from calibrate.geometry import Array, inverse, pose_from_rotvec
-from recordings.schema.messages import Image, Matrix4, RobotState, Stamps, Stillness, Vector6, View
+from recordings.schema.messages import Image, RobotState, Stamps, Stillness, Vector6, View
 from station.analysis.pool import WorkerError
 from station.analysis.worker import Sighting, sight
+from station.cell.config import matrix4
 from station.cell.errors import CameraError, StaleStateError, StationError
 from station.cell.status import PoseState, StationState
 from station.devices.frames import mid_exposure
@@ -109,10 +110,6 @@ def flange_pose(state: RobotState, tcp_offset: Vector6) -> Array:
     """base_from_flange (4, 4): the controller's own tool pose without the tool."""
     base_from_tcp = pose_from_rotvec(state.tcp_pose[:3], state.tcp_pose[3:])
     return np.asarray(base_from_tcp @ inverse(pose_from_rotvec(tcp_offset[:3], tcp_offset[3:])))
-
-
-def matrix4(matrix: Array) -> Matrix4:
-    return tuple(tuple(float(x) for x in row) for row in matrix)
 
 
 def _view(

@@ -21,7 +21,7 @@ from calibrate.kinematics import forward
 from calibrate.views import BoardView
 from recordings.schema.messages import Vector6
 from station.analysis.worker import sight
-from station.cell.config import PointerConfig
+from station.cell.config import PointerConfig, matrix4
 from station.cell.errors import LimitError, RefusedError, RobotError
 from station.cell.plan import plan_sha256
 from station.cell.status import GoSummary, HoverOffer, StationState
@@ -29,7 +29,7 @@ from station.cell.stillness import NotStillError
 from station.plan.hover import Hover, HoverAnswer, HoverQuestion, answer_hover, least_standoff_m
 from station.protocol import verbs
 from station.session.bench import Bench
-from station.session.capture import flange_pose, matrix4
+from station.session.capture import flange_pose
 from station.session.guard import JOGGED_RAD, displacement
 from station.session.lease import Go, GoDesk
 from station.session.patience import RestingCheck

@@ -10,6 +10,7 @@ import msgspec
 
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import RobotState
+from station.cell.config import matrix4
 from station.cell.errors import RobotError
 from station.cell.limits import SPEED_CAP_M_S, point_speed_m_s
 from station.cell.session_folder import CALIBRATION_FILE
@@ -24,7 +25,7 @@ from station.cell.status import (
 from station.devices.ur_condition import mode_word, program_word, safety_word, what_holds
 from station.protocol.states import RUNNING
 from station.session.bench import Bench
-from station.session.capture import flange_pose, matrix4
+from station.session.capture import flange_pose
 
 DISK_PERIOD_S = 2.0
 FPS_PERIOD_S = 2.0

@@ -23,9 +23,9 @@ from station.cell.errors import (
     TriggerError,
 )
 from station.cell.limits import check_path, with_plan_speeds
+from station.cell.scene import geometry_from
 from station.cell.status import Event, StationState
 from station.cell.stillness import NotStillError
-from station.plan.standing import geometry_from
 from station.session.bench import Bench
 from station.session.capture import PoseFailedError, take_pose
 from station.session.guard import JOGGED_RAD

@@ -63,15 +63,3 @@ def read_truth(path: Path) -> CellTruth:
         raise ConfigError(
             f"{path}: no truth of a simulated cell ({error}); make one with make_cell"
         ) from error
-
-
-def make_cell(
-    scene: SceneName = "paper", seed: int = 0, noise: NoiseLevel = "low", mount: Mount = "eye-in-hand"
-) -> CellTruth:
-    """The truth of a cell; the same arguments give the same cell. ConfigError for an unknown name.
-
-    Seed 0 is the scene as published; see `scenes`.
-    """
-    from station.simulation.scenes import build_cell  # the controller reads truths and plans nothing
-
-    return build_cell(scene, seed, noise, mount)

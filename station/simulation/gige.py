@@ -30,8 +30,9 @@ from station.cell.errors import CameraError, RobotError
 from station.devices.pixels import encode
 from station.simulation import genicam
 from station.simulation.camera_process import CameraProcess
-from station.simulation.cell import CellTruth, make_cell, read_truth
+from station.simulation.cell import CellTruth, read_truth
 from station.simulation.renderer import render
+from station.simulation.scenes import make_cell
 
 LIBRARY = "libaravis-0.8.so.0"
 CONTROL_PORT = 3956

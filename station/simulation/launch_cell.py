@@ -14,8 +14,9 @@ from station.cell.config import StationConfig, TriggerConfig
 from station.cell.errors import ConfigError, StationError
 from station.devices.base import Camera, Trigger
 from station.devices.cell import Cell
-from station.simulation.cell import CellTruth, NoiseLevel, SceneName, make_cell, write_truth
+from station.simulation.cell import CellTruth, NoiseLevel, SceneName, write_truth
 from station.simulation.launch import start_controller
+from station.simulation.scenes import make_cell
 
 if TYPE_CHECKING:
     from station.simulation.trigger import SimulatedTriggerBox
@@ -128,7 +129,7 @@ def _camera(
         wires.camera = rendered.pulse
         return config, rendered, lambda: None
     from station.devices.aravis import AravisCamera
-    from station.simulation.gige_launch import start_gige
+    from station.simulation.launch import start_gige
 
     free = options.frame_rate_hz > 0
     serial = f"SIM{options.seed:05d}"

@@ -11,15 +11,15 @@ from typing import NamedTuple
 import numpy as np
 
 from calibrate.boards.model import board_points
-from calibrate.geometry import Array, inverse, pose, quaternion_from_matrix, rotation_exp, transform_points
+from calibrate.geometry import Array, inverse, pose, rotation_exp, transform_points
 from calibrate.kinematics import MODELS, forward, inverse_all, singularity_measure
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
 from station.cell.collision import body_segments, margins, segment_distance
 from station.cell.config import CameraConfig, LimitsConfig, Plane, PoseGuess, RobotConfig, StationConfig
 from station.cell.errors import ConfigError
-from station.cell.scene import Scene, scene_of
+from station.cell.scene import Scene, guess_from, scene_of
 from station.plan.candidates import find_candidates
-from station.plan.view_range import view_range
+from station.plan.visibility import view_range
 
 ROBOT = "UR10"
 TABLE = Plane("table", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
@@ -67,16 +67,6 @@ def cell_description(
         camera_guess=camera_guess,
         board_guess=board_guess,
         limits=LimitsConfig(planes=(TABLE,)),
-    )
-
-
-def guess_of(matrix: Array, sigma_m: float, sigma_rad: float) -> PoseGuess:
-    t, q = matrix[:3, 3], quaternion_from_matrix(matrix[:3, :3])
-    return PoseGuess(
-        (float(t[0]), float(t[1]), float(t[2])),
-        (float(q[0]), float(q[1]), float(q[2]), float(q[3])),
-        sigma_m,
-        sigma_rad,
     )
 
 
@@ -145,7 +135,7 @@ def _random_turn(rng: np.random.Generator) -> Array:
 def _exact_scene(mount: Mount, camera: CameraModel, board: BoardSpec, X: Array, Y: Array) -> Scene:
     # 20 mm of doubt about what stands in the cell: room for the guesses that the configuration hands out.
     camera_sigma_m, board_sigma_m = (0.0, 0.02) if mount == "eye-in-hand" else (0.02, 0.0)
-    guesses = guess_of(X, camera_sigma_m, 0.0), guess_of(Y, board_sigma_m, 0.0)
+    guesses = guess_from(X, camera_sigma_m, 0.0), guess_from(Y, board_sigma_m, 0.0)
     return scene_of(cell_description(mount, camera, board, *guesses))
 
 

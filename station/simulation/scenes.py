@@ -10,19 +10,18 @@ from typing import NamedTuple
 
 import msgspec
 import numpy as np
-from numpy.typing import ArrayLike
 
 from calibrate.geometry import Array, pose, project_to_rotation, random_rotation, rotation_exp
 from calibrate.kinematics import MODELS, forward
 from recordings.schema.messages import BoardSpec, CameraModel, Matrix4, Mount, Vector6
-from station.cell.config import BLOG_BOARD, PAPER_BOARD, PoseGuess, StationConfig
+from station.cell.config import BLOG_BOARD, PAPER_BOARD, PoseGuess, StationConfig, matrix4, vector6
 from station.cell.errors import ConfigError
+from station.cell.scene import guess_from
 from station.simulation.cell import CellTruth, NoiseLevel, SceneName
 from station.simulation.placement import (
     Placement,
     board_centre,
     cell_description,
-    guess_of,
     place_fixed_camera,
     place_moving_camera,
 )
@@ -62,7 +61,9 @@ _NOISE = {
 }
 
 
-def build_cell(scene: SceneName, seed: int, noise: NoiseLevel, mount: Mount) -> CellTruth:
+def make_cell(
+    scene: SceneName = "paper", seed: int = 0, noise: NoiseLevel = "low", mount: Mount = "eye-in-hand"
+) -> CellTruth:
     """The truth of a cell; the same arguments give the same cell. ConfigError for an unknown name."""
     scenes = {"paper": _paper_scene, "blog": _blog_scene, "paper-binned": _paper_binned_scene}
     if scene not in scenes or noise not in _NOISE or mount not in ("eye-in-hand", "eye-to-hand"):
@@ -81,9 +82,9 @@ def build_cell(scene: SceneName, seed: int, noise: NoiseLevel, mount: Mount) -> 
         robot_model="UR10",
         board=published.board,
         camera=camera,
-        camera_mount=_matrix4(placed.camera_mount),
-        board_place=_matrix4(placed.board_place),
-        start_joints_rad=_vector6(placed.start_joints_rad),
+        camera_mount=matrix4(placed.camera_mount),
+        board_place=matrix4(placed.board_place),
+        start_joints_rad=vector6(placed.start_joints_rad),
     )
     return _with_noise(truth, _NOISE[noise], rng)
 
@@ -158,7 +159,7 @@ def _with_noise(truth: CellTruth, level: _Noise, rng: np.random.Generator) -> Ce
     spread = 1.0 if truth.seed == 0 else float(rng.uniform(0.8, 1.2))
 
     def deltas(sigma: float) -> Vector6:
-        return _vector6(rng.normal(0, sigma, 6) if sigma else np.zeros(6))
+        return vector6(rng.normal(0, sigma, 6) if sigma else np.zeros(6))
 
     return msgspec.structs.replace(
         truth,
@@ -176,15 +177,6 @@ def _with_noise(truth: CellTruth, level: _Noise, rng: np.random.Generator) -> Ce
     )
 
 
-def _matrix4(matrix: Array) -> Matrix4:
-    return tuple(tuple(float(x) for x in row) for row in matrix)
-
-
-def _vector6(values: ArrayLike) -> Vector6:
-    a, b, c, d, e, f = (float(x) for x in np.asarray(values))
-    return a, b, c, d, e, f
-
-
 def cell_config(truth: CellTruth, host: str = "") -> StationConfig:
     """What an operator with a tape measure would write down: guesses of mount, board and lens, all a bit off.
 
@@ -198,7 +190,7 @@ def cell_config(truth: CellTruth, host: str = "") -> StationConfig:
             np.clip(rng.normal(0, _GUESS_RAD, 3), -2 * _GUESS_RAD, 2 * _GUESS_RAD)
         )
         moved = M[:3, 3] + np.clip(rng.normal(0, _GUESS_M, 3), -2 * _GUESS_M, 2 * _GUESS_M)
-        return guess_of(pose(turned, moved), _GUESS_M, _GUESS_RAD)
+        return guess_from(pose(turned, moved), _GUESS_M, _GUESS_RAD)
 
     assert truth.camera.matrix is not None
     focal_px = round(truth.camera.matrix[0][0], -1)

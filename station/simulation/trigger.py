@@ -9,7 +9,7 @@ import time
 import tty
 from collections.abc import Callable
 
-from station.devices.trigger_lines import PRODUCT, PROTOCOL, LineReader, frame
+from station.devices.serial_trigger import PRODUCT, PROTOCOL, LineReader, frame
 
 _COUNTS = 1 << 32
 _SERIAL = "SIM1"

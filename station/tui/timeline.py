@@ -7,10 +7,11 @@ from pathlib import Path
 import msgspec
 import numpy as np
 
-from calibrate.geometry import Array, pose_from_rotvec
+from calibrate.geometry import pose_from_rotvec
 from recordings.plain_text import plain_text
 from recordings.reader import open_recording
-from recordings.schema.messages import CaptureEvent, Matrix4, RobotState, View
+from recordings.schema.messages import CaptureEvent, RobotState, View
+from station.cell.config import matrix4
 from station.cell.status import (
     CameraStatus,
     EstimateStatus,
@@ -130,7 +131,7 @@ class Timeline:
         return msgspec.structs.replace(
             status,
             joints_rad=state.joints_rad,
-            base_from_flange=_rows(base_from_tcp @ np.linalg.inv(flange_from_tcp)),
+            base_from_flange=matrix4(base_from_tcp @ np.linalg.inv(flange_from_tcp)),
         )
 
     def _pose(self, number: int, done: int, state: StationState) -> PoseStatus:
@@ -171,7 +172,3 @@ def _state(robot: RobotState | None) -> StationState:
 def _event(event: CaptureEvent) -> Event:
     text = plain_text(event.detail or event.kind)
     return Event(event.stamps.host_wall_ns, event.level, text, event.pose_index)
-
-
-def _rows(matrix: Array) -> Matrix4:
-    return tuple(tuple(float(x) for x in row) for row in matrix)

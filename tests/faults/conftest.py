@@ -17,10 +17,10 @@ import pytest
 from station.cell.config import RobotConfig
 from station.cell.errors import RobotError
 from station.devices.ur import UrRobot
-from station.simulation.admin import AdminClient
 from station.simulation.camera import RenderedCamera
-from station.simulation.cell import make_cell, write_truth
-from station.simulation.launch import SimulatedController
+from station.simulation.cell import write_truth
+from station.simulation.launch import AdminClient, SimulatedController
+from station.simulation.scenes import make_cell
 
 AT_REST_RAD_S = 1e-3
 FAR_RAD = 1.5

@@ -21,7 +21,7 @@ from station.cell.errors import CameraError
 from station.devices.aravis import AravisCamera
 from station.simulation import genicam
 from station.simulation.gige import numbered_picture
-from station.simulation.gige_launch import SimulatedGige, start_gige
+from station.simulation.launch import SimulatedGige, start_gige
 from tests.faults.lossy_wire import LossyWire
 
 pytestmark = pytest.mark.gige
@@ -169,7 +169,7 @@ _LOST_AND_FORGOTTEN = """
 import gc, sys, time
 from station.cell.config import CameraConfig
 from station.devices.aravis_device import GenicamDevice
-from station.simulation.gige_launch import start_gige
+from station.simulation.launch import start_gige
 
 with start_gige(numbered=True, serial="KJ0042") as server:
     device = GenicamDevice(CameraConfig(device="127.0.0.1", packet_size=8996))

@@ -6,7 +6,7 @@ import pytest
 
 from station.analysis.picture_motion import picture_motion
 from station.simulation.camera import RenderedCamera
-from station.simulation.cell import make_cell
+from station.simulation.scenes import make_cell
 
 pytestmark = pytest.mark.process
 

@@ -17,8 +17,7 @@ from station.cell.plan import Plan, PlannedPose
 from station.cell.status import StationState as S
 from station.devices.ur import UrRobot
 from station.protocol.verbs import Purpose
-from station.simulation.admin import AdminClient
-from station.simulation.launch import SimulatedController
+from station.simulation.launch import AdminClient, SimulatedController
 from tests.station.session_rig import TRUTH, Rig
 
 pytestmark = pytest.mark.process

@@ -25,8 +25,7 @@ from station.devices.cell import Cell
 from station.devices.frames import CameraCounts
 from station.protocol.verbs import Purpose
 from station.session import Session
-from station.simulation.cell import make_cell
-from station.simulation.scenes import cell_config
+from station.simulation.scenes import cell_config, make_cell
 
 TRUTH = make_cell()
 POSES = 4

@@ -24,10 +24,9 @@ from station.cell.plan import Plan
 from station.cell.status import StationState, StationStatus
 from station.plan.planner import make_plan
 from station.protocol.client import Client
-from station.simulation.admin import AdminClient
-from station.simulation.cell import make_cell, write_truth
-from station.simulation.launch import SimulatedController
-from station.simulation.scenes import cell_config
+from station.simulation.cell import write_truth
+from station.simulation.launch import AdminClient, SimulatedController
+from station.simulation.scenes import cell_config, make_cell
 
 TRUTH = make_cell(seed=5)
 AT_REST_RAD_S = 1e-3

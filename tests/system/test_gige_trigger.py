@@ -13,8 +13,7 @@ from station.devices.frames import frames_between
 from station.operate.attend import carry_out, wait_until_idle
 from station.plan.planner import make_plan
 from station.protocol.client import Client
-from station.simulation.cell import make_cell
-from station.simulation.scenes import cell_config
+from station.simulation.scenes import cell_config, make_cell
 
 POSES = 3
 

@@ -14,7 +14,7 @@ from station.cell.errors import StationError
 from station.simulation.controller.admin import AdminServer
 from station.simulation.controller.kinematics import TABLES
 from station.simulation.controller.machine import Machine
-from station.simulation.controller.robot import Settings
+from station.simulation.controller.state import Settings
 
 PARENT_POLL_S = 0.5
 

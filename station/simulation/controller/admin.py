@@ -8,65 +8,240 @@ from __future__ import annotations
 import asyncio
 import json
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Sequence
+from math import inf, isfinite
 from typing import Any
 
-from station.simulation.controller.admin_faults import FAULTS
-from station.simulation.controller.admin_hands import HANDS
+from station.simulation.controller.arm import Vibration
+from station.simulation.controller.kinematics import DhTable, Six
 from station.simulation.controller.machine import Machine
+from station.simulation.controller.network import Cut
+from station.simulation.controller.paths import Path, PolylinePath
+from station.simulation.controller.programs import ForeignProgram
+from station.simulation.controller.rtde_server import ADMIN
 
 PORT = 29990
 LINE_LIMIT = 1_000_000
 TRUTH_WAIT_S = 2.0
 
 Command = Callable[..., Awaitable[dict[str, Any] | None] | dict[str, Any] | None]
+HAND_RAD_S2 = 2.0
 
 
-class AdminServer:
-    def __init__(self, machine: Machine) -> None:
-        self._machine = machine
-        self._commands: dict[str, Command] = {
-            **FAULTS,
-            **HANDS,
-            "help": self._help,
-            "truth": truth,
-            "state": state,
-            "stats": stats,
-            "log": log,
-        }
+def number(name: str, value: float, low: float = -inf, high: float = inf) -> float:
+    """A finite number within low…high."""
+    checked = float(value)
+    if not (isfinite(checked) and low <= checked <= high):
+        raise ValueError(f"{name} must be a number in {low:g}…{high:g}, not {value}")
+    return checked
 
-    async def open(self) -> asyncio.Server:
-        return await asyncio.start_server(self._serve, self._machine.host, PORT, limit=LINE_LIMIT)
 
-    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        try:
-            while line := await reader.readline():
-                answer = await self._answer(line)
-                writer.write(json.dumps(answer).encode() + b"\n")
-                await writer.drain()
-        except (ValueError, ConnectionError):
-            pass  # an endless line, or the client left
-        finally:
-            writer.close()
+def numbers(name: str, values: Sequence[float] | None, count: int) -> Six:
+    """Exactly so many finite numbers; zeros for None."""
+    if values is None:
+        return (0.0,) * count
+    if not isinstance(values, list | tuple) or len(values) != count:
+        raise ValueError(f"{name}: expected {count} numbers, not {values}")
+    return tuple(number(name, value) for value in values)
 
-    async def _answer(self, line: bytes) -> dict[str, Any]:
-        try:
-            request = json.loads(line)
-            name = request.pop("cmd")
-            command = self._commands[name]
-        except (ValueError, KeyError, AttributeError, TypeError):
-            return {"ok": False, "error": 'expected {"cmd": name, …}; {"cmd": "help"} lists the names'}
-        try:
-            result = command(self._machine, **request)
-            if result is not None and not isinstance(result, dict):
-                result = await result
-        except (TypeError, ValueError, LookupError) as error:
-            return {"ok": False, "error": f"{name}: {error}"}
-        return {"ok": True, **(result or {})}
 
-    def _help(self, _: Machine) -> dict[str, Any]:
-        """This list."""
-        return {"commands": {n: " ".join((c.__doc__ or "").split()) for n, c in self._commands.items()}}
+def pstop(machine: Machine) -> None:
+    """Protective stop now."""
+    machine.robot.protective_stop("admin")
+
+
+def estop(machine: Machine, on: bool = True) -> None:
+    """Emergency stop button pressed (on) or pulled out again; afterwards the arm has no power: `run`."""
+    machine.robot.emergency_stop(on)
+
+
+def safeguard(machine: Machine, on: bool = True) -> None:
+    """Safeguard stop: the program pauses; released, it stays paused until `play`."""
+    machine.robot.safeguard(on)
+
+
+def power_off(machine: Machine) -> None:
+    """The arm loses power."""
+    machine.robot.power_off()
+
+
+def drop(machine: Machine, how: Cut = "fin", ports: list[str] | None = None) -> dict[str, Any]:
+    """Cuts every connection of these ports (rtde, script, dashboard; all if none named) by fin or rst."""
+    if how not in ("fin", "rst"):
+        raise ValueError(f"how is fin or rst, not {how}")
+    return {"cut": machine.cut(how, ports)}
+
+
+def stall(machine: Machine, on: bool = True) -> None:
+    """RTDE links stay open but no data comes; everything else works."""
+    machine.rtde.stalled = on
+
+
+def freeze(machine: Machine, on: bool = True) -> None:
+    """RTDE sends the same packet for ever: the timestamp stands still on a live link."""
+    machine.rtde.frozen = on
+
+
+def mute(machine: Machine, on: bool = True, ports: list[str] | None = None) -> None:
+    """Ports accept connections, but what arrives is lost and nothing is answered."""
+    for service in machine.chosen(ports):
+        service.silent = on
+
+
+def stall_dash(machine: Machine, on: bool = True) -> None:
+    """The dashboard accepts connections and never says a word."""
+    machine.dashboard.silent = on
+
+
+def black_hole(machine: Machine, on: bool = True, ports: list[str] | None = None) -> None:
+    """As a cable pulled out: links carry nothing, connecting hangs."""
+    for service in machine.chosen(ports):
+        service.black_hole(on)
+
+
+def restart(machine: Machine, down_s: float = 1.0, running: bool = False) -> None:
+    """The controller reboots: links reset, ports closed for down_s, time 0, no power unless running."""
+    machine.reboot(number("down_s", down_s, 0.0, 60.0), running)
+
+
+def late(machine: Machine, ms: float) -> None:
+    """No cycle runs for this long; then all that were due run at once (a hiccup of the simulation)."""
+    machine.clock.hold_until_ns = time.monotonic_ns() + int(number("ms", ms, 0.0, 60_000.0) * 1e6)
+
+
+def delay(machine: Machine, ms: float) -> None:
+    """Every data packet leaves this much later from now on (0 = none): a slow network."""
+    machine.rtde.delay_s = number("ms", ms, 0.0, 10_000.0) / 1000
+
+
+def lose(machine: Machine, packets: int) -> None:
+    """The next cycles' data packets are never sent."""
+    machine.lose_packets = int(number("packets", packets, 0))
+
+
+def in_use(machine: Machine, inputs: list[str], on: bool = True) -> None:
+    """Another RTDE client owns these input variables (e.g. "input_int_register_0")."""
+    for name in inputs:
+        if name not in machine.robot.inputs.types:
+            raise ValueError(f"there is no input variable {name}")
+        if not on:
+            machine.rtde.claims.pop(name, None)
+        elif not machine.rtde.claim(name, ADMIN):
+            raise ValueError(f"{name} is owned by a client already")
+
+
+def vibrate(
+    machine: Machine,
+    amplitude_rad: float,
+    frequency_hz: float = 12.0,
+    decay_s: float | None = None,
+    joint: int = 1,
+) -> None:
+    """A joint shakes about its rest: for ever, or fading after each motion. amplitude_rad 0 ends it."""
+    vibration = Vibration(
+        number("amplitude_rad", amplitude_rad, 0.0, 0.1),
+        number("frequency_hz", frequency_hz, 0.0),
+        None if decay_s is None else number("decay_s", decay_s, 1e-3),
+        int(number("joint", joint, 0, 5)),
+    )
+    machine.robot.arm.vibration = vibration if vibration.amplitude_rad > 0 else None
+
+
+def offset(machine: Machine, joints_rad: list[float] | None = None) -> None:
+    """From the next motion on the arm rests this much short of its command (none: as commanded)."""
+    machine.robot.arm.offset = numbers("joints_rad", joints_rad, 6)
+
+
+def dh(
+    machine: Machine,
+    a_m: list[float] | None = None,
+    d_m: list[float] | None = None,
+    alpha_rad: list[float] | None = None,
+    theta_rad: list[float] | None = None,
+) -> None:
+    """The true arm differs from the nominal table by these; what the controller reports does not."""
+    nominal: DhTable = machine.robot.table
+    machine.robot.true_table = nominal.plus(
+        numbers("a_m", a_m, 6),
+        numbers("d_m", d_m, 6),
+        numbers("alpha_rad", alpha_rad, 6),
+        numbers("theta_rad", theta_rad, 6),
+    )
+
+
+def unlock(machine: Machine) -> dict[str, Any]:
+    """A person clears the protective stop (refused within 5 s of it). Not in the dashboard's log."""
+    return {"unlocked": machine.robot.unlock()}
+
+
+def run(machine: Machine) -> None:
+    """A person powers the arm on and releases the brakes."""
+    machine.robot.power_on()
+    machine.robot.release_brakes()
+
+
+def stop_program(machine: Machine) -> None:
+    """Stop pressed on the pendant."""
+    machine.robot.stop_program("pendant")
+
+
+def pause(machine: Machine) -> dict[str, Any]:
+    """Pause pressed on the pendant."""
+    return {"paused": machine.robot.pause_program()}
+
+
+def play(machine: Machine) -> dict[str, Any]:
+    """Play pressed on the pendant: a paused program goes on."""
+    return {"playing": machine.robot.play_program()}
+
+
+def foreign(machine: Machine, name: str = "palletising.urp") -> None:
+    """Somebody else's program starts."""
+    machine.robot.start_program(ForeignProgram(name))
+
+
+def slider(machine: Machine, fraction: float) -> None:
+    """Speed slider on the pendant, 0…1."""
+    machine.robot.slider = number("fraction", fraction, 0.0, 1.0)
+
+
+def remote(machine: Machine, on: bool = True) -> None:
+    """Remote (on) or local control (e-Series). Going local stops a remotely started program."""
+    robot = machine.robot
+    if robot.remote and not on and robot.settings.is_e_series:
+        robot.stop_program("local control")
+    robot.remote = on
+
+
+def tcp(machine: Machine, pose: list[float]) -> None:
+    """TCP of the installation: x y z [m], rotation vector [rad], in the flange."""
+    machine.robot.tcp = numbers("pose", pose, 6)
+
+
+def payload(machine: Machine, kg: float, cog_m: list[float] | None = None) -> None:
+    """Payload of the installation."""
+    machine.robot.payload_kg = number("kg", kg, 0.0)
+    machine.robot.payload_cog = numbers("cog_m", cog_m, 3)
+
+
+def jog(machine: Machine, joints_rad: list[float], speed_rad_s: float = 0.5) -> dict[str, Any]:
+    """Moves the arm with the pendant's arrows. Refused while a program plays or the arm has no power."""
+    return hand_move(machine, [joints_rad], speed_rad_s)
+
+
+def hand_move(machine: Machine, path: list[list[float]], speed_rad_s: float = 0.5) -> dict[str, Any]:
+    """A person leads the arm through these joints (free-drive), the fastest joint at speed_rad_s."""
+    robot = machine.robot
+    corners = [numbers("path", corner, 6) for corner in path]
+    speed_rad_s = number("speed_rad_s", speed_rad_s, 1e-3, 100.0)
+
+    def make_path(start: Six) -> Path:
+        return PolylinePath([start, *corners])
+
+    length_rad = PolylinePath([robot.arm.command, *corners]).length
+    if not robot.lead(make_path, speed_rad_s, HAND_RAD_S2):
+        raise ValueError("the arm is not free: a program plays, a safety stop holds it, or it has no power")
+    return {"length_rad": length_rad}
 
 
 async def truth(machine: Machine, at_monotonic_ns: int | None = None) -> dict[str, Any]:
@@ -132,3 +307,51 @@ def log(machine: Machine, since_monotonic_ns: int = 0) -> dict[str, Any]:
     counts: how often each came, of all time."""
     journal = machine.robot.journal
     return {"entries": journal.entries(since_monotonic_ns), "counts": journal.counts}
+
+
+def list_commands(_: Machine) -> dict[str, Any]:
+    """This list."""
+    return {"commands": {name: " ".join((c.__doc__ or "").split()) for name, c in COMMANDS.items()}}
+
+
+_NAMED: tuple[Any, ...] = (
+    pstop, estop, safeguard, power_off, drop, stall, freeze, mute, stall_dash, black_hole, restart, late,
+    delay, lose, in_use, vibrate, offset, dh,
+    unlock, run, stop_program, pause, play, foreign, slider, remote, tcp, payload, jog, hand_move,
+    truth, state, stats, log,
+)  # fmt: skip
+COMMANDS: dict[str, Command] = {command.__name__: command for command in _NAMED} | {"help": list_commands}
+
+
+class AdminServer:
+    def __init__(self, machine: Machine) -> None:
+        self._machine = machine
+
+    async def open(self) -> asyncio.Server:
+        return await asyncio.start_server(self._serve, self._machine.host, PORT, limit=LINE_LIMIT)
+
+    async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
+        try:
+            while line := await reader.readline():
+                answer = await self._answer(line)
+                writer.write(json.dumps(answer).encode() + b"\n")
+                await writer.drain()
+        except (ValueError, ConnectionError):
+            pass  # an endless line, or the client left
+        finally:
+            writer.close()
+
+    async def _answer(self, line: bytes) -> dict[str, Any]:
+        try:
+            request = json.loads(line)
+            name = request.pop("cmd")
+            command = COMMANDS[name]
+        except (ValueError, KeyError, AttributeError, TypeError):
+            return {"ok": False, "error": 'expected {"cmd": name, …}; {"cmd": "help"} lists the names'}
+        try:
+            result = command(self._machine, **request)
+            if result is not None and not isinstance(result, dict):
+                result = await result
+        except (TypeError, ValueError, LookupError) as error:
+            return {"ok": False, "error": f"{name}: {error}"}
+        return {"ok": True, **(result or {})}

@@ -5,18 +5,12 @@ Knows no socket, so that every rule here can be tested without one.
 
 from __future__ import annotations
 
-import random
 from collections import deque
-from dataclasses import dataclass
 from math import inf
 
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode
-from station.simulation.controller.arm import PROGRAM_END_RAD_S2, Arm, MakePath, Motion
-from station.simulation.controller.history import History
-from station.simulation.controller.journal import Journal
+from station.simulation.controller.arm import PROGRAM_END_RAD_S2, MakePath, Motion
 from station.simulation.controller.kinematics import (
-    TABLES,
-    DhTable,
     Rigid,
     Six,
     compose,
@@ -24,87 +18,26 @@ from station.simulation.controller.kinematics import (
     from_rotvec,
 )
 from station.simulation.controller.paths import UnreachableError
-from station.simulation.controller.programs import CustomScript, ForeignProgram, Program, ScriptError
-from station.simulation.controller.publisher import Publisher
+from station.simulation.controller.programs import CustomScript, ForeignProgram, Program, ScriptError, Upload
 from station.simulation.controller.script import ControlScript
-from station.simulation.controller.uploads import Upload
-from station.simulation.controller.variables import INPUT_TYPES, OUTPUT_TYPES, VariableStore
+from station.simulation.controller.state import ControllerState, Journal, Settings
 
 PROGRAM_START_S = 0.05
 UNLOCK_AFTER_S = 5.0
 _DIGITAL_OUTPUTS = {"standard_digital": 0, "configurable_digital": 8, "tool_digital": 16}
 """Kind → first bit of `actual_digital_output_bits`."""
-CB3_VERSION = (3, 15, 8, 106339)
-E_SERIES_VERSION = (5, 11, 1, 108318)
 
 
-@dataclass(frozen=True)
-class Settings:
-    model: str = "UR10"
-    start_joints_rad: Six = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
-    serial: str = "20263000001"
-    time_scale: float = 1.0
-    """The arm moves this many times faster than it says; clocks stay real. For tests."""
-    sigma_m: float = 0.0
-    sigma_rad: float = 0.0
-    seed: int = 0
-    dh_delta: tuple[Six, Six, Six, Six] = ((0.0,) * 6,) * 4
-    """a_m, d_m, alpha_rad, theta_rad of the true arm against the nominal table."""
-    remote: bool = True
-    paused_by_protective_stop: bool = True
-    """runtime_state after a protective stop: paused (4), else stopped (1)."""
-    input_delay_cycles: int = 0
-    """Registers act this many cycles later than the next one."""
-
-    @property
-    def is_e_series(self) -> bool:
-        return self.model.endswith("e")
-
-    @property
-    def version(self) -> tuple[int, int, int, int]:
-        return E_SERIES_VERSION if self.is_e_series else CB3_VERSION
-
-    @property
-    def rate_hz(self) -> int:
-        return 500 if self.is_e_series else 125
-
-
-class SimulatedRobot:
+class SimulatedRobot(ControllerState):
     def __init__(self, settings: Settings, journal: Journal) -> None:
-        self.settings = settings
-        self.journal = journal
-        self.dt_s = 1.0 / settings.rate_hz
-        self.table = TABLES[settings.model]
-        self.true_table: DhTable = self.table.plus(*settings.dh_delta)
-        self._random = random.Random(settings.seed)
-        self.arm = Arm(self.table, settings.start_joints_rad, self._draw_miss)
-        self.history = History(self.dt_s)
-        self.inputs = VariableStore(INPUT_TYPES)
-        self.outputs = VariableStore(OUTPUT_TYPES)
+        super().__init__(settings, journal)
         self._waiting: deque[tuple[int, tuple[str, ...], tuple[float, ...]]] = deque()
         """Inputs on their way: cycle in which they act, names, elements."""
-        self.tcp: Six = (0.0,) * 6
-        self.payload_kg = 0.0
-        self.payload_cog: Six = (0.0,) * 3
-        self.robot_mode = RobotMode.RUNNING
-        self.safety_mode = SafetyMode.NORMAL
-        self.runtime_state = RuntimeState.STOPPED
-        self.remote = settings.remote
-        self.slider = 1.0
         self.program: Program | None = None
         self._starting: tuple[int, Program] | None = None
-        self.ticks = 0
-        self.time_s = 0.0
         self._safety_since_s = -inf
-        self.watchdog_s = 0.0
-        """Longest silence of the command register that is allowed; 0 = none."""
         self._silence_s = 0.0
         self._hands: Motion | None = None
-        self._publisher = Publisher(self)
-
-    def _draw_miss(self) -> Six:
-        m, rad = self.settings.sigma_m, self.settings.sigma_rad
-        return tuple(self._random.gauss(0.0, sigma) for sigma in (m, m, m, rad, rad, rad))
 
     # -- one cycle ----------------------------------------------------------------------------------
 
@@ -128,7 +61,7 @@ class SimulatedRobot:
         except UnreachableError as error:
             self.protective_stop(str(error))
         self.history.add(monotonic_ns, self.arm.actual, self.arm.miss)
-        self._publisher.publish()
+        self.publish()
 
     def _count_down(self) -> None:
         assert self._starting is not None
@@ -304,14 +237,11 @@ class SimulatedRobot:
             self.robot_mode = RobotMode.RUNNING
 
     def reset(self, running: bool) -> None:
-        """After a reboot: time 0, empty registers; installation and the arm's place survive."""
-        self.inputs, self.outputs = VariableStore(INPUT_TYPES), VariableStore(OUTPUT_TYPES)
-        self.history = History(self.dt_s)
+        """After a reboot."""
         self._waiting.clear()
-        self.ticks, self.time_s, self.slider = 0, 0.0, 1.0
+        self.clear()
         self._safety(SafetyMode.NORMAL)
         self.robot_mode = RobotMode.RUNNING if running else RobotMode.POWER_OFF
-        self._publisher = Publisher(self)
 
     def _safety(self, mode: SafetyMode) -> None:
         if mode != self.safety_mode:

@@ -7,10 +7,10 @@ output int 0 = state (1 ready, 2 done), output int 1 / doubles = results, output
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from math import isfinite
-from typing import TYPE_CHECKING
 
-from station.simulation.controller.arm import MakePath
+from station.simulation.controller.arm import Arm, MakePath, Motion
 from station.simulation.controller.kinematics import (
     JOINT_LIMIT_RAD,
     Rigid,
@@ -22,13 +22,9 @@ from station.simulation.controller.kinematics import (
     invert,
     to_pose,
 )
-from station.simulation.controller.operation import AsyncWord, MoveStep, Operation
 from station.simulation.controller.paths import JointPath, LinePath, UnreachableError
-from station.simulation.controller.programs import ScriptError
-
-if TYPE_CHECKING:
-    from station.simulation.controller.robot import SimulatedRobot
-    from station.simulation.controller.uploads import PathStep, Upload
+from station.simulation.controller.programs import PathStep, ScriptError, Upload
+from station.simulation.controller.state import ControllerState
 
 READY, DONE = 1, 2
 STEADY_RAD_S = 1e-3
@@ -58,8 +54,89 @@ REALTIME = frozenset({6, 9, 10, 11, 24, 25, 26, 27, 38, 58, *range(66, 72)})
 """Processed every cycle while the id stands in the register."""
 
 
+class AsyncWord:
+    """bits 24–30 operation id, 16–22 change counter, 15 running, 0–14 progress."""
+
+    def __init__(self, write: Callable[[int], None]) -> None:
+        self._write = write
+        self._operation = 0
+        self._change = 0
+
+    def start(self) -> None:
+        self._operation = (self._operation + 1) & 0x7F
+        self.progress(0)
+
+    def progress(self, value: int) -> None:
+        self._put(True, value & 0x7FFF)
+
+    def finish(self) -> None:
+        self._put(False, 0)
+
+    def _put(self, running: bool, progress: int) -> None:
+        self._change = (self._change + 1) & 0x7F
+        self._write(self._operation << 24 | self._change << 16 | running << 15 | progress)
+
+
+@dataclass(frozen=True)
+class MoveStep:
+    make_path: MakePath
+    speed: float
+    acceleration: float
+
+
+class Operation:
+    """Moves and progress marks, one after the other. With a word it reports itself there, from the cycle
+    after it was asked for; the arm begins at once."""
+
+    def __init__(self, arm: Arm, steps: list[MoveStep | int], word: AsyncWord | None) -> None:
+        self._arm = arm
+        self._steps = list(steps)
+        self._word = word
+        self._motion: Motion | None = None
+        self._started = word is None
+        if self._steps and isinstance(self._steps[0], MoveStep):
+            self._begin_move()
+
+    def _begin_move(self) -> None:
+        step = self._steps.pop(0)
+        assert isinstance(step, MoveStep)
+        self._motion = self._arm.start(step.make_path, step.speed, step.acceleration)
+
+    def kill(self) -> None:
+        """Another move or a stop takes over."""
+        if self._word is not None:
+            if not self._started:
+                self._word.start()
+            self._word.finish()
+
+    def step(self) -> bool:
+        """One cycle; True when everything is done. Raises UnreachableError."""
+        if not self._started:
+            self._started = True
+            assert self._word is not None
+            self._word.start()
+            return False
+        while True:
+            if self._motion is not None and not self._motion.done:
+                return False
+            self._motion = None
+            if self._arm.moving:
+                return False
+            if not self._steps:
+                break
+            if isinstance(self._steps[0], MoveStep):
+                self._begin_move()
+                continue
+            mark = self._steps.pop(0)
+            if self._word is not None and isinstance(mark, int):
+                self._word.progress(mark)
+        if self._word is not None:
+            self._word.finish()
+        return True
+
+
 class ControlScript:
-    def __init__(self, robot: SimulatedRobot, upload: Upload) -> None:
+    def __init__(self, robot: ControllerState, upload: Upload) -> None:
         self.name = upload.name
         self._robot = robot
         self.offset_int = upload.offset("int")

@@ -21,8 +21,8 @@ from recordings.reader import open_recording
 from recordings.schema.messages import CameraModel, Image, RobotState, SessionInfo, Stamps
 from recordings.writer import RecordingWriter
 from station.cell.config import PAPER_BOARD
-from station.simulation.cell import make_cell
 from station.simulation.renderer import Light, render, scaled
+from station.simulation.scenes import make_cell
 
 CELL = make_cell()
 LENS = scaled(CELL.camera, 0.375)

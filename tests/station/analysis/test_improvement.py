@@ -13,13 +13,13 @@ from calibrate.projection import project
 from station.analysis.improvement import better_guesses
 from station.cell.errors import RefusedError
 from station.plan.planner import make_plan
-from station.simulation.scenes import build_cell, cell_config
+from station.simulation.scenes import cell_config, make_cell
 
 
 @pytest.fixture(scope="module", params=["eye-in-hand", "eye-to-hand"])
 def captured(request):
     """A cell, its configuration, and eight noisy views of its plan."""
-    truth = build_cell("paper", 1, "low", request.param)
+    truth = make_cell("paper", 1, "low", request.param)
     config, rng = cell_config(truth), np.random.default_rng(0)
     plan = make_plan(config, start_joints_rad=truth.start_joints_rad, seed=3, count=8)
     X, Y, points = np.array(truth.camera_mount), np.array(truth.board_place), board_points(truth.board)

@@ -14,12 +14,12 @@ from station.cell.config import PAPER_BOARD
 from station.cell.status import StationStatus
 from station.simulation.placement import seen_from
 from station.simulation.renderer import Light, render, scaled
-from station.simulation.scenes import build_cell
+from station.simulation.scenes import make_cell
 from station.tui.widgets.panels import detection_lines
 
 
 def test_a_picture_too_bright_says_what_to_set_on_the_screen() -> None:
-    camera = build_cell("paper", 0, "low", "eye-in-hand").camera
+    camera = make_cell("paper", 0, "low", "eye-in-hand").camera
     view = seen_from(PAPER_BOARD, 0.5)
     for light, words in ((1.0, ""), (4.0, "too bright")):
         picture = render(camera, PAPER_BOARD, view, Light(illumination=light), np.random.default_rng(0))
@@ -32,7 +32,7 @@ def test_a_picture_too_bright_says_what_to_set_on_the_screen() -> None:
 
 @pytest.mark.parametrize("factor", [1.0, 0.5])
 def test_the_distance_is_the_same_in_a_preview_of_half_the_size(factor: float) -> None:
-    camera = build_cell("paper", 0, "low", "eye-in-hand").camera
+    camera = make_cell("paper", 0, "low", "eye-in-hand").camera
     view = seen_from(PAPER_BOARD, 0.5)
     picture = render(scaled(camera, factor), PAPER_BOARD, view, Light(), np.random.default_rng(0))
     status = sight(picture, PAPER_BOARD, camera, False).status

@@ -9,7 +9,7 @@ import pytest
 import station
 from station.cell.config_file import load_config
 from station.cell.errors import ConfigError
-from station.devices.factory import configured_cell
+from station.devices.cell import configured_cell
 
 GOOD = """\
 robot: {model: UR10, host: 192.0.2.10}

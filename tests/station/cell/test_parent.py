@@ -12,7 +12,7 @@ from pathlib import Path
 
 CHILD = (
     "import os, signal, sys, time\n"
-    "from station.cell.parent import die_with_parent\n"
+    "from station.cell.process import die_with_parent\n"
     "die_with_parent(int(sys.argv[1]))\n"
     "print(os.getpid(), flush=True)\n"
     "time.sleep(60)\n"

@@ -11,7 +11,7 @@ import pytest
 
 AUTOGROUP = Path("/proc/self/autogroup")
 ASK = (
-    "import os, sys; from pathlib import Path; from station.cell.priority import go_before_others;"
+    "import os, sys; from pathlib import Path; from station.cell.process import go_before_others;"
     "go_before_others({wanted}); print(os.getpriority(os.PRIO_PROCESS, 0), Path(sys.argv[1]).read_text())"
 )
 

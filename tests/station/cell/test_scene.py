@@ -14,8 +14,7 @@ from station.cell.collision import segment_distance
 from station.cell.config import Capsule, PoseGuess
 from station.cell.errors import LimitError
 from station.cell.scene import cell_geometry, geometry_of, require_kept_clear
-from station.simulation.cell import make_cell
-from station.simulation.scenes import cell_config
+from station.simulation.scenes import cell_config, make_cell
 
 BOARD = BoardSpec(BoardKind.CHESSBOARD, 4, 3, 0.02)
 LOW, HIGH = (-0.02, -0.02), (0.08, 0.06)

@@ -21,19 +21,19 @@ from recordings.schema.messages import SessionInfo, Source, Vector6
 from station.analysis.worker import check_run
 from station.cell.errors import ConfigError, LimitError
 from station.cell.plan import Plan, PlannedPose
+from station.cell.scene import guess_from
 from station.cell.status import StationState, StationStatus
 from station.cli import bootstrap as cli_bootstrap
 from station.cli.bootstrap import slow_plan
 from station.plan.planner import make_plan
 from station.protocol.client import Client
-from station.simulation.placement import guess_of
-from station.simulation.scenes import build_cell, cell_config
+from station.simulation.scenes import cell_config, make_cell
 from tests.system.conftest import short_folder
 
 pytestmark = [pytest.mark.process, pytest.mark.timeout(400)]
 __all__ = ["short_folder"]
 SEED = 0
-TRUTH = build_cell("paper", SEED, "low", "eye-in-hand")
+TRUTH = make_cell("paper", SEED, "low", "eye-in-hand")
 
 
 @pytest.fixture
@@ -60,7 +60,7 @@ def test_a_mount_wrong_by_30_degrees_and_100_mm_is_found(socket: Path, tmp_path:
     axis = np.array([0.6, -0.64, 0.48])
     wrong = pose(rotation_exp(np.deg2rad(30) * axis) @ X[:3, :3], X[:3, 3] + 0.1 * axis[::-1])
     bad = msgspec.structs.replace(
-        cell_config(TRUTH, "127.0.0.1"), camera_guess=guess_of(wrong, 0.06, 0.3), board_guess=None
+        cell_config(TRUTH, "127.0.0.1"), camera_guess=guess_from(wrong, 0.06, 0.3), board_guess=None
     )
     config, guesses = tmp_path / "cell.yaml", tmp_path / "guesses.yaml"
     config.write_text(yaml.safe_dump(msgspec.to_builtins(bad)))
@@ -178,7 +178,7 @@ def test_its_moves_are_slower_than_those_of_a_plan() -> None:
 
 
 def test_a_configuration_of_the_other_mount_is_refused(socket: Path, tmp_path: Path) -> None:
-    other = cell_config(build_cell("paper", SEED, "low", "eye-to-hand"), "127.0.0.1")
+    other = cell_config(make_cell("paper", SEED, "low", "eye-to-hand"), "127.0.0.1")
     config = tmp_path / "cell.yaml"
     config.write_text(yaml.safe_dump(msgspec.to_builtins(other)))
     command = [sys.executable, "-m", "station.cli", "bootstrap", "--config", str(config), "--headless"]

@@ -19,7 +19,7 @@ from station.operate.attend import Outcome
 from station.operate.progress import SessionProgress
 from station.plan.files import save_plan
 from station.protocol.verbs import Check
-from station.simulation.scenes import build_cell, cell_config
+from station.simulation.scenes import cell_config, make_cell
 from tests.command_line import call
 
 NAMES = ("[red]x[/]", "[/]", "a :bug: [bold]", "end\\")
@@ -35,13 +35,13 @@ def folder(tmp_path: Path) -> Path:
 
 def test_a_configuration(folder: Path) -> None:
     file = folder / "].yaml"
-    cell = cell_config(build_cell("paper", 0, "low", "eye-in-hand"), "127.0.0.1")
+    cell = cell_config(make_cell("paper", 0, "low", "eye-in-hand"), "127.0.0.1")
     file.write_bytes(msgspec.yaml.encode(cell))
     assert call(main, "doctor", "--config", file).stdout.startswith(f"{file}: good; ")
 
 
 def test_a_plan_and_its_poses(folder: Path) -> None:
-    start = build_cell("paper", 0, "low", "eye-in-hand").start_joints_rad
+    start = make_cell("paper", 0, "low", "eye-in-hand").start_joints_rad
     joints = [tuple(q + 0.02 * k for q in start) for k in range(len(NAMES))]
     poses = tuple(PlannedPose(name, q, why=f"why {name}") for name, q in zip(NAMES, joints, strict=True))
     made, shown = folder / "].yaml", folder / "]shown.yaml"

@@ -12,7 +12,7 @@ from mcap.reader import make_reader
 
 from station.cli import main
 from station.plan.files import load_plan, save_plan
-from station.simulation.scenes import build_cell, cell_config
+from station.simulation.scenes import cell_config, make_cell
 from tests.command_line import call
 from tests.recordings.small_recording import write_small
 
@@ -108,7 +108,7 @@ def test_wrong_use_is_a_sentence_and_exit_code_2(args, code, told):
 
 
 def test_a_plan_of_the_other_mount_fails_the_check_with_1(made, tmp_path):
-    config = cell_config(build_cell("paper", 0, "low", "eye-to-hand"), "127.0.0.1")
+    config = cell_config(make_cell("paper", 0, "low", "eye-to-hand"), "127.0.0.1")
     (tmp_path / "cell.yaml").write_bytes(msgspec.yaml.encode(config))
     result = run("--config", tmp_path / "cell.yaml", "--check", made[1]["plan.yaml"])
     assert result.returncode == 1
@@ -116,7 +116,7 @@ def test_a_plan_of_the_other_mount_fails_the_check_with_1(made, tmp_path):
 
 
 def test_a_list_from_elsewhere_is_checked_like_any_plan(tmp_path):
-    truth = build_cell("paper", 0, "low", "eye-in-hand")
+    truth = make_cell("paper", 0, "low", "eye-in-hand")
     config = msgspec.structs.replace(cell_config(truth, "127.0.0.1"))
     (tmp_path / "cell.yaml").write_bytes(msgspec.yaml.encode(config))
     header = ",".join(f"j{i}_rad" for i in range(1, 7))
@@ -131,7 +131,7 @@ def test_a_list_from_elsewhere_is_checked_like_any_plan(tmp_path):
 
 
 def test_checking_needs_no_lens_but_a_picture_does(made, tmp_path):
-    truth = build_cell("paper", 0, "low", "eye-in-hand")
+    truth = make_cell("paper", 0, "low", "eye-in-hand")
     config = cell_config(truth, "127.0.0.1")
     blind = msgspec.structs.replace(config, camera=msgspec.structs.replace(config.camera, model=None))
     (tmp_path / "cell.yaml").write_bytes(msgspec.yaml.encode(blind))
@@ -144,7 +144,7 @@ def test_checking_needs_no_lens_but_a_picture_does(made, tmp_path):
 
 def test_only_plans_and_scenes_are_written_over(made, tmp_path, small_recording):
     """A slip of the name must not cost a configuration or a recording."""
-    truth = build_cell("paper", 0, "low", "eye-in-hand")
+    truth = make_cell("paper", 0, "low", "eye-in-hand")
     config = tmp_path / "cell.yaml"
     config.write_bytes(msgspec.yaml.encode(cell_config(truth, "127.0.0.1")))
     before = config.read_bytes(), small_recording.read_bytes()

@@ -22,7 +22,7 @@ from station.devices.frames import mid_exposure, next_frame_id
 from station.devices.pixels import decode, encode
 from station.simulation import genicam
 from station.simulation.gige import numbered_picture
-from station.simulation.gige_launch import SimulatedGige, start_gige
+from station.simulation.launch import SimulatedGige, start_gige
 
 pytestmark = pytest.mark.gige
 ADDRESS = CameraConfig(device="127.0.0.1", packet_size=8996)

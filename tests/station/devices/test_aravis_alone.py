@@ -13,8 +13,7 @@ from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices import aravis_device
 from station.devices.aravis import AravisCamera
-from station.devices.aravis_device import GenicamDevice
-from station.devices.aravis_settings import apply_settings, require_settings
+from station.devices.aravis_device import GenicamDevice, apply_settings, require_settings
 from station.devices.base import TriggerPulse
 from station.devices.frames import DeviceClock
 

@@ -14,7 +14,7 @@ from recordings.writer import RecordingWriter
 from station.cell.config import PAPER_BOARD, CameraConfig, RobotConfig, StationConfig
 from station.cell.errors import ConfigError, RobotError
 from station.cli.serve import serve_command
-from station.devices.playback_cell import playback_cell
+from station.devices.playback import playback_cell
 
 CONFIG = StationConfig(
     robot=RobotConfig(model="UR10", host="192.168.1.9", serial="R1"),

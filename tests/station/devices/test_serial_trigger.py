@@ -13,8 +13,7 @@ from hypothesis import strategies as st
 from station.cell.config import TriggerConfig
 from station.cell.errors import TriggerError
 from station.devices import serial_trigger
-from station.devices.serial_trigger import SerialTrigger
-from station.devices.trigger_lines import LINE_LIMIT, LineReader, checksum, frame
+from station.devices.serial_trigger import LINE_LIMIT, LineReader, SerialTrigger, checksum, frame
 from station.simulation.trigger import SimulatedTriggerBox
 
 

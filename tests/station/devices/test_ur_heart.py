@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from station.devices.ur_heart import Heart
+from station.devices.ur import Heart
 
 
 class Clock:

@@ -9,7 +9,7 @@ import pytest
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import RobotState, Stamps
 from station.cell.errors import StaleStateError
-from station.devices.ur_history import state_at
+from station.devices.ur_state import state_at
 from tests.station.devices.test_ur_moves import STATE
 
 HOST_S, WALL_S = 500.0, 9_000.0

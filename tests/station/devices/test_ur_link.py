@@ -12,8 +12,7 @@ import pytest
 from station.cell.config import RobotConfig
 from station.cell.errors import RobotError
 from station.devices.ur_link import UrLink
-from station.devices.ur_lock import RobotLock
-from station.devices.ur_probe import ProbeResult
+from station.devices.ur_probe import ProbeResult, RobotLock
 
 CONFIG = RobotConfig(model="UR10", host="127.0.0.1", serial="2016")
 

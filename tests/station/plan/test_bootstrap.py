@@ -9,12 +9,12 @@ import pytest
 from calibrate.geometry import difference, inverse, pose, rotation_exp, transform_points
 from calibrate.kinematics import MODELS, forward
 from station.cell.errors import ConfigError, LimitError
+from station.cell.scene import guess_from
 from station.plan.belief import Glimpse, believe, improved_config
 from station.plan.bootstrap import MOVES_MAX, MOVES_MIN, next_move
 from station.plan.planner import make_plan
 from station.plan.visibility import outline, visible
-from station.simulation.placement import guess_of
-from station.simulation.scenes import build_cell, cell_config
+from station.simulation.scenes import cell_config, make_cell
 
 ARM = MODELS["UR10"]
 
@@ -28,7 +28,7 @@ class Cell:
     """A simulated cell whose operator guessed the mount badly, and a camera with a little noise."""
 
     def __init__(self, seed, mount="eye-in-hand"):
-        self.truth = build_cell("paper", seed, "low", mount)
+        self.truth = make_cell("paper", seed, "low", mount)
         self.rng = np.random.default_rng(seed)
         self.X, self.Y = np.array(self.truth.camera_mount), np.array(self.truth.board_place)
         wrong = pose(
@@ -36,7 +36,7 @@ class Cell:
             self.X[:3, 3] + 0.1 * unit(self.rng),
         )
         self.config = msgspec.structs.replace(
-            cell_config(self.truth), camera_guess=guess_of(wrong, 0.06, 0.3), board_guess=None
+            cell_config(self.truth), camera_guess=guess_from(wrong, 0.06, 0.3), board_guess=None
         )
 
     def camera_from_board(self, joints):

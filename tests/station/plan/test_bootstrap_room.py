@@ -16,13 +16,11 @@ from station.cell.collision import margins
 from station.cell.config import PAPER_BOARD, CameraConfig, LimitsConfig, Plane, RobotConfig, StationConfig
 from station.cell.errors import LimitError
 from station.cell.limits import check_path
-from station.cell.scene import geometry_of
+from station.cell.scene import geometry_from, geometry_of, guess_from
 from station.plan import bootstrap
 from station.plan.belief import Glimpse
 from station.plan.bootstrap import as_taught, next_move
-from station.plan.standing import geometry_from
 from station.plan.visibility import outline
-from station.simulation.placement import guess_of
 
 ARM = MODELS["UR10"]
 TAUGHT = np.array([-0.364, -2.365, -0.459, 0.876, -0.866, -1.122])
@@ -39,7 +37,7 @@ def config(mount=WRONG, sigma_m=0.06, sigma_rad=0.3, board_clearance_m=0.10):
         robot=RobotConfig(model="UR10"),
         camera=CameraConfig(driver="rendered", model=LENS),
         board=PAPER_BOARD,
-        camera_guess=guess_of(mount, sigma_m, sigma_rad),
+        camera_guess=guess_from(mount, sigma_m, sigma_rad),
         limits=LimitsConfig(
             planes=(Plane("table", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),), board_clearance_m=board_clearance_m
         ),

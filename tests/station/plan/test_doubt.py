@@ -12,20 +12,19 @@ from calibrate.geometry import perturb
 from calibrate.kinematics import forward
 from station.cell.collision import margins
 from station.cell.errors import LimitError
-from station.cell.scene import cell_geometry, scene_of
+from station.cell.scene import cell_geometry, guess_from, scene_of
 from station.plan.planner import make_plan
 from station.plan.visibility import outline, uncertain_pixels
-from station.simulation.placement import guess_of
-from station.simulation.scenes import build_cell, cell_config
+from station.simulation.scenes import cell_config, make_cell
 
 
 def config_of(mount="eye-in-hand", sigma_m=0.005):
-    truth = build_cell("paper", 0, "low", mount)
+    truth = make_cell("paper", 0, "low", mount)
     X, Y = np.array(truth.camera_mount), np.array(truth.board_place)
     config = msgspec.structs.replace(
         cell_config(truth),
-        camera_guess=guess_of(X, sigma_m, 0.03),
-        board_guess=guess_of(Y, sigma_m, 0.03),
+        camera_guess=guess_from(X, sigma_m, 0.03),
+        board_guess=guess_from(Y, sigma_m, 0.03),
     )
     return truth, config, X, Y
 
@@ -40,7 +39,7 @@ def test_what_hangs_on_a_guess_stays_clear_of_the_arm_when_the_guess_is_three_si
     columns = [i for i, label in enumerate(labels) if label.endswith(f"against {name}")]
     for way in np.vstack([np.eye(3), -np.eye(3)]):
         shift = np.concatenate([0.015 * way, np.zeros(3)])
-        there = guess_of(perturb(X if name == "camera" else Y, shift), 0.0, 0.0)
+        there = guess_from(perturb(X if name == "camera" else Y, shift), 0.0, 0.0)
         moved = msgspec.structs.replace(config, **{f"{name}_guess": there})
         true_gaps, same = margins(cell_geometry(moved), joints)
         assert same == labels
@@ -56,7 +55,7 @@ def test_the_camera_is_not_thickened_without_bound():
 def test_a_guess_that_is_not_kept_clear_of_makes_no_plan(mount, name):
     """The camera may be anywhere within 60 mm, the checks keep clear of 30."""
     truth, config, X, Y = config_of(mount)
-    rough = guess_of(X if name == "camera" else Y, 0.06, 0.3)
+    rough = guess_from(X if name == "camera" else Y, 0.06, 0.3)
     config = msgspec.structs.replace(config, **{f"{name}_guess": rough})
     with pytest.raises(LimitError, match=f"{name}_guess is known to 60 mm only.*station bootstrap"):
         make_plan(config, start_joints_rad=truth.start_joints_rad)
@@ -64,7 +63,9 @@ def test_a_guess_that_is_not_kept_clear_of_makes_no_plan(mount, name):
 
 def test_solids_of_the_configuration_are_taken_as_they_are():
     _, config, _, _ = config_of()
-    drawn = cell_geometry(msgspec.structs.replace(config, camera_guess=guess_of(np.eye(4), 0.0, 0.0))).solids
+    drawn = cell_geometry(
+        msgspec.structs.replace(config, camera_guess=guess_from(np.eye(4), 0.0, 0.0))
+    ).solids
     limits = msgspec.structs.replace(config.limits, solids=drawn)
     assert cell_geometry(msgspec.structs.replace(config, limits=limits)).solids == drawn
 

@@ -27,8 +27,8 @@ from station.plan.hover import (
     outer_corners,
     plan_hover,
 )
-from station.simulation.cell import CellTruth, make_cell
-from station.simulation.scenes import cell_config
+from station.simulation.cell import CellTruth
+from station.simulation.scenes import cell_config, make_cell
 from tests.station.hover_cell import POINTER, ROBOT_M, ROBOT_RAD, calibration_of, seen_from
 
 ROBOT, CAMERA = RobotIdentity(model="UR10", serial="R"), CameraIdentity("c", "1", "rendered")

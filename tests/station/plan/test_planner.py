@@ -29,9 +29,8 @@ from station.plan.candidates import branch_of, find_candidates
 from station.plan.choose import choose, informations, objective_for
 from station.plan.planner import PlanOptions, make_plan, plan_scene
 from station.plan.predict import forecast_views
-from station.plan.view_range import ViewRange, view_range
-from station.plan.visibility import blind_share, lens_radius, visible
-from station.simulation.scenes import build_cell, cell_config
+from station.plan.visibility import ViewRange, blind_share, lens_radius, view_range, visible
+from station.simulation.scenes import cell_config, make_cell
 
 CELLS = [
     ("paper", "eye-in-hand", 0),
@@ -43,7 +42,7 @@ CELLS = [
 
 @cache
 def cell(scene="paper", mount="eye-in-hand", seed=0):
-    truth = build_cell(scene, seed, "low", mount)
+    truth = make_cell(scene, seed, "low", mount)
     return truth, cell_config(truth)
 
 

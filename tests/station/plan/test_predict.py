@@ -17,12 +17,12 @@ from station.cell.plan import PlannedPose
 from station.cell.scene import scene_of
 from station.plan.planner import make_plan
 from station.plan.predict import AdviceOptions, advise, forecast_views, with_forecast
-from station.simulation.scenes import build_cell, cell_config
+from station.simulation.scenes import cell_config, make_cell
 
 
 @cache
 def world():
-    truth = build_cell("paper", 0, "low", "eye-in-hand")
+    truth = make_cell("paper", 0, "low", "eye-in-hand")
     config = cell_config(truth)
     plan = make_plan(config, start_joints_rad=truth.start_joints_rad)
     scene = scene_of(config)
@@ -90,7 +90,7 @@ def test_a_goal_beyond_the_arm_is_not_promised():
 
 
 def test_the_session_names_the_next_best_pose_until_it_is_enough():
-    config = cell_config(build_cell("paper", 0, "low", "eye-in-hand"))
+    config = cell_config(make_cell("paper", 0, "low", "eye-in-hand"))
     _, plan, flange = world()
     text = next_best_text(config, flange[:5], plan.poses[4].joints_rad)
     assert "more for 0.5 mm" in text and "next best" in text and "tilt" in text

@@ -10,9 +10,8 @@ from calibrate.kinematics import forward, link_frames
 from station.analysis.worker import check_run
 from station.cell.collision import margins
 from station.cell.plan import Plan
-from station.cell.scene import cell_geometry
+from station.cell.scene import cell_geometry, geometry_from
 from station.plan.bootstrap import next_move
-from station.plan.standing import geometry_from
 from tests.station.plan.test_bootstrap_room import ARM, GLIMPSE, TAUGHT, WRONG, X, config
 
 FLANGE = forward(ARM, TAUGHT)

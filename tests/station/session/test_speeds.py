@@ -10,8 +10,8 @@ import pytest
 
 from station.cell.limits import SPEED_CAP_M_S, check_path, point_speed_m_s, sample_path, with_plan_speeds
 from station.cell.plan import Plan
+from station.cell.scene import geometry_from
 from station.cell.status import StationState as S
-from station.plan.standing import geometry_from
 from tests.station.session_rig import POSES, TRUTH, Rig
 
 

@@ -16,7 +16,7 @@ from station.analysis.worker import Sighting
 from station.cell.errors import CameraError, RefusedError
 from station.cell.status import DetectionStatus
 from station.cell.status import StationState as S
-from station.plan.sweep import SWINGS, sweep_plan
+from station.plan.files import SWINGS, sweep_plan
 from station.protocol.verbs import Drop, Purpose, Skip
 from tests.station.session_rig import TRUTH, CameraInMemory, Rig, sealed
 

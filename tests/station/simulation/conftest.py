@@ -16,16 +16,15 @@ from typing import Any
 import pytest
 
 from station.devices.rtde import PORT, PacketReader, PacketType, Recipe, join_names, packet, split_names
-from station.simulation.admin import AdminClient
-from station.simulation.controller.journal import Journal
-from station.simulation.controller.robot import Settings, SimulatedRobot
-from station.simulation.controller.uploads import Upload
-from station.simulation.launch import SimulatedController, start_controller
+from station.simulation.controller.programs import Upload
+from station.simulation.controller.robot import SimulatedRobot
+from station.simulation.controller.state import Journal, Settings
+from station.simulation.launch import AdminClient, SimulatedController, start_controller
 
 _BEFORE = """
 import json, math, os, sys, threading, time
 import rtde_control, rtde_receive, rtde_io, dashboard_client
-from station.simulation.admin import AdminClient
+from station.simulation.launch import AdminClient
 host = sys.argv[1]
 admin = AdminClient(host)
 result = {}

@@ -15,10 +15,10 @@ from calibrate.geometry import inverse
 from recordings.schema.messages import Image
 from station.cell.errors import CameraError
 from station.devices import frames
-from station.simulation.admin import AdminClient
 from station.simulation.camera import RenderedCamera
-from station.simulation.cell import CellTruth, make_cell, write_truth
-from station.simulation.launch import SimulatedController
+from station.simulation.cell import CellTruth, write_truth
+from station.simulation.launch import AdminClient, SimulatedController
+from station.simulation.scenes import make_cell
 
 pytestmark = pytest.mark.process
 

@@ -13,9 +13,9 @@ from calibrate.kinematics import MODELS, forward
 from station.cell.config import BLOG_BOARD, PAPER_BOARD
 from station.cell.errors import ConfigError
 from station.plan.planner import make_plan
-from station.simulation.cell import CellTruth, make_cell, read_truth, write_truth
+from station.simulation.cell import CellTruth, read_truth, write_truth
 from station.simulation.placement import board_centre
-from station.simulation.scenes import cell_config
+from station.simulation.scenes import cell_config, make_cell
 
 
 def camera_from_board(cell: CellTruth, joints_rad: object) -> np.ndarray:

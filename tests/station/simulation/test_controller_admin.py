@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from station.cell.errors import RobotError
-from station.simulation.admin import AdminClient
+from station.simulation.launch import AdminClient
 
 pytestmark = pytest.mark.process
 HOME = [0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0]

@@ -8,8 +8,8 @@ import pytest
 
 from station.devices.rtde import RuntimeState
 from station.simulation.controller.kinematics import forward, from_pose, to_pose
-from station.simulation.controller.operation import AsyncWord, Operation
-from station.simulation.controller.uploads import Upload
+from station.simulation.controller.programs import Upload
+from station.simulation.controller.script import AsyncWord, Operation
 
 HOME = [0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0]
 GOAL = [0.4, -1.5, 1.5, -1.5, -1.5, 0.1]

@@ -8,7 +8,7 @@ import pytest
 from calibrate.geometry import perturb
 from calibrate.kinematics import MODELS, DhDeltas
 from calibrate.kinematics import forward as station_forward
-from station.simulation.controller.history import SPAN_S, History
+from station.simulation.controller.arm import SPAN_S, History
 
 Q = (0.3, -1.2, 1.6, -1.0, -1.3, 0.4)
 

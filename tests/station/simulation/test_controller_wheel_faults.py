@@ -8,8 +8,7 @@ from typing import Any
 
 import pytest
 
-from station.simulation.admin import AdminClient
-from station.simulation.launch import SimulatedController
+from station.simulation.launch import AdminClient, SimulatedController
 
 pytestmark = pytest.mark.process
 Start = Callable[..., SimulatedController]

@@ -15,10 +15,10 @@ from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices.aravis import AravisCamera
 from station.simulation import genicam
-from station.simulation.cell import make_cell, write_truth
-from station.simulation.gige_launch import start_gige
-from station.simulation.launch import SimulatedController
+from station.simulation.cell import write_truth
+from station.simulation.launch import SimulatedController, start_gige
 from station.simulation.netns import is_isolated, isolated_command
+from station.simulation.scenes import make_cell
 
 
 def test_it_does_not_run_beside_other_networks() -> None:

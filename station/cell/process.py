@@ -3,11 +3,21 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
+import signal
 from pathlib import Path
 
 DAEMON_NICENESS = -5
 """The arm's watchdog hangs on the daemon's loop and the control process: they go before other programs."""
+_PR_SET_PDEATHSIG = 1
+
+
+def die_with_parent(parent_pid: int) -> None:
+    """Has the kernel kill this process when the thread that started it ends."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent_pid:  # it died before the line above
+        os._exit(1)
 
 
 def go_before_others(niceness: int, autogroup: Path = Path("/proc/self/autogroup")) -> None:

@@ -1,0 +1,187 @@
+"""What the controller is at one moment: settings, registers, arm and modes, published once per cycle.
+
+Programs see and change this; `robot` adds what the controller does by itself.
+"""
+
+from __future__ import annotations
+
+import random
+import time
+from abc import ABC, abstractmethod
+from collections import Counter, deque
+from dataclasses import dataclass
+from typing import Any
+
+from station.devices.rtde import RobotMode, RobotStatus, RuntimeState, SafetyMode, SafetyStatus
+from station.simulation.controller.arm import Arm, History
+from station.simulation.controller.kinematics import (
+    TABLES,
+    DhTable,
+    Rigid,
+    Six,
+    compose,
+    forward,
+    from_pose,
+    to_pose,
+)
+from station.simulation.controller.variables import INPUT_TYPES, OUTPUT_TYPES, VariableStore
+
+ENTRIES = 20_000
+CB3_VERSION = (3, 15, 8, 106339)
+E_SERIES_VERSION = (5, 11, 1, 108318)
+_SAFETY_BITS = {
+    SafetyMode.NORMAL: SafetyStatus.NORMAL,
+    SafetyMode.REDUCED: SafetyStatus.REDUCED,
+    SafetyMode.PROTECTIVE_STOP: SafetyStatus.PROTECTIVE_STOPPED | SafetyStatus.STOPPED_DUE_TO_SAFETY,
+    SafetyMode.SAFEGUARD_STOP: SafetyStatus.SAFEGUARD_STOPPED | SafetyStatus.STOPPED_DUE_TO_SAFETY,
+    SafetyMode.ROBOT_EMERGENCY_STOP: SafetyStatus.ROBOT_EMERGENCY_STOPPED
+    | SafetyStatus.EMERGENCY_STOPPED
+    | SafetyStatus.STOPPED_DUE_TO_SAFETY,
+}
+_JOINT_MODE = {RobotMode.RUNNING: 253, RobotMode.IDLE: 255}
+
+
+@dataclass(frozen=True)
+class Settings:
+    model: str = "UR10"
+    start_joints_rad: Six = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
+    serial: str = "20263000001"
+    time_scale: float = 1.0
+    """The arm moves this many times faster than it says; clocks stay real. For tests."""
+    sigma_m: float = 0.0
+    sigma_rad: float = 0.0
+    seed: int = 0
+    dh_delta: tuple[Six, Six, Six, Six] = ((0.0,) * 6,) * 4
+    """a_m, d_m, alpha_rad, theta_rad of the true arm against the nominal table."""
+    remote: bool = True
+    paused_by_protective_stop: bool = True
+    """runtime_state after a protective stop: paused (4), else stopped (1)."""
+    input_delay_cycles: int = 0
+    """Registers act this many cycles later than the next one."""
+
+    @property
+    def is_e_series(self) -> bool:
+        return self.model.endswith("e")
+
+    @property
+    def version(self) -> tuple[int, int, int, int]:
+        return E_SERIES_VERSION if self.is_e_series else CB3_VERSION
+
+    @property
+    def rate_hz(self) -> int:
+        return 500 if self.is_e_series else 125
+
+
+class Journal:
+    """The newest entries in full; counts per (source, verb) of all of them, never forgotten."""
+
+    def __init__(self) -> None:
+        self._entries: deque[dict[str, Any]] = deque(maxlen=ENTRIES)
+        self._counts: Counter[str] = Counter()
+
+    def note(self, source: str, verb: str, **details: Any) -> None:
+        """source: dashboard, script, upload, rtde or controller (what it did by itself)."""
+        self._counts[f"{source}: {verb}"] += 1
+        self._entries.append({"monotonic_ns": time.monotonic_ns(), "source": source, "verb": verb, **details})
+
+    def count(self, source: str, verb: str) -> None:
+        """For what comes many times a second: counted only."""
+        self._counts[f"{source}: {verb}"] += 1
+
+    @property
+    def counts(self) -> dict[str, int]:
+        return dict(self._counts)
+
+    def entries(self, since_ns: int = 0) -> list[dict[str, Any]]:
+        return [e for e in self._entries if e["monotonic_ns"] >= since_ns]
+
+
+class ControllerState(ABC):
+    def __init__(self, settings: Settings, journal: Journal) -> None:
+        self.settings = settings
+        self.journal = journal
+        self.dt_s = 1.0 / settings.rate_hz
+        self.table = TABLES[settings.model]
+        self.true_table: DhTable = self.table.plus(*settings.dh_delta)
+        self._random = random.Random(settings.seed)
+        self.arm = Arm(self.table, settings.start_joints_rad, self._draw_miss)
+        self.tcp: Six = (0.0,) * 6
+        self.payload_kg = 0.0
+        self.payload_cog: Six = (0.0,) * 3
+        self.robot_mode = RobotMode.RUNNING
+        self.safety_mode = SafetyMode.NORMAL
+        self.runtime_state = RuntimeState.STOPPED
+        self.remote = settings.remote
+        self.watchdog_s = 0.0
+        """Longest silence of the command register that is allowed; 0 = none."""
+        self.clear()
+
+    def clear(self) -> None:
+        """Time 0, empty registers; installation and the arm's place survive."""
+        self.ticks, self.time_s, self.slider = 0, 0.0, 1.0
+        self.history = History(self.dt_s)
+        self._seen: dict[str, tuple[Six, Six, Rigid]] = {}
+        """Per tool pose: joints, TCP and pose it was last computed for."""
+        self.inputs, self.outputs = VariableStore(INPUT_TYPES), VariableStore(OUTPUT_TYPES)
+        out = self.outputs
+        out.set("joint_temperatures", *(28.0, 29.0, 30.0, 31.0, 32.0, 33.0))
+        out.set("actual_main_voltage", 48.0)
+        out.set("actual_robot_voltage", 48.0)
+        out.set("actual_joint_voltage", *(48.0,) * 6)
+        out.set("actual_execution_time", 0.0004)
+        out.set("actual_tool_accelerometer", 0.0, 0.0, -9.81)
+
+    @abstractmethod
+    def protective_stop(self, reason: str) -> None:
+        """The arm rests at once."""
+
+    def _draw_miss(self) -> Six:
+        m, rad = self.settings.sigma_m, self.settings.sigma_rad
+        return tuple(self._random.gauss(0.0, sigma) for sigma in (m, m, m, rad, rad, rad))
+
+    def publish(self) -> None:
+        """The present state as RTDE output variables."""
+        out, arm = self.outputs, self.arm
+        out.set("timestamp", self.time_s)
+        out.set("target_q", *arm.command)
+        out.set("actual_q", *arm.actual)
+        out.set("target_qd", *arm.command_speed)
+        out.set("actual_qd", *arm.actual_speed)
+        self._publish_tool("target_TCP", arm.command)
+        self._publish_tool("actual_TCP", arm.actual)
+        out.set("target_speed_fraction", self.slider)
+        out.set("speed_scaling", min(1.0, arm.scale / self.slider) if self.slider > 0 else 1.0)
+        out.set("payload", self.payload_kg)
+        out.set("payload_cog", *self.payload_cog)
+        out.set("robot_mode", self.robot_mode)
+        out.set("safety_mode", self.safety_mode)
+        out.set("safety_status", self.safety_mode)
+        out.set("safety_status_bits", _SAFETY_BITS[self.safety_mode])
+        out.set("runtime_state", self.runtime_state)
+        powered = self.robot_mode in (RobotMode.POWER_ON, RobotMode.IDLE, RobotMode.RUNNING)
+        playing = self.runtime_state == RuntimeState.PLAYING
+        bits = (RobotStatus.POWER_ON if powered else 0) | (RobotStatus.PROGRAM_RUNNING if playing else 0)
+        out.set("robot_status_bits", bits)
+        out.set("joint_mode", *(_JOINT_MODE.get(self.robot_mode, 239),) * 6)
+
+    def _publish_tool(self, name: str, joints: Six) -> None:
+        """Pose and speed of the tool; computed only when joints or TCP changed."""
+        before = self._seen.get(name)
+        if before is not None and before[0] is joints and before[1] is self.tcp:
+            self.outputs.set(f"{name}_speed", *(0.0,) * 6)
+            return
+        self.arm.flange_from_tcp = from_pose(self.tcp)
+        T = compose(forward(self.table, joints), self.arm.flange_from_tcp)
+        self.outputs.set(f"{name}_pose", *to_pose(T))
+        self._seen[name] = (joints, self.tcp, T)
+        if before is not None and before[1] is self.tcp:
+            per_s = 1 / (self.dt_s * self.settings.time_scale)
+            self.outputs.set(f"{name}_speed", *_speed(before[2], T, per_s))
+
+
+def _speed(last: Rigid, now: Rigid, per_s: float) -> Six:
+    """Velocity (6,) between two neighbouring poses: m/s, then rad/s, both in base."""
+    l0, l1, l2, lx, l4, l5, l6, ly, l8, l9, l10, lz = last
+    turn = compose(now, (l0, l4, l8, 0.0, l1, l5, l9, 0.0, l2, l6, l10, 0.0))
+    rx, ry, rz = (turn[9] - turn[6]) / 2, (turn[2] - turn[8]) / 2, (turn[4] - turn[1]) / 2
+    return tuple(per_s * v for v in (now[3] - lx, now[7] - ly, now[11] - lz, rx, ry, rz))

@@ -14,10 +14,10 @@ from benchmarks.imperfect_cells import table_errors
 from benchmarks.scene import LOW, PAPER_X, Noise, grid, make_cell, pose_arrays, view_set
 from benchmarks.trials import rms, share_spread, table, trials
 from calibrate.geometry import Array, difference, inverse, perturb, pose, rotation_exp
+from calibrate.handeye.arm import by_parameters
 from calibrate.handeye.axxb.peer_methods import HAND_EYE, opencv_hand_eye
 from calibrate.handeye.metrics import board_spread
 from calibrate.handeye.solve import SolveOptions, solve_views
-from calibrate.handeye.table import by_parameters
 from calibrate.kinematics import MODELS, forward, inverse_nearest
 from calibrate.projection import project
 from calibrate.views import ViewSet

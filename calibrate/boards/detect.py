@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 from calibrate.boards.chessboard import find_chessboard, other_size
 from calibrate.boards.circles import find_circles
 from calibrate.boards.corners import Grey, to_grey
-from calibrate.boards.markers import find_april_grid, find_charuco
+from calibrate.boards.markers import find_april_grid, find_charuco, find_tag
 from calibrate.boards.model import board_points, check_board, describe_board, fixes_a_plane
-from calibrate.boards.tags import find_tag
 from calibrate.geometry import Array
 from recordings.schema.messages import SINGLE_TAGS, BoardKind, BoardSpec
 

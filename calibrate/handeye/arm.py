@@ -1,4 +1,8 @@
-"""The estimate with errors of the arm's kinematic table and a bracket that bends, whose size nobody knows.
+"""Errors of the arm's Denavit-Hartenberg table and of a bracket that bends, whose size nobody knows.
+
+Of the 24 errors of a table, eight change nothing that X and the board's pose would not take: six of the first
+and the last joint, and two of the three shifts along the parallel axes of joints 2, 3 and 4. They are held.
+Two turns of those axes about y (S. Hayati, 1983) are added, which the table cannot say.
 
 The size s is not fitted but averaged over: one solution for each s of a grid, weighed by its evidence; no
 errors at all count as much beforehand as all other sizes together. So the price for an arm without errors is
@@ -11,11 +15,106 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from calibrate.geometry import Array
+from calibrate.geometry import Array, difference, skew
 from calibrate.handeye.estimate import Estimate, corner_weights
 from calibrate.handeye.linear import Linear, LinearSolution
 from calibrate.handeye.observations import Observations
 from calibrate.handeye.priors import Priors
+from calibrate.kinematics import MODELS, RobotModel, forward, inverse_many, link_frames
+from calibrate.views import ViewSet
+from recordings.schema.messages import Mount
+
+PARAMETERS = (
+    *(f"a{joint}" for joint in range(1, 6)),
+    *(f"d{joint}" for joint in (4, 5)),
+    *(f"alpha{joint}" for joint in range(1, 6)),
+    *(f"theta{joint}" for joint in range(2, 6)),
+    "beta2",
+    "beta3",
+)
+"""Names of the 18 errors, true minus nominal: a and d in metres, angles in radians."""
+FLEX = tuple(f"flex {row}{column}" for row in "xyz" for column in "xyz")
+"""Names of a bracket's compliance, radians: turn about `row` for gravity along `column` of the flange."""
+RELATIVE_SIGMA = np.array([3**0.5 if name == "d4" else 1.0 for name in PARAMETERS])
+"""1σ of each against the common one: d4 stands for d2 + d3 + d4."""
+_SAME_M, _SAME_RAD = 0.02, float(np.radians(2.0))
+"""Recorded joints and flange belong together when the nominal table agrees within this."""
+
+
+def table_motion(views: ViewSet) -> Array | None:
+    """(n, 6, 18) motion [δt, δφ] of the flange, in base, by each of `PARAMETERS`.
+
+    From the recorded joints, else from inverse kinematics of the recorded flanges in one branch that reaches
+    them all. None where the robot's model is unknown or its nominal table does not reach the flanges.
+    """
+    model = MODELS.get(views.robot_model)
+    if model is None:
+        return None
+    joints = _recorded_joints(views, model)
+    if joints is None:
+        joints = _joints_of_one_branch(model, views.base_from_flange)
+    return None if joints is None else by_parameters(model, joints)
+
+
+def flex_motion(mount: Mount, flange: Array, held: Array) -> Array:
+    """(n, 6, 9) motion of the flange, in base, by each entry of a bracket's compliance (3, 3), row by row.
+
+    What the flange carries at `held` (4, 4), the camera (eye-in-hand) or the board, turns by
+    compliance times the direction of gravity in it, less its mean over the views: X and Y are those of
+    the mean. Base's z is taken to be up.
+    """
+    R = flange[:, :3, :3]
+    gravity = -R[:, 2, :]
+    gravity = gravity - gravity.mean(axis=0)
+    turn = np.einsum("rk,nc->nkrc", np.eye(3), gravity).reshape(len(R), 3, 9)
+    return np.concatenate([-R @ skew(held[:3, 3]) @ turn, -R @ turn], axis=1)
+
+
+def _recorded_joints(views: ViewSet, model: RobotModel) -> Array | None:
+    if any(view.joints_rad is None for view in views):
+        return None
+    joints = np.array([view.joints_rad for view in views], dtype=float)
+    if not np.isfinite(joints).all():
+        return None
+    miss = difference(forward(model, joints), views.base_from_flange)
+    far = (np.linalg.norm(miss[:, :3], axis=1) > _SAME_M) | (np.linalg.norm(miss[:, 3:], axis=1) > _SAME_RAD)
+    return None if far.any() else joints
+
+
+def _joints_of_one_branch(model: RobotModel, flanges: Array) -> Array | None:
+    """(n, 6): any branch serves X as well as the true one, if it is the same in all views."""
+    owner, joints, branch = inverse_many(model, flanges)
+    for one in range(8):
+        if np.array_equal(owner[branch == one], np.arange(len(flanges))):
+            return np.asarray(joints[branch == one])
+    return None
+
+
+def by_parameters(model: RobotModel, joints_rad: Array) -> Array:
+    """`table_motion` for joints (n, 6) of a known model.
+
+    Standard convention: theta and d act about and along z of the frame before the joint; alpha and a about
+    and along x, beta about y, of the frame after it.
+    """
+    frames = link_frames(model, joints_rad)
+    z, before = frames[:, :6, :3, 2], frames[:, :6, :3, 3]
+    x, y, after = frames[:, 1:, :3, 0], frames[:, 1:, :3, 1], frames[:, 1:, :3, 3]
+    flange = frames[:, 6:, :3, 3]
+    zero = np.zeros_like(z)
+    columns = {
+        "a": (x, zero),
+        "d": (z, zero),
+        "alpha": (np.cross(x, flange - after), x),
+        "theta": (np.cross(z, flange - before), z),
+        "beta": (np.cross(y, flange - after), y),
+    }
+    motion = np.zeros((len(joints_rad), 6, len(PARAMETERS)))
+    for place, name in enumerate(PARAMETERS):
+        shift, turn = columns[name[:-1]]
+        joint = int(name[-1]) - 1
+        motion[:, :3, place], motion[:, 3:, place] = shift[:, joint], turn[:, joint]
+    return motion
+
 
 SIZES = np.array([1e-6, 0.05, 0.12, 0.3, 0.7, 1.5])
 """1σ of the errors, mm and mrad; the first stands for none."""

@@ -7,18 +7,16 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from calibrate.errors import BadViewsError, PosesDisagreeError
-from calibrate.handeye.arm import WithTable, allow_for_table
+from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
+from calibrate.handeye.arm import RELATIVE_SIGMA, WithTable, allow_for_table, flex_motion, table_motion
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses
 from calibrate.handeye.axxb.robust import GlobalResult, solve_global
 from calibrate.handeye.estimate import Estimate, estimate
 from calibrate.handeye.metrics import require_motion
 from calibrate.handeye.observations import SHAPE, Moved, Observations, Places, State, observe_views
-from calibrate.handeye.poses import PoseViews, fit_poses
+from calibrate.handeye.poses import BoardPoses, PoseViews, agreed_start, fit_poses
 from calibrate.handeye.priors import Priors
-from calibrate.handeye.start import BoardPoses, agreed_start
-from calibrate.handeye.table import RELATIVE_SIGMA, flex_motion, table_motion
-from calibrate.handeye.turns import set_boards_right
-from calibrate.views import ViewSet
+from calibrate.views import BoardView, ViewSet
 
 FEWEST_FOR_TABLE = 8
 """Fewer views cannot tell 18 errors of a table from noise."""
@@ -130,3 +128,50 @@ def require_plausible_noise(found: Estimate) -> None:
             f"Robot poses and pictures disagree by {robot_m * 1e3:.0f} mm, "
             f"{np.degrees(robot_rad):.1f}° per axis."
         )
+
+
+_LEVER_M = 0.5
+_NEARER = 0.2
+"""A turned board is believed when it brings the view this much nearer (the factor) to where the board is."""
+
+
+def set_boards_right(views: ViewSet, X: Array, Y: Array) -> tuple[ViewSet, tuple[int, ...]]:
+    """The views, boards turned where that brings them to the board's pose Y, and the places turned."""
+    H = mount_poses(views.base_from_flange, views.mount)
+    kept, turned = list(views.views), []
+    for place, view in enumerate(views):
+        apart = _distance(H[place] @ X @ view.camera_from_board, Y)
+        for turn in _turns(view):
+            trial = _turned(view, turn)
+            if _distance(H[place] @ X @ trial.camera_from_board, Y) < _NEARER * apart:
+                kept[place] = trial
+                turned.append(place)
+                break
+    return (replace(views, views=tuple(kept)) if turned else views), tuple(turned)
+
+
+def _distance(found: Array, expected: Array) -> float:
+    delta = difference(found, expected)
+    return float(np.linalg.norm(delta[:3]) + _LEVER_M * np.linalg.norm(delta[3:]))
+
+
+def _turns(view: BoardView) -> list[Array]:
+    """Rigid maps of the board onto itself: half a turn, and quarter turns where it is square."""
+    if not len(view.board_points):
+        return []
+    low, high = view.board_points.min(axis=0), view.board_points.max(axis=0)
+    centre = (low + high) / 2
+    square = abs((high - low)[0] - (high - low)[1]) < 1e-9
+    turns = []
+    for quarter in (2, 1, 3) if square else (2,):
+        R = rotation_exp([0.0, 0.0, quarter * np.pi / 2])
+        turns.append(pose(R, centre - R @ centre))
+    return turns
+
+
+def _turned(view: BoardView, turn: Array) -> BoardView:
+    return replace(
+        view,
+        board_points=transform_points(turn, view.board_points),
+        camera_from_board=np.asarray(view.camera_from_board) @ inverse(turn),
+    )

@@ -16,8 +16,7 @@ import numpy as np
 
 from calibrate.geometry import Array, perturb
 from calibrate.handeye.corners import CornerBlocks, linearise_corners
-from calibrate.handeye.flange import flange_derivatives, flange_residuals
-from calibrate.handeye.observations import Layout, Observations, State
+from calibrate.handeye.observations import Layout, Observations, State, flange_derivatives, flange_residuals
 from calibrate.handeye.priors import Quadratic
 
 _ROUNDS = 8

@@ -1,4 +1,4 @@
-"""How good is an X: hold-out errors of the paper, board spread, what the motions can and cannot show."""
+"""Quality of an X: held-out errors of the paper, board spread, what the motions can and cannot show."""
 
 # ruff: noqa: N815  (e_t and e_R are written as the paper writes them)
 from __future__ import annotations
@@ -9,7 +9,8 @@ import numpy as np
 
 from calibrate.errors import DegenerateMotionError
 from calibrate.geometry import Array, difference, pose, project_to_rotation, rotation_angle, skew
-from calibrate.handeye.axxb.pairs import Pairs, screw_invariants
+from calibrate.handeye.axxb.pairs import Pairs, all_pairs, consecutive_pairs, mount_poses, screw_invariants
+from calibrate.views import ViewSet
 
 _MIN_SECOND_AXIS_RAD = np.radians(0.3)
 """Root mean square rotation about the second axis below which no X is worth the name."""
@@ -158,3 +159,33 @@ def distance_in_sigmas(X: Array, reference: Array, covariance: Array) -> float:
     """
     delta = difference(X, reference)
     return float(np.sqrt(max(0.0, float(delta @ np.linalg.pinv(covariance, 1e-14, hermitian=True) @ delta))))
+
+
+HELD_OUT = 6
+_FEWEST_FITTED = 5
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    fitted: ViewSet
+    pairs: Pairs
+
+
+def held_out_views(views: ViewSet) -> HeldOut | None:
+    """All pairs inside the last 6 views, with camera poses; None for too few views."""
+    fitted = len(views) - HELD_OUT
+    if fitted < _FEWEST_FITTED:
+        return None
+    last = views.select(list(range(fitted, len(views))))
+    H = mount_poses(last.base_from_flange, views.mount)
+    return HeldOut(views.select(list(range(fitted))), all_pairs(H, last.camera_from_board))
+
+
+def held_out_pairs(views: ViewSet) -> HeldOut | None:
+    """The paper's own samples: the last 6 consecutive pairs; fitted on the views of the pairs before."""
+    H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
+    pairs = consecutive_pairs(H, C)
+    count = len(pairs) - HELD_OUT
+    if count + 1 < _FEWEST_FITTED:
+        return None
+    return HeldOut(views.select(list(range(count + 1))), pairs.select(slice(count, None)))

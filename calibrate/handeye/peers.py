@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 
 from calibrate.errors import CalibrationError
-from calibrate.geometry import Array, is_rigid, rotation_log
+from calibrate.geometry import Array, inverse, is_rigid, perturb, rotation_log
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, consecutive_pairs, mount_poses
 from calibrate.handeye.axxb.paper import on_box, solve_paper
 from calibrate.handeye.axxb.peer_methods import (
@@ -25,16 +25,24 @@ from calibrate.handeye.axxb.peer_methods import (
     zhao_minimax,
     zhi_linear,
 )
+from calibrate.handeye.corners import corner_residuals, linearise_corners
 from calibrate.handeye.estimate import estimate
-from calibrate.handeye.held_out import HeldOut, held_out_pairs, held_out_views
 from calibrate.handeye.linear import Scales
-from calibrate.handeye.metrics import board_places, board_spread, distance_in_sigmas, mean_pose, motion_errors
+from calibrate.handeye.metrics import (
+    HeldOut,
+    board_places,
+    board_spread,
+    distance_in_sigmas,
+    held_out_pairs,
+    held_out_views,
+    mean_pose,
+    motion_errors,
+)
 from calibrate.handeye.observations import SHAPE, State, observe_views
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from calibrate.handeye.profile_robust import solve_robust_profile
-from calibrate.handeye.reprojection import reprojection_px
 from calibrate.handeye.solution import PeerResult, Solution, SolveOptions
-from calibrate.handeye.validate_views import require_solvable
+from calibrate.handeye.solve import require_solvable
 from calibrate.projection import intrinsics_vector
 from calibrate.views import ViewSet
 
@@ -174,3 +182,34 @@ def _with_samples(row: PeerResult, partial_X: Array | None, pairs: Pairs) -> Pee
         return row
     e_t, e_R = motion_errors(partial_X, pairs)
     return replace(row, e_t_m=float(e_t.mean()), e_R=float(e_R.mean()), samples_e_t_m=e_t, samples_e_R=e_R)
+
+
+_STEPS = 8
+
+
+def reprojection_px(views: ViewSet, X: Array) -> float | None:
+    """Root mean square distance over all corners with the best board pose for this X; None without pixels.
+
+    Infinite when corners fall behind the camera.
+    """
+    observed = observe_views(views)
+    if not observed.has_pixels:
+        return None
+    H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
+    camera_from_place = inverse(H @ X)
+    Y = mean_pose(board_places(H, C, X))
+    best = np.inf
+    for _ in range(_STEPS):
+        C = camera_from_place @ Y
+        square = float((corner_residuals(observed, views.camera, C) ** 2).sum())
+        if not np.isfinite(square) or square >= best * (1 - 1e-9):
+            break
+        best = square
+        blocks = linearise_corners(observed, views.camera, C, observed.present)
+        T = np.zeros((len(H), 6, 6))
+        T[:, :3, :3] = T[:, 3:, 3:] = camera_from_place[:, :3, :3]
+        T_t = np.swapaxes(T, 1, 2)
+        N = (T_t @ blocks.LL @ T).sum(axis=0)
+        g = (T_t @ blocks.Lr[..., None]).sum(axis=0)[:, 0]
+        Y = perturb(Y, np.linalg.lstsq(N, g, rcond=None)[0])
+    return float(np.sqrt(best / observed.present.sum()))

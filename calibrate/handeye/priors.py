@@ -8,7 +8,6 @@ import numpy as np
 
 from calibrate.geometry import Array
 from calibrate.handeye.observations import SHAPE, Layout, State
-from calibrate.handeye.table import UNIT
 from calibrate.projection import intrinsics_names, intrinsics_vector
 from recordings.schema.messages import BoardSpec, CameraModel
 
@@ -22,6 +21,8 @@ _KNOWN_SHARE = 0.002
 _UNKNOWN = {"k1": 1.0, "k2": 3.0, "k3": 10.0, "k4": 1.0, "k5": 3.0, "k6": 10.0, "p1": 0.02, "p2": 0.02}
 """1σ of a lens of which nothing is known, about no distortion; the centre is the middle ± 20 %."""
 _UNKNOWN_CENTRE = 0.2
+TABLE_UNIT = 1e-3
+"""Errors of the arm's table are counted in mm and mrad: equal harm at an arm's length of 1 m."""
 
 
 @dataclass(frozen=True)
@@ -104,7 +105,7 @@ class Priors:
         at = Layout.of(state)
         N, right = np.zeros((at.size, at.size)), np.zeros(at.size)
         vector = intrinsics_vector(state.camera)
-        table_sigma = np.full(len(state.table), UNIT * table)
+        table_sigma = np.full(len(state.table), TABLE_UNIT * table)
         sigma = np.concatenate([self.lens.sigma, self.board_sigma, table_sigma])
         value = np.concatenate([vector - self.lens.mean, state.shape, state.table])
         places = np.arange(at.lens.start, at.table.stop)

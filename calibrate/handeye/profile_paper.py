@@ -9,8 +9,7 @@ from scipy import stats
 from calibrate.frames import board_frames, camera_frames
 from calibrate.geometry import Array, Transform
 from calibrate.handeye.axxb.certificate import Certificate, certify
-from calibrate.handeye.axxb.objective import QuadraticObjective, build_objective
-from calibrate.handeye.axxb.pair_covariance import pair_covariance
+from calibrate.handeye.axxb.objective import QuadraticObjective, build_objective, pair_covariance
 from calibrate.handeye.axxb.pairs import consecutive_pairs, mount_poses
 from calibrate.handeye.axxb.paper import solve_paper
 from calibrate.handeye.metrics import (

@@ -9,15 +9,22 @@ import numpy as np
 from calibrate.errors import BadViewsError, PosesDisagreeError
 from calibrate.frames import board_frames, camera_frames
 from calibrate.geometry import Array, Transform
-from calibrate.handeye.axxb.pair_covariance import pair_covariance
+from calibrate.handeye.arm import FLEX, PARAMETERS, RELATIVE_SIGMA
+from calibrate.handeye.axxb.objective import pair_covariance
 from calibrate.handeye.axxb.pairs import all_pairs, mount_poses
 from calibrate.handeye.corners import boards_by_corners, corner_distance, corner_residuals
+from calibrate.handeye.diagnosis import (
+    cross_validate,
+    error_shares,
+    explain_views,
+    judge_board,
+    judge_lens,
+    suspect_text,
+)
 from calibrate.handeye.estimate import FULL, estimate
-from calibrate.handeye.findings import error_shares, judge_board, judge_lens
 from calibrate.handeye.fit import CellFit, fit_cell, fit_moved
-from calibrate.handeye.folds import cross_validate
-from calibrate.handeye.held_out import HELD_OUT
 from calibrate.handeye.metrics import (
+    HELD_OUT,
     HoldoutScore,
     board_spread,
     distance_in_sigmas,
@@ -29,8 +36,7 @@ from calibrate.handeye.metrics import (
 from calibrate.handeye.observations import Layout, Moved
 from calibrate.handeye.poses import pose_views
 from calibrate.handeye.priors import LensPrior, Priors
-from calibrate.handeye.readings import Explanation, Reading, explain_recording
-from calibrate.handeye.session_text import explain_text, suspect_text
+from calibrate.handeye.readings import Explanation, Reading, explain_recording, explain_text
 from calibrate.handeye.solution import (
     ArmTable,
     BoardShape,
@@ -40,8 +46,6 @@ from calibrate.handeye.solution import (
     Solution,
     SolveOptions,
 )
-from calibrate.handeye.suspects import explain_views
-from calibrate.handeye.table import FLEX, PARAMETERS, RELATIVE_SIGMA
 from calibrate.stopwatch import Stopwatch
 from calibrate.views import ViewSet
 

@@ -24,8 +24,8 @@ from calibrate.geometry import (
     rotation_log,
 )
 from calibrate.handeye.observations import Moved
-from calibrate.handeye.poses import PoseFit, PoseViews, fit_poses
-from calibrate.handeye.start import BoardPoses
+from calibrate.handeye.poses import BoardPoses, PoseFit, PoseViews, fit_poses
+from calibrate.views import ViewSet
 
 _CLEAR = 10.0
 """Log evidence beyond chance by which another reading has to win."""
@@ -222,3 +222,46 @@ _CONVENTIONS: dict[Reading, Callable[[Array], Array]] = {
     Reading.ANGLES_AS_ROTATION_VECTOR: _rotations(_angles),
     Reading.INVERSE_ROTATIONS: _rotations(lambda R: np.asarray(R.transpose(0, 2, 1))),
 }
+
+
+_INPUT = " Correct poses.csv or dataset.yaml and import again."
+_MOVED = "{moved} {where}. Record again, or use both parts with --accept-move (result: after the move)."
+_TEXTS = {
+    Reading.AS_RECORDED: "No other reading explains the recording. "
+    "Check the mounting, and that the robot poses belong to these images.",
+    Reading.INVERSE_POSES: "The views agree with inverted robot poses, or with the other mounting." + _INPUT,
+    Reading.QUATERNION_ORDER: "The views agree with quaternions in the order w, x, y, z." + _INPUT,
+    Reading.ROTATION_VECTOR_AS_ANGLES: "Rotation vectors were read as roll, pitch, yaw." + _INPUT,
+    Reading.ANGLES_AS_ROTATION_VECTOR: "Roll, pitch, yaw were read as rotation vectors." + _INPUT,
+    Reading.INVERSE_ROTATIONS: "The views agree with inverted rotations and the given positions." + _INPUT,
+    Reading.SHIFTED: "Each image belongs to the robot pose {rows} {later}. "
+    "Move the poses by that many rows and import again.",
+    Reading.MIRRORED: "The images are mirrored. Switch the camera's flip or reverse x off and record again.",
+    Reading.SQUARE_SIZE: "The board's squares are {factor:.4g} times as large as configured. "
+    "Measure the board, correct square_m and solve again with --square-mm.",
+    Reading.MILLIMETRES: "The {in_mm} are in millimetres. Write them in metres and import again.",
+    Reading.FOCAL_LENGTH: "The focal length is {factor:.3f} times the given one. "
+    "Solve with --estimate-intrinsics, or calibrate the camera again.",
+    Reading.REFOCUSED: "The camera was refocused or zoomed {where}. Lock the lens and record again.",
+    Reading.BOARD_MOVED: _MOVED,
+    Reading.CAMERA_MOVED: _MOVED,
+}
+_WHAT_MOVED = {
+    (Reading.BOARD_MOVED, "eye-in-hand"): "The board was moved",
+    (Reading.BOARD_MOVED, "eye-to-hand"): "The board moved on the flange, or the TCP was changed,",
+    (Reading.CAMERA_MOVED, "eye-in-hand"): "The camera moved on its mount, or the TCP was changed,",
+    (Reading.CAMERA_MOVED, "eye-to-hand"): "The camera or the robot's base was moved",
+}
+
+
+def explain_text(session: Explanation, views: ViewSet) -> str:
+    """Tell in at most two sentences how the recording reads and what to do."""
+    first = views.views[0 if session.reading is Reading.SHIFTED else session.at]
+    return _TEXTS[session.reading].format(
+        factor=session.factor,
+        rows=abs(session.at),
+        later="later" if session.at > 0 else "earlier",
+        in_mm="robot positions" if session.factor > 1 else "square sizes",
+        moved=_WHAT_MOVED.get((session.reading, views.mount), ""),
+        where=f"from view {first.index + 1} ({first.name}) on",
+    )

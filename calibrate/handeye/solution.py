@@ -14,8 +14,7 @@ import numpy as np
 
 from calibrate.geometry import Array, Transform
 from calibrate.handeye.axxb.certificate import Certificate
-from calibrate.handeye.findings import Finding
-from calibrate.handeye.folds import CrossValidation
+from calibrate.handeye.diagnosis import CrossValidation, Finding
 from calibrate.handeye.metrics import HoldoutScore, Observability
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.readings import Explanation, Reading

@@ -1,4 +1,8 @@
-"""Board poses from pictures, with every pose that the picture alone cannot tell apart."""
+"""Board poses from images: every pose that one image cannot tell apart, and the choice by the robot's motion.
+
+For the right readings of two views the robot's and the board's relative motions A and B are the same screw:
+equal angles, equal translations along the axis, whatever X is. So every pair of readings is scored without X.
+"""
 
 from __future__ import annotations
 
@@ -10,14 +14,13 @@ from numpy.typing import NDArray
 
 from calibrate.boards.model import board_from_turned, looks_same_turns
 from calibrate.errors import BadViewsError
-from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
+from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, rotation_log, transform_points
 from calibrate.handeye.corners import corner_residuals, linearise_corners
 from calibrate.handeye.observations import Observations, observe_views
 from calibrate.lens.model import project, undistort
-from calibrate.lens.orientation import choose_candidates
 from calibrate.projection import camera_matrix
 from calibrate.views import BoardView, ViewSet
-from recordings.schema.messages import BoardSpec, CameraModel
+from recordings.schema.messages import BoardSpec, CameraModel, Mount
 
 _STEPS = 20
 _SETTLED = 1e-6
@@ -78,7 +81,7 @@ def _candidates(views: ViewSet, board: BoardSpec | None) -> list[list[Candidate]
 
 def _planar_poses(views: ViewSet) -> list[list[Array]]:
     """T. Collins, A. Bartoli: "Infinitesimal plane-based pose estimation" (2014), then least squares."""
-    starts = [_tilts(view, views.camera) for view in views]
+    starts = [planar_tilts(view, views.camera) for view in views]
     owner = np.repeat(np.arange(len(views)), [len(each) for each in starts])
     poses, rms_px = _least_squares(views, owner, np.concatenate(starts))
     in_front = np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(rms_px) & (poses[:, 2, 3] > 0)
@@ -100,8 +103,8 @@ def _credible_px(best_px: Array) -> Array:
     return np.maximum(1.5 * best_px, best_px + 0.05)
 
 
-def _tilts(view: BoardView, camera: CameraModel) -> Array:
-    """(1 or 2, 4, 4)"""
+def planar_tilts(view: BoardView, camera: CameraModel) -> Array:
+    """Poses (1 or 2, 4, 4) by which a flat board explains the image, the likelier first (IPPE)."""
     K = camera_matrix(camera)
     points = np.ascontiguousarray(view.board_points)
     pixels = np.ascontiguousarray(undistort(camera, view.pixels))
@@ -160,3 +163,81 @@ def view_rms_px(view: BoardView, camera: CameraModel, camera_from_board: Array) 
     """Root mean square distance of the corners from where the pose shows them."""
     miss = project(camera, camera_from_board, view.board_points) - view.pixels
     return float(np.sqrt(np.square(miss).sum(axis=1).mean()))
+
+
+ANGLE_SCALE_RAD = 0.01
+PITCH_SCALE_M = 0.005
+_LARGEST_VOTERS = 120
+
+
+def choose_candidates(candidates: list[Array], base_from_flange: Array, mount: Mount) -> list[int]:
+    """Per view the number of the reading to keep.
+
+    candidates: n arrays (k_i, 4, 4) camera_from_board; base_from_flange: (n, 4, 4). At most 120 views, evenly
+    spread, vote; the others follow them, so the work is bounded. Best of all starts of iterated conditional
+    modes (J. Besag, 1986), each start holding one reading of one view.
+    """
+    count = len(candidates)
+    voters = np.unique(np.linspace(0, count - 1, min(count, _LARGEST_VOTERS)).astype(int))
+    owner = np.concatenate([np.full(len(candidates[v]), n) for n, v in enumerate(voters)])
+    poses = np.concatenate([candidates[v] for v in voters])
+    flanges = np.repeat(base_from_flange[voters], [len(candidates[v]) for v in voters], axis=0)
+    cost = _disagreement(mount, flanges[:, None], poses[:, None], flanges[None], poses[None])
+    cost[owner[:, None] == owner[None, :]] = 0.0
+    starts = np.array([np.flatnonzero(owner == n)[0] for n in range(len(voters))])
+    best, best_cost = starts, np.inf
+    for start in range(len(owner)):
+        labels = _settle(cost, owner, len(voters), start)
+        total = float(cost[np.ix_(labels, labels)].sum())
+        if total < best_cost - 1e-9:
+            best, best_cost = labels, total
+    kept = {int(v): int(best[n] - starts[n]) for n, v in enumerate(voters)}
+    anchor_poses = np.array([candidates[v][k] for v, k in kept.items()])
+    anchor_flanges = base_from_flange[list(kept)]
+    for i in set(range(count)) - set(kept):
+        votes = [
+            _disagreement(mount, base_from_flange[i], each, anchor_flanges, anchor_poses).sum()
+            for each in candidates[i]
+        ]
+        kept[i] = int(np.argmin(votes))
+    return [kept[i] for i in range(count)]
+
+
+def _settle(cost: Array, owner: NDArray[np.intp], views: int, start: int) -> NDArray[np.intp]:
+    """Labels as row numbers of `cost`, one per view."""
+
+    def cheapest(column: Array) -> NDArray[np.intp]:
+        order = np.lexsort((np.arange(len(owner)), column, owner))
+        first = np.searchsorted(owner[order], np.arange(views))
+        return np.asarray(order[first])
+
+    column = cost[:, start].copy()
+    column[start] = -1.0
+    labels = cheapest(column)
+    for _ in range(20):
+        following = cheapest(cost[:, labels].sum(axis=1))
+        if (following == labels).all():
+            break
+        labels = following
+    return labels
+
+
+def _disagreement(mount: Mount, flange: Array, pose: Array, later_flange: Array, later_pose: Array) -> Array:
+    """(...) in 0 … 1 (Geman-McClure) by which the motions of arm and board are not the same screw."""
+    if mount == "eye-in-hand":
+        A = inverse(later_flange) @ flange
+    else:
+        A = later_flange @ inverse(flange)
+    B = later_pose @ inverse(pose)
+    alpha, beta = rotation_log(A[..., :3, :3]), rotation_log(B[..., :3, :3])
+    angle_a, angle_b = np.linalg.norm(alpha, axis=-1), np.linalg.norm(beta, axis=-1)
+    along_a = (alpha * A[..., :3, 3]).sum(axis=-1) / np.maximum(angle_a, 1e-9)
+    along_b = (beta * B[..., :3, 3]).sum(axis=-1) / np.maximum(angle_b, 1e-9)
+    # The axis of a small turn is not known, nor is the sign of that of a half turn.
+    trust = np.minimum(1.0, np.minimum(angle_a, angle_b) / 0.2)
+    pitch_miss = np.abs(along_a - along_b)
+    pitch_miss = np.where(
+        angle_a > np.pi - 0.1, np.minimum(pitch_miss, np.abs(along_a + along_b)), pitch_miss
+    )
+    square = ((angle_a - angle_b) / ANGLE_SCALE_RAD) ** 2 + (trust * pitch_miss / PITCH_SCALE_M) ** 2
+    return np.asarray(square / (1.0 + square))

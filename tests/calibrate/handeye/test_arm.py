@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from benchmarks.kinematics import worn_cell
+from calibrate.handeye.arm import PARAMETERS
 from calibrate.handeye.solve import SolveOptions, solve_views
-from calibrate.handeye.table import PARAMETERS
 from tests.calibrate.cells import inside
 
 WITH = SolveOptions(holdout=False, folds=False)

@@ -6,7 +6,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.handeye.findings import Finding
+from calibrate.handeye.diagnosis import Finding
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.readings import Reading
 from calibrate.handeye.solve import SolveOptions, solve_views

@@ -6,8 +6,13 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from calibrate.geometry import difference, perturb, pose, random_rotation
-from calibrate.handeye.flange import flange_derivatives, flange_residuals, implied_flange
-from calibrate.handeye.observations import Observations, State
+from calibrate.handeye.observations import (
+    Observations,
+    State,
+    flange_derivatives,
+    flange_residuals,
+    implied_flange,
+)
 from recordings.schema.messages import CameraModel
 
 

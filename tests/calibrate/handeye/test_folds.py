@@ -7,10 +7,10 @@ import pytest
 
 from calibrate.geometry import perturb
 from calibrate.handeye import folds, profile_robust
+from calibrate.handeye.diagnosis import cross_validate
 from calibrate.handeye.estimate import estimate
 from calibrate.handeye.fit import fit_cell
-from calibrate.handeye.folds import cross_validate
-from calibrate.handeye.held_out import HELD_OUT
+from calibrate.handeye.metrics import HELD_OUT
 from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.quality.gates import GateInputs, judge

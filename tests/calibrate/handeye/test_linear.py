@@ -7,9 +7,8 @@ import pytest
 
 from calibrate.geometry import perturb
 from calibrate.handeye.corners import corner_residuals
-from calibrate.handeye.flange import flange_residuals
 from calibrate.handeye.linear import Linear, Scales, first_scales
-from calibrate.handeye.observations import Layout, State, observe_views
+from calibrate.handeye.observations import Layout, State, flange_residuals, observe_views
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from tests.calibrate.cells import LENSES, MID, Noise, changed, make_cell, real_cell
 

@@ -7,8 +7,7 @@ from calibrate.geometry import inverse, is_rigid, pose, random_rotation, rotatio
 from calibrate.handeye.axxb.objective import build_objective
 from calibrate.handeye.axxb.pairs import all_pairs, consecutive_pairs, mount_poses
 from calibrate.handeye.axxb.peer_methods import linear_system, orthonormalised, zhao_minimax
-from calibrate.handeye.peers import compare_all
-from calibrate.handeye.reprojection import reprojection_px
+from calibrate.handeye.peers import compare_all, reprojection_px
 from calibrate.handeye.solve import SolveOptions, solve_views
 from tests.calibrate.cells import LOW, MID, Noise, error_mm_deg, make_cell
 

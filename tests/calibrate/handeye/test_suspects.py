@@ -78,9 +78,9 @@ def test_one_wrong_number_is_named_with_axis_and_size(mount, number, size):
 
 
 def test_the_size_of_a_wrong_number_is_recorded_minus_true():
+    from calibrate.handeye.diagnosis import explain_views
     from calibrate.handeye.fit import fit_cell
     from calibrate.handeye.priors import LensPrior, Priors
-    from calibrate.handeye.suspects import explain_views
 
     c = cell(3)
     for number, size in ((1, 0.03), (5, -0.05)):

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from benchmarks.kinematics import worn_cell
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp
-from calibrate.handeye.table import PARAMETERS, by_parameters, table_motion
+from calibrate.handeye.arm import PARAMETERS, by_parameters, table_motion
 from calibrate.kinematics import MODELS, DhDeltas, forward, link_frames
 from tests.calibrate.cells import changed
 

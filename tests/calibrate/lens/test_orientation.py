@@ -17,8 +17,7 @@ from calibrate.geometry import (
     rotation_angle,
     transform_points,
 )
-from calibrate.lens.orientation import choose_candidates
-from calibrate.lens.pnp import candidate_poses, solve_pnp
+from calibrate.lens.pnp import candidate_poses, choose_candidates, solve_pnp
 from calibrate.projection import project_pixels
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Mount

@@ -6,7 +6,7 @@ import numpy as np
 
 from benchmarks.scene import Noise, make_cell, zhang
 from calibrate.geometry import Array, rotation_exp
-from calibrate.lens.fit import fit_lens
+from calibrate.lens.intrinsics import fit_lens
 from calibrate.lens.model import undistort
 from calibrate.lens.uncertainty import LensUncertainty, lens_uncertainty
 from calibrate.projection import camera_matrix, project_pixels

@@ -11,8 +11,7 @@ import numpy as np
 import pytest
 
 from calibrate.files.calibration import Gate
-from calibrate.handeye.findings import Finding
-from calibrate.handeye.folds import CrossValidation
+from calibrate.handeye.diagnosis import CrossValidation, Finding
 from calibrate.handeye.readings import Explanation, Reading
 from calibrate.handeye.solution import HoldoutScore, NoiseScales, Remark, Solution
 from calibrate.pipeline import SolvedRecording

@@ -1,0 +1,249 @@
+"""An estimate against what was stated and recorded: lens and board, single views, views left out of folds."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy import stats
+
+from calibrate.errors import BadViewsError
+from calibrate.geometry import Array, difference, skew
+from calibrate.handeye.estimate import FULL, Estimate, estimate
+from calibrate.handeye.fit import CellFit
+from calibrate.handeye.linear import Linear, inverse_of
+from calibrate.handeye.observations import Layout, Places, implied_flange
+from calibrate.projection import intrinsics_vector
+from calibrate.views import ViewSet
+
+_EXPLAINED = 4.0
+"""Sigmas of a statement's own tolerance within which views may differ from it."""
+_LOOSER = 0.01
+"""A statement is taken back by giving its information this factor, not none: without it X may be open."""
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """One statement (the lens, the board) against the views."""
+
+    sigmas: float
+    """By which views and statement contradict each other, as those of one normal number."""
+    pull_m: float
+    """By which believing the statement moves X at the working distance."""
+
+    @property
+    def unexplained_m(self) -> float:
+        """The part of `pull_m` that the statement's tolerance does not explain."""
+        return float(self.pull_m * np.maximum(0.0, 1.0 - _EXPLAINED / np.maximum(self.sigmas, 1e-9)))
+
+
+def judge_lens(fit: CellFit, distance_m: float) -> Finding:
+    """A given lens against its pictures and the robot's motion."""
+    state, prior = fit.estimate.state, fit.priors.lens
+    places = np.arange(Layout.of(state).lens.start, Layout.of(state).lens.stop)
+    return _judge(fit, places, intrinsics_vector(state.camera) - prior.mean, prior.sigma, distance_m)
+
+
+def judge_board(fit: CellFit, distance_m: float) -> Finding:
+    """The stated board (size, equal print, flatness) against the views."""
+    state = fit.estimate.state
+    places = np.arange(Layout.of(state).shape.start, Layout.of(state).shape.stop)
+    return _judge(fit, places, state.shape, fit.priors.board_sigma, distance_m)
+
+
+def _judge(fit: CellFit, places: Array, miss: Array, sigma: Array, distance_m: float) -> Finding:
+    covariance = fit.estimate.covariance
+    # Where both agree, the difference of the estimates has the difference of their covariances.
+    root = 1.0 / sigma
+    left = np.eye(len(places)) - covariance[np.ix_(places, places)] * root * root[:, None]
+    values, vectors = np.linalg.eigh((left + left.T) / 2)
+    told = values > 1e-3
+    square = float(((vectors.T @ (miss * root))[told] ** 2 / values[told]).sum())
+    log_chance = float(stats.chi2.logsf(square, max(int(told.sum()), 1)))
+    if log_chance < -600:
+        sigmas = float(np.sqrt(-2 * log_chance))
+    else:
+        sigmas = float(stats.norm.isf(np.exp(log_chance) / 2))
+    precision = np.zeros(len(covariance))
+    precision[places] = (1 - _LOOSER) * sigma**-2.0
+    step = np.zeros(len(covariance))
+    step[places] = precision[places] * miss
+    try:
+        moved = inverse_of(inverse_of(covariance) - np.diag(precision)) @ step
+    except np.linalg.LinAlgError:
+        moved = np.zeros(len(covariance))
+    lever = fit.estimate.state.X[:3, :3] @ np.array([0.0, 0.0, distance_m])
+    J = np.concatenate([np.eye(3), -skew(lever)], axis=1)
+    return Finding(sigmas if told.any() else 0.0, float(np.linalg.norm(J @ moved[:6])))
+
+
+def error_shares(fit: CellFit) -> dict[str, float]:
+    """Share of X's variance by source, mean over directions, summing to 1.
+
+    Of lens, board shape and arm: what knowing them would take away; the rest by whose noise it is.
+    """
+    state, covariance = fit.estimate.state, fit.estimate.covariance
+    at = Layout.of(state)
+    whiten = np.linalg.inv(covariance[:6, :6])
+    shares = {}
+    for name, part in (("intrinsics", at.lens), ("board", at.shape), ("kinematics", at.table)):
+        cross, inner = covariance[:6, part], covariance[part, part]
+        taken = cross @ np.linalg.pinv(inner, hermitian=True) @ cross.T if inner.size else np.zeros((6, 6))
+        shares[name] = float(np.trace(whiten @ taken)) / 6
+    modelled = min(sum(shares.values()), 0.99)
+    shares = {name: share * modelled / max(sum(shares.values()), 1e-12) for name, share in shares.items()}
+    corners, translation, rotation = fit.estimate.noise_parts.tolist()
+    total = corners + translation + rotation
+    left = 1.0 - modelled
+    return {
+        "corners": left * corners / total,
+        "robot_translation": left * translation / total,
+        "robot_rotation": left * rotation / total,
+        **shares,
+    }
+
+
+Cause = Literal["wrong-pose", "wrong-number", "inconsistent"]
+_CHANCE = 1e-6
+"""Below this a residual is not explained by noise."""
+
+
+_COMPONENTS = ("x", "y", "z", "rotation about x", "rotation about y", "rotation about z")
+
+
+@dataclass(frozen=True)
+class Suspect:
+    place: int
+    cause: Cause
+    residual_m: float
+    residual_rad: float
+    other: int | None = None
+    """Place of the view whose recorded pose belongs to this picture (wrong-pose)."""
+    number: int | None = None
+    """Place in [δt, δφ] of the only wrong number of its recorded pose (wrong-number)."""
+    slip: float = 0.0
+    """By which that number is off, metres or radians."""
+
+
+def explain_views(fit: CellFit, places: Places) -> tuple[Suspect, ...]:
+    """Causes of the views at these places, none of which counts."""
+    found = fit.estimate
+    X, Y = found.state.poses(fit.observed)
+    implied = implied_flange(fit.observed.mount, X, Y, found.board_poses)
+    return tuple(_explain(fit, found, implied, int(place), places) for place in places)
+
+
+def _explain(fit: CellFit, found: Estimate, implied: Array, place: int, places: Places) -> Suspect:
+    residual, covariance = found.robot[place], found.robot_covariance[place]
+    sizes = float(np.linalg.norm(residual[:3])), float(np.linalg.norm(residual[3:]))
+    for other in places:
+        if (
+            other != place
+            and _chance(difference(implied[place], fit.observed.flange[other]), covariance) > _CHANCE
+        ):
+            return Suspect(place, "wrong-pose", *sizes, other=int(other))
+    if _chance(residual, covariance) < _CHANCE:
+        for number in range(6):
+            rest = np.delete(np.arange(6), number)
+            inner = covariance[np.ix_(rest, rest)]
+            if _chance(residual[rest], inner) > _CHANCE:
+                gain = covariance[number, rest] @ np.linalg.solve(inner, residual[rest])
+                # `robot` is implied minus recorded; a slip is recorded minus true.
+                return Suspect(
+                    place, "wrong-number", *sizes, number=number, slip=float(gain - residual[number])
+                )
+    return Suspect(place, "inconsistent", *sizes)
+
+
+def _chance(residual: Array, covariance: Array) -> float:
+    return float(stats.chi2.sf(residual @ np.linalg.solve(covariance, residual), len(residual)))
+
+
+def suspect_text(suspect: Suspect, views: ViewSet) -> str:
+    """How a view contradicts the others, with its cause where the data name one."""
+    apart = f"{suspect.residual_m * 1e3:.2f} mm, {np.degrees(suspect.residual_rad):.2f}°"
+    if suspect.other is not None:
+        other = views.views[suspect.other]
+        return f"The picture belongs to the robot pose of view {other.index + 1} ({other.name})."
+    if suspect.number is not None:
+        component = _COMPONENTS[suspect.number]
+        slip = f"{suspect.slip * 1e3:.2f} mm" if suspect.number < 3 else f"{np.degrees(suspect.slip):.2f}°"
+        return f"Only {component} in base is off, by {slip}; the other five numbers of its pose agree."
+    return f"Robot pose and picture differ by {apart} from what all other views say."
+
+
+FOLDS = 5
+FEWEST_VIEWS = 6
+_STEPS = 3
+"""Linearisations of each fold: it starts from the estimate of all views."""
+_CALLED_TOO_SMALL = 1e-4
+"""That sound claims are called too small."""
+
+
+@dataclass(frozen=True, eq=False)
+class CrossValidation:
+    """Of the views that count fully, at the middle of the board."""
+
+    rms_m: float
+    rms_rad: float
+    claimed_m: float
+    """The same as the estimates predict it."""
+    limit: float
+    """Of `rms_m` over `claimed_m`; beyond it the claim is too small."""
+    folds: int
+    residual_m: dict[int, float]
+    """Place of each view → distance by which it was missed."""
+
+
+def cross_validate(fit: CellFit, seed: int) -> CrossValidation | None:
+    """None with too few views, or where a fold determines nothing."""
+    full = np.flatnonzero(fit.estimate.chances[:, 0] > FULL)
+    if len(full) < FEWEST_VIEWS:
+        return None
+    order = np.random.default_rng(seed).permutation(full)
+    missed = np.zeros((len(fit.views), 6))
+    claimed = np.zeros((len(fit.views), 6, 6))
+    for k in range(FOLDS):
+        left_out = np.sort(order[k::FOLDS])
+        try:
+            missed[left_out], claimed[left_out] = _predict(fit, left_out)
+        except (BadViewsError, np.linalg.LinAlgError):
+            return None
+    T = _at_board(fit)
+    missed, claimed = (T @ missed[..., None])[full, :, 0], (T @ claimed @ np.swapaxes(T, 1, 2))[full]
+    distance = np.linalg.norm(missed[:, :3], axis=1)
+    expected = np.trace(claimed[:, :3, :3], axis1=1, axis2=2)
+    freedom = 3 * len(full)
+    limit = float(np.sqrt(stats.f.isf(_CALLED_TOO_SMALL, freedom, max(freedom - 6, 1))))
+    return CrossValidation(
+        float(np.sqrt((distance**2).mean())),
+        float(np.sqrt((missed[:, 3:] ** 2).sum(axis=1).mean())),
+        float(np.sqrt(expected.mean())),
+        limit,
+        FOLDS,
+        dict(zip(full.tolist(), distance.tolist(), strict=True)),
+    )
+
+
+def _predict(fit: CellFit, left_out: Places) -> tuple[Array, Array]:
+    """Residuals (m, 6) of the views left out, and the covariance (m, 6, 6) that the other views give them."""
+    others = np.setdiff1d(np.arange(len(fit.views)), left_out)
+    whole = fit.estimate
+    start = whole.state.of_views(others)
+    found = estimate(fit.observed.part(others), start, fit.priors, whole.scales, max_steps=_STEPS)
+    seen = found.state.with_boards(whole.board_poses[left_out])
+    linear = Linear.at(fit.observed.part(left_out), seen, whole.corner_weights[left_out])
+    return linear.m, linear.predicted(found.scales, found.covariance)
+
+
+def _at_board(fit: CellFit) -> Array:
+    """(n, 6, 6) from [δt, δφ] of the flange to that of the middle of the board, in base."""
+    state, observed = fit.estimate.state, fit.observed
+    middle = np.array([*observed.extent[0], 0.0])
+    _, Y = state.poses(observed)
+    board = Y if observed.mount == "eye-in-hand" else observed.flange @ Y
+    point = np.broadcast_to(board[..., :3, :3] @ middle + board[..., :3, 3], (len(observed), 3))
+    T = np.tile(np.eye(6), (len(observed), 1, 1))
+    T[:, :3, 3:] = -skew(point - observed.flange[:, :3, 3])
+    return T

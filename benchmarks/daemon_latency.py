@@ -93,10 +93,10 @@ async def _loop_lags() -> tuple[list[float], int]:
             recorder = Recorder(folder / "lag.mcap", info)
             ended = threading.Event()
             source = threading.Thread(target=_pictures, args=(recorder, model.width, model.height, ended))
-            session.guard.lags_s.clear()
+            session.supervisor.lags_s.clear()
             source.start()
             await asyncio.sleep(RECORD_S)
-            lags = [1000 * lag for lag in session.guard.lags_s]
+            lags = [1000 * lag for lag in session.supervisor.lags_s]
             ended.set()
             await asyncio.to_thread(source.join)
             await asyncio.wrap_future(recorder.finish())

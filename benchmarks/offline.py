@@ -92,7 +92,7 @@ def make_recording(path: Path, views: int = 25, factor: float = 1.0, seed: int =
         board=truth.board,
         camera=CameraModel(camera.width, camera.height),
         robot=RobotIdentity("UR10"),
-        camera_identity=CameraIdentity("rendered", "bench"),
+        camera_identity=CameraIdentity("rendered", "context"),
     )
     with RecordingWriter(path, info) as writer:
         for k in range(views):

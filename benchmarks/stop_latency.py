@@ -34,7 +34,7 @@ Times = dict[str, list[float]]
 """Milliseconds since the call, by what happened."""
 
 
-class Bench:
+class SessionContext:
     """One arm that swings its base joint to and fro."""
 
     def __init__(self, robot: UrRobot, admin: AdminClient) -> None:
@@ -81,12 +81,12 @@ class Bench:
         return next((e["monotonic_ns"] for e in entries if (e["source"], e["verb"]) == (source, verb)), None)
 
 
-async def trial(bench: Bench, way: str, times: Times) -> None:
-    move = await bench.cruise()
-    robot = bench.robot
+async def trial(context: SessionContext, way: str, times: Times) -> None:
+    move = await context.cruise()
+    robot = context.robot
     child, dashboard = robot._child, robot.dashboard
     if child is None or dashboard is None:
-        await bench.rest(move)
+        await context.rest(move)
         raise RobotError("control ended before the STOP")
     ways: dict[str, Callable[[], Awaitable[object] | None]] = {
         "both": lambda: robot.stop("benchmark"),
@@ -105,12 +105,12 @@ async def trial(bench: Bench, way: str, times: Times) -> None:
     else:
         handed_ns = time.monotonic_ns()
     times["bytes handed to the kernel"].append((handed_ns - begun_ns) / 1e6)
-    await bench.rest(move)
+    await context.rest(move)
     source, verb = ("script", "stopJ") if way == "control process" else ("dashboard", "stop")
-    received_ns = bench.received_ns(source, verb, begun_ns)
+    received_ns = context.received_ns(source, verb, begun_ns)
     if received_ns is not None:
         times[f"{source} {verb} reached the controller"].append((received_ns - begun_ns) / 1e6)
-    times["first deceleration"].append((bench.deceleration_ns() - begun_ns) / 1e6)
+    times["first deceleration"].append((context.deceleration_ns() - begun_ns) / 1e6)
 
 
 async def measure(host: str, admin: AdminClient, folder: Path, count: int) -> list[tuple[str, ...]]:
@@ -123,13 +123,13 @@ async def measure(host: str, admin: AdminClient, folder: Path, count: int) -> li
             await asyncio.sleep(0.03)
 
     beating = asyncio.create_task(heart())
-    bench = Bench(robot, admin)
+    context = SessionContext(robot, admin)
     rows, disturbed = [], 0
     for way in ("both", "control process", "dashboard"):
         times: Times = defaultdict(list)
         while len(times["first deceleration"]) < count:
             try:
-                await trial(bench, way, times)
+                await trial(context, way, times)
             except RobotError:  # this machine was too busy for the watchdog, before the STOP
                 disturbed += 1
                 await robot.stop("disturbed")

@@ -93,7 +93,7 @@ class Daemon:
 
     def _speed_rad_s(self) -> float | None:
         try:
-            return max(map(abs, self.session.bench.cell.robot.latest().joint_speeds_rad_s))
+            return max(map(abs, self.session.context.cell.robot.latest().joint_speeds_rad_s))
         except RobotError:
             return None
 
@@ -111,7 +111,7 @@ class Daemon:
 
     def _healthy(self) -> bool:
         """systemd may restart us when this stays false."""
-        recording = self.session.bench.recording
+        recording = self.session.context.recording
         recorder = recording.recorder if recording is not None else None
         writing = recorder is None or recorder.error is not None or recorder.alive
         return writing and time.monotonic() - self._served_s < CONTROL_SERVED_S

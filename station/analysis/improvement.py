@@ -43,7 +43,7 @@ _CONTRADICTION = 5.0
 
 
 @dataclass(frozen=True)
-class Worth:
+class ReplanGain:
     """What the poses that are left would bring, by the better estimate."""
 
     sigma_m: float
@@ -58,8 +58,8 @@ class Worth:
 class Improvement:
     plan: Plan
     """The poses in place of those left."""
-    before: Worth
-    after: Worth
+    before: ReplanGain
+    after: ReplanGain
     sigma_m: float
     """1 sigma per axis of the mount it was made from."""
     sigma_rad: float
@@ -134,7 +134,7 @@ def _require_agreement(guess: PoseGuess, X: Array) -> None:
     )
 
 
-def _worth(scene: Scene, seen: Sequence[Seen], left: Plan, free_lens: bool) -> Worth:
+def _worth(scene: Scene, seen: Sequence[Seen], left: Plan, free_lens: bool) -> ReplanGain:
     flange = flange_poses(scene, left)
     captured = np.array([pose for _, pose, _, _ in seen])
     everything = informations(scene, np.concatenate([captured, flange]), MeasurementNoise()).sum(axis=0)
@@ -146,4 +146,4 @@ def _worth(scene: Scene, seen: Sequence[Seen], left: Plan, free_lens: bool) -> W
     )
     size = np.array([scene.camera.width, scene.camera.height]) - 1
     margin_px = float(max(pixels.min(axis=0).max(), (size - pixels.max(axis=0)).max()))
-    return Worth(sigma_m, int((~whole).sum()), margin_px)
+    return ReplanGain(sigma_m, int((~whole).sum()), margin_px)

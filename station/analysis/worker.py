@@ -35,7 +35,7 @@ _NICENESS = 5
 
 
 @dataclass(frozen=True, eq=False)
-class Sighting:
+class BoardDetection:
     """What one picture shows."""
 
     status: DetectionStatus
@@ -65,7 +65,7 @@ def sight(
     camera: CameraModel | None,
     thorough: bool = True,
     exposure: tuple[float, float] | None = None,
-) -> Sighting:
+) -> BoardDetection:
     """Looks for the board; distance and tilt where a lens, even a rough one, is given.
 
     `exposure`: what the picture was taken with (µs, dB); with it comes advice on what to set.
@@ -91,12 +91,12 @@ def sight(
         distance_m=distance_m,
         advice=advice,
     )
-    return Sighting(status, found.indices, found.pixels)
+    return BoardDetection(status, found.indices, found.pixels)
 
 
 def seen_before(
     path: Path, board: BoardSpec, camera: CameraModel | None
-) -> list[tuple[int, Array, Sighting]]:
+) -> list[tuple[int, Array, BoardDetection]]:
     """Pose number, base_from_flange (4, 4) and sighting of every picture of a recording that shows the board.
 
     A picture that cannot be read shows none. RecordingError for a recording that cannot be.

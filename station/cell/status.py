@@ -191,7 +191,7 @@ class Event(msgspec.Struct, frozen=True, omit_defaults=True):
     pose_index: int | None = None
 
 
-class GoSummary(msgspec.Struct, frozen=True, omit_defaults=True):
+class MotionPreview(msgspec.Struct, frozen=True, omit_defaults=True):
     """What a person confirms before anything moves. `token` is for one use."""
 
     token: str
@@ -215,7 +215,7 @@ class GoSummary(msgspec.Struct, frozen=True, omit_defaults=True):
 class HoverOffer(msgspec.Struct, frozen=True, omit_defaults=True):
     """A way that puts the pointer's tip over a corner of the board, waiting for its go."""
 
-    go: GoSummary
+    go: MotionPreview
     corner: int
     """Row of `calibrate.boards.model.board_points`."""
     corner_m: tuple[float, float]
@@ -252,7 +252,7 @@ class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     session: SessionStatus = SessionStatus()
     estimate: EstimateStatus = EstimateStatus()
     lease: Lease = Lease()
-    go: GoSummary | None = None
+    go: MotionPreview | None = None
     """A go that waits for a person's confirmation."""
     loop_lag_ms: float = 0.0
     """How late the daemon's working loop came, worst of the last second."""

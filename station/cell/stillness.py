@@ -30,7 +30,7 @@ KEPT_SAMPLES = 4096
 
 
 @dataclass(frozen=True)
-class Look:
+class ImageMotion:
     """What the pictures say: how far they move, px; None where that cannot be measured."""
 
     motion_px: float | None
@@ -123,7 +123,7 @@ class StillnessMonitor:
     async def settle(
         self,
         alive: Callable[[], object],
-        look: Callable[[int], Look | None] = lambda since_ns: Look(None),
+        look: Callable[[int], ImageMotion | None] = lambda since_ns: ImageMotion(None),
         now_s: Callable[[], float] = time.monotonic,
     ) -> Stillness:
         """Returns as soon as everything is at rest. `alive` raises when the robot is lost; False: old news.

@@ -20,7 +20,7 @@ from rich.text import Text
 from station.cell.errors import ConfigError, RefusedError, StationError
 from station.cell.plan import Plan
 from station.cell.socket_folder import default_socket
-from station.cell.status import GoSummary, StationStatus
+from station.cell.status import MotionPreview, StationStatus
 from station.cli.console import AsJson, Headless, Socket, err, out
 from station.operate.attend import Confirm, Outcome, carry_out, wait_until_idle
 from station.operate.drift_check import (
@@ -199,7 +199,7 @@ async def _status(client: Client) -> StationStatus:
 def _confirmation(approved: str, interactive: bool, simulated: bool) -> Confirm:
     """Who says yes: the approved hash, the person, or, for a simulated cell only, nobody."""
 
-    def confirm(summary: GoSummary) -> bool:
+    def confirm(summary: MotionPreview) -> bool:
         if approved:
             if not summary.plan_sha256.startswith(approved) or len(approved) < 12:
                 raise RefusedError(f"--approve {approved} is not the hash of this plan: nothing moved")
@@ -213,7 +213,7 @@ def _confirmation(approved: str, interactive: bool, simulated: bool) -> Confirm:
     return confirm
 
 
-def ask_person(summary: GoSummary) -> bool:
+def ask_person(summary: MotionPreview) -> bool:
     many = "1 pose" if summary.poses == 1 else f"{summary.poses} poses"
     err.print(Text.assemble(("\nThe arm will move", "bold"), f": {summary.purpose}, {many}"))
     err.print(f"first {summary.first_move}; {summary.path_m:.2f} m, up to {summary.top_speed_m_s:.2f} m/s")

@@ -11,11 +11,11 @@ from dataclasses import dataclass
 import msgspec
 
 from station.cell.errors import RefusedError, StationError
-from station.cell.status import GoSummary, StationState, StationStatus
+from station.cell.status import MotionPreview, StationState, StationStatus
 from station.protocol.client import Client, DaemonGoneError
 
 Watcher = Callable[[StationStatus], None]
-Confirm = Callable[[GoSummary], bool]
+Confirm = Callable[[MotionPreview], bool]
 CONNECT_WAIT_S = 30.0
 STOP_ANSWER_S = 3.0
 PREPARE_S = 180.0
@@ -79,7 +79,7 @@ async def carry_out(
     RefusedError when the daemon or the person says no. Being cancelled (Ctrl-C) sends STOP and says so.
     """
     answer = await client.request("prepare", purpose=purpose, timeout_s=PREPARE_S)
-    summary = msgspec.convert(answer, GoSummary)
+    summary = msgspec.convert(answer, MotionPreview)
     if not confirm(summary):
         raise RefusedError("nothing moved: the go was not given")
     await asyncio.sleep(0)  # Ctrl-C at the question strikes here, before the go is sent

@@ -17,7 +17,7 @@ from station.cell import status
 from station.cell.errors import RefusedError
 from station.cell.plan import Plan, PlannedPose
 from station.cell.session_folder import SessionSummary
-from station.cell.status import GoSummary, HoverOffer
+from station.cell.status import HoverOffer, MotionPreview
 from station.cell.status import StationState as S
 from station.protocol.states import LATCHED, RESTING, RUNNING
 
@@ -192,7 +192,7 @@ class MakePlan(Verb[PlanFacts], frozen=True):
     lens_known: bool = False
 
 
-class Prepare(Verb[GoSummary], frozen=True):
+class Prepare(Verb[MotionPreview], frozen=True):
     """Check the whole path from where the arm is and offer its approval."""
 
     states = RESTING

@@ -12,7 +12,7 @@ import msgspec
 from station.cell.errors import RefusedError
 from station.cell.session_folder import SessionSummary, list_sessions
 from station.cell.socket_folder import user_name
-from station.cell.status import GoSummary, HoverOffer, Lease
+from station.cell.status import HoverOffer, Lease, MotionPreview
 from station.protocol import verbs
 from station.protocol.verbs import VERBS, Purpose
 from station.server.approval import Applicant, ApprovalRule, Process, process
@@ -51,7 +51,7 @@ class SessionDispatcher:
 
     def __init__(self, session: Session, see: Callable[[int], Process | None] = process) -> None:
         self._session, self._see = session, see
-        cell = session.bench.cell
+        cell = session.context.cell
         self._rule = ApprovalRule(cell.config.approval, cell.simulated, see)
         self._callers: dict[int, _Caller] = {}
         self._leaving: set[asyncio.Task[None]] = set()
@@ -114,7 +114,7 @@ class SessionDispatcher:
 
     async def _hello(self, caller: _Caller, args: verbs.Hello) -> verbs.Welcome:
         caller.introduce(await self._name(caller.uid), args.who)
-        return verbs.Welcome(software()["calibration-station"], os.getpid(), str(self._session.bench.root))
+        return verbs.Welcome(software()["calibration-station"], os.getpid(), str(self._session.context.root))
 
     async def _lease(self, caller: _Caller, args: verbs.Lease) -> Lease:
         if args.action == "take":
@@ -127,7 +127,7 @@ class SessionDispatcher:
         self._session.acknowledge(caller.who)
 
     async def _plan(self, caller: _Caller, args: verbs.GetPlan) -> verbs.LoadedPlan:
-        queue = self._session.bench.queue
+        queue = self._session.context.queue
         return verbs.LoadedPlan() if queue is None else verbs.LoadedPlan(queue.plan, queue.sha256)
 
     async def _load_plan(self, caller: _Caller, args: verbs.LoadPlan) -> verbs.PlanFacts:
@@ -139,10 +139,10 @@ class SessionDispatcher:
         return self._plan_facts()
 
     def _plan_facts(self) -> verbs.PlanFacts:
-        queue = self._session.bench.require_queue()
+        queue = self._session.context.require_queue()
         return verbs.PlanFacts(len(queue.statuses), queue.sha256)
 
-    async def _prepare(self, caller: _Caller, args: verbs.Prepare) -> GoSummary:
+    async def _prepare(self, caller: _Caller, args: verbs.Prepare) -> MotionPreview:
         if args.purpose in (Purpose.REPLAN, Purpose.NEXT_POSE):
             self._rule.by_person(await self._asks(caller), "a plan that is changed on the way")
         return await self._session.prepare(caller.client_id, args.purpose, args.index)
@@ -196,8 +196,8 @@ class SessionDispatcher:
         return await self._session.previews.preview(args.width, args.height)
 
     async def _doctor(self, caller: _Caller, args: verbs.Doctor) -> list[verbs.Check]:
-        return await checklist(self._session.bench, self._session.troubles)
+        return await checklist(self._session.context, self._session.troubles)
 
     async def _sessions(self, caller: _Caller, args: verbs.Sessions) -> list[SessionSummary]:
         # In a thread: hundreds of files are read, and the arm's heartbeat does not wait.
-        return await asyncio.to_thread(list_sessions, self._session.bench.root)
+        return await asyncio.to_thread(list_sessions, self._session.context.root)

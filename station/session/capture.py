@@ -12,12 +12,12 @@ import numpy as np
 from calibrate.geometry import Array, inverse, pose_from_rotvec
 from recordings.schema.messages import Image, RobotState, Stamps, Stillness, Vector6, View
 from station.analysis.pool import WorkerError
-from station.analysis.worker import Sighting, sight
+from station.analysis.worker import BoardDetection, sight
 from station.cell.config import matrix4
 from station.cell.errors import CameraError, StaleStateError, StationError
 from station.cell.status import PoseState, StationState
 from station.devices.frames import mid_exposure
-from station.session.bench import Bench, SeenView
+from station.session.context import CapturedView, SessionContext
 from station.session.patience import RestingCheck
 from station.session.picture_watch import PictureWatch
 from station.session.recording import to_the_end
@@ -32,40 +32,40 @@ class PoseFailedError(StationError):
     """This pose gave nothing usable; the message says why. The session goes on."""
 
 
-async def take_pose(bench: Bench, index: int, attempt: int) -> None:
+async def take_pose(context: SessionContext, index: int, attempt: int) -> None:
     """At rest → picture → disk; marks the pose done.
 
     PoseFailedError and NotStillError when this pose gave nothing; RobotError and RecordingError end the run.
     """
-    _phase(bench, index, StationState.SETTLING, "settling")
-    resting = RestingCheck(bench.cell.robot.check)
-    async with PictureWatch(bench, index) as watch:
-        still = await bench.stillness.settle(resting, watch.look)
-    _phase(bench, index, StationState.CAPTURING, "capturing")
-    picture = bench.require_recording().number(await take_picture(bench, index))
-    show_frame(bench, picture)
+    _phase(context, index, StationState.SETTLING, "settling")
+    resting = RestingCheck(context.cell.robot.check)
+    async with PictureWatch(context, index) as watch:
+        still = await context.stillness.settle(resting, watch.look)
+    _phase(context, index, StationState.CAPTURING, "capturing")
+    picture = context.require_recording().number(await take_picture(context, index))
+    show_frame(context, picture)
     device_ns, arrival_ns = picture.stamps.device_ns, picture.stamps.host_monotonic_ns
-    clock = bench.cell.camera.clock
+    clock = context.cell.camera.clock
     mid_ns, camera_bound_s = mid_exposure(device_ns, arrival_ns, picture.exposure_us, clock)
-    state = await _state_at(bench, mid_ns)
+    state = await _state_at(context, mid_ns)
     await resting.news()
-    bench.stillness.require_rest(state)
-    view = _view(bench, index, attempt, picture, state, still, camera_bound_s)
-    _require_bound(bench, view)
-    _phase(bench, index, StationState.WRITING, "writing")
-    await to_the_end(_write(bench, index, picture, view))
+    context.stillness.require_rest(state)
+    view = _view(context, index, attempt, picture, state, still, camera_bound_s)
+    _require_bound(context, view)
+    _phase(context, index, StationState.WRITING, "writing")
+    await to_the_end(_write(context, index, picture, view))
 
 
-def _phase(bench: Bench, index: int, state: StationState, pose_state: PoseState) -> None:
-    bench.require_queue().mark(index, pose_state)
-    bench.store.enter(state)
-    bench.show_poses(index)
+def _phase(context: SessionContext, index: int, state: StationState, pose_state: PoseState) -> None:
+    context.require_queue().mark(index, pose_state)
+    context.store.enter(state)
+    context.show_poses(index)
 
 
-async def take_picture(bench: Bench, index: int | None = None) -> Image:
+async def take_picture(context: SessionContext, index: int | None = None) -> Image:
     """Of a pose, or of none. PoseFailedError once the configured retries are used up."""
-    tries = 1 + bench.cell.config.capture.retries
-    camera = bench.cell.camera
+    tries = 1 + context.cell.config.capture.retries
+    camera = context.cell.camera
     for number in range(1, tries + 1):
         try:
             if number == tries > 1:  # the last try, with a camera that was opened anew
@@ -77,14 +77,14 @@ async def take_picture(bench: Bench, index: int | None = None) -> Image:
             return await camera.capture()
         except CameraError as error:
             last = error
-            bench.store.event(f"picture {number} of at most {tries}: {error}", "warning", index)
+            context.store.event(f"picture {number} of at most {tries}: {error}", "warning", index)
     raise PoseFailedError(f"no good picture in {tries} tries: {last}")
 
 
-def show_frame(bench: Bench, picture: Image) -> None:
+def show_frame(context: SessionContext, picture: Image) -> None:
     height, width = picture.pixels.shape[:2]
     shown = msgspec.structs.replace(
-        bench.store.status.camera,
+        context.store.status.camera,
         connected=True,
         frames=picture.sequence + 1,
         width=width,
@@ -92,14 +92,14 @@ def show_frame(bench: Bench, picture: Image) -> None:
         exposure_us=picture.exposure_us,
         gain_db=picture.gain_db,
     )
-    bench.store.update(camera=shown)
+    context.store.update(camera=shown)
 
 
-async def _state_at(bench: Bench, host_monotonic_ns: int) -> RobotState:
+async def _state_at(context: SessionContext, host_monotonic_ns: int) -> RobotState:
     deadline_s = time.monotonic() + STATE_WAIT_S
     while True:
         try:
-            return bench.cell.robot.at(host_monotonic_ns)
+            return context.cell.robot.at(host_monotonic_ns)
         except StaleStateError:
             if time.monotonic() > deadline_s:
                 raise
@@ -113,7 +113,7 @@ def flange_pose(state: RobotState, tcp_offset: Vector6) -> Array:
 
 
 def _view(
-    bench: Bench,
+    context: SessionContext,
     index: int,
     attempt: int,
     picture: Image,
@@ -121,14 +121,14 @@ def _view(
     still: Stillness,
     camera_bound_s: float,
 ) -> View:
-    robot_clock = bench.cell.robot.clock()
+    robot_clock = context.cell.robot.clock()
     bound_s = camera_bound_s + (robot_clock.bound_s if robot_clock else 0.0)
     exposure_ns = state.stamps.host_monotonic_ns
     return View(
         index=index,
-        name=bench.require_queue().pose(index).name,
+        name=context.require_queue().pose(index).name,
         picture_sequence=picture.sequence,
-        base_from_flange=matrix4(flange_pose(state, bench.cell.robot.identity.tcp_offset)),
+        base_from_flange=matrix4(flange_pose(state, context.cell.robot.identity.tcp_offset)),
         joints_rad=state.joints_rad,
         attempt=attempt,
         stamps=Stamps(
@@ -142,8 +142,8 @@ def _view(
     )
 
 
-def _require_bound(bench: Bench, view: View) -> None:
-    limit_s = bench.cell.config.capture.time_bound_s
+def _require_bound(context: SessionContext, view: View) -> None:
+    limit_s = context.cell.config.capture.time_bound_s
     if view.time_bound_s is not None and view.time_bound_s > limit_s:
         raise PoseFailedError(
             f"the picture's time is known to ±{1000 * view.time_bound_s:.1f} ms only, the limit is "
@@ -151,11 +151,11 @@ def _require_bound(bench: Bench, view: View) -> None:
         )
 
 
-async def _write(bench: Bench, index: int, picture: Image, view: View) -> None:
+async def _write(context: SessionContext, index: int, picture: Image, view: View) -> None:
     """Disk and detection side by side; the view is written, and the pose counted, only with a board in it."""
-    recording, queue = bench.require_recording(), bench.require_queue()
+    recording, queue = context.require_recording(), context.require_queue()
     recording.picture(picture)
-    sighting = await _sighting(bench, picture, index)
+    sighting = await _sighting(context, picture, index)
     reason = _unusable(sighting) if sighting is not None else ""
     if sighting is not None and len(sighting.pixels):
         recording.corners(picture.sequence, sighting.pixels)
@@ -166,30 +166,30 @@ async def _write(bench: Bench, index: int, picture: Image, view: View) -> None:
     await recording.sync()
     if sighting is not None:
         queue.note(index, corners=sighting.status.corners, coverage=sighting.status.coverage)
-        bench.store.update(detection=sighting.status)
-        bench.seen[index] = SeenView(
+        context.store.update(detection=sighting.status)
+        context.seen[index] = CapturedView(
             index, np.array(view.base_from_flange), sighting.indices, sighting.pixels
         )
     queue.mark(index, "done")
     await recording.save_state(queue)
-    bench.show_poses(index)
+    context.show_poses(index)
     corners = f", {sighting.status.corners} corners" if sighting is not None else ""
-    bench.store.event(f"saved{corners}", pose_index=index)
+    context.store.event(f"saved{corners}", pose_index=index)
 
 
-async def _sighting(bench: Bench, picture: Image, index: int) -> Sighting | None:
+async def _sighting(context: SessionContext, picture: Image, index: int) -> BoardDetection | None:
     """None when the worker could not say: the data are kept, the offline stage looks again."""
-    config = bench.cell.config
+    config = context.cell.config
     try:
-        return await bench.workers.call(
+        return await context.workers.call(
             sight, picture.pixels, config.board, config.camera.model, timeout_s=SIGHT_TIMEOUT_S
         )
     except WorkerError as error:
-        bench.store.event(f"the picture was not looked at: {error}", "warning", index)
+        context.store.event(f"the picture was not looked at: {error}", "warning", index)
         return None
 
 
-def _unusable(sighting: Sighting) -> str:
+def _unusable(sighting: BoardDetection) -> str:
     """Why a picture does not count; empty when it does."""
     status = sighting.status
     if not status.found:

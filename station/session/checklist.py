@@ -12,25 +12,25 @@ from station.cell.status import StationState
 from station.devices.ur_condition import mode_word, not_powered, safety_stop, safety_word
 from station.devices.ur_probe import probe
 from station.protocol.verbs import Check
-from station.session.bench import Bench
+from station.session.context import SessionContext
 
 CLOCK_BOUND_S = 0.005
 
 
-async def checklist(bench: Bench, troubles: dict[str, str]) -> list[Check]:
+async def checklist(context: SessionContext, troubles: dict[str, str]) -> list[Check]:
     """In the order in which a person would go through them."""
     return [
-        *await _robot_checks(bench, troubles),
-        await _camera_check(bench, troubles),
-        _trigger_check(bench, troubles),
-        _board_check(bench),
-        _disk_check(bench),
-        _clock_check(bench),
+        *await _robot_checks(context, troubles),
+        await _camera_check(context, troubles),
+        _trigger_check(context, troubles),
+        _board_check(context),
+        _disk_check(context),
+        _clock_check(context),
     ]
 
 
-async def _robot_checks(bench: Bench, troubles: dict[str, str]) -> list[Check]:
-    robot, host = bench.cell.robot, bench.cell.config.robot.host
+async def _robot_checks(context: SessionContext, troubles: dict[str, str]) -> list[Check]:
+    robot, host = context.cell.robot, context.cell.config.robot.host
     try:
         state = robot.latest()
     except RobotError as error:
@@ -62,12 +62,12 @@ async def _from_outside(host: str) -> str:
     return "; ".join([f"{who} answers at {host}", *found.problems])
 
 
-async def _camera_check(bench: Bench, troubles: dict[str, str]) -> Check:
+async def _camera_check(context: SessionContext, troubles: dict[str, str]) -> Check:
     if "camera" in troubles:
         return Check("camera", "failed", troubles["camera"], "check cable, power and camera.device")
-    if bench.store.state not in (StationState.IDLE, StationState.DISCONNECTED, StationState.PAUSED):
+    if context.store.state not in (StationState.IDLE, StationState.DISCONNECTED, StationState.PAUSED):
         return Check("camera", "skipped", "in use")
-    camera = bench.cell.camera
+    camera = context.cell.camera
     try:
         async with asyncio.timeout(6.0):
             picture, settings = await camera.preview(), await camera.settings()
@@ -82,16 +82,16 @@ async def _camera_check(bench: Bench, troubles: dict[str, str]) -> Check:
     return Check("camera", "ok", f"{camera.identity.model} {camera.identity.serial}, {width}×{height}")
 
 
-def _trigger_check(bench: Bench, troubles: dict[str, str]) -> Check:
-    if bench.cell.trigger is None:
+def _trigger_check(context: SessionContext, troubles: dict[str, str]) -> Check:
+    if context.cell.trigger is None:
         return Check("trigger", "skipped", "none configured: the camera is triggered by software")
     if "trigger" in troubles:
         return Check("trigger", "failed", troubles["trigger"], "check the box's USB cable and trigger.port")
     return Check("trigger", "ok", "answers")
 
 
-def _board_check(bench: Bench) -> Check:
-    board = bench.cell.config.board
+def _board_check(context: SessionContext) -> Check:
+    board = context.cell.config.board
     try:
         check_board(board)
     except BoardError as error:
@@ -99,23 +99,23 @@ def _board_check(bench: Bench) -> Check:
     return Check("board", "ok", describe_board(board))
 
 
-def _disk_check(bench: Bench) -> Check:
-    reserve = bench.cell.config.capture.free_space_bytes
+def _disk_check(context: SessionContext) -> Check:
+    reserve = context.cell.config.capture.free_space_bytes
     try:
-        free = shutil.disk_usage(bench.root).free
-        probe = bench.root / ".write-test"
+        free = shutil.disk_usage(context.root).free
+        probe = context.root / ".write-test"
         probe.write_bytes(b"x")
         probe.unlink()
     except OSError as error:
-        return Check("disk", "failed", f"{bench.root}: {error.strerror}", "give --root a writable folder")
-    text = f"{bytes_text(free)} free at {bench.root}"
+        return Check("disk", "failed", f"{context.root}: {error.strerror}", "give --root a writable folder")
+    text = f"{bytes_text(free)} free at {context.root}"
     if free < reserve:
         return Check("disk", "failed", text, f"free {bytes_text(reserve - free)}")
     return Check("disk", "ok", text)
 
 
-def _clock_check(bench: Bench) -> Check:
-    fits = {"controller": bench.cell.robot.clock(), "camera": bench.cell.camera.clock}
+def _clock_check(context: SessionContext) -> Check:
+    fits = {"controller": context.cell.robot.clock(), "camera": context.cell.camera.clock}
     known = {name: fit for name, fit in fits.items() if fit is not None}
     if not known:
         return Check("clocks", "warning", "not known yet", "wait a few seconds and check again")

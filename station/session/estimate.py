@@ -13,7 +13,7 @@ from recordings.schema.messages import CameraModel
 from station.analysis.estimation import next_best_text, running_estimate
 from station.analysis.pool import WorkerError
 from station.cell.status import EstimateStatus
-from station.session.bench import Bench
+from station.session.context import SessionContext
 
 log = logging.getLogger(__name__)
 
@@ -21,25 +21,27 @@ _TIMEOUT_S = 20.0
 
 
 class Estimator:
-    def __init__(self, bench: Bench, hint: Callable[[EstimateStatus], str] = lambda estimate: "") -> None:
+    def __init__(
+        self, context: SessionContext, hint: Callable[[EstimateStatus], str] = lambda estimate: ""
+    ) -> None:
         """`hint`: what else to tell a person about an estimate."""
-        self._bench, self._hint = bench, hint
+        self._context, self._hint = context, hint
         self._known: tuple[int, ...] = ()
         self._woken = asyncio.Event()
 
     def poke(self) -> None:
         """Something changed; cheap."""
-        if tuple(self._bench.seen) != self._known:
+        if tuple(self._context.seen) != self._known:
             self._woken.set()
 
     async def run(self) -> None:
-        bench, config = self._bench, self._bench.cell.config
+        context, config = self._context, self._context.cell.config
         while True:
             await self._woken.wait()
             self._woken.clear()
-            self._known = tuple(bench.seen)
+            self._known = tuple(context.seen)
             if not self._known:
-                bench.store.update(estimate=EstimateStatus())
+                context.store.update(estimate=EstimateStatus())
                 continue
             camera = config.camera.model
             if camera is None or camera.matrix is None:
@@ -49,30 +51,30 @@ class Estimator:
             except Exception as error:  # this task looks on; it must outlive every picture and every defect
                 if not isinstance(error, WorkerError):
                     log.exception("the running estimate failed")
-                bench.store.event(f"no running estimate: {error}", "warning")
+                context.store.event(f"no running estimate: {error}", "warning")
                 continue
             hint = self._hint(estimate)
-            if hint and not bench.store.status.estimate.improve:
-                bench.store.event(hint)
-            bench.store.update(estimate=msgspec.structs.replace(estimate, improve=hint))
+            if hint and not context.store.status.estimate.improve:
+                context.store.event(hint)
+            context.store.update(estimate=msgspec.structs.replace(estimate, improve=hint))
 
     async def _estimate(self, camera: CameraModel) -> EstimateStatus:
         """With advice on the next pose, where one more would help."""
-        bench, config = self._bench, self._bench.cell.config
-        seen = [(v.index, v.base_from_flange, v.indices, v.pixels) for v in bench.seen.values()]
-        estimate = await bench.workers.call(
+        context, config = self._context, self._context.cell.config
+        seen = [(v.index, v.base_from_flange, v.indices, v.pixels) for v in context.seen.values()]
+        estimate = await context.workers.call(
             running_estimate,
             config.mount,
             camera,
-            bench.cell.camera_model is not None,
+            context.cell.camera_model is not None,
             config.board,
             seen,
             config.capture.goal_m,
             timeout_s=_TIMEOUT_S,
         )
-        joints = bench.store.status.robot.joints_rad
+        joints = context.store.status.robot.joints_rad
         if joints is None or estimate.sigma_translation_mm is None or estimate.enough:
             return estimate
         flange = np.array([v[1] for v in seen])
-        text = await bench.workers.call(next_best_text, config, flange, joints, timeout_s=_TIMEOUT_S)
+        text = await context.workers.call(next_best_text, config, flange, joints, timeout_s=_TIMEOUT_S)
         return msgspec.structs.replace(estimate, advice=text or estimate.advice)

@@ -14,8 +14,8 @@ from station.cell.plan import Plan, PlannedPose
 from station.cell.status import StationState
 from station.cell.stillness import NotStillError
 from station.protocol.verbs import Record
-from station.session.bench import Bench
 from station.session.capture import PoseFailedError, take_pose
+from station.session.context import SessionContext
 from station.session.queue import GUIDED, PoseQueue
 from station.session.recording import SessionRecording
 from station.session.run import disk_failed, recover_parts, unmark_busy
@@ -31,8 +31,8 @@ WATCH_PERIOD_S = 0.1
 class FreeDrive:
     """Nothing here moves the arm, so nothing here needs a go."""
 
-    def __init__(self, bench: Bench) -> None:
-        self._bench = bench
+    def __init__(self, context: SessionContext) -> None:
+        self._context = context
         self._taking = asyncio.Lock()
         self._watcher: asyncio.Task[None] | None = None
         self._last_place: Vector6 | None = None
@@ -42,9 +42,9 @@ class FreeDrive:
         if self.taking:
             raise RefusedError("the last picture is still ending: try again in a moment")
         self._end_watch()
-        bench, store = self._bench, self._bench.store
-        bench.cell.robot.check()
-        bench.halting = False
+        context, store = self._context, self._context.store
+        context.cell.robot.check()
+        context.halting = False
         # At once, and taking: while the disk works nobody is offered a go, and no picture is begun.
         store.enter(StationState.FREE_DRIVE, "the recording is being opened")
         async with self._taking:
@@ -52,42 +52,42 @@ class FreeDrive:
                 await self._open_recording()
             except BaseException:
                 if store.state in (StationState.FREE_DRIVE, StationState.PAUSED):
-                    store.enter(bench.resting)
+                    store.enter(context.resting)
                 raise
         if (refusal := Record.refusal(store.state)) is not None:
             raise refusal  # STOP, or the end of free drive, came in between
         store.enter(StationState.FREE_DRIVE, _GUIDE)
-        bench.show_poses()
+        context.show_poses()
         self._last_place = None
         if auto:
             self._watcher = asyncio.create_task(self._watch())
 
     async def _open_recording(self) -> None:
-        bench, before = self._bench, self._bench.recording
-        if bench.queue is None:
-            bench.queue = PoseQueue(Plan(bench.cell.config.robot.model, bench.cell.config.mount, ()))
-        queue = bench.queue if before is not None else bench.queue.anew(guided=False)
+        context, before = self._context, self._context.recording
+        if context.queue is None:
+            context.queue = PoseQueue(Plan(context.cell.config.robot.model, context.cell.config.mount, ()))
+        queue = context.queue if before is not None else context.queue.anew(guided=False)
         if before is not None and before.recorder is not None:
             return
         if before is not None:
-            await recover_parts(bench, before)
-        recording = before or SessionRecording(bench.root, bench.cell)
-        picture = await bench.cell.camera.capture() if bench.cell.config.camera.model is None else None
-        bench.recording = recording  # before it is open: after a STOP in between it must be closed
+            await recover_parts(context, before)
+        recording = before or SessionRecording(context.root, context.cell)
+        picture = await context.cell.camera.capture() if context.cell.config.camera.model is None else None
+        context.recording = recording  # before it is open: after a STOP in between it must be closed
         try:
             await recording.open(queue, picture)
         except BaseException:
-            bench.recording = before
+            context.recording = before
             raise
         if before is None:
-            bench.forget_session()
-        bench.queue = queue
+            context.forget_session()
+        context.queue = queue
 
     def end(self) -> None:
         """To paused; the recording stays open."""
         self._end_watch()
-        if self._bench.store.state is StationState.FREE_DRIVE:
-            self._bench.store.enter(StationState.PAUSED, "free drive ended: go on, or finish")
+        if self._context.store.state is StationState.FREE_DRIVE:
+            self._context.store.enter(StationState.PAUSED, "free drive ended: go on, or finish")
 
     @property
     def taking(self) -> bool:
@@ -112,46 +112,46 @@ class FreeDrive:
             return await self._record()
 
     async def _record(self) -> int:
-        bench = self._bench
-        queue, store = bench.require_queue(), bench.store
-        joints = bench.cell.robot.latest().joints_rad
+        context = self._context
+        queue, store = context.require_queue(), context.store
+        joints = context.cell.robot.latest().joints_rad
         index = queue.add(PlannedPose(f"hand-{queue.next_index + 1:02d}", joints, why=GUIDED))
         attempt = queue.start_attempt(index)
         self._last_place = joints
         try:
-            await take_pose(bench, index, attempt)
+            await take_pose(context, index, attempt)
         except (PoseFailedError, NotStillError) as error:
             queue.mark(index, "failed", str(error))
             store.event(str(error), "warning", index)
         except RecordingError as error:
-            disk_failed(bench, error)
+            disk_failed(context, error)
             return index
         except (RobotError, TriggerError) as error:
             self._failed(str(error), index)
             return index
         except Exception as error:
-            if not bench.halting:  # else STOP came in between: its state stays
+            if not context.halting:  # else STOP came in between: its state stays
                 log.exception("a picture failed")
             self._failed(f"internal error ({error!r}); see the log", index)
-        if not bench.halting and store.state is not StationState.FAULT:
+        if not context.halting and store.state is not StationState.FAULT:
             store.enter(StationState.FREE_DRIVE, _GUIDE)
-        bench.show_poses(index)
-        if bench.pause_wanted:
-            bench.pause_wanted = ""
+        context.show_poses(index)
+        if context.pause_wanted:
+            context.pause_wanted = ""
             self.end()
         return index
 
     def _failed(self, reason: str, index: int) -> None:
-        unmark_busy(self._bench)
-        if not self._bench.halting:
-            self._bench.store.enter(StationState.FAULT, reason)
-            self._bench.store.event(reason, "error", index)
+        unmark_busy(self._context)
+        if not self._context.halting:
+            self._context.store.enter(StationState.FAULT, reason)
+            self._context.store.event(reason, "error", index)
 
     async def _watch(self) -> None:
         """For as long as free drive lasts."""
-        while self._bench.store.state not in (StationState.PAUSED, StationState.IDLE):
+        while self._context.store.state not in (StationState.PAUSED, StationState.IDLE):
             await asyncio.sleep(WATCH_PERIOD_S)
-            if self._bench.store.state is not StationState.FREE_DRIVE:
+            if self._context.store.state is not StationState.FREE_DRIVE:
                 continue
             try:
                 if self._at_rest_elsewhere():
@@ -159,11 +159,11 @@ class FreeDrive:
             except StaleStateError:
                 continue  # a hiccup of the news; a picture waits for better ones
             except StationError as error:
-                self._bench.store.event(str(error), "warning")
+                self._context.store.event(str(error), "warning")
 
     def _at_rest_elsewhere(self) -> bool:
-        if not self._bench.stillness.at_rest:
+        if not self._context.stillness.at_rest:
             return False
-        joints = self._bench.cell.robot.latest().joints_rad
+        joints = self._context.cell.robot.latest().joints_rad
         last = self._last_place
         return last is None or bool(np.abs(np.subtract(joints, last)).max() > NEW_PLACE_RAD)

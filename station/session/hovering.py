@@ -24,16 +24,16 @@ from station.analysis.worker import sight
 from station.cell.config import PointerConfig, matrix4
 from station.cell.errors import LimitError, RefusedError, RobotError
 from station.cell.plan import plan_sha256
-from station.cell.status import GoSummary, HoverOffer, StationState
+from station.cell.status import HoverOffer, MotionPreview, StationState
 from station.cell.stillness import NotStillError
 from station.plan.hover import Hover, HoverAnswer, HoverQuestion, answer_hover, least_standoff_m
 from station.protocol import verbs
-from station.session.bench import Bench
 from station.session.capture import flange_pose
-from station.session.guard import JOGGED_RAD, displacement
-from station.session.lease import Go, GoDesk
+from station.session.context import SessionContext
+from station.session.lease import ApprovalManager, MotionApproval
 from station.session.patience import RestingCheck
 from station.session.run import Run
+from station.session.supervisor import JOGGED_RAD, displacement
 
 VIEW_LIFETIME_S = 900.0
 """From close above the board a camera on the flange sees nothing: one picture serves several corners."""
@@ -52,17 +52,17 @@ class _Look:
     at_s: float
 
 
-class HoverDesk:
+class TouchTestPlanner:
     """Finds ways over corners; remembers the last picture of the board."""
 
-    def __init__(self, bench: Bench) -> None:
-        self._bench = bench
+    def __init__(self, context: SessionContext) -> None:
+        self._context = context
         self._look: _Look | None = None
 
     async def prepare(self, request: verbs.Hover) -> tuple[Hover, HoverOffer]:
         """RefusedError, LimitError, RobotError and CameraError say what is in the way. Nothing moves."""
-        bench = self._bench
-        robot, config = bench.cell.robot, bench.cell.config
+        context = self._context
+        robot, config = context.cell.robot, context.cell.config
         calibration = self._calibration(request)
         pointer, words = self._pointer(request)
         if not 0 <= request.corner < len(board_points(config.board)):
@@ -75,27 +75,27 @@ class HoverDesk:
                 f"{1000 * request.standoff_m:.0f} mm: nearer, it is guided by hand only"
             )
         robot.check()
-        await bench.stillness.settle(RestingCheck(robot.check))
+        await context.stillness.settle(RestingCheck(robot.check))
         look = await self._seen(request, calibration)
         start = robot.latest().joints_rad
         question = HoverQuestion(request.corner, request.standoff_m, pointer, start, self._model_miss_m())
         try:
-            answer = await bench.workers.call(
+            answer = await context.workers.call(
                 answer_hover, config, calibration, look.view, question, timeout_s=_PLAN_S
             )
         except CalibrationError as error:
             raise RefusedError(str(error)) from error
         summary = self._summary(answer, start, look, words)
-        return answer.hover, _offer(answer, summary, bench, pointer, words)
+        return answer.hover, _offer(answer, summary, context, pointer, words)
 
     def _calibration(self, request: verbs.Hover) -> Calibration:
         """Of this very cell, and good: a wrong one would put the board somewhere else."""
-        cell = self._bench.cell
+        cell = self._context.cell
         try:
             if request.calibration:
                 found = read_calibration(Path(request.calibration))
             else:
-                found = load_installed(self._bench.root, allow_simulated=cell.simulated)
+                found = load_installed(self._context.root, allow_simulated=cell.simulated)
         except CalibrationError as error:
             raise RefusedError(str(error)) from error
         robot, camera = cell.robot.identity, cell.camera.identity
@@ -116,7 +116,7 @@ class HoverDesk:
 
     def _pointer(self, request: verbs.Hover) -> tuple[PointerConfig, str]:
         """The pointer and its words: as asked for, as configured, or the tool set on the pendant."""
-        configured = self._bench.cell.config.pointer
+        configured = self._context.cell.config.pointer
         if request.pointer_m is not None:
             if not 0.01 <= request.pointer_m <= 1.0:
                 raise RefusedError(f"a pointer is 10 to 1000 mm long, not {1000 * request.pointer_m:g} mm")
@@ -124,7 +124,7 @@ class HoverDesk:
             return pointer, f"pointer {1000 * request.pointer_m:.1f} mm along the flange's z axis"
         if configured is not None:
             return configured, f"configured pointer, tip at {_mm(configured.tip_m)} mm in the flange"
-        tcp = self._bench.cell.robot.identity.tcp_offset
+        tcp = self._context.cell.robot.identity.tcp_offset
         tip, along = tcp[:3], pose_from_rotvec(tcp[:3], tcp[3:])[:3, 2]
         if np.linalg.norm(tip) < 0.01:
             raise RefusedError(
@@ -135,40 +135,40 @@ class HoverDesk:
         return PointerConfig(tip, (x, y, z)), f"the pendant's tool, tip at {_mm(tip)} mm in the flange"
 
     async def _seen(self, request: verbs.Hover, calibration: Calibration) -> _Look:
-        bench, place = self._bench, calibration.provenance.recording_sha256
+        context, place = self._context, calibration.provenance.recording_sha256
         if not request.new_picture:
             look = self._look
             if look is None or look.place != place or time.monotonic() - look.at_s > VIEW_LIFETIME_S:
                 raise RefusedError("the board was not looked at lately: bring it into the picture first")
             return look
         self._look = None
-        before = bench.cell.robot.latest().joints_rad
-        picture = await bench.cell.camera.capture()
-        await RestingCheck(bench.cell.robot.check).news()
-        state = bench.cell.robot.latest()
+        before = context.cell.robot.latest().joints_rad
+        picture = await context.cell.camera.capture()
+        await RestingCheck(context.cell.robot.check).news()
+        state = context.cell.robot.latest()
         if np.abs(np.subtract(state.joints_rad, before)).max() > _SAME_PLACE_RAD:
             raise RefusedError("the arm was moved while the picture was taken: leave it at rest, then again")
-        board = bench.cell.config.board
-        sighting = await bench.workers.call(
+        board = context.cell.config.board
+        sighting = await context.workers.call(
             sight, picture.pixels, board, calibration.intrinsics.model, timeout_s=_SIGHT_S
         )
         if not sighting.status.found:
             reason = sighting.status.reason or "no board in the picture"
             raise RefusedError(f"{reason}: jog the arm or lay the board so that the camera sees it whole")
-        flange = flange_pose(state, bench.cell.robot.identity.tcp_offset)
+        flange = flange_pose(state, context.cell.robot.identity.tcp_offset)
         points = board_points(board)[sighting.indices]
         view = BoardView(0, "verification", flange, points, sighting.pixels)
         self._look = _Look(view, place, time.monotonic())
         return self._look
 
     def _model_miss_m(self) -> float:
-        bench, state = self._bench, self._bench.cell.robot.latest()
-        told = flange_pose(state, bench.cell.robot.identity.tcp_offset)
-        modelled = forward(bench.geometry.model, state.joints_rad)
+        context, state = self._context, self._context.cell.robot.latest()
+        told = flange_pose(state, context.cell.robot.identity.tcp_offset)
+        modelled = forward(context.geometry.model, state.joints_rad)
         return float(np.linalg.norm(told[:3, 3] - modelled[:3, 3]))
 
-    def _summary(self, answer: HoverAnswer, start: Vector6, look: _Look, words: str) -> GoSummary:
-        bench, hover = self._bench, answer.hover
+    def _summary(self, answer: HoverAnswer, start: Vector6, look: _Look, words: str) -> MotionPreview:
+        context, hover = self._context, answer.hover
         check, poses = hover.check, hover.plan.poses
         warnings = [words]
         age_s = time.monotonic() - look.at_s
@@ -178,11 +178,11 @@ class HoverDesk:
             warnings.append(
                 f"the board lies {1000 * answer.board_moved_m:.0f} mm from where it was calibrated"
             )
-        if bench.cell.simulated:
+        if context.cell.simulated:
             warnings.append("SIMULATED cell: nothing real moves")
-        x, y = 1000 * board_points(bench.cell.config.board)[hover.corner][:2]
-        return GoSummary(
-            token=GoDesk.new_token(),
+        x, y = 1000 * board_points(context.cell.config.board)[hover.corner][:2]
+        return MotionPreview(
+            token=ApprovalManager.new_token(),
             purpose=f"put the tip {1000 * hover.standoff_m:.0f} mm above corner {hover.corner} "
             f"(x {x:.0f}, y {y:.0f} mm on the board)",
             plan_sha256=plan_sha256(hover.plan),
@@ -191,7 +191,7 @@ class HoverDesk:
             largest_step_rad=round(check.largest_step_rad, 4),
             top_speed_m_s=round(check.top_speed_m_s, 3),
             duration_s=round(check.duration_s, 1),
-            first_move=f"{displacement(bench, start, poses[0].joints_rad)}, high over the corner",
+            first_move=f"{displacement(context, start, poses[0].joints_rad)}, high over the corner",
             warnings=tuple(warnings),
             start_joints_rad=start,
         )
@@ -202,10 +202,10 @@ def _mm(point: tuple[float, float, float]) -> str:
 
 
 def _offer(
-    answer: HoverAnswer, summary: GoSummary, bench: Bench, pointer: PointerConfig, words: str
+    answer: HoverAnswer, summary: MotionPreview, context: SessionContext, pointer: PointerConfig, words: str
 ) -> HoverOffer:
     hover, sigma = answer.hover, np.sqrt(np.diag(answer.offset_covariance))
-    x, y = (float(v) for v in board_points(bench.cell.config.board)[hover.corner][:2])
+    x, y = (float(v) for v in board_points(context.cell.config.board)[hover.corner][:2])
     return HoverOffer(
         go=summary,
         corner=hover.corner,
@@ -222,47 +222,49 @@ def _offer(
 class HoverRun(Run):
     """Carries out one go for a hover: two moves, no picture, nothing recorded."""
 
-    def __init__(self, bench: Bench, go: Go, hover: Hover) -> None:
-        self._bench, self._go, self._hover = bench, go, hover
+    def __init__(self, context: SessionContext, go: MotionApproval, hover: Hover) -> None:
+        self._context, self._go, self._hover = context, go, hover
         self._geometry, self._failures = hover.geometry, 0
 
     async def _open_recording(self) -> None:
         return None
 
     async def _poses(self) -> None:
-        bench, robot = self._bench, self._bench.cell.robot
+        context, robot = self._context, self._context.cell.robot
         for planned in self._hover.plan.poses:
             await RestingCheck(robot.check).news()
-            bench.store.enter(StationState.MOVING)
+            context.store.enter(StationState.MOVING)
             try:
                 await self._drive(robot.latest().joints_rad, planned.joints_rad, planned.name)
             except LimitError as error:
-                bench.store.enter(StationState.IDLE, str(error))
+                context.store.enter(StationState.IDLE, str(error))
                 return
-            if bench.halting:
+            if context.halting:
                 return
             if self._wants_rest() and planned is not self._hover.plan.poses[-1]:
-                reason = f"paused by {bench.pause_wanted}" if bench.pause_wanted else "ended"
-                bench.store.enter(StationState.IDLE, f"{reason} high over the corner: ask for the hover anew")
+                reason = f"paused by {context.pause_wanted}" if context.pause_wanted else "ended"
+                context.store.enter(
+                    StationState.IDLE, f"{reason} high over the corner: ask for the hover anew"
+                )
                 return
         with contextlib.suppress(NotStillError):  # what is read next is the place where it rests
-            await bench.stillness.settle(RestingCheck(robot.check))
+            await context.stillness.settle(RestingCheck(robot.check))
         await RestingCheck(robot.check).news()
         there = robot.latest().joints_rad
-        if bench.halting:
+        if context.halting:
             return
         reason = (
             f"the tip stands {1000 * self._hover.standoff_m:.0f} mm above corner {self._hover.corner}: "
             "guide it down by hand only"
         )
-        bench.store.event(reason)
-        bench.store.enter(StationState.IDLE, reason)
-        _unsay_when_moved(bench, reason, there)
+        context.store.event(reason)
+        context.store.enter(StationState.IDLE, reason)
+        _unsay_when_moved(context, reason, there)
 
 
-def _unsay_when_moved(bench: Bench, reason: str, there: Vector6) -> None:
+def _unsay_when_moved(context: SessionContext, reason: str, there: Vector6) -> None:
     """The sentence is true for as long as the arm rests there."""
-    store, robot = bench.store, bench.cell.robot
+    store, robot = context.store, context.cell.robot
 
     def look() -> None:
         moved = False

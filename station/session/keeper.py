@@ -10,7 +10,7 @@ from collections.abc import Awaitable, Callable
 from station.analysis.pool import WorkerError
 from station.cell.errors import CameraError, RobotError, StationError
 from station.cell.status import TriggerStatus
-from station.session.bench import Bench
+from station.session.context import SessionContext
 from station.session.monitor import camera_status
 
 log = logging.getLogger(__name__)
@@ -18,9 +18,9 @@ log = logging.getLogger(__name__)
 RETRY_S = 3.0
 
 
-class Keeper:
-    def __init__(self, bench: Bench) -> None:
-        self._bench = bench
+class DeviceConnector:
+    def __init__(self, context: SessionContext) -> None:
+        self._context = context
         self.troubles: dict[str, str] = {}
         """Device → why it is not there."""
 
@@ -35,7 +35,7 @@ class Keeper:
 
     async def _start_worker(self) -> None:
         try:
-            await self._bench.workers.start()
+            await self._context.workers.start()
         except WorkerError as error:
             log.warning("%s", error)
 
@@ -48,31 +48,31 @@ class Keeper:
                     log.exception("%s could not be opened", device)
                 if self.troubles.get(device) != str(error):
                     self.troubles[device] = str(error)
-                    self._bench.store.event(f"{device}: {error}", "warning")
+                    self._context.store.event(f"{device}: {error}", "warning")
                 await asyncio.sleep(RETRY_S)
             else:
                 self.troubles.pop(device, None)
                 return
 
     async def _open_robot(self) -> None:
-        identity = await self._bench.cell.robot.connect()
-        self._bench.store.event(f"robot {identity.model} {identity.serial} found")
+        identity = await self._context.cell.robot.connect()
+        self._context.store.event(f"robot {identity.model} {identity.serial} found")
 
     async def _open_camera(self) -> None:
-        identity = await self._bench.cell.camera.open()
-        model = self._bench.cell.config.camera.model
+        identity = await self._context.cell.camera.open()
+        model = self._context.cell.config.camera.model
         width, height = (model.width, model.height) if model else (0, 0)
-        self._bench.store.update(camera=camera_status(self._bench, True, width, height, 0))
-        self._bench.store.event(f"camera {identity.model} {identity.serial} found")
+        self._context.store.update(camera=camera_status(self._context, True, width, height, 0))
+        self._context.store.event(f"camera {identity.model} {identity.serial} found")
 
     async def _open_trigger(self) -> None:
-        if (trigger := self._bench.cell.trigger) is not None:
+        if (trigger := self._context.cell.trigger) is not None:
             identity = await trigger.open()
-            self._bench.store.update(trigger=TriggerStatus(present=True, identity=identity))
-            self._bench.store.event(f"trigger {identity} found")
+            self._context.store.update(trigger=TriggerStatus(present=True, identity=identity))
+            self._context.store.event(f"trigger {identity} found")
 
     async def close(self) -> None:
-        cell = self._bench.cell
+        cell = self._context.cell
         for closing in (cell.camera.close(), cell.robot.close()):
             with contextlib.suppress(RobotError, CameraError):
                 await closing

@@ -10,17 +10,17 @@ import numpy as np
 
 from recordings.schema.messages import Vector6
 from station.cell.errors import RefusedError
-from station.cell.status import GoSummary, Lease
+from station.cell.status import Lease, MotionPreview
 from station.plan.hover import Hover
 from station.protocol.verbs import Purpose
-from station.session.queue import Replanned
+from station.session.queue import PlanRevision
 
-GO_LIFETIME_S = 120.0
+APPROVAL_LIFETIME_S = 120.0
 START_TOLERANCE_RAD = 0.005
 """The arm must stand where it stood when the person was asked."""
 
 
-class LeaseDesk:
+class LeaseManager:
     """At most one client holds the lease."""
 
     def __init__(self) -> None:
@@ -54,10 +54,10 @@ class LeaseDesk:
 
 
 @dataclass(frozen=True)
-class Go:
+class MotionApproval:
     """A permission as it was asked for."""
 
-    summary: GoSummary
+    summary: MotionPreview
     client_id: int
     expires_s: float
     start_joints_rad: Vector6
@@ -67,7 +67,7 @@ class Go:
     """Nobody is there to be asked: poses that do not come to rest are tried once more at the end."""
     purpose: Purpose | None = None
     """None: a hover."""
-    replanned: Replanned | None = None
+    replanned: PlanRevision | None = None
     """Poses that take the place of the session's with this go."""
     hover: Hover | None = None
     """A way over one corner of the board instead of poses of the plan."""
@@ -80,17 +80,17 @@ class Go:
         return f"{self.approval}: {self.summary.purpose}, plan {self.summary.plan_sha256[:12]}"
 
 
-class GoDesk:
+class ApprovalManager:
     """At most one go waits for a person; redeeming or voiding destroys it."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
-        self._waiting: Go | None = None
+        self._waiting: MotionApproval | None = None
         self.voids = 0
         """How often a go was made void: a check that was under way meanwhile offers none."""
 
     @property
-    def waiting(self) -> Go | None:
+    def waiting(self) -> MotionApproval | None:
         return self._waiting
 
     @staticmethod
@@ -99,18 +99,18 @@ class GoDesk:
 
     def offer(
         self,
-        summary: GoSummary,
+        summary: MotionPreview,
         client_id: int,
         poses: tuple[int, ...],
         hover: Hover | None = None,
         purpose: Purpose | None = None,
-        replanned: Replanned | None = None,
-    ) -> Go:
+        replanned: PlanRevision | None = None,
+    ) -> MotionApproval:
         """From where the summary begins. An older one is void."""
         start = summary.start_joints_rad
         assert start is not None
-        expires_s = self._clock() + GO_LIFETIME_S
-        self._waiting = Go(
+        expires_s = self._clock() + APPROVAL_LIFETIME_S
+        self._waiting = MotionApproval(
             summary, client_id, expires_s, start, poses, purpose=purpose, hover=hover, replanned=replanned
         )
         return self._waiting
@@ -128,13 +128,15 @@ class GoDesk:
         plan_sha256: str,
         joints_rad: Sequence[float],
         again: bool = False,
-    ) -> Go:
+    ) -> MotionApproval:
         """The go, once. RefusedError says what changed since the person was asked; the go is void then."""
         go, self._waiting = self._waiting, None
         if go is None or not secrets.compare_digest(go.summary.token.encode(), token.encode()):
             raise RefusedError("this go is not valid (used, stopped or replaced): prepare again and confirm")
         if self._clock() > go.expires_s:
-            raise RefusedError(f"this go is older than {GO_LIFETIME_S:.0f} s: prepare again and confirm")
+            raise RefusedError(
+                f"this go is older than {APPROVAL_LIFETIME_S:.0f} s: prepare again and confirm"
+            )
         if go.client_id != client_id:
             raise RefusedError("this go was asked for by another client: prepare again and confirm")
         asked_for = go.replanned.before_sha256 if go.replanned else go.summary.plan_sha256

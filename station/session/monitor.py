@@ -24,8 +24,8 @@ from station.cell.status import (
 )
 from station.devices.ur_condition import mode_word, program_word, safety_word, what_holds
 from station.protocol.states import RUNNING
-from station.session.bench import Bench
 from station.session.capture import flange_pose
+from station.session.context import SessionContext
 
 DISK_PERIOD_S = 2.0
 FPS_PERIOD_S = 2.0
@@ -36,8 +36,8 @@ WALL_STEP_S = 0.5
 
 
 class Monitor:
-    def __init__(self, bench: Bench) -> None:
-        self._bench = bench
+    def __init__(self, context: SessionContext) -> None:
+        self._context = context
         self._free_bytes: int | None = None
         self._free_checked_s = -DISK_PERIOD_S
         self._controller: tuple[float, float] | None = None
@@ -45,7 +45,7 @@ class Monitor:
         self._frames = (0.0, 0)
         """When, and how many until then"""
         self._wall_ahead_ns = _wall_ahead_ns()
-        bench.cell.robot.subscribe(self._count)
+        context.cell.robot.subscribe(self._count)
 
     def _count(self, state: RobotState) -> None:
         """From the reader's thread: one addition."""
@@ -53,7 +53,7 @@ class Monitor:
 
     def refresh(self, lag_ms: float) -> None:
         self._watch_wall_clock()
-        store, notice = self._bench.store, self._bench.cell.robot.notice
+        store, notice = self._context.store, self._context.cell.robot.notice
         if store.state is StationState.MOVING:
             store.update(reason=notice)  # 'speed slider at 5 %': no fault, but a person wants to know
         store.update(
@@ -68,10 +68,10 @@ class Monitor:
 
     def _pending(self) -> str:
         """A wish that waits for the end of the pose under way: who asked sees that it was heard."""
-        bench = self._bench
-        if bench.store.state not in RUNNING:
+        context = self._context
+        if context.store.state not in RUNNING:
             return ""
-        return FINISHES if bench.finish_wanted else PAUSES if bench.pause_wanted else ""
+        return FINISHES if context.finish_wanted else PAUSES if context.pause_wanted else ""
 
     def _watch_wall_clock(self) -> None:
         """Nothing is placed by it, but a person who compares times with another computer wants to know."""
@@ -79,11 +79,11 @@ class Monitor:
         step_s, self._wall_ahead_ns = (ahead_ns - self._wall_ahead_ns) / 1e9, ahead_ns
         if abs(step_s) >= WALL_STEP_S:
             text = f"the wall clock was set by {step_s:+.1f} s; pictures and poses are placed by other clocks"
-            self._bench.store.event(text, "warning")
+            self._context.store.event(text, "warning")
 
     def _robot(self) -> RobotStatus:
-        bench, robot = self._bench, self._bench.cell.robot
-        identity, config = robot.identity, bench.cell.config
+        context, robot = self._context, self._context.cell.robot
+        identity, config = robot.identity, context.cell.config
         limit = min(config.limits.speed_m_s, SPEED_CAP_M_S)
         base = RobotStatus(
             model=identity.model,
@@ -105,17 +105,17 @@ class Monitor:
             age_ms=round((time.monotonic_ns() - state.stamps.host_monotonic_ns) / 1e6, 0),
             safety=safety_word(state),
             mode=mode_word(state),
-            held="" if bench.cell.source == "playback" else what_holds(state),
+            held="" if context.cell.source == "playback" else what_holds(state),
             program=program_word(state),
             speed_m_s=round(self._speed_m_s(state), 3),
             slider=round(state.target_speed_fraction, 3),
             joints_rad=state.joints_rad,
             base_from_flange=matrix4(flange_pose(state, identity.tcp_offset)),
-            still=bench.stillness.at_rest,
+            still=context.stillness.at_rest,
         )
 
     def _speed_m_s(self, state: RobotState) -> float:
-        return point_speed_m_s(self._bench.geometry, state.joints_rad, state.joint_speeds_rad_s)
+        return point_speed_m_s(self._context.geometry, state.joints_rad, state.joint_speeds_rad_s)
 
     def _rate_hz(self) -> float:
         """Over the last round trip of at least a second."""
@@ -128,8 +128,8 @@ class Monitor:
         return self._controller[1]
 
     def _camera(self) -> CameraStatus:
-        counts, now_s = self._bench.cell.camera.counts(), time.monotonic()
-        shown = self._bench.store.status.camera
+        counts, now_s = self._context.cell.camera.counts(), time.monotonic()
+        shown = self._context.store.status.camera
         fps, (then_s, frames) = shown.fps, self._frames
         if now_s - then_s >= FPS_PERIOD_S:
             fps = round((counts.frames - frames) / (now_s - then_s), 1) if then_s else 0.0
@@ -143,19 +143,19 @@ class Monitor:
         )
 
     def _trigger(self) -> TriggerStatus:
-        shown, box = self._bench.store.status.trigger, self._bench.cell.trigger
+        shown, box = self._context.store.status.trigger, self._context.cell.trigger
         if box is None or not shown.present:
             return shown
-        paired = self._bench.cell.camera.counts().paired
+        paired = self._context.cell.camera.counts().paired
         return msgspec.structs.replace(shown, pulses=box.pulses, frames=paired)
 
     def _recorder(self) -> RecorderStatus:
         now_s = time.monotonic()
         if now_s - self._free_checked_s >= DISK_PERIOD_S:
             self._free_checked_s = now_s
-            self._free_bytes = _free_bytes(self._bench.root)
+            self._free_bytes = _free_bytes(self._context.root)
             self._look_for_calibration()
-        recording = self._bench.recording
+        recording = self._context.recording
         recorder = recording.recorder if recording is not None else None
         if recording is None or recorder is None:
             return RecorderStatus(free_bytes=self._free_bytes)
@@ -171,14 +171,14 @@ class Monitor:
 
     def _look_for_calibration(self) -> None:
         """A process of its own solves a sealed session, and puts what it found beside the recording."""
-        store = self._bench.store
+        store = self._context.store
         session = store.status.session
         path = Path(session.folder) / CALIBRATION_FILE
         solved = str(path) if session.recording and path.is_file() else ""
         store.update(session=msgspec.structs.replace(session, calibration=solved))
 
     def _clock(self) -> ClockStatus:
-        robot, camera = self._bench.cell.robot.clock(), self._bench.cell.camera.clock
+        robot, camera = self._context.cell.robot.clock(), self._context.cell.camera.clock
         return ClockStatus(*_clock_facts(robot), *_clock_facts(camera))
 
 
@@ -202,8 +202,10 @@ def _clock_facts(fit: ClockFit | None) -> tuple[float | None, float | None, floa
     return round(1000 * fit.offset_s, 1), round(1000 * fit.bound_s, 2), round(fit.drift_ppm, 1)
 
 
-def camera_status(bench: Bench, connected: bool, width: int, height: int, frames: int) -> CameraStatus:
-    identity, config = bench.cell.camera.identity, bench.cell.config.camera
+def camera_status(
+    context: SessionContext, connected: bool, width: int, height: int, frames: int
+) -> CameraStatus:
+    identity, config = context.cell.camera.identity, context.cell.config.camera
     return CameraStatus(
         connected=connected,
         model=identity.model,

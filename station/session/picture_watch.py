@@ -14,8 +14,8 @@ from numpy.typing import NDArray
 from recordings.schema.messages import Image
 from station.analysis.picture_motion import board_box, picture_motion
 from station.cell.errors import CameraError, StationError
-from station.cell.stillness import Look
-from station.session.bench import Bench
+from station.cell.stillness import ImageMotion
+from station.session.context import SessionContext
 
 log = logging.getLogger(__name__)
 
@@ -32,26 +32,26 @@ class PictureWatch:
     A camera that cannot be looked at (played pictures), or fails to, leaves the motion unmeasured.
     """
 
-    def __init__(self, bench: Bench, index: int) -> None:
-        self._bench, self._index = bench, index
+    def __init__(self, context: SessionContext, index: int) -> None:
+        self._context, self._index = context, index
         self._pictures: deque[tuple[int, NDArray[Any]]] = deque(maxlen=PICTURES)
-        self._found: tuple[int, Look] | None = None
+        self._found: tuple[int, ImageMotion] | None = None
         """With the time before which none of its pictures began."""
         self._blind = False
         self._again = asyncio.Event()
         self._glimpsing: asyncio.Task[Image | None] | None = None
         self._task: asyncio.Task[None] | None = None
-        model = bench.cell.config.camera.model
+        model = context.cell.config.camera.model
         self._width = model.width if model is not None else 0
-        view = bench.require_queue().pose(index).view
+        view = context.require_queue().pose(index).view
         # A fixed camera may see more of a resting background than of the board that swings before it.
-        fixed = bench.cell.config.mount == "eye-to-hand" and model is not None
+        fixed = context.cell.config.mount == "eye-to-hand" and model is not None
         self._box = board_box(view, model.width, model.height) if fixed and model is not None else None
 
-    def look(self, since_ns: int) -> Look | None:
+    def look(self, since_ns: int) -> ImageMotion | None:
         """Of pictures that were exposed after this host time; None: not yet, ask again."""
         if self._blind:
-            return Look(None)
+            return ImageMotion(None)
         self._again.set()
         if self._found is None or self._found[0] < since_ns:
             return None
@@ -87,14 +87,16 @@ class PictureWatch:
         except Exception as error:  # a defect, too, must not keep the pose waiting
             if not isinstance(error, StationError):
                 log.exception("the picture's motion could not be measured")
-            self._bench.store.event(f"the picture's motion is not measured: {error}", "warning", self._index)
+            self._context.store.event(
+                f"the picture's motion is not measured: {error}", "warning", self._index
+            )
         self._blind = True
 
     async def _one_more(self) -> bool:
         """False when this camera has none to show."""
         for left in reversed(range(GLIMPSE_TRIES)):
             asked_ns = time.monotonic_ns()
-            self._glimpsing = asyncio.create_task(self._bench.cell.camera.glimpse())
+            self._glimpsing = asyncio.create_task(self._context.cell.camera.glimpse())
             try:
                 picture = await asyncio.shield(self._glimpsing)
             except CameraError:
@@ -108,7 +110,7 @@ class PictureWatch:
 
     async def _measure(self) -> None:
         images = [image for _, image in self._pictures]
-        motion_px = await self._bench.workers.call(
+        motion_px = await self._context.workers.call(
             picture_motion, images, self._width, self._box, timeout_s=WORKER_TIMEOUT_S
         )
-        self._found = (self._pictures[0][0], Look(motion_px))
+        self._found = (self._pictures[0][0], ImageMotion(motion_px))

@@ -13,11 +13,11 @@ from numpy.typing import NDArray
 
 from recordings.schema.messages import Image
 from station.analysis.pool import WorkerError
-from station.analysis.worker import Sighting, sight
+from station.analysis.worker import BoardDetection, sight
 from station.cell.errors import CameraError
 from station.cell.status import StationState
 from station.protocol.verbs import PreviewImage
-from station.session.bench import Bench
+from station.session.context import SessionContext
 
 PERIOD_S = 0.2
 JPEG_LIMIT_BYTES = 40_000
@@ -29,11 +29,11 @@ SIDES = (16, 1024)
 class Previewer:
     """Asks the camera at most once per `PERIOD_S`, however many screens watch."""
 
-    def __init__(self, bench: Bench) -> None:
-        self._bench = bench
+    def __init__(self, context: SessionContext) -> None:
+        self._context = context
         self._taking = asyncio.Lock()
         self._picture: Image | None = None
-        self._sighting: Sighting | None = None
+        self._sighting: BoardDetection | None = None
         self._taken_s = 0.0
         self._count = 0
 
@@ -49,31 +49,31 @@ class Previewer:
         return await asyncio.to_thread(self._encode, self._picture.pixels, self._sighting, width, height)
 
     async def _take(self) -> None:
-        bench = self._bench
+        context = self._context
         self._taken_s = time.monotonic()
-        if bench.store.state is StationState.CAPTURING or bench.workers.waiting:
+        if context.store.state is StationState.CAPTURING or context.workers.waiting:
             return  # the capture has the camera, or the worker is needed for more than the screen
         try:
-            picture = await bench.cell.camera.preview()
+            picture = await context.cell.camera.preview()
         except CameraError:
             picture = None
         if picture is None:
             return
-        config = bench.cell.config
+        config = context.cell.config
         try:
             exposure = (picture.exposure_us, picture.gain_db) if picture.exposure_us else None
-            sighting = await bench.workers.call(
+            sighting = await context.workers.call(
                 sight, picture.pixels, config.board, config.camera.model, False, exposure, timeout_s=5.0
             )
         except WorkerError:
             sighting = None
         self._picture, self._sighting = picture, sighting
         self._count += 1
-        if sighting is not None and bench.store.state is not StationState.WRITING:
-            bench.store.update(detection=sighting.status)
+        if sighting is not None and context.store.state is not StationState.WRITING:
+            context.store.update(detection=sighting.status)
 
     def _encode(
-        self, image: NDArray[Any], sighting: Sighting | None, width: int, height: int
+        self, image: NDArray[Any], sighting: BoardDetection | None, width: int, height: int
     ) -> PreviewImage:
         scale = min(width / image.shape[1], height / image.shape[0], 1.0)
         size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))

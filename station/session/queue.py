@@ -23,7 +23,7 @@ NOT_AGAIN = "not taken again: the picture it has counts"
 
 
 @dataclass(frozen=True, eq=False)
-class Replanned:
+class PlanRevision:
     """Poses that wait for a person's yes to take the place of the session's."""
 
     purpose: Purpose

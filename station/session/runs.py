@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from station.session.bench import Bench
+from station.session.context import SessionContext
 from station.session.hovering import HoverRun
-from station.session.lease import Go
+from station.session.lease import MotionApproval
 from station.session.run import Run
 from station.session.sweeping import SweepRun
 
 
-def run_for(bench: Bench, go: Go) -> Run:
+def run_for(context: SessionContext, go: MotionApproval) -> Run:
     """By what the person said yes to: a hover, or the plan's poses as stops or as a sweep."""
     if go.hover is not None:
-        return HoverRun(bench, go, go.hover)
-    return SweepRun(bench, go) if bench.require_queue().plan.motion == "sweep" else Run(bench, go)
+        return HoverRun(context, go, go.hover)
+    return SweepRun(context, go) if context.require_queue().plan.motion == "sweep" else Run(context, go)

@@ -22,28 +22,28 @@ from station.analysis.worker import plan_poses
 from station.cell.errors import RefusedError, RobotError
 from station.cell.plan import Plan
 from station.cell.scene import cell_geometry
-from station.cell.status import GoSummary, HoverOffer, Lease, StationState, StationStatus
+from station.cell.status import HoverOffer, Lease, MotionPreview, StationState, StationStatus
 from station.cell.stillness import StillnessMonitor
 from station.devices.cell import Cell
 from station.protocol import verbs
 from station.protocol.states import RUNNING
 from station.protocol.verbs import Purpose, Verb
-from station.session.bench import Bench
+from station.session.context import SessionContext
 from station.session.estimate import Estimator
 from station.session.free_drive import FreeDrive
-from station.session.guard import Guard
-from station.session.hovering import HoverDesk
-from station.session.improving import ImproveDesk
+from station.session.hovering import TouchTestPlanner
 from station.session.interrupted import close_or_seal, find_interrupted
-from station.session.keeper import Keeper
-from station.session.lease import Go, GoDesk, LeaseDesk
+from station.session.keeper import DeviceConnector
+from station.session.lease import ApprovalManager, LeaseManager, MotionApproval
 from station.session.logbook import Logbook
 from station.session.preview import Previewer
 from station.session.queue import PoseQueue
+from station.session.replan import Replanner
 from station.session.run import unmark_busy
 from station.session.runs import run_for
 from station.session.store import StatusStore
 from station.session.summary import begun_anew, poses_to_drive, summarise
+from station.session.supervisor import SessionSupervisor
 
 R = TypeVar("R")
 END_RUN_S = 10.0
@@ -69,35 +69,35 @@ class Session:
             StationStatus(simulated=cell.simulated, playback=playback, cell=config.name, mount=config.mount)
         )
         monitor = StillnessMonitor(geometry.model, config.stillness)
-        self.bench = Bench(cell, geometry, self.store, Workers(), monitor, root)
-        self.leases = LeaseDesk()
-        self._goes = GoDesk(time.monotonic)
-        self.guard = Guard(self.bench, self._jogged, ticked, self._void_go, first)
-        self._keeper = Keeper(self.bench)
-        self._improver = ImproveDesk(self.bench)
-        self._estimator = Estimator(self.bench, self._improver.hint)
-        self.previews = Previewer(self.bench)
-        self.free_drive = FreeDrive(self.bench)
-        self._hovers = HoverDesk(self.bench)
+        self.context = SessionContext(cell, geometry, self.store, Workers(), monitor, root)
+        self.leases = LeaseManager()
+        self._goes = ApprovalManager(time.monotonic)
+        self.supervisor = SessionSupervisor(self.context, self._jogged, ticked, self._void_go, first)
+        self._keeper = DeviceConnector(self.context)
+        self._improver = Replanner(self.context)
+        self._estimator = Estimator(self.context, self._improver.hint)
+        self.previews = Previewer(self.context)
+        self.free_drive = FreeDrive(self.context)
+        self._hovers = TouchTestPlanner(self.context)
         self._run: asyncio.Task[None] | None = None
         self._tasks: list[asyncio.Task[None]] = []
         self._notes: tuple[str, ...] = ()
         cell.robot.subscribe(monitor.add)
-        cell.robot.subscribe(self.bench.record_state)
-        self.store.on_event(self.bench.record_event)
+        cell.robot.subscribe(self.context.record_state)
+        self.store.on_event(self.context.record_event)
         self.store.watch(self._estimator.poke)
-        self._logbook = Logbook(lambda: self.bench.recording)
+        self._logbook = Logbook(lambda: self.context.recording)
 
     # -- life -------------------------------------------------------------------------------------------
 
     async def start(self) -> None:
         """Connects, read-only, and keeps trying. Nothing moves. A session that a crash cut is found again."""
-        self.bench.root.mkdir(parents=True, exist_ok=True)
+        self.context.root.mkdir(parents=True, exist_ok=True)
         logging.getLogger("station").addHandler(self._logbook)
-        find_interrupted(self.bench)
-        if self.bench.cell.plan is not None and self.bench.queue is None:
-            self._replace_plan(self.bench.cell.plan)
-        loops = (self.guard.run(), self._keeper.run(), self._estimator.run())
+        find_interrupted(self.context)
+        if self.context.cell.plan is not None and self.context.queue is None:
+            self._replace_plan(self.context.cell.plan)
+        loops = (self.supervisor.run(), self._keeper.run(), self._estimator.run())
         self._tasks = [asyncio.create_task(loop) for loop in loops]
 
     async def close(self) -> None:
@@ -107,15 +107,15 @@ class Session:
             await self._halt(StationState.STOPPED, "the station is ending")
         with contextlib.suppress(RefusedError):
             await self._run_ended()
-        if self.bench.recording is not None and self.bench.recording.recorder is not None:
+        if self.context.recording is not None and self.context.recording.recorder is not None:
             with contextlib.suppress(RecordingError):
-                path = await self.bench.recording.seal(self.bench.require_queue())
+                path = await self.context.recording.seal(self.context.require_queue())
                 self.store.event(f"sealed before the end: {path}")
         logging.getLogger("station").removeHandler(self._logbook)
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        self.bench.workers.close()
+        self.context.workers.close()
         await self._keeper.close()
 
     # -- stopping, by anyone and anything ----------------------------------------------------------------
@@ -123,7 +123,7 @@ class Session:
     async def stop(self, who: str) -> None:
         """Now, from anyone, in any state; latched until acknowledged."""
         if self.store.state is StationState.STOPPED:
-            await self.bench.cell.robot.stop(f"STOP by {who}")
+            await self.context.cell.robot.stop(f"STOP by {who}")
             return
         await self._halt(StationState.STOPPED, f"STOP by {who}: look at the cell, then acknowledge")
 
@@ -135,28 +135,28 @@ class Session:
         self._void_go()
         self.store.update(lease=self.leases.lease)
         if self.store.state in RUNNING:
-            await self._halt(self.bench.resting, how.format(holder) + ": give a new go to go on")
+            await self._halt(self.context.resting, how.format(holder) + ": give a new go to go on")
 
     async def _halt(self, state: StationState, reason: str) -> None:
         """No go is left, the arm stops both ways, its run ends: where it writes, once the disk has it."""
-        bench, run = self.bench, self._run
+        context, run = self.context, self._run
         self._void_go()
-        bench.halting, bench.pause_wanted, bench.finish_wanted = True, "", False
+        context.halting, context.pause_wanted, context.finish_wanted = True, "", False
         self.store.enter(state, reason)
         if run is not None:
             run.cancel()
-        await bench.cell.robot.stop(reason)
+        await context.cell.robot.stop(reason)
         self.store.event(reason, "warning")
         if run is not None:
             await asyncio.wait({run}, timeout=STOP_WAIT_S)
-        unmark_busy(bench)
+        unmark_busy(context)
 
     def acknowledge(self, who: str) -> None:
         """A person looked. What still holds the arm is told when the next go is given."""
         self._require_state(verbs.Acknowledge)
         try:
-            self.bench.cell.robot.latest()
-            resting = self.bench.resting
+            self.context.cell.robot.latest()
+            resting = self.context.resting
         except RobotError:
             resting = StationState.DISCONNECTED
         self.store.enter(resting)
@@ -164,16 +164,16 @@ class Session:
 
     # -- the way to a motion -----------------------------------------------------------------------------
 
-    async def prepare(self, client_id: int, purpose: Purpose, index: int | None = None) -> GoSummary:
+    async def prepare(self, client_id: int, purpose: Purpose, index: int | None = None) -> MotionPreview:
         """Checks the whole way from where the arm is and offers a one-use go for it."""
         self.permit(verbs.Prepare, client_id)
         await self._run_ended()  # it is sealed and shown; its control process may take a moment more
         self._void_go()
         voids = self._goes.voids
-        found = await self._improver.replan(purpose) or begun_anew(self.bench, purpose)
-        poses = found.poses if found else poses_to_drive(self.bench, purpose, index)
-        queue, changes = (found.queue, found.changes) if found else (self.bench.require_queue(), ())
-        summary = await summarise(self.bench, purpose, queue, poses, self._notes, changes)
+        found = await self._improver.replan(purpose) or begun_anew(self.context, purpose)
+        poses = found.poses if found else poses_to_drive(self.context, purpose, index)
+        queue, changes = (found.queue, found.changes) if found else (self.context.require_queue(), ())
+        summary = await summarise(self.context, purpose, queue, poses, self._notes, changes)
         self._require_unchanged(client_id, voids)
         self._goes.offer(summary, client_id, poses, purpose=purpose, replanned=found)
         self._show_go(summary)
@@ -192,7 +192,7 @@ class Session:
         self._show_go(offer.go)
         return offer
 
-    def _show_go(self, summary: GoSummary) -> None:
+    def _show_go(self, summary: MotionPreview) -> None:
         """To every watcher, without the token that is for the one who asked."""
         self.store.update(go=msgspec.structs.replace(summary, token=""))
 
@@ -203,34 +203,34 @@ class Session:
             raise RefusedError("something changed while the way was checked: prepare again")
 
     @property
-    def waiting_go(self) -> Go | None:
+    def waiting_go(self) -> MotionApproval | None:
         """What was offered last and is not approved yet."""
         return self._goes.waiting
 
     def go(self, client_id: int, token: str, approval: str = "", again: bool = False) -> None:
         """The person's yes to exactly that summary. RefusedError when anything changed.
 
-        `approval`: who gave it and how, for log and recording. `again`: see Go.
+        `approval`: who gave it and how, for log and recording. `again`: see MotionApproval.
         """
         self.permit(verbs.Go, client_id)
         self._require_run_ended()
         if self.free_drive.taking:
             raise RefusedError("free drive is still ending: try again in a moment")
-        joints = self.bench.cell.robot.latest().joints_rad
-        queue = self.bench.queue
+        joints = self.context.cell.robot.latest().joints_rad
+        queue = self.context.queue
         try:
             go = self._goes.redeem(token, client_id, queue.sha256 if queue else "", joints, again)
             go = replace(go, approval=approval or f"motion approved by {self.leases.lease.holder}")
         finally:
             self.store.update(go=None)
         self._notes = ()
-        self.bench.halting = False
-        self.bench.pause_wanted, self.bench.finish_wanted = "", False
-        if self.bench.recording is None and go.hover is None:
-            self.bench.forget_session(check=go.purpose is Purpose.DRIFT_CHECK)
+        self.context.halting = False
+        self.context.pause_wanted, self.context.finish_wanted = "", False
+        if self.context.recording is None and go.hover is None:
+            self.context.forget_session(check=go.purpose is Purpose.DRIFT_CHECK)
         if go.replanned is not None:
             self._improver.adopt(go.replanned)
-        run = run_for(self.bench, go)
+        run = run_for(self.context, go)
         self.store.enter(StationState.CHECKING)
         self.store.event(go.said)
         self._run = asyncio.create_task(run.drive())
@@ -238,7 +238,7 @@ class Session:
     def pause(self, who: str) -> None:
         """After this pose. Anyone may: it only ever makes the arm do less."""
         self._require_state(verbs.Pause)
-        self.bench.pause_wanted = who
+        self.context.pause_wanted = who
         self.store.event(f"{who} asks to pause after this pose")
 
     async def finish(self, client_id: int) -> None:
@@ -246,14 +246,14 @@ class Session:
         self.permit(verbs.Finish, client_id)
         self._void_go()
         if self.store.state in RUNNING and not self.free_drive.taking:
-            self.bench.finish_wanted = True
+            self.context.finish_wanted = True
             self.store.event("finish after this pose")
             return
-        if self.bench.recording is None:
+        if self.context.recording is None:
             raise RefusedError("nothing is recorded yet: there is nothing to finish")
         await asyncio.gather(self._run_ended(), self.free_drive.last_picture())
         self._require_state(verbs.Finish)
-        self._run = closing = asyncio.create_task(close_or_seal(self.bench))  # nothing new begins beside it
+        self._run = closing = asyncio.create_task(close_or_seal(self.context))  # nothing new begins beside it
         await asyncio.wait({closing})
         if not closing.cancelled():
             closing.result()
@@ -291,12 +291,12 @@ class Session:
         self.permit(verbs.MakePlan, client_id)
         self._require_no_session()
         try:
-            start = self.bench.cell.robot.latest().joints_rad
+            start = self.context.cell.robot.latest().joints_rad
         except RobotError:
             start = None
         self.store.event(f"planning {poses} poses")
-        plan = await self.bench.workers.call(
-            plan_poses, self.bench.cell.config, start, seed, poses, lens_known, timeout_s=PLAN_TIMEOUT_S
+        plan = await self.context.workers.call(
+            plan_poses, self.context.cell.config, start, seed, poses, lens_known, timeout_s=PLAN_TIMEOUT_S
         )
         self.permit(verbs.MakePlan, client_id)
         self._require_no_session()
@@ -304,27 +304,27 @@ class Session:
         return plan
 
     def _require_no_session(self) -> None:
-        if self.bench.recording is not None:
+        if self.context.recording is not None:
             raise RefusedError("a session is open: finish it first")
 
     def _replace_plan(self, plan: Plan) -> None:
         self._void_go()
-        self.bench.queue = PoseQueue(plan)
-        self.bench.forget_session()
-        self.bench.show_poses()
+        self.context.queue = PoseQueue(plan)
+        self.context.forget_session()
+        self.context.show_poses()
         self.store.event(f"plan of {len(plan.poses)} poses loaded")
 
     async def edit(self, verb: type[Verb[Any]], client_id: int, change: Callable[[PoseQueue], R]) -> R:
         """Retake, skip, reorder, add, drop: voids a waiting go. RecordingError: done, but not on the disk."""
         self.permit(verb, client_id)
-        if self.bench.queue is None:
+        if self.context.queue is None:
             raise RefusedError("no plan is loaded: load or make one first")
-        result = change(self.bench.queue)
+        result = change(self.context.queue)
         self._void_go()
-        self.bench.show_poses(self.store.status.session.current)
-        if self.bench.recording is not None:
+        self.context.show_poses(self.store.status.session.current)
+        if self.context.recording is not None:
             try:
-                await self.bench.recording.save_state(self.bench.queue)
+                await self.context.recording.save_state(self.context.queue)
             except RecordingError as error:
                 raise RecordingError(f"it is changed, but a restart would forget it: {error}") from None
         return result

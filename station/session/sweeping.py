@@ -10,9 +10,9 @@ from station.analysis.worker import sight
 from station.cell.errors import CameraError, LimitError
 from station.cell.status import StationState
 from station.devices.base import StreamingCamera
-from station.session.bench import Bench
 from station.session.capture import SIGHT_TIMEOUT_S, show_frame, take_picture
-from station.session.lease import Go
+from station.session.context import SessionContext
+from station.session.lease import MotionApproval
 from station.session.recording import SessionRecording
 from station.session.run import FAILURES_IN_A_ROW, Run
 
@@ -25,15 +25,15 @@ SHOW_PERIOD_S = 0.1
 class SweepRun(Run):
     """Every swing is a pose of the plan: checked like one, and done once its pictures are on the disk."""
 
-    def __init__(self, bench: Bench, go: Go) -> None:
-        super().__init__(bench, go)
+    def __init__(self, context: SessionContext, go: MotionApproval) -> None:
+        super().__init__(context, go)
         self._pictures, self._ended = 0, threading.Event()
 
     async def _open_recording(self) -> None:
         """StationError without the board in view: a sweep that sees none is worth nothing."""
-        bench, config = self._bench, self._bench.cell.config
-        picture = await take_picture(bench)
-        seen = await bench.workers.call(
+        context, config = self._context, self._context.cell.config
+        picture = await take_picture(context)
+        seen = await context.workers.call(
             sight, picture.pixels, config.board, config.camera.model, timeout_s=SIGHT_TIMEOUT_S
         )
         if not seen.status.found:
@@ -53,17 +53,17 @@ class SweepRun(Run):
                     self._ended.set()  # a camera may swallow being cancelled, just when its picture comes
         except ExceptionGroup as failed:
             raise failed.exceptions[0] from None  # of two the first one tells the cause
-        if not self._bench.halting:
-            self._bench.store.event(f"{self._pictures} pictures while the arm moved")
+        if not self._context.halting:
+            self._context.store.event(f"{self._pictures} pictures while the arm moved")
 
     async def _swings(self) -> None:
-        bench, queue = self._bench, self._bench.require_queue()
+        context, queue = self._context, self._context.require_queue()
         for index in self._go.poses:
-            if bench.halting or self._wants_rest() or self._failures >= FAILURES_IN_A_ROW:
+            if context.halting or self._wants_rest() or self._failures >= FAILURES_IN_A_ROW:
                 return
             if index not in queue.open:
                 continue  # skipped or dropped since the go
-            bench.require_recording().require_space()
+            context.require_recording().require_space()
             queue.start_attempt(index)
             try:
                 await self._move_to(index)
@@ -71,15 +71,15 @@ class SweepRun(Run):
                 self._give_up(str(error))
                 queue.mark(index, "failed", str(error))
                 return
-            bench.store.enter(StationState.SETTLING)
-            await bench.require_recording().sync()
+            context.store.enter(StationState.SETTLING)
+            await context.require_recording().sync()
             queue.mark(index, "done")
-            await bench.require_recording().save_state(queue)
-            bench.show_poses(index)
+            await context.require_recording().save_state(queue)
+            context.show_poses(index)
 
     async def _take_pictures(self) -> None:
         """Until the arm rests, or until the camera failed several times in a row."""
-        camera, recording, failures = self._bench.cell.camera, self._bench.require_recording(), 0
+        camera, recording, failures = self._context.cell.camera, self._context.require_recording(), 0
         streaming = camera if isinstance(camera, StreamingCamera) and camera.free_running else None
         while not self._ended.is_set():
             if failures == FAILURES_IN_A_ROW:
@@ -90,11 +90,11 @@ class SweepRun(Run):
                 if streaming is not None:
                     await self._stream(streaming, recording)
                 else:
-                    show_frame(self._bench, self._keep(recording, await camera.capture()))
+                    show_frame(self._context, self._keep(recording, await camera.capture()))
                     await asyncio.sleep(BREATH_S)
             except CameraError as error:
                 failures = 1 if self._pictures > before else failures + 1
-                self._bench.store.event(f"picture: {error}", "warning")
+                self._context.store.event(f"picture: {error}", "warning")
             else:
                 failures = 0
 
@@ -117,7 +117,7 @@ class SweepRun(Run):
             while True:
                 await asyncio.sleep(SHOW_PERIOD_S)
                 if newest:
-                    show_frame(self._bench, newest[0])
+                    show_frame(self._context, newest[0])
 
         showing = asyncio.create_task(show())
         try:
@@ -128,4 +128,4 @@ class SweepRun(Run):
     def _give_up(self, reason: str) -> None:
         """The arm rests after this swing; a person decides."""
         self._failures, self._why = FAILURES_IN_A_ROW, reason
-        self._bench.store.event(reason, "error")
+        self._context.store.event(reason, "error")

@@ -11,7 +11,7 @@ from textual.app import App
 from textual.reactive import reactive
 
 from station.cell.errors import RefusedError, StationError
-from station.cell.status import GoSummary, SessionStatus, StationState, StationStatus
+from station.cell.status import MotionPreview, SessionStatus, StationState, StationStatus
 from station.protocol.states import RUNNING
 from station.protocol.verbs import Finish
 from station.tui.confirm import Confirm, ConfirmGo
@@ -139,7 +139,7 @@ class Commands(App[None]):
         answer = await self.ask_long(words, "prepare", purpose=purpose)
         if answer is None:
             return False
-        go = msgspec.convert(answer, GoSummary)
+        go = msgspec.convert(answer, MotionPreview)
         go = msgspec.structs.replace(go, changes=(*changes, *go.changes))
         if not await self.push_screen_wait(ConfirmGo(go)):
             return False

@@ -11,7 +11,7 @@ from textual.containers import Horizontal, Vertical
 from textual.screen import ModalScreen
 from textual.widgets import Button, Label, Static
 
-from station.cell.status import GoSummary
+from station.cell.status import MotionPreview
 from station.tui.words import degrees, duration
 
 WIDTH, INDENT = 70, 11
@@ -55,7 +55,7 @@ ASK = (
 )
 
 
-def go_text(go: GoSummary) -> str:
+def go_text(go: MotionPreview) -> str:
     """The summary a person confirms, one fact a line; long ones go on below themselves."""
     facts = [
         ("What", f"{go.purpose}, {go.poses} pose{'s' if go.poses != 1 else ''}"),
@@ -80,5 +80,5 @@ def go_text(go: GoSummary) -> str:
 class ConfirmGo(Confirm):
     """Go, for exactly this summary and once."""
 
-    def __init__(self, go: GoSummary) -> None:
+    def __init__(self, go: MotionPreview) -> None:
         super().__init__("The arm will move", go_text(go), yes="Go: move the arm", no="Do not move")

@@ -16,7 +16,7 @@ from calibrate.geometry import rotation_log
 from calibrate.kinematics import MODELS, forward
 from recordings.reader import Recording, open_recording
 from recordings.schema.messages import CameraIdentity, Image, RobotIdentity, RobotState, Stamps
-from station.analysis.worker import Sighting, sight
+from station.analysis.worker import BoardDetection, sight
 from station.cell.config import StationConfig
 from station.cell.errors import CameraError, RobotError, StaleStateError
 from station.cell.status import DetectionStatus, StationState
@@ -209,7 +209,7 @@ class WorkerInThisProcess:
         points = board_points(TRUTH.board)
         pixels = 300 + 5000 * points[:, :2]
         status = DetectionStatus(found=True, corners=len(points), expected=len(points))
-        self.sees = Sighting(status, np.arange(len(points)), pixels)
+        self.sees = BoardDetection(status, np.arange(len(points)), pixels)
 
     async def start(self) -> None:
         return None
@@ -238,7 +238,7 @@ class Rig:
         robot = robot or self.arm
         cell = Cell(memory_config(), robot, self.camera, source, attachments={"truth.json": b"{}"})
         self.session = Session(cell, root)
-        self.session.bench.workers = self.worker  # type: ignore[assignment]
+        self.session.context.workers = self.worker  # type: ignore[assignment]
         self.states: list[StationState] = []
         self.session.store.watch(self._note)
 
@@ -309,11 +309,11 @@ def crash(rig: Rig) -> None:
     for task in (*rig.session._tasks, rig.session._run):
         if task is not None:
             task.cancel()
-    recording = rig.session.bench.require_recording()
+    recording = rig.session.context.require_recording()
     recording.abandon()
     assert recording._closing is not None
     recording._closing.join()  # a dead process holds no file
-    rig.session.bench.recording = None
+    rig.session.context.recording = None
 
 
 def sealed(rig: Rig) -> Recording:

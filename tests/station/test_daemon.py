@@ -26,7 +26,7 @@ async def test_what_was_loaded_is_not_searched_for_garbage_beside_a_moving_arm(
     daemon = Daemon(
         Cell(memory_config(), ArmInMemory(), CameraInMemory(), "simulated"), tmp_path / "root", tmp_path / "s"
     )
-    daemon.session.bench.workers = WorkerInThisProcess()  # type: ignore[assignment]
+    daemon.session.context.workers = WorkerInThisProcess()  # type: ignore[assignment]
     left: list[int] = []
 
     def ready() -> None:

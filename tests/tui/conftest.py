@@ -16,7 +16,7 @@ from textual.pilot import Pilot
 
 from station.cell.status import (
     CameraStatus,
-    GoSummary,
+    MotionPreview,
     PoseStatus,
     RobotStatus,
     SessionStatus,
@@ -24,7 +24,7 @@ from station.cell.status import (
     StationStatus,
 )
 
-SUMMARY = GoSummary(
+SUMMARY = MotionPreview(
     token="t-1",
     purpose="run plan",
     plan_sha256="ab" * 32,

@@ -17,7 +17,7 @@ ROBOT = RobotStatus(
 )
 
 WIDE = (
-    " FREE-DRIVE SIMULATED UR10e Series 5 (lab bench)│0.21/0.25 m/s│"
+    " FREE-DRIVE SIMULATED UR10e Series 5 (lab context)│0.21/0.25 m/s│"
     "AUTOMATIC MODE SAFEGUARD REMOTE│18/25│212 GB│    F12=STOP"
 )
 
@@ -32,7 +32,7 @@ def working(state: StationState = StationState.MOVING) -> StationStatus:
 def long_one() -> StationStatus:
     status = working(StationState.FREE_DRIVE)
     robot = msgspec.structs.replace(
-        ROBOT, model="UR10e Series 5 (lab bench)", safety="AUTOMATIC MODE SAFEGUARD"
+        ROBOT, model="UR10e Series 5 (lab context)", safety="AUTOMATIC MODE SAFEGUARD"
     )
     return msgspec.structs.replace(status, robot=robot)
 

@@ -140,7 +140,7 @@ async def test_a_camera_that_fails_when_nobody_looks_any_more_is_no_traceback(
 
     asyncio.get_running_loop().set_exception_handler(lambda loop, context: logged.append(context))
     monkeypatch.setattr(rig.camera, "glimpse", hangs)
-    async with PictureWatch(rig.session.bench, 0):
+    async with PictureWatch(rig.session.context, 0):
         await asyncio.sleep(0.01)
         asyncio.get_running_loop().call_later(0.05, given_up.set)  # the pose ends before that
     gc.collect()
@@ -155,15 +155,15 @@ async def test_a_ringing_bracket_is_waited_for(
     write_truth(TRUTH, tmp_path / "truth.json")
     rendered = RenderedCamera(TRUTH, controller(truth=tmp_path / "truth.json").host)
     await rendered.open()
-    bench = rig.session.bench
-    bench.queue = PoseQueue(bench.require_queue().plan)
-    bench.stillness = StillnessMonitor(bench.geometry.model, StillnessConfig(timeout_s=20.0))
-    rig.arm.subscribe(bench.stillness.add)
+    context = rig.session.context
+    context.queue = PoseQueue(context.require_queue().plan)
+    context.stillness = StillnessMonitor(context.geometry.model, StillnessConfig(timeout_s=20.0))
+    rig.arm.subscribe(context.stillness.add)
     rig.arm.rest()
-    object.__setattr__(bench.cell, "camera", rendered)
+    object.__setattr__(context.cell, "camera", rendered)
     await rendered.inject("ringing", {"amplitude_rad": 0.01, "frequency_hz": 6.3})
-    async with PictureWatch(bench, 0) as watch:
-        settling = asyncio.ensure_future(bench.stillness.settle(lambda: None, watch.look))
+    async with PictureWatch(context, 0) as watch:
+        settling = asyncio.ensure_future(context.stillness.settle(lambda: None, watch.look))
         look = None
         while look is None:
             await asyncio.sleep(0.02)

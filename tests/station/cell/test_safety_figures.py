@@ -9,7 +9,7 @@ import pytest
 from station.cell import limits
 from station.devices import ur_child, ur_condition, ur_control, ur_moves
 from station.plan import hover
-from station.session import guard, lease, patience
+from station.session import lease, patience, supervisor
 
 PROMISES = (Path(__file__).parents[3] / "docs" / "safety.md").read_text()
 
@@ -25,13 +25,13 @@ PROMISES = (Path(__file__).parents[3] / "docs" / "safety.md").read_text()
         (1 / ur_control.WATCHDOG_HZ, 0.2, "silent for 0.2 s"),
         (ur_control.BEAT_FRESH_NS / 1e9, 0.1, "silent for 0.2 s"),
         (ur_moves.STALE_S, 0.25, "no fresh state for 0.25 s in mid-move"),
-        (guard.LOST_ROUNDS * guard.STATUS_TICKS * guard.TICK_S, 1.0, "(1 s at rest)"),
+        (supervisor.LOST_ROUNDS * supervisor.STATUS_TICKS * supervisor.TICK_S, 1.0, "(1 s at rest)"),
         (patience.REST_PATIENCE_S, 1.0, "(1 s at rest)"),
         (ur_moves.STRAYED_RAD, 0.05, "(by 0.05 rad)"),
         (ur_moves.SLIDER_ZERO_S, 10.0, "after 10 s the move is given up"),
         (ur_child.STOP_DECELERATION, 2.0, "decelerates the tool with 2 m/s²"),
         (hover.SPEED_M_S, 0.05, "faster than 0.05 m/s"),
-        (lease.GO_LIFETIME_S, 120.0, "A go is for one use"),
+        (lease.APPROVAL_LIFETIME_S, 120.0, "A go is for one use"),
         (lease.START_TOLERANCE_RAD, 0.005, "from where the arm stood"),
     ],
 )
@@ -48,5 +48,7 @@ def test_the_distance_kept_over_the_board_is_the_one_that_is_promised() -> None:
 
 def test_a_heartbeat_reaches_the_controller_before_its_watchdog_bites() -> None:
     """The loop beats, the child takes beats of a certain age, the script waits for its kick."""
-    assert guard.TICK_S < ur_child.HEARD_NS / 1e9 < ur_control.BEAT_FRESH_NS / 1e9 < ur_condition.WATCHDOG_S
+    assert (
+        supervisor.TICK_S < ur_child.HEARD_NS / 1e9 < ur_control.BEAT_FRESH_NS / 1e9 < ur_condition.WATCHDOG_S
+    )
     assert ur_condition.WATCHDOG_S < 1 / ur_control.WATCHDOG_HZ

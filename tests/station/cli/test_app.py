@@ -19,7 +19,7 @@ import typer
 
 from station.cell.errors import RefusedError
 from station.cell.plan import plan_sha256
-from station.cell.status import GoSummary
+from station.cell.status import MotionPreview
 from station.cli import main
 from station.cli import session as cli_session
 from station.cli.screen import tell_what_goes_on
@@ -153,7 +153,7 @@ def test_ctrl_c_at_the_question_is_a_no_at_once(monkeypatch: pytest.MonkeyPatch)
             raise typer.Abort from None
         return True
 
-    summary = GoSummary("t", "run plan", "ab" * 32, 4, 1.0, 0.5, 0.2, 30.0, "84 mm and 22° to pose 1")
+    summary = MotionPreview("t", "run plan", "ab" * 32, 4, 1.0, 0.5, 0.2, 30.0, "84 mm and 22° to pose 1")
     monkeypatch.setattr(typer, "confirm", pressed)
 
     async def ask() -> bool:  # below an event loop's own handler of Ctrl-C

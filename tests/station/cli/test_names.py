@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 
 from station.cell.plan import Plan, PlannedPose
-from station.cell.status import Event, GoSummary, PoseStatus, SessionStatus, StationStatus
+from station.cell.status import Event, MotionPreview, PoseStatus, SessionStatus, StationStatus
 from station.cli import control as cli_control
 from station.cli import main
 from station.cli import session as cli_session
@@ -81,7 +81,7 @@ def test_a_question(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixtu
     monkeypatch.setattr(typer, "confirm", lambda *told, **more: True)
     told = {"purpose": f"p {ALL}", "first_move": f"f {ALL}", "changes": (f"c {ALL}",), "warnings": (ALL,)}
     numbers = {"poses": 1, "path_m": 1, "largest_step_rad": 1, "top_speed_m_s": 0.1, "duration_s": 1}
-    go = msgspec.convert({"token": "", "plan_sha256": "", **told, **numbers}, GoSummary)
+    go = msgspec.convert({"token": "", "plan_sha256": "", **told, **numbers}, MotionPreview)
     assert cli_session.ask_person(go)
     said = capsys.readouterr().err
     assert said.count(ALL) == 4

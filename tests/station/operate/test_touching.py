@@ -7,7 +7,7 @@ import pytest
 
 from calibrate.geometry import Array, pose, rotation_exp
 from station.cell.errors import RefusedError, StationError
-from station.cell.status import GoSummary, HoverOffer
+from station.cell.status import HoverOffer, MotionPreview
 from station.operate.touching import (
     Hovering,
     read_offset_mm,
@@ -20,7 +20,7 @@ from station.operate.touching import (
 TIP = (0.01, -0.02, 0.15)
 BASE_FROM_BOARD = pose(rotation_exp([np.pi, 0.0, 0.3]), [0.6, 0.1, 0.05])
 OFFER = HoverOffer(
-    go=GoSummary("t", "hover", "ab" * 32, 2, 1.0, 0.5, 0.05, 3.0, ""),
+    go=MotionPreview("t", "hover", "ab" * 32, 2, 1.0, 0.5, 0.05, 3.0, ""),
     corner=7,
     corner_m=(0.1, 0.05),
     standoff_m=0.08,

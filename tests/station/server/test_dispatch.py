@@ -81,7 +81,7 @@ async def test_poses_of_a_check_are_planned_for_a_known_lens(
         asked.append(args[-1])
         return small_plan
 
-    monkeypatch.setattr(served.rig.session.bench.workers, "call", call)
+    monkeypatch.setattr(served.rig.session.context.workers, "call", call)
     async with await served.client() as anna:
         await anna.request("lease", action="take")
         await anna.request("make_plan", poses=6, lens_known=True)
@@ -148,9 +148,9 @@ async def test_arguments_that_do_not_fit_are_refused_in_words(
 
 async def real_cell(new_rig: NewRig, folder: Path, see: See, approval: ApprovalConfig) -> Served:
     rig = await new_rig(with_plan=False, source="real")
-    cell = rig.session.bench.cell
+    cell = rig.session.context.cell
     config = msgspec.structs.replace(cell.config, approval=approval)
-    rig.session.bench.cell = dataclasses.replace(cell, config=config)
+    rig.session.context.cell = dataclasses.replace(cell, config=config)
     await rig.until(StationState.IDLE)
     served = Served(rig, folder / "r", see)
     await served.control.start()
@@ -307,7 +307,7 @@ async def test_neither_a_long_list_of_sessions_nor_a_slow_name_holds_the_loop_up
         assert await anna.request("sessions") == []
         await anna.request("stop")
         await asyncio.sleep(0.1)  # a frozen loop shows in the round after
-    assert served.rig.session.guard.lag_ms() < 300
+    assert served.rig.session.supervisor.lag_ms() < 300
 
 
 async def test_who_is_turned_away_is_not_kept(served: Served) -> None:

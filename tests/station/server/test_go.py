@@ -7,9 +7,15 @@ import pytest
 
 from station.cell.errors import RefusedError
 from station.cell.plan import Plan
-from station.cell.status import GoSummary
-from station.session.lease import GO_LIFETIME_S, START_TOLERANCE_RAD, Go, GoDesk, LeaseDesk
-from station.session.queue import PoseQueue, Replanned
+from station.cell.status import MotionPreview
+from station.session.lease import (
+    APPROVAL_LIFETIME_S,
+    START_TOLERANCE_RAD,
+    ApprovalManager,
+    LeaseManager,
+    MotionApproval,
+)
+from station.session.queue import PlanRevision, PoseQueue
 
 HERE = (0.0, -1.5, 1.5, -1.5, -1.5, 0.0)
 PLAN = "ab" * 32
@@ -22,14 +28,18 @@ class Clock:
         return self.now_s
 
 
-def offered(desk: GoDesk, client_id: int = 1, replanned: Replanned | None = None) -> Go:
-    summary = GoSummary(desk.new_token(), "run plan", PLAN, 4, 1.0, 0.5, 0.2, 30.0, "84 mm and 22° to pose 1")
+def offered(
+    desk: ApprovalManager, client_id: int = 1, replanned: PlanRevision | None = None
+) -> MotionApproval:
+    summary = MotionPreview(
+        desk.new_token(), "run plan", PLAN, 4, 1.0, 0.5, 0.2, 30.0, "84 mm and 22° to pose 1"
+    )
     summary = msgspec.structs.replace(summary, start_joints_rad=HERE)
     return desk.offer(summary, client_id, (0, 1, 2, 3), replanned=replanned)
 
 
 def test_a_go_is_for_one_use() -> None:
-    desk = GoDesk(Clock())
+    desk = ApprovalManager(Clock())
     go = offered(desk)
     assert desk.redeem(go.summary.token, 1, PLAN, HERE) == go
     with pytest.raises(RefusedError, match="not valid"):
@@ -43,14 +53,14 @@ def test_a_go_is_for_one_use() -> None:
         ({"client_id": 2}, "another client"),
         ({"plan": "cd" * 32}, "plan changed"),
         ({"joints": (0.0, -1.5, 1.5 + 2 * START_TOLERANCE_RAD, -1.5, -1.5, 0.0)}, "arm moved"),
-        ({"later_s": GO_LIFETIME_S + 1}, "older than"),
+        ({"later_s": APPROVAL_LIFETIME_S + 1}, "older than"),
     ],
 )
 def test_a_go_is_bound_to_what_was_shown_and_a_wrong_try_voids_it(
     change: dict[str, object], said: str
 ) -> None:
     clock = Clock()
-    desk = GoDesk(clock)
+    desk = ApprovalManager(clock)
     token = offered(desk).summary.token
     clock.now_s += float(change.get("later_s", 0))  # type: ignore[arg-type]
     with pytest.raises(RefusedError, match=said):
@@ -65,8 +75,8 @@ def test_a_go_is_bound_to_what_was_shown_and_a_wrong_try_voids_it(
 
 
 def test_improved_poses_go_only_into_the_plan_they_were_made_for() -> None:
-    desk, before = GoDesk(Clock()), "ef" * 32
-    better = Replanned("improve", PoseQueue(Plan("UR10", "eye-in-hand", ())), (), before, ())
+    desk, before = ApprovalManager(Clock()), "ef" * 32
+    better = PlanRevision("improve", PoseQueue(Plan("UR10", "eye-in-hand", ())), (), before, ())
     for plan in (PLAN, "cd" * 32):
         token = offered(desk, replanned=better).summary.token
         with pytest.raises(RefusedError, match="plan changed"):
@@ -76,7 +86,7 @@ def test_improved_poses_go_only_into_the_plan_they_were_made_for() -> None:
 
 
 def test_a_newer_go_replaces_the_older_and_void_ends_both() -> None:
-    desk = GoDesk(Clock())
+    desk = ApprovalManager(Clock())
     old, new = offered(desk), offered(desk)
     assert old.summary.token != new.summary.token
     assert desk.void()
@@ -87,7 +97,7 @@ def test_a_newer_go_replaces_the_older_and_void_ends_both() -> None:
 
 
 def test_one_commander_the_second_hears_who_it_is() -> None:
-    desk = LeaseDesk()
+    desk = LeaseManager()
     desk.take(1, "anna on tty1", 0)
     desk.take(1, "anna on tty1", 0)
     with pytest.raises(RefusedError, match="anna on tty1"):

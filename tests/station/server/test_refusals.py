@@ -39,7 +39,7 @@ def test_every_verb_that_depends_on_a_state_is_tried_here() -> None:
 async def test_a_verb_out_of_its_state_is_refused_and_changes_nothing(
     rig: Rig, small_plan: Plan, monkeypatch: pytest.MonkeyPatch, verb: str
 ) -> None:
-    monkeypatch.setattr(rig.session.guard, "_look", lambda: None)  # it would correct the state
+    monkeypatch.setattr(rig.session.supervisor, "_look", lambda: None)  # it would correct the state
     dispatcher, store = SessionDispatcher(rig.session), rig.session.store
     calm, done = store.status, list(rig.arm.log)
     for state in set(S) - VERBS[verb].states:
@@ -49,7 +49,7 @@ async def test_a_verb_out_of_its_state_is_refused_and_changes_nothing(
         assert (refused.value.code, refused.value.values["state"]) == ("wrong-state", state)
         assert store.status == msgspec.structs.replace(calm, state=state)
     assert rig.arm.log == done
-    assert not (rig.session.bench.pause_wanted or rig.session.bench.finish_wanted)
+    assert not (rig.session.context.pause_wanted or rig.session.context.finish_wanted)
     store._status = calm
 
 

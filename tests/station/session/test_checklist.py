@@ -15,10 +15,10 @@ from tests.station.session_rig import Rig
 
 
 async def robot_check(rig: Rig, host: str) -> Check:
-    cell = rig.session.bench.cell
+    cell = rig.session.context.cell
     config = msgspec.structs.replace(cell.config, robot=msgspec.structs.replace(cell.config.robot, host=host))
     object.__setattr__(cell, "config", config)
-    return (await checklist(rig.session.bench, {}))[0]
+    return (await checklist(rig.session.context, {}))[0]
 
 
 async def test_a_robot_that_is_there_is_ok(rig: Rig) -> None:
@@ -48,10 +48,10 @@ async def test_the_size_of_the_camera_is_that_of_its_pictures_not_of_the_preview
         return {"region": [0, 0, 1280, 1024]}
 
     monkeypatch.setattr(rig.camera, "preview", rig.camera.glimpse)
-    said = {check.name: check.text for check in await checklist(rig.session.bench, {})}
+    said = {check.name: check.text for check in await checklist(rig.session.context, {})}
     assert said["camera"].endswith("80×64")  # a camera that tells no more
     monkeypatch.setattr(rig.camera, "settings", settings)
-    said = {check.name: check.text for check in await checklist(rig.session.bench, {})}
+    said = {check.name: check.text for check in await checklist(rig.session.context, {})}
     assert said["camera"].endswith("1280×1024")
 
 

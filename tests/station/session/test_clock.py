@@ -13,7 +13,7 @@ from tests.station.session_rig import Rig
 
 
 async def test_24_a_step_of_the_wall_clock_is_told_once(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monitor = Monitor(rig.session.bench)
+    monitor = Monitor(rig.session.context)
     real_ns = time.time_ns
     monkeypatch.setattr(time, "time_ns", lambda: real_ns() + 3_600_000_000_000)
     monitor.refresh(0.0)
@@ -24,7 +24,7 @@ async def test_24_a_step_of_the_wall_clock_is_told_once(rig: Rig, monkeypatch: p
 
 
 async def test_25_a_pose_whose_time_is_too_uncertain_is_refused(rig: Rig) -> None:
-    cell = rig.session.bench.cell
+    cell = rig.session.context.cell
     capture = msgspec.structs.replace(cell.config.capture, time_bound_s=0.001)  # no clock: ±25 ms
     object.__setattr__(cell, "config", msgspec.structs.replace(cell.config, capture=capture))
     await rig.give_go()

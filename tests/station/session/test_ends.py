@@ -110,7 +110,7 @@ async def test_a_disk_that_fails_after_stop_is_told_and_stop_stays_latched(
     assert "STOP by bert" in rig.session.store.status.reason
     assert "no space left" in rig.session.store.status.reason
     assert any("no space left" in e.text and e.level == "error" for e in rig.session.store.status.events)
-    assert rig.session.bench.require_recording().recorder is None
+    assert rig.session.context.require_recording().recorder is None
     assert "done" not in rig.pose_states
 
 
@@ -141,7 +141,7 @@ async def test_of_two_states_of_a_session_the_newer_one_stays_on_the_disk(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     await rig.go_until_it_moves()
-    recording, queue = rig.session.bench.require_recording(), rig.session.bench.require_queue()
+    recording, queue = rig.session.context.require_recording(), rig.session.context.require_queue()
     disk, begun, written = threading.Event(), [], []
 
     def slow(self: SessionRecording, state: SessionState) -> None:

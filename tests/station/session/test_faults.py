@@ -44,7 +44,7 @@ async def test_a_picture_without_the_board_does_not_count(rig: Rig) -> None:
 
 
 async def test_an_arm_that_does_not_rest_fails_the_pose(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(rig.session.bench.stillness, "unrest", lambda found: "wrist 2 moves at 0.5°/s")
+    monkeypatch.setattr(rig.session.context.stillness, "unrest", lambda found: "wrist 2 moves at 0.5°/s")
     await rig.give_go()
     await rig.until(S.PAUSED)
     assert "wrist 2 moves" in rig.session.store.status.session.poses[0].reason
@@ -97,7 +97,7 @@ async def test_a_full_disk_is_noticed_before_the_pose(rig: Rig, monkeypatch: pyt
 
 
 async def test_a_full_disk_is_told_before_anybody_is_asked(rig: Rig) -> None:
-    cell = rig.session.bench.cell
+    cell = rig.session.context.cell
     capture = msgspec.structs.replace(cell.config.capture, free_space_bytes=10**18)
     object.__setattr__(cell, "config", msgspec.structs.replace(cell.config, capture=capture))
     with pytest.raises(RefusedError, match=r"free \d+\.\d GB and go on\. Nothing moved"):

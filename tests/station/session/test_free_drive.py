@@ -122,7 +122,7 @@ async def test_stop_while_free_drive_begins_stays_latched(
     opened.set()
     with pytest.raises(RefusedError, match="STOP is latched"):
         await beginning
-    assert bare_rig.state is S.STOPPED and bare_rig.session.bench.halting
+    assert bare_rig.state is S.STOPPED and bare_rig.session.context.halting
 
 
 async def test_no_go_is_given_while_free_drive_begins(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -177,7 +177,7 @@ async def test_stop_while_free_drive_opens_the_recording_leaves_a_way_on(
     disk.set()
     with pytest.raises(RecordingError if fails else RefusedError):
         await beginning
-    assert (rig.state, rig.session.bench.recording is None) == (
+    assert (rig.state, rig.session.context.recording is None) == (
         (S.IDLE, True) if fails else (S.PAUSED, False)
     )
     if not fails:

@@ -12,7 +12,7 @@ import pytest
 from calibrate.files.calibration import FramePose, Gate, write_calibration
 from calibrate.geometry import Array, Transform
 from calibrate.kinematics import MODELS, forward
-from station.analysis.worker import Sighting
+from station.analysis.worker import BoardDetection
 from station.cell.errors import LimitError, RefusedError, RobotError
 from station.cell.status import DetectionStatus, HoverOffer
 from station.cell.status import StationState as S
@@ -34,7 +34,7 @@ def request(path: Path, corner: int = 0, **more: object) -> Hover:
 async def hover_rig(bare_rig: Rig) -> Rig:
     view = seen_from(TRUTH, forward(MODELS["UR10"], TRUTH.start_joints_rad), BOARD)
     status = DetectionStatus(found=True, corners=len(view.pixels), expected=len(view.pixels))
-    bare_rig.worker.sees = Sighting(status, np.arange(len(view.pixels)), view.pixels)
+    bare_rig.worker.sees = BoardDetection(status, np.arange(len(view.pixels)), view.pixels)
     return bare_rig
 
 
@@ -70,7 +70,7 @@ async def test_a_go_brings_the_tip_over_the_corner_and_is_used_up(hover_rig: Rig
     assert rig.states == [S.IDLE, S.CHECKING, S.MOVING, S.IDLE]
     assert tip_of(rig) == pytest.approx([0, 0, -0.08], abs=1e-6)
     assert "by hand only" in rig.session.store.status.reason
-    assert rig.session.bench.recording is None
+    assert rig.session.context.recording is None
     await rig.until_true(lambda: rig.arm.log[-1] == "end control")
     assert rig.arm.log.count("move") == 2
     with pytest.raises(RefusedError, match="not valid"):
@@ -176,7 +176,7 @@ async def test_what_is_not_fit_to_drive_by_is_refused(
         await rig.session.prepare_hover(1, request(calibration, new_picture=False))
     with pytest.raises(RefusedError, match=r"take the lease|held by"):
         await rig.session.prepare_hover(2, request(calibration))
-    rig.worker.sees = Sighting(DetectionStatus(reason="too dark"), np.arange(0), np.zeros((0, 2)))
+    rig.worker.sees = BoardDetection(DetectionStatus(reason="too dark"), np.arange(0), np.zeros((0, 2)))
     with pytest.raises(RefusedError, match="too dark"):
         await rig.session.prepare_hover(1, request(calibration))
     assert "start control" not in rig.arm.log
@@ -231,7 +231,7 @@ async def test_a_moment_without_news_at_the_end_is_no_fault(
 ) -> None:
     rig = hover_rig
     offer = await rig.session.prepare_hover(1, request(calibration))
-    settle = rig.session.bench.stillness.settle
+    settle = rig.session.context.stillness.settle
 
     async def hiccup(*args: object) -> object:
         try:
@@ -240,7 +240,7 @@ async def test_a_moment_without_news_at_the_end_is_no_fault(
             rig.arm.stale = True
             asyncio.get_running_loop().call_later(0.05, setattr, rig.arm, "stale", False)
 
-    monkeypatch.setattr(rig.session.bench.stillness, "settle", hiccup)
+    monkeypatch.setattr(rig.session.context.stillness, "settle", hiccup)
     rig.session.go(1, offer.go.token)
     await rig.until(S.CHECKING)
     await rig.until(S.IDLE, S.FAULT)
@@ -257,7 +257,7 @@ async def test_a_robot_lost_at_the_end_of_a_hover_is_a_fault(
     async def lost(*args: object) -> None:
         rig.arm.stale = True
 
-    monkeypatch.setattr(rig.session.bench.stillness, "settle", lost)
+    monkeypatch.setattr(rig.session.context.stillness, "settle", lost)
     monkeypatch.setattr("station.session.patience.REST_PATIENCE_S", 0.05)
     rig.session.go(1, offer.go.token)
     await rig.until(S.CHECKING)

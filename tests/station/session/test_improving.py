@@ -16,7 +16,7 @@ from calibrate.kinematics import MODELS, forward
 from calibrate.projection import project
 from recordings.reader import open_recording
 from station.analysis.estimation import next_best
-from station.analysis.worker import Sighting, seen_before, sight
+from station.analysis.worker import BoardDetection, seen_before, sight
 from station.cell.errors import LimitError, RefusedError
 from station.cell.limits import check_plan
 from station.cell.plan import Plan, PlannedPose
@@ -44,7 +44,7 @@ class WorkerThatSees(WorkerInThisProcess):
         board = inverse(flange @ np.array(TRUTH.camera_mount)) @ np.array(TRUTH.board_place)
         points = board_points(TRUTH.board)
         pixels = project(TRUTH.camera, transform_points(board, points)).pixels
-        return Sighting(
+        return BoardDetection(
             self.sees.status, np.arange(len(points)), pixels + self.noise.normal(0, 0.1, pixels.shape)
         )
 
@@ -58,7 +58,7 @@ def plan() -> Plan:
 async def half_way(new_rig: NewRig, plan: Plan) -> Rig:
     """Paused after some poses."""
     rig = await new_rig()
-    rig.session.bench.workers = WorkerThatSees(rig)  # type: ignore[assignment]
+    rig.session.context.workers = WorkerThatSees(rig)  # type: ignore[assignment]
     rig.session.load_plan(1, plan)
     ended = rig.session.store.watch(lambda: _pause_after(rig, BEFORE))
     await rig.give_go()
@@ -69,11 +69,11 @@ async def half_way(new_rig: NewRig, plan: Plan) -> Rig:
 
 def _pause_after(rig: Rig, poses: int) -> None:
     if rig.session.store.status.session.captured == poses:
-        rig.session.bench.pause_wanted = "anna"
+        rig.session.context.pause_wanted = "anna"
 
 
 def queue_of(rig: Rig) -> PoseQueue:
-    return rig.session.bench.require_queue()
+    return rig.session.context.require_queue()
 
 
 async def test_the_remaining_poses_are_planned_anew_only_by_a_go(half_way: Rig, plan: Plan) -> None:
@@ -127,8 +127,8 @@ class WorkerThatLooksBack(WorkerInThisProcess):
     def __init__(self, rig: Rig) -> None:
         super().__init__()
         self.known = [
-            (view.index, view.base_from_flange, Sighting(self.sees.status, view.indices, view.pixels))
-            for view in rig.session.bench.seen.values()
+            (view.index, view.base_from_flange, BoardDetection(self.sees.status, view.indices, view.pixels))
+            for view in rig.session.context.seen.values()
         ]
 
     async def call(self, function: Callable[..., Any], *args: Any, timeout_s: float = 60.0) -> Any:
@@ -147,7 +147,7 @@ async def test_after_a_crash_the_pictures_before_it_count_in_the_estimate_and_th
     again = await new_rig(with_plan=False)
     assert again.session.store.status.session.elapsed_s == pytest.approx(known.session.elapsed_s, abs=0.3)
     assert known.session.elapsed_s > 0.1
-    again.session.bench.workers = WorkerThatLooksBack(half_way)  # type: ignore[assignment]
+    again.session.context.workers = WorkerThatLooksBack(half_way)  # type: ignore[assignment]
     again.session.take_lease(1, "anna")
     again.session.acknowledge("anna")
     summary = await again.session.prepare(1, Purpose.NEXT_POSE)
@@ -213,7 +213,7 @@ async def test_the_pose_that_helps_most_is_added_and_taken_by_its_own_go(half_wa
 
 async def test_a_pose_that_helps_is_checked_like_any(half_way: Rig) -> None:
     """Whatever the search thought of it."""
-    worker, before = half_way.session.bench.workers, queue_of(half_way)
+    worker, before = half_way.session.context.workers, queue_of(half_way)
     folded = PlannedPose("p01", (0.0, -1.5, 3.0, 0.0, 0.0, 0.0), why="folded", predicted_sigma_m=1e-4)
 
     class WorkerThatFolds(WorkerThatSees):
@@ -221,7 +221,7 @@ async def test_a_pose_that_helps_is_checked_like_any(half_way: Rig) -> None:
             found = await worker.call(function, *args, timeout_s=timeout_s)
             return replace(found, next_pose=folded) if function is next_best else found
 
-    half_way.session.bench.workers = WorkerThatFolds(half_way)  # type: ignore[assignment]
+    half_way.session.context.workers = WorkerThatFolds(half_way)  # type: ignore[assignment]
     with pytest.raises(LimitError, match="refused, nothing moved"):
         await half_way.session.prepare(1, Purpose.NEXT_POSE)
     assert queue_of(half_way) is before and half_way.session.store.status.go is None

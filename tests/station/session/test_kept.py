@@ -116,4 +116,4 @@ async def test_the_name_of_a_sessions_folder_is_on_the_disk_before_its_first_pos
         await rig.until_true(lambda: rig.pose_states[0] == "done")
         until_then = list(order)
         await rig.until(S.IDLE)
-    assert {"sync sessions", f"sync {rig.session.bench.root.name}"} <= set(until_then)
+    assert {"sync sessions", f"sync {rig.session.context.root.name}"} <= set(until_then)

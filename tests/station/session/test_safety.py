@@ -19,7 +19,7 @@ from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, Reorder
 from station.server.control import ControlServer
 from station.server.dispatch import SessionDispatcher
-from station.session import guard, keeper, monitor
+from station.session import keeper, monitor, supervisor
 from station.session.recording import SessionRecording
 from tests.station.session_rig import POSES, HeldDisk, NewRig, Rig
 
@@ -91,7 +91,7 @@ async def test_what_changes_while_the_way_is_checked_leaves_no_go(rig: Rig, chan
 
 
 async def test_a_robot_that_was_lost_voids_the_go(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(guard, "LOST_ROUNDS", 2)
+    monkeypatch.setattr(supervisor, "LOST_ROUNDS", 2)
     summary = await rig.session.prepare(1, Purpose.RUN)
     rig.arm.stale = True
     await rig.until(S.DISCONNECTED)
@@ -125,10 +125,10 @@ async def test_stop_while_an_interrupted_session_is_closed_stays_latched(
 ) -> None:
     await rig.go_until_it_moves()
     await rig.session.stop("bert")
-    recorder = rig.session.bench.require_recording().recorder
+    recorder = rig.session.context.require_recording().recorder
     assert recorder is not None
     recorder.close()
-    rig.session.bench.recording = None  # as after a crash
+    rig.session.context.recording = None  # as after a crash
     other = await new_rig(with_plan=False)
     other.session.take_lease(1, "anna")
     other.session.acknowledge("anna")
@@ -183,7 +183,7 @@ async def test_a_client_that_leaves_at_once_is_served_to_the_end(rig: Rig, tmp_p
     await control.close()
 
 
-async def test_the_guard_outlives_an_error_in_what_it_shows(
+async def test_the_supervisor_outlives_an_error_in_what_it_shows(
     rig: Rig, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def gone(path: object) -> None:
@@ -192,9 +192,9 @@ async def test_the_guard_outlives_an_error_in_what_it_shows(
     monkeypatch.setattr(monitor, "DISK_PERIOD_S", 0.0)
     monkeypatch.setattr(monitor.shutil, "disk_usage", gone)
     await asyncio.sleep(0.15)
-    rounds = len(rig.session.guard.lags_s)
+    rounds = len(rig.session.supervisor.lags_s)
     await asyncio.sleep(0.1)
-    assert len(rig.session.guard.lags_s) > rounds
+    assert len(rig.session.supervisor.lags_s) > rounds
     assert rig.session.store.status.recorder.free_bytes is None
 
 
@@ -216,7 +216,7 @@ async def test_a_session_of_a_simulated_cell_is_not_gone_on_with_by_a_real_arm(
     await rig.session.stop("bert")
     real = await new_rig(with_plan=False, source="real")
     await real.until(S.IDLE)
-    assert real.session.bench.recording is None
+    assert real.session.context.recording is None
     assert any("simulated" in event.text for event in real.session.store.status.events)
 
 
@@ -237,7 +237,7 @@ async def test_a_disk_that_hangs_does_not_hang_the_station(rig: Rig, monkeypatch
     await rig.give_go()
     await rig.until(S.FAULT)
     await asyncio.sleep(0.1)  # a frozen loop shows in the round after
-    assert rig.session.guard.lag_ms() < 300
+    assert rig.session.supervisor.lag_ms() < 300
 
 
 @pytest.mark.parametrize("speeds", [{"joint_speed_rad_s": -0.5}, {"joint_acceleration_rad_s2": 0.0}])
@@ -282,7 +282,7 @@ async def test_an_error_nobody_foresaw_is_answered(rig: Rig, tmp_path: Path) -> 
     control = ControlServer(tmp_path / "s", SessionDispatcher(rig.session))
     await control.start()
     await rig.session.release_lease(1)
-    rig.session.bench.queue = None
+    rig.session.context.queue = None
     async with await Client.connect(tmp_path / "s", "tty1") as anna:
         await anna.request("lease", action="take")
         async with asyncio.timeout(3):

@@ -32,7 +32,7 @@ async def test_no_modelled_point_is_driven_faster_than_the_cap_nor_a_joint_than_
     await rig.give_go()
     await rig.until(S.IDLE)
     assert len(moves) == POSES
-    config = rig.session.bench.cell.config
+    config = rig.session.context.cell.config
     geometry = with_plan_speeds(geometry_from(config, TRUTH.start_joints_rad), plan)
     for start, target, speed_rad_s, acceleration_rad_s2 in moves:
         checked = check_path(geometry, start, target)

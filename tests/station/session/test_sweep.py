@@ -12,7 +12,7 @@ import pytest
 
 from recordings.reader import Recording
 from recordings.schema.messages import Image
-from station.analysis.worker import Sighting
+from station.analysis.worker import BoardDetection
 from station.cell.errors import CameraError, RefusedError
 from station.cell.status import DetectionStatus
 from station.cell.status import StationState as S
@@ -43,7 +43,7 @@ async def test_it_swings_takes_pictures_and_comes_back(sweeping: Rig) -> None:
     assert "sweep: 8 slow swings" in summary.purpose and sweeping.arm.log == []
     sweeping.session.go(1, summary.token)
     await sweeping.until(S.MOVING)
-    assert sweeping.session.bench.require_recording().elapsed_s > 0
+    assert sweeping.session.context.require_recording().elapsed_s > 0
     await swing_to_the_end(sweeping)
     assert sweeping.arm.joints == pytest.approx(TRUTH.start_joints_rad)
     assert sweeping.pose_states == ["done"] * SWINGS
@@ -68,11 +68,11 @@ async def test_stop_ends_swing_and_pictures(sweeping: Rig) -> None:
 
 
 async def test_without_the_board_in_view_nothing_moves(sweeping: Rig) -> None:
-    sweeping.worker.sees = Sighting(DetectionStatus(reason="too dark"), np.arange(0), np.zeros((0, 2)))
+    sweeping.worker.sees = BoardDetection(DetectionStatus(reason="too dark"), np.arange(0), np.zeros((0, 2)))
     await sweeping.give_go()
     await sweeping.until(S.IDLE)
     assert "board in view: too dark" in sweeping.session.store.status.reason
-    assert "move" not in sweeping.arm.log and sweeping.session.bench.recording is None
+    assert "move" not in sweeping.arm.log and sweeping.session.context.recording is None
 
 
 async def test_a_camera_that_fails_again_and_again_ends_it_after_the_swing(sweeping: Rig) -> None:
@@ -129,8 +129,8 @@ class StreamingInMemory(CameraInMemory):
 @pytest.fixture
 async def streaming(rig: Rig) -> Rig:
     rig.camera = StreamingInMemory()
-    cell = dataclasses.replace(rig.session.bench.cell, camera=rig.camera)
-    rig.session.bench.cell = cell
+    cell = dataclasses.replace(rig.session.context.cell, camera=rig.camera)
+    rig.session.context.cell = cell
     rig.arm.slow = True
     rig.session.load_plan(1, sweep_plan("UR10", "eye-in-hand", TRUTH.start_joints_rad))
     return rig

@@ -167,7 +167,7 @@ def rtde() -> Iterator[Callable[..., RtdeClient]]:
         client.close()
 
 
-class Bench:
+class SessionContext:
     """A robot without sockets: time goes on only by `run`, registers are written by hand."""
 
     def __init__(self, **settings: Any) -> None:
@@ -228,13 +228,13 @@ class Bench:
 
 
 @pytest.fixture
-def bench() -> Callable[..., Bench]:
-    return Bench
+def context() -> Callable[..., SessionContext]:
+    return SessionContext
 
 
 @pytest.fixture
-def script(bench: Callable[..., Bench]) -> Bench:
+def script(context: Callable[..., SessionContext]) -> SessionContext:
     """A UR10 whose control script runs."""
-    made = bench()
+    made = context()
     made.start_script()
     return made

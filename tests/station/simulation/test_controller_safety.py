@@ -28,8 +28,8 @@ def test_protective_stop_rests_at_once_and_holds_the_word(script) -> None:
     assert script.robot.arm.actual == where
 
 
-def test_protective_stop_may_stop_the_program_instead(bench) -> None:
-    made = bench(paused_by_protective_stop=False)
+def test_protective_stop_may_stop_the_program_instead(context) -> None:
+    made = context(paused_by_protective_stop=False)
     made.start_script()
     made.robot.protective_stop("test")
     made.run(0.02)
@@ -37,8 +37,8 @@ def test_protective_stop_may_stop_the_program_instead(bench) -> None:
 
 
 @pytest.mark.parametrize(("model", "mode"), [("UR10", RobotMode.POWER_OFF), ("UR10e", RobotMode.IDLE)])
-def test_emergency_stop_bits_and_way_back(bench, model, mode) -> None:
-    made = bench(model=model)
+def test_emergency_stop_bits_and_way_back(context, model, mode) -> None:
+    made = context(model=model)
     made.start_script()
     made.robot.emergency_stop(True)
     made.run(0.02)
@@ -56,21 +56,21 @@ def test_emergency_stop_bits_and_way_back(bench, model, mode) -> None:
     assert made.robot.robot_mode == RobotMode.RUNNING and made.output("robot_status_bits") == 1
 
 
-def test_programs_are_ignored_when_they_must_be(bench) -> None:
+def test_programs_are_ignored_when_they_must_be(context) -> None:
     for spoil in (
         lambda robot: robot.power_off(),
         lambda robot: robot.protective_stop("test"),
         lambda robot: setattr(robot, "remote", False),
     ):
-        made = bench(model="UR10e")
+        made = context(model="UR10e")
         spoil(made.robot)
         made.start_script()
         assert made.robot.program is None
         assert made.robot.journal.entries()[-1]["accepted"] is False
 
 
-def test_cb3_has_no_local_mode(bench) -> None:
-    made = bench(model="UR10", remote=False)
+def test_cb3_has_no_local_mode(context) -> None:
+    made = context(model="UR10", remote=False)
     made.start_script()
     assert made.robot.runtime_state == RuntimeState.PLAYING
 
@@ -110,9 +110,9 @@ def test_hands_move_the_arm_only_when_it_is_free(script) -> None:
     assert list(script.robot.arm.command) == GOAL, "the motion that was under way is lost"
 
 
-def test_time_scale_speeds_up_motion_and_nothing_else(bench) -> None:
+def test_time_scale_speeds_up_motion_and_nothing_else(context) -> None:
     """Faster motion, same clock, and speeds as commanded."""
-    fast = bench(time_scale=4.0)
+    fast = context(time_scale=4.0)
     fast.start_script()
     fast.write(1, [2.0, *HOME[1:], 0.5, 2.0], 1)
     fast.run(0.5)

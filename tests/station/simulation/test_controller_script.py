@@ -27,8 +27,8 @@ def changes(word: int) -> int:
     return word >> 16 & 0x7F
 
 
-def test_the_script_starts_after_its_delay_and_is_ready(bench) -> None:
-    made = bench()
+def test_the_script_starts_after_its_delay_and_is_ready(context) -> None:
+    made = context()
     made.robot.upload(Upload("rtde_control", "def rtde_control():\n reg_offset_int = 0\nend\n"))
     made.run(0.03)
     assert made.robot.runtime_state == RuntimeState.STOPPED
@@ -76,9 +76,9 @@ def test_operation_ids_wrap_at_seven_bits_and_stay_positive(script) -> None:
     assert operation(script.word) == 130 % 128
 
 
-def test_an_operation_killed_before_its_first_cycle_still_counts(bench) -> None:
+def test_an_operation_killed_before_its_first_cycle_still_counts(context) -> None:
     words = []
-    operation_without_time = Operation(bench().robot.arm, [], AsyncWord(words.append))
+    operation_without_time = Operation(context().robot.arm, [], AsyncWord(words.append))
     operation_without_time.kill()
     assert [(operation(word), running(word)) for word in words] == [(1, True), (1, False)]
 
@@ -94,8 +94,8 @@ def test_a_new_move_replaces_a_running_one(script) -> None:
     assert list(script.robot.arm.command) == GOAL
 
 
-def test_progress_of_a_path_counts_its_marks(bench) -> None:
-    made = bench()
+def test_progress_of_a_path_counts_its_marks(context) -> None:
+    made = context()
     body = "".join(
         f"  signal_async_progress({i})\n  movej([{q},-1.5,1.5,-1.5,-1.5,0],a=2.0,v=1.0,r=0.0)\n"
         for i, q in enumerate((0.2, 0.4, 0.1))
@@ -263,8 +263,8 @@ def test_unknown_commands_are_acknowledged_and_logged(script) -> None:
     assert script.robot.journal.counts["script: command 199"] == 1
 
 
-def test_upper_registers(bench) -> None:
-    made = bench()
+def test_upper_registers(context) -> None:
+    made = context()
     made.start_script(
         Upload(
             "rtde_control",

@@ -37,20 +37,20 @@ def test_history_keeps_its_span_and_no_more() -> None:
         history.at(newest - int((SPAN_S + 0.01) * 1e9))
 
 
-def test_the_true_flange_has_the_true_lengths_and_the_miss(bench) -> None:
+def test_the_true_flange_has_the_true_lengths_and_the_miss(context) -> None:
     deltas = DhDeltas(
         a_m=(0, 1e-3, 0, 0, 0, 0), d_m=(0, 0, 0, 2e-3, 0, 0), alpha_rad=(1e-3, 0, 0, 0, 0, 0),
         theta_rad=(0, 0, 2e-3, 0, 0, 0),
     )  # fmt: skip
-    made = bench(dh_delta=(deltas.a_m, deltas.d_m, deltas.alpha_rad, deltas.theta_rad))
+    made = context(dh_delta=(deltas.a_m, deltas.d_m, deltas.alpha_rad, deltas.theta_rad))
     miss = (1e-4, -2e-4, 3e-4, 1e-3, 2e-3, -1e-3)
     expected = perturb(station_forward(MODELS["UR10"].calibrated(deltas), Q), np.array(miss))
     found = np.array(made.robot.true_flange(Q, miss)).reshape(3, 4)
     assert np.allclose(found, expected[:3], atol=1e-12)
 
 
-def test_reported_poses_know_nothing_of_the_truth(bench) -> None:
-    made = bench(sigma_m=1e-3, sigma_rad=1e-2, dh_delta=((0.0, 0.01, 0, 0, 0, 0),) + ((0.0,) * 6,) * 3)
+def test_reported_poses_know_nothing_of_the_truth(context) -> None:
+    made = context(sigma_m=1e-3, sigma_rad=1e-2, dh_delta=((0.0, 0.01, 0, 0, 0, 0),) + ((0.0,) * 6,) * 3)
     made.run(0.1)
     reported = made.robot.outputs.vector("actual_TCP_pose")[:3]
     nominal = station_forward(MODELS["UR10"], made.robot.arm.actual)[:3, 3]
@@ -60,8 +60,8 @@ def test_reported_poses_know_nothing_of_the_truth(bench) -> None:
     )
 
 
-def test_the_misses_have_the_sigma_they_were_asked_for_and_repeat_with_the_seed(bench) -> None:
-    draws = np.array([bench(sigma_m=1e-3, sigma_rad=2e-3, seed=s).robot.arm.miss for s in range(400)])
+def test_the_misses_have_the_sigma_they_were_asked_for_and_repeat_with_the_seed(context) -> None:
+    draws = np.array([context(sigma_m=1e-3, sigma_rad=2e-3, seed=s).robot.arm.miss for s in range(400)])
     assert draws[:, :3].std() == pytest.approx(1e-3, rel=0.15)
     assert draws[:, 3:].std() == pytest.approx(2e-3, rel=0.15)
-    assert bench(sigma_m=1e-3, seed=5).robot.arm.miss == bench(sigma_m=1e-3, seed=5).robot.arm.miss
+    assert context(sigma_m=1e-3, seed=5).robot.arm.miss == context(sigma_m=1e-3, seed=5).robot.arm.miss

@@ -19,7 +19,7 @@ from recordings.schema.messages import Vector6
 from station.cell.errors import RobotError, StaleStateError
 from station.cell.status import StationState
 from station.protocol.states import RUNNING
-from station.session.bench import Bench
+from station.session.context import SessionContext
 from station.session.monitor import Monitor
 
 log = logging.getLogger(__name__)
@@ -33,10 +33,10 @@ RESTING_RAD_S = 0.01
 LAGS_KEPT = 3000
 
 
-class Guard:
+class SessionSupervisor:
     def __init__(
         self,
-        bench: Bench,
+        context: SessionContext,
         jogged: Callable[[str], None],
         ticked: Callable[[], None],
         lost: Callable[[], None],
@@ -44,8 +44,8 @@ class Guard:
     ) -> None:
         """`jogged`: the resting arm was moved by somebody, in words. `ticked`: after every round. `lost`: the
         resting robot was silent for too long. `first`: before anything else in every round."""
-        self._bench = bench
-        self._monitor = Monitor(bench)
+        self._context = context
+        self._monitor = Monitor(context)
         self._jogged, self._ticked, self._lost, self._first = jogged, ticked, lost, first
         self._failure = ""
         self._rest_joints: Vector6 | None = None
@@ -66,8 +66,8 @@ class Guard:
 
     def _round(self, number: int) -> None:
         self._first()
-        if self._bench.store.state in RUNNING:
-            self._bench.cell.robot.heartbeat()
+        if self._context.store.state in RUNNING:
+            self._context.cell.robot.heartbeat()
         if number % STATUS_TICKS == 0:
             self._look()
         self._ticked()
@@ -82,7 +82,7 @@ class Guard:
             if repr(error) != self._failure:
                 self._failure = repr(error)
                 log.exception("the status could not be refreshed")
-                self._bench.store.event(f"what the screen shows is not fresh: {error!r}", "error")
+                self._context.store.event(f"what the screen shows is not fresh: {error!r}", "error")
 
     def lag_ms(self) -> float:
         """Worst of the last second."""
@@ -91,7 +91,7 @@ class Guard:
 
     def _watch_link(self) -> None:
         """idle ⇄ disconnected; a running session notices a lost robot by itself."""
-        store, robot = self._bench.store, self._bench.cell.robot
+        store, robot = self._context.store, self._context.cell.robot
         try:
             robot.latest()
         except StaleStateError as error:
@@ -106,17 +106,17 @@ class Guard:
             return
         self._stale_rounds = 0
         if store.state is StationState.DISCONNECTED:
-            store.enter(self._bench.resting)
+            store.enter(self._context.resting)
             store.event("robot connected")
 
     def _watch_rest(self) -> None:
         """Says so when the arm is moved by somebody while the session rests; any go is void then."""
-        bench = self._bench
-        if bench.store.state is not StationState.PAUSED:
+        context = self._context
+        if context.store.state is not StationState.PAUSED:
             self._rest_joints = None
             return
         try:
-            state = bench.cell.robot.latest()
+            state = context.cell.robot.latest()
         except RobotError:
             return
         joints = state.joints_rad
@@ -125,13 +125,13 @@ class Guard:
                 self._rest_joints = joints
             return
         if np.abs(np.subtract(joints, self._rest_joints)).max() > JOGGED_RAD:
-            self._jogged(displacement(bench, self._rest_joints, joints))
+            self._jogged(displacement(context, self._rest_joints, joints))
             self._rest_joints = joints
 
 
-def displacement(bench: Bench, before: Vector6, after: Vector6) -> str:
+def displacement(context: SessionContext, before: Vector6, after: Vector6) -> str:
     """'84 mm and 22°' of the flange."""
-    poses = forward(bench.geometry.model, [before, after])
+    poses = forward(context.geometry.model, [before, after])
     distance_m = float(np.linalg.norm(poses[1, :3, 3] - poses[0, :3, 3]))
     cosine = (np.trace(poses[0, :3, :3].T @ poses[1, :3, :3]) - 1) / 2
     angle = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))

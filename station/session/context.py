@@ -24,7 +24,7 @@ from station.session.store import StatusStore
 
 
 @dataclass(frozen=True, eq=False)
-class SeenView:
+class CapturedView:
     """A pose that counts, as far as the running estimate needs it."""
 
     index: int
@@ -34,7 +34,7 @@ class SeenView:
 
 
 @dataclass(eq=False)
-class Bench:
+class SessionContext:
     """Touched by the event loop's thread only."""
 
     cell: Cell
@@ -46,7 +46,7 @@ class Bench:
     queue: PoseQueue | None = None
     recording: SessionRecording | None = None
     """Of the session that is not sealed yet."""
-    seen: dict[int, SeenView] = field(default_factory=dict)
+    seen: dict[int, CapturedView] = field(default_factory=dict)
     pause_wanted: str = ""
     """Who asked to pause after this pose; empty = nobody."""
     finish_wanted: bool = False

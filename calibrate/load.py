@@ -73,10 +73,10 @@ def load_views(
             missing.append(RejectedView(view.index, view.name, detection.reason, "corners"))
     pictures = len(seen) + sum(view.kind == "unreadable-picture" for view in missing)
     if len(views) < fewest:
-        counted = sum(detection.squares_counted for detection in seen.values())
+        counted = sum(detection.cause == "squares-counted" for detection in seen.values())
         if counted >= max(1, len(missing) / 2):
             raise _squares_counted(recording, spec, counted, pictures)
-        mirrored = sum(detection.mirrored for detection in seen.values())
+        mirrored = sum(detection.cause == "mirrored" for detection in seen.values())
         if mirrored >= max(1, len(missing) / 2):
             raise MirroredPicturesError(
                 f"{recording.path}: the board is seen only in the mirror image, in {mirrored} of {pictures} "

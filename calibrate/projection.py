@@ -78,7 +78,9 @@ def _pixels(K: Array, xd: Array, yd: Array) -> Array:
 def camera_matrix(camera: CameraModel) -> Array:
     """K (3, 3); BadViewsError where it is missing or not a camera matrix."""
     if camera.matrix is None:
-        raise BadViewsError("the camera's intrinsics are not known yet: calibrate them first")
+        raise BadViewsError(
+            "The camera's intrinsics are not known.", code="no-intrinsics", remedy="Estimate them first."
+        )
     K = np.array(camera.matrix, dtype=float)
     if (
         K.shape != (3, 3)
@@ -88,8 +90,9 @@ def camera_matrix(camera: CameraModel) -> Array:
         or K[2].tolist() != [0, 0, 1]
     ):
         raise BadViewsError(
-            f"the camera matrix {camera.matrix} is not one: [[fx, skew, cx], [0, fy, cy], [0, 0, 1]] is "
-            "needed, finite, with positive focal lengths in pixels"
+            f"The camera matrix {camera.matrix} is not one.",
+            code="camera-matrix",
+            remedy="Write [[fx, skew, cx], [0, fy, cy], [0, 0, 1]], finite, fx and fy positive, in pixels.",
         )
     return K
 

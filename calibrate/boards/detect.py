@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 import cv2
 import numpy as np
@@ -20,15 +20,29 @@ from recordings.schema.messages import SINGLE_TAGS, BoardKind, BoardSpec
 FEWEST_POINTS = 6
 """Fewer corners of a partial board do not give a trustworthy pose."""
 _SATURATED_GREY = 252
+Cause = Literal[
+    "",
+    "not-found",
+    "in-line",
+    "few-corners",
+    "too-dark",
+    "over-exposed",
+    "empty",
+    "other-board",
+    "squares-counted",
+    "mirrored",
+]
+"""squares-counted: a chessboard one smaller each way is seen; mirrored: markers in the mirror image only."""
 
 
 @dataclass(frozen=True, eq=False)
 class Detection:
     """What one picture shows of the board."""
 
-    found: bool
+    cause: Cause
+    """Why the board was not found; empty when it was."""
     reason: str
-    """Empty when found; otherwise a sentence for people."""
+    """The same for people."""
     indices: NDArray[np.intp]
     """(k,) rows of `board_points`"""
     pixels: Array
@@ -44,12 +58,10 @@ class Detection:
     """Share of pixels at the upper end of the scale there, 0 … 1; NaN when not asked for."""
     coverage: float
     """Share of the picture inside the outline of the points, 0 … 1."""
-    seen_instead: tuple[int, int] | None = None
-    """Inner corners (columns, rows) of another chessboard that is seen; looked for where none is found."""
-    squares_counted: bool = False
-    """The other chessboard is one smaller each way: the squares were declared, not the inner corners."""
-    mirrored: bool = False
-    """The board's markers are seen in the mirror image of the picture only."""
+
+    @property
+    def found(self) -> bool:
+        return not self.cause
 
     @property
     def corners(self) -> int:
@@ -73,29 +85,14 @@ def detect(
     fewest = min(FEWEST_POINTS, expected)
     whole = len(indices) == expected
     found = whole or (len(indices) >= fewest and fixes_a_plane(board_points(spec)[indices]))
-    reason, instead = ("", None) if found else _reason(grey, spec, len(indices), fewest, thorough)
+    cause: Cause
+    cause, reason = ("", "") if found else _reason(grey, spec, len(indices), fewest, thorough)
     if not found:
         indices, pixels = indices[:0], pixels[:0]
-    mirrored = not found and thorough and _seen_in_a_mirror(grey, spec)
-    if mirrored:
-        reason = "the board is seen in the mirror image only: the camera or its driver mirrors the pictures"
     sharpness, saturated = _picture_quality(grey, pixels) if with_quality else (np.nan, np.nan)
     area = cv2.contourArea(cv2.convexHull(pixels.astype(np.float32))) if found else 0.0
-    return Detection(
-        found,
-        reason,
-        indices,
-        pixels,
-        expected,
-        width,
-        height,
-        sharpness,
-        saturated,
-        area / (width * height),
-        instead,
-        instead == (spec.columns - 1, spec.rows - 1),
-        mirrored,
-    )
+    share = area / (width * height)
+    return Detection(cause, reason, indices, pixels, expected, width, height, sharpness, saturated, share)
 
 
 def _find(grey: Grey, spec: BoardSpec, thorough: bool) -> tuple[NDArray[np.intp], Array]:
@@ -114,32 +111,27 @@ def _find(grey: Grey, spec: BoardSpec, thorough: bool) -> tuple[NDArray[np.intp]
     return np.arange(len(pixels)), pixels
 
 
-def _reason(
-    grey: Grey, spec: BoardSpec, count: int, fewest: int, thorough: bool
-) -> tuple[str, tuple[int, int] | None]:
-    """A sentence for people, and the other chessboard that is seen."""
+def _reason(grey: Grey, spec: BoardSpec, count: int, fewest: int, thorough: bool) -> tuple[Cause, str]:
+    if thorough and _seen_in_a_mirror(grey, spec):
+        return "mirrored", "only the mirror image shows the board: the camera or its driver mirrors images"
     if count >= fewest:
-        return f"the {count} corners of the board that are seen lie in a line: they fix no pose", None
+        return "in-line", f"the {count} corners of the board that are seen lie in a line: they fix no pose"
     if count:
-        return f"only {count} corners of the board are seen, {fewest} are needed", None
+        return "few-corners", f"{count} corners of the board are seen (minimum {fewest})"
     level = float(grey.mean())
     if level < 12.0:
-        return f"the picture is too dark (mean grey {level:.0f})", None
+        return "too-dark", f"the image is too dark (mean grey {level:.0f})"
     if float((grey >= _SATURATED_GREY).mean()) > 0.5:
-        return "the picture is over-exposed: more than half of it is saturated", None
+        return "over-exposed", "the image is over-exposed: more than half of it is saturated"
     if float(grey.std()) < 3.0:
-        return f"the picture is empty (grey {level:.0f}, no contrast)", None
-    if thorough and spec.kind is BoardKind.CHESSBOARD:
-        seen = other_size(grey, spec)
-        if seen is not None and sorted(seen) != sorted((spec.columns, spec.rows)):
-            why = "partly hidden, or another board"
-            if seen == (spec.columns - 1, spec.rows - 1):
-                why = "were squares counted?"
-            text = (
-                f"board {spec.columns}×{spec.rows} expected, {seen[0]}×{seen[1]} seen (inner corners; {why})"
-            )
-            return text, seen
-    return f"no {describe_board(spec)} found", None
+        return "empty", f"the image is empty (grey {level:.0f}, no contrast)"
+    seen = other_size(grey, spec) if thorough and spec.kind is BoardKind.CHESSBOARD else None
+    if seen is None or sorted(seen) == sorted((spec.columns, spec.rows)):
+        return "not-found", f"no {describe_board(spec)} found"
+    text = f"board {spec.columns}×{spec.rows} expected, {seen[0]}×{seen[1]} seen (inner corners)"
+    if seen == (spec.columns - 1, spec.rows - 1):
+        return "squares-counted", f"{text}: squares were counted"
+    return "other-board", f"{text}: partly hidden, or another board"
 
 
 def _seen_in_a_mirror(grey: Grey, spec: BoardSpec) -> bool:

@@ -22,73 +22,74 @@ from recordings.schema.messages import (
 
 APRIL_DICTIONARY = "DICT_APRILTAG_36h11"
 _LARGEST_SIDE = 200
+_WITH_MARKERS = (BoardKind.CHARUCO, BoardKind.APRIL_GRID)
 
 
 class BoardError(CalibrationError):
-    """The description of a board cannot be right."""
+    """A board whose description cannot be right."""
 
+    code = "board"
     exit_code = 2
 
 
 def dictionary_id(name: str) -> int:
-    """OpenCV's number of a marker dictionary such as DICT_6X6_250; BoardError when there is none."""
+    """Look up OpenCV's number of a marker dictionary such as DICT_6X6_250; BoardError when there is none."""
     value = getattr(cv2.aruco, name, None)
     if not name.startswith("DICT_") or not isinstance(value, int):
         raise BoardError(
-            f"board: dictionary {name!r} is not one of OpenCV's; write for example DICT_6X6_250."
+            f"board: OpenCV has no dictionary {name!r}.",
+            code="dictionary-unknown",
+            remedy="Write for example DICT_6X6_250.",
         )
     return value
 
 
-def _require_markers(spec: BoardSpec, dictionary: str, count: int) -> None:
-    held = len(cv2.aruco.getPredefinedDictionary(dictionary_id(dictionary)).bytesList)
-    if count > held:
-        raise BoardError(
-            f"board: {spec.columns} × {spec.rows} needs {count} markers, {dictionary} holds {held}. "
-            "Fewer columns and rows, or a larger dictionary."
-        )
+def _require(right: bool, code: str, wrong: str, remedy: str) -> None:
+    if not right:
+        raise BoardError(f"board: {wrong}.", code=code, remedy=remedy)
 
 
 def check_board(spec: BoardSpec) -> None:
-    """Raises BoardError where the numbers cannot belong to a real board."""
-    smallest = 1 if spec.kind in (BoardKind.APRIL_GRID, *SINGLE_TAGS) else 2
-    if not all(smallest <= side <= _LARGEST_SIDE for side in (spec.columns, spec.rows)):
-        raise BoardError(
-            f"board: {spec.columns} × {spec.rows} is impossible; columns and rows must be {smallest} … "
-            f"{_LARGEST_SIDE}. A chessboard counts inner corners, a charuco board counts squares."
-        )
-    if not 1e-4 <= spec.square_m <= 10.0:
-        raise BoardError(f"board: square_m = {spec.square_m} is not a size in metres (25 mm is 0.025).")
-    if spec.square_tolerance is not None and not 0 < spec.square_tolerance <= LARGEST_TOLERANCE:
-        raise BoardError(
-            f"board: square_tolerance = {spec.square_tolerance} is not a relative tolerance (0.3 % is 0.003)."
-        )
-    if spec.flatness_m is not None and not 0 < spec.flatness_m <= LARGEST_FLATNESS_M:
-        raise BoardError(f"board: flatness_m = {spec.flatness_m} is not in metres (1 mm is 0.001).")
-    if spec.kind in SINGLE_TAGS:
-        _check_tag(spec)
-    elif spec.kind is BoardKind.CHARUCO:
-        _require_markers(spec, spec.dictionary or "", spec.columns * spec.rows // 2)
-        if spec.marker_m is None or not 0 < spec.marker_m < spec.square_m:
-            raise BoardError("board: a charuco board needs marker_m, smaller than square_m.")
-    elif spec.kind is BoardKind.APRIL_GRID:
-        _require_markers(spec, spec.dictionary or APRIL_DICTIONARY, spec.columns * spec.rows)
-        if spec.marker_m is None or not 0 < spec.marker_m < spec.square_m:
+    """Raise BoardError where the numbers cannot belong to a real board."""
+    tag, charuco, april = (spec.kind in SINGLE_TAGS, *(spec.kind is kind for kind in _WITH_MARKERS))
+    columns, rows, smallest = spec.columns, spec.rows, 1 if april or tag else 2
+    _require(
+        all(smallest <= side <= _LARGEST_SIDE for side in (columns, rows)),
+        "board-columns-rows",
+        f"{columns} × {rows} is impossible (limits {smallest} and {_LARGEST_SIDE})",
+        "Count the inner corners of a chessboard, the squares of a charuco board.",
+    )
+    wrong = f"square_m = {spec.square_m} is no size in metres"
+    _require(1e-4 <= spec.square_m <= 10.0, "board-square", wrong, "Write 25 mm as 0.025.")
+    if (tolerance := spec.square_tolerance) is not None:
+        wrong = f"square_tolerance = {tolerance} is no relative tolerance"
+        _require(0 < tolerance <= LARGEST_TOLERANCE, "board-tolerance", wrong, "Write 0.3 % as 0.003.")
+    if (flatness_m := spec.flatness_m) is not None:
+        wrong = f"flatness_m = {flatness_m} is no flatness in metres"
+        _require(0 < flatness_m <= LARGEST_FLATNESS_M, "board-flatness", wrong, "Write 1 mm as 0.001.")
+    if charuco or april:
+        smaller = spec.marker_m is not None and 0 < spec.marker_m < spec.square_m
+        wrong = "marker_m, the side of a marker or the gap between tags, is not between 0 and square_m"
+        _require(smaller, "board-marker", wrong, "Measure it and write it in metres.")
+    elif tag:
+        _require((columns, rows) == (1, 1), "tag-columns-rows", "a tag has no columns and rows", "Omit them.")
+        _require(spec.tag_id >= 0, "tag-id", f"id {spec.tag_id} is negative", "Use the tag's number.")
+    else:
+        _require(columns * rows >= 4, "board-points", "fewer than 4 points fix no pose", "Add columns.")
+    if charuco or april or tag:
+        named = spec.kind in (BoardKind.APRIL_GRID, BoardKind.APRIL_TAG) or bool(spec.dictionary)
+        remedy = "Write for example DICT_4X4_50."
+        _require(named, "dictionary-missing", f"{spec.kind.value} needs its dictionary", remedy)
+        needed = spec.tag_id + 1 if tag else columns * rows // (2 if charuco else 1)
+        held = len(cv2.aruco.getPredefinedDictionary(dictionary_id(tag_dictionary(spec))).bytesList)
+        if needed > held:
             raise BoardError(
-                "board: an april-grid needs marker_m, the gap between tags, smaller than square_m."
+                f"board: {needed} markers are needed, {tag_dictionary(spec)} holds {held}.",
+                code="dictionary-too-small",
+                remedy="Use fewer columns and rows, a smaller id, or a larger dictionary.",
+                needed=needed,
+                held=held,
             )
-    elif spec.columns * spec.rows < 4:
-        raise BoardError("board: fewer than 4 points do not fix a pose.")
-
-
-def _check_tag(spec: BoardSpec) -> None:
-    if (spec.columns, spec.rows) != (1, 1):
-        raise BoardError("board: a single tag has no columns and rows; leave them out.")
-    if spec.kind is BoardKind.ARUCO and not spec.dictionary:
-        raise BoardError("board: an aruco tag needs its dictionary, for example DICT_4X4_50.")
-    held = len(cv2.aruco.getPredefinedDictionary(dictionary_id(tag_dictionary(spec))).bytesList)
-    if not 0 <= spec.tag_id < held:
-        raise BoardError(f"board: id {spec.tag_id} is not in {tag_dictionary(spec)} (0 … {held - 1}).")
 
 
 def tag_dictionary(spec: BoardSpec) -> str:

@@ -2,16 +2,30 @@
 
 from __future__ import annotations
 
+import io
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
 import cv2
 import numpy as np
+from numpy.typing import NDArray
 
 from calibrate.boards.markers import charuco_board
-from calibrate.boards.model import BoardError, check_board, describe_board, dictionary_id, tag_dictionary
-from calibrate.boards.vector import Circle, Line, Rectangle, Shape, Sheet, moved
+from calibrate.boards.model import (
+    BoardError,
+    board_points,
+    check_board,
+    describe_board,
+    dictionary_id,
+    tag_dictionary,
+)
+from calibrate.geometry import Array
 from recordings.schema.messages import SINGLE_TAGS, BoardKind, BoardSpec
 
 _MARGIN_MM = 7.0
 _FOOT_MM = 16.0
+_TEXT_MM = 2.6
 _CIRCLE_SHARE = 0.25
 """Radius of a printed circle over the distance of neighbours."""
 PAPER_MM = {
@@ -23,108 +37,148 @@ PAPER_MM = {
 }
 
 
-def board_sheet(spec: BoardSpec, paper: str | None = None) -> Sheet:
-    """The board with ruler and text. `paper` (A4 … A0): centred on that sheet; BoardError when too small.
+@dataclass(frozen=True, eq=False)
+class Sheet:
+    """Black shapes and text on white paper, millimetres from the top left."""
 
-    Without `paper` the sheet is as large as the board needs.
+    width_mm: float
+    height_mm: float
+    rectangles: Array
+    """(n, 4) x, y, width, height"""
+    circles: Array
+    """(m, 3) x, y, radius"""
+    texts: tuple[tuple[float, float, str], ...] = ()
+    """x and y of the start of each line."""
+
+    def encode(self, file_format: Literal["pdf", "svg"]) -> bytes:
+        """Draw one page of the sheet's true size; the same sheet gives the same bytes."""
+        import matplotlib  # a third of a second, for this command only
+        from matplotlib.figure import Figure
+        from matplotlib.patches import PathPatch
+        from matplotlib.path import Path
+
+        corners = np.array([[0, 0], [1, 0], [1, 1], [0, 1], [0, 0]])
+        shapes = [Path(at[:2] + corners * at[2:], closed=True) for at in self.rectangles]
+        shapes += [Path.circle((x, y), radius) for x, y, radius in self.circles]
+        ink = Path.make_compound_path(*shapes)  # one shape: no hairlines between neighbours
+        figure = Figure(figsize=(self.width_mm / 25.4, self.height_mm / 25.4))
+        axes = figure.add_axes((0, 0, 1, 1), xlim=(0, self.width_mm), ylim=(self.height_mm, 0))
+        axes.set_axis_off()
+        axes.add_patch(PathPatch(ink, facecolor="black", edgecolor="none"))
+        for x, y, text in self.texts:
+            axes.text(x, y, text, fontsize=_TEXT_MM * 72 / 25.4)
+        content, date = io.BytesIO(), "CreationDate" if file_format == "pdf" else "Date"
+        with matplotlib.rc_context({"svg.fonttype": "none", "svg.hashsalt": "board"}):
+            figure.savefig(content, format=file_format, metadata={date: None})
+        return content.getvalue()
+
+
+def board_sheet(spec: BoardSpec, paper: str | None = None) -> Sheet:
+    """Lay out the board with ruler and text, centred on `paper` (A4 … A0) or on a sheet as large as needed.
+
+    Raises BoardError for an impossible board and for a sheet that is too small.
     """
     check_board(spec)
-    shapes, width, height = _BOARDS[spec.kind](spec)
+    squares, circles, width, height = _DRAWN[spec.kind](spec)
     need_w, need_h = width + 2 * _MARGIN_MM, height + 2 * _MARGIN_MM + _FOOT_MM
-    sheet_w, sheet_h = need_w, need_h
-    if paper is not None:
-        sheet_w, sheet_h = _paper(paper, need_w, need_h, spec)
+    sheet_w, sheet_h = (need_w, need_h) if paper is None else _paper(paper, need_w, need_h, spec)
     x, y = (sheet_w - width) / 2, (sheet_h - _FOOT_MM - height) / 2
-    drawn = [moved(shape, x, y) for shape in shapes]
-    foot = _foot(spec, x, y + height + _MARGIN_MM, max(width, 60.0))
-    return Sheet(sheet_w, sheet_h, (*drawn, *foot))
+    ruler_y = y + height + _MARGIN_MM
+    length = int(min(max(width, 60.0), 150.0) // 10) * 10
+    says = f"{describe_board(spec)}. The bar is {length} mm: measure it, and one square, before use."
+    return Sheet(
+        sheet_w,
+        sheet_h,
+        np.concatenate([_moved(squares, x, y), _moved(_ruler(length), x, ruler_y)]),
+        _moved(circles, x, y),
+        ((x, ruler_y + 5.0, says), (x, ruler_y + 9.5, _yaml(spec))),
+    )
 
 
 def _paper(paper: str, need_w: float, need_h: float, spec: BoardSpec) -> tuple[float, float]:
     if paper not in PAPER_MM:
-        raise BoardError(f"there is no paper {paper!r}; there are: {', '.join(PAPER_MM)}.")
-    for width, height in (PAPER_MM[paper], PAPER_MM[paper][::-1]):
-        if need_w <= width and need_h <= height:
-            return width, height
-    fitting = [
-        name
-        for name, (w, h) in PAPER_MM.items()
-        if (need_w <= w and need_h <= h) or (need_w <= h and need_h <= w)
-    ]
-    hint = f"it fits on {fitting[0]}" if fitting else "make the squares smaller"
-    raise BoardError(f"{describe_board(spec)} needs {need_w:.0f} × {need_h:.0f} mm: not on {paper}; {hint}.")
+        raise BoardError(
+            f"There is no paper {paper!r}.", code="paper-unknown", remedy=f"Choose {', '.join(PAPER_MM)}."
+        )
+    fitting = {
+        name: size
+        for name, sides in PAPER_MM.items()
+        for size in (sides[::-1], sides)  # the wide way where both fit
+        if need_w <= size[0] and need_h <= size[1]
+    }
+    if paper not in fitting:
+        raise BoardError(
+            f"{describe_board(spec)} needs {need_w:.0f} × {need_h:.0f} mm: not on {paper}.",
+            code="paper-too-small",
+            remedy=f"Print on {next(iter(fitting))}." if fitting else "Make the squares smaller.",
+            width_mm=need_w,
+            height_mm=need_h,
+        )
+    return fitting[paper]
 
 
-def _chessboard(spec: BoardSpec) -> tuple[list[Shape], float, float]:
+_Drawn = tuple[Array, Array, float, float]
+"""Rectangles (n, 4), circles (m, 3), width and height of the pattern, mm."""
+_NO_CIRCLES = np.zeros((0, 3))
+
+
+def _chessboard(spec: BoardSpec) -> _Drawn:
     """The square before the first inner corner is black."""
-    side = spec.square_m * 1000
-    squares: list[Shape] = [
-        Rectangle(c * side, r * side, side, side)
-        for r in range(spec.rows + 1)
-        for c in range(spec.columns + 1)
-        if (r + c) % 2 == 0
-    ]
-    return squares, (spec.columns + 1) * side, (spec.rows + 1) * side
+    side, shape = spec.square_m * 1000, (spec.rows + 1, spec.columns + 1)
+    squares = _cells(np.indices(shape).sum(axis=0) % 2 == 0, side)
+    return squares, _NO_CIRCLES, shape[1] * side, shape[0] * side
 
 
-def _circles(spec: BoardSpec) -> tuple[list[Shape], float, float]:
+def _circles(spec: BoardSpec) -> _Drawn:
     pitch = spec.square_m * 1000
-    asymmetric = spec.kind is BoardKind.ASYMMETRIC_CIRCLES
-    across = 2 * spec.columns - 1 if asymmetric else spec.columns - 1
-    radius = pitch * _CIRCLE_SHARE * (1.4 if asymmetric else 1.0)
-    circles: list[Shape] = [
-        Circle(pitch * ((2 * c + r % 2 if asymmetric else c) + 1), pitch * (r + 1), radius)
-        for r in range(spec.rows)
-        for c in range(spec.columns)
-    ]
-    return circles, pitch * (across + 2), pitch * (spec.rows + 1)
+    radius = pitch * _CIRCLE_SHARE * (1.4 if spec.kind is BoardKind.ASYMMETRIC_CIRCLES else 1.0)
+    circles = board_points(spec) * 1000 + [pitch, pitch, radius]
+    width, height = circles[:, :2].max(axis=0) + pitch
+    return np.zeros((0, 4)), circles, float(width), float(height)
 
 
-def _charuco(spec: BoardSpec) -> tuple[list[Shape], float, float]:
+def _charuco(spec: BoardSpec) -> _Drawn:
     side, marker = spec.square_m * 1000, (spec.marker_m or 0.0) * 1000
     board = charuco_board(spec)
-    taken = {
-        (round(float(c[:, 1].mean()) * 1000 / side - 0.5), round(float(c[:, 0].mean()) * 1000 / side - 0.5))
-        for c in board.getObjPoints()
-    }
-    shapes: list[Shape] = [
-        Rectangle(c * side, r * side, side, side)
-        for r in range(spec.rows)
-        for c in range(spec.columns)
-        if (r, c) not in taken
+    corners = np.array(board.getObjPoints(), dtype=float)[..., :2].min(axis=1) * 1000
+    black = np.ones((spec.rows, spec.columns), dtype=bool)
+    black[tuple((corners // side).astype(int).T[::-1])] = False
+    markers = [
+        _marker(spec.dictionary or "", number, x, y, marker, 1)
+        for number, (x, y) in zip(board.getIds().ravel().tolist(), corners.tolist(), strict=True)
     ]
-    for corners, number in zip(board.getObjPoints(), board.getIds().ravel().tolist(), strict=True):
-        x, y = (float(v) * 1000 for v in corners[:, :2].min(axis=0))
-        shapes += _marker(spec.dictionary or "", int(number), x, y, marker, 1)
-    return shapes, spec.columns * side, spec.rows * side
+    return (
+        np.concatenate([_cells(black, side), *markers]),
+        _NO_CIRCLES,
+        spec.columns * side,
+        spec.rows * side,
+    )
 
 
-def _april_grid(spec: BoardSpec) -> tuple[list[Shape], float, float]:
+def _april_grid(spec: BoardSpec) -> _Drawn:
     """As Kalibr draws it: tag 0 at the bottom left, two bits of border, black squares between."""
     side, gap = spec.square_m * 1000, (spec.marker_m or 0.0) * 1000
     pitch = side + gap
     width, height = spec.columns * pitch + gap, spec.rows * pitch + gap
-    shapes: list[Shape] = [
-        Rectangle(c * pitch, r * pitch, gap, gap)
-        for r in range(spec.rows + 1)
-        for c in range(spec.columns + 1)
-    ]
+    row, column = np.indices((spec.rows + 1, spec.columns + 1)).reshape(2, -1) * pitch
+    between = np.stack([column, row, np.full(row.shape, gap), np.full(row.shape, gap)], axis=1)
+    tags = []
     for number in range(spec.columns * spec.rows):
         r, c = divmod(number, spec.columns)
         top = height - gap - r * pitch - side
-        shapes += _marker(tag_dictionary(spec), number, gap + c * pitch, top, side, 2)
-    return shapes, width, height
+        tags.append(_marker(tag_dictionary(spec), number, gap + c * pitch, top, side, 2))
+    return np.concatenate([between, *tags]), _NO_CIRCLES, width, height
 
 
-def _tag(spec: BoardSpec) -> tuple[list[Shape], float, float]:
+def _tag(spec: BoardSpec) -> _Drawn:
     """One tag with a quiet zone of one cell."""
     side, dictionary = spec.square_m * 1000, tag_dictionary(spec)
-    family = cv2.aruco.getPredefinedDictionary(dictionary_id(dictionary))
-    quiet = side / (family.markerSize + 2)
-    return _marker(dictionary, spec.tag_id, quiet, quiet, side, 1), side + 2 * quiet, side + 2 * quiet
+    quiet = side / (cv2.aruco.getPredefinedDictionary(dictionary_id(dictionary)).markerSize + 2)
+    whole = side + 2 * quiet
+    return _marker(dictionary, spec.tag_id, quiet, quiet, side, 1), _NO_CIRCLES, whole, whole
 
 
-_BOARDS = {
+_DRAWN: dict[BoardKind, Callable[[BoardSpec], _Drawn]] = {
     BoardKind.CHESSBOARD: _chessboard,
     BoardKind.CIRCLES: _circles,
     BoardKind.ASYMMETRIC_CIRCLES: _circles,
@@ -135,34 +189,29 @@ _BOARDS = {
 }
 
 
-def _marker(dictionary: str, number: int, x: float, y: float, side: float, border_bits: int) -> list[Shape]:
-    """Black cells of one marker, runs of a row joined."""
+def _marker(dictionary: str, number: int, x: float, y: float, side: float, border_bits: int) -> Array:
     family = cv2.aruco.getPredefinedDictionary(dictionary_id(dictionary))
     cells = family.markerSize + 2 * border_bits
     bits = np.asarray(cv2.aruco.generateImageMarker(family, number, cells, borderBits=border_bits))
-    step = side / cells
-    found: list[Shape] = []
-    for r in range(cells):
-        c = 0
-        while c < cells:
-            end = c
-            while end < cells and bits[r, end] == 0:
-                end += 1
-            if end > c:
-                found.append(Rectangle(x + c * step, y + r * step, (end - c) * step, step))
-            c = max(end, c + 1)
-    return found
+    return _moved(_cells(bits == 0, side / cells), x, y)
 
 
-def _foot(spec: BoardSpec, x: float, y: float, width: float) -> list[Shape]:
-    """A ruler whose marks are 10 mm apart, and what the board is."""
-    length = int(min(max(width, 50.0), 150.0) // 10) * 10
-    marks: list[Shape] = [Rectangle(x, y, length, 0.3)]
-    for k in range(length // 10 + 1):
-        tall = 4.0 if k % 5 == 0 else 2.5
-        marks.append(Rectangle(x + 10 * k - 0.1, y - tall, 0.2, tall))
-    says = f"{describe_board(spec)}. The bar is {length} mm: measure it, and one square, before use."
-    return [*marks, Line(x, y + 5.0, 3.0, says), Line(x, y + 9.5, 3.0, _yaml(spec))]
+def _moved(shapes: Array, x: float, y: float) -> Array:
+    return np.concatenate([shapes[:, :2] + (x, y), shapes[:, 2:]], axis=1)
+
+
+def _cells(black: NDArray[np.bool_], side: float) -> Array:
+    """Rectangles (n, 4) of the black cells of a grid, runs of a row joined."""
+    edges = np.diff(np.pad(black, ((0, 0), (1, 1))).astype(int), axis=1)
+    row, first = np.nonzero(edges == 1)
+    _, end = np.nonzero(edges == -1)
+    return np.stack([first, row, end - first, np.ones(len(row))], axis=1) * side
+
+
+def _ruler(length_mm: int) -> Array:
+    """Rectangles (n, 4): a bar with marks 10 mm apart, every fifth one taller."""
+    tall = [(10.0 * k - 0.1, 4.0 if k % 5 == 0 else 2.5) for k in range(length_mm // 10 + 1)]
+    return np.array([[0.0, 0.0, length_mm, 0.3], *([x, -height, 0.2, height] for x, height in tall)])
 
 
 def _yaml(spec: BoardSpec) -> str:

@@ -9,7 +9,6 @@ import typer
 
 from calibrate.boards.model import ambiguity_text, describe_board
 from calibrate.boards.printing import PAPER_MM, board_sheet
-from calibrate.boards.vector import pdf, svg
 from calibrate.cli.files import read_board
 from calibrate.cli.output import OutputError, check_folder, err, out
 from calibrate.files.calibration import write_output
@@ -66,8 +65,7 @@ def board(
     if board_file is not None:
         spec = read_board(board_file)
     sheet = board_sheet(spec, paper)
-    content = pdf(sheet) if output.suffix.lower() == ".pdf" else svg(sheet).encode()
-    write_output(output, content)
+    write_output(output, sheet.encode("pdf" if output.suffix.lower() == ".pdf" else "svg"))
     out.print(f"written: {output} ({describe_board(spec)}, {sheet.width_mm:.0f} × {sheet.height_mm:.0f} mm)")
     out.print(
         "print at 100 % (no fitting to the page), glue it on something flat, measure the bar and one square"

@@ -99,8 +99,9 @@ def estimate(
         covariance = linear.covariance(solved)
     except np.linalg.LinAlgError as problem:
         raise BadViewsError(
-            f"The views do not determine the camera's pose ({problem}). "
-            "Record more poses, tilted about two axes."
+            f"The views do not determine the camera's pose ({problem}).",
+            code="pose-open",
+            remedy="Record more poses, tilted about two axes.",
         ) from None
     return Estimate(
         state=state,

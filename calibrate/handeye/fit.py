@@ -100,7 +100,11 @@ def fit_moved(views: ViewSet, priors: Priors, poses: PoseViews, at: int, moved: 
     try:
         start = fit_poses(replace(poses, later=later, moved=moved), seed)
     except np.linalg.LinAlgError as problem:
-        raise BadViewsError(f"The views before or after the move determine no pose ({problem}).") from None
+        raise BadViewsError(
+            f"The views before or after the move determine no pose ({problem}).",
+            code="pose-open",
+            remedy="Record again.",
+        ) from None
     # The later value is the one that holds now: `second` is that of the views before.
     observed = replace(observe_views(views), later=~later, moved=moved)
     state = State(

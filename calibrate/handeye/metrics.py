@@ -97,15 +97,20 @@ def require_motion(pairs: Pairs) -> None:
     needed = _MIN_SECOND_AXIS_RAD
     if singular[0] < needed:
         raise DegenerateMotionError(
-            f"The poses hardly turn: {np.degrees(angle_A.max()):.2f}° at most between any two views. "
-            "Record views that turn by 20° or more about two axes."
+            f"Rotation range {np.degrees(angle_A.max()):.2f}° too small.",
+            code="rotation-range",
+            remedy="Rotate by 20° or more about two axes.",
+            largest_rad=float(angle_A.max()),
         )
     if singular[1] < needed:
         axis = ", ".join(f"{v:+.2f}" for v in directions[0])
         raise DegenerateMotionError(
-            f"All rotations are about one axis ({axis} in the moving frame): {np.degrees(singular[1]):.2f}° "
-            f"rms about any other, {np.degrees(needed):.2f}° needed. Record views that also tilt about a "
-            "second axis by 20° or more."
+            f"All rotations share axis ({axis}): {np.degrees(singular[1]):.2f}° rms about any other "
+            f"(limit {np.degrees(needed):.2f}°).",
+            code="one-axis",
+            remedy="Add tilts by 20° or more about a second axis.",
+            second_axis_rad=float(singular[1]),
+            limit_rad=float(needed),
         )
 
 

@@ -222,6 +222,7 @@ def _rejected(fit: CellFit) -> tuple[RejectedView, ...]:
             fit.views.views[suspect.place].name,
             suspect_text(suspect, fit.views),
             suspect.cause,
+            None if suspect.other is None else fit.views.views[suspect.other].index,
             suspect.number,
         )
         for suspect in explain_views(fit, places)

@@ -52,6 +52,8 @@ class RejectedView:
     reason: str
     """One sentence for people."""
     kind: Literal["wrong-pose", "wrong-number", "inconsistent", "corners", "unreadable-picture", "by-hand"]
+    belongs_to: int | None = None
+    """Pose number of the view whose recorded pose belongs to this image (wrong-pose)."""
     wrong_number: int | None = None
     """Place in [δt, δφ] of the only wrong number of its recorded pose."""
 

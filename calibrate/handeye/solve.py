@@ -38,60 +38,56 @@ def require_solvable(views: ViewSet) -> None:
     """Raise TooFewViewsError or BadViewsError, naming view and remedy."""
     if len(views) < MIN_VIEWS:
         raise TooFewViewsError(
-            f"{len(views)} usable views, at least {MIN_VIEWS} are needed (15 to 25 are good). Record "
-            "more poses, or check why the board was not found in the others."
+            f"{len(views)} usable views (minimum {MIN_VIEWS}).",
+            remedy="Record 15 to 25 poses, or check why the board was not found in the others.",
+            views=len(views),
+            minimum=MIN_VIEWS,
         )
     if len(views) > MAX_VIEWS:
         raise BadViewsError(
-            f"{len(views)} views; at most {MAX_VIEWS} are solved at once. Split the recording."
+            f"{len(views)} views (limit {MAX_VIEWS}).", code="too-many-views", remedy="Split the recording."
         )
-    _require_camera(views)
     fewest = FEWEST_CORNERS if any(len(view.pixels) for view in views) else 0
+    if views.camera.matrix is not None or fewest:
+        camera_matrix(views.camera)
+        if not np.isfinite(views.camera.distortion).all():
+            raise BadViewsError(
+                "The distortion is not finite.", code="distortion", remedy="Correct it, or estimate it."
+            )
     for view in views:
         _require_view(view, fewest)
     first = views.views[0].base_from_flange
     if all(np.abs(view.base_from_flange - first).max() < 1e-9 for view in views):
-        raise BadViewsError("All robot poses are identical. Check how the poses were recorded.")
+        raise BadViewsError(
+            "All robot poses are identical.", code="poses-identical", remedy="Check how they were recorded."
+        )
     require_no_copies(views)
 
 
-def _require_camera(views: ViewSet) -> None:
-    if views.camera.matrix is None:
-        if any(len(view.pixels) for view in views):
-            raise BadViewsError("No camera matrix: calibrate the intrinsics first.")
-        return
-    camera_matrix(views.camera)
-    if not np.isfinite(views.camera.distortion).all():
-        raise BadViewsError("The lens distortion contains NaN or infinity.")
-
-
 def _require_view(view: BoardView, fewest_corners: int) -> None:
-    where = f"View {view.index + 1} ({view.name})"
-    if not is_rigid(np.asarray(view.base_from_flange)):
-        raise BadViewsError(
-            f"{where}: the robot pose is not a rigid transform (NaN, or a rotation that is not orthonormal). "
-            "Correct or remove this view."
-        )
-    if view.camera_from_board is None:
-        raise BadViewsError(f"{where}: no board pose yet. Run PnP before the solver.")
-    if not is_rigid(np.asarray(view.camera_from_board)):
-        raise BadViewsError(
-            f"{where}: the board pose is mirrored or not a rigid transform. Check the order of the corners."
-        )
-    if view.camera_from_board[2, 3] <= 0:
-        raise BadViewsError(f"{where}: the board pose lies behind the camera. Check corners and intrinsics.")
-    if len(view.pixels) != len(view.board_points):
-        raise BadViewsError(f"{where}: {len(view.pixels)} pixels for {len(view.board_points)} board points.")
-    if len(view.pixels) < fewest_corners:
-        raise BadViewsError(
-            f"{where}: {len(view.pixels)} corners, at least {fewest_corners} are needed. Remove this view."
-        )
-    if not (np.isfinite(view.pixels).all() and np.isfinite(view.board_points).all()):
-        raise BadViewsError(f"{where}: NaN among its corners. Remove this view.")
+    def require(right: bool, code: str, wrong: str) -> None:
+        if not right:
+            raise BadViewsError(
+                f"View {view.index + 1} ({view.name}): {wrong}.",
+                code=code,
+                remedy="Correct or remove this view.",
+                view=view.index + 1,
+            )
+
+    T, corners = np.array(view.camera_from_board), len(view.pixels)
+    require(is_rigid(np.asarray(view.base_from_flange)), "robot-pose", "the robot pose is no rigid transform")
+    require(T.shape == (4, 4), "no-board-pose", "no board pose is known")
+    require(is_rigid(T), "board-pose", "the board pose is mirrored or no rigid transform")
+    require(T[2, 3] > 0, "board-pose", "the board pose lies behind the camera")
+    points = len(view.board_points)
+    require(corners == points, "corners", f"{corners} pixels for {points} board points")
+    require(corners >= fewest_corners, "corners", f"{corners} corners (minimum {fewest_corners})")
+    finite = np.isfinite(view.pixels).all() and np.isfinite(view.board_points).all()
+    require(bool(finite), "corners", "a corner is not finite")
 
 
 def require_no_copies(views: ViewSet) -> None:
-    """BadViewsError for a view that is in the set twice: it tells nothing, and halves the stated variance."""
+    """Raise BadViewsError for a view that is in the set twice: it tells nothing, and halves the variance."""
     first: dict[bytes, BoardView] = {}
     for view in views:
         seen = view.pixels if len(view.pixels) else np.asarray(view.camera_from_board)
@@ -99,8 +95,11 @@ def require_no_copies(views: ViewSet) -> None:
         if key in first:
             other = first[key]
             raise BadViewsError(
-                f"Views {other.index + 1} ({other.name}) and {view.index + 1} ({view.name}) are one: their "
-                "robot poses and corners agree to the last bit. Solve with "
-                f"--without {view.index + 1}, or take it out of the folder and import again."
+                f"Views {other.index + 1} ({other.name}) and {view.index + 1} ({view.name}) are one: "
+                "their robot poses and corners agree to the last bit.",
+                code="view-twice",
+                remedy=f"Solve with --without {view.index + 1}, or remove it and import again.",
+                view=view.index + 1,
+                other=other.index + 1,
             )
         first[key] = view

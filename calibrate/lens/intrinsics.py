@@ -50,8 +50,10 @@ def calibrate_intrinsics(views: ViewSet, model: LensModel = "plumb_bob") -> Intr
     """
     if len(views) < FEWEST_VIEWS:
         raise TooFewViewsError(
-            f"The lens cannot be found from {len(views)} view(s): at least {FEWEST_VIEWS} with different "
-            "tilts are needed. Give the camera's matrix and distortion, or take more pictures."
+            f"{len(views)} views cannot tell the intrinsics (minimum {FEWEST_VIEWS}).",
+            remedy="Give the camera's matrix and distortion, or record more views with different tilts.",
+            views=len(views),
+            minimum=FEWEST_VIEWS,
         )
     dropped: dict[int, str] = {}
     used = views
@@ -61,7 +63,9 @@ def calibrate_intrinsics(views: ViewSet, model: LensModel = "plumb_bob") -> Intr
         except (cv2.error, np.linalg.LinAlgError) as problem:
             reason = problem.err if isinstance(problem, cv2.error) else problem
             raise BadViewsError(
-                f"The lens cannot be found from these corners ({reason}). Check the board's size."
+                f"The intrinsics cannot be estimated from these corners ({reason}).",
+                code="intrinsics-open",
+                remedy="Check the board's size.",
             ) from None
         limit = max(4 * float(np.median(fit.view_rms_px)), 0.5)
         good = [k for k in range(len(used)) if fit.view_rms_px[k] <= limit]
@@ -76,9 +80,11 @@ def calibrate_intrinsics(views: ViewSet, model: LensModel = "plumb_bob") -> Intr
     size, K = (views.camera.width, views.camera.height), camera_matrix(fit.camera)
     if not (0.2 * max(size) < K[0, 0] < 100 * max(size) and fit.rms_px <= 0.01 * max(size)):
         raise BadViewsError(
-            f"No lens explains the corners (focal length {K[0, 0]:.0f} px, rms {fit.rms_px:.1f} px). "
-            "Check the board's columns and rows, or give the camera's matrix. Pictures that all face the "
-            "board squarely do not determine a lens: tilt the camera by 20° to 40°."
+            f"No lens explains the corners (focal length {K[0, 0]:.0f} px, rms {fit.rms_px:.1f} px).",
+            code="no-lens-fits",
+            remedy="Check the board's columns and rows, give the camera's matrix, or tilt views by 20°.",
+            focal_px=float(K[0, 0]),
+            rms_px=fit.rms_px,
         )
     return Intrinsics(
         fit.camera,
@@ -113,7 +119,9 @@ def _first_fisheye(views: ViewSet) -> CameraModel:
         )
     except cv2.error as problem:
         raise BadViewsError(
-            f"No fisheye lens explains the corners ({problem.err}). Try plumb_bob, or more tilted views."
+            f"No fisheye lens explains the corners ({problem.err}).",
+            code="no-lens-fits",
+            remedy="Use plumb_bob, or record more tilted views.",
         ) from None
     matrix: Any = tuple(tuple(float(v) for v in row) for row in np.asarray(K))
     return CameraModel(*size, matrix, tuple(float(v) for v in np.asarray(D).ravel()), "equidistant")

@@ -20,7 +20,11 @@ def distortion(camera: CameraModel) -> Array:
     values = np.array(camera.distortion, dtype=float)
     size = 4 if camera.distortion_model == "equidistant" else (8 if len(values) > 5 else 5)
     if len(values) > size or not np.isfinite(values).all():
-        raise BadViewsError(f"distortion {camera.distortion} does not fit {camera.distortion_model}")
+        raise BadViewsError(
+            f"The distortion {camera.distortion} does not fit {camera.distortion_model}.",
+            code="distortion",
+            remedy=f"Write at most {size} finite numbers.",
+        )
     return np.concatenate([values, np.zeros(size - len(values))])
 
 

@@ -24,7 +24,7 @@ def test_chains_touch_or_raise() -> None:
     np.testing.assert_allclose(
         chained.apply(point), base_from_flange.apply(flange_from_camera.apply(point)), atol=1e-15
     )
-    with pytest.raises(g.FrameMismatchError, match="'camera' does not touch 'base'"):
+    with pytest.raises(g.FrameMismatchError):
         flange_from_camera @ base_from_flange
 
 

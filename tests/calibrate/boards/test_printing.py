@@ -3,15 +3,16 @@
 from __future__ import annotations
 
 import re
+import zlib
 
 import cv2
 import numpy as np
 import pytest
+import yaml
 
 from calibrate.boards.detect import detect
 from calibrate.boards.model import BoardError, board_points
-from calibrate.boards.printing import board_sheet
-from calibrate.boards.vector import Circle, Rectangle, Sheet, pdf, svg
+from calibrate.boards.printing import Sheet, board_sheet
 from recordings.schema.messages import BoardKind, BoardSpec
 
 PX_MM = 4.0
@@ -38,20 +39,34 @@ BOARDS = [
 ]
 
 
-def rasterise(sheet: Sheet) -> np.ndarray:
-    """Black on white at PX_MM, four times oversampled."""
-    fine = 4
-    scale = PX_MM * fine
-    canvas = np.full((round(sheet.height_mm * scale), round(sheet.width_mm * scale)), 235, np.uint8)
-    for shape in sheet.shapes:
-        if isinstance(shape, Rectangle):
-            x0, y0 = round(shape.x * scale), round(shape.y * scale)
-            x1, y1 = round((shape.x + shape.width) * scale), round((shape.y + shape.height) * scale)
-            canvas[y0:y1, x0:x1] = 20
-        elif isinstance(shape, Circle):
-            centre = (round(shape.x * scale), round(shape.y * scale))
-            cv2.circle(canvas, centre, round(shape.radius * scale), 20, -1)
-    return cv2.resize(canvas, None, fx=1 / fine, fy=1 / fine, interpolation=cv2.INTER_AREA)
+def printed(sheet: Sheet) -> np.ndarray:
+    """The shapes that the PDF itself draws, black on white at PX_MM, four times oversampled."""
+    content = sheet.encode("pdf")
+    width, height = page_mm(content)
+    streams = re.findall(rb"stream\r?\n(.*?)endstream", content, re.DOTALL)
+    page = next(s for s in map(zlib.decompress, streams) if s.startswith(b"/DeviceRGB"))
+    ink = page.partition(b" 0 g ")[2].partition(b"\nf")[0].decode()
+    fine = 4 * PX_MM / 72 * 25.4
+    polygons: list[list[tuple[float, float]]] = []
+    for numbers, operator in re.findall(r"((?:-?[\d.]+ )+)([mlc])\n", ink):
+        values = [float(v) for v in numbers.split()]
+        if operator == "m":
+            polygons.append([])
+        elif operator == "c":  # a short arc: its middle and its end
+            (x0, y0), (x1, y1, x2, y2, x3, y3) = polygons[-1][-1], values
+            polygons[-1].append(((x0 + 3 * x1 + 3 * x2 + x3) / 8, (y0 + 3 * y1 + 3 * y2 + y3) / 8))
+        polygons[-1].append((values[-2], values[-1]))
+    canvas = np.full((round(4 * PX_MM * height), round(4 * PX_MM * width)), 235, np.uint8)
+    for polygon in polygons:
+        corners = np.array(polygon) * fine * [1, -1] + [0, canvas.shape[0]] - 0.5
+        cv2.fillPoly(canvas, [np.round(corners * 16).astype(np.int32)], 20, shift=4)
+    return cv2.resize(canvas, None, fx=1 / 4, fy=1 / 4, interpolation=cv2.INTER_AREA)
+
+
+def page_mm(content: bytes) -> tuple[float, float]:
+    box = re.search(rb"/MediaBox *\[ *0 0 ([\d.]+) ([\d.]+) *\]", content)
+    assert box is not None
+    return float(box[1]) / 72 * 25.4, float(box[2]) / 72 * 25.4
 
 
 @pytest.mark.parametrize(
@@ -59,15 +74,17 @@ def rasterise(sheet: Sheet) -> np.ndarray:
 )
 def test_a_board_needs_no_more_markers_than_its_dictionary_holds(kind, columns, rows, held) -> None:  # type: ignore[no-untyped-def]
     spec = BoardSpec(kind, columns, rows, 0.02, 0.015, "DICT_4X4_50")
-    assert board_sheet(spec).shapes
-    with pytest.raises(BoardError, match=f"needs {held + 5} markers, DICT_4X4_50 holds {held}"):
+    assert len(board_sheet(spec).rectangles)
+    with pytest.raises(BoardError) as refused:
         board_sheet(BoardSpec(kind, columns, rows + 1, 0.02, 0.015, "DICT_4X4_50"))
+    assert refused.value.code == "dictionary-too-small"
+    assert refused.value.values == {"needed": held + 5, "held": held}
 
 
 def test_a_tag_that_is_seen_on_two_boards_is_read_on_neither() -> None:
     """Its corners would be in two places at once, and the board's pose anywhere."""
     spec = next(board for board in BOARDS if board.kind is BoardKind.APRIL_GRID)
-    sheet = rasterise(board_sheet(spec))
+    sheet = printed(board_sheet(spec))
     first_column = sheet[:, : sheet.shape[1] // 4 + 10]
     assert not detect(np.concatenate([sheet, sheet], axis=1), spec).found
     found = detect(np.concatenate([sheet, first_column], axis=1), spec)
@@ -79,9 +96,8 @@ def test_a_tag_that_is_seen_on_two_boards_is_read_on_neither() -> None:
 
 @pytest.mark.parametrize("spec", BOARDS, ids=lambda s: f"{s.kind.value}-{s.columns}x{s.rows}")
 def test_every_printed_board_is_found_whole_and_to_scale(spec: BoardSpec) -> None:
-    found = detect(rasterise(board_sheet(spec)), spec)
-    assert found.reason == ""
-    assert found.corners == len(board_points(spec))
+    found = detect(printed(board_sheet(spec)), spec)
+    assert found.corners == len(board_points(spec)), found.reason
     # Distances on the sheet are those of the board, to a tenth of a millimetre over the whole board.
     plane = board_points(spec)[found.indices][:, :2] * 1000
     H, _ = cv2.estimateAffine2D(plane, found.pixels / PX_MM)
@@ -91,41 +107,36 @@ def test_every_printed_board_is_found_whole_and_to_scale(spec: BoardSpec) -> Non
     assert np.linalg.det(H[:, :2]) > 0, "the board's frame is mirrored"
 
 
-def test_svg_and_pdf_state_their_true_size() -> None:
+def test_pdf_and_svg_are_pages_of_their_true_size() -> None:
     sheet = board_sheet(BOARDS[0], "A4")
-    assert (sheet.width_mm, sheet.height_mm) == (297.0, 210.0)
-    assert 'width="297.000mm" height="210.000mm"' in svg(sheet)
-    box = re.search(rb"/MediaBox \[0 0 ([\d.]+) ([\d.]+)\]", pdf(sheet))
-    assert box is not None
-    assert float(box[1]) / 72 * 25.4 == pytest.approx(297.0, abs=1e-3)
-    assert float(box[2]) / 72 * 25.4 == pytest.approx(210.0, abs=1e-3)
+    assert page_mm(sheet.encode("pdf")) == pytest.approx((297.0, 210.0), abs=1e-3)
+    size_pt = re.search(rb'width="([\d.]+)pt" height="([\d.]+)pt" viewBox="0 0 \1 \2"', sheet.encode("svg"))
+    assert size_pt is not None
+    assert float(size_pt[1]) / 72 * 25.4 == pytest.approx(297.0, abs=1e-3)
+    assert sheet.encode("svg") == board_sheet(BOARDS[0], "A4").encode("svg")
 
 
-def test_pdf_draws_the_same_shapes_as_svg() -> None:
-    sheet = board_sheet(BOARDS[0])
-    drawn = re.findall(rb"([\d.]+) ([\d.]+) ([\d.]+) ([\d.]+) re f", pdf(sheet))
-    in_svg = re.findall(r'<rect x="([\d.]+)" y="([\d.]+)" width="([\d.]+)" height="([\d.]+)"/>', svg(sheet))
-    assert len(drawn) == len(in_svg) >= 28
-    points = np.array(drawn, float) / 72 * 25.4
-    points[:, 1] = sheet.height_mm - points[:, 1] - points[:, 3]
-    assert np.abs(points - np.array(in_svg, float)).max() < 1e-3
+def test_the_print_carries_its_own_configuration() -> None:
+    text = re.search(r"board: (\{.*\})", board_sheet(BOARDS[5]).encode("svg").decode())
+    assert text is not None
+    assert yaml.safe_load(text[1]) == {
+        "kind": "charuco",
+        "columns": 6,
+        "rows": 8,
+        "square_m": 0.03,
+        "marker_m": 0.022,
+        "dictionary": "DICT_5X5_100",
+        "legacy": True,
+    }
 
 
-def test_pdf_is_whole_by_its_own_table() -> None:
-    content = pdf(board_sheet(BOARDS[3]))
-    start = int(content.rsplit(b"startxref\n", 1)[1].split()[0])
-    assert content[start:].startswith(b"xref")
-    for number, offset in enumerate(re.findall(rb"(\d{10}) 00000 n", content[start:]), 1):
-        assert content[int(offset) :].startswith(b"%d 0 obj" % number)
-
-
-def test_the_print_says_what_it_is() -> None:
-    text = svg(board_sheet(BOARDS[5]))
-    assert "dictionary: DICT_5X5_100" in text
-    assert "legacy: true" in text
-    assert "square_m: 0.03" in text
-
-
-def test_a_board_larger_than_the_paper_is_refused_with_one_that_fits() -> None:
-    with pytest.raises(BoardError, match="not on A4; it fits on A3"):
-        board_sheet(BOARDS[1], "A4")
+@pytest.mark.parametrize(
+    ("paper", "code"), [("A4", "paper-too-small"), ("A3", None), ("letter", "paper-unknown")]
+)
+def test_a_board_larger_than_the_paper_is_refused(paper, code) -> None:  # type: ignore[no-untyped-def]
+    try:
+        assert board_sheet(BOARDS[1], paper).width_mm == 420.0
+    except BoardError as refused:
+        assert refused.code == code
+    else:
+        assert code is None

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from calibrate.geometry import perturb
-from calibrate.handeye import folds, profile_robust
+from calibrate.handeye import diagnosis, profile_robust
 from calibrate.handeye.diagnosis import cross_validate
 from calibrate.handeye.estimate import estimate
 from calibrate.handeye.fit import fit_cell
@@ -76,10 +76,10 @@ def test_left_out_views_take_no_part_in_the_fold_that_predicts_them(fit, monkeyp
 
     spoilt = spoiled(fit, np.array([3]))
     for name, seen in (("as it is", fit), ("spoilt", spoilt)):
-        monkeypatch.setattr(folds, "estimate", remembered(name))
+        monkeypatch.setattr(diagnosis, "estimate", remembered(name))
         cross_validate(seen, 0)
     same = [np.array_equal(a, b) for a, b in zip(found["as it is"], found["spoilt"], strict=True)]
-    assert len(same) == folds.FOLDS and sum(same) == 1
+    assert len(same) == diagnosis.FOLDS and sum(same) == 1
 
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
@@ -103,7 +103,7 @@ def test_a_claim_that_is_too_small_closes_the_gate(fit, monkeypatch):
         return replace(found, covariance=found.covariance / 9, scales=scales)
 
     honest = cross_validate(fit, 0)
-    monkeypatch.setattr(folds, "estimate", boasting)
+    monkeypatch.setattr(diagnosis, "estimate", boasting)
     boasted = cross_validate(fit, 0)
     assert boasted.claimed_m == pytest.approx(honest.claimed_m / 3, rel=0.01)
     assert honest.rms_m < honest.limit * honest.claimed_m

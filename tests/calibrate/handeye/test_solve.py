@@ -75,7 +75,6 @@ def test_the_papers_split_and_score():
     score = solution.holdout
     assert score.pairs == tuple((n, n + 1) for n in range(18, 24))
     assert score.fitted_views == 19
-    assert "share a pose" in score.note
     A, B = (
         inverse(M[1:]) @ M[:-1] for M in (cell.views.base_from_flange, inverse(cell.views.camera_from_board))
     )
@@ -129,7 +128,7 @@ def test_two_processes_give_the_same_bits(profile):
 def test_too_few_views(profile):
     cell = make_cell(np.random.default_rng(0), 3, LOW)
     for count in (1, 2, 3):
-        with pytest.raises(TooFewViewsError, match="at least 4"):
+        with pytest.raises(TooFewViewsError):
             solve_views(cell.views.select(list(range(count))), SolveOptions(profile=profile))
 
 
@@ -138,8 +137,9 @@ def test_no_rotation_no_result(profile):
     rng = np.random.default_rng(0)
     X = pose(random_rotation(rng), [0.1, 0, 0])
     H = pose(np.broadcast_to(random_rotation(rng), (10, 3, 3)), rng.normal(size=(10, 3)))
-    with pytest.raises(DegenerateMotionError, match="hardly turn"):
+    with pytest.raises(DegenerateMotionError) as refused:
         solve_views(in_front(H, X, rng), SolveOptions(profile=profile))
+    assert refused.value.code == "rotation-range"
 
 
 @BOTH
@@ -150,15 +150,17 @@ def test_one_axis_is_refused_and_named(profile):
     H = pose(R, rng.normal(size=(10, 3)) * 0.2)
     C = inverse(X) @ inverse(H) @ pose(rotation_exp([0, 0, 0.3]), [0, 0, 1.0])
     C[:, 2, 3] = np.abs(C[:, 2, 3])
-    with pytest.raises((DegenerateMotionError, BadViewsError), match=r"one axis|agree"):
+    with pytest.raises((DegenerateMotionError, BadViewsError)) as refused:
         solve_views(poses_only(H, C), SolveOptions(profile=profile))
+    assert refused.value.code in {"one-axis", "poses-disagree"}
 
 
 def test_identical_views_are_refused():
     view = make_cell(np.random.default_rng(0), 1, LOW).views.views[0]
-    with pytest.raises(CalibrationError, match="identical"):
+    with pytest.raises(CalibrationError) as refused:
         cell = make_cell(np.random.default_rng(0), 1, LOW)
         solve_views(replace(cell.views, views=(view,) * 8))
+    assert refused.value.code == "poses-identical"
 
 
 @pytest.mark.parametrize("with_pixels", [True, False])
@@ -168,8 +170,9 @@ def test_a_view_counts_once(with_pixels):
     if not with_pixels:
         bare = (replace(v, pixels=v.pixels[:0], board_points=v.board_points[:0]) for v in views)
         views = replace(views, views=tuple(bare))
-    with pytest.raises(BadViewsError, match=r"Views 1 \(view 0\) and 1 \(view 0\) are one"):
+    with pytest.raises(BadViewsError) as refused:
         solve_views(views.select([*range(10), 0]))
+    assert (refused.value.code, refused.value.values) == ("view-twice", {"view": 1, "other": 1})
 
 
 def broken(field, value):
@@ -186,20 +189,21 @@ def mirrored(C):
 
 @BOTH
 @pytest.mark.parametrize(
-    ("field", "value", "says"),
+    ("field", "value", "code"),
     [
-        ("base_from_flange", lambda F: F * np.nan, "not a rigid transform"),
-        ("base_from_flange", lambda F: F * 2, "not a rigid transform"),
-        ("camera_from_board", mirrored, "mirrored"),
-        ("camera_from_board", lambda C: C @ pose(np.eye(3), [0, 0, -9.0]), "behind"),
-        ("pixels", lambda p: p * np.nan, "NaN"),
-        ("pixels", lambda p: p[:-1], "pixels for"),
-        ("both", lambda p: p[:3], "3 corners, at least 4"),
+        ("base_from_flange", lambda F: F * np.nan, "robot-pose"),
+        ("base_from_flange", lambda F: F * 2, "robot-pose"),
+        ("camera_from_board", mirrored, "board-pose"),
+        ("camera_from_board", lambda C: C @ pose(np.eye(3), [0, 0, -9.0]), "board-pose"),
+        ("pixels", lambda p: p * np.nan, "corners"),
+        ("pixels", lambda p: p[:-1], "corners"),
+        ("both", lambda p: p[:3], "corners"),
     ],
 )
-def test_a_broken_view_is_named(profile, field, value, says):
-    with pytest.raises(BadViewsError, match=f"View 4.*{says}"):
+def test_a_broken_view_is_named(profile, field, value, code):
+    with pytest.raises(BadViewsError) as refused:
         solve_views(broken(field, value), SolveOptions(profile=profile))
+    assert (refused.value.code, refused.value.values) == (code, {"view": 4})
 
 
 @pytest.mark.parametrize("entry", [0.0, np.nan, -5.0])
@@ -207,8 +211,9 @@ def test_a_singular_camera_matrix_is_refused(entry):
     cell = make_cell(np.random.default_rng(0), 8, LOW)
     (_, *rest), second, third = cell.camera.matrix
     camera = msgspec.structs.replace(cell.camera, matrix=((entry, *rest), second, third))
-    with pytest.raises(BadViewsError, match="camera matrix"):
+    with pytest.raises(BadViewsError) as refused:
         solve_views(replace(cell.views, camera=camera))
+    assert refused.value.code == "camera-matrix"
 
 
 def test_ten_thousand_views_end_in_bounded_time():
@@ -221,8 +226,9 @@ def test_ten_thousand_views_end_in_bounded_time():
     solution = solve_views(poses_only(H[keep], C[keep]), SolveOptions(holdout=False))
     assert time.perf_counter() - start < 60
     assert error_mm_deg(solution.matrix, X)[0] < 0.05
-    with pytest.raises(BadViewsError, match="at most"):
+    with pytest.raises(BadViewsError) as refused:
         solve_views(poses_only(np.repeat(H[:5], 5000, axis=0), np.repeat(C[:5], 5000, axis=0)))
+    assert refused.value.code == "too-many-views"
 
 
 def test_a_covariance_is_positive_and_predicts_the_error_at_work():

@@ -1,9 +1,8 @@
-"""`calibrate`: the entry point. The verbs are in `calibrate.cli`."""
+"""`calibrate`: the entry point of the command line."""
 
 from __future__ import annotations
 
 import os
-import sys
 
 
 def main() -> None:
@@ -12,18 +11,6 @@ def main() -> None:
     # with the same processor, whatever its number of cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     from calibrate.cli.app import app
-    from calibrate.errors import CalibrationError
-    from recordings.cli.terminal import print_what_it_can
-    from recordings.errors import RecordingError, printed
-    from recordings.plain_text import plain_text
+    from recordings.cli.lazy import run
 
-    print_what_it_can()
-    try:
-        app(prog_name="calibrate")  # the station calls it as a module
-    except (CalibrationError, RecordingError) as problem:
-        print(f"calibrate: {printed(problem)}", file=sys.stderr)
-        sys.exit(problem.exit_code)
-    except OSError as problem:  # of a full disk behind stdout, say
-        where = problem.filename or "the output"
-        print(plain_text(f"calibrate: {where}: {problem.strerror or problem}"), file=sys.stderr)
-        sys.exit(1)
+    run("calibrate", app)

@@ -7,20 +7,13 @@ from typing import Annotated
 
 import typer
 
-from calibrate.annotate import annotate
+from calibrate.annotate import annotate as draw
 from calibrate.cli.output import AsJson, detection_progress, out, print_json
 from calibrate.files.calibration import read_calibration
-from recordings.cli.terminal import examples
 from recordings.reader import open_recording
 
 
-def register(app: typer.Typer) -> None:
-    app.command("annotate", epilog=examples("calibrate annotate session.mcap calibration.yaml -o seen.mcap"))(
-        annotate_recording
-    )
-
-
-def annotate_recording(
+def annotate(
     recording: Annotated[Path, typer.Argument(help="A recording (.mcap) or a session's folder")],
     calibration: Annotated[Path, typer.Argument(help="The calibration file to draw into it")],
     output: Annotated[Path, typer.Option("-o", "--output", help="The recording to write (.mcap)")],
@@ -28,12 +21,12 @@ def annotate_recording(
 ) -> None:
     """Draw a calibration into a recording, for Foxglove, Lichtblick or rerun.
 
-    Camera, board and every view in space; over each picture its corners, and lines to where the calibration
-    puts them. Views that the solver rejected are red.
+    Camera, board and every view in space; over each image its corners, and lines to where the calibration
+    predicts them. Rejected views are red.
     """
     source = open_recording(recording)
     with detection_progress() as progress:
-        found = annotate(source, read_calibration(calibration), output, progress)
+        found = draw(source, read_calibration(calibration), output, progress)
     rejected = [view.index + 1 for view in found if view.rejected]
     if as_json:
         views = [{"index": v.index, "rms_px": v.rms_px, "rejected": v.rejected} for v in found]

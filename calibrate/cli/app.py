@@ -1,22 +1,104 @@
-"""All verbs of `calibrate` under one roof."""
+"""All commands of `calibrate`: name → module and short help. Only a called one is loaded."""
 
 from __future__ import annotations
 
-import typer
+from recordings.cli.lazy import LazyCommand, LazyGroup
 
-from calibrate.cli import annotate, batch, board, check, install, solve, sweep
-
-app = typer.Typer(
-    context_settings={"help_option_names": ["-h", "--help"]},
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="markdown",
+_SOLVE, _FILES = "calibrate.cli.solve", "calibrate.cli.installed"
+COMMANDS = {
+    "solve": LazyCommand(
+        f"{_SOLVE}:solve",
+        "Solve a recording and write the calibration file.",
+        (
+            "calibrate solve session.mcap -o cell.yaml --report cell.html",
+            "calibrate solve session.mcap -o cell.yaml --without 3,7",
+        ),
+    ),
+    "compare": LazyCommand(
+        f"{_SOLVE}:compare",
+        "Compare all methods on the same views.",
+        ("calibrate compare session.mcap", "calibrate compare session.mcap --camera cell.yaml"),
+    ),
+    "report": LazyCommand(
+        f"{_SOLVE}:report",
+        "Solve a recording again and write its report: one HTML file.",
+        ("calibrate report session.mcap -o cell.html",),
+    ),
+    "show": LazyCommand(
+        f"{_FILES}:show",
+        "Show a calibration: verdict, result, gates.",
+        ("calibrate show  # the installed one", "calibrate show cell.yaml"),
+    ),
+    "diff": LazyCommand(
+        f"{_FILES}:diff",
+        "Compare two calibrations with their uncertainty.",
+        ("calibrate diff cell.yaml  # and the installed one", "calibrate diff a.yaml b.yaml"),
+    ),
+    "export": LazyCommand(
+        f"{_FILES}:export",
+        "Write a calibration in another program's format.",
+        (
+            "calibrate export --to ros-launch -o camera.launch.py  # of the installed one",
+            "calibrate export cell.yaml --to ros-camera-info -o camera_info.yaml",
+        ),
+    ),
+    "install": LazyCommand(
+        f"{_FILES}:install",
+        "Make a calibration the installed one.",
+        (
+            "calibrate install cell.yaml --cell-config station.yaml",
+            "calibrate install mine.yaml --cell imported --root my-cell  # of your own images",
+        ),
+    ),
+    "list": LazyCommand(
+        f"{_FILES}:list_installed",
+        "List every calibration that was installed here.",
+        ("calibrate list", "calibrate list --root my-cell"),
+    ),
+    "rollback": LazyCommand(
+        f"{_FILES}:rollback",
+        "Go back to an older installed calibration.",
+        ("calibrate rollback --reason 'camera was knocked'", "calibrate rollback 3"),
+    ),
+    "drift-check": LazyCommand(
+        "calibrate.cli.drift_check:drift_check",
+        "Test the installed calibration on new views.",
+        ("calibrate drift-check later.mcap", "calibrate drift-check later.mcap --calibration cell.yaml"),
+    ),
+    "annotate": LazyCommand(
+        "calibrate.cli.annotate:annotate",
+        "Draw a calibration into a recording, for Foxglove, Lichtblick or rerun.",
+        ("calibrate annotate session.mcap calibration.yaml -o seen.mcap",),
+    ),
+    "board": LazyCommand(
+        "calibrate.cli.board:board",
+        "Write a printable board (PDF or SVG, true scale).",
+        (
+            "calibrate board -o board.pdf --paper A4",
+            "calibrate board --kind charuco --columns 12 --rows 9 --square-mm 30 --marker-mm 22 -o board.svg",
+            "calibrate board --kind april-tag --id 3 --square-mm 120 -o tag.pdf",
+        ),
+    ),
+    "batch": LazyCommand(
+        "calibrate.cli.batch:batch",
+        "Solve many recordings; resumable.",
+        (
+            "calibrate batch monday.mcap tuesday.mcap -o results",
+            "calibrate batch sessions/* -o results --workers 2  # each worker needs the memory of a solve",
+        ),
+    ),
+    "sweep": LazyCommand(
+        "calibrate.cli.sweep:sweep",
+        "Estimate the time offset between camera and robot.",
+        ("calibrate sweep sweep.mcap", "calibrate sweep sweep.mcap --calibration cell.yaml"),
+    ),
+}
+app = LazyGroup(
+    COMMANDS,
     help="From a recording to a calibration that can be trusted, installed and undone.\n\n"
-    "A round: calibrate solve REC -o cell.yaml --report cell.html, then calibrate install cell.yaml. Your "
-    "own pictures become a recording by: recordings import FOLDER -o REC.",
-    epilog="Exit codes: 0 good, 1 failed, 2 wrong usage or configuration, 3 done with loss, 4 a gate failed "
-    "or a check did not hold.",
+    "First: calibrate solve REC -o cell.yaml --report cell.html, then calibrate install cell.yaml. Your own "
+    "images become a recording by: recordings import FOLDER -o REC.",
+    epilog="Exit codes: 0 good, 1 failed, 2 wrong usage or configuration, 3 done with loss, 4 a gate or a "
+    "drift check failed.",
+    aliases={"check": "drift-check"},
 )
-for family in (solve, install, check, annotate, board, batch, sweep):
-    family.register(app)

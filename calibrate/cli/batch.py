@@ -20,19 +20,8 @@ from calibrate.cli.output import AsJson, OutputError, err, out
 from calibrate.files.calibration import write_output
 from calibrate.options import JobOptions
 from calibrate.quality.gates import GateLimits, read_limits
-from recordings.cli.terminal import examples
 
 DONE_WITH_LOSS = 3
-
-
-def register(app: typer.Typer) -> None:
-    app.command(
-        "batch",
-        epilog=examples(
-            "calibrate batch monday.mcap tuesday.mcap -o results",
-            "calibrate batch sessions/* -o results --workers 2  # each worker needs the memory of a solve",
-        ),
-    )(batch)
 
 
 def batch(
@@ -57,10 +46,11 @@ def batch(
     memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
     as_json: AsJson = False,
 ) -> None:
-    """Solve many recordings; resumable. Exit 3: done, but some recordings could not be solved.
+    """Solve many recordings; resumable.
 
     OUTPUT then holds a calibration each, results.jsonl, results.csv, and what moved: trends.html, trends.txt.
     The limits are those of one solve in a process here; on a cluster the workers' own hold.
+    Exit codes: 0 all solved, 3 some recordings could not be solved.
     """
     from calibrate.batch.page import fleet_page  # matplotlib is slow to load
 

@@ -12,19 +12,7 @@ from calibrate.boards.printing import PAPER_MM, board_sheet
 from calibrate.cli.files import read_board
 from calibrate.cli.output import OutputError, check_folder, err, out
 from calibrate.files.calibration import write_output
-from recordings.cli.terminal import examples
 from recordings.schema.messages import SINGLE_TAGS, BoardKind, BoardSpec
-
-
-def register(app: typer.Typer) -> None:
-    app.command(
-        "board",
-        epilog=examples(
-            "calibrate board -o board.pdf --paper A4",
-            "calibrate board --kind charuco --columns 12 --rows 9 --square-mm 30 --marker-mm 22 -o board.svg",
-            "calibrate board --kind april-tag --id 3 --square-mm 120 -o tag.pdf",
-        ),
-    )(board)
 
 
 def board(

@@ -1,4 +1,4 @@
-"""Boards and cameras that a person names on the command line."""
+"""Boards, cameras and cells from files that a person names on the command line."""
 
 from __future__ import annotations
 
@@ -24,18 +24,20 @@ T = TypeVar("T")
 class InputFileError(CalibrationError):
     """A file named on the command line cannot be used."""
 
+    code = "input-file"
+
     exit_code = 2
 
 
 def read_board(path: Path) -> BoardSpec:
-    """A board's fields, or any YAML with `board:` in it (dataset.yaml, a station's configuration)."""
+    """Read a board's fields, or any YAML with `board:` in it (dataset.yaml, a station's configuration)."""
     board = _strictly(path, BoardSpec, "board")
     check_board(board)
     return board
 
 
 def read_camera(path: Path) -> CameraModel:
-    """A calibration file, ROS camera_info YAML, or the fields of a camera (width, height, matrix …)."""
+    """Read a calibration file, ROS camera_info YAML, or a camera's fields (width, height, matrix …)."""
     plain = _read(path, "a calibration file, a camera_info file or a camera's width, height and matrix")
     if plain.get("format") == FORMAT:
         return read_calibration(path).intrinsics.model
@@ -44,14 +46,14 @@ def read_camera(path: Path) -> CameraModel:
     else:
         camera = _strictly(path, CameraModel, "camera")
     if camera.width < 1 or camera.height < 1:
-        raise InputFileError(f"{path}: {camera.width}×{camera.height} is no picture size.")
+        raise InputFileError(f"{path}: {camera.width}×{camera.height} is no image size.")
     camera_matrix(camera)
     distortion(camera)
     return camera
 
 
 def read_lens_sigma(path: Path) -> dict[str, float]:
-    """1σ of each parameter of the lens, as a calibration file states them; empty for other files."""
+    """1σ of each of the intrinsics, as a calibration file states them; empty for other files."""
     plain = _read(path, "a calibration file, a camera_info file or a camera's width, height and matrix")
     return dict(read_calibration(path).intrinsics.sigma) if plain.get("format") == FORMAT else {}
 
@@ -98,7 +100,11 @@ def _content(path: Path) -> bytes:
     except OSError as problem:
         raise InputFileError(f"{path}: {problem.strerror or problem}.") from None
     if len(content) > _LIMIT_BYTES:
-        raise InputFileError(f"{path}: larger than {_LIMIT_BYTES // 1024} kB. Is it the right file?")
+        raise InputFileError(
+            f"{path}: larger than {_LIMIT_BYTES // 1024} kB.",
+            remedy="Check that it is the right file.",
+            limit_bytes=_LIMIT_BYTES,
+        )
     return content
 
 

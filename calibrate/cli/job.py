@@ -29,47 +29,40 @@ class LensName(StrEnum):
     fisheye = "equidistant"
 
 
-Profile = Annotated[
-    ProfileName, typer.Option(help="robust: the station's; paper: the published method, exactly")
-]
-Seed = Annotated[int, typer.Option(min=0, help="Of every random draw")]
+Profile = Annotated[ProfileName, typer.Option(help="robust: the station's; paper: the published method")]
+Seed = Annotated[int, typer.Option(min=0, help="Random seed")]
 BoardFile = Annotated[
-    Path | None, typer.Option("--board", help="YAML of another board than the recorded one")
+    Path | None, typer.Option("--board", help="YAML of a board that replaces the recorded one")
 ]
-SquareMm = Annotated[float | None, typer.Option("--square-mm", help="Another square size")]
+SquareMm = Annotated[
+    float | None, typer.Option("--square-mm", help="Square size that replaces the recorded one")
+]
 CameraFile = Annotated[
-    Path | None, typer.Option("--camera", help="Known lens: camera_info YAML or a calibration file")
+    Path | None, typer.Option("--camera", help="Fixed intrinsics: camera_info YAML or a calibration file")
 ]
 Find = Annotated[
     bool,
     typer.Option(
         "--estimate-intrinsics",
         "--find-intrinsics",
-        help="Estimate the intrinsics from these pictures, even where some are recorded",
+        help="Estimate the intrinsics even where some are recorded",
     ),
 ]
 AcceptMove = Annotated[
     bool,
-    typer.Option("--accept-move", help="Use both parts of a session in which camera or board was moved"),
+    typer.Option("--accept-move", help="Use both halves of a session in which camera or board moved"),
 ]
-LensKind = Annotated[LensName, typer.Option("--lens", help="Model of a lens that has to be found")]
-GatesFile = Annotated[Path | None, typer.Option("--gates", help="YAML of other limits")]
-Without = Annotated[
-    str | None, typer.Option(help="Numbers of poses to leave out, such as 3,7; the file says so")
-]
-Threads = Annotated[
-    int | None, typer.Option(min=1, help="For finding boards; the result does not depend on it")
-]
+LensKind = Annotated[LensName, typer.Option("--lens", help="Lens model of estimated intrinsics")]
+GatesFile = Annotated[Path | None, typer.Option("--gates", help="YAML of other gate limits")]
+Without = Annotated[str | None, typer.Option(help="Poses to exclude, e.g. 3,7")]
+Threads = Annotated[int | None, typer.Option(min=1, help="Threads of the board detection")]
 Distance = Annotated[
-    float | None, typer.Option("--working-distance-mm", min=1.0, max=1e5, help="Where the error is stated")
+    float | None,
+    typer.Option("--working-distance-mm", min=1.0, max=1e5, help="Distance for predicted error, mm"),
 ]
 
-TimeLimit = Annotated[
-    float, typer.Option(min=0.0, max=1e6, help="A solve ends with an error after so long; 0: no limit")
-]
-MemoryLimit = Annotated[
-    int, typer.Option(min=0, max=2**30, help="… when its process needs so much; 0: no limit")
-]
+TimeLimit = Annotated[float, typer.Option(min=0.0, max=1e6, help="Time limit, s (0: none)")]
+MemoryLimit = Annotated[int, typer.Option(min=0, max=2**30, help="Memory limit, MiB (0: none)")]
 
 
 def takes(build: Callable[..., JobOptions]) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
@@ -106,9 +99,13 @@ def picture_options(
     without: Without = None,
     threads: Threads = None,
 ) -> JobOptions:
-    """How pictures are read."""
+    """Options of reading images."""
     if camera is not None and find_intrinsics:
-        raise OutputError("--camera gives the lens, --estimate-intrinsics finds it: choose one of them.")
+        raise OutputError(
+            "--camera fixes the intrinsics, --estimate-intrinsics estimates them.",
+            code="options",
+            remedy="Choose one of them.",
+        )
     return JobOptions(
         seed=seed,
         board=None if board is None else read_board(board),
@@ -126,7 +123,7 @@ def _numbers(words: str) -> tuple[int, ...]:
     try:
         return tuple(sorted({int(word) for word in words.split(",")}))
     except ValueError:
-        raise typer.BadParameter(f"--without {words}: give numbers of poses, such as 3,7") from None
+        raise typer.BadParameter(f"--without {words}: give pose numbers, e.g. 3,7") from None
 
 
 @takes(picture_options)
@@ -137,7 +134,7 @@ def job_options(
     accept_move: AcceptMove = False,
     working_distance_mm: Distance = None,
 ) -> JobOptions:
-    """And how they are solved and judged."""
+    """Add how they are solved and judged."""
     return replace(
         options,
         profile=profile.value,

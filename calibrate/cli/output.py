@@ -1,4 +1,4 @@
-"""How the command line speaks: results on stdout, everything else on stderr."""
+"""Output of the command line: results on stdout, everything else on stderr."""
 
 from __future__ import annotations
 
@@ -23,41 +23,50 @@ _told_width = sys.stdout.isatty() or "COLUMNS" in os.environ
 out = plain_console(width=None if _told_width else 150)
 err = plain_console(stderr=True)
 
-AsJson = Annotated[bool, typer.Option("--json", help="One JSON object on stdout and nothing else")]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout and nothing else")]
 
 
 class OutputError(CalibrationError):
     """Where the result should go is wrong, or what was asked for does not exist."""
 
+    code = "output"
+
     exit_code = 2
 
 
 def check_folder(target: Path) -> None:
-    """Before the work, not after it: a file can be written there."""
+    """Raise OutputError, before the work, where no file can be written."""
     try:
         if not target.parent.is_dir():
-            text = f"{target}: the folder {target.parent} does not exist. Create it, or name another."
-            raise OutputError(text)
+            raise OutputError(
+                f"{target}: the folder {target.parent} does not exist.", remedy="Create it, or name another."
+            )
         if target.is_dir():
-            raise OutputError(f"{target} is a folder; name a file in it.")
+            raise OutputError(f"{target} is a folder.", remedy="Name a file in it.")
         if target.exists() and not target.is_file():
-            raise OutputError(f"{target} is a device or a pipe; name a file.")
+            raise OutputError(f"{target} is a device or a pipe.", remedy="Name a file.")
     except PermissionError as problem:
-        raise OutputError(f"{target}: {problem.strerror}. Name another place.") from None
+        raise OutputError(f"{target}: {problem.strerror}.", remedy="Name another place.") from None
 
 
 def check_page(target: Path) -> None:
-    """A report may be replaced; anything else that stands there, the recording say, is left alone."""
+    """Raise OutputError where something else than a report stands: only that may be replaced."""
     check_folder(target)
     if target.exists() and not _beginning(target).startswith(b"<!doctype html>"):
-        raise OutputError(f"{target} exists and is no report; give the report another name.")
+        raise OutputError(
+            f"{target} exists and is no report.", code="target-exists", remedy="Give the report another name."
+        )
 
 
 def check_export(target: Path) -> None:
-    """What an arm or a solve was needed for is not replaced by a file that one command makes again."""
+    """Raise OutputError where a recording or a calibration stands: an export does not replace it."""
     check_folder(target)
     if target.exists() and _beginning(target).startswith((MAGIC, f"format: {FORMAT}".encode())):
-        raise OutputError(f"{target} is a recording or a calibration file; give another name with -o.")
+        raise OutputError(
+            f"{target} is a recording or a calibration file.",
+            code="target-exists",
+            remedy="Give another name with -o.",
+        )
 
 
 def _beginning(target: Path) -> bytes:
@@ -65,24 +74,26 @@ def _beginning(target: Path) -> bytes:
         with target.open("rb") as file:
             return file.read(64)
     except OSError as problem:
-        raise OutputError(f"{target}: {problem.strerror}. Name another place.") from None
+        raise OutputError(f"{target}: {problem.strerror}.", remedy="Name another place.") from None
 
 
 def check_target(target: Path) -> None:
-    """A calibration file may be replaced; anything else that stands there is left alone."""
+    """Raise OutputError where something else than a calibration file stands: only that may be replaced."""
     check_folder(target)
     if target.exists():
         try:
             read_calibration(target)
         except CalibrationFileError:
             raise OutputError(
-                f"{target} exists and is no whole calibration file; give another name with -o."
+                f"{target} exists and is no whole calibration file.",
+                code="target-exists",
+                remedy="Give another name with -o.",
             ) from None
 
 
 @contextmanager
 def detection_progress() -> Iterator[LoadProgress | None]:
-    """On stderr: a bar on a terminal, plain lines where CALIBRATE_PROGRESS=lines asks for them."""
+    """Show progress on stderr: a bar on a terminal, plain lines with CALIBRATE_PROGRESS=lines."""
     if not err.is_terminal:
         yield _progress_line if os.environ.get("CALIBRATE_PROGRESS") == "lines" else None
         return

@@ -11,7 +11,7 @@ import typer
 from rich.table import Table
 
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, bounded
-from calibrate.cli.install import Root, history_rows
+from calibrate.cli.installed import Root, history_rows
 from calibrate.cli.job import MemoryLimit, TimeLimit, job_options, picture_options, takes
 from calibrate.cli.output import (
     AsJson,
@@ -24,34 +24,16 @@ from calibrate.cli.output import (
 )
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Touch, write_calibration
+from calibrate.files.formatting import summary
 from calibrate.files.install import install_line, load_installed
-from calibrate.files.summary import summary
 from calibrate.frames import camera_frames
 from calibrate.geometry import rotation_log
 from calibrate.handeye.solution import PeerResult
 from calibrate.options import JobOptions
 from calibrate.pipeline import SolvedRecording, prepare_views, solve_recording, solver_options
-from recordings.cli.terminal import examples
 
 Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session folder", show_default=False)]
 GATE_FAILED = 4
-
-
-def register(app: typer.Typer) -> None:
-    app.command(
-        "solve",
-        epilog=examples(
-            "calibrate solve session.mcap -o cell.yaml --report cell.html",
-            "calibrate solve session.mcap -o cell.yaml --without 3,7",
-        ),
-    )(solve)
-    app.command(
-        "compare",
-        epilog=examples(
-            "calibrate compare session.mcap", "calibrate compare session.mcap --camera cell.yaml"
-        ),
-    )(compare)
-    app.command("report", epilog=examples("calibrate report session.mcap -o cell.html"))(report_file)
 
 
 @takes(job_options)
@@ -66,16 +48,21 @@ def solve(
     time_limit_s: TimeLimit = TIME_LIMIT_S,
     memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
 ) -> None:
-    """Solve a recording and write the calibration file. Exit 4: written, but a gate failed.
+    """Solve a recording and write the calibration file.
 
     Next: look at the report, then `calibrate install`.
+    Exit codes: 0 all gates passed, 4 written, but a gate failed.
     """
     target = output or Path(f"{recording.name.removesuffix('.mcap')}.calibration.yaml")
     check_target(target)
     if report is not None:
         check_page(report)
         if report.resolve() == target.resolve():
-            raise OutputError(f"{target} cannot be calibration and report; give --report another name.")
+            raise OutputError(
+                f"{target} cannot be calibration and report.",
+                code="target-exists",
+                remedy="Give --report another name.",
+            )
     with bounded(time_limit_s, memory_limit_mib), detection_progress() as progress:
         job = solve_recording(recording, options, progress)
     write_calibration(job.calibration, target)
@@ -85,9 +72,9 @@ def solve(
         print_json(solve_json(job))
     else:
         out.print(summary(job.calibration))
-        out.print(f"written: {target}" + ("" if report is None else f"  report: {report}"), soft_wrap=True)
+        out.print(f"Written: {target}" + ("" if report is None else f"  Report: {report}"), soft_wrap=True)
         if job.passed:
-            out.print(f"next: {install_line(job.calibration.source, target)}", soft_wrap=True)
+            out.print(f"Next: {install_line(job.calibration.source, target)}", soft_wrap=True)
     if not job.passed:
         raise typer.Exit(GATE_FAILED)
 
@@ -131,7 +118,7 @@ def solve_json(job: SolvedRecording) -> dict[str, Any]:
 
 
 @takes(job_options)
-def report_file(
+def report(
     recording: Rec,
     options: JobOptions,
     output: Annotated[
@@ -141,21 +128,21 @@ def report_file(
     time_limit_s: TimeLimit = TIME_LIMIT_S,
     memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
 ) -> None:
-    """Solve a recording again and write its report: one HTML file. With the history of what is installed.
+    """Solve a recording again and write its report: one HTML file.
 
-    It opens in any browser, without a network.
+    With the history of what is installed. It opens in any browser, without a network.
     """
     target = output or Path(f"{recording.name.removesuffix('.mcap')}.report.html")
     check_page(target)
     with bounded(time_limit_s, memory_limit_mib), detection_progress() as progress:
         job = solve_recording(recording, options, progress)
     _write_report(job, target, options, root)
-    out.print(f"written: {target}", soft_wrap=True)
+    out.print(f"Written: {target}", soft_wrap=True)
 
 
 def _write_report(job: SolvedRecording, target: Path, options: JobOptions, root: Path | None = None) -> None:
     from calibrate.handeye.peers import compare_all  # like matplotlib, slow to load
-    from calibrate.report import write_report
+    from calibrate.report.page import write_report
 
     try:
         peers = compare_all(job.views, solver_options(options, job))
@@ -180,10 +167,10 @@ def compare(
     options: JobOptions,
     as_json: AsJson = False,
 ) -> None:
-    """Every method side by side on the same views. Nothing is written.
+    """Compare all methods on the same views.
 
-    e_t, e_R: how far views that took no part are missed; spread: how far apart the views see the board; px:
-    how far the corners are missed; σ from ours: distance to what `solve` finds, in its own sigmas.
+    e_t, e_R: held-out error; spread: of the board's pose over the views; px: reprojection error; σ from ours:
+    distance to the result of `solve`, in its own standard uncertainties. Nothing is written.
     """
     from calibrate.handeye.peers import compare_all
 

@@ -11,32 +11,24 @@ import typer
 from calibrate.cli.output import AsJson, err, out, print_json
 from calibrate.files.calibration import read_calibration
 from calibrate.quality.sweep import sweep_time_offset
-from recordings.cli.terminal import examples
 from recordings.reader import open_recording
-
-
-def register(app: typer.Typer) -> None:
-    app.command(
-        "sweep",
-        epilog=examples("calibrate sweep sweep.mcap", "calibrate sweep sweep.mcap --calibration cell.yaml"),
-    )(sweep)
 
 
 def sweep(
     recording: Annotated[Path, typer.Argument(help="Arm turning, camera free-running")],
     calibration_file: Annotated[
-        Path | None, typer.Option("--calibration", help="Whose lens is used, if the recording knows none")
+        Path | None, typer.Option("--calibration", help="Calibration that supplies intrinsics")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Estimate the time offset between camera and robot, with its sigma.
+    """Estimate the time offset between camera and robot.
 
     `station capture --sweep` makes such a recording: the arm swings while the camera sees the board.
     """
     lens = None if calibration_file is None else read_calibration(calibration_file).intrinsics.model
     found = sweep_time_offset(open_recording(recording), lens)
     for problem in found.lost:
-        err.print(f"left out: {problem}", style="yellow")
+        err.print(f"Rejected: {problem}", style="yellow")
     if as_json:
         print_json(
             {
@@ -49,6 +41,6 @@ def sweep(
         )
         return
     out.print(
-        f"A picture was taken {1000 * found.offset_s:+.2f} ± {1000 * found.sigma_s:.2f} ms from its stamp, "
+        f"Image taken {1000 * found.offset_s:+.2f} ± {1000 * found.sigma_s:.2f} ms from its stamp, "
         f"on the robot's clock ({found.pairs} turns compared)."
     )

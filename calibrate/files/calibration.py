@@ -34,10 +34,13 @@ from recordings.schema.messages import (
 FORMAT: Literal["handeye-calibration/1"] = "handeye-calibration/1"
 _LIMIT_BYTES = 4 * 1024 * 1024
 Vector3 = tuple[float, float, float]
+Verdict = Literal["PASS", "PASS WITH A REASON", "FAIL"]
 
 
 class CalibrationFileError(CalibrationError):
     """A calibration file is missing, damaged, or of another format."""
+
+    code = "calibration-file"
 
 
 class FramePose(msgspec.Struct, frozen=True):
@@ -247,14 +250,45 @@ class Touch(msgspec.Struct, frozen=True, omit_defaults=True):
     note: str = ""
 
 
-class Gate(msgspec.Struct, frozen=True, omit_defaults=True):
+class Gate(msgspec.Struct, frozen=True):
+    """A condition that a calibration must meet before it may be installed."""
+
     name: str
+    """The gate's id: the name of its limit in `GateLimits` (files of earlier versions hold other names)."""
     passed: bool
     value: float | None
-    """In the unit of the limit of its name in `GateLimits`; None in a file where it was no finite number."""
+    """In `unit`; None in a file where it was no finite number."""
     limit: float | None
     text: str
-    """What was found and, where it failed, what to do."""
+    """Name, value, unit, limit, PASS or FAIL, and the remedy of a failed one."""
+    unit: str = ""
+    """m, deg, s, px, share; empty for plain numbers."""
+    remedy: str = ""
+    """What to do; empty when passed."""
+
+    @classmethod
+    def measured(
+        cls, name: str, title: str, value: float, sense: Sense, limit: float, unit: str, remedy: str
+    ) -> Gate:
+        """Judge `value` against `limit` and render both: the only place that makes a gate's text."""
+        passed = bool(np.isfinite(value) and (value >= limit if sense == "≥" else value <= limit))
+        factor, suffix = _SHOWN[unit]
+        limit_unit = suffix if suffix in ("°", " %") else ""
+        shown = f"{title}: {value * factor:.3g}{suffix} ({sense} {limit * factor:.3g}{limit_unit})"
+        text = f"{shown} PASS" if passed else f"{shown} FAIL. {remedy}"
+        return cls(name, passed, float(value), float(limit), text, unit, "" if passed else remedy)
+
+
+Sense = Literal["≥", "≤"]
+_SHOWN = {
+    "m": (1e3, " mm"),
+    "deg": (1.0, "°"),
+    "s": (1e3, " ms"),
+    "px": (1.0, " px"),
+    "share": (100.0, " %"),
+    "": (1.0, ""),
+}
+"""Unit inside → factor and unit where a person reads."""
 
 
 class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -284,6 +318,13 @@ class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):
         """flange_from_camera or base_from_camera."""
         return self.result.transform
 
+    @property
+    def verdict(self) -> Verdict:
+        """By the gates, and by the reason of whoever installed it in spite of one."""
+        if self.override is not None:
+            return "PASS WITH A REASON"
+        return "FAIL" if self.quality.failed else "PASS"
+
 
 def content_sha256(plain: dict[str, Any]) -> str:
     """Over everything but `sha256` and `created`, independent of layout."""
@@ -310,30 +351,43 @@ def encode_calibration(calibration: Calibration) -> bytes:
 
 
 def decode_calibration(content: bytes, where: str) -> Calibration:
-    """Proves and parses a file's bytes; CalibrationFileError says what is wrong."""
+    """Prove and parse a file's bytes; CalibrationFileError says what is wrong."""
     if content.startswith(MAGIC):
         solve = f"calibrate solve {shlex.quote(where)}"
-        raise CalibrationFileError(f"{where} is a recording, no calibration file. First run: {solve}")
+        raise CalibrationFileError(
+            f"{where} is a recording, no calibration file.",
+            code="not-a-calibration",
+            remedy=f"First run: {solve}",
+        )
     if len(content) > _LIMIT_BYTES:
-        raise CalibrationFileError(f"{where}: larger than any calibration file ({len(content)} bytes).")
+        raise CalibrationFileError(
+            f"{where}: larger than any calibration file.",
+            code="not-a-calibration",
+            size_bytes=len(content),
+            limit_bytes=_LIMIT_BYTES,
+        )
     try:
         plain = strict_yaml.load_plain(content)
     except strict_yaml.StrictYamlError as problem:
-        raise CalibrationFileError(f"{where}: damaged, or no calibration file: {problem}.") from None
+        raise CalibrationFileError(
+            f"{where}: damaged, or no calibration file: {problem}.", code="damaged-calibration"
+        ) from None
     if not isinstance(plain, dict) or plain.get("format") != FORMAT:
         found = plain.get("format") if isinstance(plain, dict) else None
         raise CalibrationFileError(
-            f"{where}: not a calibration file: format is {found!r}, expected {FORMAT!r}. Give one that "
-            "`calibrate solve` wrote."
+            f"{where}: not a calibration file: format is {found!r}, expected {FORMAT!r}.",
+            code="not-a-calibration",
+            remedy="Give one that `calibrate solve` wrote.",
         )
     try:
         hash_now = content_sha256(plain)
     except (TypeError, ValueError) as problem:
-        raise CalibrationFileError(f"{where}: damaged ({problem}).") from None
+        raise CalibrationFileError(f"{where}: damaged ({problem}).", code="damaged-calibration") from None
     if plain.pop("sha256", None) != hash_now:
         raise CalibrationFileError(
-            f"{where}: the content does not fit its hash. It was edited by hand or damaged; use the "
-            "original, or solve the recording again."
+            f"{where}: the content does not fit its hash: it was edited by hand or damaged.",
+            code="damaged-calibration",
+            remedy="Use the original, or solve the recording again.",
         )
     try:
         calibration = msgspec.convert(plain, Calibration)
@@ -344,31 +398,35 @@ def decode_calibration(content: bytes, where: str) -> Calibration:
 
 
 def _check_result(calibration: Calibration, where: str) -> None:
+    """Raise CalibrationFileError (code `contradiction`) for a result that no solve can have written."""
     result, matrix = calibration.result, np.array(calibration.result.matrix)
     parent = "flange" if calibration.mount == "eye-in-hand" else "base"
+    quaternion, covariance = np.array(result.rotation_xyzw), np.array(calibration.covariance)
+    wrong = ""
     if (result.parent_frame, result.child_frame) != (parent, "camera"):
-        raise CalibrationFileError(
-            f"{where}: {calibration.mount} must give {parent}_from_camera, not "
-            f"{result.parent_frame}_from_{result.child_frame}."
-        )
-    quaternion = np.array(result.rotation_xyzw)
-    if matrix.shape != (4, 4) or not is_rigid(matrix) or abs(np.linalg.norm(quaternion) - 1) > 1e-6:
-        raise CalibrationFileError(f"{where}: the result is not a rigid transform.")
-    if (
+        wrong = f"{calibration.mount} with {result.parent_frame}_from_{result.child_frame}"
+    elif matrix.shape != (4, 4) or not is_rigid(matrix) or abs(np.linalg.norm(quaternion) - 1) > 1e-6:
+        wrong = "the result is not a rigid transform"
+    elif (
         np.abs(matrix_from_quaternion(quaternion) - matrix[:3, :3]).max() > 1e-9
         or np.abs(matrix[:3, 3] - np.array(result.translation_m)).max() > 1e-12
     ):
-        raise CalibrationFileError(f"{where}: matrix, translation and quaternion do not agree.")
-    covariance = np.array(calibration.covariance)
-    if covariance.shape != (6, 6) or not np.isfinite(covariance).all():
-        raise CalibrationFileError(f"{where}: the covariance is not 6 × 6 finite numbers.")
-    rounding = 1e-9 * float(np.abs(covariance).max())
-    if np.abs(covariance - covariance.T).max() > rounding or np.linalg.eigvalsh(covariance).min() < -rounding:
-        raise CalibrationFileError(f"{where}: the covariance is not symmetric and positive.")
+        wrong = "matrix, translation and quaternion do not agree"
+    elif covariance.shape != (6, 6) or not np.isfinite(covariance).all():
+        wrong = "the covariance is not 6 × 6 finite numbers"
+    else:
+        rounding = 1e-9 * float(np.abs(covariance).max())
+        skew = np.abs(covariance - covariance.T).max()
+        if skew > rounding or np.linalg.eigvalsh(covariance).min() < -rounding:
+            wrong = "the covariance is not symmetric and positive"
+    if wrong:
+        raise CalibrationFileError(
+            f"{where}: {wrong}.", code="contradiction", remedy="Solve the recording again."
+        )
 
 
 def read_calibration(path: Path) -> Calibration:
-    """Reads and verifies a calibration file. Raises CalibrationFileError."""
+    """Read and verify a calibration file. Raises CalibrationFileError."""
     try:
         with path.open("rb") as file:
             content = file.read(_LIMIT_BYTES + 1)
@@ -378,12 +436,12 @@ def read_calibration(path: Path) -> Calibration:
 
 
 def write_calibration(calibration: Calibration, path: Path) -> None:
-    """In one durable step. Raises CalibrationFileError."""
+    """Write the file in one durable step. Raises CalibrationFileError."""
     write_output(path, encode_calibration(calibration))
 
 
 def write_output(path: Path, content: bytes) -> None:
-    """A file for whoever asked for it, in one durable step. Raises CalibrationFileError."""
+    """Write a file for whoever asked for it, in one durable step. Raises CalibrationFileError."""
     try:
         write_atomically(path, content, ASKED_FOR)
     except OSError as problem:

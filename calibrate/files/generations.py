@@ -40,6 +40,8 @@ _NAME = re.compile(r"(\d{4,})-[0-9a-f]{8}\.yaml")
 class InstallError(CalibrationError):
     """Refused or failed: what was installed before still is, or the message says what is now."""
 
+    code = "install"
+
 
 @dataclass(frozen=True)
 class Generation:
@@ -72,7 +74,7 @@ def state_root(root: Path | None = None) -> Path:
 
 
 def generations(root: Path | None = None) -> list[Generation]:
-    """Everything ever installed, oldest first; damaged files are listed with their problem.
+    """List everything ever installed, oldest first; damaged files are listed with their problem.
 
     InstallError where the folder may not be looked into.
     """
@@ -149,7 +151,7 @@ def _content_name(content: bytes) -> str:
     """First 8 hex digits of the content's own hash, as written in the file."""
     found = re.search(rb"^sha256: '?([0-9a-f]{8})", content, re.MULTILINE)
     if found is None:
-        raise CalibrationFileError("a calibration file without its hash cannot be installed")
+        raise CalibrationFileError("A calibration file without its hash cannot be installed.")
     return found[1].decode()
 
 
@@ -163,7 +165,11 @@ def readable_folder(root: Path | None) -> Path:
     try:
         (folder / "gen").exists()
     except PermissionError as problem:
-        raise InstallError(f"{folder}: {problem.strerror}. Name another state folder with --root.") from None
+        raise InstallError(
+            f"{folder}: {problem.strerror}.",
+            code="state-folder",
+            remedy="Name another state folder with --root.",
+        ) from None
     return folder
 
 
@@ -187,7 +193,11 @@ def _switch(folder: Path, name: str, content: bytes) -> None:
     temporary.replace(folder / "current")
     sync_folder(folder)
     if (folder / "current").read_bytes() != content:
-        raise InstallError(f"{folder / 'current'} does not read back what was installed; check the disk.")
+        raise InstallError(
+            f"{folder / 'current'} does not read back what was installed.",
+            code="read-back",
+            remedy="Check the disk.",
+        )
 
 
 @contextmanager
@@ -198,7 +208,9 @@ def locked(folder: Path) -> Iterator[None]:
         descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o640)
     except OSError as problem:
         raise InstallError(
-            f"{folder} cannot be used: {problem.strerror}. Name another with --root."
+            f"{folder} cannot be used: {problem.strerror}.",
+            code="state-folder",
+            remedy="Name another with --root.",
         ) from None
     before = ""
     try:
@@ -210,7 +222,9 @@ def locked(folder: Path) -> Iterator[None]:
         switched = (
             f"{now} is installed now, and the log may not say so" if now != before else "Nothing was switched"
         )
-        raise InstallError(f"{folder}: {problem.strerror or problem}. {switched}.") from None
+        raise InstallError(
+            f"{folder}: {problem.strerror or problem}. {switched}.", code="install-io", switched=now != before
+        ) from None
     finally:
         os.close(descriptor)
 
@@ -218,7 +232,11 @@ def locked(folder: Path) -> Iterator[None]:
 def no_generation(folder: Path, number: int, known: list[Generation]) -> NoReturn:
     """Raises InstallError, which names those that there are."""
     have = ", ".join(str(g.number) for g in known) or "none"
-    raise InstallError(f"{folder}: there is no generation {number}; there are: {have}.")
+    raise InstallError(
+        f"{folder}: there is no generation {number}; there are: {have}.",
+        code="no-such-version",
+        generation=number,
+    )
 
 
 def _now_text() -> str:

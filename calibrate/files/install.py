@@ -1,7 +1,4 @@
-"""Installing a calibration, who refuses it and why, loading it in other programs, and the way back.
-
-How it lies on the disk is `generations`' business.
-"""
+"""Install a calibration, load it in other programs, and roll back. Its folder: `generations`."""
 
 from __future__ import annotations
 
@@ -13,7 +10,7 @@ import msgspec
 import numpy as np
 
 from calibrate.errors import GateFailedError
-from calibrate.files.calibration import Calibration, Override, read_calibration
+from calibrate.files.calibration import Calibration, Gate, Override, read_calibration
 from calibrate.files.generations import (
     Generation,
     InstallError,
@@ -27,7 +24,7 @@ from calibrate.files.generations import (
     readable_folder,
     who,
 )
-from calibrate.files.verification import objections as by_hand
+from calibrate.files.verification import agrees, touch_text
 from calibrate.geometry import difference
 from recordings.schema.messages import Source
 
@@ -47,11 +44,13 @@ REASON_LETTERS = 5
 
 
 class InstallGateError(GateFailedError, InstallError):
-    """A gate failed and nobody took responsibility."""
+    """A gate failed and nobody gave a reason to override it."""
+
+    code = "gate-failed"
 
 
 def load_installed(root: Path | None = None, allow_simulated: bool = False) -> Calibration:
-    """The installed calibration, verified: the call for programs that use the camera.
+    """Load the installed calibration, verified: the call for programs that use the camera.
 
     `calibration.transform` is `flange_from_camera` (eye-in-hand) or `base_from_camera` (eye-to-hand), with
     both frame names in it; `calibration.intrinsics.model` is the lens. Raises InstallError when nothing is
@@ -59,11 +58,17 @@ def load_installed(root: Path | None = None, allow_simulated: bool = False) -> C
     """
     current = readable_folder(root) / "current"
     if not current.exists():
-        raise InstallError(f"{current}: nothing is installed. Run: calibrate install FILE")
+        raise InstallError(
+            f"{current}: nothing is installed.",
+            code="nothing-installed",
+            remedy="Run: calibrate install FILE",
+        )
     calibration = read_calibration(current)
     if _CELL_OF[calibration.source] == "simulated" and not allow_simulated:
         raise InstallError(
-            f"{current}: the installed calibration is {calibration.source}, not of a real cell."
+            f"{current}: the installed calibration is {calibration.source}, not of a real cell.",
+            code="not-real",
+            source=calibration.source,
         )
     return calibration
 
@@ -77,7 +82,7 @@ def install(
     robot_serial: str = "",
     camera_serial: str = "",
 ) -> Generation:
-    """Makes the calibration file `path` the current one.
+    """Make the calibration file `path` the current one.
 
     `cell`: what kind of cell this root belongs to; a real one takes nothing simulated, played back or
     imported, and no override changes that. `override`: a person's reason to install although a gate failed
@@ -87,27 +92,30 @@ def install(
     calibration = read_calibration(path)
     with locked(calibrations_folder(root)):
         before = _installed_before(root)
-        objections = _objections(calibration, before, robot_serial, camera_serial)
-        objections += by_hand(calibration)
         _refuse_foreign_source(calibration, before, cell, path)
-        failed = [f"gate {gate.name}: {gate.text}" for gate in calibration.quality.failed]
-        failed += _worse(calibration, before)
-        if (failed or objections) and not override.strip():
-            kind = InstallGateError if failed and not objections else InstallError
+        objections = _objections(calibration, before, robot_serial, camera_serial)
+        objections += [f"Touch test, {touch_text(t)}." for t in calibration.verification if not agrees(t)]
+        failed = [f"{gate.name}: {gate.text}" for gate in _failed_gates(calibration, before)]
+        overridden = [*objections, *failed]
+        if overridden and not override.strip():
+            kind = InstallError if objections else InstallGateError
             raise kind(
-                f"{path} is not installed. " + " ".join([*objections, *failed]) + " If a person takes "
-                'responsibility: calibrate install --override "REASON".'
+                f"{path} is not installed. {' '.join(overridden)}",
+                code="objection" if objections else "",
+                remedy='To override: calibrate install --override "REASON".',
+                gates=len(failed),
+                objections=len(objections),
             )
-        if failed or objections:
+        if overridden:
             _require_words(override)
-            taken = Override(override.strip(), who(), [*objections, *failed])
+            taken = Override(override.strip(), who(), overridden)
             calibration = msgspec.structs.replace(calibration, override=taken)
         change = change_text(before, calibration)
         return add_generation(root, calibration, "install", change, override.strip())
 
 
 def rollback(root: Path | None = None, to: int | None = None, reason: str = "") -> Generation:
-    """Switches back: to the calibration before the current one, or to generation `to`. As `install` does.
+    """Switch back: to the calibration before the current one, or to generation `to`. As `install` does.
 
     `reason`: may be empty. Raises InstallError.
     """
@@ -120,12 +128,16 @@ def rollback(root: Path | None = None, to: int | None = None, reason: str = "") 
         if to is None:
             older = before_current(known)
             if older is None:
-                raise InstallError(f"{folder}: there is no older calibration to go back to.")
+                raise InstallError(f"{folder}: no older calibration to go back to.", code="nothing-older")
             target = older
         else:
             target = next((g for g in known if g.number == to), None) or no_generation(folder, to, known)
         if target.calibration is None:
-            raise InstallError(f"generation {target.number} is damaged and cannot be used: {target.problem}")
+            raise InstallError(
+                f"Generation {target.number} is damaged and cannot be used: {target.problem}",
+                code="damaged-version",
+                generation=target.number,
+            )
         before = None if current is None else current.calibration
         make_current(root, target, "rollback", change_text(before, target.calibration), reason)
     return Generation(target.number, target.path, True, target.calibration)
@@ -135,12 +147,12 @@ def reason_problem(reason: str) -> str:
     """Why this is no reason that a person may give; empty when it is one."""
     if len({letter for letter in reason.casefold() if letter.isalpha()}) >= REASON_LETTERS:
         return ""
-    return f"“{reason.strip()}” is no reason: say in words why, so that it is understood in a year."
+    return f"Override reason “{reason.strip()}” is too short. State the cause."
 
 
 def _require_words(reason: str) -> None:
     if problem := reason_problem(reason):
-        raise InstallError(f"{problem} Nothing was changed.")
+        raise InstallError(f"{problem} Nothing was changed.", code="reason-too-short")
 
 
 def objections_beside(calibration: Calibration, root: Path | None = None) -> list[str]:
@@ -149,7 +161,8 @@ def objections_beside(calibration: Calibration, root: Path | None = None) -> lis
     Another robot, camera or mount than that, or much less certain.
     """
     before = _installed_before(root)
-    return [*_objections(calibration, before, "", ""), *_worse(calibration, before)]
+    regression = _regression(calibration, before)
+    return [*_objections(calibration, before, "", ""), *([regression.text] if regression else [])]
 
 
 def change_text(before: Calibration | None, after: Calibration) -> str:
@@ -180,64 +193,62 @@ def _refuse_foreign_source(
 ) -> None:
     kind = _CELL_OF[calibration.source]
     if kind != cell:
-        hint = {
-            "real": "A real cell takes only what was captured on it.",
-            "imported": "This root is for imported recordings.",
-            "simulated": "This root belongs to a simulated cell.",
-        }[cell]
         raise InstallError(
-            f"{path} is {calibration.source} and is not installed on {_ARTICLE[cell]} {cell} cell. {hint} "
-            f"Files from elsewhere have their own place: {install_line(calibration.source, path)}"
+            f"{path} is {calibration.source} and is not installed on {_ARTICLE[cell]} {cell} cell.",
+            code="other-cell",
+            remedy=f"Files from elsewhere have their own place: {install_line(calibration.source, path)}",
+            source=calibration.source,
+            cell=cell,
         )
     if before is not None and _CELL_OF[before.source] != kind:
         raise InstallError(
-            f"{path} ({calibration.source}) does not follow a {before.source} calibration in the same place. "
-            "Use another --root."
+            f"{path} ({calibration.source}) does not follow a {before.source} calibration in the same place.",
+            code="other-cell",
+            remedy="Use another --root.",
+            source=calibration.source,
+            cell=_CELL_OF[before.source],
         )
 
 
-def _worse(calibration: Calibration, before: Calibration | None) -> list[str]:
-    """That it is much less certain than what it would replace; unless that failed its own gates."""
+def _failed_gates(calibration: Calibration, before: Calibration | None) -> list[Gate]:
+    regression = _regression(calibration, before)
+    return [*calibration.quality.failed, *([regression] if regression else [])]
+
+
+def _regression(calibration: Calibration, before: Calibration | None) -> Gate | None:
+    """The failed gate of one much less certain than what it would replace, unless that failed its own."""
     if before is None or before.quality.failed:
-        return []
+        return None
     new, old = calibration.quality, before.quality
     same_place = new.working_distance_m == old.working_distance_m
     if same_place and new.predicted_error_mm is not None and old.predicted_error_mm is not None:
         ours, theirs = new.predicted_error_mm, old.predicted_error_mm
-        what = f"a point at {1000 * (new.working_distance_m or 0):.0f} mm is expected to be off by"
+        title = f"Regression: predicted error at {1e3 * (new.working_distance_m or 0):.0f} mm"
     else:
         ours, theirs = calibration.sigma.translation_mm, before.sigma.translation_mm
-        what = "the camera's position is uncertain by"
-    if not ours > WORSE_TIMES * theirs:
-        return []
-    text = (
-        f"gate no worse: {what} {ours:.2f} mm (1σ), by the installed calibration {theirs:.2f} mm. Capture "
-        "more or better poses, or keep the installed one; `calibrate check` says whether that still holds."
-    )
-    return [text]
+        title = "Regression: standard uncertainty of the position"
+    remedy = "Capture more or better poses, or keep the installed one."
+    gate = Gate.measured("no_worse", title, ours / 1e3, "≤", WORSE_TIMES * theirs / 1e3, "m", remedy)
+    return None if gate.passed else gate
 
 
 def _objections(
     calibration: Calibration, before: Calibration | None, robot_serial: str, camera_serial: str
 ) -> list[str]:
     """Reasons against, other than gates: another robot or camera than the cell's."""
-    robot, camera = calibration.robot, calibration.camera
+    devices = (("robot", robot_serial), ("camera", camera_serial))
     found = []
-    if robot_serial and robot.serial != robot_serial:
-        found.append(f"It is of robot {robot.serial or 'unknown'}, the cell has {robot_serial}.")
-    if camera_serial and camera.serial != camera_serial:
-        found.append(f"It is of camera {camera.serial or 'unknown'}, the cell has {camera_serial}.")
-    if before is not None:
-        if (before.robot.model, before.robot.serial) != (robot.model, robot.serial):
+    for name, serial in devices:
+        device = getattr(calibration, name)
+        if serial and device.serial != serial:
+            found.append(f"It is of {name} {device.serial or 'unknown'}, the cell has {serial}.")
+    for name, _ in devices if before is not None else ():
+        device, installed = getattr(calibration, name), getattr(before, name)
+        if (installed.model, installed.serial) != (device.model, device.serial):
             found.append(
-                f"It is of robot {robot.model} {robot.serial}, the installed one of {before.robot.model} "
-                f"{before.robot.serial}."
+                f"It is of {name} {device.model} {device.serial}, the installed one of {installed.model} "
+                f"{installed.serial}."
             )
-        if (before.camera.model, before.camera.serial) != (camera.model, camera.serial):
-            found.append(
-                f"It is of camera {camera.model} {camera.serial}, the installed one of {before.camera.model} "
-                f"{before.camera.serial}."
-            )
-        if before.mount != calibration.mount:
-            found.append(f"It is {calibration.mount}, the installed one {before.mount}.")
+    if before is not None and before.mount != calibration.mount:
+        found.append(f"It is {calibration.mount}, the installed one {before.mount}.")
     return found

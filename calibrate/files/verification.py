@@ -6,12 +6,12 @@ tells the offset. The entries live in the calibration file.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 
 import msgspec
 import numpy as np
-from scipy import stats
 
 from calibrate.files.calibration import Calibration, Touch, read_calibration, write_calibration
 from calibrate.files.generations import (
@@ -27,6 +27,8 @@ HAND_MM = 0.3
 """1 sigma per axis of reading an offset or meeting a corner by hand and eye."""
 CONFIDENCE = 0.99
 """Of one corner; several share the error of X, so that few of them alarm by chance."""
+LIMIT_SIGMAS = math.sqrt(-2 * math.log(1 - CONFIDENCE))
+"""Of two numbers: χ²(2) at `CONFIDENCE`, 3.03."""
 
 
 def touch_sigmas(touch: Touch) -> float:
@@ -36,35 +38,27 @@ def touch_sigmas(touch: Touch) -> float:
 
 
 def agrees(touch: Touch) -> bool:
-    """Whether the offset is within what was predicted (two numbers, χ²(2): 3.03 sigmas for 99 %)."""
-    return touch_sigmas(touch) <= float(np.sqrt(stats.chi2.ppf(CONFIDENCE, 2)))
+    """Whether the offset is within what was predicted."""
+    return touch_sigmas(touch) <= LIMIT_SIGMAS
 
 
 def touch_text(touch: Touch) -> str:
-    """'corner 0: 0.31 mm off (x +0.21, y -0.23), 0.9 sigmas'"""
+    """'corner 0: 0.31 mm (x +0.21, y -0.23), 0.9σ (limit 3.0) PASS'"""
     x, y = touch.offset_mm
-    far = float(np.hypot(x, y))
-    text = (
-        f"corner {touch.corner}: {far:.2f} mm off (x {x:+.2f}, y {y:+.2f}), {touch_sigmas(touch):.1f} sigmas"
-    )
-    return text if agrees(touch) else f"{text}: MORE than the calibration claims"
-
-
-def objections(calibration: Calibration) -> list[str]:
-    """Why hands speak against it."""
-    bad = [touch for touch in calibration.verification if not agrees(touch)]
-    return [f"Checked by hand, it is off at {touch_text(touch)}." for touch in bad]
+    verdict = "PASS" if agrees(touch) else "FAIL"
+    figures = f"{np.hypot(x, y):.2f} mm (x {x:+.2f}, y {y:+.2f}), {touch_sigmas(touch):.1f}σ"
+    return f"corner {touch.corner}: {figures} (limit {LIMIT_SIGMAS:.1f}) {verdict}"
 
 
 def note_in_file(path: Path, touches: Sequence[Touch]) -> Calibration:
-    """Adds them to a calibration file, atomically; nothing else in it changes. CalibrationFileError."""
+    """Add them to a calibration file, atomically; nothing else in it changes. CalibrationFileError."""
     calibration = _with_touches(read_calibration(path), touches)
     write_calibration(calibration, path)
     return calibration
 
 
 def note_installed(root: Path | None, touches: Sequence[Touch]) -> Generation:
-    """Adds them to the installed calibration: a new generation, for generations never change.
+    """Add them to the installed calibration: a new generation, for generations never change.
 
     Raises InstallError where no whole calibration is installed, or the folder or the disk does not allow it.
     """
@@ -72,7 +66,11 @@ def note_installed(root: Path | None, touches: Sequence[Touch]) -> Generation:
     with locked(folder):
         current = next((g for g in generations(root) if g.current), None)
         if current is None or current.calibration is None:
-            raise InstallError(f"{folder}: no whole calibration is installed; nothing was noted.")
+            raise InstallError(
+                f"{folder}: no whole calibration is installed, so nothing was noted.",
+                code="nothing-installed",
+                remedy="Install one: calibrate install FILE.",
+            )
         calibration = _with_touches(current.calibration, touches)
         found = "; ".join(touch_text(touch) for touch in touches)
         return add_generation(root, calibration, "verify", found)

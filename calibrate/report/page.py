@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
+import cv2
 import numpy as np
 
+from calibrate.boards.corners import to_grey
 from calibrate.boards.model import describe_board
 from calibrate.files.calibration import Touch, write_output
-from calibrate.files.cell_text import cell_sentences
-from calibrate.files.summary import pose_text, source_stamp, verdict
+from calibrate.files.formatting import cell_sentences, pose_text, source_stamp, verdict_text
 from calibrate.files.verification import agrees, touch_text
 from calibrate.geometry import Array
 from calibrate.handeye.corners import bent_points
@@ -21,10 +23,9 @@ from calibrate.lens.model import project
 from calibrate.lens.pnp import solve_pnp
 from calibrate.pipeline import SolvedRecording
 from calibrate.report import html, plots
-from calibrate.report.lens_plots import uncertainty_map
-from calibrate.report.pictures import drawn_view
 
 _PICTURES_LIMIT = 60
+_WIDTH_PX = 480
 
 
 def write_report(
@@ -68,19 +69,17 @@ def report_page(
 
 def _verdict(job: SolvedRecording) -> Iterator[str]:
     calibration = job.calibration
-    good, sentence = verdict(calibration)
-    quality = calibration.quality
+    good, quality = calibration.verdict != "FAIL", calibration.quality
     yield f"<h1>Calibration of {html.escape(job.recording.info.name)}</h1>"
     if stamp := source_stamp(calibration):
         yield f'<div class="stamp">{html.escape(stamp)}. It is not installed on a real cell.</div>'
     expected = " ".join(gate.text for gate in quality.failed)
     if good and quality.predicted_error_mm is not None and quality.working_distance_m is not None:
-        expected = (
-            f"A point {quality.working_distance_m * 1000:.0f} mm in front of the camera should be right "
-            f"to {quality.predicted_error_mm:.2f} mm (1σ)."
-        )
+        distance_mm = quality.working_distance_m * 1000
+        expected = f"Predicted error at {distance_mm:.0f} mm: {quality.predicted_error_mm:.2f} mm (1σ)."
     yield (
-        f'<div class="verdict {"good" if good else "bad"}"><strong>{html.escape(sentence)}</strong>'
+        f'<div class="verdict {"good" if good else "bad"}"><strong>'
+        f"{html.escape(verdict_text(calibration))}</strong>"
         f"{html.escape(expected)}</div>"
     )
     for warning in quality.warnings:
@@ -119,22 +118,22 @@ def _result(job: SolvedRecording) -> Iterator[str]:
 def _gates(job: SolvedRecording) -> Iterator[str]:
     yield html.heading("Gates")
     yield html.table(
-        ("", "gate", "found"), [("✓" if gate.passed else "✗", gate.name, gate.text) for gate in job.gates]
+        ("", "gate", "result"), [("✓" if gate.passed else "✗", gate.name, gate.text) for gate in job.gates]
     )
 
 
 def _touches(touches: Sequence[Touch]) -> Iterator[str]:
     if touches:
-        yield html.heading("Checked by hand")
+        yield html.heading("Touch tests")
         yield html.table(
-            ("", "where the tip stood beside the corner, against what was predicted", "when", "by whom"),
+            ("", "tip beside the corner, against the prediction", "time", "operator"),
             [("✓" if agrees(t) else "✗", touch_text(t), t.wall, f"{t.who}, {t.found}") for t in touches],
         )
 
 
 def _error(job: SolvedRecording) -> Iterator[str]:
     quality = job.calibration.quality
-    yield html.heading("Where the error comes from")
+    yield html.heading("Error sources")
     if quality.error_shares:
         shares = {name: share for name, share in quality.error_shares.items() if share > 0.001}
         listed = ", ".join(f"{name.replace('_', ' ')} {share:.0%}" for name, share in shares.items())
@@ -142,8 +141,8 @@ def _error(job: SolvedRecording) -> Iterator[str]:
     noise = quality.noise
     if noise:
         yield html.paragraph(
-            f"Corners scatter by {noise['corner_px']:.3f} px, the robot by {noise['robot_mm']:.3f} mm and "
-            f"{noise['robot_deg']:.4f}° (estimated from the residuals)."
+            f"Measurement noise (1σ): corners {noise['corner_px']:.3f} px, robot {noise['robot_mm']:.3f} mm "
+            f"and {noise['robot_deg']:.4f}°."
         )
     yield html.paragraph(f"Least known: {quality.weakest}." if quality.weakest else "")
     for sentence in cell_sentences(job.calibration):
@@ -173,10 +172,10 @@ def _residuals(job: SolvedRecording) -> Iterator[str]:
     yield html.heading("Residuals")
     if solution.residual_px:
         robot_mm = {index: metres * 1000 for index, (metres, _) in solution.residual_robot.items()}
-        limit = next((gate.limit for gate in job.gates if gate.name == "view residual"), None)
+        limit = next((gate.limit for gate in job.gates if gate.name == "view_rms_px"), None)
         yield html.figure(
             plots.residuals_by_view(solution.residual_px, robot_mm, limit),
-            "Per pose: how far the corners miss the model, and the modelled flange the recorded one.",
+            "Per pose: reprojection error of the corners, and modelled against recorded flange.",
         )
     pairs = [both for index, both in _modelled_pixels(job).items() if index in set(solution.used)]
     if pairs:
@@ -193,7 +192,7 @@ def _holdout(job: SolvedRecording, peers: Sequence[PeerResult]) -> Iterator[str]
     score = job.solution.holdout
     if score is None:
         return
-    yield html.heading("Views that took no part")
+    yield html.heading("Held-out error")
     methods = [("this calibration", np.asarray(score.samples_e_t_m), np.asarray(score.samples_e_R))]
     methods += [
         (peer.name, peer.samples_e_t_m, peer.samples_e_R)
@@ -214,7 +213,7 @@ def _holdout(job: SolvedRecording, peers: Sequence[PeerResult]) -> Iterator[str]
 def _methods(peers: Sequence[PeerResult]) -> Iterator[str]:
     if not peers:
         return
-    yield html.heading("Every method on the same views")
+    yield html.heading("All methods on the same views")
     rows = [
         (
             peer.name,
@@ -234,9 +233,9 @@ def _methods(peers: Sequence[PeerResult]) -> Iterator[str]:
 
 def _lens(job: SolvedRecording) -> Iterator[str]:
     lens = job.calibration.intrinsics
-    yield html.heading("Lens")
-    origin = "found from these pictures" if job.intrinsics is not None else "given, refined with X"
-    rms = "" if lens.rms_px is None else f", rms {lens.rms_px:.3f} px"
+    yield html.heading("Intrinsics")
+    origin = "estimated from these images" if job.intrinsics is not None else "fixed, refined with X"
+    rms = "" if lens.rms_px is None else f", RMS {lens.rms_px:.3f} px"
     yield html.paragraph(f"{lens.distortion_model}, {lens.width}×{lens.height}, {origin}{rms}.")
     values = {
         "fx": lens.matrix[0][0],
@@ -251,13 +250,13 @@ def _lens(job: SolvedRecording) -> Iterator[str]:
     yield html.table(("", "value", "1σ"), rows, (1, 2))
     yield html.figure(
         plots.coverage_map(job.views),
-        f"Left: where corners were seen ({job.coverage:.0%} of the picture). Right: what the lens bends.",
+        f"Left: image coverage by corners ({job.coverage:.0%}). Right: distortion.",
     )
     if job.lens_known is not None:
         px = job.lens_known.figures
         yield html.figure(
-            uncertainty_map(job.lens_known, job.views),
-            f"By how much the lens may show a direction wrongly (1σ): {px['centre']:.3f} px at the centre, "
+            plots.uncertainty_map(job.lens_known, job.views),
+            f"Standard uncertainty of a direction (1σ): {px['centre']:.3f} px at the centre, "
             f"{px['corner']:.3f} px in the worst corner, {px['worst']:.3f} px at worst. Blue: the corners "
             "that fixed it. Where it is large, show the board there too.",
         )
@@ -273,11 +272,11 @@ def _distortion_names(model: str) -> tuple[str, ...]:
 
 def _views(job: SolvedRecording) -> Iterator[str]:
     rejected = {view.index: view.reason for view in job.calibration.views.rejected}
-    yield html.heading(f"Views: {len(job.solution.used)} used, {len(rejected)} left out")
+    yield html.heading(f"Views: {len(job.solution.used)} used, {len(rejected)} rejected")
     if rejected:
         names = {view.index: view.name for view in job.recording.views()}
         yield html.table(
-            ("pose", "name", "why it was left out"),
+            ("pose", "name", "reason"),
             [(str(index + 1), names.get(index, ""), reason) for index, reason in rejected.items()],
         )
     modelled = _modelled_pixels(job)
@@ -292,14 +291,13 @@ def _views(job: SolvedRecording) -> Iterator[str]:
         name = "" if view.name == str(view.index) else f": {view.name}"
         caption = f"pose {view.index + 1}{name}" + (f", {px:.2f} px" if px is not None else "")
         if view.index in rejected:
-            caption += ", left out"
+            caption += ", rejected"
         elif view.index in job.solution.in_doubt:
-            caption += f", in doubt: wrong with a chance of {job.solution.in_doubt[view.index]:.0%}"
+            caption += f", suspect: P(outlier) {job.solution.in_doubt[view.index]:.0%}"
         mark = "out" if view.index in rejected else "in"
         cells.append(f'<div class="{mark}">{html.figure(html.picture(jpeg, caption), caption)}</div>')
     yield html.paragraph(
-        "Orange: the corners found, the first one in red. Blue rings: where the board's pose and the "
-        "lens put them.",
+        "Orange: detected corners, the first in red. Blue rings: corners by board pose and intrinsics.",
         "note",
     )
     yield '<div class="views">' + "\n".join(cells) + "</div>"
@@ -309,14 +307,14 @@ def _views(job: SolvedRecording) -> Iterator[str]:
 
 def _history(history: Sequence[Sequence[str]]) -> Iterator[str]:
     if history:
-        yield html.heading("Installed before")
-        yield html.table(("generation", "when", "what", "change"), history)
+        yield html.heading("Installed versions")
+        yield html.table(("version", "time", "action", "change"), history)
 
 
 def _provenance(job: SolvedRecording) -> Iterator[str]:
     calibration = job.calibration
     origin, robot, camera = calibration.provenance, calibration.robot, calibration.camera
-    yield html.heading("Where it comes from")
+    yield html.heading("Provenance")
     rows = [
         ("recording", f"{origin.recording}, SHA-256 {origin.recording_sha256}"),
         ("source", calibration.source),
@@ -329,3 +327,26 @@ def _provenance(job: SolvedRecording) -> Iterator[str]:
         ("solved", calibration.created),
     ]
     yield html.table(("", ""), rows)
+
+
+def drawn_view(image: Any, found: Array, modelled: Array | None) -> bytes:
+    """JPEG of the picture, brightened, with the found corners (orange) and the modelled ones (blue rings)."""
+    grey = to_grey(image)
+    scale = _WIDTH_PX / grey.shape[1]
+    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    top = max(float(np.percentile(small, 99.5)), 1.0)
+    canvas = cv2.cvtColor(np.clip(small * (245.0 / top), 0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)
+    if modelled is not None:
+        for x, y in _places(modelled, scale):
+            cv2.circle(canvas, (x, y), 7, (218, 105, 9), 2, cv2.LINE_AA)
+    for k, (x, y) in enumerate(_places(found, scale)):
+        colour = (0, 0, 255) if k == 0 else (0, 140, 255)
+        cv2.drawMarker(canvas, (x, y), colour, cv2.MARKER_CROSS, 8 if k else 18, 2)
+    _, jpeg = cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, 70])
+    return jpeg.tobytes()
+
+
+def _places(pixels: Array, scale: float) -> list[tuple[int, int]]:
+    scaled = (pixels + 0.5) * scale - 0.5
+    finite = np.isfinite(scaled).all(axis=1) & (np.abs(scaled) < 10_000).all(axis=1)
+    return [(round(x), round(y)) for x, y in scaled[finite].tolist()]

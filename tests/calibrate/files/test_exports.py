@@ -20,8 +20,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from calibrate.files.calibration import Calibration, FramePose
-from calibrate.files.exports import FORMATS, ExportError, export
-from calibrate.files.exports.frames import FrameNames
+from calibrate.files.exports import FORMATS, ExportError, FrameNames, export
 from calibrate.geometry import Array, Transform, pose, pose_from_rotvec, rotation_exp
 from calibrate.pipeline import SolvedRecording
 

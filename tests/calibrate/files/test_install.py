@@ -175,7 +175,7 @@ def test_trouble_that_no_other_error_names_is_one_sentence(
     def full(_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("calibrate.cli.install.print_json", full)
+    monkeypatch.setattr("calibrate.cli.installed.print_json", full)
     done = call(main, "show", real_file, "--json")
     assert (done.returncode, done.stderr) == (1, "calibrate: the output: No space left on device\n")
 

@@ -10,9 +10,9 @@ import pytest
 from rich.console import Console
 
 from calibrate.files.calibration import CalibrationFileError, Touch, read_calibration, write_calibration
+from calibrate.files.formatting import summary
 from calibrate.files.generations import InstallError, generations, read_log
 from calibrate.files.install import install, load_installed, rollback
-from calibrate.files.summary import summary
 from calibrate.files.verification import agrees, note_in_file, note_installed, touch_sigmas, touch_text
 from calibrate.pipeline import SolvedRecording
 from calibrate.report.page import report_page

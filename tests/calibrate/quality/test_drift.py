@@ -11,7 +11,7 @@ import pytest
 from scipy import stats
 
 from calibrate.boards.model import board_points
-from calibrate.cli.check import check_text
+from calibrate.cli.drift_check import check_text
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp
 from calibrate.lens.model import project

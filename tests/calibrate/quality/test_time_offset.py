@@ -8,7 +8,7 @@ import pytest
 from calibrate.errors import BadViewsError, DegenerateMotionError, TooFewViewsError
 from calibrate.geometry import Array, inverse, pose, random_rotation, rotation_exp
 from calibrate.kinematics import MODELS, forward
-from calibrate.quality.time_offset import estimate_time_offset
+from calibrate.quality.sweep import estimate_time_offset
 
 NOISE_RAD = 3e-4
 """Of a PnP rotation, per axis"""

@@ -1,6 +1,8 @@
-"""A calibration in the terminal: the verdict first, then what a person needs to trust it."""
+"""A calibration in words: its verdict, pose, findings and, for the terminal, its summary."""
 
 from __future__ import annotations
+
+from collections.abc import Iterator
 
 import numpy as np
 from rich.console import Group, RenderableType
@@ -9,8 +11,7 @@ from rich.text import Text
 from scipy.spatial.transform import Rotation
 
 from calibrate.boards.model import describe_board
-from calibrate.files.calibration import Calibration, Override
-from calibrate.files.cell_text import cell_sentences
+from calibrate.files.calibration import BoardFound, Calibration, Override
 from calibrate.files.verification import agrees, touch_text
 from calibrate.geometry import difference
 
@@ -26,16 +27,16 @@ def source_stamp(calibration: Calibration) -> str:
     return _STAMPS.get(calibration.source, "")
 
 
-def verdict(calibration: Calibration) -> tuple[bool, str]:
-    failed = calibration.quality.failed
-    if not failed:
-        return True, f"PASS: {len(calibration.quality.gates)} of {len(calibration.quality.gates)} gates"
-    names = ", ".join(gate.name for gate in failed)
-    return False, f"FAIL: {names} ({len(failed)} of {len(calibration.quality.gates)} gates)"
+def verdict_text(calibration: Calibration) -> str:
+    failed = [gate.name for gate in calibration.quality.failed]
+    if calibration.verdict == "FAIL":
+        return f"FAIL: {', '.join(failed)}"
+    count = len(calibration.quality.gates)
+    return f"{calibration.verdict}: {count - len(failed)} of {count} gates"
 
 
 def override_text(override: Override) -> str:
-    return f"installed although refused, by {override.who}: {override.reason}"
+    return f"Override by {override.who}: {override.reason}"
 
 
 def pose_text(calibration: Calibration) -> str:
@@ -47,8 +48,8 @@ def pose_text(calibration: Calibration) -> str:
 
 def summary(calibration: Calibration) -> RenderableType:
     """For a rich console, 80 columns and more."""
-    good, sentence = verdict(calibration)
-    parts: list[RenderableType] = [Text(sentence, style="bold green" if good else "bold red")]
+    style = "bold red" if calibration.verdict == "FAIL" else "bold green"
+    parts: list[RenderableType] = [Text(verdict_text(calibration), style=style)]
     if source_stamp(calibration):
         parts.append(Text(source_stamp(calibration), style="bold yellow"))
     if calibration.override is not None:
@@ -56,11 +57,11 @@ def summary(calibration: Calibration) -> RenderableType:
     parts += [_result_table(calibration), _gate_table(calibration)]
     for touch in calibration.verification:
         style = "green" if agrees(touch) else "bold red"
-        parts.append(Text(f"checked by hand, {touch.wall}, {touch.who}: {touch_text(touch)}", style=style))
+        parts.append(Text(f"Touch test, {touch.wall}, {touch.who}: {touch_text(touch)}", style=style))
     parts += [Text(sentence) for sentence in cell_sentences(calibration)]
     parts += [Text(f"! {warning}", style="yellow") for warning in calibration.quality.warnings]
     for view in calibration.views.rejected:
-        parts.append(Text(f"- view {view.index + 1} ({view.name}) left out: {view.reason}"))
+        parts.append(Text(f"- view {view.index + 1} ({view.name}) rejected: {view.reason}"))
     return Group(*parts)
 
 
@@ -73,12 +74,12 @@ def _result_table(calibration: Calibration) -> Table:
     table.add_row("1σ", f"{calibration.sigma.translation_mm:.3f} mm  {calibration.sigma.rotation_deg:.4f}°")
     if quality.predicted_error_mm is not None:
         table.add_row(
-            "expected error",
+            "predicted error",
             f"{quality.predicted_error_mm:.3f} mm (1σ) at {(quality.working_distance_m or 0) * 1000:.0f} mm",
         )
     if quality.holdout is not None:
         table.add_row(
-            "hold-out", f"e_t {quality.holdout.e_t_m * 1000:.4f} mm   e_R {quality.holdout.e_R:.6f}"
+            "held-out error", f"e_t {quality.holdout.e_t_m * 1000:.4f} mm   e_R {quality.holdout.e_R:.6f}"
         )
     if quality.board_spread_mm is not None:
         spread_deg = quality.board_spread_deg or 0.0
@@ -86,14 +87,14 @@ def _result_table(calibration: Calibration) -> Table:
     lens = calibration.intrinsics
     fx, cx = lens.matrix[0][0], lens.matrix[0][2]
     fy, cy = lens.matrix[1][1], lens.matrix[1][2]
-    rms = "" if lens.rms_px is None else f"  rms {lens.rms_px:.3f} px"
-    table.add_row("lens", f"f {fx:.1f} {fy:.1f}  c {cx:.1f} {cy:.1f} px{rms}  ({lens.found})")
+    rms = "" if lens.rms_px is None else f"  RMS {lens.rms_px:.3f} px"
+    table.add_row("intrinsics", f"f {fx:.1f} {fy:.1f}  c {cx:.1f} {cy:.1f} px{rms}  ({lens.found})")
     if quality.error_shares:
         shares = sorted(quality.error_shares.items(), key=lambda item: -item[1])
         text = ", ".join(f"{name.replace('_', ' ')} {share:.0%}" for name, share in shares if share > 0.005)
         table.add_row("error comes from", text)
     used, rejected = len(calibration.views.used), len(calibration.views.rejected)
-    table.add_row("views", f"{used} used, {rejected} left out")
+    table.add_row("views", f"{used} used, {rejected} rejected")
     table.add_row("board", describe_board(calibration.board))
     robot, camera = calibration.robot, calibration.camera
     table.add_row(
@@ -110,6 +111,50 @@ def _gate_table(calibration: Calibration) -> Table:
         mark = Text("✓", style="green") if gate.passed else Text("✗", style="bold red")
         table.add_row(mark, gate.name, Text(gate.text))
     return table
+
+
+_SAID = 3.0
+"""Sigmas from which a finding is told."""
+_COSTLY = 0.2
+"""Share of X's variance from which its source is named with its remedy."""
+_REMEDIES = {
+    "intrinsics": "calibrate the lens from more pictures",
+    "board": "measure the board and state its tolerance (square_tolerance, flatness_m)",
+    "kinematics": "have the arm calibrated",
+    "corners": "take better or more pictures",
+    "robot_translation": "take more poses",
+    "robot_rotation": "take more poses",
+}
+
+
+def cell_sentences(calibration: Calibration) -> list[str]:
+    """One sentence for each thing worth knowing, most telling first."""
+    quality = calibration.quality
+    sentences: list[str] = []
+    if quality.board is not None:
+        sentences += _board(quality.board, calibration.board.square_m * 1e3)
+    shares = sorted(quality.error_shares.items(), key=lambda item: -item[1])
+    if shares and shares[0][1] > _COSTLY and (name := shares[0][0]) in _REMEDIES:
+        label = name.replace("_", " ")
+        sentences.append(
+            f"{label.capitalize()} make up {shares[0][1]:.0%} of the variance: {_REMEDIES[name]}."
+        )
+    return sentences
+
+
+def _board(board: BoardFound, square_mm: float) -> Iterator[str]:
+    if abs(board.scale) > _SAID * board.sigma[0]:
+        size = square_mm * (1 + board.scale)
+        yield (
+            f"The board's squares are {size:.3f} ± {square_mm * board.sigma[0]:.3f} mm, "
+            f"{square_mm:g} mm are stated."
+        )
+    if abs(board.anisotropy) > _SAID * board.sigma[1]:
+        wider = "wider than tall" if board.anisotropy > 0 else "taller than wide"
+        yield f"The print is {abs(board.anisotropy):.2%} {wider}."
+    bends = [b for b, sigma in zip(board.bend_m, board.sigma[2:], strict=True) if abs(b) > _SAID * sigma]
+    if bends:
+        yield f"The board is bent by {max(map(abs, bends)) * 1e3:.2f} mm."
 
 
 def pose_difference(first: Calibration, second: Calibration) -> tuple[float, float, float]:

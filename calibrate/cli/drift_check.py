@@ -1,4 +1,4 @@
-"""`calibrate check`: does the installed calibration still hold on this recording."""
+"""`calibrate drift-check`: test the installed calibration on new views."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated
 
 import typer
 
-from calibrate.cli.install import Root, named_or_installed
+from calibrate.cli.installed import Root, named_or_installed
 from calibrate.cli.job import Threads
 from calibrate.cli.output import AsJson, OutputError, detection_progress, out, print_json
 from calibrate.errors import BadViewsError
@@ -18,28 +18,18 @@ from calibrate.options import JobOptions
 from calibrate.pipeline import prepare_views
 from calibrate.quality.checks import CheckEntry, append_check, earlier_text, read_checks, trend_text
 from calibrate.quality.drift import FEWEST_VIEWS, POWER, DriftCheck, check_drift
-from recordings.cli.terminal import examples
 from recordings.schema.messages import SessionInfo
 
 DRIFTED = 4
-OWN_VIEWS = (
-    "PROVES NOTHING: the calibration was made from {recording}, so it fits these views whatever the camera "
-    "did since. Take new ones: `station check`, or capture again."
-)
+OWN_VIEWS = "INVALID: {recording} is the calibration's source. Capture new views: `station drift-check`."
+MOST_DISAGREEMENT = 3.0
 _BY_CHANCE = 0.001
 """A smaller p is not worth a second look."""
 
 
-def register(app: typer.Typer) -> None:
-    app.command(
-        "check",
-        epilog=examples("calibrate check later.mcap", "calibrate check later.mcap --calibration cell.yaml"),
-    )(check)
-
-
-def check(
+def drift_check(
     recording: Annotated[
-        Path, typer.Argument(help="3 and more new views of a board: a recording or a session")
+        Path, typer.Argument(help="Recording or session with 3 or more new views of a board")
     ],
     calibration_file: Annotated[
         Path | None, typer.Option("--calibration", help="Instead of the installed one; nothing is noted")
@@ -48,13 +38,13 @@ def check(
     as_json: AsJson = False,
     threads: Threads = None,
 ) -> None:
-    """Does the installed calibration still hold? Tests it on new views, wherever the board lies by now.
+    """Test the installed calibration on new views.
 
-    Says how surely it would have noticed 0.5 mm or 0.1°, and how many more views would do. Every check of the
-    installed calibration is noted; a trend over five and more is warned of. `station check` takes the views.
+    The board may lie elsewhere by now. The result states the power to detect 0.5 mm or 0.1°, and how many
+    more views are needed. Every drift check of the installed calibration is logged, and a trend over five or
+    more is reported. `station drift-check` captures the views.
 
-    Exit codes: 0 it holds, 4 it does not, 1 the views or files cannot be used (they are those the calibration
-    was made from, say), 2 wrong options or kind.
+    Exit codes: 0 PASS, 4 FAIL, 1 views or files unusable (the calibration's source, say), 2 wrong options.
     """
     calibration = named_or_installed(calibration_file, root)
     options = JobOptions(camera=calibration.intrinsics.model, threads=threads)
@@ -98,66 +88,64 @@ def _is_origin(sha256: str, info: SessionInfo, provenance: Provenance) -> bool:
 
 
 def _require_same_cell(recording: Path, info: SessionInfo, calibration: Calibration) -> None:
-    if info.mount != calibration.mount:
-        raise OutputError(f"{recording} is {info.mount}, the calibration {calibration.mount}.")
-    if (info.source == "simulated") != (calibration.source == "simulated"):
-        raise OutputError(f"{recording} is {info.source}, the calibration {calibration.source}.")
-    for name, seen, known in (
-        ("robot", info.robot.serial, calibration.robot.serial),
-        ("camera", info.camera_identity.serial, calibration.camera.serial),
+    simulated = calibration.source == "simulated"
+    for name, new, known, same in (
+        ("mounting", info.mount, calibration.mount, info.mount == calibration.mount),
+        ("source", info.source, calibration.source, (info.source == "simulated") == simulated),
+        ("robot", *_serials(info.robot.serial, calibration.robot.serial)),
+        ("camera", *_serials(info.camera_identity.serial, calibration.camera.serial)),
     ):
-        if seen and known and seen != known:
+        if not same:
             raise OutputError(
-                f"{recording} was taken with {name} {seen}, the calibration is of {name} {known}: that is no "
-                "drift. Calibrate the new one."
+                f"{recording} has {name} {new}, the calibration {known}: that is no drift.",
+                code="other-cell",
+                remedy="Calibrate the new one.",
+                differs=name,
             )
 
 
+def _serials(new: str, known: str) -> tuple[str, str, bool]:
+    return new, known, not new or not known or new == known
+
+
 def check_text(result: DriftCheck, calibration: Calibration) -> str:
-    """What a person should know: holds or not, by how much, and what this test could have seen."""
+    """Verdict, shift, power of the test, and what to do."""
     frame = f"{calibration.result.parent_frame}_from_{calibration.result.child_frame}"
-    if result.passed:
-        sure = "HOLDS" if result.power >= POWER else "HOLDS, as far as these views can tell"
-        text = f"{sure}: {frame} fits {result.views} new views (p = {result.p_value:.2f})."
-    else:
+    if not result.passed:
         text = (
-            f"DOES NOT HOLD: the camera seems to have moved by {result.shift_mm:.2f} mm and "
-            f"{result.shift_deg:.3f}° (p = {result.p_value:.1e}). {_next_step(result)}"
+            f"FAIL: camera shift {result.shift_mm:.2f} mm, {result.shift_deg:.3f}° "
+            f"(p = {result.p_value:.1e}). {_next_step(result)}"
         )
+    else:
+        verdict = "PASS" if result.power >= POWER else "PASS, low sensitivity"
+        text = f"{verdict}: {frame} on {result.views} new views (p = {result.p_value:.2f})."
     text += (
-        f" This check notices a shift of 0.5 mm in {result.power_translation:.0%} and a turn of 0.1° in "
-        f"{result.power_rotation:.0%} of cases, whatever the direction; false alarms: 5 %."
+        f" Detection power: 0.5 mm {result.power_translation:.0%}, 0.1° {result.power_rotation:.0%}; "
+        "false alarms 5 %."
     )
     if result.passed and result.power < POWER:
         text += f" {_more_text(result, calibration)}"
-    if result.disagreement > 3:
-        text += (
-            f" The views disagree {result.disagreement:.1f} times more than when the cell was calibrated: "
-            "board or robot are not what they were, or a view is bad."
-        )
+    if result.disagreement > MOST_DISAGREEMENT:
+        text += f" Noise {result.disagreement:.1f}× higher than at calibration. Check board and robot."
     return text
 
 
 def _next_step(result: DriftCheck) -> str:
     if result.p_value < _BY_CHANCE:
-        return "Check its mount, and calibrate again."
-    return (
-        f"Of cameras that did not move, one check in {1 / result.p_value:.0f} looks like this: check once "
-        "more, and if it does not hold again, check the mount and calibrate again."
-    )
+        return "Check the camera's bracket, and calibrate again."
+    return f"Weak evidence (p = {result.p_value:.3f}). Repeat the check."
 
 
 def _more_text(result: DriftCheck, calibration: Calibration) -> str:
     if result.views_needed is not None:
         return (
-            f"Take {result.views_needed - result.views} more for {POWER:.0%}: "
-            f"station check --poses {result.views_needed}."
+            f"Capture {result.views_needed - result.views} more for {POWER:.0%}: "
+            f"station drift-check --poses {result.views_needed}."
         )
     sigma = calibration.sigma
     return (
-        f"More views would hardly help: the installed calibration itself is known to "
-        f"{sigma.translation_mm:.2f} mm and {sigma.rotation_deg:.3f}° only (1σ). To notice so little, "
-        "calibrate again with more poses."
+        f"The installed calibration limits the power (1σ {sigma.translation_mm:.2f} mm, "
+        f"{sigma.rotation_deg:.3f}°). Calibrate again with more poses."
     )
 
 

@@ -13,24 +13,20 @@ from rich.table import Column, Table
 
 from calibrate.cli.files import read_cell_serials
 from calibrate.cli.output import AsJson, OutputError, check_export, err, out, print_json
+from calibrate.files import exports
+from calibrate.files import install as installing
 from calibrate.files.calibration import Calibration, Lens, read_calibration, write_output
-from calibrate.files.exports import FORMATS, export
-from calibrate.files.exports.frames import FrameNames
+from calibrate.files.exports import FORMATS, FrameNames
+from calibrate.files.formatting import override_text, pose_difference, pose_text, summary, verdict_text
 from calibrate.files.generations import Generation, generations, read_log, state_root
-from calibrate.files.install import install, load_installed, rollback
-from calibrate.files.summary import override_text, pose_difference, pose_text, summary, verdict
-from recordings.cli.terminal import examples
 
 Root = Annotated[
     Path | None,
     typer.Option("--root", help="State folder (default: $STATE_DIRECTORY or the XDG state folder)"),
 ]
-_FORMATS_HELP = "; ".join(f"{name}: {kind.says}" for name, kind in FORMATS.items())
+_FORMATS_HELP = "; ".join(f"{name}: {kind.description}" for name, kind in FORMATS.items())
 FormatName = StrEnum("FormatName", {name.replace("-", "_"): name for name in FORMATS})  # type: ignore[misc]
 Named = Annotated[Path | None, typer.Argument(help="A calibration file; default: the installed one")]
-
-
-_OTHER_PIXELS = "the lenses are of pictures of different sizes"
 
 
 class CellKind(StrEnum):
@@ -39,41 +35,12 @@ class CellKind(StrEnum):
     simulated = "simulated"
 
 
-def register(app: typer.Typer) -> None:
-    app.command("show", epilog=examples("calibrate show  # the installed one", "calibrate show cell.yaml"))(
-        show
-    )
-    app.command(
-        "diff",
-        epilog=examples("calibrate diff cell.yaml  # and the installed one", "calibrate diff a.yaml b.yaml"),
-    )(diff)
-    app.command(
-        "export",
-        epilog=examples(
-            "calibrate export --to ros-launch -o camera.launch.py  # of the installed one",
-            "calibrate export cell.yaml --to ros-camera-info -o camera_info.yaml",
-        ),
-    )(export_file)
-    app.command(
-        "install",
-        epilog=examples(
-            "calibrate install cell.yaml --cell-config station.yaml",
-            "calibrate install mine.yaml --cell imported --root my-cell  # of your own pictures",
-        ),
-    )(install_file)
-    app.command("list", epilog=examples("calibrate list", "calibrate list --root my-cell"))(list_installed)
-    app.command(
-        "rollback",
-        epilog=examples("calibrate rollback --reason 'camera was knocked'", "calibrate rollback 3"),
-    )(roll_back)
-
-
 def named_or_installed(file: Path | None, root: Path | None) -> Calibration:
-    return load_installed(root, allow_simulated=True) if file is None else read_calibration(file)
+    return installing.load_installed(root, allow_simulated=True) if file is None else read_calibration(file)
 
 
 def show(file: Named = None, root: Root = None, as_json: AsJson = False) -> None:
-    """Show a calibration: the verdict, the result, the gates."""
+    """Show a calibration: verdict, result, gates."""
     calibration = named_or_installed(file, root)
     if as_json:
         print_json(msgspec.to_builtins(calibration))
@@ -87,10 +54,12 @@ def diff(
     root: Root = None,
     as_json: AsJson = False,
 ) -> None:
-    """How far two calibrations are apart, and whether that is more than their uncertainty."""
+    """Compare two calibrations with their uncertainty."""
     a, b = read_calibration(first), named_or_installed(second, root)
     if a.mount != b.mount:
-        raise OutputError(f"{first} is {a.mount}, the other is {b.mount}: there is nothing to compare.")
+        raise OutputError(
+            f"{first} is {a.mount}, the other is {b.mount}: there is nothing to compare.", code="other-mount"
+        )
     millimetres, degrees, sigmas = pose_difference(a, b)
     lens_px = _lens_difference_px(a.intrinsics, b.intrinsics)
     if as_json:
@@ -108,7 +77,7 @@ def diff(
     rows: list[tuple[str, Any]] = [
         ("result", pose_text),
         ("1σ", lambda c: f"{c.sigma.translation_mm:.3f} mm  {c.sigma.rotation_deg:.4f}°"),
-        ("verdict", lambda c: verdict(c)[1]),
+        ("verdict", verdict_text),
         ("source", lambda c: c.source),
         ("solved", lambda c: c.created),
         ("robot", lambda c: f"{c.robot.model} {c.robot.serial}"),
@@ -118,12 +87,10 @@ def diff(
     for name, say in rows:
         table.add_row(name, say(a), say(b))
     out.print(table)
-    # Six numbers: 3.55 sigmas are exceeded by chance in 5 % of honest pairs (chi-square, 6 degrees).
-    judged = "more than" if sigmas > 3.55 else "within"
-    out.print(
-        f"apart: {millimetres:.3f} mm, {degrees:.4f}°, {sigmas:.1f} sigmas ({judged} their uncertainty); "
-        + (_OTHER_PIXELS if lens_px is None else f"camera matrix differs by up to {lens_px:.2f} px")
-    )
+    # Six numbers: 3.55σ are exceeded by chance in 5 % of honest pairs (chi-square, 6 degrees).
+    judged = f"{'more than' if sigmas > 3.55 else 'within'} their uncertainty"
+    lens = "images of different sizes" if lens_px is None else f"camera matrix up to {lens_px:.2f} px"
+    out.print(f"Difference: {millimetres:.3f} mm, {degrees:.4f}°, {sigmas:.1f}σ ({judged}); {lens}")
 
 
 def _lens_difference_px(a: Lens, b: Lens) -> float | None:
@@ -133,19 +100,19 @@ def _lens_difference_px(a: Lens, b: Lens) -> float | None:
     return float(np.abs(np.array(a.matrix) - np.array(b.matrix)).max())
 
 
-def export_file(
+def export(
     to: Annotated[FormatName, typer.Option("--to", help=_FORMATS_HELP)],
     file: Named = None,
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Default: stdout")] = None,
-    base: Annotated[str, typer.Option(help="What the robot's base is called there")] = FrameNames.base,
-    flange: Annotated[str, typer.Option(help="… its flange")] = FrameNames.flange,
-    camera: Annotated[str, typer.Option(help="… the camera's optical frame")] = FrameNames.camera,
-    body: Annotated[str, typer.Option(help="… the camera's body frame")] = FrameNames.body,
+    base: Annotated[str, typer.Option(help="Name of the robot's base there")] = FrameNames.base,
+    flange: Annotated[str, typer.Option(help="Name of its flange")] = FrameNames.flange,
+    camera: Annotated[str, typer.Option(help="Name of the camera's optical frame")] = FrameNames.camera,
+    body: Annotated[str, typer.Option(help="Name of the camera's body frame")] = FrameNames.body,
     root: Root = None,
 ) -> None:
     """Write a calibration in another program's format."""
     calibration = named_or_installed(file, root)
-    text = export(calibration, str(to.value), FrameNames(base, flange, camera, body))
+    text = exports.export(calibration, str(to.value), FrameNames(base, flange, camera, body))
     if output is None:
         typer.echo(text, nl=False)
         return
@@ -153,34 +120,33 @@ def export_file(
     write_output(output, text.encode())
 
 
-def install_file(
+def install(
     file: Annotated[Path, typer.Argument(help="A calibration file")],
     root: Root = None,
     cell: Annotated[
         CellKind,
-        typer.Option(help="What kind of cell the root belongs to; all but real must name it: --root"),
+        typer.Option(help="Kind of cell the root belongs to; others than real need --root"),
     ] = CellKind.real,
     cell_config: Annotated[
-        Path | None, typer.Option(help="The station's configuration: its robot and camera are checked")
+        Path | None, typer.Option(help="The station's configuration: check its robot and camera")
     ] = None,
     override: Annotated[
-        str, typer.Option(help="Install although refused; this reason goes into the file")
+        str, typer.Option(help="Reason to install in spite of a refusal; kept in the file")
     ] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Make a calibration the installed one. What was installed stays: `calibrate rollback` goes back.
+    """Make a calibration the installed one.
 
-    Programs read one path that never changes: ROOT/calibrations/current. Refused are a failed gate, another
-    robot or camera than the cell's, and whatever does not come from this kind of cell.
+    What was installed stays: `calibrate rollback` goes back. Programs read one path that never changes:
+    ROOT/calibrations/current. Refused are a failed gate, another robot or camera than the cell's, and
+    whatever does not come from this kind of cell.
 
     Exit codes: 0 installed, 4 a gate failed, 1 refused for another reason; then nothing was changed.
     """
     if root is None and cell is not CellKind.real:
-        raise OutputError(
-            f"What is {cell} never lies where a real cell's is: name its place with --root FOLDER."
-        )
+        raise OutputError(f"{cell} needs its own folder.", code="root-missing", remedy="Name it with --root.")
     robot_serial, camera_serial = ("", "") if cell_config is None else read_cell_serials(cell_config)
-    made = install(
+    made = installing.install(
         file,
         root,
         cell=cell.value,
@@ -191,14 +157,17 @@ def install_file(
     _switched(made, root, as_json)
 
 
-def roll_back(
-    to: Annotated[int | None, typer.Argument(help="Generation; default: the one before")] = None,
+def rollback(
+    to: Annotated[int | None, typer.Argument(help="Version number; default: the one before")] = None,
     root: Root = None,
-    reason: Annotated[str, typer.Option(help="Goes into the log")] = "",
+    reason: Annotated[str, typer.Option(help="Reason, kept in the log")] = "",
     as_json: AsJson = False,
 ) -> None:
-    """Go back to an older installed calibration: the one before, or a generation of `calibrate list`."""
-    _switched(rollback(root, to, reason), root, as_json)
+    """Go back to an older installed calibration.
+
+    The one before, or a version of `calibrate list`.
+    """
+    _switched(installing.rollback(root, to, reason), root, as_json)
 
 
 def _switched(generation: Generation, root: Path | None, as_json: bool) -> None:
@@ -207,19 +176,22 @@ def _switched(generation: Generation, root: Path | None, as_json: bool) -> None:
         print_json({"generation": generation.number, "path": str(generation.path), "current": str(stable)})
         return
     log = read_log(root)
-    out.print(f"generation {generation.number} is installed: {stable}", soft_wrap=True)
+    out.print(f"Installed: version {generation.number}, {stable}", soft_wrap=True)
     if log and log[-1].change:
-        out.print(f"change: {log[-1].change}")
+        out.print(f"Change: {log[-1].change}")
 
 
 def list_installed(root: Root = None, as_json: AsJson = False) -> None:
-    """Every calibration that was installed here, oldest first; → marks the current one."""
+    """List every calibration that was installed here.
+
+    Oldest first; → marks the current one.
+    """
     known = generations(root)
     if as_json:
         print_json([_plain(generation) for generation in known])
         return
     if not known:
-        err.print(f"nothing is installed in {state_root(root)}. Run: calibrate install FILE")
+        err.print(f"Nothing is installed in {state_root(root)}. Run: calibrate install FILE")
         return
     for generation in known:
         mark = "→" if generation.current else " "
@@ -236,7 +208,7 @@ def _lines(generation: Generation) -> list[str]:
 
 
 def _verdict_text(calibration: Calibration) -> str:
-    text = verdict(calibration)[1]
+    text = verdict_text(calibration)
     return text if calibration.override is None else f"{text}; {override_text(calibration.override)}"
 
 

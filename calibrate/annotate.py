@@ -1,6 +1,6 @@
-"""A recording with a calibration drawn into it: camera, board, residuals of each view, rejected views in red.
+"""A calibration drawn into its recording: camera, board, residuals of each view, rejected views in red.
 
-To be looked at in Foxglove, Lichtblick or rerun. It holds all that the recording holds, so it can be solved
+For Foxglove, Lichtblick or rerun. It holds all that the recording holds, so it can be solved
 and exported like it.
 """
 
@@ -36,30 +36,33 @@ _FEWEST_VIEWS = 1
 class AnnotateError(CalibrationError):
     """The calibration and the recording do not belong together."""
 
+    code = "other-cell"
+
 
 @dataclass(frozen=True, eq=False)
 class ViewResidual:
-    """How far the detected corners of a view are from where robot, camera and board place put them."""
+    """Reprojection error of one view by robot pose, camera pose and board pose."""
 
     index: int
     rms_px: float | None
     """None where no board was seen."""
     rejected: str
-    """Why the solver did not use it; empty = used."""
+    """Reason; empty = used."""
 
 
 def annotate(
     recording: Recording, calibration: Calibration, output: Path, progress: Progress | None = None
 ) -> list[ViewResidual]:
-    """Writes `output` (.mcap), which must not exist. AnnotateError or RecordingError."""
+    """Write `output` (.mcap), which must not exist. AnnotateError or RecordingError."""
     camera, info = calibration.intrinsics.model, recording.info
     if (camera.width, camera.height) != (info.camera.width, info.camera.height):
         raise AnnotateError(
-            f"the calibration is for {camera.width}×{camera.height} pictures, the recording holds "
-            f"{info.camera.width}×{info.camera.height}. Name the calibration of this camera"
+            f"The calibration is for {camera.width}×{camera.height} images, the recording holds "
+            f"{info.camera.width}×{info.camera.height}.",
+            remedy="Name the calibration of this camera.",
         )
     if calibration.mount != info.mount:
-        raise AnnotateError(f"the calibration is {calibration.mount}, the recording {info.mount}")
+        raise AnnotateError(f"The calibration is {calibration.mount}, the recording {info.mount}.")
     seen = load_views(recording, calibration.board, camera, progress, fewest=_FEWEST_VIEWS).detections
     rejected = {view.index: view.reason for view in calibration.views.rejected}
     chain = _camera_from_board(calibration)

@@ -1,4 +1,4 @@
-"""Limits on the time and the memory of one solve: a hostile or broken recording ends in a sentence.
+"""Limits on time and memory of one solve: a hostile or broken recording ends in an error.
 
 Nothing is written before a solve is finished, so ending it at any moment leaves what was there before.
 """
@@ -27,10 +27,12 @@ _GRACE_S = 10.0
 class SolveLimitError(CalibrationError):
     """A solve took more time or memory than it may; nothing was written."""
 
+    code = "solve-limit"
+
 
 @dataclass(frozen=True)
 class Limits:
-    """Of one solve; 0 = no limit."""
+    """Limits of one solve; 0 = no limit."""
 
     time_s: float = TIME_LIMIT_S
     memory_mib: int = MEMORY_LIMIT_MIB
@@ -39,7 +41,7 @@ class Limits:
 def bounded(
     time_limit_s: float = TIME_LIMIT_S, memory_limit_mib: int = MEMORY_LIMIT_MIB
 ) -> AbstractContextManager[None]:
-    """Within the block SolveLimitError is raised once it has taken so long, or so much memory; 0 = no limit.
+    """Raise SolveLimitError once the block has taken so long, or so much memory; 0 = no limit.
 
     Memory is that of this whole process (its data, not the files it maps). Outside the main thread, where no
     signal can be had and others share the memory, nothing is limited.
@@ -54,9 +56,11 @@ class _Bounded(AbstractContextManager[None]):
 
     def __init__(self, limits: Limits) -> None:
         self._limits = limits
-        self._text = (
-            f"The solve took longer than {limits.time_s:g} s; nothing was written. Other work on this "
-            "computer, or a recording far larger than usual? More is allowed with --time-limit-s."
+        self._late_error = SolveLimitError(
+            f"The solve took longer than {limits.time_s:g} s; nothing was written.",
+            code="time-limit",
+            remedy="Reduce other load, or allow more with --time-limit-s.",
+            limit_s=limits.time_s,
         )
 
     def __enter__(self) -> None:
@@ -83,9 +87,10 @@ class _Bounded(AbstractContextManager[None]):
         resource.setrlimit(resource.RLIMIT_DATA, self._memory_before)
         if problem is not None and _is_out_of_memory(problem):
             raise SolveLimitError(
-                f"The solve needs more than {self._limits.memory_mib} MiB of memory; nothing was written. "
-                "Does the recording hold far more or far larger pictures than you think (recordings info)? "
-                "More is allowed with --memory-limit-mib."
+                f"The solve needs more than {self._limits.memory_mib} MiB of memory; nothing was written.",
+                code="memory-limit",
+                remedy="Check the recording's size (recordings info), or allow more with --memory-limit-mib.",
+                limit_mib=self._limits.memory_mib,
             ) from None
 
     def _late(self, signal_number: int, frame: FrameType | None) -> None:
@@ -94,10 +99,10 @@ class _Bounded(AbstractContextManager[None]):
             if frame.f_code in (_Bounded.__enter__.__code__, _Bounded.__exit__.__code__):
                 return
             frame = frame.f_back
-        raise SolveLimitError(self._text)
+        raise self._late_error
 
     def _too_late(self) -> None:
-        print(f"calibrate: {self._text}", file=sys.stderr, flush=True)
+        print(f"calibrate: {self._late_error}", file=sys.stderr, flush=True)
         os._exit(SolveLimitError.exit_code)
 
 

@@ -1,4 +1,4 @@
-"""The one family of errors this room raises for anything a person or a file can cause."""
+"""Errors of `calibrate` that a person or a file can cause."""
 
 from __future__ import annotations
 
@@ -16,39 +16,45 @@ class CalibrationError(CodedError):
 class TooFewViewsError(CalibrationError):
     """Fewer usable views than the method needs."""
 
+    code = "too-few-views"
+
 
 class SquaresCountedError(TooFewViewsError):
-    """A chessboard was declared in squares where inner corners are counted."""
+    """A chessboard was declared in squares, not in inner corners; values: `columns`, `rows` seen."""
 
-    hypothesis = "squares-counted"
-
-    def __init__(self, text: str, columns: int, rows: int) -> None:
-        super().__init__(text)
-        self.columns, self.rows = columns, rows
-        """Inner corners that the pictures show."""
+    code = hypothesis = "squares-counted"
 
 
-class MirroredPicturesError(TooFewViewsError):
-    """The board's markers can be read only in the mirror image of the pictures."""
+class MirroredImagesError(TooFewViewsError):
+    """The board's markers can be read only in the mirror image."""
 
-    hypothesis = "mirrored"
+    code = hypothesis = "mirrored"
 
 
 class DegenerateMotionError(CalibrationError):
     """The rotations do not determine X; the message names the missing direction."""
 
+    code = "degenerate-motion"
+
 
 class BadViewsError(CalibrationError):
-    """Input that cannot be solved: NaN, mixed picture sizes, singular intrinsics …"""
+    """Input that cannot be solved: NaN, mixed image sizes, singular intrinsics …"""
+
+    code = "bad-views"
 
 
 class PosesDisagreeError(BadViewsError):
-    """Robot poses and pictures contradict each other; `hypothesis` is the code of the reading that fits."""
+    """Robot poses and images contradict each other; `hypothesis` is the code of the reading that fits."""
 
-    def __init__(self, text: str, hypothesis: str = "") -> None:
-        super().__init__(text)
+    code = "poses-disagree"
+
+    def __init__(self, text: str, hypothesis: str = "", **data: str) -> None:
+        super().__init__(text, **data)
         self.hypothesis = hypothesis
 
 
 class GateFailedError(CalibrationError):
+    """A quality gate failed."""
+
+    code = "gate-failed"
     exit_code = 4

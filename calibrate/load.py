@@ -1,4 +1,4 @@
-"""A recording becomes views: pictures decoded, boards found, in bounded memory and in a fixed order."""
+"""From a recording to views: images decoded, boards detected, in bounded memory and in a fixed order."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ import numpy as np
 
 from calibrate.boards.detect import Detection, detect
 from calibrate.boards.model import board_points
-from calibrate.errors import BadViewsError, MirroredPicturesError, SquaresCountedError, TooFewViewsError
+from calibrate.errors import BadViewsError, MirroredImagesError, SquaresCountedError, TooFewViewsError
 from calibrate.geometry import is_rigid
 from calibrate.handeye.solution import RejectedView
 from calibrate.views import BoardView, ViewSet
@@ -49,7 +49,7 @@ def load_views(
     threads: int | None = None,
     fewest: int = FEWEST_VIEWS,
 ) -> LoadedViews:
-    """Finds the board in every picture of the recording.
+    """Find the board in every image of the recording.
 
     `board` and `camera` replace the recorded ones (another size, known intrinsics). The result does not
     depend on the number of `threads`, as long as OpenCV itself uses one thread in each. Raises
@@ -78,11 +78,13 @@ def load_views(
             raise _squares_counted(recording, spec, counted, pictures)
         mirrored = sum(detection.cause == "mirrored" for detection in seen.values())
         if mirrored >= max(1, len(missing) / 2):
-            raise MirroredPicturesError(
-                f"{recording.path}: the board is seen only in the mirror image, in {mirrored} of {pictures} "
-                "pictures. Switch the camera's mirroring (flip, reverse x) off and record again."
+            raise MirroredImagesError(
+                f"{recording.path}: {mirrored} of {pictures} images show the board mirrored.",
+                remedy="Switch the camera's mirroring (flip, reverse x) off and record again.",
+                mirrored=mirrored,
+                images=pictures,
             )
-        raise TooFewViewsError(_too_few_text(recording, len(views), pictures, missing, fewest))
+        raise _too_few(recording, len(views), pictures, missing, fewest)
     model = CameraModel(
         model.width or next(iter(seen.values())).width,
         model.height or next(iter(seen.values())).height,
@@ -95,7 +97,7 @@ def load_views(
 
 
 def without_views(loaded: LoadedViews, numbers: tuple[int, ...], fewest: int = FEWEST_VIEWS) -> LoadedViews:
-    """Without the poses of these numbers (from 1), which a person chose; they are listed as left out.
+    """Exclude the poses of these numbers (from 1), which a person chose; they are listed as rejected.
 
     A pose whose picture shows no board is left out already. Raises BadViewsError for a number that no pose
     has, TooFewViewsError when fewer than `fewest` stay.
@@ -104,15 +106,17 @@ def without_views(loaded: LoadedViews, numbers: tuple[int, ...], fewest: int = F
     views = loaded.views
     if unknown := chosen - {view.index for view in (*views, *loaded.without_board)}:
         told = ", ".join(str(index + 1) for index in sorted(unknown))
-        raise BadViewsError(f"--without {told}: there is no view of that number.")
+        raise BadViewsError(f"--without {told}: there is no view of that number.", code="no-such-view")
     left = tuple(
-        RejectedView(view.index, view.name, "left out by hand (--without)", "by-hand")
+        RejectedView(view.index, view.name, "excluded (--without)", "by-hand")
         for view in views
         if view.index in chosen
     )
     if len(views) - len(left) < fewest:
         raise TooFewViewsError(
-            f"--without leaves {len(views) - len(left)} of {len(views)} views; at least {fewest} are needed."
+            f"--without leaves {len(views) - len(left)} of {len(views)} views; at least {fewest} are needed.",
+            views=len(views) - len(left),
+            needed=fewest,
         )
     kept = views.select([place for place, view in enumerate(views) if view.index not in chosen])
     return replace(loaded, views=kept, without_board=(*loaded.without_board, *left))
@@ -158,7 +162,7 @@ def _finished(
     except BadImageError as problem:
         return view, problem
     except ValueError as problem:
-        raise BadViewsError(f"view {view.index + 1} ({view.name}): {problem}") from None
+        raise BadViewsError(f"View {view.index + 1} ({view.name}): {problem}.", pose=view.index + 1) from None
 
 
 def _decode_and_detect(recording: Recording, view: View, spec: BoardSpec, camera: CameraModel) -> Detection:
@@ -174,10 +178,14 @@ def _available_cores() -> int:
 def _check_size(view: View, width: int, height: int, camera: CameraModel) -> None:
     if camera.width and (width, height) != (camera.width, camera.height):
         raise BadViewsError(
-            f"view {view.index + 1} ({view.name}): the picture is {width}×{height}, the camera or its lens "
-            f"is given for {camera.width}×{camera.height}. All pictures, and the lens, must be of one camera "
-            "in one setting: check the region of interest, the width and height in dataset.yaml, or whether "
-            "this lens (--camera, the calibration that is checked) belongs to these pictures."
+            f"View {view.index + 1} ({view.name}): the image is {width}×{height}, camera or intrinsics are "
+            f"given for {camera.width}×{camera.height}.",
+            code="image-size",
+            remedy="Check the region of interest, the size in dataset.yaml, or whether these intrinsics "
+            "(--camera, --calibration) belong to these images.",
+            pose=view.index + 1,
+            width_px=width,
+            height_px=height,
         )
 
 
@@ -185,8 +193,10 @@ def _image_view(view: View, detection: Detection, spec: BoardSpec) -> BoardView:
     base_from_flange = np.array(view.base_from_flange, dtype=float)
     if base_from_flange.shape != (4, 4) or not is_rigid(base_from_flange, 1e-5):
         raise BadViewsError(
-            f"view {view.index + 1} ({view.name}): base_from_flange is not a rigid transform. Record it "
-            "again, or leave the view out of the folder and import again."
+            f"View {view.index + 1} ({view.name}): base_from_flange is not a rigid transform.",
+            code="not-rigid",
+            remedy="Record it again, or leave the view out of the folder and import again.",
+            pose=view.index + 1,
         )
     return BoardView(
         index=view.index,
@@ -201,25 +211,23 @@ def _image_view(view: View, detection: Detection, spec: BoardSpec) -> BoardView:
 def _squares_counted(recording: Recording, spec: BoardSpec, counted: int, total: int) -> SquaresCountedError:
     columns, rows = spec.columns - 1, spec.rows - 1
     return SquaresCountedError(
-        f"{recording.path}: {counted} of {total} pictures show {columns}×{rows} inner corners where "
-        f"{spec.columns}×{spec.rows} are declared: squares were counted. Declare columns: {columns}, "
-        f"rows: {rows} (solve again with --board).",
-        columns,
-        rows,
+        f"{recording.path}: {counted} of {total} images show {columns}×{rows} inner corners where "
+        f"{spec.columns}×{spec.rows} are declared: squares were counted.",
+        remedy=f"Declare columns: {columns}, rows: {rows} (solve again with --board).",
+        columns=columns,
+        rows=rows,
     )
 
 
-def _too_few_text(
+def _too_few(
     recording: Recording, found: int, total: int, missing: list[RejectedView], fewest: int
-) -> str:
+) -> TooFewViewsError:
     if total == 0:
-        return f"{recording.path} holds no picture with a robot pose: there is nothing to solve."
-    text = (
-        f"{recording.path}: the board is seen in {found} of {total} pictures; at least {fewest} views "
-        "are needed."
-    )
+        return TooFewViewsError(f"{recording.path} holds no image with a robot pose.", views=0, needed=fewest)
+    text = f"{recording.path}: the board is seen in {found} of {total} images; {fewest} views are needed."
     if missing:
         text += f" First reason, view {missing[0].index + 1} ({missing[0].name}): {missing[0].reason}."
-    if total >= fewest:
-        text += " Check the board's kind, columns and rows; solve again with --board to try another."
-    return text
+    remedy = "Check the board's kind, columns and rows; solve again with --board to try another."
+    return TooFewViewsError(
+        text, remedy=remedy if total >= fewest else "", views=found, images=total, needed=fewest
+    )

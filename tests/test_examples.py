@@ -14,7 +14,7 @@ from calibrate.cli.app import app as calibrate_app
 from station.cli.app import STATION
 
 PROGRAMS = {
-    "calibrate": typer.main.get_command(calibrate_app),
+    "calibrate": calibrate_app,
     "recordings": typer.main.get_command(recordings.cli.app.app),
     "station": STATION,
 }

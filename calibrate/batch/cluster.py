@@ -23,6 +23,8 @@ _CONNECT_S = 30
 class ClusterError(BatchError):
     """The cluster cannot be used as asked."""
 
+    code = "cluster-options"
+
     exit_code = 2
 
 
@@ -41,18 +43,20 @@ class Cluster:
         scheme, _, place = self.address.partition("://")
         if scheme not in ("tcp", "tls") or ":" not in place:
             raise ClusterError(
-                f"--scheduler {self.address!r}: write tcp://HOST:PORT or tls://HOST:PORT, as "
-                "`dask scheduler` prints it."
+                f"--scheduler {self.address!r} is no address.",
+                code="cluster-address",
+                remedy="Write tcp://HOST:PORT or tls://HOST:PORT, as `dask scheduler` prints it.",
             )
         given = [path for path in (self.tls_ca, self.tls_cert, self.tls_key) if path is not None]
         if (scheme == "tls") != (len(given) == 3) or (scheme == "tcp" and given):
             raise ClusterError(
                 f"--scheduler {self.address}: a tls:// address needs --tls-ca, --tls-cert and --tls-key; a "
-                "tcp:// address takes none of them."
+                "tcp:// address takes none of them.",
+                code="cluster-tls",
             )
         for path in given:
             if not path.is_file():
-                raise ClusterError(f"{path} does not exist or is no file.")
+                raise ClusterError(f"{path} does not exist or is no file.", code="cluster-file")
 
 
 def cluster_solver(cluster: Cluster) -> Solver:
@@ -62,8 +66,9 @@ def cluster_solver(cluster: Cluster) -> Solver:
         dask: Any = importlib.import_module("distributed")
     except ImportError:
         raise ClusterError(
-            "--scheduler needs the package `distributed`: pip install 'calibration-station[cluster]', the "
-            "same version as on the workers."
+            "--scheduler needs the package `distributed`.",
+            code="package-missing",
+            remedy="pip install 'calibration-station[cluster]', the same version as on the workers.",
         ) from None
     return lambda todo, options: _solve(dask, cluster, todo, options) if todo else iter(())
 
@@ -79,8 +84,9 @@ def _solve(dask: Any, cluster: Cluster, todo: Sequence[Task], options: JobOption
             recording, key = futures.pop(future)
             if future.cancelled() or client.status not in ("running", "connecting"):
                 raise BatchError(
-                    f"The connection to {cluster.address} is lost. Finished results are kept: run the same "
-                    "command again to go on."
+                    f"The connection to {cluster.address} is lost; finished results are kept.",
+                    code="cluster-lost",
+                    remedy="Run the same command again to go on.",
                 )
             problem = future.exception()
             if problem is None:
@@ -107,15 +113,18 @@ def _connect(dask: Any, cluster: Cluster) -> Any:
     except (OSError, ValueError) as problem:
         reason = problem.__cause__ or problem
         raise BatchError(
-            f"{cluster.address}: no scheduler answers ({reason}). Is `dask scheduler` running there, and "
-            "does it use TLS exactly if the address begins with tls?"
+            f"{cluster.address}: no scheduler answers ({reason}).",
+            code="cluster-silent",
+            remedy="Start `dask scheduler` there, with TLS exactly if the address begins with tls.",
         ) from None
     try:
         client.wait_for_workers(1, timeout=_CONNECT_S)
     except TimeoutError:
         client.close()
         raise BatchError(
-            f"{cluster.address}: the scheduler has no workers. Start some: dask worker {cluster.address}"
+            f"{cluster.address}: the scheduler has no workers.",
+            code="cluster-workers",
+            remedy=f"Start some: dask worker {cluster.address}",
         ) from None
     return client
 
@@ -127,13 +136,15 @@ def _require_same_software(client: Any, address: str) -> None:
         there: dict[str, dict[str, str]] = client.run(software_versions)
     except Exception as problem:  # whatever a worker without this package raises
         raise BatchError(
-            f"{address}: a worker cannot run this package ({problem}). Install calibration-station[cluster] "
-            "on every worker, the same version as here."
+            f"{address}: a worker cannot run this package ({problem}).",
+            code="cluster-software",
+            remedy="Install calibration-station[cluster] on every worker, the same version as here.",
         ) from None
     for worker, versions in there.items():
         for name, version in versions.items():
             if version != here.get(name):
                 raise BatchError(
-                    f"{address}: worker {worker} has {name} {version}, here it is {here.get(name)}: results "
-                    "would differ. Install the same versions."
+                    f"{address}: worker {worker} has {name} {version}, here it is {here.get(name)}.",
+                    code="cluster-software",
+                    remedy="Install the same versions: results would differ.",
                 )

@@ -44,7 +44,7 @@ def _findings(cells: Sequence[Cell]) -> Iterator[str]:
         return
     found = []
     for cell in moved:
-        found += [f"{cell.name}: {finding}." for finding in cell.findings[:_FINDINGS_LISTED]]
+        found += [f"{cell.name}: {finding.text}." for finding in cell.findings[:_FINDINGS_LISTED]]
         if (more := len(cell.findings) - _FINDINGS_LISTED) > 0:
             found.append(f"{cell.name}: and {more} more, in its table below.")
     items = "<br>".join(html.escape(text) for text in found)

@@ -36,6 +36,8 @@ _ATTEMPTS = 2
 class BatchError(CalibrationError):
     """The batch cannot start or go on; finished results are kept."""
 
+    code = "batch"
+
 
 class BatchResult(msgspec.Struct, frozen=True, omit_defaults=True):
     recording: str
@@ -114,7 +116,7 @@ def run_batch(
         results = [done[key] for _, key in keys]
         write_output(output / "results.csv", _csv(results))
     except OSError as problem:
-        raise BatchError(f"{output}: {problem.strerror or problem}.") from None
+        raise BatchError(f"{output}: {problem.strerror or problem}.", code="batch-folder") from None
     return results
 
 
@@ -199,7 +201,7 @@ def _pool_solver(workers: int | None, limits: Limits) -> Solver:
                 attempts[key] += 1
                 if attempts[key] >= _ATTEMPTS:
                     finished.add(key)
-                    error = f"its worker process was killed, {_ATTEMPTS} times"
+                    error = f"worker process killed {_ATTEMPTS} times"
                     yield Solved(BatchResult(recording, key, False, error=error))
             waiting = [task for task in waiting if task[1] not in finished]
 

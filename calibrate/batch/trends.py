@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from itertools import pairwise, zip_longest
 
@@ -29,13 +29,15 @@ class Move:
     """Mahalanobis length of the difference, the two sessions taken as independent."""
     real: bool
     """Beyond what chance explains (see `_FALSE_ALARM`)."""
+    creep: bool = False
+    """No single step stands out between the two sessions."""
 
     @property
-    def sentence(self) -> str:
+    def text(self) -> str:
         where = "on the flange" if self.later.mount == "eye-in-hand" else "in the base frame"
         return (
-            f"the camera moved {self.distance_mm:.2f} mm and {self.angle_deg:.3f}° {where} between "
-            f"{label(self.earlier)} and {label(self.later)} ({self.sigmas:.0f} sigmas)"
+            f"Camera {'crept' if self.creep else 'moved'} {self.distance_mm:.2f} mm, {self.angle_deg:.3f}° "
+            f"{where} between {label(self.earlier)} and {label(self.later)} ({self.sigmas:.0f}σ)"
         )
 
 
@@ -59,13 +61,13 @@ class Cell:
     """False: the robot is not named, these may be sessions of many cells."""
 
     @property
-    def findings(self) -> list[str]:
-        """Jumps by name; a creep that no single step shows is found between the first and the last."""
-        jumps = [move.sentence for move in self.moves if move.real]
+    def findings(self) -> list[Move]:
+        """Real moves; a creep that no single step shows is found between the first and the last."""
+        jumps = [move for move in self.moves if move.real]
         if jumps or len(self.sessions) < 3 or not self.followed:
             return jumps
-        whole = _move(self.sessions[0], self.sessions[-1])
-        return [f"slowly, no step stands out: {whole.sentence}"] if whole.real else []
+        whole = replace(_move(self.sessions[0], self.sessions[-1]), creep=True)
+        return [whole] if whole.real else []
 
 
 def cells(results: Iterable[BatchResult]) -> tuple[Cell, ...]:
@@ -109,7 +111,7 @@ def quiet_text(found: Sequence[Cell]) -> str:
 
 def trends_text(found: Sequence[Cell]) -> str:
     """Plain text: findings first, then one table per cell."""
-    lines = [f"{cell.name}: {finding}" for cell in found for finding in cell.findings]
+    lines = [f"{cell.name}: {finding.text}" for cell in found for finding in cell.findings]
     lines = lines or [quiet_text(found)]
     for cell in found:
         lines += [

@@ -55,7 +55,7 @@ def batch(
     from calibrate.batch.page import fleet_page  # matplotlib is slow to load
 
     if output.exists() and not output.is_dir():
-        raise OutputError(f"{output} is a file; the results need a folder.")
+        raise OutputError(f"{output} is a file; the results need a folder.", code="target-exists")
     gate_limits = GateLimits() if gates is None else read_limits(gates)
     options = JobOptions(profile=profile.value, seed=seed, limits=gate_limits)
     solver = _solver(scheduler, workers, tls_ca, tls_cert, tls_key)
@@ -90,7 +90,7 @@ def _tell(results: list[BatchResult], found: tuple[Cell, ...], output: Path) -> 
     )
     for cell in found:
         for finding in cell.findings:
-            out.print(f"{cell.name}: {finding}", soft_wrap=True)
+            out.print(f"{cell.name}: {finding.text}", soft_wrap=True)
     for result in failed:
         named = result.error.startswith(result.recording)
         err.print(result.error if named else f"{result.recording}: {result.error}", soft_wrap=True)
@@ -102,10 +102,12 @@ def _solver(
     """None: the process pool."""
     if scheduler is not None:
         if workers is not None:
-            raise OutputError("--workers counts processes here; a cluster has as many as were started there.")
+            raise OutputError("--workers counts processes here, not on a cluster.", code="options")
         return cluster_solver(Cluster(scheduler, ca, cert, key))
     if ca or cert or key:
-        raise OutputError("--tls-ca, --tls-cert and --tls-key belong to --scheduler tls://HOST:PORT.")
+        raise OutputError(
+            "--tls-ca, --tls-cert and --tls-key need --scheduler tls://HOST:PORT.", code="options"
+        )
     return None
 
 

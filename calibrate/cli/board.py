@@ -38,7 +38,7 @@ def board(
     With a bar to measure on the paper, and the lines for the station's configuration.
     """
     if output.suffix.lower() not in (".pdf", ".svg"):
-        raise OutputError(f"{output}: the name must end in .pdf or .svg.")
+        raise OutputError(f"{output}: the name must end in .pdf or .svg.", code="board-format")
     check_folder(output)
     marker_m = None if marker_mm is None else marker_mm / 1000
     if marker_m is None and kind in (BoardKind.CHARUCO, BoardKind.APRIL_GRID):

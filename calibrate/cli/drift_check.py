@@ -16,7 +16,7 @@ from calibrate.files.calibration import Calibration, Provenance
 from calibrate.files.generations import generations
 from calibrate.options import JobOptions
 from calibrate.pipeline import prepare_views
-from calibrate.quality.checks import CheckEntry, append_check, earlier_text, read_checks, trend_text
+from calibrate.quality.checks import CheckEntry, Trend, append_check, earlier_results, find_trend, read_checks
 from calibrate.quality.drift import FEWEST_VIEWS, POWER, DriftCheck, check_drift
 from recordings.schema.messages import SessionInfo
 
@@ -54,7 +54,7 @@ def drift_check(
     _require_same_cell(recording, info, calibration)
     result = check_drift(prepared.views, calibration)
     own = _is_origin(prepared.recording.sha256, info, calibration.provenance)
-    before, trend = ("", "") if own or calibration_file is not None else _note(result, info, root)
+    before, trend = ([], None) if own or calibration_file is not None else _log(result, info, root)
     proves_nothing = own and result.passed
     if as_json:
         print_json({**_plain(result, trend), "passed": result.passed and not own, "own_views": own})
@@ -63,21 +63,21 @@ def drift_check(
     else:
         out.print(check_text(result, calibration), style="green" if result.passed else "bold red")
         if before:
-            out.print(before)
-        if trend:
-            out.print(trend, style="yellow")
+            out.print(f"Earlier drift checks: {sum(before)} of {len(before)} passed.")
+        if trend is not None:
+            out.print(trend.text, style="yellow")
     if not result.passed:
         raise typer.Exit(DRIFTED)
     if proves_nothing:
         raise typer.Exit(BadViewsError.exit_code)
 
 
-def _note(result: DriftCheck, info: SessionInfo, root: Path | None) -> tuple[str, str]:
-    """Adds the check to those of the installed calibration: what to say of them before it, and with it."""
+def _log(result: DriftCheck, info: SessionInfo, root: Path | None) -> tuple[list[bool], Trend | None]:
+    """Log the check: results of the earlier ones of the installed calibration, and the trend with it."""
     number = next((g.number for g in generations(root) if g.current), 0)
-    before = earlier_text(read_checks(root), number)
+    before = earlier_results(read_checks(root), number)
     append_check(CheckEntry.of(result, info.created_wall_ns / 1e9 or time.time(), number, info.name), root)
-    return before, trend_text(read_checks(root), number)
+    return before, find_trend(read_checks(root), number)
 
 
 def _is_origin(sha256: str, info: SessionInfo, provenance: Provenance) -> bool:
@@ -149,7 +149,7 @@ def _more_text(result: DriftCheck, calibration: Calibration) -> str:
     )
 
 
-def _plain(result: DriftCheck, trend: str) -> dict[str, object]:
+def _plain(result: DriftCheck, trend: Trend | None) -> dict[str, object]:
     return {
         "passed": result.passed,
         "shift": result.shift.tolist(),
@@ -161,5 +161,5 @@ def _plain(result: DriftCheck, trend: str) -> dict[str, object]:
         "views_needed": result.views_needed,
         "disagreement": result.disagreement,
         "views": result.views,
-        "trend": trend,
+        "trend": "" if trend is None else trend.text,
     }

@@ -52,14 +52,16 @@ def locate_board(calibration: Calibration, view: BoardView, board: BoardSpec) ->
     same = [k for k, miss in enumerate(misses) if _is_small(miss)]
     if same and not in_hand:
         raise BadViewsError(
-            "The board is still on the flange: take it off, lay it into the camera's view, fix the pointer "
-            "to the flange, and start again."
+            "The board is still on the flange.",
+            code="board-on-flange",
+            remedy="Lay it into the camera's view, fix the pointer to the flange, and start again.",
         )
     tilts = [r.camera_from_board for r in readings if r.turn == readings[0].turn]
     if not same and any(np.linalg.norm(difference(t, tilts[0])[3:]) > _SAME_TILT_RAD for t in tilts):
         raise BadViewsError(
-            "From here the picture leaves open to which side the board is tilted: bring the camera nearer or "
-            "look at the board from more to the side."
+            "The image leaves open to which side the board is tilted.",
+            code="ambiguous-tilt",
+            remedy="Bring the camera nearer, or look at the board from more to the side.",
         )
     best = same[0] if same else 0
     seen = readings[best].camera_from_board

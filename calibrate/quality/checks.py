@@ -1,8 +1,9 @@
-"""The history of drift checks, one line each, and whether it shows a trend."""
+"""History of the drift checks, one line each, and whether it shows a trend."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import msgspec
@@ -50,7 +51,9 @@ def append_check(entry: CheckEntry, root: Path | None = None) -> None:
         folder.mkdir(parents=True, exist_ok=True)
         append_line(folder / "checks.jsonl", entry)
     except OSError as problem:
-        raise InstallError(f"{folder}: the check cannot be noted: {problem.strerror}.") from None
+        raise InstallError(
+            f"{folder}: the drift check cannot be logged: {problem.strerror}.", code="state-folder"
+        ) from None
 
 
 def read_checks(root: Path | None = None) -> list[CheckEntry]:
@@ -58,16 +61,30 @@ def read_checks(root: Path | None = None) -> list[CheckEntry]:
     return read_lines(calibrations_folder(root) / "checks.jsonl", CheckEntry)
 
 
-def earlier_text(history: Sequence[CheckEntry], generation: int) -> str:
-    """How the checks of this generation went so far, else empty: one alarm alone may be chance."""
-    earlier = [entry.passed for entry in history if entry.generation == generation]
-    if not earlier:
-        return ""
-    return f"Earlier checks of generation {generation}: {len(earlier)}, it held in {sum(earlier)} of them."
+def earlier_results(history: Sequence[CheckEntry], generation: int) -> list[bool]:
+    """Which checks of this installed version passed: one alarm alone may be chance."""
+    return [entry.passed for entry in history if entry.generation == generation]
 
 
-def trend_text(history: Sequence[CheckEntry], generation: int) -> str:
-    """A warning when the checks of this generation wander with time, else empty.
+@dataclass(frozen=True)
+class Trend:
+    """Camera shift that grows with time, over the checks of one installed version."""
+
+    shift_mm: float
+    shift_deg: float
+    days: float
+    checks: int
+
+    @property
+    def text(self) -> str:
+        return (
+            f"Drift trend: {self.shift_mm:.2f} mm, {self.shift_deg:.3f}° in {_duration(self.days)} "
+            f"({self.checks} checks). Inspect the bracket and calibrate again."
+        )
+
+
+def find_trend(history: Sequence[CheckEntry], generation: int) -> Trend | None:
+    """Look for a trend in the checks of this installed version; None where chance explains it.
 
     Six straight lines through the shifts, weighted by their covariance; the installed calibration's own error
     is the same in every check and moves the lines, not their slopes. Slopes are judged by χ² with 6 degrees
@@ -75,10 +92,10 @@ def trend_text(history: Sequence[CheckEntry], generation: int) -> str:
     """
     entries = [entry for entry in history if entry.generation == generation]
     if len(entries) < _FEWEST_FOR_TREND:
-        return ""
+        return None
     days = np.array([entry.wall_s for entry in entries]) / 86400
     if np.ptp(days) <= 0:
-        return ""
+        return None
     span = float(np.ptp(days))
     days = days - days.mean()
     shifts = np.array([entry.shift for entry in entries])
@@ -90,18 +107,13 @@ def trend_text(history: Sequence[CheckEntry], generation: int) -> str:
     slope = (covariance @ right)[6:]
     statistic = float(slope @ np.linalg.solve(covariance[6:, 6:], slope))
     if stats.chi2.sf(statistic, 6) > _TREND_P:
-        return ""
+        return None
     millimetres = float(np.linalg.norm(slope[:3]) * 1e3 * span)
     degrees = float(np.degrees(np.linalg.norm(slope[3:])) * span)
-    again = "calibrate again before it fails" if entries[-1].passed else "then calibrate again"
-    return (
-        f"The last {len(entries)} checks wander: by about {millimetres:.2f} mm and {degrees:.3f}° "
-        f"{_within(span)}. Look for a loosening mount; {again}."
-    )
+    return Trend(millimetres, degrees, span, len(entries))
 
 
-def _within(days: float) -> str:
-    """Only the time that was looked at: minutes say nothing about a month."""
+def _duration(days: float) -> str:
     if days >= 2:
-        return f"in {days:.0f} days"
-    return f"in {days * 24:.0f} hours" if days * 24 >= 2 else f"in {max(days * 1440, 1):.0f} min"
+        return f"{days:.0f} days"
+    return f"{days * 24:.0f} hours" if days * 24 >= 2 else f"{max(days * 1440, 1):.0f} min"

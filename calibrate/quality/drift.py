@@ -1,4 +1,4 @@
-"""Does the installed calibration still hold? A few new views, one statistical test, its power stated.
+"""Drift check: a few new views, one statistical test, its power stated.
 
 The shift δX of the camera is fitted to the new views together with the board's place (the board may have been
 moved since). If nothing changed, δX is normal with covariance S = S_fit + S_installed, so δᵀ S⁻¹ δ follows
@@ -85,8 +85,9 @@ class Noise:
         noise = calibration.quality.noise
         if not noise:
             raise BadViewsError(
-                "The calibration does not say how noisy its robot and corners were (paper profile); "
-                "solve its recording again with --profile robust and install that."
+                "The calibration states no measurement noise (paper profile).",
+                code="no-noise",
+                remedy="Solve its recording again with --profile robust and install that.",
             )
         return cls(
             max(noise["corner_px"], 0.02),
@@ -131,7 +132,11 @@ def judge_shift(views: ViewSet, installed: Array, covariance: Array, noise: Nois
     it, and r has the covariance of PnP plus that of the robot's pose, carried over to r.
     """
     if len(views) < FEWEST_VIEWS:
-        raise TooFewViewsError(f"{len(views)} views are too few for a check: {FEWEST_VIEWS} to 5 are needed.")
+        raise TooFewViewsError(
+            f"{len(views)} views are too few for a drift check (≥ {FEWEST_VIEWS}).",
+            views=len(views),
+            needed=FEWEST_VIEWS,
+        )
     flanges, in_hand = views.base_from_flange, views.mount == "eye-in-hand"
     seen = views.camera_from_board
     pnp = np.array(
@@ -176,8 +181,9 @@ def _inverse(information: Array) -> Array:
     values, vectors = np.linalg.eigh(information * scale * scale[:, None])
     if not values[0] > _SMALLEST_EIGENVALUE:
         raise BadViewsError(
-            "These views do not tell a shift of the camera: they turn about one axis only, or too little. "
-            "Take views that tilt by 20° and more about different axes."
+            "These views do not determine a camera shift: they rotate about one axis only, or too little.",
+            code="degenerate-motion",
+            remedy="Capture views tilted by 20° and more about different axes.",
         )
     root = scale[:, None] * vectors / np.sqrt(values)
     return np.asarray(root @ root.T)

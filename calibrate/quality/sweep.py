@@ -67,22 +67,26 @@ def sweep_time_offset(recording: Recording, camera: CameraModel | None = None) -
     camera = camera or recording.info.camera
     if camera.matrix is None:
         raise BadViewsError(
-            f"{recording.path} does not know its lens, and a sweep cannot find it: calibrate from stops "
-            "first, and give that calibration (calibrate sweep --calibration FILE)"
+            f"{recording.path} holds no intrinsics, and a sweep cannot estimate them.",
+            code="intrinsics-missing",
+            remedy="Give a calibration of this camera: calibrate sweep --calibration FILE.",
         )
     robot_s, flange = _robot(recording)
     lost: list[str] = []
     seen = list(_seen(recording, camera, lost))
     if len(robot_s) < 2 or len(seen) < FEWEST_PICTURES:
         raise TooFewViewsError(
-            f"{recording.path}: {len(seen)} pictures with the board and {len(robot_s)} robot states are too "
-            f"few for a time offset; {FEWEST_PICTURES} pictures are needed"
+            f"{recording.path}: {len(seen)} images with the board and {len(robot_s)} robot states are too "
+            f"few for a time offset ({FEWEST_PICTURES} images needed).",
+            views=len(seen),
+            needed=FEWEST_PICTURES,
         )
     times, poses = (np.array(column) for column in zip(*seen, strict=True))
     if _median_turning_rad_s(robot_s, flange, times) < _STILL_RAD_S:
         raise BadViewsError(
-            f"{recording.path} is no sweep: the arm stood still at most of its pictures, so they say "
-            "nothing of the time. Take one with: station capture --sweep"
+            f"{recording.path} is no sweep: the arm stood still at most of its images.",
+            code="no-sweep",
+            remedy="Capture one: station capture --sweep.",
         )
     found = estimate_time_offset(robot_s, flange, times, poses)
     return replace(found, sigma_s=math.hypot(found.sigma_s, UNSEEN_DELAY_S), lost=tuple(lost))
@@ -116,7 +120,11 @@ def on_host(device_s: Array, arrivals_s: Array) -> Array:
     BadViewsError for what is no time.
     """
     if not (np.abs(device_s) < _LARGEST_STAMP_S).all():
-        raise BadViewsError("a clock of this recording gives times that are none: take the sweep again")
+        raise BadViewsError(
+            "A clock of this recording gives invalid times.",
+            code="bad-clock",
+            remedy="Capture the sweep again.",
+        )
     if len(device_s) < 2 or np.ptp(device_s) == 0:
         return arrivals_s
     since_s = device_s - device_s[0]
@@ -177,13 +185,15 @@ def estimate_time_offset(
     """
     for name, times in (("robot", robot_s), ("camera", camera_s)):
         if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
-            raise BadViewsError(f"the {name}'s times are not in order; are two recordings mixed?")
+            raise BadViewsError(f"The {name}'s times are not in order.", code="bad-clock")
     inside = (camera_s - LIMIT_S >= robot_s[0]) & (camera_s + LIMIT_S <= robot_s[-1])
     times, poses = camera_s[inside], camera_from_board[inside]
     if len(times) < FEWEST_PICTURES:
         raise TooFewViewsError(
-            f"only {len(times)} pictures lie within the robot's recording; {FEWEST_PICTURES} are needed for "
-            "a time offset. Sweep longer, with the board in view"
+            f"Only {len(times)} images lie within the robot's states ({FEWEST_PICTURES} needed).",
+            remedy="Sweep longer, with the board in view.",
+            views=len(times),
+            needed=FEWEST_PICTURES,
         )
     flange = Slerp(robot_s, Rotation.from_matrix(base_from_flange[:, :3, :3]))
     R = poses[:, :3, :3]
@@ -206,8 +216,11 @@ def estimate_time_offset(
     sigma_s = _sigma(r, slope, _weights(r))
     if sigma_s > LIMIT_S / 4 or abs(offset_s) >= LIMIT_S - 1e-9:
         raise DegenerateMotionError(
-            f"the motion does not determine the time offset (sigma {1000 * sigma_s:.0f} ms within "
-            f"± {1000 * LIMIT_S:.0f} ms): the arm must turn, and speed up and slow down, during the sweep"
+            f"The motion does not determine the time offset (1σ {1000 * sigma_s:.0f} ms within "
+            f"± {1000 * LIMIT_S:.0f} ms).",
+            remedy="The arm must rotate, speed up and slow down during the sweep.",
+            sigma_s=sigma_s,
+            limit_s=LIMIT_S,
         )
     return TimeOffset(offset_s, sigma_s, float(np.sqrt(np.mean(r**2))), len(r))
 

@@ -18,6 +18,7 @@ from calibrate.bounds import SolveLimitError, bounded
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import read_calibration, write_calibration
 from calibrate.pipeline import SolvedRecording
+from tests.calibrate.calling import raises_code
 
 PROGRAM = (sys.executable, "-m", "calibrate.cli", "solve")
 
@@ -31,7 +32,7 @@ def old_file(solved_real: SolvedRecording, tmp_path: Path) -> Path:
 
 def test_what_takes_too_long_is_ended_with_a_name() -> None:
     begun_s = time.monotonic()
-    with pytest.raises(SolveLimitError, match=r"longer than 0\.1 s; nothing was written"), bounded(0.1, 0):
+    with raises_code(SolveLimitError, "time-limit", limit_s=0.1), bounded(0.1, 0):
         while time.monotonic() - begun_s < 10:
             pass
     assert time.monotonic() - begun_s < 5
@@ -76,7 +77,7 @@ def _timers() -> set[threading.Thread]:
 @pytest.mark.parametrize("eater", ["numpy", "opencv"])
 def test_what_needs_too_much_memory_is_ended_with_a_name(eater: str) -> None:
     before = resource.getrlimit(resource.RLIMIT_DATA)
-    with pytest.raises(SolveLimitError, match="more than 6000 MiB"), bounded(0, 6000):
+    with raises_code(SolveLimitError, "memory-limit", limit_mib=6000), bounded(0, 6000):
         if eater == "numpy":
             np.ones((1000, 1000, 1000))
         else:
@@ -91,22 +92,16 @@ def test_other_errors_pass_unchanged() -> None:
         assert signal.getitimer(signal.ITIMER_REAL)[0] > 0
 
 
-@pytest.mark.parametrize(
-    ("option", "value", "said"),
-    [
-        ("--time-limit-s", "0.05", "longer than 0.05 s"),
-        ("--memory-limit-mib", "1", "more than 1 MiB"),
-    ],
-)
+@pytest.mark.parametrize(("option", "value"), [("--time-limit-s", "0.05"), ("--memory-limit-mib", "1")])
 def test_the_command_ends_with_1_and_the_old_file_stays(
-    real_session_file: Path, old_file: Path, option: str, value: str, said: str
+    real_session_file: Path, old_file: Path, option: str, value: str
 ) -> None:
     content = old_file.read_bytes()
     done = subprocess.run(
         [*PROGRAM, str(real_session_file), "-o", str(old_file), option, value], capture_output=True, text=True
     )
     assert done.returncode == 1
-    assert said in " ".join(done.stderr.split())
+    assert option in done.stderr, "the remedy names it"
     assert "Traceback" not in done.stderr
     assert old_file.read_bytes() == content
 

@@ -19,6 +19,7 @@ from recordings.manifest import enter_part
 from recordings.reader import Recording, open_recording
 from recordings.recover import recover
 from recordings.writer import RecordingWriter
+from tests.calibrate.calling import raises_code
 
 Damage = Callable[[bytes], bytes]
 
@@ -59,12 +60,10 @@ def test_a_picture_that_cannot_be_decoded_costs_its_own_pose_only(source: Record
         (3, "unreadable-picture"),
         (7, "unreadable-picture"),
     ]
-    assert "picture 3 the PNG is cut" in loaded.without_board[0].reason
-    assert "picture 7 the PNG is damaged (checksum" in loaded.without_board[1].reason
     assert loaded.pictures == 14
     job = solve_recording(path)
     assert [rejected.index for rejected in job.calibration.views.rejected] == [3, 7]
-    assert "the PNG is cut" in report_page(job)
+    assert loaded.without_board[0].reason in report_page(job)
 
 
 def test_leaving_out_a_view_that_shows_no_board_is_fine(source: Recording, tmp_path: Path) -> None:
@@ -82,9 +81,8 @@ def test_leaving_out_a_view_that_shows_no_board_is_fine(source: Recording, tmp_p
 def test_a_board_declared_in_squares_is_named_with_its_inner_corners(source: Recording) -> None:
     board = source.info.board
     squares = msgspec.structs.replace(board, columns=board.columns + 1, rows=board.rows + 1)
-    with pytest.raises(SquaresCountedError) as caught:
+    with raises_code(SquaresCountedError, "squares-counted", columns=board.columns, rows=board.rows):
         load_views(source, squares)
-    assert (caught.value.columns, caught.value.rows) == (board.columns, board.rows)
 
 
 def test_a_picture_of_impossible_size_is_refused_before_decoding(source: Recording, tmp_path: Path) -> None:

@@ -49,7 +49,6 @@ def test_a_broken_recording_is_a_result_and_the_rest_goes_on(recordings: list[Pa
     recordings[0].write_bytes(recordings[0].read_bytes()[:-3000])
     results = run_batch([*recordings[:2], tmp_path / "none.mcap"], tmp_path / "out", solver=in_this_process)
     assert [result.solved for result in results] == [False, True, False]
-    assert "recordings recover" in results[0].error
     assert results[2].recording.endswith("none.mcap")
 
 

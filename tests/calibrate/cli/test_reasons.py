@@ -12,6 +12,7 @@ from calibrate.files.calibration import Touch, read_calibration
 from calibrate.files.generations import InstallError, before_current, generations
 from calibrate.files.install import install, load_installed, objections_beside, reason_problem, rollback
 from calibrate.files.verification import note_installed
+from tests.calibrate.calling import raises_code
 
 MakeFile = Callable[..., Path]
 HAND = Touch(0, (0.0, 0.0), (9.0, 0.0), (0.1, 0.1), "told by a person", "anna", "2026-01-01T00:00:00+00:00")
@@ -19,7 +20,7 @@ HAND = Touch(0, (0.0, 0.0), (9.0, 0.0), (0.1, 0.1), "told by a person", "anna", 
 
 @pytest.mark.parametrize("said", ["", "x", "ok", "...", "aaaaaaaaaa", "12345678", "test"])
 def test_a_keypress_is_no_reason(said: str) -> None:
-    assert "in words" in reason_problem(said)
+    assert reason_problem(said)
 
 
 @pytest.mark.parametrize("said", ["line is down, checked with a pointer", "trial", "标定板移动了"])
@@ -30,10 +31,10 @@ def test_words_are_one_in_any_script(said: str) -> None:
 def test_who_overrules_or_takes_back_says_it_in_words(make_file: MakeFile, tmp_path: Path) -> None:
     install(make_file(), tmp_path)
     doubted = make_file(0.001, verification=[HAND])
-    with pytest.raises(InstallError, match="in words"):
+    with raises_code(InstallError, "reason-too-short"):
         install(doubted, tmp_path, override="x")
     assert install(doubted, tmp_path, override="the board was bent").number == 2
-    with pytest.raises(InstallError, match="in words"):
+    with raises_code(InstallError, "reason-too-short"):
         rollback(tmp_path, reason="x")
     assert [g.current for g in generations(tmp_path)] == [False, True]
     rollback(tmp_path)  # nobody must say why he goes back
@@ -54,7 +55,7 @@ def test_a_check_by_hand_alone_is_nothing_to_go_back_to(make_file: MakeFile, tmp
     install(make_file(), tmp_path)
     note_installed(tmp_path, [HAND])
     assert before_current(generations(tmp_path)) is None
-    with pytest.raises(InstallError, match="no older"):
+    with raises_code(InstallError, "nothing-older"):
         rollback(tmp_path)
 
 
@@ -67,7 +68,7 @@ def test_what_speaks_against_it_beside_its_gates_is_known_before(make_file: Make
     assert error_mm is not None
     quality = msgspec.structs.replace(now.quality, predicted_error_mm=3 * error_mm)
     (worse,) = objections_beside(msgspec.structs.replace(now, quality=quality), tmp_path)
-    assert "no worse" in worse
+    assert "Regression" in worse
     robot = msgspec.structs.replace(now.robot, serial="2099999999")
     (other,) = objections_beside(msgspec.structs.replace(now, robot=robot), tmp_path)
     assert "2099999999" in other

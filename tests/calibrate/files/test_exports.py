@@ -278,5 +278,5 @@ def test_other_frame_names_and_unknown_formats(calibration: Calibration) -> None
     )
     parent = "flange_b" if calibration.mount == "eye-in-hand" else "cell_base"
     assert f"--frame-id {parent} --child-frame-id cam" in text
-    with pytest.raises(ExportError, match="there is no format 'nix'"):
+    with pytest.raises(ExportError):
         export(calibration, "nix")

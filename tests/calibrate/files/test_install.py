@@ -24,6 +24,7 @@ from calibrate.files.calibration import (
 from calibrate.files.generations import InstallError, generations, read_log
 from calibrate.files.install import InstallGateError, install, install_line, load_installed, rollback
 from calibrate.pipeline import SolvedRecording
+from tests.calibrate.calling import raises_code
 from tests.command_line import call
 
 
@@ -52,12 +53,12 @@ def test_install_list_rollback(make_file, tmp_path: Path) -> None:  # type: igno
 
 
 def test_nothing_installed_and_nothing_older_are_said(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
-    with pytest.raises(InstallError, match="nothing is installed"):
+    with raises_code(InstallError, "nothing-installed"):
         load_installed(tmp_path)
     install(make_file(), tmp_path)
-    with pytest.raises(InstallError, match="no older"):
+    with raises_code(InstallError, "nothing-older"):
         rollback(tmp_path)
-    with pytest.raises(InstallError, match="no generation 9; there are: 1"):
+    with raises_code(InstallError, "no-such-version", generation=9):
         rollback(tmp_path, to=9)
 
 
@@ -66,7 +67,7 @@ def test_nothing_unreal_installs_on_a_real_cell_whatever_the_reason(  # type: ig
     make_file, tmp_path: Path, source: str
 ) -> None:
     path = make_file(source=source)
-    with pytest.raises(InstallError, match=f"is {source} and is not installed on a real cell"):
+    with raises_code(InstallError, "other-cell", source=source, cell="real"):
         install(path, tmp_path / "s", override="I insist")
     assert not (tmp_path / "s/calibrations/current").exists()
 
@@ -74,11 +75,11 @@ def test_nothing_unreal_installs_on_a_real_cell_whatever_the_reason(  # type: ig
 def test_kinds_of_cells_do_not_mix(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     root = tmp_path / "s"
     install(make_file(), root)
-    with pytest.raises(InstallError, match="does not follow a real calibration"):
+    with raises_code(InstallError, "other-cell", source="simulated", cell="real"):
         install(make_file(source="simulated"), root, cell="simulated")
     simulated = tmp_path / "simulated"
     install(make_file(source="simulated"), simulated, cell="simulated")
-    with pytest.raises(InstallError, match="not of a real cell"):
+    with raises_code(InstallError, "not-real", source="simulated"):
         load_installed(simulated)
     assert load_installed(simulated, allow_simulated=True).source == "simulated"
 
@@ -88,7 +89,7 @@ def test_a_failed_gate_needs_a_persons_reason_which_goes_into_the_file(  # type:
 ) -> None:
     bad = Gate("hold-out", False, 0.1, 0.005, "predicted to 100 mm")
     path = make_file(quality=msgspec.structs.replace(solved_real.calibration.quality, gates=[bad]))
-    with pytest.raises(InstallGateError, match="predicted to 100 mm") as refused:
+    with raises_code(InstallGateError, "gate-failed", gates=1) as refused:
         install(path, tmp_path / "s")
     assert refused.value.exit_code == 4
     with pytest.raises(InstallGateError):
@@ -107,10 +108,10 @@ def test_another_robot_or_camera_is_refused(make_file, solved_real: SolvedRecord
     before = (root / "calibrations/current").read_bytes()
     robot = msgspec.structs.replace(solved_real.calibration.robot, serial="2099999999")
     camera = msgspec.structs.replace(solved_real.calibration.camera, serial="99")
-    for changes, text in (({"robot": robot}, "robot UR10 2099999999"), ({"camera": camera}, "camera MER 99")):
-        with pytest.raises(InstallError, match=text):
+    for changes in ({"robot": robot}, {"camera": camera}):
+        with raises_code(InstallError, "objection", objections=1):
             install(make_file(**changes), root)
-    with pytest.raises(InstallError, match="the cell has 4711"):
+    with raises_code(InstallError, "objection", objections=1):
         install(make_file(), tmp_path / "t", robot_serial="4711")
     assert (root / "calibrations/current").read_bytes() == before
 
@@ -126,10 +127,10 @@ def test_a_damaged_file_is_not_installed_and_a_damaged_generation_not_used(make_
     generation = generations(root)[0].path
     generation.chmod(0o600)
     generation.write_bytes(generation.read_bytes().replace(b"eye-in-hand", b"eye-to-hand"))
-    assert "hash" in generations(root)[0].problem
-    with pytest.raises(InstallError, match="no older"):
+    assert generations(root)[0].problem
+    with raises_code(InstallError, "nothing-older"):
         rollback(root)
-    with pytest.raises(InstallError, match="damaged"):
+    with raises_code(InstallError, "damaged-version"):
         rollback(root, to=1)
 
 
@@ -143,7 +144,7 @@ def test_identity_is_still_checked_when_the_current_file_is_damaged(  # type: ig
     current.chmod(0o600)
     current.write_bytes(b"garbage")
     robot = msgspec.structs.replace(solved_real.calibration.robot, serial="2099999999")
-    with pytest.raises(InstallError, match="2099999999"):
+    with raises_code(InstallError, "objection"):
         install(make_file(robot=robot), root)
     install(make_file(0.002), root)
     assert load_installed(root).result.translation_m[0] == pytest.approx(
@@ -153,7 +154,7 @@ def test_identity_is_still_checked_when_the_current_file_is_damaged(  # type: ig
 
 def test_an_unwritable_place_is_said(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     (tmp_path / "file").write_text("")
-    with pytest.raises(InstallError, match="--root"):
+    with raises_code(InstallError, "state-folder"):
         install(make_file(), tmp_path / "file")
 
 
@@ -165,7 +166,7 @@ def test_a_place_that_may_not_be_looked_into_is_said(
         raise PermissionError(13, "Permission denied", str(path))
 
     monkeypatch.setattr(Path, "exists", refused)  # who runs the tests may be root
-    with pytest.raises(InstallError, match=r"calibrations: Permission denied\. Name another"):
+    with raises_code(InstallError, "state-folder"):
         look(tmp_path)
 
 
@@ -281,12 +282,12 @@ def test_a_much_less_certain_one_replaces_no_better_one_without_a_reason(  # typ
     install(make_file(quality=worse), root)  # nothing to compare with
     install(make_file(), root)
     install(make_file(quality=hardly), root)
-    with pytest.raises(InstallGateError, match=r"gate no worse: a point at \d+ mm is expected to be off by"):
+    with raises_code(InstallGateError, "gate-failed", gates=1, objections=0):
         install(make_file(quality=worse), root)
     assert len(generations(root)) == 3
     made = install(make_file(quality=worse), root, override="the old lens is broken")
     assert made.calibration is not None and made.calibration.override is not None
-    assert "no worse" in made.calibration.override.overridden[0]
+    assert "no_worse" in made.calibration.override.overridden[0]
     rollback(root)
     assert load_installed(root).quality == hardly
 
@@ -297,5 +298,5 @@ def test_without_a_predicted_error_the_sigmas_are_compared(make_file, tmp_path: 
     sigma = load_installed(root).sigma
     quality = msgspec.structs.replace(load_installed(root).quality, predicted_error_mm=None)
     vague = msgspec.structs.replace(sigma, translation_mm=3 * sigma.translation_mm)
-    with pytest.raises(InstallGateError, match="camera's position is uncertain"):
+    with raises_code(InstallGateError, "gate-failed", gates=1, objections=0):
         install(make_file(quality=quality, sigma=vague), root)

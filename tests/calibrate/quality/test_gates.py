@@ -1,4 +1,4 @@
-"""Each gate closes for its own reason, and says so in words."""
+"""Each gate closes for its own reason; one id in output, limits and documents."""
 
 from __future__ import annotations
 
@@ -16,11 +16,13 @@ from calibrate.handeye.readings import Explanation, Reading
 from calibrate.handeye.solution import HoldoutScore, NoiseScales, Remark, Solution
 from calibrate.pipeline import SolvedRecording
 from calibrate.quality.gates import GateInputs, GateLimits, GatesError, judge, read_limits
+from tests.calibrate.calling import raises_code
 
 GOOD = GateInputs(0.6, 0.001)
 NAMES = [
-    "session", "weight", "views", "rotation", "axes", "view residual", "hold-out", "cross-validation",
-    "predicted error", "lens coverage", "clocks", "lens", "board", "robot position", "robot orientation",
+    "session", "weight", "views", "rotation_deg", "axis_spread", "view_rms_px", "holdout_share",
+    "cross_validation", "predicted_error_m", "coverage", "clock_bound_s", "lens_pull", "board_pull",
+    "robot_error_m", "robot_error_deg",
 ]  # fmt: skip
 
 
@@ -54,6 +56,8 @@ def test_a_good_solution_passes_every_gate(solution: Solution) -> None:
     gates = judge(solution, GOOD)
     assert failed(gates) == []
     assert [gate.name for gate in gates] == NAMES
+    in_force = {k for k, v in msgspec.structs.asdict(GateLimits()).items() if v is not None}
+    assert set(NAMES) == in_force, "a gate's id is the name of its limit"
 
 
 def spoiled(solution: Solution, name: str) -> tuple[Solution, GateInputs]:
@@ -62,22 +66,22 @@ def spoiled(solution: Solution, name: str) -> tuple[Solution, GateInputs]:
     other = Explanation(Reading.SHIFTED, 90.0, 1)
     changed = {
         "views": replace(solution, used=solution.used[:5]),
-        "rotation": replace(solution, observability=replace(seen, largest_angle_rad=0.2)),
-        "axes": replace(solution, observability=replace(seen, axis_spread=0.01)),
+        "rotation_deg": replace(solution, observability=replace(seen, largest_angle_rad=0.2)),
+        "axis_spread": replace(solution, observability=replace(seen, axis_spread=0.01)),
         "session": replace(solution, session=other, warnings=(Remark(other.reading.value, "Move them."),)),
         "weight": replace(solution, weights=dict.fromkeys(solution.used, 0.79)),
-        "cross-validation": replace(solution, cross_validation=replace(folds, rms_m=0.00061)),
-        "lens": replace(solution, lens_finding=Finding(8.0, 0.0011)),
-        "board": replace(solution, board_finding=Finding(8.0, 0.0011)),
-        "view residual": replace(solution, residual_px={3: 9.0}),
-        "hold-out": replace(solution, holdout=replace(solution.holdout, e_t_m=0.02)),
-        "predicted error": replace(solution, predicted_error_m=0.003),
-        "robot position": replace(solution, noise=NoiseScales(0.1, 0.01, 0.0)),
-        "robot orientation": replace(solution, noise=NoiseScales(0.1, 0.0, 0.02)),
+        "cross_validation": replace(solution, cross_validation=replace(folds, rms_m=0.00061)),
+        "lens_pull": replace(solution, lens_finding=Finding(8.0, 0.0011)),
+        "board_pull": replace(solution, board_finding=Finding(8.0, 0.0011)),
+        "view_rms_px": replace(solution, residual_px={3: 9.0}),
+        "holdout_share": replace(solution, holdout=replace(solution.holdout, e_t_m=0.02)),
+        "predicted_error_m": replace(solution, predicted_error_m=0.003),
+        "robot_error_m": replace(solution, noise=NoiseScales(0.1, 0.01, 0.0)),
+        "robot_error_deg": replace(solution, noise=NoiseScales(0.1, 0.0, 0.02)),
     }
     evidence = {
-        "lens coverage": replace(GOOD, coverage=0.05),
-        "clocks": replace(GOOD, clock_bound_s=0.05),
+        "coverage": replace(GOOD, coverage=0.05),
+        "clock_bound_s": replace(GOOD, clock_bound_s=0.05),
     }
     return changed.get(name, solution), evidence.get(name, GOOD)
 
@@ -87,16 +91,18 @@ def test_each_gate_closes_alone_and_says_why(solution: Solution, name: str) -> N
     bad, evidence = spoiled(solution, name)
     gates = judge(bad, evidence)
     assert failed(gates) == [name]
-    assert next(gate.text for gate in gates if gate.name == name)
+    gate = next(gate for gate in gates if gate.name == name)
+    assert gate.remedy and gate.text.endswith(f"FAIL. {gate.remedy}")
+    assert all(gate.text.endswith("PASS") and not gate.remedy for gate in gates if gate.name != name)
 
 
 def test_values_and_limits_are_in_the_units_of_the_file_of_limits(solution: Solution) -> None:
     gates = {gate.name: (gate.value, gate.limit) for gate in judge(solution, GOOD)}
-    assert gates["rotation"] == pytest.approx((np.degrees(1.2), 30))
-    assert gates["hold-out"] == pytest.approx((0.0005, 0.01 * 0.5))
-    assert gates["cross-validation"] == pytest.approx((0.0005 / 0.0004 / 1.5, 1.0))
-    assert gates["robot orientation"] == pytest.approx((np.degrees(0.0002), 0.3))
-    assert gates["lens"] == gates["board"] == (0.0, 1.0)
+    assert gates["rotation_deg"] == pytest.approx((np.degrees(1.2), 30))
+    assert gates["holdout_share"] == pytest.approx((0.0005, 0.01 * 0.5))
+    assert gates["cross_validation"] == pytest.approx((0.0005 / 0.0004 / 1.5, 1.0))
+    assert gates["robot_error_deg"] == pytest.approx((np.degrees(0.0002), 0.3))
+    assert gates["lens_pull"] == gates["board_pull"] == (0.0, 1.0)
 
 
 @pytest.mark.parametrize(
@@ -115,7 +121,7 @@ def test_a_statement_closes_its_gate_by_what_its_tolerance_leaves_unexplained(
 ) -> None:
     for name in ("lens", "board"):
         told = replace(solution, **{f"{name}_finding": Finding(sigmas, pull_m)})
-        assert failed(judge(told, GOOD)) == [name] * closed
+        assert failed(judge(told, GOOD)) == [f"{name}_pull"] * closed
 
 
 def test_an_accepted_move_opens_the_session_gate(solution: Solution) -> None:
@@ -133,14 +139,14 @@ def test_the_certificate_informs_and_closes_nothing(solution: Solution) -> None:
 def test_what_cannot_be_judged_is_left_out(solution: Solution) -> None:
     bare = replace(solution, noise=None, holdout=None, predicted_error_m=None, cross_validation=None)
     names = [gate.name for gate in judge(bare, GateInputs())]
-    assert names == ["session", "weight", "views", "rotation", "axes", "view residual"]
+    assert names == ["session", "weight", "views", "rotation_deg", "axis_spread", "view_rms_px"]
 
 
 def test_limits_come_from_a_file_and_null_switches_a_gate_off(solution: Solution, tmp_path: Path) -> None:
     path = tmp_path / "gates.yaml"
     path.write_text("views: 3\nview_rms_px: null\n")
     limits = read_limits(path)
-    bad, _ = spoiled(solution, "view residual")
+    bad, _ = spoiled(solution, "view_rms_px")
     assert failed(judge(bad, GOOD, limits)) == []
     assert limits.views == 3
     assert limits.rotation_deg == GateLimits().rotation_deg
@@ -150,9 +156,9 @@ def test_limits_come_from_a_file_and_null_switches_a_gate_off(solution: Solution
 def test_wrong_limits_are_refused_with_the_file(tmp_path: Path, content: str) -> None:
     path = tmp_path / "gates.yaml"
     path.write_text(content)
-    with pytest.raises(GatesError, match=r"gates\.yaml"):
+    with raises_code(GatesError, "gate-limits", path=str(path)):
         read_limits(path)
-    with pytest.raises(GatesError, match=r"none\.yaml"):
+    with raises_code(GatesError, "gate-limits"):
         read_limits(tmp_path / "none.yaml")
 
 
@@ -170,7 +176,7 @@ def test_the_pose_to_retake_is_numbered_as_on_the_screen(solution: Solution) -> 
     """From 1, as `station retake` takes it."""
     bad = solution.used[3]
     residual_px = {**solution.residual_px, bad: 9.0}
-    (gate,) = (
-        g for g in judge(replace(solution, residual_px=residual_px), GOOD) if g.name == "view residual"
-    )
-    assert f"pose {bad + 1}, fits to 9.00 px" in gate.text and f"Retake pose {bad + 1}," in gate.text
+    gates = judge(replace(solution, residual_px=residual_px), GOOD)
+    (gate,) = (gate for gate in gates if not gate.passed)
+    assert (gate.name, gate.value, gate.unit) == ("view_rms_px", 9.0, "px")
+    assert f"pose {bad + 1}" in gate.remedy

@@ -9,6 +9,7 @@ from calibrate.errors import BadViewsError, DegenerateMotionError, TooFewViewsEr
 from calibrate.geometry import Array, inverse, pose, random_rotation, rotation_exp
 from calibrate.kinematics import MODELS, forward
 from calibrate.quality.sweep import estimate_time_offset
+from tests.calibrate.calling import raises_code
 
 NOISE_RAD = 3e-4
 """Of a PnP rotation, per axis"""
@@ -68,20 +69,20 @@ def test_a_steady_or_resting_arm_determines_nothing() -> None:
     noise = rotation_exp(rng.normal(0, NOISE_RAD, (len(seen), 3)))
     resting = np.repeat(seen[:1], len(seen), axis=0)
     resting[:, :3, :3] = noise @ resting[:, :3, :3]
-    with pytest.raises(DegenerateMotionError, match="speed up and slow down"):
+    with pytest.raises(DegenerateMotionError):
         estimate_time_offset(robot_s, still, camera_s, resting)
 
 
 def test_bad_input_is_named() -> None:
     robot_s, flange, camera_s, seen = sweep(np.random.default_rng(2), 0.0)
-    with pytest.raises(TooFewViewsError, match="only 5 pictures"):
+    with raises_code(TooFewViewsError, "too-few-views", views=5):
         estimate_time_offset(robot_s, flange, camera_s[:5], seen[:5])
-    with pytest.raises(BadViewsError, match="robot's times"):
+    with raises_code(BadViewsError, "bad-clock"):
         estimate_time_offset(robot_s[::-1], flange, camera_s, seen)
     for wrong_s in (camera_s[6], camera_s[6] - 1e-3, np.nan):  # twice the same, one back, none
         stamps_s = camera_s.copy()
         stamps_s[7] = wrong_s
-        with pytest.raises(BadViewsError, match="camera's times"):
+        with raises_code(BadViewsError, "bad-clock"):
             estimate_time_offset(robot_s, flange, stamps_s, seen)
 
 

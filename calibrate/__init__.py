@@ -1,0 +1,59 @@
+"""Hand-eye calibration of a robot's camera: solve a recording, judge, install and load the result.
+
+    from pathlib import Path
+    from calibrate import JobOptions, install, load_installed, solve_recording, write_calibration
+
+    job = solve_recording(Path("session.mcap"), JobOptions(seed=1))
+    for gate in job.gates:
+        print(gate.name, gate.passed, gate.value, gate.limit, gate.unit)
+    write_calibration(job.calibration, Path("cell.yaml"))
+    install(Path("cell.yaml"), Path("state"), cell="simulated")
+    calibration = load_installed(Path("state"), allow_simulated=True)
+    flange_from_camera = calibration.transform.matrix  # (4, 4), metres
+
+Errors are `CalibrationError`s with `code`, `values` and `remedy`. Names are loaded at their first use. The
+solver without files is `calibrate.handeye`. Everything else is private.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from calibrate.errors import CalibrationError as CalibrationError
+    from calibrate.files.calibration import Calibration as Calibration
+    from calibrate.files.calibration import Gate as Gate
+    from calibrate.files.calibration import read_calibration as read_calibration
+    from calibrate.files.calibration import write_calibration as write_calibration
+    from calibrate.files.exports import export as export
+    from calibrate.files.install import install as install
+    from calibrate.files.install import load_installed as load_installed
+    from calibrate.files.install import rollback as rollback
+    from calibrate.geometry import Transform as Transform
+    from calibrate.options import JobOptions as JobOptions
+    from calibrate.pipeline import SolvedRecording as SolvedRecording
+    from calibrate.pipeline import solve_recording as solve_recording
+    from calibrate.quality.gates import GateLimits as GateLimits
+
+_MODULES = {
+    "Calibration": "files.calibration",
+    "CalibrationError": "errors",
+    "Gate": "files.calibration",
+    "GateLimits": "quality.gates",
+    "JobOptions": "options",
+    "SolvedRecording": "pipeline",
+    "Transform": "geometry",
+    "export": "files.exports",
+    "install": "files.install",
+    "load_installed": "files.install",
+    "read_calibration": "files.calibration",
+    "rollback": "files.install",
+    "solve_recording": "pipeline",
+    "write_calibration": "files.calibration",
+}
+__all__ = list(_MODULES)
+
+
+def __getattr__(name: str) -> object:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -33,9 +33,10 @@ def board(
         str | None, typer.Option(help=f"{', '.join(PAPER_MM)}; default: as large as needed")
     ] = None,
 ) -> None:
-    """Write a printable board (PDF or SVG, true scale). Without options: 8 × 7 squares of 25 mm.
+    """Write a printable board (PDF or SVG, true scale).
 
-    With a bar to measure on the paper, and the lines for the station's configuration.
+    Without options: 8 × 7 squares of 25 mm. With a bar to measure on the paper, and the lines for the
+    station's configuration.
     """
     if output.suffix.lower() not in (".pdf", ".svg"):
         raise OutputError(f"{output}: the name must end in .pdf or .svg.", code="board-format")

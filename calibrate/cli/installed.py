@@ -24,7 +24,7 @@ Root = Annotated[
     Path | None,
     typer.Option("--root", help="State folder (default: $STATE_DIRECTORY or the XDG state folder)"),
 ]
-_FORMATS_HELP = "; ".join(f"{name}: {kind.description}" for name, kind in FORMATS.items())
+_FORMATS_HELP = "; ".join(f"{name}: {kind.says}" for name, kind in FORMATS.items())
 FormatName = StrEnum("FormatName", {name.replace("-", "_"): name for name in FORMATS})  # type: ignore[misc]
 Named = Annotated[Path | None, typer.Argument(help="A calibration file; default: the installed one")]
 

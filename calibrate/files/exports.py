@@ -227,7 +227,7 @@ def ur_tool(calibration: Calibration, frames: FrameNames) -> str:
 
 class Format(NamedTuple):
     suffix: str
-    description: str
+    says: str
     text: Callable[[Calibration, FrameNames], str]
 
 

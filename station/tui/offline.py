@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from station.tui.app import StationApp
 
 OVERRIDE = "--override"
-PERSON = "If a person takes responsibility"
+PERSON = "To override:"
 """Before it the command says why it refuses, after it how a person overrules that."""
 NOT_INSTALLED = " is not installed. "
 """Between the file's path and why."""
@@ -40,7 +40,7 @@ class ChooseFormat(ModalScreen[str | None]):
     def compose(self) -> ComposeResult:
         with Vertical(id="choose"):
             yield Label("Export for", id="choose-title")
-            lines = [Option(f"{name:<20}  {kind.description}", id=name) for name, kind in FORMATS.items()]
+            lines = [Option(f"{name:<20}  {kind.says}", id=name) for name, kind in FORMATS.items()]
             yield OptionList(*lines, id="formats", markup=False, compact=True)
             yield Label("Enter writes it beside the recording, Escape: no", id="choose-keys")
 

@@ -122,8 +122,8 @@ def test_recordings_that_were_not_solved_are_of_no_cell() -> None:
 
 
 def test_a_session_that_failed_a_gate_says_so_in_its_row() -> None:
-    found = cells([still(0), replace(still(1), failed_gates=["views", "axes"])])
-    assert "failed: views, axes" in trends_text(found)
+    found = cells([still(0), replace(still(1), failed_gates=["views", "axis_spread"])])
+    assert "failed: views, axis_spread" in trends_text(found)
 
 
 def test_one_unnamed_robot_does_not_silence_the_others() -> None:

@@ -87,7 +87,7 @@ def test_kinds_of_cells_do_not_mix(make_file, tmp_path: Path) -> None:  # type: 
 def test_a_failed_gate_needs_a_persons_reason_which_goes_into_the_file(  # type: ignore[no-untyped-def]
     make_file, solved_real: SolvedRecording, tmp_path: Path
 ) -> None:
-    bad = Gate("hold-out", False, 0.1, 0.005, "predicted to 100 mm")
+    bad = Gate("holdout_share", False, 0.1, 0.005, "predicted to 100 mm")
     path = make_file(quality=msgspec.structs.replace(solved_real.calibration.quality, gates=[bad]))
     with raises_code(InstallGateError, "gate-failed", gates=1) as refused:
         install(path, tmp_path / "s")
@@ -98,7 +98,7 @@ def test_a_failed_gate_needs_a_persons_reason_which_goes_into_the_file(  # type:
     override = load_installed(tmp_path / "s").override
     assert override is not None
     assert override.reason == "line is down, checked with a pointer"
-    assert "hold-out" in override.overridden[0]
+    assert "holdout_share" in override.overridden[0]
 
 
 def test_another_robot_or_camera_is_refused(make_file, solved_real: SolvedRecording, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]

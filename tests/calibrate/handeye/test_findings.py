@@ -51,7 +51,7 @@ def test_a_lens_that_is_far_off_closes_its_gate(mount):
     for factor in (0.95, 1.05):
         solution = solve_views(seen_through(cell.views, with_focal(cell.camera, factor)), QUICK)
         assert solution.lens_finding.sigmas > 4
-        assert "lens" in closed(solution)
+        assert "lens_pull" in closed(solution)
 
 
 def test_a_lens_that_is_stated_too_surely_closes_its_gate():
@@ -61,7 +61,7 @@ def test_a_lens_that_is_stated_too_surely_closes_its_gate():
     sure = solve_views(views, replace(QUICK, lens_sigma=(0.15, 0.15, 0.5, 0.5, 1e-3, 1e-3, 1e-5, 1e-5, 1e-3)))
     assert sure.lens_finding.sigmas > 8
     assert sure.lens_finding.unexplained_m > sure.predicted_error_m
-    assert "lens" in closed(sure)
+    assert "lens_pull" in closed(sure)
     assert closed(solve_views(views, QUICK)) == set()
 
 
@@ -70,11 +70,11 @@ def test_a_board_that_was_measured_wrongly_closes_its_gate(mount):
     cell = real_cell(np.random.default_rng(7), 25, LOW, mount=mount, shape=(0.01, 0.01, 2e-3, 2e-3, 0))
     measured = solve_views(cell.views, MEASURED)
     assert measured.board_finding.sigmas > 8
-    assert "board" in closed(measured)
+    assert "board_pull" in closed(measured)
     assert measured.session.reading is Reading.SQUARE_SIZE
     usual = solve_views(cell.views, QUICK)
     assert usual.board_finding.unexplained_m < 0.05 * usual.predicted_error_m
-    assert "board" not in closed(usual)
+    assert "board_pull" not in closed(usual)
     # What the statement does to X: who takes it back finds it about that far away.
     apart_mm = error_mm_deg(measured.matrix, usual.matrix)[0]
     assert 0.2 < 1e3 * measured.board_finding.pull_m / apart_mm < 5
@@ -89,14 +89,14 @@ def test_a_board_that_is_believed_exactly_is_contradicted_too(true_scale):
     cell = real_cell(np.random.default_rng(7), 25, LOW, shape=(true_scale, 0, 0, 0, 0))
     exact = solve_views(cell.views, replace(QUICK, board=BoardTolerance(1e-5, 2e-5)))
     assert not inside(exact, cell.X)
-    assert {"board", "session"} & closed(exact)
+    assert {"board_pull", "session"} & closed(exact)
 
 
 def test_a_lens_found_from_the_same_pictures_was_never_stated():
     cell = make_cell(np.random.default_rng(2), 15, LOW, refit_camera=True)
     solution = solve_views(cell.views, replace(QUICK, intrinsics_from_same_pictures=True))
     assert solution.lens_finding is None
-    assert "lens" not in {gate.name for gate in judge(solution, GateInputs())}
+    assert "lens_pull" not in {gate.name for gate in judge(solution, GateInputs())}
 
 
 def test_a_principal_point_that_is_off_is_found():

@@ -91,7 +91,7 @@ def test_sound_claims_are_confirmed(mount):
         assert cv.folds == 5 and len(cv.residual_m) == len(solution.used)
         assert 0.5 < cv.rms_m / cv.claimed_m < cv.limit
         assert cv.rms_m == pytest.approx(np.sqrt(np.mean(np.square(list(cv.residual_m.values())))))
-        assert all(g.passed for g in judge(solution, GateInputs()) if g.name == "cross-validation")
+        assert all(g.passed for g in judge(solution, GateInputs()) if g.name == "cross_validation")
 
 
 def test_a_claim_that_is_too_small_closes_the_gate(fit, monkeypatch):
@@ -109,7 +109,7 @@ def test_a_claim_that_is_too_small_closes_the_gate(fit, monkeypatch):
     assert honest.rms_m < honest.limit * honest.claimed_m
     assert boasted.rms_m > boasted.limit * boasted.claimed_m
     solution = replace(solve_views(fit.views, replace(CV, folds=False)), cross_validation=boasted)
-    assert "cross-validation" in [g.name for g in judge(solution, GateInputs()) if not g.passed]
+    assert "cross_validation" in [g.name for g in judge(solution, GateInputs()) if not g.passed]
 
 
 def test_five_views_are_too_few_to_leave_some_out():

@@ -20,7 +20,7 @@ from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, perturb, transform_points
 from calibrate.kinematics import forward
 from calibrate.projection import project
-from station.analysis.estimation import Seen
+from station.analysis.estimation import CapturedView
 from station.analysis.improvement import improve
 from station.cell.errors import StationError
 from station.cell.plan import Plan
@@ -88,13 +88,13 @@ def _flange(plan: Plan) -> Array:
     return forward(ARM, np.array([pose.joints_rad for pose in plan.poses]))
 
 
-def _picture(cell: RandomCell, index: int, flange: Array, rng: np.random.Generator) -> Seen:
+def _picture(cell: RandomCell, index: int, flange: Array, rng: np.random.Generator) -> CapturedView:
     """Corners outside the picture are not seen."""
     there = perturb(flange, rng.normal(size=6) * np.repeat([NOISE.robot_m, NOISE.robot_rad], 3))
     pixels = project(CAMERA, transform_points(cell.camera_from_board(there), POINTS)).pixels
     pixels = pixels + rng.normal(0, NOISE.pixel_px, pixels.shape)
     inside = ((pixels > 2) & (pixels < [CAMERA.width - 3, CAMERA.height - 3])).all(axis=1)
-    return index, flange, np.flatnonzero(inside), pixels[inside]
+    return CapturedView(index, flange, np.flatnonzero(inside), pixels[inside])
 
 
 def _errors(cell: RandomCell, flange: Array, rng: np.random.Generator) -> Array:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import cv2
 import msgspec
@@ -31,8 +31,19 @@ FEWEST_VIEWS = 4
 FEWEST_FOR_LENS = 6
 COVERAGE_ROWS, COVERAGE_COLUMNS = 4, 6
 
-Seen = tuple[int, Array, NDArray[np.intp], Array]
-"""Pose number, base_from_flange (4, 4), rows of `board_points` (k,), pixels (k, 2)."""
+
+@dataclass(frozen=True, eq=False)
+class CapturedView:
+    """A view that counts."""
+
+    index: int
+    """Of its pose."""
+    base_from_flange: Array
+    """(4, 4)"""
+    indices: NDArray[np.intp]
+    """(k,) rows of `board_points`"""
+    pixels: Array
+    """(k, 2)"""
 
 
 def running_estimate(
@@ -40,11 +51,11 @@ def running_estimate(
     camera: CameraModel,
     lens_is_known: bool,
     board: BoardSpec,
-    seen: Sequence[Seen],
+    seen: Sequence[CapturedView],
     goal_m: float,
 ) -> EstimateStatus:
     """Few views or degenerate motion give an answer without numbers and with advice."""
-    coverage = image_coverage(camera, [pixels for _, _, _, pixels in seen])
+    coverage = image_coverage(camera, [view.pixels for view in seen])
     blank = EstimateStatus(len(seen), goal_mm=1000 * goal_m, image_coverage=coverage)
     if len(seen) < FEWEST_VIEWS:
         return msgspec.structs.replace(blank, advice="too few views yet")
@@ -110,7 +121,7 @@ def image_coverage(camera: CameraModel, pixels: Sequence[Array]) -> tuple[tuple[
 
 
 def solve_quickly(
-    mount: Mount, camera: CameraModel, lens_is_known: bool, board: BoardSpec, seen: Sequence[Seen]
+    mount: Mount, camera: CameraModel, lens_is_known: bool, board: BoardSpec, seen: Sequence[CapturedView]
 ) -> tuple[ViewSet, Array, Array]:
     """Views with the lens they were read by, X and Y.
 
@@ -121,11 +132,11 @@ def solve_quickly(
 
 
 def _views(
-    mount: Mount, camera: CameraModel, lens_is_known: bool, board: BoardSpec, seen: Sequence[Seen]
+    mount: Mount, camera: CameraModel, lens_is_known: bool, board: BoardSpec, seen: Sequence[CapturedView]
 ) -> ViewSet:
     points = board_points(board)
     found = tuple(
-        BoardView(index, f"p{index}", flange, points[rows], pixels) for index, flange, rows, pixels in seen
+        BoardView(v.index, f"p{v.index}", v.base_from_flange, points[v.indices], v.pixels) for v in seen
     )
     views = ViewSet(mount, found, camera)
     if not lens_is_known and len(found) >= FEWEST_FOR_LENS:

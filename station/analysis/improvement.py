@@ -24,7 +24,7 @@ from calibrate.geometry import (
 )
 from calibrate.handeye.information import MeasurementNoise
 from calibrate.projection import project
-from station.analysis.estimation import FEWEST_FOR_LENS, Seen, quick_sigma, solve_quickly
+from station.analysis.estimation import FEWEST_FOR_LENS, CapturedView, quick_sigma, solve_quickly
 from station.cell.config import PoseGuess, StationConfig
 from station.cell.errors import LimitError, RefusedError
 from station.cell.limits import check_plan
@@ -68,7 +68,7 @@ class Improvement:
 def improve(
     config: StationConfig,
     lens_is_known: bool,
-    seen: Sequence[Seen],
+    seen: Sequence[CapturedView],
     left: Plan,
     here_rad: Sequence[float],
     seed: int = 0,
@@ -82,28 +82,32 @@ def improve(
     guess = better.camera_guess
     assert guess is not None
     scene = scene_of(better)
-    captured = np.array([flange for _, flange, _, _ in seen])
+    captured = np.array([view.base_from_flange for view in seen])
     options = PlanOptions(count=len(left.poses), seed=seed, free_intrinsics=not lens_is_known)
     known = msgspec.structs.replace(config, board_guess=config.board_guess or better.board_guess)
     wary = replace(scene, geometry=geometry_from(known, here_rad))
     plan = plan_scene(wary, options, here_rad, captured=captured)
     if problems := check_plan(plan, here_rad, cell_geometry(better)).problems:
-        raise LimitError(f"by what the pictures show the new way would not be free: {problems[0]}")
+        text = f"By what the images show the new path would not be free: {problems[0]}"
+        raise LimitError(text, code="path")
     before, after = (_worth(scene, seen, poses, not lens_is_known) for poses in (left, plan))
     return Improvement(plan, before, after, guess.sigma_m, guess.sigma_rad)
 
 
-def better_guesses(config: StationConfig, lens_is_known: bool, seen: Sequence[Seen]) -> StationConfig:
+def better_guesses(config: StationConfig, lens_is_known: bool, seen: Sequence[CapturedView]) -> StationConfig:
     """The configuration with mount, board and lens as the captured pictures show them."""
     camera, guess = config.camera.model, config.camera_guess
     if camera is None or camera.matrix is None or guess is None:
-        raise RefusedError("the configuration holds no camera_guess and rough lens to improve on")
+        text = "The configuration has no camera_guess or no rough lens to improve on."
+        raise RefusedError(text, code="no-guess")
     if len(seen) < FEWEST_VIEWS:
-        raise RefusedError(f"{len(seen)} pictures say too little yet: take at least {FEWEST_VIEWS}")
+        text = f"{len(seen)} images captured (limit {FEWEST_VIEWS})."
+        raise RefusedError(text, code="too-few-views", views=len(seen), limit=FEWEST_VIEWS)
     try:
         views, X, _ = solve_quickly(config.mount, camera, lens_is_known, config.board, seen)
     except (CalibrationError, cv2.error, np.linalg.LinAlgError):
-        raise RefusedError("the motion so far says too little of the mount: take more poses first") from None
+        text = "The poses so far do not determine the camera pose."
+        raise RefusedError(text, code="degenerate", remedy="Take more poses first.") from None
     flange = views.base_from_flange
     gripper = flange if config.mount == "eye-in-hand" else np.array([inverse(E) for E in flange])
     places = gripper @ X @ views.camera_from_board
@@ -127,22 +131,26 @@ def _require_agreement(guess: PoseGuess, X: Array) -> None:
     sigmas = np.repeat([guess.sigma_m, guess.sigma_rad], 3)
     if (np.abs(off) <= _CONTRADICTION * sigmas).all():
         return
+    distance_m, angle_rad = float(np.linalg.norm(off[:3])), float(np.linalg.norm(off[3:]))
     raise RefusedError(
-        f"the pictures put the camera {1000 * np.linalg.norm(off[:3]):.0f} mm and "
-        f"{np.rad2deg(np.linalg.norm(off[3:])):.1f}° from camera_guess, far beyond its sigmas: look whether "
-        "camera or board were moved, and correct the guess; the plan stays as it is"
+        f"The images put the camera {1000 * distance_m:.0f} mm and {np.rad2deg(angle_rad):.1f}° from "
+        f"camera_guess (limit {_CONTRADICTION:g} sigma).",
+        code="guess-contradicted",
+        remedy="Check whether camera or board were moved, and correct the guess.",
+        distance_m=distance_m,
+        angle_rad=angle_rad,
     )
 
 
-def _worth(scene: Scene, seen: Sequence[Seen], left: Plan, free_lens: bool) -> ReplanGain:
+def _worth(scene: Scene, seen: Sequence[CapturedView], left: Plan, free_lens: bool) -> ReplanGain:
     flange = flange_poses(scene, left)
-    captured = np.array([pose for _, pose, _, _ in seen])
+    captured = np.array([view.base_from_flange for view in seen])
     everything = informations(scene, np.concatenate([captured, flange]), MeasurementNoise()).sum(axis=0)
     sigma_m = sigma_of(everything, objective_for(scene, "A", free_lens))[0]
     whole = visible(scene.camera, scene.seen(flange, outline(scene.board)), 0.0)
     points = scene.seen(flange[whole], board_points(scene.board))
     pixels = np.concatenate(
-        [*(p for _, _, _, p in seen), project(scene.camera, points).pixels.reshape(-1, 2)]
+        [*(view.pixels for view in seen), project(scene.camera, points).pixels.reshape(-1, 2)]
     )
     size = np.array([scene.camera.width, scene.camera.height]) - 1
     margin_px = float(max(pixels.min(axis=0).max(), (size - pixels.max(axis=0)).max()))

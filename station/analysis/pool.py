@@ -8,6 +8,7 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from functools import partial
 from multiprocessing import get_context
 from multiprocessing.process import BaseProcess
 from typing import Any, TypeVar
@@ -40,7 +41,7 @@ class Workers:
         """Returns when the worker has loaded what it needs (about a second)."""
         await self.call(warm_up)
 
-    async def call(self, function: Callable[..., R], *args: Any, timeout_s: float = 60.0) -> R:
+    async def call(self, function: Callable[..., R], *args: Any, timeout_s: float = 60.0, **named: Any) -> R:
         """The function's result or exception. WorkerError when the process fails or is too slow.
 
         `timeout_s`: from when its turn comes and the worker is there, so that no call ends another one.
@@ -49,25 +50,24 @@ class Workers:
         try:
             async with self._turn:
                 if self._closed:
-                    raise WorkerError("the station is ending")
+                    raise WorkerError("The station is ending.", code="station-ending")
                 pool = self._pool
                 if pool is None:
                     pool = self._pool = ProcessPoolExecutor(1, get_context("spawn"), initializer=start_worker)
-                    await self._ask(pool, START_S, warm_up)
-                return await self._ask(pool, timeout_s, function, *args)
+                    await self._ask(pool, START_S, partial(warm_up))
+                return await self._ask(pool, timeout_s, partial(function, *args, **named))
         finally:
             self.waiting -= 1
 
-    async def _ask(
-        self, pool: ProcessPoolExecutor, timeout_s: float, function: Callable[..., R], *args: Any
-    ) -> R:
+    async def _ask(self, pool: ProcessPoolExecutor, timeout_s: float, work: partial[R]) -> R:
         try:
             async with asyncio.timeout(timeout_s):
-                return await asyncio.wrap_future(pool.submit(function, *args))
+                return await asyncio.wrap_future(pool.submit(work))
         except (BrokenProcessPool, TimeoutError) as error:
             self._discard(pool)
-            what = "took too long" if isinstance(error, TimeoutError) else "died"
-            raise WorkerError(f"the worker process {what} in {function.__name__}; it is replaced") from error
+            late = isinstance(error, TimeoutError)
+            text = f"The worker process {'took too long' if late else 'died'} in {work.func.__name__}."
+            raise WorkerError(text, code="worker-late" if late else "worker-died") from error
 
     def close(self) -> None:
         self._closed = True

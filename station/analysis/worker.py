@@ -1,4 +1,4 @@
-"""What runs in the daemon's worker process: looking at pictures, checking and making plans, estimating.
+"""The work of the daemon's worker process: looking at images, checking plans.
 
 Plain functions of plain data, so that they cross a process border; the daemon's loop never runs them.
 """
@@ -22,6 +22,7 @@ from calibrate.geometry import Array
 from recordings.errors import RecordingError
 from recordings.reader import open_recording
 from recordings.schema.messages import BoardSpec, CameraModel, Vector6
+from station.analysis.estimation import CapturedView
 from station.analysis.exposure import assess
 from station.cell.config import StationConfig
 from station.cell.limits import PlanCheck, check_plan
@@ -29,14 +30,13 @@ from station.cell.plan import Plan
 from station.cell.process import die_with_parent
 from station.cell.scene import geometry_from
 from station.cell.status import DetectionStatus
-from station.plan.planner import make_plan
 
 _NICENESS = 5
 
 
 @dataclass(frozen=True, eq=False)
 class BoardDetection:
-    """What one picture shows."""
+    """The board in one image."""
 
     status: DetectionStatus
     indices: NDArray[np.intp]
@@ -68,12 +68,12 @@ def sight(
 ) -> BoardDetection:
     """Looks for the board; distance and tilt where a lens, even a rough one, is given.
 
-    `exposure`: what the picture was taken with (µs, dB); with it comes advice on what to set.
+    `exposure`: what the image was taken with (µs, dB); with it comes advice on what to set.
     """
     found = detect(image, board, thorough)
     distance_m = tilt_rad = None
     if found.found and camera is not None and camera.matrix is not None:
-        full = camera.width / image.shape[1]  # previews may be smaller than the camera's pictures
+        full = camera.width / image.shape[1]  # previews may be smaller than the camera's images
         pixels = (found.pixels + 0.5) * full - 0.5
         distance_m, tilt_rad = _distance_and_tilt(pixels, board_points(board)[found.indices], camera)
     advice = ""
@@ -94,20 +94,19 @@ def sight(
     return BoardDetection(status, found.indices, found.pixels)
 
 
-def seen_before(
-    path: Path, board: BoardSpec, camera: CameraModel | None
-) -> list[tuple[int, Array, BoardDetection]]:
-    """Pose number, base_from_flange (4, 4) and sighting of every picture of a recording that shows the board.
+def seen_before(path: Path, board: BoardSpec) -> list[CapturedView]:
+    """The views of a recording that show the board; an image that cannot be read shows none.
 
-    A picture that cannot be read shows none. RecordingError for a recording that cannot be.
+    RecordingError for a recording that cannot be read.
     """
-    recording = open_recording(path)
-    found = []
+    recording, seen = open_recording(path), []
     for view in recording.views():
         with contextlib.suppress(RecordingError):
-            seen = sight(recording.image(view).pixels, board, camera)
-            found.append((view.index, np.array(view.base_from_flange), seen))
-    return [entry for entry in found if entry[2].status.found]
+            found = detect(recording.image(view).pixels, board)
+            if found.found:
+                flange = np.array(view.base_from_flange)
+                seen.append(CapturedView(view.index, flange, found.indices, found.pixels))
+    return seen
 
 
 def _distance_and_tilt(
@@ -127,12 +126,5 @@ def _distance_and_tilt(
 
 
 def check_run(config: StationConfig, plan: Plan, start_joints_rad: Vector6) -> PlanCheck:
-    """The whole way, from where the arm is."""
+    """Checks the whole path, from where the arm is."""
     return check_plan(plan, start_joints_rad, geometry_from(config, start_joints_rad))
-
-
-def plan_poses(
-    config: StationConfig, start_joints_rad: Vector6 | None, seed: int, count: int, lens_known: bool
-) -> Plan:
-    """ConfigError or LimitError with the remedy."""
-    return make_plan(config, start_joints_rad=start_joints_rad, seed=seed, count=count, lens_known=lens_known)

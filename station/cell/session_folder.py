@@ -1,6 +1,6 @@
-"""Where sessions lie on the disk, and what of a session outlives the daemon.
+"""The sessions' folders on the disk, and what of a session outlives the daemon.
 
-ROOT/sessions/20260131-101500-cell/   session.mcap, session-2.mcap … one file a part
+ROOT/sessions/20260131-101500-cell/   session.mcap, session-2.mcap … one file a segment
                                       session.json  poses and their state, written after every pose
 ROOT/active                           names the session that runs; still there after a crash
 """
@@ -35,8 +35,9 @@ class SessionState(msgspec.Struct, frozen=True, omit_defaults=True):
     plan: Plan
     poses: tuple[PoseStatus, ...]
     parts: int = 1
+    """Segments"""
     elapsed_s: float = 0.0
-    """Of all its runs."""
+    """Of all its runs together"""
     check: bool = False
     """A drift check of the installed calibration."""
     sealed: bool = False
@@ -81,12 +82,13 @@ def new_session_folder(root: Path, cell: str) -> Path:
                 continue
             return folder
     except OSError as error:
-        raise StationError(f"cannot make a folder in {sessions}: {error.strerror}; give --root") from error
-    raise StationError(f"{sessions} holds too many sessions of this second; try again")
+        text = f"Cannot make a folder in {sessions}: {error.strerror}"
+        raise StationError(text, code="session-folder", remedy="Give another --root.") from error
+    raise StationError(f"{sessions} holds too many sessions of this second.", code="session-folder")
 
 
-def part_path(folder: Path, part: int) -> Path:
-    return folder / ("session.mcap" if part == 1 else f"session-{part}.mcap")
+def segment_path(folder: Path, segment: int) -> Path:
+    return folder / ("session.mcap" if segment == 1 else f"session-{segment}.mcap")
 
 
 def write_state(folder: Path, state: SessionState) -> None:

@@ -7,6 +7,7 @@ from typing import Literal
 
 import msgspec
 
+from recordings.errors import Value
 from recordings.schema.messages import Matrix4, Mount, Source, Vector6
 
 
@@ -34,6 +35,8 @@ class PoseStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     name: str
     state: PoseState = "planned"
     reason: str = ""
+    cause: str = ""
+    """The code of `reason`, for programs."""
     why: str = ""
     """Why the planner put it there."""
     attempt: int = 0
@@ -184,11 +187,18 @@ class Lease(msgspec.Struct, frozen=True, omit_defaults=True):
     since_wall_ns: int = 0
 
 
+Level = Literal["debug", "info", "warning", "error"]
+
+
 class Event(msgspec.Struct, frozen=True, omit_defaults=True):
     wall_ns: int
-    level: Literal["debug", "info", "warning", "error"]
+    level: Level
     text: str
     pose_index: int | None = None
+    code: str = ""
+    """What happened, for programs: kebab-case"""
+    values: dict[str, Value] = {}
+    """Figures of it; each name ends in its unit"""
 
 
 class MotionPreview(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -236,6 +246,8 @@ class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     state: StationState = StationState.DISCONNECTED
     reason: str = ""
     """Why stopped, paused or at fault, and what to do: the sentence for the top bar."""
+    cause: str = ""
+    """The code of `reason`, for programs."""
     pending: str = ""
     """What comes after the pose under way: a pause or the end."""
     simulated: bool = False

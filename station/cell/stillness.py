@@ -19,25 +19,29 @@ from calibrate.geometry import rotation_angle
 from calibrate.kinematics import JOINT_NAMES, RobotModel, forward
 from recordings.schema.messages import RobotState, Stillness
 from station.cell.config import StillnessConfig
-from station.cell.errors import StationError
+from station.cell.errors import StaleStateError, StationError
 
 POLL_S = 0.02
-FIND_SHAKE = "Look for what shakes the arm or the camera, or take this pose again later"
-UNSEEN = "the joints rest, but the camera gave no pictures to see by whether it does"
-CHECK_CAMERA = "Check the camera's cable and power, or take this pose again later"
+NEWS_POLL_S = 0.01
+REST_PATIENCE_S = 1.0
+FIND_SHAKE = "Find what shakes the arm or the camera, or retake the pose later."
+UNSEEN = "image motion unknown, no images"
+CHECK_CAMERA = "Check the camera's cable and power, or retake the pose later."
 LEAST_SAMPLES = 8
 KEPT_SAMPLES = 4096
 
 
 @dataclass(frozen=True)
 class ImageMotion:
-    """What the pictures say: how far they move, px; None where that cannot be measured."""
+    """How far images move, px; None where that cannot be measured."""
 
     motion_px: float | None
 
 
 class NotStillError(StationError):
-    """The arm did not come to rest in time; the message says what still moved, and by how much."""
+    """The arm did not settle in time; the message says what still moved, and by how much."""
+
+    code = "not-settled"
 
 
 class StillnessMonitor:
@@ -107,7 +111,7 @@ class StillnessMonitor:
             )
         if found.image_motion_px is not None and found.image_motion_px > limits.image_motion_px:
             parts.append(
-                f"the picture moves by {found.image_motion_px:.2f} px (limit {limits.image_motion_px:.2f})"
+                f"the image moves by {found.image_motion_px:.2f} px (limit {limits.image_motion_px:.2f})"
             )
         return ", ".join(parts)
 
@@ -128,7 +132,7 @@ class StillnessMonitor:
     ) -> Stillness:
         """Returns as soon as everything is at rest. `alive` raises when the robot is lost; False: old news.
 
-        `look`: at pictures exposed since this host time, when the joints came to rest; None = not yet.
+        `look`: at images exposed since this host time, when the joints came to rest; None = not yet.
         NotStillError after the configured time-out, with what still moved.
         """
         give_up_s = now_s() + self._limits.timeout_s
@@ -151,20 +155,62 @@ class StillnessMonitor:
                     if not unrest:
                         return found
             if now_s() >= give_up_s:
-                raise NotStillError(f"not at rest within {self._limits.timeout_s:g} s: {unrest}. {remedy}")
+                limit_s = self._limits.timeout_s
+                code = "no-images" if remedy is CHECK_CAMERA else "no-news" if old else ""
+                text = f"Not settled after {limit_s:g} s: {unrest}."
+                raise NotStillError(text, code=code, remedy=remedy, limit_s=limit_s)
             await asyncio.sleep(POLL_S)
 
     def require_rest(self, state: RobotState) -> None:
-        """NotStillError when the arm moved at that moment: rest before a picture is no rest during it."""
+        """NotStillError when the arm moved at that moment: rest before an image is no rest during it."""
         speeds, limit = np.abs(state.joint_speeds_rad_s), self._limits.joint_speed_rad_s
         joint = int(speeds.argmax())
         if speeds[joint] > limit:
             raise NotStillError(
-                f"the arm was moved while the picture was taken: joint {JOINT_NAMES[joint]} at "
-                f"{math.degrees(speeds[joint]):.2f}°/s (limit {math.degrees(limit):.2f}). "
-                "Leave it at rest, and take this pose again"
+                f"The arm was moved while the image was taken: joint {JOINT_NAMES[joint]} at "
+                f"{math.degrees(speeds[joint]):.2f}°/s (limit {math.degrees(limit):.2f}).",
+                code="moved-in-exposure",
+                remedy="Leave it at rest, and retake the pose.",
+                joint=JOINT_NAMES[joint],
+                speed_rad_s=float(speeds[joint]),
+                limit_rad_s=limit,
             )
 
     def _window_begin_ns(self, found: Stillness) -> int:
         """Host monotonic time."""
         return self._states[-1].stamps.host_monotonic_ns - round(found.window_s * 1e9)
+
+
+class RestingCheck:
+    """`check` (the robot's), forgiving stale news for up to `patience_s` at a stretch; all else at once.
+
+    Nothing is commanded to move while this waits. A moving arm has no such patience: `Robot.move` ends it.
+    """
+
+    def __init__(
+        self,
+        check: Callable[[], None],
+        patience_s: float = REST_PATIENCE_S,
+        now_s: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self._check, self._patience_s, self._now_s = check, patience_s, now_s
+        self._stale_since_s: float | None = None
+
+    def __call__(self) -> bool:
+        """True when the news are fresh and good. Raises what `check` raises."""
+        try:
+            self._check()
+        except StaleStateError:
+            now_s = self._now_s()
+            if self._stale_since_s is None:
+                self._stale_since_s = now_s
+            if now_s - self._stale_since_s >= self._patience_s:
+                raise
+            return False
+        self._stale_since_s = None
+        return True
+
+    async def news(self) -> None:
+        """Returns with fresh and good news."""
+        while not self():
+            await asyncio.sleep(NEWS_POLL_S)

@@ -152,7 +152,7 @@ class SessionDispatcher:
         return await self._session.prepare_hover(caller.client_id, args)
 
     async def _go(self, caller: _Caller, args: verbs.Go) -> None:
-        asks, waiting = await self._asks(caller), self._session.waiting_go
+        asks, waiting = await self._asks(caller), self._session.approvals.waiting
         if waiting is not None and waiting.hover is not None:
             how = self._rule.by_person(asks, "a move over the board")
         else:
@@ -196,7 +196,7 @@ class SessionDispatcher:
         return await self._session.previews.preview(args.width, args.height)
 
     async def _doctor(self, caller: _Caller, args: verbs.Doctor) -> list[verbs.Check]:
-        return await checklist(self._session.context, self._session.troubles)
+        return await checklist(self._session.context, self._session.devices.troubles)
 
     async def _sessions(self, caller: _Caller, args: verbs.Sessions) -> list[SessionSummary]:
         # In a thread: hundreds of files are read, and the arm's heartbeat does not wait.

@@ -1,59 +1,73 @@
-"""One stop of the arm: rest, picture, robot pose of the same moment, disk. It counts only after the disk."""
+"""One stop of the arm: settle, image, robot pose of the same moment, disk. It counts only after the disk."""
 
 from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import time
+from collections import deque
+from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from calibrate.geometry import Array, inverse, pose_from_rotvec
 from recordings.schema.messages import Image, RobotState, Stamps, Stillness, Vector6, View
+from station.analysis.estimation import CapturedView
+from station.analysis.picture_motion import board_box, picture_motion
 from station.analysis.pool import WorkerError
 from station.analysis.worker import BoardDetection, sight
 from station.cell.config import matrix4
 from station.cell.errors import CameraError, StaleStateError, StationError
 from station.cell.status import PoseState, StationState
+from station.cell.stillness import ImageMotion, RestingCheck
 from station.devices.frames import mid_exposure
-from station.session.context import CapturedView, SessionContext
-from station.session.patience import RestingCheck
-from station.session.picture_watch import PictureWatch
+from station.session.context import SessionContext
 from station.session.recording import to_the_end
 
 STATE_WAIT_S = 1.0
-"""The robot state of mid-exposure may come later than the picture, on a busy computer by this much."""
+"""The robot state of mid-exposure may come later than the image, on a busy computer by this much."""
 SIGHT_TIMEOUT_S = 20.0
 SATURATED_LIMIT = 0.05
+GAPS_S = (0.0, 0.03)
+"""Between glimpses. Uneven, so that a ringing whose period fits one gap does not fit the other."""
+IMAGES = 3
+GLIMPSE_TRIES = 2
+WORKER_TIMEOUT_S = 5.0
+
+log = logging.getLogger(__name__)
 
 
 class PoseFailedError(StationError):
-    """This pose gave nothing usable; the message says why. The session goes on."""
+    """This pose gave nothing usable; the session goes on."""
+
+    code = "pose-failed"
 
 
 async def take_pose(context: SessionContext, index: int, attempt: int) -> None:
-    """At rest → picture → disk; marks the pose done.
+    """Settles, takes the image, writes it; marks the pose done.
 
     PoseFailedError and NotStillError when this pose gave nothing; RobotError and RecordingError end the run.
     """
     _phase(context, index, StationState.SETTLING, "settling")
     resting = RestingCheck(context.cell.robot.check)
-    async with PictureWatch(context, index) as watch:
+    async with ImageWatch(context, index) as watch:
         still = await context.stillness.settle(resting, watch.look)
     _phase(context, index, StationState.CAPTURING, "capturing")
-    picture = context.require_recording().number(await take_picture(context, index))
-    show_frame(context, picture)
-    device_ns, arrival_ns = picture.stamps.device_ns, picture.stamps.host_monotonic_ns
+    image = context.require_recording().number(await take_image(context, index))
+    show_frame(context, image)
+    device_ns, arrival_ns = image.stamps.device_ns, image.stamps.host_monotonic_ns
     clock = context.cell.camera.clock
-    mid_ns, camera_bound_s = mid_exposure(device_ns, arrival_ns, picture.exposure_us, clock)
+    mid_ns, camera_bound_s = mid_exposure(device_ns, arrival_ns, image.exposure_us, clock)
     state = await _state_at(context, mid_ns)
     await resting.news()
     context.stillness.require_rest(state)
-    view = _view(context, index, attempt, picture, state, still, camera_bound_s)
+    view = _view(context, index, attempt, image, state, still, camera_bound_s)
     _require_bound(context, view)
     _phase(context, index, StationState.WRITING, "writing")
-    await to_the_end(_write(context, index, picture, view))
+    await to_the_end(_write(context, index, image, view))
 
 
 def _phase(context: SessionContext, index: int, state: StationState, pose_state: PoseState) -> None:
@@ -62,8 +76,8 @@ def _phase(context: SessionContext, index: int, state: StationState, pose_state:
     context.show_poses(index)
 
 
-async def take_picture(context: SessionContext, index: int | None = None) -> Image:
-    """Of a pose, or of none. PoseFailedError once the configured retries are used up."""
+async def take_image(context: SessionContext, index: int | None = None) -> Image:
+    """For a pose, or for none. PoseFailedError once the configured retries are used up."""
     tries = 1 + context.cell.config.capture.retries
     camera = context.cell.camera
     for number in range(1, tries + 1):
@@ -77,20 +91,20 @@ async def take_picture(context: SessionContext, index: int | None = None) -> Ima
             return await camera.capture()
         except CameraError as error:
             last = error
-            context.store.event(f"picture {number} of at most {tries}: {error}", "warning", index)
-    raise PoseFailedError(f"no good picture in {tries} tries: {last}")
+            context.store.problem(error, "warning", index, f"image {number} of at most {tries}: {{}}")
+    raise PoseFailedError(f"No good image in {tries} tries: {last}", code="no-image", tries=tries)
 
 
-def show_frame(context: SessionContext, picture: Image) -> None:
-    height, width = picture.pixels.shape[:2]
+def show_frame(context: SessionContext, image: Image) -> None:
+    height, width = image.pixels.shape[:2]
     shown = msgspec.structs.replace(
         context.store.status.camera,
         connected=True,
-        frames=picture.sequence + 1,
+        frames=image.sequence + 1,
         width=width,
         height=height,
-        exposure_us=picture.exposure_us,
-        gain_db=picture.gain_db,
+        exposure_us=image.exposure_us,
+        gain_db=image.gain_db,
     )
     context.store.update(camera=shown)
 
@@ -116,7 +130,7 @@ def _view(
     context: SessionContext,
     index: int,
     attempt: int,
-    picture: Image,
+    image: Image,
     state: RobotState,
     still: Stillness,
     camera_bound_s: float,
@@ -127,7 +141,7 @@ def _view(
     return View(
         index=index,
         name=context.require_queue().pose(index).name,
-        picture_sequence=picture.sequence,
+        picture_sequence=image.sequence,
         base_from_flange=matrix4(flange_pose(state, context.cell.robot.identity.tcp_offset)),
         joints_rad=state.joints_rad,
         attempt=attempt,
@@ -135,7 +149,7 @@ def _view(
             host_monotonic_ns=exposure_ns,
             host_wall_ns=state.stamps.host_wall_ns,
             controller_s=state.stamps.controller_s,
-            device_ns=picture.stamps.device_ns + round(picture.exposure_us * 500),
+            device_ns=image.stamps.device_ns + round(image.exposure_us * 500),
         ),
         time_bound_s=bound_s,
         stillness=still,
@@ -146,54 +160,149 @@ def _require_bound(context: SessionContext, view: View) -> None:
     limit_s = context.cell.config.capture.time_bound_s
     if view.time_bound_s is not None and view.time_bound_s > limit_s:
         raise PoseFailedError(
-            f"the picture's time is known to ±{1000 * view.time_bound_s:.1f} ms only, the limit is "
-            f"{1000 * limit_s:.1f} ms (capture.time_bound_s): look at the load of this computer"
+            f"Image time known to ±{1000 * view.time_bound_s:.1f} ms (limit {1000 * limit_s:.1f} ms, "
+            "capture.time_bound_s).",
+            code="time-unsure",
+            remedy="Reduce this computer's load.",
+            bound_s=view.time_bound_s,
+            limit_s=limit_s,
         )
 
 
-async def _write(context: SessionContext, index: int, picture: Image, view: View) -> None:
+async def _write(context: SessionContext, index: int, image: Image, view: View) -> None:
     """Disk and detection side by side; the view is written, and the pose counted, only with a board in it."""
     recording, queue = context.require_recording(), context.require_queue()
-    recording.picture(picture)
-    sighting = await _sighting(context, picture, index)
-    reason = _unusable(sighting) if sighting is not None else ""
+    recording.image(image)
+    sighting = await _sighting(context, image, index)
+    unusable = _unusable(sighting) if sighting is not None else None
     if sighting is not None and len(sighting.pixels):
-        recording.corners(picture.sequence, sighting.pixels)
-    if reason:
+        recording.corners(image.sequence, sighting.pixels)
+    if unusable is not None:
         await recording.sync()
-        raise PoseFailedError(reason)
+        raise unusable
     recording.view(view)
     await recording.sync()
     if sighting is not None:
         queue.note(index, corners=sighting.status.corners, coverage=sighting.status.coverage)
         context.store.update(detection=sighting.status)
-        context.seen[index] = CapturedView(
-            index, np.array(view.base_from_flange), sighting.indices, sighting.pixels
-        )
+        flange = np.array(view.base_from_flange)
+        context.seen[index] = CapturedView(index, flange, sighting.indices, sighting.pixels)
     queue.mark(index, "done")
     await recording.save_state(queue)
     context.show_poses(index)
-    corners = f", {sighting.status.corners} corners" if sighting is not None else ""
-    context.store.event(f"saved{corners}", pose_index=index)
+    corners = sighting.status.corners if sighting is not None else None
+    text = "saved" if corners is None else f"saved, {corners} corners"
+    context.store.event("saved", text, pose_index=index, corners=corners)
 
 
-async def _sighting(context: SessionContext, picture: Image, index: int) -> BoardDetection | None:
+async def _sighting(context: SessionContext, image: Image, index: int) -> BoardDetection | None:
     """None when the worker could not say: the data are kept, the offline stage looks again."""
     config = context.cell.config
     try:
         return await context.workers.call(
-            sight, picture.pixels, config.board, config.camera.model, timeout_s=SIGHT_TIMEOUT_S
+            sight, image.pixels, config.board, config.camera.model, timeout_s=SIGHT_TIMEOUT_S
         )
     except WorkerError as error:
-        context.store.event(f"the picture was not looked at: {error}", "warning", index)
+        context.store.problem(error, "warning", index, "the image was not looked at: {}")
         return None
 
 
-def _unusable(sighting: BoardDetection) -> str:
-    """Why a picture does not count; empty when it does."""
+def _unusable(sighting: BoardDetection) -> PoseFailedError | None:
+    """Why an image does not count; None when it does."""
     status = sighting.status
     if not status.found:
-        return status.reason or "no board in the picture"
+        return PoseFailedError(status.reason or "No board in the image.", code="no-board")
     if status.saturated > SATURATED_LIMIT:
-        return f"over-exposed: {100 * status.saturated:.0f} % of the board's pixels are white; expose less"
-    return ""
+        return PoseFailedError(
+            f"Over-exposed: {100 * status.saturated:.0f} % of the board's pixels are white "
+            f"(limit {100 * SATURATED_LIMIT:.0f} %).",
+            code="over-exposed",
+            remedy="Expose less.",
+            saturated=status.saturated,
+            limit=SATURATED_LIMIT,
+        )
+    return None
+
+
+class ImageWatch:
+    """Watches the image while the arm settles: three images, their motion, and again while it moves.
+
+    For the time of a `with` block; `look` is for `StillnessMonitor.settle`. A camera that cannot be looked
+    at (playback), or fails to, leaves the motion unmeasured.
+    """
+
+    def __init__(self, context: SessionContext, index: int) -> None:
+        self._context, self._index = context, index
+        self._images: deque[tuple[int, NDArray[Any]]] = deque(maxlen=IMAGES)
+        self._found: tuple[int, ImageMotion] | None = None
+        """With the time before which none of its images began."""
+        self._blind = False
+        self._again = asyncio.Event()
+        self._glimpsing: asyncio.Task[Image | None] | None = None
+        self._task: asyncio.Task[None] | None = None
+        model = context.cell.config.camera.model
+        self._width = model.width if model is not None else 0
+        view = context.require_queue().pose(index).view
+        # A fixed camera may see more of a resting background than of the board that swings before it.
+        fixed = context.cell.config.mount == "eye-to-hand" and model is not None
+        self._box = board_box(view, model.width, model.height) if fixed and model is not None else None
+
+    def look(self, since_ns: int) -> ImageMotion | None:
+        """The motion in images exposed after this host time; None: not yet, ask again."""
+        if self._blind:
+            return ImageMotion(None)
+        self._again.set()
+        if self._found is None or self._found[0] < since_ns:
+            return None
+        return self._found[1]
+
+    async def __aenter__(self) -> ImageWatch:
+        self._task = asyncio.create_task(self._run())
+        return self
+
+    async def __aexit__(self, *_: object) -> None:
+        """The camera is free again when this returns: a request to it is never given up half-way."""
+        assert self._task is not None
+        self._task.cancel()
+        ending = {self._task, *([self._glimpsing] if self._glimpsing else [])}
+        await asyncio.wait(ending)
+        # Nobody waits for this look any more: its failure is the next image's to tell.
+        await asyncio.gather(*ending, return_exceptions=True)
+
+    async def _run(self) -> None:
+        try:
+            while await self._one_more():
+                if len(self._images) == IMAGES:
+                    await self._measure()
+                    self._again.clear()
+                    await self._again.wait()
+                else:
+                    await asyncio.sleep(GAPS_S[len(self._images) - 1])
+        except Exception as error:  # a defect, too, must not keep the pose waiting
+            if not isinstance(error, StationError):
+                log.exception("the image motion could not be measured")
+            self._context.store.problem(error, "warning", self._index, "image motion not measured: {}")
+        self._blind = True
+
+    async def _one_more(self) -> bool:
+        """False when this camera has none to show."""
+        for left in reversed(range(GLIMPSE_TRIES)):
+            asked_ns = time.monotonic_ns()
+            self._glimpsing = asyncio.create_task(self._context.cell.camera.glimpse())
+            try:
+                image = await asyncio.shield(self._glimpsing)
+            except CameraError:
+                if not left:
+                    raise
+                continue
+            if image is not None:
+                self._images.append((asked_ns, image.pixels))
+            return image is not None
+        return False
+
+    async def _measure(self) -> None:
+        images = [image for _, image in self._images]
+        motion_px = await self._context.workers.call(
+            picture_motion, images, self._width, self._box, timeout_s=WORKER_TIMEOUT_S
+        )
+        self._found = (self._images[0][0], ImageMotion(motion_px))

@@ -6,15 +6,13 @@ import contextlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import msgspec
-import numpy as np
-from numpy.typing import NDArray
-
-from calibrate.geometry import Array
 from recordings.errors import RecordingError
+from recordings.recover import recover
 from recordings.schema.messages import RobotState
+from station.analysis.estimation import CapturedView
 from station.analysis.pool import Workers
 from station.cell.collision import CellGeometry
+from station.cell.errors import RefusedError
 from station.cell.status import Event, SessionStatus, StationState
 from station.cell.stillness import StillnessMonitor
 from station.devices.cell import Cell
@@ -23,19 +21,9 @@ from station.session.recording import SessionRecording
 from station.session.store import StatusStore
 
 
-@dataclass(frozen=True, eq=False)
-class CapturedView:
-    """A pose that counts, as far as the running estimate needs it."""
-
-    index: int
-    base_from_flange: Array
-    indices: NDArray[np.intp]
-    pixels: Array
-
-
 @dataclass(eq=False)
 class SessionContext:
-    """Touched by the event loop's thread only."""
+    """State of a session. Touched by the event loop's thread only."""
 
     cell: Cell
     geometry: CellGeometry
@@ -45,18 +33,25 @@ class SessionContext:
     root: Path
     queue: PoseQueue | None = None
     recording: SessionRecording | None = None
-    """Of the session that is not sealed yet."""
+    """Of the session that is not finished yet."""
     seen: dict[int, CapturedView] = field(default_factory=dict)
+    """By pose number: views that count."""
     pause_wanted: str = ""
-    """Who asked to pause after this pose; empty = nobody."""
+    """Who asked to pause after this pose; empty: nobody."""
     finish_wanted: bool = False
     halting: bool = False
-    """STOP, a fault or a lost lease ends the run: it must not change the state any more."""
+    """STOP, a fault or lost control ends the run: it must not change the state any more."""
 
     @property
     def resting(self) -> StationState:
-        """Where the station stands between two goes: `paused` always has a session to go on with."""
+        """Where the station stands between two motions: `paused` always has a session to continue."""
         return StationState.IDLE if self.recording is None else StationState.PAUSED
+
+    def loaded(self) -> PoseQueue:
+        """The plan's poses. RefusedError when there are none."""
+        if self.queue is None:
+            raise RefusedError("No plan is loaded.", code="no-plan", remedy="Load or make one first.")
+        return self.queue
 
     def require_queue(self) -> PoseQueue:
         """Inside a run there always is one."""
@@ -77,12 +72,39 @@ class SessionContext:
             with contextlib.suppress(RecordingError):
                 self.recording.event(event)
 
+    async def open_recording(self, queue: PoseQueue, check: bool = False) -> None:
+        """Opens the session's next file where none is open; begins a session where there is none.
+
+        `check`: as a drift check. Raises RecordingError, StationError; all is as before then.
+        """
+        before = self.recording
+        if before is not None and before.recorder is not None:
+            return
+        image = await self.cell.camera.capture() if self.cell.config.camera.model is None else None
+        if before is not None:
+            await self.recover_segments(before)
+        recording = before or SessionRecording(self.root, self.cell, check=check)
+        # Before it is open, and so it stays when STOP cuts in: what is there then must be closed.
+        self.recording = recording
+        try:
+            await recording.open(queue, image)
+        except Exception:
+            self.recording = before
+            raise
+
+    async def recover_segments(self, recording: SessionRecording) -> None:
+        """What a crash left open is made whole before another segment follows. Raises RecordingError."""
+        await recording.released()
+        async with recording.recovering:
+            if recording.unfinished_segments:
+                for found in await self.workers.call(recover, recording.folder):
+                    self.store.event("recovered", f"recovered {found.text}")
+            recording.count_segments()
+
     def forget_session(self, check: bool = False) -> None:
         """What is shown of the session before ends when the next one begins; `check`: as a drift check."""
         self.seen.clear()
-        session = self.store.status.session
-        fresh = msgspec.structs.replace(
-            session,
+        self.store.update_session(
             name="",
             folder="",
             recording="",
@@ -91,28 +113,19 @@ class SessionContext:
             elapsed_s=0.0,
             remaining_s=None,
         )
-        self.store.update(session=fresh)
 
     def show_poses(self, current: int | None = None) -> None:
         """Brings the status up to date with the queue and the recording."""
         queue, recording = self.queue, self.recording
-        old = self.store.status.session
         if queue is None:
             self.store.update(session=SessionStatus(source=self.cell.source))
             return
-        self.store.update(
-            session=SessionStatus(
-                name=recording.name if recording else old.name,
-                folder=str(recording.folder) if recording else old.folder,
-                plan_sha256=queue.sha256,
-                poses=queue.statuses,
-                current=current,
-                captured=queue.done,
-                elapsed_s=old.elapsed_s,
-                remaining_s=old.remaining_s,
-                recording=old.recording,
-                calibration=old.calibration,
-                check=old.check,
-                source=self.cell.source,
-            )
+        named = {"name": recording.name, "folder": str(recording.folder)} if recording else {}
+        self.store.update_session(
+            plan_sha256=queue.sha256,
+            poses=queue.statuses,
+            current=current,
+            captured=queue.done,
+            source=self.cell.source,
+            **named,
         )

@@ -16,20 +16,19 @@ from station.cell.stillness import NotStillError
 from station.protocol.verbs import Record
 from station.session.capture import PoseFailedError, take_pose
 from station.session.context import SessionContext
-from station.session.queue import GUIDED, PoseQueue
-from station.session.recording import SessionRecording
-from station.session.run import disk_failed, recover_parts, unmark_busy
+from station.session.queue import PoseQueue
+from station.session.run import disk_failed, internal_error, unmark_busy
 
 log = logging.getLogger(__name__)
 
-_GUIDE = "guide the arm by hand; the station does not move it"
+_GUIDE = "Guide the arm by hand. The station does not move it."
 NEW_PLACE_RAD = 0.1
-"""Auto-record: some joint must have turned by this much since the last picture."""
+"""Auto-record: some joint must have turned by this much since the last image."""
 WATCH_PERIOD_S = 0.1
 
 
 class FreeDrive:
-    """Nothing here moves the arm, so nothing here needs a go."""
+    """Nothing here moves the arm, so nothing here needs an approval."""
 
     def __init__(self, context: SessionContext) -> None:
         self._context = context
@@ -38,15 +37,15 @@ class FreeDrive:
         self._last_place: Vector6 | None = None
 
     async def begin(self, auto: bool) -> None:
-        """Opens the recording if none is open. `auto`: a picture whenever the arm rests anew."""
+        """Opens the recording if none is open. `auto`: an image whenever the arm rests anew."""
         if self.taking:
-            raise RefusedError("the last picture is still ending: try again in a moment")
+            raise _taking()
         self._end_watch()
         context, store = self._context, self._context.store
         context.cell.robot.check()
         context.halting = False
-        # At once, and taking: while the disk works nobody is offered a go, and no picture is begun.
-        store.enter(StationState.FREE_DRIVE, "the recording is being opened")
+        # At once, and taking: while the disk works nobody is offered a motion, and no image is begun.
+        store.enter(StationState.FREE_DRIVE, "The recording is being opened.")
         async with self._taking:
             try:
                 await self._open_recording()
@@ -55,7 +54,7 @@ class FreeDrive:
                     store.enter(context.resting)
                 raise
         if (refusal := Record.refusal(store.state)) is not None:
-            raise refusal  # STOP, or the end of free drive, came in between
+            raise refusal  # STOP, or the end of freedrive, came in between
         store.enter(StationState.FREE_DRIVE, _GUIDE)
         context.show_poses()
         self._last_place = None
@@ -63,23 +62,13 @@ class FreeDrive:
             self._watcher = asyncio.create_task(self._watch())
 
     async def _open_recording(self) -> None:
-        context, before = self._context, self._context.recording
+        context, new = self._context, self._context.recording is None
+        config = context.cell.config
         if context.queue is None:
-            context.queue = PoseQueue(Plan(context.cell.config.robot.model, context.cell.config.mount, ()))
-        queue = context.queue if before is not None else context.queue.anew(guided=False)
-        if before is not None and before.recorder is not None:
-            return
-        if before is not None:
-            await recover_parts(context, before)
-        recording = before or SessionRecording(context.root, context.cell)
-        picture = await context.cell.camera.capture() if context.cell.config.camera.model is None else None
-        context.recording = recording  # before it is open: after a STOP in between it must be closed
-        try:
-            await recording.open(queue, picture)
-        except BaseException:
-            context.recording = before
-            raise
-        if before is None:
+            context.queue = PoseQueue(Plan(config.robot.model, config.mount, ()))
+        queue = context.queue.anew(guided=False) if new else context.queue
+        await context.open_recording(queue)
+        if new:
             context.forget_session()
         context.queue = queue
 
@@ -87,15 +76,17 @@ class FreeDrive:
         """To paused; the recording stays open."""
         self._end_watch()
         if self._context.store.state is StationState.FREE_DRIVE:
-            self._context.store.enter(StationState.PAUSED, "free drive ended: go on, or finish")
+            self._context.store.enter(
+                StationState.PAUSED, "Freedrive ended. Resume or finish.", "freedrive-ended"
+            )
 
     @property
     def taking(self) -> bool:
-        """A picture is under way."""
+        """An image is under way."""
         return self._taking.locked()
 
     async def last_picture(self) -> None:
-        """Returns when the picture under way is taken; no further one is begun by itself."""
+        """Returns when the image under way is taken; no further one is begun by itself."""
         async with self._taking:
             self._end_watch()
 
@@ -105,9 +96,9 @@ class FreeDrive:
             self._watcher = None
 
     async def record(self) -> int:
-        """One picture here and now; its pose number. RefusedError when one is being taken already."""
+        """One image here and now; its pose number. RefusedError when one is being taken already."""
         if self._taking.locked():
-            raise RefusedError("a picture is being taken")
+            raise _taking()
         async with self._taking:
             return await self._record()
 
@@ -115,24 +106,26 @@ class FreeDrive:
         context = self._context
         queue, store = context.require_queue(), context.store
         joints = context.cell.robot.latest().joints_rad
-        index = queue.add(PlannedPose(f"hand-{queue.next_index + 1:02d}", joints, why=GUIDED))
+        index = queue.add(
+            PlannedPose(f"hand-{queue.next_index + 1:02d}", joints, why="guided by hand", guided=True)
+        )
         attempt = queue.start_attempt(index)
         self._last_place = joints
         try:
             await take_pose(context, index, attempt)
         except (PoseFailedError, NotStillError) as error:
-            queue.mark(index, "failed", str(error))
-            store.event(str(error), "warning", index)
+            queue.mark(index, "failed", error)
+            store.problem(error, "warning", index)
         except RecordingError as error:
             disk_failed(context, error)
             return index
         except (RobotError, TriggerError) as error:
-            self._failed(str(error), index)
+            self._failed(error, index)
             return index
         except Exception as error:
             if not context.halting:  # else STOP came in between: its state stays
-                log.exception("a picture failed")
-            self._failed(f"internal error ({error!r}); see the log", index)
+                log.exception("an image failed")
+            self._failed(internal_error(error), index)
         if not context.halting and store.state is not StationState.FAULT:
             store.enter(StationState.FREE_DRIVE, _GUIDE)
         context.show_poses(index)
@@ -141,14 +134,14 @@ class FreeDrive:
             self.end()
         return index
 
-    def _failed(self, reason: str, index: int) -> None:
+    def _failed(self, error: StationError, index: int) -> None:
         unmark_busy(self._context)
         if not self._context.halting:
-            self._context.store.enter(StationState.FAULT, reason)
-            self._context.store.event(reason, "error", index)
+            self._context.store.enter(StationState.FAULT, error)
+            self._context.store.problem(error, "error", index)
 
     async def _watch(self) -> None:
-        """For as long as free drive lasts."""
+        """For as long as freedrive lasts."""
         while self._context.store.state not in (StationState.PAUSED, StationState.IDLE):
             await asyncio.sleep(WATCH_PERIOD_S)
             if self._context.store.state is not StationState.FREE_DRIVE:
@@ -157,9 +150,9 @@ class FreeDrive:
                 if self._at_rest_elsewhere():
                     await self.record()
             except StaleStateError:
-                continue  # a hiccup of the news; a picture waits for better ones
+                continue  # a hiccup of the news; an image waits for better ones
             except StationError as error:
-                self._context.store.event(str(error), "warning")
+                self._context.store.problem(error)
 
     def _at_rest_elsewhere(self) -> bool:
         if not self._context.stillness.at_rest:
@@ -167,3 +160,7 @@ class FreeDrive:
         joints = self._context.cell.robot.latest().joints_rad
         last = self._last_place
         return last is None or bool(np.abs(np.subtract(joints, last)).max() > NEW_PLACE_RAD)
+
+
+def _taking() -> RefusedError:
+    return RefusedError("An image is being taken.", code="still-ending", remedy="Try again in a moment.")

@@ -1,4 +1,4 @@
-"""Who may command, and the one-use permission to move. Both end the moment anything is in doubt."""
+"""Who has control, and the one-use approval to move. Both end the moment anything is in doubt."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from recordings.errors import Value
 from recordings.schema.messages import Vector6
 from station.cell.errors import RefusedError
 from station.cell.status import Lease, MotionPreview
@@ -21,41 +22,41 @@ START_TOLERANCE_RAD = 0.005
 
 
 class LeaseManager:
-    """At most one client holds the lease."""
+    """At most one client has control."""
 
     def __init__(self) -> None:
         self.lease = Lease()
 
     def take(self, client_id: int, who: str, wall_ns: int) -> Lease:
-        """Taking it again is fine. RefusedError names the present holder."""
-        if self.lease.client_id not in (None, client_id):
-            raise RefusedError(
-                f"control is held by {self.lease.holder}: ask them to let go (F4 on their screen); "
-                "you may watch and STOP"
-            )
+        """Taking it again is fine. RefusedError names who has it."""
         if self.lease.client_id is None:
             self.lease = Lease(holder=who, client_id=client_id, since_wall_ns=wall_ns)
+        self.require(client_id)
         return self.lease
 
     def release(self, client_id: int) -> bool:
-        """True when this client held it."""
+        """True when this client had it."""
         if self.lease.client_id != client_id:
             return False
         self.lease = Lease()
         return True
 
     def require(self, client_id: int) -> None:
-        """RefusedError unless this client holds the lease."""
-        if self.lease.client_id == client_id:
-            return
+        """RefusedError unless this client has control."""
         if self.lease.client_id is None:
-            raise RefusedError("take the lease first: nobody commands this station right now")
-        raise RefusedError(f"control is held by {self.lease.holder}; you may watch and STOP")
+            raise RefusedError("No client has control.", code="no-control", remedy="Take control first.")
+        if self.lease.client_id != client_id:
+            raise RefusedError(
+                f"{self.lease.holder} has control.",
+                code="control-held",
+                remedy="Ask them to release it (F4 on their screen); you may watch and STOP.",
+                holder=self.lease.holder,
+            )
 
 
 @dataclass(frozen=True)
 class MotionApproval:
-    """A permission as it was asked for."""
+    """A permission to move, as it was asked for."""
 
     summary: MotionPreview
     client_id: int
@@ -64,34 +65,30 @@ class MotionApproval:
     poses: tuple[int, ...]
     """Pose numbers it covers, in order; more may not be driven to with it."""
     again: bool = False
-    """Nobody is there to be asked: poses that do not come to rest are tried once more at the end."""
+    """Nobody is there to be asked: poses that do not settle are tried once more at the end."""
     purpose: Purpose | None = None
-    """None: a hover."""
+    """None: a touch test."""
     replanned: PlanRevision | None = None
-    """Poses that take the place of the session's with this go."""
+    """Poses that take the place of the session's with this approval."""
     hover: Hover | None = None
-    """A way over one corner of the board instead of poses of the plan."""
+    """A path over one corner of the board instead of poses of the plan."""
     approval: str = ""
     """Who approved it, and how."""
 
     @property
     def said(self) -> str:
-        """For log and recording."""
+        """A line for log and recording."""
         return f"{self.approval}: {self.summary.purpose}, plan {self.summary.plan_sha256[:12]}"
 
 
 class ApprovalManager:
-    """At most one go waits for a person; redeeming or voiding destroys it."""
+    """At most one approval waits for a person; redeeming or voiding destroys it."""
 
     def __init__(self, clock: Callable[[], float]) -> None:
         self._clock = clock
-        self._waiting: MotionApproval | None = None
+        self.waiting: MotionApproval | None = None
         self.voids = 0
-        """How often a go was made void: a check that was under way meanwhile offers none."""
-
-    @property
-    def waiting(self) -> MotionApproval | None:
-        return self._waiting
+        """How often one was made void: a check that was under way meanwhile offers none."""
 
     @staticmethod
     def new_token() -> str:
@@ -110,15 +107,15 @@ class ApprovalManager:
         start = summary.start_joints_rad
         assert start is not None
         expires_s = self._clock() + APPROVAL_LIFETIME_S
-        self._waiting = MotionApproval(
+        self.waiting = MotionApproval(
             summary, client_id, expires_s, start, poses, purpose=purpose, hover=hover, replanned=replanned
         )
-        return self._waiting
+        return self.waiting
 
     def void(self) -> bool:
         """True when there was one."""
         self.voids += 1
-        was, self._waiting = self._waiting, None
+        was, self.waiting = self.waiting, None
         return was is not None
 
     def redeem(
@@ -129,23 +126,29 @@ class ApprovalManager:
         joints_rad: Sequence[float],
         again: bool = False,
     ) -> MotionApproval:
-        """The go, once. RefusedError says what changed since the person was asked; the go is void then."""
-        go, self._waiting = self._waiting, None
-        if go is None or not secrets.compare_digest(go.summary.token.encode(), token.encode()):
-            raise RefusedError("this go is not valid (used, stopped or replaced): prepare again and confirm")
-        if self._clock() > go.expires_s:
-            raise RefusedError(
-                f"this go is older than {APPROVAL_LIFETIME_S:.0f} s: prepare again and confirm"
-            )
-        if go.client_id != client_id:
-            raise RefusedError("this go was asked for by another client: prepare again and confirm")
-        asked_for = go.replanned.before_sha256 if go.replanned else go.summary.plan_sha256
-        if go.hover is None and asked_for != plan_sha256:  # a hover carries its own plan
-            raise RefusedError("the plan changed since this go was asked for: prepare again and confirm")
-        moved_rad = float(np.abs(np.subtract(joints_rad, go.start_joints_rad)).max())
-        if moved_rad > START_TOLERANCE_RAD:
-            raise RefusedError(
-                f"the arm moved by {np.rad2deg(moved_rad):.1f}° since this go was asked for: "
-                "prepare again and confirm"
-            )
-        return replace(go, again=again)
+        """The approval, once. RefusedError says what changed since the person was asked; it is void then."""
+        asked, self.waiting = self.waiting, None
+        if asked is None or not secrets.compare_digest(asked.summary.token.encode(), token.encode()):
+            raise _void("approval-used", "Approval used or revoked.")
+        if self._clock() > asked.expires_s:
+            text = f"Approval older than {APPROVAL_LIFETIME_S:.0f} s."
+            raise _void("approval-expired", text, limit_s=APPROVAL_LIFETIME_S)
+        if asked.client_id != client_id:
+            raise _void("approval-of-another", "Approval was asked for by another client.")
+        before = asked.replanned.before_sha256 if asked.replanned else asked.summary.plan_sha256
+        if asked.hover is None and before != plan_sha256:  # a touch test carries its own plan
+            raise _void("plan-changed", "The plan changed since the approval was asked for.")
+        require_start(joints_rad, asked.start_joints_rad, "since the approval was asked for")
+        return replace(asked, again=again)
+
+
+def require_start(joints_rad: Sequence[float], start_rad: Sequence[float], when: str) -> None:
+    """RefusedError when the arm does not stand where it stood."""
+    moved_rad = float(np.abs(np.subtract(joints_rad, start_rad)).max())
+    if moved_rad > START_TOLERANCE_RAD:
+        text = f"The arm moved by {np.rad2deg(moved_rad):.1f}° {when}."
+        raise _void("arm-moved", text, moved_rad=moved_rad, limit_rad=START_TOLERANCE_RAD)
+
+
+def _void(code: str, text: str, **values: Value) -> RefusedError:
+    return RefusedError(text, code=code, remedy="Request the approval again.", **values)

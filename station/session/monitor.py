@@ -1,17 +1,22 @@
-"""Puts what the devices say into the status, ten times a second."""
+"""Devices in the status: opened, opened again, and what they say ten times a second."""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
+import logging
 import shutil
 import time
+from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import msgspec
 
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import RobotState
+from station.analysis.pool import WorkerError
 from station.cell.config import matrix4
-from station.cell.errors import RobotError
+from station.cell.errors import CameraError, RobotError, StationError
 from station.cell.limits import SPEED_CAP_M_S, point_speed_m_s
 from station.cell.session_folder import CALIBRATION_FILE
 from station.cell.status import (
@@ -27,6 +32,9 @@ from station.protocol.states import RUNNING
 from station.session.capture import flange_pose
 from station.session.context import SessionContext
 
+log = logging.getLogger(__name__)
+
+RETRY_S = 3.0
 DISK_PERIOD_S = 2.0
 FPS_PERIOD_S = 2.0
 PAUSES = "pauses after this pose"
@@ -78,8 +86,8 @@ class Monitor:
         ahead_ns = _wall_ahead_ns()
         step_s, self._wall_ahead_ns = (ahead_ns - self._wall_ahead_ns) / 1e9, ahead_ns
         if abs(step_s) >= WALL_STEP_S:
-            text = f"the wall clock was set by {step_s:+.1f} s; pictures and poses are placed by other clocks"
-            self._context.store.event(text, "warning")
+            text = f"the wall clock was set by {step_s:+.1f} s; images and poses are placed by other clocks"
+            self._context.store.event("wall-clock-set", text, "warning", step_s=round(step_s, 1))
 
     def _robot(self) -> RobotStatus:
         context, robot = self._context, self._context.cell.robot
@@ -170,12 +178,11 @@ class Monitor:
         )
 
     def _look_for_calibration(self) -> None:
-        """A process of its own solves a sealed session, and puts what it found beside the recording."""
-        store = self._context.store
-        session = store.status.session
+        """A process of its own solves a finished session, and puts its calibration beside the recording."""
+        session = self._context.store.status.session
         path = Path(session.folder) / CALIBRATION_FILE
         solved = str(path) if session.recording and path.is_file() else ""
-        store.update(session=msgspec.structs.replace(session, calibration=solved))
+        self._context.store.update_session(calibration=solved)
 
     def _clock(self) -> ClockStatus:
         robot, camera = self._context.cell.robot.clock(), self._context.cell.camera.clock
@@ -202,18 +209,78 @@ def _clock_facts(fit: ClockFit | None) -> tuple[float | None, float | None, floa
     return round(1000 * fit.offset_s, 1), round(1000 * fit.bound_s, 2), round(fit.drift_ppm, 1)
 
 
-def camera_status(
-    context: SessionContext, connected: bool, width: int, height: int, frames: int
-) -> CameraStatus:
-    identity, config = context.cell.camera.identity, context.cell.config.camera
-    return CameraStatus(
-        connected=connected,
-        model=identity.model,
-        serial=identity.serial,
-        driver=identity.driver,
-        width=width,
-        height=height,
-        frames=frames,
-        exposure_us=config.exposure_us,
-        gain_db=config.gain_db,
-    )
+class DeviceConnector:
+    """Opens the devices and opens them again: read-only, in the background, for the daemon's life."""
+
+    def __init__(self, context: SessionContext) -> None:
+        self._context = context
+        self.troubles: dict[str, str] = {}
+        """Device → why it is not there."""
+
+    async def run(self) -> None:
+        """Everything at once: none waits for another."""
+        await asyncio.gather(
+            self._start_worker(),
+            self._until_open("robot", self._open_robot),
+            self._until_open("camera", self._open_camera),
+            self._until_open("trigger", self._open_trigger),
+        )
+
+    async def _start_worker(self) -> None:
+        try:
+            await self._context.workers.start()
+        except WorkerError as error:
+            log.warning("%s", error)
+
+    async def _until_open(self, device: str, opening: Callable[[], Awaitable[None]]) -> None:
+        while True:
+            try:
+                await opening()
+            except Exception as error:
+                if not isinstance(error, StationError):
+                    log.exception("%s could not be opened", device)
+                if self.troubles.get(device) != str(error):
+                    self.troubles[device] = str(error)
+                    self._context.store.problem(error, said=f"{device}: {{}}")
+                await asyncio.sleep(RETRY_S)
+            else:
+                self.troubles.pop(device, None)
+                return
+
+    async def _open_robot(self) -> None:
+        identity = await self._context.cell.robot.connect()
+        self._found("robot", f"{identity.model} {identity.serial}")
+
+    async def _open_camera(self) -> None:
+        identity, config = await self._context.cell.camera.open(), self._context.cell.config.camera
+        width, height = (config.model.width, config.model.height) if config.model else (0, 0)
+        shown = CameraStatus(
+            connected=True,
+            model=identity.model,
+            serial=identity.serial,
+            driver=identity.driver,
+            width=width,
+            height=height,
+            exposure_us=config.exposure_us,
+            gain_db=config.gain_db,
+        )
+        self._context.store.update(camera=shown)
+        self._found("camera", f"{identity.model} {identity.serial}")
+
+    async def _open_trigger(self) -> None:
+        if (trigger := self._context.cell.trigger) is not None:
+            identity = await trigger.open()
+            self._context.store.update(trigger=TriggerStatus(present=True, identity=identity))
+            self._found("trigger", identity)
+
+    def _found(self, device: str, identity: str) -> None:
+        self._context.store.event("device-found", f"{device} {identity} found", device=device)
+
+    async def close(self) -> None:
+        cell = self._context.cell
+        for closing in (cell.camera.close(), cell.robot.close()):
+            with contextlib.suppress(RobotError, CameraError):
+                await closing
+        if cell.trigger is not None:
+            await cell.trigger.close()
+        await asyncio.to_thread(cell.ended)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import msgspec
 
+from recordings.errors import CodedError
 from station.cell.errors import RefusedError
 from station.cell.plan import Plan, PlannedPose, plan_sha256
 from station.cell.status import PoseState, PoseStatus
@@ -15,21 +16,19 @@ from station.protocol.verbs import Purpose
 OPEN: frozenset[PoseState] = frozenset({"planned"})
 BUSY: frozenset[PoseState] = frozenset({"moving", "settling", "capturing", "writing"})
 POSE_LIMIT = 2000
-GUIDED = "guided by hand"
-"""Why such a pose is there."""
 TAKE_AGAIN = "to be taken again"
-STILL_COUNTS = "; the picture it has counts until then"
-NOT_AGAIN = "not taken again: the picture it has counts"
+STILL_COUNTS = "; the image it has counts until then"
+NOT_AGAIN = "not taken again: the image it has counts"
 
 
 @dataclass(frozen=True, eq=False)
 class PlanRevision:
-    """Poses that wait for a person's yes to take the place of the session's."""
+    """Poses that wait for a person's approval to take the place of the session's."""
 
     purpose: Purpose
     queue: PoseQueue
     poses: tuple[int, ...]
-    """Those that the go covers, in order."""
+    """Those that the approval covers, in order."""
     before_sha256: str
     """Of the poses that they were made for."""
     changes: tuple[str, ...]
@@ -56,7 +55,7 @@ class PoseQueue:
 
     @property
     def sha256(self) -> str:
-        """Of the plan and the order: what a go is bound to."""
+        """Of the plan and the order: what an approval is bound to."""
         return plan_sha256(self.plan)
 
     @property
@@ -80,7 +79,7 @@ class PoseQueue:
 
     @property
     def done(self) -> int:
-        """Poses whose picture counts, those that are to be taken again included."""
+        """Poses whose image counts, those that are to be taken again included."""
         return sum(status.counts for status in self._status.values())
 
     @property
@@ -93,16 +92,23 @@ class PoseQueue:
     def status(self, index: int) -> PoseStatus:
         """RefusedError for a number that does not exist."""
         if index not in self._status:
-            raise RefusedError(f"there is no pose {index + 1}; the plan has {len(self._poses)}")
+            text = f"There is no pose {index + 1}; the plan has {len(self._poses)}."
+            raise RefusedError(text, code="no-such-pose", pose=index, poses=len(self._poses))
         return self._status[index]
 
-    def mark(self, index: int, state: PoseState, reason: str = "") -> None:
+    def mark(self, index: int, state: PoseState, reason: str | CodedError = "") -> None:
         before = self.status(index)
-        kept = before.counts and state != "done"
-        self._status[index] = msgspec.structs.replace(before, state=state, reason=reason, kept=kept)
+        cause = reason.code if isinstance(reason, CodedError) else ""
+        self._status[index] = msgspec.structs.replace(
+            before,
+            state=state,
+            reason=str(reason),
+            cause=cause,
+            kept=before.counts and state != "done",
+        )
 
     def note(self, index: int, *, corners: int | None = None, coverage: float | None = None) -> None:
-        """What the picture showed."""
+        """What the image showed."""
         self._status[index] = msgspec.structs.replace(self.status(index), corners=corners, coverage=coverage)
 
     def with_fresh(self, poses: Sequence[PlannedPose]) -> PoseQueue:
@@ -124,7 +130,7 @@ class PoseQueue:
 
         `guided`: with the places that a hand brought the arm to.
         """
-        kept = {i: pose for i, pose in self._poses.items() if guided or pose.why != GUIDED}
+        kept = {i: pose for i, pose in self._poses.items() if guided or not pose.guided}
         left_out = {i for i in kept if self._status[i].state == "skipped"}
         plan = msgspec.structs.replace(self._plan, poses=tuple(kept.values()))
         again = PoseQueue(plan, [_fresh(index, pose) for index, pose in kept.items()])
@@ -142,34 +148,34 @@ class PoseQueue:
         """Plans it once more, where it stands in the order."""
         status = self.status(index)
         if status.state in BUSY:
-            raise RefusedError(f"pose {index + 1} is being taken right now")
+            raise _refused("pose-busy", index, "is being taken right now")
         self.mark(index, "planned", TAKE_AGAIN + (STILL_COUNTS if status.counts else ""))
 
     def skip(self, index: int) -> None:
-        """Leaves it out; of one that has a picture only the retake, for the recording keeps the picture."""
+        """Leaves it out; of one that has an image only the retake, for the recording keeps the image."""
         status = self.status(index)
         state = status.state
         if status.kept and state not in BUSY:
             self.mark(index, "done", NOT_AGAIN)
             return
         if state in BUSY or state == "done":
-            raise RefusedError(
-                f"pose {index + 1} is {state}: only a pose that waits or failed can be skipped"
-            )
+            text = f"is {state}: only a pose that waits or failed can be skipped"
+            raise _refused("pose-busy" if state in BUSY else "pose-taken", index, text)
         self.mark(index, "skipped", "skipped by the operator")
 
     def reorder(self, order: Sequence[int]) -> None:
         """`order`: every pose number once."""
         if sorted(order) != sorted(self._poses):
-            raise RefusedError(f"an order names each of the {len(self._poses)} poses exactly once")
+            text = f"An order names each of the {len(self._poses)} poses exactly once."
+            raise RefusedError(text, code="wrong-order")
         self._poses = {i: self._poses[i] for i in order}
 
     def add(self, pose: PlannedPose) -> int:
         """At the end; returns its number."""
         if any(pose.name == other.name for other in self._poses.values()):
-            raise RefusedError(f"there is already a pose named '{pose.name}'")
+            raise RefusedError(f"There is already a pose named '{pose.name}'.", code="pose-name")
         if len(self._poses) >= POSE_LIMIT:
-            raise RefusedError(f"a session has at most {POSE_LIMIT} poses")
+            raise RefusedError(f"A session has at most {POSE_LIMIT} poses.", code="too-many-poses")
         index, self._next_index = self._next_index, self._next_index + 1
         self._poses[index] = pose
         self._status[index] = _fresh(index, pose)
@@ -178,11 +184,17 @@ class PoseQueue:
     def drop(self, index: int) -> None:
         """Forgets a pose that was never taken."""
         status = self.status(index)
-        if status.state in BUSY or status.attempt:
-            raise RefusedError(f"pose {index + 1} was already tried: skip it instead")
+        if status.state in BUSY:
+            raise _refused("pose-busy", index, "is being taken right now")
+        if status.attempt:
+            raise _refused("pose-tried", index, "was already tried", "Skip it instead.")
         if len(self._poses) == 1:
-            raise RefusedError("the last pose cannot be dropped: finish the session instead")
+            raise _refused("last-pose", index, "is the last one", "Finish the session instead.")
         del self._poses[index], self._status[index]
+
+
+def _refused(code: str, index: int, what: str, remedy: str = "") -> RefusedError:
+    return RefusedError(f"Pose {index + 1} {what}.", code=code, remedy=remedy, pose=index)
 
 
 def _named(pose: PlannedPose, index: int, word: str) -> PlannedPose:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import asyncio
 import contextlib
+import logging
 import platform
 import threading
 import time
-from collections.abc import Coroutine
+from collections.abc import Callable, Coroutine
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar
@@ -37,10 +38,10 @@ from station.cell.session_folder import (
     clear_active,
     mark_active,
     new_session_folder,
-    part_path,
+    segment_path,
     write_state,
 )
-from station.cell.status import Event
+from station.cell.status import Event, Level
 from station.devices.cell import Cell
 from station.session.queue import PoseQueue
 
@@ -48,6 +49,10 @@ _PACKAGES = (
     "calibration-station", "numpy", "scipy", "opencv-python-headless", "mcap", "ur-rtde",
 )  # fmt: skip
 SYNC_TIMEOUT_S = 30.0
+_LEVELS: tuple[tuple[int, Level], ...] = (
+    (logging.ERROR, "error"), (logging.WARNING, "warning"), (logging.INFO, "info"),
+)  # fmt: skip
+_LOG_TEXT_LIMIT = 2000
 
 R = TypeVar("R")
 
@@ -82,23 +87,23 @@ def stamps_now() -> Stamps:
 
 
 class SessionRecording:
-    """Open from a go to sealing. Pictures are numbered here, without gaps or repeats."""
+    """Open from an approval to its end. Images are numbered here, without gaps or repeats."""
 
     def __init__(
         self,
         root: Path,
         cell: Cell,
         folder: Path | None = None,
-        parts: int = 0,
+        segments: int = 0,
         elapsed_s: float = 0.0,
         check: bool = False,
     ) -> None:
-        """`folder`, `parts`, `elapsed_s`: of an interrupted session; its next part follows. StationError.
+        """`folder`, `segments`, `elapsed_s`: of an interrupted session; its next one follows. StationError.
 
         `check`: it is a drift check, also after a restart.
         """
         self._root, self._cell, self._check = root, cell, check
-        self.part = parts + 1
+        self.segment = segments + 1
         self.folder = folder or new_session_folder(root, cell.config.name)
         self.recorder: Recorder | None = None
         self._sequence = 0
@@ -118,15 +123,15 @@ class SessionRecording:
         self._before_s, self._run_since_s = self.elapsed_s, time.monotonic() if running else 0.0
 
     @property
-    def unsealed_parts(self) -> bool:
+    def unfinished_segments(self) -> bool:
         """Files that a crash left open."""
         return any(self.folder.glob(f"*.mcap{PART_SUFFIX}"))
 
-    def count_parts(self) -> None:
-        """The next part follows those that are whole, and those that are empty or lost. RecordingError."""
+    def count_segments(self) -> None:
+        """The next segment follows those that are whole, and those that are empty or lost. RecordingError."""
         files = len([*self.folder.glob("*.mcap"), *self.folder.glob(f"*.mcap*{EMPTY_SUFFIX}")])
         manifest = read_manifest(self.folder)
-        self.part = 1 + max([files, *(manifest.parts if manifest else [])])
+        self.segment = 1 + max([files, *(manifest.parts if manifest else [])])
 
     @property
     def whole(self) -> Path:
@@ -138,17 +143,17 @@ class SessionRecording:
     def name(self) -> str:
         return self.folder.name
 
-    async def open(self, queue: PoseQueue, first_picture: Image | None = None) -> None:
+    async def open(self, queue: PoseQueue, first_image: Image | None = None) -> None:
         """Creates the file with everything needed to re-solve it. Raises RecordingError."""
         try:
             settings = await self._cell.camera.settings()
         except CameraError as error:
             settings = {"error": str(error)}  # its pictures will say the same
-        await asyncio.to_thread(self._open, queue.plan, queue.sha256, first_picture, settings)
+        await asyncio.to_thread(self._open, queue.plan, queue.sha256, first_image, settings)
         await self.save_state(queue)
 
     def _open(
-        self, plan: Plan, plan_sha256: str, first_picture: Image | None, settings: dict[str, Any]
+        self, plan: Plan, plan_sha256: str, first_image: Image | None, settings: dict[str, Any]
     ) -> None:
         config = self._cell.config
         require_free_space(self.folder, config.capture.free_space_bytes)
@@ -157,16 +162,16 @@ class SessionRecording:
             mount=config.mount,
             source=self._cell.source,
             board=config.board,
-            camera=self._session_camera(first_picture),
+            camera=self._session_camera(first_image),
             robot=self._cell.robot.identity,
             camera_identity=self._cell.camera.identity,
-            part=self.part,
+            part=self.segment,
             created_wall_ns=time.time_ns(),
             plan_sha256=plan_sha256,
             config_sha256=self._cell.config_sha256,
             software=software(),
         )
-        path = part_path(self.folder, self.part)
+        path = segment_path(self.folder, self.segment)
         recorder = Recorder(path, info, lossless_png=config.capture.lossless_png)
         try:
             enter_part(self.folder, info.name, info.part, path.name)
@@ -189,12 +194,12 @@ class SessionRecording:
                 recorder.frame(parent, child, matrix_from_quaternion(at, turn))
         self.recorder = recorder
 
-    def _session_camera(self, picture: Image | None) -> CameraModel:
-        """Known intrinsics, or at least the size of the pictures."""
+    def _session_camera(self, image: Image | None) -> CameraModel:
+        """Known intrinsics, or at least the size of the images."""
         if (known := self._cell.camera_model) is not None:
             return known
-        if picture is not None:
-            height, width = picture.pixels.shape[:2]
+        if image is not None:
+            height, width = image.pixels.shape[:2]
             return CameraModel(width=width, height=height)
         rough = self._cell.config.camera.model
         return CameraModel(width=rough.width if rough else 0, height=rough.height if rough else 0)
@@ -210,9 +215,10 @@ class SessionRecording:
             stamps = Stamps(host_monotonic_ns=time.monotonic_ns(), host_wall_ns=event.wall_ns)
             self.recorder.event(CaptureEvent(stamps, "station", event.pose_index, event.text, event.level))
 
-    def number(self, picture: Image) -> Image:
-        """The same picture with its number in this session."""
-        numbered = msgspec.structs.replace(picture, sequence=self._sequence, pixels=_own(picture.pixels))
+    def number(self, image: Image) -> Image:
+        """The same image with its number in this session, and pixels that no camera overwrites."""
+        pixels = np.array(image.pixels, copy=True)
+        numbered = msgspec.structs.replace(image, sequence=self._sequence, pixels=pixels)
         self._sequence += 1
         return numbered
 
@@ -224,17 +230,18 @@ class SessionRecording:
         self._plans += 1
         self._require().attach(f"plan-{self._plans}.json", "application/json", msgspec.json.encode(plan))
 
-    def picture(self, picture: Image) -> None:
+    def image(self, image: Image) -> None:
         """Hands it to the writer. Raises RecordingError when the disk cannot keep up or has failed."""
         recorder = self._require()
-        if not recorder.image(picture):
-            raise recorder.error or RecordingError("the disk cannot keep up: a picture was dropped")
+        if not recorder.image(image):
+            text = "The disk cannot keep up: an image was dropped."
+            raise recorder.error or RecordingError(text, code="disk-too-slow")
 
     def view(self, view: View) -> None:
         self._require().view(view)
 
     def corners(self, sequence: int, pixels: Array) -> None:
-        """Of the board in a recorded picture, (n, 2); for whoever looks at the recording."""
+        """The board's in a recorded image, (n, 2) px; for whoever looks at the recording."""
         self._require().corners(sequence, pixels)
 
     async def sync(self) -> None:
@@ -244,7 +251,9 @@ class SessionRecording:
                 await asyncio.shield(asyncio.wrap_future(self._require().sync()))
         except TimeoutError as error:
             raise RecordingError(
-                f"the disk did not take the data within {SYNC_TIMEOUT_S:.0f} s: look at {self.folder}"
+                f"The disk did not take the data of {self.folder} within {SYNC_TIMEOUT_S:.0f} s.",
+                code="disk-hangs",
+                limit_s=SYNC_TIMEOUT_S,
             ) from error
 
     def require_space(self) -> None:
@@ -252,7 +261,7 @@ class SessionRecording:
         require_free_space(self.folder, self._cell.config.capture.free_space_bytes)
 
     async def save_state(self, queue: PoseQueue, recording: Path | None = None) -> None:
-        """What a restarted daemon needs; `recording`: set once it is sealed. Raises RecordingError.
+        """What a restarted daemon needs; `recording`: set once it is finished. Raises RecordingError.
 
         In a thread: a disk may take long over an fsync, and the arm's heartbeat does not wait.
         """
@@ -261,7 +270,7 @@ class SessionRecording:
             source=self._cell.source,
             plan=queue.plan,
             poses=queue.statuses,
-            parts=self.part,
+            parts=self.segment,
             elapsed_s=round(self.elapsed_s, 1),
             check=self._check,
             sealed=recording is not None,
@@ -278,10 +287,11 @@ class SessionRecording:
             else:
                 mark_active(self._root, self.folder)
         except OSError as error:
-            raise RecordingError(f"cannot write to {self.folder}: {error.strerror}") from error
+            text = f"Cannot write to {self.folder}: {error.strerror}"
+            raise RecordingError(text, code="disk-write") from error
 
     async def seal(self, queue: PoseQueue) -> Path:
-        """Finishes the file; returns the recording: the file, or the folder where there are several parts."""
+        """Finishes the file; returns the recording: the file, or the folder of several."""
         # Shielded: a cancelled waiter must not cancel what the writer's thread is doing.
         await asyncio.shield(asyncio.wrap_future(self._require().finish()))
         self.recorder = None
@@ -306,10 +316,24 @@ class SessionRecording:
 
     def _require(self) -> Recorder:
         if self.recorder is None:
-            raise RecordingError(f"the recording in {self.folder} is not open")
+            raise RecordingError(f"The recording in {self.folder} is not open.", code="not-open")
         return self.recorder
 
 
-def _own(image: np.ndarray) -> np.ndarray:
-    """A camera may reuse its buffer; the writer's thread reads this one later."""
-    return np.array(image, copy=True)
+class Logbook(logging.Handler):
+    """The log of `station`, also inside the recording. Events for people get there by their own way."""
+
+    def __init__(self, recording: Callable[[], SessionRecording | None]) -> None:
+        super().__init__(logging.INFO)
+        self._recording = recording
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """From any thread; never raises, a log must not harm what it describes."""
+        recording = self._recording()
+        recorder = recording.recorder if recording is not None else None
+        if recorder is None or record.name == "station.events":
+            return
+        level: Level = next((word for number, word in _LEVELS if record.levelno >= number), "debug")
+        text = f"{record.name}: {record.getMessage()}"[:_LOG_TEXT_LIMIT]
+        with contextlib.suppress(RecordingError):
+            recorder.event(CaptureEvent(stamps_now(), "log", detail=text, level=level))

@@ -1,31 +1,38 @@
-"""The plan gets better while it is carried out: poses that are left, planned anew, or one that helps most.
+"""Improves the plan while it is carried out: the running estimate, remaining poses replanned, a next pose.
 
-Both are offered to a person and become the session's by that person's go only.
+Poses are offered to a person and become the session's by that person's approval only.
 """
 
 from __future__ import annotations
 
+import asyncio
 import contextlib
+import logging
 import math
+from collections.abc import Callable
 
 import msgspec
 import numpy as np
 
 from recordings.errors import RecordingError
-from station.analysis.estimation import Seen, next_best
+from recordings.schema.messages import CameraModel
+from station.analysis.estimation import next_best, next_best_text, running_estimate
 from station.analysis.improvement import FEWEST_LEFT, FEWEST_VIEWS, Improvement, improve
+from station.analysis.pool import WorkerError
 from station.cell.errors import RefusedError
 from station.cell.status import EstimateStatus
+from station.cell.stillness import RestingCheck
 from station.plan.predict import Advice
 from station.protocol.verbs import Purpose
 from station.session.context import SessionContext
 from station.session.interrupted import look_back
-from station.session.patience import RestingCheck
 from station.session.queue import PlanRevision, PoseQueue
 
 _SHARPER = 4.0
 """So many times sharper the mount must be known than when the plan was made, to speak of it."""
-_PLAN_S = 120.0
+_PLAN_S, _ESTIMATE_S = 120.0, 20.0
+
+log = logging.getLogger(__name__)
 
 
 class Replanner:
@@ -48,8 +55,8 @@ class Replanner:
         if self._context.recording is None or self._context.recording.name == self._improved:
             return ""
         return (
-            f"the mount is known {times:.0f} times better than the guess the poses were planned from: pause, "
-            f"then `station improve` (p on the plan screen) plans the {len(queue.fresh)} that are left anew"
+            f"The camera pose is known {times:.0f} times better than when the poses were planned. Pause, "
+            f"then `station replan` (p on the plan screen) plans the remaining {len(queue.fresh)} again."
         )
 
     async def replan(self, purpose: Purpose) -> PlanRevision | None:
@@ -63,13 +70,16 @@ class Replanner:
         if purpose not in (Purpose.REPLAN, Purpose.NEXT_POSE):
             return None
         if context.recording is None or context.queue is None:
-            raise RefusedError("no session is open: run the plan, and pause after its first pictures")
+            remedy = "Run the plan, and pause after its first images."
+            raise RefusedError("No session is open.", code="no-session", remedy=remedy)
         if context.queue.plan.motion != "stops":
-            raise RefusedError("a sweep has no poses to improve")
+            raise RefusedError("A sweep has no poses to replan.", code="sweep")
         if not context.seen and context.queue.done:
             raise RefusedError(
-                "what the pictures from before the daemon's restart show could not be read: go on with the "
-                f"plan as it is (`station resume`), and ask again after {FEWEST_VIEWS} more"
+                "The images from before the daemon's restart could not be read.",
+                code="images-unread",
+                remedy="Continue with the plan as it is (`station resume`), and ask again after "
+                f"{FEWEST_VIEWS} more.",
             )
         await RestingCheck(context.cell.robot.check).news()
         return await (
@@ -81,16 +91,18 @@ class Replanner:
         context, robot = self._context, self._context.cell.robot
         fresh = queue.fresh
         if len(fresh) < FEWEST_LEFT:
-            raise RefusedError(f"{len(fresh)} poses are left: too few to plan them anew")
+            text = f"{len(fresh)} poses are left (limit {FEWEST_LEFT})."
+            raise RefusedError(text, code="too-few-left", poses=len(fresh), limit=FEWEST_LEFT)
         before = [queue.pose(index) for index in queue.open if index not in fresh]
         start = before[-1].joints_rad if before else robot.latest().joints_rad
         left = msgspec.structs.replace(queue.plan, poses=tuple(queue.pose(index) for index in fresh))
-        seen: list[Seen] = [(v.index, v.base_from_flange, v.indices, v.pixels) for v in context.seen.values()]
+        seen = list(context.seen.values())
         known = context.cell.camera_model is not None
         config = context.cell.config
         found = await context.workers.call(improve, config, known, seen, left, start, timeout_s=_PLAN_S)
         if not is_worth_it(found):
-            raise RefusedError(f"nothing to gain, go on with the plan as it is ({'; '.join(changes(found))})")
+            text = f"Nothing to gain ({'; '.join(changes(found))})."
+            raise RefusedError(text, code="no-gain", remedy="Continue with the plan as it is.")
         better = queue.with_fresh(found.plan.poses)
         return PlanRevision(Purpose.REPLAN, better, better.open, queue.sha256, changes(found))
 
@@ -98,7 +110,7 @@ class Replanner:
         """The poses and the one that would help most after those captured."""
         context = self._context
         if not context.seen:
-            raise RefusedError("no picture counts yet: what would help most is not known")
+            raise RefusedError("No image counts yet: the next pose is not known.", code="nothing-captured")
         flange = np.array([view.base_from_flange for view in context.seen.values()])
         here = context.cell.robot.latest().joints_rad
         onward = queue.pose(queue.open[0]).joints_rad if queue.open else None
@@ -106,7 +118,7 @@ class Replanner:
             next_best, context.cell.config, flange, here, onward, timeout_s=_PLAN_S
         )
         if found.next_pose is None:
-            raise RefusedError(found.text)
+            raise RefusedError(found.text, code="no-gain")
         more, index = queue.with_more(found.next_pose)
         return PlanRevision(Purpose.NEXT_POSE, more, (index,), queue.sha256, what_it_brings(found, index))
 
@@ -119,7 +131,7 @@ class Replanner:
             return  # the loaded plan, for a session that begins
         if found.purpose is Purpose.REPLAN:
             self._improved = recording.name
-        context.store.event("; ".join(found.changes))
+        context.store.event("replanned", "; ".join(found.changes), purpose=found.purpose.value)
         with contextlib.suppress(RecordingError):  # a disk that fails is told by the next picture
             recording.attach_plan(found.queue.plan)
 
@@ -153,3 +165,65 @@ def changes(found: Improvement) -> tuple[str, ...]:
         f"empty strip along the picture's edges: {before.margin_px:.0f} → {after.margin_px:.0f} px",
         *cut,
     )
+
+
+class Estimator:
+    """Keeps the running estimate fresh: one look in the worker after each pose, never two at once."""
+
+    def __init__(
+        self, context: SessionContext, hint: Callable[[EstimateStatus], str] = lambda estimate: ""
+    ) -> None:
+        """`hint`: what else to tell a person about an estimate."""
+        self._context, self._hint = context, hint
+        self._known: tuple[int, ...] = ()
+        self._woken = asyncio.Event()
+
+    def poke(self) -> None:
+        """Something changed; cheap."""
+        if tuple(self._context.seen) != self._known:
+            self._woken.set()
+
+    async def run(self) -> None:
+        context, config = self._context, self._context.cell.config
+        while True:
+            await self._woken.wait()
+            self._woken.clear()
+            self._known = tuple(context.seen)
+            if not self._known:
+                context.store.update(estimate=EstimateStatus())
+                continue
+            camera = config.camera.model
+            if camera is None or camera.matrix is None:
+                continue
+            try:
+                estimate = await self._estimate(camera)
+            except Exception as error:  # this task looks on; it must outlive every picture and every defect
+                if not isinstance(error, WorkerError):
+                    log.exception("the running estimate failed")
+                context.store.problem(error, said="no running estimate: {}")
+                continue
+            hint = self._hint(estimate)
+            if hint and not context.store.status.estimate.improve:
+                context.store.event("replan-helps", hint)
+            context.store.update(estimate=msgspec.structs.replace(estimate, improve=hint))
+
+    async def _estimate(self, camera: CameraModel) -> EstimateStatus:
+        """With advice on the next pose, where one more would help."""
+        context, config = self._context, self._context.cell.config
+        seen = list(context.seen.values())
+        estimate = await context.workers.call(
+            running_estimate,
+            config.mount,
+            camera,
+            context.cell.camera_model is not None,
+            config.board,
+            seen,
+            config.capture.goal_m,
+            timeout_s=_ESTIMATE_S,
+        )
+        joints = context.store.status.robot.joints_rad
+        if joints is None or estimate.sigma_translation_mm is None or estimate.enough:
+            return estimate
+        flange = np.array([view.base_from_flange for view in seen])
+        text = await context.workers.call(next_best_text, config, flange, joints, timeout_s=_ESTIMATE_S)
+        return msgspec.structs.replace(estimate, advice=text or estimate.advice)

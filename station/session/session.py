@@ -18,32 +18,31 @@ import msgspec
 
 from recordings.errors import RecordingError
 from station.analysis.pool import Workers
-from station.analysis.worker import plan_poses
 from station.cell.errors import RefusedError, RobotError
 from station.cell.plan import Plan
 from station.cell.scene import cell_geometry
 from station.cell.status import HoverOffer, Lease, MotionPreview, StationState, StationStatus
 from station.cell.stillness import StillnessMonitor
 from station.devices.cell import Cell
+from station.plan.planner import make_plan
 from station.protocol import verbs
 from station.protocol.states import RUNNING
 from station.protocol.verbs import Purpose, Verb
 from station.session.context import SessionContext
-from station.session.estimate import Estimator
 from station.session.free_drive import FreeDrive
-from station.session.hovering import TouchTestPlanner
 from station.session.interrupted import close_or_seal, find_interrupted
-from station.session.keeper import DeviceConnector
 from station.session.lease import ApprovalManager, LeaseManager, MotionApproval
-from station.session.logbook import Logbook
+from station.session.monitor import DeviceConnector
 from station.session.preview import Previewer
 from station.session.queue import PoseQueue
-from station.session.replan import Replanner
-from station.session.run import unmark_busy
-from station.session.runs import run_for
+from station.session.recording import Logbook
+from station.session.replan import Estimator, Replanner
+from station.session.run import Run, unmark_busy
 from station.session.store import StatusStore
 from station.session.summary import begun_anew, poses_to_drive, summarise
 from station.session.supervisor import SessionSupervisor
+from station.session.sweeping import SweepRun
+from station.session.touch_test import HoverRun, TouchTestPlanner
 
 R = TypeVar("R")
 END_RUN_S = 10.0
@@ -71,14 +70,14 @@ class Session:
         monitor = StillnessMonitor(geometry.model, config.stillness)
         self.context = SessionContext(cell, geometry, self.store, Workers(), monitor, root)
         self.leases = LeaseManager()
-        self._goes = ApprovalManager(time.monotonic)
-        self.supervisor = SessionSupervisor(self.context, self._jogged, ticked, self._void_go, first)
-        self._keeper = DeviceConnector(self.context)
-        self._improver = Replanner(self.context)
-        self._estimator = Estimator(self.context, self._improver.hint)
+        self.approvals = ApprovalManager(time.monotonic)
+        self.supervisor = SessionSupervisor(self.context, self._jogged, ticked, self._void, first)
+        self.devices = DeviceConnector(self.context)
         self.previews = Previewer(self.context)
         self.free_drive = FreeDrive(self.context)
-        self._hovers = TouchTestPlanner(self.context)
+        self._replanner = Replanner(self.context)
+        self._estimator = Estimator(self.context, self._replanner.hint)
+        self._touch_tests = TouchTestPlanner(self.context)
         self._run: asyncio.Task[None] | None = None
         self._tasks: list[asyncio.Task[None]] = []
         self._notes: tuple[str, ...] = ()
@@ -88,8 +87,6 @@ class Session:
         self.store.watch(self._estimator.poke)
         self._logbook = Logbook(lambda: self.context.recording)
 
-    # -- life -------------------------------------------------------------------------------------------
-
     async def start(self) -> None:
         """Connects, read-only, and keeps trying. Nothing moves. A session that a crash cut is found again."""
         self.context.root.mkdir(parents=True, exist_ok=True)
@@ -97,26 +94,27 @@ class Session:
         find_interrupted(self.context)
         if self.context.cell.plan is not None and self.context.queue is None:
             self._replace_plan(self.context.cell.plan)
-        loops = (self.supervisor.run(), self._keeper.run(), self._estimator.run())
+        loops = (self.supervisor.run(), self.devices.run(), self._estimator.run())
         self._tasks = [asyncio.create_task(loop) for loop in loops]
 
     async def close(self) -> None:
-        """In this order: the arm stands, the recording is sealed, devices and worker end."""
-        self._goes.void()
+        """In this order: the arm stands, the recording is finished, devices and worker end."""
+        context = self.context
+        self.approvals.void()
         if self.store.state in RUNNING:
-            await self._halt(StationState.STOPPED, "the station is ending")
+            await self._halt(StationState.STOPPED, "The station is ending.", "station-ending")
         with contextlib.suppress(RefusedError):
             await self._run_ended()
-        if self.context.recording is not None and self.context.recording.recorder is not None:
+        if context.recording is not None and context.recording.recorder is not None:
             with contextlib.suppress(RecordingError):
-                path = await self.context.recording.seal(self.context.require_queue())
-                self.store.event(f"sealed before the end: {path}")
+                path = await context.recording.seal(context.require_queue())
+                self.store.event("finished", f"finished before the end: {path}", path=str(path))
         logging.getLogger("station").removeHandler(self._logbook)
         for task in self._tasks:
             task.cancel()
         await asyncio.gather(*self._tasks, return_exceptions=True)
-        self.context.workers.close()
-        await self._keeper.close()
+        context.workers.close()
+        await self.devices.close()
 
     # -- stopping, by anyone and anything ----------------------------------------------------------------
 
@@ -125,34 +123,35 @@ class Session:
         if self.store.state is StationState.STOPPED:
             await self.context.cell.robot.stop(f"STOP by {who}")
             return
-        await self._halt(StationState.STOPPED, f"STOP by {who}: look at the cell, then acknowledge")
+        await self._halt(StationState.STOPPED, f"STOP by {who}. Look at the cell, then acknowledge.", "stop")
 
-    async def lease_lost(self, client_id: int, how: str = "the connection of {} was lost") -> None:
-        """Nobody commands any more: decelerate at once; go on only with a new go."""
+    async def lease_lost(self, client_id: int, how: str = "The connection of {} was lost.") -> None:
+        """Nobody commands any more: decelerate at once; go on only with a new approval."""
         holder = self.leases.lease.holder
         if not self.leases.release(client_id):
             return
-        self._void_go()
+        self._void()
         self.store.update(lease=self.leases.lease)
         if self.store.state in RUNNING:
-            await self._halt(self.context.resting, how.format(holder) + ": give a new go to go on")
+            reason = how.format(holder) + " Approve again to continue."
+            await self._halt(self.context.resting, reason, "control-lost")
 
-    async def _halt(self, state: StationState, reason: str) -> None:
-        """No go is left, the arm stops both ways, its run ends: where it writes, once the disk has it."""
+    async def _halt(self, state: StationState, reason: str, cause: str) -> None:
+        """Voids the approval, stops the arm both ways, ends the run: one that writes once the disk has it."""
         context, run = self.context, self._run
-        self._void_go()
+        self._void()
         context.halting, context.pause_wanted, context.finish_wanted = True, "", False
-        self.store.enter(state, reason)
+        self.store.enter(state, reason, cause)
         if run is not None:
             run.cancel()
         await context.cell.robot.stop(reason)
-        self.store.event(reason, "warning")
+        self.store.event(cause, reason, "warning")
         if run is not None:
             await asyncio.wait({run}, timeout=STOP_WAIT_S)
         unmark_busy(context)
 
     def acknowledge(self, who: str) -> None:
-        """A person looked. What still holds the arm is told when the next go is given."""
+        """A person looked. What still holds the arm is told at the next approval."""
         self._require_state(verbs.Acknowledge)
         try:
             self.context.cell.robot.latest()
@@ -160,97 +159,101 @@ class Session:
         except RobotError:
             resting = StationState.DISCONNECTED
         self.store.enter(resting)
-        self.store.event(f"acknowledged by {who}")
+        self.store.event("acknowledged", f"acknowledged by {who}", who=who)
 
-    # -- the way to a motion -----------------------------------------------------------------------------
+    # -- from a question to a motion ---------------------------------------------------------------------
 
     async def prepare(self, client_id: int, purpose: Purpose, index: int | None = None) -> MotionPreview:
-        """Checks the whole way from where the arm is and offers a one-use go for it."""
+        """Checks the whole path from where the arm is and offers a one-use approval for it."""
         self.permit(verbs.Prepare, client_id)
-        await self._run_ended()  # it is sealed and shown; its control process may take a moment more
-        self._void_go()
-        voids = self._goes.voids
-        found = await self._improver.replan(purpose) or begun_anew(self.context, purpose)
+        voids = await self._begin_offer()
+        found = await self._replanner.replan(purpose) or begun_anew(self.context, purpose)
         poses = found.poses if found else poses_to_drive(self.context, purpose, index)
         queue, changes = (found.queue, found.changes) if found else (self.context.require_queue(), ())
         summary = await summarise(self.context, purpose, queue, poses, self._notes, changes)
         self._require_unchanged(client_id, voids)
-        self._goes.offer(summary, client_id, poses, purpose=purpose, replanned=found)
-        self._show_go(summary)
+        self.approvals.offer(summary, client_id, poses, purpose=purpose, replanned=found)
+        self._show_offer(summary)
         return summary
 
     async def prepare_hover(self, client_id: int, request: verbs.Hover) -> HoverOffer:
-        """Offers a one-use go for a slow way to a place over a corner of the board."""
+        """Offers a one-use approval for a slow path to a place over a corner of the board."""
         self.permit(verbs.Hover, client_id)
         self._require_no_session()
-        await self._run_ended()
-        self._void_go()
-        voids = self._goes.voids
-        hover, offer = await self._hovers.prepare(request)
+        voids = await self._begin_offer()
+        hover, offer = await self._touch_tests.prepare(request)
         self._require_unchanged(client_id, voids)
-        self._goes.offer(offer.go, client_id, (), hover)
-        self._show_go(offer.go)
+        self.approvals.offer(offer.go, client_id, (), hover)
+        self._show_offer(offer.go)
         return offer
 
-    def _show_go(self, summary: MotionPreview) -> None:
+    async def _begin_offer(self) -> int:
+        """How many approvals were void before the path is checked."""
+        await self._run_ended()  # it is finished and shown; its control process may take a moment more
+        self._void()
+        return self.approvals.voids
+
+    def _show_offer(self, summary: MotionPreview) -> None:
         """To every watcher, without the token that is for the one who asked."""
         self.store.update(go=msgspec.structs.replace(summary, token=""))
 
     def _require_unchanged(self, client_id: int, voids: int) -> None:
-        """RefusedError when something happened while the way was checked."""
         self.permit(verbs.Prepare, client_id)
-        if self._goes.voids != voids:
-            raise RefusedError("something changed while the way was checked: prepare again")
-
-    @property
-    def waiting_go(self) -> MotionApproval | None:
-        """What was offered last and is not approved yet."""
-        return self._goes.waiting
+        if self.approvals.voids != voids:
+            raise RefusedError(
+                "Conditions changed during the preflight check.", code="changed", remedy="Retry."
+            )
 
     def go(self, client_id: int, token: str, approval: str = "", again: bool = False) -> None:
-        """The person's yes to exactly that summary. RefusedError when anything changed.
+        """A person approves exactly that summary. RefusedError when anything changed.
 
         `approval`: who gave it and how, for log and recording. `again`: see MotionApproval.
         """
+        context = self.context
         self.permit(verbs.Go, client_id)
         self._require_run_ended()
         if self.free_drive.taking:
-            raise RefusedError("free drive is still ending: try again in a moment")
-        joints = self.context.cell.robot.latest().joints_rad
-        queue = self.context.queue
+            raise _still_ending("freedrive")
+        joints = context.cell.robot.latest().joints_rad
+        plan_sha256 = context.queue.sha256 if context.queue else ""
         try:
-            go = self._goes.redeem(token, client_id, queue.sha256 if queue else "", joints, again)
+            go = self.approvals.redeem(token, client_id, plan_sha256, joints, again)
             go = replace(go, approval=approval or f"motion approved by {self.leases.lease.holder}")
         finally:
             self.store.update(go=None)
         self._notes = ()
-        self.context.halting = False
-        self.context.pause_wanted, self.context.finish_wanted = "", False
-        if self.context.recording is None and go.hover is None:
-            self.context.forget_session(check=go.purpose is Purpose.DRIFT_CHECK)
+        context.halting, context.pause_wanted, context.finish_wanted = False, "", False
+        if context.recording is None and go.hover is None:
+            context.forget_session(check=go.purpose is Purpose.DRIFT_CHECK)
         if go.replanned is not None:
-            self._improver.adopt(go.replanned)
-        run = run_for(self.context, go)
+            self._replanner.adopt(go.replanned)
+        run = self._run_for(go)
         self.store.enter(StationState.CHECKING)
-        self.store.event(go.said)
+        self.store.event("approved", go.said, plan_sha256=go.summary.plan_sha256)
         self._run = asyncio.create_task(run.drive())
+
+    def _run_for(self, go: MotionApproval) -> Run:
+        if go.hover is not None:
+            return HoverRun(self.context, go, go.hover)
+        sweeps = self.context.require_queue().plan.motion == "sweep"
+        return (SweepRun if sweeps else Run)(self.context, go)
 
     def pause(self, who: str) -> None:
         """After this pose. Anyone may: it only ever makes the arm do less."""
         self._require_state(verbs.Pause)
         self.context.pause_wanted = who
-        self.store.event(f"{who} asks to pause after this pose")
+        self.store.event("pause-wanted", f"{who} asks to pause after this pose", who=who)
 
     async def finish(self, client_id: int) -> None:
-        """Seals what is there; a pose under way is taken first."""
+        """Finishes what is there; a pose under way is taken first."""
         self.permit(verbs.Finish, client_id)
-        self._void_go()
+        self._void()
         if self.store.state in RUNNING and not self.free_drive.taking:
             self.context.finish_wanted = True
-            self.store.event("finish after this pose")
+            self.store.event("finish-wanted", "finish after this pose")
             return
         if self.context.recording is None:
-            raise RefusedError("nothing is recorded yet: there is nothing to finish")
+            raise RefusedError("Nothing is recorded yet.", code="nothing-recorded")
         await asyncio.gather(self._run_ended(), self.free_drive.last_picture())
         self._require_state(verbs.Finish)
         self._run = closing = asyncio.create_task(close_or_seal(self.context))  # nothing new begins beside it
@@ -266,9 +269,9 @@ class Session:
 
     def _require_run_ended(self) -> None:
         if self._run is not None and not self._run.done():
-            raise RefusedError("the last run is still ending: try again in a moment")
+            raise _still_ending("the last run")
 
-    # -- the lease ---------------------------------------------------------------------------------------
+    # -- control, plan, freedrive ------------------------------------------------------------------------
 
     def take_lease(self, client_id: int, who: str) -> Lease:
         lease = self.leases.take(client_id, who, time.time_ns())
@@ -276,17 +279,15 @@ class Session:
         return lease
 
     async def release_lease(self, client_id: int) -> None:
-        """Letting go during a run is losing it: the arm decelerates."""
-        await self.lease_lost(client_id, "{} let go of control")
-
-    # -- the plan ----------------------------------------------------------------------------------------
+        """Releasing control during a run is losing it: the arm decelerates."""
+        await self.lease_lost(client_id, "{} released control.")
 
     def load_plan(self, client_id: int, plan: Plan) -> None:
         self.permit(verbs.LoadPlan, client_id)
         self._require_no_session()
         self._replace_plan(plan)
 
-    async def make_plan(self, client_id: int, poses: int, seed: int, lens_known: bool = False) -> Plan:
+    async def make_plan(self, client_id: int, poses: int, seed: int, lens_known: bool = False) -> None:
         """Made in the worker. ConfigError and LimitError say what is missing or in the way."""
         self.permit(verbs.MakePlan, client_id)
         self._require_no_session()
@@ -294,46 +295,52 @@ class Session:
             start = self.context.cell.robot.latest().joints_rad
         except RobotError:
             start = None
-        self.store.event(f"planning {poses} poses")
+        self.store.event("planning", f"planning {poses} poses", poses=poses)
         plan = await self.context.workers.call(
-            plan_poses, self.context.cell.config, start, seed, poses, lens_known, timeout_s=PLAN_TIMEOUT_S
+            make_plan,
+            self.context.cell.config,
+            start_joints_rad=start,
+            seed=seed,
+            count=poses,
+            lens_known=lens_known,
+            timeout_s=PLAN_TIMEOUT_S,
         )
-        self.permit(verbs.MakePlan, client_id)
-        self._require_no_session()
-        self._replace_plan(plan)
-        return plan
+        self.load_plan(client_id, plan)
 
     def _require_no_session(self) -> None:
         if self.context.recording is not None:
-            raise RefusedError("a session is open: finish it first")
+            raise RefusedError("A session is open.", code="session-open", remedy="Finish it first.")
 
     def _replace_plan(self, plan: Plan) -> None:
-        self._void_go()
+        self._void()
         self.context.queue = PoseQueue(plan)
         self.context.forget_session()
         self.context.show_poses()
-        self.store.event(f"plan of {len(plan.poses)} poses loaded")
+        count = len(plan.poses)
+        self.store.event("plan-loaded", f"plan of {count} poses loaded", poses=count)
 
     async def edit(self, verb: type[Verb[Any]], client_id: int, change: Callable[[PoseQueue], R]) -> R:
-        """Retake, skip, reorder, add, drop: voids a waiting go. RecordingError: done, but not on the disk."""
-        self.permit(verb, client_id)
-        if self.context.queue is None:
-            raise RefusedError("no plan is loaded: load or make one first")
-        result = change(self.context.queue)
-        self._void_go()
-        self.context.show_poses(self.store.status.session.current)
-        if self.context.recording is not None:
-            try:
-                await self.context.recording.save_state(self.context.queue)
-            except RecordingError as error:
-                raise RecordingError(f"it is changed, but a restart would forget it: {error}") from None
-        return result
+        """Retake, skip, reorder, add, drop: voids a waiting approval.
 
-    # -- without control --------------------------------------------------------------------------------
+        RecordingError: it is done, but not on the disk.
+        """
+        self.permit(verb, client_id)
+        context = self.context
+        queue = context.loaded()
+        result = change(queue)
+        self._void()
+        context.show_poses(self.store.status.session.current)
+        if context.recording is not None:
+            try:
+                await context.recording.save_state(queue)
+            except RecordingError as error:
+                text = f"It is changed, but a restart would forget it: {error}"
+                raise RecordingError(text, code="change-not-saved") from None
+        return result
 
     async def switch_free_drive(self, client_id: int, on: bool, auto: bool) -> None:
         self.permit(verbs.FreeDrive, client_id)
-        self._void_go()
+        self._void()
         if on:
             await self._run_ended()
             await self.free_drive.begin(auto)
@@ -343,12 +350,6 @@ class Session:
     async def record(self, client_id: int) -> int:
         self.permit(verbs.Record, client_id)
         return await self.free_drive.record()
-
-    @property
-    def troubles(self) -> dict[str, str]:
-        return self._keeper.troubles
-
-    # -- inside ------------------------------------------------------------------------------------------
 
     def permit(self, verb: type[Verb[Any]], client_id: int) -> None:
         """RefusedError unless the table of verbs allows it to this client now."""
@@ -360,12 +361,15 @@ class Session:
         if (refusal := verb.refusal(self.store.state)) is not None:
             raise refusal
 
-    def _void_go(self) -> None:
-        self._goes.void()
+    def _void(self) -> None:
+        self.approvals.void()
         self.store.update(go=None)
 
     def _jogged(self, how_far: str) -> None:
-        text = f"the arm was moved by {how_far} while paused: the way on is checked again, a new go is needed"
         self._notes = (f"the arm was moved by {how_far} since the pause",)
-        self._void_go()
-        self.store.event(text, "warning")
+        self._void()
+        self.store.event("jogged", f"Arm moved {how_far} while paused. Approve again.", "warning")
+
+
+def _still_ending(what: str) -> RefusedError:
+    return RefusedError(f"{what} is still ending", code="still-ending", remedy="Try again in a moment.")

@@ -5,36 +5,31 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any
 
 import msgspec
 
-from station.cell.status import Event, StationState, StationStatus
+from recordings.errors import CodedError, Value
+from station.cell.status import Event, Level, StationState, StationStatus
 from station.protocol.states import check_transition
 
 log = logging.getLogger("station.events")
 
 EVENTS_KEPT = 100
 EVENT_TEXT_LIMIT = 400
-Level = Literal["debug", "info", "warning", "error"]
-_LEVELS = {"debug": logging.DEBUG, "info": logging.INFO, "warning": logging.WARNING, "error": logging.ERROR}
 
 
 class StatusStore:
     """Holds the newest immutable snapshot. Only the event loop's thread may call it."""
 
     def __init__(self, status: StationStatus) -> None:
-        self._status = status
+        self.status = status
         self._watchers: list[Callable[[], None]] = []
         self._listeners: list[Callable[[Event], None]] = []
 
     @property
-    def status(self) -> StationStatus:
-        return self._status
-
-    @property
     def state(self) -> StationState:
-        return self._status.state
+        return self.status.state
 
     def watch(self, changed: Callable[[], None]) -> Callable[[], None]:
         """`changed` is called after every change; returns what ends it, however often it is called."""
@@ -51,25 +46,46 @@ class StatusStore:
         self._listeners.append(listener)
 
     def update(self, **sections: Any) -> None:
-        changed = {k: v for k, v in sections.items() if getattr(self._status, k) != v}
+        changed = {k: v for k, v in sections.items() if getattr(self.status, k) != v}
         if changed:
-            self._status = msgspec.structs.replace(self._status, **changed)
+            self.status = msgspec.structs.replace(self.status, **changed)
             for watcher in list(self._watchers):
                 try:
                     watcher()
                 except Exception:  # who only looks on must not come between STOP and the arm
                     log.exception("a watcher of the status failed")
 
-    def enter(self, state: StationState, reason: str = "") -> None:
-        """Raises TransitionError for a step that the table does not allow."""
+    def update_session(self, **fields: Any) -> None:
+        self.update(session=msgspec.structs.replace(self.status.session, **fields))
+
+    def enter(self, state: StationState, reason: str | CodedError = "", cause: str = "") -> None:
+        """`reason` for people, `cause` for programs. TransitionError for a step not in the table."""
         if state is not self.state:
             check_transition(self.state, state)
-        self.update(state=state, reason=reason)
+        if isinstance(reason, CodedError):
+            cause = reason.code
+        self.update(state=state, reason=str(reason), cause=cause)
 
-    def event(self, text: str, level: Level = "info", pose_index: int | None = None) -> None:
+    def event(
+        self, code: str, text: str, level: Level = "info", pose_index: int | None = None, **values: Value
+    ) -> None:
+        """Tells people, log and recording; `code` and `values` are for programs."""
+        self._tell(code, text, level, pose_index, values)
+
+    def problem(
+        self, error: Exception, level: Level = "warning", pose_index: int | None = None, said: str = "{}"
+    ) -> None:
+        """Tells of an error; `said` puts its text into a sentence."""
+        code, values = (error.code, error.values) if isinstance(error, CodedError) else ("internal", {})
+        self._tell(code, said.format(error), level, pose_index, values)
+
+    def _tell(
+        self, code: str, text: str, level: Level, pose_index: int | None, values: dict[str, Value]
+    ) -> None:
         text = text if len(text) <= EVENT_TEXT_LIMIT else text[: EVENT_TEXT_LIMIT - 1] + "…"
-        event = Event(time.time_ns(), level, text, pose_index)
-        log.log(_LEVELS[level], "%s%s", f"pose {pose_index + 1}: " if pose_index is not None else "", text)
-        self.update(events=(*self._status.events, event)[-EVENTS_KEPT:])
+        event = Event(time.time_ns(), level, text, pose_index, code, values)
+        pose = f"pose {pose_index + 1}: " if pose_index is not None else ""
+        log.log(getattr(logging, level.upper()), "%s%s", pose, text)
+        self.update(events=(*self.status.events, event)[-EVENTS_KEPT:])
         for listener in self._listeners:
             listener(event)

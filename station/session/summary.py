@@ -1,19 +1,22 @@
-"""What a person is asked before anything moves: checked, from where the arm stands now."""
+"""The preview a person approves before anything moves: checked, from where the arm stands now."""
 
 from __future__ import annotations
+
+from typing import Any
 
 import msgspec
 
 from recordings.errors import RecordingError
 from recordings.files import require_free_space
+from recordings.schema.messages import Vector6
 from station.analysis.worker import check_run
 from station.cell.errors import LimitError, RefusedError
 from station.cell.limits import PlanCheck
 from station.cell.status import MotionPreview
+from station.cell.stillness import RestingCheck
 from station.protocol.verbs import Purpose
 from station.session.context import SessionContext
 from station.session.lease import ApprovalManager
-from station.session.patience import RestingCheck
 from station.session.queue import PlanRevision, PoseQueue
 from station.session.supervisor import displacement
 
@@ -24,7 +27,7 @@ _SLOW_SLIDER = 0.99
 
 
 def begun_anew(context: SessionContext, purpose: Purpose) -> PlanRevision | None:
-    """The loaded plan for a session that begins with this go; until then the last session stays shown."""
+    """The loaded plan for a session that begins with this approval; until then the last one stays shown."""
     queue = context.queue
     if purpose is not Purpose.RUN or context.recording is not None or queue is None:
         return None
@@ -33,26 +36,24 @@ def begun_anew(context: SessionContext, purpose: Purpose) -> PlanRevision | None
 
 
 def poses_to_drive(context: SessionContext, purpose: Purpose, index: int | None) -> tuple[int, ...]:
-    """The poses a go for this purpose covers. RefusedError when there are none."""
-    queue = context.queue
-    if queue is None:
-        raise RefusedError("no plan is loaded: load or make one first")
+    """The poses an approval for this purpose covers. RefusedError when there are none."""
+    queue = context.loaded()
     if purpose in (Purpose.RETAKE, Purpose.RESUME) and context.recording is None:
-        raise RefusedError("no session is open: run the plan to begin one")
+        raise RefusedError("No session is open.", code="no-session", remedy="Run the plan to begin one.")
     if purpose is Purpose.RETAKE:
         if index is None:
-            raise RefusedError("say which pose to retake")
+            raise RefusedError("Missing: which pose to retake.", code="no-pose-named")
         if queue.status(index).state != "planned":
             queue.retake(index)
         return (index,)
     if purpose is Purpose.DRIFT_CHECK and context.recording is not None:
-        raise RefusedError("a session is open: finish it first, then check")
+        raise RefusedError("A session is open.", code="session-open", remedy="Finish it first, then check.")
     return _open(queue)
 
 
 def _open(queue: PoseQueue) -> tuple[int, ...]:
     if not queue.open:
-        raise RefusedError("no pose is left to take: retake some, or finish")
+        raise RefusedError("No pose is left to take.", code="no-pose-left", remedy="Retake some, or finish.")
     return queue.open
 
 
@@ -64,32 +65,44 @@ async def summarise(
     notes: tuple[str, ...],
     changes: tuple[str, ...] = (),
 ) -> MotionPreview:
-    """Checks the whole way in the worker. LimitError lists what is wrong with it, RobotError with the arm."""
+    """Checks the whole path in the worker. LimitError: it is not free; RobotError: what the arm lacks."""
     robot = context.cell.robot
     try:
         require_free_space(context.root, context.cell.config.capture.free_space_bytes)
     except (RecordingError, OSError) as full:
-        raise RefusedError(f"{full}. Nothing moved.") from None
+        raise RefusedError(f"{full} Nothing moved.", code="disk-full") from None
     await RestingCheck(robot.check).news()
     start = robot.latest().joints_rad
-    plan = queue.plan
-    part = msgspec.structs.replace(plan, poses=tuple(queue.pose(index) for index in poses))
-    check: PlanCheck = await context.workers.call(check_run, context.cell.config, part, start)
+    plan = msgspec.structs.replace(queue.plan, poses=tuple(queue.pose(index) for index in poses))
+    check: PlanCheck = await context.workers.call(check_run, context.cell.config, plan, start)
     if check.problems:
-        raise LimitError(_problem_text(check))
-    return MotionPreview(
-        token=ApprovalManager.new_token(),
+        raise LimitError(_problem_text(check), code="plan", problems=len(check.problems))
+    first = plan.poses[0].joints_rad
+    return motion_preview(
+        check,
+        start,
+        overhead_s=POSE_OVERHEAD_S * len(poses),
         purpose=_purpose_words(context, purpose, poses),
         plan_sha256=queue.sha256,
         poses=len(poses),
+        first_move=f"{displacement(context, start, first)} to pose {poses[0] + 1}",
+        changes=changes,
+        warnings=(*notes, *motion_warnings(context)),
+    )
+
+
+def motion_preview(
+    check: PlanCheck, start_joints_rad: Vector6, *, overhead_s: float = 0.0, **said: Any
+) -> MotionPreview:
+    """The figures of a checked path with the words said of it, and a new token."""
+    return MotionPreview(
+        token=ApprovalManager.new_token(),
         path_m=round(check.path_m, 3),
         largest_step_rad=round(check.largest_step_rad, 4),
         top_speed_m_s=round(check.top_speed_m_s, 3),
-        duration_s=round(check.duration_s + POSE_OVERHEAD_S * len(poses), 1),
-        first_move=f"{displacement(context, start, part.poses[0].joints_rad)} to pose {poses[0] + 1}",
-        changes=changes,
-        warnings=(*notes, *_warnings(context)),
-        start_joints_rad=start,
+        duration_s=round(check.duration_s + overhead_s, 1),
+        start_joints_rad=start_joints_rad,
+        **said,
     )
 
 
@@ -97,7 +110,7 @@ def _problem_text(check: PlanCheck) -> str:
     shown = [str(problem) for problem in check.problems[:_PROBLEMS_SHOWN]]
     more = len(check.problems) - len(shown)
     tail = [f"… and {more} more"] if more > 0 else []
-    return "the plan is refused, nothing moved:\n" + "\n".join([*shown, *tail])
+    return "The plan is refused, nothing moved:\n" + "\n".join([*shown, *tail])
 
 
 def _purpose_words(context: SessionContext, purpose: Purpose, poses: tuple[int, ...]) -> str:
@@ -110,13 +123,13 @@ def _purpose_words(context: SessionContext, purpose: Purpose, poses: tuple[int, 
     if context.recording is None:
         return "run plan"
     if purpose is Purpose.NEXT_POSE:
-        return f"one pose more for session {context.recording.name}"
+        return f"next pose for session {context.recording.name}"
     if purpose is Purpose.REPLAN:
-        return f"go on with session {context.recording.name}, the poses that are left planned anew"
-    return f"go on with session {context.recording.name}"
+        return f"continue session {context.recording.name} with the remaining poses replanned"
+    return f"continue session {context.recording.name}"
 
 
-def _warnings(context: SessionContext) -> list[str]:
+def motion_warnings(context: SessionContext) -> list[str]:
     warnings = []
     slider = context.cell.robot.latest().target_speed_fraction
     if slider < _SLOW_SLIDER:

@@ -1,4 +1,4 @@
-"""The working loop: heartbeat to the arm, watch over what rests, fresh status. Nothing in it may wait.
+"""The working loop: heartbeat to the arm, watch over the resting arm, status. Nothing in it may wait.
 
 The arm's watchdog and systemd's hang on this one loop: when it stalls, the arm stops and the daemon is
 restarted. That is why the heartbeat comes from nowhere else.
@@ -73,7 +73,7 @@ class SessionSupervisor:
         self._ticked()
 
     def _look(self) -> None:
-        """What fails here must not end the heartbeat; a person is told that the screen is not fresh."""
+        """Refreshes the status. What fails here must not end the heartbeat; a person is told."""
         try:
             self._watch_link()
             self._watch_rest()
@@ -82,7 +82,7 @@ class SessionSupervisor:
             if repr(error) != self._failure:
                 self._failure = repr(error)
                 log.exception("the status could not be refreshed")
-                self._context.store.event(f"what the screen shows is not fresh: {error!r}", "error")
+                self._context.store.problem(error, "error", said="what the screen shows is not fresh: {!r}")
 
     def lag_ms(self) -> float:
         """Worst of the last second."""
@@ -99,18 +99,18 @@ class SessionSupervisor:
             if self._stale_rounds == LOST_ROUNDS:
                 self._lost()
             if store.state is StationState.IDLE and self._stale_rounds >= LOST_ROUNDS:
-                store.enter(StationState.DISCONNECTED, str(error))
-                store.event(f"robot lost: {error}", "warning")
+                store.enter(StationState.DISCONNECTED, error)
+                store.problem(error, said="robot lost: {}")
             return
         except RobotError:
             return
         self._stale_rounds = 0
         if store.state is StationState.DISCONNECTED:
             store.enter(self._context.resting)
-            store.event("robot connected")
+            store.event("robot-connected", "robot connected")
 
     def _watch_rest(self) -> None:
-        """Says so when the arm is moved by somebody while the session rests; any go is void then."""
+        """Tells when somebody moves the arm while the session rests; any approval is void then."""
         context = self._context
         if context.store.state is not StationState.PAUSED:
             self._rest_joints = None

@@ -4,22 +4,25 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
+import pytest
 
 from calibrate.boards.model import board_points
 from calibrate.geometry import rotation_log
 from calibrate.kinematics import MODELS, forward
+from recordings.errors import CodedError
 from recordings.reader import Recording, open_recording
 from recordings.schema.messages import CameraIdentity, Image, RobotIdentity, RobotState, Stamps
 from station.analysis.worker import BoardDetection, sight
 from station.cell.config import StationConfig
-from station.cell.errors import CameraError, RobotError, StaleStateError
-from station.cell.status import DetectionStatus, StationState
+from station.cell.errors import CameraError, RefusedError, RobotError, StaleStateError
+from station.cell.status import DetectionStatus, Event, StationState
 from station.devices.base import Robot
 from station.devices.cell import Cell
 from station.devices.frames import CameraCounts
@@ -214,9 +217,11 @@ class WorkerInThisProcess:
     async def start(self) -> None:
         return None
 
-    async def call(self, function: Callable[..., Any], *args: Any, timeout_s: float = 60.0) -> Any:
+    async def call(
+        self, function: Callable[..., Any], *args: Any, timeout_s: float = 60.0, **named: Any
+    ) -> Any:
         await asyncio.sleep(0)
-        return self.sees if function is sight else function(*args)
+        return self.sees if function is sight else function(*args, **named)
 
     def close(self) -> None:
         return None
@@ -227,6 +232,14 @@ def memory_config() -> StationConfig:
     capture = msgspec.structs.replace(config.capture, free_space_bytes=1, time_bound_s=1.0)
     stillness = msgspec.structs.replace(config.stillness, timeout_s=0.8)
     return msgspec.structs.replace(config, capture=capture, stillness=stillness)
+
+
+@contextmanager
+def raises(code: str, kind: type[CodedError] = RefusedError) -> Iterator[pytest.ExceptionInfo[CodedError]]:
+    """As `pytest.raises`, by the error's code."""
+    with pytest.raises(kind) as caught:
+        yield caught
+    assert caught.value.code == code, caught.value
 
 
 class Rig:
@@ -253,6 +266,15 @@ class Rig:
     @property
     def state(self) -> StationState:
         return self.session.store.state
+
+    @property
+    def cause(self) -> str:
+        """Why it stands there."""
+        return self.session.store.status.cause
+
+    def told(self, code: str) -> list[Event]:
+        """The events of this kind."""
+        return [event for event in self.session.store.status.events if event.code == code]
 
     async def until(self, *states: StationState) -> None:
         """A slow arm that is `moving` is under way: its way was checked."""

@@ -18,7 +18,7 @@ from station.cell.errors import CameraError
 from station.cell.plan import ExpectedView
 from station.cell.status import StationState as S
 from station.cell.stillness import StillnessMonitor
-from station.session.picture_watch import GLIMPSE_TRIES, PictureWatch
+from station.session.capture import GLIMPSE_TRIES, ImageWatch
 from station.session.queue import PoseQueue
 from station.simulation.camera import RenderedCamera
 from station.simulation.cell import write_truth
@@ -110,7 +110,7 @@ async def test_what_cannot_be_looked_at_is_recorded_as_not_measured(rig: Rig, wh
     if why == "failing":
         rig.camera.glimpse_fails = ["no frame"] * GLIMPSE_TRIES * POSES
     assert await recorded(rig) == [None] * POSES
-    told = [e.text for e in rig.session.store.status.events if "motion is not measured" in e.text]
+    told = rig.told("camera")
     assert len(told) == (POSES if why == "failing" else 0)
 
 
@@ -140,7 +140,7 @@ async def test_a_camera_that_fails_when_nobody_looks_any_more_is_no_traceback(
 
     asyncio.get_running_loop().set_exception_handler(lambda loop, context: logged.append(context))
     monkeypatch.setattr(rig.camera, "glimpse", hangs)
-    async with PictureWatch(rig.session.context, 0):
+    async with ImageWatch(rig.session.context, 0):
         await asyncio.sleep(0.01)
         asyncio.get_running_loop().call_later(0.05, given_up.set)  # the pose ends before that
     gc.collect()
@@ -162,7 +162,7 @@ async def test_a_ringing_bracket_is_waited_for(
     rig.arm.rest()
     object.__setattr__(context.cell, "camera", rendered)
     await rendered.inject("ringing", {"amplitude_rad": 0.01, "frequency_hz": 6.3})
-    async with PictureWatch(context, 0) as watch:
+    async with ImageWatch(context, 0) as watch:
         settling = asyncio.ensure_future(context.stillness.settle(lambda: None, watch.look))
         look = None
         while look is None:

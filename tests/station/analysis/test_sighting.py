@@ -42,8 +42,8 @@ def test_the_distance_is_the_same_in_a_preview_of_half_the_size(factor: float) -
 def test_the_pictures_of_a_recording_are_seen_again_with_their_poses() -> None:
     path = Path(recordings.__file__).parent / "samples" / "paper-640.mcap"
     recording = open_recording(path)
-    found = seen_before(path, recording.info.board, None)
-    assert [index for index, _, _ in found] == [view.index for view in recording.views()]
-    for (_, flange, seen), view in zip(found, recording.views(), strict=True):
-        assert np.array_equal(flange, view.base_from_flange)
-        assert seen.status.corners == len(seen.pixels) == 42
+    found = seen_before(path, recording.info.board)
+    assert [seen.index for seen in found] == [view.index for view in recording.views()]
+    for seen, view in zip(found, recording.views(), strict=True):
+        assert np.array_equal(seen.base_from_flange, view.base_from_flange)
+        assert len(seen.indices) == len(seen.pixels) == 42

@@ -6,10 +6,10 @@ from pathlib import Path
 
 import pytest
 
-from station.cell import limits
+from station.cell import limits, stillness
 from station.devices import ur_child, ur_condition, ur_control, ur_moves
 from station.plan import hover
-from station.session import lease, patience, supervisor
+from station.session import lease, supervisor
 
 PROMISES = (Path(__file__).parents[3] / "docs" / "safety.md").read_text()
 
@@ -26,7 +26,7 @@ PROMISES = (Path(__file__).parents[3] / "docs" / "safety.md").read_text()
         (ur_control.BEAT_FRESH_NS / 1e9, 0.1, "silent for 0.2 s"),
         (ur_moves.STALE_S, 0.25, "no fresh state for 0.25 s in mid-move"),
         (supervisor.LOST_ROUNDS * supervisor.STATUS_TICKS * supervisor.TICK_S, 1.0, "(1 s at rest)"),
-        (patience.REST_PATIENCE_S, 1.0, "(1 s at rest)"),
+        (stillness.REST_PATIENCE_S, 1.0, "(1 s at rest)"),
         (ur_moves.STRAYED_RAD, 0.05, "(by 0.05 rad)"),
         (ur_moves.SLIDER_ZERO_S, 10.0, "after 10 s the move is given up"),
         (ur_child.STOP_DECELERATION, 2.0, "decelerates the tool with 2 m/s²"),

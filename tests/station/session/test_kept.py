@@ -11,7 +11,7 @@ from recordings.errors import RecordingError
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, Retake, Skip
 from tests.durability import disk_order
-from tests.station.session_rig import POSES, NewRig, Rig, crash, sealed
+from tests.station.session_rig import POSES, NewRig, Rig, crash, raises, sealed
 
 
 def under_way(rig: Rig, moves: int) -> bool:
@@ -52,7 +52,7 @@ async def test_a_change_that_the_disk_does_not_take_is_told_to_who_asked(
         raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
 
     monkeypatch.setattr("station.session.recording.write_state", full)
-    with pytest.raises(RecordingError, match=r"a restart would forget it.*No space left"):
+    with raises("change-not-saved", RecordingError):
         await rig.session.edit(Skip, 1, lambda queue: queue.skip(2))
     assert rig.pose_states == ["done", "planned", "skipped", "planned"]
 
@@ -99,11 +99,10 @@ async def test_what_people_were_told_is_in_the_recording(rig: Rig, trouble: tupl
     await rig.give_go()
     await rig.until(S.IDLE)
     recording = sealed(rig)
-    told = [event.text for event in rig.session.store.status.events]
-    assert any("approved by anna" in text and "run plan" in text for text in told)
-    assert f"sealed with {POSES} of {POSES} poses: {recording.path}" in told
+    assert "anna" in rig.told("approved")[0].text
+    assert rig.told("finished")[0].values == {"captured": POSES, "poses": POSES, "path": str(recording.path)}
     written = [event.detail for event in recording.events()]
-    assert any(text.startswith("recording to ") for text in written)
+    assert rig.told("recording")[0].text in written
     assert sum("frame lost" in text for text in written) == len(trouble)
 
 

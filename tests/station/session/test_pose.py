@@ -80,7 +80,7 @@ async def test_an_arm_that_is_moved_between_rest_and_exposure_gives_no_view(
     index = await rig.session.record(1)
     status = rig.session.context.require_queue().status(index)
     assert status.state == "failed"
-    assert "moved while the picture was taken" in status.reason and "elbow" in status.reason
+    assert status.cause == "moved-in-exposure" and "elbow" in status.reason
     monkeypatch.setattr(rig.arm, "at", at)
     await rig.session.record(1)
     await rig.session.finish(1)

@@ -13,12 +13,12 @@ import pytest
 from recordings.reader import Recording
 from recordings.schema.messages import Image
 from station.analysis.worker import BoardDetection
-from station.cell.errors import CameraError, RefusedError
+from station.cell.errors import CameraError
 from station.cell.status import DetectionStatus
 from station.cell.status import StationState as S
 from station.plan.files import SWINGS, sweep_plan
 from station.protocol.verbs import Drop, Purpose, Skip
-from tests.station.session_rig import TRUTH, CameraInMemory, Rig, sealed
+from tests.station.session_rig import TRUTH, CameraInMemory, Rig, raises, sealed
 
 
 @pytest.fixture
@@ -63,7 +63,7 @@ async def test_stop_ends_swing_and_pictures(sweeping: Rig) -> None:
     assert sweeping.camera.taken == taken and sweeping.arm.log.count("move") == 1
     sweeping.session.acknowledge("anna")
     assert sweeping.session.store.state is S.PAUSED
-    with pytest.raises(RefusedError, match="not valid"):
+    with raises("approval-used"):
         sweeping.session.go(1, "the old one")
 
 
@@ -71,7 +71,7 @@ async def test_without_the_board_in_view_nothing_moves(sweeping: Rig) -> None:
     sweeping.worker.sees = BoardDetection(DetectionStatus(reason="too dark"), np.arange(0), np.zeros((0, 2)))
     await sweeping.give_go()
     await sweeping.until(S.IDLE)
-    assert "board in view: too dark" in sweeping.session.store.status.reason
+    assert sweeping.cause == "no-board"
     assert "move" not in sweeping.arm.log and sweeping.session.context.recording is None
 
 

@@ -1,4 +1,4 @@
-"""The verification hover: the pointer's tip over a corner of the board, slowly, well above it, a go each.
+"""The touch test: the pointer's tip over a corner of the board, slowly, well above it, approved each time.
 
 Nothing is recorded and nothing is touched: contact is made by a person's hand only.
 """
@@ -25,25 +25,27 @@ from station.cell.config import PointerConfig, matrix4
 from station.cell.errors import LimitError, RefusedError, RobotError
 from station.cell.plan import plan_sha256
 from station.cell.status import HoverOffer, MotionPreview, StationState
-from station.cell.stillness import NotStillError
+from station.cell.stillness import NotStillError, RestingCheck
 from station.plan.hover import Hover, HoverAnswer, HoverQuestion, answer_hover, least_standoff_m
 from station.protocol import verbs
 from station.session.capture import flange_pose
 from station.session.context import SessionContext
-from station.session.lease import ApprovalManager, MotionApproval
-from station.session.patience import RestingCheck
+from station.session.lease import MotionApproval
 from station.session.run import Run
+from station.session.summary import motion_preview, motion_warnings
 from station.session.supervisor import JOGGED_RAD, displacement
 
+OVER_CORNER = "over-corner"
+"""Cause of the state after a path over a corner: the tip stands there."""
 VIEW_LIFETIME_S = 900.0
-"""From close above the board a camera on the flange sees nothing: one picture serves several corners."""
+"""From close above the board a camera on the flange sees nothing: one image serves several corners."""
 _SIGHT_S, _PLAN_S = 20.0, 60.0
 _SAME_PLACE_RAD = 1e-3
-"""The arm stands where the picture was taken: a board seen from elsewhere lies elsewhere."""
+"""The arm stands where the image was taken: a board seen from elsewhere lies elsewhere."""
 
 
 @dataclass(frozen=True, eq=False)
-class _Look:
+class _BoardSeen:
     """The board as last seen."""
 
     view: BoardView
@@ -53,11 +55,11 @@ class _Look:
 
 
 class TouchTestPlanner:
-    """Finds ways over corners; remembers the last picture of the board."""
+    """Finds paths over corners; remembers the last image of the board."""
 
     def __init__(self, context: SessionContext) -> None:
         self._context = context
-        self._look: _Look | None = None
+        self._board: _BoardSeen | None = None
 
     async def prepare(self, request: verbs.Hover) -> tuple[Hover, HoverOffer]:
         """RefusedError, LimitError, RobotError and CameraError say what is in the way. Nothing moves."""
@@ -66,26 +68,30 @@ class TouchTestPlanner:
         calibration = self._calibration(request)
         pointer, words = self._pointer(request)
         if not 0 <= request.corner < len(board_points(config.board)):
-            raise RefusedError(
-                f"the board has corners 0 to {len(board_points(config.board)) - 1}, not {request.corner}"
-            )
+            last = len(board_points(config.board)) - 1
+            text = f"The board has corners 0 to {last}, not {request.corner}."
+            raise RefusedError(text, code="no-such-corner", corner=request.corner, last=last)
         if not request.standoff_m >= least_standoff_m(0.0):
+            least_m = least_standoff_m(0.0)
             raise LimitError(
-                f"the tip must stay at least {1000 * least_standoff_m(0.0):.0f} mm above the board, not "
-                f"{1000 * request.standoff_m:.0f} mm: nearer, it is guided by hand only"
+                f"Tip {1000 * request.standoff_m:.0f} mm above the board (limit {1000 * least_m:.0f} mm).",
+                code="standoff",
+                remedy="Nearer, guide it by hand only.",
+                standoff_m=request.standoff_m,
+                limit_m=least_m,
             )
         robot.check()
         await context.stillness.settle(RestingCheck(robot.check))
-        look = await self._seen(request, calibration)
+        seen = await self._seen(request, calibration)
         start = robot.latest().joints_rad
         question = HoverQuestion(request.corner, request.standoff_m, pointer, start, self._model_miss_m())
         try:
             answer = await context.workers.call(
-                answer_hover, config, calibration, look.view, question, timeout_s=_PLAN_S
+                answer_hover, config, calibration, seen.view, question, timeout_s=_PLAN_S
             )
         except CalibrationError as error:
-            raise RefusedError(str(error)) from error
-        summary = self._summary(answer, start, look, words)
+            raise _refused(error) from error
+        summary = self._summary(answer, start, seen, words)
         return answer.hover, _offer(answer, summary, context, pointer, words)
 
     def _calibration(self, request: verbs.Hover) -> Calibration:
@@ -97,21 +103,24 @@ class TouchTestPlanner:
             else:
                 found = load_installed(self._context.root, allow_simulated=cell.simulated)
         except CalibrationError as error:
-            raise RefusedError(str(error)) from error
+            raise _refused(error) from error
         robot, camera = cell.robot.identity, cell.camera.identity
-        if found.mount != cell.config.mount or found.source != cell.source:
-            raise RefusedError(
-                f"the calibration is {found.source}, {found.mount}; this cell is {cell.source}, "
-                f"{cell.config.mount}"
-            )
+        here = cell.config.mount
+        if found.mount != here or found.source != cell.source:
+            text = f"The calibration is {found.source}, {found.mount}; this cell is {cell.source}, {here}."
+            raise RefusedError(text, code="other-cell")
         if (found.robot.serial, found.camera.serial) != (robot.serial, camera.serial):
             raise RefusedError(
-                f"the calibration is of robot {found.robot.serial} and camera {found.camera.serial}, this "
-                f"cell has {robot.serial} and {camera.serial}"
+                f"The calibration is of robot {found.robot.serial} and camera {found.camera.serial}; this "
+                f"cell has {robot.serial} and {camera.serial}.",
+                code="other-devices",
+                robot=found.robot.serial,
+                camera=found.camera.serial,
             )
         if found.quality.failed:
             names = ", ".join(gate.name for gate in found.quality.failed)
-            raise RefusedError(f"the calibration failed its gates ({names}): nothing is driven by it")
+            text = f"The calibration failed its gates ({names}): nothing is driven by it."
+            raise RefusedError(text, code="failed-gates", gates=names)
         return found
 
     def _pointer(self, request: verbs.Hover) -> tuple[PointerConfig, str]:
@@ -119,7 +128,8 @@ class TouchTestPlanner:
         configured = self._context.cell.config.pointer
         if request.pointer_m is not None:
             if not 0.01 <= request.pointer_m <= 1.0:
-                raise RefusedError(f"a pointer is 10 to 1000 mm long, not {1000 * request.pointer_m:g} mm")
+                text = f"A pointer is 10 to 1000 mm long, not {1000 * request.pointer_m:g} mm."
+                raise RefusedError(text, code="pointer-length", pointer_m=request.pointer_m)
             pointer = PointerConfig((0.0, 0.0, request.pointer_m))
             return pointer, f"pointer {1000 * request.pointer_m:.1f} mm along the flange's z axis"
         if configured is not None:
@@ -128,38 +138,45 @@ class TouchTestPlanner:
         tip, along = tcp[:3], pose_from_rotvec(tcp[:3], tcp[3:])[:3, 2]
         if np.linalg.norm(tip) < 0.01:
             raise RefusedError(
-                "the station knows no pointer: give its length (--pointer-mm; on the screen Tab), or "
-                "`pointer` in the configuration, or set the tool centre point on the pendant"
+                "The station knows no pointer.",
+                code="no-pointer",
+                remedy="Give its length (--pointer-mm; Tab on the screen), `pointer` in the configuration, "
+                "or set the tool centre point on the pendant.",
             )
         x, y, z = (float(v) for v in along)
         return PointerConfig(tip, (x, y, z)), f"the pendant's tool, tip at {_mm(tip)} mm in the flange"
 
-    async def _seen(self, request: verbs.Hover, calibration: Calibration) -> _Look:
+    async def _seen(self, request: verbs.Hover, calibration: Calibration) -> _BoardSeen:
         context, place = self._context, calibration.provenance.recording_sha256
         if not request.new_picture:
-            look = self._look
-            if look is None or look.place != place or time.monotonic() - look.at_s > VIEW_LIFETIME_S:
-                raise RefusedError("the board was not looked at lately: bring it into the picture first")
-            return look
-        self._look = None
+            seen = self._board
+            if seen is None or seen.place != place or time.monotonic() - seen.at_s > VIEW_LIFETIME_S:
+                text = "The board was not seen lately."
+                raise RefusedError(text, code="board-not-seen", remedy="Bring it into the image first.")
+            return seen
+        self._board = None
         before = context.cell.robot.latest().joints_rad
-        picture = await context.cell.camera.capture()
+        image = await context.cell.camera.capture()
         await RestingCheck(context.cell.robot.check).news()
         state = context.cell.robot.latest()
         if np.abs(np.subtract(state.joints_rad, before)).max() > _SAME_PLACE_RAD:
-            raise RefusedError("the arm was moved while the picture was taken: leave it at rest, then again")
+            text = "The arm was moved while the image was taken."
+            raise RefusedError(text, code="arm-moved", remedy="Leave it at rest, then retry.")
         board = context.cell.config.board
         sighting = await context.workers.call(
-            sight, picture.pixels, board, calibration.intrinsics.model, timeout_s=_SIGHT_S
+            sight, image.pixels, board, calibration.intrinsics.model, timeout_s=_SIGHT_S
         )
         if not sighting.status.found:
-            reason = sighting.status.reason or "no board in the picture"
-            raise RefusedError(f"{reason}: jog the arm or lay the board so that the camera sees it whole")
+            raise RefusedError(
+                sighting.status.reason or "No board in the image.",
+                code="no-board",
+                remedy="Jog the arm or lay the board so that the camera sees it whole.",
+            )
         flange = flange_pose(state, context.cell.robot.identity.tcp_offset)
         points = board_points(board)[sighting.indices]
         view = BoardView(0, "verification", flange, points, sighting.pixels)
-        self._look = _Look(view, place, time.monotonic())
-        return self._look
+        self._board = _BoardSeen(view, place, time.monotonic())
+        return self._board
 
     def _model_miss_m(self) -> float:
         context, state = self._context, self._context.cell.robot.latest()
@@ -167,33 +184,26 @@ class TouchTestPlanner:
         modelled = forward(context.geometry.model, state.joints_rad)
         return float(np.linalg.norm(told[:3, 3] - modelled[:3, 3]))
 
-    def _summary(self, answer: HoverAnswer, start: Vector6, look: _Look, words: str) -> MotionPreview:
+    def _summary(self, answer: HoverAnswer, start: Vector6, board: _BoardSeen, words: str) -> MotionPreview:
         context, hover = self._context, answer.hover
-        check, poses = hover.check, hover.plan.poses
         warnings = [words]
-        age_s = time.monotonic() - look.at_s
+        age_s = time.monotonic() - board.at_s
         if age_s > 5:
             warnings.append(f"the board was seen {age_s:.0f} s ago: it must not have been moved since")
         if answer.board_moved_m > 0.01:
-            warnings.append(
-                f"the board lies {1000 * answer.board_moved_m:.0f} mm from where it was calibrated"
-            )
-        if context.cell.simulated:
-            warnings.append("SIMULATED cell: nothing real moves")
+            moved_mm = 1000 * answer.board_moved_m
+            warnings.append(f"the board lies {moved_mm:.0f} mm from where it was calibrated")
         x, y = 1000 * board_points(context.cell.config.board)[hover.corner][:2]
-        return MotionPreview(
-            token=ApprovalManager.new_token(),
+        first = hover.plan.poses[0].joints_rad
+        return motion_preview(
+            hover.check,
+            start,
             purpose=f"put the tip {1000 * hover.standoff_m:.0f} mm above corner {hover.corner} "
             f"(x {x:.0f}, y {y:.0f} mm on the board)",
             plan_sha256=plan_sha256(hover.plan),
-            poses=len(poses),
-            path_m=round(check.path_m, 3),
-            largest_step_rad=round(check.largest_step_rad, 4),
-            top_speed_m_s=round(check.top_speed_m_s, 3),
-            duration_s=round(check.duration_s, 1),
-            first_move=f"{displacement(context, start, poses[0].joints_rad)}, high over the corner",
-            warnings=tuple(warnings),
-            start_joints_rad=start,
+            poses=len(hover.plan.poses),
+            first_move=f"{displacement(context, start, first)}, high over the corner",
+            warnings=(*warnings, *motion_warnings(context)),
         )
 
 
@@ -220,7 +230,7 @@ def _offer(
 
 
 class HoverRun(Run):
-    """Carries out one go for a hover: two moves, no picture, nothing recorded."""
+    """Carries out one approval over a corner: two moves, no image, nothing recorded."""
 
     def __init__(self, context: SessionContext, go: MotionApproval, hover: Hover) -> None:
         self._context, self._go, self._hover = context, go, hover
@@ -237,7 +247,7 @@ class HoverRun(Run):
             try:
                 await self._drive(robot.latest().joints_rad, planned.joints_rad, planned.name)
             except LimitError as error:
-                context.store.enter(StationState.IDLE, str(error))
+                context.store.enter(StationState.IDLE, error)
                 return
             if context.halting:
                 return
@@ -254,15 +264,15 @@ class HoverRun(Run):
         if context.halting:
             return
         reason = (
-            f"the tip stands {1000 * self._hover.standoff_m:.0f} mm above corner {self._hover.corner}: "
-            "guide it down by hand only"
+            f"The tip stands {1000 * self._hover.standoff_m:.0f} mm above corner {self._hover.corner}. "
+            "Guide it down by hand only."
         )
-        context.store.event(reason)
-        context.store.enter(StationState.IDLE, reason)
-        _unsay_when_moved(context, reason, there)
+        context.store.event(OVER_CORNER, reason, corner=self._hover.corner)
+        context.store.enter(StationState.IDLE, reason, OVER_CORNER)
+        _unsay_when_moved(context, there)
 
 
-def _unsay_when_moved(context: SessionContext, reason: str, there: Vector6) -> None:
+def _unsay_when_moved(context: SessionContext, there: Vector6) -> None:
     """The sentence is true for as long as the arm rests there."""
     store, robot = context.store, context.cell.robot
 
@@ -270,9 +280,14 @@ def _unsay_when_moved(context: SessionContext, reason: str, there: Vector6) -> N
         moved = False
         with contextlib.suppress(RobotError):
             moved = np.abs(np.subtract(robot.latest().joints_rad, there)).max() > JOGGED_RAD
-        if moved or store.status.reason != reason:
+        said = store.status.cause == OVER_CORNER
+        if moved or not said:
             end()
-        if moved and store.status.reason == reason:
-            store.update(reason="")
+        if moved and said:
+            store.update(reason="", cause="")
 
     end = store.watch(look)
+
+
+def _refused(error: CalibrationError) -> RefusedError:
+    return RefusedError(error.text, code=error.code, remedy=error.remedy, **error.values)

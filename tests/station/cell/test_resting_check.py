@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from station.cell.errors import SafetyStopError, StaleStateError
-from station.session.patience import RestingCheck
+from station.cell.stillness import RestingCheck
 
 
 class Robot:

@@ -75,21 +75,27 @@ class ApprovalRule:
         if terminal := self._terminal(asks):
             self._require_permitted(asks)
             return f"at {terminal}"
-        raise RefusedError(f"{what} needs a person at a terminal who reviews and approves it (docs: Safety).")
+        raise RefusedError(
+            f"{what} needs a person at a terminal.",
+            code="no-terminal",
+            remedy="A person must review and approve it there (docs: Safety).",
+        )
 
     def approve(self, asks: Applicant, plan_sha256: str, offered_sha256: str) -> str:
         """As `by_person`; a service that the configuration names may approve the plan whose hash it knows."""
         if plan_sha256 and offered_sha256 and plan_sha256 != offered_sha256:
-            raise RefusedError("the approved plan is not the one that is loaded: nothing moved")
+            raise RefusedError("The approved plan is not the one that is loaded.", code="other-plan")
         if self._simulated or self._terminal(asks):
-            return self.by_person(asks, "a move")
+            return self.by_person(asks, "A move")
         if asks.user not in self._config.services:
             raise RefusedError(
-                f"{asks.user} has no terminal here and is no service in approval.services. "
-                "A person must review and approve the plan (docs: Safety)."
+                f"{asks.user} has no terminal here and is no service in approval.services.",
+                code="no-terminal",
+                remedy="A person must review and approve the plan (docs: Safety).",
             )
         if not plan_sha256:
-            raise RefusedError(f"the service {asks.user} must name the plan that a person approved")
+            text = f"The service {asks.user} must name the plan that a person approved."
+            raise RefusedError(text, code="no-plan-named")
         return "as a service, by the plan's hash"
 
     def _terminal(self, asks: Applicant) -> str:
@@ -100,4 +106,5 @@ class ApprovalRule:
 
     def _require_permitted(self, asks: Applicant) -> None:
         if self._config.persons and asks.user not in self._config.persons:
-            raise RefusedError(f"{asks.user} is not in approval.persons: somebody who is must approve")
+            text = f"{asks.user} is not in approval.persons."
+            raise RefusedError(text, code="not-permitted", remedy="Somebody who is must approve.")

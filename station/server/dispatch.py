@@ -144,17 +144,17 @@ class SessionDispatcher:
 
     async def _prepare(self, caller: _Caller, args: verbs.Prepare) -> MotionPreview:
         if args.purpose in (Purpose.REPLAN, Purpose.NEXT_POSE):
-            self._rule.by_person(await self._asks(caller), "a plan that is changed on the way")
+            self._rule.by_person(await self._asks(caller), "A plan that changes on the way")
         return await self._session.prepare(caller.client_id, args.purpose, args.index)
 
     async def _hover(self, caller: _Caller, args: verbs.Hover) -> HoverOffer:
-        self._rule.by_person(await self._asks(caller), "a move over the board")
+        self._rule.by_person(await self._asks(caller), "A move over the board")
         return await self._session.prepare_hover(caller.client_id, args)
 
     async def _go(self, caller: _Caller, args: verbs.Go) -> None:
         asks, waiting = await self._asks(caller), self._session.approvals.waiting
         if waiting is not None and waiting.hover is not None:
-            how = self._rule.by_person(asks, "a move over the board")
+            how = self._rule.by_person(asks, "A move over the board")
         else:
             how = self._rule.approve(asks, args.plan_sha256, waiting.summary.plan_sha256 if waiting else "")
         approval = f"motion approved by {caller.who}, {how}"

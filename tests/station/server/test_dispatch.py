@@ -187,7 +187,7 @@ async def test_a_program_cannot_approve_motion_of_a_real_arm_whatever_it_says(
             summary = await offered(program, small_plan)
             with pytest.raises(RefusedError) as refused:
                 await program.request("go", token=summary["token"], **named)
-            said = str(refused.value)
+            said = msgspec.json.encode(refused.value.data).decode()
             assert summary["token"] not in said and plan_sha256(small_plan)[:12] not in said
         with raises("no-terminal"):
             await program.request("prepare", purpose="improve")

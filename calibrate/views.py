@@ -10,6 +10,13 @@ import numpy as np
 from calibrate.geometry import Array
 from recordings.schema.messages import CameraModel, Mount
 
+_NOMINAL_CAMERA = CameraModel(
+    640, 480, ((600.0, 0.0, 320.0), (0.0, 600.0, 240.0), (0.0, 0.0, 1.0)), (0.0,) * 5
+)
+
+
+_NOMINAL_MATRIX = ((600.0, 0.0, 320.0), (0.0, 600.0, 240.0), (0.0, 0.0, 1.0))
+
 
 @dataclass(frozen=True, eq=False)
 class BoardView:
@@ -39,6 +46,16 @@ class ViewSet:
     camera: CameraModel
     """matrix is None until intrinsics are known."""
     robot_model: str = "unknown"
+
+    @classmethod
+    def from_poses(cls, mount: Mount, base_from_flange: Array, camera_from_board: Array) -> ViewSet:
+        """Make views without corners from poses (n, 4, 4); a nominal camera stands in for the real one."""
+        nothing = np.zeros((0, 3)), np.zeros((0, 2))
+        views = (
+            BoardView(i, f"view {i}", F, *nothing, camera_from_board=C)
+            for i, (F, C) in enumerate(zip(base_from_flange, camera_from_board, strict=True))
+        )
+        return cls(mount, tuple(views), CameraModel(640, 480, _NOMINAL_MATRIX))
 
     def __len__(self) -> int:
         return len(self.views)

@@ -1,6 +1,57 @@
-"""One likelihood for everything a cell does not know: X, board, lens, arm, and what each view is worth.
+"""Hand-eye calibration as a library: poses and corners in, X with its uncertainty out; no files, no images.
 
-Usable as a library: views in, an estimate out; no files, no pictures. `fit.fit_cell` runs the whole way,
-`readings.explain_recording` reads the same views in other ways, `folds.cross_validate` holds the claim
-against left-out views.
+    import numpy as np
+    from calibrate.handeye import SolveOptions, ViewSet, solve_views
+
+    poses = np.load("poses.npz")  # (n, 4, 4) each, n ≥ 4, tilted about two axes; metres
+    views = ViewSet.from_poses("eye-in-hand", poses["base_from_flange"], poses["camera_from_board"])
+    solution = solve_views(views, SolveOptions(seed=1))
+    flange_from_camera = solution.matrix  # (4, 4)
+    print(solution.sigma_translation_m, solution.sigma_rotation_rad, solution.certificate.certified)
+    for view in solution.rejected:
+        print(view.index, view.kind, view.reason)
+
+With corners in each `BoardView` and a camera, the same call also estimates lens, board shape and arm.
+`compare_all` puts the published methods beside it, `view_information` tells what poses would show before
+they are recorded. Errors are `calibrate.errors.CalibrationError`s with `code`, `values` and `remedy`.
+Everything else is private. Names are loaded at their first use.
 """
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from calibrate.handeye.information import MeasurementNoise as MeasurementNoise
+    from calibrate.handeye.information import covariance_of as covariance_of
+    from calibrate.handeye.information import prior_information as prior_information
+    from calibrate.handeye.information import view_information as view_information
+    from calibrate.handeye.peers import compare_all as compare_all
+    from calibrate.handeye.priors import BoardTolerance as BoardTolerance
+    from calibrate.handeye.solution import PeerResult as PeerResult
+    from calibrate.handeye.solution import Solution as Solution
+    from calibrate.handeye.solution import SolveOptions as SolveOptions
+    from calibrate.handeye.solve import solve_views as solve_views
+    from calibrate.views import BoardView as BoardView
+    from calibrate.views import ViewSet as ViewSet
+
+_MODULES = {
+    "BoardTolerance": "calibrate.handeye.priors",
+    "BoardView": "calibrate.views",
+    "MeasurementNoise": "calibrate.handeye.information",
+    "PeerResult": "calibrate.handeye.solution",
+    "Solution": "calibrate.handeye.solution",
+    "SolveOptions": "calibrate.handeye.solution",
+    "ViewSet": "calibrate.views",
+    "compare_all": "calibrate.handeye.peers",
+    "covariance_of": "calibrate.handeye.information",
+    "prior_information": "calibrate.handeye.information",
+    "solve_views": "calibrate.handeye.solve",
+    "view_information": "calibrate.handeye.information",
+}
+__all__ = list(_MODULES)
+
+
+def __getattr__(name: str) -> object:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_MODULES[name]), name)

@@ -4,6 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy import stats
 
 from benchmarks.kinematics import worn_cell
 from calibrate.handeye.arm import PARAMETERS
@@ -57,6 +58,19 @@ def test_of_an_unknown_arm_no_table_is_claimed(model):
     views = replace(worn_cell(np.random.default_rng(2), 0.4).views, robot_model=model)
     arm = solve_views(views, WITH).arm
     assert arm is None or not set(arm.errors) & set(PARAMETERS)
+
+
+@pytest.mark.parametrize("options", [WITH, WITHOUT], ids=["arm", "no arm"])
+@pytest.mark.parametrize("count", [9, 20])
+def test_the_stated_region_is_wider_for_fewer_views_with_and_without_the_arm(count, options):
+    """6·F(6, ν), ν = 3n - 5 of the n views that count: never the limit of a noise that is known exactly."""
+    views = worn_cell(np.random.default_rng(2), 0.4).views.select(list(range(count)))
+    solution = solve_views(views, options)
+    assert (solution.arm is None) == (options is WITHOUT)
+    counted = sum(1 - solution.in_doubt.get(index, 0.0) for index in solution.used)
+    expected = 6 * stats.f.ppf(0.95, 6, 3 * counted - 5)
+    assert solution.confidence_threshold == pytest.approx(expected, rel=0.03)
+    assert solution.confidence_threshold > 1.04 * stats.chi2.ppf(0.95, 6)
 
 
 def test_seven_views_are_too_few_for_eighteen_errors():

@@ -10,11 +10,6 @@ import numpy as np
 from calibrate.geometry import Array
 from recordings.schema.messages import CameraModel, Mount
 
-_NOMINAL_CAMERA = CameraModel(
-    640, 480, ((600.0, 0.0, 320.0), (0.0, 600.0, 240.0), (0.0, 0.0, 1.0)), (0.0,) * 5
-)
-
-
 _NOMINAL_MATRIX = ((600.0, 0.0, 320.0), (0.0, 600.0, 240.0), (0.0, 0.0, 1.0))
 
 

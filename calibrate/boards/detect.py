@@ -9,9 +9,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from calibrate.boards.chessboard import find_chessboard, other_size
-from calibrate.boards.circles import find_circles
 from calibrate.boards.corners import Grey, to_grey
+from calibrate.boards.grids import find_chessboard, find_circles, other_size
 from calibrate.boards.markers import find_april_grid, find_charuco, find_tag
 from calibrate.boards.model import board_points, check_board, describe_board, fixes_a_plane
 from calibrate.geometry import Array

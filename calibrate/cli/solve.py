@@ -26,9 +26,8 @@ from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Touch, write_calibration
 from calibrate.files.formatting import summary
 from calibrate.files.install import install_line, load_installed
-from calibrate.frames import camera_frames
 from calibrate.geometry import rotation_log
-from calibrate.handeye.solution import PeerResult
+from calibrate.handeye.solution import PeerResult, camera_frames
 from calibrate.options import JobOptions
 from calibrate.pipeline import SolvedRecording, prepare_views, solve_recording, solver_options
 

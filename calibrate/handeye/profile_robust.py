@@ -7,7 +7,6 @@ from dataclasses import replace
 import numpy as np
 
 from calibrate.errors import BadViewsError, PosesDisagreeError
-from calibrate.frames import board_frames, camera_frames
 from calibrate.geometry import Array, Transform
 from calibrate.handeye.arm import FLEX, PARAMETERS, RELATIVE_SIGMA
 from calibrate.handeye.axxb.objective import pair_covariance
@@ -45,6 +44,8 @@ from calibrate.handeye.solution import (
     Remark,
     Solution,
     SolveOptions,
+    board_frames,
+    camera_frames,
 )
 from calibrate.stopwatch import Stopwatch
 from calibrate.views import ViewSet
@@ -93,7 +94,7 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
         solution,
         session=session,
         move_accepted=fit.estimate.state.second is not None,
-        warnings=_remarks(fit, options, solution, session),
+        warnings=_remarks(fit, solution, session),
         stage_ms=watch.stage_ms,
         solve_ms=watch.total_ms,
     )
@@ -253,36 +254,28 @@ def _holdout(fit: CellFit) -> HoldoutScore | None:
     return score_holdout(partial.state.X, pairs, indices, len(first), note)
 
 
-def _remarks(
-    fit: CellFit, options: SolveOptions, solution: Solution, session: Explanation
-) -> tuple[Remark, ...]:
-    found, remarks = fit.estimate, []
-    if session.reading is not Reading.AS_RECORDED:
-        remarks.append(Remark(session.reading.value, explain_text(session, fit.views)))
-    if solution.in_doubt:
-        chances = ", ".join(f"{index + 1} ({chance:.0%})" for index, chance in solution.in_doubt.items())
-        remarks.append(
-            Remark("suspect-views", f"Suspect views, down-weighted: {chances} likely wrong. Retake them.")
-        )
-    if not found.converged:
-        remarks.append(Remark("not-converged", f"Not converged after {found.steps} iterations."))
-    if not fit.observed.has_pixels:
-        remarks.append(
-            Remark(
-                "no-corners",
-                "No corners were recorded: board poses are taken as exact, all error is the robot's.",
-            )
-        )
-    if solution.arm is not None and not solution.arm.arm_known:
-        text = "The arm's model is not known: errors of its kinematic table are not in the stated error."
-        remarks.append(Remark("arm-not-modelled", text))
-    if solution.arm is not None and solution.arm.detected:
-        remarks.append(
-            Remark(
-                "arm-systematics",
-                "The robot's residuals follow its posture: errors of about "
-                f"{solution.arm.size_mm:.2f} mm or mrad in its kinematic table, or a bracket that bends. "
-                "Have the arm calibrated, and stiffen the bracket.",
-            )
-        )
-    return tuple(remarks)
+def _remarks(fit: CellFit, solution: Solution, session: Explanation) -> tuple[Remark, ...]:
+    found, arm = fit.estimate, solution.arm
+    suspects = ", ".join(f"{index + 1} (P(outlier) {p:.2f})" for index, p in solution.in_doubt.items())
+    systematic = (
+        f"Robot residuals follow the posture: {arm.size_mm if arm else 0.0:.2f} mm or mrad in the arm's "
+        "kinematic table, or a bracket that bends. Have the arm calibrated, and stiffen the bracket."
+    )
+    as_recorded = session.reading is Reading.AS_RECORDED
+    said = (
+        (not as_recorded, session.reading.value, explain_text(session, fit.views)),
+        (bool(suspects), "suspect-views", f"Suspect views, down-weighted: {suspects}. Retake them."),
+        (not found.converged, "not-converged", f"Not converged after {found.steps} iterations."),
+        (
+            not fit.observed.has_pixels,
+            "no-corners",
+            "No corners were recorded: board poses count as exact, all error is the robot's.",
+        ),
+        (
+            arm is not None and not arm.arm_known,
+            "arm-not-modelled",
+            "The arm's model is unknown: errors of its kinematic table are not in the stated error.",
+        ),
+        (arm is not None and arm.detected, "arm-systematics", systematic),
+    )
+    return tuple(Remark(code, text) for true, code, text in said if true)

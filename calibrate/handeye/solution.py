@@ -21,6 +21,17 @@ from calibrate.handeye.readings import Explanation, Reading
 from calibrate.views import BoardView
 from recordings.schema.messages import CameraModel, Mount
 
+
+def camera_frames(mount: Mount) -> tuple[str, str]:
+    """(parent, child) of X."""
+    return ("flange", "camera") if mount == "eye-in-hand" else ("base", "camera")
+
+
+def board_frames(mount: Mount) -> tuple[str, str]:
+    """(parent, child) of the board's constant place Y."""
+    return ("base", "board") if mount == "eye-in-hand" else ("flange", "board")
+
+
 Profile = Literal["robust", "paper"]
 
 

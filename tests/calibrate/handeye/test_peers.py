@@ -119,6 +119,5 @@ def test_a_method_that_fails_is_a_row_not_a_crash():
     views = tuple(replace(view, board_points=empty[0], pixels=empty[1]) for view in cell.views)
     rows = {row.name: row for row in compare_all(replace(cell.views, views=views))}
     assert rows["reprojection only"].matrix is None
-    assert "no corners" in rows["reprojection only"].note
     assert rows["ours"].reprojection_px is None
     assert is_rigid(inverse(rows["ours"].matrix))

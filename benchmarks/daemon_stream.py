@@ -27,11 +27,12 @@ from recordings.reader import open_recording
 from recordings.segment import RecordingSegment
 from station.cell.plan import Plan, PlannedPose
 from station.cell.status import StationState, StationStatus
-from station.cli.demo import simulated_daemon
+from station.cli.demo import approve_simulated, simulated_daemon
 from station.devices.frames import frames_between
-from station.operate.attend import carry_out, wait_until_idle
+from station.operate.motion import carry_out, wait_until_idle
 from station.plan.files import sweep_plan
 from station.protocol.client import Client
+from station.protocol.verbs import Purpose
 from station.simulation.cell import CellTruth
 from station.simulation.gige import numbered_picture, still_picture
 from station.simulation.netns import isolated_command
@@ -197,7 +198,7 @@ async def stream(fps: float, seconds: float, root: Path) -> Outcome:
                 outcome.sync_ms = max(outcome.sync_ms, status.recorder.sync_ms)
 
         for _ in range(max(1, round(seconds / SESSION_S))):
-            ended = await carry_out(client, "run", confirm=lambda summary: True, watch=look)
+            ended = await carry_out(client, Purpose.RUN, approve_simulated, look)
             if ended.exit_code != 0:
                 raise RuntimeError(f"{ended.status.state.value}: {ended.status.reason}")
             outcome.sessions += 1

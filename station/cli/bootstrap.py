@@ -27,11 +27,12 @@ from station.cell.errors import ConfigError, LimitError, StationError
 from station.cell.plan import Plan, PlannedPose
 from station.cell.socket_folder import default_socket
 from station.cli.console import Headless, Socket, err, out
-from station.cli.session import attended_session, load_into
-from station.operate.attend import wait_until_idle
+from station.cli.session import load_into, session
+from station.operate.motion import wait_until_idle
 from station.plan.belief import Glimpse, believe, improved_config
 from station.plan.bootstrap import MOVES_MAX, MOVES_MIN, next_move
 from station.protocol.client import Client
+from station.protocol.verbs import Purpose
 
 _STRAYED_RAD = 0.01
 """Somebody moved the arm: the next move was checked from elsewhere."""
@@ -138,7 +139,7 @@ def _take(
     """One go, one picture: the joints (6,) where it was taken, and all views so far."""
     plan = slow_plan(cell, move)
     outcome = asyncio.run(
-        attended_session(socket, "run", headless, "", False, lambda client: load_into(client, plan))
+        session(socket, Purpose.RUN, headless, before=lambda client: load_into(client, plan))
     )
     if not outcome.recording or not outcome.captured:
         reason = (outcome.status.reason or outcome.status.state.value).rstrip(".")

@@ -26,11 +26,13 @@ from calibrate.geometry import difference
 from recordings.reader import open_recording
 from station.cell.errors import ConfigError, StationError
 from station.cell.session_folder import CALIBRATION_FILE, default_root
+from station.cell.status import MotionPreview
 from station.cli.console import AsJson, Headless, err, out
+from station.cli.progress import SessionProgress
 from station.cli.serve import require_choices
-from station.operate.attend import Outcome, carry_out, wait_until_idle
-from station.operate.progress import SessionProgress
+from station.operate.motion import Outcome, carry_out, wait_until_idle
 from station.protocol.client import Client
+from station.protocol.verbs import Lease, MakePlan, Purpose
 from station.simulation.cell import CellTruth
 from station.simulation.netns import is_isolated, isolated_command
 
@@ -157,18 +159,19 @@ async def _capture(options: DemoOptions, progress: SessionProgress) -> Outcome:
         await Client.connect(socket, "the demo") as client,
     ):
         await wait_until_idle(client)
-        await client.request("lease", action="take")
+        await client.call(Lease("take"))
         progress.say(f"planning {options.poses} poses")
-        await client.request("make_plan", poses=options.poses, seed=options.seed, timeout_s=120.0)
+        await client.call(MakePlan(options.poses, options.seed), timeout_s=120.0)
+
         with progress:
             return await carry_out(
-                client,
-                "run",
-                confirm=lambda summary: True,
-                watch=progress,
-                finish_with_loss=True,
-                headless=True,
+                client, Purpose.RUN, approve_simulated, progress, finish_with_loss=True, headless=True
             )
+
+
+async def approve_simulated(_: MotionPreview) -> bool:
+    """For a cell that `simulated_daemon` started: nothing real moves."""
+    return True
 
 
 @asynccontextmanager

@@ -3,45 +3,35 @@
 from __future__ import annotations
 
 import asyncio
-import contextlib
 import json
-import signal
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import msgspec
 import typer
 from rich.text import Text
 
-from station.cell.errors import ConfigError, RefusedError, StationError
+from station.cell.errors import ConfigError, RefusedError
 from station.cell.plan import Plan
-from station.cell.socket_folder import default_socket
-from station.cell.status import MotionPreview, StationStatus
+from station.cell.status import StationStatus
+from station.cli.attended import attended
 from station.cli.console import AsJson, Headless, Socket, err, out
-from station.operate.attend import Confirm, Outcome, carry_out, wait_until_idle
-from station.operate.drift_check import (
-    PLAN_ANSWER_S,
-    POSES,
-    SEED,
-    check_arguments,
-    never_run,
-    require_installed,
-)
-from station.operate.progress import SessionProgress
+from station.operate.drift_check import POSES, check_arguments, start_drift_check
+from station.operate.motion import Outcome, wait_until_idle
 from station.plan.files import load_plan, sweep_plan
 from station.protocol.client import Client
+from station.protocol.verbs import LoadPlan, Purpose
 
-Approve = Annotated[str, typer.Option("--approve", help="Hash of the plan that a person approved.")]
+Approve = Annotated[str, typer.Option("--approve", help="Hash of the approved plan, 12 digits or more")]
 
 
 def capture_command(
-    plan: Annotated[Path | None, typer.Option(help="The pose plan.")] = None,
+    plan: Annotated[Path | None, typer.Option(help="Pose plan from `station plan`")] = None,
     sweep: Annotated[
-        bool, typer.Option("--sweep", help="Swing slowly about where the arm stands, camera running.")
+        bool, typer.Option("--sweep", help="Swing slowly about the arm's place, camera running")
     ] = False,
     headless: Headless = False,
     approve: Approve = "",
@@ -50,24 +40,21 @@ def capture_command(
 ) -> None:
     """Capture all poses of a plan into a recording. Ctrl-C stops the arm.
 
-    `station plan` makes the plan. Next: `calibrate solve RECORDING`. Nobody there:
-    `--headless --approve HASH`, with the hash (12 digits and more) that `station plan --json` prints, as a
-    user that the configuration names in approval.services.
+    Shows what would move and asks. Next: `calibrate solve RECORDING`. With nobody there a real arm needs
+    `--headless --approve HASH`: the hash that `station plan --json` prints, given as a user that the
+    configuration names in approval.services.
 
-    With --sweep no poses are taken: the arm swings slowly where it stands, with the board in view, and
-    `calibrate sweep RECORDING` tells the time between camera and robot.
+    With --sweep no poses are captured: the arm swings with the board in view, and `calibrate sweep RECORDING`
+    tells the time between camera and robot.
 
-    Exit codes: 0 all poses, sealed; 1 failed or stopped; 2 usage; 3 sealed with fewer poses than planned.
+    Exit codes: 0 all poses captured, 1 failed or stopped, 2 usage, 3 poses missing.
     """
     if (plan is None) != sweep:
-        raise ConfigError("say what to do, one of: --plan FILE (poses), --sweep (the clocks)")
-    if plan is None:
-        before = load_sweep
-    else:
-        before = partial(load_into, plan=load_plan(plan))
-    outcome = asyncio.run(attended_session(socket, "run", headless, approve, as_json, before))
+        raise ConfigError("Missing --plan or --sweep.", code="usage", remedy="Give one of them.")
+    before = load_sweep if plan is None else partial(load_into, plan=load_plan(plan))
+    outcome = asyncio.run(session(socket, Purpose.RUN, headless, approve, as_json, before))
     if sweep and outcome.recording and not as_json:
-        out.print(f"next: calibrate sweep {outcome.recording}")
+        out.print(f"Next: calibrate sweep {outcome.recording}")
     _finish(outcome, as_json)
 
 
@@ -83,15 +70,15 @@ def resume_command(
 
     Exit codes: as of `station capture`.
     """
-    _finish(asyncio.run(attended_session(socket, "resume", headless, approve, as_json, None)), as_json)
+    _finish(asyncio.run(session(socket, Purpose.RESUME, headless, approve, as_json)), as_json)
 
 
 def replan_command(headless: Headless = False, socket: Socket = None, as_json: AsJson = False) -> None:
     """Replan the remaining poses of a paused session from its images.
 
-    Shows what would change and asks; then goes on with the session. Ctrl-C stops the arm.
+    Shows what would change and asks; then continues the session. Ctrl-C stops the arm.
     """
-    _finish(asyncio.run(attended_session(socket, "improve", headless, "", as_json, None)), as_json)
+    _finish(asyncio.run(session(socket, Purpose.REPLAN, headless, quiet=as_json)), as_json)
 
 
 def next_pose_command(headless: Headless = False, socket: Socket = None) -> None:
@@ -100,9 +87,9 @@ def next_pose_command(headless: Headless = False, socket: Socket = None) -> None
     Shows the pose and its gain, and asks; its path is checked as any other. Then the session is paused as
     before, or finished when no other pose was left. Ctrl-C stops the arm.
 
-    Exit codes: 0 it was taken, 1 it was not.
+    Exit codes: 0 captured, 1 not captured.
     """
-    outcome = asyncio.run(attended_session(socket, "best", headless, "", False, None))
+    outcome = asyncio.run(session(socket, Purpose.NEXT_POSE, headless))
     added = max(outcome.status.session.poses, key=lambda pose: pose.index)
     out.print(f"pose {added.index + 1}: {added.state}{f', {added.reason}' if added.reason else ''}")
     _say_state(outcome.status, outcome.status.reason or outcome.recording)
@@ -110,7 +97,7 @@ def next_pose_command(headless: Headless = False, socket: Socket = None) -> None
 
 
 def drift_check_command(
-    poses: Annotated[int, typer.Option(min=4, max=50, help="How many to take")] = POSES,
+    poses: Annotated[int, typer.Option(min=4, max=50, help="Poses to capture")] = POSES,
     headless: Headless = False,
     approve: Approve = "",
     socket: Socket = None,
@@ -120,12 +107,20 @@ def drift_check_command(
     The board may lie elsewhere by now. Eight poses detect a shift of 0.5 mm or 0.1° on a usual cell, five on
     a quiet one; where they do not, it says how many more would. Ctrl-C stops the arm.
 
-    Exit codes: 0 it holds, 4 it does not, 1 no recording or nothing installed, 2 usage.
+    Exit codes: 0 PASS, 4 FAIL, 1 no recording or nothing installed, 2 usage.
     """
-    asyncio.run(_require_installed(socket or default_socket()))  # or the arm would move for nothing
-    outcome = asyncio.run(
-        attended_session(socket, "check", headless, approve, False, lambda c: _make(c, poses))
-    )
+
+    async def captured() -> Outcome:
+        async with attended(socket, headless, approve) as shell:
+            standing = await shell.status()
+            shell.progress.skip(standing)
+            return await shell.watch(
+                await start_drift_check(
+                    shell.client, standing, shell.approves, poses, headless=not shell.interactive
+                )
+            )
+
+    outcome = asyncio.run(captured())
     if not outcome.recording:
         _finish(outcome, False)
     what = check_arguments(outcome.recording, outcome.status.session.folder)
@@ -133,112 +128,33 @@ def drift_check_command(
     raise typer.Exit(done.returncode)
 
 
-async def _require_installed(socket: Path) -> None:
-    async with await Client.connect(socket) as client:
-        assert client.root is not None
-        require_installed(client.root)
-
-
 async def load_into(client: Client, plan: Plan) -> None:
-    await client.request("load_plan", plan=msgspec.to_builtins(plan))
+    await client.call(LoadPlan(plan))
 
 
 async def load_sweep(client: Client) -> None:
     """A sweep about where the arm stands now."""
     status = await wait_until_idle(client)
     if status.robot.joints_rad is None:
-        raise RefusedError("the robot's joints are not known: `station doctor` says why")
+        raise RefusedError(
+            "The robot's joints are not known.", code="no-robot-state", remedy="`station doctor` says why."
+        )
     await load_into(client, sweep_plan(status.robot.model, status.mount, status.robot.joints_rad))
 
 
-async def _make(client: Client, poses: int) -> None:
-    if lost := never_run(await _status(client)):
-        err.print(f"the check takes the place of the loaded plan of {lost} poses, which was never run")
-    await client.request("make_plan", poses=poses, seed=SEED, lens_known=True, timeout_s=PLAN_ANSWER_S)
-
-
-async def attended_session(
+async def session(
     socket: Path | None,
-    purpose: str,
+    purpose: Purpose,
     headless: bool,
-    approved: str,
-    quiet: bool,
-    before: Callable[..., Any] | None,
+    approved: str = "",
+    quiet: bool = False,
+    before: Callable[[Client], Awaitable[None]] | None = None,
 ) -> Outcome:
-    """One session as `purpose` says, approved by a person here or by the hash of what was approved."""
-    path = socket or default_socket()
-    interactive = not headless and sys.stdin.isatty()
-    async with await Client.connect(path) as client:
-        await wait_until_idle(client)
-        await client.request("lease", action="take")
+    """One session, approved by a person here or by the hash of what was approved."""
+    async with attended(socket, headless, approved, quiet) as shell:
         if before is not None:
-            await before(client)
-        standing = await _status(client)
-        progress = SessionProgress(err, quiet=headless or quiet)
-        progress.skip(standing)
-        confirm = _confirmation(approved, interactive, standing.simulated)
-        with progress:
-            # One pose more never ends a session that has others left.
-            to_the_end = headless and purpose != "best"
-            return await carry_out(
-                client,
-                purpose,
-                confirm=confirm,
-                watch=progress,
-                finish_with_loss=to_the_end,
-                headless=not interactive,
-            )
-
-
-async def _status(client: Client) -> StationStatus:
-    async for status in client.statuses():
-        return status
-    raise StationError("the daemon ended")
-
-
-def _confirmation(approved: str, interactive: bool, simulated: bool) -> Confirm:
-    """Who says yes: the approved hash, the person, or, for a simulated cell only, nobody."""
-
-    def confirm(summary: MotionPreview) -> bool:
-        if approved:
-            if not summary.plan_sha256.startswith(approved) or len(approved) < 12:
-                raise RefusedError(f"--approve {approved} is not the hash of this plan: nothing moved")
-            return True
-        if interactive:
-            return ask_person(summary)
-        if simulated:
-            return True
-        raise RefusedError("Nobody is asked here. A person must review and approve the plan (docs: Safety).")
-
-    return confirm
-
-
-def ask_person(summary: MotionPreview) -> bool:
-    many = "1 pose" if summary.poses == 1 else f"{summary.poses} poses"
-    err.print(Text.assemble(("\nThe arm will move", "bold"), f": {summary.purpose}, {many}"))
-    err.print(f"first {summary.first_move}; {summary.path_m:.2f} m, up to {summary.top_speed_m_s:.2f} m/s")
-    err.print(f"about {summary.duration_s:.0f} s, plan {summary.plan_sha256[:12]}")
-    for change in summary.changes:
-        err.print(change)
-    for warning in summary.warnings:
-        err.print(warning, style="yellow")
-    err.print("The emergency stop on the pendant is the safety device. Ctrl-C stops too.")
-    try:
-        with ctrl_c_at_once():
-            return typer.confirm("Is everybody out of the arm's reach? Move?", default=False, err=True)
-    except typer.Abort:
-        err.print()  # after the terminal's ^C
-        return False
-
-
-@contextlib.contextmanager
-def ctrl_c_at_once() -> Iterator[None]:
-    """At a question: the event loop, which waits for the answer too, would hear of Ctrl-C only after it."""
-    before = signal.signal(signal.SIGINT, signal.default_int_handler)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, before)
+            await before(shell.client)
+        return await shell.carry_out(purpose)
 
 
 def _finish(outcome: Outcome, as_json: bool) -> None:
@@ -247,7 +163,7 @@ def _finish(outcome: Outcome, as_json: bool) -> None:
         state = outcome.status.state.value
         print(json.dumps({"state": state, "poses": poses, "recording": outcome.recording}))
     elif outcome.recording:
-        out.print(f"{outcome.captured} of {outcome.planned} poses, sealed: {outcome.recording}")
+        out.print(f"{outcome.captured} of {outcome.planned} poses, finished: {outcome.recording}")
     else:
         _say_state(outcome.status, outcome.status.reason)
     raise typer.Exit(outcome.exit_code)

@@ -1,29 +1,66 @@
-"""The drift check, by the shell or the screen: a few poses, then `calibrate check` on their recording."""
+"""The drift check: capture a few poses in place of the loaded plan, then judge what is installed by them."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 from calibrate.files.install import load_installed
-from station.cell.status import StationStatus
+from station.cell.status import SessionStatus, StationState, StationStatus
+from station.operate.motion import PREPARE_S, Approve, Link, prepared_motion
+from station.protocol.verbs import GetPlan, LoadPlan, MakePlan, Purpose
 
 POSES = 8
-"""Notice a shift of 0.5 mm in 96 of 100 cases at mid noise, five in 88 (benchmarks/README.md)."""
+"""Detect a shift of 0.5 mm in 96 of 100 cases at mid noise, five in 88 (benchmarks/README.md)."""
 SEED = 0
-PLAN_ANSWER_S = 200.0
 
 
-def never_run(status: StationStatus) -> int:
-    """How many poses the loaded plan has when none was ever tried: somebody may still want it; else 0."""
+async def start_drift_check(
+    link: Link, status: StationStatus, approve: Approve, poses: int = POSES, headless: bool = False
+) -> str:
+    """Plan a few poses, ask, start. Returns the plan's SHA-256; empty: not approved, nothing moved.
+
+    A loaded plan that was never run is named in the question, and loaded again where nothing was started.
+    Raises CalibrationError before anything is planned when nothing is installed below the daemon's root.
+    """
+    load_installed(link.root, allow_simulated=True)
+    before = (await link.call(GetPlan())).plan if _never_run(status) else None
+    lost = 0 if before is None else len(before.poses)
+    changes = () if before is None else (f"replaces the loaded plan of {lost} poses, which was never run",)
+    made = await link.call(MakePlan(poses, SEED, lens_known=True), timeout_s=PREPARE_S)
+    started = False
+    try:
+        started = await prepared_motion(
+            link, Purpose.DRIFT_CHECK, approve, changes=changes, headless=headless
+        )
+    finally:
+        if before is not None and not started:
+            await link.call(LoadPlan(before))
+    return made.sha256 if started else ""
+
+
+def _never_run(status: StationStatus) -> bool:
+    """Whether a plan is loaded and none of its poses was ever tried: somebody may still want it."""
     poses = status.session.poses
-    return 0 if any(pose.attempt for pose in poses) else len(poses)
+    return bool(poses) and not any(pose.attempt for pose in poses)
 
 
-def require_installed(root: Path) -> None:
-    """CalibrationError when nothing is installed below the daemon's root: the arm would move for nothing."""
-    load_installed(root, allow_simulated=True)
+async def recorded(link: Link, plan_sha256: str) -> SessionStatus | None:
+    """The session of the plan that was just started, once its recording is finished; after pauses, too.
+
+    None when another plan takes its place, or when the daemon ends.
+    """
+    seen = False
+    async for status in link.statuses():
+        session = status.session
+        ours = session.plan_sha256 == plan_sha256
+        if seen and not ours:
+            return None
+        seen = seen or ours
+        if ours and session.recording and status.state is StationState.IDLE:
+            return session
+    return None
 
 
 def check_arguments(recording: str, folder: str) -> tuple[str, ...]:
-    """Of `calibrate`. A session lies in ROOT/sessions/NAME: what is installed below that root is checked."""
-    return ("check", recording, "--root", str(Path(folder).resolve().parents[1]))
+    """Arguments of `calibrate`. A session lies in ROOT/sessions/NAME: what is installed there is checked."""
+    return ("drift-check", recording, "--root", str(Path(folder).resolve().parents[1]))

@@ -1,7 +1,7 @@
 """The operator's screen: a client that shows the daemon's status and sends the operator's wishes.
 
-It holds no truth: closing it, killing it or losing ssh changes nothing but the lease, whose loss
-makes the daemon decelerate the arm and pause.
+It holds no truth: closing it, killing it or losing ssh loses nothing but control, and the daemon then
+decelerates the arm and pauses.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import gc
-from collections.abc import Iterable
+from collections.abc import Awaitable, Callable, Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
@@ -25,25 +25,24 @@ from station.cell.errors import StationError
 from station.cell.status import StationState, StationStatus
 from station.protocol.client import Client
 from station.protocol.stop_client import send_stop
-from station.tui import offline
-from station.tui.attendance import Attended
+from station.protocol.verbs import Sessions
+from station.tui.attendance import Attended, listen
 from station.tui.checklist import ChecklistScreen
-from station.tui.drift import drift_check
-from station.tui.help import Help
-from station.tui.link import Connect, Link, listen
-from station.tui.live import LiveScreen
-from station.tui.log import LogScreen
+from station.tui.desk import Link
+from station.tui.dialogs import Help
+from station.tui.live import LiveScreen, LogScreen
 from station.tui.plan import PlanScreen
 from station.tui.replay import ReplayLink
-from station.tui.replay_screen import WATCHABLE, Player, ReplayScreen
+from station.tui.replay_screen import Player, ReplayScreen
 from station.tui.result import ResultScreen
+from station.tui.results import ResultsDesk
 from station.tui.screen import StationScreen
 from station.tui.sessions import SessionsScreen
 from station.tui.themes import THEMES, chosen_theme
-from station.tui.verify import verify
-from station.tui.widgets.graphics import Graphics, detect
+from station.tui.widgets.graphics import detect
 from station.tui.widgets.preview import Preview
 
+Connect = Callable[[], Awaitable[Link]]
 PREVIEW_PERIOD_S = 0.25
 STATUS_PERIOD_S = 0.25
 """Laying out what flickers is most of what this screen costs: four times a second are enough for eyes."""
@@ -51,8 +50,8 @@ SETTLED_S = 2.0
 RECONNECT_S = 1.0
 GONE = "The daemon ended: the arm decelerates by itself. This screen goes on as soon as one serves again."
 SILENT = (
-    "The station does not answer: the daemon hangs, or its computer is far too busy. What stands below is "
-    "old. The arm's own watchdog stops it; if it moves all the same, use the emergency stop on the pendant."
+    "Daemon not responding: what stands below is old. The arm's own watchdog stops it; if the arm moves, "
+    "press the emergency stop."
 )
 
 
@@ -62,16 +61,14 @@ def freeze_startup() -> None:
     gc.freeze()
 
 
-LOOKED = "I looked: leave STOPPED or FAULT"
-LET_GO = "Give up control, so that another screen may take it"
 SCREENS = Binding.Group("Screens", compact=True)
 SCREEN_TOOLTIPS = {
     "live": "The running capture",
     "plan": "All poses, their state and reasons",
-    "result": "May it be trusted?",
+    "result": "Calibration result",
     "sessions": "Past recordings",
-    "log": "Everything that was said",
-    "checklist": "Is everything there?",
+    "log": "Event log",
+    "checklist": "Setup check",
 }
 
 
@@ -83,7 +80,7 @@ class StatusChanged(Message):
         self.status, self.why = status, why
 
 
-class StationApp(Attended):
+class StationApp(Attended, ResultsDesk):
     """One app, several screens; the same keys everywhere."""
 
     TITLE = "Calibration station"
@@ -97,23 +94,23 @@ class StationApp(Attended):
         "checklist": ChecklistScreen,
     }
     DEFAULT_MODE = "live"
-    graphics: Graphics | None = None
-    """How the terminal draws pictures; None: half blocks only."""
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("f12", "stop", "STOP", show=False, priority=True, id="stop", tooltip="Stop the arm now"),
         Binding("f1", "help", "Help", id="help", tooltip="What this screen is for, and all its keys"),
         Binding("f5", "run", "Run", id="run", tooltip="Check the plan, show what would move, and ask"),
         Binding("f6", "pause", "Pause", id="pause", tooltip="Stop after this pose; nothing is lost"),
-        Binding("f7", "finish", "Finish", id="finish", tooltip="Seal the recording with what is there"),
-        Binding("f8", "acknowledge", "Ack", priority=True, id="acknowledge", tooltip=LOOKED),
+        Binding("f7", "finish", "Finish", id="finish", tooltip="Finish the recording with what is there"),
+        Binding(
+            "f8", "acknowledge", "Ack", priority=True, id="acknowledge", tooltip="Leave STOPPED or FAULT"
+        ),
         *(
             Binding(key, f"switch_mode('{mode}')", mode.title(), id=mode, group=SCREENS, tooltip=tooltip)
             for key, (mode, tooltip) in zip("123456", SCREEN_TOOLTIPS.items(), strict=True)
         ),
         Binding("f9", "solve_newest", "Solve", id="solve", tooltip="Solve the session just recorded"),
-        Binding("f3", "free_drive", "Hand", id="free-drive", tooltip="Free-drive: move the arm by hand"),
-        Binding("f2", "record", "Take", id="record", tooltip="Take a picture here (free-drive)"),
-        Binding("f4", "let_go", "Let go", show=False, id="let-go", tooltip=LET_GO),
+        Binding("f3", "freedrive", "Hand", id="freedrive", tooltip="Freedrive: move the arm by hand"),
+        Binding("f2", "record", "Grab", id="record", tooltip="Capture an image here (freedrive)"),
+        Binding("f4", "release", "Release", show=False, id="release", tooltip="Release control of the arm"),
         Binding(
             "ctrl+q", "leave", "Quit", show=False, id="quit", tooltip="Close this screen; the daemon goes on"
         ),
@@ -126,8 +123,6 @@ class StationApp(Attended):
         for theme in THEMES:
             self.register_theme(theme)
         self.theme = chosen_theme()
-        self.result_path: str | None = None
-        """The calibration file the result screen shows."""
 
     def on_mount(self) -> None:
         self.follow()
@@ -145,6 +140,7 @@ class StationApp(Attended):
                 self.link = await self._connect()
                 self.run_worker(listen(self.link, self.hear), group="listen", exclusive=True)
                 async for status in self.link.statuses():
+                    self.tell_newest(status)
                     await self._pace(status)
                     self.post_message(StatusChanged(status))
             except (OSError, StationError) as problem:
@@ -166,15 +162,19 @@ class StationApp(Attended):
 
     def _tell_trouble(self, trouble: str) -> None:
         self.trouble = trouble
-        for screen in self.screen_stack:
-            if isinstance(screen, StationScreen) and screen.is_mounted:
-                screen.doubt(trouble, self.silent_s)
+        for screen in self._screens():
+            screen.doubt(trouble, self.silent_s)
+
+    def _screens(self) -> list[StationScreen]:
+        return [s for s in self.screen_stack if isinstance(s, StationScreen) and s.is_mounted]
+
+    def playing(self) -> bool:
+        return any(isinstance(screen, ReplayScreen) for screen in self.screen_stack)
 
     def tell_busy(self, words: str) -> None:
         super().tell_busy(words)
-        for screen in self.screen_stack:
-            if isinstance(screen, StationScreen) and screen.is_mounted:
-                screen.say_busy(words)
+        for screen in self._screens():
+            screen.say_busy(words)
 
     async def _pace(self, status: StationStatus) -> None:
         """A new state or reason is shown at once; numbers that only flicker, a few times a second."""
@@ -203,9 +203,8 @@ class StationApp(Attended):
         if message.status is not None and not self._greeted:
             self._greeted = True
             self.greet(message.status)
-        for screen in self.screen_stack:
-            if isinstance(screen, StationScreen) and screen.is_mounted:
-                screen.show(message.status)
+        for screen in self._screens():
+            screen.show(message.status)
         if self.silent_s is None and self.trouble != message.why:
             self._tell_trouble(message.why)
 
@@ -215,7 +214,7 @@ class StationApp(Attended):
         if status.playback:
             return
         missing = status.state is StationState.DISCONNECTED
-        unused = not status.session.poses and await self.ask("sessions") == []
+        unused = not status.session.poses and await self.ask(Sessions()) == []
         if (missing or unused) and self.current_mode == self.DEFAULT_MODE:
             await self.switch_mode("checklist")
 
@@ -248,74 +247,6 @@ class StationApp(Attended):
                     binding.tooltip,
                     partial(self.call_later, self.run_action, binding.action, place),
                 )
-
-    # --- recordings and results ---
-
-    @work(exclusive=True, group="job", exit_on_error=False)
-    async def watch_recording(self, folder: str) -> None:
-        state = None if self.status is None else self.status.state
-        if state is not None and state not in WATCHABLE:
-            self.notify(f"The cell is {state.value}: finish that first, then look at old recordings.")
-            return
-        try:
-            link = await asyncio.to_thread(ReplayLink, Path(folder))
-        except StationError as problem:
-            self.notify(str(problem), severity="warning", timeout=10)
-            return
-        await self.push_screen(ReplayScreen(link))
-
-    async def show_result(self, calibration: str) -> None:
-        self.result_path = calibration
-        await self.switch_mode("result")
-        if isinstance(self.screen, ResultScreen):
-            self.screen.load()
-
-    @work(exclusive=True, group="job", exit_on_error=False)
-    async def solve(self, recording: str, folder: str) -> None:
-        if (calibration := await offline.solve(self, recording, folder)) is not None:
-            await self.show_result(calibration)
-
-    def action_solve_newest(self) -> None:
-        session = self.status.session if self.status is not None else None
-        if session is None or not session.recording:
-            self.notify("Nothing is sealed yet: F7 finishes a session; older ones are on screen 4.")
-            return
-        self.solve(session.recording, session.folder)
-
-    @work(exclusive=True, group="job", exit_on_error=False)
-    async def recover(self, folder: str) -> None:
-        await offline.recover(self, folder)
-
-    @work(exclusive=True, group="job", exit_on_error=False)
-    async def install(self, calibration: str, ended: str) -> None:
-        await offline.install(self, calibration, ended)
-
-    @work(exclusive=True, group="job", exit_on_error=False)
-    async def roll_back(self, calibration: str) -> None:
-        await offline.roll_back(self, calibration)
-
-    @work(exclusive=True, group="job", exit_on_error=False)
-    async def check(self, recording: str, folder: str) -> None:
-        await offline.check(self, recording, folder)
-
-    @work(exclusive=True, group="drift", exit_on_error=False)
-    async def drift_check(self) -> None:
-        await drift_check(self)
-
-    @work(exclusive=True, group="job", exit_on_error=False)
-    async def verify(self, calibration: str) -> None:
-        if await verify(self, calibration):
-            await self.show_result(calibration)
-
-    @work(exclusive=True, group="job", exit_on_error=False)
-    async def export(self, calibration: str) -> None:
-        await offline.export(self, calibration)
-
-    @work(exclusive=True, group="job", exit_on_error=False)
-    async def discard(self, calibration: str) -> None:
-        if await offline.discard(self, calibration):
-            self.result_path = None
-            await self.switch_mode("sessions")
 
 
 class ReplayApp(Player, StationApp):

@@ -1,20 +1,54 @@
-"""Is anybody there? An ssh that dies silently leaves this screen alive, and with it control of the arm."""
+"""Is anybody there: the daemon that is shown, and the person whom it is shown to.
+
+An ssh that dies silently leaves this screen alive, and with it control of the arm.
+"""
 
 from __future__ import annotations
 
+import asyncio
+import time
+from collections.abc import Callable
+
 from textual import events
 
+from station.cell.errors import RefusedError
 from station.protocol.states import RUNNING
-from station.tui.commands import Commands
+from station.protocol.verbs import Lease, Watch
+from station.tui.desk import Desk, Link
 
+LISTEN_S = 0.5
+SILENT_S = 2.0
+"""A working daemon answers within milliseconds, on a busy computer within some hundred."""
+_PATIENT_S = 7 * 86400.0
 WHERE_IS_THE_CURSOR = "\x1b[6n"
 """ECMA-48's device status report: a terminal answers by itself, from where the person sits."""
 ASK_S = 3.0
 UNANSWERED = 5
-GONE = "Nothing came back from your terminal for {:.0f} s: the arm was stopped, control was let go of."
+TERMINAL_SILENT = "Terminal silent {:.0f} s. The arm was stopped, control released."
 
 
-class Attended(Commands):
+async def listen(link: Link, tell: Callable[[float | None], None]) -> None:
+    """Ask something small again and again; ends with the link. A daemon that hangs keeps its socket open.
+
+    `tell` hears for how many seconds it has not answered, and None when it did.
+    """
+    while True:
+        asked_s = time.monotonic()
+        answer = asyncio.ensure_future(link.call(Watch(), timeout_s=_PATIENT_S))
+        try:
+            while not (await asyncio.wait({answer}, timeout=LISTEN_S))[0]:
+                if (waited_s := time.monotonic() - asked_s) >= SILENT_S:
+                    tell(waited_s)
+            problem = answer.exception()
+        finally:
+            answer.cancel()
+        if problem is not None and not isinstance(problem, RefusedError):
+            return
+        tell(None)
+        await asyncio.sleep(LISTEN_S)
+
+
+class Attended(Desk):
     """Asks the terminal while this screen moves the arm. One that never answered is not waited for."""
 
     _unanswered: int | None = None
@@ -38,9 +72,9 @@ class Attended(Commands):
             self._unanswered = 0
             return
         if self._unanswered >= UNANSWERED:
-            await self.ask("lease", action="lost")
+            await self.ask(Lease("lost"))
             self._unanswered = 0
-            self.notify(GONE.format(ASK_S * UNANSWERED), severity="error", timeout=3600)
+            self.notify(TERMINAL_SILENT.format(ASK_S * UNANSWERED), severity="error", timeout=3600)
             return
         self._unanswered += 1
         self._ask_terminal()

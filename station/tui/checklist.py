@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from rich.console import Group
 from rich.table import Table
@@ -13,6 +13,7 @@ from textual.binding import Binding, BindingType
 from textual.containers import VerticalScroll
 from textual.widgets import Static
 
+from station.protocol.verbs import Check, Doctor
 from station.tui.screen import StationScreen
 
 WORDS = {"ok": "ok", "warning": "WARN", "failed": "MISSING", "skipped": "-"}
@@ -22,21 +23,22 @@ READY = "\nNothing is missing. 1 shows the cell, 2 then n makes a plan, F5 asks 
 NOT_READY = "\nSomething is missing: its remedy stands beside it. This list looks again every few seconds."
 
 
-def checklist_table(checks: list[dict[str, Any]]) -> Table:
+def checklist_table(checks: list[Check]) -> Table:
     """One row a check; the remedy stands below what is missing."""
     table = Table(box=None, expand=True, padding=(0, 1))
     for title, width in (("", 8), ("what", 18), ("found", None)):
         table.add_column(title, width=width)
     for check in checks:
-        state = str(check.get("state", ""))
-        text = Text(str(check.get("text", "")))
-        if check.get("remedy") and state != "ok":
-            text.append(f"\n→ {check['remedy']}", style="bold")
-        table.add_row(WORDS.get(state, state), str(check.get("name", "")), text)
+        text = Text(check.text)
+        if check.remedy and check.state != "ok":
+            text.append(f"\n→ {check.remedy}", style="bold")
+        table.add_row(WORDS[check.state], check.name, text)
     return table
 
 
 class ChecklistScreen(StationScreen):
+    """The preflight check, looked at again while something is missing."""
+
     HELP = "The same list as `station doctor`. It only looks: nothing moves and nothing is changed."
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("r", "refresh_checks", "Check again", tooltip="Look at every item again")
@@ -60,10 +62,10 @@ class ChecklistScreen(StationScreen):
 
     @work(exclusive=True, exit_on_error=False)
     async def action_refresh_checks(self) -> None:
-        answer = await self.station.ask("doctor")
+        answer = await self.desk.ask(Doctor())
         if answer is None:
             return
-        self._missing = any(check.get("state") == "failed" for check in answer)
+        self._missing = any(check.state == "failed" for check in answer)
         words = NOT_READY if self._missing else READY
         self.query_one("#checklist", Static).update(Group(checklist_table(answer), Text(words, style="bold")))
 

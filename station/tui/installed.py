@@ -1,7 +1,8 @@
-"""What is installed on this cell, and what was: taken back, or replaced by another."""
+"""What is installed on this cell, and what was: rolled back, or replaced by another."""
 
 from __future__ import annotations
 
+import os
 from dataclasses import dataclass
 from datetime import datetime
 from functools import lru_cache
@@ -13,6 +14,9 @@ from calibrate.files.calibration import Calibration, read_calibration
 from calibrate.files.generations import LogEntry, calibrations_folder, read_log, same_solve
 from calibrate.files.install import load_installed
 
+LOOK_S = 2.0
+Marks = frozenset[tuple[str, int]]
+
 
 @dataclass(frozen=True)
 class Ended:
@@ -20,7 +24,7 @@ class Ended:
 
     calibration: Calibration
     how: str
-    """'taken back' or 'replaced'"""
+    """'rolled back' or 'replaced'"""
     by: str
     """'anna, 2026-11-22 04:50 (“the board had moved”)'"""
 
@@ -59,7 +63,7 @@ def read_installed(root: Path) -> Installed:
         was = _generation(root, before.generation)
         if was is None or entry.generation == before.generation or entry.action == "verify":
             continue  # a check by hand goes into a generation of its own, of the same solve
-        how = "taken back" if entry.action == "rollback" else "replaced"
+        how = "rolled back" if entry.action == "rollback" else "replaced"
         ended = [end for end in ended if not same_solve(end.calibration, was)]
         ended.append(Ended(was, how, _by(entry)))
     return Installed(now, tuple(end for end in ended if not same_solve(end.calibration, now)))
@@ -89,3 +93,30 @@ def local(iso: str) -> str:
         return datetime.fromisoformat(iso).astimezone().strftime("%Y-%m-%d %H:%M")
     except ValueError:
         return iso
+
+
+def state_root(calibration: str) -> Path:
+    """A session lies in ROOT/sessions/NAME; what is installed lies below the same ROOT."""
+    return Path(calibration).resolve().parents[2]
+
+
+def marks(root: Path) -> Marks:
+    """Differs from the one before when a screen over this root shows old things. For a thread.
+
+    Other screens and commands record, solve, install and roll back meanwhile.
+    """
+    found = {_mark(calibrations_folder(root) / "current")}
+    try:
+        with os.scandir(root / "sessions") as entries:
+            found |= {_mark(Path(entry.path)) for entry in entries}
+    except OSError:
+        pass
+    return frozenset(found)
+
+
+def _mark(path: Path) -> tuple[str, int]:
+    """When it was changed itself: a folder by what came into it or left it, a link by where it leads."""
+    try:
+        return str(path), path.lstat().st_mtime_ns
+    except OSError:
+        return str(path), 0

@@ -11,17 +11,19 @@ from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
 from textual.widgets import DataTable, Static
 
+from station.cell.plan import PlannedPose
 from station.cell.status import PoseStatus, StationStatus
-from station.tui.screen import StationScreen
-from station.tui.widgets.rows import Rows
+from station.operate.motion import PREPARE_S
+from station.protocol.verbs import Add, Drop, MakePlan, Reorder, Retake, Skip
+from station.tui.screen import Rows, StationScreen
 from station.tui.widgets.sketch import PlanSketch
 from station.tui.words import POSE_MARKS
 
-COLUMNS = ("#", "pose", "state", "± then", "why it is there / what happened", "try", "corners")
+COLUMNS = ("#", "pose", "state", "± then", "why it is there / what happened", "attempt", "corners")
 NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves); a adds the arm's posture."
-PLANNING = "Planning 25 poses … (seconds; minutes on a busy computer). Nothing moves."
-RETAKE = "Take this pose again at the next run; the picture it has counts until then"
-SKIP = "Leave this pose out; of one that has a picture only its retake"
+RETAKE = "Capture this pose again at the next run; the view it has counts until then"
+SKIP = "Leave this pose out; of one that has a view only its retake"
+POSE_VERBS = {"retake": Retake, "skip": Skip, "drop": Drop}
 MOVE = Binding.Group("Move", compact=True)
 SIGMA_SHOWN_MM = 100.0
 
@@ -44,7 +46,7 @@ def row_of(pose: PoseStatus) -> tuple[str, ...]:
 
 def detail_of(pose: PoseStatus) -> str:
     """What the table has no room for."""
-    seen = "" if pose.corners is None else f" {pose.corners} corners in try {pose.attempt}."
+    seen = "" if pose.corners is None else f" {pose.corners} corners in attempt {pose.attempt}."
     why = f" {pose.why}." if pose.why and pose.reason else ""
     return f"{pose.name}: {pose.reason or pose.why}.{why}{seen}"
 
@@ -53,7 +55,7 @@ class PlanScreen(StationScreen):
     """The table is the plan as the daemon holds it; every change is asked of the daemon."""
 
     HELP = (
-        "Poses in capture order. Nothing moves without your yes: F5, p and b show what would move and ask. "
+        "Poses in capture order. Nothing moves without your approval: F5, p and b show the motion and ask. "
         "Home and End go to the first and the last pose. ± then: the expected error after this pose, "
         "as planned."
     )
@@ -63,8 +65,8 @@ class PlanScreen(StationScreen):
         Binding("d", "pose('drop')", "Drop", tooltip="Remove this pose from the plan"),
         Binding("a", "add", "Add", tooltip="Add the arm's present posture as a pose"),
         Binding("n", "make", "New", tooltip="Plan 25 poses from the configured guesses (seconds)"),
-        Binding("p", "app.improve", "Improve", tooltip="Plan what is left anew from the pictures so far"),
-        Binding("b", "app.best", "Best", tooltip="Add the pose that would help most, and take it (asks)"),
+        Binding("p", "app.replan", "Replan", tooltip="Plan the remaining poses again from the images so far"),
+        Binding("b", "app.next_pose", "Next pose", tooltip="Add and capture the most useful pose (asks)"),
         Binding("ctrl+up", "shift(-1)", "Move", group=MOVE, tooltip="Visit this pose earlier"),
         Binding("ctrl+down", "shift(1)", "Move", group=MOVE, tooltip="Visit this pose later"),
     ]
@@ -110,7 +112,7 @@ class PlanScreen(StationScreen):
         self._explain(status, self.table.cursor_row)
 
     def on_data_table_row_highlighted(self, event: DataTable.RowHighlighted) -> None:
-        self._explain(self.station.status, event.cursor_row)
+        self._explain(self.desk.status, event.cursor_row)
 
     def _explain(self, status: StationStatus | None, line: int) -> None:
         """The highlighted pose in words and in the sketch."""
@@ -122,19 +124,18 @@ class PlanScreen(StationScreen):
             self.query_one("#plan-detail", Static).update(Text(text))
 
     def _selected(self) -> int | None:
-        status = self.station.status
+        status = self.desk.status
         if status is None or not status.session.poses:
             self.notify("No plan is loaded: n makes one, or `station plan` in a shell.", severity="warning")
             return None
         return status.session.poses[self.table.cursor_row].index
 
     def action_pose(self, verb: str) -> None:
-        index = self._selected()
-        if index is not None:
-            self.station.send(verb, index=index)
+        if (index := self._selected()) is not None:
+            self.desk.send(POSE_VERBS[verb](index))
 
     def action_shift(self, by: int) -> None:
-        status, line = self.station.status, self.table.cursor_row
+        status, line = self.desk.status, self.table.cursor_row
         if self._selected() is None or status is None:
             return
         if not 0 <= line + by < len(status.session.poses):
@@ -142,18 +143,17 @@ class PlanScreen(StationScreen):
             return
         order = [pose.index for pose in status.session.poses]
         order[line], order[line + by] = order[line + by], order[line]
-        self.station.send("reorder", order=order)
+        self.desk.send(Reorder(tuple(order)))
         self.table.move_cursor(row=line + by)
 
     def action_add(self) -> None:
-        status = self.station.status
+        status = self.desk.status
         if status is None or status.robot.joints_rad is None:
             self.notify("The arm's posture is not known: no robot state.", severity="warning")
             return
         name = f"here-{max((pose.index for pose in status.session.poses), default=-1) + 2}"
-        pose = {"name": name, "joints_rad": status.robot.joints_rad, "why": "added on the screen"}
-        self.station.send("add", pose=pose)
+        self.desk.send(Add(PlannedPose(name, status.robot.joints_rad, why="added on the screen")))
 
     @work(exit_on_error=False)
     async def action_make(self) -> None:
-        await self.station.ask_long(PLANNING, "make_plan", poses=25, seed=1)
+        await self.desk.ask(MakePlan(25, seed=1), timeout_s=PREPARE_S)

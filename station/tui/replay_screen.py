@@ -23,8 +23,8 @@ class Player:
 
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("space", "play", "Play/Pause", tooltip="Stop the playback here, or go on"),
-        Binding("left", "step(-1)", "Picture back", tooltip="To the picture before this one"),
-        Binding("right", "step(1)", "Picture on", tooltip="To the next picture"),
+        Binding("left", "step(-1)", "Image back", tooltip="To the image before this one"),
+        Binding("right", "step(1)", "Image on", tooltip="To the next image"),
         Binding("pageup", f"seek({-JUMP_S})", "10 s back", show=False, tooltip="Ten seconds back"),
         Binding("pagedown", f"seek({JUMP_S})", "10 s on", show=False, tooltip="Ten seconds on"),
         Binding("home", f"seek({-1e9})", "Start", show=False, tooltip="To the start of the recording"),

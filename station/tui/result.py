@@ -1,4 +1,4 @@
-"""Result: may this calibration be trusted? Gates first, then X with its sigmas, then the views."""
+"""Result: the gates first, then the camera pose with its uncertainty, then the views."""
 
 from __future__ import annotations
 
@@ -21,15 +21,13 @@ from calibrate.files.generations import same_solve
 from calibrate.files.install import objections_beside
 from calibrate.files.verification import agrees, touch_text
 from calibrate.geometry import difference
-from station.tui.elsewhere import LOOK_S, Marks, marks
-from station.tui.installed import Ended, Installed, read_installed
-from station.tui.offline import state_root
+from station.tui.installed import LOOK_S, Ended, Installed, Marks, marks, read_installed, state_root
 from station.tui.screen import StationScreen
 
 NO_RESULT = "No result yet. F9 solves the session just captured; on screen 4, v shows older ones."
 NOTHING = Installed()
 BAR_CELLS = 24
-REASONED = {False: "installs only with a reason", True: "installed all the same"}
+REASONED = {False: "installs only with a reason", True: "installed, overridden"}
 
 
 def ended_words(end: Ended) -> str:
@@ -48,7 +46,7 @@ def verdict_text(
     touches = sorted(calibration.verification, key=agrees)
     against = [
         _many(len(calibration.quality.failed), "GATE") + " FAILED",
-        _many(sum(not agrees(touch) for touch in touches), "CORNER") + " OFF BY HAND",
+        _many(sum(not agrees(touch) for touch in touches), "CORNER") + " OFF IN THE TOUCH TEST",
         _many(len(objections), "OBJECTION"),
     ]
     against = [words for words in against if not words.startswith("0 ")]
@@ -57,13 +55,13 @@ def verdict_text(
     head = ", ".join(against) + f": {REASONED[installed]}" if against else ready
     text = Text().append(stamp, "bold").append(f"{head}\n", "bold reverse" if against else "bold")
     if installed and state.now is not None and (taken := state.now.override) is not None:
-        text.append(f"{taken.who} took responsibility: “{taken.reason}”\n")
+        text.append(f"Override by {taken.who}: “{taken.reason}”\n")
     if end is not None:
         text.append(f"{ended_words(end)}. i installs it again\n")
     text.append(f"session {calibration.provenance.session}\n")
     for passed, words in (
         *((False, words) for words in objections),
-        *((agrees(touch), f"by hand: {touch_text(touch)}") for touch in touches),
+        *((agrees(touch), f"touch test, {touch_text(touch)}") for touch in touches),
         *((gate.passed, f"{gate.name}: {gate.text}") for gate in gates),
     ):
         text.append(f"\n[{'ok' if passed else 'FAIL'}] ", style="" if passed else "bold reverse")
@@ -76,7 +74,7 @@ def _many(count: int, what: str) -> str:
 
 
 def answer_text(calibration: Calibration) -> Text:
-    """X for people: millimetres and degrees, with one sigma each."""
+    """The camera pose in millimetres and degrees, with standard uncertainties (1σ)."""
     result, quality = calibration.result, calibration.quality
     x, y, z = (1000 * v for v in result.translation_m)
     sx, sy, sz = 1000 * np.sqrt(np.diag(np.array(calibration.covariance))[:3])
@@ -92,7 +90,7 @@ def answer_text(calibration: Calibration) -> Text:
         lines.append(f"a point at {quality.working_distance_m:.2f} m: ± {quality.predicted_error_mm:.2f} mm")
     if quality.holdout is not None:
         e_t, e_R = quality.holdout.e_t_m, quality.holdout.e_R
-        lines.append(f"hold-out e_t {1000 * e_t:.2f} mm, e_R {e_R:.4f}")
+        lines.append(f"held-out error e_t {1000 * e_t:.2f} mm, e_R {e_R:.4f}")
     return Text("\n".join([*lines, *quality.warnings]))
 
 
@@ -105,11 +103,11 @@ def residual_text(calibration: Calibration) -> Text:
         for index, value in sorted(rms.items())
     ]
     rejected = [f"{r.index + 1:>3} REJECTED {r.name}: {r.reason}" for r in calibration.views.rejected]
-    return Text("\n".join([*rejected, "reprojection per view", *lines]))
+    return Text("\n".join([*rejected, "reprojection error per view", *lines]))
 
 
 def change_text(calibration: Calibration, installed: Calibration | None) -> Text:
-    """What installing would change."""
+    """Describe what installing would change."""
     if installed is None:
         return Text("\nnothing is installed yet")
     if same_solve(calibration, installed):
@@ -124,11 +122,13 @@ def change_text(calibration: Calibration, installed: Calibration | None) -> Text
 
 
 class ResultScreen(StationScreen):
+    """A calibration file: its verdict, its numbers, and what may be done with it."""
+
     HELP = "The newest result, or the one picked on the sessions screen. Installing can be undone."
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("i", "install", "Install", tooltip="Make this the cell's calibration; rollback undoes it"),
+        Binding("i", "install", "Install", tooltip="Make this the cell's calibration; b undoes it"),
         Binding("b", "roll_back", "Back", tooltip="Back to the calibration that was installed before"),
-        Binding("h", "verify", "By hand", tooltip="Check it by hand: the tip over corners of the board"),
+        Binding("h", "touch_test", "Touch test", tooltip="Bring the tip onto corners of the board"),
         Binding("e", "export", "Export", tooltip="Write it for ROS, OpenCV, URDF … beside the recording"),
         Binding("x", "discard", "Discard", tooltip="Delete this result; the recording stays"),
     ]
@@ -152,10 +152,14 @@ class ResultScreen(StationScreen):
 
     def on_mount(self) -> None:
         self.query_one("#result-left").focus()
+        self.watch(self.desk, "result_path", self._picked, init=False)
         self.set_interval(LOOK_S, self.look_again)
 
     def on_screen_resume(self) -> None:
         super().on_screen_resume()
+        self.load()
+
+    def _picked(self) -> None:
         self.load()
 
     async def look_again(self) -> None:
@@ -170,8 +174,8 @@ class ResultScreen(StationScreen):
     @property
     def _shown(self) -> str:
         """The file that was picked, else that of the session just captured; empty: neither."""
-        status = self.station.status
-        return self.station.result_path or (status.session.calibration if status is not None else "")
+        status = self.desk.status
+        return self.desk.result_path or (status.session.calibration if status is not None else "")
 
     @work(exclusive=True, group="load", exit_on_error=False)
     async def load(self) -> None:
@@ -203,20 +207,20 @@ class ResultScreen(StationScreen):
     def action_install(self) -> None:
         if (path := self._path()) is not None and self._calibration is not None:
             end = self._state.end_of(self._calibration)
-            self.station.install(path, f"{ended_words(end)}." if end is not None else "")
+            self.desk.install(path, f"{ended_words(end)}." if end is not None else "")
 
     def action_roll_back(self) -> None:
         if (path := self._path()) is not None:
-            self.station.roll_back(path)
+            self.desk.roll_back(path)
 
-    def action_verify(self) -> None:
+    def action_touch_test(self) -> None:
         if (path := self._path()) is not None:
-            self.station.verify(path)
+            self.desk.touch_test(path)
 
     def action_export(self) -> None:
         if (path := self._path()) is not None:
-            self.station.export(path)
+            self.desk.export(path)
 
     def action_discard(self) -> None:
         if (path := self._path()) is not None:
-            self.station.discard(path)
+            self.desk.discard(path)

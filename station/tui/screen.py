@@ -2,17 +2,17 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, cast
+from typing import ClassVar, cast
 
 from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
 from textual.screen import Screen
+from textual.widgets import DataTable
 
 from station.cell.status import StationStatus
+from station.tui.results import ResultsDesk
 from station.tui.widgets.bar import ReasonLine, StatusBar
 from station.tui.widgets.keys import Keys
-
-if TYPE_CHECKING:
-    from station.tui.app import StationApp
 
 
 class StationScreen(Screen[None]):
@@ -26,17 +26,17 @@ class StationScreen(Screen[None]):
         yield StatusBar(id="bar")
         yield ReasonLine(id="reason")
         yield from self.body()
-        yield Keys(self.station.common_actions())
+        yield Keys(self.desk.common_actions())
 
     @property
-    def station(self) -> StationApp:
-        return cast("StationApp", self.app)
+    def desk(self) -> ResultsDesk:
+        return cast(ResultsDesk, self.app)
 
     def on_screen_resume(self) -> None:
-        for status in (self.station.known, self.station.status):  # it may be the first time, or long ago
+        for status in (self.desk.known, self.desk.status):  # it may be the first time, or long ago
             self.show(status)
-        self.doubt(self.station.trouble, self.station.silent_s)
-        self.say_busy(self.station.busy)
+        self.doubt(self.desk.trouble, self.desk.silent_s)
+        self.say_busy(self.desk.busy)
 
     def body(self) -> ComposeResult:
         yield from ()
@@ -60,3 +60,15 @@ class StationScreen(Screen[None]):
             line.trouble = trouble
         for part in self.query("Panel, Preview"):
             part.old = bool(trouble)  # type: ignore[attr-defined]
+
+
+class Rows(DataTable[str]):
+    """A table of whole rows: one is marked, Home and End mark the first and the last."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("home", "scroll_top", show=False),
+        Binding("end", "scroll_bottom", show=False),
+    ]
+
+    def __init__(self, *, id: str) -> None:
+        super().__init__(id=id, cursor_type="row", zebra_stripes=True)

@@ -3,31 +3,32 @@
 from __future__ import annotations
 
 import asyncio
-from typing import Any, ClassVar
+from pathlib import Path
+from typing import ClassVar
 
 from textual import work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.widgets import Static
 
+from station.cell.session_folder import SessionSummary
 from station.operate.drift_check import POSES
 from station.protocol.states import RUNNING
-from station.tui.elsewhere import LOOK_S, Marks, marks
-from station.tui.installed import Installed, read_installed
-from station.tui.screen import StationScreen
-from station.tui.widgets.rows import Rows
+from station.protocol.verbs import Sessions
+from station.tui.installed import LOOK_S, Installed, Marks, marks, read_installed
+from station.tui.replay import ReplayLink
+from station.tui.replay_screen import WATCHABLE, ReplayScreen
+from station.tui.screen import Rows, StationScreen
 from station.tui.words import size
 
-DRIFT = f"Take {POSES} pictures in place of the loaded plan: does the installed one still hold? (asks)"
-NO_SESSION = "No session is recorded yet: 2 then n makes a plan, F5 shows its way and asks."
+DRIFT = f"Drift check: capture {POSES} poses in place of the loaded plan (asks)"
+NO_SESSION = "No session is recorded yet: 2 then n makes a plan, F5 shows its path and asks."
 COLUMNS = ("session", "source", "views", "size", "state", "calibration")
 
 
-def calibration_word(session: dict[str, Any], installed: Installed) -> str:
-    return installed.word(str(session.get("name"))) or ("solved" if session.get("calibration") else "-")
-
-
 class SessionsScreen(StationScreen):
+    """What was recorded, and what became of it."""
+
     HELP = (
         "Past recordings. Solving runs in its own process; the daemon and a running capture go on. Home and "
         "End go to the newest and the oldest."
@@ -36,14 +37,14 @@ class SessionsScreen(StationScreen):
         Binding("f9", "solve", "Solve", tooltip="Solve this recording again, outside the daemon"),
         Binding("v", "result", "Result", tooltip="Show this session's calibration; so does Enter"),
         Binding("w", "watch", "Watch", tooltip="Play this recording in the live screen"),
-        Binding("k", "check", "Check", tooltip="Does the installed calibration still hold on this one?"),
+        Binding("k", "check", "Check", tooltip="Drift check on the views of this recording"),
         Binding("d", "drift", "Drift", tooltip=DRIFT),
         Binding("c", "recover", "Recover", tooltip="Rebuild an unfinished recording"),
     ]
 
     def __init__(self) -> None:
         super().__init__()
-        self._sessions: list[dict[str, Any]] = []
+        self._sessions: list[SessionSummary] = []
         self._marks: Marks = frozenset()
 
     def body(self) -> ComposeResult:
@@ -61,12 +62,10 @@ class SessionsScreen(StationScreen):
 
     async def look_again(self) -> None:
         """Another screen or a shell may have solved or installed. A daemon at work is left in peace."""
-        link, status = self.station.link, self.station.status
-        if not self.is_current or link is None or link.root is None:
+        root, status = self.desk.root, self.desk.status
+        if not self.is_current or root is None or status is None or status.state in RUNNING:
             return
-        if status is None or status.state in RUNNING:
-            return
-        if await asyncio.to_thread(marks, link.root) != self._marks:
+        if await asyncio.to_thread(marks, root) != self._marks:
             self.fetch()
 
     @property
@@ -75,32 +74,31 @@ class SessionsScreen(StationScreen):
 
     @work(exclusive=True, group="fetch", exit_on_error=False)
     async def fetch(self) -> None:
-        link = self.station.link
-        root = None if link is None else link.root
+        root = self.desk.root
         if root is not None:  # noted first: a slow answer must not be asked for again and again
             self._marks = await asyncio.to_thread(marks, root)
-        answer = await self.station.ask("sessions")
+        answer = await self.desk.ask(Sessions())
         if answer is None:
             self._marks = frozenset()
             return  # why was said; what was known stays
         installed = Installed() if root is None else await asyncio.to_thread(read_installed, root)
-        at = self._sessions[self.table.cursor_row]["name"] if self._sessions else ""
-        self._sessions = list(answer)
+        at = self._sessions[self.table.cursor_row].name if self._sessions else ""
+        self._sessions = answer
         self.query_one("#sessions-none").display = not self._sessions
         self.table.clear()
         for session in self._sessions:
             self.table.add_row(
-                str(session.get("name", "")),
-                str(session.get("source", "")),
-                str(session.get("views", "")),
-                size(float(session.get("bytes", 0))),
-                "sealed" if session.get("sealed") else "UNSEALED",
-                calibration_word(session, installed),
+                session.name,
+                session.source,
+                str(session.views),
+                size(session.bytes),
+                "finished" if session.sealed else "UNFINISHED",
+                installed.word(session.name) or ("solved" if session.calibration else "-"),
             )
-        names = [session.get("name", "") for session in self._sessions]
+        names = [session.name for session in self._sessions]
         self.table.move_cursor(row=names.index(at) if at in names else 0)
 
-    def _selected(self) -> dict[str, Any] | None:
+    def _selected(self) -> SessionSummary | None:
         if not self._sessions:
             self.notify(NO_SESSION)
             return None
@@ -108,17 +106,17 @@ class SessionsScreen(StationScreen):
 
     def action_solve(self) -> None:
         if (session := self._selected()) is not None:
-            if not session.get("sealed"):
+            if not session.sealed:
                 self.notify("This recording was never finished: press c to recover it first.")
                 return
-            self.station.solve(str(session["recording"]), str(session["folder"]))
+            self.desk.solve(session.recording, session.folder)
 
     async def action_result(self) -> None:
         if (session := self._selected()) is not None:
-            if not session.get("calibration"):
+            if not session.calibration:
                 self.notify("Not solved yet: F9 solves it.")
                 return
-            await self.station.show_result(str(session["calibration"]))
+            await self.desk.show_result(session.calibration)
 
     async def on_data_table_row_selected(self) -> None:
         """Enter on a session: what it gave."""
@@ -126,15 +124,23 @@ class SessionsScreen(StationScreen):
 
     def action_check(self) -> None:
         if (session := self._selected()) is not None:
-            self.station.check(str(session["recording"]), str(session["folder"]))
+            self.desk.check(session.recording, session.folder)
 
     def action_drift(self) -> None:
-        self.station.drift_check()
+        self.desk.drift_check()
 
-    def action_watch(self) -> None:
-        if (session := self._selected()) is not None:
-            self.station.watch_recording(str(session["folder"]))
+    @work(exclusive=True, group="job", exit_on_error=False)
+    async def action_watch(self) -> None:
+        session, status = self._selected(), self.desk.status
+        if session is None:
+            return
+        if status is not None and status.state not in WATCHABLE:
+            self.notify(f"The cell is {status.state.value}: finish that first, then look at old recordings.")
+            return
+        link = await self.desk.attempt(asyncio.to_thread(ReplayLink, Path(session.folder)))
+        if link is not None:
+            await self.app.push_screen(ReplayScreen(link))
 
     def action_recover(self) -> None:
         if (session := self._selected()) is not None:
-            self.station.recover(str(session["folder"]))
+            self.desk.recover(session.folder)

@@ -8,11 +8,12 @@ import msgspec
 import pytest
 
 from recordings.reader import open_recording
-from station.cli.demo import simulated_daemon
+from station.cli.demo import approve_simulated, simulated_daemon
 from station.devices.frames import frames_between
-from station.operate.attend import carry_out, wait_until_idle
+from station.operate.motion import carry_out, wait_until_idle
 from station.plan.planner import make_plan
 from station.protocol.client import Client
+from station.protocol.verbs import Purpose
 from station.simulation.scenes import cell_config, make_cell
 
 POSES = 3
@@ -30,7 +31,7 @@ async def test_every_pose_has_the_picture_of_its_own_pulse(lonely_network: None,
         await wait_until_idle(client)
         await client.request("lease", action="take")
         await client.request("load_plan", plan=msgspec.to_builtins(plan))
-        ended = await carry_out(client, "run", confirm=lambda summary: True, watch=lambda status: None)
+        ended = await carry_out(client, Purpose.RUN, approve_simulated, lambda status: None)
     assert ended.captured == POSES, ended.status.reason
     box = ended.status.trigger
     assert box.identity == "calibration-trigger SIM1" and box.pulses == box.frames > POSES, "glimpses too"

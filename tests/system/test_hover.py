@@ -18,7 +18,7 @@ from recordings.schema.messages import CameraIdentity, Matrix4, RobotIdentity
 from station.cell.limits import point_speed_m_s
 from station.cell.status import HoverOffer, StationStatus
 from station.cell.status import StationState as S
-from station.operate.touching import read_offset_mm, tip_on_board_m
+from station.operate.touch_test import read_offset_mm, tip_on_board_m
 from station.plan.hover import SPEED_M_S, board_from_tip, hover_geometry
 from station.protocol.client import Client
 from station.simulation.cell import CellTruth, write_truth

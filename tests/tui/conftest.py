@@ -10,12 +10,15 @@ from pathlib import Path
 from typing import Any
 
 import cv2
+import msgspec
 import numpy as np
 import pytest
 from textual.pilot import Pilot
 
+from station.cell.session_folder import SessionSummary
 from station.cell.status import (
     CameraStatus,
+    Lease,
     MotionPreview,
     PoseStatus,
     RobotStatus,
@@ -23,6 +26,7 @@ from station.cell.status import (
     StationState,
     StationStatus,
 )
+from station.protocol.verbs import Done, Preview, PreviewImage, Sessions, Verb, Watch
 
 SUMMARY = MotionPreview(
     token="t-1",
@@ -54,16 +58,17 @@ class FakeLink:
     root: Path | None = None
 
     def __init__(self) -> None:
-        self.asked: list[tuple[str, dict[str, Any]]] = []
+        self.asked: list[Verb[Any]] = []
         self.refuse: dict[str, Exception] = {}
         self.answers: dict[str, Any] = {
             "prepare": SUMMARY,
-            "preview": _picture(),
-            "lease": {"holder": "me", "client_id": 7},
-            "sessions": [{"name": "s-0"}],
+            "preview": _image(),
+            "lease": Lease("me", 7),
+            "sessions": [summary("s-0")],
         }
         self.silent = asyncio.Event()
         """While set nothing is answered, as by a daemon that hangs."""
+        self.same_image, self._images = False, 0
         self._statuses: asyncio.Queue[StationStatus | None] = asyncio.Queue()
         self.show(idle())
 
@@ -73,15 +78,21 @@ class FakeLink:
 
     @property
     def verbs(self) -> list[str]:
-        return [verb for verb, _ in self.asked if verb not in ("preview", "sessions", "watch")]
+        return [verb.verb() for verb in self.asked if not isinstance(verb, (Preview, Sessions, Watch))]
 
-    async def request(self, verb: str, **args: Any) -> Any:
-        self.asked.append((verb, args))
+    async def call(self, verb: Verb[Any], *, timeout_s: float = 0.0) -> Any:
+        self.asked.append(verb)
         while self.silent.is_set():
             await asyncio.sleep(0.01)
-        if verb in self.refuse:
-            raise self.refuse[verb]
-        return self.answers.get(verb, {})
+        if verb.verb() in self.refuse:
+            raise self.refuse[verb.verb()]
+        if isinstance(verb, Preview):
+            self._images += not self.same_image
+            return msgspec.structs.replace(self.answers["preview"], sequence=self._images)
+        return self.answers.get(verb.verb(), Done())
+
+    def outdate(self) -> None:
+        """Every status of a test is a new one."""
 
     async def statuses(self) -> AsyncIterator[StationStatus]:
         while (status := await self._statuses.get()) is not None:
@@ -91,10 +102,14 @@ class FakeLink:
         self.show(None)
 
 
-def _picture() -> dict[str, Any]:
+def summary(name: str, calibration: Path | str = "") -> SessionSummary:
+    return SessionSummary(name, "", "", "simulated", 0, 0, True, str(calibration))
+
+
+def _image() -> PreviewImage:
     board = np.kron(np.indices((6, 8)).sum(axis=0) % 2, np.ones((16, 16))).astype(np.uint8) * 255
     data = cv2.imencode(".jpg", board)[1].tobytes()
-    return {"jpeg_base64": base64.b64encode(data).decode(), "corners": [[0.25, 0.25], [0.5, 0.5]]}
+    return PreviewImage(base64.b64encode(data).decode(), 128, 96, ((0.25, 0.25), (0.5, 0.5)))
 
 
 def idle(state: StationState = StationState.IDLE, reason: str = "") -> StationStatus:

@@ -7,11 +7,12 @@ import pytest
 from textual import events
 
 from station.cell.status import Lease, StationState, StationStatus
+from station.protocol import verbs
 from station.tui import attendance
 from tests.tui.conftest import FakeLink, idle, until
 from tests.tui.test_keys import app_on, text_of
 
-LOST = ("lease", {"action": "lost"})
+LOST = verbs.Lease("lost")
 
 
 def commanded(state: StationState, client_id: int = 7) -> StationStatus:
@@ -49,7 +50,7 @@ async def test_who_commands_a_moving_arm_is_asked_for(
             await app._look_for_terminal()
             await pilot.pause()
         assert (LOST in link.asked) is lost
-        assert any("Nothing came back" in said.message for said in app._notifications) is lost
+        assert any("Terminal silent" in said.message for said in app._notifications) is lost
         assert len(asked) >= attendance.UNANSWERED or not lost
 
 

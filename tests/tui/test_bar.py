@@ -17,7 +17,7 @@ ROBOT = RobotStatus(
 )
 
 WIDE = (
-    " FREE-DRIVE SIMULATED UR10e Series 5 (lab context)│0.21/0.25 m/s│"
+    " FREE-DRIVE SIMULATED UR10e Series 5 (lab bench)│0.21/0.25 m/s│"
     "AUTOMATIC MODE SAFEGUARD REMOTE│18/25│212 GB│    F12=STOP"
 )
 
@@ -32,7 +32,7 @@ def working(state: StationState = StationState.MOVING) -> StationStatus:
 def long_one() -> StationStatus:
     status = working(StationState.FREE_DRIVE)
     robot = msgspec.structs.replace(
-        ROBOT, model="UR10e Series 5 (lab context)", safety="AUTOMATIC MODE SAFEGUARD"
+        ROBOT, model="UR10e Series 5 (lab bench)", safety="AUTOMATIC MODE SAFEGUARD"
     )
     return msgspec.structs.replace(status, robot=robot)
 
@@ -103,7 +103,7 @@ def test_a_disk_that_is_nearly_full_is_not_left_out() -> None:
 
 @pytest.mark.parametrize(
     ("state", "key"),
-    [(StationState.FREE_DRIVE, "F2"), (StationState.PAUSED, "F5"), (StationState.FAULT, "F8: I looked")],
+    [(StationState.FREE_DRIVE, "F2"), (StationState.PAUSED, "F5"), (StationState.FAULT, "F8 after a look")],
 )
 async def test_the_reason_names_the_next_key(link: FakeLink, state: StationState, key: str) -> None:
     link.show(idle(state, "why"))
@@ -116,7 +116,7 @@ HELD = "protective stop: find what the arm ran into, then enable it again on the
 
 
 @pytest.mark.parametrize(
-    ("state", "key"), [(StationState.IDLE, ""), (StationState.PAUSED, "then F5 goes on")]
+    ("state", "key"), [(StationState.IDLE, ""), (StationState.PAUSED, "then F5 continues")]
 )
 async def test_what_holds_the_arm_at_rest_is_said_before_the_next_key(
     link: FakeLink, state: StationState, key: str

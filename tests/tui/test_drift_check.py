@@ -12,18 +12,23 @@ from textual.pilot import Pilot
 from calibrate.files.calibration import write_calibration
 from calibrate.files.install import install
 from station.cell.errors import RefusedError
+from station.cell.plan import Plan, PlannedPose
 from station.cell.status import StationState, StationStatus
-from station.tui import offline
+from station.operate.drift_check import POSES, SEED
+from station.protocol import verbs
+from station.tui import results
 from station.tui.app import StationApp
-from station.tui.confirm import ConfirmGo
-from station.tui.drift import INSTEAD, PLANNING_CHECK
-from station.tui.jobs import JobScreen
+from station.tui.desk import busy_words
+from station.tui.dialogs import ConfirmMotion
+from station.tui.results import JobScreen
 from tests.tui.conftest import FakeLink, idle, until
 from tests.tui.test_install import GOOD
 from tests.tui.test_keys import app_on, text_of
 from tests.tui.test_plan_screen import SlowPlanner
 
 CHECK_PLAN = "cd" * 32
+LOADED = Plan("UR10", "eye-in-hand", (PlannedPose("p1", (0.0,) * 6),) * 3)
+PLANNING = busy_words(verbs.MakePlan(POSES, SEED, lens_known=True))
 JOB = """
 import json, pathlib, sys
 (pathlib.Path(__file__).parent / "asked").write_text(json.dumps(sys.argv[1:]))
@@ -31,17 +36,22 @@ print("The installed calibration holds.")
 """
 
 
+def install_on(link: FakeLink, folder: Path) -> None:
+    write_calibration(GOOD, folder / "c.yaml")
+    link.root = folder / "root"
+    install(folder / "c.yaml", root=link.root, cell="simulated")
+
+
 @pytest.fixture
 def installed(link: FakeLink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """The daemon's root, with something installed; the check itself is a job that notes what it was asked."""
-    write_calibration(GOOD, tmp_path / "c.yaml")
-    link.root = tmp_path / "root"
-    install(tmp_path / "c.yaml", root=link.root, cell="simulated")
-    link.answers["make_plan"] = {"poses": 6, "sha256": CHECK_PLAN}
+    install_on(link, tmp_path)
+    link.answers["make_plan"] = verbs.PlanFacts(6, CHECK_PLAN)
+    link.answers["plan"] = verbs.LoadedPlan(LOADED)
     (tmp_path / "some_job.py").write_text(JOB)
     monkeypatch.setenv("PYTHONPATH", str(tmp_path))
     monkeypatch.setattr(
-        offline, "JobScreen", lambda title, module, *args, **more: JobScreen(title, "some_job", *args, **more)
+        results, "JobScreen", lambda title, module, *args, **more: JobScreen(title, "some_job", *args, **more)
     )
     return tmp_path
 
@@ -71,9 +81,7 @@ async def test_nothing_is_planned_where_nothing_is_installed(link: FakeLink, tmp
     app = app_on(link)
     async with app.run_test(size=(80, 24), notifications=True) as pilot:
         await ask_for_it(pilot)
-        await until(
-            pilot, lambda: said(app, "nothing is installed. 3 shows the newest result, i installs it")
-        )
+        await until(pilot, lambda: said(app, "nothing is installed"))
         assert link.verbs == []
 
 
@@ -87,15 +95,13 @@ async def test_what_the_daemon_refuses_is_said(link: FakeLink, installed: Path) 
 
 
 async def test_a_no_leaves_arm_and_plan_as_they_were(link: FakeLink, installed: Path) -> None:
-    link.answers["plan"] = {"plan": {"poses": [1, 2, 3]}, "sha256": "ab" * 32}
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await ask_for_it(pilot)
         await until(pilot, lambda: pilot.app.screen.query("#confirm-body"))
-        body = " ".join(text_of(pilot.app, "#confirm-body").split())
-        assert INSTEAD.format(3) in body
+        assert "Change     replaces the loaded plan of 3 poses" in text_of(pilot.app, "#confirm-body")
         await pilot.press("escape")
         await until(pilot, lambda: link.verbs[-1] == "load_plan")
-        assert ("load_plan", {"plan": {"poses": [1, 2, 3]}}) in link.asked
+        assert verbs.LoadPlan(LOADED) in link.asked
         assert "go" not in link.verbs
 
 
@@ -109,9 +115,9 @@ async def test_a_plan_that_was_used_is_not_missed(link: FakeLink, installed: Pat
         await ask_for_it(pilot)
         await until(pilot, lambda: app.screen.query("#confirm-body"))
         assert "plan" not in link.verbs
-        assert "takes the place" not in text_of(app, "#confirm-body")
+        assert "Change" not in text_of(app, "#confirm-body")
         await pilot.press("escape")
-        await until(pilot, lambda: not isinstance(app.screen, ConfirmGo))
+        await until(pilot, lambda: not isinstance(app.screen, ConfirmMotion))
         await pilot.pause()
         assert "load_plan" not in link.verbs
 
@@ -121,9 +127,9 @@ async def test_the_verdict_comes_when_the_recording_is_sealed(link: FakeLink, in
     app = app_on(link)
     async with app.run_test(size=(80, 24), notifications=True) as pilot:
         await ask_for_it(pilot)
-        await until(pilot, lambda: isinstance(app.screen, ConfirmGo))
+        await until(pilot, lambda: isinstance(app.screen, ConfirmMotion))
         assert "go" not in link.verbs
-        assert any(args.get("purpose") == "check" for _, args in link.asked)
+        assert verbs.Prepare(verbs.Purpose.DRIFT_CHECK) in link.asked
         await pilot.press("tab", "enter")
         await until(pilot, lambda: "go" in link.verbs and app.current_mode == "live")
         link.show(check_session(installed, state=StationState.PAUSED))
@@ -133,9 +139,9 @@ async def test_the_verdict_comes_when_the_recording_is_sealed(link: FakeLink, in
         await pilot.pause(0.3)
         assert not (installed / "asked").exists()
         link.show(check_session(installed, recording))
-        await until(pilot, lambda: (installed / "asked").exists() and isinstance(app.screen, JobScreen))
+        await until(pilot, lambda: isinstance(app.screen, JobScreen) and app.screen.said)
         asked = json.loads((installed / "asked").read_text())
-        assert asked == ["check", recording, "--root", str(installed / "root")]
+        assert asked == ["drift-check", recording, "--root", str(installed / "root")]
         await until(pilot, lambda: any("holds" in line for line in app.screen.said))  # type: ignore[attr-defined]
 
 
@@ -143,7 +149,7 @@ async def test_another_plan_ends_it_without_a_verdict(link: FakeLink, installed:
     app = app_on(link)
     async with app.run_test(size=(80, 24), notifications=True) as pilot:
         await ask_for_it(pilot)
-        await until(pilot, lambda: isinstance(app.screen, ConfirmGo))
+        await until(pilot, lambda: isinstance(app.screen, ConfirmMotion))
         await pilot.press("tab", "enter")
         link.show(check_session(installed))
         await until(pilot, lambda: app.status == check_session(installed))
@@ -153,16 +159,18 @@ async def test_another_plan_ends_it_without_a_verdict(link: FakeLink, installed:
         assert not (installed / "asked").exists()
 
 
-async def test_planning_it_is_said_on_every_screen() -> None:
+async def test_planning_it_is_said_on_every_screen(tmp_path: Path) -> None:
     link = SlowPlanner()
+    install_on(link, tmp_path)
+    link.answers |= {"plan": verbs.LoadedPlan(LOADED), "make_plan": verbs.PlanFacts(6, CHECK_PLAN)}
     app = app_on(link)
     async with app.run_test(size=(80, 24)) as pilot:
         await ask_for_it(pilot)
-        await until(pilot, lambda: PLANNING_CHECK in text_of(app, "#reason"))
+        await until(pilot, lambda: PLANNING in text_of(app, "#reason"))
         await pilot.press("5")
-        await until(pilot, lambda: app.current_mode == "log" and PLANNING_CHECK in text_of(app, "#reason"))
+        await until(pilot, lambda: app.current_mode == "log" and PLANNING in text_of(app, "#reason"))
         link.show(idle(StationState.PAUSED, "poses 3, 7 failed: retake or skip them, or finish"))
         await until(pilot, lambda: "poses 3, 7 failed" in text_of(app, "#reason"))
-        assert text_of(app, "#reason").strip().startswith(PLANNING_CHECK)  # a long reason may be cut
+        assert text_of(app, "#reason").strip().startswith(PLANNING)  # a long reason may be cut
         link.made.set()
         await until(pilot, lambda: not app.busy)

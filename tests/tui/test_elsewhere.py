@@ -15,9 +15,9 @@ from calibrate.files.install import install, load_installed, rollback
 from station.cell.errors import StationError
 from station.tui import result, sessions
 from station.tui.app import StationApp
-from station.tui.confirm import Confirm
+from station.tui.dialogs import Confirm
 from station.tui.installed import read_installed
-from tests.tui.conftest import FakeLink, idle, until
+from tests.tui.conftest import FakeLink, idle, summary, until
 from tests.tui.test_install import GOOD, OFF
 from tests.tui.test_keys import app_on, text_of
 
@@ -36,8 +36,7 @@ def root(link: FakeLink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pat
     monkeypatch.setattr(result, "LOOK_S", 0.05)
     link.root = tmp_path
     link.answers["sessions"] = [
-        {"name": name, "calibration": str(tmp_path / "sessions" / name / "calibration.yaml")}
-        for name in ("s-2", "s-1")
+        summary(name, tmp_path / "sessions" / name / "calibration.yaml") for name in ("s-2", "s-1")
     ]
     return tmp_path
 
@@ -69,10 +68,10 @@ async def test_the_list_of_sessions_names_what_is_installed_now(link: FakeLink, 
         put(root, "s-2")
         await until(pilot, lambda: states() == ["INSTALLED", "replaced"])
         rollback(root)
-        await until(pilot, lambda: states() == ["taken back", "INSTALLED"])
-        link.answers["sessions"] = [{"name": "s-3"}, *link.answers["sessions"]]
+        await until(pilot, lambda: states() == ["rolled back", "INSTALLED"])
+        link.answers["sessions"] = [summary("s-3"), *link.answers["sessions"]]
         (root / "sessions" / "s-3").mkdir()
-        await until(pilot, lambda: states() == ["-", "taken back", "INSTALLED"])
+        await until(pilot, lambda: states() == ["-", "rolled back", "INSTALLED"])
         assert table.cursor_row == 2
 
 
@@ -99,18 +98,18 @@ async def test_a_calibration_that_was_taken_back_says_so_and_who_did_it(link: Fa
         put(root, "s-2")
         rollback(root, reason="the camera had slipped")
         await app.show_result(str(root / "sessions" / "s-2" / "calibration.yaml"))
-        await until(pilot, lambda: "TAKEN BACK" in text_of(app, "#verdict").splitlines()[1:])
+        await until(pilot, lambda: "ROLLED BACK" in text_of(app, "#verdict").splitlines()[1:])
         said = text_of(app, "#verdict")
         assert "READY TO INSTALL" not in said
-        assert f"installed before, and taken back by {who()}, 20" in said
+        assert f"installed before, and rolled back by {who()}, 20" in said
         assert "the camera had slipped" in said
         await pilot.press("i")
         await until(pilot, lambda: isinstance(app.screen, Confirm) and app.screen.query("#confirm-body"))
-        assert "installed before, and taken back" in text_of(app, "#confirm-body")
+        assert "installed before, and rolled back" in text_of(app, "#confirm-body")
         await pilot.press("escape")
         put(root, "s-2")
         await until(pilot, lambda: "INSTALLED" in text_of(app, "#verdict").splitlines()[1:])
-        assert "taken back" not in text_of(app, "#verdict")
+        assert "rolled back" not in text_of(app, "#verdict")
 
 
 def test_a_check_by_hand_is_no_end_of_what_is_installed(root: Path) -> None:
@@ -147,7 +146,7 @@ async def test_a_list_that_did_not_come_is_asked_for_again_and_the_old_one_stays
         (root / "sessions" / "s-3").mkdir()
         await until(pilot, lambda: any("gone" in notice.message for notice in app._notifications))
         assert table.row_count == 2
-        link.answers["sessions"] = [{"name": "s-3"}, *link.answers["sessions"]]
+        link.answers["sessions"] = [summary("s-3"), *link.answers["sessions"]]
         del link.refuse["sessions"]
         await until(pilot, lambda: table.row_count == 3)
 

@@ -23,8 +23,9 @@ from textual._xterm_parser import XTermParser
 from textual.geometry import Region, Size
 from textual.pilot import Pilot
 
+from station.protocol import verbs
 from station.tui.app import StationApp
-from station.tui.confirm import ConfirmGo
+from station.tui.dialogs import ConfirmMotion
 from station.tui.widgets import graphics as graphics_module
 from station.tui.widgets.graphics import SWITCH, Graphics, SharpPicture, detect
 from station.tui.widgets.preview import Preview
@@ -95,7 +96,7 @@ async def test_half_blocks_while_something_stands_over_it(link: FakeLink, sixels
         await until(pilot, lambda: not sharp(pilot))
         await until(pilot, lambda: sharp(pilot))
         await pilot.press("f5")
-        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmGo))
+        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmMotion))
         assert not sharp(pilot)
         assert any("▀" in line for line in lines_of(pilot))
 
@@ -121,8 +122,8 @@ async def test_a_dear_picture_makes_the_next_one_wait(
     monkeypatch.setattr(sixels, "draw", dear)
     async with sharp_app(link, sixels).run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: drawn)
-        asked = sum(verb == "preview" for verb, _ in link.asked)
-        await until(pilot, lambda: sum(verb == "preview" for verb, _ in link.asked) >= asked + 3)
+        asked = sum(isinstance(verb, verbs.Preview) for verb in link.asked)
+        await until(pilot, lambda: sum(isinstance(verb, verbs.Preview) for verb in link.asked) >= asked + 3)
         assert len(drawn) == 1
 
 
@@ -217,7 +218,7 @@ def test_without_the_extra_nothing_is_missed(
 async def test_a_status_repaints_only_what_it_changes(
     link: FakeLink, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    link.answers["preview"]["sequence"] = 1
+    link.same_image = True
     updates: list[str] = []
     render = Compositor.render_update
 
@@ -240,14 +241,14 @@ async def test_a_status_repaints_only_what_it_changes(
 async def test_until_the_next_picture_is_due_only_the_smallest_is_asked_for(link: FakeLink) -> None:
     async with app_on(link).run_test(size=(160, 48)) as pilot:
         preview = pilot.app.screen.query_one(Preview)
-        await until(pilot, lambda: preview._picture is not None)
-        shown = preview._picture
+        await until(pilot, lambda: preview._image is not None)
+        shown = preview._image
         preview._next_s = time.monotonic() + 3600.0
         link.asked.clear()
         await preview.fetch(link)  # what the daemon finds in it is still told by the status
-        assert link.asked[-1] == ("preview", {"width": 16, "height": 16})
-        assert preview._picture is shown
+        assert link.asked[-1] == verbs.Preview(16, 16)
+        assert preview._image is shown
         preview._next_s = 0.0
         await preview.fetch(link)
-        assert link.asked[-1][1]["width"] > 16
-        assert preview._picture is not shown
+        assert isinstance(asked := link.asked[-1], verbs.Preview) and asked.width > 16
+        assert preview._image is not shown

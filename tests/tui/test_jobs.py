@@ -12,7 +12,7 @@ import pytest
 from textual.pilot import Pilot
 from textual.widgets import Button, Label, RichLog
 
-from station.tui.jobs import JobScreen
+from station.tui.results import JobScreen
 from tests.tui.conftest import FakeLink, until
 from tests.tui.test_keys import app_on
 

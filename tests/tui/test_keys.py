@@ -9,9 +9,9 @@ from textual.widgets import Static
 
 from station.cell.errors import RefusedError
 from station.cell.status import Lease, StationState, StationStatus
+from station.protocol import verbs
 from station.tui.app import StationApp
-from station.tui.commands import PLAN_ANSWER_S
-from station.tui.confirm import Confirm, ConfirmGo
+from station.tui.dialogs import Confirm, ConfirmMotion
 from tests.tui.conftest import SUMMARY, FakeLink, idle, until
 
 
@@ -30,13 +30,13 @@ async def test_run_asks_first_and_go_carries_the_token(link: FakeLink) -> None:
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
         await pilot.press("f5")
-        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmGo))
+        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmMotion))
         assert "go" not in link.verbs
         body = str(pilot.app.screen.query_one("#confirm-body", Static).render())
         assert "84 mm and 22° to pose 1" in body
         assert "0.22 m/s" in body
         await pilot.click("#yes")
-        await until(pilot, lambda: ("go", {"token": "t-1"}) in link.asked)
+        await until(pilot, lambda: verbs.Go("t-1", SUMMARY.plan_sha256) in link.asked)
 
 
 @pytest.mark.parametrize("answer", ["escape", "enter"])
@@ -44,9 +44,9 @@ async def test_the_harmless_answer_is_the_easy_one(link: FakeLink, answer: str) 
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
         await pilot.press("f5")
-        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmGo))
+        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmMotion))
         await pilot.press(answer)
-        await until(pilot, lambda: not isinstance(pilot.app.screen, ConfirmGo))
+        await until(pilot, lambda: not isinstance(pilot.app.screen, ConfirmMotion))
         await pilot.pause()
         assert "go" not in link.verbs
 
@@ -57,7 +57,7 @@ async def test_no_notice_stands_before_the_question(link: FakeLink) -> None:
         await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
         pilot.app.notify("no session is open", timeout=3600)
         await pilot.press("f5")
-        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmGo))
+        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmMotion))
         await until(pilot, lambda: not pilot.app._notifications)
 
 
@@ -65,7 +65,7 @@ async def test_stop_works_inside_the_question_too(link: FakeLink) -> None:
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
         await pilot.press("f5")
-        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmGo))
+        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmMotion))
         await pilot.press("f12")
         await until(pilot, lambda: "stop" in link.verbs)
 
@@ -128,16 +128,16 @@ async def test_finish_asks_and_then_seals(link: FakeLink) -> None:
 @pytest.mark.parametrize(
     ("key", "request_"),
     [
-        ("r", ("retake", {"index": 2})),
-        ("s", ("skip", {"index": 2})),
-        ("d", ("drop", {"index": 2})),
-        ("ctrl+up", ("reorder", {"order": [0, 2, 1, *range(3, 25)]})),
-        ("ctrl+down", ("reorder", {"order": [0, 1, 3, 2, *range(4, 25)]})),
-        ("n", ("make_plan", {"poses": 25, "seed": 1, "timeout_s": PLAN_ANSWER_S})),
+        ("r", verbs.Retake(2)),
+        ("s", verbs.Skip(2)),
+        ("d", verbs.Drop(2)),
+        ("ctrl+up", verbs.Reorder((0, 2, 1, *range(3, 25)))),
+        ("ctrl+down", verbs.Reorder((0, 1, 3, 2, *range(4, 25)))),
+        ("n", verbs.MakePlan(25, seed=1)),
     ],
 )
 async def test_the_plan_screen_asks_for_changes_of_the_highlighted_pose(
-    link: FakeLink, key: str, request_: tuple[str, dict[str, object]]
+    link: FakeLink, key: str, request_: verbs.Verb[object]
 ) -> None:
     async with app_on(link).run_test(size=(120, 34)) as pilot:
         await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
@@ -147,28 +147,28 @@ async def test_the_plan_screen_asks_for_changes_of_the_highlighted_pose(
         await until(pilot, lambda: request_ in link.asked)
 
 
-@pytest.mark.parametrize(("key", "purpose"), [("p", "improve"), ("b", "best")])
+@pytest.mark.parametrize(("key", "purpose"), [("p", verbs.Purpose.REPLAN), ("b", verbs.Purpose.NEXT_POSE)])
 async def test_changing_the_plan_on_the_way_asks_as_every_motion_does(
-    link: FakeLink, key: str, purpose: str
+    link: FakeLink, key: str, purpose: verbs.Purpose
 ) -> None:
     link.answers["prepare"] = msgspec.structs.replace(SUMMARY, changes=("0.61 → 0.52 mm " * 6,))
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
         await pilot.press("2", key)
         await until(pilot, lambda: pilot.app.screen.query("#confirm-body"))
-        assert isinstance(pilot.app.screen, ConfirmGo)
-        assert ("prepare", {"purpose": purpose, "timeout_s": PLAN_ANSWER_S}) in link.asked
+        assert isinstance(pilot.app.screen, ConfirmMotion)
+        assert verbs.Prepare(purpose) in link.asked
         assert "go" not in link.verbs
         facts = text_of(pilot.app, "#confirm-body").splitlines()
         change = next(i for i, line in enumerate(facts) if line.startswith("Change"))
         assert facts[change + 1].startswith(" " * 11 + "0")  # a long fact goes on below itself
         await pilot.click("#yes")
-        await until(pilot, lambda: ("go", {"token": "t-1"}) in link.asked)
+        await until(pilot, lambda: verbs.Go("t-1", SUMMARY.plan_sha256) in link.asked)
 
 
 async def test_every_screen_opens_and_stop_works_on_each(link: FakeLink) -> None:
     link.answers["sessions"] = []
-    link.answers["doctor"] = [{"name": "camera", "state": "failed", "text": "none", "remedy": "plug it in"}]
+    link.answers["doctor"] = [verbs.Check("camera", "failed", "none", "plug it in")]
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
         for stops, key in enumerate("123456", start=1):
@@ -185,9 +185,9 @@ async def test_the_palette_names_the_screen_s_own_keys_too(link: FakeLink) -> No
         await pilot.press("2")
         await pilot.pause()
         named = {command.title: command for command in pilot.app.get_system_commands(pilot.app.screen)}
-        assert {"Retake (r)", "Best (b)", "Pause (f6)", "STOP (f12)"} <= set(named)
+        assert {"Retake (r)", "Next pose (b)", "Pause (f6)", "STOP (f12)"} <= set(named)
         named["Skip (s)"].callback()
-        await until(pilot, lambda: ("skip", {"index": 0}) in link.asked)
+        await until(pilot, lambda: verbs.Skip(0) in link.asked)
 
 
 async def test_stop_works_in_the_command_palette(link: FakeLink) -> None:
@@ -217,7 +217,7 @@ async def test_what_ends_control_asks_while_the_arm_works_by_it(link: FakeLink, 
         assert "decelerates" in str(pilot.app.screen.query_one("#confirm-body", Static).render())
         await pilot.press("escape")
         await pilot.pause()
-        assert ("lease", {"action": "release"}) not in link.asked
+        assert verbs.Lease("release") not in link.asked
 
 
 @pytest.mark.parametrize("state", [StationState.MOVING, StationState.PAUSED])
@@ -242,13 +242,13 @@ async def test_control_is_let_go_of_by_its_holder_alone(link: FakeLink) -> None:
         await pilot.press("f3")  # takes it, as if anna had let go
         await until(pilot, lambda: "free_drive" in link.verbs)
         await pilot.press("f4")
-        await until(pilot, lambda: ("lease", {"action": "release"}) in link.asked)
+        await until(pilot, lambda: verbs.Lease("release") in link.asked)
 
 
 async def test_after_looking_the_line_says_which_key_goes_on(link: FakeLink) -> None:
     link.show(idle(StationState.PAUSED))  # acknowledged: the daemon has no more to say
     async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "F5 goes on, F7 finishes" in text_of(pilot.app, "#reason"))
+        await until(pilot, lambda: "F5 continues, F7 finishes" in text_of(pilot.app, "#reason"))
         assert pilot.app.screen.query_one("#reason").display
 
 
@@ -278,6 +278,6 @@ async def test_what_a_stop_refused_is_not_said_any_more_after_it(link: FakeLink)
         await pilot.press("f3", "f4")
         await until(pilot, lambda: len(pilot.app._notifications) == 1)
         await pilot.press("f5")
-        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmGo))
+        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmMotion))
         await pilot.press("tab", "enter")
         await until(pilot, lambda: "go" in link.verbs and not pilot.app._notifications)

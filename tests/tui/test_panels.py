@@ -45,7 +45,7 @@ def test_a_picture_counts_until_its_pose_was_taken_again() -> None:
     second = msgspec.structs.replace(second, kept=True)
     session = msgspec.structs.replace(idle().session, poses=(first, second, *rest))
     paused = msgspec.structs.replace(idle(StationState.PAUSED), session=session)
-    assert progress_lines(paused) == ["2 of 25 poses captured, 1 to be taken again"]
+    assert progress_lines(paused) == ["2 of 25 poses captured, 1 to be captured again"]
 
 
 def test_a_drift_check_is_to_be_judged_and_not_solved() -> None:

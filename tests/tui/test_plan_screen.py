@@ -12,8 +12,9 @@ from textual.widgets import DataTable
 
 from calibrate.geometry import pose as pose_of
 from station.cell.status import EstimateStatus, PoseStatus
+from station.protocol import verbs
+from station.tui.desk import busy_words
 from station.tui.live import LiveScreen
-from station.tui.plan import PLANNING
 from station.tui.widgets.panels import estimate_lines, pose_map_lines, progress_lines
 from station.tui.words import POSE_MARKS
 from tests.tui.conftest import FakeLink, idle, until
@@ -27,9 +28,9 @@ class SlowPlanner(FakeLink):
         super().__init__()
         self.made = asyncio.Event()
 
-    async def request(self, verb: str, **args: Any) -> Any:
-        answer = await super().request(verb, **args)
-        if verb == "make_plan":
+    async def call(self, verb: verbs.Verb[Any], *, timeout_s: float = 0.0) -> Any:
+        answer = await super().call(verb)
+        if isinstance(verb, verbs.MakePlan):
             await self.made.wait()
         return answer
 
@@ -39,7 +40,7 @@ async def test_it_says_that_it_plans_for_as_long_as_it_does() -> None:
     async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
         await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
         await pilot.press("2", "n")
-        await until(pilot, lambda: PLANNING in text_of(pilot.app, "#reason"))
+        await until(pilot, lambda: busy_words(verbs.MakePlan(25)) in text_of(pilot.app, "#reason"))
         await pilot.press("n")
         await until(pilot, lambda: any("One after the other" in n.message for n in pilot.app._notifications))
         assert link.verbs.count("make_plan") == 1
@@ -56,7 +57,7 @@ async def test_the_end_of_two_hundred_poses_is_told_as_the_start_is(link: FakeLi
         await pilot.press("2", "end")
         await until(pilot, lambda: "place 200" in text_of(pilot.app, "#plan-detail"))
         await pilot.press("d")
-        await until(pilot, lambda: ("drop", {"index": 199}) in link.asked)
+        await until(pilot, lambda: verbs.Drop(199) in link.asked)
         fewer = msgspec.structs.replace(status.session, poses=poses[:-1])
         link.show(msgspec.structs.replace(status, session=fewer))
         await until(pilot, lambda: "place 199" in text_of(pilot.app, "#plan-detail"))
@@ -136,8 +137,8 @@ async def test_a_pose_added_here_is_called_by_its_number(link: FakeLink) -> None
         await until(pilot, lambda: "/22" in text_of(pilot.app, "#bar"))
         await pilot.press("2", "a")
         await until(pilot, lambda: "add" in link.verbs)
-        (added,) = [args for verb, args in link.asked if verb == "add"]
-        assert added["pose"]["name"] == "here-26"
+        (added,) = [verb for verb in link.asked if isinstance(verb, verbs.Add)]
+        assert added.pose.name == "here-26"
 
 
 def test_the_estimate_of_a_sealed_session_asks_for_no_more_poses() -> None:

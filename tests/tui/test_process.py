@@ -174,7 +174,7 @@ async def test_a_lost_screen_a_hung_and_a_killed_daemon_leave_the_session_whole(
     desk.rig.daemons[-1].process.send_signal(signal.SIGSTOP)
     await desk.rig.at_rest()
     await shows(second, "^ NO ANSWER for .* EMERGENCY STOP")
-    await shows(second, "The station does not answer")
+    await shows(second, "Daemon not responding")
     second.press("f12")
     await shows(second, "STOP was sent, but")
     desk.rig.daemons[-1].process.send_signal(signal.SIGCONT)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import pytest
 from textual.widgets import DataTable
 
@@ -12,13 +13,13 @@ from recordings.images import encode_png
 from recordings.writer import RecordingWriter
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import StationState
+from station.protocol import verbs
 from station.tui.app import ReplayApp
-from station.tui.replay import ReplayLink
+from station.tui.replay import END_TEXT, NO_ESTIMATE, ReplayLink, Timeline
 from station.tui.replay_screen import ReplayScreen
-from station.tui.timeline import END_TEXT, NO_ESTIMATE, Timeline
 from station.tui.widgets.preview import Preview
 from tests.recordings.small_recording import make_info, make_picture, make_view
-from tests.tui.conftest import FakeLink, idle, until
+from tests.tui.conftest import FakeLink, idle, summary, until
 from tests.tui.test_keys import app_on, text_of
 
 SAMPLE = Path(recordings.__file__).parent / "samples" / "paper-640.mcap"
@@ -47,7 +48,7 @@ def test_a_picture_that_cannot_be_decoded_is_said_in_its_place(tmp_path: Path) -
         writer.view(make_view(0))
         writer.finish()
     link = ReplayLink(tmp_path / "a.mcap", 0.0)
-    assert link._look(make_view(0), 80, 24) is None
+    assert not link._look(make_view(0), 80, 24).jpeg_base64
     assert "picture 0 the PNG is cut" in link._seen.reason
 
 
@@ -58,7 +59,7 @@ async def test_it_plays_to_its_end_with_pictures_and_marks(link: FakeLink) -> No
         assert END_TEXT in text_of(pilot.app, "#reason")
         assert text_of(pilot.app, "#estimate").split("\n") == ["25 views", NO_ESTIMATE]
         preview = pilot.app.screen.query_one(Preview)
-        await until(pilot, lambda: preview._picture is not None and len(preview._corners) == 42)
+        await until(pilot, lambda: preview._image is not None and len(preview._corners) == 42)
 
 
 async def test_it_pauses_steps_jumps_and_starts_again() -> None:
@@ -90,10 +91,13 @@ async def test_it_pauses_steps_jumps_and_starts_again() -> None:
         await shows(0, "playing")
 
 
-@pytest.mark.parametrize("verb", ["stop", "lease", "prepare", "go", "acknowledge", "finish", "retake"])
-async def test_nothing_can_be_commanded(verb: str) -> None:
-    with pytest.raises(RefusedError, match="PLAYBACK"):
-        await ReplayLink(SAMPLE).request(verb)  # type: ignore[arg-type]
+@pytest.mark.parametrize(
+    "verb", [verbs.Stop(), verbs.Lease(), verbs.Prepare(), verbs.Go("t"), verbs.Finish(), verbs.Retake(0)]
+)
+async def test_nothing_can_be_commanded(verb: verbs.Verb[object]) -> None:
+    with pytest.raises(RefusedError) as refused:
+        await ReplayLink(SAMPLE).call(verb)
+    assert refused.value.code == "playback"
 
 
 def test_a_missing_recording_is_said_before_the_screen_opens(tmp_path: Path) -> None:
@@ -104,9 +108,7 @@ def test_a_missing_recording_is_said_before_the_screen_opens(tmp_path: Path) -> 
 @pytest.fixture
 def beside(link: FakeLink) -> FakeLink:
     """A cell whose sessions screen lists the sample."""
-    link.answers["sessions"] = [
-        {"name": "s-0", "folder": str(SAMPLE), "recording": str(SAMPLE), "sealed": True}
-    ]
+    link.answers["sessions"] = [msgspec.structs.replace(summary("s-0"), folder=str(SAMPLE))]
     return link
 
 

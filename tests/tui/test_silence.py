@@ -8,9 +8,9 @@ from textual.widgets import DataTable
 
 from station.cell.status import Event, StationState
 from station.protocol.client import DaemonGoneError
-from station.tui import link as link_module
-from station.tui.app import StationApp
-from station.tui.commands import STOP_UNHEARD
+from station.tui import attendance
+from station.tui.app import SILENT, StationApp
+from station.tui.desk import STOP_UNHEARD
 from station.tui.widgets.preview import OLD, Preview
 from tests.tui.conftest import FakeLink, idle, until
 from tests.tui.test_keys import app_on, text_of
@@ -18,8 +18,8 @@ from tests.tui.test_keys import app_on, text_of
 
 @pytest.fixture(autouse=True)
 def short_patience(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(link_module, "LISTEN_S", 0.02)
-    monkeypatch.setattr(link_module, "SILENT_S", 0.1)
+    monkeypatch.setattr(attendance, "LISTEN_S", 0.02)
+    monkeypatch.setattr(attendance, "SILENT_S", 0.1)
 
 
 async def test_a_daemon_that_does_not_answer_is_announced_and_what_it_said_is_old(link: FakeLink) -> None:
@@ -27,13 +27,13 @@ async def test_a_daemon_that_does_not_answer_is_announced_and_what_it_said_is_ol
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: "MOVING" in text_of(pilot.app, "#bar"))
         preview = pilot.app.screen.query_one(Preview)
-        await until(pilot, lambda: preview._picture is not None)
+        await until(pilot, lambda: preview._image is not None)
         link.silent.set()
         await until(pilot, lambda: "NO ANSWER" in text_of(pilot.app, "#bar"))
         await pilot.pause()
         assert "MOVING" not in text_of(pilot.app, "#bar")
         assert "EMERGENCY STOP" in text_of(pilot.app, "#bar")
-        assert "does not answer" in text_of(pilot.app, "#reason")
+        assert SILENT in " ".join(text_of(pilot.app, "#reason").split())
         assert str(pilot.app.screen.query_one("#devices").border_title) == "Devices: OLD"
         assert OLD in preview.render_line(preview.size.height // 2).text
         await pilot.press("2")  # every screen says it

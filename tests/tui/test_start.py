@@ -7,9 +7,10 @@ import pytest
 from textual.widgets import DataTable
 
 from station.cell.status import StationState
+from station.protocol.verbs import Check
 from station.tui.app import StationApp
 from station.tui.checklist import ChecklistScreen
-from station.tui.help import Help
+from station.tui.dialogs import Help
 from station.tui.live import LiveScreen
 from station.tui.plan import NO_PLAN, PlanScreen
 from station.tui.themes import chosen_theme
@@ -17,8 +18,8 @@ from station.tui.widgets.preview import Preview
 from tests.tui.conftest import FakeLink, idle, until
 from tests.tui.test_keys import app_on, text_of
 
-MISSING = [{"name": "robot", "state": "failed", "text": "no answer", "remedy": "switch it on"}]
-THERE = [{"name": "robot", "state": "ok", "text": "UR10"}]
+MISSING = [Check("robot", "failed", "no answer", "switch it on")]
+THERE = [Check("robot", "ok", "UR10")]
 
 
 async def test_without_a_robot_the_checklist_comes_first(link: FakeLink) -> None:
@@ -63,7 +64,7 @@ async def test_later_the_live_screen_comes_first(link: FakeLink) -> None:
     ("screen", "keys", "words"),
     [
         ("1", ["f7"], "no session is running"),
-        ("1", ["f9"], "Nothing is sealed yet"),
+        ("1", ["f9"], "Nothing is finished yet"),
         ("2", ["r"], "No plan is loaded"),
         ("2", ["ctrl+up"], "No plan is loaded"),
         ("3", ["i"], "There is no result"),
@@ -114,7 +115,7 @@ async def test_help_names_every_key_of_the_screen_and_stop_works_in_it(link: Fak
         await pilot.press("2", "f1")
         await until(pilot, lambda: isinstance(pilot.app.screen, Help))
         shown = pilot.app.export_screenshot().replace("&#160;", " ")
-        for words in ("F5 ", "Retake: Take this pose again", "Ctrl-q", "4 ", "Nothing moves without"):
+        for words in ("F5 ", "Retake: Capture this pose again", "^q", "4 ", "Nothing moves without"):
             assert words in shown, words
         await pilot.press("f12")
         await until(pilot, lambda: link.verbs == ["stop"])
@@ -145,7 +146,7 @@ async def test_the_picture_needs_no_grey_background_on_a_console(
     monkeypatch.setenv("TEXTUAL_THEME", theme)
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         preview = pilot.app.screen.query_one(Preview)
-        await until(pilot, lambda: preview._picture is not None)
+        await until(pilot, lambda: preview._image is not None)
         text = "".join(preview.render_line(y).text for y in range(preview.size.height))
         assert set(text) - {" ", "+"} <= set(marks)
         assert "+" in text

@@ -14,10 +14,10 @@ _ALARM = {StationState.STOPPED, StationState.FAULT, StationState.DISCONNECTED}
 STOP_KEY = "F12=STOP"
 LEVELS = 6
 _NEXT = {
-    StationState.STOPPED: "F8: I looked at the cell",
-    StationState.FAULT: "F8: I looked at the cell",
-    StationState.PAUSED: "F5 goes on, F7 finishes",
-    StationState.FREE_DRIVE: "F2 takes a picture here, F3 ends it",
+    StationState.STOPPED: "F8 after a look at the cell",
+    StationState.FAULT: "F8 after a look at the cell",
+    StationState.PAUSED: "F5 continues, F7 finishes",
+    StationState.FREE_DRIVE: "F2 captures an image here, F3 ends it",
 }
 """Which key is next. The daemon's own sentence is for shells too."""
 _AT_REST = {StationState.IDLE, StationState.PAUSED, StationState.FREE_DRIVE}

@@ -132,16 +132,16 @@ def _counted(session: SessionStatus) -> list[str]:
     if not session.poses:
         return ["no plan loaded"]
     if not session.name:
-        return [f"{len(session.poses)} poses planned: F5 shows the way and asks"]
+        return [f"{len(session.poses)} poses planned: F5 shows the path and asks"]
     done = sum(pose.counts for pose in session.poses)
     again = sum(pose.kept for pose in session.poses)
     closed = ""
     if session.recording:
-        closed = ", sealed: k on 4 judges it" if session.check else ", sealed: F9 solves it"
+        closed = ", finished: k on 4 judges it" if session.check else ", finished: F9 solves it"
     if session.calibration:
         closed = ", solved: 3 shows it"
     if again and not closed:
-        closed = f", {again} to be taken again"
+        closed = f", {again} to be captured again"
     return [f"{done} of {len(session.poses)} poses captured{closed}"]
 
 
@@ -167,7 +167,7 @@ _SHADES = " ░▒▓█"
 
 
 def coverage_lines(status: StationStatus) -> list[str]:
-    """The picture as a grid: the fuller a part, the more corners were seen there."""
+    """The image as a grid: the fuller a part, the more corners were seen there."""
     counts = status.estimate.image_coverage
     if not counts:
         return ["no corners yet"]

@@ -1,4 +1,4 @@
-"""The camera's picture and its found corners: half blocks on any terminal, sharp where it can draw them."""
+"""The camera's image and its found corners: half blocks on any terminal, sharp where it can draw them."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import base64
 import time
 from functools import lru_cache
 from itertools import groupby
-from typing import TYPE_CHECKING, Any, cast
+from typing import cast
 
 import cv2
 import numpy as np
@@ -20,29 +20,27 @@ from textual.reactive import reactive
 from textual.strip import Strip
 from textual.widget import Widget
 
-from station.tui.link import Link
+from station.protocol import verbs
+from station.tui.desk import Desk, Link
 from station.tui.widgets.graphics import PERIOD_S, SHARE, Graphics, SharpPicture
-
-if TYPE_CHECKING:
-    from station.tui.app import StationApp
 
 Grey = NDArray[np.uint8]
 LEVELS = 20
-"""Shades a terminal picture is drawn with: fewer styles to send, and no eye sees more in half blocks."""
+"""Shades a terminal image is drawn with: fewer styles to send, and no eye sees more in half blocks."""
 CORNER = Segment("+", Style(color=Color.from_rgb(0, 230, 0), bgcolor=Color.from_rgb(0, 0, 0), bold=True))
 """A sign and not only a colour."""
 
-OLD = "OLD PICTURE"
+OLD = "OLD IMAGE"
 SMALLEST = (16, 16)
-"""Pixels of a picture that nobody will see."""
+"""Pixels of an image that nobody will see."""
 FEW_SHADES = " ░▒▓█"
 """For a console with 16 colours, whose backgrounds have no greys: one shade a cell."""
 
 
 class Preview(Widget):
-    """Shows the last picture it was given; scales with its own size, keeps the aspect ratio.
+    """The last image it was given; scales with its own size, keeps the aspect ratio.
 
-    Half blocks are drawn whenever something may stand over the picture: a terminal's own graphics hide text.
+    Half blocks are drawn whenever something may stand over the image: a terminal's own graphics hide text.
     """
 
     DEFAULT_CSS = "Preview { width: 1fr; height: 1fr; }"
@@ -52,8 +50,8 @@ class Preview(Widget):
 
     def __init__(self, *, id: str | None = None) -> None:
         super().__init__(id=id)
-        self._picture: Grey | None = None
-        self._sequence: object = None
+        self._image: Grey | None = None
+        self._sequence: int | None = None
         self._corners: NDArray[np.float64] = np.zeros((0, 2))
         self._rows: list[Strip] = []
         self._rows_size = Size(0, 0)
@@ -62,45 +60,46 @@ class Preview(Widget):
         """Not before: drawing takes no more than its share of the computer."""
 
     async def fetch(self, link: Link) -> None:
-        """Asks for a picture and shows it. What the daemon sees in it stands in the status, shown or not.
+        """Ask for an image and show it. What the daemon sees in it stands in the status, shown or not.
 
         Until the next one may be drawn the smallest will do: a large one is dear to send and to read.
         """
         due = time.monotonic() >= self._next_s
         width, height = self.wanted_pixels() if due else SMALLEST
-        if (answer := await link.request("preview", width=width, height=height)) and due:
+        answer = await link.call(verbs.Preview(width, height))
+        if due and answer.jpeg_base64:
             await self.show(answer)
 
-    async def show(self, answer: dict[str, Any]) -> None:
-        """A `preview` reply: jpeg_base64, and corners as fractions of width and height."""
-        if answer.get("sequence") is not None and answer["sequence"] == self._sequence:
+    async def show(self, answer: verbs.PreviewImage) -> None:
+        """Show an image unless it stands there already."""
+        if answer.sequence == self._sequence:
             return
-        data = np.frombuffer(base64.b64decode(answer.get("jpeg_base64", "")), dtype=np.uint8)
-        picture = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE) if len(data) else None
-        if picture is None:
+        data = np.frombuffer(base64.b64decode(answer.jpeg_base64), dtype=np.uint8)
+        image = cv2.imdecode(data, cv2.IMREAD_GRAYSCALE)
+        if image is None:
             return
-        self._picture, self._sequence = np.asarray(picture, dtype=np.uint8), answer.get("sequence")
-        self._corners = np.array(answer.get("corners", []), dtype=float).reshape(-1, 2)
+        self._image, self._sequence = np.asarray(image, dtype=np.uint8), answer.sequence
+        self._corners = np.array(answer.corners, dtype=float).reshape(-1, 2)
         self._rows_size = Size(0, 0)
         await self._sharpen(self.size)
         self.refresh()
 
     async def _sharpen(self, size: Size) -> None:
         graphics, self._sharp = self._graphics(), None
-        if graphics is None or self._picture is None:
+        if graphics is None or self._image is None:
             return
-        self._sharp = await asyncio.to_thread(graphics.draw, self._picture, self._corners, size)
+        self._sharp = await asyncio.to_thread(graphics.draw, self._image, self._corners, size)
         self._next_s = time.monotonic() + max(PERIOD_S, self._sharp.spent_s / SHARE)
 
     def _graphics(self) -> Graphics | None:
-        """How this terminal draws pictures; None while half blocks are due."""
-        graphics = cast("StationApp", self.app).graphics
+        """How this terminal draws images; None while half blocks are due."""
+        graphics = cast(Desk, self.app).graphics
         if graphics is None or self.old or not self.screen.is_active or not graphics.ready():
             return None
         return None if any(part.display for part in self.screen.query("Toast, Tooltip")) else graphics
 
     def wanted_pixels(self) -> tuple[int, int]:
-        """Width and height of a picture that shows all that this widget can: a cell is one by two."""
+        """Width and height of an image that shows all that this widget can: a cell is one by two."""
         if (graphics := self._graphics()) is not None:
             return graphics.pixels(self.size)
         return max(16, self.size.width), max(16, 2 * self.size.height)
@@ -113,18 +112,18 @@ class Preview(Widget):
     def render_line(self, y: int) -> Strip:
         if self._rows_size != self.size:
             self._rows, self._rows_size = self._draw(self.size), self.size
-        if self.old and self._picture is not None and y == self.size.height // 2:
+        if self.old and self._image is not None and y == self.size.height // 2:
             return Strip([Segment(OLD.center(self.size.width), Style(reverse=True, bold=True))])
         return self._rows[y] if y < len(self._rows) else Strip.blank(self.size.width, self.rich_style)
 
     def _draw(self, size: Size) -> list[Strip]:
-        if self._picture is None or size.width < 2 or size.height < 1:
-            words = Segment("no picture yet".center(size.width), self.rich_style)
+        if self._image is None or size.width < 2 or size.height < 1:
+            words = Segment("no image yet".center(size.width), self.rich_style)
             return [Strip([words])] if size.width else []
-        height, width = self._picture.shape
+        height, width = self._image.shape
         scale = min(size.width / width, 2 * size.height / height)
         columns, rows = max(1, int(width * scale)), max(2, int(height * scale) // 2 * 2)
-        small = cv2.resize(self._picture, (columns, rows), interpolation=cv2.INTER_AREA)
+        small = cv2.resize(self._image, (columns, rows), interpolation=cv2.INTER_AREA)
         shades = (small.astype(int) * LEVELS // 256).reshape(rows // 2, 2, columns)
         few = self.app.current_theme.ansi
         shades_of_a_cell = shades[:, 0] + shades[:, 1] if few else shades[:, 0] * LEVELS + shades[:, 1]

@@ -20,10 +20,8 @@ import typer
 from station.cell.errors import RefusedError
 from station.cell.plan import plan_sha256
 from station.cell.status import MotionPreview
-from station.cli import main
-from station.cli import session as cli_session
+from station.cli import attended, main
 from station.cli.screen import tell_what_goes_on
-from station.operate import attend
 from station.plan.files import load_plan
 from station.protocol.client import NoAnswerError
 from station.protocol.states import RUNNING
@@ -75,11 +73,13 @@ def test_one_pose_more_leaves_the_session_open(shell: Shell, monkeypatch: pytest
     """Where nobody is there to say how it goes on, every other command seals what it got."""
     asked: dict[str, bool] = {}
 
-    async def carry_out(_: object, purpose: str, *, finish_with_loss: bool, **more: object) -> None:
+    async def carry_out(
+        _: object, purpose: str, *more: object, finish_with_loss: bool, **rest: object
+    ) -> None:
         asked[purpose] = finish_with_loss
         raise RefusedError("seen enough")
 
-    monkeypatch.setattr(cli_session, "carry_out", carry_out)
+    monkeypatch.setattr(attended, "carry_out", carry_out)
     for command in ("next-pose", "replan", "resume"):
         assert "seen enough" in shell.ask(command, "--headless")[2]
     assert asked == {"best": False, "improve": True, "resume": True}
@@ -137,10 +137,10 @@ def test_ctrl_c_is_stop(shell: Shell, tmp_path: Path) -> None:
 
 async def test_ctrl_c_without_an_answer_says_what_to_do(capsys: pytest.CaptureFixture[str]) -> None:
     class Hanging:
-        async def request(self, verb: str, *, timeout_s: float) -> None:
-            raise NoAnswerError(f"{verb}: no answer from the daemon within {timeout_s:.0f} s.")
+        async def call(self, verb: object, *, timeout_s: float) -> None:
+            raise NoAnswerError(f"no answer from the daemon within {timeout_s:.0f} s.")
 
-    await attend.stop_and_say(Hanging())  # type: ignore[arg-type]
+    await attended.stop_and_say(Hanging())  # type: ignore[arg-type]
     said = capsys.readouterr().err
     assert "STOP was not answered" in said and "use the emergency stop" in said
 
@@ -157,7 +157,7 @@ def test_ctrl_c_at_the_question_is_a_no_at_once(monkeypatch: pytest.MonkeyPatch)
     monkeypatch.setattr(typer, "confirm", pressed)
 
     async def ask() -> bool:  # below an event loop's own handler of Ctrl-C
-        return cli_session.ask_person(summary)
+        return attended.ask_person(summary)
 
     before = signal.getsignal(signal.SIGINT)
     assert asyncio.run(ask()) is False

@@ -15,8 +15,9 @@ from station.cell.status import Event, MotionPreview, PoseStatus, SessionStatus,
 from station.cli import control as cli_control
 from station.cli import main
 from station.cli import session as cli_session
-from station.operate.attend import Outcome
-from station.operate.progress import SessionProgress
+from station.cli.attended import ask_person
+from station.cli.progress import SessionProgress
+from station.operate.motion import Outcome
 from station.plan.files import save_plan
 from station.protocol.verbs import Check
 from station.simulation.scenes import cell_config, make_cell
@@ -82,7 +83,7 @@ def test_a_question(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixtu
     told = {"purpose": f"p {ALL}", "first_move": f"f {ALL}", "changes": (f"c {ALL}",), "warnings": (ALL,)}
     numbers = {"poses": 1, "path_m": 1, "largest_step_rad": 1, "top_speed_m_s": 0.1, "duration_s": 1}
     go = msgspec.convert({"token": "", "plan_sha256": "", **told, **numbers}, MotionPreview)
-    assert cli_session.ask_person(go)
+    assert ask_person(go)
     said = capsys.readouterr().err
     assert said.count(ALL) == 4
     assert "The arm will move: p" in said

@@ -1,38 +1,117 @@
-"""What `station check` says before its poses take the place of a plan."""
+"""The drift check: nothing moves or is lost without an approval, and its own recording ends it."""
 
 from __future__ import annotations
 
 from collections.abc import AsyncIterator
-from typing import Any, cast
+from pathlib import Path
+from typing import Any
 
 import pytest
 
-from station.cell.status import PoseStatus, SessionStatus, StationStatus
-from station.cli import session as cli_session
-from station.operate.drift_check import never_run
-from station.protocol.client import Client
+from calibrate.errors import CalibrationError
+from station.cell.errors import RefusedError
+from station.cell.plan import Plan, PlannedPose
+from station.cell.status import MotionPreview, PoseStatus, SessionStatus, StationState, StationStatus
+from station.operate import drift_check
+from station.operate.drift_check import recorded, start_drift_check
+from station.protocol import verbs
+
+PREVIEW = MotionPreview("t", "drift check", "cd" * 32, 8, 1.0, 0.5, 0.2, 30.0, "")
+LOADED = Plan("UR10", "eye-in-hand", (PlannedPose("p1", (0.0,) * 6),) * 3)
 
 
-class FakeClient:
-    def __init__(self, *attempts: int) -> None:
-        poses = tuple(PoseStatus(i, f"p{i}", attempt=attempt) for i, attempt in enumerate(attempts))
-        self.status = StationStatus(session=SessionStatus(poses=poses))
-        self.asked: list[str] = []
+class FakeLink:
+    root = Path("root")
+
+    def __init__(self, *told: StationStatus) -> None:
+        self.asked: list[verbs.Verb[Any]] = []
+        self.refuse: type[verbs.Verb[Any]] | None = None
+        self._told = told
+
+    async def call(self, verb: verbs.Verb[Any], *, timeout_s: float = 0.0) -> Any:
+        self.asked.append(verb)
+        if self.refuse is type(verb):
+            raise RefusedError("not now")
+        answers = {
+            verbs.GetPlan: verbs.LoadedPlan(LOADED),
+            verbs.MakePlan: verbs.PlanFacts(8, PREVIEW.plan_sha256),
+            verbs.Prepare: PREVIEW,
+        }
+        return answers.get(type(verb), verbs.Done())
 
     async def statuses(self) -> AsyncIterator[StationStatus]:
-        yield self.status
+        for status in self._told:
+            yield status
 
-    async def request(self, verb: str, **args: Any) -> None:
-        self.asked.append(verb)
+    def outdate(self) -> None:
+        pass
 
 
-@pytest.mark.parametrize(("attempts", "lost"), [((), 0), ((0, 0, 0), 3), ((1, 0, 0), 0)])
+class Person:
+    def __init__(self, yes: bool = True) -> None:
+        self.yes, self.shown = yes, PREVIEW
+
+    async def approves(self, preview: MotionPreview) -> bool:
+        self.shown = preview
+        return self.yes
+
+
+def loaded(*attempts: int) -> StationStatus:
+    poses = tuple(PoseStatus(i, f"p{i}", attempt=attempt) for i, attempt in enumerate(attempts))
+    return StationStatus(session=SessionStatus(poses=poses))
+
+
+@pytest.fixture(autouse=True)
+def installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drift_check, "load_installed", lambda root, allow_simulated: None)
+
+
+@pytest.mark.parametrize(("attempts", "named"), [((), False), ((0, 0, 0), True), ((1, 0, 0), False)])
 async def test_a_plan_that_was_never_run_is_named_before_it_is_replaced(
-    attempts: tuple[int, ...], lost: int, capsys: pytest.CaptureFixture[str]
+    attempts: tuple[int, ...], named: bool
 ) -> None:
-    client = FakeClient(*attempts)
-    assert never_run(client.status) == lost
-    await cli_session._make(cast(Client, client), 8)
-    assert client.asked == ["make_plan"]
-    words = " ".join(capsys.readouterr().err.split())
-    assert (f"loaded plan of {lost} poses, which was never run" in words) is bool(lost)
+    link, person = FakeLink(), Person()
+    assert await start_drift_check(link, loaded(*attempts), person.approves) == PREVIEW.plan_sha256
+    assert bool(person.shown.changes) is named
+    assert link.asked[-1] == verbs.Go("t", PREVIEW.plan_sha256)
+
+
+@pytest.mark.parametrize("refused", [None, verbs.Prepare, verbs.Go])
+async def test_it_is_loaded_again_where_nothing_was_started(refused: type[verbs.Verb[Any]] | None) -> None:
+    link, person = FakeLink(), Person(yes=refused is not None)
+    link.refuse = refused
+    if refused is None:
+        assert await start_drift_check(link, loaded(0), person.approves) == ""
+        assert verbs.Go not in map(type, link.asked)
+    else:
+        with pytest.raises(RefusedError):
+            await start_drift_check(link, loaded(0), person.approves)
+    assert link.asked[-1] == verbs.LoadPlan(LOADED)
+
+
+async def test_nothing_is_planned_where_nothing_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def nothing(root: Path, allow_simulated: bool) -> None:
+        raise CalibrationError("nothing is installed")
+
+    monkeypatch.setattr(drift_check, "load_installed", nothing)
+    link = FakeLink()
+    with pytest.raises(CalibrationError):
+        await start_drift_check(link, loaded(), Person().approves)
+    assert link.asked == []
+
+
+def during(sha256: str, recording: str = "", state: StationState = StationState.IDLE) -> StationStatus:
+    return StationStatus(state=state, session=SessionStatus(plan_sha256=sha256, recording=recording))
+
+
+async def test_its_finished_recording_ends_it_after_pauses_too() -> None:
+    moments = [("old", ""), ("check", StationState.MOVING), ("check", StationState.PAUSED)]
+    told = [during(sha256, state=StationState(state or "idle")) for sha256, state in moments]
+    sealing = during("check", "r.mcap", StationState.SEALING)
+    done = await recorded(FakeLink(*told, sealing, during("check", "r.mcap")), "check")
+    assert done == SessionStatus(plan_sha256="check", recording="r.mcap")
+
+
+async def test_another_plan_ends_it_without_a_recording() -> None:
+    assert await recorded(FakeLink(during("check"), during("new", "r.mcap")), "check") is None
+    assert await recorded(FakeLink(during("check")), "check") is None

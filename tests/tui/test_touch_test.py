@@ -17,8 +17,9 @@ from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.cell.errors import RefusedError
 from station.cell.status import HoverOffer, RobotStatus, StationState, StationStatus
 from station.plan.hover import outer_corners
-from station.tui.confirm import ConfirmGo
-from station.tui.verify import ChooseCorner, Touching
+from station.protocol import verbs
+from station.tui.dialogs import ConfirmMotion
+from station.tui.touch_test import ChooseCorner, Touching
 from tests.station.hover_cell import calibration_of
 from tests.station.session_rig import TRUTH
 from tests.tui.conftest import SUMMARY, FakeLink, idle, until
@@ -58,7 +59,7 @@ def calibration(tmp_path: Path) -> Path:
 
 async def choose(pilot: Pilot[None], link: FakeLink, calibration: Path, *pointer: str) -> None:
     """On the result screen, `h`, the pointer's length, the first corner."""
-    link.answers["hover"] = msgspec.to_builtins(OFFER)
+    link.answers["hover"] = OFFER
     await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
     pilot.app.result_path = str(calibration)  # type: ignore[attr-defined]
     await pilot.press("3")
@@ -72,7 +73,7 @@ async def choose(pilot: Pilot[None], link: FakeLink, calibration: Path, *pointer
 
 async def hover(pilot: Pilot[None], link: FakeLink, calibration: Path) -> None:
     await choose(pilot, link, calibration)
-    await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmGo))
+    await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmMotion))
     await pilot.press("tab", "enter")
     await until(pilot, lambda: isinstance(pilot.app.screen, Touching))
     link.show(at(0, 0, 150, StationState.MOVING))
@@ -90,13 +91,8 @@ def shown(pilot: Pilot[None], selector: str) -> str:
 async def test_nothing_moves_without_a_go_of_its_own(link: FakeLink, calibration: Path) -> None:
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await choose(pilot, link, calibration)
-        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmGo))
-        asked = dict(link.asked)["hover"]
-        assert (asked["corner"], asked["standoff_m"], asked["calibration"]) == (
-            CORNER,
-            STANDOFF_M,
-            str(calibration),
-        )
+        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmMotion))
+        assert verbs.Hover(str(calibration), CORNER, STANDOFF_M) in link.asked
         await pilot.press("enter")  # the easy answer is no
         await until(pilot, lambda: isinstance(pilot.app.screen, ChooseCorner))
         assert "go" not in link.verbs
@@ -105,16 +101,16 @@ async def test_nothing_moves_without_a_go_of_its_own(link: FakeLink, calibration
 async def test_what_is_told_goes_into_the_file(link: FakeLink, calibration: Path) -> None:
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await hover(pilot, link, calibration)
-        assert ("go", {"token": SUMMARY.token, "plan_sha256": SUMMARY.plan_sha256}) in link.asked
+        assert verbs.Go(SUMMARY.token, SUMMARY.plan_sha256) in link.asked
         link.show(at(0.1, 0, 80))
-        await until(pilot, lambda: "80 mm above" in shown(pilot, "#verify-text"))
+        await until(pilot, lambda: "80 mm above" in shown(pilot, "#touch-text"))
         await pilot.press(*"nonsense", "enter")
-        await until(pilot, lambda: "two numbers" in shown(pilot, "#verify-problem"))
+        await until(pilot, lambda: "two numbers" in shown(pilot, "#dialog-problem"))
         pilot.app.screen.query_one(Input).value = "0.3,-0.2"
         await pilot.press("enter")
         await until(pilot, lambda: isinstance(pilot.app.screen, ChooseCorner))
         await pilot.press("escape")
-        await until(pilot, lambda: "by hand" in text_of(pilot.app, "#verdict"))
+        await until(pilot, lambda: "touch test, corner" in text_of(pilot.app, "#verdict"))
         (touch,) = read_calibration(calibration).verification
         assert touch.offset_mm == pytest.approx((0.2, -0.2), abs=1e-6)
         assert touch.found == "told by a person"
@@ -128,7 +124,7 @@ async def test_what_is_found_of_the_installed_one_is_noted_there_too(
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await hover(pilot, link, calibration)
         link.show(at(0.1, 0, 80))
-        await until(pilot, lambda: "80 mm above" in shown(pilot, "#verify-text"))
+        await until(pilot, lambda: "80 mm above" in shown(pilot, "#touch-text"))
         pilot.app.screen.query_one(Input).value = "9,0"
         await pilot.press("enter")
         await until(pilot, lambda: isinstance(pilot.app.screen, ChooseCorner))
@@ -144,9 +140,9 @@ async def test_the_next_corner_is_marked_and_the_boards_axes_are_told(
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await hover(pilot, link, calibration)
         link.show(at(0.1, 0, 80))
-        await until(pilot, lambda: "80 mm above" in shown(pilot, "#verify-text"))
+        await until(pilot, lambda: "80 mm above" in shown(pilot, "#touch-text"))
         axes = f"x (from corner {origin} to {x_end}) and y (from {origin} to {y_end})"
-        assert axes in shown(pilot, "#verify-text")
+        assert axes in shown(pilot, "#touch-text")
         pilot.app.screen.query_one(Input).value = "0.3,-0.2"
         await pilot.press("enter")
         await until(pilot, lambda: isinstance(pilot.app.screen, ChooseCorner))
@@ -160,9 +156,9 @@ async def test_or_is_read_from_the_arm_once_the_tip_is_on_the_corner(
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await hover(pilot, link, calibration)
         link.show(at(0, 0, 80))
-        await until(pilot, lambda: "80 mm above" in shown(pilot, "#verify-text"))
+        await until(pilot, lambda: "80 mm above" in shown(pilot, "#touch-text"))
         await pilot.press("enter")
-        await until(pilot, lambda: "off the board" in shown(pilot, "#verify-problem"))
+        await until(pilot, lambda: "off the board" in shown(pilot, "#dialog-problem"))
         link.show(at(0.5, 0.25, 0))
         await until(pilot, lambda: (s := pilot.app.status) is not None and s == at(0.5, 0.25, 0))  # type: ignore[attr-defined]
         await pilot.press("enter")
@@ -181,7 +177,7 @@ async def test_stop_on_the_way_ends_it_with_nothing_found(link: FakeLink, calibr
         await until(pilot, lambda: "stop" in link.verbs)
         link.show(at(0, 0, 120, StationState.STOPPED))
         await until(pilot, lambda: isinstance(pilot.app.screen, ChooseCorner))
-        assert any("stopped" in said.message for said in pilot.app._notifications)
+        await until(pilot, lambda: any("stopped" in said.message for said in pilot.app._notifications))
         await pilot.press("f8")
         await until(pilot, lambda: "acknowledge" in link.verbs)
         await pilot.press("escape")
@@ -192,19 +188,19 @@ async def test_stop_on_the_way_ends_it_with_nothing_found(link: FakeLink, calibr
 async def test_a_fault_before_the_first_move_ends_it_too(link: FakeLink, calibration: Path) -> None:
     async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
         await choose(pilot, link, calibration)
-        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmGo))
+        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmMotion))
         await pilot.press("tab", "enter")
         await until(pilot, lambda: isinstance(pilot.app.screen, Touching))
         link.show(idle(StationState.FAULT, "the heartbeat is missing"))
         await until(pilot, lambda: isinstance(pilot.app.screen, ChooseCorner))
-        assert any("heartbeat" in said.message for said in pilot.app._notifications)
+        await until(pilot, lambda: any("heartbeat" in said.message for said in pilot.app._notifications))
 
 
 async def test_the_pointer_is_asked_for_and_kept(link: FakeLink, calibration: Path) -> None:
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await choose(pilot, link, calibration, *"150")
-        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmGo))
-        assert dict(link.asked)["hover"]["pointer_m"] == pytest.approx(0.15)
+        await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmMotion))
+        assert verbs.Hover(str(calibration), CORNER, STANDOFF_M, 0.15) in link.asked
         await pilot.press("escape")
         await until(pilot, lambda: isinstance(pilot.app.screen, ChooseCorner))
         assert pilot.app.screen.query_one(Input).value == "150"
@@ -220,7 +216,7 @@ async def test_leaving_while_the_arm_moves_stops_it(link: FakeLink, calibration:
 async def test_a_corner_that_cannot_be_reached_is_said_and_another_may_be_chosen(
     link: FakeLink, calibration: Path
 ) -> None:
-    link.refuse["hover"] = RefusedError(f"corner {CORNER}: out of reach")
+    link.refuse["hover"] = RefusedError("out of reach", code="corner-out-of-reach", corner=CORNER)
     async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
         await choose(pilot, link, calibration)
         await until(pilot, lambda: any("out of reach" in said.message for said in pilot.app._notifications))

@@ -8,7 +8,7 @@ import pytest
 from calibrate.geometry import Array, pose, rotation_exp
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import HoverOffer, MotionPreview
-from station.operate.touching import (
+from station.operate.touch_test import (
     Hovering,
     read_offset_mm,
     tip_on_board_m,
@@ -50,8 +50,9 @@ def test_a_tip_over_its_corner_has_arrived_and_knows_how_far_beside_it_stands() 
 
 @pytest.mark.parametrize("place", [(0.106, 0.05, -0.08), (0.1, 0.044, -0.08), (0.1, 0.05, -0.074)])
 def test_a_tip_that_is_elsewhere_did_not_come(place: tuple[float, float, float]) -> None:
-    with pytest.raises(StationError, match="did not come over corner 7: STOP by anna"):
+    with pytest.raises(StationError) as problem:
         Hovering.arrived(OFFER, flange_with_tip_at(place), "STOP by anna")
+    assert problem.value.code == "not-over-corner" and "STOP by anna" in problem.value.text
 
 
 def test_the_tip_on_the_true_corner_tells_the_offset_the_other_way_round() -> None:
@@ -59,18 +60,20 @@ def test_the_tip_on_the_true_corner_tells_the_offset_the_other_way_round() -> No
 
 
 @pytest.mark.parametrize(
-    ("touching", "said"),
+    ("touching", "code", "distance_m"),
     [
-        ((0.1, 0.05, 0.011), "11 mm off the board"),
-        ((0.1, 0.05, -0.011), "11 mm off the board"),
-        ((0.16, 0.05, 0.0), "60 mm from corner 7"),
+        ((0.1, 0.05, 0.011), "not-touching", 0.011),
+        ((0.1, 0.05, -0.011), "not-touching", 0.011),
+        ((0.16, 0.05, 0.0), "other-corner", 0.06),
     ],
 )
 def test_a_tip_off_the_board_or_at_another_corner_is_no_touch(
-    touching: tuple[float, float, float], said: str
+    touching: tuple[float, float, float], code: str, distance_m: float
 ) -> None:
-    with pytest.raises(RefusedError, match=said):
+    with pytest.raises(RefusedError) as refused:
         read_offset_mm(OFFER, np.array(touching))
+    assert refused.value.code == code
+    assert refused.value.values["distance_m"] == pytest.approx(distance_m)
 
 
 @pytest.mark.parametrize("said", ["0.2,-0.1", " 0.2 ; -0.1 ", "0.2, -0.1"])
@@ -80,14 +83,15 @@ def test_two_numbers_as_people_type_them(said: str) -> None:
 
 @pytest.mark.parametrize("said", ["", "0.2", "0.2,0.1,0", "a,b", "nan,0", "inf,0", "51,0", "0,-51"])
 def test_anything_else_is_refused(said: str) -> None:
-    with pytest.raises(RefusedError, match="two numbers in mm, at most 50"):
+    with pytest.raises(RefusedError) as refused:
         two_numbers(said)
+    assert (refused.value.code, refused.value.values["limit_mm"]) == ("no-offset", 50.0)
 
 
 def test_what_goes_into_the_file_is_in_millimetres() -> None:
     hovering = Hovering.arrived(OFFER, flange_with_tip_at((0.1, 0.05, -0.08)), "")
-    touch = touch_of(hovering, np.array([0.12345, -0.2]), "told")
-    assert (touch.corner, touch.pointer, touch.found) == (7, "a needle", "told")
+    touch = touch_of(hovering, np.array([0.12345, -0.2]), "told by a person")
+    assert (touch.corner, touch.pointer, touch.found) == (7, "a needle", "told by a person")
     assert touch.corner_mm == pytest.approx((100, 50))
     assert touch.offset_mm == (0.123, -0.2)
     assert touch.sigma_mm == (0.1, 0.2)

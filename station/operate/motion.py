@@ -1,0 +1,158 @@
+"""Motion that a person approves: check the path, show it, start it, watch until the arm rests."""
+
+from __future__ import annotations
+
+import contextlib
+from asyncio import timeout
+from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol, TypeVar
+
+import msgspec
+
+from station.cell.errors import RefusedError
+from station.cell.status import MotionPreview, StationState, StationStatus
+from station.protocol.client import ANSWER_S, Client, DaemonGoneError
+from station.protocol.verbs import Finish, Go, Prepare, Purpose, Verb
+
+R = TypeVar("R")
+Watcher = Callable[[StationStatus], None]
+Approve = Callable[[MotionPreview], Awaitable[bool]]
+"""Show a person what would move; True: they approve exactly this motion."""
+CONNECT_WAIT_S = 30.0
+PREPARE_S = 200.0
+"""Poses may be planned for it: seconds on a quick computer, minutes on a busy one."""
+_RESTING = (StationState.PAUSED, StationState.STOPPED, StationState.FAULT, StationState.DISCONNECTED)
+
+
+class Link(Protocol):
+    """The daemon as a flow sees it: `station.protocol.client.Client`, or the screen's desk."""
+
+    @property
+    def root(self) -> Path | None:
+        """Below which the daemon keeps sessions and what is installed."""
+
+    async def call(self, verb: Verb[R], *, timeout_s: float = ANSWER_S) -> R:
+        """The verb's result. RefusedError with the daemon's code; StationError when it is gone."""
+
+    def statuses(self) -> AsyncIterator[StationStatus]:
+        """The full status now and at every change; ends when the daemon is gone."""
+
+    def outdate(self) -> None:
+        """What is known is older than what was just asked: `statuses` begins with the next change."""
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """How a session came to rest."""
+
+    status: StationStatus
+
+    @property
+    def recording(self) -> str:
+        """Path of the finished recording; empty while there is none."""
+        return self.status.session.recording
+
+    @property
+    def planned(self) -> int:
+        return len(self.status.session.poses)
+
+    @property
+    def captured(self) -> int:
+        return self.status.session.captured
+
+    @property
+    def exit_code(self) -> int:
+        """0 finished with all poses, 3 finished with fewer, 1 not finished."""
+        if not self.recording:
+            return 1
+        return 0 if self.captured == self.planned else 3
+
+
+async def status_now(socket: Path) -> StationStatus:
+    """The status as it is now, by a connection of its own, where none waits in a queue."""
+    async with await Client.connect(socket) as client:
+        async for status in client.statuses():
+            return status
+    raise DaemonGoneError("The daemon ended before it told its status.")
+
+
+async def wait_until_idle(link: Link) -> StationStatus:
+    """The status once robot and camera are there. RefusedError names what does not come."""
+    status, told = StationStatus(), False
+    with contextlib.suppress(TimeoutError):
+        async with timeout(CONNECT_WAIT_S):
+            async for status in link.statuses():
+                told = status.playback or status.robot.joints_rad is not None
+                if status.state is not StationState.DISCONNECTED and status.camera.connected and told:
+                    return status
+    missing = "camera" if status.robot.connected and told else "robot"
+    raise RefusedError(
+        f"The {missing} did not come within {CONNECT_WAIT_S:.0f} s.",
+        code=f"no-{missing}",
+        remedy="`station doctor` says why.",
+        limit_s=CONNECT_WAIT_S,
+    )
+
+
+async def prepared_motion(
+    link: Link, purpose: Purpose, approve: Approve, *, changes: tuple[str, ...] = (), headless: bool = False
+) -> bool:
+    """Check the whole path, then as `approved_motion`. `changes`: what else an approval changes."""
+    preview = await link.call(Prepare(purpose), timeout_s=PREPARE_S)
+    preview = msgspec.structs.replace(preview, changes=(*changes, *preview.changes))
+    return await approved_motion(link, preview, approve, headless)
+
+
+async def approved_motion(
+    link: Link, preview: MotionPreview, approve: Approve, headless: bool = False
+) -> bool:
+    """Start the motion that a person approves. False: they do not, and nothing moves.
+
+    `headless`: nobody will be asked on the way; poses that do not settle are tried once more.
+    """
+    if not await approve(preview):
+        return False
+    await link.call(Go(preview.token, preview.plan_sha256, headless))
+    link.outdate()  # it would show the session before, finished and at rest
+    return True
+
+
+async def carry_out(
+    link: Link,
+    purpose: Purpose,
+    approve: Approve,
+    watch: Watcher,
+    *,
+    finish_with_loss: bool = False,
+    headless: bool = False,
+) -> Outcome:
+    """One session from its approval until it rests. RefusedError when the daemon or the person says no."""
+    if not await prepared_motion(link, purpose, approve, headless=headless):
+        raise not_approved()
+    return await watched(link, watch, finish_with_loss)
+
+
+def not_approved() -> RefusedError:
+    return RefusedError("Nothing moved: the motion was not approved.", code="not-approved")
+
+
+async def watched(link: Link, watch: Watcher, finish_with_loss: bool = False) -> Outcome:
+    """How the session that was just started comes to rest; `finish_with_loss`: although poses failed."""
+    status = await _until_rest(link, watch)
+    if status.state is StationState.PAUSED and finish_with_loss and status.session.captured:
+        await link.call(Finish())
+        link.outdate()
+        status = await _until_rest(link, watch)
+    return Outcome(status)
+
+
+async def _until_rest(link: Link, watch: Watcher) -> StationStatus:
+    async for status in link.statuses():
+        watch(status)
+        if status.state in _RESTING:
+            return status
+        if status.state is StationState.IDLE and (status.session.recording or status.reason):
+            return status
+    raise DaemonGoneError("The daemon ended during the session.", remedy="What was saved before is safe.")

@@ -1,0 +1,267 @@
+"""The screen's desk: what is asked of the daemon, what a person is asked first, what is said when refused."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import AsyncIterator, Awaitable, Callable
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from textual import work
+from textual.app import App
+from textual.reactive import reactive
+
+from recordings.errors import CodedError
+from station.cell.errors import RefusedError, StationError
+from station.cell.status import MotionPreview, SessionStatus, StationState, StationStatus
+from station.operate import motion
+from station.operate.motion import prepared_motion
+from station.protocol import verbs
+from station.protocol.client import ANSWER_S
+from station.protocol.states import RUNNING
+from station.protocol.verbs import Purpose, Verb
+from station.tui.dialogs import Confirm, ConfirmMotion
+from station.tui.widgets.graphics import Graphics
+
+R = TypeVar("R")
+STOP_UNHEARD = "STOP was sent, but the station does not answer: press the EMERGENCY STOP on the pendant."
+DECELERATES = "It decelerates at once, and the session pauses."
+BUSY: dict[Purpose, str] = {
+    Purpose.REPLAN: "Planning the remaining poses again … Nothing moves.",
+    Purpose.NEXT_POSE: "Looking for the most useful pose … Nothing moves.",
+}
+
+
+class Link(motion.Link, Protocol):
+    """A connection: `station.protocol.client.Client`, a recording, or a test's own."""
+
+    async def close(self) -> None: ...
+
+
+class Desk(App[None]):
+    """Every wish goes through `call`; the daemon decides, nothing is decided here.
+
+    For the flows of `station.operate` it is a link: it takes control where a verb needs it, and says on every
+    screen what the daemon is at work on.
+    """
+
+    status: reactive[StationStatus | None] = reactive(None, repaint=False)
+    known: StationStatus | None = None
+    """The newest status; it outlives the daemon."""
+    serves = True
+    """A station stands behind this screen, not a recording alone."""
+    link: Link | None = None
+    """The connection while there is one."""
+    stop_unconnected: Callable[[], bool] = staticmethod(lambda: False)
+    """Sends STOP where there is no connection (`protocol.stop_client.send_stop`); False: nobody listens."""
+    silent_s: float | None = None
+    """For how long the daemon has not answered; None while it does."""
+    trouble = ""
+    """Why what is shown is not how it is: no daemon, or one that does not answer."""
+    busy = ""
+    """What the daemon is at work on for this screen; empty: nothing that takes long."""
+    graphics: Graphics | None = None
+    """How the terminal draws images; None: half blocks only."""
+    _own_id: int | None = None
+    """How the daemon knows this connection, once it had control."""
+    _newest: StationStatus | None = None
+    _news = asyncio.Event()
+
+    @property
+    def root(self) -> Path | None:
+        """Below which the daemon keeps sessions and what is installed."""
+        return None if self.link is None else self.link.root
+
+    def common_actions(self) -> list[str]:
+        """What has a key on every screen."""
+        return []
+
+    def playing(self) -> bool:
+        """A recording is shown in place of the cell."""
+        return False
+
+    async def call(self, verb: Verb[R], *, timeout_s: float = ANSWER_S) -> R:
+        """The verb's result. Raises StationError, also where nothing is sent: in a playback, while silent."""
+        if self.playing():
+            raise RefusedError(
+                "This is the PLAYBACK of a recording.",
+                code="playback",
+                remedy="Escape leaves it; F12 still stops the arm.",
+            )
+        if self.link is None:
+            raise StationError("No connection to the daemon: nothing was sent.", code="no-daemon")
+        if self.silent_s is not None:
+            raise StationError("The station does not answer: nothing was sent.", code="no-answer")
+        words = busy_words(verb)
+        if words and self.busy:
+            raise RefusedError(f"One after the other: {self.busy}", code="busy")
+        if words:
+            self.tell_busy(words)
+        try:
+            if verb.control and not isinstance(verb, verbs.Go):  # who approves had it before
+                await self._take_control(self.link)
+            return await self.link.call(verb, timeout_s=timeout_s)
+        finally:
+            if words:
+                self.tell_busy("")
+
+    async def _take_control(self, link: Link) -> None:
+        self._own_id = (await link.call(verbs.Lease("take"))).client_id
+
+    async def statuses(self) -> AsyncIterator[StationStatus]:
+        """Every new status from now on, slow readers the newest only."""
+        seen = self._newest
+        while True:
+            while self._newest is None or self._newest is seen:
+                await self._news.wait()
+            seen = self._newest
+            yield seen
+
+    def tell_newest(self, status: StationStatus) -> None:
+        """For `statuses`, before the screens' own slower pace."""
+        self._newest = status
+        self._news.set()
+        self._news = asyncio.Event()
+
+    def outdate(self) -> None:
+        if self.link is not None:
+            self.link.outdate()
+
+    async def attempt(self, work: Awaitable[R]) -> R | None:
+        """Its result, or None after a notice that says why not."""
+        try:
+            return await work
+        except (CodedError, OSError) as problem:
+            refused = isinstance(problem, RefusedError)
+            words = str(problem) or "The daemon is gone."
+            self.notify(words, severity="warning" if refused else "error", timeout=10, markup=False)
+        return None
+
+    async def ask(self, verb: Verb[R], *, timeout_s: float = ANSWER_S) -> R | None:
+        """As `call`, with a notice in place of an error."""
+        return await self.attempt(self.call(verb, timeout_s=timeout_s))
+
+    @work(group="command", exit_on_error=False)
+    async def send(self, verb: Verb[Any]) -> None:
+        """A wish of one of the screens."""
+        await self.ask(verb)
+
+    def has_control(self) -> bool:
+        """This screen has control, and no other."""
+        holder = None if self.status is None else self.status.lease.client_id
+        return holder is not None and holder == self._own_id
+
+    def tell_busy(self, words: str) -> None:
+        self.busy = words
+
+    async def approves(self, preview: MotionPreview) -> bool:
+        """The one question before anything moves."""
+        question: Confirm = ConfirmMotion(preview)
+        return await self.push_screen_wait(question)
+
+    async def start(self, begun: Awaitable[R]) -> R | None:
+        """A flow that begins with a motion; None when it did not come to that."""
+        if (started := await self.attempt(begun)) or None:
+            self.clear_notifications()  # they were of the time before
+        return started
+
+    # --- keys ---
+
+    @work(group="stop", exit_on_error=False)
+    async def action_stop(self) -> None:
+        await self.stop()
+
+    async def stop(self) -> None:
+        """STOP, whatever is shown, and also where nobody answers or no connection is left."""
+        if self.link is None:
+            if self.stop_unconnected():
+                self.notify("STOP was sent without a connection: look at the arm.", severity="warning")
+            else:
+                self.notify("No connection to the daemon: nothing was sent.", severity="error")
+            return
+        if self.silent_s is not None:
+            self.notify(STOP_UNHEARD, severity="error", timeout=10)
+        await self.attempt(self.link.call(verbs.Stop()))
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_run(self) -> None:
+        resuming = self.status is not None and self.status.state is StationState.PAUSED
+        await self.start(prepared_motion(self, Purpose.RESUME if resuming else Purpose.RUN, self.approves))
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_replan(self) -> None:
+        await self.start(prepared_motion(self, Purpose.REPLAN, self.approves))
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_next_pose(self) -> None:
+        await self.start(prepared_motion(self, Purpose.NEXT_POSE, self.approves))
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_pause(self) -> None:
+        await self.ask(verbs.Pause())
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_finish(self) -> None:
+        if self.status is not None and (refusal := verbs.Finish.refusal(self.status.state)) is not None:
+            self.notify(str(refusal), severity="warning")
+            return
+        session = SessionStatus() if self.status is None else self.status.session
+        captured = f"{session.captured} of {len(session.poses)} poses are captured."
+        body = f"{captured} The recording is closed; F9 then solves it."
+        if await self.push_screen_wait(Confirm("Finish this session?", body, yes="Finish")):
+            await self.ask(verbs.Finish())
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_freedrive(self) -> None:
+        """Capture by hand: the operator holds the pendant's freedrive button, the station only looks."""
+        if self.status is not None:
+            await self.ask(verbs.FreeDrive(self.status.state is not StationState.FREE_DRIVE))
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_record(self) -> None:
+        await self.ask(verbs.Record())
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_acknowledge(self) -> None:
+        if await self.ask(verbs.Acknowledge()) is not None:
+            self.clear_notifications()  # what they said of the stop is over
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_release(self) -> None:
+        """Another screen or a command may take control then."""
+        if self.status is None or not self.has_control():
+            holder = "" if self.status is None else self.status.lease.holder
+            self.notify(f"This screen does not have control: {holder or 'nobody'} does.", markup=False)
+            return
+        body = f"The arm works. {DECELERATES}"
+        if self.status.state not in RUNNING or await self.push_screen_wait(
+            Confirm("Release control?", body, yes="Release")
+        ):
+            await self.ask(verbs.Lease("release"))
+            self.notify("Control released: another screen or command may take it.")
+
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_leave(self) -> None:
+        state = None if self.status is None else self.status.state
+        if self.serves and state not in (None, StationState.IDLE, StationState.DISCONNECTED):
+            held = state in RUNNING and self.has_control()
+            text = (
+                f"The arm works, commanded from here. {DECELERATES}"
+                if held
+                else "The daemon and its session stay as they are; `station` opens this screen again."
+            )
+            if not await self.push_screen_wait(Confirm("Close the screen?", text, yes="Close")):
+                return
+        self.exit()
+
+
+def busy_words(verb: Verb[Any]) -> str:
+    """What takes the daemon seconds, or minutes on a busy computer; empty: an answer comes at once."""
+    match verb:
+        case verbs.MakePlan():
+            return f"Planning {verb.poses} poses … Nothing moves."
+        case verbs.Prepare():
+            return BUSY.get(verb.purpose, "Checking the path … Nothing moves.")
+        case verbs.Hover():
+            return f"Looking for a path over corner {verb.corner} … Nothing moves."
+    return ""

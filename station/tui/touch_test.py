@@ -1,0 +1,176 @@
+"""The touch test on the screen: which corner, by which pointer, and what the hand finds there."""
+
+from __future__ import annotations
+
+import asyncio
+from collections.abc import Awaitable
+from pathlib import Path
+from typing import ClassVar
+
+from rich.text import Text
+from textual import work
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import Vertical
+from textual.screen import ModalScreen
+from textual.widgets import Input, Label, OptionList, Static
+from textual.widgets.option_list import Option
+
+from calibrate.boards.model import board_points
+from calibrate.files.calibration import Touch, read_calibration
+from calibrate.files.verification import touch_text
+from recordings.schema.messages import BoardSpec
+from station.cell.errors import RefusedError, StationError
+from station.cell.status import HoverOffer, MotionPreview
+from station.operate.touch_test import Hovering, note_touches, touch_test, touch_told
+from station.plan.hover import outer_corners
+from station.tui.desk import Desk
+from station.tui.installed import state_root
+
+ABOUT = (
+    "The tip of the tool or pointer is put 80 mm above a corner of the board; every motion asks first and is "
+    "0.05 m/s at most. From there you guide it down by hand. The board must be in the camera's view now and "
+    "must not be touched until the end."
+)
+POINTER = "pointer's length in mm; empty: as configured, or as on the pendant"
+
+
+class ChooseCorner(ModalScreen[int | None]):
+    """Which corner is next, and by which pointer. None: no more of them."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("escape", "dismiss(None)", "End", tooltip="No more corners")
+    ]
+
+    def __init__(self, board: BoardSpec, found: dict[int, Touch], pointer_mm: str) -> None:
+        super().__init__()
+        self._board, self._found = board, found
+        self.pointer_mm = pointer_mm
+        """As typed; empty: the configured one, or the tool set on the pendant."""
+
+    def compose(self) -> ComposeResult:
+        with Vertical(id="dialog"):
+            yield Label("Touch test of this calibration", id="dialog-title")
+            yield Static(ABOUT, markup=False)
+            lines = [Option(self._line(corner), str(corner)) for corner in outer_corners(self._board)]
+            end = "end, and write what was found" if self._found else "end; nothing was found yet"
+            yield OptionList(*lines, Option(end, "end"), id="corners", compact=True)
+            yield Input(self.pointer_mm, id="pointer", type="number", placeholder=POINTER, compact=True)
+            yield Label("Enter: that corner. Tab: the pointer's length. Escape: no more.", id="dialog-keys")
+
+    def on_mount(self) -> None:
+        corners = outer_corners(self._board)
+        left = [line for line, corner in enumerate(corners) if corner not in self._found]
+        self.query_one(OptionList).highlighted = left[0] if left else len(corners)
+
+    def _line(self, corner: int) -> Text:
+        if (touch := self._found.get(corner)) is not None:
+            return Text(touch_text(touch))
+        x_mm, y_mm = 1000 * board_points(self._board)[corner, :2]
+        return Text(f"corner {corner}, at {x_mm:.0f}, {y_mm:.0f} mm on the board: not touched yet")
+
+    def on_input_changed(self, event: Input.Changed) -> None:
+        self.pointer_mm = event.value.strip()
+
+    def on_input_submitted(self) -> None:
+        self.query_one("#corners").focus()
+
+    def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
+        self.dismiss(None if event.option_id == "end" else int(str(event.option_id)))
+
+
+class Touching(ModalScreen[Touch | None]):
+    """From the start of the motion to what the hand found. None: nothing was."""
+
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("escape", "leave", "Leave out", tooltip="Leave this corner out")
+    ]
+
+    def __init__(self, desk: Desk, corner: int, board: BoardSpec, arrival: Awaitable[Hovering]) -> None:
+        super().__init__()
+        self._desk, self._corner, self._board, self._arrival = desk, corner, board, arrival
+        self._hovering: Hovering | None = None
+
+    def compose(self) -> ComposeResult:
+        with Vertical(id="dialog"):
+            yield Label(f"Corner {self._corner}", id="dialog-title")
+            yield Static("The arm moves; F12 stops it.", id="touch-text", markup=False)
+            yield Input(id="touch-offset", placeholder="x,y in mm, or only Enter", compact=True)
+            yield Label("", id="dialog-problem", markup=False)
+            yield Label("Escape leaves this corner out", id="dialog-keys")
+
+    def on_mount(self) -> None:
+        self.query_one(Input).display = False
+        self.await_arrival()
+
+    @work(exit_on_error=False)
+    async def await_arrival(self) -> None:
+        try:
+            self._hovering = await self._arrival
+        except StationError as problem:
+            self.notify(str(problem), severity="error", timeout=10, markup=False)
+            self.dismiss(None)
+            return
+        self.query_one("#touch-text", Static).update(self._hovering.instructions(self._board))
+        self.query_one(Input).display = True
+        self.query_one(Input).focus()
+
+    def on_input_submitted(self, event: Input.Submitted) -> None:
+        if self._hovering is None:
+            return
+        try:
+            now = None if self._desk.silent_s is not None else self._desk.status
+            self.dismiss(touch_told(self._hovering, event.value.strip(), now))
+        except RefusedError as problem:
+            self.query_one("#dialog-problem", Label).update(str(problem))
+
+    async def action_leave(self) -> None:
+        """Also while the arm moves: then it stops."""
+        if self._hovering is None:
+            await self._desk.stop()
+        self.dismiss(None)
+
+
+class _Visit:
+    """Who guides the tip: the person in front of this screen."""
+
+    def __init__(self, desk: Desk, board: BoardSpec) -> None:
+        self._desk, self._board, self._pointer_mm = desk, board, ""
+        self.found: dict[int, Touch] = {}
+
+    async def next_corner(self) -> int | None:
+        choice = ChooseCorner(self._board, self.found, self._pointer_mm)
+        corner: int | None = await self._desk.push_screen_wait(choice)
+        self._pointer_mm = choice.pointer_mm
+        return corner
+
+    def pointer_m(self) -> float | None:
+        return float(self._pointer_mm) / 1000 if self._pointer_mm else None
+
+    async def approves(self, preview: MotionPreview) -> bool:
+        return await self._desk.approves(preview)
+
+    def refused(self, corner: int, problem: StationError) -> None:
+        self._desk.notify(str(problem), severity="warning", timeout=10, markup=False)
+
+    async def touch(self, offer: HoverOffer, arrival: Awaitable[Hovering]) -> None:
+        screen = Touching(self._desk, offer.corner, self._board, arrival)
+        if (touch := await self._desk.push_screen_wait(screen)) is not None:
+            self.found[offer.corner] = touch
+
+
+async def run_touch_test(desk: Desk, path: Path) -> bool:
+    """As many corners as the person wants. True when something was written into the file."""
+
+    calibration = await desk.attempt(asyncio.to_thread(read_calibration, path))
+    if calibration is None:
+        return False
+    person = _Visit(desk, calibration.board)
+    await desk.attempt(touch_test(desk, person, path))
+    if not person.found:
+        return False
+    found = list(person.found.values())
+    words = await desk.attempt(asyncio.to_thread(note_touches, state_root(str(path)), path, found))
+    if words:
+        desk.notify(words, markup=False)
+    return bool(words)

@@ -31,9 +31,8 @@ from calibrate.geometry import Array, inverse, pose, quaternion_from_matrix, rot
 from calibrate.handeye.readings import Reading
 from calibrate.pipeline import solve_recording
 from recordings.errors import RecordingError
-from recordings.importers.dataset import read_dataset
+from recordings.importers.dataset import DATASET_FILE, HEADER, read_dataset, read_poses
 from recordings.importers.folder import import_folder
-from recordings.importers.poses import HEADER, read_poses
 from recordings.schema.messages import BoardSpec
 
 SETS = ("ur5-chessboard", "charuco-eye-to-hand", "rendered-truth")
@@ -279,7 +278,7 @@ def _try(source: Path, mistake: Mistake) -> Said:
 
 
 def _session(source: Path) -> Session:
-    read_dataset(source)  # an understandable error, should the set be broken
+    read_dataset(source / DATASET_FILE)  # an understandable error, should the set be broken
     rows, _ = read_poses(source)
     description = yaml.safe_load((source / "dataset.yaml").read_text())
     return Session(description, [row.image for row in rows], np.array([row.base_from_flange for row in rows]))

@@ -67,21 +67,44 @@ class RecordingError(CodedError):
 class UnfinishedRecordingError(RecordingError):
     """The file was never finished or is cut; `recordings recover` can help."""
 
+    code = "unfinished-recording"
+
 
 class MissingSegmentError(RecordingError):
-    """The session has more parts than are here."""
+    """The session has more segments than are here."""
+
+    code = "missing-segment"
 
 
 class CorruptRecordingError(RecordingError):
-    """The file breaks a rule of the format; the message names the byte offset."""
+    """The file breaks a rule of the format; value `at_byte` where one place does."""
+
+    code = "damaged-recording"
 
 
 class BadImageError(CorruptRecordingError):
-    """One picture cannot be decoded; the rest of the recording is proven and can be used without it."""
+    """One image cannot be decoded; the rest of the recording is proven and can be used without it."""
+
+    code = "bad-image"
 
 
 class ImportSourceError(RecordingError):
     """What is to be imported lacks something or is wrong."""
+
+    code = "import-source"
+
+
+def disk_error(doing: str, path: Path, error: OSError, remedy: str = "") -> RecordingError:
+    """The operating system's refusal to `doing` this path, as an error; value `errno`."""
+    reason = error.strerror or str(error)
+    return RecordingError(f"Cannot {doing} {path}: {reason}", code="disk", remedy=remedy, errno=error.errno)
+
+
+def exists_error(path: Path) -> RecordingError:
+    """Nothing that is there is ever written over."""
+    return RecordingError(
+        f"{path} exists already", code="exists", remedy="Choose another name or move it away."
+    )
 
 
 def recover_line(path: Path) -> str:

@@ -10,7 +10,7 @@ import secrets
 import shutil
 from pathlib import Path
 
-from recordings.errors import RecordingError
+from recordings.errors import RecordingError, disk_error, exists_error
 
 PART_SUFFIX = ".part"
 """Of a recording that is being written; gone once it is finished and on the disk."""
@@ -46,11 +46,11 @@ def create_exclusively(path: Path) -> int:
     try:
         descriptor = os.open(path, flags, 0o640)
     except FileExistsError as error:
-        raise RecordingError(f"{path} exists already; choose another name or move it away") from error
-    except FileNotFoundError as error:
-        raise RecordingError(f"the folder {path.parent} does not exist; create it first") from error
+        raise exists_error(path) from error
     except OSError as error:
-        raise RecordingError(f"cannot create {path}: {error.strerror}") from error
+        raise disk_error(
+            "create", path, error, "Create its folder first." if error.errno == errno.ENOENT else ""
+        ) from error
     lock(descriptor, path)
     return descriptor
 
@@ -60,7 +60,9 @@ def lock(descriptor: int, path: Path) -> None:
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
     except BlockingIOError as error:
-        raise RecordingError(f"{path} is in use by another process; wait until it has finished") from error
+        raise RecordingError(
+            f"{path} is in use by another process", code="in-use", remedy="Wait until it has finished."
+        ) from error
 
 
 def discard_leftover(path: Path) -> None:
@@ -88,7 +90,9 @@ def sync_folder(folder: Path) -> None:
 def rename_new(source: Path, target: Path) -> None:
     """Renames within one folder, durably, and never over something that is there. Raises RecordingError."""
     if os.path.lexists(target):
-        raise RecordingError(f"{target} appeared meanwhile; the new recording is kept as {source}")
+        raise RecordingError(
+            f"{target} appeared meanwhile; the new recording is kept as {source}", code="exists"
+        )
     source.rename(target)
     sync_folder(target.parent)
 
@@ -123,8 +127,11 @@ def require_free_space(folder: Path, reserve_bytes: int) -> int:
     free = shutil.disk_usage(folder).free
     if free < reserve_bytes:
         raise RecordingError(
-            f"only {bytes_text(free)} are free at {folder}, the reserve is {bytes_text(reserve_bytes)}: "
-            f"free {bytes_text(reserve_bytes - free)} and go on"
+            f"Free space at {folder}: {bytes_text(free)} (reserve {bytes_text(reserve_bytes)})",
+            code="disk-full",
+            remedy=f"Free {bytes_text(reserve_bytes - free)} and go on.",
+            free_bytes=free,
+            limit_bytes=reserve_bytes,
         )
     return free
 

@@ -23,6 +23,10 @@ _JPEG_SIZES = {0xC0, 0xC1, 0xC2}
 _BAYER = re.compile(r"Bayer(RG|BG|GB|GR)8$")
 
 
+KEPT_FORMATS = ("png", "jpeg")
+"""Files that recordings hold as they are."""
+
+
 class ImageError(ValueError):
     """Bytes that are not the picture they should be; says why."""
 
@@ -144,6 +148,11 @@ def encode_png(image: NDArray[Any]) -> bytes:
     if not done:
         raise ImageError("could not be compressed")
     return data.tobytes()
+
+
+def pixel_format_of(pixels: NDArray[Any]) -> str:
+    """GenICam's name for an array as recordings hold it."""
+    return "BGR8" if pixels.ndim == 3 else "Mono8" if pixels.itemsize == 1 else "Mono16"
 
 
 def raw_encoding(image: NDArray[Any], pixel_format: str) -> str:

@@ -10,7 +10,7 @@ from recordings.reader import Recording
 from recordings.schema.messages import SINGLE_TAGS, BoardSpec
 from recordings.schema.topics import Topic
 from recordings.segment import RecordingSegment
-from recordings.stream_quality import Arrivals, Steps
+from recordings.streams import Arrivals, Steps
 
 _SHORTEST_SPAN_S = 0.01
 """Messages that all came at once have no rate."""

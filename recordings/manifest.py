@@ -1,7 +1,7 @@
-"""`parts.json`: which parts a session's folder must hold, so that a lost one is noticed, the last one too.
+"""`parts.json`: the segments a session's folder must hold, so that a lost one is noticed, the last one too.
 
-A part cannot know of the parts that follow it, and a sealed file is never touched again: the list stands
-beside them. A part is entered when its file is there and before anything in it is acknowledged.
+A segment cannot know of those that follow it, and a finished file is never touched again: the list stands
+beside them. A segment is entered when its file is there and before anything in it is acknowledged.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from pathlib import Path
 
 import msgspec
 
-from recordings.errors import CorruptRecordingError, RecordingError
+from recordings.errors import CorruptRecordingError, RecordingError, disk_error
 from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, write_atomically
 from recordings.mcap.scan import open_file
 
@@ -30,9 +30,9 @@ class Manifest(
 ):
     session: str
     parts: dict[int, str]
-    """Part → file name; a part given up by recovery whose file nobody knew has ''."""
+    """Segment → file name; one given up by recovery whose file nobody knew has ''."""
     given_up: list[int] = []
-    """Parts that `recordings recover` did not find. One that comes back is read again."""
+    """Segments that `recordings recover` did not find. One that comes back is read again."""
 
 
 def read_manifest(folder: Path) -> Manifest | None:
@@ -44,7 +44,7 @@ def read_manifest(folder: Path) -> Manifest | None:
     try:
         content = os.pread(descriptor, _LIMIT_BYTES, 0)
     except OSError as error:
-        raise RecordingError(f"cannot read {path}: {error.strerror}") from error
+        raise disk_error("read", path, error) from error
     finally:
         os.close(descriptor)
     try:
@@ -60,8 +60,9 @@ def read_manifest(folder: Path) -> Manifest | None:
 
 def _damaged(path: Path, reason: str) -> CorruptRecordingError:
     return CorruptRecordingError(
-        f"{path} is damaged ({reason}): it lists the parts of the session. Use the original; only if you "
-        "know that every part is there, delete it"
+        f"{path} is damaged ({reason}): it lists the segments of the session",
+        code="damaged-manifest",
+        remedy="Use the original; only if you know that every segment is there, delete it.",
     )
 
 
@@ -69,7 +70,11 @@ def enter_part(folder: Path, session: str, part: int, file_name: str) -> None:
     """From now on the session is incomplete without this file. Returns when it is on the disk."""
     known = read_manifest(folder) or Manifest(session, {})
     if known.session != session:
-        raise RecordingError(f"{folder} belongs to session '{known.session}': record '{session}' elsewhere")
+        raise RecordingError(
+            f"{folder} belongs to session '{known.session}'",
+            code="several-sessions",
+            remedy=f"Record '{session}' elsewhere.",
+        )
     _write(folder, msgspec.structs.replace(known, parts=known.parts | {part: file_name}))
 
 
@@ -108,4 +113,4 @@ def _write(folder: Path, manifest: Manifest) -> None:
     try:
         write_atomically(folder / MANIFEST_FILE, msgspec.json.encode(manifest))
     except OSError as error:
-        raise RecordingError(f"cannot write {folder / MANIFEST_FILE}: {error.strerror}") from error
+        raise disk_error("write", folder / MANIFEST_FILE, error) from error

@@ -1,4 +1,4 @@
-"""Opens a recording: one file, or a session folder whose parts belong together."""
+"""Opens a recording: one file, or a session folder whose segments belong together."""
 
 from __future__ import annotations
 
@@ -7,11 +7,18 @@ from collections.abc import Iterator
 from itertools import chain
 from pathlib import Path
 
-from recordings.errors import MissingSegmentError, RecordingError, UnfinishedRecordingError, recover_line
+from recordings.errors import (
+    CorruptRecordingError,
+    MissingSegmentError,
+    RecordingError,
+    UnfinishedRecordingError,
+    disk_error,
+    recover_line,
+)
 from recordings.files import PART_SUFFIX
+from recordings.manifest import PARTS_LIMIT, Manifest, missing_parts, read_manifest
 from recordings.schema.messages import CaptureEvent, Image, RobotState, SessionInfo, View
 from recordings.segment import RecordingSegment
-from recordings.session_parts import parts_of_file, parts_of_folder
 
 
 class Recording:
@@ -28,27 +35,27 @@ class Recording:
         self.segments = segments
         """In the order they were recorded."""
         self.missing = missing
-        """A sentence for each part of the session that should be there and is not."""
+        """A sentence for each segment of the session that should be there and is not."""
         self.losses = losses
         """A sentence for everything that recovery could not save, or that nobody can rule out."""
-        self._by_number = {part.info.part: part for part in segments}
+        self._by_number = {segment.info.part: segment for segment in segments}
 
     @property
     def info(self) -> SessionInfo:
-        """Of the first part."""
+        """Of the first segment."""
         return self.segments[0].info
 
     @property
     def sha256(self) -> str:
-        """Of the file; of the parts' hashes, one after the other, when there are several."""
+        """Of the file; of the segments' hashes, one after the other, when there are several."""
         if len(self.segments) == 1:
             return self.segments[0].sha256
-        return hashlib.sha256("".join(part.sha256 for part in self.segments).encode()).hexdigest()
+        return hashlib.sha256("".join(segment.sha256 for segment in self.segments).encode()).hexdigest()
 
     def views(self) -> list[View]:
         """The latest attempt of every pose, in the order of their index."""
         latest: dict[int, View] = {}
-        for view in chain.from_iterable(part.views for part in self.segments):
+        for view in chain.from_iterable(segment.views for segment in self.segments):
             before = latest.get(view.index)
             if before is None or (view.part, view.attempt) >= (before.part, before.attempt):
                 latest[view.index] = view
@@ -59,7 +66,8 @@ class Recording:
         try:
             return self._by_number[view.part].image(view.picture_sequence)
         except KeyError as error:
-            raise RecordingError(f"{self.path} has no picture for view {view.index}") from error
+            text = f"{self.path} has no image for view {view.index}"
+            raise RecordingError(text, code="no-image", view=view.index) from error
 
     def stored_image(self, view: View) -> tuple[str, bytes] | None:
         """(format, file bytes) of a picture that is kept compressed; None when it is kept raw."""
@@ -71,46 +79,135 @@ class Recording:
             yield view, self.image(view)
 
     def robot_states(self) -> Iterator[RobotState]:
-        return chain.from_iterable(part.robot_states() for part in self.segments)
+        return chain.from_iterable(segment.robot_states() for segment in self.segments)
 
     def events(self) -> Iterator[CaptureEvent]:
-        return chain.from_iterable(part.events() for part in self.segments)
+        return chain.from_iterable(segment.events() for segment in self.segments)
 
     def attachments(self) -> dict[str, bytes]:
-        """Of all parts; the latest part's where a name is in several."""
+        """Of all segments; the latest segment's where a name is in several."""
         merged: dict[str, bytes] = {}
-        for part in self.segments:
-            merged.update(part.attachments)
+        for segment in self.segments:
+            merged.update(segment.attachments)
         return merged
 
     def media_types(self) -> dict[str, str]:
         """Of the attachments."""
-        return {name: kind for part in self.segments for name, kind in part.media_types.items()}
+        return {name: kind for segment in self.segments for name, kind in segment.media_types.items()}
 
 
 def open_recording(path: Path, *, incomplete: bool = False) -> Recording:
     """Reads and proves the whole recording. At most 256 MiB of memory, whatever the file says.
 
     Raises UnfinishedRecordingError for one that was never finished or is cut, CorruptRecordingError for one
-    that breaks a rule of the format, MissingSegmentError when parts of the session are not there (unless
+    that breaks a rule of the format, MissingSegmentError when segments of the session are not there (unless
     `incomplete`: then `missing` names them), RecordingError when there is none.
     """
     path = Path(path)
     if path.is_dir():
-        found = parts_of_folder(path)
+        recording = _open_folder(path)
         remedy = f"Copy it back beside the others; if it is lost for good: {recover_line(path)}"
     else:
-        _require_finished(path)
-        found = parts_of_file(path)
-        remedy = f"If the other parts are lost for good: {recover_line(path.parent)}"
-    if found.missing and not incomplete:
-        raise MissingSegmentError(f"{'; '.join(found.missing)}. {remedy}")
-    return Recording(path, found.parts, found.missing, found.losses)
+        recording = _open_file(path)
+        remedy = f"If the other segments are lost for good: {recover_line(path.parent)}"
+    if recording.missing and not incomplete:
+        raise MissingSegmentError("; ".join(recording.missing), remedy=remedy, missing=len(recording.missing))
+    return recording
 
 
-def _require_finished(path: Path) -> None:
+def _open_file(path: Path) -> Recording:
+    """One file that is the whole session, or says of which session it is a segment."""
     unfinished = path if path.name.endswith(PART_SUFFIX) else path.with_name(path.name + PART_SUFFIX)
     if unfinished.is_file() and (unfinished == path or not path.exists()):
-        raise UnfinishedRecordingError(
-            f"{path} was never finished. Save what is whole: {recover_line(unfinished)}"
+        raise _unfinished(unfinished)
+    segment = RecordingSegment(path)
+    info = segment.info
+    manifest = read_manifest(path.parent)
+    if manifest is not None and (manifest.session, manifest.parts.get(info.part)) != (info.name, path.name):
+        manifest = None  # it lists other files of this folder
+    missing: tuple[str, ...] = ()
+    if missing_parts(path.parent, manifest, {info.part}):
+        count = str(len(manifest.parts)) if manifest else f"at least {info.part}"
+        text = f"{path} is segment {info.part} of {count} of session '{info.name}'"
+        missing = (f"{text}: give the session's folder ({path.parent}) instead of the file",)
+    return Recording(path, [segment], missing, _losses([segment], manifest))
+
+
+def _open_folder(folder: Path) -> Recording:
+    """Every segment in the folder. RecordingError when they are of different sessions, or one twice."""
+    try:
+        names = sorted(entry.name for entry in folder.iterdir())
+    except OSError as error:
+        raise disk_error("open", folder, error) from error
+    unfinished = [name for name in names if name.endswith(".mcap" + PART_SUFFIX)]
+    if unfinished:
+        raise _unfinished(folder / unfinished[0], folder)
+    files = [name for name in names if name.endswith(".mcap")]
+    manifest = read_manifest(folder)
+    if not files and manifest is None:
+        raise RecordingError(f"{folder} holds no recording (*.mcap)", code="no-recording")
+    if not files and manifest is not None:
+        raise MissingSegmentError(
+            f"{folder} holds none of the segments of session '{manifest.session}'",
+            remedy=f"Copy back {', '.join(filter(None, manifest.parts.values()))}.",
         )
+    if len(files) > PARTS_LIMIT:
+        raise _several_sessions(f"{folder} holds {len(files)} recordings")
+    segments = sorted((RecordingSegment(folder / name) for name in files), key=lambda found: found.info.part)
+    _check_one_session(segments, manifest)
+    missing = missing_parts(folder, manifest, {segment.info.part for segment in segments})
+    sentences = tuple(
+        f"{folder} lacks segment {n}{f' ({name})' if name else ''} of session '{segments[0].info.name}'"
+        for n, name in missing.items()
+    )
+    return Recording(folder, segments, sentences, _losses(segments, manifest))
+
+
+def _unfinished(path: Path, recover: Path | None = None) -> UnfinishedRecordingError:
+    return UnfinishedRecordingError(
+        f"{path} is unfinished", remedy=f"Save what is whole: {recover_line(recover or path)}"
+    )
+
+
+def _several_sessions(text: str) -> RecordingError:
+    return RecordingError(text, code="several-sessions", remedy="Name one of the files, not the folder.")
+
+
+def _check_one_session(segments: list[RecordingSegment], manifest: Manifest | None) -> None:
+    first, path = segments[0].info, segments[0].path
+    if manifest is not None and manifest.session != first.name:
+        raise _several_sessions(f"{path} is of session '{first.name}', its folder of '{manifest.session}'")
+    for before, segment in zip([None, *segments], segments, strict=False):
+        info = segment.info
+        if (info.name, info.mount, info.board, info.source) != (
+            first.name,
+            first.mount,
+            first.board,
+            first.source,
+        ):
+            raise _several_sessions(f"{segment.path} and {path} are of different sessions")
+        if info.camera != first.camera or info.camera_identity.serial != first.camera_identity.serial:
+            raise _several_sessions(f"{segment.path} was recorded with another camera than {path}")
+        if before and before.info.part == info.part:
+            raise CorruptRecordingError(
+                f"{before.path} and {segment.path} are both segment {info.part}",
+                code="segment-twice",
+                remedy="Move the copy away.",
+            )
+
+
+def _losses(segments: list[RecordingSegment], manifest: Manifest | None) -> tuple[str, ...]:
+    found = [
+        f"{segment.path.name} was cut or damaged: {segment.lost_bytes} bytes were lost when it was recovered"
+        for segment in segments
+        if segment.lost_bytes
+    ]
+    present = {segment.info.part for segment in segments}
+    if manifest is not None:
+        found += [f"segment {n} of the session was lost" for n in manifest.given_up if n not in present]
+    elif segments[-1].recovered:
+        found.append(
+            f"{segments[-1].path.name} was interrupted, and no parts.json beside it says whether the session "
+            "went on: a later segment may be missing"
+        )
+    return tuple(found)

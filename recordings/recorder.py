@@ -18,7 +18,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from recordings.errors import RecordingError
+from recordings.errors import RecordingError, UnfinishedRecordingError, recover_line
 from recordings.schema.messages import (
     CameraModel,
     CaptureEvent,
@@ -116,7 +116,9 @@ class Recorder:
         """Raises RecordingError when its picture was dropped or an earlier write failed."""
         if self.error is None and view.picture_sequence in self._dropped_pictures:
             raise RecordingError(
-                f"the picture of pose {view.index + 1} was dropped, the disk is too slow: take the pose again"
+                f"The image of pose {view.index + 1} was dropped: the disk is too slow",
+                code="image-dropped",
+                remedy="Take the pose again.",
             )
         self._put(_Item(lambda: self._writer.view(view), _SMALL_BYTES))
 
@@ -150,7 +152,7 @@ class Recorder:
         return done
 
     def finish(self) -> Future[Path]:
-        """Seals the file after all that was handed over before; the future is its path. Idempotent."""
+        """Finishes the file after all that was handed over before; the future is its path. Idempotent."""
         with self._lock:
             if self._finished is None:
                 self._finished = Future()
@@ -158,13 +160,13 @@ class Recorder:
                 if self.error is not None:
                     self._finished.set_exception(self.error)
                 elif self._closing:
-                    text = f"{self.part_path} was closed unsealed: `recordings recover` makes it whole"
-                    self._finished.set_exception(RecordingError(text))
+                    text, remedy = f"{self.part_path} is unfinished", f"Run {recover_line(self.part_path)}"
+                    self._finished.set_exception(UnfinishedRecordingError(text, remedy=remedy))
                 self._wake.notify()
             return self._finished
 
     def close(self) -> None:
-        """Stops the thread without sealing, after what is queued; the `.part` file stays. Idempotent."""
+        """Stops the thread after what is queued; the unfinished `.part` file stays. Idempotent."""
         with self._lock:
             self._closing = True
             self._wake.notify()
@@ -191,7 +193,7 @@ class Recorder:
             if self.error is not None:
                 raise self.error
             if self._ended:
-                raise RecordingError(f"the recording {self._writer.path} is finished")
+                raise RecordingError(f"The recording {self._writer.path} is finished", code="closed")
             self._append(item)
             self._wake.notify()
 
@@ -209,7 +211,7 @@ class Recorder:
         except RecordingError as error:
             self._fail(error)
         except Exception as error:
-            self._fail(RecordingError(f"the recorder failed on {self.part_path}: {error!r}"))
+            self._fail(RecordingError(f"The recorder failed on {self.part_path}: {error!r}", code="recorder"))
         finally:
             self._writer.close()
 

@@ -8,13 +8,22 @@ from pathlib import Path
 
 import msgspec
 
-from recordings.errors import CorruptRecordingError, RecordingError, UnfinishedRecordingError
+from recordings.errors import (
+    CorruptRecordingError,
+    RecordingError,
+    UnfinishedRecordingError,
+    disk_error,
+    exists_error,
+)
 from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, discard_leftover, lock, rename_new, sync_folder
 from recordings.manifest import MANIFEST_FILE, give_up_parts, missing_parts, read_manifest
+from recordings.mcap.records import MESSAGE_HEAD, Opcode, with_crc
+from recordings.mcap.salvage import Salvage, salvage
 from recordings.mcap.scan import open_file
-from recordings.rebuild import NothingToSaveError, rebuild
-from recordings.schema.messages import SessionInfo
-from recordings.schema.topics import Topic
+from recordings.mcap.writer import McapFile
+from recordings.schema.definitions import RECOVERY_RECORD, SESSION_RECORDS, SchemaError, decode
+from recordings.schema.messages import SessionInfo, View
+from recordings.schema.topics import Topic, identify
 from recordings.segment import RecordingSegment
 
 DAMAGED_SUFFIX = ".damaged"
@@ -39,7 +48,7 @@ class Recovery:
 
     @property
     def missing(self) -> bool:
-        """A part of the session that is not there at all."""
+        """A segment of the session that is not there at all."""
         return bool(self.losses) and not self.rebuilt
 
     @property
@@ -50,7 +59,7 @@ class Recovery:
         if not self.rebuilt:
             return f"{self.path}: whole, nothing was lost ({self.poses} poses)"
         return (
-            f"{self.path}: saved {self.poses} poses, {self.pictures} pictures and {self.robot_states} "
+            f"{self.path}: saved {self.poses} poses, {self.pictures} images and {self.robot_states} "
             f"robot states; {self.lost_bytes} bytes were lost"
         )
 
@@ -59,12 +68,14 @@ def recover(source: Path, output: Path | None = None) -> list[Recovery]:
     """A file, or every file of a session folder. The result is read back strictly before it gets its name.
 
     Without `output` the recovered file takes the recording's name and the damaged one is kept beside it as
-    `.damaged`. Parts of the session that are not in its folder are given up: reported here, and named by
+    `.damaged`. Segments of the session that are not in its folder are given up: reported here, and named by
     every later reader. Raises RecordingError when another process still writes it or nothing can be saved.
     """
     if source.is_dir():
         if output is not None:
-            raise RecordingError("a session folder is recovered in place; leave out the output")
+            raise RecordingError(
+                "A session folder is recovered in place", code="no-output", remedy="Leave out the output."
+            )
         return _recover_session(source)
     return [_recover_file(source, output)[0]]
 
@@ -73,15 +84,15 @@ def _recover_session(folder: Path) -> list[Recovery]:
     try:
         files = sorted(p for p in folder.iterdir() if p.name.endswith((".mcap", ".mcap" + PART_SUFFIX)))
     except OSError as error:
-        raise RecordingError(f"cannot open {folder}: {error.strerror}") from error
+        raise disk_error("open", folder, error) from error
     if not files:
-        raise RecordingError(f"{folder} holds no recording (*.mcap, *.mcap.part)")
+        raise RecordingError(f"{folder} holds no recording (*.mcap, *.mcap.part)", code="no-recording")
     manifest = read_manifest(folder)
     done = [_recover_part(path) for path in files]
     present = {info.part: result.path.name for result, info in done if info is not None}
     sessions = {info.name for _, info in done if info is not None}
     results = [result for result, _ in done]
-    if len(sessions) != 1:  # nothing is left, or files of several sessions: nobody knows whose parts lack
+    if len(sessions) != 1:  # nothing is left, or files of several sessions: nobody knows whose segments lack
         return results
     session = sessions.pop()
     again = manifest and msgspec.structs.replace(manifest, given_up=[])  # said every time, not only the first
@@ -93,17 +104,17 @@ def _recover_session(folder: Path) -> list[Recovery]:
 
 def _given_up(folder: Path, part: int, name: str) -> Recovery:
     reason = (
-        f"part {part} of the session is not in the folder; noted as lost in {MANIFEST_FILE}. "
+        f"segment {part} of the session is not in the folder; noted as lost in {MANIFEST_FILE}. "
         "Should it turn up, put it back here and it is read again"
     )
     return Recovery(folder / name, None, 0, 0, 0, 0, (reason,))
 
 
 def _recover_part(source: Path) -> tuple[Recovery, SessionInfo | None]:
-    """Of a session: a part that was begun but holds nothing is set aside, the session goes on without it."""
+    """A segment that was begun but holds nothing is set aside, the session goes on without it."""
     try:
         return _recover_file(source, None)
-    except NothingToSaveError as error:
+    except _NothingToSaveError as error:
         aside = _free_name(source.with_name(source.name + EMPTY_SUFFIX))
         rename_new(source, aside)
         return Recovery(source, aside, 0, 0, 0, aside.stat().st_size, (str(error),)), None
@@ -115,9 +126,9 @@ def _recover_file(source: Path, output: Path | None) -> tuple[Recovery, SessionI
         lock(descriptor, source)
         final = output or source.with_name(source.name.removesuffix(PART_SUFFIX))
         if final.suffix != ".mcap":
-            raise RecordingError(f"{final}: a recording's name ends in .mcap")
+            raise RecordingError(f"{final}: a recording's name ends in .mcap", code="recording-name")
         if final != source and os.path.lexists(final):
-            raise RecordingError(f"{final} exists already; name another output with -o")
+            raise exists_error(final)
         try:
             return _nothing_lost(RecordingSegment(source), source, final)
         except (UnfinishedRecordingError, CorruptRecordingError):
@@ -126,45 +137,43 @@ def _recover_file(source: Path, output: Path | None) -> tuple[Recovery, SessionI
         os.close(descriptor)
 
 
-def _nothing_lost(part: RecordingSegment, source: Path, final: Path) -> tuple[Recovery, SessionInfo]:
+def _nothing_lost(segment: RecordingSegment, source: Path, final: Path) -> tuple[Recovery, SessionInfo]:
     """A file that is whole; at most its last rename was missing."""
     if source.name.endswith(PART_SUFFIX):
         rename_new(source, final)
     else:
         final = source
-    return _report(final, part, None, 0, ())
+    return _report(final, segment, None, 0, ())
 
 
 def _report(
-    path: Path, part: RecordingSegment, original: Path | None, lost_bytes: int, losses: tuple[str, ...]
+    path: Path, segment: RecordingSegment, original: Path | None, lost_bytes: int, losses: tuple[str, ...]
 ) -> tuple[Recovery, SessionInfo]:
     done = Recovery(
         path=path,
         kept_original=original,
-        poses=len({view.index for view in part.views}),
-        pictures=len(part.image_sequences()),
-        robot_states=len(part.messages(Topic.ROBOT_STATE)),
+        poses=len({view.index for view in segment.views}),
+        pictures=len(segment.image_sequences()),
+        robot_states=len(segment.messages(Topic.ROBOT_STATE)),
         lost_bytes=lost_bytes,
         losses=losses,
     )
-    return done, part.info
+    return done, segment.info
 
 
 def _rebuild(descriptor: int, source: Path, final: Path, in_place: bool) -> tuple[Recovery, SessionInfo]:
     temporary = final.with_name(final.name + ".recovering")
     discard_leftover(temporary)
     try:
-        rebuilt = rebuild(descriptor, source, temporary)
+        segment, lost_bytes, losses = _save(descriptor, source, temporary)
         original = source
         if in_place:
             original = _put_in_place(source, temporary, final)
         else:
             rename_new(temporary, final)
-        return _report(final, rebuilt.part, original, rebuilt.lost_bytes, rebuilt.losses)
+        return _report(final, segment, original, lost_bytes, losses)
     except OSError as error:
-        raise RecordingError(
-            f"writing {temporary} failed ({error.strerror}); {source} is unchanged"
-        ) from error
+        raise disk_error("write", temporary, error, f"{source} is unchanged.") from error
     finally:
         temporary.unlink(missing_ok=True)
 
@@ -190,3 +199,107 @@ def _free_name(path: Path) -> Path:
         count += 1
         free = path.with_name(f"{path.name}-{count}")
     return free
+
+
+class _NothingToSaveError(RecordingError):
+    """Not even the description of the session is whole."""
+
+    code = "nothing-to-save"
+
+
+def _save(descriptor: int, source: Path, target: Path) -> tuple[RecordingSegment, int, tuple[str, ...]]:
+    """The open file `source` → the new file `target`, on the disk and read strictly; lost bytes; losses.
+
+    Raises _NothingToSaveError, RecordingError, or OSError when the disk fails.
+    """
+    found = salvage(descriptor, identify)
+    session = next(
+        (found.contents.metadata[n] for n in SESSION_RECORDS if n in found.contents.metadata), None
+    )
+    if session is None:
+        size = os.fstat(descriptor).st_size
+        raise _NothingToSaveError(
+            f"Nothing can be saved from {source}: the description of the session is lost ({size} bytes)",
+            remedy="Look for another copy; this file is unchanged.",
+            size_bytes=size,
+        )
+    dropped, reasons = _orphans(found)
+    losses = (*(f"bytes {start} to {end}: {why}" for start, end, why in found.lost), *reasons)
+    file = McapFile(target)
+    try:
+        _write(file, found, session, dropped, losses)
+        os.fsync(file.descriptor)
+    finally:
+        file.close()
+    try:
+        return RecordingSegment(target), found.lost_bytes, losses
+    except RecordingError as error:
+        text = f"{source} cannot be recovered and is unchanged: {error.text}"
+        raise RecordingError(text, code="unrecoverable") from error
+
+
+def _orphans(found: Salvage) -> tuple[set[int], list[str]]:
+    """Addresses of messages that lost their partner: an image its facts, a view its image."""
+    contents, source = found.contents, found.source
+    index = {channel.topic: contents.messages[number] for number, channel in contents.channels.items()}
+
+    def places(topic: Topic) -> dict[int, int]:
+        addresses = index[topic.value].addresses if topic.value in index else ()
+        return {source.head(address)[2]: address for address in addresses}
+
+    facts = places(Topic.PICTURE_FACTS)
+    images = places(Topic.RAW_IMAGE) | places(Topic.COMPRESSED_IMAGE)
+    whole = facts.keys() & images.keys()
+    dropped = {
+        place for table in (facts, images) for sequence, place in table.items() if sequence not in whole
+    }
+    reasons = [f"image {sequence} is incomplete" for sequence in sorted(facts.keys() ^ images.keys())]
+    for address in index[Topic.VIEW.value].addresses if Topic.VIEW.value in index else ():
+        try:
+            view = decode(View, source.message(address).data)
+        except SchemaError:
+            dropped.add(address)
+            reasons.append(f"a view at byte {source.place(address)} cannot be read")
+            continue
+        if view.picture_sequence not in whole:
+            dropped.add(address)
+            reasons.append(f"pose {view.index + 1} (attempt {view.attempt}) lost its image")
+    return dropped, reasons
+
+
+def _write(
+    file: McapFile,
+    found: Salvage,
+    session: dict[str, str],
+    dropped: set[int],
+    losses: tuple[str, ...],
+) -> None:
+    """The good chunks' messages, as they were, into a new finished file."""
+    file.start()
+    contents = found.contents
+    for name in SESSION_RECORDS:
+        file.metadata(name, session)
+    before = contents.metadata.get(RECOVERY_RECORD, {}).get("lost_bytes", "0")  # of an earlier recovery
+    lost_bytes = found.lost_bytes + (int(before) if before.isdecimal() else 0)
+    note = {"lost_bytes": str(lost_bytes), "losses": msgspec.json.encode(losses[:100]).decode()}
+    file.metadata(RECOVERY_RECORD, with_crc(note))
+    for name, data in contents.attachments.items():
+        file.attachment(name, contents.media_types[name], data, 0)
+    numbers: dict[int, int] = {}
+    for chunk in found.chunks:
+        for address, opcode, content in found.records(chunk):
+            if opcode != Opcode.MESSAGE or address in dropped:
+                continue
+            number, sequence, time_ns, _ = MESSAGE_HEAD.unpack_from(content)
+            if number not in contents.channels:
+                continue
+            if number not in numbers:
+                channel = contents.channels[number]
+                schema = contents.schema_of(channel)
+                declared = (schema.name, schema.encoding, schema.data)
+                numbers[number] = file.register(
+                    channel.topic, channel.encoding, declared, dict(channel.metadata)
+                )
+            file.message(numbers[number], [content[MESSAGE_HEAD.size :]], time_ns, sequence, more=True)
+        file.end_chunk()
+    file.finish()

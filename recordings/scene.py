@@ -14,7 +14,7 @@ from google.protobuf.message import Message
 from mcap_protobuf.writer import Writer
 from numpy.typing import NDArray
 
-from recordings.errors import RecordingError
+from recordings.errors import disk_error, exists_error
 from recordings.files import ASKED_FOR, write_atomically
 
 TOPIC = "/plan/scene"
@@ -49,7 +49,7 @@ def write_scene(path: Path, steps: Sequence[tuple[float, Sequence[Entity]]]) -> 
     Only a scene is replaced: a recording's name ends like one.
     """
     if path.is_file() and not _is_scene(path):
-        raise RecordingError(f"{path} exists and is no scene of a plan; choose another name")
+        raise exists_error(path)
     stream = BytesIO()
     writer = Writer(stream)
     for seconds, entities in steps:
@@ -59,7 +59,7 @@ def write_scene(path: Path, steps: Sequence[tuple[float, Sequence[Entity]]]) -> 
     try:
         write_atomically(path, stream.getvalue(), ASKED_FOR)
     except OSError as error:
-        raise RecordingError(f"cannot write {path}: {error.strerror}; choose another folder") from error
+        raise disk_error("write", path, error, "Choose another folder.") from error
 
 
 def _is_scene(path: Path) -> bool:

@@ -1,4 +1,4 @@
-"""One sealed file of a recording: proven when opened, then read message by message."""
+"""One finished file of a recording: proven when opened, then read message by message."""
 
 from __future__ import annotations
 
@@ -44,7 +44,7 @@ from recordings.schema.messages import (
 )
 from recordings.schema.topics import Topic, schema_bytes, schema_name
 from recordings.schema.viewing import camera_model_of, matrix_of
-from recordings.stamps_table import StampsTable, stamps_tables
+from recordings.streams import StampsTable, stamps_tables
 
 VIEWS_LIMIT = 10_000
 _RIGID_TOLERANCE = 1e-6
@@ -69,10 +69,10 @@ class RecordingSegment:
             self.lost_bytes = self._recovery_loss()
             self.attachments = self._checked_attachments()
             self.media_types = dict(self._contents.media_types)
-            self._facts = self._index_pictures(Topic.PICTURE_FACTS)
-            self._raw = self._index_pictures(Topic.RAW_IMAGE)
-            self._compressed = self._index_pictures(Topic.COMPRESSED_IMAGE)
-            self._check_picture_pairs()
+            self._facts = self._index_images(Topic.PICTURE_FACTS)
+            self._raw = self._index_images(Topic.RAW_IMAGE)
+            self._compressed = self._index_images(Topic.COMPRESSED_IMAGE)
+            self._check_image_pairs()
             self.views = self._checked_views()
         except BaseException:
             self._close()
@@ -98,7 +98,7 @@ class RecordingSegment:
         return self._stamps(Topic.ROBOT_STATE, RobotState)
 
     def image_stamps(self) -> Iterator[StampsTable]:
-        """The clocks of all pictures, many at once."""
+        """The clocks of all images, many at once."""
         return self._stamps(Topic.PICTURE_FACTS, PictureFacts)
 
     def _stamps(self, topic: Topic, struct: type[RobotState] | type[PictureFacts]) -> Iterator[StampsTable]:
@@ -128,7 +128,7 @@ class RecordingSegment:
         try:
             return kind.FromString(message.data)
         except DecodeError as error:
-            raise self._file_error("a message for viewers cannot be parsed") from error
+            raise self._unusable("a message for viewers cannot be parsed") from error
 
     def events(self) -> Iterator[CaptureEvent]:
         return self._decoded(Topic.EVENT, CaptureEvent)
@@ -137,7 +137,7 @@ class RecordingSegment:
         return self._decoded(Topic.PICTURE_FACTS, PictureFacts)
 
     def image_sequences(self) -> list[int]:
-        """Of all pictures, in file order."""
+        """Sequences of all images, in file order."""
         return list(self._facts)
 
     def image(self, sequence: int) -> Image:
@@ -153,7 +153,9 @@ class RecordingSegment:
             image = self._decoded_image(topic, address, *size)
         except ImageError as error:
             place = self._source.place(address)
-            raise BadImageError(f"{self.path} at byte {place}: picture {sequence} {error}") from error
+            raise BadImageError(
+                f"{self.path} at byte {place}: image {sequence} {error}", image=sequence, at_byte=place
+            ) from error
         image.flags.writeable = False
         return Image(
             pixels=image,
@@ -177,16 +179,18 @@ class RecordingSegment:
         return raw_array(data, message.encoding, width, height)
 
     def stored_image(self, sequence: int) -> tuple[str, bytes] | None:
-        """(format, file bytes) of a picture that is kept compressed; None when it is kept raw."""
+        """(format, file bytes) of an image that is kept compressed; None when it is kept raw."""
         if sequence not in self._compressed:
             return None
         message = self._image_message(Topic.COMPRESSED_IMAGE, self._compressed[sequence])
         return str(message.format), bytes(message.data)
 
-    def corrupt(self, topic: Topic, address: int, reason: str) -> CorruptRecordingError:
+    def _corrupt(self, topic: Topic, address: int, reason: str) -> CorruptRecordingError:
+        place = self._source.place(address)
         return CorruptRecordingError(
-            f"{self.path} is damaged at byte {self._source.place(address)} ({topic.value}): {reason}. "
-            "Use the original file"
+            f"{self.path} is damaged at byte {place} ({topic.value}): {reason}",
+            remedy="Use the original file.",
+            at_byte=place,
         )
 
     def _image_message(self, topic: Topic, address: int) -> Any:
@@ -194,13 +198,13 @@ class RecordingSegment:
         try:
             return kind.FromString(self._read(topic, address).data)
         except DecodeError as error:
-            raise self.corrupt(topic, address, "the image message cannot be parsed") from error
+            raise self._corrupt(topic, address, "the image message cannot be parsed") from error
 
     def _read(self, topic: Topic, address: int) -> Message:
         try:
             return self._source.message(address)
         except ShortFileError as error:
-            raise self.corrupt(topic, address, "the file became shorter after it was opened") from error
+            raise self._corrupt(topic, address, "the file became shorter after it was opened") from error
 
     def stored(self, topic: Topic) -> Iterator[Message]:
         """A topic's messages as they are stored, in file order."""
@@ -210,14 +214,14 @@ class RecordingSegment:
         try:
             return decode(struct, self._read(topic, address).data)
         except SchemaError as error:
-            raise self.corrupt(topic, address, str(error)) from error
+            raise self._corrupt(topic, address, str(error)) from error
 
     def _decoded(self, topic: Topic, struct: type[S]) -> Iterator[S]:
         for address in self.messages(topic).addresses:
             yield self._message(topic, address, struct)
 
-    def _file_error(self, reason: str) -> CorruptRecordingError:
-        return CorruptRecordingError(f"{self.path} cannot be used: {reason}")
+    def _unusable(self, reason: str, code: str = "contradiction", remedy: str = "") -> CorruptRecordingError:
+        return CorruptRecordingError(f"{self.path} cannot be used: {reason}", code=code, remedy=remedy)
 
     def _check_channels(self) -> dict[Topic, MessageIndex]:
         """Known topics with exactly the meaning this version knows; the others are `foreign`."""
@@ -230,20 +234,18 @@ class RecordingSegment:
                 self.foreign[channel.topic] = index
                 continue
             schema = self._contents.schema_of(channel)
-            if (channel.encoding, schema.encoding, schema.name) != (
-                "protobuf",
-                "protobuf",
-                schema_name(topic),
-            ):
-                raise self._file_error(
-                    f"topic {topic.value} holds {schema.name[:60]}, not {schema_name(topic)}"
-                )
+            meaning = (channel.encoding, schema.encoding, schema.name)
+            if meaning != ("protobuf", "protobuf", schema_name(topic)):
+                text = f"topic {topic.value} holds {schema.name[:60]}, not {schema_name(topic)}"
+                raise self._unusable(text, "other-schema")
             try:
                 difference = schema_difference(schema_bytes(topic), schema.data)
             except SchemaError as error:
                 difference = str(error)
             if difference:
-                raise self._file_error(f"topic {topic.value}: {difference}; use the version that wrote it")
+                raise self._unusable(
+                    f"topic {topic.value}: {difference}", "other-schema", "Use the version that wrote it."
+                )
             found.setdefault(topic, []).append(index)
         return {topic: joined(indexes) for topic, indexes in found.items()}
 
@@ -251,18 +253,18 @@ class RecordingSegment:
         record = self._contents.metadata.get(SESSION_RECORDS[0], {})
         version = record.get("format", "")
         if version not in FORMATS:
-            raise self._file_error(_other_format(version))
+            raise self._unusable(*_other_format(version))
         if version != FORMATS[0] or "crc32" in record:
             try:
                 require_crc(record)
             except BadRecordError as error:
-                raise self._file_error(str(error)) from error
+                raise self._unusable(str(error)) from error
         try:
             info = msgspec.json.decode(record.get("session", ""), type=SessionInfo)
         except (msgspec.DecodeError, RecursionError) as error:
-            raise self._file_error(f"its description does not fit this version: {error}") from error
+            raise self._unusable(f"its description does not fit this version: {error}") from error
         if not is_session_name(info.name) or not 1 <= info.part <= PARTS_LIMIT:
-            raise self._file_error(f"its session name '{info.name[:60]}' or part {info.part} is not allowed")
+            raise self._unusable(f"its session name '{info.name[:60]}' or part {info.part} is not allowed")
         return info
 
     @property
@@ -274,56 +276,55 @@ class RecordingSegment:
         """Bytes that `recordings recover` could not save when it made this file."""
         stated = self._contents.metadata.get(RECOVERY_RECORD, {}).get("lost_bytes", "0")
         if not stated.isdecimal() or len(stated) > 18:
-            raise self._file_error(f"it says that '{stated[:20]}' bytes were lost")
+            raise self._unusable(f"it says that '{stated[:20]}' bytes were lost")
         return int(stated)
 
     def _checked_attachments(self) -> dict[str, bytes]:
         for name in self._contents.attachments:
             if not is_attachment_name(name):
-                raise self._file_error(f"an attachment is named '{name[:60]}'")
+                raise self._unusable(f"an attachment is named '{name[:60]}'")
         return dict(self._contents.attachments)
 
-    def _index_pictures(self, topic: Topic) -> dict[int, int]:
+    def _index_images(self, topic: Topic) -> dict[int, int]:
         """Sequence → address of the message."""
         found: dict[int, int] = {}
         for address in self.messages(topic).addresses:
             _, _, sequence = self._source.head(address)
             if found.setdefault(sequence, address) != address:
-                raise self.corrupt(topic, address, f"picture {sequence} stands twice in the file")
+                raise self._corrupt(topic, address, f"image {sequence} stands twice in the file")
         return found
 
-    def _check_picture_pairs(self) -> None:
+    def _check_image_pairs(self) -> None:
         if self._raw.keys() & self._compressed.keys():
-            raise self._file_error("a picture is stored both raw and compressed")
+            raise self._unusable("an image is stored both raw and compressed")
         if self._facts.keys() != self._raw.keys() | self._compressed.keys():
-            raise self._file_error("some pictures lack their description, or the other way round")
+            raise self._unusable("some images lack their description, or the other way round")
 
     def _checked_views(self) -> list[View]:
-        """All attempts in file order, each with this file's part number."""
+        """All attempts in file order, each with this file's segment number."""
         if len(self.messages(Topic.VIEW)) > VIEWS_LIMIT:
-            raise self._file_error(f"more than {VIEWS_LIMIT} views")
+            raise self._unusable(f"more than {VIEWS_LIMIT} views")
         views = []
         for address in self.messages(Topic.VIEW).addresses:
             view = self._message(Topic.VIEW, address, View)
             if view.picture_sequence not in self._facts:
-                raise self.corrupt(
-                    Topic.VIEW, address, f"view {view.index} names a picture that is not there"
-                )
+                raise self._corrupt(Topic.VIEW, address, f"view {view.index} names an image that is lost")
             if not _is_rigid(view):
-                raise self.corrupt(
-                    Topic.VIEW, address, f"the flange pose of view {view.index} is no rigid transform"
-                )
+                text = f"the flange pose of view {view.index} is no rigid transform"
+                raise self._corrupt(Topic.VIEW, address, text)
             views.append(msgspec.structs.replace(view, part=self.info.part))
         return views
 
 
-def _other_format(version: str) -> str:
-    """Why a file with this format is not read."""
+def _other_format(version: str) -> tuple[str, str, str]:
+    """Why a file with this format is not read: reason, code, remedy."""
     name, _, number = version.partition("/")
     own_name, _, newest = FORMATS[-1].partition("/")
     if name != own_name or not number.isdecimal():
-        return "it is no recording of this station. Bring in other people's data with `recordings import`"
-    return f"it was written by newer software (format {number[:20]}, this version reads up to {newest})"
+        remedy = "Bring in other people's data with `recordings import`."
+        return "it is no recording of this station", "not-a-recording", remedy
+    text = f"it was written by newer software (format {number[:20]}, this version reads up to {newest})"
+    return text, "newer-format", ""
 
 
 def _is_rigid(view: View) -> bool:

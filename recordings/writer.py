@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import os
+import threading
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -18,8 +19,7 @@ from typing import Any, Self
 
 import msgspec
 
-from recordings.background_sync import BackgroundSync
-from recordings.errors import RecordingError, recover_line
+from recordings.errors import RecordingError, disk_error, exists_error, recover_line
 from recordings.files import (
     PART_SUFFIX,
     is_attachment_name,
@@ -48,6 +48,9 @@ from recordings.schema.topics import Topic, schema_bytes, schema_name
 ATTACHMENT_LIMIT_BYTES = 16 * 1024 * 1024
 SHOWN_PERIOD_NS = 40_000_000
 """Viewers get the arm at 25 Hz; the states themselves are kept at their full rate."""
+KEPT_IN_MEMORY_BYTES = 256 * 2**20
+"""Of one file: a session of single images stays for the solve that follows."""
+_FREE_SPACE = "Nothing is left of it: free space or name another disk, and begin again."
 _SECOND_NS = 1_000_000_000
 
 
@@ -60,11 +63,12 @@ class RecordingWriter:
     def __init__(self, path: Path, info: SessionInfo, *, lossless_png: bool = False) -> None:
         """Creates `path` + '.part'. `lossless_png` compresses pictures (half the size, 20 ms each)."""
         if path.suffix != ".mcap":
-            raise RecordingError(f"{path}: a recording's name ends in .mcap")
+            raise RecordingError(f"{path}: a recording's name ends in .mcap", code="recording-name")
         if not is_session_name(info.name):
-            raise RecordingError(f"'{info.name}' is no session name: use 1 to 40 of a-z, 0-9 and '-'")
+            text = f"'{info.name}' is no session name"
+            raise RecordingError(text, code="session-name", remedy="Use 1 to 40 of a-z, 0-9 and '-'.")
         if os.path.lexists(path):
-            raise RecordingError(f"{path} exists already; choose another name or move it away")
+            raise exists_error(path)
         self.path = path
         self.part_path = path.with_name(path.name + PART_SUFFIX)
         self.info = info
@@ -89,9 +93,7 @@ class RecordingWriter:
             self._file.close()
             # Nothing is in it, and its name is wanted for the next try.
             self.part_path.unlink(missing_ok=True)
-            raise RecordingError(
-                f"{path} cannot be begun ({error.strerror}): free space or replace the disk, then begin again"
-            ) from error
+            raise disk_error("begin", path, error, _FREE_SPACE) from error
         if info.camera.matrix is not None:
             self.camera_model(info.camera)
 
@@ -108,13 +110,17 @@ class RecordingWriter:
     def image(self, picture: Image, encoded: bytes | None = None) -> None:
         """`encoded`: the same picture's PNG or JPEG bytes, stored instead of the array (imported files)."""
         if picture.sequence in self._pictures or picture.sequence < 0:
-            raise RecordingError(f"picture {picture.sequence} was recorded before; sequences count up from 0")
+            text = f"Image {picture.sequence} was recorded before; sequences count up from 0"
+            raise RecordingError(text, code="image-twice", image=picture.sequence)
         height, width = picture.pixels.shape[:2]
         camera = self.info.camera
         if (width, height) != (camera.width, camera.height):
             raise RecordingError(
-                f"picture {picture.sequence} is {width}×{height}, the session's camera is "
-                f"{camera.width}×{camera.height}: all pictures of a session have one size"
+                f"Image {picture.sequence} is {width}×{height}, the session's camera is "
+                f"{camera.width}×{camera.height}",
+                code="image-size",
+                width_px=width,
+                height_px=height,
             )
         facts = PictureFacts(
             stamps=picture.stamps,
@@ -131,7 +137,7 @@ class RecordingWriter:
         try:
             topic, image = self._image(picture, encoded, time_ns)
         except ImageError as error:
-            raise RecordingError(f"picture {picture.sequence}: {error}") from error
+            raise RecordingError(f"Image {picture.sequence} {error}", code="bad-image") from error
         for part_of_it in (Topic.PICTURE_FACTS, topic):  # declared first: the two lie in one chunk
             self._channel(part_of_it)
         self._add(Topic.PICTURE_FACTS, [encode(facts)], time_ns, picture.sequence, more=True)
@@ -150,8 +156,9 @@ class RecordingWriter:
         """The picture must have been recorded before: a view never points at nothing."""
         if view.picture_sequence not in self._pictures:
             raise RecordingError(
-                f"view {view.index} names picture {view.picture_sequence}, which is not in the recording; "
-                "take the pose again"
+                f"View {view.index} names image {view.picture_sequence}, which is not in the recording",
+                code="no-image",
+                remedy="Take the pose again.",
             )
         time_ns = self._time_ns(view.stamps, view.picture_sequence)
         self._add(Topic.VIEW, [encode(view)], time_ns)
@@ -197,9 +204,11 @@ class RecordingWriter:
     def attach(self, name: str, media_type: str, content: bytes) -> None:
         """A small file that rides along, like `plan.yaml`."""
         if not is_attachment_name(name) or name in self._attachments:
-            raise RecordingError(f"'{name}' is no new attachment name: a-z, 0-9, '-', single dots, once")
+            text = f"'{name}' is no new attachment name: a-z, 0-9, '-', single dots, once"
+            raise RecordingError(text, code="attachment-name")
         if len(content) > ATTACHMENT_LIMIT_BYTES:
-            raise RecordingError(f"attachment {name} is larger than {ATTACHMENT_LIMIT_BYTES >> 20} MiB")
+            text = f"Attachment {name} is larger than {ATTACHMENT_LIMIT_BYTES >> 20} MiB"
+            raise RecordingError(text, code="attachment-size", size_bytes=len(content))
         with self._disk():
             self._file.attachment(name, media_type, content, self._start_ns)
         self._attachments.add(name)
@@ -227,7 +236,7 @@ class RecordingWriter:
                 self._background.begin()
 
     def finish(self) -> Path:
-        """Seals the file, renames it, and returns its final path."""
+        """Finishes the file, renames it, and returns its final path."""
         with self._disk():
             self._file.finish()
             self._background.wait()
@@ -237,7 +246,7 @@ class RecordingWriter:
         return self.path
 
     def close(self) -> None:
-        """Closes without sealing; the `.part` file stays for `recordings recover`. Idempotent."""
+        """Closes the file unfinished; the `.part` file stays for `recordings recover`. Idempotent."""
         self._file.close()
 
     def __enter__(self) -> Self:
@@ -294,14 +303,12 @@ class RecordingWriter:
         if self.error is not None:
             raise self.error
         if self._file.closed:
-            raise RecordingError(f"{self.path} is closed")
+            raise RecordingError(f"{self.path} is closed", code="closed")
 
     def _failed(self, error: OSError) -> RecordingError:
         """A writer that failed once cannot be trusted again: what it holds in memory is thrown away."""
-        self.error = RecordingError(
-            f"writing {self.part_path} failed ({error.strerror}); everything synced before is safe. "
-            f"Free space or replace the disk, then: {recover_line(self.part_path)}"
-        )
+        remedy = "What was synced before is safe: free space or replace the disk, then "
+        self.error = disk_error("write", self.part_path, error, remedy + recover_line(self.part_path))
         self._file.close()
         return self.error
 
@@ -324,10 +331,50 @@ def derived_recording(
     except BaseException as problem:
         writer.part_path.unlink(missing_ok=True)
         if problem is writer.error and isinstance(problem.__cause__, OSError):
-            raise RecordingError(
-                f"writing {path} failed ({problem.__cause__.strerror}); nothing is left of it. Free space or "
-                "name another disk, and try again"
-            ) from problem
+            raise disk_error("write", path, problem.__cause__, _FREE_SPACE) from problem
         raise
     finally:
         writer.close()
+
+
+class BackgroundSync:
+    """fdatasync of one open file beside its writer; a failed one is raised by the next call.
+
+    What is on the disk leaves the computer's memory again, but for the newest part: gigabytes of pages that
+    nobody reads made the daemon fall silent for tenths of a second (docs/decisions/0088).
+    """
+
+    def __init__(self, descriptor: int) -> None:
+        self._descriptor = descriptor
+        self._thread: threading.Thread | None = None
+        self._error: OSError | None = None
+        self.last_s = 0.0
+        """How long the newest one took."""
+
+    @property
+    def busy(self) -> bool:
+        return self._thread is not None and self._thread.is_alive()
+
+    def begin(self) -> None:
+        """Waits for the one before. OSError when that failed."""
+        self.wait()
+        self._thread = threading.Thread(target=self._sync, name="recorder sync", daemon=True)
+        self._thread.start()
+
+    def wait(self) -> None:
+        """Until none runs. OSError when one failed: what it should have kept may be lost."""
+        if self._thread is not None:
+            self._thread.join()
+        if self._error is not None:
+            raise self._error
+
+    def _sync(self) -> None:
+        start_s = time.monotonic()
+        try:
+            os.fdatasync(self._descriptor)
+            surplus = os.fstat(self._descriptor).st_size - KEPT_IN_MEMORY_BYTES
+            if surplus > 0:  # a length of 0 would mean all of it
+                os.posix_fadvise(self._descriptor, 0, surplus, os.POSIX_FADV_DONTNEED)
+        except OSError as error:
+            self._error = error
+        self.last_s = time.monotonic() - start_s

@@ -9,13 +9,13 @@ from pathlib import Path
 import pytest
 import typer
 
-import recordings.cli.app
 from calibrate.cli.app import app as calibrate_app
+from recordings.cli.app import RECORDINGS
 from station.cli.app import STATION
 
 PROGRAMS = {
     "calibrate": calibrate_app,
-    "recordings": typer.main.get_command(recordings.cli.app.app),
+    "recordings": RECORDINGS,
     "station": STATION,
 }
 HANDED_ON = ("station", "board")

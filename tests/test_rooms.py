@@ -17,7 +17,10 @@ OF_THE_STATION = (
 )
 
 
-@pytest.mark.parametrize("module", ["calibrate.cli.app", "calibrate.pipeline", "recordings.cli.app"])
+@pytest.mark.parametrize(
+    "module",
+    ["calibrate.cli.app", "calibrate.pipeline", "recordings.cli.commands", "recordings.cli.importing"],
+)
 def test_offline_rooms_load_nothing_of_the_station(module: str) -> None:
     program = f"import sys, {module}; print([m for m in {OF_THE_STATION!r} if m in sys.modules])"
     loaded = subprocess.run(

@@ -1,9 +1,11 @@
-"""`recordings`, the command line of the recordings room."""
+"""The command line `recordings`: a table of commands (`app`), each in a module that loads when it runs."""
 
 from __future__ import annotations
 
 
 def main() -> None:
-    from recordings.cli.app import main as run
+    """Run one command."""
+    from recordings.cli.app import RECORDINGS
+    from recordings.cli.lazy import run
 
-    run()
+    run("recordings", RECORDINGS)

@@ -1,7 +1,13 @@
-"""Recordings for other people's programs."""
+"""Recordings for other people's programs: folders and tables, ROS 2 bags, smaller recordings."""
 
 from __future__ import annotations
 
-from recordings.exporters.ros2 import write_ros2
+from enum import StrEnum
 
-__all__ = ["write_ros2"]
+
+class Target(StrEnum):
+    """What `recordings export` writes."""
+
+    FOLDER = "folder"
+    CSV = "csv"
+    ROS2 = "ros2"

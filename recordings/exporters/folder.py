@@ -4,20 +4,18 @@ from __future__ import annotations
 
 import csv
 import shutil
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from enum import StrEnum
 from pathlib import Path
 from typing import Any
 
 import msgspec
 
-from recordings.errors import RecordingError
-from recordings.exporters import write_ros2
+from recordings.errors import disk_error, exists_error
+from recordings.exporters import Target
 from recordings.files import sync_folder
 from recordings.images import encode_png
-from recordings.importers.dataset import DATASET_FILE, POSES_FILE
-from recordings.importers.poses import HEADER, JOINTS
+from recordings.importers.dataset import DATASET_FILE, HEADER, JOINTS, POSES_FILE
 from recordings.reader import Recording
 from recordings.schema.messages import Stamps, View
 from recordings.schema.viewing import quaternion_xyzw
@@ -27,21 +25,15 @@ _JOINTS = ("base", "shoulder", "elbow", "wrist_1", "wrist_2", "wrist_3")
 _STAMPS = list(Stamps.__struct_fields__)
 
 
-class Target(StrEnum):
-    FOLDER = "folder"
-    CSV = "csv"
-    ROS2 = "ros2"
-
-
 def export_recording(recording: Recording, output: Path, target: Target) -> Path:
     """Writes the folder `output`, which must not exist; nothing is left when it fails. RecordingError."""
-    write: Callable[[Recording, Path], None] = {
-        Target.FOLDER: _write_folder,
-        Target.CSV: _write_tables,
-        Target.ROS2: write_ros2,
-    }[target]
     with _new_folder(output) as folder:
-        write(recording, folder)
+        if target is Target.ROS2:
+            from recordings.exporters.ros2 import write_ros2
+
+            write_ros2(recording, folder)
+        else:
+            (_write_folder if target is Target.FOLDER else _write_tables)(recording, folder)
     return output
 
 
@@ -49,9 +41,7 @@ def export_recording(recording: Recording, output: Path, target: Target) -> Path
 def _new_folder(output: Path) -> Iterator[Path]:
     """Appears under its name when it is complete."""
     if output.exists() or output.is_symlink():
-        raise RecordingError(f"{output} exists already; choose another name")
-    if not output.absolute().parent.is_dir():
-        raise RecordingError(f"the folder {output.absolute().parent} does not exist; create it first")
+        raise exists_error(output)
     temporary = output.with_name(output.name + ".part")
     try:
         temporary.mkdir()
@@ -63,7 +53,7 @@ def _new_folder(output: Path) -> Iterator[Path]:
             shutil.rmtree(temporary, ignore_errors=True)
             raise
     except OSError as error:
-        raise RecordingError(f"cannot write {output}: {error.strerror}") from error
+        raise disk_error("write", output, error) from error
 
 
 def _write_folder(recording: Recording, folder: Path) -> None:

@@ -40,9 +40,8 @@ def write_ros2(recording: Recording, folder: Path) -> None:
     try:
         from rosbags.rosbag2 import StoragePlugin, Writer
     except ImportError as error:
-        raise RecordingError(
-            "ROS 2 bags need the package rosbags: pip install 'calibration-station[ros]'"
-        ) from error
+        text, remedy = "ROS 2 bags need the package rosbags", "pip install 'calibration-station[ros]'"
+        raise RecordingError(text, code="missing-package", remedy=remedy) from error
     messages = _Messages()
     inner = folder / recording.info.name
     with Writer(inner, version=_BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as writer:
@@ -177,8 +176,11 @@ class _Messages:
         seconds, nanoseconds = divmod(time_ns, _NS)
         if seconds > _LAST_S:
             raise RecordingError(
-                f"a message is stamped {seconds} s after 1970, and ROS 2 ends in 2038: the host's clock was "
-                "wrong. Export to csv or folder instead"
+                f"A message is stamped {seconds} s after 1970, and ROS 2 ends in 2038",
+                code="stamp-too-late",
+                remedy="The host's clock was wrong: export to csv or folder instead.",
+                stamp_s=seconds,
+                limit_s=_LAST_S,
             )
         stamp = self.make("builtin_interfaces/msg/Time", seconds, nanoseconds)
         return self.make("std_msgs/msg/Header", stamp, frame)

@@ -7,10 +7,9 @@ time.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
-from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -20,20 +19,24 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recordings.errors import ImportSourceError
-from recordings.files import session_name_from
-from recordings.images import ImageError, decode_image, encode_png, read_header
-from recordings.importers.bags import CountedBag, open_bag
-from recordings.importers.dataset import DATASET_FILE, BagDescription, read_description
+from recordings.images import (
+    KEPT_FORMATS,
+    ImageError,
+    decode_image,
+    encode_png,
+    pixel_format_of,
+    read_header,
+)
+from recordings.importers.bags import Bag, open_bag
+from recordings.importers.dataset import DATASET_FILE, Dataset, read_dataset, vector6
+from recordings.importers.messages import Array, ImageMessage, Joints, Progress
 from recordings.importers.selection import Selection, Wanted, select
 from recordings.importers.stops import Limits, Stop, find_stops
-from recordings.importers.values import Array, Bag, ImageMessage, Joints, Progress
 from recordings.schema.messages import (
-    CameraIdentity,
     CameraModel,
     Image,
     Matrix4,
     RobotState,
-    SessionInfo,
     Stamps,
     Vector6,
     View,
@@ -42,7 +45,6 @@ from recordings.writer import RecordingWriter, derived_recording
 
 PAIR_WITHIN_S = 0.05
 STOPS_LEAST = 3
-_KEPT_AS_THEY_ARE = ("png", "jpeg")
 _LAYOUTS = {
     "mono8": (1, np.uint8, None), "8UC1": (1, np.uint8, None), "mono16": (1, np.uint16, None),
     "bgr8": (3, np.uint8, None), "8UC3": (3, np.uint8, None), "rgb8": (3, np.uint8, cv2.COLOR_RGB2BGR),
@@ -90,9 +92,8 @@ def import_bag(
     described, description_bytes = _description(source, description, needed=output is not None)
     bag = open_bag(source, progress)
     try:
-        counted = CountedBag(bag, progress)
-        chosen = select(counted, wanted)
-        images_ns = np.fromiter(counted.image_stamps(chosen.image.name), np.int64)
+        chosen = select(bag, wanted)
+        images_ns = np.fromiter(bag.image_stamps(chosen.image.name), np.int64)
         joints = chosen.joints
         speeds = (joints.stamps_ns, joints.fastest_rad_s) if joints and joints.has_speeds else None
         stops, passed = find_stops(chosen.track, images_ns, speeds, limits, pair_within_s)
@@ -102,8 +103,11 @@ def import_bag(
         if len(stops) < STOPS_LEAST:
             why = ", ".join(f"{count} {reason}" for reason, count in passed.items() if count)
             raise ImportSourceError(
-                f"{source}: the arm stands still in {len(stops)} pictures of {len(images_ns)} ({why}). "
-                "Look at it with --dry-run; --still-mm and --still-deg allow for a noisier arm"
+                f"{source}: the arm stands still in {len(stops)} images of {len(images_ns)} ({why})",
+                code="no-stops",
+                remedy="Look at it with --dry-run; --still-mm and --still-deg allow for a noisier arm.",
+                stops=len(stops),
+                limit=STOPS_LEAST,
             )
         assert described is not None
         size = _write(
@@ -114,15 +118,16 @@ def import_bag(
         bag.close()
 
 
-def _description(source: Path, given: Path | None, needed: bool) -> tuple[BagDescription | None, bytes]:
+def _description(source: Path, given: Path | None, needed: bool) -> tuple[Dataset | None, bytes]:
     folder = source if source.is_dir() else source.parent
     for path in (given, folder / DATASET_FILE, folder.parent / DATASET_FILE):
         if path is not None and (path == given or path.is_file()):
-            return read_description(path)
+            return read_dataset(path)
     if needed:
         raise ImportSourceError(
-            f"nothing says which board {source} shows and how the camera is mounted. Write a {DATASET_FILE} "
-            "with mount and board (docs/recording-format.md), and name it with --dataset"
+            f"Nothing says which board {source} shows and how the camera is mounted",
+            code="no-dataset",
+            remedy=f"Name a {DATASET_FILE} with mount and board (docs/recording-format.md) by --dataset.",
         )
     return None, b""
 
@@ -130,7 +135,7 @@ def _description(source: Path, given: Path | None, needed: bool) -> tuple[BagDes
 def _plan(
     bag: Bag,
     chosen: Selection,
-    described: BagDescription | None,
+    described: Dataset | None,
     images: int,
     stops: list[Stop],
     passed: dict[str, int],
@@ -156,7 +161,7 @@ def _write(
     bag: Bag,
     chosen: Selection,
     stops: list[Stop],
-    described: BagDescription,
+    described: Dataset,
     description_bytes: bytes,
     source: Path,
     output: Path,
@@ -169,24 +174,15 @@ def _write(
     images = bag.images(chosen.image.name, [stop.place for stop in in_file_order])
     first = next(images)
     width, height = _size(first)
-    info = SessionInfo(
-        name=session_name_from(source.resolve().stem),
-        mount=described.mount,
-        source="imported",
-        board=described.board,
-        camera=_camera(described, chosen.camera, width, height),
-        robot=described.identity,
-        camera_identity=CameraIdentity(driver="imported"),
-        created_wall_ns=min(stop.stamp_ns for stop in stops) if stops[0].stamp_ns > 0 else time.time_ns(),
-        software={"calibration-station": version("calibration-station")},
-        note=described.note or f"imported from {source.name}: {plan.image_topic}, {plan.poses_from}",
-    )
+    camera = _camera(described, chosen.camera, width, height)
+    note = f"imported from {source.name}: {plan.image_topic}, {plan.poses_from}"
+    info = described.session(source, camera, max(0, min(stop.stamp_ns for stop in stops)), note)
     with derived_recording(output, info) as writer:
         writer.attach(DATASET_FILE, "application/yaml", description_bytes)
         writer.attach("import.json", "application/json", msgspec.json.encode(asdict(plan)))
         states = _states(bag, chosen)
         last, waiting = None, next(states, None)
-        for done, (stop, image) in enumerate(zip(in_file_order, _chain(first, images), strict=True)):
+        for done, (stop, image) in enumerate(zip(in_file_order, chain([first], images), strict=True)):
             while waiting is not None and waiting.stamps.host_wall_ns <= stop.stamp_ns:
                 writer.robot_state(waiting)
                 last, waiting = waiting, next(states, None)
@@ -199,18 +195,12 @@ def _write(
         return writer.finish().stat().st_size
 
 
-def _chain(first: ImageMessage, rest: Iterator[ImageMessage]) -> Iterator[ImageMessage]:
-    yield first
-    yield from rest
-
-
-def _camera(described: BagDescription, found: CameraModel | None, width: int, height: int) -> CameraModel:
+def _camera(described: Dataset, found: CameraModel | None, width: int, height: int) -> CameraModel:
     """The description's, else the bag's, else the size alone. ImportSourceError for another size."""
     camera = described.camera or found or CameraModel(width, height)
     if (camera.width, camera.height) != (width, height):
-        raise ImportSourceError(
-            f"the pictures are {width}×{height}, their camera is described as {camera.width}×{camera.height}"
-        )
+        text = f"The images are {width}×{height}, their camera is described as {camera.width}×{camera.height}"
+        raise ImportSourceError(text, code="image-size", width_px=width, height_px=height)
     return camera
 
 
@@ -251,19 +241,17 @@ def _joints_at(
     if not near or any(abs(s.stamps.host_wall_ns - stamp_ns) > within_s * 1e9 for s in near):
         return None
     times = [state.stamps.host_wall_ns - stamp_ns for state in near]
-    a, b, c, d, e, f = (
-        float(np.interp(0, times, joint)) for joint in zip(*[s.joints_rad for s in near], strict=True)
-    )
-    return a, b, c, d, e, f
+    joints = zip(*[state.joints_rad for state in near], strict=True)
+    return vector6([float(np.interp(0, times, joint)) for joint in joints])
 
 
 def _write_view(
-    writer: RecordingWriter, index: int, stop: Stop, image: ImageMessage, joints_rad: Vector6 | None
+    writer: RecordingWriter, index: int, stop: Stop, message: ImageMessage, joints_rad: Vector6 | None
 ) -> None:
-    pixels, encoded = _pixels(image, stop.place)
-    pixel_format = "BGR8" if pixels.ndim == 3 else "Mono8" if pixels.itemsize == 1 else "Mono16"
+    pixels, encoded = _pixels(message, stop.place)
     stamps = Stamps(host_wall_ns=stop.stamp_ns, device_ns=stop.stamp_ns)
-    writer.image(Image(pixels, stamps, stop.place, index, pixel_format=pixel_format), encoded)
+    image = Image(pixels, stamps, stop.place, index, pixel_format=pixel_format_of(pixels))
+    writer.image(image, encoded)
     T: Matrix4 = tuple(tuple(map(float, row)) for row in stop.base_from_flange)
     writer.view(
         View(
@@ -285,7 +273,7 @@ def _size(image: ImageMessage) -> tuple[int, int]:
     try:
         header = read_header(image.data)
     except ImageError as error:
-        raise ImportSourceError(f"the first picture {error}") from error
+        raise ImportSourceError(f"The first image {error}", code="bad-image") from error
     return header.width, header.height
 
 
@@ -295,7 +283,7 @@ def _pixels(image: ImageMessage, place: int) -> tuple[NDArray[Any], bytes | None
         if image.encoding == "compressed":
             header = read_header(image.data)
             decoded = decode_image(image.data, header.width, header.height)
-            return decoded, image.data if header.format in _KEPT_AS_THEY_ARE else encode_png(decoded)
+            return decoded, image.data if header.format in KEPT_FORMATS else encode_png(decoded)
         if image.encoding not in _LAYOUTS:
             raise ImageError(f"is encoded as '{image.encoding}' (known: {', '.join(_LAYOUTS)}, PNG, JPEG)")
         channels, kind, conversion = _LAYOUTS[image.encoding]
@@ -310,4 +298,4 @@ def _pixels(image: ImageMessage, place: int) -> tuple[NDArray[Any], bytes | None
             pixels = pixels.reshape(image.height, image.width, channels)
         return (pixels if conversion is None else np.asarray(cv2.cvtColor(pixels, conversion))), None
     except ImageError as error:
-        raise ImportSourceError(f"picture {place + 1} {error}") from error
+        raise ImportSourceError(f"Image {place + 1} {error}", code="bad-image", image=place + 1) from error

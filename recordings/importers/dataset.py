@@ -1,15 +1,21 @@
-"""`dataset.yaml`: how other people describe their board and camera to `recordings import`."""
+"""`dataset.yaml` and `poses.csv`: how other people describe board, camera and robot poses for an import."""
 
 from __future__ import annotations
 
+import csv
+import io
 import math
+import time
+from dataclasses import dataclass
+from importlib.metadata import version
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
 from recordings import strict_yaml
-from recordings.errors import ImportSourceError
+from recordings.errors import ImportSourceError, disk_error
+from recordings.files import session_name_from
 from recordings.images import SIDE_LIMIT_PX
 from recordings.schema.messages import (
     LARGEST_FLATNESS_M,
@@ -17,27 +23,32 @@ from recordings.schema.messages import (
     SINGLE_TAGS,
     BoardKind,
     BoardSpec,
+    CameraIdentity,
     CameraModel,
+    Matrix4,
     Mount,
     RobotIdentity,
+    SessionInfo,
+    Vector6,
+    matrix_from_quaternion,
 )
 
 DATASET_FILE = "dataset.yaml"
 POSES_FILE = "poses.csv"
+HEADER = ["image", "x", "y", "z", "qx", "qy", "qz", "qw"]
+JOINTS = ["j1", "j2", "j3", "j4", "j5", "j6"]
+"""Optional, after the others."""
+_CSV_LIMIT_BYTES = 4 * 1024 * 1024
+_REACH_LIMIT_M = 20.0
+"""No arm reaches this far: such numbers are millimetres."""
+_UNIT_TOLERANCE = 0.01
+_TURN_LIMIT_RAD = 4 * math.pi
+"""No joint turns this far: such numbers are degrees."""
+_HELP = "See docs/recording-format.md, 'Bring your own pictures'."
 
 
 class Dataset(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What stands in dataset.yaml."""
-
-    mount: Mount
-    board: BoardSpec
-    camera: CameraModel
-    robot: str | RobotIdentity = ""
-    note: str = ""
-
-
-class BagDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """What a bag does not say of itself: dataset.yaml, in which `camera` may be left to the bag."""
+    """Content of dataset.yaml; a bag may tell the camera itself."""
 
     mount: Mount
     board: BoardSpec
@@ -45,95 +56,184 @@ class BagDescription(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     robot: str | RobotIdentity = ""
     note: str = ""
 
-    @property
-    def identity(self) -> RobotIdentity:
-        return RobotIdentity(model=self.robot or "unknown") if isinstance(self.robot, str) else self.robot
+    def session(self, source: Path, camera: CameraModel, created_ns: int = 0, note: str = "") -> SessionInfo:
+        """Description of a recording made from `source`; `note` where dataset.yaml has none."""
+        robot = self.robot
+        return SessionInfo(
+            name=session_name_from(source.resolve().name if source.is_dir() else source.stem),
+            mount=self.mount,
+            source="imported",
+            board=self.board,
+            camera=camera,
+            robot=RobotIdentity(model=robot or "unknown") if isinstance(robot, str) else robot,
+            camera_identity=CameraIdentity(driver="imported"),
+            created_wall_ns=created_ns or time.time_ns(),
+            software={"calibration-station": version("calibration-station")},
+            note=self.note or note,
+        )
 
 
-def read_description(path: Path) -> tuple[BagDescription, bytes]:
-    """(description, the file's bytes). Raises ImportSourceError with file, place and remedy."""
-    content = read_small_file(path, strict_yaml.LIMIT_BYTES)
-    try:
-        described = strict_yaml.load(content, BagDescription)
-    except strict_yaml.StrictYamlError as error:
-        raise ImportSourceError(f"{path}: {'; '.join(map(str, error.problems))} (see {_HELP})") from None
-    problem = _board_problem(described.board) or (described.camera and _camera_problem(described.camera))
-    if problem:
-        raise ImportSourceError(f"{path}: {problem}. See {_HELP}")
-    return described, content
+@dataclass(frozen=True)
+class PoseRow:
+    """One line of poses.csv."""
+
+    line: int
+    image: str
+    """Relative to the folder, as written."""
+    base_from_flange: Matrix4
+    joints_rad: Vector6 | None = None
 
 
-def read_dataset(folder: Path) -> tuple[Dataset, bytes]:
-    """(description, the file's bytes). Raises ImportSourceError with file, place and remedy."""
-    path = folder / DATASET_FILE
-    content = read_small_file(path, strict_yaml.LIMIT_BYTES)
+def read_dataset(path: Path) -> tuple[Dataset, bytes]:
+    """(description, the file's bytes). Raises ImportSourceError with file and place."""
+    content = _read_small_file(path, strict_yaml.LIMIT_BYTES)
     try:
         dataset = strict_yaml.load(content, Dataset)
     except strict_yaml.StrictYamlError as error:
-        raise ImportSourceError(f"{path}: {'; '.join(map(str, error.problems))} (see {_HELP})") from None
-    problem = _board_problem(dataset.board) or _camera_problem(dataset.camera)
-    if problem:
-        raise ImportSourceError(f"{path}: {problem}. See {_HELP}")
+        text, first = f"{path}: {'; '.join(map(str, error.problems))}", error.problems[0]
+        raise ImportSourceError(
+            text, code="dataset", remedy=_HELP, line=first.line, key=first.where
+        ) from None
+    for problem in (_board_problem(dataset.board), _camera_problem(dataset.camera)):
+        if problem:
+            key, text = problem
+            raise ImportSourceError(f"{path}: {key}: {text}", code="dataset", remedy=_HELP, key=key)
     return dataset, content
 
 
-_HELP = "docs/recording-format.md, 'Bring your own pictures'"
-
-
-def _board_problem(board: BoardSpec) -> str:
+def _board_problem(board: BoardSpec) -> tuple[str, str] | None:
+    """(key, what is wrong with it)."""
+    size, square_m, marker_m = f"{board.columns}×{board.rows} columns×rows", board.square_m, board.marker_m
     if board.kind not in SINGLE_TAGS and not (2 <= board.columns <= 100 and 2 <= board.rows <= 100):
-        return f"board: {board.columns}×{board.rows} columns×rows; each is 2 to 100"
+        return "board.columns", f"{size}; each is 2 to 100"
     if board.kind in SINGLE_TAGS and (board.columns, board.rows) != (1, 1):
-        return f"board: {board.columns}×{board.rows} columns×rows; a single tag has none, leave them out"
+        return "board.columns", f"{size}; a single tag has none, leave them out"
     if board.kind is BoardKind.ARUCO and not board.dictionary:
-        return "board: an aruco tag needs its dictionary, such as DICT_4X4_50"
-    if not 1e-4 <= board.square_m <= 10:
-        return f"board: square_m = {board.square_m} is not a length in metres (25 mm = 0.025)"
-    if board.kind is BoardKind.CHARUCO and not (board.marker_m and board.dictionary):
-        return "board: a charuco board needs marker_m and dictionary"
-    if board.marker_m is not None and board.marker_m <= 0:
-        return f"board: marker_m = {board.marker_m} is not a length in metres"
-    if board.kind is BoardKind.CHARUCO and board.marker_m and board.marker_m >= board.square_m:
-        return f"board: marker_m = {board.marker_m} must be smaller than square_m = {board.square_m}"
+        return "board.dictionary", "an aruco tag needs its dictionary, such as DICT_4X4_50"
+    if not 1e-4 <= square_m <= 10:
+        return "board.square_m", f"{square_m} is not a length in metres (25 mm = 0.025)"
+    if board.kind is BoardKind.CHARUCO and not (marker_m and board.dictionary):
+        return "board.marker_m", "a charuco board needs marker_m and dictionary"
+    if marker_m is not None and marker_m <= 0:
+        return "board.marker_m", f"{marker_m} is not a length in metres"
+    if board.kind is BoardKind.CHARUCO and marker_m and marker_m >= square_m:
+        return "board.marker_m", f"{marker_m} must be smaller than square_m = {square_m}"
     if board.square_tolerance is not None and not 0 < board.square_tolerance <= LARGEST_TOLERANCE:
-        return (
-            f"board: square_tolerance = {board.square_tolerance} is no relative tolerance of square_m "
-            f"(0.003 is 0.3 %; above 0, at most {LARGEST_TOLERANCE:g})"
+        text = (
+            f"{board.square_tolerance} is no share of square_m (0.003 is 0.3 %, limit {LARGEST_TOLERANCE:g})"
         )
+        return "board.square_tolerance", text
     if board.flatness_m is not None and not 0 < board.flatness_m <= LARGEST_FLATNESS_M:
-        return (
-            f"board: flatness_m = {board.flatness_m} is no flatness in metres (1 mm is 0.001; above 0, "
-            f"at most {LARGEST_FLATNESS_M:g})"
-        )
-    return ""
+        text = f"{board.flatness_m} is no flatness in metres (1 mm is 0.001, limit {LARGEST_FLATNESS_M:g})"
+        return "board.flatness_m", text
+    return None
 
 
-def _camera_problem(camera: CameraModel) -> str:
+def _camera_problem(camera: CameraModel | None) -> tuple[str, str] | None:
+    """(key, what is wrong with it)."""
+    if camera is None:
+        return None
     if not (0 < camera.width <= SIDE_LIMIT_PX and 0 < camera.height <= SIDE_LIMIT_PX):
-        return f"camera: {camera.width}×{camera.height} is no picture size"
-    if not all(math.isfinite(d) for d in camera.distortion):
-        return "camera: distortion holds a number that is not finite"
+        return "camera.width", f"{camera.width}×{camera.height} is no image size"
+    if not all(map(math.isfinite, camera.distortion)):
+        return "camera.distortion", "a number is not finite"
     if camera.matrix is None:
-        return "" if not camera.distortion else "camera: distortion without matrix; give both or neither"
+        return (
+            ("camera.matrix", "distortion without matrix; give both or neither")
+            if camera.distortion
+            else None
+        )
     K = np.array(camera.matrix)
     if K.shape != (3, 3) or not np.isfinite(K).all() or K[0, 0] <= 0 or K[1, 1] <= 0:
-        return "camera: matrix must be 3×3 with positive focal lengths"
+        return "camera.matrix", "it must be 3×3 with positive focal lengths"
     if K[2].tolist() != [0, 0, 1]:
-        return "camera: the last row of matrix must be [0, 0, 1]"
-    return ""
+        return "camera.matrix", "its last row must be [0, 0, 1]"
+    return None
 
 
-def read_small_file(path: Path, limit_bytes: int) -> bytes:
-    """The whole file. ImportSourceError when it is missing, unreadable or too large to be right."""
+def _read_small_file(path: Path, limit_bytes: int) -> bytes:
+    """The whole file. ImportSourceError when it is missing or too large to be right."""
     if not path.is_file():
-        raise ImportSourceError(
-            f"{path} is missing; a folder to import has {DATASET_FILE}, {POSES_FILE} and pictures"
-        )
+        remedy = f"A folder to import has {DATASET_FILE}, {POSES_FILE} and images."
+        raise ImportSourceError(f"{path} is missing", code="no-file", remedy=remedy)
     try:
         with path.open("rb") as file:
             content = file.read(limit_bytes + 1)
     except OSError as error:
-        raise ImportSourceError(f"cannot read {path}: {error.strerror}") from error
+        raise disk_error("read", path, error) from error
     if len(content) > limit_bytes:
-        raise ImportSourceError(f"{path} is larger than {limit_bytes // 1024} kB; is it the right file?")
+        text = f"{path} is larger than {limit_bytes // 1024} kB"
+        raise ImportSourceError(text, code="file-too-large", remedy="Check that it is the right file.")
     return content
+
+
+def read_poses(folder: Path) -> tuple[list[PoseRow], bytes]:
+    """(rows, the file's bytes). Raises ImportSourceError; values `line` and what is wrong there."""
+    path = folder / POSES_FILE
+    content = _read_small_file(path, _CSV_LIMIT_BYTES)
+    try:
+        text = content.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise ImportSourceError(
+            f"{path} is not UTF-8 text", code="poses", remedy="Save it as plain CSV."
+        ) from error
+    reader = csv.reader(io.StringIO(text, newline=""), strict=True)
+    try:
+        lines = [(reader.line_num, cells) for cells in reader if any(cell.strip() for cell in cells)]
+    except csv.Error as error:
+        raise _wrong_row(path, reader.line_num, str(error)) from error
+    header = [cell.strip() for cell in lines[0][1]] if lines else []
+    if header not in (HEADER, HEADER + JOINTS):
+        found = ",".join(lines[0][1])[:100] if lines else "nothing"
+        needed = f"'{','.join(HEADER)}' (metres, unit quaternion) or with ,{','.join(JOINTS)} (radians)"
+        raise _wrong_row(path, 1, f"the header is '{found}', it must be {needed}", "header")
+    rows = [_pose_row(path, line, header, [cell.strip() for cell in cells]) for line, cells in lines[1:]]
+    if not rows:
+        raise _wrong_row(path, 1, "a header but no poses; add one line per image", "no-poses")
+    first: dict[str, int] = {}
+    for row in rows:
+        if (line := first.setdefault(row.image, row.line)) != row.line:
+            text = f"{row.image} stands already in line {line}; each image has one pose"
+            raise _wrong_row(path, row.line, text, "image-twice")
+    return rows, content
+
+
+def _wrong_row(path: Path, line: int, reason: str, code: str = "pose-row") -> ImportSourceError:
+    return ImportSourceError(f"{path} line {line}: {reason}", code=code, line=line)
+
+
+def _pose_row(path: Path, line: int, header: list[str], cells: list[str]) -> PoseRow:
+    if len(cells) != len(header):
+        text = f"{len(cells)} values where {len(header)} are needed ({','.join(header)})"
+        raise _wrong_row(path, line, text)
+    if not any(cells[len(HEADER) :]):  # this image's joints are not known
+        header, cells = HEADER, cells[: len(HEADER)]
+    numbers = []
+    for name, cell in zip(header[1:], cells[1:], strict=True):
+        try:
+            numbers.append(float(cell))
+        except ValueError as error:
+            raise _wrong_row(path, line, f"{name} = '{cell[:40]}' is not a number") from error
+        if not math.isfinite(numbers[-1]):
+            raise _wrong_row(path, line, f"{name} = {cell} is not finite; correct or delete the line")
+    if not cells[0] or "\0" in cells[0]:
+        raise _wrong_row(path, line, "the image's name is missing")
+    position, quaternion, joints = numbers[:3], numbers[3:7], numbers[7:]
+    if (far_m := max(map(abs, position))) > _REACH_LIMIT_M:
+        text = f"the flange is {far_m:g} m away: x, y, z must be metres, not millimetres"
+        raise _wrong_row(path, line, text, "not-metres")
+    length = math.hypot(*quaternion)
+    if abs(length - 1) > _UNIT_TOLERANCE:
+        text = f"the quaternion's length is {length:.4g}, it must be 1 (qx,qy,qz,qw, no rotation vector)"
+        raise _wrong_row(path, line, text, "no-unit-quaternion")
+    if joints and (turn := max(map(abs, joints))) > _TURN_LIMIT_RAD:
+        text = f"a joint is at {turn:g}: j1 … j6 must be radians, not degrees, from the base to wrist 3"
+        raise _wrong_row(path, line, text, "not-radians")
+    base_from_flange = matrix_from_quaternion(position, [q / length for q in quaternion])
+    return PoseRow(line, cells[0], base_from_flange, vector6(joints) if joints else None)
+
+
+def vector6(numbers: list[float]) -> Vector6:
+    """Exactly six numbers."""
+    a, b, c, d, e, f = numbers
+    return a, b, c, d, e, f

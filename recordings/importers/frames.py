@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recordings.errors import ImportSourceError
-from recordings.importers.values import Array, Frame
+from recordings.importers.messages import Array, Frame
 
 SAMPLES_LIMIT = 4_000_000
 """Of all frames together: 64 bytes each."""
@@ -56,18 +56,15 @@ class FrameTree:
             numbers = (*frame.position_m, *frame.rotation_xyzw)
             length = float(np.linalg.norm(frame.rotation_xyzw))
             if not np.isfinite(numbers).all() or abs(length - 1) > _UNIT_TOLERANCE:
-                raise ImportSourceError(
-                    f"the frame {frame.parent} → {frame.child} at {frame.stamp_ns} ns is no rigid transform"
-                )
+                text = f"Frame {frame.parent} → {frame.child} at {frame.stamp_ns} ns is no rigid transform"
+                raise ImportSourceError(text, code="not-rigid", at_ns=frame.stamp_ns)
             self._samples += 1
             if self._samples > SAMPLES_LIMIT:
-                raise ImportSourceError(f"the bag has more than {SAMPLES_LIMIT} frames. Cut it first")
+                text = f"The bag has more than {SAMPLES_LIMIT} frames"
+                raise ImportSourceError(text, code="too-many-frames", remedy="Cut it first.")
             edge = self.edges.setdefault((frame.parent.lstrip("/"), frame.child.lstrip("/")), Edge())
             edge.stamps_ns.append(frame.stamp_ns)
             edge.numbers.extend(numbers)
-
-    def names(self) -> set[str]:
-        return {name for pair in self.edges for name in pair}
 
     def chain(self, base: str, flange: str) -> list[tuple[tuple[str, str], bool]] | None:
         """The edges from base to flange, each with whether it is walked from parent to child."""
@@ -94,11 +91,14 @@ class FrameTree:
             pair = (base or known_base, flange or known_flange)
             if (path := self.chain(*pair)) and any(self.moves(edge) for edge, _ in path):
                 return pair
-        names = ", ".join(sorted(self.names())) or "none"
-        raise ImportSourceError(
-            f"no frames lead from {base or 'a known base'} to {flange or 'a known flange'} "
-            f"(frames: {names}). "
-            "Name them with --base and --flange, or a topic of poses with --pose-topic"
+        raise self._no_chain(base or "a known base", flange or "a known flange")
+
+    def _no_chain(self, base: str, flange: str) -> ImportSourceError:
+        names = ", ".join(sorted({name for pair in self.edges for name in pair})) or "none"
+        return ImportSourceError(
+            f"No frames lead from {base} to {flange} (frames: {names})",
+            code="no-frames",
+            remedy="Name them with --base and --flange, or a topic of poses with --pose-topic.",
         )
 
     def moves(self, pair: tuple[str, str]) -> bool:
@@ -110,7 +110,7 @@ class FrameTree:
         """base_from_flange over time. ImportSourceError when a chain is not there."""
         path = self.chain(base, flange)
         if not path:
-            raise ImportSourceError(f"no frames lead from {base} to {flange}")
+            raise self._no_chain(base, flange)
         links = [_Link(*self.edges[pair].sorted(), forward, self.moves(pair)) for pair, forward in path]
         return Track(links)
 

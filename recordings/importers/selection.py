@@ -8,8 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recordings.errors import ImportSourceError
+from recordings.importers.bags import Bag, Topic
 from recordings.importers.frames import FrameTree, Track
-from recordings.importers.values import Array, Bag, Camera, Frame, Joints, Kind, Topic
+from recordings.importers.messages import Array, Camera, Frame, Joints, Kind
 from recordings.schema.messages import CameraModel, Vector6
 
 _UR_ORDER = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
@@ -96,15 +97,16 @@ def _one(bag: Bag, kind: Kind, name: str | None, option: str) -> Topic:
     if name is not None:
         found = [topic for topic in topics if topic.name == name]
         if not found:
-            raise ImportSourceError(f"the bag has no {kind.value} on {name} (there are: {there})")
+            text = f"The bag has no {kind.value} on {name} (there are: {there})"
+            raise ImportSourceError(text, code="no-topic", topic=name)
         return found[0]
     if not topics:
         others = f"; other topics: {', '.join(bag.others[:10])}" if bag.others else ""
-        raise ImportSourceError(f"the bag holds no topic with {kind.value} of a known kind{others}")
+        text = f"The bag holds no topic with {kind.value} of a known kind{others}"
+        raise ImportSourceError(text, code="no-topic", kind=kind.value)
     if len(topics) > 1:
-        raise ImportSourceError(
-            f"the bag holds {kind.value} on several topics: {there}. Choose with {option}"
-        )
+        text = f"The bag holds {kind.value} on several topics: {there}"
+        raise ImportSourceError(text, code="several-topics", remedy=f"Choose with {option}.", kind=kind.value)
     return topics[0]
 
 
@@ -114,7 +116,8 @@ def _from_poses(bag: Bag, topic: str) -> tuple[Track, str]:
         assert isinstance(frames, list)
         base = frames[0].parent or "base"
         if tree.edges and (base.lstrip("/"), _POSE_CHILD) not in tree.edges:
-            raise ImportSourceError(f"the poses on {topic} are in several frames; export one of them")
+            text, remedy = f"The poses on {topic} are in several frames", "Export one of them."
+            raise ImportSourceError(text, code="several-frames", remedy=remedy)
         pose = frames[0]
         tree.add([Frame(pose.stamp_ns, base, _POSE_CHILD, pose.position_m, pose.rotation_xyzw)])
     return tree.track(base.lstrip("/"), _POSE_CHILD), f"poses on {topic} in {base}"

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recordings.importers.frames import Track
-from recordings.importers.values import Array
+from recordings.importers.messages import Array
 from recordings.schema.messages import Stillness
 
 WINDOW_S = 0.3

@@ -18,7 +18,6 @@ RECORD_HEAD = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<HIQQ")
 FOOTER = struct.Struct("<QQI")
 FOOTER_BYTES = RECORD_HEAD.size + FOOTER.size
-DATA_END_BYTES = RECORD_HEAD.size + 4
 
 
 class Opcode(IntEnum):

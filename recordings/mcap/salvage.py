@@ -36,8 +36,7 @@ from recordings.mcap.records import (
     split_records,
 )
 from recordings.mcap.scan import CHUNK_LIMIT_BYTES, SUMMARY_LIMIT_BYTES
-from recordings.mcap.source import Source
-from recordings.mcap.unpack import unpack
+from recordings.mcap.source import Source, unpack
 
 _LIKE_A_RECORD = re.compile(rb"[\x06\x09\x0c].{4}\x00{4}", re.DOTALL)
 """Opcode of a chunk, attachment or metadata record, and a length below 4 GiB."""

@@ -16,7 +16,13 @@ from array import array
 from collections.abc import Callable
 from pathlib import Path
 
-from recordings.errors import CorruptRecordingError, RecordingError, UnfinishedRecordingError, recover_line
+from recordings.errors import (
+    CorruptRecordingError,
+    RecordingError,
+    UnfinishedRecordingError,
+    disk_error,
+    recover_line,
+)
 from recordings.mcap import checksum
 from recordings.mcap.contents import Contents
 from recordings.mcap.records import (
@@ -33,8 +39,7 @@ from recordings.mcap.records import (
     parse_statistics,
     split_records,
 )
-from recordings.mcap.source import ShortFileError, Source
-from recordings.mcap.unpack import unpack
+from recordings.mcap.source import ShortFileError, Source, unpack
 
 CHUNK_LIMIT_BYTES = 40 * 1024 * 1024
 """Of a record, packed or unpacked: the largest picture of a recording and a little more."""
@@ -65,8 +70,9 @@ def scan_file(
     try:
         return scan.contents, scan.source, scan.run()
     except ShortFileError as error:
+        text = f"{path} became shorter while it was read: another program changes it"
         raise CorruptRecordingError(
-            f"{path} became shorter while it was read: another program changes it. Try again afterwards"
+            text, code="changed-while-read", remedy="Try again afterwards."
         ) from error
 
 
@@ -75,10 +81,10 @@ def open_file(path: Path) -> int:
     try:
         descriptor = os.open(path, os.O_RDONLY | os.O_CLOEXEC | os.O_NONBLOCK)
     except OSError as error:
-        raise RecordingError(f"cannot open {path}: {error.strerror}") from error
+        raise disk_error("open", path, error) from error
     if not stat.S_ISREG(os.fstat(descriptor).st_mode):
         os.close(descriptor)
-        raise RecordingError(f"{path} is not a file")
+        raise RecordingError(f"{path} is not a file", code="no-file")
     return descriptor
 
 
@@ -132,35 +138,34 @@ class _Scan:
 
     def _corrupt(self, offset: int, reason: str) -> CorruptRecordingError:
         return CorruptRecordingError(
-            f"{self._path} is damaged at byte {offset}: {reason}. "
-            f"Use the original, or save what is whole: {self._rescue}"
+            f"{self._path} is damaged at byte {offset}: {reason}",
+            remedy=f"Use the original, or save what is whole: {self._rescue}",
+            at_byte=offset,
         )
 
-    def _unsealed(self, reason: str) -> UnfinishedRecordingError:
-        return UnfinishedRecordingError(
-            f"{self._path} was not finished or is cut ({reason}). Save what is whole: {self._rescue}"
-        )
+    def _unfinished(self, reason: str) -> UnfinishedRecordingError:
+        text = f"{self._path} is unfinished or cut ({reason})"
+        return UnfinishedRecordingError(text, remedy=f"Save what is whole: {self._rescue}")
 
     def _tail(self) -> tuple[int, int]:
         """Magic at both ends and the footer → (where the summary starts, 0 for none; its checksum)."""
         beginning = os.pread(self.source.descriptor, len(MAGIC), 0)
         if beginning != MAGIC:
             if not beginning:
-                raise CorruptRecordingError(
-                    f"{self._path} is empty: it was never written, or its copy failed. Copy it again"
-                )
+                text = f"{self._path} is empty: it was never written, or its copy failed"
+                raise CorruptRecordingError(text, code="empty-file", remedy="Copy it again.")
             if MAGIC.startswith(beginning):
-                raise self._unsealed(f"only {self._size} bytes")
+                raise self._unfinished(f"only {self._size} bytes")
             raise self._corrupt(0, "it does not begin like an MCAP file, perhaps another one was meant")
         tail = FOOTER_BYTES + len(MAGIC)
         if self._size < len(MAGIC) + tail:
-            raise self._unsealed(f"only {self._size} bytes")
+            raise self._unfinished(f"only {self._size} bytes")
         content = self.source.read(self._size - tail, tail)
         if not content.endswith(MAGIC):
-            raise self._unsealed("the end mark is missing")
+            raise self._unfinished("the end mark is missing")
         opcode, length = RECORD_HEAD.unpack_from(content)
         if opcode != Opcode.FOOTER or length != FOOTER.size:
-            raise self._unsealed("the footer is missing")
+            raise self._unfinished("the footer is missing")
         summary_start, _, crc = FOOTER.unpack_from(content, RECORD_HEAD.size)
         if summary_start and not len(MAGIC) < summary_start <= self._size - tail:
             raise self._corrupt(self._size - tail, f"the footer points to byte {summary_start}")

@@ -6,17 +6,22 @@ possible place in a file, so one number says where a message is; one unpacked ch
 
 from __future__ import annotations
 
+import io
 import os
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator
 from typing import NamedTuple
 
-from recordings.mcap.records import MESSAGE_HEAD, RECORD_HEAD
-from recordings.mcap.unpack import unpack
+import lz4.frame
+import zstandard
+
+from recordings.mcap.records import MESSAGE_HEAD, RECORD_HEAD, BadRecordError
 
 UNPACKED_START = 1 << 60
 _WINDOW_BYTES = 64 * 1024
 _HEAD_BYTES = RECORD_HEAD.size + MESSAGE_HEAD.size
+_ZSTD_WINDOW_LIMIT_BYTES = 64 * 1024 * 1024
+"""Look-back that packed data may ask for."""
 
 
 class Message(NamedTuple):
@@ -131,3 +136,23 @@ class Source:
             )
             self._unpacked = (start, data)
         return start, data
+
+
+def unpack(packed: memoryview, compression: str, size_bytes: int) -> bytes:
+    """Returns exactly `size_bytes`, which the caller has limited. BadRecordError for any other outcome."""
+    try:
+        if compression == "zstd":
+            reader = zstandard.ZstdDecompressor(max_window_size=_ZSTD_WINDOW_LIMIT_BYTES).stream_reader(
+                io.BytesIO(packed), read_across_frames=True
+            )
+            data: bytes = reader.read(size_bytes + 1)
+        elif compression == "lz4":
+            data = lz4.frame.LZ4FrameDecompressor().decompress(packed, max_length=size_bytes + 1)
+        else:
+            raise BadRecordError(f"its compression '{compression[:20]}' is unknown (known: zstd, lz4)")
+    except (zstandard.ZstdError, RuntimeError, EOFError) as error:
+        raise BadRecordError(f"a chunk cannot be unpacked ({error})") from error
+    if len(data) != size_bytes:
+        more = "more" if len(data) > size_bytes else str(len(data))
+        raise BadRecordError(f"a chunk says it unpacks to {size_bytes} bytes, it gives {more}")
+    return data

@@ -12,7 +12,6 @@ from pathlib import Path
 import pytest
 
 from recordings import manifest
-from recordings.errors import RecordingError
 from recordings.manifest import enter_part, read_manifest
 from recordings.recover import recover
 from station.cell.session_folder import list_sessions, new_session_folder
@@ -92,7 +91,7 @@ def test_29_a_disk_that_is_really_full_loses_nothing_acknowledged(tmp_path: Path
     said, counts = done.stdout.splitlines()
     acknowledged, saved = map(int, counts.split())
     assert "No space left on device" in said
-    assert "Free space or replace the disk, then: recordings recover" in said
+    assert "recordings recover" in said
     assert 10 < acknowledged <= saved <= acknowledged + 1
 
 
@@ -105,7 +104,7 @@ def test_29_a_list_of_parts_that_cannot_be_written_keeps_the_old_one(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(manifest, "write_atomically", full)
-    with pytest.raises(RecordingError, match=r"cannot write .*parts\.json: No space left on device"):
+    with refused("disk", errno=28):
         enter_part(tmp_path, "cell", 2, "session-2.mcap")
     listed = read_manifest(tmp_path)
     assert listed is not None
@@ -132,6 +131,6 @@ def test_39_two_sessions_in_one_second_and_a_clock_set_back(
     ]
     path = write_small(folders[0] / "session.mcap")
     before = path.read_bytes()
-    with pytest.raises(RecordingError, match="exists already"):
+    with refused("exists"):
         write_small(path)
     assert path.read_bytes() == before

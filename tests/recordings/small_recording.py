@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
+import pytest
 
+from recordings.errors import RecordingError
 from recordings.schema.messages import (
     BoardKind,
     BoardSpec,
@@ -24,6 +28,14 @@ WIDTH, HEIGHT = 32, 24
 START_NS = 1_700_000_000_000_000_000
 BOARD = BoardSpec(BoardKind.CHESSBOARD, 7, 6, 0.025)
 TURNED = ((0.0, -1.0, 0.0, 0.1), (1.0, 0.0, 0.0, 0.2), (0.0, 0.0, 1.0, 0.3), (0.0, 0.0, 0.0, 1.0))
+
+
+@contextmanager
+def refused(code: str, **values: object) -> Iterator[None]:
+    """A RecordingError with this code, and these among its values."""
+    with pytest.raises(RecordingError) as caught:
+        yield
+    assert (caught.value.code, caught.value.values) == (code, caught.value.values | values)
 
 
 def make_info(**changes: object) -> SessionInfo:

@@ -9,8 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from recordings import background_sync
-from recordings.background_sync import BackgroundSync
+from recordings import writer
+from recordings.writer import BackgroundSync
 
 MIB = 2**20
 
@@ -25,7 +25,7 @@ def in_memory_bytes(path: Path) -> int:
 def test_what_is_on_the_disk_leaves_the_memory_but_for_the_newest_part(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(background_sync, "KEPT_IN_MEMORY_BYTES", MIB)
+    monkeypatch.setattr(writer, "KEPT_IN_MEMORY_BYTES", MIB)
     path = tmp_path / "stream"
     with path.open("wb", buffering=0) as file:
         sync = BackgroundSync(file.fileno())

@@ -8,8 +8,8 @@ from scipy.spatial.transform import Rotation
 
 from recordings.errors import ImportSourceError
 from recordings.importers.frames import FrameTree
+from recordings.importers.messages import Frame
 from recordings.importers.stops import Limits, find_stops
-from recordings.importers.values import Frame
 
 
 def frame(stamp_ns: int, parent: str, child: str, T: np.ndarray) -> Frame:

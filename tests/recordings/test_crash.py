@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import random
 import resource
@@ -40,7 +41,7 @@ WRITER = textwrap.dedent(
             recorder.sync().result()
             print(index, flush=True)
     except RecordingError as error:
-        print("error", error, flush=True)
+        print("error", error.code, error.values["errno"], flush=True)
     """
 )
 
@@ -88,6 +89,7 @@ def kill_at_a_random_moment(folder: Path, seed: int) -> int:
         process.kill()
     lines += process.stdout.read().splitlines(keepends=True)
     process.wait()
+    process.stdout.close()
     acknowledged = [int(line) for line in lines if line.endswith("\n") and line.strip().isdigit()]
     check_what_is_left(path.with_name("a.mcap.part"), acknowledged)
     return len(acknowledged)
@@ -110,9 +112,7 @@ def fill_the_disk(folder: Path, limit_bytes: int) -> None:
     process = start(path, limit_bytes)
     output = process.communicate(timeout=60)[0].splitlines()
     assert output[0] == "ready"
-    assert output[-1].startswith("error writing ")
-    assert "File too large" in output[-1]
-    assert "recordings recover" in output[-1]
+    assert output[-1] == f"error disk {errno.EFBIG}"
     assert not path.exists()
     part = path.with_name("a.mcap.part")
     assert part.stat().st_size <= limit_bytes
@@ -130,7 +130,7 @@ def test_a_full_disk_loses_nothing_acknowledged(tmp_path: Path, limit_bytes: int
 def test_a_disk_that_is_full_at_the_beginning_leaves_the_name_free(tmp_path: Path, limit_bytes: int) -> None:
     process = start(tmp_path / "a.mcap", limit_bytes)
     said = process.communicate(timeout=60)[0]
-    assert "a.mcap cannot be begun (File too large)" in said
+    assert said == f"error disk {errno.EFBIG}\n"
     assert not list(tmp_path.iterdir())
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import errno
 import os
 import shutil
 import subprocess
@@ -18,7 +19,6 @@ from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation
 
 from recordings.cli import main
-from recordings.errors import RecordingError
 from recordings.exporters.excerpt import write_excerpt
 from recordings.exporters.folder import Target, export_recording
 from recordings.importers.folder import import_folder
@@ -37,6 +37,7 @@ from tests.recordings.small_recording import (
     make_picture,
     make_state,
     make_view,
+    refused,
     write_small,
 )
 
@@ -71,7 +72,7 @@ def test_tables_hold_every_value_in_full_precision(tmp_path: Path) -> None:
             writer.view(make_view(0, sequence, attempt))
         recording = open_recording(writer.finish())
     out = export_recording(recording, tmp_path / "out", Target.CSV)
-    tables = {path.stem: list(csv.DictReader(path.open())) for path in out.iterdir()}
+    tables = {path.stem: list(csv.DictReader(path.read_text().splitlines())) for path in out.iterdir()}
     assert {name: len(rows) for name, rows in tables.items()} == {
         "robot_states": 4,
         "pictures": 2,
@@ -88,9 +89,9 @@ def test_tables_hold_every_value_in_full_precision(tmp_path: Path) -> None:
 def test_nothing_is_overwritten_and_nothing_left_behind(small: Path, tmp_path: Path) -> None:
     taken = tmp_path / "taken"
     taken.mkdir()
-    with pytest.raises(RecordingError, match="exists already"):
+    with refused("exists"):
         export_recording(open_recording(small), taken, Target.CSV)
-    with pytest.raises(RecordingError, match="does not exist; create it first"):
+    with refused("disk", errno=errno.ENOENT):
         export_recording(open_recording(small), tmp_path / "no" / "out", Target.CSV)
     assert list(taken.iterdir()) == []
     assert not (tmp_path / "no").exists()
@@ -99,7 +100,7 @@ def test_nothing_is_overwritten_and_nothing_left_behind(small: Path, tmp_path: P
 def test_an_export_that_fails_halfway_leaves_nothing(small: Path, tmp_path: Path) -> None:
     recording = open_recording(small)
     (tmp_path / "out.part").mkdir()
-    with pytest.raises(RecordingError, match="cannot write"):
+    with refused("disk", errno=errno.EEXIST):
         export_recording(recording, tmp_path / "out", Target.FOLDER)
     assert not (tmp_path / "out").exists()
 
@@ -137,7 +138,7 @@ def test_a_full_disk_leaves_no_half_of_a_recording_that_can_be_made_again(
 
     monkeypatch.setattr("recordings.mcap.writer.os.writev", write)
     output = tmp_path / "out.mcap"
-    with pytest.raises(RecordingError, match=r"No space left on device.*nothing is left of it.*try again"):
+    with refused("disk", errno=errno.ENOSPC):
         import_folder(folder, output) if make == "import" else write_excerpt(recording, output)
     assert not list(tmp_path.glob("out*"))
 
@@ -217,7 +218,7 @@ def test_times_that_ros_cannot_hold_are_said(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
         writer.robot_state(msgspec.structs.replace(make_state(0), stamps=late))
         recording = open_recording(writer.finish())
-    with pytest.raises(RecordingError, match="ROS 2 ends in 2038"):
+    with refused("stamp-too-late"):
         export_recording(recording, tmp_path / "bag", Target.ROS2)
     assert not list(tmp_path.glob("bag*"))
 

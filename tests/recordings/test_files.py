@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 import subprocess
@@ -26,7 +27,7 @@ from recordings.files import (
 from recordings.reader import open_recording
 from recordings.writer import RecordingWriter
 from tests.durability import disk_order
-from tests.recordings.small_recording import make_info, make_picture, write_small
+from tests.recordings.small_recording import make_info, make_picture, refused, write_small
 
 EVIL = ["../../etc/x", "/etc/passwd", "a\0b", "x" * 300, "", "..", ".", "a/b", "Ä", "a..b", "A", "a\n"]
 
@@ -71,13 +72,13 @@ def test_an_unfinished_file_names_recover(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
         writer.image(make_picture(0))
     for place in (writer.part_path, writer.path, tmp_path):
-        with pytest.raises(UnfinishedRecordingError, match=r"recordings recover /.*"):
+        with pytest.raises(UnfinishedRecordingError):
             open_recording(place)
 
 
 def test_nothing_is_overwritten(small: Path) -> None:
     before = small.read_bytes()
-    with pytest.raises(RecordingError, match="exists already"):
+    with refused("exists"):
         RecordingWriter(small, make_info())
     assert small.read_bytes() == before
 
@@ -86,7 +87,7 @@ def test_a_file_that_appears_meanwhile_is_kept(tmp_path: Path) -> None:
     path = tmp_path / "a.mcap"
     with RecordingWriter(path, make_info()) as writer:
         path.write_text("somebody else's")
-        with pytest.raises(RecordingError, match="appeared meanwhile"):
+        with refused("exists"):
             writer.finish()
     assert path.read_text() == "somebody else's"
     assert writer.part_path.exists()
@@ -97,7 +98,7 @@ def test_a_planted_symlink_is_not_followed(tmp_path: Path, suffix: str) -> None:
     target = tmp_path / "precious.txt"
     target.write_text("precious")
     (tmp_path / f"a.mcap{suffix}").symlink_to(target)
-    with pytest.raises(RecordingError, match="exists already"):
+    with refused("exists"):
         RecordingWriter(tmp_path / "a.mcap", make_info())
     assert target.read_text() == "precious"
 
@@ -111,12 +112,12 @@ def test_a_dangling_symlink_creates_nothing(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", EVIL)
 def test_evil_names_are_refused(tmp_path: Path, name: str) -> None:
-    with pytest.raises(RecordingError, match="name"):
+    with refused("session-name"):
         RecordingWriter(tmp_path / "a.mcap", make_info(name=name))
     assert list(tmp_path.iterdir()) == []
     with (
         RecordingWriter(tmp_path / "b.mcap", make_info()) as writer,
-        pytest.raises(RecordingError, match="name"),
+        refused("attachment-name"),
     ):
         writer.attach(name, "text/plain", b"")
 
@@ -133,14 +134,14 @@ def test_no_attachment_name_leaves_its_folder(text: str) -> None:
 
 
 def test_a_missing_folder_says_so(tmp_path: Path) -> None:
-    with pytest.raises(RecordingError, match="does not exist"):
+    with refused("disk", errno=errno.ENOENT):
         write_small(tmp_path / "no" / "a.mcap")
 
 
 def test_free_space_below_the_reserve_is_refused_with_the_amount(tmp_path: Path) -> None:
     free = require_free_space(tmp_path, 1)
     assert free > 1
-    with pytest.raises(RecordingError, match=r"free 4\.0 GB and go on"):
+    with refused("disk-full", limit_bytes=free + 4_000_000_000):
         require_free_space(tmp_path, free + 4_000_000_000)
 
 
@@ -168,14 +169,14 @@ def test_a_small_file_that_cannot_be_written_stays_as_it_was(
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(OSError):
         write_atomically(tmp_path / "a.json", b"new")
     assert [path.read_bytes() for path in tmp_path.iterdir()] == [b"old"], "and no scraps beside it"
 
 
 def test_a_pipe_or_a_device_is_never_replaced_by_a_file(tmp_path: Path) -> None:
     os.mkfifo(tmp_path / "pipe")
-    with pytest.raises(OSError, match="is no file"):
+    with pytest.raises(FileExistsError):
         write_atomically(tmp_path / "pipe", b"new")
     assert (tmp_path / "pipe").is_fifo() and len(list(tmp_path.iterdir())) == 1
 

@@ -40,6 +40,7 @@ from tests.recordings.small_recording import (
     make_info,
     make_state,
     make_view,
+    refused,
 )
 
 STATE_SCHEMA = schema(1, Topic.ROBOT_STATE)
@@ -239,9 +240,9 @@ LIES: dict[str, tuple[bytes, str]] = {
 @pytest.mark.parametrize("name", LIES)
 def test_one_lie_is_enough(tmp_path: Path, name: str) -> None:
     content, reason = LIES[name]
-    with pytest.raises(CorruptRecordingError, match=r"byte \d+|cannot be used") as caught:
+    with pytest.raises(CorruptRecordingError) as caught:
         open_recording(write(tmp_path, content))
-    assert reason in str(caught.value)
+    assert reason in caught.value.text
 
 
 @pytest.mark.parametrize("compression", ["zstd", "lz4"])
@@ -249,11 +250,11 @@ def test_a_decompression_bomb_is_refused_at_once(tmp_path: Path, compression: st
     path = write(tmp_path, bomb(compression))
     start_s = time.perf_counter()
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    with pytest.raises(CorruptRecordingError, match="more than is read here"):
+    with refused("damaged-recording"):
         open_recording(path)
     assert time.perf_counter() - start_s < 0.5
     path.write_bytes(path.read_bytes().replace(struct.pack("<Q", BOMB_BYTES), struct.pack("<Q", 4_000_000)))
-    with pytest.raises(CorruptRecordingError, match="gives more"):
+    with refused("damaged-recording"):
         open_recording(path)
     recover(path)
     assert time.perf_counter() - start_s < 1.0
@@ -264,7 +265,9 @@ def test_messages_that_are_wrong_in_themselves_name_their_place(tmp_path: Path) 
     for data in (b"\xff\xff\xff", b"", encode(make_view(0))):
         records = DECLARED + message(1, data)
         recording = open_recording(write(tmp_path, sealed(SESSION + chunk(records), ONE, DECLARED)))
-        with pytest.raises(CorruptRecordingError, match=r"byte \d+ \(/robot/state\)"):
+        with refused(
+            "damaged-recording", at_byte=recording.segments[0].messages(Topic.ROBOT_STATE).addresses[0]
+        ):
             list(recording.robot_states())
 
 

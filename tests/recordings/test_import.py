@@ -14,14 +14,13 @@ import numpy as np
 import pytest
 
 from recordings.cli import main
-from recordings.errors import ImportSourceError, RecordingError
 from recordings.exporters.folder import Target, export_recording
+from recordings.importers.dataset import read_poses
 from recordings.importers.folder import import_folder
-from recordings.importers.poses import read_poses
 from recordings.reader import open_recording
 from recordings.schema.messages import BoardKind, matrix_from_quaternion
 from tests.command_line import call
-from tests.recordings.small_recording import BOARD, HEIGHT, WIDTH, make_image
+from tests.recordings.small_recording import BOARD, HEIGHT, WIDTH, make_image, refused
 
 Change = Callable[[Path], object]
 
@@ -52,7 +51,7 @@ def test_a_good_folder_becomes_a_recording(folder: Path, tmp_path: Path) -> None
     stored = recording.segments[0].stored_image(0)
     assert stored == ("png", (folder / "images/0.png").read_bytes())
     assert set(recording.attachments()) == {"dataset.yaml", "poses.csv"}
-    assert done.pictures == 3
+    assert done.images == 3
 
 
 def test_other_formats_and_colour_are_stored_without_loss(folder: Path, tmp_path: Path) -> None:
@@ -73,7 +72,7 @@ def test_other_formats_and_colour_are_stored_without_loss(folder: Path, tmp_path
 def test_a_byte_order_mark_spaces_and_crlf_are_fine(folder: Path, tmp_path: Path) -> None:
     text = (folder / "poses.csv").read_text().replace(",", ", ").replace("\n", "\r\n") + "\r\n"
     (folder / "poses.csv").write_bytes(b"\xef\xbb\xbf" + text.encode())
-    assert import_folder(folder, tmp_path / "out.mcap").pictures == 3
+    assert import_folder(folder, tmp_path / "out.mcap").images == 3
 
 
 def with_joints(folder: Path, *joints: str) -> None:
@@ -147,133 +146,117 @@ def huge_header(folder: Path) -> None:
     (folder / "images/1.png").write_bytes(data)
 
 
-BAD: dict[str, tuple[Change, str]] = {
-    "no dataset": (lambda f: (f / "dataset.yaml").unlink(), r"dataset.yaml is missing"),
-    "no poses": (lambda f: (f / "poses.csv").unlink(), r"poses.csv is missing"),
-    "wrong header": (
-        edit("poses.csv", "qx,qy,qz,qw", "qw,qx,qy,qz"),
-        r"line 1: the header is .*must be 'image,x,y",
+BAD: dict[str, tuple[Change, str, dict[str, object]]] = {
+    "no dataset": (lambda f: (f / "dataset.yaml").unlink(), "no-file", {}),
+    "no poses": (lambda f: (f / "poses.csv").unlink(), "no-file", {}),
+    "wrong header": (edit("poses.csv", "qx,qy,qz,qw", "qw,qx,qy,qz"), "header", {"line": 1}),
+    "no header": (edit("poses.csv", "image,x,y,z,qx,qy,qz,qw\n", ""), "header", {"line": 1}),
+    "only a header": (
+        lambda f: (f / "poses.csv").write_text("image,x,y,z,qx,qy,qz,qw\n"),
+        "no-poses",
+        {"line": 1},
     ),
-    "no header": (edit("poses.csv", "image,x,y,z,qx,qy,qz,qw\n", ""), r"line 1: the header is"),
-    "only a header": (lambda f: (f / "poses.csv").write_text("image,x,y,z,qx,qy,qz,qw\n"), r"no poses"),
-    "empty": (lambda f: (f / "poses.csv").write_text(""), r"the header is 'nothing'"),
-    "column missing": (edit("poses.csv", "0.1,0.2,0.3,0,", "0.1,0.2,0.3,"), r"line 3: 7 values where 8"),
-    "not a number": (edit("poses.csv", "0.1,0.2", "0.1,abc"), r"line 3: y = 'abc' is not a number"),
-    "decimal comma": (edit("poses.csv", "0.1,0.2", '"0,1",0.2'), r"line 3: x = '0,1' is not a number"),
-    "nan": (edit("poses.csv", "0.1,0.2", "nan,0.2"), r"line 3: x = nan is not finite"),
-    "infinite": (edit("poses.csv", "0.1,0.2", "inf,0.2"), r"line 3: x = inf is not finite"),
+    "empty": (lambda f: (f / "poses.csv").write_text(""), "header", {"line": 1}),
+    "column missing": (edit("poses.csv", "0.1,0.2,0.3,0,", "0.1,0.2,0.3,"), "pose-row", {"line": 3}),
+    "not a number": (edit("poses.csv", "0.1,0.2", "0.1,abc"), "pose-row", {"line": 3}),
+    "decimal comma": (edit("poses.csv", "0.1,0.2", '"0,1",0.2'), "pose-row", {"line": 3}),
+    "nan": (edit("poses.csv", "0.1,0.2", "nan,0.2"), "pose-row", {"line": 3}),
+    "infinite": (edit("poses.csv", "0.1,0.2", "inf,0.2"), "pose-row", {"line": 3}),
     "zero quaternion": (
         edit("poses.csv", "0.7071067811865476,0.7071067811865476", "0,0"),
-        r"line 2: .*length is 0,",
+        "no-unit-quaternion",
+        {"line": 2},
     ),
     "rotation vector": (
         edit("poses.csv", "0.7071067811865476,0.7071067811865476", "1.57,0"),
-        r"not a rotation vector",
+        "no-unit-quaternion",
+        {"line": 2},
     ),
-    "millimetres": (edit("poses.csv", "0.1,0.2", "612.3,0.2"), r"line 3: .*612.3 m away.*not millimetres"),
-    "twice": (
-        edit("poses.csv", "images/2.png", "images/0.png"),
-        r"line 4: images/0.png stands already in line 2",
-    ),
-    "joints in degrees": (lambda f: with_joints(f, "10,-90,90,-60,-90,180"), r"line 2: .*radians"),
-    "a joint missing": (lambda f: with_joints(f, "0.1,,1.5,-1,-1.57,3.2"), r"line 2: j2 = ''"),
-    "five joints": (lambda f: with_joints(f, "0.1,0.1,1.5,-1,-1.57"), r"line 2: 13 values where 14"),
-    "no image name": (edit("poses.csv", "images/1.png", ""), r"line 3: the image's name is missing"),
-    "zero in the image name": (
-        edit("poses.csv", "images/1.png", "images/\0.png"),
-        r"line 3: the image's name is missing",
-    ),
-    "binary poses": (lambda f: (f / "poses.csv").write_bytes(b"\xff\xfe\x00"), r"not UTF-8"),
-    "picture missing": (
-        lambda f: (f / "images/1.png").unlink(),
-        r"line 3: picture images/1.png cannot be read",
-    ),
-    "picture is a folder": (
-        replaced(Path.mkdir),
-        r"line 3: picture images/1.png cannot be read \(not a file",
-    ),
-    "picture is a pipe": (replaced(os.mkfifo), r"line 3: picture images/1.png cannot be read \(not a file"),
-    "picture is its own link": (
-        replaced(lambda p: p.symlink_to(p.name)),
-        r"line 3: picture images/1.png cannot be read \(Too many levels of symbolic links",
-    ),
-    "picture is a link to outside": (replaced(lambda p: p.symlink_to("/etc/passwd")), r"outside the folder"),
-    "picture's name too long": (
-        edit("poses.csv", "images/1.png", "ü" * 3000),
-        r"line 3: picture ü+ cannot be read \(File name too long",
-    ),
-    "picture unreadable": (lambda f: (f / "images/1.png").write_text("no"), r"line 3: .*neither PNG"),
-    "picture empty": (lambda f: (f / "images/1.png").write_bytes(b""), r"line 3: .*neither PNG"),
-    "picture cut": (cut_picture, r"line 3: .*the PNG is cut"),
-    "jpeg cut": (cut_jpeg, r"line 3: .*the JPEG is cut"),
-    "picture damaged": (flip_picture, r"line 3: .*the PNG is damaged"),
-    "header of 30000×30000": (huge_header, r"line 3: .*impossible size 30000×30000"),
-    "mixed sizes": (another_size, r"line 4: picture images/2.png is 40×30, dataset.yaml says 32×24"),
-    "outside": (edit("poses.csv", "images/1.png", "../../secret.png"), r"line 3: .*outside the folder"),
-    "unknown mount": (
-        edit("dataset.yaml", "eye-in-hand", "on-hand"),
-        r"mount: must be one of eye-in-hand, .*'on-hand'",
-    ),
-    "unknown key": (
-        edit("dataset.yaml", "note:", "nota:"),
-        r"line 5: nota: unknown key; did you mean 'note'",
-    ),
+    "millimetres": (edit("poses.csv", "0.1,0.2", "612.3,0.2"), "not-metres", {"line": 3}),
+    "twice": (edit("poses.csv", "images/2.png", "images/0.png"), "image-twice", {"line": 4}),
+    "joints in degrees": (lambda f: with_joints(f, "10,-90,90,-60,-90,180"), "not-radians", {"line": 2}),
+    "a joint missing": (lambda f: with_joints(f, "0.1,,1.5,-1,-1.57,3.2"), "pose-row", {"line": 2}),
+    "five joints": (lambda f: with_joints(f, "0.1,0.1,1.5,-1,-1.57"), "pose-row", {"line": 2}),
+    "no image name": (edit("poses.csv", "images/1.png", ""), "pose-row", {"line": 3}),
+    "zero in the image name": (edit("poses.csv", "images/1.png", "images/\0.png"), "pose-row", {"line": 3}),
+    "binary poses": (lambda f: (f / "poses.csv").write_bytes(b"\xff\xfe\x00"), "poses", {}),
+    "picture missing": (lambda f: (f / "images/1.png").unlink(), "unreadable", {"line": 3}),
+    "picture is a folder": (replaced(Path.mkdir), "unreadable", {"line": 3}),
+    "picture is a pipe": (replaced(os.mkfifo), "unreadable", {"line": 3}),
+    "picture is its own link": (replaced(lambda p: p.symlink_to(p.name)), "unreadable", {"line": 3}),
+    "picture is a link to outside": (replaced(lambda p: p.symlink_to("/etc/passwd")), "outside", {"line": 3}),
+    "picture's name too long": (edit("poses.csv", "images/1.png", "ü" * 3000), "unreadable", {"line": 3}),
+    "picture unreadable": (lambda f: (f / "images/1.png").write_text("no"), "bad-image", {"line": 3}),
+    "picture empty": (lambda f: (f / "images/1.png").write_bytes(b""), "bad-image", {"line": 3}),
+    "picture cut": (cut_picture, "bad-image", {"line": 3}),
+    "jpeg cut": (cut_jpeg, "bad-image", {"line": 3}),
+    "picture damaged": (flip_picture, "bad-image", {"line": 3}),
+    "header of 30000×30000": (huge_header, "bad-image", {"line": 3}),
+    "mixed sizes": (another_size, "image-size", {"line": 4}),
+    "outside": (edit("poses.csv", "images/1.png", "../../secret.png"), "outside", {"line": 3}),
+    "unknown mount": (edit("dataset.yaml", "eye-in-hand", "on-hand"), "dataset", {"key": "mount"}),
+    "unknown key": (edit("dataset.yaml", "note:", "nota:"), "dataset", {"key": "nota"}),
     "unknown camera key": (
         edit("dataset.yaml", "height: 24", "height: 24, distorsion: [0.1]"),
-        r"camera.distorsion: unknown key; did you mean 'distortion'",
+        "dataset",
+        {"key": "camera.distorsion"},
     ),
-    "board kind": (
-        edit("dataset.yaml", "kind: chessboard", "kind: chess"),
-        r"board.kind: must be one of chessboard, .*'chess'",
-    ),
-    "board size": (edit("dataset.yaml", "columns: 7", "columns: 0"), r"0×6 columns×rows"),
-    "rows forgotten": (edit("dataset.yaml", "rows: 6, ", ""), r"7×1 columns×rows"),
-    "size forgotten": (edit("dataset.yaml", ", square_m: 0.025", ""), r"square_m = 0.0 is not a length"),
+    "board kind": (edit("dataset.yaml", "kind: chessboard", "kind: chess"), "dataset", {"key": "board.kind"}),
+    "board size": (edit("dataset.yaml", "columns: 7", "columns: 0"), "dataset", {"key": "board.columns"}),
+    "rows forgotten": (edit("dataset.yaml", "rows: 6, ", ""), "dataset", {"key": "board.columns"}),
+    "size forgotten": (edit("dataset.yaml", ", square_m: 0.025", ""), "dataset", {"key": "board.square_m"}),
     "tolerance in percent": (
         edit("dataset.yaml", "0.025", "0.025, square_tolerance: 0.3"),
-        r"square_tolerance",
+        "dataset",
+        {"key": "board.square_tolerance"},
     ),
-    "flatness in mm": (edit("dataset.yaml", "0.025", "0.025, flatness_m: 0.2"), r"flatness_m"),
+    "flatness in mm": (
+        edit("dataset.yaml", "0.025", "0.025, flatness_m: 0.2"),
+        "dataset",
+        {"key": "board.flatness_m"},
+    ),
     "a tag of no dictionary": (
         edit("dataset.yaml", "kind: chessboard, columns: 7, rows: 6", "kind: aruco, id: 3"),
-        r"needs its dictionary",
+        "dataset",
+        {"key": "board.dictionary"},
     ),
     "a tag with columns": (
         edit("dataset.yaml", "chessboard", "april-tag"),
-        r"7×6 columns×rows; a single tag",
+        "dataset",
+        {"key": "board.columns"},
     ),
-    "square in mm": (edit("dataset.yaml", "0.025", "25"), r"square_m = 25.0 is not a length in metres"),
-    "no number": (edit("dataset.yaml", "0.025", "25 mm"), r"board.square_m: Expected `float`.*25 mm"),
-    "key twice": (
-        edit("dataset.yaml", "note:", "mount: eye-in-hand\nnote:"),
-        r"line 5: mount: stands here twice",
-    ),
-    "alias": (edit("dataset.yaml", "made", "&a made\nx: *a #"), r"aliases"),
-    "tag": (edit("dataset.yaml", "made", "!!python/object:os.system made"), r"tags"),
-    "brackets": (lambda f: (f / "dataset.yaml").write_text("[" * 100_000), r"nested too deeply"),
-    "not yaml": (edit("dataset.yaml", "mount:", "mount: : :"), r"line 1:"),
-    "a list": (lambda f: (f / "dataset.yaml").write_text("- 1\n"), r"line 1: fields are needed here"),
-    "huge": (lambda f: (f / "dataset.yaml").write_text("#" * 300_000), r"larger than 256 kB"),
+    "square in mm": (edit("dataset.yaml", "0.025", "25"), "dataset", {"key": "board.square_m"}),
+    "no number": (edit("dataset.yaml", "0.025", "25 mm"), "dataset", {"key": "board.square_m"}),
+    "key twice": (edit("dataset.yaml", "note:", "mount: eye-in-hand\nnote:"), "dataset", {"key": "mount"}),
+    "alias": (edit("dataset.yaml", "made", "&a made\nx: *a #"), "dataset", {"line": 5}),
+    "tag": (edit("dataset.yaml", "made", "!!python/object:os.system made"), "dataset", {"line": 5}),
+    "brackets": (lambda f: (f / "dataset.yaml").write_text("[" * 100_000), "dataset", {"line": 1}),
+    "not yaml": (edit("dataset.yaml", "mount:", "mount: : :"), "dataset", {"line": 1}),
+    "a list": (lambda f: (f / "dataset.yaml").write_text("- 1\n"), "dataset", {"line": 1}),
+    "huge": (lambda f: (f / "dataset.yaml").write_text("#" * 300_000), "file-too-large", {}),
     "singular camera": (
         edit("dataset.yaml", "height: 24", "height: 24, matrix: [[0,0,0],[0,0,0],[0,0,1]]"),
-        r"positive focal lengths",
+        "dataset",
+        {"key": "camera.matrix"},
     ),
     "distortion alone": (
         edit("dataset.yaml", "height: 24", "height: 24, distortion: [0.1]"),
-        r"without matrix",
+        "dataset",
+        {"key": "camera.matrix"},
     ),
     "charuco without markers": (
         edit("dataset.yaml", "chessboard", "charuco"),
-        r"needs marker_m and dictionary",
+        "dataset",
+        {"key": "board.marker_m"},
     ),
 }
 
 
 @pytest.mark.parametrize("name", BAD)
 def test_a_bad_folder_says_what_where_and_what_to_do(folder: Path, tmp_path: Path, name: str) -> None:
-    change, message = BAD[name]
+    change, code, values = BAD[name]
     change(folder)
-    with pytest.raises(ImportSourceError, match=message):
+    with refused(code, **values):
         import_folder(folder, tmp_path / "out.mcap")
     assert [p.name for p in tmp_path.iterdir()] == ["pictures"], "something half-written was left behind"
 
@@ -296,7 +279,7 @@ def test_the_command_line_prints_one_json_object(folder: Path, tmp_path: Path) -
 def test_an_existing_output_is_not_touched(folder: Path, tmp_path: Path) -> None:
     output = tmp_path / "out.mcap"
     output.write_text("precious")
-    with pytest.raises(RecordingError, match="exists already"):
+    with refused("exists"):
         import_folder(folder, output)
     assert output.read_text() == "precious"
 
@@ -317,7 +300,7 @@ def test_every_real_dataset_imports(datasets: Path, tmp_path: Path) -> None:
         done = import_folder(source, tmp_path / f"{source.name}.mcap")
         recording = open_recording(done.path)
         camera = recording.info.camera
-        assert len(recording.views()) == done.pictures == len((source / "poses.csv").read_text().split()) - 1
+        assert len(recording.views()) == done.images == len((source / "poses.csv").read_text().split()) - 1
         assert recording.image(recording.views()[0]).pixels.shape[:2] == (camera.height, camera.width)
 
 

@@ -15,7 +15,7 @@ def run(program: str, *arguments: str, **environment: str) -> subprocess.Complet
     return subprocess.run(command, capture_output=True, text=True, env=os.environ | environment)
 
 
-@pytest.mark.parametrize("package", ["station"])
+@pytest.mark.parametrize("package", ["recordings", "station"])
 def test_the_version_is_that_of_the_package(package: str) -> None:
     done = run(f"from {package}.cli import main; main()", "--version")
     assert (done.returncode, done.stdout) == (0, version("calibration-station") + "\n")

@@ -12,14 +12,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from recordings.errors import CorruptRecordingError, MissingSegmentError, RecordingError
+from recordings.errors import CorruptRecordingError
 from recordings.exporters.excerpt import write_excerpt
 from recordings.manifest import MANIFEST_FILE, Manifest, enter_part, read_manifest
 from recordings.reader import open_recording
 from recordings.recover import recover
 from recordings.schema.messages import SessionInfo
 from recordings.writer import RecordingWriter
-from tests.recordings.small_recording import make_info, write_small
+from tests.recordings.small_recording import make_info, refused, write_small
 
 
 @pytest.fixture
@@ -43,7 +43,7 @@ def test_the_list_names_every_part(session: Path) -> None:
 @pytest.mark.parametrize("name", ["session.mcap", "session-2.mcap", "session-3.mcap"])
 def test_any_missing_part_is_noticed_also_the_last(session: Path, name: str) -> None:
     (session / name).unlink()
-    with pytest.raises(MissingSegmentError, match=rf"lacks part \d \({name}\) .* recover {session}"):
+    with refused("missing-segment", missing=1):
         open_recording(session)
     (missing,) = open_recording(session, incomplete=True).missing
     assert name in missing
@@ -51,14 +51,14 @@ def test_any_missing_part_is_noticed_also_the_last(session: Path, name: str) -> 
 
 def test_one_file_of_several_is_not_the_session(session: Path) -> None:
     for name in ("session.mcap", "session-3.mcap"):
-        with pytest.raises(MissingSegmentError, match=rf"is part \d of 3 .* \({session}\) instead"):
+        with refused("missing-segment", missing=1):
             open_recording(session / name)
 
 
 def test_all_parts_missing_is_noticed(session: Path) -> None:
     for path in session.glob("*.mcap"):
         path.unlink()
-    with pytest.raises(RecordingError, match=r"none of the parts .*: copy back session\.mcap, "):
+    with refused("missing-segment"):
         open_recording(session)
 
 
@@ -67,11 +67,11 @@ def test_recover_gives_a_missing_part_up_and_every_reader_says_so(session: Path,
     *whole, lost = recover(session)
     assert not any(result.missing or result.rebuilt for result in whole)
     assert lost.missing
-    assert "part 3 of the session is not in the folder" in lost.text
+    assert lost.path.name == "session-3.mcap"
     recording = open_recording(session)
-    assert recording.losses == ("part 3 of the session was lost",)
+    (loss,) = recording.losses
     excerpt = write_excerpt(recording, tmp_path / "small.mcap")
-    assert "part 3 of the session was lost" in open_recording(excerpt).info.note
+    assert loss in open_recording(excerpt).info.note
     kept.rename(session / "session-3.mcap")
     assert open_recording(session).losses == ()
     assert len(open_recording(session).segments) == 3
@@ -81,7 +81,7 @@ def test_recover_makes_the_list_where_there_was_none(tmp_path: Path) -> None:
     write_small(tmp_path / "session-2.mcap", info=make_info(part=2))
     assert [result.missing for result in recover(tmp_path)] == [False, True]
     assert read_manifest(tmp_path) == Manifest("test-cell", {1: "", 2: "session-2.mcap"}, [1])
-    assert open_recording(tmp_path / "session-2.mcap").losses == ("part 1 of the session was lost",)
+    assert len(open_recording(tmp_path / "session-2.mcap").losses) == 1
 
 
 def test_a_part_that_held_nothing_is_not_missing(session: Path) -> None:
@@ -94,7 +94,7 @@ def test_a_part_that_held_nothing_is_not_missing(session: Path) -> None:
 def test_a_sealed_part_of_which_nothing_is_left_is_missing(session: Path) -> None:
     (session / "session-3.mcap").write_bytes(b"\x00" * 500)
     assert [result.missing for result in recover(session)] == [False, False, False, True]
-    assert open_recording(session).losses == ("part 3 of the session was lost",)
+    assert len(open_recording(session).losses) == 1
 
 
 def test_an_interrupted_file_without_a_list_is_doubted(tmp_path: Path) -> None:
@@ -102,9 +102,7 @@ def test_an_interrupted_file_without_a_list_is_doubted(tmp_path: Path) -> None:
     data = write_small(tmp_path / "whole.mcap").read_bytes()
     (tmp_path / "session.mcap.part").write_bytes(data[: len(data) * 2 // 5])
     recover(tmp_path / "session.mcap.part")
-    cut, doubt = open_recording(tmp_path / "session.mcap").losses
-    assert "bytes were lost when it was recovered" in cut
-    assert "a later part may be missing" in doubt
+    assert len(open_recording(tmp_path / "session.mcap").losses) == 2, "what was cut, and what may follow"
     assert open_recording(tmp_path / "whole.mcap").losses == ()
 
 
@@ -122,7 +120,7 @@ def test_what_a_first_recovery_lost_is_not_forgotten_by_a_second(tmp_path: Path)
 def test_the_list_of_another_session_does_not_speak_for_a_file_beside_it(session: Path) -> None:
     path = write_small(session / "session.mcap-copy.mcap", info=make_info(name="another"))
     assert open_recording(path).missing == ()
-    with pytest.raises(RecordingError, match="different sessions"):
+    with refused("several-sessions"):
         open_recording(session)
 
 
@@ -144,7 +142,7 @@ def test_the_list_of_another_session_does_not_speak_for_a_file_beside_it(session
 def test_a_damaged_list_is_refused(session: Path, content: bytes) -> None:
     (session / MANIFEST_FILE).write_bytes(content)
     for read in (lambda: open_recording(session), lambda: recover(session)):
-        with pytest.raises(CorruptRecordingError, match=r"parts\.json is damaged .*delete it"):
+        with refused("damaged-manifest"):
             read()
 
 
@@ -162,12 +160,12 @@ def test_any_edit_of_a_list_is_a_list_or_is_refused(piece: bytes, at: int) -> No
 def test_a_list_that_is_no_file_does_not_hang_its_reader(session: Path) -> None:
     (session / MANIFEST_FILE).unlink()
     os.mkfifo(session / MANIFEST_FILE)
-    with pytest.raises(RecordingError, match=r"parts\.json is not a file"):
+    with refused("no-file"):
         open_recording(session)
 
 
 def test_a_folder_belongs_to_one_session(session: Path) -> None:
-    with pytest.raises(RecordingError, match="belongs to session 'test-cell'"):
+    with refused("several-sessions"):
         enter_part(session, "another", 1, "session.mcap")
 
 
@@ -175,7 +173,7 @@ def test_a_part_number_is_bounded(tmp_path: Path) -> None:
     info: SessionInfo = make_info(part=1_000_000_000)
     with RecordingWriter(tmp_path / "a.mcap", info) as writer:
         writer.finish()
-    with pytest.raises(CorruptRecordingError, match="part 1000000000 is not allowed"):
+    with refused("contradiction"):
         open_recording(tmp_path / "a.mcap")
 
 

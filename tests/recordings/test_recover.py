@@ -11,14 +11,13 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from recordings.errors import RecordingError
 from recordings.files import create_exclusively
 from recordings.reader import open_recording
 from recordings.recover import recover
 from recordings.schema.messages import CameraModel
 from recordings.schema.topics import Topic
 from recordings.writer import RecordingWriter
-from tests.recordings.small_recording import make_info, make_picture, make_view, write_small
+from tests.recordings.small_recording import make_info, make_picture, make_view, refused, write_small
 
 
 def write_unfinished(path: Path, poses: int = 2, part: int = 1) -> Path:
@@ -70,7 +69,7 @@ def test_a_whole_file_is_left_alone(small: Path) -> None:
 def test_a_file_that_is_being_written_is_refused(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
         writer.image(make_picture(0))
-        with pytest.raises(RecordingError, match="in use by another process"):
+        with refused("in-use"):
             recover(writer.part_path)
 
 
@@ -78,7 +77,7 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
     part = write_unfinished(tmp_path / "a.mcap")
     taken = write_small(tmp_path / "b.mcap")
     before = taken.read_bytes()
-    with pytest.raises(RecordingError, match="exists already"):
+    with refused("exists"):
         recover(part, taken)
     assert taken.read_bytes() == before
 
@@ -93,14 +92,14 @@ def test_a_picture_without_its_view_and_a_view_without_its_picture(tmp_path: Pat
     path.write_bytes(data)
     (result,) = recover(path)
     assert [view.index for view in open_recording(path).views()] == [0, 2]
-    assert any("pose 2 (" in loss and "lost its picture" in loss for loss in result.losses)
+    assert any("pose 2 (" in loss for loss in result.losses)
 
 
 @pytest.mark.parametrize("content", [b"", b"\x89MCAP0\r\n", b"hello" * 100, bytes(5000), b"\x06" * 5000])
 def test_a_file_with_nothing_in_it_says_so_and_leaves_nothing(tmp_path: Path, content: bytes) -> None:
     part = tmp_path / "a.mcap.part"
     part.write_bytes(content)
-    with pytest.raises(RecordingError, match="nothing can be saved"):
+    with refused("nothing-to-save"):
         recover(part)
     assert list(tmp_path.iterdir()) == [part]
 
@@ -214,7 +213,7 @@ def test_a_recovery_that_still_runs_is_not_disturbed(small: Path) -> None:
     data = small.read_bytes()
     small.write_bytes(data[:-9000])
     other = create_exclusively(small.with_name("small.mcap.recovering"))
-    with pytest.raises(RecordingError, match=r"recovering is in use by another process"):
+    with refused("in-use"):
         recover(small)
     os.close(other)
     assert small.read_bytes() == data[:-9000]

@@ -14,7 +14,7 @@ from recordings.reader import open_recording
 from recordings.schema.definitions import encode
 from recordings.schema.messages import Stamps
 from recordings.schema.topics import Topic
-from recordings.stream_quality import Steps
+from recordings.streams import Steps
 from tests.recordings.crafted import Counts, channel, chunk, message, schema, sealed, session_metadata
 from tests.recordings.small_recording import make_state
 

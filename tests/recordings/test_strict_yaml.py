@@ -49,7 +49,7 @@ def test_all_problems_come_in_one_report_with_their_lines() -> None:
     found = problems(
         "inner:\n  speed_ms: 3\n  name: [1]\npoint_m: [1, 2]\nmany: [{speed_m_s: fast}]\non: yes\n"
     )
-    assert found[0].startswith("line 2: inner.speed_ms: unknown key; did you mean 'speed_m_s'?")
+    assert found[0].startswith("line 2: inner.speed_ms:") and "'speed_m_s'" in found[0]
     assert any(p.startswith("line 2: inner.speed_m_s: is missing") for p in found)
     assert any(p.startswith("line 3: inner.name:") for p in found)
     assert any(p.startswith("line 4: point_m: 3 values are needed, 2 are here") for p in found)

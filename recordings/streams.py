@@ -1,20 +1,111 @@
-"""Rate, gaps and clock of a stream of any length, in memory that does not grow with it."""
+"""Clocks, rate and gaps of a recording's streams, in memory that does not grow with their length.
+
+RobotState and PictureFacts begin with their `Stamps`, which are read many at once by NumPy. Protobuf writes
+fields in their order and leaves out zeros; a message that somebody wrote otherwise is decoded alone.
+"""
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
+from recordings.mcap import Source
+from recordings.mcap.source import UNPACKED_START
 from recordings.schema.clocks import DRIFT_SPAN_S, ClockEstimator
+from recordings.schema.messages import Stamps
 
+_BLOCK_BYTES = 256 * 1024
+_HEAD_BYTES = 31
+"""Of a message record, before its data."""
+_LONGEST_BYTES = 48
+"""Of the stamps: a tag, a length, three numbers of at most 11 bytes, one of 9."""
+_STAMPS_TAG, _VARINT, _DOUBLE = 0x0A, "varint", "double"
+_FIELDS = ((0x08, _VARINT), (0x10, _VARINT), (0x19, _DOUBLE), (0x20, _VARINT))
 LARGEST_STAMP_S = 1e12
 """30 000 years: what is more, or no number, is no time."""
 _BIN_SHIFT = 11
 """Of a float32's bits: bins of 1/4096 of their value."""
 _SAMPLES = 65536
-Stamps = NDArray[np.float64]
+Times = NDArray[np.float64]
+Bytes = NDArray[np.uint8]
+Places = NDArray[np.int64]
+
+
+@dataclass(frozen=True, eq=False)
+class StampsTable:
+    """One row a message."""
+
+    host_monotonic_ns: NDArray[np.int64]
+    host_wall_ns: NDArray[np.int64]
+    controller_s: NDArray[np.float64]
+    device_ns: NDArray[np.int64]
+
+
+DecodeOne = Callable[[int], Stamps]
+"""The stamps of the message at this address, the slow way."""
+
+
+def stamps_tables(
+    source: Source, addresses: NDArray[np.uint64], decode_one: DecodeOne
+) -> Iterator[StampsTable]:
+    """Blocks in file order, each of a bounded size. Raises what `decode_one` raises."""
+    first = 0
+    while first < len(addresses):
+        start = int(addresses[first])
+        limit = start + _BLOCK_BYTES if start < UNPACKED_START else start + 1
+        last = max(first + 1, int(np.searchsorted(addresses, np.uint64(limit))))
+        chosen = addresses[first:last]
+        length = int(chosen[-1]) - start + _HEAD_BYTES + _LONGEST_BYTES
+        data = source.read(start, min(length, source.room(start)))
+        buffer = np.frombuffer(data + bytes(_LONGEST_BYTES), np.uint8)
+        yield _table(buffer, (chosen - chosen[0]).astype(np.int64) + _HEAD_BYTES, chosen, decode_one)
+        first = last
+
+
+def _table(
+    buffer: Bytes, starts: Places, addresses: NDArray[np.uint64], decode_one: DecodeOne
+) -> StampsTable:
+    at, end = starts + 2, starts + 2 + buffer[starts + 1]
+    good = (buffer[starts] == _STAMPS_TAG) & (end - starts <= _LONGEST_BYTES)
+    columns: list[NDArray[np.int64]] = []
+    for tag, kind in _FIELDS:
+        there = (at < end) & (buffer[at] == tag) & good
+        if kind == _VARINT:
+            value, size = _varints(buffer, at + 1, there)
+        else:
+            value, size = _doubles(buffer, at + 1), np.full(len(at), 8)
+        columns.append(np.where(there, value, 0))
+        at = np.where(there, at + 1 + size, at)
+    for row in np.flatnonzero(~good | (at != end)).tolist():
+        for column, number in zip(columns, _numbers(decode_one(int(addresses[row]))), strict=True):
+            column[row] = number
+    return StampsTable(columns[0], columns[1], columns[2].view(np.float64), columns[3])
+
+
+def _numbers(stamps: Stamps) -> tuple[int, int, int, int]:
+    double = int(np.array(stamps.controller_s).view(np.int64))
+    return stamps.host_monotonic_ns, stamps.host_wall_ns, double, stamps.device_ns
+
+
+def _varints(buffer: Bytes, at: Places, there: NDArray[np.bool_]) -> tuple[NDArray[np.int64], Places]:
+    value, size, going = np.zeros(len(at), np.uint64), np.zeros(len(at), np.int64), there.copy()
+    for shift in range(0, 70, 7):
+        if not going.any():
+            break
+        byte = buffer[np.where(going, at + size, 0)]
+        value |= np.where(going, (byte & 127).astype(np.uint64) << np.uint64(shift), np.uint64(0))
+        size += going
+        going &= byte > 127
+    return value.view(np.int64), size
+
+
+def _doubles(buffer: Bytes, at: Places) -> NDArray[np.int64]:
+    inside = np.minimum(at, len(buffer) - 8)
+    return np.ascontiguousarray(buffer[inside[:, None] + np.arange(8)]).view(np.int64)[:, 0]
 
 
 class Steps:
@@ -35,7 +126,7 @@ class Steps:
         """What follows is of another file: no step leads there."""
         self._last_s = None
 
-    def add(self, stamps_s: Stamps) -> None:
+    def add(self, stamps_s: Times) -> None:
         self.messages += len(stamps_s)
         good = stamps_s[np.abs(stamps_s) < LARGEST_STAMP_S]
         if not len(good):
@@ -74,7 +165,7 @@ class Arrivals:
         """The same of the latest arrival of each block: over a block the line hardly moves."""
         self._every = 1
 
-    def add(self, device_s: Stamps, host_monotonic_ns: NDArray[np.int64]) -> None:
+    def add(self, device_s: Times, host_monotonic_ns: NDArray[np.int64]) -> None:
         seen = (np.abs(device_s) < LARGEST_STAMP_S) & (device_s != 0) & (host_monotonic_ns != 0)
         device_s, host_ns = device_s[seen], host_monotonic_ns[seen]
         if not len(device_s):
@@ -97,7 +188,7 @@ class Arrivals:
         if fit is None:
             return None
 
-        def above_ms(arrivals: Stamps) -> Stamps:
+        def above_ms(arrivals: Times) -> Times:
             line_s = fit.offset_ns / 1e9 + fit.drift * (arrivals[:, 0] - fit.reference_s)
             return np.maximum(arrivals[:, 1] - line_s, 0.0) * 1e3
 

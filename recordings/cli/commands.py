@@ -1,0 +1,182 @@
+"""`recordings info | export | excerpt | recover`, and what they print."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterator
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from recordings.exporters import Target
+from recordings.plain_text import plain_text
+from recordings.reader import open_recording
+from recordings.recover import Recovery
+from recordings.recover import recover as recover_recording
+
+Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session's folder", show_default=False)]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]
+_LOSSES_SHOWN = 20
+_STYLES = {"MISSING": "red", "lost": "yellow"}
+
+
+def info_command(recording: Rec, json_: Json = False) -> None:
+    """Show contents, rates, gaps and clock quality. Exit 3: segment missing."""
+    from recordings.info import recording_info
+
+    facts = recording_info(open_recording(recording, incomplete=True))
+    if json_:
+        print(json.dumps(facts))
+    else:
+        _print_info(facts)
+    if facts["missing"]:
+        raise typer.Exit(3)
+
+
+def export_command(
+    recording: Rec,
+    output: Annotated[Path, typer.Option("-o", "--output", help="The folder to write; it must not exist.")],
+    to: Annotated[
+        Target,
+        typer.Option("--to", help="folder: images and poses, for `import`; csv: tables; ros2: a bag."),
+    ],
+    json_: Json = False,
+) -> None:
+    """Write a folder of images and poses, CSV tables, or a ROS 2 bag."""
+    from recordings.exporters.folder import export_recording
+
+    _print_written(export_recording(open_recording(recording), output, to), json_)
+
+
+def excerpt_command(
+    recording: Rec,
+    output: Annotated[Path, typer.Option("-o", "--output", help="The smaller recording (.mcap) to write.")],
+    json_: Json = False,
+) -> None:
+    """Write a smaller recording that solves like the whole.
+
+    Images become lossless PNG; robot states stay only around the images.
+    """
+    from recordings.exporters.excerpt import write_excerpt
+
+    _print_written(write_excerpt(open_recording(recording), output), json_)
+
+
+def recover_command(
+    recording: Annotated[
+        Path, typer.Argument(help="A recording (.mcap, .mcap.part) or a session's folder", show_default=False)
+    ],
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", help="Default: in place, and the damaged file is kept beside it."),
+    ] = None,
+    json_: Json = False,
+) -> None:
+    """Rebuild an unfinished, cut or damaged recording. Exit 3: it had to."""
+    results = recover_recording(recording, output)
+    if json_:
+        print(json.dumps([dataclasses.asdict(result) for result in results], default=str))
+    else:
+        for result in results:
+            _print_recovery(result)
+        if output is not None and not results[0].rebuilt:
+            print(f"{output} was not written: there was nothing to repair")
+    raise typer.Exit(3 if any(result.rebuilt or result.missing for result in results) else 0)
+
+
+def _print_written(path: Path, json_: bool) -> None:
+    print(json.dumps({"output": str(path)}) if json_ else f"{path} written")
+
+
+def _print_info(facts: dict[str, Any]) -> None:
+    """Prints what `recording_info` found as two small tables."""
+    from rich.table import Column, Table
+    from rich.text import Text
+
+    from recordings.cli.console import plain_console
+
+    console = plain_console()
+    table = Table("", Column("", overflow="fold"), box=None, show_header=False, padding=(0, 2, 0, 0))
+    for name, value in _info_rows(facts):
+        table.add_row(Text(name, _STYLES.get(name, "")), value)
+    console.print(table)
+    topics = Table("topic", "messages", "rate", "size", box=None, padding=(0, 2, 0, 0), header_style="dim")
+    for topic in facts["topics"]:
+        rate = f"{topic['rate_hz']:.1f} Hz" if topic["rate_hz"] else "-"
+        name = topic["topic"] + (" (of another program, ignored)" if topic["foreign"] else "")
+        topics.add_row(name, str(topic["messages"]), rate, f"{topic['bytes'] / 1e6:.2f} MB")
+    console.print(topics)
+
+
+def _info_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
+    created = datetime.fromtimestamp(facts["created_wall_ns"] / 1e9, UTC)
+    camera, robot, views = facts["camera"], facts["robot"], facts["views"]
+    whole = "INCOMPLETE, what is here is finished" if facts["missing"] else "finished"
+    yield "recording", f"{facts['path']}  {facts['size_bytes'] / 1e6:.1f} MB  {whole}, all checksums good"
+    yield "session", f"{facts['name']}  {facts['source']}  {facts['mount']}  {created:%Y-%m-%d %H:%M} UTC"
+    if facts["parts"] > 1:
+        yield "segments", str(facts["parts"])
+    for missing in facts["missing"]:
+        yield "MISSING", missing
+    for loss in facts["losses"]:
+        yield "lost", loss
+    yield "board", facts["board"]
+    known = "intrinsics known" if camera["intrinsics"] else "intrinsics to be estimated"
+    yield (
+        "camera",
+        f"{camera['identity']} {camera['serial']} {camera['width']}×{camera['height']}, {known}".strip(),
+    )
+    yield "robot", f"{robot['model']} {robot['serial']}".strip()
+    retakes = views["attempts"] - views["poses"]
+    yield "views", f"{views['poses']} poses" + (f", {retakes} retaken" if retakes else "")
+    if states := facts["robot_states"]:
+        rate = f"{states['rate_hz']:.1f} Hz" if states["rate_hz"] else "a controller time that does not go on"
+        count = states["gaps"]
+        gaps = "no gap"
+        if count:
+            plural = "s" if count > 1 else ""
+            gaps = f"{count} gap{plural}, largest {states['largest_gap_s'] * 1e3:.0f} ms"
+        if back := states["backward"]:
+            gaps += f", controller time goes back {back} time{'s' * (back > 1)}"
+        yield "robot states", f"{states['count']} at {rate}, {gaps}"
+    if pictures := facts["pictures"]:
+        yield "images", _images_text(pictures)
+    for name, clock in facts["clocks"].items():
+        if clock:
+            yield f"{name} clock", _clock_text(clock)
+    if facts["attachments"]:
+        yield "attached", ", ".join(f"{name} ({size} B)" for name, size in facts["attachments"].items())
+    if facts["note"]:
+        yield "note", facts["note"]
+
+
+def _images_text(pictures: dict[str, Any]) -> str:
+    settings = [f"{value:g} µs" for value in pictures["exposure_us"]]
+    settings += [f"{value:g} dB" for value in pictures["gain_db"]]
+    jumps = pictures["frame_id_jumps"]
+    order = "no frame id missing"
+    if jumps:  # between triggered pictures a camera may go on counting
+        order = f"frame ids jump {jumps} time{'s' * (jumps > 1)}"
+    return ", ".join([str(pictures["count"]), *pictures["pixel_formats"], *settings, order])
+
+
+def _clock_text(clock: dict[str, float | None]) -> str:
+    within = f"95 % within {clock['spread_p95_ms']:.2f} ms, all within {clock['spread_max_ms']:.2f} ms"
+    if clock["drift_ppm"] is None:
+        return f"too short for a drift, {within}"
+    return f"drift {clock['drift_ppm']:+.1f} ppm against the host, {within}"
+
+
+def _print_recovery(result: Recovery) -> None:
+    """What `recordings recover` did with one file."""
+    print(plain_text(result.text))
+    if not result.rebuilt:
+        return
+    for loss in result.losses[:_LOSSES_SHOWN]:
+        print(plain_text(f"  lost: {loss}"))
+    if len(result.losses) > _LOSSES_SHOWN:
+        print(f"  and {len(result.losses) - _LOSSES_SHOWN} more")
+    print(plain_text(f"the damaged file is kept as {result.kept_original}"))

@@ -1,0 +1,109 @@
+"""`recordings import`, and what it prints."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import shlex
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from recordings.cli.console import plain_console
+from recordings.importers.bag import PAIR_WITHIN_S, import_bag
+from recordings.importers.dataset import DATASET_FILE, POSES_FILE
+from recordings.importers.folder import import_folder
+from recordings.importers.selection import Wanted
+from recordings.importers.stops import POSITION_M, ROTATION_RAD, Limits
+from recordings.plain_text import plain_text
+
+
+def import_command(
+    source: Annotated[
+        Path,
+        typer.Argument(
+            help="A folder (dataset.yaml, poses.csv, pictures), a ROS 2 bag, or an MCAP file",
+            show_default=False,
+        ),
+    ],
+    output: Annotated[
+        Path | None, typer.Option("-o", "--output", help="The recording to write (.mcap).")
+    ] = None,
+    dataset: Annotated[
+        Path | None, typer.Option(help="dataset.yaml of a bag: mount, board. Default: in or beside it.")
+    ] = None,
+    image_topic: Annotated[str | None, typer.Option(help="Topic of the pictures.")] = None,
+    pose_topic: Annotated[
+        str | None, typer.Option(help="Topic of the flange's poses, instead of frames.")
+    ] = None,
+    base: Annotated[str | None, typer.Option(help="Frame of the robot's base.")] = None,
+    flange: Annotated[str | None, typer.Option(help="Frame of the flange.")] = None,
+    pair_within: Annotated[
+        float, typer.Option(help="Largest time between a picture and the nearest pose, seconds.")
+    ] = PAIR_WITHIN_S,
+    still_mm: Annotated[float, typer.Option(help="What still counts as standing, mm.")] = POSITION_M * 1e3,
+    still_deg: Annotated[
+        float, typer.Option(help="The same in degrees.", show_default="0.003")
+    ] = math.degrees(ROTATION_RAD),
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Say what would be taken; write nothing.")
+    ] = False,
+    json_: Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")] = False,
+) -> None:
+    """Turn other people's images and poses into a recording.
+
+    Of a bag the stops of the arm are found, and the last image of each is taken. poses.csv:
+    image,x,y,z,qx,qy,qz,qw (and j1 … j6), where the flange is in the robot's base, in metres and radians.
+    """
+    if output is None and not dry_run:
+        raise typer.BadParameter("name the recording to write with -o, or ask with --dry-run")
+    target = None if dry_run else output
+    with _progress(not json_) as progress:
+        if (source / DATASET_FILE).is_file() and (source / POSES_FILE).is_file():
+            done = import_folder(source, target, progress)
+            facts = {"recording": str(target or ""), "views": done.images, "bytes": done.size_bytes}
+        else:
+            wanted = Wanted(image_topic, pose_topic, base, flange)
+            limits = Limits(still_mm / 1e3, math.radians(still_deg))
+            plan = import_bag(source, target, dataset, wanted, limits, pair_within, progress)
+            facts = {"recording": str(target or ""), "views": plan.stops, "bytes": plan.bytes_written}
+            facts["bag"] = dataclasses.asdict(plan)
+    if json_:
+        print(json.dumps(facts))
+    else:
+        _print_import(facts)
+
+
+def _print_import(facts: dict[str, Any]) -> None:
+    """What `recordings import` took, or would take."""
+    if bag := facts.get("bag"):
+        print(plain_text(f"images    {bag['image_topic']} ({bag['images']}), {bag['camera']}"))
+        print(plain_text(f"poses     {bag['poses_from']}, paired by stamp within {bag['bound_ms']:.2f} ms"))
+        print(plain_text(f"joints    {bag['joints_from'] or 'none of a six-axis arm'}"))
+        passed = ", ".join(f"{count} {reason}" for reason, count in bag["passed_over"].items() if count)
+        print(plain_text(f"stops     {bag['stops']}" + (f"; images passed over: {passed}" if passed else "")))
+        if bag["other_topics"]:
+            print(plain_text(f"not used  {', '.join(bag['other_topics'])}"))
+    if not facts["recording"]:
+        print(plain_text(f"{facts['views']} views would be taken; nothing was written"))
+        return
+    print(plain_text(f"{facts['recording']}: {facts['views']} views, {facts['bytes'] / 1e6:.1f} MB"))
+    print(plain_text(f"next: calibrate solve {shlex.quote(facts['recording'])}"))
+
+
+@contextmanager
+def _progress(shown: bool) -> Iterator[Callable[[str, int, int], None]]:
+    """A bar on stderr, where it is a terminal."""
+    console = plain_console(stderr=True)
+    if not shown or not console.is_terminal:
+        yield lambda text, done, total: None
+        return
+    from rich.progress import Progress
+
+    with Progress(console=console, transient=True) as bar:
+        task = bar.add_task("", total=None)
+        yield lambda text, done, total: bar.update(task, description=text, completed=done, total=total)

@@ -1,0 +1,219 @@
+"""What a bag can tell about a calibration, whoever wrote it, decoded from ROS 2 (CDR) or foxglove (protobuf).
+
+One type per kind of message, times in ns. ROS messages need `rosbags` (the extra `ros`).
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+from dataclasses import dataclass
+from enum import Enum
+from functools import cache
+from typing import Any
+
+import numpy as np
+from foxglove_schemas_protobuf.CameraCalibration_pb2 import CameraCalibration
+from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
+from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
+from foxglove_schemas_protobuf.FrameTransforms_pb2 import FrameTransforms
+from foxglove_schemas_protobuf.JointStates_pb2 import JointStates
+from foxglove_schemas_protobuf.PoseInFrame_pb2 import PoseInFrame
+from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
+from numpy.typing import NDArray
+
+from recordings.errors import ImportSourceError
+from recordings.schema.messages import CameraModel
+from recordings.schema.viewing import camera_model_of, intrinsics
+
+Array = NDArray[np.float64]
+Progress = Callable[[str, int, int], None]
+"""Is told what is being done, how much of it is, and of how much."""
+
+
+class Kind(Enum):
+    """What a topic carries."""
+
+    IMAGE = "pictures"
+    CAMERA = "camera calibration"
+    JOINTS = "joints"
+    TRANSFORMS = "frames"
+    POSE = "poses"
+
+
+@dataclass(frozen=True, eq=False)
+class ImageMessage:
+    stamp_ns: int
+    frame: str
+    width: int
+    height: int
+    encoding: str
+    """As ROS names it: mono8, bgr8, bayer_rggb8 …; `compressed` for a PNG or JPEG file."""
+    step: int
+    """Bytes of a row; 0 for a file."""
+    data: bytes
+
+
+@dataclass(frozen=True)
+class Camera:
+    frame: str
+    model: CameraModel
+
+
+@dataclass(frozen=True)
+class Joints:
+    stamp_ns: int
+    names: tuple[str, ...]
+    positions_rad: tuple[float, ...]
+    speeds_rad_s: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class Frame:
+    """parent_from_child at one time; PoseStamped: of the thing that moves, in `parent`."""
+
+    stamp_ns: int
+    parent: str
+    child: str
+    position_m: tuple[float, float, float]
+    rotation_xyzw: tuple[float, float, float, float]
+
+
+Value = ImageMessage | Camera | Joints | list[Frame]
+
+
+CDR, PROTOBUF = "cdr", "protobuf"
+_FOXGLOVE: dict[str, tuple[Any, Kind]] = {
+    "foxglove.RawImage": (RawImage, Kind.IMAGE),
+    "foxglove.CompressedImage": (CompressedImage, Kind.IMAGE),
+    "foxglove.CameraCalibration": (CameraCalibration, Kind.CAMERA),
+    "foxglove.JointStates": (JointStates, Kind.JOINTS),
+    "foxglove.FrameTransform": (FrameTransform, Kind.TRANSFORMS),
+    "foxglove.FrameTransforms": (FrameTransforms, Kind.TRANSFORMS),
+    "foxglove.PoseInFrame": (PoseInFrame, Kind.POSE),
+}
+_ROS = {
+    "sensor_msgs/msg/Image": Kind.IMAGE,
+    "sensor_msgs/msg/CompressedImage": Kind.IMAGE,
+    "sensor_msgs/msg/CameraInfo": Kind.CAMERA,
+    "sensor_msgs/msg/JointState": Kind.JOINTS,
+    "tf2_msgs/msg/TFMessage": Kind.TRANSFORMS,
+    "geometry_msgs/msg/TransformStamped": Kind.TRANSFORMS,
+    "geometry_msgs/msg/PoseStamped": Kind.POSE,
+}
+_NS = 1_000_000_000
+_LITTLE_ENDIAN = 1
+STAMP_BYTES = 12
+"""Of a ROS message with a header: the encapsulation's four, seconds, nanoseconds."""
+
+
+def kind_of(encoding: str, schema: str) -> Kind | None:
+    """What such messages carry; None for kinds that are not used here."""
+    if encoding == PROTOBUF:
+        return _FOXGLOVE[schema][1] if schema in _FOXGLOVE else None
+    return _ROS.get(schema) if encoding == CDR else None
+
+
+def decoded(encoding: str, schema: str, data: bytes, time_ns: int) -> Value:
+    """`time_ns`: when it was recorded; stands in for a stamp that is missing. Raises ImportSourceError."""
+    try:
+        if encoding == PROTOBUF:
+            return _from_foxglove(schema, _FOXGLOVE[schema][0].FromString(data), time_ns)
+        message = ros_types().deserialize_cdr(data, schema)
+    except ImportSourceError:
+        raise
+    except Exception as error:  # whatever rosbags makes of bytes that are no message
+        raise _undecodable(schema, repr(error)) from error
+    return _from_ros(schema, message, time_ns)
+
+
+def _undecodable(schema: str, reason: str) -> ImportSourceError:
+    return ImportSourceError(f"A {schema} cannot be decoded ({reason})", code="undecodable-message")
+
+
+@cache
+def ros_types() -> Any:
+    """The message types of ROS 2 Humble. ImportSourceError when `rosbags` is not installed."""
+    try:
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as error:
+        text, remedy = "ROS messages need the package rosbags", "pip install 'calibration-station[ros]'"
+        raise ImportSourceError(text, code="missing-package", remedy=remedy) from error
+    return get_typestore(Stores.ROS2_HUMBLE)
+
+
+def ros_image_stamp_ns(data: bytes, time_ns: int) -> int:
+    """The stamp of a message that begins with a header, without decoding the rest."""
+    if len(data) < STAMP_BYTES:
+        raise _undecodable("ROS 2 image", f"{len(data)} bytes")
+    order = "<" if data[1] == _LITTLE_ENDIAN else ">"
+    seconds, nanoseconds = struct.unpack_from(f"{order}iI", data, 4)
+    return int(seconds * _NS + nanoseconds) or time_ns
+
+
+def _frame(stamp_ns: int, parent: str, child: str, at: Any, turn: Any) -> Frame:
+    return Frame(stamp_ns, parent, child, (at.x, at.y, at.z), (turn.x, turn.y, turn.z, turn.w))
+
+
+def _from_foxglove(schema: str, message: Any, time_ns: int) -> Value:
+    if schema == "foxglove.FrameTransforms":
+        return [_foxglove_frame(transform, time_ns) for transform in message.transforms]
+    if schema == "foxglove.FrameTransform":
+        return [_foxglove_frame(message, time_ns)]
+    stamp_ns, frame = _foxglove_stamp(message, time_ns), getattr(message, "frame_id", "")
+    if schema == "foxglove.RawImage":
+        size = (message.width, message.height)
+        return ImageMessage(stamp_ns, frame, *size, message.encoding, message.step, message.data)
+    if schema == "foxglove.CompressedImage":
+        return ImageMessage(stamp_ns, frame, 0, 0, "compressed", 0, message.data)
+    if schema == "foxglove.CameraCalibration":
+        return Camera(frame, camera_model_of(message))
+    if schema == "foxglove.JointStates":
+        joints = message.joints
+        speeds = tuple(j.velocity for j in joints) if all(j.HasField("velocity") for j in joints) else ()
+        return Joints(stamp_ns, tuple(j.name for j in joints), tuple(j.position for j in joints), speeds)
+    return [_frame(stamp_ns, frame, "", message.pose.position, message.pose.orientation)]
+
+
+def _foxglove_stamp(message: Any, time_ns: int) -> int:
+    return int(message.timestamp.seconds * _NS + message.timestamp.nanos) or time_ns
+
+
+def _foxglove_frame(message: Any, time_ns: int) -> Frame:
+    names = (message.parent_frame_id, message.child_frame_id)
+    return _frame(_foxglove_stamp(message, time_ns), *names, message.translation, message.rotation)
+
+
+def _from_ros(schema: str, message: Any, time_ns: int) -> Value:
+    if schema == "tf2_msgs/msg/TFMessage":
+        return [_ros_frame(transform, time_ns) for transform in message.transforms]
+    if schema == "geometry_msgs/msg/TransformStamped":
+        return [_ros_frame(message, time_ns)]
+    stamp_ns, frame = _ros_stamp(message.header, time_ns), str(message.header.frame_id)
+    if schema == "sensor_msgs/msg/Image":
+        if message.is_bigendian and "16" in message.encoding:
+            raise ImportSourceError(
+                "The bag's 16 bit images are big-endian",
+                code="big-endian",
+                remedy="Record them little-endian.",
+            )
+        size = (message.width, message.height)
+        return ImageMessage(stamp_ns, frame, *size, message.encoding, message.step, message.data.tobytes())
+    if schema == "sensor_msgs/msg/CompressedImage":
+        return ImageMessage(stamp_ns, frame, 0, 0, "compressed", 0, message.data.tobytes())
+    if schema == "sensor_msgs/msg/CameraInfo":
+        size = (message.width, message.height)
+        return Camera(frame, intrinsics(*size, message.k, message.d, message.distortion_model))
+    if schema == "sensor_msgs/msg/JointState":
+        speeds = tuple(map(float, message.velocity))
+        return Joints(stamp_ns, tuple(message.name), tuple(map(float, message.position)), speeds)
+    return [_frame(stamp_ns, frame, "", message.pose.position, message.pose.orientation)]
+
+
+def _ros_stamp(header: Any, time_ns: int) -> int:
+    return int(header.stamp.sec * _NS + header.stamp.nanosec) or time_ns
+
+
+def _ros_frame(message: Any, time_ns: int) -> Frame:
+    names, moved = (message.header.frame_id, message.child_frame_id), message.transform
+    return _frame(_ros_stamp(message.header, time_ns), *names, moved.translation, moved.rotation)

@@ -15,7 +15,7 @@ from recordings import manifest
 from recordings.manifest import enter_part, read_manifest
 from recordings.recover import recover
 from station.cell.session_folder import list_sessions, new_session_folder
-from tests.recordings.small_recording import write_small
+from tests.recordings.small_recording import refused, write_small
 
 ROOT = Path(__file__).parents[2]
 

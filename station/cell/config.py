@@ -51,12 +51,18 @@ class KinematicsDeltas(Section, frozen=True):
     theta_rad: Vector6 = (0.0,) * 6
 
 
+ControlPath = Literal["ur_rtde", "script"]
+"""What drives the arm: the library, or a script of our own where the library does not exist."""
+
+
 class RobotConfig(Section, frozen=True):
     model: str = "UR10"
     host: str = ""
     serial: str = ""
     """When given, another arm is refused."""
     kinematics: KinematicsDeltas | None = None
+    control: ControlPath | None = None
+    """None = ur_rtde where it is installed, else script"""
 
 
 class CameraConfig(Section, frozen=True):

@@ -12,11 +12,12 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable, Coroutine, Sequence
+from importlib.util import find_spec
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
-from station.cell.config import RobotConfig
+from station.cell.config import ControlPath, RobotConfig
 from station.cell.errors import RobotError, SafetyStopError, StaleStateError
 from station.devices.rtde import RuntimeState
 from station.devices.ur_child import ControlChild
@@ -65,6 +66,15 @@ def longest_gap_s(moments_s: Sequence[float], since_s: float) -> float:
     return max((b - a for a, b in pairwise(moments_s) if a > since_s), default=0.0)
 
 
+def control_path(config: RobotConfig) -> ControlPath:
+    """As configured; else ur_rtde where it is installed, and our own script where it is not."""
+    return config.control or ("ur_rtde" if library_installed() else "script")
+
+
+def library_installed() -> bool:
+    return find_spec("rtde_control") is not None
+
+
 class UrRobot(UrLink):
     """`log_dir`: where the control process's words go."""
 
@@ -81,6 +91,10 @@ class UrRobot(UrLink):
         self._played_s = 0.0
         """When the control program was last seen playing, in a move."""
         self._background: set[asyncio.Task[Any]] = set()
+
+    @property
+    def control_path(self) -> ControlPath:
+        return control_path(self.config)
 
     @property
     def control(self) -> bool:
@@ -107,7 +121,7 @@ class UrRobot(UrLink):
         await self._may_start()
         if why := self._why_stopped():
             raise RobotError(f"stopped before control started{why}")
-        child = self._child = ControlChild.spawn(self.config.host, self._log_path)
+        child = self._child = ControlChild.spawn(self.config.host, self._log_path, self.control_path)
         try:
             tcp = await child.ready()
             if self._why_stopped():

@@ -16,6 +16,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, BinaryIO
 
+from station.cell.config import ControlPath
 from station.cell.errors import RobotError
 
 log = logging.getLogger(__name__)
@@ -30,6 +31,18 @@ REAP_S = 2.0
 LOG_LIMIT_BYTES = 1_000_000
 STOP_DECELERATION = 2.0
 """The script reads it as m/s² of the tool for an asynchronous stop (see docs/safety.md)."""
+
+REFUSALS = {
+    "registers-in-use": "another program controls the robot (its RTDE registers are in use): close that "
+    "program, or the field bus on the pendant, then try again",
+    "local-control": "the robot is in local control: switch the pendant to Remote (top right), then try again",
+    "script-not-started": "the control program did not start: power on, release the brakes, clear the "
+    "pendant's messages",
+    "program-playing": "another program is playing on the robot: stop it on the pendant, then try again",
+    "ur-rtde-missing": "the library ur_rtde is not installed (its wheels exist for Python 3.10-3.12 on x86-64): "
+    "install it, or set robot.control: script in the configuration",
+}
+"""By the code of the control process's refusal: what a person can do."""
 
 
 class ControlChild:
@@ -57,13 +70,13 @@ class ControlChild:
         self._loop.add_reader(channel, self._receive)
 
     @classmethod
-    def spawn(cls, host: str, log_path: Path) -> ControlChild:
+    def spawn(cls, host: str, log_path: Path, path: ControlPath = "ur_rtde") -> ControlChild:
         """Starts the process (milliseconds). From the loop's thread: the child dies with that thread.
 
         Raises RobotError when this computer does not let it.
         """
         ours, theirs = socket.socketpair(socket.AF_UNIX, socket.SOCK_SEQPACKET)
-        command = [sys.executable, "-m", "station.devices.ur_control", host, str(theirs.fileno())]
+        command = [sys.executable, "-m", "station.devices.ur_control", path, host, str(theirs.fileno())]
         try:
             with theirs, _log(log_path) as log:
                 process = subprocess.Popen(
@@ -102,7 +115,9 @@ class ControlChild:
         if "refused" in answer:
             self.kill()
             await self.reap()
-            raise RobotError(_refusal(str(answer["refused"])) + self.epitaph())
+            code, text = str(answer.get("code", "")), str(answer["refused"])
+            words = REFUSALS.get(code, f"control could not start: {text}")
+            raise RobotError(words + self.epitaph(), code=code)
         return tuple(answer["tcp"]) if answer.get("tcp") else None
 
     async def heard(self) -> None:
@@ -274,18 +289,3 @@ def _log(path: Path) -> BinaryIO:
         if path.stat().st_size > LOG_LIMIT_BYTES:
             path.replace(path.with_suffix(".log.1"))
     return path.open("ab")
-
-
-def _refusal(text: str) -> str:
-    """ur_rtde's words → what a person can do."""
-    lowered = text.lower()
-    if "in use" in lowered:
-        return (
-            "another program controls the robot (its RTDE registers are in use): close that program, or the "
-            "field bus on the pendant, then try again"
-        )
-    if "remote control" in lowered:
-        return "the robot is in local control: switch the pendant to Remote (top right), then try again"
-    if "start control script" in lowered:
-        return "the control program did not start: power on, release the brakes, clear the pendant's messages"
-    return f"control could not start: {text}"

@@ -1,4 +1,4 @@
-"""The disposable process that holds ur_rtde's control interface: `python -m station.devices.ur_control`.
+"""The disposable process that controls the arm, by ur_rtde or by our own script: `python -m …ur_control`.
 
 Everything that can hang, crash or abort inside that library happens here and costs only this process. It is
 started by `ur_child`, answers requests on one inherited socket (one JSON object per message) and dies with
@@ -8,7 +8,7 @@ Requests: {"do": "beat", "ns": N}   N = host monotonic time of the session loop;
           {"do": "move", "id": I, "joints": [6], "speed": rad/s, "acceleration": rad/s²}
           {"do": "stop", "deceleration": …}
           {"do": "end"}
-Answers:  {"ready": true, "tcp": [6] | null} · {"refused": text}
+Answers:  {"ready": true, "tcp": [6] | null} · {"refused": text, "code": see `ur_child`}
           {"beat": N, "kicked": bool, "lost": bool}   kicked: the beat was fresh and the script took the kick
           {"id": I, "ok": bool, "error": text} · {"stopped": true}
 """
@@ -24,12 +24,19 @@ import sys
 import time
 from typing import Any, NoReturn
 
+from station.cell.errors import RobotError
 from station.cell.process import DAEMON_NICENESS, die_with_parent, go_before_others
 
 BEAT_FRESH_NS = 100_000_000
 WATCHDOG_HZ = 5.0
 """The controller stops the script after 1/5 s without a kick."""
 MESSAGE_LIMIT = 4096
+LIBRARY_WORDS = {
+    "in use": "registers-in-use",
+    "remote control": "local-control",
+    "start control script": "script-not-started",
+}
+"""What ur_rtde's refusals say, in small letters; it has no codes."""
 
 
 class ControlServer:
@@ -97,18 +104,35 @@ class ControlServer:
         return "" if ok else "the controller did not take the move"
 
 
-def main(host: str, descriptor: int, parent_pid: int) -> NoReturn:
+def open_control(path: str, host: str) -> Any:
+    """The interface of ur_rtde, or what has the same calls. Raises RobotError with a code, OSError."""
+    if path == "script":
+        from station.devices.ur_script import ScriptControl
+
+        return ScriptControl(host)
+    try:
+        from rtde_control import RTDEControlInterface
+    except ImportError as error:
+        raise RobotError(f"ur_rtde cannot be imported ({error})", code="ur-rtde-missing") from None
+    try:
+        return RTDEControlInterface(host)
+    except RuntimeError as error:
+        words = str(error).lower()
+        code = next((code for said, code in LIBRARY_WORDS.items() if said in words), "control")
+        raise RobotError(str(error), code=code) from None
+
+
+def main(path: str, host: str, descriptor: int, parent_pid: int) -> NoReturn:
     """`descriptor`: the inherited socket. Leaves by os._exit: the library's destructors can hang or abort."""
     die_with_parent(parent_pid)
     go_before_others(DAEMON_NICENESS)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     channel = socket.socket(fileno=descriptor)
-    from rtde_control import RTDEControlInterface
-
     try:
-        control = RTDEControlInterface(host)
-    except RuntimeError as error:
-        channel.send(json.dumps({"refused": str(error)}).encode())
+        control = open_control(path, host)
+    except (RobotError, OSError) as error:
+        code = error.code if isinstance(error, RobotError) else "control"
+        channel.send(json.dumps({"refused": str(error), "code": code}).encode())
         os._exit(1)
     server = ControlServer(control, channel)
     try:
@@ -124,4 +148,4 @@ def main(host: str, descriptor: int, parent_pid: int) -> NoReturn:
 
 
 if __name__ == "__main__":
-    main(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))
+    main(sys.argv[1], sys.argv[2], int(sys.argv[3]), int(sys.argv[4]))

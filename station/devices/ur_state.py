@@ -26,17 +26,8 @@ from calibrate.geometry import pose_from_rotvec, rotation_log
 from recordings.schema.clocks import ClockEstimator, ClockFit, monotonic_from_wall_ns
 from recordings.schema.messages import RobotState, Stamps, Vector6
 from station.cell.errors import StaleStateError
-from station.devices.rtde import (
-    PORT,
-    PROTOCOL_VERSION,
-    PacketReader,
-    PacketType,
-    Recipe,
-    RtdeError,
-    join_names,
-    packet,
-    split_names,
-)
+from station.devices.rtde import PORT, PacketType, Recipe, RtdeError
+from station.devices.rtde_link import HANDSHAKE_S, RtdeLink
 from station.devices.ur_dashboard import connect_trouble
 
 log = logging.getLogger(__name__)
@@ -44,7 +35,6 @@ log = logging.getLogger(__name__)
 HISTORY_S = 10.0
 SILENCE_S = 2.0
 """Without data for this long the connection is given up."""
-HANDSHAKE_S = 2.0
 SO_TIMESTAMPNS = 35
 """Linux, 64 bit: receive time by the kernel, wall clock; `socket` does not name it."""
 RECEIVE_BUFFER_BYTES = 1 << 20
@@ -103,8 +93,6 @@ class StateReader(threading.Thread):
         """Why the connection is over; None while it lives."""
         self._on_state = on_state
         self._on_end = on_end
-        self._packets = PacketReader()
-        self._pending: deque[tuple[int, bytes]] = deque()
         self._stop_read, self._stop_write = socket.socketpair()
         self._wall_ahead_ns = _wall_ahead_ns()
         self._wall_set_ns = 0
@@ -120,8 +108,8 @@ class StateReader(threading.Thread):
                 link.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, RECEIVE_BUFFER_BYTES)
                 link.settimeout(HANDSHAKE_S)
                 link.connect((self.host, PORT))
-                recipe = self._handshake(link)
-                self._follow(link, recipe)
+                rtde = RtdeLink(link)
+                self._follow(link, rtde, self._handshake(rtde))
         except TimeoutError:
             why = f"no answer from {self.host}:{PORT} within {HANDSHAKE_S:g} s"
         except ConnectionResetError:
@@ -147,59 +135,26 @@ class StateReader(threading.Thread):
         with contextlib.suppress(OSError):
             self._stop_write.close()
 
-    # -- handshake --------------------------------------------------------------------------------------
-
-    def _handshake(self, link: socket.socket) -> Recipe:
-        link.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-        accepted = self._ask(link, PacketType.PROTOCOL_VERSION, struct.pack(">H", PROTOCOL_VERSION))
-        if accepted != b"\x01":
-            raise RtdeError(f"the controller does not speak RTDE version {PROTOCOL_VERSION}")
+    def _handshake(self, link: RtdeLink) -> Recipe:
+        link.speak()
         begun = time.perf_counter()
-        version = self._ask(link, PacketType.CONTROLLER_VERSION)
+        self.version = link.version()
         self.clock.latency_s = (time.perf_counter() - begun) / 2
-        if len(version) != 16:
-            raise RtdeError(f"the controller's version has {len(version)} bytes, expected 16")
-        self.version = struct.unpack(">4I", version)
         self.rate_hz = 500.0 if self.version[0] > 3 else 125.0
         self.history = deque(maxlen=int(HISTORY_S * self.rate_hz) + 1)
         names: tuple[str, ...] = NAMES
         if self.version[:2] >= PAYLOAD_SINCE.get(self.version[0], (0, 0)):
             names += ("payload", "payload_cog")
-        wanted = struct.pack(">d", self.rate_hz) + join_names(names)
-        answer = self._ask(link, PacketType.OUTPUT_SETUP, wanted)
-        types = split_names(answer[1:])
-        if len(types) != len(names):
-            raise RtdeError(f"asked for {len(names)} variables, the controller answered {len(types)} types")
-        refused = [n for n, t in zip(names, types, strict=True) if t == "NOT_FOUND"]
-        if refused:
-            raise RtdeError(f"the controller has no {', '.join(refused)}; update its software")
-        recipe = Recipe(answer[0], names, types)
-        if self._ask(link, PacketType.START) != b"\x01":
-            raise RtdeError("the controller refused to send its state")
+        recipe = link.outputs(self.rate_hz, names)
+        link.start()
         return recipe
-
-    def _ask(self, link: socket.socket, kind: PacketType, payload: bytes = b"") -> bytes:
-        """Sends a request; what else arrives before its reply (messages) is skipped."""
-        link.settimeout(HANDSHAKE_S)
-        link.sendall(packet(kind, payload))
-        give_up = time.monotonic() + HANDSHAKE_S
-        while time.monotonic() < give_up:
-            while self._pending:
-                got, answer = self._pending.popleft()
-                if got == kind:
-                    return answer
-            data = link.recv(65536)
-            if not data:
-                raise RtdeError(f"{self.host}:{PORT} closed the connection during the handshake")
-            self._pending.extend(self._packets.feed(data))
-        raise TimeoutError
 
     # -- the stream -------------------------------------------------------------------------------------
 
-    def _follow(self, link: socket.socket, recipe: Recipe) -> None:
+    def _follow(self, link: socket.socket, rtde: RtdeLink, recipe: Recipe) -> None:
         link.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
         link.setblocking(False)
-        for kind, payload in self._pending:
+        for kind, payload in rtde.pending:
             self._take(kind, payload, recipe, time.monotonic_ns(), time.time_ns())
         poller = select.poll()
         poller.register(link, select.POLLIN)
@@ -217,7 +172,7 @@ class StateReader(threading.Thread):
             if not data:
                 raise RtdeError("the robot closed the connection")
             monotonic_ns, wall_ns = self._arrival(ancillary)
-            for kind, payload in self._packets.feed(data):
+            for kind, payload in rtde.packets.feed(data):
                 self._take(kind, payload, recipe, monotonic_ns, wall_ns)
 
     def _take(self, kind: int, payload: bytes, recipe: Recipe, monotonic_ns: int, wall_ns: int) -> None:

@@ -14,6 +14,7 @@ LIMIT = 4_000_000
 _BEGIN = re.compile(r"^(?:def|sec)\s+(\w+)\s*\([^\n]*\)\s*:[ \t]*$", re.MULTILINE)
 _END = re.compile(r"^end[ \t]*\r?\n", re.MULTILINE)
 _OFFSET = r"reg_offset_{}\s*=\s*(?:#[^\n]*\n)?\s*(\d+)"
+_CUSTOM = re.compile(r"write_output_integer_register\(\d+ \+\d+, 1\)")
 _STEP = re.compile(
     r"signal_async_progress\((\d+)\)|(movej|movel|movep)\((p?)\[([^\]]*)\],\s*a=([^,]+),\s*v=([^,]+),\s*r=([^)]+)\)"
 )
@@ -44,6 +45,11 @@ class Upload:
     def is_control_script(self) -> bool:
         """ur_rtde's own: it answers commands in registers."""
         return "reg_offset_int" in self.text
+
+    @property
+    def is_custom_script(self) -> bool:
+        """Made by ur_rtde's `sendCustomScriptFunction`: `write_output_integer_register(0 +0, 1)`."""
+        return _CUSTOM.search(self.text) is not None
 
     def offset(self, kind: Literal["int", "float"]) -> int:
         found = re.search(_OFFSET.format(kind), self.text)

@@ -10,6 +10,7 @@ from math import inf
 
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode
 from station.simulation.controller.arm import PROGRAM_END_RAD_S2, MakePath, Motion
+from station.simulation.controller.interpreted import InterpretedProgram, interpreted
 from station.simulation.controller.kinematics import (
     Rigid,
     Six,
@@ -81,6 +82,8 @@ class SimulatedRobot(ControllerState):
             if self._silence_s > self.watchdog_s:
                 self.stop_program("watchdog: the command register was silent")
                 return
+        if late and isinstance(self.program, InterpretedProgram):
+            return  # it counts its own time
         try:
             running = self.program.step()
         except (ScriptError, UnreachableError) as error:
@@ -153,10 +156,11 @@ class SimulatedRobot(ControllerState):
             return
         if upload.is_control_script:
             self.start_program(ControlScript(self, upload))
-        elif "write_output_integer_register" in upload.text:
+        elif upload.is_custom_script:
             self.start_program(CustomScript(self, upload))
         else:
-            self.start_program(ForeignProgram(upload.name or "line", 1 if not upload.name else None))
+            foreign = ForeignProgram(upload.name or "line", 1 if not upload.name else None)
+            self.start_program(interpreted(self, foreign.name, upload.text) or foreign)
 
     def start_program(self, program: Program) -> None:
         self.stop_program(f"replaced by {program.name}")

@@ -1,0 +1,346 @@
+"""Control of an arm by a script of our own, where ur_rtde does not exist: the six calls of `ur_control`.
+
+The script is uploaded once. It obeys one RTDE data packet that carries everything: sequence, verb, keepalive,
+six joints, speed, acceleration. A verb counts once, when its sequence is new; the script answers with that
+sequence, negative for what it refuses. Once armed it ends by itself when the keepalive stands still for
+0.2 s: it kills the thread that moves, brakes and halts, as Universal Robots' own library does. Every other
+end is the same. A lost connection is never opened again: the script is lost with it.
+"""
+
+from __future__ import annotations
+
+import math
+import random
+import select
+import socket
+import time
+from collections.abc import Callable, Sequence
+from enum import IntEnum
+from typing import NamedTuple
+
+from station.cell.errors import RobotError
+from station.devices.rtde import PORT, PacketType, RtdeError, RuntimeState
+from station.devices.rtde_link import HANDSHAKE_S, RtdeLink
+from station.devices.ur_moves import JOINT_ACCELERATION_LIMIT_RAD_S2, JOINT_SPEED_LIMIT_RAD_S
+
+SCRIPT_PORT = 30002
+FIRST_REGISTER = 24
+"""The upper half of the registers is for RTDE clients, the lower for field buses."""
+SILENCE_S = 0.2
+"""Without a new keepalive for so long the script stops the arm and ends."""
+STOP_RAD_S2 = 4.0
+RATE_HZ = 125.0
+START_S = 5.0
+SETTLE_SAMPLES = 5
+"""The first packet must act before the script starts: it refuses registers that somebody else left."""
+ANSWER_S = 0.25
+STOP_ANSWER_S = 0.04
+END_S = 0.5
+STALE_S = 0.5
+"""Without news for so long the script counts as lost. The session gives up sooner."""
+
+
+class Verb(IntEnum):
+    """What the script obeys. Any other number ends it."""
+
+    NONE = 0
+    ARM = 1
+    MOVE = 2
+    STOP = 3
+    END = 4
+
+
+class State(IntEnum):
+    """What the script says of itself."""
+
+    WAITING = 1
+    ARMED = 2
+    MOVING = 3
+    ENDED = 4
+
+
+SCRIPT = """\
+def station_control():
+  # Inputs from {r}: integers sequence, verb, keepalive; floats six joints, speed, acceleration.
+  # Outputs from {r}: integers answer, state; floats TCP offset. Integer 2: count of moves, and running.
+  global goal = [0.0, 0.0, 0.0, 0.0, 0.0, 0.0]
+  global speed = 0.0
+  global acceleration = 0.0
+  global moving = False
+  thread motion():
+    movej(goal, a=acceleration, v=speed)
+    moving = False
+  end
+  def read_move():
+    local i = 0
+    while i < 6:
+      goal[i] = read_input_float_register({r} + i)
+      if not (norm(goal[i]) <= {joint_limit}):
+        return False
+      end
+      i = i + 1
+    end
+    speed = read_input_float_register({r} + 6)
+    acceleration = read_input_float_register({r} + 7)
+    if speed > {speed_limit}:
+      speed = {speed_limit}
+    end
+    if acceleration > {acceleration_limit}:
+      acceleration = {acceleration_limit}
+    end
+    return (speed > 0) and (acceleration > 0)
+  end
+  seen = {sequence}
+  if read_input_integer_register({r}) != seen:
+    halt
+  end
+  tcp = get_tcp_offset()
+  n = 0
+  while n < 6:
+    write_output_float_register({r} + n, tcp[n])
+    n = n + 1
+  end
+  hand = 0
+  moves = 0
+  armed = False
+  silence = 0.0
+  kept = read_input_integer_register({r} + 2)
+  write_output_integer_register(2, 0)
+  write_output_integer_register({r} + 1, {waiting})
+  write_output_integer_register({r}, seen)
+  obeying = True
+  while obeying:
+    sync()
+    sequence = read_input_integer_register({r})
+    verb = read_input_integer_register({r} + 1)
+    alive = read_input_integer_register({r} + 2)
+    if alive != kept:
+      kept = alive
+      silence = 0.0
+    elif armed:
+      silence = silence + get_steptime()
+    end
+    if silence > {silence}:
+      obeying = False
+    elif sequence != seen:
+      seen = sequence
+      answer = 0 - sequence
+      if verb == {arm}:
+        armed = True
+        answer = sequence
+      elif verb == {move}:
+        if armed and not moving:
+          if read_move() and (read_input_integer_register({r}) == sequence):
+            moves = moves + 1
+            if moves > 127:
+              moves = 1
+            end
+            moving = True
+            hand = run motion()
+            answer = sequence
+          end
+        end
+      else:
+        answer = sequence
+        obeying = False
+      end
+      write_output_integer_register({r}, answer)
+    end
+    if moving:
+      write_output_integer_register(2, moves * 16777216 + 32768)
+      write_output_integer_register({r} + 1, {moving})
+    else:
+      write_output_integer_register(2, moves * 16777216)
+      if armed:
+        write_output_integer_register({r} + 1, {armed})
+      end
+    end
+  end
+  write_output_integer_register({r} + 1, {ended})
+  if moving:
+    kill hand
+    stopj({stop})
+  end
+  write_output_integer_register(2, moves * 16777216)
+  halt
+end
+"""
+
+
+def script(sequence: int) -> str:
+    """The program that obeys whoever wrote this sequence into its register before it started."""
+    return SCRIPT.format(
+        r=FIRST_REGISTER, sequence=sequence, joint_limit=2 * math.pi, speed_limit=JOINT_SPEED_LIMIT_RAD_S,
+        acceleration_limit=JOINT_ACCELERATION_LIMIT_RAD_S2, silence=SILENCE_S, stop=STOP_RAD_S2,
+        arm=int(Verb.ARM), move=int(Verb.MOVE), waiting=int(State.WAITING), armed=int(State.ARMED),
+        moving=int(State.MOVING), ended=int(State.ENDED),
+    )  # fmt: skip
+
+
+_INPUTS = (
+    *(f"input_int_register_{FIRST_REGISTER + i}" for i in range(3)),
+    *(f"input_double_register_{FIRST_REGISTER + i}" for i in range(8)),
+)
+_OUTPUTS = (
+    "timestamp",
+    "runtime_state",
+    *(f"output_int_register_{FIRST_REGISTER + i}" for i in range(2)),
+    *(f"output_double_register_{FIRST_REGISTER + i}" for i in range(6)),
+)
+
+
+class Told(NamedTuple):
+    """One sample of what the controller and the script say."""
+
+    controller_s: float
+    program: int
+    """RuntimeState"""
+    answer: int
+    state: int
+    tcp: tuple[float, ...]
+
+
+class ScriptControl:
+    """The calls have ur_rtde's names and meaning. Belongs to one thread; nothing blocks for long."""
+
+    def __init__(self, host: str) -> None:
+        """Uploads the script and waits until it answers.
+
+        Raises RobotError `registers-in-use`, `program-playing`, `script-not-started`; RtdeError, OSError.
+        """
+        self._told = Told(-1.0, RuntimeState.STOPPED, 0, 0, ())
+        self._told_s = time.monotonic()
+        """When its clock last advanced."""
+        self._samples = 0
+        self._lost = self._broken = False
+        self._keepalive = 0
+        self._command: tuple[int, Verb, Sequence[float]] = (0, Verb.NONE, (0.0,) * 8)
+        self._link = socket.create_connection((host, PORT), HANDSHAKE_S)
+        self._rtde = RtdeLink(self._link)
+        self._rtde.speak()
+        self._inputs = self._rtde.inputs(_INPUTS)
+        self._outputs = self._rtde.outputs(RATE_HZ, _OUTPUTS)
+        self._rtde.start()
+        for kind, payload in self._rtde.pending:
+            self._take(kind, payload)
+        self._link.setblocking(False)
+        self._start(host)
+
+    def _start(self, host: str) -> None:
+        sequence = random.randrange(1, 2**30)  # an answer left by an earlier script is never ours
+        self._write(sequence, Verb.NONE)
+        self._wait(lambda: self._samples > SETTLE_SAMPLES, HANDSHAKE_S)
+        if self._told.program not in (RuntimeState.STOPPED, RuntimeState.STOPPING):
+            raise RobotError("a program is playing on the robot", code="program-playing")
+        with socket.create_connection((host, SCRIPT_PORT), HANDSHAKE_S) as upload:
+            upload.sendall(script(sequence).encode("ascii"))
+            # Open until the script answers: closed with unread data, it could take the text with it.
+            if not self._wait(lambda: self._plays() and self._told.answer == sequence, START_S):
+                raise RobotError("the control script did not start", code="script-not-started")
+
+    # -- the six calls ----------------------------------------------------------------------------------
+
+    def getTCPOffset(self) -> list[float]:
+        """Flange to TCP as the script read it at its start: metres, rotation vector."""
+        return list(self._told.tcp)
+
+    def setWatchdog(self, minimum_hz: float) -> bool:
+        """From now on the script lives only as long as its keepalive advances; the time is its own."""
+        return self._ask(Verb.ARM)
+
+    def kickWatchdog(self) -> bool:
+        """Sends the next keepalive. False, and none is sent, when the script is lost."""
+        if not self._alive():
+            return False
+        self._keepalive = self._keepalive % (2**31 - 1) + 1
+        self._write(*self._command)
+        return not self._lost
+
+    def moveJ(self, q: Sequence[float], speed: float, acceleration: float, asynchronous: bool) -> bool:
+        """True when the script has taken the move. Speeds beyond its own limits are lowered to them."""
+        return self._ask(Verb.MOVE, (*q, speed, acceleration))
+
+    def stopJ(self, deceleration: float, asynchronous: bool) -> None:
+        """The script brakes the joints with its own deceleration, then ends. Waits a moment for its word."""
+        sequence = self._write(self._command[0] + 1, Verb.STOP)
+        self._wait(lambda: self._told.answer == sequence or not self._plays(), STOP_ANSWER_S)
+
+    def stopScript(self) -> None:
+        self._write(self._command[0] + 1, Verb.END)
+        self._wait(lambda: not self._plays(), END_S)
+
+    # -- the connection ---------------------------------------------------------------------------------
+
+    def _ask(self, verb: Verb, numbers: Sequence[float] = (0.0,) * 8) -> bool:
+        """A verb and the script's answer. Without one the script is lost."""
+        if not self._alive():
+            return False
+        sequence = self._write(self._command[0] + 1, verb, numbers)
+        if not self._wait(lambda: abs(self._told.answer) == sequence or not self._alive(), ANSWER_S):
+            self._lose()
+        return self._told.answer == sequence and not self._lost
+
+    def _plays(self) -> bool:
+        return not self._lost and self._told.program == RuntimeState.PLAYING
+
+    def _alive(self) -> bool:
+        """The script plays and obeys, by news that are not old. What is lost stays lost."""
+        self._read()
+        if time.monotonic() - self._told_s > STALE_S or self._told.state == State.ENDED or not self._plays():
+            self._lose()
+        return not self._lost
+
+    def _lose(self) -> None:
+        """A program that was only paused must find STOP when it goes on, not a move that nobody waits for."""
+        if not self._lost:
+            self._lost = True
+            self._write(self._command[0] + 1, Verb.STOP)
+
+    def _break(self) -> None:
+        """Nothing is written behind half a packet: its rest would be read as numbers of that one."""
+        self._lost = self._broken = True
+        self._link.close()
+
+    def _write(self, sequence: int, verb: Verb, numbers: Sequence[float] = (0.0,) * 8) -> int:
+        """One packet, that acts as a whole. A connection that does not take it at once is lost."""
+        self._command = (sequence, verb, numbers)
+        try:
+            if not self._broken:
+                self._link.sendall(self._inputs.pack((sequence, verb, self._keepalive, *numbers)))
+        except OSError:
+            self._break()
+        return sequence
+
+    def _wait(self, condition: Callable[[], bool], timeout_s: float) -> bool:
+        """Reads until it holds. False at the deadline, or when the connection is lost."""
+        give_up_s = time.monotonic() + timeout_s
+        while not condition():
+            left_s = give_up_s - time.monotonic()
+            if left_s <= 0 or self._broken:
+                return False
+            select.select([self._link], [], [], left_s)
+            self._read()
+        return True
+
+    def _read(self) -> None:
+        """Everything that has arrived."""
+        try:
+            while not self._broken:
+                data = self._link.recv(65536)
+                if not data:
+                    self._break()
+                for kind, payload in self._rtde.packets.feed(data):
+                    self._take(kind, payload)
+        except BlockingIOError:
+            pass
+        except (OSError, RtdeError):
+            self._break()
+
+    def _take(self, kind: int, payload: bytes) -> None:
+        if kind != PacketType.DATA:
+            return
+        v = self._outputs.unpack_elements(payload)
+        if v[0] != self._told.controller_s:
+            self._told_s = time.monotonic()
+            self._samples += 1
+        self._told = Told(v[0], int(v[1]), int(v[2]), int(v[3]), v[4:10])

@@ -11,7 +11,9 @@ from typing import Any
 
 import pytest
 
+from station.cell.config import ControlPath
 from station.cell.errors import StationError
+from station.devices.ur import library_installed
 from station.simulation.launch import AdminClient, SimulatedController, start_controller
 from station.simulation.netns import isolated_thread
 
@@ -26,8 +28,30 @@ MAY_BE_SENT = {
     "dashboard: safetystatus", "dashboard: programState", "dashboard: running",
     "dashboard: get loaded program", "upload: rtde_control", "script: moveJ", "script: stopJ",
     "script: setWatchdog", "script: getTCPOffset", "script: stopScript",
+    "upload: station_control", "script: movej", "script: stopj",
 }  # fmt: skip
 """Everything a station ever says to a controller; a change here is a change of the safety rules."""
+
+CONTROL_WORDS = {
+    "upload": ("upload: rtde_control", "upload: station_control"),
+    "move": ("script: moveJ", "script: movej"),
+    "stop": ("script: stopJ", "script: stopj"),
+}
+"""How the controller's log names the same thing on the two control paths."""
+no_library = pytest.mark.skipif(not library_installed(), reason="ur_rtde is not installed")
+CONTROL_PATHS = [pytest.param("ur_rtde", marks=no_library), "script"]
+
+
+@pytest.fixture(params=CONTROL_PATHS)
+def control_path(request: pytest.FixtureRequest) -> ControlPath:
+    """What asks for it is tested with both ways of driving an arm."""
+    return request.param
+
+
+def asked(admin: AdminClient, what: str) -> int:
+    """How often a controller was told this: a key of its log's counts, or of CONTROL_WORDS."""
+    counts = admin.ask("log")["counts"]
+    return sum(int(counts.get(word, 0)) for word in CONTROL_WORDS.get(what, (what,)))
 
 
 @pytest.hookimpl(optionalhook=True)

@@ -73,6 +73,8 @@ class RobotStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     """stopped, playing, paused"""
     control: bool = False
     """A control child lives."""
+    control_path: str = ""
+    """What drives the arm: ur_rtde, or script (the station's own)"""
     speed_m_s: float = 0.0
     """Fastest modelled point, now."""
     speed_limit_m_s: float = 0.25

@@ -51,6 +51,8 @@ def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
     _print_state(status)
     robot, session = status.robot, status.session
     words = [f"{robot.model} {robot.safety or 'not connected'}", f"slider {100 * robot.slider:.0f} %"]
+    if robot.control_path:
+        words.append(f"control by {robot.control_path}")
     if session.poses:
         words.append(f"{session.captured} of {len(session.poses)} poses")
     if session.name:
@@ -163,9 +165,15 @@ def doctor_command(
         return
     if config is not None:
         from station.cell.config_file import load_config
+        from station.devices.ur import control_path, control_trouble
 
         found, _ = load_config(config)
-        out.print(f"{config}: good; {found.robot.model} at {found.robot.host}, {found.mount}")
+        path = control_path(found.robot)
+        out.print(
+            f"{config}: good; {found.robot.model} at {found.robot.host}, {found.mount}, control by {path}"
+        )
+        if words := ": ".join(filter(None, control_trouble(path, real=True))):
+            out.print(words)
         out.print(f"next: station serve --config {shlex.quote(str(config))}, then station doctor beside it")
         return
     checks = ask(socket or default_socket(), Doctor())

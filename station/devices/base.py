@@ -24,6 +24,10 @@ class Robot(Protocol):
         """The control program runs and obeys us."""
 
     @property
+    def control_path(self) -> str:
+        """What drives the arm: ur_rtde or script; empty where nothing real moves."""
+
+    @property
     def notice(self) -> str:
         """What a person should know while a move is under way, though it is no fault; empty = nothing."""
 

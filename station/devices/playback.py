@@ -266,6 +266,10 @@ class PlaybackRobot:
         return self._controlled
 
     @property
+    def control_path(self) -> str:
+        return ""
+
+    @property
     def notice(self) -> str:
         return ""
 

@@ -20,7 +20,7 @@ from typing import Any
 from station.cell.config import ControlPath, RobotConfig
 from station.cell.errors import RobotError, SafetyStopError, StaleStateError
 from station.devices.rtde import RuntimeState
-from station.devices.ur_child import ControlChild
+from station.devices.ur_child import REFUSALS, ControlChild
 from station.devices.ur_condition import (
     foreign_program,
     not_powered,
@@ -39,8 +39,9 @@ POLL_S = 0.005
 STOP_WAIT_S = 0.05
 UNANSWERED_S = 0.1
 """A heartbeat that the control process did not answer for so long kicked nothing any more."""
-OUTLIVED_S = 0.3
-"""A program that still plays so long after a pause began did not stop for it."""
+OUTLIVED_S: dict[ControlPath, float] = {"ur_rtde": 0.3, "script": 0.6}
+"""A program that still plays so long after a pause began did not stop for it. Our script plays until the arm
+rests: at its fastest it brakes for 0.26 s."""
 PROGRAM_START_NS = 200_000_000
 LEFTOVER_WAIT_NS = 2_000_000_000
 CLOSE_WAIT_S = 0.5
@@ -73,6 +74,18 @@ def control_path(config: RobotConfig) -> ControlPath:
 
 def library_installed() -> bool:
     return find_spec("rtde_control") is not None
+
+
+def control_trouble(path: str, real: bool) -> tuple[str, str]:
+    """What speaks against driving an arm that way, and what to do; empty: nothing."""
+    if path == "ur_rtde" and not library_installed():
+        return "ur_rtde is not installed", REFUSALS["ur-rtde-missing"]
+    if path == "script" and real:
+        return (
+            "the station's own script drives the arm: not yet accepted on a real arm",
+            "low speed slider, hand on the emergency stop; or install ur_rtde (Python 3.10 to 3.12 on x86-64)",
+        )
+    return "", ""
 
 
 class UrRobot(UrLink):
@@ -233,13 +246,13 @@ class UrRobot(UrLink):
         if reader is None or state is None:
             return error
         if reader.ended is not None or isinstance(error, StaleStateError):
-            pause_s = self._heart.worst_s(time.monotonic() - self.age_s() - OUTLIVED_S)
+            pause_s = self._heart.worst_s(time.monotonic() - self.age_s() - OUTLIVED_S[self.control_path])
             busy = watchdog_cause(pause_s, 0.0) if reader.ended is None else None
             return busy or StaleStateError(self._stale_words(self.age_s()))
         refused = child.kicks_refused and state.runtime_state == RuntimeState.PLAYING  # it tells no more yet
         if state.runtime_state != RuntimeState.STOPPED and not refused:
             return error
-        since_s = self._played_s - OUTLIVED_S
+        since_s = self._played_s - OUTLIVED_S[self.control_path]
         arrivals_s = [s.stamps.host_monotonic_ns / 1e9 for s in reader.history.copy()]
         cause = watchdog_cause(self._heart.worst_s(since_s), longest_gap_s(arrivals_s, since_s))
         if cause is not None:

@@ -35,11 +35,12 @@ STOP_DECELERATION = 2.0
 REFUSALS = {
     "registers-in-use": "another program controls the robot (its RTDE registers are in use): close that "
     "program, or the field bus on the pendant, then try again",
-    "local-control": "the robot is in local control: switch the pendant to Remote (top right), then try again",
+    "local-control": "the robot is in local control: switch the pendant to Remote (top right), "
+    "then try again",
     "script-not-started": "the control program did not start: power on, release the brakes, clear the "
     "pendant's messages",
     "program-playing": "another program is playing on the robot: stop it on the pendant, then try again",
-    "ur-rtde-missing": "the library ur_rtde is not installed (its wheels exist for Python 3.10-3.12 on x86-64): "
+    "ur-rtde-missing": "the library ur_rtde is not installed (it exists for Python 3.10 to 3.12 on x86-64): "
     "install it, or set robot.control: script in the configuration",
 }
 """By the code of the control process's refusal: what a person can do."""

@@ -9,6 +9,7 @@ from calibrate.boards.model import BoardError, check_board, describe_board
 from recordings.files import bytes_text
 from station.cell.errors import CameraError, RobotError
 from station.cell.status import StationState
+from station.devices.ur import control_trouble
 from station.devices.ur_condition import mode_word, not_powered, safety_stop, safety_word
 from station.devices.ur_probe import probe
 from station.protocol.verbs import Check
@@ -48,7 +49,16 @@ async def _robot_checks(context: SessionContext, troubles: dict[str, str]) -> li
     else:
         words = "remote" if robot.remote else "this controller has no remote switch"
         checks.append(Check("remote control", "ok", words))
+    checks.append(_control_check(context))
     return checks
+
+
+def _control_check(context: SessionContext) -> Check:
+    path = context.cell.robot.control_path
+    trouble, remedy = control_trouble(path, real=context.cell.source == "real")
+    if trouble:
+        return Check("control", "failed" if path == "ur_rtde" else "warning", trouble, remedy)
+    return Check("control", "ok", path) if path else Check("control", "skipped", "no arm moves")
 
 
 async def _from_outside(host: str) -> str:

@@ -100,6 +100,7 @@ class Monitor:
             host=config.robot.host,
             remote=robot.remote,
             control=robot.control,
+            control_path=robot.control_path,
             speed_limit_m_s=limit,
             rate_hz=self._rate_hz(),
         )

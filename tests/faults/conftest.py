@@ -14,13 +14,14 @@ from typing import Any
 
 import pytest
 
-from station.cell.config import RobotConfig
+from station.cell.config import ControlPath, RobotConfig
 from station.cell.errors import RobotError
 from station.devices.ur import UrRobot
 from station.simulation.camera import RenderedCamera
 from station.simulation.cell import write_truth
 from station.simulation.launch import AdminClient, SimulatedController
 from station.simulation.scenes import make_cell
+from tests.conftest import asked
 
 AT_REST_RAD_S = 1e-3
 FAR_RAD = 1.5
@@ -78,7 +79,8 @@ class Cell:
         return joints
 
     def asked(self, what: str) -> int:
-        return int(self.admin.ask("log")["counts"].get(what, 0))
+        """See `asked`: a key of the log's counts, or upload, move, stop."""
+        return asked(self.admin, what)
 
     def far_goal(self) -> list[float]:
         goal = self.joints_rad()
@@ -142,11 +144,11 @@ class Cell:
     async def stays_at_rest(self, seconds: float = 0.4) -> None:
         """Nothing moves by itself, and no control comes back by itself."""
         before = self.joints_rad()
-        uploads = self.asked("upload: rtde_control")
+        uploads = self.asked("upload")
         await asyncio.sleep(seconds)
         after = self.joints_rad()
         assert max(abs(a - b) for a, b in zip(before, after, strict=True)) < 1e-3
-        assert self.asked("upload: rtde_control") == uploads
+        assert self.asked("upload") == uploads
         assert not self.robot.control
 
 
@@ -154,13 +156,18 @@ MakeCell = Callable[..., Awaitable[Cell]]
 
 
 @pytest.fixture
-async def cell(controller: Callable[..., SimulatedController], tmp_path: Path) -> AsyncIterator[MakeCell]:
-    """`await cell("UR10e", control=True)`: connected, with control started as if by a person's go."""
+async def cell(
+    controller: Callable[..., SimulatedController], control_path: ControlPath, tmp_path: Path
+) -> AsyncIterator[MakeCell]:
+    """`await cell("UR10e", control=True)`: connected, with control started as if by a person's go.
+
+    Each test of it runs twice: with ur_rtde, and with the station's own script.
+    """
     cells: list[Cell] = []
 
     async def make(model: str = "UR10", control: bool = True, **options: Any) -> Cell:
         running = await asyncio.to_thread(controller, model, **options)
-        robot = UrRobot(RobotConfig(model=model, host=running.host), tmp_path / "log")
+        robot = UrRobot(RobotConfig(model=model, host=running.host, control=control_path), tmp_path / "log")
         made = Cell(running, running.admin(), robot)
         cells.append(made)
         made.start_heart()
@@ -184,7 +191,7 @@ def fault_times(request: pytest.FixtureRequest) -> Callable[[Outcome], None]:
         place = os.environ.get("FAULT_TIMES")
         if place:
             row = {
-                "test": request.node.name,
+                "test": request.node.name,  # with the control path in brackets
                 "noticed_ms": round(outcome.noticed_s * 1000),
                 "stopped_ms": round(outcome.stopped_s * 1000),
                 "error": str(outcome.error),

@@ -23,8 +23,8 @@ from pathlib import Path
 from station.cell.config import RobotConfig
 from station.devices.ur import UrRobot
 
-async def main(host, folder):
-    robot = UrRobot(RobotConfig(host=host), folder / "log")
+async def main(host, folder, control):
+    robot = UrRobot(RobotConfig(host=host, control=control), folder / "log")
     await robot.connect()
     async def heart():
         while True:
@@ -37,7 +37,7 @@ async def main(host, folder):
     print(robot.control_pid, flush=True)
     await robot.move(goal, 0.5, 1.0)
 
-asyncio.run(main(sys.argv[1], Path(sys.argv[2])))
+asyncio.run(main(sys.argv[1], Path(sys.argv[2]), sys.argv[3]))
 """
 
 
@@ -47,9 +47,8 @@ async def test_driving_process(
 ) -> None:
     c = await cell(control=False)
     await c.robot.close()
-    driver = subprocess.Popen(
-        [sys.executable, "-c", DRIVER, c.controller.host, str(tmp_path)], stdout=subprocess.PIPE, text=True
-    )
+    arguments = [c.controller.host, str(tmp_path), c.robot.control_path]
+    driver = subprocess.Popen([sys.executable, "-c", DRIVER, *arguments], stdout=subprocess.PIPE, text=True)
     with driver:
         assert driver.stdout is not None
         child_pid = int(await asyncio.to_thread(driver.stdout.readline))

@@ -11,13 +11,14 @@ import msgspec
 import numpy as np
 import pytest
 
-from station.cell.config import RobotConfig
+from station.cell.config import ControlPath, RobotConfig
 from station.cell.errors import LimitError, RefusedError
 from station.cell.plan import Plan, PlannedPose
 from station.cell.status import StationState as S
 from station.devices.ur import UrRobot
 from station.protocol.verbs import Purpose
 from station.simulation.launch import AdminClient, SimulatedController
+from tests.conftest import asked
 from tests.station.session_rig import TRUTH, Rig
 
 pytestmark = pytest.mark.process
@@ -31,7 +32,7 @@ PLAN = Plan(
 
 @pytest.fixture
 async def cell(
-    controller: Callable[..., SimulatedController], tmp_path: Path
+    controller: Callable[..., SimulatedController], control_path: ControlPath, tmp_path: Path
 ) -> AsyncIterator[tuple[Rig, AdminClient]]:
     """A session in `idle` with the plan loaded, and the controller's back door."""
     running = await asyncio.to_thread(controller, "UR10")
@@ -39,7 +40,7 @@ async def cell(
     admin.ask("jog", joints_rad=HOME.tolist())
     while np.abs(np.array(admin.ask("state")["joints_rad"]) - HOME).max() > 1e-6:
         await asyncio.sleep(0.02)
-    robot = UrRobot(RobotConfig("UR10", running.host), tmp_path / "log")
+    robot = UrRobot(RobotConfig("UR10", running.host, control=control_path), tmp_path / "log")
     rig = Rig(tmp_path / "root", robot=robot)
     await rig.start()
     await rig.until(S.IDLE)
@@ -64,11 +65,11 @@ async def test_07_an_arm_jogged_while_paused_voids_the_go(cell: tuple[Rig, Admin
     admin.ask("jog", joints_rad=(state + 0.1).tolist())
     await rig.until_true(lambda: any("was moved by" in e.text for e in rig.session.store.status.events))
     assert time.monotonic() - begun_s < 1.0
-    uploads = admin.ask("log")["counts"]["upload: rtde_control"]
+    uploads = asked(admin, "upload")
     with pytest.raises(RefusedError, match="prepare again"):
         rig.session.go(1, summary.token)
     await asyncio.sleep(1.0)
-    assert admin.ask("log")["counts"]["upload: rtde_control"] == uploads and rig.state is S.PAUSED
+    assert asked(admin, "upload") == uploads and rig.state is S.PAUSED
     assert np.abs(np.array(admin.ask("state")["joints_rad"]) - state - 0.1).max() < 1e-3
 
 
@@ -78,5 +79,5 @@ async def test_an_unreachable_pose_is_refused_before_anything_is_sent(cell: tupl
     rig.session.load_plan(1, msgspec.structs.replace(PLAN, poses=(*PLAN.poses, PlannedPose("far", far))))
     with pytest.raises(LimitError, match=r"pose 5 \(far\): elbow would"):
         await rig.session.prepare(1, Purpose.RUN)
-    assert admin.ask("log")["counts"].get("upload: rtde_control", 0) == 0
+    assert asked(admin, "upload") == 0
     assert np.abs(np.array(admin.ask("state")["joints_rad"]) - HOME).max() < 1e-3

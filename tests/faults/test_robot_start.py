@@ -54,7 +54,7 @@ async def gone(c: Any) -> None:
     await c.robot.idle()
     assert not c.robot.control and c.robot.control_pid is None
     await c.stays_at_rest()
-    assert c.asked("script: moveJ") == 0
+    assert c.asked("move") == 0
 
 
 def is_well(robot: UrRobot) -> bool:

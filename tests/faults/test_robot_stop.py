@@ -44,7 +44,7 @@ async def test_both_paths_are_used(cell: Make) -> None:
         await move
     await c.until(lambda: c.asked("dashboard: stop") > 0)
     # The script may have been ended by the dashboard's stop before it read the child's.
-    assert c.asked("script: stopJ") + c.asked("controller: program stopped") > 0
+    assert c.asked("stop") + c.asked("controller: program stopped") > 0
 
 
 async def test_with_a_hung_child_the_dashboard_stops_the_arm(
@@ -63,7 +63,7 @@ async def test_with_a_hung_child_the_dashboard_stops_the_arm(
     await c.robot.stop("operator")
     assert time.monotonic() - begun < 0.1
     assert await c.at_rest() < 0.4
-    assert c.asked("script: stopJ") == 0 and c.asked("dashboard: stop") >= 1
+    assert c.asked("stop") == 0 and c.asked("dashboard: stop") >= 1
     with pytest.raises(RobotError):
         await move
 
@@ -76,7 +76,7 @@ async def test_with_a_silent_dashboard_the_child_stops_the_arm(cell: Make) -> No
     await c.robot.stop("operator")
     assert time.monotonic() - begun < 0.1
     assert await c.at_rest() < 0.5
-    assert c.asked("script: stopJ") == 1
+    assert c.asked("stop") == 1
     with pytest.raises(RobotError):
         await move
 
@@ -118,7 +118,7 @@ async def test_stop_before_the_control_process_exists(cell: Make, monkeypatch: p
     monkeypatch.setattr(c.robot, "_may_start", stop_comes_now)
     with pytest.raises(RobotError, match="changed my mind"):
         await c.robot.start_control()
-    assert c.robot.control_pid is None and c.asked("upload: rtde_control") == 0
+    assert c.robot.control_pid is None and c.asked("upload") == 0
 
 
 async def test_a_dashboard_connection_that_does_not_answer_is_replaced(

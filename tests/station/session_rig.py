@@ -44,6 +44,7 @@ class ArmInMemory:
         self.joints = TRUTH.start_joints_rad
         self.log: list[str] = []
         self.control, self.notice, self.remote = False, "", None
+        self.control_path = "ur_rtde"
         self.slow = self.under_way = False
         self.arrive = asyncio.Event()
         self.trouble: RobotError | None = None

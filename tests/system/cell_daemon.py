@@ -1,7 +1,8 @@
 """The real daemon in front of a simulated controller that outlives it: python -m tests.system.cell_daemon …
 
 `station serve --simulate` owns its controller, which ends with it; here a test can look at the arm of a
-daemon that was killed. CELL_TOLD: another truth, that the configuration is made from.
+daemon that was killed. CELL_TOLD: another truth, that the configuration is made from. CELL_CONTROL: what
+drives the arm.
 """
 
 from __future__ import annotations
@@ -27,7 +28,8 @@ def main() -> None:
     truth = read_truth(Path(truth_file))
     config = cell_config(read_truth(Path(os.environ.get("CELL_TOLD", truth_file))), host)
     capture = msgspec.structs.replace(config.capture, free_space_bytes=1)
-    config = msgspec.structs.replace(config, capture=capture)
+    robot = msgspec.structs.replace(config.robot, control=os.environ.get("CELL_CONTROL"))
+    config = msgspec.structs.replace(config, capture=capture, robot=robot)
     place = Path(root)
     cell = Cell(
         config=config,

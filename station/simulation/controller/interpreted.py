@@ -114,20 +114,20 @@ class InterpretedProgram:
 
     # -- motion -----------------------------------------------------------------------------------------
 
-    def _movej(self, q: Six, a: float = 1.4, v: float = 1.05, t: float = 0, r: float = 0) -> Wait:
+    def _movej(self, q: list[float], a: float = 1.4, v: float = 1.05, t: float = 0, r: float = 0) -> Wait:
         if isinstance(q, Pose):
             raise ScriptRuntimeError("movej to a pose is not simulated")
         yield from self._move("movej", q, a, v, t)
 
-    def _movel(self, pose: Six, a: float = 1.2, v: float = 0.25, t: float = 0, r: float = 0) -> Wait:
+    def _movel(self, pose: list[float], a: float = 1.2, v: float = 0.25, t: float = 0, r: float = 0) -> Wait:
         if not isinstance(pose, Pose):
             raise ScriptRuntimeError("movel to joints is not simulated")
         yield from self._move("movel", pose, a, v, t)
 
-    def _move(self, name: str, goal: Six, a: float, v: float, t: float) -> Wait:
+    def _move(self, name: str, values: list[float], a: float, v: float, t: float) -> Wait:
         """Until the arm rests at the goal. The thread that moves controls the arm as long."""
         robot = self._robot
-        goal = tuple(map(float, goal))
+        goal: Six = tuple(map(float, values))
         if len(goal) != 6 or not all(map(isfinite, (*goal, a, v))) or a <= 0 or v <= 0 or t != 0:
             raise ScriptRuntimeError(f"{name} to {goal} with a={a}, v={v}, t={t}")
 
@@ -161,7 +161,7 @@ class InterpretedProgram:
             raise ScriptRuntimeError(f"{name}: another thread is already controlling the robot")
 
     def _hold(self, motion: Motion) -> Wait:
-        """Waits for its end. A thread that is killed meanwhile leaves it to whoever stops it in this cycle."""
+        """Waits for its end. A thread killed meanwhile leaves it to whoever stops it in the same cycle."""
         self._mover, self._orphan = self._run.thread, None
         try:
             while not motion.done:

@@ -6,17 +6,20 @@ import asyncio
 import json
 import os
 import socket
+import sys
 import time
 from collections.abc import AsyncIterator, Callable
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
+from station.cell.config import ControlPath
 from station.cell.errors import RobotError
 from station.devices import ur_child
 from station.devices.ur_child import ControlChild
-from station.devices.ur_control import BEAT_FRESH_NS, WATCHDOG_HZ, ControlServer
+from station.devices.ur_control import BEAT_FRESH_NS, WATCHDOG_HZ, ControlServer, open_control
 from station.simulation.launch import SimulatedController
 
 GOAL = [0.0, -1.5, 1.5, -1.5, -1.5, 0.0]
@@ -161,12 +164,12 @@ def test_nothing_moves_after_a_stop(child: Conversation) -> None:
 
 @pytest.mark.process
 async def test_a_constructor_that_hangs_is_killed_at_its_deadline(
-    controller: Callable[..., SimulatedController], tmp_path: Path
+    controller: Callable[..., SimulatedController], control_path: ControlPath, tmp_path: Path
 ) -> None:
     running = await asyncio.to_thread(controller)
     with running.admin() as admin:
         admin.ask("mute", ports=["rtde"])
-        child = ControlChild.spawn(running.host, tmp_path / "control.log")
+        child = ControlChild.spawn(running.host, tmp_path / "control.log", control_path)
         begun = time.monotonic()
         with pytest.raises(RobotError, match=r"not ready within 0.7 s and was killed; see .*control.log"):
             await child.ready(timeout_s=0.7)
@@ -178,12 +181,12 @@ async def test_a_constructor_that_hangs_is_killed_at_its_deadline(
 
 @pytest.mark.process
 async def test_its_words_go_to_the_log_and_the_log_is_bounded(
-    controller: Callable[..., SimulatedController], tmp_path: Path
+    controller: Callable[..., SimulatedController], control_path: ControlPath, tmp_path: Path
 ) -> None:
     running = await asyncio.to_thread(controller)
     log = tmp_path / "control.log"
     log.write_bytes(b"x" * 1_000_001)
-    child = ControlChild.spawn(running.host, log)
+    child = ControlChild.spawn(running.host, log, control_path)
     await child.ready()
     await child.end()
     assert (tmp_path / "control.log.1").stat().st_size == 1_000_001
@@ -254,22 +257,46 @@ async def test_a_move_that_was_not_taken_raises(parent: Parent) -> None:
         await moving
 
 
+@pytest.mark.parametrize("code", ["registers-in-use", "control"])
+async def test_a_start_that_is_refused_keeps_its_code_and_its_words(parent: Parent, code: str) -> None:
+    parent.answer({"refused": "boost: no route", "code": code})
+    with pytest.raises(RobotError) as caught:
+        await parent.child.ready(timeout_s=5.0)
+    assert caught.value.code == code
+    assert ("boost: no route" in str(caught.value)) == (code not in ur_child.REFUSALS)
+    assert parent.process.kills
+
+
 @pytest.mark.parametrize(
-    ("words", "said"),
+    ("words", "code"),
     [
-        ("One of the RTDE input registers are already in use!", "another program controls the robot"),
-        ("please enable Remote Control on the robot", "switch the pendant to Remote"),
-        ("Failed to start control script, before timeout of 5 seconds", "release the brakes"),
-        ("boost: no route", "control could not start: boost: no route"),
+        ("One of the RTDE input registers are already in use!", "registers-in-use"),
+        ("please enable Remote Control on the robot", "local-control"),
+        ("Failed to start control script, before timeout of 5 seconds", "script-not-started"),
+        ("boost: no route", "control"),
     ],
 )
-async def test_a_start_that_the_library_refuses_is_told_with_the_remedy(
-    parent: Parent, words: str, said: str
+def test_what_the_library_says_becomes_a_code(monkeypatch: pytest.MonkeyPatch, words: str, code: str) -> None:
+    def refuse(host: str) -> None:
+        raise RuntimeError(words)
+
+    monkeypatch.setitem(sys.modules, "rtde_control", SimpleNamespace(RTDEControlInterface=refuse))
+    with pytest.raises(RobotError) as caught:
+        open_control("ur_rtde", "127.0.0.1")
+    assert caught.value.code == code
+
+
+async def test_a_missing_library_is_told_with_what_to_do(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    parent.answer({"refused": words})
-    with pytest.raises(RobotError, match=said):
-        await parent.child.ready(timeout_s=5.0)
-    assert parent.process.kills
+    """By the real process, whose Python finds a module that cannot be imported."""
+    (tmp_path / "rtde_control.py").write_text("raise ImportError('no wheel for this Python')")
+    monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(tmp_path), *sys.path]))
+    child = ControlChild.spawn("127.0.0.1", tmp_path / "control.log")
+    with pytest.raises(RobotError) as caught:
+        await child.ready()
+    assert caught.value.code == "ur-rtde-missing"
+    assert "robot.control: script" in str(caught.value)
 
 
 @pytest.mark.parametrize("asked", ["ready", "move", "heard"])

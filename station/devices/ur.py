@@ -83,7 +83,7 @@ def control_trouble(path: str, real: bool) -> tuple[str, str]:
     if path == "script" and real:
         return (
             "the station's own script drives the arm: not yet accepted on a real arm",
-            "low speed slider, hand on the emergency stop; or install ur_rtde (Python 3.10 to 3.12 on x86-64)",
+            "lower the speed slider, keep a hand on the emergency stop; or install ur_rtde where it exists",
         )
     return "", ""
 

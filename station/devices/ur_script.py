@@ -216,6 +216,18 @@ class ScriptControl:
         self._keepalive = 0
         self._command: tuple[int, Verb, Sequence[float]] = (0, Verb.NONE, (0.0,) * 8)
         self._link = socket.create_connection((host, PORT), HANDSHAKE_S)
+        try:
+            self._start(host)
+        except BaseException:
+            self.close()
+            raise
+
+    def close(self) -> None:
+        """Without a word to the script: it ends by itself."""
+        self._lost = self._broken = True
+        self._link.close()
+
+    def _start(self, host: str) -> None:
         self._rtde = RtdeLink(self._link)
         self._rtde.speak()
         self._inputs = self._rtde.inputs(_INPUTS)
@@ -224,9 +236,6 @@ class ScriptControl:
         for kind, payload in self._rtde.pending:
             self._take(kind, payload)
         self._link.setblocking(False)
-        self._start(host)
-
-    def _start(self, host: str) -> None:
         sequence = random.randrange(1, 2**30)  # an answer left by an earlier script is never ours
         self._write(sequence, Verb.NONE)
         self._wait(lambda: self._samples > SETTLE_SAMPLES, HANDSHAKE_S)
@@ -296,11 +305,6 @@ class ScriptControl:
             self._lost = True
             self._write(self._command[0] + 1, Verb.STOP)
 
-    def _break(self) -> None:
-        """Nothing is written behind half a packet: its rest would be read as numbers of that one."""
-        self._lost = self._broken = True
-        self._link.close()
-
     def _write(self, sequence: int, verb: Verb, numbers: Sequence[float] = (0.0,) * 8) -> int:
         """One packet, that acts as a whole. A connection that does not take it at once is lost."""
         self._command = (sequence, verb, numbers)
@@ -308,7 +312,7 @@ class ScriptControl:
             if not self._broken:
                 self._link.sendall(self._inputs.pack((sequence, verb, self._keepalive, *numbers)))
         except OSError:
-            self._break()
+            self.close()  # nothing may follow half a packet: it would be read as the rest of it
         return sequence
 
     def _wait(self, condition: Callable[[], bool], timeout_s: float) -> bool:
@@ -328,13 +332,13 @@ class ScriptControl:
             while not self._broken:
                 data = self._link.recv(65536)
                 if not data:
-                    self._break()
+                    self.close()
                 for kind, payload in self._rtde.packets.feed(data):
                     self._take(kind, payload)
         except BlockingIOError:
             pass
         except (OSError, RtdeError):
-            self._break()
+            self.close()
 
     def _take(self, kind: int, payload: bytes) -> None:
         if kind != PacketType.DATA:

@@ -27,10 +27,12 @@ from station.protocol.client import Client
 from station.simulation.cell import write_truth
 from station.simulation.launch import AdminClient, SimulatedController
 from station.simulation.scenes import cell_config, make_cell
+from tests.conftest import CONTROL_PATHS
 
 TRUTH = make_cell(seed=5)
 AT_REST_RAD_S = 1e-3
 LOOK_S = 0.01
+both_paths = pytest.mark.parametrize("rig", CONTROL_PATHS, indirect=True)
 PROGRAM = (sys.executable, "-m", "tests.system.cell_daemon")
 
 
@@ -64,12 +66,14 @@ class Notified:
 class DaemonProcess:
     """One life of the daemon. The controller outlives it."""
 
-    def __init__(self, controller: SimulatedController, folder: Path, root: Path, number: int) -> None:
+    def __init__(
+        self, controller: SimulatedController, folder: Path, root: Path, number: int, control: str = ""
+    ) -> None:
         self.controller, self.root = controller, root
         self.socket = folder / f"{number}.sock"
         self.notified = Notified(folder) if number == 1 else None
         truth = folder / "truth.json"
-        environment = dict(os.environ)
+        environment = dict(os.environ) | ({"CELL_CONTROL": control} if control else {})
         if self.notified is not None:
             environment |= {"NOTIFY_SOCKET": str(self.notified.path), "WATCHDOG_USEC": "1000000"}
         self._words = (root / f"daemon-{number}.log").open("wb")
@@ -136,14 +140,17 @@ class Stopwatch(threading.Thread):
 class SystemRig:
     """A controller, the daemons that came and went before it, and a look at the arm."""
 
-    def __init__(self, controller: SimulatedController, folder: Path, root: Path) -> None:
+    def __init__(self, controller: SimulatedController, folder: Path, root: Path, control: str = "") -> None:
         self.controller, self.folder, self.root = controller, folder, root
+        self.control = control
+        """What drives the arm; empty: what is installed."""
         self.admin: AdminClient = controller.admin()
         self.daemons: list[DaemonProcess] = []
         self._watch = Stopwatch()
 
     async def daemon(self) -> DaemonProcess:
-        made = DaemonProcess(self.controller, self.folder, self.root, len(self.daemons) + 1)
+        number = len(self.daemons) + 1
+        made = DaemonProcess(self.controller, self.folder, self.root, number, self.control)
         self.daemons.append(made)
         await made.ready()
         return made
@@ -216,10 +223,15 @@ def short_folder() -> Iterator[Path]:
 
 @pytest.fixture
 async def rig(
-    controller: Callable[..., SimulatedController], short_folder: Path, tmp_path: Path
+    controller: Callable[..., SimulatedController],
+    short_folder: Path,
+    tmp_path: Path,
+    request: pytest.FixtureRequest,
 ) -> AsyncIterator[SystemRig]:
+    """`@both_paths` runs a test with each way of driving the arm."""
     truth = short_folder / "truth.json"
     write_truth(TRUTH, truth)
-    made = SystemRig(await asyncio.to_thread(controller, "UR10", truth=truth), short_folder, tmp_path)
+    running = await asyncio.to_thread(controller, "UR10", truth=truth)
+    made = SystemRig(running, short_folder, tmp_path, getattr(request, "param", ""))
     yield made
     await asyncio.to_thread(made.end)

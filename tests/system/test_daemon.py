@@ -18,11 +18,12 @@ from station.cell.plan import Plan
 from station.cell.status import StationState as S
 from station.protocol.client import Client, DaemonGoneError
 from station.protocol.stop_client import Outcome, stop
-from tests.system.conftest import SystemRig, go, status_when
+from tests.system.conftest import SystemRig, both_paths, go, status_when
 
 pytestmark = pytest.mark.process
 
 
+@both_paths
 async def test_stop_from_a_watcher_halts_the_arm_and_is_latched(rig: SystemRig, short_plan: Plan) -> None:
     daemon = await rig.daemon()
     async with await daemon.client() as anna, await daemon.client() as bert:
@@ -43,6 +44,7 @@ async def test_stop_from_a_watcher_halts_the_arm_and_is_latched(rig: SystemRig, 
         assert len(open_recording(Path(done.session.recording)).views()) == 4
 
 
+@both_paths
 async def test_a_killed_operator_stops_the_arm(rig: SystemRig, short_plan: Plan) -> None:
     daemon = await rig.daemon()
     anna = await daemon.client()
@@ -64,6 +66,7 @@ def children_of(pid: int) -> list[Path]:
     return [Path("/proc") / child for child in listed]
 
 
+@both_paths
 async def test_a_killed_daemon_stops_the_arm_and_the_next_one_waits_for_a_person(
     rig: SystemRig, short_plan: Plan
 ) -> None:
@@ -92,6 +95,7 @@ async def test_a_killed_daemon_stops_the_arm_and_the_next_one_waits_for_a_person
         assert len(open_recording(Path(done.session.recording)).views()) == status.session.captured
 
 
+@both_paths
 async def test_a_daemon_that_hangs_stops_the_arm_and_goes_silent(rig: SystemRig, short_plan: Plan) -> None:
     daemon = await rig.daemon()
     assert daemon.notified is not None
@@ -111,6 +115,7 @@ async def test_a_daemon_that_hangs_stops_the_arm_and_goes_silent(rig: SystemRig,
         await rig.stays_at_rest()
 
 
+@both_paths
 async def test_sigterm_stops_the_arm_then_seals_then_ends(rig: SystemRig, short_plan: Plan) -> None:
     daemon = await rig.daemon()
     assert daemon.notified is not None

@@ -259,6 +259,8 @@ def _all(nodes: Sequence[Node], frame: Frame) -> Generator[None, None, list[Valu
 
 _ARITHMETIC: dict[str, Callable[[Any, Any], Any]] = {
     "+": operator.add, "-": operator.sub, "*": operator.mul, "/": operator.truediv, "%": operator.mod,
+}  # fmt: skip
+_ORDER: dict[str, Callable[[float, float], bool]] = {
     "<": operator.lt, "<=": operator.le, ">": operator.gt, ">=": operator.ge,
 }  # fmt: skip
 
@@ -279,6 +281,8 @@ def _operate(sign: str, left: Value, right: Value) -> Value:
     """On two numbers; on lists item by item, a number beside a list counting for each of its items."""
     if sign in ("==", "!="):
         return (left == right) == (sign == "==")
+    if sign in _ORDER:
+        return _ORDER[sign](_number(left), _number(right))
     if type(left) is list or type(right) is list:
         lefts = left if type(left) is list else [left] * len(right)
         rights = right if type(right) is list else [right] * len(left)

@@ -1,0 +1,320 @@
+"""The interpreter of URScript, without a robot."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from station.simulation.controller import urscript
+from station.simulation.controller.urscript import (
+    PURE,
+    Pose,
+    Run,
+    ScriptRuntimeError,
+    ScriptSyntaxError,
+    parse,
+    tokens,
+)
+
+
+class Tape:
+    """Runs a program; `say(…)` in it leaves something here, `sync()` takes a cycle."""
+
+    def __init__(self, text: str) -> None:
+        self.said: list[Any] = []
+        self.killed = 0
+        self.run = Run(parse(text, {"say": self.said.append, "sync": self._sync, "wait": self._wait}))
+
+    def _sync(self) -> Any:
+        yield
+
+    def _wait(self, cycles: int) -> Any:
+        try:
+            for _ in range(cycles):
+                yield
+        except GeneratorExit:
+            self.killed += 1
+            raise
+
+    def play(self, cycles: int = 100) -> list[Any]:
+        """To its end, which must come within so many cycles."""
+        for _ in range(cycles):
+            if not self.run.step():
+                return self.said
+        raise AssertionError("it does not end")
+
+
+def said(text: str) -> list[Any]:
+    return Tape(text).play()
+
+
+@pytest.mark.parametrize(
+    ("expression", "value"),
+    [
+        ("1 + 2 * 3 - 4", 3),
+        ("(1 + 2) * 3", 9),
+        ("-2 * -3", 6),
+        ("7 % 4", 3),
+        ("1 / 2", 0.5),
+        ("1e3 + .5 + 2.", 1002.5),
+        ("0x1F", 31),
+        ("not 1 < 2 or 2 <= 2 and 3 != 4", True),
+        ("True xor True", False),
+        ("1 == 1.0", True),
+        ("[1, 2, 3][1]", 2),
+        ("[1, 2] + [3, 4] * 2 - 1", [6, 9]),
+        ("p[0, 0, 1, 0, 0, 0]", Pose([0, 0, 1, 0, 0, 0])),
+        ("norm([3.0, -4.0])", 5.0),
+        ("norm(-3)", 3),
+        ("[[1, 2], [3]][0][1]", 2),
+        ("'a # b'", "a # b"),
+        ("floor(d2r(180) * 100)", 314),
+        ("[\n  1,  # in brackets lines may end\n  2\n]", [1, 2]),
+    ],
+)
+def test_a_value(expression: str, value: Any) -> None:
+    found = said(f"say({expression})")[0]
+    assert found == value and type(found) is type(value)
+
+
+NUMBERS = st.one_of(
+    st.integers(0, 1000), st.floats(0, 1000, allow_subnormal=False).map(lambda x: round(x, 3))
+)
+ARITHMETIC = st.recursive(
+    NUMBERS.map(str),
+    lambda inner: st.one_of(
+        st.tuples(inner, st.sampled_from("+-*"), inner).map(" ".join),
+        inner.map("({})".format),
+        inner.map("-{}".format),
+    ),
+)
+
+
+@given(ARITHMETIC, st.sampled_from(["<", "<=", ">", ">=", "==", "!="]), ARITHMETIC)
+def test_arithmetic_is_as_everywhere(left: str, sign: str, right: str) -> None:
+    assert said(f"say({left}); say({left} {sign} {right})") == [
+        eval(left),
+        eval(f"({left}) {sign} ({right})"),
+    ]
+
+
+PIECES = [
+    "def f():\n", "end\n", "if", "while", "(", ")", "[", "]", ":", "=", ",", "say", "run", "kill", "1",
+    "return", "x", "True", "\n", "+", "not", "'", "thread t():\n", "else", "p", "$", "global", "halt",
+]  # fmt: skip
+
+
+@given(st.lists(st.sampled_from(PIECES), max_size=30).map(" ".join))
+def test_a_text_runs_or_is_refused(text: str) -> None:
+    try:
+        tape = Tape(text)
+    except ScriptSyntaxError:
+        return
+    try:
+        for _ in range(5):
+            if not tape.run.step():
+                break
+    except ScriptRuntimeError:
+        pass
+
+
+def test_blocks_and_loops() -> None:
+    text = """
+def counted():
+  n = 0
+  while True:
+    n = n + 1
+    if n == 2:
+      continue
+    elif n > 5:
+      break
+    else:
+      say(n)
+    end
+  end
+  return
+  say("never")
+end
+"""
+    assert said(text) == [1, 3, 4, 5]
+
+
+def test_scope() -> None:
+    text = """
+def prog():
+  global shared = 1
+  around = 10
+  def inner(given, factor=2):
+    local shared_too = 5
+    shared = shared + 1
+    around = given * factor
+    return around + shared_too
+  end
+  def hiding():
+    local shared = 100
+    return shared
+  end
+  say(inner(3))
+  say(inner(factor=5, given=3))
+  say(hiding())
+  say(shared)
+  say(around)
+end
+"""
+    assert said(text) == [11, 20, 100, 3, 10]
+
+
+def test_an_inner_function_reads_what_is_around_it_and_lists_are_copied() -> None:
+    text = """
+def prog():
+  limit = [1, 2]
+  other = limit
+  other[0] = 9
+  def read():
+    return limit[0]
+  end
+  def change(given):
+    given[1] = 7
+    return given
+  end
+  say(read())
+  say(change(other))
+  say(other)
+end
+"""
+    assert said(text) == [1, [9, 7], [9, 2]]
+
+
+def test_threads_share_globals_and_have_one_turn_each_cycle() -> None:
+    text = """
+def prog():
+  global n = 0
+  thread count(step):
+    while True:
+      n = n + step
+      sync()
+    end
+  end
+  hand = run count(10)
+  sync()
+  say(n)
+  sync()
+  say(n)
+  kill hand
+  sync()
+  say(n)
+end
+"""
+    assert said(text) == [10, 20, 20]
+
+
+def test_kill_ends_what_the_thread_waits_for_and_join_waits_for_it() -> None:
+    text = """
+def prog():
+  thread long():
+    wait(1000)
+    say("never")
+  end
+  thread short():
+    wait(3)
+    say("short")
+  end
+  a = run long()
+  b = run short()
+  join b
+  say("joined")
+  kill a
+  kill a
+  kill 0
+  join a
+end
+"""
+    tape = Tape(text)
+    assert tape.play() == ["short", "joined"] and tape.killed == 1
+
+
+def test_the_end_of_the_program_is_the_end_of_its_threads() -> None:
+    tape = Tape("def p():\n thread t():\n wait(1000)\n end\n h = run t()\n sync()\nend")
+    tape.play()
+    tape.run.end()
+    assert tape.killed == 1
+
+
+@pytest.mark.parametrize(
+    "where", ["halt", "stop_it()", "x = 1 + stop_it()", "h = run ender()\n sync()\n sync()"]
+)
+def test_halt_ends_everything_wherever_it_is_said(where: str) -> None:
+    text = f"def p():\n def stop_it():\n halt\n end\n thread ender():\n halt\n end\n {where}\n say(1)\nend"
+    assert said(text) == []
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "x = ",
+        "if True:\n say(1)\n",
+        "def p():\n say(1)\n",
+        "def p():\nend\nsay(2)",
+        "say(1) say(2)",
+        "1 = 2",
+        "say(unknown_function())",
+        "say(1, 2)",
+        "say(stranger=1)",
+        "def p():\n def f(x):\n return x\n end\n say(f(1, 2))\nend",
+        "x = 'open",
+        "x = $",
+        "run 3",
+        "(" * 5000 + "1" + ")" * 5000,
+    ],
+)
+def test_a_text_that_is_no_program(text: str) -> None:
+    with pytest.raises(ScriptSyntaxError):
+        parse(text, {"say": lambda what: None})
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "say(nobody)",
+        "say([1, 2][2])",
+        "say([1, 2][-1])",
+        "say([1, 2] + [1, 2, 3])",
+        "say(1 + 'a')",
+        "say(1 + True)",
+        "say(1 / 0)",
+        "say(1 < [1])",
+        "say(sqrt(-1))",
+        "if 1:\n say(1)\nend",
+        "say(not 0)",
+        "x = 1\nx[0] = 2",
+        "x = run say(1)",
+        "while True:\n x = 1\nend",
+        "def p():\n def f(n):\n return f(n + 1)\n end\n f(0)\nend",
+        "def p():\n def f(x):\n return x\n end\n f()\nend",
+    ],
+)
+def test_what_stops_a_program(text: str) -> None:
+    with pytest.raises(ScriptRuntimeError):
+        said(text)
+
+
+def test_a_loop_that_waits_is_none_that_never_ends() -> None:
+    tape = Tape("while True:\n x = 1\n sync()\nend")
+    for _ in range(3 * urscript.STATEMENTS_PER_CYCLE // 2):
+        assert tape.run.step()
+
+
+def test_tokens_know_their_line() -> None:
+    assert [t.line for t in tokens("a\n\n  b # c\n(\n)\nd") if t.kind == "name"] == [1, 3, 6]
+
+
+def test_it_imports_nothing_of_the_station() -> None:
+    tree = ast.parse(Path(urscript.__file__).read_text())
+    names = [n.module or "" for n in ast.walk(tree) if isinstance(n, ast.ImportFrom)]
+    assert not [n for n in names if n.startswith(("station", "calibrate", "recordings"))]
+    assert all(callable(builtin) for builtin in PURE.values())

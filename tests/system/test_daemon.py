@@ -135,7 +135,7 @@ async def test_sigterm_stops_the_arm_then_seals_then_ends(rig: SystemRig, short_
     views = len(open_recording(folder).views())
     assert views >= 1
     words = (rig.root / "daemon-1.log").read_text()
-    order = [words.index(text) for text in ("the station is ending", "sealed before the end", ":ended")]
+    order = [words.index(text) for text in ("The station is ending", "finished before the end", ": ended")]
     assert order == sorted(order)
     assert daemon.notified.heard()[-1] == "STOPPING=1"
     assert not daemon.socket.exists()

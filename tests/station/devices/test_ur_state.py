@@ -132,6 +132,7 @@ def test_a_port_that_is_no_rtde_is_refused() -> None:
         async def babble(_: Any, writer: asyncio.StreamWriter) -> None:
             writer.write(b"\x00\x01HTTP/1.1 400 Bad Request")
             await writer.drain()
+            writer.close()
 
         server = await asyncio.start_server(babble, "127.91.7.3", 30004)
         reader = StateReader("127.91.7.3", lambda _: None, lambda _: None)

@@ -1,0 +1,92 @@
+"""The package as pip installs it, away from the checkout: a complete sdist, and a wheel whose offline work runs."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import sys
+import tarfile
+import venv
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[2]
+pytestmark = pytest.mark.timeout(600)
+
+
+@pytest.fixture(scope="module")
+def tracked() -> list[str]:
+    listed = subprocess.run(["git", "ls-files"], cwd=ROOT, capture_output=True, text=True)
+    if listed.returncode:
+        pytest.skip("no git checkout: nothing says which files belong to the project")
+    return listed.stdout.splitlines()
+
+
+@pytest.fixture(scope="module")
+def packed(tmp_path_factory: pytest.TempPathFactory, tracked: list[str]) -> Path:
+    """The folder with the sdist and the wheel that was built from the sdist."""
+    source = tmp_path_factory.mktemp("source")
+    for name in tracked:
+        (source / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / name, source / name)
+    command = [sys.executable, "-m", "build", "--outdir", "dist"]
+    subprocess.run(command, cwd=source, check=True, capture_output=True)
+    return source / "dist"
+
+
+@pytest.fixture(scope="module")
+def installed(packed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Programs of a venv with the wheel and no extra."""
+    folder = tmp_path_factory.mktemp("installed")
+    venv.create(folder, with_pip=True)
+    [wheel] = packed.glob("*.whl")
+    install = ("-m", "pip", "--disable-pip-version-check", "install", "--quiet", "--only-binary=:all:")
+    command = [folder / "bin/python", *install, "-c", ROOT / "constraints.txt", wheel]
+    subprocess.run(command, check=True, cwd=folder, capture_output=True)
+    return folder / "bin"
+
+
+def call(program: Path, *arguments: object, code: int = 0) -> str:
+    done = subprocess.run([program, *map(str, arguments)], cwd="/", capture_output=True, text=True)
+    assert done.returncode == code, done.stderr
+    return done.stdout if code == 0 else done.stderr
+
+
+def test_the_sdist_holds_every_file_of_the_project(packed: Path, tracked: list[str]) -> None:
+    [sdist] = packed.glob("*.tar.gz")
+    with tarfile.open(sdist) as archive:
+        held = {name.partition("/")[2] for name in archive.getnames()}
+    assert set(tracked) - held <= {".gitignore"}
+
+
+def test_offline_work_runs_from_the_wheel_alone(installed: Path, tmp_path: Path) -> None:
+    where = "import recordings; print(recordings.__path__[0])"
+    package = Path(call(installed / "python", "-c", where).strip())
+    assert not package.is_relative_to(ROOT)
+    sample = package / "samples/paper-640.mcap"
+    call(installed / "recordings", "info", sample)
+    solved = call(installed / "calibrate", "solve", sample, "-o", tmp_path / "cell.yaml", "--json")
+    assert json.loads(solved)["verdict"] == "pass"
+    install = ("install", tmp_path / "cell.yaml", "--cell", "simulated", "--root", tmp_path / "root")
+    call(installed / "calibrate", *install)
+    assert (tmp_path / "root/calibrations/current").exists()
+
+
+@pytest.mark.parametrize(
+    ("program", "arguments", "extra"),
+    [
+        ("calibrate", ("solve", "{sample}", "-o", "{out}/c.yaml", "--report", "{out}/r.html"), "report"),
+        ("recordings", ("export", "{sample}", "--to", "ros2", "-o", "{out}/bag"), "ros"),
+        ("calibrate", ("board", "-o", "{out}/board.pdf"), "report"),
+    ],
+)
+def test_a_command_without_its_extra_says_which(
+    installed: Path, tmp_path: Path, program: str, arguments: tuple[str, ...], extra: str
+) -> None:
+    sample = next(installed.parent.rglob("samples/paper-640.mcap"))
+    filled = [word.format(sample=sample, out=tmp_path) for word in arguments]
+    done = subprocess.run([installed / program, *filled], cwd="/", capture_output=True, text=True)
+    assert done.returncode in (1, 2) and "Traceback" not in done.stderr
+    assert f"calibration-station[{extra}]" in done.stderr

@@ -1,4 +1,4 @@
-"""The package as pip installs it, away from the checkout: a complete sdist, and a wheel whose offline work runs."""
+"""The package as pip installs it: a complete sdist, and a wheel whose offline work runs."""
 
 from __future__ import annotations
 

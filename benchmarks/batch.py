@@ -13,7 +13,7 @@ from benchmarks.offline import make_recording
 from benchmarks.trials import trials
 from calibrate.batch.run import BatchResult, Progress, Solved, Solver, Task, run_batch, solve_one
 from calibrate.bounds import Limits
-from calibrate.options import JobOptions
+from calibrate.pipeline import JobOptions
 
 _PARTS = 4
 """Both ways take turns, a quarter of the recordings each, so that both see the same load of the machine."""

@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from calibrate.files.install import load_installed as load_installed
     from calibrate.files.install import rollback as rollback
     from calibrate.geometry import Transform as Transform
-    from calibrate.options import JobOptions as JobOptions
+    from calibrate.pipeline import JobOptions as JobOptions
     from calibrate.pipeline import SolvedRecording as SolvedRecording
     from calibrate.pipeline import solve_recording as solve_recording
     from calibrate.quality.gates import GateLimits as GateLimits
@@ -39,7 +39,7 @@ _MODULES = {
     "CalibrationError": "errors",
     "Gate": "files.calibration",
     "GateLimits": "quality.gates",
-    "JobOptions": "options",
+    "JobOptions": "pipeline",
     "SolvedRecording": "pipeline",
     "Transform": "geometry",
     "export": "files.exports",

@@ -1,4 +1,4 @@
-"""Puts together the calibration document from everything a solve found."""
+"""Put together the calibration document from everything a solve found."""
 
 from __future__ import annotations
 
@@ -16,17 +16,14 @@ from calibrate.boards.model import ambiguity_text
 from calibrate.files.calibration import (
     FORMAT,
     Arm,
-    BoardFound,
     Calibration,
     Folds,
     FramePose,
     Gate,
-    Holdout,
     Lens,
     Proof,
     Provenance,
     Quality,
-    Rejected,
     Session,
     Sigma,
     TableError,
@@ -39,12 +36,12 @@ from calibrate.lens.intrinsics import Intrinsics
 from calibrate.lens.pnp import view_rms_px
 from calibrate.lens.uncertainty import LensUncertainty
 from calibrate.load import LoadedViews
-from calibrate.options import JobOptions
 from calibrate.projection import intrinsics_names
 from calibrate.views import ViewSet
 from recordings.reader import Recording
 
 _PACKAGES = ("calibration-station", "numpy", "scipy", "opencv-python-headless", "clarabel")
+_DEG = float(np.degrees(1.0))
 
 
 def make_calibration(
@@ -54,9 +51,10 @@ def make_calibration(
     intrinsics: Intrinsics | None,
     solution: Solution,
     gates: tuple[Gate, ...],
-    options: JobOptions,
+    options: dict[str, Any],
     lens_known: LensUncertainty | None = None,
 ) -> Calibration:
+    """`options`: the choices that differ from the defaults."""
     info = recording.info
     return Calibration(
         format=FORMAT,
@@ -64,7 +62,7 @@ def make_calibration(
         source=info.source,
         mount=solution.mount,
         result=FramePose.of(solution.parent_from_child),
-        sigma=Sigma(solution.sigma_translation_m * 1e3, float(np.degrees(solution.sigma_rotation_rad))),
+        sigma=Sigma(solution.sigma_translation_m * 1e3, solution.sigma_rotation_rad * _DEG),
         covariance=tuple(tuple(row) for row in solution.covariance.tolist()),
         confidence_threshold=float(solution.confidence_threshold),
         board_place=FramePose.of(solution.board_place),
@@ -74,13 +72,7 @@ def make_calibration(
         camera=info.camera_identity,
         views=Views(
             used=list(solution.used),
-            rejected=sorted(
-                (
-                    Rejected(r.index, r.name, r.reason, r.kind)
-                    for r in (*loaded.without_board, *solution.rejected)
-                ),
-                key=lambda r: r.index,
-            ),
+            rejected=sorted((*loaded.without_board, *solution.rejected), key=lambda view: view.index),
             turned=list(solution.turned),
             weights=[ViewWeight(i, round(w, 4)) for i, w in solution.weights.items() if w < 0.9999],
         ),
@@ -92,19 +84,16 @@ def make_calibration(
             software=software_versions(),
             profile=solution.profile,
             seed=solution.seed,
-            options=_options(options),
+            options=options,
             recorded_wall_ns=info.created_wall_ns,
             plan_sha256=info.plan_sha256,
         ),
     )
 
 
-def software_versions() -> dict[str, str]:
-    return dict(_software_versions())
-
-
 @cache
-def _software_versions() -> dict[str, str]:
+def software_versions() -> dict[str, str]:
+    """Python, machine and the packages that a result depends on."""
     found = {"python": platform.python_version(), "machine": f"{sys.platform} {platform.machine()}"}
     for name in _PACKAGES:
         try:
@@ -112,16 +101,6 @@ def _software_versions() -> dict[str, str]:
         except metadata.PackageNotFoundError:
             found[name] = "not installed as a package"
     return found
-
-
-def _options(options: JobOptions) -> dict[str, Any]:
-    """The choices that differ from the defaults, except how many threads worked."""
-    default = type(options)()
-    return {
-        name: msgspec.to_builtins(getattr(options, name))
-        for name in vars(options)
-        if name not in ("threads", "profile", "seed") and getattr(options, name) != getattr(default, name)
-    }
 
 
 def _lens(views: ViewSet, intrinsics: Intrinsics | None, solution: Solution) -> Lens:
@@ -150,22 +129,17 @@ def _quality(
     intrinsics: Intrinsics | None,
     lens_known: LensUncertainty | None,
 ) -> Quality:
-    proof, noise = solution.certificate, solution.noise
+    noise, folds, arm, board = solution.noise, solution.cross_validation, solution.arm, solution.board
     remarks = _remarks(solution, loaded, intrinsics)
+    reading = solution.session.reading.value
     return Quality(
         gates=list(gates),
-        certificate=Proof(
-            proof.certified,
-            float(proof.relative_gap),
-            float(proof.objective),
-            proof.distance_sigma,
-            proof.problem,
-        ),
-        holdout=_holdout(solution),
+        certificate=msgspec.convert(solution.certificate, Proof, from_attributes=True),
+        holdout=solution.holdout,
         rms_px=solution.rms_px,
         views=[_view_quality(index, solution) for index in solution.used],
         board_spread_mm=_scaled(solution.board_spread_m, 1e3),
-        board_spread_deg=_scaled(solution.board_spread_rad, float(np.degrees(1.0))),
+        board_spread_deg=_scaled(solution.board_spread_rad, _DEG),
         predicted_error_mm=_scaled(solution.predicted_error_m, 1e3),
         working_distance_m=solution.working_distance_m,
         projection_sigma_px={} if lens_known is None else lens_known.figures,
@@ -174,15 +148,24 @@ def _quality(
         else {
             "corner_px": noise.corner_px,
             "robot_mm": noise.robot_m * 1e3,
-            "robot_deg": float(np.degrees(noise.robot_rad)),
+            "robot_deg": noise.robot_rad * _DEG,
         },
         error_shares=solution.error_shares,
         weakest=solution.observability.weakest_text,
-        board_scale=None if solution.board is None else 1.0 + solution.board.scale,
-        board=None if solution.board is None else BoardFound(**vars(solution.board)),
-        cross_validation=_folds(solution),
-        session=Session(solution.session.reading.value, _session_text(solution)),
-        arm=_arm(solution),
+        board_scale=None if board is None else 1.0 + board.scale,
+        board=board,
+        cross_validation=None
+        if folds is None
+        else Folds(folds.rms_m * 1e3, folds.rms_rad * _DEG, folds.claimed_m * 1e3, folds.folds),
+        session=Session(reading, next((r.text for r in solution.warnings if r.code == reading), "")),
+        arm=None
+        if arm is None
+        else Arm(
+            arm.detected,
+            arm.log_bayes,
+            arm.size_mm,
+            [TableError(name, value, sigma) for name, (value, sigma) in arm.errors.items()],
+        ),
         warnings=[remark.text for remark in remarks],
         warning_codes=[remark.code for remark in remarks],
     )
@@ -194,16 +177,11 @@ def _remarks(solution: Solution, loaded: LoadedViews, intrinsics: Intrinsics | N
         *(Remark("recording-loss", loss) for loss in loaded.losses),
         *([Remark("symmetric-board", ambiguity)] if ambiguity else []),
         *(
-            Remark("view-left-out-of-lens", f"View {i + 1} left out of the first lens: {why}.")
+            Remark("view-left-out-of-lens", f"View {i + 1} excluded from the first intrinsics: {why}.")
             for i, why in (intrinsics.dropped if intrinsics else {}).items()
         ),
         *solution.warnings,
     ]
-
-
-def _session_text(solution: Solution) -> str:
-    code = solution.session.reading.value
-    return next((remark.text for remark in solution.warnings if remark.code == code), "")
 
 
 def _lens_sigma(solution: Solution) -> dict[str, float]:
@@ -213,41 +191,10 @@ def _lens_sigma(solution: Solution) -> dict[str, float]:
     return dict(zip(intrinsics_names(solution.camera), sigma, strict=True))
 
 
-def _folds(solution: Solution) -> Folds | None:
-    found = solution.cross_validation
-    if found is None:
-        return None
-    return Folds(found.rms_m * 1e3, float(np.degrees(found.rms_rad)), found.claimed_m * 1e3, found.folds)
-
-
-def _arm(solution: Solution) -> Arm | None:
-    arm = solution.arm
-    if arm is None:
-        return None
-    table = [TableError(name, value, sigma) for name, (value, sigma) in arm.errors.items()]
-    return Arm(arm.detected, arm.log_bayes, arm.size_mm, table)
-
-
 def _scaled(value: float | None, factor: float) -> float | None:
     return None if value is None else float(value * factor)
 
 
 def _view_quality(index: int, solution: Solution) -> ViewQuality:
-    rms_px = solution.residual_px.get(index)
     metres, radians = solution.residual_robot.get(index, (None, None))
-    return ViewQuality(index, rms_px, _scaled(metres, 1e3), _scaled(radians, float(np.degrees(1.0))))
-
-
-def _holdout(solution: Solution) -> Holdout | None:
-    score = solution.holdout
-    if score is None:
-        return None
-    return Holdout(
-        e_t_m=float(score.e_t_m),
-        e_R=float(score.e_R),
-        samples_e_t_m=np.asarray(score.samples_e_t_m, dtype=float).tolist(),
-        samples_e_R=np.asarray(score.samples_e_R, dtype=float).tolist(),
-        pairs=[(int(i), int(j)) for i, j in score.pairs],
-        fitted_views=score.fitted_views,
-        note=score.note,
-    )
+    return ViewQuality(index, solution.residual_px.get(index), _scaled(metres, 1e3), _scaled(radians, _DEG))

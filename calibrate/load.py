@@ -14,7 +14,7 @@ from calibrate.boards.detect import Detection, detect
 from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, MirroredImagesError, SquaresCountedError, TooFewViewsError
 from calibrate.geometry import is_rigid
-from calibrate.handeye.solution import RejectedView
+from calibrate.results import RejectedView
 from calibrate.views import BoardView, ViewSet
 from recordings.errors import BadImageError
 from recordings.reader import Recording

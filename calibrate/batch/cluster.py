@@ -15,7 +15,7 @@ from typing import Any
 from calibrate.batch.run import BatchError, BatchResult, Solved, Solver, Task, solve_one
 from calibrate.bounds import Limits
 from calibrate.document import software_versions
-from calibrate.options import JobOptions
+from calibrate.pipeline import JobOptions
 
 _CONNECT_S = 30
 

@@ -24,8 +24,7 @@ from calibrate.bounds import Limits, bounded
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import content_sha256, encode_calibration, write_output
 from calibrate.files.lines import append_line, read_lines
-from calibrate.options import JobOptions
-from calibrate.pipeline import SolvedRecording, solve_recording
+from calibrate.pipeline import JobOptions, SolvedRecording, solve_recording
 from recordings.errors import RecordingError
 
 RESULTS = "results.jsonl"

@@ -18,7 +18,7 @@ from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
 from calibrate.cli.job import GatesFile, MemoryLimit, Profile, ProfileName, Seed, TimeLimit
 from calibrate.cli.output import AsJson, OutputError, err, out
 from calibrate.files.calibration import write_output
-from calibrate.options import JobOptions
+from calibrate.pipeline import JobOptions
 from calibrate.quality.gates import GateLimits, read_limits
 
 DONE_WITH_LOSS = 3

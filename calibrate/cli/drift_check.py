@@ -14,8 +14,7 @@ from calibrate.cli.output import AsJson, OutputError, detection_progress, out, p
 from calibrate.errors import BadViewsError
 from calibrate.files.calibration import Calibration, Provenance
 from calibrate.files.generations import generations
-from calibrate.options import JobOptions
-from calibrate.pipeline import prepare_views
+from calibrate.pipeline import JobOptions, prepare_views
 from calibrate.quality.checks import CheckEntry, Trend, append_check, earlier_results, find_trend, read_checks
 from calibrate.quality.drift import FEWEST_VIEWS, POWER, DriftCheck, check_drift
 from recordings.schema.messages import SessionInfo

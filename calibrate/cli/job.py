@@ -14,7 +14,7 @@ import typer
 
 from calibrate.cli.files import read_board, read_camera, read_lens_sigma
 from calibrate.cli.output import OutputError
-from calibrate.options import JobOptions
+from calibrate.pipeline import JobOptions
 from calibrate.quality.gates import GateLimits, read_limits
 
 

@@ -28,8 +28,7 @@ from calibrate.files.formatting import summary
 from calibrate.files.install import install_line, load_installed
 from calibrate.geometry import rotation_log
 from calibrate.handeye.solution import PeerResult, camera_frames
-from calibrate.options import JobOptions
-from calibrate.pipeline import SolvedRecording, prepare_views, solve_recording, solver_options
+from calibrate.pipeline import JobOptions, SolvedRecording, prepare_views, solve_recording, solver_options
 
 Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session folder", show_default=False)]
 GATE_FAILED = 4

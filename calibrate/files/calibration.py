@@ -3,7 +3,6 @@
 Field by field in docs/calibration-file.md. Metres and radians unless the name says otherwise; covariances are
 of `geometry.perturb`'s delta.
 """
-# ruff: noqa: N815  (e_t and e_R are written as the paper writes them)
 
 from __future__ import annotations
 
@@ -18,6 +17,7 @@ import yaml
 
 from calibrate.errors import CalibrationError
 from calibrate.geometry import Transform, is_rigid, matrix_from_quaternion
+from calibrate.results import BoardShape, HoldoutScore, RejectedView
 from recordings import strict_yaml
 from recordings.files import ASKED_FOR, write_atomically
 from recordings.mcap.records import MAGIC
@@ -73,14 +73,6 @@ class Sigma(msgspec.Struct, frozen=True):
     rotation_deg: float
 
 
-class Rejected(msgspec.Struct, frozen=True, omit_defaults=True):
-    index: int
-    name: str
-    reason: str
-    kind: str = ""
-    """The cause as a code, where the views name one."""
-
-
 class ViewWeight(msgspec.Struct, frozen=True):
     index: int
     weight: float
@@ -88,7 +80,7 @@ class ViewWeight(msgspec.Struct, frozen=True):
 
 class Views(msgspec.Struct, frozen=True, omit_defaults=True):
     used: list[int]
-    rejected: list[Rejected] = []
+    rejected: list[RejectedView] = []
     turned: list[int] = []
     weights: list[ViewWeight] = []
     """Of the views that count for less than 1."""
@@ -104,20 +96,11 @@ class Lens(msgspec.Struct, frozen=True, omit_defaults=True):
     found: Literal["from these pictures", "given"]
     sigma: dict[str, float] = {}
     held: list[str] = []
+    """No effect: of files of earlier versions."""
 
     @property
     def model(self) -> CameraModel:
         return CameraModel(self.width, self.height, self.matrix, self.distortion, self.distortion_model)
-
-
-class Holdout(msgspec.Struct, frozen=True, omit_defaults=True):
-    e_t_m: float
-    e_R: float
-    samples_e_t_m: list[float]
-    samples_e_R: list[float]
-    pairs: list[tuple[int, int]]
-    fitted_views: int
-    note: str = ""
 
 
 class Proof(msgspec.Struct, frozen=True):
@@ -133,16 +116,6 @@ class ViewQuality(msgspec.Struct, frozen=True, omit_defaults=True):
     rms_px: float | None = None
     robot_mm: float | None = None
     robot_deg: float | None = None
-
-
-class BoardFound(msgspec.Struct, frozen=True):
-    """What the views say of the board's shape."""
-
-    scale: float
-    """True over stated size, minus 1."""
-    anisotropy: float
-    bend_m: Vector3
-    sigma: tuple[float, float, float, float, float]
 
 
 class Folds(msgspec.Struct, frozen=True):
@@ -180,7 +153,7 @@ class Arm(msgspec.Struct, frozen=True):
 class Quality(msgspec.Struct, frozen=True, omit_defaults=True):
     gates: list[Gate]
     certificate: Proof
-    holdout: Holdout | None = None
+    holdout: HoldoutScore | None = None
     rms_px: float | None = None
     views: list[ViewQuality] = []
     board_spread_mm: float | None = None
@@ -195,12 +168,12 @@ class Quality(msgspec.Struct, frozen=True, omit_defaults=True):
     weakest: str = ""
     board_scale: float | None = None
     """True over stated size."""
-    board: BoardFound | None = None
+    board: BoardShape | None = None
     cross_validation: Folds | None = None
     session: Session | None = None
     arm: Arm | None = None
     robot_systematics: str = ""
-    """Of files from before version 0.2; see `arm`."""
+    """No effect: of files from before version 0.2; see `arm`."""
     warnings: list[str] = []
     warning_codes: list[str] = []
     """One for each of `warnings`."""

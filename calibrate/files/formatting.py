@@ -11,9 +11,10 @@ from rich.text import Text
 from scipy.spatial.transform import Rotation
 
 from calibrate.boards.model import describe_board
-from calibrate.files.calibration import BoardFound, Calibration, Override
+from calibrate.files.calibration import Calibration, Override
 from calibrate.files.verification import agrees, touch_text
 from calibrate.geometry import difference
+from calibrate.results import BoardShape
 
 _STAMPS = {
     "simulated": "SIMULATED: made without a robot or a camera",
@@ -142,7 +143,7 @@ def cell_sentences(calibration: Calibration) -> list[str]:
     return sentences
 
 
-def _board(board: BoardFound, square_mm: float) -> Iterator[str]:
+def _board(board: BoardShape, square_mm: float) -> Iterator[str]:
     if abs(board.scale) > _SAID * board.sigma[0]:
         size = square_mm * (1 + board.scale)
         yield (

@@ -1,6 +1,5 @@
 """Quality of an X: held-out errors of the paper, board spread, what the motions can and cannot show."""
 
-# ruff: noqa: N815  (e_t and e_R are written as the paper writes them)
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -10,27 +9,11 @@ import numpy as np
 from calibrate.errors import DegenerateMotionError
 from calibrate.geometry import Array, difference, pose, project_to_rotation, rotation_angle, skew
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, consecutive_pairs, mount_poses, screw_invariants
+from calibrate.results import HoldoutScore
 from calibrate.views import ViewSet
 
 _MIN_SECOND_AXIS_RAD = np.radians(0.3)
 """Root mean square rotation about the second axis below which no X is worth the name."""
-
-
-@dataclass(frozen=True, eq=False)
-class HoldoutScore:
-    """Equations 24 to 26 of the paper on pairs that took no part in the fit."""
-
-    e_t_m: float
-    """Mean translation error."""
-    e_R: float
-    """Mean spectral norm of the rotation error."""
-    samples_e_t_m: Array
-    """(m,) per held-out pair."""
-    samples_e_R: Array
-    pairs: tuple[tuple[int, int], ...]
-    """Pose numbers (earlier, later) of the held-out pairs."""
-    fitted_views: int
-    note: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,10 +42,12 @@ def score_holdout(
 ) -> HoldoutScore:
     """Score held-out `pairs`; `indices` are the pose numbers of the view places that pairs speak of."""
     e_t, e_R = motion_errors(X, pairs)
-    named = tuple(
+    named = [
         (indices[i], indices[j]) for i, j in zip(pairs.first.tolist(), pairs.second.tolist(), strict=True)
+    ]
+    return HoldoutScore(
+        float(e_t.mean()), float(e_R.mean()), e_t.tolist(), e_R.tolist(), named, fitted_views, note
     )
-    return HoldoutScore(float(e_t.mean()), float(e_R.mean()), e_t, e_R, named, fitted_views, note)
 
 
 def mean_pose(poses: Array) -> Array:

@@ -77,8 +77,8 @@ def compare_all(views: ViewSet, options: SolveOptions | None = None) -> list[Pee
             final,
             e_t_m=ours.holdout.e_t_m,
             e_R=ours.holdout.e_R,
-            samples_e_t_m=ours.holdout.samples_e_t_m,
-            samples_e_R=ours.holdout.samples_e_R,
+            samples_e_t_m=np.array(ours.holdout.samples_e_t_m),
+            samples_e_R=np.array(ours.holdout.samples_e_R),
         )
     return [*rows, replace(final, time_ms=ours_ms, note="hold-out, outliers and proof included in the time")]
 

@@ -24,7 +24,6 @@ from calibrate.handeye.estimate import FULL, estimate
 from calibrate.handeye.fit import CellFit, fit_cell, fit_moved
 from calibrate.handeye.metrics import (
     HELD_OUT,
-    HoldoutScore,
     board_spread,
     distance_in_sigmas,
     median_distance_m,
@@ -38,15 +37,14 @@ from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.handeye.readings import Explanation, Reading, explain_recording, explain_text
 from calibrate.handeye.solution import (
     ArmTable,
-    BoardShape,
     NoiseScales,
-    RejectedView,
     Remark,
     Solution,
     SolveOptions,
     board_frames,
     camera_frames,
 )
+from calibrate.results import BoardShape, HoldoutScore, RejectedView
 from calibrate.stopwatch import Stopwatch
 from calibrate.views import ViewSet
 

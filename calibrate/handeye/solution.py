@@ -15,9 +15,10 @@ import numpy as np
 from calibrate.geometry import Array, Transform
 from calibrate.handeye.axxb.certificate import Certificate
 from calibrate.handeye.diagnosis import CrossValidation, Finding
-from calibrate.handeye.metrics import HoldoutScore, Observability
+from calibrate.handeye.metrics import Observability
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.readings import Explanation, Reading
+from calibrate.results import BoardShape, HoldoutScore, RejectedView
 from calibrate.views import BoardView
 from recordings.schema.messages import CameraModel, Mount
 
@@ -56,20 +57,6 @@ class SolveOptions:
 
 
 @dataclass(frozen=True)
-class RejectedView:
-    index: int
-    """Pose number of the session."""
-    name: str
-    reason: str
-    """One sentence for people."""
-    kind: Literal["wrong-pose", "wrong-number", "inconsistent", "corners", "unreadable-picture", "by-hand"]
-    belongs_to: int | None = None
-    """Pose number of the view whose recorded pose belongs to this image (wrong-pose)."""
-    wrong_number: int | None = None
-    """Place in [δt, δφ] of the only wrong number of its recorded pose."""
-
-
-@dataclass(frozen=True)
 class Remark:
     """Something that is doubtful, as a code for programs and a sentence for people."""
 
@@ -85,18 +72,6 @@ class NoiseScales:
     """Of what moves a board's pose: corner errors are smooth over a board."""
     robot_m: float
     robot_rad: float
-
-
-@dataclass(frozen=True)
-class BoardShape:
-    """What the views say of the board, with 1σ each; see `handeye.observations.SHAPE`."""
-
-    scale: float
-    """True over stated size, minus 1."""
-    anisotropy: float
-    """x against y of the print."""
-    bend_m: tuple[float, float, float]
-    sigma: tuple[float, float, float, float, float]
 
 
 @dataclass(frozen=True)

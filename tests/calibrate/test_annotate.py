@@ -12,7 +12,8 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from calibrate.annotate import AnnotateError, annotate
 from calibrate.cli import main
-from calibrate.files.calibration import Calibration, FramePose, Rejected, read_calibration
+from calibrate.files.calibration import Calibration, FramePose, read_calibration
+from calibrate.results import RejectedView
 from recordings.reader import open_recording
 from tests.command_line import call
 
@@ -81,7 +82,7 @@ def shifted(calibration: Calibration, by_m: float) -> Calibration:
 def test_rejected_views_are_red_and_say_why(tmp_path: Path, solved: Path) -> None:
     calibration = read_calibration(solved)
     views = msgspec.structs.replace(
-        calibration.views, rejected=[Rejected(3, "pose-4", "robot pose is wrong")]
+        calibration.views, rejected=[RejectedView(3, "pose-4", "robot pose is wrong")]
     )
     found = annotate(
         open_recording(SAMPLE), msgspec.structs.replace(calibration, views=views), tmp_path / "a.mcap"

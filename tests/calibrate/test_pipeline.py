@@ -17,8 +17,7 @@ from calibrate.geometry import Array, difference
 from calibrate.handeye.poses import pose_views
 from calibrate.handeye.readings import Reading, explain_recording
 from calibrate.load import load_views
-from calibrate.options import JobOptions
-from calibrate.pipeline import SolvedRecording, prepare_views, solve_recording
+from calibrate.pipeline import JobOptions, SolvedRecording, prepare_views, solve_recording
 from recordings.importers.folder import import_folder
 from recordings.reader import open_recording
 from recordings.schema.messages import BoardKind, BoardSpec, CameraModel

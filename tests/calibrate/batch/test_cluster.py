@@ -17,7 +17,7 @@ import pytest
 
 from calibrate.batch.cluster import Cluster, ClusterError, cluster_solver
 from calibrate.batch.run import BatchError, BatchResult, Solved, Task, read_results, run_batch
-from calibrate.options import JobOptions
+from calibrate.pipeline import JobOptions
 from tests.calibrate.batch.test_run import in_this_process
 from tests.calibrate.calling import raises_code
 

@@ -13,7 +13,7 @@ import pytest
 from benchmarks.batch import worker_pids
 from calibrate.batch.run import BatchResult, Solved, Task, batch_key, read_results, run_batch, solve_one
 from calibrate.bounds import Limits
-from calibrate.options import JobOptions
+from calibrate.pipeline import JobOptions
 
 
 def in_this_process(todo: Sequence[Task], options: JobOptions) -> Iterator[Solved]:

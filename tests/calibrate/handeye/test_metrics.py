@@ -41,7 +41,7 @@ def test_the_holdout_is_the_mean_over_its_pairs_named_by_their_poses():
     score = score_holdout(perturb(X, [0.01, 0, 0, 0, 0.02, 0]), pairs, [4, 7, 9], 19)
     e_t, e_R = motion_errors(perturb(X, [0.01, 0, 0, 0, 0.02, 0]), pairs)
     assert (score.e_t_m, score.e_R) == pytest.approx(((e_t[0] + e_t[1]) / 2, (e_R[0] + e_R[1]) / 2))
-    assert score.pairs == ((4, 7), (7, 9))
+    assert score.pairs == [(4, 7), (7, 9)]
 
 
 def turns(first_deg, second_deg, misfit_deg=0.0):

@@ -13,9 +13,10 @@ import pytest
 from calibrate.files.calibration import Gate
 from calibrate.handeye.diagnosis import CrossValidation, Finding
 from calibrate.handeye.readings import Explanation, Reading
-from calibrate.handeye.solution import HoldoutScore, NoiseScales, Remark, Solution
+from calibrate.handeye.solution import NoiseScales, Remark, Solution
 from calibrate.pipeline import SolvedRecording
 from calibrate.quality.gates import GateInputs, GateLimits, GatesError, judge, read_limits
+from calibrate.results import HoldoutScore
 from tests.calibrate.calling import raises_code
 
 GOOD = GateInputs(0.6, 0.001)
@@ -30,7 +31,7 @@ NAMES = [
 def solution(solved_real: SolvedRecording) -> Solution:
     """One that every gate lets through."""
     found = solved_real.solution
-    holdout = HoldoutScore(0.0005, 0.001, np.array([0.0005]), np.array([0.001]), ((0, 1),), 12)
+    holdout = HoldoutScore(0.0005, 0.001, [0.0005], [0.001], [(0, 1)], 12)
     noise = NoiseScales(0.1, 0.0001, 0.0002)
     return replace(
         found,
@@ -74,7 +75,7 @@ def spoiled(solution: Solution, name: str) -> tuple[Solution, GateInputs]:
         "lens_pull": replace(solution, lens_finding=Finding(8.0, 0.0011)),
         "board_pull": replace(solution, board_finding=Finding(8.0, 0.0011)),
         "view_rms_px": replace(solution, residual_px={3: 9.0}),
-        "holdout_share": replace(solution, holdout=replace(solution.holdout, e_t_m=0.02)),
+        "holdout_share": replace(solution, holdout=msgspec.structs.replace(solution.holdout, e_t_m=0.02)),
         "predicted_error_m": replace(solution, predicted_error_m=0.003),
         "robot_error_m": replace(solution, noise=NoiseScales(0.1, 0.01, 0.0)),
         "robot_error_deg": replace(solution, noise=NoiseScales(0.1, 0.0, 0.02)),

@@ -28,6 +28,12 @@ class ErrorData(msgspec.Struct, frozen=True, omit_defaults=True):
     """Measured figures and limits; each name ends in its unit."""
 
 
+class ErrorReport(msgspec.Struct, frozen=True):
+    """What a command with `--json` prints when it fails."""
+
+    error: ErrorData
+
+
 class CodedError(Exception):
     """An error that a person can act on: code, values and remedy beside what happened.
 

@@ -8,12 +8,13 @@ import sys
 from collections.abc import Mapping
 from typing import Annotated, Any, NamedTuple, cast
 
+import msgspec
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from recordings.cli.terminal import examples, print_what_it_can
-from recordings.errors import CodedError, printed
+from recordings.errors import CodedError, ErrorReport, printed
 from recordings.plain_text import plain_text
 
 _HELP_KEYS = {"help_option_names": ["-h", "--help"]}
@@ -127,6 +128,8 @@ def run(name: str, group: LazyGroup) -> None:
         print(f"{name}: this command needs the package {package}: {extra}", file=sys.stderr)
         sys.exit(2)
     except CodedError as problem:
+        if "--json" in sys.argv:
+            print(msgspec.json.encode(ErrorReport(problem.data)).decode())
         print(f"{name}: {printed(problem)}", file=sys.stderr)
         sys.exit(problem.exit_code)
     except OSError as problem:  # a folder that may not be written, a full disk behind stdout

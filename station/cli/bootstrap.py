@@ -1,4 +1,4 @@
-"""`station bootstrap`: from a rough mount and a taught view to guesses that a plan can be made from."""
+"""`station bootstrap`: from a rough camera pose and a taught view to guesses good enough for a plan."""
 
 from __future__ import annotations
 
@@ -34,6 +34,7 @@ from station.plan.bootstrap import MOVES_MAX, MOVES_MIN, next_move
 from station.protocol.client import Client
 from station.protocol.verbs import Purpose
 
+_SAME_FILE = "Give the configuration that the daemon runs with, or restart the daemon."
 _STRAYED_RAD = 0.01
 """Somebody moved the arm: the next move was checked from elsewhere."""
 _JOINT_SPEED_RAD_S, _JOINT_ACCELERATION_RAD_S2 = 0.2, 0.5
@@ -41,14 +42,14 @@ _JOINT_SPEED_RAD_S, _JOINT_ACCELERATION_RAD_S2 = 0.2, 0.5
 
 
 class BootstrapError(StationError):
-    """A move or a picture of the bootstrap failed; nothing is left running."""
+    """A move or an image of the bootstrap failed; nothing is left running."""
+
+    code = "bootstrap"
 
 
 def bootstrap_command(
-    config: Annotated[Path, typer.Option(help="The configuration that the daemon runs with.")],
-    output: Annotated[
-        Path | None, typer.Option("--output", "-o", help="Where the guesses go (YAML).")
-    ] = None,
+    config: Annotated[Path, typer.Option(help="The configuration that the daemon runs with")],
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Where the guesses go (YAML)")] = None,
     headless: Headless = False,
     socket: Socket = None,
 ) -> None:
@@ -56,17 +57,21 @@ def bootstrap_command(
 
     Each move starts at a taught view and is asked for. Ctrl-C stops the arm.
 
-    First jog the arm to where the camera sees the whole board in the middle of its picture: that is the
-    taught view. The configuration holds `camera_guess`, good to about 30° and 100 mm, and `camera.model`.
+    First jog the arm to where the camera sees the whole board in the middle of its image: the taught view.
+    The configuration holds `camera_guess`, good to about 30° and 100 mm, and `camera.model`.
 
-    Exit codes: 0 the guesses are good enough for a plan, 3 they are not yet, 1 refused or failed.
+    Exit codes: 0 good enough for a plan, 3 not yet, 1 refused or failed.
     """
     cell, text = load_config(config)
     if cell.camera.model is None or cell.camera.model.matrix is None:
-        raise ConfigError("bootstrap needs camera.model with width, height and a rough matrix")
+        raise ConfigError(
+            "The bootstrap needs rough intrinsics.",
+            code="no-intrinsics",
+            remedy="Give camera.model with width, height and a matrix.",
+        )
     believe(cell, [])  # says so when there is no camera_guess, before anything is asked
     if output is not None and output.exists():
-        raise ConfigError(f"{output} exists: give another name for the guesses")
+        raise ConfigError(f"{output} exists.", code="target-exists", remedy="Give the guesses another name.")
     glimpses = _make_moves(cell, socket, headless, hashlib.sha256(text).hexdigest())
     found = improved_config(cell, glimpses)
     assert found.camera_guess is not None and found.board_guess is not None
@@ -81,12 +86,12 @@ def bootstrap_command(
             write_atomically(output, entries.encode(), ASKED_FOR)
         except OSError as error:
             raise ConfigError(
-                f"cannot write {output}: {error.strerror}; the guesses are:\n{entries}"
+                f"Cannot write {output}: {error.strerror}. The guesses are:\n{entries}", code="output"
             ) from error
-        err.print(f"put the two entries of {output} into {config}, start the daemon anew, then plan")
+        err.print(f"Put the two entries of {output} into {config}, restart the daemon, then plan.")
     if not believe(cell, glimpses).good:
         err.print(
-            "not sure enough for a good plan: teach another view and repeat with these guesses",
+            "Not certain enough for a good plan: teach another view and repeat with these guesses.",
             style="yellow",
         )
         raise typer.Exit(3)
@@ -95,16 +100,21 @@ def bootstrap_command(
 def _make_moves(
     cell: StationConfig, socket: Path | None, headless: bool, config_sha256: str = ""
 ) -> list[Glimpse]:
-    """The taught view and those after each move. Every one is a session of its own, with its own go."""
+    """The taught view and those after each move: each a session of its own, with its own approval."""
     path = socket or default_socket()
     taught = asyncio.run(_standing(path, cell.mount))
-    move: PlannedPose | None = PlannedPose("taught", taught, why="a picture where the arm stands")
+    move: PlannedPose | None = PlannedPose("taught", taught, why="an image where the arm stands")
     glimpses: list[Glimpse] = []
     views: ViewSet | None = None
     while move is not None:
         before = glimpses[-1].joints_rad if glimpses else np.array(taught)
         if np.abs(np.array(asyncio.run(_standing(path, cell.mount))) - before).max() > _STRAYED_RAD:
-            raise BootstrapError("the arm was moved meanwhile: teach the view again and start over")
+            raise BootstrapError(
+                "The arm was moved meanwhile.",
+                code="arm-moved",
+                remedy="Teach the view again and start over.",
+                limit_rad=_STRAYED_RAD,
+            )
         of = f" (of {MOVES_MIN} to {MOVES_MAX})" if glimpses else ""
         err.print(Text.assemble((move.name, "bold"), f"{of}: {move.why}"))
         joints, views = _take(cell, move, views, path, headless, config_sha256)
@@ -117,7 +127,7 @@ def _make_moves(
             )
         ]
         belief = believe(cell, glimpses)
-        err.print(f"mount known to {1000 * belief.sigma_m:.1f} mm, {np.rad2deg(belief.sigma_rad):.2f}°")
+        err.print(f"camera pose ± {1000 * belief.sigma_m:.1f} mm, {np.rad2deg(belief.sigma_rad):.2f}°")
         try:
             move = next_move(cell, glimpses)
         except LimitError as error:
@@ -136,7 +146,7 @@ def _take(
     headless: bool,
     config_sha256: str,
 ) -> tuple[Array, ViewSet]:
-    """One go, one picture: the joints (6,) where it was taken, and all views so far."""
+    """One approval, one image: the joints (6,) where it was captured, and all views so far."""
     plan = slow_plan(cell, move)
     outcome = asyncio.run(
         session(socket, Purpose.RUN, headless, before=lambda client: load_into(client, plan))
@@ -144,15 +154,16 @@ def _take(
     if not outcome.recording or not outcome.captured:
         reason = (outcome.status.reason or outcome.status.state.value).rstrip(".")
         raise BootstrapError(
-            f"{move.name}: no picture was saved ({reason}). When that is mended, `station finish` closes "
-            "what is open; then start over from a view with the whole board"
+            f"{move.name}: no image was saved ({reason}).",
+            code="no-image",
+            remedy="Then `station finish` closes what is open; start over from a view of the whole board.",
         )
     recording = open_recording(Path(outcome.recording))
     require_same_cell(cell, config_sha256, recording.info)
     loaded = load_views(recording, cell.board, cell.camera.model, fewest=1).views
     [view] = recording.views()
     if view.joints_rad is None or view.name != move.name:
-        raise BootstrapError(f"{outcome.recording} is not the picture of {move.name}")
+        raise BootstrapError(f"{outcome.recording} does not hold {move.name}.", code="other-recording")
     if before is None:
         return np.array(view.joints_rad), loaded
     # All views together decide which way round a symmetric board lies.
@@ -162,16 +173,15 @@ def _take(
 def require_same_cell(cell: StationConfig, config_sha256: str, seen: SessionInfo) -> None:
     """ConfigError when the daemon's cell is another one: moves are chosen by this file and checked by that.
 
-    `seen`: of the taught picture, before anything moved. A simulated daemon has no file to compare.
+    `seen`: of the taught view, before anything moved. A simulated daemon has no file to compare.
     """
     if seen.board != cell.board:
-        raise ConfigError(
-            "the daemon runs with another board than this configuration: give the file it runs with"
-        )
+        raise ConfigError("The daemon runs with another board.", code="other-cell", remedy=_SAME_FILE)
     if seen.source == "real" and seen.config_sha256 != config_sha256:
         raise ConfigError(
-            "the daemon runs with another configuration, or with this one as it was before: give the file it "
-            "runs with, or start the daemon anew"
+            "The daemon runs with another configuration, or with this one as it was before.",
+            code="other-cell",
+            remedy=_SAME_FILE,
         )
 
 
@@ -193,11 +203,15 @@ async def _standing(socket: Path, mount: Mount) -> Vector6:
         status = await wait_until_idle(client)
     if status.mount != mount:
         raise ConfigError(
-            f"the configuration says {mount}, the daemon's cell is {status.mount}: give the file it runs with"
+            f"The configuration says {mount}, the daemon's cell is {status.mount}.",
+            code="other-cell",
+            remedy=_SAME_FILE,
         )
     joints = status.robot.joints_rad
     if joints is None:
-        raise BootstrapError("the daemon does not know the arm's joints: `station doctor` says why")
+        raise BootstrapError(
+            "The robot's joints are not known.", code="no-robot-state", remedy="`station doctor` says why."
+        )
     return joints
 
 

@@ -12,10 +12,10 @@ import msgspec
 import typer
 from rich.text import Text
 
-from station.cell.errors import StationError
 from station.cell.socket_folder import default_socket
 from station.cell.status import StationState, StationStatus
 from station.cli.console import AsJson, Socket, out
+from station.operate.motion import status_now
 from station.protocol.client import Client, ask
 from station.protocol.stop_client import stop_and_tell
 from station.protocol.verbs import Acknowledge, Doctor, Finish, Lease, Pause, Retake, Skip, Verb
@@ -29,14 +29,8 @@ _MARKS = {
 }
 
 
-def status_now(socket: Path | None) -> StationStatus:
-    async def first() -> StationStatus:
-        async with await Client.connect(socket or default_socket()) as client:
-            async for status in client.statuses():
-                return status
-        raise StationError("the daemon ended before it told its status")
-
-    return asyncio.run(first())
+def status_of(socket: Path | None) -> StationStatus:
+    return asyncio.run(status_now(socket or default_socket()))
 
 
 def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
@@ -44,7 +38,7 @@ def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
 
     Needs no control and works beside any screen. --json: every figure, the unit in its name.
     """
-    status = status_now(socket)
+    status = status_of(socket)
     if as_json:
         print(msgspec.json.encode(status).decode())
         return
@@ -58,7 +52,7 @@ def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
     if session.name:
         words.append(session.name)
     if status.lease.holder:
-        words.append(f"commanded by {status.lease.holder}")
+        words.append(f"control: {status.lease.holder}")
     out.print(", ".join(words))
     out.print(camera_words(status))
     if session.recording:
@@ -71,13 +65,13 @@ def _print_state(status: StationStatus) -> None:
 
 
 def camera_words(status: StationStatus) -> str:
-    """What camera and trigger box did, in one line."""
+    """One line on what camera and trigger box did."""
     camera, trigger = status.camera, status.trigger
     if not camera.connected:
         return "camera not connected"
     words = [f"{camera.model} {camera.fps:.1f} fps", f"{camera.dropped} frames dropped"]
     if camera.lost_packets or camera.resent_packets:
-        words.append(f"{camera.lost_packets} packets lost, {camera.resent_packets} sent again")
+        words.append(f"{camera.lost_packets} packets lost, {camera.resent_packets} resent")
     if trigger.present:
         words.append(f"trigger {trigger.pulses} pulses, {trigger.frames} frames")
     return ", ".join(words)
@@ -100,7 +94,7 @@ def acknowledge_command(socket: Socket = None) -> None:
     Next: `station resume` continues the session, `station finish` finishes it.
     """
     ask(socket or default_socket(), Acknowledge())
-    status = status_now(socket)
+    status = status_of(socket)
     _print_state(status)
     if status.state is StationState.PAUSED:
         out.print("Next: `station resume` continues, `station finish` finishes")
@@ -121,7 +115,7 @@ def finish_command(socket: Socket = None) -> None:
     A pose under way is captured first. Next: `calibrate solve RECORDING`; `station status` names it.
     """
     _command(socket, Finish())
-    status = status_now(socket)
+    status = status_of(socket)
     _print_state(status)
     if status.session.recording:
         out.print(f"recording {status.session.recording}")
@@ -144,7 +138,7 @@ def skip_command(pose: PoseNumber, socket: Socket = None) -> None:
 
 def _why(socket: Path | None, pose: int) -> str:
     """What became of a pose, as the daemon says it."""
-    return next((p.reason for p in status_now(socket).session.poses if p.index == pose - 1), "")
+    return next((p.reason for p in status_of(socket).session.poses if p.index == pose - 1), "")
 
 
 def doctor_command(

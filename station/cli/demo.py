@@ -12,7 +12,6 @@ import tempfile
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,14 +22,15 @@ from rich.table import Table
 from rich.text import Text
 
 from calibrate.geometry import difference
+from recordings.errors import ErrorReport
 from recordings.reader import open_recording
 from station.cell.errors import ConfigError, StationError
 from station.cell.session_folder import CALIBRATION_FILE, default_root
 from station.cell.status import MotionPreview
 from station.cli.console import AsJson, Headless, err, out
 from station.cli.progress import SessionProgress
-from station.cli.serve import require_choices
-from station.operate.motion import Outcome, carry_out, wait_until_idle
+from station.cli.serve import GigE, Mounting, Noise, Scene, Seed, require_choices
+from station.operate.motion import carry_out, wait_until_idle
 from station.protocol.client import Client
 from station.protocol.verbs import Lease, MakePlan, Purpose
 from station.simulation.cell import CellTruth
@@ -43,61 +43,44 @@ SOLVE_TIMEOUT_S = 300.0
 _GATE_FAILED = 4
 
 
-@dataclass(frozen=True)
-class DemoOptions:
-    out: Path
-    seed: int = 0
-    scene: str = "paper"
-    mount: str = "eye-in-hand"
-    noise: str = "low"
-    poses: int = 25
-    time_scale: float = 1.0
-    gige: bool = False
-    """The camera over GigE Vision; this process must be in a network namespace with only `lo`."""
-
-    @property
-    def serve_arguments(self) -> list[str]:
-        return [
-            *("--seed", str(self.seed), "--scene", self.scene, "--mount", self.mount, "--noise", self.noise),
-            *("--time-scale", str(self.time_scale)),
-            *(["--gige"] if self.gige else []),
-        ]
-
-
 class DemoError(StationError):
-    """A step of the demonstration failed; the message is that step's own."""
+    """A step of the demonstration failed; text and code are that step's own."""
+
+    code = "demo"
 
 
 def demo_command(
-    seed: Annotated[int, typer.Option(help="Another seed: another mount, board place, lens, noise.")] = 0,
-    output: Annotated[Path | None, typer.Option("--out", help="Folder for everything it makes.")] = None,
-    scene: Annotated[str, typer.Option(help="paper, blog or paper-binned (640×512)")] = "paper",
-    mount: Annotated[str, typer.Option(help="eye-in-hand or eye-to-hand")] = "eye-in-hand",
-    noise: Annotated[str, typer.Option(help="low, mid or high")] = "low",
-    poses: Annotated[int, typer.Option(min=4, max=200)] = 25,
-    gige: Annotated[bool, typer.Option("--gige", help="The camera over GigE Vision.")] = False,
+    seed: Seed = 0,
+    output: Annotated[Path | None, typer.Option("--out", help="Folder for everything it makes")] = None,
+    scene: Scene = "paper",
+    mount: Mounting = "eye-in-hand",
+    noise: Noise = "low",
+    poses: Annotated[int, typer.Option(min=4, max=200, help="Poses to capture")] = 25,
+    gige: GigE = False,
     headless: Headless = False,
     as_json: AsJson = False,
     time_scale: Annotated[float, typer.Option(hidden=True)] = 1.0,
 ) -> None:
     """Run the whole job on a simulated cell and compare with the truth.
 
-    Takes about a minute, and ends with the paths of recording, calibration and report (open that in a
-    browser). The same cell to play with: `station`.
+    Takes about a minute and ends with the paths of recording, calibration and report (open it in a browser).
+    The same cell to play with: `station`.
 
-    Exit codes: 0 done, 1 failed, 3 done with fewer poses than planned, 4 a gate failed.
+    Exit codes: 0 done, 1 failed, 3 poses missing, 4 a gate failed.
     """
     require_choices(scene=scene, noise=noise, mount=mount)
     if output is not None and output.exists() and not output.is_dir():
-        raise ConfigError(f"--out {output} is a file: name a folder for what the demo makes")
+        raise ConfigError(f"--out {output} is a file.", code="not-a-folder", remedy="Name a folder.")
     if gige and not is_isolated():
         # Discovery broadcasts on every network: the same command again, where there is only loopback.
         command = isolated_command([sys.executable, "-m", "station.cli", *sys.argv[1:]])
         os.execv(command[0], command)
     folder = output or default_root() / "demo" / time.strftime("%Y%m%d-%H%M%S")
-    options = DemoOptions(folder, seed, scene, mount, noise, poses, time_scale, gige)
-    started_s = time.monotonic()
-    result = asyncio.run(run_demo(options, SessionProgress(err, quiet=headless or as_json)))
+    cell: dict[str, Any] = {"seed": seed, "scene": scene, "mount": mount, "noise": noise}
+    arguments = [part for name, value in cell.items() for part in (f"--{name}", str(value))]
+    arguments += ["--time-scale", str(time_scale), *(["--gige"] if gige else [])]
+    progress, started_s = SessionProgress(err, quiet=headless or as_json), time.monotonic()
+    result = cell | asyncio.run(_run(folder, arguments, poses, seed, progress))
     if as_json:
         print(json.dumps(result))
     else:
@@ -114,7 +97,7 @@ def _show_demo(result: dict[str, Any], duration_s: float) -> None:
     table = Table(title=f"SIMULATED cell, seed {result['seed']}: {result['mount']}, {result['scene']} scene")
     for heading in ("", "translation", "rotation"):
         table.add_column(heading, justify="left" if not heading else "right")
-    for name, value in (("error against the truth", error), ("claimed sigma", sigma)):
+    for name, value in (("error against the truth", error), ("standard uncertainty", sigma)):
         table.add_row(name, f"{value['translation_mm']:.3f} mm", f"{value['rotation_deg']:.4f}°")
     out.print(table)
     verdict = "all gates passed" if result["gates_passed"] else ("a gate FAILED", "red")
@@ -124,16 +107,28 @@ def _show_demo(result: dict[str, Any], duration_s: float) -> None:
         out.print(f"{name:<12} {result[name]}")
 
 
-async def run_demo(options: DemoOptions, progress: SessionProgress) -> dict[str, Any]:
-    """What `--json` prints, and `gates_passed`. Raises StationError."""
-    options.out.mkdir(parents=True, exist_ok=True)
-    progress.say(f"starting a simulated {options.scene} cell, seed {options.seed}")
-    outcome = await _capture(options, progress)
+async def _run(
+    folder: Path, arguments: list[str], poses: int, seed: int, progress: SessionProgress
+) -> dict[str, Any]:
+    """Return what `--json` prints of it. `arguments`: of `station serve`. Raises StationError."""
+    folder.mkdir(parents=True, exist_ok=True)
+    progress.say(f"starting a simulated cell: {' '.join(arguments)}")
+    async with (
+        simulated_daemon(folder, arguments) as socket,
+        await Client.connect(socket, "the demo") as client,
+    ):
+        await wait_until_idle(client)
+        await client.call(Lease("take"))
+        progress.say(f"planning {poses} poses")
+        await client.call(MakePlan(poses, seed), timeout_s=120.0)
+        with progress:
+            outcome = await carry_out(
+                client, Purpose.RUN, approve_simulated, progress, finish_with_loss=True, headless=True
+            )
     if not outcome.recording:
-        raise DemoError(f"no recording: {outcome.status.reason or outcome.status.state.value}")
-    recording = Path(outcome.recording)
-    folder = Path(outcome.status.session.folder)
-    calibration, report = folder / CALIBRATION_FILE, folder / "report.html"
+        raise DemoError(f"No recording: {outcome.status.reason or outcome.status.state.value}")
+    recording, session = Path(outcome.recording), Path(outcome.status.session.folder)
+    calibration, report = session / CALIBRATION_FILE, session / "report.html"
     progress.say("solving the recording, in a process of its own")
     solved = await _solve(recording, calibration, report)
     translation_mm, rotation_deg = truth_error(recording, solved["result"]["matrix"])
@@ -144,29 +139,9 @@ async def run_demo(options: DemoOptions, progress: SessionProgress) -> dict[str,
         "recording": str(recording),
         "calibration": str(calibration),
         "report": str(report),
-        "seed": options.seed,
-        "scene": options.scene,
-        "mount": options.mount,
-        "noise": options.noise,
         "holdout": solved["holdout"],
         "gates_passed": all(gate["passed"] for gate in solved["gates"]),
     }
-
-
-async def _capture(options: DemoOptions, progress: SessionProgress) -> Outcome:
-    async with (
-        simulated_daemon(options.out, options.serve_arguments) as socket,
-        await Client.connect(socket, "the demo") as client,
-    ):
-        await wait_until_idle(client)
-        await client.call(Lease("take"))
-        progress.say(f"planning {options.poses} poses")
-        await client.call(MakePlan(options.poses, options.seed), timeout_s=120.0)
-
-        with progress:
-            return await carry_out(
-                client, Purpose.RUN, approve_simulated, progress, finish_with_loss=True, headless=True
-            )
 
 
 async def approve_simulated(_: MotionPreview) -> bool:
@@ -198,7 +173,7 @@ async def simulated_daemon(root: Path, arguments: list[str]) -> AsyncIterator[Pa
             said = b""
         if not said:
             tail = "\n".join(log.read_text(errors="replace").splitlines()[-3:])
-            raise DemoError(f"the simulated daemon did not start; {log} ends with:\n{tail}")
+            raise DemoError(f"The simulated daemon did not start; {log} ends with:\n{tail}", code="no-daemon")
         yield socket
     finally:
         child.stdin.close()
@@ -226,8 +201,12 @@ async def _solve(recording: Path, calibration: Path, report: Path) -> dict[str, 
             child.kill()
         raise
     if child.returncode not in (0, _GATE_FAILED):
-        said = words.decode(errors="replace").strip().removeprefix("calibrate: ")
-        raise DemoError(said or f"calibrate ended with {child.returncode}")
+        try:
+            problem = msgspec.json.decode(out, type=ErrorReport).error
+        except msgspec.DecodeError:
+            said = words.decode(errors="replace").strip()
+            raise DemoError(said or f"`calibrate solve` ended with {child.returncode}.") from None
+        raise DemoError(problem.text, code=problem.code, remedy=problem.remedy, **problem.values)
     result: dict[str, Any] = json.loads(out)
     return result
 
@@ -236,7 +215,7 @@ def truth_error(recording: Path, found: list[list[float]]) -> tuple[float, float
     """Distance (mm) and angle (deg) of the found X from the truth that rides in a simulated recording."""
     attachment = open_recording(recording).attachments().get("truth.json")
     if attachment is None:
-        raise DemoError(f"{recording} holds no truth.json: it is not of a simulated cell")
+        raise DemoError(f"{recording} holds no truth.json.", code="not-simulated")
     truth = msgspec.json.decode(attachment, type=CellTruth)
     delta = difference(np.array(found), np.array(truth.camera_mount))
     translation_mm = 1000 * float(np.linalg.norm(delta[:3]))

@@ -32,25 +32,25 @@ _NOTHING_KNOWN_M = 0.05
 
 def plan_command(
     config: Annotated[
-        Path | None, typer.Option(help="The cell's configuration; none: a simulated cell.")
+        Path | None, typer.Option(help="The cell's configuration; none: a simulated cell")
     ] = None,
-    output: Annotated[Path | None, typer.Option("--output", "-o", help="Where plan.yaml goes.")] = None,
-    check: Annotated[Path | None, typer.Option(help="Check this plan instead of making one.")] = None,
-    from_list: Annotated[Path | None, typer.Option(help="CSV of joints or flange poses instead.")] = None,
+    output: Annotated[Path | None, typer.Option("--output", "-o", help="Where plan.yaml goes")] = None,
+    check: Annotated[Path | None, typer.Option(help="Check this plan instead of making one")] = None,
+    from_list: Annotated[Path | None, typer.Option(help="CSV of joints or flange poses instead")] = None,
     taught: Annotated[
-        Path | None, typer.Option(help="Recording whose poses, guided by hand say, become the plan.")
+        Path | None, typer.Option(help="Recording whose poses, guided by hand say, become the plan")
     ] = None,
     start: Annotated[
         str | None, typer.Option(help="Joints where the arm stands, degrees: 0,-90,90,…")
     ] = None,
-    poses: Annotated[int, typer.Option(min=3, max=200, help="How many.")] = 25,
-    seed: Annotated[int, typer.Option(help="The same seed gives the same plan.")] = 0,
-    scene: Annotated[str, typer.Option(help="Simulated cell: paper or blog.")] = "paper",
+    poses: Annotated[int, typer.Option(min=3, max=200, help="How many")] = 25,
+    seed: Annotated[int, typer.Option(help="The same seed gives the same plan")] = 0,
+    scene: Annotated[str, typer.Option(help="Simulated cell: paper or blog")] = "paper",
     d_optimal: Annotated[
-        bool, typer.Option("--d-optimal", help="Smallest error ellipsoid, not smallest error.")
+        bool, typer.Option("--d-optimal", help="Smallest error ellipsoid, not smallest error")
     ] = False,
-    picture: Annotated[Path | None, typer.Option(help="Save a picture of the plan (png, svg, pdf).")] = None,
-    foxglove: Annotated[Path | None, typer.Option(help="Save a scene for Foxglove (mcap).")] = None,
+    picture: Annotated[Path | None, typer.Option(help="Save a picture of the plan (png, svg, pdf)")] = None,
+    foxglove: Annotated[Path | None, typer.Option(help="Save a scene for Foxglove (mcap)")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Make a pose plan, or check one. Nothing moves.
@@ -93,7 +93,9 @@ def _require_replaceable(output: Path) -> None:
         try:
             load_plan(output)
         except ConfigError:
-            raise ConfigError(f"{output} exists and is no plan; give another name with -o") from None
+            raise ConfigError(
+                f"{output} exists and is no plan.", code="target-exists", remedy="Give another name with -o."
+            ) from None
 
 
 def _cell(config: Path | None, scene: str, start: str | None) -> tuple[StationConfig, list[float] | None]:
@@ -125,7 +127,9 @@ def _joints(text: str) -> list[float]:
         degrees = []
     if len(degrees) != 6 or not np.isfinite(degrees).all():
         raise ConfigError(
-            f"--start {text!r}: six joint angles in degrees are needed, e.g. 0,-90,90,-90,-90,0"
+            f"--start {text!r} is no posture.",
+            code="usage",
+            remedy="Give six joint angles in degrees, e.g. 0,-90,90,-90,-90,0.",
         )
     return [float(np.deg2rad(angle)) for angle in degrees]
 
@@ -139,7 +143,9 @@ def _given(
 ) -> Plan | None:
     """The plan that is there already; None when one is to be made."""
     if sum(path is not None for path in (check, from_list, taught)) > 1:
-        raise ConfigError("--check, --from-list and --taught exclude each other; give one of them")
+        raise ConfigError(
+            "--check, --from-list and --taught exclude each other.", code="usage", remedy="Give one of them."
+        )
     if check is not None:
         return load_plan(check)
     if from_list is not None:

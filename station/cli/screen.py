@@ -67,7 +67,7 @@ def ensure_daemon(socket: Path) -> Path:
     config = find_config()
     what = ["--simulate"] if config is None else ["--config", str(config)]
     cell = "a SIMULATED cell (no configuration found)" if config is None else f"the cell of {config}"
-    print(f"no daemon serves {socket}: starting one for {cell} …", file=sys.stderr)
+    print(f"No daemon serves {socket}: starting one for {cell} …", file=sys.stderr)
     root.mkdir(parents=True, exist_ok=True)
     log = root / "daemon.log"
     with log.open("ab") as words:
@@ -84,7 +84,7 @@ def ensure_daemon(socket: Path) -> Path:
             return socket
         time.sleep(0.2)
     tail = "\n".join(log.read_text(errors="replace").splitlines()[-3:])
-    raise StationError(f"the daemon did not start; {log} ends with:\n{tail}")
+    raise StationError(f"The daemon did not start; {log} ends with:\n{tail}", code="no-daemon")
 
 
 def tell_what_goes_on(socket: Path) -> None:
@@ -97,7 +97,7 @@ def tell_what_goes_on(socket: Path) -> None:
         credentials = link.getsockopt(SOL_SOCKET, SO_PEERCRED, struct.calcsize("3i"))
     pid, user, _ = struct.unpack("3i", credentials)
     own = pid and user == os.getuid()
-    ends = f"; `kill {pid}` ends it: the arm stops first, and what is recorded is sealed" if own else ""
+    ends = f"; `kill {pid}` ends it: the arm stops first, and the recording is finished" if own else ""
     print(f"The station goes on without this screen. `station` opens it again{ends}.")
 
 

@@ -21,25 +21,28 @@ from station.devices.cell import Cell
 from station.simulation.cell import NoiseLevel, SceneName
 
 _RANGES = {"scene": SceneName, "noise": NoiseLevel, "mount": Mount}
+Seed = Annotated[int, typer.Option(help="Simulated: seed of camera pose, board pose, intrinsics, noise")]
+Scene = Annotated[str, typer.Option(help="Simulated: paper, blog or paper-binned (640×512)")]
+Noise = Annotated[str, typer.Option(help="Simulated: low, mid or high")]
+Mounting = Annotated[str, typer.Option("--mount", help="Simulated: eye-in-hand or eye-to-hand")]
+GigE = Annotated[bool, typer.Option("--gige", help="Simulated: the camera over GigE Vision packets")]
 
 
 def serve_command(
-    config: Annotated[Path | None, typer.Option(help="The cell's configuration.")] = None,
-    simulate: Annotated[bool, typer.Option("--simulate", help="A simulated cell, marked so.")] = False,
-    replay: Annotated[Path | None, typer.Option(help="Play this recording as a cell.")] = None,
+    config: Annotated[Path | None, typer.Option(help="The cell's configuration")] = None,
+    simulate: Annotated[bool, typer.Option("--simulate", help="A simulated cell, marked so")] = False,
+    replay: Annotated[Path | None, typer.Option(help="Play this recording as a cell")] = None,
     socket: Annotated[
-        Path | None, typer.Option(help="Where to listen; the default is told when it is ready.")
+        Path | None, typer.Option(help="Where to listen; the default is told when it is ready")
     ] = None,
-    root: Annotated[Path | None, typer.Option(help="State folder: sessions, calibrations.")] = None,
-    seed: Annotated[int, typer.Option(help="Simulated: another mount, board place, lens, noise.")] = 0,
-    scene: Annotated[str, typer.Option(help="Simulated: paper, blog or paper-binned.")] = "paper",
-    noise: Annotated[str, typer.Option(help="Simulated: low, mid or high.")] = "low",
-    mount: Annotated[str, typer.Option(help="Simulated: eye-in-hand or eye-to-hand.")] = "eye-in-hand",
-    gige: Annotated[
-        bool, typer.Option("--gige", help="Simulated: the camera over GigE Vision packets.")
-    ] = False,
+    root: Annotated[Path | None, typer.Option(help="State folder: sessions, calibrations")] = None,
+    seed: Seed = 0,
+    scene: Scene = "paper",
+    noise: Noise = "low",
+    mount: Mounting = "eye-in-hand",
+    gige: GigE = False,
     hardware_trigger: Annotated[
-        bool, typer.Option("--hardware-trigger", help="Simulated: a trigger box fires the camera.")
+        bool, typer.Option("--hardware-trigger", help="Simulated: a trigger box fires the camera")
     ] = False,
     frame_rate_hz: Annotated[float, typer.Option(hidden=True)] = 0.0,
     robot: Annotated[str, typer.Option(hidden=True)] = "UR10",
@@ -53,7 +56,9 @@ def serve_command(
     """
     if [simulate, config is not None, replay is not None].count(True) != 1:
         raise ConfigError(
-            "say what to serve, one of: --config FILE (a real cell), --simulate, --replay RECORDING"
+            "Missing the cell to serve.",
+            code="usage",
+            remedy="Give one of --config FILE (a real cell), --simulate, --replay RECORDING.",
         )
     require_choices(scene=scene, noise=noise, mount=mount)
     log_to_stderr()
@@ -87,7 +92,9 @@ def require_choices(**chosen: str) -> None:
     """ConfigError for a word that is not one of the offered ones."""
     for name, word in chosen.items():
         if word not in (known := get_args(_RANGES[name])):
-            raise ConfigError(f"--{name} {word}: choose one of {', '.join(known)}")
+            raise ConfigError(
+                f"--{name} {word} is unknown.", code="usage", remedy=f"Choose one of {', '.join(known)}."
+            )
 
 
 def _real_cell(config: Path, root: Path) -> Cell:

@@ -14,13 +14,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import msgspec
 import pytest
 import typer
 
+from recordings.errors import CodedError, ErrorReport
 from station.cell.errors import RefusedError
 from station.cell.plan import plan_sha256
 from station.cell.status import MotionPreview
 from station.cli import attended, main
+from station.cli.app import STATION
 from station.cli.screen import tell_what_goes_on
 from station.plan.files import load_plan
 from station.protocol.client import NoAnswerError
@@ -45,6 +48,12 @@ class Shell:
 
     def ask(self, *args: str) -> tuple[int, str, str]:
         return self(*args, "--socket", str(self.socket))
+
+    def refused(self, *args: str) -> str:
+        """The code of what a command fails with."""
+        with pytest.raises(CodedError) as problem:
+            STATION([*args, "--socket", str(self.socket)], prog_name="station")
+        return problem.value.code
 
     def state(self) -> dict[str, Any]:
         state: dict[str, Any] = json.loads(self.ask("status", "--json")[1])
@@ -77,11 +86,11 @@ def test_one_pose_more_leaves_the_session_open(shell: Shell, monkeypatch: pytest
         _: object, purpose: str, *more: object, finish_with_loss: bool, **rest: object
     ) -> None:
         asked[purpose] = finish_with_loss
-        raise RefusedError("seen enough")
+        raise RefusedError("seen enough", code="seen")
 
     monkeypatch.setattr(attended, "carry_out", carry_out)
     for command in ("next-pose", "replan", "resume"):
-        assert "seen enough" in shell.ask(command, "--headless")[2]
+        assert shell.refused(command, "--headless") == "seen"
     assert asked == {"best": False, "improve": True, "resume": True}
 
 
@@ -89,9 +98,7 @@ def test_a_session_from_the_shell(shell: Shell, tmp_path: Path) -> None:
     plan = tmp_path / "plan.yaml"
     assert shell("plan", "--poses", "4", "-o", str(plan), "--json")[0] == 0
 
-    code, _, err = shell.ask("capture", "--plan", str(plan), "--headless", "--go", "ab" * 32)
-    assert code == 1
-    assert "is not the hash of this plan" in err and "nothing moved" in err
+    assert shell.refused("capture", "--plan", str(plan), "--headless", "--go", "ab" * 32) == "other-plan"
 
     sha = plan_sha256(load_plan(plan))
     code, out, err = shell.ask("capture", "--plan", str(plan), "--headless", "--approve", sha[:12], "--json")
@@ -105,15 +112,14 @@ def test_a_session_from_the_shell(shell: Shell, tmp_path: Path) -> None:
     assert "SIMULATED" in shell.ask("status")[1]
     code, out, _ = shell.ask("doctor", "--json")
     assert code == 0 and json.loads(out)["ok"]
-    code, _, err = shell.ask("pause")
-    assert code == 1 and "no session is running" in err
+    assert shell.refused("pause") == "wrong-state"
     assert shell.ask("stop")[0] == 0
     assert shell.state()["state"] == "stopped"
     code, out, _ = shell.ask("acknowledge")
     assert code == 0 and out.startswith("idle SIMULATED")
     assert shell.ask("retake", "9")[0] == 1
-    assert "pose 2: to be taken again; the picture it has counts until then" in shell.ask("retake", "2")[1]
-    assert "pose 2: not taken again: the picture it has counts" in shell.ask("skip", "2")[1]
+    assert shell.ask("retake", "2")[0] == 0 and shell.state()["session"]["poses"][1]["kept"]
+    assert shell.ask("skip", "2")[0] == 0 and "kept" not in shell.state()["session"]["poses"][1]
 
 
 def test_ctrl_c_is_stop(shell: Shell, tmp_path: Path) -> None:
@@ -165,25 +171,42 @@ def test_ctrl_c_at_the_question_is_a_no_at_once(monkeypatch: pytest.MonkeyPatch)
 
 
 @pytest.mark.parametrize(
-    ("args", "code", "said"),
+    ("args", "exit_code", "code"),
     [
-        (("serve",), 2, "--simulate"),
-        (("serve", "--simulate", "--scene", "moon"), 2, "paper, blog"),
-        (("serve", "--config", "absent.yaml"), 2, "absent.yaml"),
-        (("status", "--socket", "/nowhere/s"), 1, "station serve"),
-        (("capture", "--plan", "absent.yaml"), 2, "absent.yaml"),
-        (("tui",), 1, "needs a terminal"),
-        (("dance",), 2, "No such command"),
-        (("demo", "--out", __file__), 2, "is a file: name a folder"),
-        (("serve", "--simulate", "--root", __file__), 1, f"{__file__}"),
-        (("retake", "0"), 2, "greater than or equal to 1"),
+        (("serve",), 2, "usage"),
+        (("serve", "--simulate", "--scene", "moon"), 2, "usage"),
+        (("serve", "--config", "absent.yaml"), 2, "configuration"),
+        (("status", "--socket", "/nowhere/s"), 1, "no-daemon"),
+        (("capture",), 2, "usage"),
+        (("capture", "--plan", "absent.yaml"), 2, "configuration"),
+        (("tui",), 1, "no-terminal"),
+        (("demo", "--out", __file__), 2, "not-a-folder"),
+        (("plan", "--start", "1,2,3"), 2, "usage"),
+        (("plan", "--check", "a", "--from-list", "b"), 2, "usage"),
+        (("bootstrap", "--config", "absent.yaml"), 2, "configuration"),
     ],
 )
-def test_what_a_user_can_cause_has_words_and_a_code(args: tuple[str, ...], code: int, said: str) -> None:
+def test_what_a_person_can_cause_has_a_code(args: tuple[str, ...], exit_code: int, code: str) -> None:
+    with pytest.raises(CodedError) as problem:
+        STATION(list(args), prog_name="station")
+    assert (problem.value.exit_code, problem.value.code) == (exit_code, code)
+
+
+@pytest.mark.parametrize("args", [("dance",), ("retake", "0"), ("capture", "--frobnicate")])
+def test_wrong_usage_ends_with_2_and_nothing_on_stdout(args: tuple[str, ...]) -> None:
     done = call(main, *args)
-    assert done.returncode == code
-    assert said in " ".join(done.stderr.replace("│", " ").split())
-    assert done.stdout == ""
+    assert (done.returncode, done.stdout) == (2, "") and done.stderr
+
+
+def test_a_failure_is_one_json_object_too() -> None:
+    done = call(main, "status", "--socket", "/nowhere/s", "--json")
+    assert done.returncode == 1 and done.stderr
+    assert msgspec.json.decode(done.stdout, type=ErrorReport).error.code == "no-daemon"
+
+
+def test_a_folder_that_cannot_be_made_is_named() -> None:
+    done = call(main, "serve", "--simulate", "--root", __file__)
+    assert done.returncode == 1 and __file__ in done.stderr and done.stdout == ""
 
 
 def test_closing_the_screen_tells_what_goes_on(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

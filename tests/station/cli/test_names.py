@@ -69,7 +69,7 @@ def test_a_plan_that_breaks_a_limit(folder: Path) -> None:
 def test_what_the_daemon_tells(monkeypatch: pytest.MonkeyPatch) -> None:
     session = SessionStatus(name=ALL, recording=f"/sessions/{ALL}", poses=(PoseStatus(0, "[/]"),))
     status = StationStatus(reason=ALL, session=session)
-    monkeypatch.setattr(cli_control, "status_now", lambda socket: status)
+    monkeypatch.setattr(cli_control, "status_of", lambda socket: status)
     said = call(main, "status").stdout
     assert said.count(ALL) == 3
     checks = [Check("[/]", "failed", "[red]x[/]", "[/]")]

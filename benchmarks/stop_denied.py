@@ -32,7 +32,7 @@ from station.cell.errors import RefusedError
 from station.cell.socket_folder import motion_page, stop_socket
 from station.cell.status import StationState, StationStatus
 from station.protocol.client import Client
-from station.protocol.motion_page import Motion, open_page, read_page
+from station.protocol.stop_client import Motion, open_page, read_page
 
 TRIALS, MOVING, COMMANDS = 100, 4, 10
 CROWD = 1000

@@ -6,7 +6,9 @@ import asyncio
 import contextlib
 import gc
 import logging
+import os
 import signal
+import socket
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -16,7 +18,6 @@ from station.cell.status import StationState
 from station.devices.cell import Cell
 from station.server.control import ControlServer
 from station.server.dispatch import SessionDispatcher
-from station.server.notify import notify, watchdog_period_s
 from station.server.stop_server import StopServer
 from station.session.session import Session
 
@@ -27,9 +28,34 @@ GATHER_S = 0.04
 
 
 def freeze_startup() -> None:
-    """What was loaded stays loaded: looking through it again and again would hold up heartbeat and STOP."""
+    """Keeps what was loaded out of garbage collection, which would hold up heartbeat and STOP."""
     gc.collect()
     gc.freeze()
+
+
+def notify(*lines: str) -> bool:
+    """Tells systemd 'READY=1', 'STATUS=…' (sd_notify). False where none listens. Never blocks."""
+    address = os.environ.get("NOTIFY_SOCKET", "")
+    if not address:
+        return False
+    if address.startswith("@"):
+        address = "\0" + address[1:]
+    with contextlib.suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as link:
+        link.setblocking(False)
+        link.sendto("\n".join(lines).encode(), address)
+        return True
+    return False
+
+
+def watchdog_period_s() -> float | None:
+    """Half of systemd's watchdog period; None when it does not watch us."""
+    if os.environ.get("WATCHDOG_PID", str(os.getpid())) != str(os.getpid()):
+        return None
+    try:
+        limit_s = int(os.environ["WATCHDOG_USEC"]) / 1e6
+    except (KeyError, ValueError):
+        return None
+    return limit_s / 2 if limit_s > 0 else None
 
 
 class Watchdog:
@@ -50,12 +76,12 @@ class Watchdog:
 
 
 class Daemon:
-    def __init__(self, cell: Cell, root: Path, socket: Path) -> None:
+    def __init__(self, cell: Cell, root: Path, control: Path) -> None:
         self._watchdog = Watchdog(self._healthy)
         self.session = Session(cell, root, ticked=self._watchdog.tick, first=lambda: self._stop.round())
         dispatcher = SessionDispatcher(self.session)
-        self._control = ControlServer(socket, dispatcher, newest=lambda: self.session.store.status)
-        self._stop = StopServer(socket, dispatcher.stop_from, self._latched, self._speed_rad_s)
+        self._control = ControlServer(control, dispatcher, newest=lambda: self.session.store.status)
+        self._stop = StopServer(control, dispatcher.stop_from, self._latched, self._speed_rad_s)
         self._changed = asyncio.Event()
         self._ending = asyncio.Event()
         self._served_s = time.monotonic()
@@ -78,7 +104,7 @@ class Daemon:
             await self._ending.wait()
             telling.cancel()
         finally:
-            # The order matters: the arm stands, the recording is sealed, then everybody is told.
+            # The order matters: the arm stands, the recording is finished, then everybody is told.
             await self.session.close()
             notify("STOPPING=1")
             await self._control.close()

@@ -37,7 +37,7 @@ class CapturedView:
     """A view that counts."""
 
     index: int
-    """Of its pose."""
+    """The pose number."""
     base_from_flange: Array
     """(4, 4)"""
     indices: NDArray[np.intp]
@@ -109,7 +109,7 @@ def next_best_text(config: StationConfig, base_from_flange: Array, joints_now_ra
 
 
 def image_coverage(camera: CameraModel, pixels: Sequence[Array]) -> tuple[tuple[int, ...], ...]:
-    """How many corners fell into each part of the picture, COVERAGE_ROWS × COVERAGE_COLUMNS."""
+    """Corners in each part of the image, COVERAGE_ROWS × COVERAGE_COLUMNS."""
     points = np.concatenate([np.zeros((0, 2)), *pixels])
     counts, _, _ = np.histogram2d(
         points[:, 1],

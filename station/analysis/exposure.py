@@ -32,7 +32,7 @@ HIGHEST_GAIN_DB = 12.0
 class ExposureAdvice:
     exposure_us: float
     gain_db: float
-    """What to set; what is set already where that is good."""
+    """Settings advised; those in use where they are good."""
     white: float
     black: float
     saturated: float
@@ -49,7 +49,7 @@ def assess(
     exposure_us: float,
     gain_db: float,
 ) -> ExposureAdvice:
-    """What a picture (h, w[, 3]) taken at this exposure and gain asks for.
+    """Advises on an image (h, w[, 3]) taken at this exposure and gain.
 
     `corners`: the board's detected points (k, 2), None when it was not found: the whole picture counts then.
     """

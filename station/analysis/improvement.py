@@ -1,4 +1,4 @@
-"""Planning the poses that are left anew, from what the captured ones show of mount and board.
+"""Planning the poses that are left anew, from what the captured ones show of camera and board.
 
 The better estimate decides where to look from. What is kept clear of stays as the configuration has it, so
 that no check becomes weaker; the new way must be free by the better estimate too.
@@ -44,7 +44,7 @@ _CONTRADICTION = 5.0
 
 @dataclass(frozen=True)
 class ReplanGain:
-    """What the poses that are left would bring, by the better estimate."""
+    """The expected gain of the remaining poses, by the better estimate."""
 
     sigma_m: float
     """Expected sigma of X at the end, translation."""
@@ -73,7 +73,7 @@ def improve(
     here_rad: Sequence[float],
     seed: int = 0,
 ) -> Improvement:
-    """As many poses as are `left`, from where the arm is. Runs in a worker; seconds.
+    """Plans as many poses as are `left`, from where the arm is. Runs in a worker; seconds.
 
     RefusedError when the pictures say too little or contradict the guess, LimitError when there are no such
     poses.

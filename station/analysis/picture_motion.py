@@ -1,4 +1,4 @@
-"""How far a picture moves between exposures: a ringing bracket, a swinging cable, unknown to the joints."""
+"""Image motion between exposures: a ringing bracket, a swinging cable, unknown to the joints."""
 
 from __future__ import annotations
 

@@ -37,7 +37,7 @@ class SessionState(msgspec.Struct, frozen=True, omit_defaults=True):
     parts: int = 1
     """Segments"""
     elapsed_s: float = 0.0
-    """Of all its runs together"""
+    """Time of all its runs together."""
     check: bool = False
     """A drift check of the installed calibration."""
     sealed: bool = False

@@ -44,7 +44,7 @@ def stop_socket(control: Path) -> Path:
 
 
 def motion_page(control: Path) -> Path:
-    """Beside the control socket: the STOP and motion state (`station.protocol.motion_page`)."""
+    """Beside the control socket: the STOP and motion state (`station.protocol.stop_client`)."""
     return control.with_suffix(".motion")
 
 

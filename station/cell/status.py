@@ -1,4 +1,4 @@
-"""What every watcher of the daemon sees: one immutable snapshot; full on connect, then changed sections."""
+"""The daemon's status: one immutable snapshot; watchers get it whole, then its changed sections."""
 
 from __future__ import annotations
 
@@ -62,11 +62,11 @@ class RobotStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     host: str = ""
     rate_hz: float = 0.0
     age_ms: float = 0.0
-    """Of the newest state."""
+    """Age of the newest state."""
     safety: str = ""
     """NORMAL, PROTECTIVE STOP, EMERGENCY STOP … in words"""
     held: str = ""
-    """What holds the arm (a stop, no power, brakes) and what to do at the pendant; empty: nothing"""
+    """Cause that holds the arm (a stop, no power, brakes) and what to do at the pendant; empty: none."""
     mode: str = ""
     remote: bool | None = None
     program: str = ""
@@ -102,7 +102,7 @@ class CameraStatus(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class DetectionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
-    """Of the newest preview or captured picture."""
+    """The board in the newest preview or captured image."""
 
     found: bool = False
     reason: str = ""
@@ -115,7 +115,7 @@ class DetectionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     tilt_rad: float | None = None
     distance_m: float | None = None
     advice: str = ""
-    """What is wrong with the light or the focus and what to set; empty = nothing."""
+    """Fault of light or focus and what to set; empty: none."""
 
 
 class RecorderStatus(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -198,13 +198,13 @@ class Event(msgspec.Struct, frozen=True, omit_defaults=True):
     text: str
     pose_index: int | None = None
     code: str = ""
-    """What happened, for programs: kebab-case"""
+    """Kind, for programs: kebab-case."""
     values: dict[str, Value] = {}
     """Figures of it; each name ends in its unit"""
 
 
 class MotionPreview(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What a person confirms before anything moves. `token` is for one use."""
+    """The motion a person approves before anything moves. `token` is for one use."""
 
     token: str
     purpose: str
@@ -219,7 +219,7 @@ class MotionPreview(msgspec.Struct, frozen=True, omit_defaults=True):
     first_move: str
     """'84 mm and 22° to pose 1'"""
     changes: tuple[str, ...] = ()
-    """What this go would change in the plan, and what that brings."""
+    """Changes of the plan that this approval brings, and their gain."""
     warnings: tuple[str, ...] = ()
     start_joints_rad: Vector6 | None = None
 
@@ -251,7 +251,7 @@ class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     cause: str = ""
     """The code of `reason`, for programs."""
     pending: str = ""
-    """What comes after the pose under way: a pause or the end."""
+    """Next after the pose under way: a pause or the end."""
     simulated: bool = False
     playback: bool = False
     cell: str = ""
@@ -269,7 +269,7 @@ class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     go: MotionPreview | None = None
     """A go that waits for a person's confirmation."""
     loop_lag_ms: float = 0.0
-    """How late the daemon's working loop came, worst of the last second."""
+    """Delay of the daemon's working loop, worst of the last second."""
     events: tuple[Event, ...] = ()
     """The newest, at most 100."""
 

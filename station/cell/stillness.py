@@ -33,7 +33,7 @@ KEPT_SAMPLES = 4096
 
 @dataclass(frozen=True)
 class ImageMotion:
-    """How far images move, px; None where that cannot be measured."""
+    """Motion between images, px; None where it cannot be measured."""
 
     motion_px: float | None
 
@@ -89,7 +89,7 @@ class StillnessMonitor:
         )
 
     def unrest(self, found: Stillness) -> str:
-        """What is not still, in words; empty = at rest."""
+        """The parts that move, in words; empty: settled."""
         limits = self._limits
         parts = []
         if found.max_joint_speed_rad_s > limits.joint_speed_rad_s:

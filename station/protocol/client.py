@@ -32,7 +32,7 @@ _ANSWER_LIMIT_BYTES = 8 * 1024 * 1024
 _SUSPECT = re.compile(
     rb"\\(u00[01]|[bfr])|\x7f|\xc2[\x80-\x9f]|\xe2(\x80[\x8e\x8f\xaa-\xae]|\x81[\xa6-\xa9])"
 )
-"""How orders to a terminal look in JSON; where none can be, nothing is looked through."""
+"""Control characters for a terminal, as JSON writes them; lines without them are taken as they are."""
 
 
 class DaemonGoneError(StationError):
@@ -125,7 +125,7 @@ class Client:
         return result
 
     async def request(self, verb: str, *, timeout_s: float = ANSWER_S, **args: Any) -> Any:
-        """As `call`, by the verb's name; the result as plain data."""
+        """Calls a verb by its name; the result as plain data."""
         if verb == "stop":
             send_stop(self._path)  # the way that nobody can hold up; the request brings the answer
         if self._gone:
@@ -187,7 +187,7 @@ class Client:
                 return
 
     def outdate(self) -> None:
-        """What is known is older than what was just asked: `statuses` begins with the next change."""
+        """Drops what is known, older than what was just asked: `statuses` begins with the next change."""
         self._outdated = True
         self._fresh.clear()
 

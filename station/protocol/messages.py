@@ -19,7 +19,7 @@ from recordings.errors import CodedError, ErrorData
 
 LINE_LIMIT_BYTES = 64 * 1024
 REQUEST_LIMIT_BYTES = 2 * 1024 * 1024
-"""Of a request in pieces: a plan of some thousand poses. A connection costs the daemon no more than that."""
+"""For a request in pieces: a plan of some thousand poses. A connection costs no more memory than that."""
 PIECE_BYTES = 32 * 1024
 CLIENT_LIMIT = 64
 USER_CLIENT_LIMIT = 16

@@ -32,7 +32,7 @@ class Verb(msgspec.Struct, Generic[R], frozen=True, forbid_unknown_fields=True):
     states: ClassVar[frozenset[S]] = _ANY
     control: ClassVar[bool] = True
     spoken: ClassVar[str] = ""
-    """What it asks for, where its name is the program's own."""
+    """Its name for people, where that is not the verb's."""
     wire: ClassVar[str] = ""
     """Its name on the wire, where that is not the class's (`LoadPlan`: load_plan)."""
 
@@ -110,7 +110,7 @@ class PreviewImage(msgspec.Struct, frozen=True, omit_defaults=True):
     width: int = 0
     height: int = 0
     corners: tuple[tuple[float, float], ...] = ()
-    """Of the board, as shares of the image's sides."""
+    """The board's, as shares of the image's sides."""
     sequence: int = 0
 
 
@@ -124,7 +124,7 @@ class Check(msgspec.Struct, frozen=True):
 
 
 class Purpose(StrEnum):
-    """What a motion is prepared for."""
+    """The aim of a motion that is prepared."""
 
     RUN = "run"
     DRIFT_CHECK = "check"
@@ -199,7 +199,7 @@ class Prepare(Verb[MotionPreview], frozen=True):
     spoken = "a motion"
     purpose: Purpose = Purpose.RUN
     index: int | None = None
-    """Of the pose to retake."""
+    """The pose to retake."""
 
 
 class Hover(Verb[HoverOffer], frozen=True):

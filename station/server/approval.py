@@ -57,7 +57,7 @@ class Applicant:
     uid: int
     user: str
     began_ticks: int | None
-    """Of the process that made the connection; None: not known."""
+    """Start of the process that made the connection; None: not known."""
 
 
 class ApprovalRule:
@@ -69,7 +69,7 @@ class ApprovalRule:
         self._config, self._simulated, self._see = config, simulated, see
 
     def by_person(self, asks: Applicant, what: str) -> str:
-        """How the approval came about, for the log. RefusedError unless a person may approve it there."""
+        """Returns how a person approves, for the log. RefusedError unless a person may approve it there."""
         if self._simulated:
             return "a simulated cell"
         if terminal := self._terminal(asks):
@@ -82,7 +82,7 @@ class ApprovalRule:
         )
 
     def approve(self, asks: Applicant, plan_sha256: str, offered_sha256: str) -> str:
-        """As `by_person`; a service that the configuration names may approve the plan whose hash it knows."""
+        """Like `by_person`; a service named in the configuration may approve the plan whose hash it knows."""
         if plan_sha256 and offered_sha256 and plan_sha256 != offered_sha256:
             raise RefusedError("The approved plan is not the one that is loaded.", code="other-plan")
         if self._simulated or self._terminal(asks):

@@ -57,7 +57,7 @@ class Peer:
 
 
 class Handler(Protocol):
-    """What the daemon does with requests."""
+    """The daemon's side of requests."""
 
     def stop_now(self, peer: Peer) -> Any:
         """STOP, from anyone: under way when it returns, should the client leave. May return an awaitable."""
@@ -205,7 +205,7 @@ class _Connection:
         self._full_status = full_status
         self._tasks: set[asyncio.Task[None]] = set()
         self._pieces = bytearray()
-        """Of a request that is longer than a line."""
+        """Pieces of a request that is longer than a line."""
 
     async def run(self) -> None:
         decoder = msgspec.json.Decoder(Request)

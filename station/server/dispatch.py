@@ -34,7 +34,7 @@ class _Caller:
         self.client_id, self.pid, self.uid = peer.client_id, peer.pid, peer.uid
         self.who = f"uid {peer.uid} (pid {peer.pid})"
         self.began_ticks: int | None = None
-        """Of its process, when it first asked for anything."""
+        """Start of its process, when it first asked for anything."""
 
     def asks(self, user: str) -> Applicant:
         return Applicant(self.pid, self.uid, user, self.began_ticks)

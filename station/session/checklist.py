@@ -1,4 +1,4 @@
-"""What a capture needs, what is there, and the remedy for what is not. Looking only."""
+"""The preflight check: what a capture needs, and the remedy for what is missing. Read-only."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def _control_check(context: SessionContext) -> Check:
 
 
 async def _from_outside(host: str) -> str:
-    """What each port of a robot that gives no state answers, as the remedy."""
+    """The answers of each port of a robot that gives no state, as the remedy."""
     if not host:
         return "give robot.host in the configuration"
     found = await probe(host)

@@ -1,4 +1,4 @@
-"""What every part of a session works with."""
+"""The state that every part of a session works with."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ class SessionContext:
     root: Path
     queue: PoseQueue | None = None
     recording: SessionRecording | None = None
-    """Of the session that is not finished yet."""
+    """The session that is not finished yet."""
     seen: dict[int, CapturedView] = field(default_factory=dict)
     """By pose number: views that count."""
     pause_wanted: str = ""
@@ -93,7 +93,7 @@ class SessionContext:
             raise
 
     async def recover_segments(self, recording: SessionRecording) -> None:
-        """What a crash left open is made whole before another segment follows. Raises RecordingError."""
+        """Makes whole what a crash left open, before another segment follows. Raises RecordingError."""
         await recording.released()
         async with recording.recovering:
             if recording.unfinished_segments:
@@ -102,7 +102,7 @@ class SessionContext:
             recording.count_segments()
 
     def forget_session(self, check: bool = False) -> None:
-        """What is shown of the session before ends when the next one begins; `check`: as a drift check."""
+        """Clears what is shown of the last session when the next begins; `check`: as a drift check."""
         self.seen.clear()
         self.store.update_session(
             name="",

@@ -88,7 +88,7 @@ class ApprovalManager:
         self._clock = clock
         self.waiting: MotionApproval | None = None
         self.voids = 0
-        """How often one was made void: a check that was under way meanwhile offers none."""
+        """Counts voided ones: a check that was under way meanwhile offers none."""
 
     @staticmethod
     def new_token() -> str:

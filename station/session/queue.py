@@ -30,9 +30,9 @@ class PlanRevision:
     poses: tuple[int, ...]
     """Those that the approval covers, in order."""
     before_sha256: str
-    """Of the poses that they were made for."""
+    """Hash of the poses that they replace."""
     changes: tuple[str, ...]
-    """What is better, in words."""
+    """Gains, in words."""
 
 
 class PoseQueue:
@@ -55,7 +55,7 @@ class PoseQueue:
 
     @property
     def sha256(self) -> str:
-        """Of the plan and the order: what an approval is bound to."""
+        """Hash of the plan and its order: an approval is bound to it."""
         return plan_sha256(self.plan)
 
     @property
@@ -108,7 +108,7 @@ class PoseQueue:
         )
 
     def note(self, index: int, *, corners: int | None = None, coverage: float | None = None) -> None:
-        """What the image showed."""
+        """Notes what the image showed."""
         self._status[index] = msgspec.structs.replace(self.status(index), corners=corners, coverage=coverage)
 
     def with_fresh(self, poses: Sequence[PlannedPose]) -> PoseQueue:
@@ -215,6 +215,6 @@ def _fresh(index: int, pose: PlannedPose) -> PoseStatus:
 
 
 def _after_restart(old: PoseStatus) -> PoseStatus:
-    """What was on the disk counts; all else is planned again."""
+    """Keeps what was on the disk; all else is planned again."""
     kept = old.state if old.state in ("done", "skipped", "failed") else "planned"
     return msgspec.structs.replace(old, state=kept)

@@ -69,7 +69,7 @@ def software() -> dict[str, str]:
 
 
 async def to_the_end(work: Coroutine[Any, Any, R]) -> R:
-    """What it returns or raises. STOP halts the arm, never the disk: who is cancelled waits for it."""
+    """Finishes `work` even when cancelled. STOP halts the arm, never the disk."""
     writing = asyncio.ensure_future(work)
     try:
         return await asyncio.shield(writing)
@@ -115,7 +115,7 @@ class SessionRecording:
 
     @property
     def elapsed_s(self) -> float:
-        """What its runs took together, the present one included; pauses are none."""
+        """Time of all its runs together, the present one included; pauses do not count."""
         return self._before_s + (time.monotonic() - self._run_since_s if self._run_since_s else 0.0)
 
     def count_time(self, running: bool) -> None:
@@ -210,7 +210,7 @@ class SessionRecording:
             recorder.robot_state(state)
 
     def event(self, event: Event) -> None:
-        """What people were told is kept; a failing disk is reported elsewhere."""
+        """Keeps what people were told; a failing disk is reported elsewhere."""
         if self.recorder is not None and self.recorder.error is None:
             stamps = Stamps(host_monotonic_ns=time.monotonic_ns(), host_wall_ns=event.wall_ns)
             self.recorder.event(CaptureEvent(stamps, "station", event.pose_index, event.text, event.level))
@@ -261,7 +261,7 @@ class SessionRecording:
         require_free_space(self.folder, self._cell.config.capture.free_space_bytes)
 
     async def save_state(self, queue: PoseQueue, recording: Path | None = None) -> None:
-        """What a restarted daemon needs; `recording`: set once it is finished. Raises RecordingError.
+        """Saves what a restarted daemon needs; `recording`: set once it is finished. Raises RecordingError.
 
         In a thread: a disk may take long over an fsync, and the arm's heartbeat does not wait.
         """

@@ -44,7 +44,7 @@ class Replanner:
         """The session whose plan was improved already: once is told, more may be asked for."""
 
     def hint(self, estimate: EstimateStatus) -> str:
-        """What to tell a person when it would be worth it; empty = nothing."""
+        """A sentence for a person when replanning would help; empty: it would not."""
         queue, config = self._context.queue, self._context.cell.config
         sigma_mm, guess = estimate.sigma_translation_mm, config.camera_guess
         if queue is None or sigma_mm is None or guess is None:
@@ -137,7 +137,7 @@ class Replanner:
 
 
 def what_it_brings(found: Advice, index: int) -> tuple[str, ...]:
-    """What a person is told of one pose more."""
+    """Lines for a person on one pose more."""
     pose = found.next_pose
     assert pose is not None and pose.predicted_sigma_m is not None
     return (
@@ -155,7 +155,7 @@ def is_worth_it(found: Improvement) -> bool:
 
 
 def changes(found: Improvement) -> tuple[str, ...]:
-    """What a person is told, before → after."""
+    """Lines for a person, before → after."""
     before, after = found.before, found.after
     cut = (f"poses that would cut the board: {before.cut} → {after.cut}",) if before.cut or after.cut else ()
     known = f"{1000 * found.sigma_m:.1f} mm and {math.degrees(found.sigma_rad):.2f}°"

@@ -188,7 +188,7 @@ class Session:
         return offer
 
     async def _begin_offer(self) -> int:
-        """How many approvals were void before the path is checked."""
+        """The number of voided approvals before the path is checked."""
         await self._run_ended()  # it is finished and shown; its control process may take a moment more
         self._void()
         return self.approvals.voids

@@ -51,7 +51,7 @@ class SessionSupervisor:
         self._rest_joints: Vector6 | None = None
         self._stale_rounds = 0
         self.lags_s: deque[float] = deque(maxlen=LAGS_KEPT)
-        """How late each round came."""
+        """Delay of each round."""
 
     async def run(self) -> None:
         """For the daemon's life."""

@@ -19,7 +19,7 @@ from station.session.run import FAILURES_IN_A_ROW, Run
 BREATH_S = 0.02
 """Between two images, for whatever else the loop has to do: the arm's heartbeat first of all."""
 SHOW_PERIOD_S = 0.1
-"""How often a streaming camera's newest image is told of."""
+"""Period at which a streaming camera's newest image is shown."""
 
 
 class SweepRun(Run):

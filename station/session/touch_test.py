@@ -95,7 +95,7 @@ class TouchTestPlanner:
         return answer.hover, _offer(answer, summary, context, pointer, words)
 
     def _calibration(self, request: verbs.Hover) -> Calibration:
-        """Of this very cell, and good: a wrong one would put the board somewhere else."""
+        """A passed calibration of this very cell: a wrong one would put the board somewhere else."""
         cell = self._context.cell
         try:
             if request.calibration:

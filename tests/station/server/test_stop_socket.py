@@ -25,8 +25,18 @@ from station.cell.socket_folder import (
 )
 from station.protocol.client import Client, DaemonGoneError
 from station.protocol.messages import USER_CLIENT_LIMIT
-from station.protocol.motion_page import Motion, Page, create_page, open_page, read_page, write_page
-from station.protocol.stop_client import Outcome, main, send_stop, stop
+from station.protocol.stop_client import (
+    Motion,
+    Outcome,
+    Page,
+    create_page,
+    main,
+    open_page,
+    read_page,
+    send_stop,
+    stop,
+    write_page,
+)
 from station.server import stop_server
 from station.server.control import ControlServer
 from station.server.stop_server import BATCH, Sender, StopServer

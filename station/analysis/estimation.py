@@ -74,7 +74,7 @@ def running_estimate(
         enough=sigma_m <= goal_m,
         advice=f"enough for {1000 * goal_m:.2g} mm: you may finish"
         if sigma_m <= goal_m
-        else "go on: every pose still helps",
+        else "continue: every pose still helps",
     )
 
 

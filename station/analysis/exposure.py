@@ -1,4 +1,4 @@
-"""The exposure assistant: reads a picture of the board and says what to set, and what else is wrong.
+"""The exposure assistant: reads an image of the board and says what to set, and what else is wrong.
 
 All levels are shares of full scale, 0 … 1. It assumes a linear sensor, as machine vision cameras are.
 """
@@ -51,7 +51,7 @@ def assess(
 ) -> ExposureAdvice:
     """Advises on an image (h, w[, 3]) taken at this exposure and gain.
 
-    `corners`: the board's detected points (k, 2), None when it was not found: the whole picture counts then.
+    `corners`: the board's detected points (k, 2), None when it was not found: the whole image counts then.
     """
     grey = _levels(image)
     # A board is half white; without one, the few brightest pixels are what may saturate.
@@ -80,7 +80,7 @@ def _levels(image: NDArray[Any]) -> NDArray[np.float32]:
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
     if grey.dtype == np.uint8:
         return grey.astype(np.float32) / np.float32(255)
-    # 10, 12 and 16 bit pictures all come as uint16: the smallest range that holds the picture is meant.
+    # 10, 12 and 16 bit images all come as uint16: the smallest range that holds the image is meant.
     full = next(f for f in (1023, 4095, 65535) if grey.max() <= f)
     return grey.astype(np.float32) / np.float32(full)
 

@@ -49,9 +49,9 @@ class ReplanGain:
     sigma_m: float
     """Expected sigma of X at the end, translation."""
     cut: int
-    """Poses from which the board would not be wholly in the picture."""
+    """Poses from which the board would not be wholly in the image."""
     margin_px: float
-    """Widest strip along an edge of the picture in which no corner comes to lie, captured ones included."""
+    """Widest strip along an edge of the image in which no corner comes to lie, captured ones included."""
 
 
 @dataclass(frozen=True)
@@ -75,7 +75,7 @@ def improve(
 ) -> Improvement:
     """Plans as many poses as are `left`, from where the arm is. Runs in a worker; seconds.
 
-    RefusedError when the pictures say too little or contradict the guess, LimitError when there are no such
+    RefusedError when the images say too little or contradict the guess, LimitError when there are no such
     poses.
     """
     better = better_guesses(config, lens_is_known, seen)
@@ -95,7 +95,7 @@ def improve(
 
 
 def better_guesses(config: StationConfig, lens_is_known: bool, seen: Sequence[CapturedView]) -> StationConfig:
-    """The configuration with mount, board and lens as the captured pictures show them."""
+    """The configuration with mount, board and lens as the captured images show them."""
     camera, guess = config.camera.model, config.camera_guess
     if camera is None or camera.matrix is None or guess is None:
         text = "The configuration has no camera_guess or no rough lens to improve on."

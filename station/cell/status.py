@@ -46,11 +46,11 @@ class PoseStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     base_from_flange: Matrix4 | None = None
     """Where the flange is expected to be."""
     kept: bool = False
-    """To be taken again: the picture it has counts until another takes its place."""
+    """To be taken again: the image it has counts until another takes its place."""
 
     @property
     def counts(self) -> bool:
-        """The recording has a picture of it that is used."""
+        """The recording has an image of it that is used."""
         return self.state == "done" or self.kept
 
 
@@ -161,7 +161,7 @@ class EstimateStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     improve: str = ""
     """Why and how the poses that are left should be planned anew; empty = no need."""
     image_coverage: tuple[tuple[int, ...], ...] = ()
-    """Corners seen so far in each part of the picture, rows from the top."""
+    """Corners seen so far in each part of the image, rows from the top."""
 
 
 class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -236,7 +236,7 @@ class HoverOffer(msgspec.Struct, frozen=True, omit_defaults=True):
     tip_m: tuple[float, float, float]
     """In `flange`."""
     base_from_board: Matrix4
-    """By the calibration and the picture."""
+    """By the calibration and the image."""
     sigma_m: tuple[float, float]
     """1 sigma of tip minus corner along the board's x and y."""
     board_moved_m: float = 0.0

@@ -72,7 +72,7 @@ class _Incoming(msgspec.Struct):
 
 
 class Client:
-    """A connection. Losing it loses the lease: the daemon then decelerates the arm and pauses."""
+    """A connection. Losing it loses control: the daemon then decelerates the arm and pauses."""
 
     def __init__(self, path: Path, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         self._path, self._reader, self._writer = path, reader, writer
@@ -127,7 +127,7 @@ class Client:
     async def request(self, verb: str, *, timeout_s: float = ANSWER_S, **args: Any) -> Any:
         """Calls a verb by its name; the result as plain data."""
         if verb == "stop":
-            send_stop(self._path)  # the way that nobody can hold up; the request brings the answer
+            send_stop(self._path)  # nobody can hold this up; the request brings the answer
         if self._gone:
             raise DaemonGoneError(f"The station daemon at {self._path} is gone; nothing was sent to the arm.")
         request = Request(self._next_id, verb, args)

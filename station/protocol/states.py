@@ -5,8 +5,8 @@
                       │  └──── sealing <─────────┴────────────────────────────────────┤
                       └── acknowledge ── stopped, fault          paused <─────────────┘
 
-The only way into `moving` from rest is a go, through `checking`; the only ways out of `stopped` and `fault`
-are a person's acknowledgement and, from `fault`, STOP. A verification hover goes from `moving` to `idle`.
+`moving` is entered from rest by an approval only, through `checking`. `stopped` and `fault` are left by a
+person's acknowledgement and, `fault`, by STOP. A touch test leads from `moving` to `idle`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ TRANSITIONS: dict[S, frozenset[S]] = {
 }
 
 RUNNING = frozenset({S.CHECKING, S.MOVING, S.SETTLING, S.CAPTURING, S.WRITING})
-"""A go is being carried out: the control child may live, heartbeats flow."""
+"""An approved motion is under way: the control child may live, heartbeats flow."""
 RESTING = frozenset({S.IDLE, S.PAUSED})
 
 

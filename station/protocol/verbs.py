@@ -274,9 +274,10 @@ class Drop(Verb[Done], frozen=True):
     index: int
 
 
-class FreeDrive(Verb[Done], frozen=True):
+class Freedrive(Verb[Done], frozen=True):
     """Begin or end capture by hand; `auto`: an image whenever the arm rests anew."""
 
+    wire = "free_drive"
     states = RESTING | {S.FREE_DRIVE}
     on: bool
     auto: bool = False

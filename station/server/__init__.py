@@ -1,0 +1,1 @@
+"""The daemon's sockets: control, STOP, and the dispatch of verbs. For `station.daemon` alone."""

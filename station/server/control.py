@@ -1,4 +1,4 @@
-"""The control socket: anyone in the group may watch and STOP; whoever holds the lease may command.
+"""The control socket: anyone in the group may watch and STOP; whoever has control may command.
 
 A client that is slow, hostile or stuck costs a bounded amount of memory and is dropped, never waited for.
 """
@@ -66,7 +66,7 @@ class Handler(Protocol):
         """The result; what a person can act on (CodedError) becomes the reply's problem."""
 
     def gone(self, peer: Peer) -> None:
-        """The connection ended; if it held the lease, the arm must decelerate now."""
+        """The connection ended; if it had control, the arm must decelerate now."""
 
 
 class ControlServer:

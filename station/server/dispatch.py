@@ -144,7 +144,7 @@ class SessionDispatcher:
 
     async def _prepare(self, caller: _Caller, args: verbs.Prepare) -> MotionPreview:
         if args.purpose in (Purpose.REPLAN, Purpose.NEXT_POSE):
-            self._rule.by_person(await self._asks(caller), "A plan that changes on the way")
+            self._rule.by_person(await self._asks(caller), "A changed plan")
         return await self._session.prepare(caller.client_id, args.purpose, args.index)
 
     async def _hover(self, caller: _Caller, args: verbs.Hover) -> HoverOffer:
@@ -186,7 +186,7 @@ class SessionDispatcher:
     async def _drop(self, caller: _Caller, args: verbs.Drop) -> None:
         await self._session.edit(verbs.Drop, caller.client_id, lambda queue: queue.drop(args.index))
 
-    async def _free_drive(self, caller: _Caller, args: verbs.FreeDrive) -> None:
+    async def _free_drive(self, caller: _Caller, args: verbs.Freedrive) -> None:
         await self._to_the_end(self._session.switch_free_drive(caller.client_id, args.on, args.auto))
 
     async def _record(self, caller: _Caller, args: verbs.Record) -> verbs.PoseNumber:

@@ -1,4 +1,7 @@
-"""The session: what the station does between a go and a sealed recording. Knows no socket and no screen."""
+"""The session, from an approval to a finished recording. Knows no socket and no screen.
+
+`Session` is all that others may use; its state is read at `Session.store` and `Session.context`.
+"""
 
 from station.session.session import Session
 

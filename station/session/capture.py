@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from calibrate.geometry import Array, inverse, pose_from_rotvec
 from recordings.schema.messages import Image, RobotState, Stamps, Stillness, Vector6, View
 from station.analysis.estimation import CapturedView
-from station.analysis.picture_motion import board_box, picture_motion
+from station.analysis.image_motion import board_box, image_motion
 from station.analysis.pool import WorkerError
 from station.analysis.worker import BoardDetection, sight
 from station.cell.config import matrix4
@@ -303,6 +303,6 @@ class ImageWatch:
     async def _measure(self) -> None:
         images = [image for _, image in self._images]
         motion_px = await self._context.workers.call(
-            picture_motion, images, self._width, self._box, timeout_s=WORKER_TIMEOUT_S
+            image_motion, images, self._width, self._box, timeout_s=WORKER_TIMEOUT_S
         )
         self._found = (self._images[0][0], ImageMotion(motion_px))

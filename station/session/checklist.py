@@ -80,14 +80,14 @@ async def _camera_check(context: SessionContext, troubles: dict[str, str]) -> Ch
     camera = context.cell.camera
     try:
         async with asyncio.timeout(6.0):
-            picture, settings = await camera.preview(), await camera.settings()
+            image, settings = await camera.preview(), await camera.settings()
     except (CameraError, TimeoutError) as error:
         return Check("camera", "failed", str(error) or "no answer", "check cable and power of the camera")
-    if picture is None:
+    if image is None:
         remedy = "check its cable and power, then take one by hand (F3, F2 on the screen)"
-        return Check("camera", "warning", f"{camera.identity.model}: no picture", remedy)
+        return Check("camera", "warning", f"{camera.identity.model}: no image", remedy)
     # A preview may be smaller than what is captured.
-    height, width = picture.pixels.shape[:2]
+    height, width = image.pixels.shape[:2]
     width, height = settings.get("region", (0, 0, width, height))[2:]
     return Check("camera", "ok", f"{camera.identity.model} {camera.identity.serial}, {width}×{height}")
 

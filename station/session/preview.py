@@ -1,4 +1,4 @@
-"""Pictures for the screen: small, shared by all watchers, looked at outside the loop, never recorded."""
+"""Images for the screen: small, shared by all watchers, looked at outside the loop, never recorded."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Previewer:
         self._count = 0
 
     async def preview(self, width: int, height: int) -> PreviewImage:
-        """A JPEG that fits into width × height, px; empty without a picture."""
+        """A JPEG that fits into width × height, px; empty without an image."""
         async with self._taking:
             if time.monotonic() - self._taken_s >= PERIOD_S:
                 await self._take()
@@ -54,20 +54,20 @@ class Previewer:
         if context.store.state is StationState.CAPTURING or context.workers.waiting:
             return  # the capture has the camera, or the worker is needed for more than the screen
         try:
-            picture = await context.cell.camera.preview()
+            image = await context.cell.camera.preview()
         except CameraError:
-            picture = None
-        if picture is None:
+            image = None
+        if image is None:
             return
         config = context.cell.config
         try:
-            exposure = (picture.exposure_us, picture.gain_db) if picture.exposure_us else None
+            exposure = (image.exposure_us, image.gain_db) if image.exposure_us else None
             sighting = await context.workers.call(
-                sight, picture.pixels, config.board, config.camera.model, False, exposure, timeout_s=5.0
+                sight, image.pixels, config.board, config.camera.model, False, exposure, timeout_s=5.0
             )
         except WorkerError:
             sighting = None
-        self._picture, self._sighting = picture, sighting
+        self._picture, self._sighting = image, sighting
         self._count += 1
         if sighting is not None and context.store.state is not StationState.WRITING:
             context.store.update(detection=sighting.status)

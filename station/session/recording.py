@@ -148,7 +148,7 @@ class SessionRecording:
         try:
             settings = await self._cell.camera.settings()
         except CameraError as error:
-            settings = {"error": str(error)}  # its pictures will say the same
+            settings = {"error": str(error)}  # its images will say the same
         await asyncio.to_thread(self._open, queue.plan, queue.sha256, first_image, settings)
         await self.save_state(queue)
 
@@ -223,7 +223,7 @@ class SessionRecording:
         return numbered
 
     def attach_plan(self, plan: Plan) -> None:
-        """The plan as it was changed on the way, beside the one it began with. Raises RecordingError.
+        """Attaches the plan as it was changed, beside the one it began with. Raises RecordingError.
 
         JSON: writing YAML would hold the loop up for longer than STOP may wait.
         """
@@ -321,7 +321,7 @@ class SessionRecording:
 
 
 class Logbook(logging.Handler):
-    """The log of `station`, also inside the recording. Events for people get there by their own way."""
+    """The log of `station`, also inside the recording. Events for people get there by themselves."""
 
     def __init__(self, recording: Callable[[], SessionRecording | None]) -> None:
         super().__init__(logging.INFO)

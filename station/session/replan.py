@@ -132,7 +132,7 @@ class Replanner:
         if found.purpose is Purpose.REPLAN:
             self._improved = recording.name
         context.store.event("replanned", "; ".join(found.changes), purpose=found.purpose.value)
-        with contextlib.suppress(RecordingError):  # a disk that fails is told by the next picture
+        with contextlib.suppress(RecordingError):  # a disk that fails is told by the next image
             recording.attach_plan(found.queue.plan)
 
 
@@ -147,7 +147,7 @@ def what_it_brings(found: Advice, index: int) -> tuple[str, ...]:
 
 
 def is_worth_it(found: Improvement) -> bool:
-    """Fewer cut boards, a smaller expected error or a better covered picture."""
+    """Fewer cut boards, a smaller expected error or a better covered image."""
     before, after = found.before, found.after
     if after.cut != before.cut:
         return after.cut < before.cut
@@ -162,7 +162,7 @@ def changes(found: Improvement) -> tuple[str, ...]:
     return (
         f"planned anew: {len(found.plan.poses)} poses, from a mount known to {known}",
         f"expected error at the end: {1000 * before.sigma_m:.2f} → {1000 * after.sigma_m:.2f} mm",
-        f"empty strip along the picture's edges: {before.margin_px:.0f} → {after.margin_px:.0f} px",
+        f"empty strip along the image's edges: {before.margin_px:.0f} → {after.margin_px:.0f} px",
         *cut,
     )
 
@@ -197,7 +197,7 @@ class Estimator:
                 continue
             try:
                 estimate = await self._estimate(camera)
-            except Exception as error:  # this task looks on; it must outlive every picture and every defect
+            except Exception as error:  # this task looks on; it must outlive every image and every defect
                 if not isinstance(error, WorkerError):
                     log.exception("the running estimate failed")
                 context.store.problem(error, said="no running estimate: {}")

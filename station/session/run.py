@@ -208,7 +208,7 @@ class Run:
         """Where the session stands when its approval is used up."""
         context = self._context
         queue = context.require_queue()
-        await context.cell.robot.end_control()  # before sealing: heartbeats end with the run
+        await context.cell.robot.end_control()  # before finishing: heartbeats end with the run
         if context.halting:
             return
         if context.finish_wanted or (not queue.open and not queue.failed):

@@ -29,7 +29,7 @@ from station.protocol import verbs
 from station.protocol.states import RUNNING
 from station.protocol.verbs import Purpose, Verb
 from station.session.context import SessionContext
-from station.session.free_drive import FreeDrive
+from station.session.freedrive import Freedrive
 from station.session.interrupted import close_or_seal, find_interrupted
 from station.session.lease import ApprovalManager, LeaseManager, MotionApproval
 from station.session.monitor import DeviceConnector
@@ -74,7 +74,7 @@ class Session:
         self.supervisor = SessionSupervisor(self.context, self._jogged, ticked, self._void, first)
         self.devices = DeviceConnector(self.context)
         self.previews = Previewer(self.context)
-        self.free_drive = FreeDrive(self.context)
+        self.freedrive = Freedrive(self.context)
         self._replanner = Replanner(self.context)
         self._estimator = Estimator(self.context, self._replanner.hint)
         self._touch_tests = TouchTestPlanner(self.context)
@@ -126,7 +126,7 @@ class Session:
         await self._halt(StationState.STOPPED, f"STOP by {who}. Look at the cell, then acknowledge.", "stop")
 
     async def lease_lost(self, client_id: int, how: str = "The connection of {} was lost.") -> None:
-        """Nobody commands any more: decelerate at once; go on only with a new approval."""
+        """Nobody commands any more: decelerate at once; continue only with a new approval."""
         holder = self.leases.lease.holder
         if not self.leases.release(client_id):
             return
@@ -212,7 +212,7 @@ class Session:
         context = self.context
         self.permit(verbs.Go, client_id)
         self._require_run_ended()
-        if self.free_drive.taking:
+        if self.freedrive.taking:
             raise _still_ending("freedrive")
         joints = context.cell.robot.latest().joints_rad
         plan_sha256 = context.queue.sha256 if context.queue else ""
@@ -248,13 +248,13 @@ class Session:
         """Finishes what is there; a pose under way is taken first."""
         self.permit(verbs.Finish, client_id)
         self._void()
-        if self.store.state in RUNNING and not self.free_drive.taking:
+        if self.store.state in RUNNING and not self.freedrive.taking:
             self.context.finish_wanted = True
             self.store.event("finish-wanted", "finish after this pose")
             return
         if self.context.recording is None:
             raise RefusedError("Nothing is recorded yet.", code="nothing-recorded")
-        await asyncio.gather(self._run_ended(), self.free_drive.last_picture())
+        await asyncio.gather(self._run_ended(), self.freedrive.last_picture())
         self._require_state(verbs.Finish)
         self._run = closing = asyncio.create_task(close_or_seal(self.context))  # nothing new begins beside it
         await asyncio.wait({closing})
@@ -339,17 +339,17 @@ class Session:
         return result
 
     async def switch_free_drive(self, client_id: int, on: bool, auto: bool) -> None:
-        self.permit(verbs.FreeDrive, client_id)
+        self.permit(verbs.Freedrive, client_id)
         self._void()
         if on:
             await self._run_ended()
-            await self.free_drive.begin(auto)
+            await self.freedrive.begin(auto)
         else:
-            self.free_drive.end()
+            self.freedrive.end()
 
     async def record(self, client_id: int) -> int:
         self.permit(verbs.Record, client_id)
-        return await self.free_drive.record()
+        return await self.freedrive.record()
 
     def permit(self, verb: type[Verb[Any]], client_id: int) -> None:
         """RefusedError unless the table of verbs allows it to this client now."""

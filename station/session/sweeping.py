@@ -32,9 +32,9 @@ class SweepRun(Run):
     async def _open_recording(self) -> None:
         """StationError without the board in view: a sweep that sees none shows nothing."""
         context, config = self._context, self._context.cell.config
-        picture = await take_image(context)
+        image = await take_image(context)
         seen = await context.workers.call(
-            sight, picture.pixels, config.board, config.camera.model, timeout_s=SIGHT_TIMEOUT_S
+            sight, image.pixels, config.board, config.camera.model, timeout_s=SIGHT_TIMEOUT_S
         )
         if not seen.status.found:
             raise CameraError(
@@ -51,7 +51,7 @@ class SweepRun(Run):
                 try:
                     await self._swings()
                 finally:
-                    self._ended.set()  # a camera may swallow being cancelled, just when its picture comes
+                    self._ended.set()  # a camera may swallow being cancelled, just when its image comes
         except ExceptionGroup as failed:
             raise failed.exceptions[0] from None  # of two the first one tells the cause
         if not self._context.halting:
@@ -101,9 +101,9 @@ class SweepRun(Run):
             else:
                 failures = 0
 
-    def _keep(self, recording: SessionRecording, picture: Image) -> Image:
+    def _keep(self, recording: SessionRecording, image: Image) -> Image:
         """Numbered and handed to the recorder; RecordingError when that cannot keep up."""
-        numbered = recording.number(picture)
+        numbered = recording.number(image)
         recording.image(numbered)
         self._taken += 1
         return numbered
@@ -112,9 +112,9 @@ class SweepRun(Run):
         """Every frame, straight from the camera's thread; what is shown of them comes from the loop."""
         newest: list[Image] = []
 
-        def keep(picture: Image) -> None:
+        def keep(image: Image) -> None:
             if not self._ended.is_set():  # the arm stopped while it was on its way
-                newest[:] = [self._keep(recording, picture)]
+                newest[:] = [self._keep(recording, image)]
 
         async def show() -> None:
             while True:

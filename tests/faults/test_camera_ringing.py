@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from station.analysis.picture_motion import picture_motion
+from station.analysis.image_motion import image_motion
 from station.simulation.camera import RenderedCamera
 from station.simulation.scenes import make_cell
 
@@ -13,7 +13,7 @@ pytestmark = pytest.mark.process
 
 async def motion_px(camera: RenderedCamera) -> float:
     looks = [await camera.glimpse() for _ in range(3)]
-    found = picture_motion([look.pixels for look in looks if look is not None], make_cell().camera.width)
+    found = image_motion([look.pixels for look in looks if look is not None], make_cell().camera.width)
     assert found is not None
     return found
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from recordings.reader import open_recording
-from station.analysis.picture_motion import board_box, picture_motion
+from station.analysis.image_motion import board_box, image_motion
 from station.cell.config import StillnessConfig
 from station.cell.errors import CameraError
 from station.cell.plan import ExpectedView
@@ -39,14 +39,14 @@ def seen(right_px: float = 0.0, noise: float = 0.0, seed: int = 0) -> np.ndarray
 @pytest.mark.parametrize("shift_px", [0.0, 0.3, 1.0, 7.5, 40.0])
 def test_the_shift_between_noisy_pictures_is_measured(shift_px: float) -> None:
     pictures = [seen(0.0, 7.0, 1), seen(0.0, 7.0, 2), seen(shift_px, 7.0, 3)]
-    motion_px = picture_motion(pictures)
+    motion_px = image_motion(pictures)
     assert motion_px == pytest.approx(shift_px, abs=0.3 if shift_px else 0.05)
-    assert picture_motion(pictures, full_width=1280) == pytest.approx(2 * (motion_px or 0))
+    assert image_motion(pictures, full_width=1280) == pytest.approx(2 * (motion_px or 0))
 
 
 def test_a_ringing_that_fits_one_gap_shows_in_the_other() -> None:
-    assert picture_motion([seen(3.0), seen(0.0), seen(0.0)]) == pytest.approx(3.0, abs=0.15)
-    assert picture_motion([seen(0.0), seen(3.0), seen(0.0)]) == pytest.approx(3.0, abs=0.15)
+    assert image_motion([seen(3.0), seen(0.0), seen(0.0)]) == pytest.approx(3.0, abs=0.15)
+    assert image_motion([seen(0.0), seen(3.0), seen(0.0)]) == pytest.approx(3.0, abs=0.15)
 
 
 @pytest.mark.parametrize("kind", ["colour", "16 bit"])
@@ -56,12 +56,12 @@ def test_every_kind_of_picture_is_understood(kind: str) -> None:
         pair = [cv2.cvtColor(picture, cv2.COLOR_GRAY2BGR) for picture in pair]
     else:
         pair = [picture.astype(np.uint16) << 8 for picture in pair]
-    assert picture_motion(pair) == pytest.approx(5.0, abs=0.15)
+    assert image_motion(pair) == pytest.approx(5.0, abs=0.15)
 
 
 def test_a_flat_picture_says_nothing() -> None:
     noise = np.random.default_rng(5).normal(90, 2, (2, 480, 640)).clip(0, 255).astype(np.uint8)
-    assert picture_motion(list(noise)) is None
+    assert image_motion(list(noise)) is None
 
 
 def test_a_board_that_swings_before_a_resting_wall_is_seen_where_it_should_be() -> None:
@@ -69,7 +69,7 @@ def test_a_board_that_swings_before_a_resting_wall_is_seen_where_it_should_be() 
     for x, picture in zip((200, 206), pair, strict=True):
         picture[160:280, x : x + 160] = 255 - seen()[160:280, 200:360] // 2
     box = board_box(ExpectedView(0.8, 0.0, 0.0, (280.0, 220.0), 120 * 160 / (640 * 480)), 640, 480)
-    assert picture_motion(pair, 640, box) == pytest.approx(6.0, abs=0.8)
+    assert image_motion(pair, 640, box) == pytest.approx(6.0, abs=0.8)
 
 
 async def recorded(rig: Rig) -> list[float | None]:

@@ -13,7 +13,7 @@ from station.cell.errors import RefusedError, TriggerError
 from station.cell.status import StationState as S
 from station.cell.stillness import StillnessMonitor
 from station.protocol.verbs import Drop, Purpose
-from station.session import free_drive
+from station.session import freedrive
 from station.session.queue import PoseQueue
 from station.session.recording import SessionRecording
 from tests.station.session_rig import POSES, Rig, raises, sealed
@@ -61,7 +61,7 @@ async def test_auto_record_waits_for_an_arm_that_is_still_guided(
 ) -> None:
     rig = bare_rig
     monkeypatch.setattr(StillnessMonitor, "at_rest", False)
-    monkeypatch.setattr(free_drive, "WATCH_PERIOD_S", 0.005)
+    monkeypatch.setattr(freedrive, "WATCH_PERIOD_S", 0.005)
     await rig.session.switch_free_drive(1, True, auto=True)
     await asyncio.sleep(0.05)
     assert rig.state is S.FREE_DRIVE and rig.pose_states == []

@@ -215,7 +215,7 @@ class Desk(App[None]):
     async def action_freedrive(self) -> None:
         """Capture by hand: the operator holds the pendant's freedrive button, the station only looks."""
         if self.status is not None:
-            await self.ask(verbs.FreeDrive(self.status.state is not StationState.FREE_DRIVE))
+            await self.ask(verbs.Freedrive(self.status.state is not StationState.FREE_DRIVE))
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_record(self) -> None:

@@ -1,0 +1,83 @@
+"""Recordings of calibration sessions: write, open, look into, rescue, import and export them.
+
+    from pathlib import Path
+    from recordings import RecordingError, open_recording
+
+    try:
+        recording = open_recording(Path("session.mcap"))
+    except RecordingError as error:
+        print(error.code, error.values, error.remedy)
+        raise
+    for view, image in recording.images():
+        print(view.index, view.base_from_flange, image.pixels.shape, image.stamps.host_monotonic_ns)
+    joints = [state.joints_rad for state in recording.robot_states()]
+
+Poses are `base_from_flange`, 4×4 in metres; angles are radians, stamps ns or s as their names end. Errors are
+`RecordingError`s with `code`, `values` and `remedy`. Names are loaded at their first use. The file format is
+docs/recording-format.md. Everything else is private.
+"""
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from recordings.errors import BadImageError as BadImageError
+    from recordings.errors import CodedError as CodedError
+    from recordings.errors import CorruptRecordingError as CorruptRecordingError
+    from recordings.errors import MissingSegmentError as MissingSegmentError
+    from recordings.errors import RecordingError as RecordingError
+    from recordings.errors import UnfinishedRecordingError as UnfinishedRecordingError
+    from recordings.exporters.excerpt import write_excerpt as write_excerpt
+    from recordings.exporters.folder import export_recording as export_recording
+    from recordings.importers.bag import import_bag as import_bag
+    from recordings.importers.folder import import_folder as import_folder
+    from recordings.info import recording_info as recording_info
+    from recordings.reader import Recording as Recording
+    from recordings.reader import open_recording as open_recording
+    from recordings.recorder import Recorder as Recorder
+    from recordings.recover import recover_recording as recover_recording
+    from recordings.schema.messages import BoardKind as BoardKind
+    from recordings.schema.messages import BoardSpec as BoardSpec
+    from recordings.schema.messages import CameraModel as CameraModel
+    from recordings.schema.messages import Image as Image
+    from recordings.schema.messages import RobotState as RobotState
+    from recordings.schema.messages import SessionInfo as SessionInfo
+    from recordings.schema.messages import Stamps as Stamps
+    from recordings.schema.messages import View as View
+    from recordings.segment import RecordingSegment as RecordingSegment
+    from recordings.writer import RecordingWriter as RecordingWriter
+
+_MODULES = {
+    "BadImageError": "errors",
+    "BoardKind": "schema.messages",
+    "BoardSpec": "schema.messages",
+    "CameraModel": "schema.messages",
+    "CodedError": "errors",
+    "CorruptRecordingError": "errors",
+    "Image": "schema.messages",
+    "MissingSegmentError": "errors",
+    "Recorder": "recorder",
+    "Recording": "reader",
+    "RecordingError": "errors",
+    "RecordingSegment": "segment",
+    "RecordingWriter": "writer",
+    "RobotState": "schema.messages",
+    "SessionInfo": "schema.messages",
+    "Stamps": "schema.messages",
+    "UnfinishedRecordingError": "errors",
+    "View": "schema.messages",
+    "export_recording": "exporters.folder",
+    "import_bag": "importers.bag",
+    "import_folder": "importers.folder",
+    "open_recording": "reader",
+    "recording_info": "info",
+    "recover_recording": "recover",
+    "write_excerpt": "exporters.excerpt",
+}
+__all__ = list(_MODULES)
+
+
+def __getattr__(name: str) -> object:
+    if name not in _MODULES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f"{__name__}.{_MODULES[name]}"), name)

@@ -64,7 +64,7 @@ class Recovery:
         )
 
 
-def recover(source: Path, output: Path | None = None) -> list[Recovery]:
+def recover_recording(source: Path, output: Path | None = None) -> list[Recovery]:
     """A file, or every file of a session folder. The result is read back strictly before it gets its name.
 
     Without `output` the recovered file takes the recording's name and the damaged one is kept beside it as

@@ -14,8 +14,7 @@ import typer
 from recordings.exporters import Target
 from recordings.plain_text import plain_text
 from recordings.reader import open_recording
-from recordings.recover import Recovery
-from recordings.recover import recover as recover_recording
+from recordings.recover import Recovery, recover_recording
 
 Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session's folder", show_default=False)]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object and nothing else.")]

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from recordings.errors import RecordingError
-from recordings.recover import recover
+from recordings.recover import recover_recording
 from recordings.schema.messages import RobotState
 from station.analysis.estimation import CapturedView
 from station.analysis.pool import Workers
@@ -97,7 +97,7 @@ class SessionContext:
         await recording.released()
         async with recording.recovering:
             if recording.unfinished_segments:
-                for found in await self.workers.call(recover, recording.folder):
+                for found in await self.workers.call(recover_recording, recording.folder):
                     self.store.event("recovered", f"recovered {found.text}")
             recording.count_segments()
 

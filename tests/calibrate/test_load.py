@@ -17,7 +17,7 @@ from recordings.errors import CorruptRecordingError, MissingSegmentError
 from recordings.images import encode_png
 from recordings.manifest import enter_part
 from recordings.reader import Recording, open_recording
-from recordings.recover import recover
+from recordings.recover import recover_recording
 from recordings.writer import RecordingWriter
 from tests.calibrate.calling import raises_code
 
@@ -122,7 +122,7 @@ def test_a_lost_part_is_never_passed_over(source: Recording, tmp_path: Path) -> 
     for path in (tmp_path, tmp_path / "session-1.mcap"):
         with pytest.raises(MissingSegmentError):
             solve_recording(path)
-    recover(tmp_path)
+    recover_recording(tmp_path)
     job = solve_recording(tmp_path)
     assert len(job.calibration.quality.warnings) == 1
     assert len(job.calibration.views.used) == 10

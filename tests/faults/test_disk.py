@@ -13,7 +13,7 @@ import pytest
 
 from recordings import manifest
 from recordings.manifest import enter_part, read_manifest
-from recordings.recover import recover
+from recordings.recover import recover_recording
 from station.cell.session_folder import list_sessions, new_session_folder
 from tests.recordings.small_recording import refused, write_small
 
@@ -26,7 +26,7 @@ UNTIL_IT_IS_FULL = textwrap.dedent(
     from recordings.errors import RecordingError
     from recordings.reader import open_recording
     from recordings.recorder import Recorder
-    from recordings.recover import recover
+    from recordings.recover import recover_recording
     from tests.recordings.small_recording import make_info, make_picture, make_state, make_view
 
     disk, elsewhere = Path(sys.argv[1]), Path(sys.argv[2])
@@ -43,7 +43,7 @@ UNTIL_IT_IS_FULL = textwrap.dedent(
     except RecordingError as error:
         print(error)
     recorder.close()
-    recover(disk / "a.mcap.part", elsewhere / "a.mcap")
+    recover_recording(disk / "a.mcap.part", elsewhere / "a.mcap")
     print(acknowledged, len(open_recording(elsewhere / "a.mcap").views()))
     """
 )
@@ -56,7 +56,7 @@ def test_27_a_killed_session_is_listed_as_unsealed_until_it_is_recovered(tmp_pat
     (folder / "session.mcap.part").write_bytes(data[: len(data) // 2])
     (listed,) = list_sessions(tmp_path)
     assert not listed["sealed"]
-    recover(folder)
+    recover_recording(folder)
     (listed,) = list_sessions(tmp_path)
     assert listed["sealed"]
     assert listed["recording"] == str(folder / "session.mcap")

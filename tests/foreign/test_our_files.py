@@ -9,7 +9,7 @@ import pytest
 from recordings.exporters.excerpt import write_excerpt
 from recordings.exporters.folder import Target, export_recording
 from recordings.reader import open_recording
-from recordings.recover import recover
+from recordings.recover import recover_recording
 from recordings.schema.messages import CaptureEvent, Stamps
 from recordings.writer import RecordingWriter
 from tests.foreign.judges import JUDGES
@@ -51,7 +51,7 @@ def recovered(folder: Path) -> Path:
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data[:-3000])
-    return recover(path, folder / "saved.mcap")[0].path
+    return recover_recording(path, folder / "saved.mcap")[0].path
 
 
 def ros2_export(folder: Path) -> Path:

@@ -10,7 +10,7 @@ from mcap.reader import make_reader
 from mcap.writer import CompressionType, Writer
 
 from recordings.reader import open_recording
-from recordings.recover import recover
+from recordings.recover import recover_recording
 from tests.recordings.small_recording import make_state, make_view, write_small
 
 WAYS: dict[str, dict[str, Any]] = {
@@ -71,7 +71,7 @@ def test_one_damaged_chunk_of_a_packed_recording_costs_no_more_than_itself(tmp_p
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data[:-1000])
-    (result,) = recover(path, tmp_path / "saved.mcap")
+    (result,) = recover_recording(path, tmp_path / "saved.mcap")
     views = open_recording(tmp_path / "saved.mcap").views()
     assert views == [make_view(view.index) for view in views]
     assert len(views) >= 14, "a chunk of 4 kB holds some four poses' parts"

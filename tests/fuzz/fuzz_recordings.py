@@ -25,7 +25,7 @@ with atheris.instrument_imports(include=["recordings"]):
     from recordings.errors import RecordingError
     from recordings.mcap import checksum
     from recordings.reader import open_recording
-    from recordings.recover import recover
+    from recordings.recover import recover_recording
     from recordings.writer import RecordingWriter
 
 from tests.recordings.small_recording import (  # after instrumentation
@@ -76,7 +76,7 @@ def read_all(path: Path) -> None:
 def one_input(data: bytes) -> None:
     source, output = SCRATCH / "a.mcap", SCRATCH / "b.mcap"
     source.write_bytes(data)
-    for attempt in (lambda: read_all(source), lambda: read_all(recover(source, output)[0].path)):
+    for attempt in (lambda: read_all(source), lambda: read_all(recover_recording(source, output)[0].path)):
         with suppress(RecordingError):
             attempt()
     output.unlink(missing_ok=True)

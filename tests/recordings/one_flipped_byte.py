@@ -18,7 +18,7 @@ from mcap.stream_reader import StreamReader, breakup_chunk
 
 from recordings.errors import RecordingError
 from recordings.reader import open_recording
-from recordings.recover import recover
+from recordings.recover import recover_recording
 from recordings.schema.definitions import decode
 from recordings.schema.messages import View
 from recordings.schema.topics import Topic
@@ -78,7 +78,7 @@ def cost_of_flips(path: Path, places: list[int], unsealed: bool) -> Cost:
             damaged.write_bytes(flipped)
             cost.places += 1
             try:
-                recover(damaged, saved)
+                recover_recording(damaged, saved)
             except RecordingError:
                 cost.unreadable += 1
                 continue

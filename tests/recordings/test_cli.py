@@ -15,7 +15,7 @@ from recordings.cli import main
 from recordings.info import recording_info
 from recordings.manifest import enter_part
 from recordings.reader import open_recording
-from recordings.recover import recover
+from recordings.recover import recover_recording
 from recordings.schema.messages import CaptureEvent, Stamps
 from recordings.writer import RecordingWriter
 from tests.command_line import call
@@ -135,7 +135,7 @@ def test_a_missing_file_is_one_sentence_and_1(tmp_path: Path, command: str) -> N
     [
         (b"", open_recording, "empty-file"),
         (b"hello", open_recording, "damaged-recording"),
-        (b"hello", recover, "nothing-to-save"),
+        (b"hello", recover_recording, "nothing-to-save"),
         (b"\x89MCAP0", open_recording, "unfinished-recording"),
     ],
 )
@@ -165,7 +165,7 @@ def test_a_name_is_printed_as_it_is(small: Path, tmp_path: Path) -> None:
 def test_a_recording_that_is_being_written_is_left_alone(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", make_info()):
         with refused("in-use"):
-            recover(tmp_path / "a.mcap.part")
+            recover_recording(tmp_path / "a.mcap.part")
         with refused("unfinished-recording"):
             open_recording(tmp_path / "a.mcap")
 

@@ -10,7 +10,7 @@ import pytest
 from recordings.errors import RecordingError
 from recordings.mcap import checksum
 from recordings.reader import open_recording
-from recordings.recover import recover
+from recordings.recover import recover_recording
 
 CORPUS = sorted((Path(__file__).parent / "corpus").iterdir())
 
@@ -22,7 +22,7 @@ def test_a_kept_input_gives_a_recording_or_a_recording_error(
     monkeypatch.setattr(checksum, "crc32", lambda data, value=0: 0)
     path = tmp_path / "a.mcap"
     path.write_bytes(source.read_bytes())
-    for read in (lambda: path, lambda: recover(path, tmp_path / "b.mcap")[0].path):
+    for read in (lambda: path, lambda: recover_recording(path, tmp_path / "b.mcap")[0].path):
         with suppress(RecordingError):
             recording = open_recording(read())
             list(recording.robot_states())

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from recordings.reader import open_recording
-from recordings.recover import recover
+from recordings.recover import recover_recording
 from tests.recordings.small_recording import make_image
 
 ROOT = Path(__file__).parents[2]
@@ -64,7 +64,7 @@ def start(path: Path, file_size_limit: int | None = None) -> subprocess.Popen[st
 
 def check_what_is_left(part: Path, acknowledged: list[int]) -> None:
     """Every acknowledged pose is there, unchanged, and at most one that was on its way beside them."""
-    recover(part)
+    recover_recording(part)
     recording = open_recording(part.with_suffix(""))
     views = recording.views()
     assert [view.index for view in views] == list(range(len(views)))

@@ -9,7 +9,7 @@ import pytest
 
 from recordings.errors import CorruptRecordingError, RecordingError, UnfinishedRecordingError
 from recordings.reader import Recording, open_recording
-from recordings.recover import recover
+from recordings.recover import recover_recording
 from recordings.schema.messages import RobotState, View
 from recordings.schema.topics import Topic
 from tests.recordings.small_recording import make_state, make_view, write_small
@@ -84,7 +84,7 @@ def check_recovery_of_cuts(path: Path, every: int) -> None:
     for length in range(0, len(data), every):
         cut.write_bytes(data[:length])
         try:
-            (result,) = recover(cut, output)
+            (result,) = recover_recording(cut, output)
         except RecordingError as error:
             assert error.code == "nothing-to-save"
             assert saved_before == (0, 0)
@@ -112,7 +112,7 @@ def check_recovery_of_flips(path: Path, every: int) -> None:
     whole = 0
     for flipped in flips(data, every):
         damaged.write_bytes(flipped)
-        (result,) = recover(damaged, output)
+        (result,) = recover_recording(damaged, output)
         views, states = assert_part_of_the_original(open_recording(output))
         assert views >= 2
         assert (views, states) == (3, 9) or result.lost_bytes > 0
@@ -138,7 +138,7 @@ def test_one_damaged_pose_costs_only_that_pose(tmp_path: Path) -> None:
     path.write_bytes(data)
     with pytest.raises(CorruptRecordingError):
         open_recording(path)
-    (result,) = recover(path)
+    (result,) = recover_recording(path)
     assert [view.index for view in open_recording(path).views()] == [0, 1, 2, 4, 5]
     assert any("pose 4 (" in loss for loss in result.losses)
     assert result.kept_original == path.with_name("a.mcap.damaged")

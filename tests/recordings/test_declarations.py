@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from recordings.reader import open_recording
-from recordings.recover import recover
+from recordings.recover import recover_recording
 from recordings.schema.topics import Topic, identify, schema_bytes
 from tests.recordings.one_flipped_byte import chunks_of_poses, cost_of_flips
 from tests.recordings.small_recording import make_info, make_state, make_view, write_small
@@ -50,7 +50,7 @@ def test_every_declaration_of_an_unsealed_file_may_be_lost(tmp_path: Path) -> No
             data[at + 20] ^= 1
     damaged, saved = tmp_path / "damaged.mcap", tmp_path / "saved.mcap"
     damaged.write_bytes(data)
-    recover(damaged, saved)
+    recover_recording(damaged, saved)
     again = open_recording(saved)
     assert again.views() == whole.views()
     assert list(again.robot_states()) == list(whole.robot_states())

@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from recordings.errors import CorruptRecordingError, RecordingError
 from recordings.mcap.records import Opcode
 from recordings.reader import open_recording
-from recordings.recover import recover
+from recordings.recover import recover_recording
 from recordings.schema.definitions import encode
 from recordings.schema.messages import RobotState
 from recordings.schema.topics import Topic
@@ -256,7 +256,7 @@ def test_a_decompression_bomb_is_refused_at_once(tmp_path: Path, compression: st
     path.write_bytes(path.read_bytes().replace(struct.pack("<Q", BOMB_BYTES), struct.pack("<Q", 4_000_000)))
     with refused("damaged-recording"):
         open_recording(path)
-    recover(path)
+    recover_recording(path)
     assert time.perf_counter() - start_s < 1.0
     assert resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before < 100 * 1024
 
@@ -293,7 +293,7 @@ def test_any_bytes_give_a_recording_or_a_recording_error(small: Path, data: st.D
     damaged, saved = small.with_name("edited.mcap"), small.with_name("saved.mcap")
     damaged.write_bytes(content)
     saved.unlink(missing_ok=True)
-    for read in (lambda: damaged, lambda: recover(damaged, saved)[0].path):
+    for read in (lambda: damaged, lambda: recover_recording(damaged, saved)[0].path):
         try:
             recording = open_recording(read())
         except RecordingError:

@@ -16,7 +16,7 @@ from recordings.errors import CorruptRecordingError
 from recordings.exporters.excerpt import write_excerpt
 from recordings.manifest import MANIFEST_FILE, Manifest, enter_part, read_manifest
 from recordings.reader import open_recording
-from recordings.recover import recover
+from recordings.recover import recover_recording
 from recordings.schema.messages import SessionInfo
 from recordings.writer import RecordingWriter
 from tests.recordings.small_recording import make_info, refused, write_small
@@ -64,7 +64,7 @@ def test_all_parts_missing_is_noticed(session: Path) -> None:
 
 def test_recover_gives_a_missing_part_up_and_every_reader_says_so(session: Path, tmp_path: Path) -> None:
     kept = (session / "session-3.mcap").rename(tmp_path / "found-later.mcap")
-    *whole, lost = recover(session)
+    *whole, lost = recover_recording(session)
     assert not any(result.missing or result.rebuilt for result in whole)
     assert lost.missing
     assert lost.path.name == "session-3.mcap"
@@ -79,7 +79,7 @@ def test_recover_gives_a_missing_part_up_and_every_reader_says_so(session: Path,
 
 def test_recover_makes_the_list_where_there_was_none(tmp_path: Path) -> None:
     write_small(tmp_path / "session-2.mcap", info=make_info(part=2))
-    assert [result.missing for result in recover(tmp_path)] == [False, True]
+    assert [result.missing for result in recover_recording(tmp_path)] == [False, True]
     assert read_manifest(tmp_path) == Manifest("test-cell", {1: "", 2: "session-2.mcap"}, [1])
     assert len(open_recording(tmp_path / "session-2.mcap").losses) == 1
 
@@ -87,13 +87,13 @@ def test_recover_makes_the_list_where_there_was_none(tmp_path: Path) -> None:
 def test_a_part_that_held_nothing_is_not_missing(session: Path) -> None:
     (session / "session-2.mcap").unlink()
     (session / "session-2.mcap.part").write_bytes(b"\x89MCAP0\r\n")
-    recover(session)
+    recover_recording(session)
     assert [part.info.part for part in open_recording(session).segments] == [1, 3]
 
 
 def test_a_sealed_part_of_which_nothing_is_left_is_missing(session: Path) -> None:
     (session / "session-3.mcap").write_bytes(b"\x00" * 500)
-    assert [result.missing for result in recover(session)] == [False, False, False, True]
+    assert [result.missing for result in recover_recording(session)] == [False, False, False, True]
     assert len(open_recording(session).losses) == 1
 
 
@@ -101,7 +101,7 @@ def test_an_interrupted_file_without_a_list_is_doubted(tmp_path: Path) -> None:
     """The killed part 1 of a session that went on, copied without the rest."""
     data = write_small(tmp_path / "whole.mcap").read_bytes()
     (tmp_path / "session.mcap.part").write_bytes(data[: len(data) * 2 // 5])
-    recover(tmp_path / "session.mcap.part")
+    recover_recording(tmp_path / "session.mcap.part")
     assert len(open_recording(tmp_path / "session.mcap").losses) == 2, "what was cut, and what may follow"
     assert open_recording(tmp_path / "whole.mcap").losses == ()
 
@@ -110,10 +110,10 @@ def test_what_a_first_recovery_lost_is_not_forgotten_by_a_second(tmp_path: Path)
     path = write_small(tmp_path / "a.mcap", poses=5)
     data = path.read_bytes()
     path.write_bytes(data[: len(data) * 2 // 3])
-    (first,) = recover(path)
+    (first,) = recover_recording(path)
     data = path.read_bytes()
     path.write_bytes(data[:-3])
-    recover(path)
+    recover_recording(path)
     assert open_recording(path).segments[0].lost_bytes >= first.lost_bytes > 0
 
 
@@ -141,7 +141,7 @@ def test_the_list_of_another_session_does_not_speak_for_a_file_beside_it(session
 )
 def test_a_damaged_list_is_refused(session: Path, content: bytes) -> None:
     (session / MANIFEST_FILE).write_bytes(content)
-    for read in (lambda: open_recording(session), lambda: recover(session)):
+    for read in (lambda: open_recording(session), lambda: recover_recording(session)):
         with refused("damaged-manifest"):
             read()
 

@@ -13,7 +13,7 @@ import pytest
 
 from recordings.files import create_exclusively
 from recordings.reader import open_recording
-from recordings.recover import recover
+from recordings.recover import recover_recording
 from recordings.schema.messages import CameraModel
 from recordings.schema.topics import Topic
 from recordings.writer import RecordingWriter
@@ -33,7 +33,7 @@ def write_unfinished(path: Path, poses: int = 2, part: int = 1) -> Path:
 def test_an_unfinished_file_takes_its_name_and_the_damaged_one_is_kept(tmp_path: Path) -> None:
     part = write_unfinished(tmp_path / "a.mcap")
     before = part.read_bytes()
-    (result,) = recover(part)
+    (result,) = recover_recording(part)
     assert result.rebuilt
     assert (result.poses, result.pictures, result.lost_bytes) == (2, 2, 0)
     recording = open_recording(tmp_path / "a.mcap")
@@ -46,14 +46,14 @@ def test_an_unfinished_file_takes_its_name_and_the_damaged_one_is_kept(tmp_path:
 
 def test_with_an_output_the_original_is_untouched(tmp_path: Path) -> None:
     part = write_unfinished(tmp_path / "a.mcap")
-    (result,) = recover(part, tmp_path / "b.mcap")
+    (result,) = recover_recording(part, tmp_path / "b.mcap")
     assert result.kept_original == part
     assert len(open_recording(tmp_path / "b.mcap").views()) == 2
 
 
 def test_a_whole_file_that_only_missed_its_rename_is_renamed(small: Path) -> None:
     part = small.rename(small.with_name("small.mcap.part"))
-    (result,) = recover(part)
+    (result,) = recover_recording(part)
     assert not result.rebuilt
     assert result.path == small
     assert len(open_recording(small).views()) == 3
@@ -61,7 +61,7 @@ def test_a_whole_file_that_only_missed_its_rename_is_renamed(small: Path) -> Non
 
 def test_a_whole_file_is_left_alone(small: Path) -> None:
     before = small.read_bytes()
-    (result,) = recover(small)
+    (result,) = recover_recording(small)
     assert not result.rebuilt
     assert small.read_bytes() == before
 
@@ -70,7 +70,7 @@ def test_a_file_that_is_being_written_is_refused(tmp_path: Path) -> None:
     with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
         writer.image(make_picture(0))
         with refused("in-use"):
-            recover(writer.part_path)
+            recover_recording(writer.part_path)
 
 
 def test_nothing_is_overwritten(tmp_path: Path) -> None:
@@ -78,7 +78,7 @@ def test_nothing_is_overwritten(tmp_path: Path) -> None:
     taken = write_small(tmp_path / "b.mcap")
     before = taken.read_bytes()
     with refused("exists"):
-        recover(part, taken)
+        recover_recording(part, taken)
     assert taken.read_bytes() == before
 
 
@@ -90,7 +90,7 @@ def test_a_picture_without_its_view_and_a_view_without_its_picture(tmp_path: Pat
     data = bytearray(path.read_bytes())
     data[offset + 50] ^= 1
     path.write_bytes(data)
-    (result,) = recover(path)
+    (result,) = recover_recording(path)
     assert [view.index for view in open_recording(path).views()] == [0, 2]
     assert any("pose 2 (" in loss for loss in result.losses)
 
@@ -100,14 +100,14 @@ def test_a_file_with_nothing_in_it_says_so_and_leaves_nothing(tmp_path: Path, co
     part = tmp_path / "a.mcap.part"
     part.write_bytes(content)
     with refused("nothing-to-save"):
-        recover(part)
+        recover_recording(part)
     assert list(tmp_path.iterdir()) == [part]
 
 
 def test_a_folder_is_recovered_file_by_file(tmp_path: Path) -> None:
     write_small(tmp_path / "part-1.mcap")
     write_unfinished(tmp_path / "part-2.mcap", part=2)
-    results = recover(tmp_path)
+    results = recover_recording(tmp_path)
     assert [result.rebuilt for result in results] == [False, True]
     assert [(v.index, v.part) for v in open_recording(tmp_path).views()] == [(0, 2), (1, 2), (2, 1)]
 
@@ -116,7 +116,7 @@ def test_what_an_earlier_recovery_kept_is_kept(tmp_path: Path) -> None:
     for _ in range(3):
         path = tmp_path / "a.mcap"
         path.unlink(missing_ok=True)
-        recover(write_unfinished(path))
+        recover_recording(write_unfinished(path))
     names = {p.name for p in tmp_path.iterdir()}
     assert names == {"a.mcap", "a.mcap.part.damaged", "a.mcap.part.damaged-2", "a.mcap.part.damaged-3"}
 
@@ -134,7 +134,7 @@ def test_a_lost_dark_picture_does_not_make_recovery_slow(tmp_path: Path) -> None
     data[open_recording(path).segments[0].messages(Topic.RAW_IMAGE).addresses[1] - 40] ^= 1
     path.write_bytes(data)
     start_s = time.perf_counter()
-    recover(path)
+    recover_recording(path)
     assert time.perf_counter() - start_s < 8
     assert [view.index for view in open_recording(path).views()] == [0, 2]
 
@@ -146,7 +146,7 @@ def test_after_a_destroyed_record_head_the_search_finds_the_next_whole_chunk(tmp
     head = data.rindex(b"\x06", 0, at - 700)  # of pose 1's chunk, or a byte before it
     data[head : head + 9] = b"\xff" * 9
     path.write_bytes(data)
-    recover(path)
+    recover_recording(path)
     assert {0, 2, 3} <= {view.index for view in open_recording(path).views()}
 
 
@@ -155,7 +155,7 @@ def test_what_a_killed_recovery_left_is_no_obstacle(small: Path) -> None:
     small.write_bytes(data[:-9000])
     leftover = small.with_name("small.mcap.recovering")
     leftover.write_bytes(b"half")
-    (result,) = recover(small)
+    (result,) = recover_recording(small)
     assert result.poses == 3
     assert not leftover.exists()
 
@@ -164,7 +164,7 @@ def test_what_a_killed_recovery_left_is_no_obstacle(small: Path) -> None:
 def test_a_recovery_killed_between_its_renames_can_be_done_again(tmp_path: Path, unfinished: bool) -> None:
     program = (
         "import os, pathlib, signal, sys\n"
-        "from recordings.recover import recover\n"
+        "from recordings.recover import recover_recording\n"
         "left = int(sys.argv[2])\n"
         "def mortal(call):\n"
         "    def made(*given, **named):\n"
@@ -175,7 +175,7 @@ def test_a_recovery_killed_between_its_renames_can_be_done_again(tmp_path: Path,
         "        return call(*given, **named)\n"
         "    return made\n"
         "os.link, os.replace, os.rename = map(mortal, (os.link, os.replace, os.rename))\n"
-        "recover(pathlib.Path(sys.argv[1]))\n"
+        "recover_recording(pathlib.Path(sys.argv[1]))\n"
     )
     kills = 0
     while True:
@@ -185,7 +185,7 @@ def test_a_recovery_killed_between_its_renames_can_be_done_again(tmp_path: Path,
         if not unfinished:
             path.write_bytes(path.read_bytes()[:-9000])
         done = subprocess.run([sys.executable, "-c", program, path, str(kills)], check=False)
-        (result,) = recover(folder)
+        (result,) = recover_recording(folder)
         assert (result.path, result.poses) == (folder / "a.mcap", 2 if unfinished else 3)
         assert list(folder.glob("*.damaged"))
         if done.returncode == 0:
@@ -203,7 +203,7 @@ def test_where_files_have_one_name_only_they_are_recovered_too(
     data = small.read_bytes()[:-9000]
     small.write_bytes(data)
     monkeypatch.setattr(os, "link", refused)
-    (result,) = recover(small)
+    (result,) = recover_recording(small)
     assert result.kept_original is not None
     assert result.kept_original.read_bytes() == data
     assert len(open_recording(small).views()) == result.poses
@@ -214,6 +214,6 @@ def test_a_recovery_that_still_runs_is_not_disturbed(small: Path) -> None:
     small.write_bytes(data[:-9000])
     other = create_exclusively(small.with_name("small.mcap.recovering"))
     with refused("in-use"):
-        recover(small)
+        recover_recording(small)
     os.close(other)
     assert small.read_bytes() == data[:-9000]

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from recordings.reader import open_recording
-from recordings.recover import recover
+from recordings.recover import recover_recording
 from recordings.schema.topics import Topic
 from recordings.writer import RecordingWriter
 from tests.durability import disk_order
@@ -45,7 +45,7 @@ def test_what_was_attached_behind_a_destroyed_record_is_found_again(tmp_path: Pa
             writer.attach(f"plan-{index}.json", "application/json", b"{}" * 50)
         path = writer.finish()
     broken_chunk(path, 0)
-    (result,) = recover(path)
+    (result,) = recover_recording(path)
     assert result.lost_bytes > 0
     assert open_recording(path).attachments() == {f"plan-{k}.json": b"{}" * 50 for k in range(2)}
 
@@ -54,7 +54,7 @@ def test_the_first_picture_takes_nothing_with_it_that_the_end_of_the_file_repeat
     """What kind of message a channel carries is said in the first chunk and once more in the summary."""
     path = write_small(tmp_path / "a.mcap", poses=3)
     broken_chunk(path, 0, whole_head=False)
-    (result,) = recover(path)
+    (result,) = recover_recording(path)
     assert (result.poses, result.pictures) == (2, 2)
     assert [view.index for view in open_recording(path).views()] == [1, 2]
 
@@ -65,7 +65,7 @@ def test_a_folder_with_parts_of_two_sessions_is_recovered_but_nothing_is_given_u
             writer.image(make_picture(0))
             writer.view(make_view(0))
             writer.flush()
-    results = recover(tmp_path)
+    results = recover_recording(tmp_path)
     assert [result.path.name for result in results] == ["one.mcap", "two.mcap"]
     assert not [result for result in results if "not in the folder" in " ".join(result.losses)]
     assert not list(tmp_path.glob("*.json"))
@@ -73,10 +73,10 @@ def test_a_folder_with_parts_of_two_sessions_is_recovered_but_nothing_is_given_u
 
 def test_an_empty_folder_and_a_name_that_is_no_recordings_are_said(tmp_path: Path) -> None:
     with refused("no-recording"):
-        recover(tmp_path)
+        recover_recording(tmp_path)
     part = write_unfinished(tmp_path / "a.mcap")
     with refused("recording-name"):
-        recover(part, tmp_path / "b.bag")
+        recover_recording(part, tmp_path / "b.bag")
     assert list(tmp_path.iterdir()) == [part]
 
 
@@ -91,7 +91,7 @@ def test_a_disk_that_fails_during_recovery_leaves_everything_as_it_was(
 
     monkeypatch.setattr(os, "fsync", full)
     with refused("disk", errno=errno.ENOSPC):
-        recover(part)
+        recover_recording(part)
     assert list(tmp_path.iterdir()) == [part]
     assert part.read_bytes() == before
 
@@ -101,7 +101,7 @@ def test_a_recovered_file_is_on_the_disk_before_it_takes_the_damaged_ones_name(
 ) -> None:
     part = write_unfinished(tmp_path / "a.mcap")
     with disk_order(monkeypatch) as order:
-        recover(part)
+        recover_recording(part)
     assert order == [
         "sync a.mcap.recovering",
         "rename a.mcap.recovering a.mcap.part",

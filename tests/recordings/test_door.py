@@ -1,0 +1,41 @@
+"""The public door: its example runs, its names exist, and nothing heavy is loaded before it is used."""
+
+from __future__ import annotations
+
+import inspect
+import subprocess
+import sys
+import textwrap
+from pathlib import Path
+
+import pytest
+
+import recordings
+from tests.recordings.small_recording import make_state, write_small
+
+
+def test_the_example_runs(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    write_small(tmp_path / "session.mcap")
+    monkeypatch.chdir(tmp_path)
+    lines = (recordings.__doc__ or "").splitlines()[1:]
+    names: dict[str, object] = {}
+    exec(textwrap.dedent("\n".join(line for line in lines if line.startswith("    ") or not line)), names)
+    assert names["joints"] == [make_state(count).joints_rad for count in range(9)]
+    assert len(capsys.readouterr().out.splitlines()) == 3
+
+
+def test_every_name_of_the_door_exists_and_says_what_it_is() -> None:
+    for name in recordings.__all__:
+        assert inspect.getdoc(getattr(recordings, name)), name
+    with pytest.raises(AttributeError):
+        recordings.nothing  # noqa: B018
+
+
+@pytest.mark.parametrize("program", ["import recordings", "from recordings.cli.app import RECORDINGS"])
+def test_what_is_not_used_is_not_loaded(program: str) -> None:
+    heavy = ("numpy", "cv2", "google", "mcap_protobuf", "scipy", "rosbags")
+    asked = f"{program}; import sys; print([name for name in {heavy} if name in sys.modules])"
+    done = subprocess.run([sys.executable, "-c", asked], capture_output=True, text=True, check=True)
+    assert done.stdout == "[]\n"

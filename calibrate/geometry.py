@@ -64,12 +64,12 @@ class Transform:
         return Transform(self.parent, other.child, self.matrix @ other.matrix)
 
     def apply(self, points: Array) -> Array:
-        """Points (..., 3) of `child` in metres → the same points in `parent`."""
+        """Map points (..., 3) of `child`, metres, into `parent`."""
         return transform_points(self.matrix, points)
 
 
 def pose(rotation: ArrayLike, translation_m: ArrayLike) -> Array:
-    """(..., 3, 3) and (..., 3) → (..., 4, 4)."""
+    """Make poses (..., 4, 4) from rotations (..., 3, 3) and translations (..., 3)."""
     R, t = np.asarray(rotation, dtype=float), np.asarray(translation_m, dtype=float)
     matrix = np.zeros((*np.broadcast_shapes(R.shape[:-2], t.shape[:-1]), 4, 4))
     matrix[..., :3, :3], matrix[..., :3, 3], matrix[..., 3, 3] = R, t, 1.0
@@ -77,13 +77,13 @@ def pose(rotation: ArrayLike, translation_m: ArrayLike) -> Array:
 
 
 def inverse(matrix: Array) -> Array:
-    """Inverse of rigid transforms (..., 4, 4)."""
+    """Invert rigid transforms (..., 4, 4)."""
     R_t = np.swapaxes(matrix[..., :3, :3], -1, -2)
     return pose(R_t, -np.einsum("...ij,...j->...i", R_t, matrix[..., :3, 3]))
 
 
 def transform_points(matrix: Array, points: Array) -> Array:
-    """Rigid transform (..., 4, 4) applied to points (..., n, 3) or (3,), metres."""
+    """Apply rigid transforms (..., 4, 4) to points (..., n, 3) or (3,), metres."""
     points = np.asarray(points, dtype=float)
     if points.ndim == 1:
         return np.asarray(matrix[..., :3, :3] @ points + matrix[..., :3, 3])
@@ -101,7 +101,7 @@ def is_rigid(matrix: Array, tolerance: float = 1e-6) -> bool:
 
 
 def skew(v: Array) -> Array:
-    """[v]× of vectors (..., 3): skew(v) @ w = v × w."""
+    """Make [v]× (..., 3, 3) of vectors (..., 3): skew(v) @ w = v × w."""
     v = np.asarray(v, dtype=float)
     S = np.zeros((*v.shape[:-1], 3, 3))
     S[..., 0, 1], S[..., 0, 2] = -v[..., 2], v[..., 1]
@@ -111,7 +111,7 @@ def skew(v: Array) -> Array:
 
 
 def rotation_exp(vector: ArrayLike) -> Array:
-    """Rotation vectors (..., 3) in radians → matrices (..., 3, 3) (Rodrigues)."""
+    """Convert rotation vectors (..., 3), radians, to matrices (..., 3, 3) (Rodrigues)."""
     v = np.asarray(vector, dtype=float)
     angle = np.sqrt((v * v).sum(axis=-1))[..., None, None]
     a, b = np.sinc(angle / np.pi), 0.5 * np.sinc(angle / (2 * np.pi)) ** 2  # sin x/x, (1 - cos x)/x²
@@ -121,7 +121,7 @@ def rotation_exp(vector: ArrayLike) -> Array:
 
 
 def rotation_log(R: ArrayLike) -> Array:
-    """Rotation matrices (..., 3, 3) → rotation vectors (..., 3) in radians, angle in [0, π].
+    """Convert rotation matrices (..., 3, 3) to rotation vectors (..., 3), radians, angle in [0, π].
 
     At exactly π the axis sign is ambiguous; either one is returned. What is not quite orthogonal is projected
     first; ValueError for what mirrors. (Written out: SciPy's takes half a millisecond a call.)
@@ -168,12 +168,12 @@ def _largest_row(four_qq: Array) -> Array:
 
 
 def rotation_angle(R: ArrayLike) -> Any:
-    """Angle of rotation matrices (..., 3, 3), radians, accurate near 0 and near π."""
+    """Measure the angle of rotation matrices (..., 3, 3), radians, accurate near 0 and near π."""
     return np.linalg.norm(rotation_log(R), axis=-1)
 
 
 def project_to_rotation(M: Array) -> Array:
-    """Nearest rotation (Frobenius) to matrices (..., 3, 3), by SVD with det = +1."""
+    """Find the nearest rotation (Frobenius) to matrices (..., 3, 3), by SVD with det = +1."""
     U, _, Vt = np.linalg.svd(M)
     D = np.zeros_like(M)
     D[..., 0, 0] = D[..., 1, 1] = 1.0
@@ -182,14 +182,14 @@ def project_to_rotation(M: Array) -> Array:
 
 
 def quaternion_from_matrix(R: ArrayLike) -> Array:
-    """(..., 3, 3) → (..., 4) x, y, z, w with w >= 0."""
+    """Convert (..., 3, 3) to quaternions (..., 4) x, y, z, w with w >= 0."""
     M = np.asarray(R, dtype=float)
     q = Rotation.from_matrix(M.reshape(-1, 3, 3)).as_quat(canonical=True)
     return np.asarray(q.reshape(*M.shape[:-2], 4))
 
 
 def matrix_from_quaternion(quaternion_xyzw: ArrayLike) -> Array:
-    """(..., 4) x, y, z, w (any positive norm) → (..., 3, 3)."""
+    """Convert quaternions (..., 4) x, y, z, w (any positive norm) to (..., 3, 3)."""
     q = np.asarray(quaternion_xyzw, dtype=float)
     return np.asarray(Rotation.from_quat(q.reshape(-1, 4)).as_matrix().reshape(*q.shape[:-1], 3, 3))
 
@@ -199,12 +199,12 @@ def pose_from_quaternion(translation_m: ArrayLike, quaternion_xyzw: ArrayLike) -
 
 
 def pose_from_rotvec(translation_m: ArrayLike, rotvec_rad: ArrayLike) -> Array:
-    """UR convention: x, y, z [m] and a rotation vector [rad]."""
+    """Convert UR's convention, x, y, z [m] and a rotation vector [rad], to (..., 4, 4)."""
     return pose(rotation_exp(rotvec_rad), translation_m)
 
 
 def perturb(matrix: Array, delta: ArrayLike) -> Array:
-    """The project's one error convention: delta = (..., 6) [δt (m), δφ (rad)], both in the parent frame.
+    """Apply the one error convention: delta = (..., 6) [δt (m), δφ (rad)], both in the parent frame.
 
     R = Exp(δφ) R̂, t = t̂ + δt. The 6×6 covariances everywhere are of this delta, in this order.
     """
@@ -213,18 +213,18 @@ def perturb(matrix: Array, delta: ArrayLike) -> Array:
 
 
 def difference(matrix: Array, reference: Array) -> Array:
-    """The delta (..., 6) with perturb(reference, delta) = matrix."""
+    """Compute the delta (..., 6) with perturb(reference, delta) = matrix."""
     d_phi = rotation_log(matrix[..., :3, :3] @ np.swapaxes(reference[..., :3, :3], -1, -2))
     return np.concatenate([matrix[..., :3, 3] - reference[..., :3, 3], d_phi], axis=-1)
 
 
 def interpolate(first: Array, second: Array, fraction: float) -> Array:
-    """Point on the path first → second (4, 4): linear translation, constant-axis rotation."""
+    """Interpolate poses (4, 4): linear translation, constant-axis rotation."""
     R1 = first[:3, :3]
     R = R1 @ rotation_exp(fraction * rotation_log(R1.T @ second[:3, :3]))
     return pose(R, (1 - fraction) * first[:3, 3] + fraction * second[:3, 3])
 
 
 def random_rotation(rng: np.random.Generator) -> Array:
-    """Uniform on SO(3), (3, 3)."""
+    """Draw a rotation (3, 3), uniform on SO(3)."""
     return matrix_from_quaternion(rng.normal(size=4))

@@ -43,7 +43,7 @@ class RobotModel:
     """Rough capsule radii of the links, for clearance; generous."""
 
     def calibrated(self, deltas: DhDeltas) -> RobotModel:
-        """This model with deltas added; the analytic inverse stays that of the nominal table."""
+        """Add deltas to the model; the analytic inverse stays that of the nominal table."""
 
         def add(nominal: tuple[float, ...], delta: tuple[float, ...]) -> tuple[float, ...]:
             return tuple(n + d for n, d in zip(nominal, delta, strict=True))
@@ -77,7 +77,7 @@ MODELS: dict[str, RobotModel] = {
 
 
 def link_frames(model: RobotModel, joints_rad: ArrayLike) -> Array:
-    """Joints (..., 6) → base_from_link for links 0…6, (..., 7, 4, 4); link 0 is the base, 6 the flange."""
+    """Compute base_from_link (..., 7, 4, 4) of joints (..., 6); link 0 is the base, 6 the flange."""
     q = np.asarray(joints_rad, dtype=float)
     frames = np.zeros((*q.shape[:-1], 7, 4, 4))
     frames[..., 0, :, :] = np.eye(4)
@@ -96,12 +96,12 @@ def link_frames(model: RobotModel, joints_rad: ArrayLike) -> Array:
 
 
 def forward(model: RobotModel, joints_rad: ArrayLike) -> Array:
-    """Joints (..., 6) → base_from_flange (..., 4, 4)."""
+    """Compute base_from_flange (..., 4, 4) of joints (..., 6)."""
     return np.asarray(link_frames(model, joints_rad)[..., 6, :, :])
 
 
 def jacobian(model: RobotModel, joints_rad: ArrayLike) -> Array:
-    """Geometric Jacobian (..., 6, 6) in base: flange velocity (m/s), then angular velocity (rad/s)."""
+    """Compute the geometric Jacobian (..., 6, 6) in base: flange velocity (m/s), angular velocity (rad/s)."""
     frames = link_frames(model, joints_rad)
     z = frames[..., :6, :3, 2]
     lever = frames[..., 6, None, :3, 3] - frames[..., :6, :3, 3]
@@ -109,14 +109,14 @@ def jacobian(model: RobotModel, joints_rad: ArrayLike) -> Array:
 
 
 def singularity_measure(model: RobotModel, joints_rad: ArrayLike) -> Array:
-    """Smallest singular value of the Jacobian, lengths divided by the arm's reach; 0 = singular. (...,)"""
+    """Compute the Jacobian's smallest singular value (...), lengths over the arm's reach; 0 = singular."""
     J = jacobian(model, joints_rad).copy()
     J[..., :3, :] /= abs(model.a_m[1]) + abs(model.a_m[2])
     return np.asarray(np.linalg.svd(J, compute_uv=False)[..., -1])
 
 
 def inverse_all(model: RobotModel, base_from_flange: Array) -> Array:
-    """All analytic solutions of the nominal table, (n, 6) with n ≤ 8, each joint in (-π, π].
+    """List all analytic solutions of the nominal table, (n, 6) with n ≤ 8, each joint in (-π, π].
 
     At a wrist singularity (sin q5 = 0) there are infinitely many; only those with wrist 3 = 0 are given, and
     there may be none near the limit of the reach. Unreachable poses give (0, 6).
@@ -127,7 +127,7 @@ def inverse_all(model: RobotModel, base_from_flange: Array) -> Array:
 def inverse_many(
     model: RobotModel, base_from_flange: Array
 ) -> tuple[NDArray[np.intp], Array, NDArray[np.intp]]:
-    """`inverse_all` of many poses (n, 4, 4): the pose of each solution (m,), joints (m, 6), branch (m,).
+    """Solve many poses (n, 4, 4): the pose of each solution (m,), joints (m, 6), branch (m,).
 
     Branches 0 … 7 are those of shoulder, wrist and elbow.
 
@@ -165,7 +165,7 @@ def inverse_many(
 def _in_arm_plane(
     T: Array, q1: Array, q5: Array, q6: Array, d1: float, d5: float, d6: float
 ) -> tuple[Array, Array, Array]:
-    """Where wrist 1 stands in the plane of upper arm and forearm: x, y (m) and q2 + q3 + q4 (rad)."""
+    """Place wrist 1 in the plane of upper arm and forearm: x, y (m) and q2 + q3 + q4 (rad)."""
     c1, n1 = np.cos(q1), np.sin(q1)
     c5, n5, c6, n6 = np.cos(q5), np.sin(q5), np.cos(q6), np.sin(q6)
     # Origin and x axis of frame 4, in the flange and then in base.
@@ -180,7 +180,7 @@ def _in_arm_plane(
 
 
 def inverse_nearest(model: RobotModel, base_from_flange: Array, near_rad: ArrayLike) -> Array | None:
-    """The solution (6,) nearest to `near_rad`, turns of 2π chosen within the joint limits; None if none."""
+    """Find the solution (6,) nearest to `near_rad`, turns of 2π within the joint limits; None if none."""
     near = np.asarray(near_rad, dtype=float)
     candidates = inverse_all(model, base_from_flange)
     if len(candidates) == 0:

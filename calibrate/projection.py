@@ -38,7 +38,7 @@ class Projected:
 
 
 def project(camera: CameraModel, points: Array, with_intrinsics: bool = False) -> Projected:
-    """Points (..., 3) in `camera`, metres. Points at or behind the camera give non-finite pixels."""
+    """Project points (..., 3) in `camera`, metres. At or behind the camera pixels are not finite."""
     K = camera_matrix(camera)
     x, y, w = _rays(points)
     xd, yd, derivatives = _bend(camera, x, y)
@@ -53,7 +53,7 @@ def project(camera: CameraModel, points: Array, with_intrinsics: bool = False) -
 
 
 def project_pixels(camera: CameraModel, points: Array) -> Array:
-    """The pixels of `project`, to the bit, without the derivatives."""
+    """Compute the pixels of `project`, to the bit, without the derivatives."""
     x, y, _ = _rays(points)
     xd, yd, _ = _bend(camera, x, y)
     return _pixels(camera_matrix(camera), xd, yd)
@@ -76,7 +76,7 @@ def _pixels(K: Array, xd: Array, yd: Array) -> Array:
 
 
 def camera_matrix(camera: CameraModel) -> Array:
-    """K (3, 3); BadViewsError where it is missing or not a camera matrix."""
+    """Return K (3, 3); BadViewsError where it is missing or not a camera matrix."""
     if camera.matrix is None:
         raise BadViewsError(
             "The camera's intrinsics are not known.", code="no-intrinsics", remedy="Estimate them first."
@@ -98,12 +98,12 @@ def camera_matrix(camera: CameraModel) -> Array:
 
 
 def intrinsics_names(camera: CameraModel) -> tuple[str, ...]:
-    """The parameters of the camera's lens model, in the order of `intrinsics_vector`."""
+    """Name the parameters of the camera's lens model, in the order of `intrinsics_vector`."""
     return _PARAMETERS[camera.distortion_model]
 
 
 def intrinsics_vector(camera: CameraModel) -> Array:
-    """(p,) in the order of `intrinsics_names`: pixels for the first four, the others plain."""
+    """Return (p,) in the order of `intrinsics_names`: pixels for the first four, the others plain."""
     K = camera_matrix(camera)
     distortion = np.zeros(len(intrinsics_names(camera)) - 4)
     distortion[: len(camera.distortion)] = camera.distortion[: len(distortion)]
@@ -111,7 +111,7 @@ def intrinsics_vector(camera: CameraModel) -> Array:
 
 
 def with_intrinsics_vector(camera: CameraModel, vector: Array) -> CameraModel:
-    """The same lens model with other numbers, skew kept."""
+    """Replace the numbers of the lens model, skew kept."""
     fx, fy, cx, cy, *distortion = (float(v) for v in vector)
     skewed = float(camera_matrix(camera)[0, 1])
     matrix = ((fx, skewed, cx), (0.0, fy, cy), (0.0, 0.0, 1.0))

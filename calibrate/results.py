@@ -18,6 +18,8 @@ class RejectedView(msgspec.Struct, frozen=True, omit_defaults=True):
     """Pose number of the view whose recorded pose belongs to this image (wrong-pose)."""
     wrong_number: int | None = None
     """Place in [δt, δφ] of the only wrong number of its recorded pose."""
+    slip: float = 0.0
+    """Recorded minus true of that number, metres or radians."""
 
 
 class HoldoutScore(msgspec.Struct, frozen=True, omit_defaults=True):

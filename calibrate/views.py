@@ -59,7 +59,7 @@ class ViewSet:
         return iter(self.views)
 
     def select(self, positions: list[int]) -> ViewSet:
-        """The views at these places in the tuple (not pose numbers)."""
+        """Select the views at these places in the tuple (not pose numbers)."""
         return replace(self, views=tuple(self.views[i] for i in positions))
 
     @property

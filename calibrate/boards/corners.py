@@ -26,7 +26,7 @@ _SMOOTH_FROM_PX = 9.5
 
 
 def to_grey(image: NDArray[Any]) -> Grey:
-    """(h, w) or (h, w, 3 BGR), uint8 or uint16 → (h, w) uint8; the maximum tells 10, 12 and 16 bits apart."""
+    """Convert (h, w) or (h, w, 3 BGR), uint8 or uint16, to (h, w) uint8; 10, 12, 16 bits by the maximum."""
     if image.dtype == np.uint16:
         bits = next(b for b in (8, 10, 12, 16) if int(image.max(initial=0)) < 1 << b)
         image = (image >> (bits - 8)).astype(np.uint8)
@@ -38,12 +38,12 @@ def to_grey(image: NDArray[Any]) -> Grey:
 
 
 def equalise(grey: Grey) -> Grey:
-    """The same picture with contrast everywhere; for finding, not for measuring."""
+    """Spread contrast over the whole picture; for finding, not for measuring."""
     return np.asarray(cv2.createCLAHE(clipLimit=4.0, tileGridSize=(8, 8)).apply(grey))
 
 
 def local_spacing(grid: Array) -> Array:
-    """(rows, columns, 2) pixels → (rows, columns): distance to the nearest neighbour in row or column."""
+    """Measure the distance to the nearest neighbour, (rows, columns) for a grid (rows, columns, 2) px."""
     across = np.linalg.norm(np.diff(grid, axis=1), axis=-1)
     down = np.linalg.norm(np.diff(grid, axis=0), axis=-1)
     spacing = np.full(grid.shape[:2], np.inf)
@@ -55,7 +55,7 @@ def local_spacing(grid: Array) -> Array:
 
 
 def is_regular(grid: Array) -> bool:
-    """Does the grid vary smoothly, as any lens shows a flat board? Finds single wrong corners.
+    """Tell whether the grid varies smoothly, as any lens shows a flat board. Finds single wrong corners.
 
     Third differences along rows and columns vanish for smooth grids; in short rows second ones are used.
     """
@@ -73,7 +73,7 @@ def is_regular(grid: Array) -> bool:
 
 
 def right_handed(grid: Array) -> Array:
-    """The grid with its columns reversed where needed, so that x × y points away from the viewer."""
+    """Reverse the grid's columns where needed, so that x × y points away from the viewer."""
     across = grid[:, -1] - grid[:, 0]
     down = grid[-1] - grid[0]
     x, y = across.mean(axis=0), down.mean(axis=0)
@@ -81,7 +81,7 @@ def right_handed(grid: Array) -> Array:
 
 
 def refine(grey: Grey, corners: Array, spacing_px: Array) -> Array:
-    """Saddle points to sub-pixel accuracy; each corner with a window that fits its own spacing.
+    """Refine saddle points to sub-pixel accuracy, each with a window that fits its own spacing.
 
     corners: (n, 2); spacing_px: (n,). A corner that runs away by more than 0.4 spacings keeps its place.
     The grey values are smoothed first: noise in the flat parts of a window pulls a corner to where the search
@@ -127,7 +127,7 @@ def _saddles(grey: Grey, corners: Array, half: int, smooth: bool) -> Array:
 
 
 def sample(grey: Grey, pixels: Array) -> Array:
-    """Grey values at pixels (r, c, 2), lightly smoothed, (r, c)."""
+    """Sample grey values (r, c) at pixels (r, c, 2), lightly smoothed."""
     # Only the part that is asked for is smoothed.
     low = np.clip(np.floor(pixels.min(axis=(0, 1))) - 3, 0, None).astype(int)
     high = np.ceil(pixels.max(axis=(0, 1))).astype(int) + 4
@@ -140,7 +140,7 @@ def sample(grey: Grey, pixels: Array) -> Array:
 
 
 def square_means(grey: Grey, grid: Array) -> Array:
-    """Grey values (rows - 1, columns - 1) in the middle of the squares between corners (rows, columns, 2)."""
+    """Sample grey values (rows - 1, columns - 1) in the squares between corners (rows, columns, 2)."""
     centres = np.round((grid[:-1, :-1] + grid[1:, :-1] + grid[:-1, 1:] + grid[1:, 1:]) / 4).astype(int)
     around = np.arange(-1, 2)
     rows = np.clip(centres[..., 1, None] + around, 0, grey.shape[0] - 1)
@@ -149,7 +149,7 @@ def square_means(grey: Grey, grid: Array) -> Array:
 
 
 def square_contrast(means: Array, mean_grey: float) -> float:
-    """Brightness of the squares at odd places minus that at even ones, over the spread; > 0: first is dark.
+    """Compare squares at odd and even places: brightness difference over the spread; > 0: first is dark.
 
     means: those of `square_means`. Value in about -1 … 1; near 0 the colours decide nothing. A single
     square is compared with the picture's `mean_grey`.

@@ -36,12 +36,12 @@ Cause = Literal[
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """What one picture shows of the board."""
+    """The board as one picture shows it."""
 
     cause: Cause
-    """Why the board was not found; empty when it was."""
+    """Cause for a program; empty when the board was found."""
     reason: str
-    """The same for people."""
+    """The cause for people."""
     indices: NDArray[np.intp]
     """(k,) rows of `board_points`"""
     pixels: Array
@@ -70,7 +70,7 @@ class Detection:
 def detect(
     image: NDArray[Any], spec: BoardSpec, thorough: bool = True, with_quality: bool = True
 ) -> Detection:
-    """Finds the board to sub-pixel accuracy.
+    """Find the board to sub-pixel accuracy.
 
     image: (h, w) uint8 or uint16, or (h, w, 3) BGR. `thorough=False` leaves out the slow attempts and the
     search for the reason (previews), `with_quality=False` the sharpness and the saturation. Raises BoardError

@@ -35,7 +35,7 @@ _PREVIEW_SIDE_PX = 640
 
 
 def find_chessboard(grey: Grey, spec: BoardSpec, thorough: bool = True) -> Array | None:
-    """All inner corners in board order, (rows·columns, 2) pixels, or None.
+    """Find all inner corners in board order, (rows·columns, 2) pixels, or None.
 
     The colours of the squares decide the orientation where they can; otherwise the order is one of the turns
     after which the board looks the same. `thorough=False` makes one quick attempt on a smaller picture.
@@ -99,7 +99,7 @@ def _orient(grey: Grey, grid: Array, spec: BoardSpec) -> Array:
 
 
 def other_size(grey: Grey, spec: BoardSpec) -> tuple[int, int] | None:
-    """Inner corners (columns, rows) of a chessboard that is seen where that of `spec` is not; None: none is.
+    """Find inner corners (columns, rows) of another chessboard than that of `spec`; None: none is seen.
 
     One smaller each way is looked for by name: that is what a board looks like whose squares were counted.
     """
@@ -112,7 +112,7 @@ def other_size(grey: Grey, spec: BoardSpec) -> tuple[int, int] | None:
 
 
 def seen_size(grey: Grey) -> tuple[int, int] | None:
-    """Sides in corners, the longer first, of whatever chessboard is there: a wrong one may be used."""
+    """Find the sides in corners, the longer first, of whatever chessboard is there."""
     factor = min(1.0, _LARGE_SIDE_PX / max(grey.shape))
     small = cv2.resize(grey, None, fx=factor, fy=factor, interpolation=cv2.INTER_AREA)
     found, _, meta = cv2.findChessboardCornersSBWithMeta(small, (3, 3), cv2.CALIB_CB_LARGER)
@@ -126,7 +126,7 @@ _GUESSED_PX = 1.5
 
 
 def find_circles(grey: Grey, spec: BoardSpec) -> Array | None:
-    """All centres in board order, (rows·columns, 2) pixels, or None; dark on light or light on dark."""
+    """Find all centres in board order, (rows·columns, 2) px, or None; dark on light or light on dark."""
     kind = (
         cv2.CALIB_CB_ASYMMETRIC_GRID
         if spec.kind is BoardKind.ASYMMETRIC_CIRCLES
@@ -148,7 +148,7 @@ def find_circles(grey: Grey, spec: BoardSpec) -> Array | None:
 
 
 def true_centres(grey: Grey, ellipses: Array, spec: BoardSpec) -> Array:
-    """Where the circles' own centres are seen, (n, 2), from the centres of their ellipses in board order.
+    """Find the seen centres of the circles themselves (n, 2) from those of their ellipses in board order.
 
     The dual conic of a circle round c with radius r is c cᵀ - r² diag(1, 1, 0); the plane's homography H
     takes it to H (…) Hᵀ, whose last column is the ellipse's centre. The lens's bend within one circle is

@@ -15,11 +15,11 @@ from calibrate.geometry import Array
 from recordings.schema.messages import BoardSpec
 
 _FEW_MARKERS = 0.7
-"""Of those of the board."""
+"""Share of the markers of the board."""
 _SMALL_MARKER_PX, _ENLARGED, _LARGEST_SIDE_PX = 20.0, 3.0, 6000
 """Markers with shorter sides are read in an enlarged picture, unless that would be larger than this."""
 _SMALLEST_PERIMETER = 0.03
-"""Of a marker, over the longer side of the picture; OpenCV's own."""
+"""Perimeter of a marker over the longer side of the picture; OpenCV's own."""
 _NEAR_SHARE, _FAR_MOVES = 0.025, 4.0
 """A corner ran away where the refinement moves it farther from the prediction than this share of the spacing
 and than so many times the middle one."""
@@ -29,7 +29,7 @@ NOTHING = (np.zeros(0, dtype=np.intp), np.zeros((0, 2)))
 
 @lru_cache(maxsize=8)
 def charuco_board(spec: BoardSpec) -> Any:
-    """OpenCV's description of the board; also what draws it."""
+    """Describe the board for OpenCV's detector."""
     dictionary = cv2.aruco.getPredefinedDictionary(dictionary_id(spec.dictionary or ""))
     board = cv2.aruco.CharucoBoard((spec.columns, spec.rows), spec.square_m, spec.marker_m or 0.0, dictionary)
     board.setLegacyPattern(spec.legacy)
@@ -37,7 +37,7 @@ def charuco_board(spec: BoardSpec) -> Any:
 
 
 def find_charuco(grey: Grey, spec: BoardSpec, thorough: bool = True) -> tuple[Indices, Array]:
-    """Point indices (k,) and pixels (k, 2) of the chessboard corners that were found.
+    """Find point indices (k,) and pixels (k, 2) of chessboard corners.
 
     `thorough`: where few markers are seen, the dark parts of the picture are brightened; where those are
     small or none, it is enlarged.
@@ -126,7 +126,7 @@ def _snap_to_corners(
 
 
 def is_saddle(grey: Grey, corners: Array, across: Array, down: Array) -> NDArray[np.bool_]:
-    """A chessboard corner: round it bright and dark alternate twice, opposite sides alike.
+    """Tell chessboard corners: round them bright and dark alternate twice, opposite sides alike.
 
     corners, across, down: (n, 2); the ring is a circle on the board, and these its half axes in the picture.
     """
@@ -154,7 +154,7 @@ def marker_detector(dictionary: str, border_bits: int, smallest: float = _SMALLE
 
 
 def find_april_grid(grey: Grey, spec: BoardSpec) -> tuple[Indices, Array]:
-    """Four corners of every tag that is seen. Printed borders of one and of two bits (Kalibr) are tried."""
+    """Find four corners of every tag. Printed borders of one and of two bits (Kalibr) are tried."""
     best = NOTHING
     for border_bits in (2, 1):
         found = _tags(grey, spec, border_bits)
@@ -188,9 +188,9 @@ _SMOOTHING_PX, _STEP_PX = 0.7, 0.25
 _SIDE_FROM, _SIDE_TO = 0.1, 0.9
 """Part of a side that is fitted: the corners are rounded by blur."""
 _REACH_SHARE, _LEAST_REACH_PX, _MOST_REACH_PX = 1 / 16, 2.0, 6.0
-"""How far from the expected side the edge is sought; less than half a cell of any dictionary's tag."""
+"""Search range about the expected side; less than half a cell of any dictionary's tag."""
 _FAINT = 0.5
-"""Of the median contrast along a side; fainter places are left out."""
+"""Share of the median contrast along a side; fainter places are left out."""
 _FAR_MADS, _FAR_PX = 4.5, 0.05
 _FIT_ROUNDS = 3
 _BENT_PX = 60.0
@@ -198,7 +198,7 @@ _BENT_PX = 60.0
 
 
 def find_tag(grey: Grey, spec: BoardSpec, thorough: bool = True) -> tuple[Indices, Array]:
-    """Point indices (4,) and pixels (4, 2) of the tag's corners, or none of either.
+    """Find point indices (4,) and pixels (4, 2) of the tag's corners, or none of either.
 
     `thorough`: where it is not seen, the dark parts of the picture are brightened.
     """
@@ -235,7 +235,7 @@ def _seen(detector: Any, grey: Grey, spec: BoardSpec) -> Array | None:
 
 
 def fit_sides(grey: Grey, corners: Array) -> Array:
-    """Corners (4, 2) in order round the tag, each where its two sides meet.
+    """Fit corners (4, 2) in order round the tag, each where its two sides meet.
 
     A corner of an outline is no saddle: smoothing pulls it inwards, which sub-pixel search follows.
     """

@@ -1,4 +1,4 @@
-"""What a board looks like: its points, how many there are, and in which turns it looks the same.
+"""A board's points, their number, and the turns in which it looks the same.
 
 Board frame: origin in the first point, x along a row, y down the columns, z into the board.
 """
@@ -93,12 +93,12 @@ def check_board(spec: BoardSpec) -> None:
 
 
 def tag_dictionary(spec: BoardSpec) -> str:
-    """Dictionary of a board of tags; AprilTags have a usual one."""
+    """Return the dictionary of a board of markers; AprilTags have a usual one."""
     return spec.dictionary or APRIL_DICTIONARY
 
 
 def grid_shape(spec: BoardSpec) -> tuple[int, int]:
-    """Columns and rows of points (not for april-grid, whose points come four to a tag)."""
+    """Count columns and rows of points (not for april-grid, whose points come four to a tag)."""
     if spec.kind is BoardKind.CHARUCO:
         return spec.columns - 1, spec.rows - 1
     if spec.kind in SINGLE_TAGS:
@@ -108,7 +108,7 @@ def grid_shape(spec: BoardSpec) -> tuple[int, int]:
 
 @lru_cache(maxsize=32)
 def board_points(spec: BoardSpec) -> Array:
-    """All points of the board in `board`, (n, 3) metres, z = 0; the row number is the point's identity.
+    """List all points in `board`, (n, 3) metres, z = 0; the row number is the point's identity.
 
     Asymmetric circles: `square_m` is the distance of neighbouring rows, half that of circles in a row
     (OpenCV's convention). april-grid: corners of tag 0, 1 … row by row from the bottom left as Kalibr counts,
@@ -137,7 +137,7 @@ def _april_points(spec: BoardSpec) -> Array:
 
 
 def looks_same_turns(spec: BoardSpec) -> tuple[int, ...]:
-    """Turns about the normal, in quarters, after which the board looks exactly as before; always with 0.
+    """List turns about the normal, in quarters, after which the board looks exactly as before; 0 included.
 
     A chessboard's colours decide when columns + rows is odd. Square markers always decide; the three dots of
     a radon board are not read.
@@ -155,7 +155,7 @@ def looks_same_turns(spec: BoardSpec) -> tuple[int, ...]:
 
 
 def board_from_turned(spec: BoardSpec, quarters: int) -> Array:
-    """(4, 4): the board frame turned by `quarters` of 90° about the centre of its points."""
+    """Turn the board frame by `quarters` of 90° about the centre of its points, (4, 4)."""
     points = board_points(spec)
     centre = (points.min(axis=0) + points.max(axis=0)) / 2
     R = np.round(rotation_exp([0.0, 0.0, quarters * np.pi / 2]))
@@ -163,7 +163,7 @@ def board_from_turned(spec: BoardSpec, quarters: int) -> Array:
 
 
 def fixes_a_plane(points: Array) -> bool:
-    """Do these points of a board (n, 3) tell its plane in a picture? Not where all but one lie in a line."""
+    """Tell whether points of a board (n, 3) fix its plane: not where all but one lie in a line."""
     xy = points[:, :2] - points[:, :2].mean(axis=0)
     xy = xy / max(float(np.abs(xy).max()), 1e-12)
     x, y, one = xy[:, 0], xy[:, 1], np.ones(len(xy))
@@ -179,7 +179,7 @@ def fixes_a_plane(points: Array) -> bool:
 
 
 def ambiguity_text(spec: BoardSpec) -> str:
-    """One sentence for people when the board can be mistaken for itself turned; empty otherwise."""
+    """Warn when the board can be mistaken for itself turned; empty otherwise."""
     turns = looks_same_turns(spec)
     if len(turns) == 1:
         return ""
@@ -191,7 +191,7 @@ def ambiguity_text(spec: BoardSpec) -> str:
 
 
 def describe_board(spec: BoardSpec) -> str:
-    """'chessboard 7×6, 25 mm'"""
+    """Describe the board for people: 'chessboard 7×6, 25 mm'."""
     if spec.kind in SINGLE_TAGS:
         return f"{spec.kind.value} {spec.tag_id} of {tag_dictionary(spec)}, {spec.square_m * 1000:g} mm"
     text = f"{spec.kind.value} {spec.columns}×{spec.rows}, {spec.square_m * 1000:g} mm"

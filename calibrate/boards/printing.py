@@ -8,7 +8,9 @@ from dataclasses import dataclass
 from typing import Literal
 
 import cv2
+import msgspec
 import numpy as np
+import yaml
 from numpy.typing import NDArray
 
 from calibrate.boards.markers import charuco_board
@@ -21,7 +23,7 @@ from calibrate.boards.model import (
     tag_dictionary,
 )
 from calibrate.geometry import Array
-from recordings.schema.messages import SINGLE_TAGS, BoardKind, BoardSpec
+from recordings.schema.messages import BoardKind, BoardSpec
 
 _MARGIN_MM = 7.0
 _FOOT_MM = 16.0
@@ -156,7 +158,7 @@ def _charuco(spec: BoardSpec) -> _Drawn:
 
 
 def _april_grid(spec: BoardSpec) -> _Drawn:
-    """As Kalibr draws it: tag 0 at the bottom left, two bits of border, black squares between."""
+    """Draw it like Kalibr: tag 0 at the bottom left, two bits of border, black squares between."""
     side, gap = spec.square_m * 1000, (spec.marker_m or 0.0) * 1000
     pitch = side + gap
     width, height = spec.columns * pitch + gap, spec.rows * pitch + gap
@@ -215,16 +217,8 @@ def _ruler(length_mm: int) -> Array:
 
 
 def _yaml(spec: BoardSpec) -> str:
-    fields = [f"kind: {spec.kind.value}"]
-    if spec.kind in SINGLE_TAGS:
-        fields.append(f"id: {spec.tag_id}")
-    else:
-        fields += [f"columns: {spec.columns}", f"rows: {spec.rows}"]
-    fields.append(f"square_m: {spec.square_m:g}")
-    if spec.marker_m is not None:
-        fields.append(f"marker_m: {spec.marker_m:g}")
-    if spec.dictionary:
-        fields.append(f"dictionary: {spec.dictionary}")
-    if spec.legacy:
-        fields.append("legacy: true")
-    return "board: {" + ", ".join(fields) + "}"
+    """Describe the board as a configuration does, in one line."""
+    fields: str = yaml.safe_dump(
+        msgspec.to_builtins(spec), default_flow_style=True, sort_keys=False, width=999
+    )
+    return f"board: {fields.strip()}"

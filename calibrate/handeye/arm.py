@@ -11,7 +11,7 @@ small, and the stated uncertainty of one with errors is not.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
@@ -42,7 +42,7 @@ _SAME_M, _SAME_RAD = 0.02, float(np.radians(2.0))
 
 
 def table_motion(views: ViewSet) -> Array | None:
-    """(n, 6, 18) motion [δt, δφ] of the flange, in base, by each of `PARAMETERS`.
+    """Compute the motion [δt, δφ] (n, 6, 18) of the flange, in base, by each of `PARAMETERS`.
 
     From the recorded joints, else from inverse kinematics of the recorded flanges in one branch that reaches
     them all. None where the robot's model is unknown or its nominal table does not reach the flanges.
@@ -57,7 +57,7 @@ def table_motion(views: ViewSet) -> Array | None:
 
 
 def flex_motion(mount: Mount, flange: Array, held: Array) -> Array:
-    """(n, 6, 9) motion of the flange, in base, by each entry of a bracket's compliance (3, 3), row by row.
+    """Compute the motion (n, 6, 9) of the flange, in base, by each entry of a bracket's compliance (3, 3).
 
     What the flange carries at `held` (4, 4), the camera (eye-in-hand) or the board, turns by
     compliance times the direction of gravity in it, less its mean over the views: X and Y are those of
@@ -91,7 +91,7 @@ def _joints_of_one_branch(model: RobotModel, flanges: Array) -> Array | None:
 
 
 def by_parameters(model: RobotModel, joints_rad: Array) -> Array:
-    """`table_motion` for joints (n, 6) of a known model.
+    """Compute `table_motion` for joints (n, 6) of a known model.
 
     Standard convention: theta and d act about and along z of the frame before the joint; alpha and a about
     and along x, beta about y, of the frame after it.
@@ -122,17 +122,12 @@ _BEFOREHAND = np.array([0.5, 0.1, 0.1, 0.1, 0.1, 0.1])
 _STEPS = 2
 
 
-@dataclass(frozen=True, eq=False)
-class WithTable:
-    estimate: Estimate
-    log_bayes: float
-    """Log evidence of errors of any size against none; above 3 they are worth saying."""
-    size: float
-    """Their size, mm and mrad: the mean over the grid."""
+def allow_for_table(observed: Observations, plain: Estimate, priors: Priors) -> tuple[Estimate, float]:
+    """Estimate anew with the `table` of the observations, from the estimate without it.
 
-
-def allow_for_table(observed: Observations, plain: Estimate, priors: Priors) -> WithTable:
-    """The estimate for observations with `table`; `plain`: the one without. LinAlgError where it fails."""
+    The second value is the log evidence of errors of any size against none; above 3 they are worth saying.
+    Raises LinAlgError where it fails.
+    """
     state = replace(plain.state, table=np.zeros(np.asarray(observed.table).shape[2]))
     scales, weights = plain.scales, plain.corner_weights
     for _ in range(_STEPS):
@@ -163,7 +158,7 @@ def allow_for_table(observed: Observations, plain: Estimate, priors: Priors) -> 
         corner_weights=weights,
         log_evidence=_log_mean(log_evidence, _BEFOREHAND),
     )
-    return WithTable(estimate, found - float(log_evidence[0]), estimate.scales.table)
+    return estimate, found - float(log_evidence[0])
 
 
 def _posterior(solutions: list[LinearSolution]) -> Array:

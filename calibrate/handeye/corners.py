@@ -37,7 +37,7 @@ class CornerBlocks:
 
 
 def bent_points(observed: Observations, shape: Array) -> Array:
-    """(n, k, 3) corners where a board of this `shape` (5,) has them, in its own frame."""
+    """Place the corners (n, k, 3) of a board of this `shape` (5,) in its own frame."""
     s, a, *bends = shape
     x, y = observed.points[..., 0], observed.points[..., 1]
     u, v = _unit_square(observed)
@@ -61,7 +61,7 @@ def _in_camera(observed: Observations, points: Array, C: Array) -> tuple[Array, 
 def corner_residuals(
     observed: Observations, camera: CameraModel, C: Array, shape: Array | None = None
 ) -> Array:
-    """Observed minus modelled pixels (n, k, 2), 0 for padding; not finite behind the camera."""
+    """Compute observed minus modelled pixels (n, k, 2), 0 for padding; not finite behind the camera."""
     if not observed.has_pixels:
         return np.zeros_like(observed.pixels)
     points = observed.points if shape is None else bent_points(observed, shape)
@@ -70,7 +70,7 @@ def corner_residuals(
 
 
 def corner_distance(residuals: Array) -> Array:
-    """(..., 2) → (...): np.linalg.norm's numbers in a third of its time."""
+    """Measure lengths (...) of (..., 2): np.linalg.norm's numbers in a third of its time."""
     square = residuals * residuals
     return np.asarray(np.sqrt(square[..., 0] + square[..., 1]))
 
@@ -83,7 +83,7 @@ def linearise_corners(
     with_lens: bool = False,
     shape: Array | None = None,
 ) -> CornerBlocks:
-    """Blocks at C (n, 4, 4) for `weights` (n, k) in 0 … 1.
+    """Linearise at C (n, 4, 4) for `weights` (n, k) in 0 … 1.
 
     Shared columns: none, those of the lens (`with_lens`), or lens and board shape (with `shape` (5,) too).
     """
@@ -142,7 +142,7 @@ def _linearise_chunk(
 
 
 def boards_by_corners(observed: Observations, camera: CameraModel, C: Array, shape: Array) -> Array:
-    """Board poses (n, 4, 4) by each view's own corners, far corners weighed down; sought from C."""
+    """Fit board poses (n, 4, 4) to each view's own corners from C, far corners weighed down."""
     if not observed.has_pixels:
         return C
     for _ in range(_STEPS):

@@ -2,51 +2,32 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal
-
 import numpy as np
 from scipy import stats
 
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, difference, skew
-from calibrate.handeye.estimate import FULL, Estimate, estimate
+from calibrate.handeye.estimate import FULL, estimate
 from calibrate.handeye.fit import CellFit
 from calibrate.handeye.linear import Linear, inverse_of
 from calibrate.handeye.observations import Layout, Places, implied_flange
+from calibrate.handeye.solution import CrossValidation, Finding
 from calibrate.projection import intrinsics_vector
-from calibrate.views import ViewSet
+from calibrate.results import RejectedView
 
-_EXPLAINED = 4.0
-"""Sigmas of a statement's own tolerance within which views may differ from it."""
 _LOOSER = 0.01
 """A statement is taken back by giving its information this factor, not none: without it X may be open."""
 
 
-@dataclass(frozen=True, eq=False)
-class Finding:
-    """One statement (the lens, the board) against the views."""
-
-    sigmas: float
-    """By which views and statement contradict each other, as those of one normal number."""
-    pull_m: float
-    """By which believing the statement moves X at the working distance."""
-
-    @property
-    def unexplained_m(self) -> float:
-        """The part of `pull_m` that the statement's tolerance does not explain."""
-        return float(self.pull_m * np.maximum(0.0, 1.0 - _EXPLAINED / np.maximum(self.sigmas, 1e-9)))
-
-
 def judge_lens(fit: CellFit, distance_m: float) -> Finding:
-    """A given lens against its pictures and the robot's motion."""
+    """Judge a given lens by its pictures and the robot's motion."""
     state, prior = fit.estimate.state, fit.priors.lens
     places = np.arange(Layout.of(state).lens.start, Layout.of(state).lens.stop)
     return _judge(fit, places, intrinsics_vector(state.camera) - prior.mean, prior.sigma, distance_m)
 
 
 def judge_board(fit: CellFit, distance_m: float) -> Finding:
-    """The stated board (size, equal print, flatness) against the views."""
+    """Judge the stated board (size, equal print, flatness) by the views."""
     state = fit.estimate.state
     places = np.arange(Layout.of(state).shape.start, Layout.of(state).shape.stop)
     return _judge(fit, places, state.shape, fit.priors.board_sigma, distance_m)
@@ -79,7 +60,7 @@ def _judge(fit: CellFit, places: Array, miss: Array, sigma: Array, distance_m: f
 
 
 def error_shares(fit: CellFit) -> dict[str, float]:
-    """Share of X's variance by source, mean over directions, summing to 1.
+    """Split X's variance by source into shares, mean over directions, summing to 1.
 
     Of lens, board shape and arm: what knowing them would take away; the rest by whose noise it is.
     """
@@ -104,73 +85,49 @@ def error_shares(fit: CellFit) -> dict[str, float]:
     }
 
 
-Cause = Literal["wrong-pose", "wrong-number", "inconsistent"]
+_COMPONENTS = ("x", "y", "z", "rotation about x", "rotation about y", "rotation about z")
 _CHANCE = 1e-6
 """Below this a residual is not explained by noise."""
 
 
-_COMPONENTS = ("x", "y", "z", "rotation about x", "rotation about y", "rotation about z")
+def explain_views(fit: CellFit, places: Places) -> tuple[RejectedView, ...]:
+    """Tell how the views at these places, none of which counts, contradict the others, and why."""
+    X, Y = fit.estimate.state.poses(fit.observed)
+    implied = implied_flange(fit.observed.mount, X, Y, fit.estimate.board_poses)
+    return tuple(_explain(fit, implied[place], int(place), places) for place in places)
 
 
-@dataclass(frozen=True)
-class Suspect:
-    place: int
-    cause: Cause
-    residual_m: float
-    residual_rad: float
-    other: int | None = None
-    """Place of the view whose recorded pose belongs to this picture (wrong-pose)."""
-    number: int | None = None
-    """Place in [δt, δφ] of the only wrong number of its recorded pose (wrong-number)."""
-    slip: float = 0.0
-    """By which that number is off, metres or radians."""
-
-
-def explain_views(fit: CellFit, places: Places) -> tuple[Suspect, ...]:
-    """Causes of the views at these places, none of which counts."""
-    found = fit.estimate
-    X, Y = found.state.poses(fit.observed)
-    implied = implied_flange(fit.observed.mount, X, Y, found.board_poses)
-    return tuple(_explain(fit, found, implied, int(place), places) for place in places)
-
-
-def _explain(fit: CellFit, found: Estimate, implied: Array, place: int, places: Places) -> Suspect:
-    residual, covariance = found.robot[place], found.robot_covariance[place]
-    sizes = float(np.linalg.norm(residual[:3])), float(np.linalg.norm(residual[3:]))
+def _explain(fit: CellFit, implied: Array, place: int, places: Places) -> RejectedView:
+    residual, covariance = fit.estimate.robot[place], fit.estimate.robot_covariance[place]
+    view = fit.views.views[place]
     for other in places:
-        if (
-            other != place
-            and _chance(difference(implied[place], fit.observed.flange[other]), covariance) > _CHANCE
-        ):
-            return Suspect(place, "wrong-pose", *sizes, other=int(other))
+        if other == place:
+            continue
+        if _chance(difference(implied, fit.observed.flange[other]), covariance) > _CHANCE:
+            owner = fit.views.views[other]
+            text = f"The image belongs to the robot pose of view {owner.index + 1} ({owner.name})."
+            return RejectedView(view.index, view.name, text, "wrong-pose", belongs_to=owner.index)
     if _chance(residual, covariance) < _CHANCE:
         for number in range(6):
             rest = np.delete(np.arange(6), number)
             inner = covariance[np.ix_(rest, rest)]
             if _chance(residual[rest], inner) > _CHANCE:
                 gain = covariance[number, rest] @ np.linalg.solve(inner, residual[rest])
-                # `robot` is implied minus recorded; a slip is recorded minus true.
-                return Suspect(
-                    place, "wrong-number", *sizes, number=number, slip=float(gain - residual[number])
+                slip = float(
+                    gain - residual[number]
+                )  # recorded minus true; `robot` is implied minus recorded
+                size = f"{slip * 1e3:.2f} mm" if number < 3 else f"{np.degrees(slip):.2f}°"
+                text = f"Only {_COMPONENTS[number]} of the robot pose in base is off, by {size}."
+                return RejectedView(
+                    view.index, view.name, text, "wrong-number", wrong_number=number, slip=slip
                 )
-    return Suspect(place, "inconsistent", *sizes)
+    shift, turn = np.linalg.norm(residual[:3]), np.linalg.norm(residual[3:])
+    text = f"Robot pose and image differ by {shift * 1e3:.2f} mm, {np.degrees(turn):.2f}°."
+    return RejectedView(view.index, view.name, text, "inconsistent")
 
 
 def _chance(residual: Array, covariance: Array) -> float:
     return float(stats.chi2.sf(residual @ np.linalg.solve(covariance, residual), len(residual)))
-
-
-def suspect_text(suspect: Suspect, views: ViewSet) -> str:
-    """How a view contradicts the others, with its cause where the data name one."""
-    apart = f"{suspect.residual_m * 1e3:.2f} mm, {np.degrees(suspect.residual_rad):.2f}°"
-    if suspect.other is not None:
-        other = views.views[suspect.other]
-        return f"The picture belongs to the robot pose of view {other.index + 1} ({other.name})."
-    if suspect.number is not None:
-        component = _COMPONENTS[suspect.number]
-        slip = f"{suspect.slip * 1e3:.2f} mm" if suspect.number < 3 else f"{np.degrees(suspect.slip):.2f}°"
-        return f"Only {component} in base is off, by {slip}; the other five numbers of its pose agree."
-    return f"Robot pose and picture differ by {apart} from what all other views say."
 
 
 FOLDS = 5
@@ -178,26 +135,11 @@ FEWEST_VIEWS = 6
 _STEPS = 3
 """Linearisations of each fold: it starts from the estimate of all views."""
 _CALLED_TOO_SMALL = 1e-4
-"""That sound claims are called too small."""
-
-
-@dataclass(frozen=True, eq=False)
-class CrossValidation:
-    """Of the views that count fully, at the middle of the board."""
-
-    rms_m: float
-    rms_rad: float
-    claimed_m: float
-    """The same as the estimates predict it."""
-    limit: float
-    """Of `rms_m` over `claimed_m`; beyond it the claim is too small."""
-    folds: int
-    residual_m: dict[int, float]
-    """Place of each view → distance by which it was missed."""
+"""Chance that sound claims are called too small."""
 
 
 def cross_validate(fit: CellFit, seed: int) -> CrossValidation | None:
-    """None with too few views, or where a fold determines nothing."""
+    """Predict each view from the other folds; None with too few views, or where a fold determines nothing."""
     full = np.flatnonzero(fit.estimate.chances[:, 0] > FULL)
     if len(full) < FEWEST_VIEWS:
         return None

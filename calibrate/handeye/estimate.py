@@ -76,7 +76,7 @@ def estimate(
     fit_scales: bool = True,
     max_steps: int = MAX_STEPS,
 ) -> Estimate:
-    """Maximum of the posterior from `start`.
+    """Find the maximum of the posterior from `start`.
 
     scales: where to start, or what to keep (`fit_scales` False); None: `wide` times what residuals show.
     Raises BadViewsError where views and priors together do not determine the unknowns.
@@ -120,7 +120,7 @@ def estimate(
 
 
 def corner_weights(observed: Observations, state: State, sigma_px: float) -> Array:
-    """(n, k): Student's t about the model; 0 for padding."""
+    """Weigh corners (n, k) by Student's t about the model; 0 for padding."""
     if not observed.has_pixels:
         return observed.present
     distance = corner_distance(corner_residuals(observed, state.camera, state.C, state.shape))

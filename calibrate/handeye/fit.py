@@ -1,4 +1,4 @@
-"""From views to the estimate: a certain start, boards set right, every unknown together."""
+"""The way from views to the estimate: a certain start, boards set right, every unknown together."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from calibrate.errors import BadViewsError, PosesDisagreeError
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
-from calibrate.handeye.arm import RELATIVE_SIGMA, WithTable, allow_for_table, flex_motion, table_motion
+from calibrate.handeye.arm import RELATIVE_SIGMA, allow_for_table, flex_motion, table_motion
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses
 from calibrate.handeye.axxb.robust import GlobalResult, solve_global
 from calibrate.handeye.estimate import Estimate, estimate
@@ -34,24 +34,24 @@ class CellFit:
     """Everything about a cell that its views tell."""
 
     views: ViewSet
-    """As they were read, boards turned where that was needed."""
+    """The input, boards turned where that was needed."""
     turned: tuple[int, ...]
     """Places of the views whose board was turned."""
     observed: Observations
     priors: Priors
     estimate: Estimate
-    table: WithTable | None
-    """None where systematic errors of arm and bracket were not modelled."""
+    log_bayes: float | None
+    """Log evidence of systematic errors of arm and bracket; None where they were not modelled."""
     arm_known: bool
     """Errors of the arm's kinematic table are among them."""
     pairs: Pairs
-    """Of the views that count; after a move, of those after it."""
+    """Pairs of the views that count; after a move, of those after it."""
     certified: GlobalResult
     """Optimum of the quadratic objective over these pairs."""
 
 
 def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True) -> CellFit:
-    """Raises BadViewsError or DegenerateMotionError where the views determine no X."""
+    """Fit everything. Raises BadViewsError or DegenerateMotionError where the views determine no X."""
     H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
     pairs = all_pairs(H, C)
     require_motion(pairs)
@@ -62,23 +62,23 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
     state = State(start.X, start.Y, C, views.camera, np.zeros(len(SHAPE)), np.zeros(0))
     found = _likeliest(observed, state, priors)
     require_plausible_noise(found)
-    table, arm = None, table_motion(views) if with_table else None
+    log_bayes, arm = None, table_motion(views) if with_table else None
     if with_table and len(views) >= FEWEST_FOR_TABLE:
         held = found.state.X if views.mount == "eye-in-hand" else found.state.Y
         flex = flex_motion(views.mount, views.base_from_flange, held)
         motion = flex if arm is None else np.concatenate([arm * RELATIVE_SIGMA, flex], axis=2)
         try:
-            table = allow_for_table(replace(observed, table=motion), found, priors)
-            observed, found = replace(observed, table=motion), table.estimate
+            found, log_bayes = allow_for_table(replace(observed, table=motion), found, priors)
+            observed = replace(observed, table=motion)
         except np.linalg.LinAlgError:
             pass
     pairs, certified = _certify(views, found, np.flatnonzero(found.used), seed)
-    known = table is not None and arm is not None
-    return CellFit(views, turned, observed, priors, found, table, known, pairs, certified)
+    known = log_bayes is not None and arm is not None
+    return CellFit(views, turned, observed, priors, found, log_bayes, known, pairs, certified)
 
 
 def _likeliest(observed: Observations, start: State, priors: Priors) -> Estimate:
-    """From two starts of the noise; the narrow one, which finds bad views, must be clearly likelier."""
+    """Try two starts of the noise; the narrow one, which finds bad views, must be clearly likelier."""
     found = estimate(observed, start, priors)
     narrow = estimate(observed, start, priors, wide=_NARROW)
     return narrow if narrow.log_evidence > found.log_evidence + _CLEARLY else found
@@ -92,7 +92,7 @@ def _certify(views: ViewSet, found: Estimate, places: Places, seed: int) -> tupl
 
 
 def fit_moved(views: ViewSet, priors: Priors, poses: PoseViews, at: int, moved: Moved, seed: int) -> CellFit:
-    """A cell whose camera or board was moved before the view at place `at`: both halves count.
+    """Fit a cell whose camera or board was moved before the view at place `at`: both halves count.
 
     X and the board's pose are those after the move. Raises BadViewsError where a half determines nothing.
     """
@@ -123,7 +123,7 @@ def fit_moved(views: ViewSet, priors: Priors, poses: PoseViews, at: int, moved: 
 
 
 def require_plausible_noise(found: Estimate) -> None:
-    """PosesDisagreeError where robot and pictures have nothing to do with each other."""
+    """Raise PosesDisagreeError where robot and pictures have nothing to do with each other."""
     robot_m, robot_rad = found.scales.robot
     if found.used.sum() < FEWEST_USED:
         raise PosesDisagreeError("Robot poses and pictures disagree in nearly every view.")
@@ -140,7 +140,7 @@ _NEARER = 0.2
 
 
 def set_boards_right(views: ViewSet, X: Array, Y: Array) -> tuple[ViewSet, tuple[int, ...]]:
-    """The views, boards turned where that brings them to the board's pose Y, and the places turned."""
+    """Turn boards where that brings them to the board's pose Y; the views, and the places turned."""
     H = mount_poses(views.base_from_flange, views.mount)
     kept, turned = list(views.views), []
     for place, view in enumerate(views):

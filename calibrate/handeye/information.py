@@ -1,4 +1,4 @@
-"""What a set of views can tell: information of X, board pose, lens and board shape from geometry alone.
+"""Information of a set of views on X, board pose, lens and board shape, from geometry alone.
 
 The model is the estimate's own (`handeye.linear`): corner noise, and on every robot pose an independent error
 that is a nuisance of its own view. Parameter order: δX (6), δY (6), the lens (`projection.intrinsics_names`),
@@ -44,7 +44,7 @@ def view_information(
     board_points: Array,
     noise: MeasurementNoise,
 ) -> Array:
-    """Information of each view (n, p, p), the whole board (k, 3) seen from each flange pose (n, 4, 4).
+    """Compute each view's information (n, p, p), the whole board (k, 3) seen from flange poses (n, 4, 4).
 
     The view's own robot error is marginalised, so views simply add.
     """
@@ -74,7 +74,7 @@ def view_information(
 
 
 def prior_information(camera: CameraModel, lens_known: bool, board: BoardTolerance) -> Array:
-    """(p, p) of what is known before any view: lens (`LensPrior`) and board's tolerance."""
+    """Compute the information (p, p) before any view: lens (`LensPrior`) and board's tolerance."""
     state = State(np.eye(4), np.eye(4), np.zeros((0, 4, 4)), camera, np.zeros(len(SHAPE)), np.zeros(0))
     lens = LensPrior.given(camera) if lens_known else LensPrior.unknown(camera)
     N = Priors(lens, board).linearise(state, 0.0).N
@@ -85,7 +85,7 @@ def prior_information(camera: CameraModel, lens_known: bool, board: BoardToleran
 
 
 def covariance_of(information: Array, prior: Array | None = None) -> Array:
-    """Information (..., p, p) → covariance (..., p, p), scaled inside so that metres and pixels do not clash.
+    """Invert information (..., p, p) to covariance, scaled so that metres and pixels do not clash.
 
     `prior` (p, p) is added. Directions without information get a huge variance.
     """

@@ -31,7 +31,7 @@ Fit = Literal["all", "robot", "nothing"]
 STUDENT = 8.0
 """Degrees of freedom of Student's t of a corner: a wrong detection loses its weight."""
 _INFORMATION = (STUDENT + 2) / (STUDENT + 4)
-"""Of a corner with that distribution, against a normal one of the same scale."""
+"""Information of a corner with that distribution over that of a normal one of the same scale."""
 ROBOT_PRIOR_COUNT = 1.0
 _ROBOT_PRIOR_M, _ROBOT_PRIOR_RAD = 1e-4, float(np.radians(0.02))
 WIDE = 3.0
@@ -63,7 +63,7 @@ class Scales:
 
 
 def first_scales(linear: Linear, wide: float = WIDE) -> Scales:
-    """Medians of the residuals, the robot's times `wide`: a view must be found wrong, not start so."""
+    """Take medians of the residuals, the robot's times `wide`: a view must be found wrong, not start so."""
     robot = [wide * 1.48 * float(np.median(np.abs(part))) for part in (linear.m[:, :3], linear.m[:, 3:])]
     pixel = 1.0 if linear.modes is None else linear.modes.typical_px
     robot_m, robot_rad = (max(value, 1e-5) for value in robot)
@@ -86,12 +86,12 @@ class LinearSolution:
     z: Array
     """(n, K, 6) S_k⁻¹ m at the step's end."""
     log_evidence: float
-    """Of the robot residuals, up to a constant of the linearisation (Laplace)."""
+    """Log evidence of the robot residuals, up to a constant of the linearisation (Laplace)."""
 
 
 @dataclass(frozen=True, eq=False)
 class CornerModes:
-    """What the corners tell of lens and board shape, board poses eliminated."""
+    """Information of the corners on lens and board shape, board poses eliminated."""
 
     to_optimum: Array
     """(n, 6) step of each board pose to its own corners' optimum."""
@@ -127,12 +127,12 @@ class CornerModes:
         )
 
     def gain(self, step: Array) -> float:
-        """Half the squares (px²) that a step (G,) takes away."""
+        """Compute half the squares (px²) that a step (G,) takes away."""
         x = step[self.shared]
         return float(self.right.sum(axis=0) @ x - 0.5 * x @ self.information.sum(axis=0) @ x)
 
     def variances(self, lambda_px: float, covariance: Array, step: Array) -> tuple[float, float]:
-        """σ² of the plain corner noise and λ² of that in the modes of lens and shape, px², after a step."""
+        """Fit σ² of plain corner noise and λ² of that in the modes of lens and shape, px², after a step."""
         scale = 1.0 / np.sqrt(np.maximum(np.einsum("nii->ni", self.whole), 1e-300))
         values, vectors = np.linalg.eigh(self.information * scale[:, :, None] * scale[:, None, :])
         kept = values > 1e-6
@@ -181,7 +181,7 @@ class Linear:
     def at(
         cls, observed: Observations, state: State, weights: Array, information: float = _INFORMATION
     ) -> Linear:
-        """weights: (n, k) of the corners; information: of a corner of weight 1, against a normal one."""
+        """Linearise at `state`; weights (n, k), and information of a corner over a normal one's."""
         at, n = Layout.of(state), len(observed)
         m = flange_residuals(observed, state)
         bare = m if observed.table is None or not len(state.table) else m + observed.table @ state.table
@@ -204,7 +204,7 @@ class Linear:
         return cls(H, A, m + (A @ modes.to_optimum[..., None])[..., 0], J, modes)
 
     def solve(self, prior: Quadratic, scales: Scales, fit: Fit = "all") -> LinearSolution:
-        """The step, and the noise scales that are to be fitted, by rounds of expectation and maximisation."""
+        """Find the step and the noise scales to be fitted, by rounds of expectation and maximisation."""
         residual = self.m
         for _ in range(1 if fit == "nothing" else _ROUNDS):
             S, S_inverse = self._noise(scales)
@@ -271,12 +271,12 @@ class Linear:
         return replace(updated, tau_px=tau, lambda_px=lambda_, sigma_px=sigma)
 
     def predicted(self, scales: Scales, covariance: Array) -> Array:
-        """(n, 6, 6) of m for an ordinary view, where the unknowns have this covariance (G, G) without it."""
+        """Predict the covariance (n, 6, 6) of m for an ordinary view, unknown to `covariance` (G, G)."""
         noise = scales.tau_px**2 * self.B + np.diag(scales.classes[0])
         return np.asarray(noise + self.J @ covariance @ np.swapaxes(self.J, 1, 2))
 
     def board_step(self, solved: LinearSolution) -> Array:
-        """(n, 6) step of the board poses that belongs to the step of the shared unknowns."""
+        """Compute the step (n, 6) of the board poses that belongs to the step of the shared unknowns."""
         pull = np.einsum("nk,nki->ni", solved.chances, solved.z)
         by_robot = np.einsum("nij,nkj,nk->ni", self.H, self.A, pull, optimize=True)
         step = -(solved.scales.tau_px**2) * by_robot
@@ -285,11 +285,11 @@ class Linear:
         return np.asarray(step)
 
     def seen_boards(self, C: Array) -> Array:
-        """(n, 4, 4) the board poses C, each moved to its own corners' optimum."""
+        """Move the board poses C (n, 4, 4), each to its own corners' optimum."""
         return C if self.modes is None else perturb(C, self.modes.to_optimum)
 
     def lost(self, solved: LinearSolution) -> Array:
-        """(G, G) information that not knowing the views' classes costs (Louis 1982)."""
+        """Compute the information (G, G) that not knowing the views' classes costs (Louis 1982)."""
         mean = np.einsum("nk,nki->ni", solved.chances, solved.z)
         spread = np.einsum("nk,nki,nkj->nij", solved.chances, solved.z, solved.z, optimize=True)
         spread -= mean[:, :, None] * mean[:, None, :]
@@ -304,7 +304,7 @@ class Linear:
         return np.asarray(np.einsum("nia,nij,njb->ab", self.J, spread, self.J, optimize=True))
 
     def noise_parts(self, solved: LinearSolution, covariance: Array) -> Array:
-        """(3,) whitened variance of X that corners, robot translation and robot rotation make."""
+        """Compute X's whitened variance (3,) from corners, robot translation and robot rotation."""
         _, S_inverse = self._noise(solved.scales)
         gain = covariance[:6] @ np.swapaxes(self.J, 1, 2)
         ordinary = solved.scales.classes[0]
@@ -320,7 +320,7 @@ class Linear:
         return np.array(parts)
 
     def covariance(self, solved: LinearSolution) -> Array:
-        """(G, G) of the posterior, doubts about the views' classes included."""
+        """Compute the posterior covariance (G, G), doubts about the views' classes included."""
         return inverse_of(solved.precision - self.lost(solved))
 
 
@@ -335,7 +335,7 @@ def _chances(residual: Array, S: Array, S_inverse: Array, shares: Array) -> tupl
 
 
 def inverse_of(N: Array) -> Array:
-    """Of a symmetric positive matrix, scaled to ones first. LinAlgError where it is not.
+    """Invert a symmetric positive matrix, scaled to ones first. LinAlgError where it is not.
 
     What rounding cannot tell from open (two terms of a rational lens, say) gets a huge variance, not an
     infinite one.

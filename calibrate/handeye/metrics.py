@@ -30,7 +30,7 @@ class Observability:
 
 
 def motion_errors(X: Array, pairs: Pairs) -> tuple[Array, Array]:
-    """Equations 24-26 per pair: e_t (n,) metres and e_R (n,), the spectral norm of the difference."""
+    """Compute e_t (n,) metres and e_R (n,), the spectral norm of the difference, per pair (eqs. 24-26)."""
     estimated = X @ pairs.B @ np.linalg.inv(X)  # raw 4×4: peers may return what is not rigid
     e_t = np.linalg.norm(estimated[:, :3, 3] - pairs.A[:, :3, 3], axis=1)
     e_R = np.linalg.norm(estimated[:, :3, :3] - pairs.A[:, :3, :3], ord=2, axis=(1, 2))
@@ -51,17 +51,17 @@ def score_holdout(
 
 
 def mean_pose(poses: Array) -> Array:
-    """Mean translation and chordal mean rotation of poses (n, 4, 4) → (4, 4)."""
+    """Average poses (n, 4, 4) → (4, 4): mean translation, chordal mean rotation."""
     return pose(project_to_rotation(poses[:, :3, :3].mean(axis=0)), poses[:, :3, 3].mean(axis=0))
 
 
 def board_places(H: Array, camera_from_board: Array, X: Array) -> Array:
-    """Where each view puts the board: H_i X C_i (n, 4, 4), all equal in a perfect world."""
+    """Compute the board's pose by each view: H_i X C_i (n, 4, 4), all equal in a perfect world."""
     return np.asarray(H @ X @ camera_from_board)
 
 
 def board_spread(H: Array, camera_from_board: Array, X: Array) -> tuple[float, float]:
-    """Root mean square deviation of those places from their mean: metres (board origin), radians."""
+    """Compute the rms deviation of `board_places` from their mean: metres (board origin), radians."""
     places = board_places(H, camera_from_board, X)
     mean = mean_pose(places)
     distance2 = ((places[:, :3, 3] - mean[:3, 3]) ** 2).sum(axis=1)
@@ -70,7 +70,7 @@ def board_spread(H: Array, camera_from_board: Array, X: Array) -> tuple[float, f
 
 
 def axis_spread(pairs: Pairs) -> tuple[Array, Array]:
-    """Singular values (3,) of the rotation vectors α of A (rms, rad), and their directions (3, 3) by row."""
+    """Compute singular values (3,) of the rotation vectors α of A (rms, rad) and directions (3, 3) by row."""
     _, singular, directions = np.linalg.svd(pairs.alpha, full_matrices=False)
     return np.asarray(singular / np.sqrt(len(pairs))), np.asarray(directions)
 
@@ -100,7 +100,7 @@ def require_motion(pairs: Pairs) -> None:
 
 
 def observe(pairs: Pairs, covariance: Array, distance_m: float, parent: str) -> Observability:
-    """Which direction of X is known worst, rotations weighed as metres at `distance_m`.
+    """Find the direction of X that is known worst, rotations weighed as metres at `distance_m`.
 
     covariance: (6, 6) of X; parent: the name of X's parent frame, for the sentence.
     """
@@ -128,7 +128,7 @@ def observe(pairs: Pairs, covariance: Array, distance_m: float, parent: str) -> 
 
 
 def point_error_m(X: Array, covariance: Array, distance_m: float) -> float:
-    """Root mean squared error, in X's parent, of a point on the camera's axis at `distance_m` (1σ).
+    """Predict the rms error (1σ), in X's parent, of a point on the camera's axis at `distance_m`.
 
     X (4, 4), covariance C (6, 6). p = R z + t moves by δt + δφ × R z, so J = [1, -[R z]×]: √trace(J C Jᵀ).
     """
@@ -138,12 +138,12 @@ def point_error_m(X: Array, covariance: Array, distance_m: float) -> float:
 
 
 def median_distance_m(camera_from_board: Array) -> float:
-    """From the camera to the board's origin, over poses (n, 4, 4)."""
+    """Compute the median distance from camera to board origin over poses (n, 4, 4)."""
     return float(np.median(np.linalg.norm(camera_from_board[:, :3, 3], axis=1)))
 
 
 def distance_in_sigmas(X: Array, reference: Array, covariance: Array) -> float:
-    """Largest number of sigmas between two X (4, 4) over all directions: the Mahalanobis norm of their delta.
+    """Compute the largest number of sigmas between two X (4, 4) over all directions (Mahalanobis).
 
     covariance: (6, 6) of that delta.
     """
@@ -162,7 +162,7 @@ class HeldOut:
 
 
 def held_out_views(views: ViewSet) -> HeldOut | None:
-    """All pairs inside the last 6 views, with camera poses; None for too few views."""
+    """Hold out all pairs inside the last 6 views; None for too few views."""
     fitted = len(views) - HELD_OUT
     if fitted < _FEWEST_FITTED:
         return None
@@ -172,7 +172,7 @@ def held_out_views(views: ViewSet) -> HeldOut | None:
 
 
 def held_out_pairs(views: ViewSet) -> HeldOut | None:
-    """The paper's own samples: the last 6 consecutive pairs; fitted on the views of the pairs before."""
+    """Hold out the paper's own samples, the last 6 consecutive pairs; fit the views of those before."""
     H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
     pairs = consecutive_pairs(H, C)
     count = len(pairs) - HELD_OUT

@@ -46,7 +46,7 @@ class Observations:
     later: NDArray[np.bool_] | None = None
     """(n,) the views after something was moved (`State.second`); None where nothing was."""
     moved: Moved = "board"
-    """What was moved: the camera (X has a second value) or the board (Y has)."""
+    """Camera (X has a second value) or board (Y has)."""
 
     def __len__(self) -> int:
         return len(self.flange)
@@ -56,7 +56,7 @@ class Observations:
         return bool(self.present.any())
 
     def part(self, places: Places) -> Observations:
-        """These views only."""
+        """Select these views."""
         return replace(
             self,
             flange=self.flange[places],
@@ -87,7 +87,7 @@ class State:
     """(4, 4) X or Y of the later views, where something was moved."""
 
     def poses(self, observed: Observations) -> tuple[Array, Array]:
-        """X and Y of every view, (n, 4, 4) each or one (4, 4) for all."""
+        """Return X and Y of every view, (n, 4, 4) each or one (4, 4) for all."""
         if self.second is None or observed.later is None:
             return self.X, self.Y
         later = observed.later[:, None, None]
@@ -96,15 +96,15 @@ class State:
         return self.X, np.where(later, self.second, self.Y)
 
     def of_views(self, places: Places) -> State:
-        """With the board poses of these views only."""
+        """Select the board poses of these views."""
         return replace(self, C=self.C[places])
 
     def with_boards(self, C: Array) -> State:
-        """With other board poses (m, 4, 4)."""
+        """Replace the board poses by others (m, 4, 4)."""
         return replace(self, C=C)
 
     def moved(self, step: Array, by_view: Array) -> State:
-        """After a step (G,) in the order of `Layout` and (n, 6) for C."""
+        """Take a step (G,) in the order of `Layout`, and (n, 6) for C."""
         at = Layout.of(self)
         camera = with_intrinsics_vector(self.camera, intrinsics_vector(self.camera) + step[at.lens])
         return replace(
@@ -161,27 +161,27 @@ def observe_views(views: ViewSet) -> Observations:
 
 
 def extent_of(points: Array) -> Array:
-    """(2, 2) middle and half size, metres, of points (m, 3) on the board."""
+    """Compute middle and half size (2, 2), metres, of points (m, 3) on the board."""
     low, high = points[:, :2].min(axis=0), points[:, :2].max(axis=0)
     return np.stack([(low + high) / 2, np.maximum((high - low) / 2, 1e-6)])
 
 
 def implied_flange(mount: Mount, X: Array, Y: Array, C: Array) -> Array:
-    """base_from_flange (n, 4, 4): Y C⁻¹ X⁻¹ (eye-in-hand) or X C Y⁻¹ (eye-to-hand)."""
+    """Compute base_from_flange (n, 4, 4): Y C⁻¹ X⁻¹ (eye-in-hand) or X C Y⁻¹ (eye-to-hand)."""
     if mount == "eye-in-hand":
         return np.asarray(Y @ inverse(C) @ inverse(X))
     return np.asarray(X @ C @ inverse(Y))
 
 
 def flange_residuals(observed: Observations, state: State) -> Array:
-    """(n, 6) [δt, δφ] in base: implied minus recorded flange, errors of the kinematic table taken out."""
+    """Compute [δt, δφ] (n, 6) in base, implied minus recorded flange, without errors of the arm's table."""
     X, Y = state.poses(observed)
     miss = difference(implied_flange(observed.mount, X, Y, state.C), observed.flange)
     return miss if observed.table is None or not len(state.table) else miss - observed.table @ state.table
 
 
 def flange_derivatives(mount: Mount, X: Array, Y: Array, C: Array, miss: Array) -> tuple[Array, Array, Array]:
-    """∂residual/∂X, ∂Y, ∂C (n, 6, 6) of `perturb`'s deltas.
+    """Compute ∂residual/∂X, ∂Y, ∂C (n, 6, 6) of `perturb`'s deltas.
 
     X and Y: (4, 4), or (n, 4, 4) where they differ from view to view; C (n, 4, 4); miss: (n, 6), the residual
     without errors of the kinematic table.

@@ -54,7 +54,7 @@ _EXACT = 1e-6
 
 
 def compare_all(views: ViewSet, options: SolveOptions | None = None) -> list[PeerResult]:
-    """One row per method, ours last. All get the views that ours keeps (turned boards set right), with the
+    """Run every method, ours last. All get the views that ours keeps (turned boards set right), with the
     board poses of the given intrinsics; e_t and e_R are scored on the last 6 of them, fitted without.
 
     With the paper's profile all get every view, as the paper's method does, and are scored on its samples.
@@ -177,7 +177,7 @@ def _scored(name: str, X: Array, views: ViewSet, ours: Solution) -> PeerResult:
 
 
 def _with_samples(row: PeerResult, partial_X: Array | None, pairs: Pairs) -> PeerResult:
-    """With e_t and e_R of an X (4, 4) that was fitted without these pairs."""
+    """Add e_t and e_R of an X (4, 4) that was fitted without these pairs."""
     if partial_X is None or not np.isfinite(partial_X).all():
         return row
     e_t, e_R = motion_errors(partial_X, pairs)
@@ -188,7 +188,7 @@ _STEPS = 8
 
 
 def reprojection_px(views: ViewSet, X: Array) -> float | None:
-    """Root mean square distance over all corners with the best board pose for this X; None without pixels.
+    """Compute the rms distance over all corners at the best board pose for this X; None without pixels.
 
     Infinite when corners fall behind the camera.
     """

@@ -23,9 +23,9 @@ from recordings.schema.messages import Mount
 
 _SUBSETS, _OF = 120, 4
 _VOTERS = 60
-"""Of more views, this many judge, evenly spread."""
+"""Most views that judge, evenly spread."""
 _SHARE = 0.55
-"""Of the views that have to agree."""
+"""Share of the views that have to agree."""
 _OPEN = 0.1
 _LEVER_M = 0.5
 """Turns a rotation into a length."""
@@ -47,7 +47,7 @@ class BoardPoses:
         return cls(C, np.zeros((0, len(C), 6)), np.zeros(0))
 
     def at(self, factors: Array) -> Array:
-        """(n, 4, 4) for factors (p,)."""
+        """Compute the poses (n, 4, 4) for factors (p,)."""
         return perturb(self.C, np.einsum("p,pni->ni", factors - 1.0, self.motion))
 
     def part(self, places: Places) -> BoardPoses:
@@ -70,7 +70,7 @@ class Start:
 
 
 def agreed_start(H: Array, boards: BoardPoses, seed: int, candidate: Array | None = None) -> Start:
-    """The X, board pose and factors on which the largest part of the views agrees best.
+    """Find the X, board pose and factors on which the largest part of the views agrees best.
 
     H as in `pairs`, (n, 4, 4). Park and Martin's method (1994) on subsets of four views; the one with the
     least 55 % quantile of the distance from the most central board pose wins. `candidate`: an X (4, 4) that
@@ -131,7 +131,7 @@ def _of_subsets(H: Array, boards: BoardPoses, subsets: Places) -> tuple[Array, A
 
 
 def central_pose(places: Array) -> Array:
-    """(4, 4): the mean of those of `places` (n, 4, 4) that are nearest to the most central one."""
+    """Average those of `places` (n, 4, 4) that are nearest to the most central one, (4, 4)."""
     some = places[:: 1 + len(places) // (4 * _VOTERS)]
     middle = some[int(_reach(some).argmin())]
     near = np.argsort(_distance(places, middle[None])[:, 0], kind="stable")[: _quorum(len(places)) + 1]
@@ -162,7 +162,7 @@ _SETTLED = 0.3
 
 @dataclass(frozen=True, eq=False)
 class PoseViews:
-    """What was recorded, each picture reduced to a board pose."""
+    """The recording with each picture reduced to a board pose."""
 
     mount: Mount
     flange: Array
@@ -188,7 +188,7 @@ class PoseViews:
 
 
 def pose_views(views: ViewSet, focal_sigma: float, size_sigma: float) -> PoseViews:
-    """The views with `camera_from_board`; 1σ of the lens' focal length and of the board's size, relative.
+    """Reduce views with `camera_from_board`; 1σ of focal length and board size are relative.
 
     Two factors move the board poses: true over assumed size of the board, and focal length.
     """
@@ -230,7 +230,7 @@ class PoseFit:
 
 
 def fit_poses(views: PoseViews, seed: int = 0) -> PoseFit:
-    """Most likely X, board pose and factors. LinAlgError where the views determine none."""
+    """Find the most likely X, board pose and factors. LinAlgError where the views determine none."""
     X, Y, factors = _start(views, seed)
     scales: Scales | None = None
     for _ in range(_STEPS):

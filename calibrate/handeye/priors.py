@@ -1,4 +1,4 @@
-"""What is known of a cell before its pictures are looked at: lens, board, arm."""
+"""Priors on lens, board and arm: knowledge from before the pictures are looked at."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from calibrate.projection import intrinsics_names, intrinsics_vector
 from recordings.schema.messages import BoardSpec, CameraModel
 
 ASPECT_SIGMA = 0.001
-"""Of log(fy/fx): a sensor's pixels are square. It tells an unequal print from the lens."""
+"""1σ of log(fy/fx): a sensor's pixels are square. It tells an unequal print from the lens."""
 _NOT_SQUARE = 0.02
 """A lens farther from square pixels than this belongs to a sensor that has none: it keeps its ratio."""
 _KNOWN = {"k1": 0.01, "k2": 0.02, "k3": 0.02, "k4": 0.02, "k5": 0.02, "k6": 0.02, "p1": 5e-4, "p2": 5e-4}
@@ -35,7 +35,7 @@ class BoardTolerance:
 
     @classmethod
     def of(cls, board: BoardSpec) -> BoardTolerance:
-        """As the board's description states it, else the usual one."""
+        """Take what the board's description states, else the usual one."""
         usual = cls()
         return cls(
             usual.square if board.square_tolerance is None else board.square_tolerance,
@@ -53,7 +53,7 @@ class LensPrior:
 
     @classmethod
     def given(cls, camera: CameraModel, sigma: Array | None = None) -> LensPrior:
-        """A lens that somebody calibrated, with the uncertainty (p,) stated for it or the usual one."""
+        """Describe a calibrated lens, with the uncertainty (p,) stated for it or the usual one."""
         mean = intrinsics_vector(camera)
         if sigma is None:
             names = intrinsics_names(camera)
@@ -64,7 +64,7 @@ class LensPrior:
 
     @classmethod
     def unknown(cls, camera: CameraModel) -> LensPrior:
-        """Of a lens found from the same pictures: only its model is known."""
+        """Describe a lens of which only the model is known: it is found from the same pictures."""
         start = intrinsics_vector(camera)
         names = intrinsics_names(camera)
         mean = np.zeros(len(names))
@@ -91,7 +91,7 @@ class Quadratic:
     log: float = 0.0
 
     def gain(self, step: Array) -> float:
-        """Log density at a step (G,) against that at the state."""
+        """Compute the log density at a step (G,) against that at the state."""
         return float(self.right @ step - 0.5 * step @ self.N @ step)
 
 
@@ -101,7 +101,7 @@ class Priors:
     board: BoardTolerance = field(default_factory=BoardTolerance)
 
     def linearise(self, state: State, table: float) -> Quadratic:
-        """Around `state`, for errors of the kinematic table of size `table` (mm and mrad)."""
+        """Linearise around `state`, for errors of the kinematic table of size `table` (mm and mrad)."""
         at = Layout.of(state)
         N, right = np.zeros((at.size, at.size)), np.zeros(at.size)
         vector = intrinsics_vector(state.camera)

@@ -18,7 +18,6 @@ from calibrate.handeye.diagnosis import (
     explain_views,
     judge_board,
     judge_lens,
-    suspect_text,
 )
 from calibrate.handeye.estimate import FULL, estimate
 from calibrate.handeye.fit import CellFit, fit_cell, fit_moved
@@ -44,7 +43,7 @@ from calibrate.handeye.solution import (
     board_frames,
     camera_frames,
 )
-from calibrate.results import BoardShape, HoldoutScore, RejectedView
+from calibrate.results import BoardShape, HoldoutScore
 from calibrate.stopwatch import Stopwatch
 from calibrate.views import ViewSet
 
@@ -57,7 +56,7 @@ _FREE_FOCAL = 0.02
 
 
 def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
-    """The estimate of all views. PosesDisagreeError names the reading that would explain the recording."""
+    """Estimate from all views. PosesDisagreeError names the reading that would explain the recording."""
     watch = Stopwatch()
     priors = _priors(views, options)
     poses = pose_views(views, _focal_sigma(priors), priors.board.square)
@@ -69,7 +68,7 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
     watch.lap("estimate")
 
     def ask() -> tuple[Explanation, CellFit | None]:
-        """How the recording has to be read, and the fit of a move that is accepted."""
+        """Find how the recording has to be read, and fit a move that is accepted."""
         found = explain_recording(poses, options.seed)
         moved = _MOVED.get(found.reading)
         watch.lap("readings")
@@ -114,7 +113,7 @@ def _focal_sigma(priors: Priors) -> float:
 
 
 def _doubtful(solution: Solution) -> bool:
-    """Is there something that another reading of the whole recording might explain?"""
+    """Tell whether something is left that another reading of the whole recording might explain."""
     folds, noise = solution.cross_validation, solution.noise
     findings = (solution.lens_finding, solution.board_finding)
     return bool(
@@ -156,7 +155,7 @@ def _describe(fit: CellFit, options: SolveOptions, watch: Stopwatch) -> Solution
         camera=state.camera,
         rms_px=rms_px,
         used=tuple(indices[i] for i in used),
-        rejected=_rejected(fit),
+        rejected=explain_views(fit, np.flatnonzero(~found.used)),
         certificate=replace(certified.certificate, distance_sigma=apart),
         observability=observe(pairs, covariance, distance, parent),
         holdout=holdout,
@@ -203,29 +202,14 @@ def _board(fit: CellFit, covariance: Array) -> BoardShape:
 
 
 def _arm(fit: CellFit, covariance: Array) -> ArmTable | None:
-    if fit.table is None:
+    if fit.log_bayes is None:
         return None
     names = (*PARAMETERS, *FLEX) if fit.arm_known else FLEX
     unit = np.concatenate([RELATIVE_SIGMA, np.ones(len(FLEX))])[-len(names) :]
     value = unit * fit.estimate.state.table
     sigma = unit * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     errors = dict(zip(names, zip(value.tolist(), sigma.tolist(), strict=True), strict=True))
-    return ArmTable(fit.table.log_bayes, fit.table.size, errors, fit.arm_known)
-
-
-def _rejected(fit: CellFit) -> tuple[RejectedView, ...]:
-    places = np.flatnonzero(~fit.estimate.used)
-    return tuple(
-        RejectedView(
-            fit.views.views[suspect.place].index,
-            fit.views.views[suspect.place].name,
-            suspect_text(suspect, fit.views),
-            suspect.cause,
-            None if suspect.other is None else fit.views.views[suspect.other].index,
-            suspect.number,
-        )
-        for suspect in explain_views(fit, places)
-    )
+    return ArmTable(fit.log_bayes, fit.estimate.scales.table, errors, fit.arm_known)
 
 
 def _holdout(fit: CellFit) -> HoldoutScore | None:

@@ -30,7 +30,7 @@ from calibrate.views import ViewSet
 _CLEAR = 10.0
 """Log evidence beyond chance by which another reading has to win."""
 _MOST_VIEWS = 60
-"""Of more, this many are read, evenly spread (neighbours for shifted pictures)."""
+"""Most views that are read, evenly spread (neighbours for shifted pictures)."""
 _LARGEST_SHIFT = 3
 _FEWEST_PER_PART = 4
 _LOST_VIEW = 15.0
@@ -46,7 +46,7 @@ _FREE = 1.0
 
 
 class Reading(Enum):
-    """What a recording may be instead of what it says; the value is its code in files."""
+    """Ways in which a recording may have to be read; the value is the code in files."""
 
     AS_RECORDED = "as-recorded"
     INVERSE_POSES = "inverse-poses"
@@ -76,14 +76,14 @@ class Explanation:
     factor: float = 1.0
     """True over configured size of the squares, or focal length, of the later part where it changed."""
     share: float = 1.0
-    """Of the views that carry full weight under this reading."""
+    """Share of the views that carry full weight under this reading."""
 
 
 _FACTOR = {Reading.SQUARE_SIZE: _SIZE, Reading.FOCAL_LENGTH: _FOCAL, Reading.REFOCUSED: -1}
 
 
 def explain_recording(views: PoseViews, seed: int = 0) -> Explanation:
-    """The best reading; AS_RECORDED unless another one's evidence is clear beyond chance."""
+    """Find the best reading; AS_RECORDED unless another one's evidence is clear beyond chance."""
     as_recorded = _fit(views, seed)
     if as_recorded is None:
         base = -np.inf
@@ -203,7 +203,7 @@ def _w_first(R: Array) -> Array:
 
 
 def _vectors(R: Array) -> Array:
-    """Of the two triples of angles that make R, the one that can be a rotation vector (at most 180° long)."""
+    """Choose, of two triples of angles that make R, the one that can be a rotation vector (at most 180°)."""
     angles = Rotation.from_matrix(R).as_euler("xyz")
     other = np.stack([angles[:, 0] + np.pi, np.pi - angles[:, 1], angles[:, 2] + np.pi], axis=1)
     other = (other + np.pi) % (2 * np.pi) - np.pi

@@ -1,4 +1,4 @@
-"""What the solver is asked and what it answers: plain values, no files, no gates.
+"""Options and results of the solver: plain values, no files, no gates.
 
 Lengths in metres, angles in radians; every sigma and covariance is of `geometry.perturb`'s delta
 [δt, δφ] in the parent frame of X.
@@ -14,7 +14,6 @@ import numpy as np
 
 from calibrate.geometry import Array, Transform
 from calibrate.handeye.axxb.certificate import Certificate
-from calibrate.handeye.diagnosis import CrossValidation, Finding
 from calibrate.handeye.metrics import Observability
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.readings import Explanation, Reading
@@ -24,12 +23,12 @@ from recordings.schema.messages import CameraModel, Mount
 
 
 def camera_frames(mount: Mount) -> tuple[str, str]:
-    """(parent, child) of X."""
+    """Return (parent, child) of X."""
     return ("flange", "camera") if mount == "eye-in-hand" else ("base", "camera")
 
 
 def board_frames(mount: Mount) -> tuple[str, str]:
-    """(parent, child) of the board's constant place Y."""
+    """Return (parent, child) of the board's constant pose Y."""
     return ("base", "board") if mount == "eye-in-hand" else ("flange", "board")
 
 
@@ -48,9 +47,9 @@ class SolveOptions:
     model_arm: bool = True
     """Allow for errors of the arm's kinematic table where its model is known."""
     accept_move: bool = False
-    """Where camera or board was moved half-way, model the move instead of refusing the recording."""
+    """Model a move of camera or board half-way instead of refusing the recording."""
     working_distance_m: float | None = None
-    """Where the predicted error is stated, along the camera's axis; None = median board distance."""
+    """Distance along the camera's axis for the predicted error; None: median board distance."""
     holdout: bool = True
     folds: bool = True
     """Cross-validate."""
@@ -64,12 +63,46 @@ class Remark:
     text: str
 
 
+_EXPLAINED = 4.0
+"""Sigmas of a statement's own tolerance within which views may differ from it."""
+
+
+@dataclass(frozen=True, eq=False)
+class Finding:
+    """One statement (the lens, the board) against the views."""
+
+    sigmas: float
+    """Contradiction of views and statement, as sigmas of one normal number."""
+    pull_m: float
+    """Shift of X at the working distance by believing the statement."""
+
+    @property
+    def unexplained_m(self) -> float:
+        """The part of `pull_m` that the statement's tolerance does not explain."""
+        return float(self.pull_m * np.maximum(0.0, 1.0 - _EXPLAINED / np.maximum(self.sigmas, 1e-9)))
+
+
+@dataclass(frozen=True, eq=False)
+class CrossValidation:
+    """Errors of views predicted without them, at the middle of the board; of views that count fully."""
+
+    rms_m: float
+    rms_rad: float
+    claimed_m: float
+    """`rms_m` as the estimates predict it."""
+    limit: float
+    """Limit of `rms_m` over `claimed_m`; beyond it the claim is too small."""
+    folds: int
+    residual_m: dict[int, float]
+    """Place of each view → distance by which it was missed."""
+
+
 @dataclass(frozen=True)
 class NoiseScales:
     """Standard deviations that the residuals show (restricted maximum likelihood)."""
 
     corner_px: float
-    """Of what moves a board's pose: corner errors are smooth over a board."""
+    """The part that moves a board's pose: corner errors are smooth over a board."""
     robot_m: float
     robot_rad: float
 
@@ -125,7 +158,7 @@ class Solution:
     in_doubt: dict[int, float] = field(default_factory=dict)
     """Used views that count in part, by pose number: the chance that they are wrong."""
     session: Explanation = field(default_factory=lambda: Explanation(Reading.AS_RECORDED, 0.0))
-    """How the recording as a whole has to be read."""
+    """Reading of the recording as a whole."""
     move_accepted: bool = False
     """The move that `session` names is modelled: X is that after it."""
     cross_validation: CrossValidation | None = None

@@ -34,7 +34,7 @@ __all__ = ["Solution", "SolveOptions", "solve_views"]
 
 
 def solve_views(views: ViewSet, options: SolveOptions | None = None) -> Solution:
-    """Hand-eye calibration of views that have `camera_from_board` (run PnP first).
+    """Calibrate from views that have `camera_from_board` (run PnP first).
 
     Same views, options and machine give the same bits. Raises TooFewViewsError, DegenerateMotionError or
     BadViewsError; what is merely doubtful comes back in `warnings`.

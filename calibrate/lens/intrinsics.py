@@ -34,7 +34,7 @@ _FISHEYE_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-9)
 class Intrinsics:
     camera: CameraModel
     rms_px: float
-    """Of the corners' distances from where the lens shows them; without dropped views."""
+    """RMS of the corners' distances from where the lens shows them; without dropped views."""
     view_rms_px: dict[int, float]
     """Pose number → rms over its corners."""
     sigma: dict[str, float]
@@ -44,7 +44,7 @@ class Intrinsics:
 
 
 def calibrate_intrinsics(views: ViewSet, model: LensModel = "plumb_bob") -> Intrinsics:
-    """Fits the lens to all views, leaving out those four times worse than the median until there is none.
+    """Fit the lens to all views, leaving out those four times worse than the median until there is none.
 
     Raises TooFewViewsError below three views, BadViewsError when no lens explains the corners.
     """
@@ -108,7 +108,7 @@ def _fit(views: ViewSet, model: LensModel) -> LensFit:
 
 
 def _first_fisheye(views: ViewSet) -> CameraModel:
-    """By OpenCV, whose start copes with boards at the edge of a wide picture."""
+    """Start from OpenCV, which copes with boards at the edge of a wide picture."""
     object_points = [v.board_points.reshape(-1, 1, 3) for v in views]
     pixels = [v.pixels.reshape(-1, 1, 2) for v in views]
     flags = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW
@@ -144,13 +144,13 @@ class LensFit:
     covariance: Array
     """(p, p) of the parameters, by the scatter of the corners and the prior."""
     rms_px: float
-    """Of the corners' distances."""
+    """RMS of the corners' distances."""
     view_rms_px: Array
     """(n,)"""
 
 
 def fit_lens(views: ViewSet, start: CameraModel) -> LensFit:
-    """From a first guess of the lens. BadViewsError or cv2.error where the corners allow no fit."""
+    """Fit from an initial lens. Raises BadViewsError or cv2.error where the corners allow no fit."""
     observed = observe_views(views)
     prior = LensPrior.unknown(start)
     camera, C = start, np.array([planar_tilts(view, start)[0] for view in views])
@@ -176,7 +176,7 @@ def fit_lens(views: ViewSet, start: CameraModel) -> LensFit:
 
 
 def first_guess(views: ViewSet) -> CameraModel:
-    """Focal length from the boards' shapes in the picture, the centre in the middle, no distortion."""
+    """Guess the focal length from the boards' shapes in the pictures; centre in the middle, no distortion."""
     size = (views.camera.width, views.camera.height)
     points = [view.board_points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]

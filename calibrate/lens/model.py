@@ -16,7 +16,7 @@ _UNDISTORT_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 50, 1e-1
 
 
 def distortion(camera: CameraModel) -> Array:
-    """(4,) for equidistant, otherwise (5,) or (8,), zeros appended; OpenCV's order."""
+    """Return OpenCV's coefficients: (4,) for equidistant, otherwise (5,) or (8,), zeros appended."""
     values = np.array(camera.distortion, dtype=float)
     size = 4 if camera.distortion_model == "equidistant" else (8 if len(values) > 5 else 5)
     if len(values) > size or not np.isfinite(values).all():
@@ -29,12 +29,12 @@ def distortion(camera: CameraModel) -> Array:
 
 
 def project(camera: CameraModel, camera_from_board: Array, points: Array) -> Array:
-    """Points (n, 3) of `board` → pixels (n, 2)."""
+    """Project points (n, 3) of `board` to pixels (n, 2)."""
     return project_pixels(camera, transform_points(camera_from_board, np.asarray(points, dtype=float)))
 
 
 def undistort(camera: CameraModel, pixels: Array) -> Array:
-    """Pixels (n, 2) → the pixels (n, 2) that a lens without distortion and the same matrix would show.
+    """Map pixels (n, 2) to those that a lens without distortion and the same matrix would show.
 
     OpenCV passes over a skew in the matrix: good enough for a start.
     """

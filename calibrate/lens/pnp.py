@@ -40,7 +40,7 @@ class Candidate:
 
 
 def solve_pnp(views: ViewSet, board: BoardSpec | None = None) -> ViewSet:
-    """The views with `camera_from_board`, and their points relabelled where a turned reading fits better.
+    """Add `camera_from_board` to the views, points relabelled where a turned reading fits better.
 
     Two things are ambiguous in one picture: which way round a symmetric board lies (only when `board` is
     given) and, for a small board far away, towards which side it is tilted. All views together decide, by
@@ -65,7 +65,7 @@ def solve_pnp(views: ViewSet, board: BoardSpec | None = None) -> ViewSet:
 
 
 def candidate_poses(view: BoardView, camera: CameraModel, board: BoardSpec | None) -> list[Candidate]:
-    """Poses that explain the picture equally well, best first, each in every turn that looks the same."""
+    """List poses that explain the picture equally well, best first, in every turn that looks the same."""
     return _candidates(ViewSet("eye-in-hand", (view,), camera), board)[0]
 
 
@@ -107,7 +107,7 @@ def _credible_px(best_px: Array) -> Array:
 
 
 def planar_tilts(view: BoardView, camera: CameraModel) -> Array:
-    """Poses (1 or 2, 4, 4) by which a flat board explains the image, the likelier first (IPPE)."""
+    """Find poses (1 or 2, 4, 4) by which a flat board explains the image, the likelier first (IPPE)."""
     K = camera_matrix(camera)
     points = np.ascontiguousarray(view.board_points)
     pixels = np.ascontiguousarray(undistort(camera, view.pixels))
@@ -166,7 +166,7 @@ def _squares(everything: Observations, camera: CameraModel, owner: NDArray[np.in
 
 
 def view_rms_px(view: BoardView, camera: CameraModel, camera_from_board: Array) -> float:
-    """Root mean square distance of the corners from where the pose shows them."""
+    """Compute the rms distance of the corners from where the pose shows them, px."""
     miss = project(camera, camera_from_board, view.board_points) - view.pixels
     return float(np.sqrt(np.square(miss).sum(axis=1).mean()))
 
@@ -177,7 +177,7 @@ _LARGEST_VOTERS = 120
 
 
 def choose_candidates(candidates: list[Array], base_from_flange: Array, mount: Mount) -> list[int]:
-    """Per view the number of the reading to keep.
+    """Choose, per view, the number of the reading to keep.
 
     candidates: n arrays (k_i, 4, 4) camera_from_board; base_from_flange: (n, 4, 4). At most 120 views, evenly
     spread, vote; the others follow them, so the work is bounded. Best of all starts of iterated conditional

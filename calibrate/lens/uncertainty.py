@@ -1,4 +1,4 @@
-"""How well the lens is known, over the picture: by how many pixels a fixed direction may be shown wrongly.
+"""Uncertainty of the lens over the picture: pixels by which a fixed direction may be shown wrongly.
 
 Lens and camera poses are one fit: a wrong principal point is mostly made good by turned cameras. What stays
 after the best turn is what counts, as in mrcal's projection uncertainty (D. Kogan, mrcal's documentation,
@@ -37,7 +37,7 @@ class LensUncertainty:
 
 
 def lens_uncertainty(camera: CameraModel, covariance: Array, seen: Array) -> LensUncertainty:
-    """covariance: (p, p) of the lens; seen: (m, 2) all corners that were seen, pixels.
+    """Propagate the lens's covariance (p, p) to the picture; seen: (m, 2) all corners that were seen, px.
 
     J being how a pixel moves by the lens, T how by a turn, Σ the covariance of the lens: σ² = trace(S Σ Sᵀ),
     S = J + T φ, and φ the turn by the lens that makes S least over the corners seen.
@@ -55,7 +55,7 @@ def lens_uncertainty(camera: CameraModel, covariance: Array, seen: Array) -> Len
 
 
 def _derivatives(camera: CameraModel, pixels: Array) -> tuple[Array, Array]:
-    """By the lens (n, 2, p) and by a turn of the camera (n, 2, 3), at the directions shown at `pixels`."""
+    """Derive by the lens (n, 2, p) and by a turn of the camera (n, 2, 3) at the directions of `pixels`."""
     plain = np.concatenate([undistort(camera, pixels), np.ones((len(pixels), 1))], axis=1)
     rays = plain @ np.linalg.inv(camera_matrix(camera)).T
     projected = project(camera, rays, with_intrinsics=True)

@@ -24,7 +24,7 @@ from calibrate.handeye.axxb.objective import QuadraticObjective
 
 TOLERANCE = 1e-6
 FLOOR = 1e-8
-"""Of the form's trace: below this an objective counts as zero in the relative gap."""
+"""Share of the form's trace below which an objective counts as zero in the relative gap."""
 _UNIQUE = 1e-9
 """Of the form's trace."""
 

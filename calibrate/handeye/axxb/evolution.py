@@ -89,7 +89,7 @@ def _partners(rng: np.random.Generator, generations: int, population: int) -> ND
 
 
 def rotations_from_vectors(gamma: Array) -> Array:
-    """Rodrigues for many rotation vectors (m, 3) → (m, 3, 3); light, for inner loops."""
+    """Convert many rotation vectors (m, 3) to (m, 3, 3); light, for inner loops."""
     theta2 = np.einsum("mi,mi->m", gamma, gamma)
     theta = np.sqrt(theta2)
     small = theta < 1e-8
@@ -112,7 +112,7 @@ def rotations_from_vectors(gamma: Array) -> Array:
 
 
 def rotations_from_quaternions(q: Array) -> Array:
-    """Any non-zero quaternions (m, 4) x, y, z, w, normalised here → (m, 3, 3)."""
+    """Convert non-zero quaternions (m, 4) x, y, z, w, normalised here, to (m, 3, 3)."""
     q = q / np.sqrt(np.maximum(np.einsum("mi,mi->m", q, q), 1e-300))[:, None]
     x, y, z, w = q.T
     R = np.empty((len(q), 3, 3))

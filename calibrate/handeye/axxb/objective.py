@@ -33,7 +33,7 @@ class QuadraticObjective:
     pairs: int
 
     def values(self, R: Array, b: Array) -> Array:
-        """f at candidates R (m, 3, 3), b (m, 3) → (m,)."""
+        """Evaluate f at candidates R (m, 3, 3), b (m, 3) → (m,)."""
         z = np.empty((len(R), 13))
         np.subtract(R.reshape(-1, 9), self.R0.reshape(9), out=z[:, :9])
         np.subtract(b, self.b0, out=z[:, 9:12])
@@ -41,26 +41,26 @@ class QuadraticObjective:
         return np.asarray(((z @ self.gram) * z).sum(axis=1))
 
     def value(self, X: Array) -> float:
-        """f at one X (4, 4)."""
+        """Evaluate f at one X (4, 4)."""
         return float(self.values(X[None, :3, :3], X[None, :3, 3])[0])
 
     def best_translation(self, R: Array) -> Array:
-        """b (m, 3) that minimises f for given R (m, 3, 3); least norm from b0 where it is not unique."""
+        """Find the b (m, 3) that minimises f for given R (m, 3, 3); least norm from b0 where not unique."""
         z = np.concatenate([(R - self.R0).reshape(-1, 9), np.ones((len(R), 1))], axis=1)
         return np.asarray(self.b0 - z @ (self._b_inverse @ self.gram[9:12][:, _REST]).T)
 
     def reduced(self) -> Array:
-        """(10, 10) form in [vec(R - R0); 1] with the translation eliminated (Schur complement)."""
+        """Eliminate the translation (Schur complement): the (10, 10) form in [vec(R - R0); 1]."""
         cross = self.gram[_REST][:, 9:12]
         reduced = self.gram[np.ix_(_REST, _REST)] - cross @ self._b_inverse @ cross.T
         return np.asarray((reduced + reduced.T) / 2)
 
     def translation_rank(self) -> int:
-        """3 where the pairs determine all of b, given R; 2 where all rotations are about one axis."""
+        """Count the directions of b that the pairs determine, given R: 2 for turns about one axis."""
         return int(np.linalg.matrix_rank(self.gram[9:12, 9:12], tol=1e-9 * np.trace(self.gram[9:12, 9:12])))
 
     def curvature(self, X: Array) -> Array:
-        """(6, 6) half the Gauss-Newton Hessian at X, for `geometry.perturb`'s delta."""
+        """Compute half the Gauss-Newton Hessian (6, 6) at X, for `geometry.perturb`'s delta."""
         J = np.zeros((13, 6))
         J[9:12, :3] = _I3
         J[:9, 3:] = (skew(_I3) @ X[:3, :3]).reshape(3, 9).T
@@ -121,7 +121,7 @@ def _add_chordal(G: Array, R_A: Array, R_B: Array, R0: Array) -> None:
 
 
 def closed_form_rotation(pairs: Pairs) -> Array:
-    """R (3, 3) that best turns β into α: orthogonal Procrustes on rotation vectors (Park and Martin 1994)."""
+    """Find the R (3, 3) that best turns β into α: Procrustes on rotation vectors (Park and Martin 1994)."""
     return project_to_rotation(pairs.alpha.T @ pairs.beta)
 
 
@@ -134,11 +134,11 @@ def _closed_form_translation(D: Array, right: Array) -> Array:
 
 
 _FEWEST_VIEWS = 10
-"""With fewer the scores do not span six directions: pairs then count as independent, variance times n/2."""
+"""Fewer views' scores do not span six directions: pairs count as independent, variance times n/2."""
 
 
 def pair_covariance(objective: QuadraticObjective, pairs: Pairs, X: Array) -> Array:
-    """(6, 6) of `geometry.perturb`'s delta at the optimum X of the chordal objective over `pairs`.
+    """Compute the covariance (6, 6) of the optimum X of the chordal objective over `pairs`.
 
     Pairs share views, so a sandwich H⁻¹ (Σ_i s_i s_iᵀ) H⁻¹ with one score per view, s_i the sum of the
     gradients of its pairs: the variance of a sum over pairs is that of its projection on views (Hájek 1968).

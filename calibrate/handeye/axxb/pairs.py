@@ -51,25 +51,25 @@ class Pairs:
 
 
 def mount_poses(base_from_flange: Array, mount: Mount) -> Array:
-    """H (n, 4, 4) of the one convention above."""
+    """Return H (n, 4, 4) of the one convention above."""
     return base_from_flange if mount == "eye-in-hand" else inverse(base_from_flange)
 
 
 def make_pairs(H: Array, camera_from_board: Array, first: Places, second: Places) -> Pairs:
-    """Pairs (first → second) of views; H and camera_from_board (n, 4, 4)."""
+    """Make pairs (first → second) of views; H and camera_from_board (n, 4, 4)."""
     A = inverse(H[second]) @ H[first]
     B = camera_from_board[second] @ inverse(camera_from_board[first])
     return Pairs(A, B, first, second)
 
 
 def consecutive_pairs(H: Array, camera_from_board: Array) -> Pairs:
-    """Each view with its successor (eq. 21): n - 1 pairs."""
+    """Pair each view with its successor (eq. 21): n - 1 pairs."""
     first = np.arange(len(H) - 1)
     return make_pairs(H, camera_from_board, first, first + 1)
 
 
 def all_pairs(H: Array, camera_from_board: Array, limit: int = MAX_PAIRS) -> Pairs:
-    """Every view with every later one, n(n-1)/2 pairs; above `limit`, each with evenly spread others."""
+    """Pair every view with every later one, n(n-1)/2 pairs; above `limit`, each with evenly spread others."""
     n = len(H)
     if n * (n - 1) // 2 <= limit:
         first, second = np.triu_indices(n, 1)
@@ -94,7 +94,7 @@ def _logarithms(R: Array) -> Array:
 
 
 def screw_invariants(motion: Array) -> tuple[Array, Array]:
-    """Rotation angle (n,) rad and translation along the axis (n,) m of motions (n, 4, 4).
+    """Compute angle (n,) rad and translation along the axis (n,) m of motions (n, 4, 4).
 
     Both are the same for A and B of a right pair, whatever X is (Chen 1991). The pitch of a motion that
     does not rotate is its length.

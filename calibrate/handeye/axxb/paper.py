@@ -33,7 +33,7 @@ class PaperResult:
 
 
 def solve_paper(pairs: Pairs, seed: int) -> PaperResult:
-    """One seeded run on the pairs that take part (the caller holds out the rest)."""
+    """Run the evolution once, seeded, on the pairs that take part (the caller holds out the rest)."""
     objective = build_objective(pairs, "log", LAMBDA)
     evolved = evolve(paper_evaluate(objective), -BOX, BOX, np.random.default_rng(seed), SETTINGS)
     x = evolved.best
@@ -42,14 +42,14 @@ def solve_paper(pairs: Pairs, seed: int) -> PaperResult:
 
 
 def on_box(vector: Array) -> tuple[str, ...]:
-    """Names of the components of [γ; b] (6,) that lie on the box of eq. 22."""
+    """Name the components of [γ; b] (6,) that lie on the box of eq. 22."""
     return tuple(
         name for name, v, limit in zip(NAMES, vector, BOX, strict=True) if abs(v) >= limit * (1 - _ON_BOX)
     )
 
 
 def paper_evaluate(objective: QuadraticObjective) -> Evaluate:
-    """Candidates [γ; b] (m, 6) → f (m,) on the collapsed form, in a dozen array operations.
+    """Make the function of candidates [γ; b] (m, 6) to f (m,), a dozen array operations.
 
     With the unit quaternion q of γ, vec R is linear in the 16 products of q's entries; so the recentred
     variables of `QuadraticObjective` are linear in [q ⊗ q; b; 1].

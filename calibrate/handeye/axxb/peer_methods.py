@@ -29,13 +29,13 @@ ROBOT_WORLD = {
 
 
 def opencv_hand_eye(H: Array, C: Array, method: int) -> Array:
-    """cv2.calibrateHandEye; eye-to-hand by giving it H = flange_from_base."""
+    """Call cv2.calibrateHandEye; eye-to-hand by giving it H = flange_from_base."""
     R, t = cv2.calibrateHandEye(*_lists(H), *_lists(C), method=method)
     return pose(np.asarray(R), np.asarray(t).ravel())
 
 
 def opencv_robot_world(H: Array, C: Array, method: int) -> Array:
-    """cv2.calibrateRobotWorldHandEye (A X = Z B); its hand-eye part, inverted to ours."""
+    """Call cv2.calibrateRobotWorldHandEye (A X = Z B); its hand-eye part, inverted to ours."""
     _, _, R, t = cv2.calibrateRobotWorldHandEye(*_lists(C), *_lists(inverse(H)), method=method)
     return inverse(pose(np.asarray(R), np.asarray(t).ravel()))
 
@@ -45,7 +45,7 @@ def _lists(poses: Array) -> tuple[list[Array], list[Array]]:
 
 
 def linear_system(pairs: Pairs) -> tuple[Array, Array]:
-    """Per pair 12 equations M x = d in x = [vec R; t] (vec row by row), R not held to SO(3)."""
+    """Build 12 equations M x = d per pair in x = [vec R; t] (vec row by row), R not held to SO(3)."""
     n = len(pairs)
     R_A, R_B, b_B = pairs.A[:, :3, :3], pairs.B[:, :3, :3], pairs.B[:, :3, 3]
     M, d = np.zeros((n, 12, 12)), np.zeros((n, 12))
@@ -59,7 +59,7 @@ def linear_system(pairs: Pairs) -> tuple[Array, Array]:
 
 
 def zhao_minimax(pairs: Pairs) -> Array:
-    """Zhao 2011: least maximum of the pairs' residual norms, a second-order cone program; raw 4×4."""
+    """Minimise the maximum of the pairs' residual norms, a second-order cone program (Zhao 2011); raw 4×4."""
     M, d = linear_system(pairs)
     n = len(pairs)
     A = np.zeros((n, 13, 13))
@@ -83,7 +83,7 @@ def zhao_minimax(pairs: Pairs) -> Array:
 
 
 def zhi_linear(pairs: Pairs) -> Array:
-    """Zhi and Schwertfeger 2017: linear least squares, the rotation made orthonormal by QR."""
+    """Solve linear least squares, the rotation made orthonormal by QR (Zhi and Schwertfeger 2017)."""
     M, d = linear_system(pairs)
     raw = _raw(np.asarray(np.linalg.lstsq(M.reshape(-1, 12), d.reshape(-1), rcond=None)[0], dtype=float))
     Q, R = np.linalg.qr(raw[:3, :3])
@@ -92,7 +92,7 @@ def zhi_linear(pairs: Pairs) -> Array:
 
 
 def orthonormalised(raw: Array) -> Array:
-    """The same with the nearest rotation."""
+    """Replace the raw rotation by the nearest one."""
     return pose(project_to_rotation(raw[:3, :3]), raw[:3, 3])
 
 
@@ -121,7 +121,7 @@ def strobl_hirzinger(pairs: Pairs, start: Array) -> Array:
 
 
 def heller_global(pairs: Pairs) -> Array:
-    """Heller, Henrion and Pajdla 2014 in our relaxation: the semidefinite program's own minimiser."""
+    """Take the semidefinite program's own minimiser (Heller, Henrion, Pajdla 2014) in our relaxation."""
     objective = build_objective(pairs)
     R = certify(objective).relaxed_rotation
     return pose(R, objective.best_translation(R[None])[0])

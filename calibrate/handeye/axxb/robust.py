@@ -39,7 +39,7 @@ class GlobalResult:
 
 
 def solve_global(pairs: Pairs, seed: int, problem: str = "") -> GlobalResult:
-    """Global minimum of the chordal objective over `pairs` (at least 2, two axes not parallel)."""
+    """Find the global minimum of the chordal objective over `pairs` (at least 2, two axes not parallel)."""
     objective = build_objective(pairs)
     rng = np.random.default_rng(seed)
     starts = objective.R0[None]
@@ -81,7 +81,7 @@ def _best_of(objective: QuadraticObjective, starts: Array) -> tuple[Array, float
 
 
 def polish(objective: QuadraticObjective, R: Array) -> tuple[Array, Array]:
-    """Damped Newton on SO(3) for many rotations at once, (m, 3, 3) → minima (m, 3, 3) and values (m,).
+    """Run damped Newton on SO(3) from many rotations (m, 3, 3) at once → minima (m, 3, 3), values (m,).
 
     With R ← Exp(δ) R, Γ = ½ ∂f/∂R and P the derivative of vec R, half the Hessian is
     Pᵀ S P + sym(Γ Rᵀ) - tr(Γ Rᵀ) I; its eigenvalues are taken by modulus, so saddles are left downhill.

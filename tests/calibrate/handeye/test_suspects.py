@@ -85,7 +85,7 @@ def test_the_size_of_a_wrong_number_is_recorded_minus_true():
         views = nudged(c.views, [7], size * np.eye(6)[number][None])
         fit = fit_cell(views, Priors(LensPrior.given(c.camera)), 0)
         (suspect,) = explain_views(fit, np.flatnonzero(~fit.estimate.used))
-        assert (suspect.place, suspect.number) == (7, number)
+        assert (suspect.index, suspect.wrong_number) == (7, number)
         assert suspect.slip == pytest.approx(size, abs=5 * SIGMA[number])
 
 

@@ -11,9 +11,8 @@ import numpy as np
 import pytest
 
 from calibrate.files.calibration import Gate
-from calibrate.handeye.diagnosis import CrossValidation, Finding
 from calibrate.handeye.readings import Explanation, Reading
-from calibrate.handeye.solution import NoiseScales, Remark, Solution
+from calibrate.handeye.solution import CrossValidation, Finding, NoiseScales, Remark, Solution
 from calibrate.pipeline import SolvedRecording
 from calibrate.quality.gates import GateInputs, GateLimits, GatesError, judge, read_limits
 from calibrate.results import HoldoutScore

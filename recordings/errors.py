@@ -21,9 +21,9 @@ class ErrorData(msgspec.Struct, frozen=True, omit_defaults=True):
     code: str
     """For programs: kebab-case, the same for the same cause, whatever the text says."""
     text: str
-    """What happened and where, for a person."""
+    """Description for a person: what happened, and where."""
     remedy: str = ""
-    """What to do next, for a person."""
+    """Next step, for a person."""
     values: dict[str, Value] = {}
     """Measured figures and limits; each name ends in its unit."""
 
@@ -41,7 +41,7 @@ class CodedError(Exception):
     """
 
     code = "failed"
-    """Of every error of the class that was not given its own."""
+    """Default for errors of this class."""
     exit_code = 1
 
     def __init__(self, text: str, *, code: str = "", remedy: str = "", **values: Value) -> None:
@@ -95,7 +95,7 @@ class BadImageError(CorruptRecordingError):
 
 
 class ImportSourceError(RecordingError):
-    """What is to be imported lacks something or is wrong."""
+    """Data to import that lack something or are wrong."""
 
     code = "import-source"
 

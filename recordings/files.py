@@ -1,4 +1,4 @@
-"""How files come to be: safe names, exclusive creation, one writer at a time, nothing half-written."""
+"""Safe names, exclusive creation, one writer at a time, nothing half-written."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from pathlib import Path
 from recordings.errors import RecordingError, disk_error, exists_error
 
 PART_SUFFIX = ".part"
-"""Of a recording that is being written; gone once it is finished and on the disk."""
+"""Suffix of an unfinished recording; gone once it is finished and on the disk."""
 EMPTY_SUFFIX = ".empty"
-"""Of a session's part that was begun but holds nothing; recovery sets it aside."""
+"""Suffix of a segment that holds nothing; recovery sets it aside."""
 ASKED_FOR = 0o666
 """Permissions of a file that somebody asked for: their umask decides."""
 _SESSION_NAME = re.compile(r"[a-z0-9-]{1,40}")

@@ -1,4 +1,4 @@
-"""Picture bytes: raw buffers with a named layout, and PNG/JPEG whose size is read before decoding."""
+"""Image bytes: raw buffers with a named layout, and PNG/JPEG whose size is read before decoding."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from recordings.mcap import checksum
 
 IMAGE_LIMIT_BYTES = 36 * 1024 * 1024
-"""Decoded size above which no picture is read or written: bounds the reader's memory."""
+"""Decoded size above which no image is read or written: bounds the reader's memory."""
 SIDE_LIMIT_PX = 16384
 
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
@@ -28,7 +28,7 @@ KEPT_FORMATS = ("png", "jpeg")
 
 
 class ImageError(ValueError):
-    """Bytes that are not the picture they should be; says why."""
+    """Bytes that are not the image they should be; says why."""
 
 
 @dataclass(frozen=True)
@@ -47,7 +47,7 @@ class ImageHeader:
 
 
 def read_header(data: bytes) -> ImageHeader:
-    """Size and depth from the first bytes, nothing decoded. Raises PictureError."""
+    """Size and depth from the first bytes, nothing decoded. Raises ImageError."""
     if data.startswith(_PNG_MAGIC):
         header = _png_header(data)
     elif data.startswith(b"\xff\xd8"):
@@ -95,7 +95,7 @@ def _jpeg_header(data: bytes) -> ImageHeader:
 
 
 def check_complete(data: bytes, header: ImageHeader) -> None:
-    """Raises PictureError for a cut or damaged file: decoders fill what is missing with grey."""
+    """Raises ImageError for a cut or damaged file: decoders fill what is missing with grey."""
     if header.format == "png":
         _check_png_chunks(data)
     elif header.format == "jpeg" and b"\xff\xd9" not in data[-64:]:
@@ -122,7 +122,7 @@ def _check_png_chunks(data: bytes) -> None:
 def decode_image(data: bytes, width: int, height: int) -> NDArray[Any]:
     """Compressed bytes → (height, width) uint8/uint16 or (height, width, 3) uint8 BGR, as stored.
 
-    The size in the header must be the expected one before anything is decoded. Raises PictureError.
+    The size in the header must be the expected one before anything is decoded. Raises ImageError.
     """
     header = read_header(data)
     if (header.width, header.height) != (width, height):
@@ -142,7 +142,7 @@ def decode_image(data: bytes, width: int, height: int) -> NDArray[Any]:
 
 
 def encode_png(image: NDArray[Any]) -> bytes:
-    """Lossless. Level 1 with run lengths: fastest, and nearly the smallest on noisy pictures."""
+    """Lossless. Level 1 with run lengths: fastest, and nearly the smallest on noisy images."""
     options = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
     done, data = cv2.imencode(".png", image, options)
     if not done:
@@ -156,7 +156,7 @@ def pixel_format_of(pixels: NDArray[Any]) -> str:
 
 
 def raw_encoding(image: NDArray[Any], pixel_format: str) -> str:
-    """The name foxglove.RawImage uses for this array's layout. PictureError for any other array."""
+    """The name foxglove.RawImage uses for this array's layout. ImageError for any other array."""
     if image.ndim == 2 and image.dtype == np.uint8:
         bayer = _BAYER.match(pixel_format)
         return (
@@ -168,11 +168,11 @@ def raw_encoding(image: NDArray[Any], pixel_format: str) -> str:
         return "mono16"
     if image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8:
         return "bgr8"
-    raise ImageError(f"a picture of shape {image.shape} and type {image.dtype} cannot be recorded")
+    raise ImageError(f"an image of shape {image.shape} and type {image.dtype} cannot be recorded")
 
 
 def raw_array(data: bytes, encoding: str, width: int, height: int) -> NDArray[Any]:
-    """The array (read-only, no copy) that a RawImage's bytes are. Raises PictureError."""
+    """The array (read-only, no copy) that a RawImage's bytes are. Raises ImageError."""
     shape: tuple[int, ...] = (height, width)
     kind = np.dtype("<u2") if encoding == "mono16" else np.dtype("u1")
     if encoding == "bgr8":

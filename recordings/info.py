@@ -1,4 +1,4 @@
-"""What a recording holds, for people and as plain data: contents, rates, gaps, clock quality, size."""
+"""Contents, rates, gaps, clock quality and size of a recording as plain data."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ _FRAME_ID_WRAP = 65535
 def recording_info(recording: Recording) -> dict[str, Any]:
     """Everything `recordings info` says, one JSON-ready object. Times in seconds, sizes in bytes."""
     info = recording.info
-    arrivals = {part: Arrivals() for part in recording.segments}
+    arrivals = {segment: Arrivals() for segment in recording.segments}
     steps = Steps()
-    for part in recording.segments:
+    for segment in recording.segments:
         steps.begin()
-        for table in part.state_stamps():
+        for table in segment.state_stamps():
             steps.add(table.controller_s)
-            arrivals[part].add(table.controller_s, table.host_monotonic_ns)
-    longest = max(recording.segments, key=lambda part: len(part.messages(Topic.ROBOT_STATE)))
-    attempts = sum(len(part.views) for part in recording.segments)
+            arrivals[segment].add(table.controller_s, table.host_monotonic_ns)
+    longest = max(recording.segments, key=lambda segment: len(segment.messages(Topic.ROBOT_STATE)))
+    attempts = sum(len(segment.views) for segment in recording.segments)
     views = recording.views()
     return {
         "path": str(recording.path),
@@ -41,7 +41,7 @@ def recording_info(recording: Recording) -> dict[str, Any]:
         "parts": len(recording.segments),
         "missing": list(recording.missing),
         "losses": list(recording.losses),
-        "size_bytes": sum(part.size_bytes for part in recording.segments),
+        "size_bytes": sum(segment.size_bytes for segment in recording.segments),
         "sha256": recording.sha256,
         "created_wall_ns": info.created_wall_ns,
         "board": _board_text(info.board),
@@ -56,7 +56,7 @@ def recording_info(recording: Recording) -> dict[str, Any]:
         "views": {"poses": len(views), "attempts": attempts, "names": [view.name for view in views]},
         "topics": _topics(recording),
         "robot_states": _robot_stream(steps),
-        "pictures": _picture_stream(recording),
+        "pictures": _image_stream(recording),
         "clocks": {"controller": arrivals[longest].fit(), "camera": _camera_clock(longest)},
         "attachments": {name: len(content) for name, content in sorted(recording.attachments().items())},
         "software": dict(info.software),
@@ -72,10 +72,10 @@ def _board_text(board: BoardSpec) -> str:
 
 def _topics(recording: Recording) -> list[dict[str, Any]]:
     """Known topics first; `foreign` ones are of other programs, and ignored."""
-    known = {topic.value: [part.messages(topic) for part in recording.segments] for topic in Topic}
+    known = {topic.value: [segment.messages(topic) for segment in recording.segments] for topic in Topic}
     foreign: dict[str, list[MessageIndex]] = {}
-    for part in recording.segments:
-        for name, index in part.foreign.items():
+    for segment in recording.segments:
+        for name, index in segment.foreign.items():
             foreign.setdefault(name, []).append(index)
     return [
         *(_topic(name, indexes, False) for name, indexes in known.items() if any(map(len, indexes))),
@@ -114,14 +114,14 @@ def _robot_stream(steps: Steps) -> dict[str, Any] | None:
     }
 
 
-def _picture_stream(recording: Recording) -> dict[str, Any] | None:
+def _image_stream(recording: Recording) -> dict[str, Any] | None:
     count = jumps = 0
     exposures: set[float] = set()
     gains: set[float] = set()
     formats: set[str] = set()
-    for part in recording.segments:
+    for segment in recording.segments:
         before: int | None = None
-        for fact in part.image_facts():
+        for fact in segment.image_facts():
             count += 1
             if before is not None:
                 step = fact.frame_id - before
@@ -142,8 +142,8 @@ def _picture_stream(recording: Recording) -> dict[str, Any] | None:
     }
 
 
-def _camera_clock(part: RecordingSegment) -> dict[str, float | None] | None:
+def _camera_clock(segment: RecordingSegment) -> dict[str, float | None] | None:
     arrivals = Arrivals()
-    for table in part.image_stamps():
+    for table in segment.image_stamps():
         arrivals.add(table.device_ns / 1e9, table.host_monotonic_ns)
     return arrivals.fit()

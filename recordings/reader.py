@@ -42,12 +42,12 @@ class Recording:
 
     @property
     def info(self) -> SessionInfo:
-        """Of the first segment."""
+        """Description of the session, from the first segment."""
         return self.segments[0].info
 
     @property
     def sha256(self) -> str:
-        """Of the file; of the segments' hashes, one after the other, when there are several."""
+        """Hash of the file; of the segments' hashes, one after the other, when there are several."""
         if len(self.segments) == 1:
             return self.segments[0].sha256
         return hashlib.sha256("".join(segment.sha256 for segment in self.segments).encode()).hexdigest()
@@ -62,7 +62,7 @@ class Recording:
         return [latest[index] for index in sorted(latest)]
 
     def image(self, view: View) -> Image:
-        """The view's picture; its array is read-only."""
+        """The view's image; its array is read-only."""
         try:
             return self._by_number[view.part].image(view.picture_sequence)
         except KeyError as error:
@@ -70,7 +70,7 @@ class Recording:
             raise RecordingError(text, code="no-image", view=view.index) from error
 
     def stored_image(self, view: View) -> tuple[str, bytes] | None:
-        """(format, file bytes) of a picture that is kept compressed; None when it is kept raw."""
+        """(format, file bytes) of an image that is kept compressed; None when it is kept raw."""
         return self._by_number[view.part].stored_image(view.picture_sequence)
 
     def images(self) -> Iterator[tuple[View, Image]]:
@@ -85,14 +85,14 @@ class Recording:
         return chain.from_iterable(segment.events() for segment in self.segments)
 
     def attachments(self) -> dict[str, bytes]:
-        """Of all segments; the latest segment's where a name is in several."""
+        """Return the attachments of all segments; the latest where a name is in several."""
         merged: dict[str, bytes] = {}
         for segment in self.segments:
             merged.update(segment.attachments)
         return merged
 
     def media_types(self) -> dict[str, str]:
-        """Of the attachments."""
+        """Media types of the attachments."""
         return {name: kind for segment in self.segments for name, kind in segment.media_types.items()}
 
 

@@ -1,7 +1,7 @@
 """The recorder of a running session: one thread owns the file, all others hand messages over and go on.
 
-Pictures and robot states are dropped, and counted, when the disk cannot keep up; views, events and
-attachments never are. Data reach the operating system after every picture and at least every 0.1 s, the
+Images and robot states are dropped, and counted, when the disk cannot keep up; views, events and
+attachments never are. Data reach the operating system after every image and at least every 0.1 s, the
 disk at every `sync` and at least every 0.5 s; the regular ones run beside the writing, which goes on.
 """
 
@@ -50,7 +50,7 @@ class _Item(NamedTuple):
 class Recorder:
     """Thread-safe. The first write error is final: later calls raise it, futures fail with it.
 
-    `dropped`: pictures and states lost to a full queue.
+    `dropped`: images and states lost to a full queue.
     """
 
     def __init__(
@@ -71,11 +71,11 @@ class Recorder:
         self._clock = clock
         self._queue: deque[_Item] = deque()
         self._queued_bytes = 0
-        self._dropped_pictures: set[int] = set()
+        self._dropped_images: set[int] = set()
         self._lock = threading.RLock()
         self._wake = threading.Condition(self._lock)
         self._awaited: Future[None] | None = None
-        """Of the item that is being written."""
+        """Future of the item that is being written."""
         self._finished: Future[Path] | None = None
         self._closing = False
         self._thread = threading.Thread(target=self._run, name="recorder", daemon=True)
@@ -88,7 +88,7 @@ class Recorder:
 
     @property
     def last_sync_s(self) -> float:
-        """How long the newest fdatasync took."""
+        """Duration of the newest fdatasync."""
         return self._writer.last_sync_s
 
     @property
@@ -105,16 +105,16 @@ class Recorder:
         """False when it was dropped, or came after the end."""
         return self._offer(lambda: self._writer.robot_state(state), _STATE_BYTES)
 
-    def image(self, picture: Image) -> bool:
+    def image(self, image: Image) -> bool:
         """False when it was dropped: take it again. The array must not be changed afterwards."""
-        kept = self._offer(lambda: self._writer.image(picture), picture.pixels.nbytes)
+        kept = self._offer(lambda: self._writer.image(image), image.pixels.nbytes)
         if not kept:
-            self._dropped_pictures.add(picture.sequence)
+            self._dropped_images.add(image.sequence)
         return kept
 
     def view(self, view: View) -> None:
-        """Raises RecordingError when its picture was dropped or an earlier write failed."""
-        if self.error is None and view.picture_sequence in self._dropped_pictures:
+        """Raises RecordingError when its image was dropped or an earlier write failed."""
+        if self.error is None and view.picture_sequence in self._dropped_images:
             raise RecordingError(
                 f"The image of pose {view.index + 1} was dropped: the disk is too slow",
                 code="image-dropped",
@@ -129,9 +129,9 @@ class Recorder:
         self._put(_Item(lambda: self._writer.camera_model(model), _SMALL_BYTES))
 
     def corners(self, sequence: int, pixels: NDArray[np.float64]) -> None:
-        """Detected corners (n, 2) of a recorded picture, for viewers."""
+        """Detected corners (n, 2) of a recorded image, for viewers."""
         marks = [Marks(pixels, DETECTED)]
-        if sequence not in self._dropped_pictures:
+        if sequence not in self._dropped_images:
             self._put(_Item(lambda: self._writer.marks(sequence, marks), _SMALL_BYTES))
 
     def frame(self, parent: str, child: str, parent_from_child: Matrix4) -> None:

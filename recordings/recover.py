@@ -31,7 +31,7 @@ DAMAGED_SUFFIX = ".damaged"
 
 @dataclass(frozen=True)
 class Recovery:
-    """What was saved, and what was not."""
+    """Result of a recovery: what was saved, and what was lost."""
 
     path: Path
     kept_original: Path | None
@@ -53,7 +53,7 @@ class Recovery:
 
     @property
     def text(self) -> str:
-        """What became of the file, one line."""
+        """One line that says what became of the file."""
         if self.missing:
             return f"{self.path}: {self.losses[0]}"
         if not self.rebuilt:

@@ -20,15 +20,15 @@ from recordings.schema.messages import Stamps
 
 _BLOCK_BYTES = 256 * 1024
 _HEAD_BYTES = 31
-"""Of a message record, before its data."""
+"""Length of a message record before its data."""
 _LONGEST_BYTES = 48
-"""Of the stamps: a tag, a length, three numbers of at most 11 bytes, one of 9."""
+"""Limit of the stamps: a tag, a length, three numbers of at most 11 bytes, one of 9."""
 _STAMPS_TAG, _VARINT, _DOUBLE = 0x0A, "varint", "double"
 _FIELDS = ((0x08, _VARINT), (0x10, _VARINT), (0x19, _DOUBLE), (0x20, _VARINT))
 LARGEST_STAMP_S = 1e12
 """30 000 years: what is more, or no number, is no time."""
 _BIN_SHIFT = 11
-"""Of a float32's bits: bins of 1/4096 of their value."""
+"""Shift of a float32's bits: bins of 1/4096 of their value."""
 _SAMPLES = 65536
 Times = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
@@ -123,7 +123,7 @@ class Steps:
         self._last_s: float | None = None
 
     def begin(self) -> None:
-        """What follows is of another file: no step leads there."""
+        """Begin another file: no step leads there."""
         self._last_s = None
 
     def add(self, stamps_s: Times) -> None:

@@ -208,7 +208,7 @@ def _leaf_problems(node: yaml.Node, kind: Any, where: str) -> Iterator[Problem]:
 
 
 def _words(kind: Any) -> tuple[Any, ...]:
-    """What may stand where a Literal or an Enum is asked for; else nothing."""
+    """Return the values of a Literal or an Enum; of other types none."""
     if get_origin(kind) is Literal:
         return get_args(kind)
     return tuple(k.value for k in kind) if isinstance(kind, type) and issubclass(kind, Enum) else ()

@@ -49,7 +49,7 @@ ATTACHMENT_LIMIT_BYTES = 16 * 1024 * 1024
 SHOWN_PERIOD_NS = 40_000_000
 """Viewers get the arm at 25 Hz; the states themselves are kept at their full rate."""
 KEPT_IN_MEMORY_BYTES = 256 * 2**20
-"""Of one file: a session of single images stays for the solve that follows."""
+"""Limit per file: a session of single images stays for the solve that follows."""
 _FREE_SPACE = "Nothing is left of it: free space or name another disk, and begin again."
 _SECOND_NS = 1_000_000_000
 
@@ -61,7 +61,7 @@ class RecordingWriter:
     """
 
     def __init__(self, path: Path, info: SessionInfo, *, lossless_png: bool = False) -> None:
-        """Creates `path` + '.part'. `lossless_png` compresses pictures (half the size, 20 ms each)."""
+        """Creates `path` + '.part'. `lossless_png` compresses images (half the size, 20 ms each)."""
         if path.suffix != ".mcap":
             raise RecordingError(f"{path}: a recording's name ends in .mcap", code="recording-name")
         if not is_session_name(info.name):
@@ -76,7 +76,7 @@ class RecordingWriter:
         self._lossless_png = lossless_png
         self._start_ns = info.created_wall_ns or time.time_ns()
         self._channels: dict[Topic, _Channel] = {}
-        self._pictures: dict[int, int] = {}
+        self._images: dict[int, int] = {}
         """Sequence → time in the file."""
         self._shown_ns = 0
         """Time of the newest state that viewers get."""
@@ -107,54 +107,54 @@ class RecordingWriter:
             self._show(Topic.TRANSFORM, viewing.frame_transform("base", "flange", T, time_ns), time_ns)
             self._show(Topic.JOINTS, viewing.joint_states(state, time_ns), time_ns)
 
-    def image(self, picture: Image, encoded: bytes | None = None) -> None:
-        """`encoded`: the same picture's PNG or JPEG bytes, stored instead of the array (imported files)."""
-        if picture.sequence in self._pictures or picture.sequence < 0:
-            text = f"Image {picture.sequence} was recorded before; sequences count up from 0"
-            raise RecordingError(text, code="image-twice", image=picture.sequence)
-        height, width = picture.pixels.shape[:2]
+    def image(self, image: Image, encoded: bytes | None = None) -> None:
+        """`encoded`: the same image's PNG or JPEG bytes, stored instead of the array (imported files)."""
+        if image.sequence in self._images or image.sequence < 0:
+            text = f"Image {image.sequence} was recorded before; sequences count up from 0"
+            raise RecordingError(text, code="image-twice", image=image.sequence)
+        height, width = image.pixels.shape[:2]
         camera = self.info.camera
         if (width, height) != (camera.width, camera.height):
             raise RecordingError(
-                f"Image {picture.sequence} is {width}×{height}, the session's camera is "
+                f"Image {image.sequence} is {width}×{height}, the session's camera is "
                 f"{camera.width}×{camera.height}",
                 code="image-size",
                 width_px=width,
                 height_px=height,
             )
         facts = PictureFacts(
-            stamps=picture.stamps,
-            frame_id=picture.frame_id,
-            sequence=picture.sequence,
+            stamps=image.stamps,
+            frame_id=image.frame_id,
+            sequence=image.sequence,
             width=width,
             height=height,
-            exposure_us=picture.exposure_us,
-            gain_db=picture.gain_db,
-            pixel_format=picture.pixel_format,
-            trigger_count=picture.trigger_count,
+            exposure_us=image.exposure_us,
+            gain_db=image.gain_db,
+            pixel_format=image.pixel_format,
+            trigger_count=image.trigger_count,
         )
-        time_ns = self._time_ns(picture.stamps, picture.sequence)
+        time_ns = self._time_ns(image.stamps, image.sequence)
         try:
-            topic, image = self._image(picture, encoded, time_ns)
+            topic, pieces = self._image(image, encoded, time_ns)
         except ImageError as error:
-            raise RecordingError(f"Image {picture.sequence} {error}", code="bad-image") from error
+            raise RecordingError(f"Image {image.sequence} {error}", code="bad-image") from error
         for part_of_it in (Topic.PICTURE_FACTS, topic):  # declared first: the two lie in one chunk
             self._channel(part_of_it)
-        self._add(Topic.PICTURE_FACTS, [encode(facts)], time_ns, picture.sequence, more=True)
-        self._add(topic, image, time_ns, picture.sequence)
-        self._pictures[picture.sequence] = time_ns
+        self._add(Topic.PICTURE_FACTS, [encode(facts)], time_ns, image.sequence, more=True)
+        self._add(topic, pieces, time_ns, image.sequence)
+        self._images[image.sequence] = time_ns
         self.flush()
 
-    def _image(self, picture: Image, encoded: bytes | None, time_ns: int) -> tuple[Topic, list[Piece]]:
+    def _image(self, image: Image, encoded: bytes | None, time_ns: int) -> tuple[Topic, list[Piece]]:
         if encoded is None and self._lossless_png:
-            encoded = encode_png(picture.pixels)
+            encoded = encode_png(image.pixels)
         if encoded is None:
-            return Topic.RAW_IMAGE, viewing.raw_image(picture.pixels, picture.pixel_format, time_ns)
+            return Topic.RAW_IMAGE, viewing.raw_image(image.pixels, image.pixel_format, time_ns)
         return Topic.COMPRESSED_IMAGE, viewing.compressed_image(encoded, read_header(encoded).format, time_ns)
 
     def view(self, view: View) -> None:
-        """The picture must have been recorded before: a view never points at nothing."""
-        if view.picture_sequence not in self._pictures:
+        """The image must have been recorded before: a view never points at nothing."""
+        if view.picture_sequence not in self._images:
             raise RecordingError(
                 f"View {view.index} names image {view.picture_sequence}, which is not in the recording",
                 code="no-image",
@@ -168,18 +168,18 @@ class RecordingWriter:
         self.flush()
 
     def marks(self, sequence: int, marks: Sequence[viewing.Marks], text: str = "") -> None:
-        """What viewers draw over a picture: detected corners, residuals. Nothing when it was not recorded."""
-        if (time_ns := self._pictures.get(sequence)) is not None:
+        """Write marks that viewers draw over an image: corners, residuals. Nothing for an unknown image."""
+        if (time_ns := self._images.get(sequence)) is not None:
             self._show(Topic.ANNOTATIONS, viewing.image_annotations(marks, text, time_ns), time_ns)
 
     def drawn_image(self, sequence: int, jpeg: bytes) -> None:
-        """A recorded picture with something drawn into it, for viewers that draw nothing over pictures."""
-        time_ns = self._pictures[sequence]
+        """A recorded image with something drawn into it, for viewers that draw nothing over images."""
+        time_ns = self._images[sequence]
         self._add(Topic.DRAWN_IMAGE, viewing.compressed_image(jpeg, "jpeg", time_ns), time_ns)
 
     def scene(self, sequence: int, entities: Sequence[Entity]) -> None:
-        """Shapes in space as they are at a recorded picture's time, for viewers."""
-        time_ns = self._pictures[sequence]
+        """Shapes in space as they are at a recorded image's time, for viewers."""
+        time_ns = self._images[sequence]
         self._show(Topic.SCENE, scene_update(entities, time_ns), time_ns)
 
     def frame(self, parent: str, child: str, parent_from_child: Matrix4) -> None:
@@ -259,7 +259,7 @@ class RecordingWriter:
 
     @property
     def last_sync_s(self) -> float:
-        """How long the newest sync took."""
+        """Duration of the newest sync."""
         return self._background.last_s
 
     @property
@@ -268,7 +268,7 @@ class RecordingWriter:
         return self._file.size_bytes
 
     def _time_ns(self, stamps: Stamps, place: int = 0) -> int:
-        """Wall time where there is one; imported pictures have none and follow each other by a second."""
+        """Wall time where there is one; imported images have none and follow each other by a second."""
         return stamps.host_wall_ns or self._start_ns + place * _SECOND_NS
 
     def _add(
@@ -349,7 +349,7 @@ class BackgroundSync:
         self._thread: threading.Thread | None = None
         self._error: OSError | None = None
         self.last_s = 0.0
-        """How long the newest one took."""
+        """Duration of the newest one."""
 
     @property
     def busy(self) -> bool:

@@ -141,8 +141,8 @@ def _info_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
         if back := states["backward"]:
             gaps += f", controller time goes back {back} time{'s' * (back > 1)}"
         yield "robot states", f"{states['count']} at {rate}, {gaps}"
-    if pictures := facts["pictures"]:
-        yield "images", _images_text(pictures)
+    if images := facts["pictures"]:
+        yield "images", _images_text(images)
     for name, clock in facts["clocks"].items():
         if clock:
             yield f"{name} clock", _clock_text(clock)
@@ -152,14 +152,14 @@ def _info_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "note", facts["note"]
 
 
-def _images_text(pictures: dict[str, Any]) -> str:
-    settings = [f"{value:g} µs" for value in pictures["exposure_us"]]
-    settings += [f"{value:g} dB" for value in pictures["gain_db"]]
-    jumps = pictures["frame_id_jumps"]
+def _images_text(images: dict[str, Any]) -> str:
+    settings = [f"{value:g} µs" for value in images["exposure_us"]]
+    settings += [f"{value:g} dB" for value in images["gain_db"]]
+    jumps = images["frame_id_jumps"]
     order = "no frame id missing"
-    if jumps:  # between triggered pictures a camera may go on counting
+    if jumps:  # between triggered images a camera may go on counting
         order = f"frame ids jump {jumps} time{'s' * (jumps > 1)}"
-    return ", ".join([str(pictures["count"]), *pictures["pixel_formats"], *settings, order])
+    return ", ".join([str(images["count"]), *images["pixel_formats"], *settings, order])
 
 
 def _clock_text(clock: dict[str, float | None]) -> str:
@@ -170,7 +170,7 @@ def _clock_text(clock: dict[str, float | None]) -> str:
 
 
 def _print_recovery(result: Recovery) -> None:
-    """What `recordings recover` did with one file."""
+    """Print what `recordings recover` did with one file."""
     print(plain_text(result.text))
     if not result.rebuilt:
         return

@@ -26,7 +26,7 @@ def import_command(
     source: Annotated[
         Path,
         typer.Argument(
-            help="A folder (dataset.yaml, poses.csv, pictures), a ROS 2 bag, or an MCAP file",
+            help="A folder (dataset.yaml, poses.csv, images), a ROS 2 bag, or an MCAP file",
             show_default=False,
         ),
     ],
@@ -36,14 +36,14 @@ def import_command(
     dataset: Annotated[
         Path | None, typer.Option(help="dataset.yaml of a bag: mount, board. Default: in or beside it.")
     ] = None,
-    image_topic: Annotated[str | None, typer.Option(help="Topic of the pictures.")] = None,
+    image_topic: Annotated[str | None, typer.Option(help="Topic of the images.")] = None,
     pose_topic: Annotated[
         str | None, typer.Option(help="Topic of the flange's poses, instead of frames.")
     ] = None,
     base: Annotated[str | None, typer.Option(help="Frame of the robot's base.")] = None,
     flange: Annotated[str | None, typer.Option(help="Frame of the flange.")] = None,
     pair_within: Annotated[
-        float, typer.Option(help="Largest time between a picture and the nearest pose, seconds.")
+        float, typer.Option(help="Largest time between an image and the nearest pose, seconds.")
     ] = PAIR_WITHIN_S,
     still_mm: Annotated[float, typer.Option(help="What still counts as standing, mm.")] = POSITION_M * 1e3,
     still_deg: Annotated[
@@ -79,7 +79,7 @@ def import_command(
 
 
 def _print_import(facts: dict[str, Any]) -> None:
-    """What `recordings import` took, or would take."""
+    """Print what `recordings import` took, or would take."""
     if bag := facts.get("bag"):
         print(plain_text(f"images    {bag['image_topic']} ({bag['images']}), {bag['camera']}"))
         print(plain_text(f"poses     {bag['poses_from']}, paired by stamp within {bag['bound_ms']:.2f} ms"))

@@ -1,4 +1,4 @@
-"""What all commands share: any terminal will do, and help ends with examples."""
+"""Output that any terminal can show, and examples at the end of help."""
 
 from __future__ import annotations
 

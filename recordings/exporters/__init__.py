@@ -6,7 +6,7 @@ from enum import StrEnum
 
 
 class Target(StrEnum):
-    """What `recordings export` writes."""
+    """Kind of output of `recordings export`."""
 
     FOLDER = "folder"
     CSV = "csv"

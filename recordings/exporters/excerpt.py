@@ -15,13 +15,13 @@ _NS = 1_000_000_000
 
 
 def write_excerpt(recording: Recording, output: Path, window_s: float = 0.5) -> Path:
-    """Writes `output` (.mcap) with lossless PNG pictures; it solves like the whole. RecordingError.
+    """Writes `output` (.mcap) with lossless PNG images; it solves like the whole. RecordingError.
 
     Robot states stay when they lie within `window_s` of a view by the host's monotonic clock.
     """
     views = recording.views()
     kept_ns = sorted(view.stamps.host_monotonic_ns for view in views)
-    note = f"excerpt: robot states within {window_s:g} s of the pictures"
+    note = f"excerpt: robot states within {window_s:g} s of the images"
     said = recording.info.note.replace(note, "").strip()  # of an excerpt's excerpt: once is enough
     note = " ".join([*filter(None, [said]), note, *recording.losses])
     info = msgspec.structs.replace(recording.info, part=1, note=note)
@@ -31,8 +31,8 @@ def write_excerpt(recording: Recording, output: Path, window_s: float = 0.5) -> 
         for state in recording.robot_states():
             if _near(state, kept_ns, window_s):
                 writer.robot_state(state)
-        for sequence, (view, picture) in enumerate(recording.images()):
-            writer.image(msgspec.structs.replace(picture, sequence=sequence))
+        for sequence, (view, image) in enumerate(recording.images()):
+            writer.image(msgspec.structs.replace(image, sequence=sequence))
             writer.view(msgspec.structs.replace(view, picture_sequence=sequence, part=1))
         for event in recording.events():
             writer.event(event)

@@ -59,7 +59,7 @@ def _new_folder(output: Path) -> Iterator[Path]:
 def _write_folder(recording: Recording, folder: Path) -> None:
     info = recording.info
     (folder / "images").mkdir()
-    rows = [_write_picture(recording, view, folder) for view in recording.views()]
+    rows = [_write_image(recording, view, folder) for view in recording.views()]
     header = HEADER
     if any(view.joints_rad is not None for view in recording.views()):
         header = HEADER + JOINTS
@@ -76,11 +76,11 @@ def _write_folder(recording: Recording, folder: Path) -> None:
     (folder / DATASET_FILE).write_bytes(msgspec.yaml.encode(described))
 
 
-def _write_picture(recording: Recording, view: View, folder: Path) -> list[Any]:
+def _write_image(recording: Recording, view: View, folder: Path) -> list[Any]:
     """The stored file where there is one, else a lossless PNG; returns the pose's row."""
-    picture = recording.image(view)
+    image = recording.image(view)
     stored = recording.stored_image(view)
-    extension, data = ("png", encode_png(picture.pixels)) if stored is None else stored
+    extension, data = ("png", encode_png(image.pixels)) if stored is None else stored
     name = f"images/{view.index:03d}.{_EXTENSIONS.get(extension, extension)}"
     (folder / name).write_bytes(data)
     T = view.base_from_flange
@@ -88,7 +88,7 @@ def _write_picture(recording: Recording, view: View, folder: Path) -> list[Any]:
 
 
 def _write_tables(recording: Recording, folder: Path) -> None:
-    """One CSV per kind of message, raw values in SI units, pictures only as their facts."""
+    """One CSV per kind of message, raw values in SI units, images only as their facts."""
     states = (
         [
             *_values(state.stamps),
@@ -105,7 +105,7 @@ def _write_tables(recording: Recording, folder: Path) -> None:
     joints = [f"{joint}_rad" for joint in _JOINTS] + [f"{joint}_rad_s" for joint in _JOINTS]
     header = [*_STAMPS, *joints, *pose, "robot_mode", "safety_mode", "speed_scaling"]
     _write_csv(folder / "robot_states.csv", header, states)
-    facts = [fact for part in recording.segments for fact in part.image_facts()]
+    facts = [fact for segment in recording.segments for fact in segment.image_facts()]
     columns = ["sequence", "frame_id", "width", "height", "exposure_us", "gain_db", "pixel_format"]
     rows = ([*_values(fact.stamps), *(getattr(fact, column) for column in columns)] for fact in facts)
     _write_csv(folder / "pictures.csv", [*_STAMPS, *columns], rows)
@@ -129,7 +129,7 @@ def _write_views(recording: Recording, folder: Path) -> None:
         "used",
     ]
     rows = []
-    for view in (view for part in recording.segments for view in part.views):
+    for view in (view for segment in recording.segments for view in segment.views):
         T = view.base_from_flange
         pose = [T[0][3], T[1][3], T[2][3], *quaternion_xyzw(T)]
         place = [view.index, view.attempt, view.part, view.name, view.picture_sequence]

@@ -1,6 +1,6 @@
 """A recording as a ROS 2 bag that can be played: written by `rosbags` (the extra `ros`), no ROS needed.
 
-A picture, its CameraInfo and the flange's frame carry one stamp: that of mid-exposure, where the picture
+An image, its CameraInfo and the flange's frame carry one stamp: that of mid-exposure, where the image
 belongs to a view. In between the flange's frame follows at 100 Hz, the joints at their full rate.
 """
 
@@ -46,8 +46,8 @@ def write_ros2(recording: Recording, folder: Path) -> None:
     inner = folder / recording.info.name
     with Writer(inner, version=_BAG_VERSION, storage_plugin=StoragePlugin.MCAP) as writer:
         connections: dict[str, Any] = {}
-        for part in recording.segments:
-            for entry in _entries(messages, recording, part):
+        for segment in recording.segments:
+            for entry in _entries(messages, recording, segment):
                 kind = entry.message.__msgtype__
                 if entry.topic not in connections:
                     connections[entry.topic] = writer.add_connection(
@@ -63,18 +63,18 @@ def write_ros2(recording: Recording, folder: Path) -> None:
     inner.rmdir()
 
 
-def _entries(messages: _Messages, recording: Recording, part: RecordingSegment) -> Iterator[_Entry]:
+def _entries(messages: _Messages, recording: Recording, segment: RecordingSegment) -> Iterator[_Entry]:
     """In time order."""
-    counted = {view.picture_sequence: view for view in recording.views() if view.part == part.info.part}
-    stored = {message.sequence: message.time_ns for message in part.stored(Topic.PICTURE_FACTS)}
+    counted = {view.picture_sequence: view for view in recording.views() if view.part == segment.info.part}
+    stored = {message.sequence: message.time_ns for message in segment.stored(Topic.PICTURE_FACTS)}
     times = {number: _mid_exposure_ns(counted.get(number), time_ns) for number, time_ns in stored.items()}
-    states = part.messages(Topic.ROBOT_STATE)
+    states = segment.messages(Topic.ROBOT_STATE)
     first_ns = min([*times.values(), *([states.start_ns] if len(states) else [])], default=0)
-    camera = part.camera_model or part.info.camera
+    camera = segment.camera_model or segment.info.camera
     return merge(
-        _fixed_frames(messages, part, first_ns),
-        _arm(messages, part),
-        _pictures(messages, part, times, counted, camera),
+        _fixed_frames(messages, segment, first_ns),
+        _arm(messages, segment),
+        _images(messages, segment, times, counted, camera),
         key=lambda entry: entry.time_ns,
     )
 
@@ -83,16 +83,16 @@ def _mid_exposure_ns(view: View | None, recorded_ns: int) -> int:
     return (view.stamps.host_wall_ns if view else 0) or recorded_ns
 
 
-def _fixed_frames(messages: _Messages, part: RecordingSegment, time_ns: int) -> Iterator[_Entry]:
-    """What the recording knows of camera and board; all in one message, as ROS expects it."""
-    if part.fixed_frames:
-        frames = [messages.transform(*names, T, time_ns) for names, T in part.fixed_frames.items()]
+def _fixed_frames(messages: _Messages, segment: RecordingSegment, time_ns: int) -> Iterator[_Entry]:
+    """Yield the fixed frames of camera and board in one message, as ROS expects it."""
+    if segment.fixed_frames:
+        frames = [messages.transform(*names, T, time_ns) for names, T in segment.fixed_frames.items()]
         yield _Entry(time_ns, "/tf_static", messages.make("tf2_msgs/msg/TFMessage", frames))
 
 
-def _arm(messages: _Messages, part: RecordingSegment) -> Iterator[_Entry]:
+def _arm(messages: _Messages, segment: RecordingSegment) -> Iterator[_Entry]:
     shown_ns = -FRAME_PERIOD_NS
-    for stored, state in zip(part.stored(Topic.ROBOT_STATE), part.robot_states(), strict=True):
+    for stored, state in zip(segment.stored(Topic.ROBOT_STATE), segment.robot_states(), strict=True):
         time_ns = stored.time_ns
         joints = messages.make(
             "sensor_msgs/msg/JointState",
@@ -105,13 +105,13 @@ def _arm(messages: _Messages, part: RecordingSegment) -> Iterator[_Entry]:
         yield _Entry(time_ns, "/joint_states", joints)
         if not 0 <= time_ns - shown_ns < FRAME_PERIOD_NS and np.isfinite(state.tcp_pose).all():
             shown_ns = time_ns
-            T = base_from_flange(state.tcp_pose, part.info.robot.tcp_offset)
+            T = base_from_flange(state.tcp_pose, segment.info.robot.tcp_offset)
             yield _Entry(time_ns, "/tf", messages.frames("base", "flange", T, time_ns))
 
 
-def _pictures(
+def _images(
     messages: _Messages,
-    part: RecordingSegment,
+    segment: RecordingSegment,
     times: dict[int, int],
     counted: dict[int, View],
     camera: CameraModel,
@@ -120,20 +120,20 @@ def _pictures(
         if view := counted.get(sequence):
             yield _Entry(time_ns, "/tf", messages.frames("base", "flange", view.base_from_flange, time_ns))
         yield _Entry(time_ns, "/camera/camera_info", messages.camera_info(camera, time_ns))
-        yield _picture(messages, part, sequence, time_ns)
+        yield _image(messages, segment, sequence, time_ns)
 
 
-def _picture(messages: _Messages, part: RecordingSegment, sequence: int, time_ns: int) -> _Entry:
+def _image(messages: _Messages, segment: RecordingSegment, sequence: int, time_ns: int) -> _Entry:
     header = messages.header(time_ns, CAMERA_FRAME)
-    stored = part.stored_image(sequence)
+    stored = segment.stored_image(sequence)
     if stored is not None:
         file = np.frombuffer(stored[1], np.uint8)
         message = messages.make("sensor_msgs/msg/CompressedImage", header, stored[0], file)
         return _Entry(time_ns, "/camera/image_raw/compressed", message)
-    picture = part.image(sequence)
-    height, width = picture.pixels.shape[:2]
-    data = np.ascontiguousarray(picture.pixels).view(np.uint8).ravel()
-    encoding = raw_encoding(picture.pixels, picture.pixel_format)
+    image = segment.image(sequence)
+    height, width = image.pixels.shape[:2]
+    data = np.ascontiguousarray(image.pixels).view(np.uint8).ravel()
+    encoding = raw_encoding(image.pixels, image.pixel_format)
     message = messages.make(
         "sensor_msgs/msg/Image", header, height, width, encoding, 0, len(data) // height, data
     )

@@ -1,7 +1,7 @@
-"""A ROS 2 bag, or any MCAP with pictures and poses → a recording like the station's own.
+"""A ROS 2 bag, or any MCAP with images and poses → a recording like the station's own.
 
-A first pass reads frames, joints and the pictures' stamps, finds the stops of the arm and pairs each with
-its last picture; a second one reads those pictures and the joints, and writes. One picture is in memory at a
+A first pass reads frames, joints and the images' stamps, finds the stops of the arm and pairs each with
+its last image; a second one reads those images and the joints, and writes. One image is in memory at a
 time.
 """
 
@@ -61,7 +61,7 @@ _LAYOUTS = {
 
 @dataclass(frozen=True)
 class BagPlan:
-    """What is taken from a bag; what `--dry-run` prints."""
+    """Summary of an import, which `--dry-run` prints."""
 
     image_topic: str
     images: int
@@ -71,7 +71,7 @@ class BagPlan:
     stops: int
     passed_over: dict[str, int]
     bound_ms: float
-    """How far the nearest report of the arm is from its picture's stamp, at worst."""
+    """Largest time between an image and the arm's nearest report."""
     other_topics: list[str]
     bytes_written: int = 0
 
@@ -141,7 +141,7 @@ def _plan(
     passed: dict[str, int],
 ) -> BagPlan:
     given = described is not None and described.camera is not None
-    camera = "of the description" if given else "size of the pictures, intrinsics to be estimated"
+    camera = "of the description" if given else "size of the images, intrinsics to be estimated"
     if not given and chosen.camera is not None and chosen.camera.matrix is not None:
         camera = "intrinsics of the bag"
     return BagPlan(

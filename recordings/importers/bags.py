@@ -96,7 +96,7 @@ class Bag:
             yield decoded(told.encoding, told.schema, data, time_ns)
 
     def image_stamps(self, topic: str) -> Iterator[int]:
-        """Of every image, without its pixels being decoded."""
+        """Yield the stamp of every image, ns, without decoding pixels."""
         if self._by_name[topic].encoding == CDR:
             for time_ns, data in self._read(topic, limit_bytes=STAMP_BYTES):
                 yield ros_image_stamp_ns(data, time_ns)

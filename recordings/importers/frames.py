@@ -14,7 +14,7 @@ from recordings.errors import ImportSourceError
 from recordings.importers.messages import Array, Frame
 
 SAMPLES_LIMIT = 4_000_000
-"""Of all frames together: 64 bytes each."""
+"""Limit over all frames together: 64 bytes each."""
 KNOWN_PAIRS = (
     ("base", "flange"), ("base", "tool0_controller"), ("base", "tool0"), ("base_link", "flange"),
     ("base_link", "tool0"), ("base_link", "ee_link"), ("base_link", "wrist_3_link"),
@@ -148,7 +148,7 @@ class Track:
 
     @property
     def stamps_ns(self) -> NDArray[np.int64]:
-        """Of the link that is told most often: when the arm was looked at."""
+        """Stamps of the link that is reported most often, (n,) ns."""
         return max((link.stamps_ns for link in self.links if link.moving), key=len)
 
     def at(self, times_ns: NDArray[np.int64]) -> Array:
@@ -161,7 +161,7 @@ class Track:
         return T
 
     def gap_s(self, time_ns: int) -> float:
-        """How far the nearest sample of any moving link is; infinite before the first and after the last."""
+        """Return the time to the farthest of the moving links' nearest samples; infinite outside them."""
         worst = 0.0
         for link in self.links:
             if link.moving:

@@ -1,4 +1,4 @@
-"""What a bag can tell about a calibration, whoever wrote it, decoded from ROS 2 (CDR) or foxglove (protobuf).
+"""Messages of bags that an import can use, decoded from ROS 2 (CDR) or foxglove (protobuf).
 
 One type per kind of message, times in ns. ROS messages need `rosbags` (the extra `ros`).
 """
@@ -32,9 +32,9 @@ Progress = Callable[[str, int, int], None]
 
 
 class Kind(Enum):
-    """What a topic carries."""
+    """Content of a topic."""
 
-    IMAGE = "pictures"
+    IMAGE = "images"
     CAMERA = "camera calibration"
     JOINTS = "joints"
     TRANSFORMS = "frames"
@@ -48,7 +48,7 @@ class ImageMessage:
     width: int
     height: int
     encoding: str
-    """As ROS names it: mono8, bgr8, bayer_rggb8 …; `compressed` for a PNG or JPEG file."""
+    """ROS's name: mono8, bgr8, bayer_rggb8 …; `compressed` for a PNG or JPEG file."""
     step: int
     """Bytes of a row; 0 for a file."""
     data: bytes
@@ -104,11 +104,11 @@ _ROS = {
 _NS = 1_000_000_000
 _LITTLE_ENDIAN = 1
 STAMP_BYTES = 12
-"""Of a ROS message with a header: the encapsulation's four, seconds, nanoseconds."""
+"""Beginning of a ROS message with a header: encapsulation (4), seconds, nanoseconds."""
 
 
 def kind_of(encoding: str, schema: str) -> Kind | None:
-    """What such messages carry; None for kinds that are not used here."""
+    """Return the content of such messages; None for kinds that are not used here."""
     if encoding == PROTOBUF:
         return _FOXGLOVE[schema][1] if schema in _FOXGLOVE else None
     return _ROS.get(schema) if encoding == CDR else None

@@ -19,7 +19,7 @@ _FLANGE, _POSE_CHILD = "flange", "flange of the pose topic"
 
 @dataclass(frozen=True)
 class Wanted:
-    """What the user named; None = find it."""
+    """Names given by the user; None: find it."""
 
     image_topic: str | None = None
     pose_topic: str | None = None
@@ -29,11 +29,11 @@ class Wanted:
 
 @dataclass(frozen=True, eq=False)
 class Selection:
-    """What is taken."""
+    """Topics and frames of a bag that are imported."""
 
     image: Topic
     camera: CameraModel | None
-    """Of the bag's camera calibration."""
+    """Intrinsics from the bag's camera calibration."""
     track: Track
     poses_from: str
     """In words: which frames or topic."""
@@ -67,7 +67,7 @@ class _Speeds:
 
 
 def select(bag: Bag, wanted: Wanted) -> Selection:
-    """Reads everything but the pictures. Raises ImportSourceError that names what is there."""
+    """Reads everything but the images. Raises ImportSourceError that names what is there."""
     image = _one(bag, Kind.IMAGE, wanted.image_topic, "--image-topic")
     if wanted.pose_topic is not None:
         topic = _one(bag, Kind.POSE, wanted.pose_topic, "--pose-topic")

@@ -1,6 +1,6 @@
-"""Where a recorded arm stood still, by the station's own rule, and which picture to take of each stop.
+"""Where a recorded arm stood still, by the station's own rule, and which image to take of each stop.
 
-The rule (station/stillness.py): over a window before the picture the flange stays within `POSITION_M` of its
+The rule (station/stillness.py): over a window before the image the flange stays within `POSITION_M` of its
 mean place and `ROTATION_RAD` of its newest orientation, and no joint is faster than `JOINT_SPEED_RAD_S`.
 """
 
@@ -27,7 +27,7 @@ NEW_STOP_RAD = 0.001
 
 @dataclass(frozen=True)
 class Limits:
-    """What still counts as standing; other people's arms report with more noise."""
+    """Limits of standing still; other people's arms report with more noise."""
 
     position_m: float = POSITION_M
     rotation_rad: float = ROTATION_RAD
@@ -36,12 +36,12 @@ class Limits:
 @dataclass(frozen=True, eq=False)
 class Stop:
     place: int
-    """Of the picture on its topic."""
+    """Index of the image on its topic."""
     stamp_ns: int
     base_from_flange: Array
     stillness: Stillness
     bound_s: float
-    """How far the nearest report of the arm is from the picture's stamp."""
+    """Time between the image and the arm's nearest report."""
 
 
 def find_stops(
@@ -51,9 +51,9 @@ def find_stops(
     limits: Limits,
     pair_within_s: float,
 ) -> tuple[list[Stop], dict[str, int]]:
-    """(one picture of each stop, how many pictures were passed over for which reason).
+    """(one image of each stop, how many images were passed over for which reason).
 
-    `speeds`: stamps and the fastest joint's speed. Of several pictures of one stop the last one is taken: the
+    `speeds`: stamps and the fastest joint's speed. Of several images of one stop the last one is taken: the
     arm has settled longest.
     """
     stamps = track.stamps_ns

@@ -1,4 +1,4 @@
-"""What a recording file holds, gathered record by record: declarations, where messages lie, small files.
+"""Contents of a recording file, record by record: declarations, places of messages, small files.
 
 Everything is checked as it comes in, and every table has a limit, so that memory is bounded whatever a file
 says. The strict reader and recovery both gather into this.
@@ -45,9 +45,9 @@ class MessageIndex:
     """Where the messages of one channel lie, in file order, and what they come to."""
 
     addresses: array[int] = field(default_factory=lambda: array("Q"))
-    """Of the message records, as `Source` counts."""
+    """Addresses of the message records, as `Source` counts."""
     size_bytes: int = 0
-    """Of the messages' data."""
+    """Sum over the messages' data."""
     start_ns: int = 0
     end_ns: int = 0
 
@@ -82,7 +82,7 @@ class Contents:
     """By channel."""
     attachments: dict[str, bytes] = field(default_factory=dict)
     media_types: dict[str, str] = field(default_factory=dict)
-    """Of the attachments."""
+    """Media types of the attachments."""
     metadata: dict[str, dict[str, str]] = field(default_factory=dict)
     """The first of each name, like the attachments."""
     attachment_count: int = 0
@@ -169,7 +169,7 @@ class Contents:
         return self.schemas.get(channel.schema_id, Schema(0, "", "", b""))
 
     def differs(self, stated: Statistics) -> str:
-        """What the summary's statistics say differently; '' when nothing."""
+        """Return what the summary's statistics say differently; '' when nothing."""
         found = {
             "messages": self.message_count,
             "attachments": self.attachment_count,

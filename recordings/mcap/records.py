@@ -69,7 +69,7 @@ class ChunkHead(NamedTuple):
     crc: int
     compression: str
     data_offset: int
-    """Of the records, inside the chunk record's content."""
+    """Place of the records inside the chunk record's content."""
 
 
 class Attachment(NamedTuple):

@@ -43,7 +43,7 @@ _LIKE_A_RECORD = re.compile(rb"[\x06\x09\x0c].{4}\x00{4}", re.DOTALL)
 _BLOCK_BYTES = 1024 * 1024
 _DATA_END_LENGTH = 4
 _PEEK_BYTES = 40
-"""Of an uncompressed chunk's content before its records."""
+"""Length of an uncompressed chunk's content before its records."""
 _CHUNK_PEEK = struct.Struct("<QIIQ")
 """Uncompressed size, checksum, length of the compression's name, stored size."""
 _NAME_LIMIT = 60
@@ -60,13 +60,13 @@ class Records:
     """The records inside one proven chunk."""
 
     address: int
-    """As the source counts: those of a compressed chunk lie unpacked behind the file."""
+    """Address in the source: records of a compressed chunk lie unpacked behind the file."""
     size_bytes: int
 
 
 @dataclass
 class Salvage:
-    """What is whole in a damaged file."""
+    """Whole parts of a damaged file."""
 
     source: Source
     contents: Contents = field(default_factory=lambda: Contents(exact=True))
@@ -243,7 +243,7 @@ class _Walk:
                 at = match.start() + 1
 
     def _plausible(self, position: int) -> bool:
-        """Whether the first bytes fit the kind: dark pictures are full of patterns that look like records."""
+        """Whether the first bytes fit the kind: dark images are full of patterns that look like records."""
         head = self._read(position, RECORD_HEAD.size + _PEEK_BYTES)
         if len(head) < RECORD_HEAD.size + _PEEK_BYTES:
             return False

@@ -42,7 +42,7 @@ from recordings.mcap.records import (
 from recordings.mcap.source import ShortFileError, Source, unpack
 
 CHUNK_LIMIT_BYTES = 40 * 1024 * 1024
-"""Of a record, packed or unpacked: the largest picture of a recording and a little more."""
+"""Limit of a record, packed or unpacked: the largest image of a recording and a little more."""
 SUMMARY_LIMIT_BYTES = 32 * 1024 * 1024
 _BLOCK_BYTES = 256 * 1024
 _AHEAD_BYTES = 64 * 1024
@@ -102,7 +102,7 @@ class _Scan:
         self._block = b""
         """The file's bytes from `_base` on."""
         self._places: array[int] = array("q")
-        """Of message records in the block."""
+        """Places of message records in the block."""
         self._sha256 = hashlib.sha256()
         self._crc = 0
 

@@ -1,7 +1,7 @@
 """Writes the MCAP format: chunks without compression, every checksum, indexes and statistics.
 
 Source: the MCAP format specification, version 0 (mcap.dev/spec). Unlike the reference library's writer it
-copies no picture and reads it once: large contents go from the caller's memory to the kernel. And it never
+copies no image and reads it once: large contents go from the caller's memory to the kernel. And it never
 makes a good-looking file after a failed write: an OSError passes through, and the caller closes the file.
 """
 
@@ -18,7 +18,7 @@ from recordings.mcap.records import FOOTER, MAGIC, MESSAGE_HEAD, RECORD_HEAD, Op
 
 CHUNK_BYTES = 1024 * 1024
 DECLARE_AGAIN_BYTES = 16 * 1024 * 1024
-"""What lies between two copies of the declarations: a scan that lost one meets the next."""
+"""Distance of two copies of the declarations: a scan that lost one meets the next."""
 LIBRARY = "calibration-station"
 _LARGE_BYTES = 32 * 1024
 _MESSAGE = struct.Struct("<BQHIQQ")
@@ -46,7 +46,7 @@ class McapFile:
         self._declared_at: int | None = None
         """Where the newest copy of all declarations is; None when it lacks some."""
         self._indexes: list[bytes] = []
-        """Of chunks, attachments and metadata, in file order, for the summary."""
+        """Index records of chunks, attachments and metadata, in file order, for the summary."""
         self._counts = dict.fromkeys(Statistics._fields[:6], 0)
         self._per_channel: dict[int, int] = {}
         self._span_ns: tuple[int, int] | None = None

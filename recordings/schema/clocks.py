@@ -1,4 +1,4 @@
-"""How a device's clock lies against this host's monotonic clock, learnt from when its messages arrived.
+"""Fit of a device's clock to this host's monotonic clock, from the arrivals of its messages.
 
 A message stamped at device time d arrives at host time d·(1 + drift) + offset + delay with delay ≥ 0. The
 best line is the one that lies under all arrivals and is nearest to them: the edge of their lower convex

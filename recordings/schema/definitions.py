@@ -20,7 +20,7 @@ from msgspec import inspect
 from recordings.schema.messages import CaptureEvent, RobotState, Stamps, Stillness, View
 
 FORMATS = ("station-recording/1", "station-recording/2")
-"""What is read, oldest first; the newest is written."""
+"""Formats that are read, oldest first; the newest is written."""
 SESSION_RECORDS = ("session", "session-copy")
 """Metadata records with the SessionInfo: twice, because nothing can be saved from a file without it."""
 RECOVERY_RECORD = "recovery"
@@ -31,7 +31,7 @@ _MATRIX_COLUMNS = 4
 
 
 class PictureFacts(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What a foxglove image message has no place for; written right before its image, same sequence."""
+    """Facts that a foxglove image has no place for; written right before it, same sequence."""
 
     stamps: Stamps
     frame_id: int
@@ -225,7 +225,7 @@ def _rows(numbers: Any) -> tuple[tuple[float, ...], ...]:
 
 
 def schema_difference(ours: bytes, theirs: bytes) -> str:
-    """What a stored FileDescriptorSet says differently from ours; '' when ours can read it without loss.
+    """Return what a stored FileDescriptorSet says differently; '' when ours reads it without loss.
 
     An older schema lacks fields at the end: allowed. Unknown, renamed or retyped fields are not.
     """

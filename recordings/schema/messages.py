@@ -1,4 +1,4 @@
-"""What a recording is made of: one type per kind of message, in metres, radians and seconds.
+"""Messages of a recording: one type per kind, in metres, radians and seconds.
 
 These are the types that every room shares. How they lie in the file is `schema`'s business.
 """
@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 Mount = Literal["eye-in-hand", "eye-to-hand"]
 Source = Literal["real", "simulated", "playback", "imported"]
-"""Where the pictures and poses came from; anything but `real` never installs on a real cell."""
+"""Where the images and poses came from; anything but `real` never installs on a real cell."""
 
 Vector6 = tuple[float, float, float, float, float, float]
 Matrix4 = tuple[tuple[float, ...], ...]
@@ -152,12 +152,12 @@ class Image(msgspec.Struct, frozen=True, eq=False):
     exposure_us: float = 0.0
     gain_db: float = 0.0
     pixel_format: str = "Mono8"
-    """As GenICam names it."""
+    """GenICam's name of the pixel format."""
     trigger_count: int | None = None
 
 
 class Stillness(msgspec.Struct, frozen=True, omit_defaults=True):
-    """How still the arm was over the window before the picture."""
+    """Stillness of the arm over the window before the image."""
 
     window_s: float
     max_joint_speed_rad_s: float
@@ -167,7 +167,7 @@ class Stillness(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 class View(msgspec.Struct, frozen=True, omit_defaults=True):
-    """The index entry that makes a picture and a robot pose belong together. Written after both."""
+    """The index entry that makes an image and a robot pose belong together. Written after both."""
 
     index: int
     """Pose number in the plan (from 0)."""
@@ -180,18 +180,18 @@ class View(msgspec.Struct, frozen=True, omit_defaults=True):
     attempt: int = 1
     """A retake of the same pose supersedes lower attempts."""
     stamps: Stamps = Stamps()
-    """Of mid-exposure."""
+    """Clocks at mid-exposure."""
     time_bound_s: float | None = None
-    """95 % bound of the pose's time against the picture's."""
+    """95 % bound of the pose's time against the image's."""
     stillness: Stillness | None = None
     source_file: str = ""
     note: str = ""
     part: int = 1
-    """The part of the session that holds the picture; filled in by the reader."""
+    """The part of the session that holds the image; filled in by the reader."""
 
 
 class CaptureEvent(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What happened, for people and for replay: kind is a short word, detail is a sentence."""
+    """Event for people and for replay: kind is a short word, detail is a sentence."""
 
     stamps: Stamps
     kind: str

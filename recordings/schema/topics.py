@@ -1,4 +1,4 @@
-"""What lies on which topic of a recording."""
+"""Topics of a recording and their schemas."""
 
 from __future__ import annotations
 
@@ -74,7 +74,7 @@ def identify(samples: list[bytes]) -> tuple[str, str, str, bytes] | None:
     topic's message has, and it says again the same number of bytes.
     """
     fitting = [topic for topic in Topic if all(_fits(topic, data) for data in samples)]
-    for twin in (Topic.FIXED_TRANSFORM, Topic.DRAWN_IMAGE):  # of /tf and of pictures; only annotated copies
+    for twin in (Topic.FIXED_TRANSFORM, Topic.DRAWN_IMAGE):  # of /tf and of images; only annotated copies
         if len(fitting) > 1 and twin in fitting:
             fitting.remove(twin)
     if len(fitting) != 1 or not samples:

@@ -34,7 +34,7 @@ CAMERA_FRAME = "camera"
 JOINT_NAMES = [
     f"{joint}_joint" for joint in ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
 ]
-"""As the UR ROS driver names them."""
+"""Names of the UR ROS driver."""
 DETECTED = (0.1, 0.9, 0.2)
 """Colour of corners as they were detected."""
 _NS = 1_000_000_000
@@ -54,7 +54,7 @@ def _stamp(message: Any, time_ns: int) -> None:
 
 
 def raw_image(image: NDArray[Any], pixel_format: str, time_ns: int) -> list[Piece]:
-    """A picture as it came: the message in pieces, the pixels not copied. PictureError for odd arrays."""
+    """An image as it came: the message in pieces, the pixels not copied. ImageError for odd arrays."""
     encoding = raw_encoding(image, pixel_format)
     pixels = np.ascontiguousarray(image).data.cast("B")
     height, width = image.shape[:2]
@@ -66,7 +66,7 @@ def raw_image(image: NDArray[Any], pixel_format: str, time_ns: int) -> list[Piec
 
 
 def compressed_image(data: bytes, format: str, time_ns: int) -> list[Piece]:
-    """A picture file: the message in pieces."""
+    """An image file: the message in pieces."""
     message = CompressedImage(frame_id=CAMERA_FRAME, format=format)
     _stamp(message, time_ns)
     return _with_data(message, data)
@@ -106,7 +106,7 @@ def camera_model_of(message: Any) -> CameraModel:
 
 
 def intrinsics(width: int, height: int, K: Any, D: Any, distortion_model: str) -> CameraModel:
-    """As Foxglove and ROS write them; a K of zeros means that nobody knows them."""
+    """Return intrinsics as Foxglove and ROS write them; a K of zeros means that nobody knows them."""
     k = [float(number) for number in K]
     if len(k) != 9 or not k[0] > 0:
         return CameraModel(width, height)
@@ -150,7 +150,7 @@ def base_from_flange(tcp_pose: Vector6, tcp_offset: Vector6) -> Matrix4:
 
 
 def _rotation(x: float, y: float, z: float) -> tuple[tuple[float, float, float], ...]:
-    """Of a rotation vector [rad]: Rodrigues' formula, row by row."""
+    """Rotation matrix of a rotation vector [rad] by Rodrigues' formula, row by row."""
     angle = math.sqrt(x * x + y * y + z * z)
     s = math.sin(angle) / angle if angle else 1.0
     h = math.sin(angle / 2) / angle if angle else 0.5
@@ -172,7 +172,7 @@ def joint_states(state: RobotState, time_ns: int) -> Any:
 
 @dataclass(frozen=True, eq=False)
 class Marks:
-    """Points that are drawn over a picture, joined in pairs where `ends` is given."""
+    """Points that are drawn over an image, joined in pairs where `ends` is given."""
 
     points: NDArray[np.float64]
     """(n, 2), pixels; (0, 0) is the centre of the top left pixel."""
@@ -205,7 +205,7 @@ def image_annotations(marks: Sequence[Marks], text: str, time_ns: int) -> Any:
 
 
 def drawn(image: NDArray[Any], marks: Sequence[Marks], text: str) -> bytes:
-    """The picture as JPEG with marks and text in its pixels."""
+    """The image as JPEG with marks and text in its pixels."""
     if image.dtype == np.uint16:
         image = np.asarray(image / max(1, int(image.max()) >> 8), np.uint8)
     canvas = image.copy() if image.ndim == 3 else cv2.cvtColor(image, cv2.COLOR_GRAY2BGR)

@@ -12,6 +12,7 @@ from mcap.writer import CompressionType
 
 from recordings.cli import main
 from recordings.importers.bag import import_bag
+from recordings.importers.messages import ros_types
 from recordings.importers.selection import Wanted
 from recordings.importers.stops import JOINT_SPEED_RAD_S, LEAST_SAMPLES, Limits
 from recordings.reader import open_recording
@@ -167,6 +168,7 @@ def test_a_cut_bag_is_named_as_such(tmp_path: Path, description: Path) -> None:
 
 def test_without_rosbags_the_way_out_is_named(tmp_path: Path, description: Path, monkeypatch) -> None:  # type: ignore[no-untyped-def]
     source = write_ros_mcap(tmp_path / "a.mcap")
+    ros_types.cache_clear()
     for module in ("rosbags.typesys", "rosbags.rosbag2"):
         monkeypatch.setitem(sys.modules, module, None)
     with refused("missing-package"):

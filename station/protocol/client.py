@@ -64,11 +64,11 @@ class _Incoming(msgspec.Struct):
 
     id: int | None = None
     ok: bool = False
-    result: Any = None
+    result: object = None
     error: str = ""
     problem: ErrorData | None = None
-    status: dict[str, Any] | None = None
-    changes: dict[str, Any] | None = None
+    status: dict[str, object] | None = None
+    changes: dict[str, object] | None = None
 
 
 class Client:
@@ -78,7 +78,7 @@ class Client:
         self._path, self._reader, self._writer = path, reader, writer
         self._next_id = 1
         self._waiting: dict[int, asyncio.Future[Reply]] = {}
-        self._plain_status: dict[str, Any] | None = None
+        self._plain_status: dict[str, object] | None = None
         self._outdated = False
         self._fresh = asyncio.Event()
         self._gone = False
@@ -124,7 +124,7 @@ class Client:
         result: R = msgspec.convert(answer, verb.result())
         return result
 
-    async def request(self, verb: str, *, timeout_s: float = ANSWER_S, **args: Any) -> Any:
+    async def request(self, verb: str, *, timeout_s: float = ANSWER_S, **args: object) -> Any:
         """Calls a verb by its name; the result as plain data."""
         if verb == "stop":
             send_stop(self._path)  # nobody can hold this up; the request brings the answer

@@ -11,11 +11,10 @@ pieces of a long request included; it also has a socket of its own: `station.ser
 
 from __future__ import annotations
 
-from typing import Any
-
 import msgspec
 
 from recordings.errors import CodedError, ErrorData
+from station.cell.status import StationStatus
 
 LINE_LIMIT_BYTES = 64 * 1024
 REQUEST_LIMIT_BYTES = 2 * 1024 * 1024
@@ -29,13 +28,13 @@ USER_CLIENT_LIMIT = 16
 class Request(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     id: int
     verb: str
-    args: dict[str, Any] = {}
+    args: dict[str, object] = {}
 
 
 class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
     id: int
     ok: bool
-    result: Any = None
+    result: object = None
     error: str = ""
     """A sentence for a person; for programs: `problem`."""
     problem: ErrorData | None = None
@@ -48,5 +47,5 @@ class Reply(msgspec.Struct, frozen=True, omit_defaults=True):
 class Notice(msgspec.Struct, frozen=True, omit_defaults=True):
     """An unasked-for line to a watcher; exactly one field is set."""
 
-    status: dict[str, Any] | None = None
-    changes: dict[str, Any] | None = None
+    status: StationStatus | None = None
+    changes: dict[str, object] | None = None

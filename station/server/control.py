@@ -13,10 +13,10 @@ import os
 import socket
 import struct
 from collections import defaultdict, deque
-from collections.abc import Callable
+from collections.abc import Awaitable, Callable, Coroutine
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Protocol
 
 import msgspec
 
@@ -59,10 +59,10 @@ class Peer:
 class Handler(Protocol):
     """The daemon's side of requests."""
 
-    def stop_now(self, peer: Peer) -> Any:
+    def stop_now(self, peer: Peer) -> Awaitable[object] | None:
         """STOP, from anyone: under way when it returns, should the client leave. May return an awaitable."""
 
-    async def handle(self, peer: Peer, verb: str, args: dict[str, Any]) -> Any:
+    async def handle(self, peer: Peer, verb: str, args: dict[str, object]) -> object:
         """The result; what a person can act on (CodedError) becomes the reply's problem."""
 
     def gone(self, peer: Peer) -> None:
@@ -184,8 +184,7 @@ class ControlServer:
     def _full_status(self) -> bytes:
         # Published first, so that the next changes start from exactly what this watcher was told.
         self.publish(self._newest())
-        plain: dict[str, Any] = msgspec.to_builtins(self._status)
-        return msgspec.json.encode(Notice(status=plain)) + b"\n"
+        return msgspec.json.encode(Notice(status=self._status)) + b"\n"
 
 
 class _Connection:
@@ -197,7 +196,7 @@ class _Connection:
         reader: asyncio.StreamReader,
         writer: asyncio.StreamWriter,
         handler: Handler,
-        full_status: Any,
+        full_status: Callable[[], bytes],
     ) -> None:
         self.peer = peer
         self.watching = False
@@ -260,12 +259,12 @@ class _Connection:
         self._pieces += piece
         self.reply(Reply(request.id, True, {}))
 
-    def _spawn(self, work: Any) -> None:
+    def _spawn(self, work: Coroutine[None, None, None]) -> None:
         task = asyncio.create_task(work)
         self._tasks.add(task)
         task.add_done_callback(self._tasks.discard)
 
-    async def _answer_stop(self, request_id: int, stopping: Any) -> None:
+    async def _answer_stop(self, request_id: int, stopping: Awaitable[object] | None) -> None:
         if stopping is not None:
             await stopping
         self.reply(Reply(request_id, True, {}))

@@ -92,7 +92,7 @@ class SessionDispatcher:
         task.add_done_callback(self._leaving.discard)
         return asyncio.shield(task)
 
-    async def handle(self, peer: Peer, verb: str, args: dict[str, Any]) -> Any:
+    async def handle(self, peer: Peer, verb: str, args: dict[str, object]) -> object:
         """RefusedError for wrong arguments, in a wrong state, or without the control that it needs."""
         if verb == "watch":
             return {}

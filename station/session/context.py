@@ -21,6 +21,18 @@ from station.session.recording import SessionRecording
 from station.session.store import StatusStore
 
 
+@dataclass
+class RunRequests:
+    """Wishes for the run under way."""
+
+    pause_by: str = ""
+    """Who asked to pause after this pose; empty: nobody."""
+    finish: bool = False
+    """Finish after this pose."""
+    halt: bool = False
+    """STOP, a fault or lost control ends the run: it must not change the state any more."""
+
+
 @dataclass(eq=False)
 class SessionContext:
     """State of a session. Touched by the event loop's thread only."""
@@ -36,11 +48,7 @@ class SessionContext:
     """The session that is not finished yet."""
     seen: dict[int, CapturedView] = field(default_factory=dict)
     """By pose number: views that count."""
-    pause_wanted: str = ""
-    """Who asked to pause after this pose; empty: nobody."""
-    finish_wanted: bool = False
-    halting: bool = False
-    """STOP, a fault or lost control ends the run: it must not change the state any more."""
+    requests: RunRequests = field(default_factory=RunRequests)
 
     @property
     def resting(self) -> StationState:

@@ -43,7 +43,7 @@ class Freedrive:
         self._end_watch()
         context, store = self._context, self._context.store
         context.cell.robot.check()
-        context.halting = False
+        context.requests.halt = False
         # At once, and taking: while the disk works nobody is offered a motion, and no image is begun.
         store.enter(StationState.FREE_DRIVE, "The recording is being opened.")
         async with self._taking:
@@ -123,20 +123,20 @@ class Freedrive:
             self._failed(error, index)
             return index
         except Exception as error:
-            if not context.halting:  # else STOP came in between: its state stays
+            if not context.requests.halt:  # else STOP came in between: its state stays
                 log.exception("an image failed")
             self._failed(internal_error(error), index)
-        if not context.halting and store.state is not StationState.FAULT:
+        if not context.requests.halt and store.state is not StationState.FAULT:
             store.enter(StationState.FREE_DRIVE, _GUIDE)
         context.show_poses(index)
-        if context.pause_wanted:
-            context.pause_wanted = ""
+        if context.requests.pause_by:
+            context.requests.pause_by = ""
             self.end()
         return index
 
     def _failed(self, error: StationError, index: int) -> None:
         unmark_busy(self._context)
-        if not self._context.halting:
+        if not self._context.requests.halt:
             self._context.store.enter(StationState.FAULT, error)
             self._context.store.problem(error, "error", index)
 

@@ -79,7 +79,7 @@ class Monitor:
         context = self._context
         if context.store.state not in RUNNING:
             return ""
-        return FINISHES if context.finish_wanted else PAUSES if context.pause_wanted else ""
+        return FINISHES if context.requests.finish else PAUSES if context.requests.pause_by else ""
 
     def _watch_wall_clock(self) -> None:
         """Nothing is placed by it, but a person who compares times with another computer wants to know."""

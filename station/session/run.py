@@ -24,7 +24,7 @@ from station.cell.scene import geometry_from
 from station.cell.status import Event, StationState
 from station.cell.stillness import NotStillError, RestingCheck
 from station.session.capture import PoseFailedError, take_pose
-from station.session.context import SessionContext
+from station.session.context import RunRequests, SessionContext
 from station.session.lease import MotionApproval, require_start
 from station.session.queue import BUSY
 from station.session.recording import to_the_end
@@ -75,7 +75,7 @@ class Run:
     def _halt(self, state: StationState, error: StationError) -> None:
         """The run's own end for a reason; nothing when STOP or lost control already ended it."""
         context = self._context
-        if context.halting:
+        if context.requests.halt:
             return
         context.store.enter(state, error)
         context.store.problem(error, "error", context.store.status.session.current)
@@ -95,7 +95,7 @@ class Run:
         except SafetyStopError:
             raise
         except (StationError, RecordingError) as error:
-            if not context.halting:
+            if not context.requests.halt:
                 context.store.enter(resting, error)
                 context.store.problem(error, "error", said="not started: {}")
             return False
@@ -119,7 +119,7 @@ class Run:
             await self._all_poses()
         finally:
             recording.count_time(running=False)
-        if not self._context.halting:
+        if not self._context.requests.halt:
             await self._rest()
 
     async def _all_poses(self) -> None:
@@ -127,7 +127,7 @@ class Run:
         queue = context.require_queue()
         started_s, taken = time.monotonic(), 0
         todo = list(self._go.poses)
-        while not context.halting:
+        while not context.requests.halt:
             todo = [index for index in todo if index in queue.open] or self._once_more()
             if self._wants_rest() or not todo or self._failures >= FAILURES_IN_A_ROW:
                 break
@@ -153,7 +153,7 @@ class Run:
         return found
 
     def _wants_rest(self) -> bool:
-        return bool(self._context.pause_wanted) or self._context.finish_wanted
+        return bool(self._context.requests.pause_by) or self._context.requests.finish
 
     async def _pose(self, index: int) -> None:
         context = self._context
@@ -209,20 +209,20 @@ class Run:
         context = self._context
         queue = context.require_queue()
         await context.cell.robot.end_control()  # before finishing: heartbeats end with the run
-        if context.halting:
+        if context.requests.halt:
             return
-        if context.finish_wanted or (not queue.open and not queue.failed):
+        if context.requests.finish or (not queue.open and not queue.failed):
             await seal(context)
             return
         cause, reason = self._why_paused()
-        context.pause_wanted = ""
+        context.requests.pause_by = ""
         context.store.enter(StationState.PAUSED, reason, cause)
         context.store.event(cause, reason)
         context.show_poses()
 
     def _why_paused(self) -> tuple[str, str]:
         """Code and sentence."""
-        queue, pausing = self._context.require_queue(), self._context.pause_wanted
+        queue, pausing = self._context.require_queue(), self._context.requests.pause_by
         if pausing:
             return "paused", f"Paused by {pausing}. Approve again to continue."
         if self._failures >= FAILURES_IN_A_ROW:
@@ -254,7 +254,7 @@ async def seal(context: SessionContext) -> None:
     """Finishes the recording: sealing → idle. A failing disk leaves a fault and the `.part` file."""
     context.store.enter(StationState.SEALING)
     context.show_poses()
-    context.pause_wanted, context.finish_wanted = "", False
+    context.requests = RunRequests(halt=context.requests.halt)
     await to_the_end(_seal(context))
 
 
@@ -281,7 +281,7 @@ def disk_failed(context: SessionContext, error: RecordingError) -> None:
         context.recording.abandon()
     text = f"Recording: {str(error).rstrip('.')}. What was saved before is safe."
     reason = StationError(text, code=error.code)
-    if context.halting:
+    if context.requests.halt:
         context.store.update(reason=f"{context.store.status.reason} — {reason}")
     else:
         context.store.enter(StationState.FAULT, reason)

@@ -28,7 +28,7 @@ from station.plan.planner import make_plan
 from station.protocol import verbs
 from station.protocol.states import RUNNING
 from station.protocol.verbs import Purpose, Verb
-from station.session.context import SessionContext
+from station.session.context import RunRequests, SessionContext
 from station.session.freedrive import Freedrive
 from station.session.interrupted import close_or_seal, find_interrupted
 from station.session.lease import ApprovalManager, LeaseManager, MotionApproval
@@ -140,7 +140,7 @@ class Session:
         """Voids the approval, stops the arm both ways, ends the run: one that writes once the disk has it."""
         context, run = self.context, self._run
         self._void()
-        context.halting, context.pause_wanted, context.finish_wanted = True, "", False
+        context.requests = RunRequests(halt=True)
         self.store.enter(state, reason, cause)
         if run is not None:
             run.cancel()
@@ -222,7 +222,7 @@ class Session:
         finally:
             self.store.update(go=None)
         self._notes = ()
-        context.halting, context.pause_wanted, context.finish_wanted = False, "", False
+        context.requests = RunRequests()
         if context.recording is None and go.hover is None:
             context.forget_session(check=go.purpose is Purpose.DRIFT_CHECK)
         if go.replanned is not None:
@@ -241,7 +241,7 @@ class Session:
     def pause(self, who: str) -> None:
         """After this pose. Anyone may: it only ever makes the arm do less."""
         self._require_state(verbs.Pause)
-        self.context.pause_wanted = who
+        self.context.requests.pause_by = who
         self.store.event("pause-wanted", f"{who} asks to pause after this pose", who=who)
 
     async def finish(self, client_id: int) -> None:
@@ -249,7 +249,7 @@ class Session:
         self.permit(verbs.Finish, client_id)
         self._void()
         if self.store.state in RUNNING and not self.freedrive.taking:
-            self.context.finish_wanted = True
+            self.context.requests.finish = True
             self.store.event("finish-wanted", "finish after this pose")
             return
         if self.context.recording is None:

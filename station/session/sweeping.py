@@ -54,14 +54,14 @@ class SweepRun(Run):
                     self._ended.set()  # a camera may swallow being cancelled, just when its image comes
         except ExceptionGroup as failed:
             raise failed.exceptions[0] from None  # of two the first one tells the cause
-        if not self._context.halting:
+        if not self._context.requests.halt:
             taken = self._taken
             self._context.store.event("swept", f"{taken} images while the arm moved", images=taken)
 
     async def _swings(self) -> None:
         context, queue = self._context, self._context.require_queue()
         for index in self._go.poses:
-            if context.halting or self._wants_rest() or self._failures >= FAILURES_IN_A_ROW:
+            if context.requests.halt or self._wants_rest() or self._failures >= FAILURES_IN_A_ROW:
                 return
             if index not in queue.open:
                 continue  # skipped or dropped since the approval

@@ -249,19 +249,19 @@ class HoverRun(Run):
             except LimitError as error:
                 context.store.enter(StationState.IDLE, error)
                 return
-            if context.halting:
+            if context.requests.halt:
                 return
             if self._wants_rest() and planned is not self._hover.plan.poses[-1]:
-                reason = f"paused by {context.pause_wanted}" if context.pause_wanted else "ended"
-                context.store.enter(
-                    StationState.IDLE, f"{reason} high over the corner: ask for the hover anew"
-                )
+                by = context.requests.pause_by
+                reason = f"Paused by {by}" if by else "Ended"
+                reason += " high over the corner. Request the touch test again."
+                context.store.enter(StationState.IDLE, reason, "paused")
                 return
         with contextlib.suppress(NotStillError):  # what is read next is the place where it rests
             await context.stillness.settle(RestingCheck(robot.check))
         await RestingCheck(robot.check).news()
         there = robot.latest().joints_rad
-        if context.halting:
+        if context.requests.halt:
             return
         reason = (
             f"The tip stands {1000 * self._hover.standoff_m:.0f} mm above corner {self._hover.corner}. "

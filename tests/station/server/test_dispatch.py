@@ -211,7 +211,7 @@ async def test_a_named_service_approves_by_the_plans_hash_and_is_written_down(
         summary = await offered(program, small_plan)
         await program.request("go", token=summary["token"], plan_sha256=plan_sha256(small_plan))
         await served.rig.until_true(lambda: bool(session.store.status.session.recording))
-    told = [event.text for event in session.store.status.events if "approved by" in event.text]
+    told = [event.text for event in served.rig.told("approved")]
     recording = open_recording(Path(session.store.status.session.recording))
     recorded = [event.detail for event in recording.events() if "approved by" in event.detail]
     for texts in (told, recorded):

@@ -49,7 +49,7 @@ async def test_a_verb_out_of_its_state_is_refused_and_changes_nothing(
         assert (refused.value.code, refused.value.values["state"]) == ("wrong-state", state)
         assert store.status == msgspec.structs.replace(calm, state=state)
     assert rig.arm.log == done
-    assert not (rig.session.context.pause_wanted or rig.session.context.finish_wanted)
+    assert not (rig.session.context.requests.pause_by or rig.session.context.requests.finish)
     store.status = calm
 
 

@@ -122,7 +122,7 @@ async def test_stop_while_free_drive_begins_stays_latched(
     opened.set()
     with raises("wrong-state"):
         await beginning
-    assert bare_rig.state is S.STOPPED and bare_rig.session.context.halting
+    assert bare_rig.state is S.STOPPED and bare_rig.session.context.requests.halt
 
 
 async def test_no_go_is_given_while_free_drive_begins(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:

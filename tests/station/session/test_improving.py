@@ -80,7 +80,7 @@ async def half_way(new_rig: NewRig, plan: Plan) -> Rig:
 
 def _pause_after(rig: Rig, poses: int) -> None:
     if rig.session.store.status.session.captured == poses:
-        rig.session.context.pause_wanted = "anna"
+        rig.session.context.requests.pause_by = "anna"
 
 
 def queue_of(rig: Rig) -> PoseQueue:

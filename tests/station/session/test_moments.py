@@ -66,7 +66,7 @@ async def test_a_lost_lease_before_anything_is_recorded_leaves_no_paused_session
 
 async def test_finish_before_a_way_that_is_not_free_seals(rig: Rig, monkeypatch: pytest.MonkeyPatch) -> None:
     def refused(geometry: Any, here: Any, there: Any, name: str) -> Any:
-        rig.session.context.finish_wanted = True  # a person asked while the way was looked at
+        rig.session.context.requests.finish = True  # a person asked while the way was looked at
         return limits._refused(name, [limits.Problem(name, "clearance", "forearm against table")])
 
     monkeypatch.setattr(run, "check_path", refused)
@@ -157,7 +157,7 @@ async def test_nothing_new_begins_beside_a_run_that_does_not_end(
     ):
         with raises("still-ending"):
             await what()
-    assert rig.session.context.halting
+    assert rig.session.context.requests.halt
     held_disk.set()
     await rig.until_true(lambda: rig.session._run is not None and rig.session._run.done())
     assert rig.arm.log.count("move") == 1

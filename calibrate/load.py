@@ -27,7 +27,7 @@ Progress = Callable[[int, int, str], None]
 
 @dataclass(frozen=True, eq=False)
 class LoadedViews:
-    """What the pictures of a recording show."""
+    """Views of a recording, and the images that gave none."""
 
     views: ViewSet
     """With pixels, without board poses; the camera's matrix is None unless it was known."""
@@ -38,7 +38,7 @@ class LoadedViews:
     detections: dict[int, Detection] = field(default_factory=dict)
     """Pose number → what was seen, also where nothing was."""
     losses: tuple[str, ...] = ()
-    """What the recording once held and does not hold any more."""
+    """Content that the recording lost."""
 
 
 def load_views(
@@ -130,49 +130,43 @@ def _detect_all(
     threads: int | None,
 ) -> Iterator[tuple[View, Detection | BadImageError]]:
     """In the order of the views, with at most a few pictures in memory."""
-    workers = threads or _available_cores()
+    workers = threads or max(1, len(os.sched_getaffinity(0)))
     total = len(recording.views())
     waiting: deque[tuple[View, Future[Detection]]] = deque()
     done = 0
+
+    def finished() -> tuple[View, Detection | BadImageError]:
+        nonlocal done
+        view, future = waiting.popleft()
+        done += 1
+        if progress:
+            progress(done, total, view.name)
+        try:
+            return view, future.result()
+        except BadImageError as problem:
+            return view, problem
+        except ValueError as problem:
+            pose = view.index + 1
+            raise BadViewsError(f"View {pose} ({view.name}): {problem}.", pose=pose) from None
+                f"View {view.index + 1} ({view.name}): {problem}.", pose=view.index + 1
+            ) from None
+
     pool = ThreadPoolExecutor(workers, thread_name_prefix="detect")
     try:
         for view in recording.views():
             waiting.append((view, pool.submit(_decode_and_detect, recording, view, spec, camera)))
             while len(waiting) > 2 * workers:
-                yield _finished(waiting)
-                done += 1
-                if progress:
-                    progress(done, total, view.name)
+                yield finished()
         while waiting:
-            name = waiting[0][0].name
-            yield _finished(waiting)
-            done += 1
-            if progress:
-                progress(done, total, name)
+            yield finished()
     finally:
         pool.shutdown(cancel_futures=True)
-
-
-def _finished(
-    waiting: deque[tuple[View, Future[Detection]]],
-) -> tuple[View, Detection | BadImageError]:
-    view, future = waiting.popleft()
-    try:
-        return view, future.result()
-    except BadImageError as problem:
-        return view, problem
-    except ValueError as problem:
-        raise BadViewsError(f"View {view.index + 1} ({view.name}): {problem}.", pose=view.index + 1) from None
 
 
 def _decode_and_detect(recording: Recording, view: View, spec: BoardSpec, camera: CameraModel) -> Detection:
     picture = recording.image(view)
     _check_size(view, picture.pixels.shape[1], picture.pixels.shape[0], camera)
     return detect(picture.pixels, spec, with_quality=False)
-
-
-def _available_cores() -> int:
-    return max(1, len(os.sched_getaffinity(0)))
 
 
 def _check_size(view: View, width: int, height: int, camera: CameraModel) -> None:

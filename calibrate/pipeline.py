@@ -1,4 +1,4 @@
-"""The whole offline job: a recording in, a solved and judged calibration out. No files are written here."""
+"""Offline job: a recording in, a solved and judged calibration out. No files are written here."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class JobOptions:
     without: tuple[int, ...] = ()
     """Numbers, from 1, of the poses that a person leaves out."""
     threads: int | None = None
-    """Of the board detection; the result does not depend on it."""
+    """Threads of the board detection; the result does not depend on it."""
 
     @property
     def chosen(self) -> dict[str, Any]:
@@ -78,7 +78,7 @@ class PreparedViews:
     loaded: LoadedViews
     views: ViewSet
     intrinsics: Intrinsics | None
-    """None when they were given."""
+    """Estimated intrinsics; None when they were given."""
     stage_ms: dict[str, float]
 
 
@@ -102,7 +102,7 @@ def prepare_views(
     progress: Progress | None = None,
     fewest: int = FEWEST_VIEWS,
 ) -> PreparedViews:
-    """Opens, finds the boards, the lens where it is not known, and the board poses.
+    """Open, find the boards, the lens where it is not known, and the board poses.
 
     Raises RecordingError (unsealed, damaged) or CalibrationError; each says what to do next.
     """
@@ -161,7 +161,7 @@ def solver_options(options: JobOptions, prepared: PreparedViews) -> SolveOptions
 def solve_recording(
     path: Path, options: JobOptions | None = None, progress: Progress | None = None
 ) -> SolvedRecording:
-    """The whole job. Raises RecordingError or CalibrationError; each says what to do next."""
+    """Solve and judge a recording. Raises RecordingError or CalibrationError; each says what to do next."""
     options = options or JobOptions()
     prepared = prepare_views(path, options, progress)
     recording, loaded, views = prepared.recording, prepared.loaded, prepared.views
@@ -180,17 +180,9 @@ def solve_recording(
         recording, loaded, views, prepared.intrinsics, solution, gates, options.chosen, known
     )
     watch.lap("judge")
+    made = vars(prepared) | {"stage_ms": prepared.stage_ms | watch.stage_ms}
     return SolvedRecording(
-        recording,
-        loaded,
-        views,
-        prepared.intrinsics,
-        prepared.stage_ms | watch.stage_ms,
-        solution,
-        coverage,
-        known,
-        gates,
-        calibration,
+        **made, solution=solution, coverage=coverage, lens_known=known, gates=gates, calibration=calibration
     )
 
 

@@ -1,4 +1,4 @@
-"""The batch's page: every cell's camera over time, jumps first. Self-contained, no network."""
+"""Page of a batch: every cell's camera over time, moves first. Self-contained, no network."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from calibrate.report import html
 from calibrate.report.plots import STYLE, new_figure, svg_text
 
 _FINDINGS_LISTED = 3
-"""Of one cell, above all sections."""
+"""Findings of one cell above all sections."""
 _COLOURS = ("#0969da", "#1a7f37", "#bc4c00")
 
 

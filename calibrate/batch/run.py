@@ -1,4 +1,4 @@
-"""Many recordings, solved again: a process pool, resumable, one result each, none stops the rest.
+"""Batch of recordings: a process pool, resumable, one result each, none stops the rest.
 
 A Dask cluster instead of the pool: `cluster`.
 """
@@ -41,7 +41,7 @@ class BatchError(CalibrationError):
 class BatchResult(msgspec.Struct, frozen=True, omit_defaults=True):
     recording: str
     key: str
-    """Of recording and options: a finished key is not solved again."""
+    """Key of recording and options: a finished one is not solved again."""
     solved: bool
     passed: bool = False
     error: str = ""
@@ -63,16 +63,16 @@ class BatchResult(msgspec.Struct, frozen=True, omit_defaults=True):
     calibration: str = ""
     """File name in the output folder."""
     content_sha256: str = ""
-    """Of the calibration: equal for equal results, whoever computed them."""
+    """Hash of the calibration: equal for equal results, whoever computed them."""
 
 
 @dataclass(frozen=True)
 class Solved:
-    """What comes back from a worker; workers write no file."""
+    """Answer of a worker; workers write no file."""
 
     result: BatchResult
     content: bytes = b""
-    """Of the calibration file."""
+    """Bytes of the calibration file."""
 
 
 Progress = Callable[[int, int, BatchResult], None]
@@ -91,7 +91,7 @@ def run_batch(
     solver: Solver | None = None,
     limits: Limits | None = None,
 ) -> list[BatchResult]:
-    """Solves what is not solved yet; returns all results in the order of `recordings`.
+    """Solve what is not solved yet; return all results in the order of `recordings`.
 
     Each result is a calibration file and a line of `results.jsonl` in `output`, written at once, so that a
     batch that was killed goes on where it stopped. `workers` and `limits` (of each solve) are those of the
@@ -120,7 +120,7 @@ def run_batch(
 
 
 def batch_key(path: Path, options: JobOptions) -> str:
-    """Changes with the recording's place, size and date, and with every option that changes the result."""
+    """Key that changes with the recording's place, size and date, and with every option of the result."""
     try:
         stat = path.stat()
         facts: list[Any] = [str(path.resolve()), stat.st_size, stat.st_mtime_ns]
@@ -131,12 +131,12 @@ def batch_key(path: Path, options: JobOptions) -> str:
 
 
 def read_results(output: Path) -> list[BatchResult]:
-    """Of earlier runs, oldest first."""
+    """Read the results of earlier runs, oldest first."""
     return read_lines(output / RESULTS, BatchResult)
 
 
 def solve_one(recording: str, key: str, options: JobOptions, limits: Limits) -> Solved:
-    """What every worker does, here or on a cluster. Any failure is a result."""
+    """Solve in a worker, here or on a cluster. Any failure is a result."""
     cv2.setNumThreads(1)
     path = Path(recording)
     try:
@@ -208,7 +208,7 @@ def _pool_solver(workers: int | None, limits: Limits) -> Solver:
 
 
 def _one_pool(tasks: Sequence[Task], options: JobOptions, limits: Limits, count: int) -> Iterator[Solved]:
-    """Ends early when a worker dies; what was not yielded is lost."""
+    """Solve in one pool; ends early when a worker dies, and what was not yielded is lost."""
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     context = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["calibrate.batch.run"])

@@ -1,4 +1,4 @@
-"""One cell's calibrations over time: where its camera was, how sure that is, and when it moved."""
+"""Calibrations of one cell over time: camera pose, its uncertainty, and when it moved."""
 
 from __future__ import annotations
 
@@ -131,7 +131,7 @@ HEAD = (
 
 
 def rows(cell: Cell) -> list[tuple[str, ...]]:
-    """As HEAD; the last column holds MOVED and the gates that failed."""
+    """Table rows under HEAD; the last column holds MOVED and the gates that failed."""
     found: list[tuple[str, ...]] = []
     for session, move in zip_longest(cell.sessions, (None, *cell.moves)):
         x, y, z = (f"{v * 1000:.3f}" for v in session.translation_m)

@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from contextlib import ExitStack
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from calibrate.batch.cluster import Cluster, cluster_solver
 from calibrate.batch.run import BatchResult, Solver, run_batch
 from calibrate.batch.trends import Cell, cells, trends_text
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
 from calibrate.cli.job import GatesFile, MemoryLimit, Profile, ProfileName, Seed, TimeLimit
-from calibrate.cli.output import AsJson, OutputError, err, out
+from calibrate.cli.output import AsJson, OutputError, err, out, progress_bar
 from calibrate.files.calibration import write_output
 from calibrate.pipeline import JobOptions
 from calibrate.quality.gates import GateLimits, read_limits
@@ -59,19 +57,13 @@ def batch(
     gate_limits = GateLimits() if gates is None else read_limits(gates)
     options = JobOptions(profile=profile.value, seed=seed, limits=gate_limits)
     solver = _solver(scheduler, workers, tls_ca, tls_cert, tls_key)
-    with ExitStack() as stack:
-        results = run_batch(
-            recordings,
-            output,
-            options,
-            workers,
-            _progress(stack),
-            solver,
-            Limits(time_limit_s, memory_limit_mib),
-        )
+    limits = Limits(time_limit_s, memory_limit_mib)
+    with progress_bar("solving") if err.is_terminal else nullcontext() as bar:
+        told = None if bar is None else lambda done, total, result: bar(done, total, result.session)
+        results = run_batch(recordings, output, options, workers, told, solver, limits)
     found = cells(results)
-    _write(output / "trends.txt", trends_text(found))
-    _write(output / "trends.html", fleet_page(results, found))
+    write_output(output / "trends.txt", trends_text(found).encode())
+    write_output(output / "trends.html", fleet_page(results, found).encode())
     if as_json:
         for result in results:
             typer.echo(msgspec.json.encode(result).decode())
@@ -85,21 +77,20 @@ def _tell(results: list[BatchResult], found: tuple[Cell, ...], output: Path) -> 
     good = sum(result.passed for result in results)
     failed = [result for result in results if not result.solved]
     out.print(
-        f"{len(results)} recordings: {good} good, {len(results) - good - len(failed)} below a gate, "
+        f"{len(results)} recordings: {good} PASS, {len(results) - good - len(failed)} FAIL, "
         f"{len(failed)} not solved. {output}/results.csv, results.jsonl, trends.html, trends.txt"
     )
     for cell in found:
         for finding in cell.findings:
             out.print(f"{cell.name}: {finding.text}", soft_wrap=True)
     for result in failed:
-        named = result.error.startswith(result.recording)
-        err.print(result.error if named else f"{result.recording}: {result.error}", soft_wrap=True)
+        err.print(f"{Path(result.recording).name}: {result.error}", soft_wrap=True)
 
 
 def _solver(
     scheduler: str | None, workers: int | None, ca: Path | None, cert: Path | None, key: Path | None
 ) -> Solver | None:
-    """None: the process pool."""
+    """Solver on a cluster; None: the process pool."""
     if scheduler is not None:
         if workers is not None:
             raise OutputError("--workers counts processes here, not on a cluster.", code="options")
@@ -109,16 +100,3 @@ def _solver(
             "--tls-ca, --tls-cert and --tls-key need --scheduler tls://HOST:PORT.", code="options"
         )
     return None
-
-
-def _write(path: Path, text: str) -> None:
-    write_output(path, text.encode())
-
-
-def _progress(stack: ExitStack) -> Callable[[int, int, BatchResult], None] | None:
-    if not err.is_terminal:
-        return None
-    columns = (TextColumn("solving"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    bar = stack.enter_context(Progress(*columns, console=err, transient=True))
-    task = bar.add_task("", total=None)
-    return lambda done, total, result: bar.update(task, completed=done, total=total)

@@ -10,7 +10,7 @@ import typer
 from calibrate.boards.model import ambiguity_text, describe_board
 from calibrate.boards.printing import PAPER_MM, board_sheet
 from calibrate.cli.files import read_board
-from calibrate.cli.output import OutputError, check_folder, err, out
+from calibrate.cli.output import OutputError, check_target, err, out
 from calibrate.files.calibration import write_output
 from recordings.schema.messages import SINGLE_TAGS, BoardKind, BoardSpec
 
@@ -40,7 +40,7 @@ def board(
     """
     if output.suffix.lower() not in (".pdf", ".svg"):
         raise OutputError(f"{output}: the name must end in .pdf or .svg.", code="board-format")
-    check_folder(output)
+    check_target(output, "export")
     marker_m = None if marker_mm is None else marker_mm / 1000
     if marker_m is None and kind in (BoardKind.CHARUCO, BoardKind.APRIL_GRID):
         marker_m = square_mm / 1000 * (0.75 if kind is BoardKind.CHARUCO else 0.3)

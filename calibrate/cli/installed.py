@@ -12,7 +12,7 @@ import typer
 from rich.table import Column, Table
 
 from calibrate.cli.files import read_cell_serials
-from calibrate.cli.output import AsJson, OutputError, check_export, err, out, print_json
+from calibrate.cli.output import AsJson, OutputError, check_target, err, out, print_json
 from calibrate.files import exports
 from calibrate.files import install as installing
 from calibrate.files.calibration import Calibration, Lens, read_calibration, write_output
@@ -116,7 +116,7 @@ def export(
     if output is None:
         typer.echo(text, nl=False)
         return
-    check_export(output)
+    check_target(output, "export")
     write_output(output, text.encode())
 
 

@@ -7,11 +7,11 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import msgspec
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import FORMAT, CalibrationFileError, read_calibration
@@ -27,68 +27,55 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on s
 
 
 class OutputError(CalibrationError):
-    """Where the result should go is wrong, or what was asked for does not exist."""
+    """A target or an option of the command line is wrong."""
 
     code = "output"
-
     exit_code = 2
 
 
-def check_folder(target: Path) -> None:
-    """Raise OutputError, before the work, where no file can be written."""
+def check_target(target: Path, kind: Literal["calibration", "report", "export"]) -> None:
+    """Raise OutputError, before the work, where no file can be written or another thing would be lost.
+
+    A calibration replaces a whole calibration file only, a report a report only; an export replaces neither a
+    recording nor a calibration.
+    """
     try:
         if not target.parent.is_dir():
             raise OutputError(
                 f"{target}: the folder {target.parent} does not exist.", remedy="Create it, or name another."
             )
-        if target.is_dir():
-            raise OutputError(f"{target} is a folder.", remedy="Name a file in it.")
         if target.exists() and not target.is_file():
-            raise OutputError(f"{target} is a device or a pipe.", remedy="Name a file.")
-    except PermissionError as problem:
+            raise OutputError(f"{target} is a folder, a device or a pipe.", remedy="Name a file.")
+        start = _beginning(target) if target.exists() else b""
+    except OSError as problem:
         raise OutputError(f"{target}: {problem.strerror}.", remedy="Name another place.") from None
-
-
-def check_page(target: Path) -> None:
-    """Raise OutputError where something else than a report stands: only that may be replaced."""
-    check_folder(target)
-    if target.exists() and not _beginning(target).startswith(b"<!doctype html>"):
+    if not target.exists():
+        return
+    if kind == "calibration":
+        spared = not _is_calibration(target)
+    elif kind == "report":
+        spared = not start.startswith(b"<!doctype html>")
+    else:
+        spared = start.startswith((MAGIC, f"format: {FORMAT}".encode()))
+    if spared:
         raise OutputError(
-            f"{target} exists and is no report.", code="target-exists", remedy="Give the report another name."
-        )
-
-
-def check_export(target: Path) -> None:
-    """Raise OutputError where a recording or a calibration stands: an export does not replace it."""
-    check_folder(target)
-    if target.exists() and _beginning(target).startswith((MAGIC, f"format: {FORMAT}".encode())):
-        raise OutputError(
-            f"{target} is a recording or a calibration file.",
+            f"{target} exists and is not replaced by this {kind}.",
             code="target-exists",
-            remedy="Give another name with -o.",
+            remedy="Give another name.",
         )
 
 
 def _beginning(target: Path) -> bytes:
+    with target.open("rb") as file:
+        return file.read(64)
+
+
+def _is_calibration(target: Path) -> bool:
     try:
-        with target.open("rb") as file:
-            return file.read(64)
-    except OSError as problem:
-        raise OutputError(f"{target}: {problem.strerror}.", remedy="Name another place.") from None
-
-
-def check_target(target: Path) -> None:
-    """Raise OutputError where something else than a calibration file stands: only that may be replaced."""
-    check_folder(target)
-    if target.exists():
-        try:
-            read_calibration(target)
-        except CalibrationFileError:
-            raise OutputError(
-                f"{target} exists and is no whole calibration file.",
-                code="target-exists",
-                remedy="Give another name with -o.",
-            ) from None
+        read_calibration(target)
+    except CalibrationFileError:
+        return False
+    return True
 
 
 @contextmanager
@@ -97,10 +84,18 @@ def detection_progress() -> Iterator[LoadProgress | None]:
     if not err.is_terminal:
         yield _progress_line if os.environ.get("CALIBRATE_PROGRESS") == "lines" else None
         return
+    with progress_bar("finding the board") as bar:
+        yield bar
+
+
+@contextmanager
+def progress_bar(label: str) -> Iterator[LoadProgress]:
+    """A bar on stderr that is gone at the end; called with done, total and what is done."""
     columns = (
-        TextColumn("finding the board"),
+        TextColumn(label),
         BarColumn(),
         MofNCompleteColumn(),
+        TimeRemainingColumn(),
         TextColumn("{task.description}", markup=False),
     )
     with Progress(*columns, console=err, transient=True) as bar:

@@ -16,7 +16,6 @@ from calibrate.cli.job import MemoryLimit, TimeLimit, job_options, picture_optio
 from calibrate.cli.output import (
     AsJson,
     OutputError,
-    check_page,
     check_target,
     detection_progress,
     out,
@@ -52,9 +51,9 @@ def solve(
     Exit codes: 0 all gates passed, 4 written, but a gate failed.
     """
     target = output or Path(f"{recording.name.removesuffix('.mcap')}.calibration.yaml")
-    check_target(target)
+    check_target(target, "calibration")
     if report is not None:
-        check_page(report)
+        check_target(report, "report")
         if report.resolve() == target.resolve():
             raise OutputError(
                 f"{target} cannot be calibration and report.",
@@ -131,7 +130,7 @@ def report(
     With the history of what is installed. It opens in any browser, without a network.
     """
     target = output or Path(f"{recording.name.removesuffix('.mcap')}.report.html")
-    check_page(target)
+    check_target(target, "report")
     with bounded(time_limit_s, memory_limit_mib), detection_progress() as progress:
         job = solve_recording(recording, options, progress)
     _write_report(job, target, options, root)
@@ -150,7 +149,7 @@ def _write_report(job: SolvedRecording, target: Path, options: JobOptions, root:
 
 
 def _touches(job: SolvedRecording, root: Path | None) -> list[Touch]:
-    """What was found by hand with the installed calibration, when it is of this recording."""
+    """Touch tests of the installed calibration, when it is of this recording."""
     try:
         installed = load_installed(root, allow_simulated=True)
     except CalibrationError:

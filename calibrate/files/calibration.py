@@ -83,7 +83,7 @@ class Views(msgspec.Struct, frozen=True, omit_defaults=True):
     rejected: list[RejectedView] = []
     turned: list[int] = []
     weights: list[ViewWeight] = []
-    """Of the views that count for less than 1."""
+    """Weights below 1."""
 
 
 class Lens(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -128,7 +128,7 @@ class Folds(msgspec.Struct, frozen=True):
 
 
 class Session(msgspec.Struct, frozen=True):
-    """How the recording as a whole has to be read."""
+    """Reading of the recording as a whole."""
 
     hypothesis: str
     text: str
@@ -237,7 +237,7 @@ class Gate(msgspec.Struct, frozen=True):
     unit: str = ""
     """m, deg, s, px, share; empty for plain numbers."""
     remedy: str = ""
-    """What to do; empty when passed."""
+    """Next step; empty when passed."""
 
     @classmethod
     def measured(
@@ -293,7 +293,7 @@ class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):
 
     @property
     def verdict(self) -> Verdict:
-        """By the gates, and by the reason of whoever installed it in spite of one."""
+        """Verdict of the gates, or of the person who overrode one."""
         if self.override is not None:
             return "PASS WITH A REASON"
         return "FAIL" if self.quality.failed else "PASS"

@@ -1,4 +1,4 @@
-"""What other programs read: the text of a file in each format, made from a calibration.
+"""Exports: the text of a file in each format of other programs, made from a calibration.
 
 `rpy` of URDF are angles about fixed axes: R = Rz(yaw) Ry(pitch) Rx(roll). REP-103: a body frame looks along x
 with z up, an optical frame looks along z with y down.
@@ -205,7 +205,7 @@ def plain_json(calibration: Calibration, frames: FrameNames) -> str:
 
 
 def ur_tool(calibration: Calibration, frames: FrameNames) -> str:
-    """What to type on the UR pendant: mm, and a rotation vector in radians."""
+    """Numbers to type on the UR pendant: mm, and a rotation vector in radians."""
     matrix = calibration.transform.matrix
     x, y, z = matrix[:3, 3] * 1000
     rx, ry, rz = rotation_log(matrix[:3, :3])

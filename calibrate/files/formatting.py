@@ -24,7 +24,7 @@ _STAMPS = {
 
 
 def source_stamp(calibration: Calibration) -> str:
-    """What must stand on everything that shows a calibration which did not come from a real cell."""
+    """Stamp for everything that shows a calibration of no real cell; else empty."""
     return _STAMPS.get(calibration.source, "")
 
 

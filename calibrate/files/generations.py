@@ -1,4 +1,4 @@
-"""Where installed calibrations lie, and the one atomic switch between them.
+"""Folder of installed calibrations, and the one atomic switch between them.
 
     ROOT/calibrations/gen/0007-1a2b3c4d.yaml     every calibration ever installed, never changed
     ROOT/calibrations/current -> gen/0007-…      what consumers read
@@ -49,7 +49,7 @@ class Generation:
     path: Path
     current: bool
     calibration: Calibration | None
-    """None when the file is damaged; `problem` says how."""
+    """Content; None when the file is damaged (`problem`)."""
     problem: str = ""
 
 
@@ -64,7 +64,7 @@ class LogEntry(msgspec.Struct, frozen=True, omit_defaults=True):
 
 
 def state_root(root: Path | None = None) -> Path:
-    """Where the station keeps its state: `root`, $STATE_DIRECTORY (systemd), or the XDG state folder."""
+    """State folder of the station: `root`, $STATE_DIRECTORY (systemd), or the XDG state folder."""
     if root is not None:
         return root
     if state := os.environ.get("STATE_DIRECTORY", "").split(":")[0]:
@@ -160,7 +160,7 @@ def calibrations_folder(root: Path | None) -> Path:
 
 
 def readable_folder(root: Path | None) -> Path:
-    """The same; InstallError where it may not be looked into."""
+    """Folder of the calibrations; InstallError where it may not be looked into."""
     folder = calibrations_folder(root)
     try:
         (folder / "gen").exists()

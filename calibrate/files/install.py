@@ -144,7 +144,7 @@ def rollback(root: Path | None = None, to: int | None = None, reason: str = "") 
 
 
 def reason_problem(reason: str) -> str:
-    """Why this is no reason that a person may give; empty when it is one."""
+    """Problem with a person's reason for people; empty when it is accepted."""
     if len({letter for letter in reason.casefold() if letter.isalpha()}) >= REASON_LETTERS:
         return ""
     return f"Override reason “{reason.strip()}” is too short. State the cause."
@@ -156,10 +156,7 @@ def _require_words(reason: str) -> None:
 
 
 def objections_beside(calibration: Calibration, root: Path | None = None) -> list[str]:
-    """What else than its gates and checks by hand makes `install` ask for a reason: the installed one.
-
-    Another robot, camera or mount than that, or much less certain.
-    """
+    """Objections against following the installed one: another robot, camera or mounting, or less certain."""
     before = _installed_before(root)
     regression = _regression(calibration, before)
     return [*_objections(calibration, before, "", ""), *([regression.text] if regression else [])]

@@ -1,4 +1,4 @@
-"""What a person found by hand: the tip brought over a corner of the board, and how far off it stood.
+"""Touch test: a tip brought over a corner of the board, and its offset told by a person.
 
 The station puts the tip above the place where the calibration says a corner is; a person guides it down and
 tells the offset. The entries live in the calibration file.
@@ -26,13 +26,13 @@ from calibrate.files.generations import (
 HAND_MM = 0.3
 """1 sigma per axis of reading an offset or meeting a corner by hand and eye."""
 CONFIDENCE = 0.99
-"""Of one corner; several share the error of X, so that few of them alarm by chance."""
+"""Probability that one sound corner passes; several share the error of X, so few alarm by chance."""
 LIMIT_SIGMAS = math.sqrt(-2 * math.log(1 - CONFIDENCE))
-"""Of two numbers: χ²(2) at `CONFIDENCE`, 3.03."""
+"""Limit for two numbers: χ²(2) at `CONFIDENCE`, 3.03."""
 
 
 def touch_sigmas(touch: Touch) -> float:
-    """How far off the corner, in sigmas of prediction and hand together: √Σ o² / (σ² + `HAND_MM`²)."""
+    """Offset in sigmas of prediction and hand together: √Σ o² / (σ² + `HAND_MM`²)."""
     offset, sigma = np.array(touch.offset_mm), np.array(touch.sigma_mm)
     return float(np.sqrt(np.square(offset / np.hypot(sigma, HAND_MM)).sum()))
 

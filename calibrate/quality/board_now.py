@@ -1,4 +1,4 @@
-"""Where the board is now, by a calibration and one picture, and how well a tip sent to a corner will meet it.
+"""Board pose by a calibration and one image, and the uncertainty of a tip sent to one of its corners.
 
 Eye-in-hand: base_from_board = base_from_flange · X · camera_from_board; eye-to-hand: X · camera_from_board,
 the board lying free in the fixed camera's view.
@@ -37,7 +37,7 @@ class BoardNow:
     outward: Array
     """(3,) unit normal in `board`, towards the camera."""
     moved_m: float
-    """Of the board's origin against its place in the calibration; eye-in-hand only, else 0."""
+    """Distance of the board's origin from its pose in the calibration; eye-in-hand only, else 0."""
     moved_rad: float
 
 
@@ -76,7 +76,7 @@ def locate_board(calibration: Calibration, view: BoardView, board: BoardSpec) ->
 
 
 def _shaped(reading: Candidate, view: BoardView, calibration: Calibration) -> Candidate:
-    """The same reading, with the board's shape that the calibration found."""
+    """Reading with the board's shape that the calibration found."""
     placed = replace(view, camera_from_board=reading.camera_from_board)
     views = ViewSet(calibration.mount, (placed,), calibration.intrinsics.model)
     return replace(reading, camera_from_board=with_found_shape(views, calibration).camera_from_board[0])

@@ -26,7 +26,7 @@ class CheckEntry(msgspec.Struct, frozen=True):
     shift: tuple[float, ...]
     """δt (m), δφ (rad)"""
     covariance: tuple[tuple[float, ...], ...]
-    """Of `shift`, the installed calibration's own part included."""
+    """Covariance of `shift`, the installed calibration's own part included."""
     statistic: float
     threshold: float
 

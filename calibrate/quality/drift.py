@@ -28,7 +28,7 @@ from recordings.schema.messages import CameraModel
 FEWEST_VIEWS = 3
 FALSE_ALARM = 0.05
 POWER = 0.95
-"""How surely a check should notice `SHIFT_M` and `TURN_RAD` before nobody needs to take more views."""
+"""Detection probability of `SHIFT_M` and `TURN_RAD` beyond which no more views are needed."""
 SHIFT_M, TURN_RAD = 0.5e-3, float(np.radians(0.1))
 _MOST_VIEWS = 30
 """Whoever needs more for a check should calibrate."""

@@ -47,9 +47,9 @@ class GateLimits(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     coverage: float | None = 0.25
     """Share of the image in which corners were seen, when the intrinsics were estimated from these images."""
     lens_pull: float | None = 1.0
-    """By which believing the given intrinsics moves X beyond their tolerance, over the predicted error."""
+    """Shift of X by believing the given intrinsics, beyond their tolerance, over the predicted error."""
     board_pull: float | None = 1.0
-    """The same of the stated board: size, print and flatness."""
+    """Shift of X by believing the stated board: size, print and flatness."""
     clock_bound_s: float | None = 0.02
     """The arm is settled: at the limit of 2 mrad/s this is 0.04 mm at one metre."""
     robot_error_m: float | None = 0.002
@@ -83,7 +83,7 @@ def read_limits(path: Path) -> GateLimits:
 
 
 def judge(solution: Solution, inputs: GateInputs, limits: GateLimits | None = None) -> tuple[Gate, ...]:
-    """Every gate that is switched on and can be judged, in the order a person would read them."""
+    """Judge every gate that is switched on and can be judged, in the order a person would read them."""
     limits = limits or GateLimits()
     found = [_session_gate(solution)] if limits.session and solution.profile == "robust" else []
     for name, value, title, remedy in _measured(solution, inputs):

@@ -33,7 +33,7 @@ FEWEST_PICTURES = 12
 LIMIT_S = 0.2
 """Offsets beyond it are not looked for."""
 _STEPS = 81
-"""Of the first search, 5 ms apart."""
+"""Steps of the first search, 5 ms apart."""
 _ITERATIONS = 20
 _DIFFERENCE_S = 1e-4
 """Half the distance of the two values that give a slope."""
@@ -52,16 +52,16 @@ class TimeOffset:
     """A picture stamped t was taken at t + offset on the robot's clock."""
     sigma_s: float
     rms_rad: float
-    """Of the angles that were compared."""
+    """Residual of the compared angles."""
     pairs: int
     lost: tuple[str, ...] = ()
     """Pictures that could not be used, each in words"""
 
 
 def sweep_time_offset(recording: Recording, camera: CameraModel | None = None) -> TimeOffset:
-    """Of every picture in the recording, whether it belongs to a stop of the arm or not.
+    """Estimate the time offset by every image, whether it belongs to a stop of the arm or not.
 
-    A picture that cannot be decoded is left out, and told of in `lost`.
+    An image that cannot be decoded is skipped and listed in `lost`.
     `camera`: the lens, needed where the recording does not know it. Raises CalibrationError.
     """
     camera = camera or recording.info.camera
@@ -104,7 +104,7 @@ def _robot(recording: Recording) -> tuple[Array, Array]:
 
 
 def _median_turning_rad_s(robot_s: Array, poses: Array, times: Array) -> float:
-    """How fast the arm turned when the pictures were taken; about 0 in a capture with stops."""
+    """Median rotation speed of the arm at the images; about 0 in a capture with stops."""
     last = len(robot_s) - 1
     before = np.clip(np.searchsorted(robot_s, times - _MOMENT_S), 0, last - 1)
     after = np.clip(np.searchsorted(robot_s, times + _MOMENT_S), before + 1, last)

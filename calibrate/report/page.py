@@ -1,4 +1,4 @@
-"""The page, in the order a person asks: is it good, what is it, why should I believe it."""
+"""Report page: verdict, result, evidence."""
 
 from __future__ import annotations
 
@@ -35,8 +35,10 @@ def write_report(
     history: Sequence[Sequence[str]] = (),
     touches: Sequence[Touch] = (),
 ) -> None:
-    """Writes the page atomically. `history`: rows (generation, when, what, change) of what was installed;
-    `touches`: what was found by hand since."""
+    """Write the page atomically.
+
+    `history`: rows (version, time, action, change); `touches`: touch tests since.
+    """
     content = report_page(job, peers, history, touches).encode()
     write_output(path, content)
 

@@ -50,7 +50,7 @@ def svg_text(figure: Figure) -> str:
 def residuals_by_view(
     residual_px: Mapping[int, float], robot_mm: Mapping[int, float], limit_px: float | None
 ) -> str:
-    """Bars: rms of the corners, and the robot's miss, per pose."""
+    """Bars per pose: RMS of the corners, and pose residual of the robot."""
     with matplotlib.rc_context(STYLE):
         figure, axes = new_figure(10, 2.6, 2)
         for axis, values, unit in (
@@ -67,7 +67,7 @@ def residuals_by_view(
 
 
 def residual_scatter(misses: Array, pixels: Array, camera: CameraModel) -> str:
-    """Where the corners miss: all misses (n, 2) px round zero, and over the picture as arrows."""
+    """Residuals of the corners (n, 2) px: round zero, and over the image as arrows."""
     with matplotlib.rc_context(STYLE):
         figure, axes = new_figure(10, 3.6, 2)
         reach = float(np.abs(misses).max(initial=1e-3)) * 1.05
@@ -134,7 +134,7 @@ def error_shares(shares: Mapping[str, float]) -> str:
 
 
 def coverage_map(views: ViewSet) -> str:
-    """How often each part of the picture saw the board, with all corners; and what the lens does."""
+    """Image coverage by boards and corners, and the distortion curve."""
     camera = views.camera
     seen = np.zeros((camera.height // 8 + 1, camera.width // 8 + 1), np.float32)
     for view in views:

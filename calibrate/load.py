@@ -148,8 +148,6 @@ def _detect_all(
         except ValueError as problem:
             pose = view.index + 1
             raise BadViewsError(f"View {pose} ({view.name}): {problem}.", pose=pose) from None
-                f"View {view.index + 1} ({view.name}): {problem}.", pose=view.index + 1
-            ) from None
 
     pool = ThreadPoolExecutor(workers, thread_name_prefix="detect")
     try:

@@ -13,7 +13,7 @@ from calibrate.cli.job import Threads
 from calibrate.cli.output import AsJson, OutputError, detection_progress, out, print_json
 from calibrate.errors import BadViewsError
 from calibrate.files.calibration import Calibration, Provenance
-from calibrate.files.generations import generations
+from calibrate.files.versions import installed_versions
 from calibrate.pipeline import JobOptions, prepare_views
 from calibrate.quality.checks import CheckEntry, Trend, append_check, earlier_results, find_trend, read_checks
 from calibrate.quality.drift import FEWEST_VIEWS, POWER, DriftCheck, check_drift
@@ -73,7 +73,7 @@ def drift_check(
 
 def _log(result: DriftCheck, info: SessionInfo, root: Path | None) -> tuple[list[bool], Trend | None]:
     """Log the check: results of the earlier ones of the installed calibration, and the trend with it."""
-    number = next((g.number for g in generations(root) if g.current), 0)
+    number = next((g.number for g in installed_versions(root) if g.current), 0)
     before = earlier_results(read_checks(root), number)
     append_check(CheckEntry.of(result, info.created_wall_ns / 1e9 or time.time(), number, info.name), root)
     return before, find_trend(read_checks(root), number)

@@ -18,7 +18,7 @@ from calibrate.files import install as installing
 from calibrate.files.calibration import Calibration, Lens, read_calibration, write_output
 from calibrate.files.exports import FORMATS, FrameNames
 from calibrate.files.formatting import override_text, pose_difference, pose_text, summary, verdict_text
-from calibrate.files.generations import Generation, generations, read_log, state_root
+from calibrate.files.versions import InstalledVersion, installed_versions, read_log, state_root
 
 Root = Annotated[
     Path | None,
@@ -170,13 +170,13 @@ def rollback(
     _switched(installing.rollback(root, to, reason), root, as_json)
 
 
-def _switched(generation: Generation, root: Path | None, as_json: bool) -> None:
+def _switched(version: InstalledVersion, root: Path | None, as_json: bool) -> None:
     stable = state_root(root) / "calibrations" / "current"
     if as_json:
-        print_json({"generation": generation.number, "path": str(generation.path), "current": str(stable)})
+        print_json({"generation": version.number, "path": str(version.path), "current": str(stable)})
         return
     log = read_log(root)
-    out.print(f"Installed: version {generation.number}, {stable}", soft_wrap=True)
+    out.print(f"Installed: version {version.number}, {stable}", soft_wrap=True)
     if log and log[-1].change:
         out.print(f"Change: {log[-1].change}")
 
@@ -186,23 +186,23 @@ def list_installed(root: Root = None, as_json: AsJson = False) -> None:
 
     Oldest first; → marks the current one.
     """
-    known = generations(root)
+    known = installed_versions(root)
     if as_json:
-        print_json([_plain(generation) for generation in known])
+        print_json([_plain(version) for version in known])
         return
     if not known:
         err.print(f"Nothing is installed in {state_root(root)}. Run: calibrate install FILE")
         return
-    for generation in known:
-        mark = "→" if generation.current else " "
-        lines = _lines(generation)
-        out.print(f"{mark} {generation.number:>3}  " + "\n       ".join(lines), soft_wrap=True)
+    for version in known:
+        mark = "→" if version.current else " "
+        lines = _lines(version)
+        out.print(f"{mark} {version.number:>3}  " + "\n       ".join(lines), soft_wrap=True)
 
 
-def _lines(generation: Generation) -> list[str]:
-    calibration = generation.calibration
+def _lines(version: InstalledVersion) -> list[str]:
+    calibration = version.calibration
     if calibration is None:
-        return [generation.problem]
+        return [version.problem]
     made = f"{calibration.provenance.session}, solved {calibration.created}"
     return [made, pose_text(calibration), _verdict_text(calibration)]
 
@@ -213,20 +213,20 @@ def _verdict_text(calibration: Calibration) -> str:
 
 
 def history_rows(root: Path | None) -> list[tuple[str, str, str, str]]:
-    """For the report: generation, when and by whom, what was done, change."""
+    """For the report: version, when and by whom, what was done, change."""
     return [
         (str(entry.generation), f"{entry.wall}, {entry.who}", entry.action, entry.change)
         for entry in read_log(root)
     ]
 
 
-def _plain(generation: Generation) -> dict[str, Any]:
-    calibration = generation.calibration
+def _plain(version: InstalledVersion) -> dict[str, Any]:
+    calibration = version.calibration
     return {
-        "generation": generation.number,
-        "current": generation.current,
-        "path": str(generation.path),
-        "problem": generation.problem,
+        "generation": version.number,
+        "current": version.current,
+        "path": str(version.path),
+        "problem": version.problem,
         "session": None if calibration is None else calibration.provenance.session,
         "created": None if calibration is None else calibration.created,
         "source": None if calibration is None else calibration.source,

@@ -61,7 +61,7 @@ def check_target(target: Path, kind: Literal["calibration", "report", "export"])
         raise OutputError(
             f"{target} exists and is not replaced by this {kind}.",
             code="target-exists",
-            remedy="Give another name.",
+            remedy="Give another name with -o or --report.",
         )
 
 

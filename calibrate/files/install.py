@@ -1,4 +1,4 @@
-"""Install a calibration, load it in other programs, and roll back. Its folder: `generations`."""
+"""Install a calibration, load it in other programs, and roll back. Its folder: `versions`."""
 
 from __future__ import annotations
 
@@ -11,20 +11,20 @@ import numpy as np
 
 from calibrate.errors import GateFailedError
 from calibrate.files.calibration import Calibration, Gate, Override, read_calibration
-from calibrate.files.generations import (
-    Generation,
+from calibrate.files.verification import agrees, touch_text
+from calibrate.files.versions import (
+    InstalledVersion,
     InstallError,
-    add_generation,
+    add_version,
     before_current,
     calibrations_folder,
-    generations,
+    installed_versions,
     locked,
     make_current,
-    no_generation,
+    no_such_version,
     readable_folder,
     who,
 )
-from calibrate.files.verification import agrees, touch_text
 from calibrate.geometry import difference
 from recordings.schema.messages import Source
 
@@ -81,7 +81,7 @@ def install(
     override: str = "",
     robot_serial: str = "",
     camera_serial: str = "",
-) -> Generation:
+) -> InstalledVersion:
     """Make the calibration file `path` the current one.
 
     `cell`: what kind of cell this root belongs to; a real one takes nothing simulated, played back or
@@ -111,10 +111,10 @@ def install(
             taken = Override(override.strip(), who(), overridden)
             calibration = msgspec.structs.replace(calibration, override=taken)
         change = change_text(before, calibration)
-        return add_generation(root, calibration, "install", change, override.strip())
+        return add_version(root, calibration, "install", change, override.strip())
 
 
-def rollback(root: Path | None = None, to: int | None = None, reason: str = "") -> Generation:
+def rollback(root: Path | None = None, to: int | None = None, reason: str = "") -> InstalledVersion:
     """Switch back: to the calibration before the current one, or to generation `to`. As `install` does.
 
     `reason`: may be empty. Raises InstallError.
@@ -123,7 +123,7 @@ def rollback(root: Path | None = None, to: int | None = None, reason: str = "") 
         _require_words(reason)
     folder = calibrations_folder(root)
     with locked(folder):
-        known = generations(root)
+        known = installed_versions(root)
         current = next((g for g in known if g.current), None)
         if to is None:
             older = before_current(known)
@@ -131,16 +131,16 @@ def rollback(root: Path | None = None, to: int | None = None, reason: str = "") 
                 raise InstallError(f"{folder}: no older calibration to go back to.", code="nothing-older")
             target = older
         else:
-            target = next((g for g in known if g.number == to), None) or no_generation(folder, to, known)
+            target = next((g for g in known if g.number == to), None) or no_such_version(folder, to, known)
         if target.calibration is None:
             raise InstallError(
-                f"Generation {target.number} is damaged and cannot be used: {target.problem}",
+                f"InstalledVersion {target.number} is damaged and cannot be used: {target.problem}",
                 code="damaged-version",
                 generation=target.number,
             )
         before = None if current is None else current.calibration
         make_current(root, target, "rollback", change_text(before, target.calibration), reason)
-    return Generation(target.number, target.path, True, target.calibration)
+    return InstalledVersion(target.number, target.path, True, target.calibration)
 
 
 def reason_problem(reason: str) -> str:
@@ -173,7 +173,7 @@ def change_text(before: Calibration | None, after: Calibration) -> str:
 
 def _installed_before(root: Path | None) -> Calibration | None:
     """The current one; where that is damaged, the newest that is whole, so that the checks still hold."""
-    known = [g for g in generations(root) if g.calibration is not None]
+    known = [g for g in installed_versions(root) if g.calibration is not None]
     current = [g for g in known if g.current]
     return (current or known)[-1].calibration if known else None
 

@@ -14,12 +14,12 @@ import msgspec
 import numpy as np
 
 from calibrate.files.calibration import Calibration, Touch, read_calibration, write_calibration
-from calibrate.files.generations import (
-    Generation,
+from calibrate.files.versions import (
+    InstalledVersion,
     InstallError,
-    add_generation,
+    add_version,
     calibrations_folder,
-    generations,
+    installed_versions,
     locked,
 )
 
@@ -57,14 +57,14 @@ def note_in_file(path: Path, touches: Sequence[Touch]) -> Calibration:
     return calibration
 
 
-def note_installed(root: Path | None, touches: Sequence[Touch]) -> Generation:
-    """Add them to the installed calibration: a new generation, for generations never change.
+def note_installed(root: Path | None, touches: Sequence[Touch]) -> InstalledVersion:
+    """Add them to the installed calibration: a new version, for versions never change.
 
     Raises InstallError where no whole calibration is installed, or the folder or the disk does not allow it.
     """
     folder = calibrations_folder(root)
     with locked(folder):
-        current = next((g for g in generations(root) if g.current), None)
+        current = next((g for g in installed_versions(root) if g.current), None)
         if current is None or current.calibration is None:
             raise InstallError(
                 f"{folder}: no whole calibration is installed, so nothing was noted.",
@@ -73,7 +73,7 @@ def note_installed(root: Path | None, touches: Sequence[Touch]) -> Generation:
             )
         calibration = _with_touches(current.calibration, touches)
         found = "; ".join(touch_text(touch) for touch in touches)
-        return add_generation(root, calibration, "verify", found)
+        return add_version(root, calibration, "verify", found)
 
 
 def _with_touches(calibration: Calibration, touches: Sequence[Touch]) -> Calibration:

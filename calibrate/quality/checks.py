@@ -10,8 +10,8 @@ import msgspec
 import numpy as np
 from scipy import stats
 
-from calibrate.files.generations import InstallError, calibrations_folder
 from calibrate.files.lines import append_line, read_lines
+from calibrate.files.versions import InstallError, calibrations_folder
 from calibrate.quality.drift import DriftCheck
 
 _FEWEST_FOR_TREND = 5

@@ -14,9 +14,9 @@ import numpy as np
 
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Touch
-from calibrate.files.generations import same_solve
 from calibrate.files.install import load_installed
 from calibrate.files.verification import note_in_file, note_installed
+from calibrate.files.versions import same_solve
 from calibrate.geometry import Array, inverse, transform_points
 from recordings.schema.messages import BoardSpec, Matrix4
 from station.cell.errors import RefusedError, StationError

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, read_calibration
-from calibrate.files.generations import LogEntry, calibrations_folder, read_log, same_solve
 from calibrate.files.install import load_installed
+from calibrate.files.versions import LogEntry, calibrations_folder, read_log, same_solve
 
 LOOK_S = 2.0
 Marks = frozenset[tuple[str, int]]

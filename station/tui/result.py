@@ -17,9 +17,9 @@ from textual.widgets import Static
 
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, read_calibration
-from calibrate.files.generations import same_solve
 from calibrate.files.install import objections_beside
 from calibrate.files.verification import agrees, touch_text
+from calibrate.files.versions import same_solve
 from calibrate.geometry import difference
 from station.tui.installed import LOOK_S, Ended, Installed, Marks, marks, read_installed, state_root
 from station.tui.screen import StationScreen

@@ -23,8 +23,8 @@ from textual.widgets import Button, Label, RichLog
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import read_calibration
 from calibrate.files.exports import FORMATS, export
-from calibrate.files.generations import Generation, before_current, generations
 from calibrate.files.install import Cell, install, rollback
+from calibrate.files.versions import InstalledVersion, before_current, installed_versions
 from recordings.files import ASKED_FOR, write_atomically
 from station.cell.session_folder import CALIBRATION_FILE
 from station.cell.status import SessionStatus
@@ -216,7 +216,7 @@ class ResultsDesk(Desk):
     async def roll_back(self, path: str) -> None:
         """Ask, naming both, then switch back to the calibration before the installed one."""
         root = state_root(path)
-        known = generations(root)
+        known = installed_versions(root)
         current = next((g for g in known if g.current), None)
         older = before_current(known)
         if current is None or older is None:
@@ -255,7 +255,7 @@ class ResultsDesk(Desk):
             await self.switch_mode("sessions")
 
 
-def _named(generation: Generation) -> str:
+def _named(generation: InstalledVersion) -> str:
     calibration = generation.calibration
     if calibration is None:
         return f"version {generation.number}"

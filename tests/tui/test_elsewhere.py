@@ -10,8 +10,8 @@ from textual.pilot import Pilot
 from textual.widgets import DataTable
 
 from calibrate.files.calibration import write_calibration
-from calibrate.files.generations import add_generation, calibrations_folder, locked, who
 from calibrate.files.install import install, load_installed, rollback
+from calibrate.files.versions import add_version, calibrations_folder, locked, who
 from station.cell.errors import StationError
 from station.tui import result, sessions
 from station.tui.app import StationApp
@@ -116,7 +116,7 @@ def test_a_check_by_hand_is_no_end_of_what_is_installed(root: Path) -> None:
     put(root, "s-1")
     with locked(calibrations_folder(root)):
         touched = msgspec.structs.replace(load_installed(root, True), verification=[OFF])
-        add_generation(root, touched, "verify", "")
+        add_version(root, touched, "verify", "")
     assert read_installed(root).word("s-1") == "INSTALLED"
     put(root, "s-2")
     (end,) = read_installed(root).ended

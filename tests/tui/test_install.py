@@ -12,9 +12,9 @@ from textual.widgets import Input, OptionList, Static
 
 from calibrate.files.calibration import Override, Touch, write_calibration
 from calibrate.files.exports import FORMATS
-from calibrate.files.generations import generations
 from calibrate.files.install import install, load_installed
 from calibrate.files.verification import note_installed
+from calibrate.files.versions import installed_versions
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.tui.dialogs import ChooseFormat, Confirm, Reason
 from station.tui.installed import Installed, local
@@ -90,7 +90,7 @@ async def test_who_does_not_installs_nothing(link: FakeLink, calibration: Path) 
         await install_until_a_reason_is_asked_for(pilot, calibration)
         await pilot.press("escape")
         await until(pilot, lambda: "Nothing was installed" in said(pilot))
-    assert not generations(calibration.parents[2])
+    assert not installed_versions(calibration.parents[2])
 
 
 async def test_going_back_names_both_and_asks(link: FakeLink, calibration: Path) -> None:

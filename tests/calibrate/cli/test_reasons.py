@@ -9,9 +9,9 @@ import msgspec
 import pytest
 
 from calibrate.files.calibration import Touch, read_calibration
-from calibrate.files.generations import InstallError, before_current, generations
 from calibrate.files.install import install, load_installed, objections_beside, reason_problem, rollback
 from calibrate.files.verification import note_installed
+from calibrate.files.versions import InstallError, before_current, installed_versions
 from tests.calibrate.calling import raises_code
 
 MakeFile = Callable[..., Path]
@@ -36,7 +36,7 @@ def test_who_overrules_or_takes_back_says_it_in_words(make_file: MakeFile, tmp_p
     assert install(doubted, tmp_path, override="the board was bent").number == 2
     with raises_code(InstallError, "reason-too-short"):
         rollback(tmp_path, reason="x")
-    assert [g.current for g in generations(tmp_path)] == [False, True]
+    assert [g.current for g in installed_versions(tmp_path)] == [False, True]
     rollback(tmp_path)  # nobody must say why he goes back
 
 
@@ -46,7 +46,7 @@ def test_going_back_passes_the_checks_by_hand_of_the_same_solve(make_file: MakeF
     install(first, tmp_path)
     install(make_file(0.001), tmp_path)
     note_installed(tmp_path, [HAND])
-    assert [g.number for g in generations(tmp_path)] == [1, 2, 3]
+    assert [g.number for g in installed_versions(tmp_path)] == [1, 2, 3]
     assert rollback(tmp_path).number == 1
     assert load_installed(tmp_path).result == read_calibration(first).result
 
@@ -54,7 +54,7 @@ def test_going_back_passes_the_checks_by_hand_of_the_same_solve(make_file: MakeF
 def test_a_check_by_hand_alone_is_nothing_to_go_back_to(make_file: MakeFile, tmp_path: Path) -> None:
     install(make_file(), tmp_path)
     note_installed(tmp_path, [HAND])
-    assert before_current(generations(tmp_path)) is None
+    assert before_current(installed_versions(tmp_path)) is None
     with raises_code(InstallError, "nothing-older"):
         rollback(tmp_path)
 

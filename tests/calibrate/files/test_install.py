@@ -21,8 +21,8 @@ from calibrate.files.calibration import (
     Touch,
     read_calibration,
 )
-from calibrate.files.generations import InstallError, generations, read_log
 from calibrate.files.install import InstallGateError, install, install_line, load_installed, rollback
+from calibrate.files.versions import InstallError, installed_versions, read_log
 from calibrate.pipeline import SolvedRecording
 from tests.calibrate.calling import raises_code
 from tests.command_line import call
@@ -42,7 +42,7 @@ def test_install_list_rollback(make_file, tmp_path: Path) -> None:  # type: igno
     install(first, root)
     install(second, root)
     assert load_installed(root).result == read_calibration(second).result
-    assert [(g.number, g.current) for g in generations(root)] == [(1, False), (2, True)]
+    assert [(g.number, g.current) for g in installed_versions(root)] == [(1, False), (2, True)]
     rollback(root)
     assert load_installed(root).result == read_calibration(first).result
     rollback(root, to=2)
@@ -124,10 +124,10 @@ def test_a_damaged_file_is_not_installed_and_a_damaged_generation_not_used(make_
         install(broken, root)
     install(good, root)
     install(make_file(0.001), root)
-    generation = generations(root)[0].path
+    generation = installed_versions(root)[0].path
     generation.chmod(0o600)
     generation.write_bytes(generation.read_bytes().replace(b"eye-in-hand", b"eye-to-hand"))
-    assert generations(root)[0].problem
+    assert installed_versions(root)[0].problem
     with raises_code(InstallError, "nothing-older"):
         rollback(root)
     with raises_code(InstallError, "damaged-version"):
@@ -158,7 +158,7 @@ def test_an_unwritable_place_is_said(make_file, tmp_path: Path) -> None:  # type
         install(make_file(), tmp_path / "file")
 
 
-@pytest.mark.parametrize("look", [generations, read_log, load_installed])
+@pytest.mark.parametrize("look", [installed_versions, read_log, load_installed])
 def test_a_place_that_may_not_be_looked_into_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, look: Callable[[Path], object]
 ) -> None:
@@ -227,7 +227,7 @@ def test_a_kill_at_any_system_call_leaves_old_or_new(  # type: ignore[no-untyped
         found = load_installed(root)
         assert found in results.values(), (name, place)
         seen.append("new" if found == results["new"] else "old")
-        assert all(not g.problem for g in generations(root)), (name, place)
+        assert all(not g.problem for g in installed_versions(root)), (name, place)
         install(new, root)  # what a person does next works
         assert load_installed(root) == results["new"]
         shutil.rmtree(root)
@@ -284,7 +284,7 @@ def test_a_much_less_certain_one_replaces_no_better_one_without_a_reason(  # typ
     install(make_file(quality=hardly), root)
     with raises_code(InstallGateError, "gate-failed", gates=1, objections=0):
         install(make_file(quality=worse), root)
-    assert len(generations(root)) == 3
+    assert len(installed_versions(root)) == 3
     made = install(make_file(quality=worse), root, override="the old lens is broken")
     assert made.calibration is not None and made.calibration.override is not None
     assert "no_worse" in made.calibration.override.overridden[0]

@@ -11,9 +11,9 @@ from rich.console import Console
 
 from calibrate.files.calibration import CalibrationFileError, Touch, read_calibration, write_calibration
 from calibrate.files.formatting import summary
-from calibrate.files.generations import InstallError, generations, read_log
 from calibrate.files.install import install, load_installed, rollback
 from calibrate.files.verification import agrees, note_in_file, note_installed, touch_sigmas, touch_text
+from calibrate.files.versions import InstallError, installed_versions, read_log
 from calibrate.pipeline import SolvedRecording
 from calibrate.report.page import report_page
 from tests.calibrate.calling import raises_code
@@ -66,7 +66,7 @@ def test_entries_for_the_installed_one_make_a_new_generation(file: Path, tmp_pat
     install(file, root)
     note_installed(root, [GOOD])
     assert load_installed(root).verification == [GOOD]
-    assert [g.number for g in generations(root)] == [1, 2]
+    assert [g.number for g in installed_versions(root)] == [1, 2]
     assert read_log(root)[-1].action == "verify"
     rollback(root, to=1)  # by its number: going back alone leads to another solve
     assert load_installed(root).verification == []

@@ -44,7 +44,7 @@ class InstallError(CalibrationError):
 
 
 @dataclass(frozen=True)
-class Generation:
+class InstalledVersion:
     number: int
     path: Path
     current: bool
@@ -73,7 +73,7 @@ def state_root(root: Path | None = None) -> Path:
     return Path(base) / "calibration-station"
 
 
-def generations(root: Path | None = None) -> list[Generation]:
+def installed_versions(root: Path | None = None) -> list[InstalledVersion]:
     """List everything ever installed, oldest first; damaged files are listed with their problem.
 
     InstallError where the folder may not be looked into.
@@ -90,8 +90,8 @@ def generations(root: Path | None = None) -> list[Generation]:
             calibration = read_calibration(path)
         except CalibrationFileError as damage:
             problem = str(damage)
-        found.append(Generation(int(match[1]), path, path.name == current, calibration, problem))
-    return sorted(found, key=lambda generation: generation.number)
+        found.append(InstalledVersion(int(match[1]), path, path.name == current, calibration, problem))
+    return sorted(found, key=lambda version: version.number)
 
 
 def same_solve(one: Calibration, other: Calibration | None) -> bool:
@@ -101,12 +101,12 @@ def same_solve(one: Calibration, other: Calibration | None) -> bool:
     return msgspec.structs.replace(one, override=other.override, verification=other.verification) == other
 
 
-def before_current(known: list[Generation]) -> Generation | None:
+def before_current(known: list[InstalledVersion]) -> InstalledVersion | None:
     """The newest whole one before the current one that is of another solve; None when there is none.
 
-    A check by hand makes a generation too: going back to the same numbers would undo nothing.
+    A check by hand makes a version too: going back to the same numbers would undo nothing.
     """
-    current = next((generation for generation in known if generation.current), None)
+    current = next((version for version in known if version.current), None)
     for older in reversed(known):
         if current is None or older.number >= current.number or older.calibration is None:
             continue
@@ -120,10 +120,10 @@ def read_log(root: Path | None = None) -> list[LogEntry]:
     return read_lines(readable_folder(root) / "log.jsonl", LogEntry)
 
 
-def add_generation(
+def add_version(
     root: Path | None, calibration: Calibration, action: Action, change: str, reason: str = ""
-) -> Generation:
-    """A new generation with this content becomes the current one and is logged. Inside `locked` only.
+) -> InstalledVersion:
+    """A new version with this content becomes the current one and is logged. Inside `locked` only.
 
     It is on the disk, whole, and read back before anything points to it. InstallError, CalibrationFileError.
     """
@@ -133,17 +133,17 @@ def add_generation(
     path = folder / "gen" / f"{number:04d}-{_content_name(content)}.yaml"
     write_atomically(path, content)
     decode_calibration(path.read_bytes(), str(path))
-    make_current(root, Generation(number, path, True, calibration), action, change, reason)
-    return Generation(number, path, True, calibration)
+    make_current(root, InstalledVersion(number, path, True, calibration), action, change, reason)
+    return InstalledVersion(number, path, True, calibration)
 
 
 def make_current(
-    root: Path | None, generation: Generation, action: Action, change: str, reason: str = ""
+    root: Path | None, version: InstalledVersion, action: Action, change: str, reason: str = ""
 ) -> None:
     """Switches to it, and writes that down. In `locked` only. InstallError where it does not read back."""
     folder = calibrations_folder(root)
-    _switch(folder, generation.path.name, generation.path.read_bytes())
-    entry = LogEntry(_now_text(), action, generation.number, who(), change, reason)
+    _switch(folder, version.path.name, version.path.read_bytes())
+    entry = LogEntry(_now_text(), action, version.number, who(), change, reason)
     append_line(folder / "log.jsonl", entry)
 
 
@@ -229,11 +229,11 @@ def locked(folder: Path) -> Iterator[None]:
         os.close(descriptor)
 
 
-def no_generation(folder: Path, number: int, known: list[Generation]) -> NoReturn:
+def no_such_version(folder: Path, number: int, known: list[InstalledVersion]) -> NoReturn:
     """Raises InstallError, which names those that there are."""
     have = ", ".join(str(g.number) for g in known) or "none"
     raise InstallError(
-        f"{folder}: there is no generation {number}; there are: {have}.",
+        f"{folder}: there is no version {number}; there are: {have}.",
         code="no-such-version",
         generation=number,
     )

@@ -8,10 +8,10 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.files import generations as module
+from calibrate.files import versions as module
 from calibrate.files.calibration import CalibrationFileError, FramePose, read_calibration, write_calibration
-from calibrate.files.generations import InstallError, generations, read_log
 from calibrate.files.install import change_text, install, load_installed, rollback
+from calibrate.files.versions import InstallError, installed_versions, read_log
 from calibrate.geometry import Transform, perturb
 from calibrate.pipeline import SolvedRecording
 from tests.calibrate.calling import raises_code
@@ -78,10 +78,10 @@ def test_a_full_disk_says_what_is_installed_now(  # type: ignore[no-untyped-def]
     def full(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(f"calibrate.files.generations.{fails}", full)
+    monkeypatch.setattr(f"calibrate.files.versions.{fails}", full)
     with raises_code(InstallError, "install-io", switched=switched):
         install(make_file(1e-4), tmp_path / "root")
-    current = next(g.number for g in generations(tmp_path / "root") if g.current)
+    current = next(g.number for g in installed_versions(tmp_path / "root") if g.current)
     assert current == 1 + switched
 
 
@@ -89,7 +89,7 @@ def test_files_of_others_beside_the_generations_are_left_alone(make_file, tmp_pa
     root = tmp_path / "s"
     install(make_file(), root)
     (root / "calibrations/gen/0009-notes.yaml").write_text("mine")
-    assert [g.number for g in generations(root)] == [1]
+    assert [g.number for g in installed_versions(root)] == [1]
     assert install(make_file(0.001), root).number == 2
 
 
@@ -97,12 +97,12 @@ def test_rollback_passes_over_a_damaged_generation(make_file, tmp_path: Path) ->
     root = tmp_path / "s"
     for k in range(3):
         install(make_file(0.0001 * k), root)
-    middle = generations(root)[1]
+    middle = installed_versions(root)[1]
     middle.path.write_bytes(middle.path.read_bytes()[:-40])
     assert rollback(root).number == 1
     with raises_code(InstallError, "damaged-version", generation=2):
         rollback(root, to=2)
-    assert [(g.number, g.current, bool(g.problem)) for g in generations(root)] == [
+    assert [(g.number, g.current, bool(g.problem)) for g in installed_versions(root)] == [
         (1, True, False),
         (2, False, True),
         (3, False, False),
@@ -131,7 +131,7 @@ def test_what_was_configured_for_the_cell_is_held_against_the_file(  # type: ign
     unknown = make_file(robot=msgspec.structs.replace(robot, serial=""))
     with raises_code(InstallError, "objection", objections=1):
         install(unknown, tmp_path / "s", robot_serial="4711")
-    assert generations(tmp_path / "s") == []
+    assert installed_versions(tmp_path / "s") == []
     install(make_file(), tmp_path / "s", robot_serial=robot.serial, camera_serial=camera.serial)
 
 

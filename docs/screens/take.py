@@ -91,7 +91,7 @@ class Terminal:
         return self._tmux("capture-pane", "-p")
 
     def go_on_until(self, pattern: str) -> None:
-        """Gives a new go whenever a busy machine made the session pause."""
+        """Approves again whenever a busy machine made the session pause."""
         deadline_s = time.monotonic() + PATIENCE_S
         while not re.search(pattern, shown := self.shown()):
             if time.monotonic() > deadline_s:
@@ -124,7 +124,7 @@ def take(terminals: list[Terminal]) -> None:
     both(terminals, "checklist", ("6",), "missing")
     first.press("2", "n")
     first.wait_for("p10 ")
-    both([first], "go", ("1", "F5"), "The arm will move")
+    both([first], "approve", ("1", "F5"), "The arm will move")
     first.press("Tab", "Enter")
     first.go_on_until(r"(1\d|2[0-4])/25")
     both(terminals, "live", ("1",), "Detection")
@@ -135,7 +135,7 @@ def take(terminals: list[Terminal]) -> None:
     first.wait_for("PAUSED")
     first.press("F7", "Tab", "Enter")
     first.wait_for("IDLE")
-    both(terminals, "sessions", ("4",), "sealed")
+    both(terminals, "sessions", ("4",), "finished")
     both([first], "result", ("F9",), "READY TO INSTALL|GATE")
     for terminal in terminals[1:]:
         terminal.press("1", "4")
@@ -145,7 +145,7 @@ def take(terminals: list[Terminal]) -> None:
     both(terminals, "help", ("1", "F1"), "Stop the arm now")
     for before, terminal in itertools.pairwise(terminals):
         before.close()  # only one holds control
-        both([terminal], "go", ("Escape", "F5"), "The arm will move")
+        both([terminal], "approve", ("Escape", "F5"), "The arm will move")
 
 
 def main() -> None:

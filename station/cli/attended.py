@@ -10,20 +10,26 @@ from collections.abc import AsyncIterator, Iterator
 from pathlib import Path
 
 import typer
-from rich.text import Text
 
 from station.cell.errors import RefusedError, StationError
 from station.cell.socket_folder import default_socket
 from station.cell.status import MotionPreview, StationStatus
 from station.cli.console import err
 from station.cli.progress import SessionProgress
-from station.operate.motion import Outcome, carry_out, not_approved, status_now, wait_until_idle, watched
+from station.operate.motion import (
+    HASH_DIGITS,
+    Outcome,
+    carry_out,
+    motion_facts,
+    not_approved,
+    status_now,
+    wait_until_idle,
+    watched,
+)
 from station.protocol.client import Client
 from station.protocol.verbs import Lease, Purpose, Stop
 
 STOP_ANSWER_S = 3.0
-HASH_DIGITS = 12
-"""Fewer digits of a plan's hash approve nothing."""
 
 
 class Attended:
@@ -125,16 +131,9 @@ async def stop_and_say(client: Client) -> None:
 
 def ask_person(preview: MotionPreview) -> bool:
     """Show what would move, and ask; Ctrl-C is a no."""
-    many = "1 pose" if preview.poses == 1 else f"{preview.poses} poses"
-    err.print(Text.assemble(("\nThe arm will move", "bold"), f": {preview.purpose}, {many}"))
-    err.print(
-        f"first {preview.first_move}; {preview.path_m:.2f} m, up to {preview.top_speed_m_s:.2f} m/s, "
-        f"about {preview.duration_s:.0f} s, plan {preview.plan_sha256[:HASH_DIGITS]}"
-    )
-    for change in preview.changes:
-        err.print(change)
-    for warning in preview.warnings:
-        err.print(warning, style="yellow")
+    err.print("\nThe arm will move", style="bold")
+    for name, fact in motion_facts(preview):
+        err.print(f"{name:<10} {fact}", style="yellow" if name == "WARNING" else None)
     err.print("The emergency stop on the pendant is the safety device. Ctrl-C stops too.")
     try:
         with ctrl_c_at_once():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 from asyncio import timeout
 from collections.abc import AsyncIterator, Awaitable, Callable
 from dataclasses import dataclass
@@ -20,6 +21,8 @@ R = TypeVar("R")
 Watcher = Callable[[StationStatus], None]
 Approve = Callable[[MotionPreview], Awaitable[bool]]
 """Show a person what would move; True: they approve exactly this motion."""
+HASH_DIGITS = 12
+"""Of a plan's hash are shown; fewer approve nothing."""
 CONNECT_WAIT_S = 30.0
 PREPARE_S = 200.0
 """Poses may be planned for it: seconds on a quick computer, minutes on a busy one."""
@@ -117,6 +120,21 @@ async def approved_motion(
     await link.call(Go(preview.token, preview.plan_sha256, headless))
     link.outdate()  # it would show the session before, finished and at rest
     return True
+
+
+def motion_facts(preview: MotionPreview) -> list[tuple[str, str]]:
+    """What a person approves, as names and facts to show."""
+    turn_deg = math.degrees(preview.largest_step_rad)
+    return [
+        ("What", f"{preview.purpose}, {preview.poses} pose{'s' * (preview.poses != 1)}"),
+        *(("Change", change) for change in preview.changes),
+        ("First", preview.first_move),
+        ("Distance", f"{preview.path_m:.2f} m of flange path, largest joint turn {turn_deg:.0f}°"),
+        ("Speed", f"up to {preview.top_speed_m_s:.2f} m/s at any point of arm, tool and camera"),
+        ("Duration", f"about {preview.duration_s // 60:.0f}:{preview.duration_s % 60:02.0f} min"),
+        ("Plan", preview.plan_sha256[:HASH_DIGITS]),
+        *(("WARNING", warning) for warning in preview.warnings),
+    ]
 
 
 async def carry_out(

@@ -9,24 +9,25 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import gc
+import time
 from collections.abc import Awaitable, Callable, Iterable
 from functools import partial
 from pathlib import Path
 from typing import Any, ClassVar
 
 import msgspec
-from textual import work
+from textual import events, work
 from textual.app import SystemCommand
 from textual.binding import Binding, BindingType
 from textual.message import Message
 from textual.screen import Screen
 
-from station.cell.errors import StationError
+from station.cell.errors import RefusedError, StationError
 from station.cell.status import StationState, StationStatus
 from station.protocol.client import Client
+from station.protocol.states import RUNNING
 from station.protocol.stop_client import send_stop
-from station.protocol.verbs import Sessions
-from station.tui.attendance import Attended, listen
+from station.protocol.verbs import Lease, Sessions, Watch
 from station.tui.checklist import ChecklistScreen
 from station.tui.desk import Link
 from station.tui.dialogs import Help
@@ -43,6 +44,15 @@ from station.tui.widgets.graphics import detect
 from station.tui.widgets.preview import Preview
 
 Connect = Callable[[], Awaitable[Link]]
+LISTEN_S = 0.5
+SILENT_S = 2.0
+"""A working daemon answers within milliseconds, on a busy computer within some hundred."""
+_PATIENT_S = 7 * 86400.0
+WHERE_IS_THE_CURSOR = "\x1b[6n"
+"""ECMA-48's device status report: a terminal answers by itself, from where the person sits."""
+ASK_S = 3.0
+UNANSWERED = 5
+TERMINAL_SILENT = "Terminal silent {:.0f} s. The arm was stopped, control released."
 PREVIEW_PERIOD_S = 0.25
 STATUS_PERIOD_S = 0.25
 """Laying out what flickers is most of what this screen costs: four times a second are enough for eyes."""
@@ -72,6 +82,27 @@ SCREEN_TOOLTIPS = {
 }
 
 
+async def listen(link: Link, tell: Callable[[float | None], None]) -> None:
+    """Ask something small again and again; ends with the link. A daemon that hangs keeps its socket open.
+
+    `tell` hears for how many seconds it has not answered, and None when it did.
+    """
+    while True:
+        asked_s = time.monotonic()
+        answer = asyncio.ensure_future(link.call(Watch(), timeout_s=_PATIENT_S))
+        try:
+            while not (await asyncio.wait({answer}, timeout=LISTEN_S))[0]:
+                if (waited_s := time.monotonic() - asked_s) >= SILENT_S:
+                    tell(waited_s)
+            problem = answer.exception()
+        finally:
+            answer.cancel()
+        if problem is not None and not isinstance(problem, RefusedError):
+            return
+        tell(None)
+        await asyncio.sleep(LISTEN_S)
+
+
 class StatusChanged(Message):
     """None: there is no daemon, and `why`."""
 
@@ -80,7 +111,7 @@ class StatusChanged(Message):
         self.status, self.why = status, why
 
 
-class StationApp(Attended, ResultsDesk):
+class StationApp(ResultsDesk):
     """One app, several screens; the same keys everywhere."""
 
     TITLE = "Calibration station"
@@ -94,11 +125,13 @@ class StationApp(Attended, ResultsDesk):
         "checklist": ChecklistScreen,
     }
     DEFAULT_MODE = "live"
+    _unanswered: int | None = None
+    """Questions since the last answer; None: there was none yet."""
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("f12", "stop", "STOP", show=False, priority=True, id="stop", tooltip="Stop the arm now"),
         Binding("f1", "help", "Help", id="help", tooltip="What this screen is for, and all its keys"),
-        Binding("f5", "run", "Run", id="run", tooltip="Check the plan, show what would move, and ask"),
-        Binding("f6", "pause", "Pause", id="pause", tooltip="Stop after this pose; nothing is lost"),
+        Binding("f5", "start('run')", "Run", id="run", tooltip="Check the path, show the motion, and ask"),
+        Binding("f6", "ask('pause')", "Pause", id="pause", tooltip="Stop after this pose; nothing is lost"),
         Binding("f7", "finish", "Finish", id="finish", tooltip="Finish the recording with what is there"),
         Binding(
             "f8", "acknowledge", "Ack", priority=True, id="acknowledge", tooltip="Leave STOPPED or FAULT"
@@ -109,7 +142,7 @@ class StationApp(Attended, ResultsDesk):
         ),
         Binding("f9", "solve_newest", "Solve", id="solve", tooltip="Solve the session just recorded"),
         Binding("f3", "freedrive", "Hand", id="freedrive", tooltip="Freedrive: move the arm by hand"),
-        Binding("f2", "record", "Grab", id="record", tooltip="Capture an image here (freedrive)"),
+        Binding("f2", "ask('record')", "Grab", id="record", tooltip="Capture an image here (freedrive)"),
         Binding("f4", "release", "Release", show=False, id="release", tooltip="Release control of the arm"),
         Binding(
             "ctrl+q", "leave", "Quit", show=False, id="quit", tooltip="Close this screen; the daemon goes on"
@@ -128,6 +161,31 @@ class StationApp(Attended, ResultsDesk):
         self.follow()
         self.fetch_previews()
         self.set_timer(SETTLED_S, freeze_startup)
+        self._ask_terminal()
+        self.set_interval(ASK_S, self._look_for_terminal)
+
+    # --- the person: an ssh that dies silently leaves this screen alive, and with it control of the arm ---
+
+    def on_cursor_position(self, event: events.CursorPosition) -> None:
+        self._unanswered = 0
+
+    def _ask_terminal(self) -> None:
+        if self._driver is not None:
+            self._driver.write(WHERE_IS_THE_CURSOR)
+
+    async def _look_for_terminal(self) -> None:
+        if self._unanswered is None:
+            return
+        if self.status is None or self.status.state not in RUNNING or not self.has_control():
+            self._unanswered = 0
+            return
+        if self._unanswered >= UNANSWERED:
+            await self.ask(Lease("lost"))
+            self._unanswered = 0
+            self.notify(TERMINAL_SILENT.format(ASK_S * UNANSWERED), severity="error", timeout=3600)
+            return
+        self._unanswered += 1
+        self._ask_terminal()
 
     # --- the daemon → the screen ---
 

@@ -26,6 +26,12 @@ from station.tui.widgets.graphics import Graphics
 R = TypeVar("R")
 STOP_UNHEARD = "STOP was sent, but the station does not answer: press the EMERGENCY STOP on the pendant."
 DECELERATES = "It decelerates at once, and the session pauses."
+REMEDIES = {
+    "nothing-installed": "3 shows the newest result, i installs it.",
+    "no-pointer": "Give its length (Tab in the list of corners), or set the tool on the pendant.",
+    "unfinished-recording": "c on screen 4 recovers it.",
+}
+"""By an error's code, where the way out on a screen is another than in a shell."""
 BUSY: dict[Purpose, str] = {
     Purpose.REPLAN: "Planning the remaining poses again … Nothing moves.",
     Purpose.NEXT_POSE: "Looking for the most useful pose … Nothing moves.",
@@ -133,8 +139,7 @@ class Desk(App[None]):
             return await work
         except (CodedError, OSError) as problem:
             refused = isinstance(problem, RefusedError)
-            words = str(problem) or "The daemon is gone."
-            self.notify(words, severity="warning" if refused else "error", timeout=10, markup=False)
+            self.notify(told(problem), severity="warning" if refused else "error", timeout=10, markup=False)
         return None
 
     async def ask(self, verb: Verb[R], *, timeout_s: float = ANSWER_S) -> R | None:
@@ -184,21 +189,16 @@ class Desk(App[None]):
         await self.attempt(self.link.call(verbs.Stop()))
 
     @work(exclusive=True, group="command", exit_on_error=False)
-    async def action_run(self) -> None:
-        resuming = self.status is not None and self.status.state is StationState.PAUSED
-        await self.start(prepared_motion(self, Purpose.RESUME if resuming else Purpose.RUN, self.approves))
+    async def action_start(self, purpose: str) -> None:
+        """`run` goes on with a session that is paused."""
+        paused = self.status is not None and self.status.state is StationState.PAUSED
+        wanted = Purpose.RESUME if purpose == Purpose.RUN and paused else Purpose(purpose)
+        await self.start(prepared_motion(self, wanted, self.approves))
 
     @work(exclusive=True, group="command", exit_on_error=False)
-    async def action_replan(self) -> None:
-        await self.start(prepared_motion(self, Purpose.REPLAN, self.approves))
-
-    @work(exclusive=True, group="command", exit_on_error=False)
-    async def action_next_pose(self) -> None:
-        await self.start(prepared_motion(self, Purpose.NEXT_POSE, self.approves))
-
-    @work(exclusive=True, group="command", exit_on_error=False)
-    async def action_pause(self) -> None:
-        await self.ask(verbs.Pause())
+    async def action_ask(self, verb: str) -> None:
+        """A verb without arguments."""
+        await self.ask(verbs.VERBS[verb]())
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_finish(self) -> None:
@@ -216,10 +216,6 @@ class Desk(App[None]):
         """Capture by hand: the operator holds the pendant's freedrive button, the station only looks."""
         if self.status is not None:
             await self.ask(verbs.Freedrive(self.status.state is not StationState.FREE_DRIVE))
-
-    @work(exclusive=True, group="command", exit_on_error=False)
-    async def action_record(self) -> None:
-        await self.ask(verbs.Record())
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_acknowledge(self) -> None:
@@ -253,6 +249,13 @@ class Desk(App[None]):
             if not await self.push_screen_wait(Confirm("Close the screen?", text, yes="Close")):
                 return
         self.exit()
+
+
+def told(problem: CodedError | OSError) -> str:
+    """What happened, and what to do about it on a screen."""
+    if isinstance(problem, OSError) or problem.code not in REMEDIES:
+        return str(problem)
+    return f"{problem.text.rstrip('.')}. {REMEDIES[problem.code]}"
 
 
 def busy_words(verb: Verb[Any]) -> str:

@@ -19,7 +19,7 @@ from textual.widgets.option_list import Option
 from calibrate.files.exports import FORMATS
 from calibrate.files.install import reason_problem
 from station.cell.status import MotionPreview
-from station.tui.words import degrees, duration
+from station.operate.motion import motion_facts
 
 WIDTH, INDENT = 70, 11
 """Letters in a line of the question on the narrowest screen, and those before a fact."""
@@ -70,20 +70,9 @@ class ConfirmMotion(Confirm):
 
 def motion_text(preview: MotionPreview) -> str:
     """What a person approves, one fact a line; long ones go on below themselves."""
-    turn = degrees(preview.largest_step_rad, 0)
-    facts = [
-        ("What", f"{preview.purpose}, {preview.poses} pose{'s' if preview.poses != 1 else ''}"),
-        *(("Change", change) for change in preview.changes),
-        ("First", preview.first_move),
-        ("Distance", f"{preview.path_m:.2f} m of flange path, largest joint turn {turn}"),
-        ("Speed", f"up to {preview.top_speed_m_s:.2f} m/s at any point of arm, tool and camera"),
-        ("Duration", f"about {duration(preview.duration_s)} min"),
-        ("Plan", preview.plan_sha256[:12]),
-        *(("WARNING", warning) for warning in preview.warnings),
-    ]
     lines = (
         textwrap.fill(text, WIDTH, initial_indent=f"{name:<{INDENT}}", subsequent_indent=" " * INDENT)
-        for name, text in facts
+        for name, text in motion_facts(preview)
     )
     return "\n".join([*lines, APPROVE])
 

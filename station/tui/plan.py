@@ -11,12 +11,12 @@ from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
 from textual.widgets import DataTable, Static
 
+from recordings.schema.messages import Matrix4
 from station.cell.plan import PlannedPose
 from station.cell.status import PoseStatus, StationStatus
 from station.operate.motion import PREPARE_S
 from station.protocol.verbs import Add, Drop, MakePlan, Reorder, Retake, Skip
 from station.tui.screen import Rows, StationScreen
-from station.tui.widgets.sketch import PlanSketch
 from station.tui.words import POSE_MARKS
 
 COLUMNS = ("#", "pose", "state", "± then", "why it is there / what happened", "attempt", "corners")
@@ -26,6 +26,8 @@ SKIP = "Leave this pose out; of one that has a view only its retake"
 POSE_VERBS = {"retake": Retake, "skip": Skip, "drop": Drop}
 MOVE = Binding.Group("Move", compact=True)
 SIGMA_SHOWN_MM = 100.0
+
+Point = tuple[float, float, str]
 
 
 def row_of(pose: PoseStatus) -> tuple[str, ...]:
@@ -51,6 +53,57 @@ def detail_of(pose: PoseStatus) -> str:
     return f"{pose.name}: {pose.reason or pose.why}.{why}{seen}"
 
 
+def scatter(points: list[Point], width: int, height: int) -> list[str]:
+    """Points (right, up, mark) scaled alike in both directions; a cell is twice as high as wide."""
+    if not points:
+        return []
+    low_x, high_x = min(p[0] for p in points), max(p[0] for p in points)
+    low_y, high_y = min(p[1] for p in points), max(p[1] for p in points)
+    per_cell = max((high_x - low_x) / max(1, width - 1), (high_y - low_y) / max(1, 2 * (height - 1)), 1e-3)
+    grid = [[" "] * width for _ in range(height)]
+    for x, y, mark in points:
+        row = height - 1 - round((y - low_y) / per_cell / 2)
+        grid[max(0, min(height - 1, row))][min(width - 1, round((x - low_x) / per_cell))] = mark
+    return ["".join(row).rstrip() for row in grid]
+
+
+class PlanSketch(Static):
+    """Two small views; the highlighted pose is `@`, the arm's flange is `A`."""
+
+    def __init__(self, *, id: str) -> None:
+        super().__init__(id=id, classes="panel")
+        self.border_title = "Where the arm goes"
+        self._shown = ""
+        self._last: tuple[StationStatus | None, int] = (None, 0)
+
+    def on_resize(self) -> None:
+        self.show(*self._last)
+
+    def show(self, status: StationStatus | None, line: int) -> None:
+        self._last = (status, line)
+        if status is None or not self.size:
+            return
+        stops = [
+            (pose.base_from_flange, "@" if i == line else POSE_MARKS[pose.state])
+            for i, pose in enumerate(status.session.poses)
+            if pose.base_from_flange is not None
+        ]
+        if status.robot.base_from_flange is not None:
+            stops.append((status.robot.base_from_flange, "A"))
+        width, height = max(10, self.size.width - 2), max(4, (self.size.height - 5) // 2)
+        above = scatter([(x, y, m) for (x, y, _), m in map(_place, stops)], width, height)
+        side = scatter([(x, z, m) for (x, _, z), m in map(_place, stops)], width, height)
+        lines = ["from above (x right, y up)", *above, "from the side (x right, z up)", *side]
+        if (text := "\n".join(lines)) != self._shown:
+            self._shown = text
+            self.update(Text(text, no_wrap=True), layout=False)
+
+
+def _place(stop: tuple[Matrix4, str]) -> tuple[tuple[float, float, float], str]:
+    matrix, mark = stop
+    return (matrix[0][3], matrix[1][3], matrix[2][3]), mark
+
+
 class PlanScreen(StationScreen):
     """The table is the plan as the daemon holds it; every change is asked of the daemon."""
 
@@ -65,8 +118,13 @@ class PlanScreen(StationScreen):
         Binding("d", "pose('drop')", "Drop", tooltip="Remove this pose from the plan"),
         Binding("a", "add", "Add", tooltip="Add the arm's present posture as a pose"),
         Binding("n", "make", "New", tooltip="Plan 25 poses from the configured guesses (seconds)"),
-        Binding("p", "app.replan", "Replan", tooltip="Plan the remaining poses again from the images so far"),
-        Binding("b", "app.next_pose", "Next pose", tooltip="Add and capture the most useful pose (asks)"),
+        Binding(
+            "p",
+            "app.start('improve')",
+            "Replan",
+            tooltip="Plan the remaining poses again",
+        ),
+        Binding("b", "app.start('best')", "Next pose", tooltip="Add and capture the most useful pose (asks)"),
         Binding("ctrl+up", "shift(-1)", "Move", group=MOVE, tooltip="Visit this pose earlier"),
         Binding("ctrl+down", "shift(1)", "Move", group=MOVE, tooltip="Visit this pose later"),
     ]

@@ -2,17 +2,54 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
+from itertools import groupby
 from typing import ClassVar, cast
 
 from textual.app import ComposeResult
-from textual.binding import Binding, BindingType
+from textual.binding import ActiveBinding, Binding, BindingType
+from textual.containers import HorizontalGroup
 from textual.screen import Screen
-from textual.widgets import DataTable
+from textual.widgets import DataTable, Footer
+from textual.widgets._footer import FooterKey, FooterLabel
 
 from station.cell.status import StationStatus
 from station.tui.results import ResultsDesk
 from station.tui.widgets.bar import ReasonLine, StatusBar
-from station.tui.widgets.keys import Keys
+
+
+class Keys(Footer):
+    """The keys at the bottom: this screen's own in a line, those of every screen below.
+
+    `common`: the actions of every screen. STOP's key stands in the bar, always.
+    """
+
+    def __init__(self, common: Iterable[str]) -> None:
+        super().__init__(compact=True)
+        self._common = set(common)
+
+    def compose(self) -> ComposeResult:
+        shown = [active for active in self.screen.active_bindings.values() if active.binding.show]
+        for common in (False, True):
+            line = [active for active in shown if (active.binding.action in self._common) is common]
+            if line:
+                with HorizontalGroup():
+                    yield from self._line(line)
+
+    def _line(self, line: list[ActiveBinding]) -> ComposeResult:
+        for group, alike in groupby(line, lambda active: active.binding.group):
+            for _, binding, enabled, tooltip in alike:
+                yield FooterKey(
+                    binding.key,
+                    self.app.get_key_display(binding),
+                    "" if group else binding.description,
+                    binding.action,
+                    disabled=not enabled,
+                    tooltip=tooltip or binding.description,
+                    classes="-grouped" if group else "",
+                ).data_bind(compact=Footer.compact)
+            if group:
+                yield FooterLabel(group.description)
 
 
 class StationScreen(Screen[None]):

@@ -24,7 +24,7 @@ from station.cell.errors import RefusedError, StationError
 from station.cell.status import HoverOffer, MotionPreview
 from station.operate.touch_test import Hovering, note_touches, touch_test, touch_told
 from station.plan.hover import outer_corners
-from station.tui.desk import Desk
+from station.tui.desk import Desk, told
 from station.tui.installed import state_root
 
 ABOUT = (
@@ -108,7 +108,7 @@ class Touching(ModalScreen[Touch | None]):
         try:
             self._hovering = await self._arrival
         except StationError as problem:
-            self.notify(str(problem), severity="error", timeout=10, markup=False)
+            self.notify(told(problem), severity="error", timeout=10, markup=False)
             self.dismiss(None)
             return
         self.query_one("#touch-text", Static).update(self._hovering.instructions(self._board))
@@ -122,7 +122,7 @@ class Touching(ModalScreen[Touch | None]):
             now = None if self._desk.silent_s is not None else self._desk.status
             self.dismiss(touch_told(self._hovering, event.value.strip(), now))
         except RefusedError as problem:
-            self.query_one("#dialog-problem", Label).update(str(problem))
+            self.query_one("#dialog-problem", Label).update(told(problem))
 
     async def action_leave(self) -> None:
         """Also while the arm moves: then it stops."""
@@ -151,7 +151,7 @@ class _Visit:
         return await self._desk.approves(preview)
 
     def refused(self, corner: int, problem: StationError) -> None:
-        self._desk.notify(str(problem), severity="warning", timeout=10, markup=False)
+        self._desk.notify(told(problem), severity="warning", timeout=10, markup=False)
 
     async def touch(self, offer: HoverOffer, arrival: Awaitable[Hovering]) -> None:
         screen = Touching(self._desk, offer.corner, self._board, arrival)

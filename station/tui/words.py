@@ -7,20 +7,7 @@ import time
 
 from station.cell.status import PoseState, StationState
 
-STATE_WORDS: dict[StationState, str] = {
-    StationState.DISCONNECTED: "NO ROBOT",
-    StationState.IDLE: "IDLE",
-    StationState.CHECKING: "CHECKING",
-    StationState.MOVING: "MOVING",
-    StationState.SETTLING: "SETTLING",
-    StationState.CAPTURING: "CAPTURING",
-    StationState.WRITING: "WRITING",
-    StationState.SEALING: "SEALING",
-    StationState.PAUSED: "PAUSED",
-    StationState.STOPPED: "STOPPED",
-    StationState.FAULT: "FAULT",
-    StationState.FREE_DRIVE: "FREE-DRIVE",
-}
+STATE_WORDS = {state: state.value.upper() for state in StationState} | {StationState.DISCONNECTED: "NO ROBOT"}
 
 POSE_MARKS: dict[PoseState, str] = {
     "planned": "·",

@@ -6,6 +6,7 @@ import asyncio
 import base64
 import time
 from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,9 @@ import cv2
 import msgspec
 import numpy as np
 import pytest
+from textual.app import App
 from textual.pilot import Pilot
+from textual.widgets import Static
 
 from station.cell.session_folder import SessionSummary
 from station.cell.status import (
@@ -27,6 +30,7 @@ from station.cell.status import (
     StationStatus,
 )
 from station.protocol.verbs import Done, Preview, PreviewImage, Sessions, Verb, Watch
+from station.tui.app import StationApp
 
 SUMMARY = MotionPreview(
     token="t-1",
@@ -127,3 +131,24 @@ def idle(state: StationState = StationState.IDLE, reason: str = "") -> StationSt
 @pytest.fixture
 def link() -> FakeLink:
     return FakeLink()
+
+
+def app_on(link: FakeLink) -> StationApp:
+    async def connect() -> FakeLink:
+        return link
+
+    return StationApp(connect)
+
+
+@asynccontextmanager
+async def opened(
+    link: FakeLink, size: tuple[int, int] = (80, 24), notifications: bool = False
+) -> AsyncIterator[Pilot[None]]:
+    """A screen that shows the link's simulated cell."""
+    async with app_on(link).run_test(size=size, notifications=notifications) as pilot:
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+        yield pilot
+
+
+def text_of(app: App[None], selector: str) -> str:
+    return str(app.screen.query_one(selector, Static).render())

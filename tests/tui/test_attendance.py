@@ -8,9 +8,8 @@ from textual import events
 
 from station.cell.status import Lease, StationState, StationStatus
 from station.protocol import verbs
-from station.tui import attendance
-from tests.tui.conftest import FakeLink, idle, until
-from tests.tui.test_keys import app_on, text_of
+from station.tui import app as attendance
+from tests.tui.conftest import FakeLink, app_on, idle, text_of, until
 
 LOST = verbs.Lease("lost")
 
@@ -38,7 +37,7 @@ async def test_who_commands_a_moving_arm_is_asked_for(
 ) -> None:
     monkeypatch.setattr(attendance, "ASK_S", 0.01)
     asked = []
-    monkeypatch.setattr(attendance.Attended, "_ask_terminal", lambda app: asked.append(app))
+    monkeypatch.setattr(attendance.StationApp, "_ask_terminal", lambda app: asked.append(app))
     link.show(commanded(state, holder))
     app = app_on(link)
     async with app.run_test(size=(80, 24), notifications=True) as pilot:

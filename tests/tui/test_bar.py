@@ -9,8 +9,7 @@ from hypothesis import strategies as st
 
 from station.cell.status import RecorderStatus, RobotStatus, StationState, StationStatus
 from station.tui.widgets.bar import bar_line
-from tests.tui.conftest import FakeLink, idle, until
-from tests.tui.test_keys import app_on, text_of
+from tests.tui.conftest import FakeLink, app_on, idle, text_of, until
 
 ROBOT = RobotStatus(
     connected=True, model="UR10", safety="NORMAL", remote=True, speed_m_s=0.21, speed_limit_m_s=0.25

@@ -18,12 +18,11 @@ from station.operate.drift_check import POSES, SEED
 from station.protocol import verbs
 from station.tui import results
 from station.tui.app import StationApp
-from station.tui.desk import busy_words
+from station.tui.desk import REMEDIES, busy_words
 from station.tui.dialogs import ConfirmMotion
 from station.tui.results import JobScreen
-from tests.tui.conftest import FakeLink, idle, until
+from tests.tui.conftest import FakeLink, app_on, idle, text_of, until
 from tests.tui.test_install import GOOD
-from tests.tui.test_keys import app_on, text_of
 from tests.tui.test_plan_screen import SlowPlanner
 
 CHECK_PLAN = "cd" * 32
@@ -81,7 +80,7 @@ async def test_nothing_is_planned_where_nothing_is_installed(link: FakeLink, tmp
     app = app_on(link)
     async with app.run_test(size=(80, 24), notifications=True) as pilot:
         await ask_for_it(pilot)
-        await until(pilot, lambda: said(app, "nothing is installed"))
+        await until(pilot, lambda: said(app, REMEDIES["nothing-installed"]))
         assert link.verbs == []
 
 

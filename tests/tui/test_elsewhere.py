@@ -17,9 +17,8 @@ from station.tui import result, sessions
 from station.tui.app import StationApp
 from station.tui.dialogs import Confirm
 from station.tui.installed import read_installed
-from tests.tui.conftest import FakeLink, idle, summary, until
+from tests.tui.conftest import FakeLink, app_on, idle, summary, text_of, until
 from tests.tui.test_install import GOOD, OFF
-from tests.tui.test_keys import app_on, text_of
 
 
 @pytest.fixture

@@ -29,8 +29,7 @@ from station.tui.dialogs import ConfirmMotion
 from station.tui.widgets import graphics as graphics_module
 from station.tui.widgets.graphics import SWITCH, Graphics, SharpPicture, detect
 from station.tui.widgets.preview import Preview
-from tests.tui.conftest import FakeLink, idle, until
-from tests.tui.test_keys import app_on, text_of
+from tests.tui.conftest import FakeLink, app_on, idle, opened, until
 
 CELL = (8, 17)
 VT340 = b"\x1b[?63;1;2;4;6;9;15;22c"
@@ -227,8 +226,7 @@ async def test_a_status_repaints_only_what_it_changes(
         updates.append(type(update).__name__)
         return update
 
-    async with app_on(link).run_test(size=(160, 48)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link, size=(160, 48)) as pilot:
         await pilot.pause(1.0)
         monkeypatch.setattr(Compositor, "render_update", noted)
         status = idle()

@@ -21,8 +21,7 @@ from station.tui.installed import Installed, local
 from station.tui.result import verdict_text
 from tests.station.hover_cell import calibration_of
 from tests.station.session_rig import TRUTH
-from tests.tui.conftest import FakeLink, until
-from tests.tui.test_keys import app_on, text_of
+from tests.tui.conftest import FakeLink, app_on, opened, text_of, until
 
 GOOD = calibration_of(
     TRUTH, RobotIdentity(serial="1", model="UR10"), CameraIdentity(serial="2", model="camera")
@@ -127,8 +126,7 @@ async def test_a_result_that_is_worse_than_the_installed_one_is_not_called_ready
     install(calibration.with_name("a.yaml"), calibration.parents[2], cell="simulated")
     vague = msgspec.structs.replace(GOOD.sigma, translation_mm=9 * GOOD.sigma.translation_mm)
     write_calibration(msgspec.structs.replace(LATER, sigma=vague), calibration)
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link) as pilot:
         pilot.app.result_path = str(calibration)  # type: ignore[attr-defined]
         await pilot.press("3")
         await until(pilot, lambda: "INSTALL" in text_of(pilot.app, "#verdict").upper())

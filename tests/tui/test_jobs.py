@@ -13,8 +13,7 @@ from textual.pilot import Pilot
 from textual.widgets import Button, Label, RichLog
 
 from station.tui.results import JobScreen
-from tests.tui.conftest import FakeLink, until
-from tests.tui.test_keys import app_on
+from tests.tui.conftest import FakeLink, app_on, until
 
 
 @pytest.fixture

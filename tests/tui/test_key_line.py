@@ -6,14 +6,12 @@ import pytest
 from textual.widgets import Footer
 from textual.widgets._footer import FooterKey, FooterLabel
 
-from tests.tui.conftest import FakeLink, until
-from tests.tui.test_keys import app_on, text_of
+from tests.tui.conftest import FakeLink, opened, until
 
 
 @pytest.mark.parametrize("screen", "123456")
 async def test_every_key_is_inside_80_columns(link: FakeLink, screen: str) -> None:
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link) as pilot:
         await pilot.press(screen)
         footer = pilot.app.screen.query_one(Footer)
         await until(pilot, lambda: len(footer.query(FooterKey)) >= 14)

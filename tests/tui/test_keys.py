@@ -4,31 +4,17 @@ from __future__ import annotations
 
 import msgspec
 import pytest
-from textual.app import App
 from textual.widgets import Static
 
 from station.cell.errors import RefusedError
 from station.cell.status import Lease, StationState, StationStatus
 from station.protocol import verbs
-from station.tui.app import StationApp
 from station.tui.dialogs import Confirm, ConfirmMotion
-from tests.tui.conftest import SUMMARY, FakeLink, idle, until
-
-
-def app_on(link: FakeLink) -> StationApp:
-    async def connect() -> FakeLink:
-        return link
-
-    return StationApp(connect)
-
-
-def text_of(app: App[None], selector: str) -> str:
-    return str(app.screen.query_one(selector, Static).render())
+from tests.tui.conftest import SUMMARY, FakeLink, app_on, idle, opened, text_of, until
 
 
 async def test_run_asks_first_and_go_carries_the_token(link: FakeLink) -> None:
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link) as pilot:
         await pilot.press("f5")
         await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmMotion))
         assert "go" not in link.verbs
@@ -41,8 +27,7 @@ async def test_run_asks_first_and_go_carries_the_token(link: FakeLink) -> None:
 
 @pytest.mark.parametrize("answer", ["escape", "enter"])
 async def test_the_harmless_answer_is_the_easy_one(link: FakeLink, answer: str) -> None:
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link) as pilot:
         await pilot.press("f5")
         await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmMotion))
         await pilot.press(answer)
@@ -53,8 +38,7 @@ async def test_the_harmless_answer_is_the_easy_one(link: FakeLink, answer: str) 
 
 async def test_no_notice_stands_before_the_question(link: FakeLink) -> None:
     """On a small terminal it hid how to answer."""
-    async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link, notifications=True) as pilot:
         pilot.app.notify("no session is open", timeout=3600)
         await pilot.press("f5")
         await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmMotion))
@@ -62,8 +46,7 @@ async def test_no_notice_stands_before_the_question(link: FakeLink) -> None:
 
 
 async def test_stop_works_inside_the_question_too(link: FakeLink) -> None:
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link) as pilot:
         await pilot.press("f5")
         await until(pilot, lambda: isinstance(pilot.app.screen, ConfirmMotion))
         await pilot.press("f12")
@@ -72,16 +55,14 @@ async def test_stop_works_inside_the_question_too(link: FakeLink) -> None:
 
 async def test_a_refusal_is_said_and_nothing_moves(link: FakeLink) -> None:
     link.refuse["lease"] = RefusedError("held by anna on tty1")
-    async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link, notifications=True) as pilot:
         await pilot.press("f5")
         await until(pilot, lambda: any("held by anna" in n.message for n in pilot.app._notifications))
         assert link.verbs == ["lease"]
 
 
 async def test_the_bar_says_state_robot_and_stop_key(link: FakeLink) -> None:
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link) as pilot:
         bar = text_of(pilot.app, "#bar")
         for word in ("SIMULATED", "UR10", "NORMAL", "REMOTE", "0/25", "F12=STOP"):
             assert word in bar
@@ -91,8 +72,7 @@ async def test_the_bar_says_state_robot_and_stop_key(link: FakeLink) -> None:
 
 
 async def test_a_dead_daemon_is_said(link: FakeLink) -> None:
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link) as pilot:
         link.show(None)
         await until(pilot, lambda: "NO DAEMON" in text_of(pilot.app, "#bar"))
 
@@ -108,8 +88,7 @@ async def test_a_dead_daemon_is_said(link: FakeLink) -> None:
     ],
 )
 async def test_a_key_sends_its_wish_at_once(link: FakeLink, key: str, verbs: list[str]) -> None:
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link) as pilot:
         await pilot.press(key)
         await until(pilot, lambda: link.verbs == verbs)
 
@@ -139,8 +118,7 @@ async def test_finish_asks_and_then_seals(link: FakeLink) -> None:
 async def test_the_plan_screen_asks_for_changes_of_the_highlighted_pose(
     link: FakeLink, key: str, request_: verbs.Verb[object]
 ) -> None:
-    async with app_on(link).run_test(size=(120, 34)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link, size=(120, 34)) as pilot:
         await pilot.press("2")
         await pilot.pause()
         await pilot.press("down", "down", key)
@@ -152,8 +130,7 @@ async def test_changing_the_plan_on_the_way_asks_as_every_motion_does(
     link: FakeLink, key: str, purpose: verbs.Purpose
 ) -> None:
     link.answers["prepare"] = msgspec.structs.replace(SUMMARY, changes=("0.61 → 0.52 mm " * 6,))
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link) as pilot:
         await pilot.press("2", key)
         await until(pilot, lambda: pilot.app.screen.query("#confirm-body"))
         assert isinstance(pilot.app.screen, ConfirmMotion)
@@ -169,8 +146,7 @@ async def test_changing_the_plan_on_the_way_asks_as_every_motion_does(
 async def test_every_screen_opens_and_stop_works_on_each(link: FakeLink) -> None:
     link.answers["sessions"] = []
     link.answers["doctor"] = [verbs.Check("camera", "failed", "none", "plug it in")]
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link) as pilot:
         for stops, key in enumerate("123456", start=1):
             await pilot.press(key)
             await pilot.pause()
@@ -180,8 +156,7 @@ async def test_every_screen_opens_and_stop_works_on_each(link: FakeLink) -> None
 
 
 async def test_the_palette_names_the_screen_s_own_keys_too(link: FakeLink) -> None:
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link) as pilot:
         await pilot.press("2")
         await pilot.pause()
         named = {command.title: command for command in pilot.app.get_system_commands(pilot.app.screen)}
@@ -191,8 +166,7 @@ async def test_the_palette_names_the_screen_s_own_keys_too(link: FakeLink) -> No
 
 
 async def test_stop_works_in_the_command_palette(link: FakeLink) -> None:
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link) as pilot:
         await pilot.press("ctrl+p")
         await pilot.pause()
         await pilot.press("x", "f12")
@@ -206,8 +180,7 @@ def commanded(state: StationState) -> StationStatus:
 
 @pytest.mark.parametrize("key", ["ctrl+q", "f4"])
 async def test_what_ends_control_asks_while_the_arm_works_by_it(link: FakeLink, key: str) -> None:
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link) as pilot:
         await pilot.press("f3")  # takes control
         await until(pilot, lambda: "free_drive" in link.verbs)
         link.show(commanded(StationState.MOVING))

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 
 from station.cell.status import EstimateStatus, Event, StationState, StationStatus
-from station.tui.widgets.events import event_text
+from station.tui.live import event_text
 from station.tui.widgets.panels import device_lines, estimate_lines, progress_lines
 from tests.tui.conftest import idle
 

@@ -17,8 +17,7 @@ from station.tui.desk import busy_words
 from station.tui.live import LiveScreen
 from station.tui.widgets.panels import estimate_lines, pose_map_lines, progress_lines
 from station.tui.words import POSE_MARKS
-from tests.tui.conftest import FakeLink, idle, until
-from tests.tui.test_keys import app_on, text_of
+from tests.tui.conftest import FakeLink, app_on, idle, opened, text_of, until
 
 
 class SlowPlanner(FakeLink):
@@ -37,8 +36,7 @@ class SlowPlanner(FakeLink):
 
 async def test_it_says_that_it_plans_for_as_long_as_it_does() -> None:
     link = SlowPlanner()
-    async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link, notifications=True) as pilot:
         await pilot.press("2", "n")
         await until(pilot, lambda: busy_words(verbs.MakePlan(25)) in text_of(pilot.app, "#reason"))
         await pilot.press("n")
@@ -173,8 +171,7 @@ async def test_the_sketch_fills_its_place_before_anything_new_is_told(link: Fake
 
 async def test_a_pose_that_changes_is_told_where_it_stands(link: FakeLink) -> None:
     status = idle()
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link) as pilot:
         await pilot.press("2")
         poses = list(status.session.poses)
         poses[7] = msgspec.structs.replace(poses[7], state="failed", reason="too dark")

@@ -8,12 +8,11 @@ from textual.widgets import DataTable
 
 from station.cell.status import Event, StationState
 from station.protocol.client import DaemonGoneError
-from station.tui import attendance
+from station.tui import app as attendance
 from station.tui.app import SILENT, StationApp
 from station.tui.desk import STOP_UNHEARD
 from station.tui.widgets.preview import OLD, Preview
-from tests.tui.conftest import FakeLink, idle, until
-from tests.tui.test_keys import app_on, text_of
+from tests.tui.conftest import FakeLink, app_on, idle, opened, text_of, until
 
 
 @pytest.fixture(autouse=True)
@@ -81,8 +80,7 @@ async def test_what_the_daemon_said_last_stays_and_is_marked_old(link: FakeLink)
 
 
 async def test_the_plan_stays_in_sight_too(link: FakeLink) -> None:
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link) as pilot:
         await pilot.press("2")
         await until(pilot, lambda: pilot.app.screen.query(DataTable))
         table = pilot.app.screen.query_one(DataTable)
@@ -94,8 +92,7 @@ async def test_the_plan_stays_in_sight_too(link: FakeLink) -> None:
 
 async def test_a_screen_that_was_away_meanwhile_shows_what_was_known_last(link: FakeLink) -> None:
     """Not what it had shown itself when it was left."""
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link) as pilot:
         await pilot.press("2")
         moving = idle(StationState.MOVING)
         link.show(msgspec.structs.replace(moving, session=msgspec.structs.replace(moving.session, current=7)))

@@ -15,8 +15,7 @@ from station.tui.live import LiveScreen
 from station.tui.plan import NO_PLAN, PlanScreen
 from station.tui.themes import chosen_theme
 from station.tui.widgets.preview import Preview
-from tests.tui.conftest import FakeLink, idle, until
-from tests.tui.test_keys import app_on, text_of
+from tests.tui.conftest import FakeLink, app_on, idle, opened, text_of, until
 
 MISSING = [Check("robot", "failed", "no answer", "switch it on")]
 THERE = [Check("robot", "ok", "UR10")]
@@ -34,8 +33,7 @@ async def test_without_a_robot_the_checklist_comes_first(link: FakeLink) -> None
 
 async def test_a_long_checklist_is_read_to_its_end_with_keys(link: FakeLink) -> None:
     link.answers["doctor"] = MISSING * 20
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link) as pilot:
         await pilot.press("6")
         await until(pilot, lambda: "MISSING" in pilot.app.export_screenshot())
         assert "Something&#160;is&#160;missing" not in pilot.app.export_screenshot()
@@ -90,8 +88,7 @@ async def test_a_key_that_can_do_nothing_says_why(
 
 
 async def test_an_empty_list_says_how_to_begin_but_not_before_it_is_known(link: FakeLink) -> None:
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+    async with opened(link) as pilot:
         await pilot.press("4")
         await until(pilot, lambda: pilot.app.screen.query_one(DataTable).row_count == 1)
         hint = pilot.app.screen.query_one("#sessions-none")

@@ -22,8 +22,7 @@ from station.tui.dialogs import ConfirmMotion
 from station.tui.touch_test import ChooseCorner, Touching
 from tests.station.hover_cell import calibration_of
 from tests.station.session_rig import TRUTH
-from tests.tui.conftest import SUMMARY, FakeLink, idle, until
-from tests.tui.test_keys import app_on, text_of
+from tests.tui.conftest import SUMMARY, FakeLink, app_on, idle, text_of, until
 
 STANDOFF_M = 0.08
 CORNER = outer_corners(TRUTH.board)[0]

@@ -21,6 +21,7 @@ from recordings.schema.messages import RobotState, Stillness
 from station.cell.config import StillnessConfig
 from station.cell.errors import StaleStateError, StationError
 
+_DEG = math.degrees(1.0)
 POLL_S = 0.02
 NEWS_POLL_S = 0.01
 REST_PATIENCE_S = 1.0
@@ -90,30 +91,28 @@ class StillnessMonitor:
 
     def unrest(self, found: Stillness) -> str:
         """The parts that move, in words; empty: settled."""
-        limits = self._limits
-        parts = []
-        if found.max_joint_speed_rad_s > limits.joint_speed_rad_s:
+        limits, speed_rad_s, joint = self._limits, found.max_joint_speed_rad_s, ""
+        if speed_rad_s > limits.joint_speed_rad_s:
             speeds = np.abs([s.joint_speeds_rad_s for s in self._states.copy()]).max(axis=0)
-            parts.append(
-                f"joint {JOINT_NAMES[int(speeds.argmax())]} moves at "
-                f"{math.degrees(found.max_joint_speed_rad_s):.2f}°/s "
-                f"(limit {math.degrees(limits.joint_speed_rad_s):.2f})"
-            )
-        if found.position_scatter_m > limits.position_m:
-            parts.append(
-                f"the flange scatters by {found.position_scatter_m * 1000:.3f} mm "
-                f"(limit {limits.position_m * 1000:.3f})"
-            )
-        if found.rotation_scatter_rad > limits.rotation_rad:
-            parts.append(
-                f"the flange turns by {math.degrees(found.rotation_scatter_rad):.4f}° "
-                f"(limit {math.degrees(limits.rotation_rad):.4f})"
-            )
-        if found.image_motion_px is not None and found.image_motion_px > limits.image_motion_px:
-            parts.append(
-                f"the image moves by {found.image_motion_px:.2f} px (limit {limits.image_motion_px:.2f})"
-            )
-        return ", ".join(parts)
+            joint = f"joint {JOINT_NAMES[int(speeds.argmax())]}"
+        checks = (
+            (
+                found.max_joint_speed_rad_s,
+                limits.joint_speed_rad_s,
+                _DEG,
+                f"joint {joint} moves at",
+                "°/s",
+                2,
+            ),
+            (found.position_scatter_m, limits.position_m, 1000.0, "the flange scatters by", " mm", 3),
+            (found.rotation_scatter_rad, limits.rotation_rad, _DEG, "the flange turns by", "°", 4),
+            (found.image_motion_px, limits.image_motion_px, 1.0, "the image moves by", " px", 2),
+        )
+        return ", ".join(
+            f"{what} {scale * value:.{digits}f}{unit} (limit {scale * limit:.{digits}f})"
+            for value, limit, scale, what, unit, digits in checks
+            if value is not None and value > limit
+        )
 
     @property
     def at_rest(self) -> bool:
@@ -158,7 +157,8 @@ class StillnessMonitor:
                 limit_s = self._limits.timeout_s
                 code = "no-images" if remedy is CHECK_CAMERA else "no-news" if old else ""
                 text = f"Not settled after {limit_s:g} s: {unrest}."
-                raise NotStillError(text, code=code, remedy=remedy, limit_s=limit_s)
+                measured = msgspec.structs.asdict(found) if found is not None else {}
+                raise NotStillError(text, code=code, remedy=remedy, limit_s=limit_s, **measured)
             await asyncio.sleep(POLL_S)
 
     def require_rest(self, state: RobotState) -> None:

@@ -156,7 +156,8 @@ async def test_an_arm_that_never_rests_is_given_up_with_the_reason() -> None:
     clock = iter([0.0, 1.0, 5.1])
     with raises("not-settled", NotStillError) as told:
         await m.settle(lambda: None, now_s=lambda: next(clock))
-    assert told.value.values == {"limit_s": 5.0} and "shoulder" in told.value.text
+    assert told.value.values["limit_s"] == 5.0 and "shoulder" in told.value.text
+    assert float(told.value.values["max_joint_speed_rad_s"]) > 0.1  # type: ignore[arg-type]
 
 
 async def test_waiting_for_rest_leaves_the_loop_to_heartbeat_and_stop() -> None:

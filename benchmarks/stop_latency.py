@@ -1,9 +1,11 @@
 """How long from the daemon's call of STOP until its bytes are out, and until the arm begins to slow down?
 
-A simulated UR10e (500 Hz) cruises at 0.5 rad/s; STOP comes at a random moment. Three ways: `stop()` as the
-daemon calls it (both paths at once), the control process alone, the dashboard alone. The controller notes
-when a stop reached it, on the same host clock. First deceleration: the first cycle whose commanded step is
-smaller than the one before by more than 1 %, its time by the fitted clock. Runs with the daemon's priority.
+A simulated UR10e (500 Hz) cruises at 0.5 rad/s, driven by ur_rtde and by the station's own script; STOP
+comes at a random moment. Four ways: `stop()` as the daemon calls it (both paths at once), the control process
+alone, the dashboard alone, and no heartbeat any more (from the last one on). The controller notes when a stop
+reached it, on the same host clock. First deceleration: the first cycle whose commanded step is smaller than
+the one before by more than 1 %, its time by the fitted clock; rest: the first cycle without a step. Runs with
+the daemon's priority.
 """
 
 from __future__ import annotations
@@ -16,12 +18,13 @@ from collections import defaultdict
 from collections.abc import Awaitable, Callable
 from contextlib import suppress
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 
 from benchmarks.trials import table, trials
 from recordings.schema.messages import RobotState
-from station.cell.config import RobotConfig
+from station.cell.config import ControlPath, RobotConfig
 from station.cell.errors import RobotError
 from station.cell.process import DAEMON_NICENESS, go_before_others
 from station.devices.ur import UrRobot
@@ -41,6 +44,8 @@ class SessionContext:
         self.robot = robot
         self.admin = admin
         self.states: list[RobotState] = []
+        self.beating = True
+        self.beat_ns = 0
         self._forth = True
         robot.subscribe(self.states.append)
 
@@ -59,6 +64,13 @@ class SessionContext:
         self.states.clear()
         return move
 
+    async def heart(self) -> None:
+        while True:
+            if self.beating:
+                self.beat_ns = time.monotonic_ns()
+                self.robot.heartbeat()
+            await asyncio.sleep(0.03)
+
     async def rest(self, move: asyncio.Task[None]) -> None:
         with suppress(RobotError):
             await move
@@ -66,14 +78,18 @@ class SessionContext:
             await asyncio.sleep(0.005)
         await self.robot.idle()
 
-    def deceleration_ns(self) -> int:
-        """Host time of the first cycle with a shorter step."""
+    def deceleration_ns(self) -> tuple[int, int]:
+        """Host times of the first cycle with a shorter step, and of the first without any."""
         clock = self.robot.clock()
         assert clock is not None
         targets = np.array([s.target_joints_rad[0] for s in self.states])
         steps = np.abs(np.diff(targets))
         shorter = int(np.argmax(steps < 0.99 * steps[0]))
-        return clock.to_host_ns(self.states[shorter + 1].stamps.controller_s)
+        still = shorter + int(np.argmax(steps[shorter:] < 1e-9))
+        shorter_ns, still_ns = (
+            clock.to_host_ns(self.states[i + 1].stamps.controller_s) for i in (shorter, still)
+        )
+        return shorter_ns, still_ns
 
     def received_ns(self, source: str, verb: str, since_ns: int) -> int | None:
         """When the controller noted it."""
@@ -88,6 +104,13 @@ async def trial(context: SessionContext, way: str, times: Times) -> None:
     if child is None or dashboard is None:
         await context.rest(move)
         raise RobotError("control ended before the STOP")
+    if way == "no heartbeat":
+        context.beating = False
+        begun_ns = context.beat_ns
+        await context.rest(move)
+        context.beating = True
+        note(context, begun_ns, times)
+        return
     ways: dict[str, Callable[[], Awaitable[object] | None]] = {
         "both": lambda: robot.stop("benchmark"),
         "control process": child.stop,
@@ -106,26 +129,29 @@ async def trial(context: SessionContext, way: str, times: Times) -> None:
         handed_ns = time.monotonic_ns()
     times["bytes handed to the kernel"].append((handed_ns - begun_ns) / 1e6)
     await context.rest(move)
-    source, verb = ("script", "stopJ") if way == "control process" else ("dashboard", "stop")
+    stop = "stopj" if robot.control_path == "script" else "stopJ"
+    source, verb = ("script", stop) if way == "control process" else ("dashboard", "stop")
     received_ns = context.received_ns(source, verb, begun_ns)
     if received_ns is not None:
         times[f"{source} {verb} reached the controller"].append((received_ns - begun_ns) / 1e6)
-    times["first deceleration"].append((context.deceleration_ns() - begun_ns) / 1e6)
+    note(context, begun_ns, times)
 
 
-async def measure(host: str, admin: AdminClient, folder: Path, count: int) -> list[tuple[str, ...]]:
-    robot = UrRobot(RobotConfig(model="UR10e", host=host), folder / "log")
+def note(context: SessionContext, begun_ns: int, times: Times) -> None:
+    shorter_ns, still_ns = context.deceleration_ns()
+    times["first deceleration"].append((shorter_ns - begun_ns) / 1e6)
+    times["rest"].append((still_ns - begun_ns) / 1e6)
+
+
+async def measure(
+    host: str, admin: AdminClient, folder: Path, count: int, control: ControlPath
+) -> list[tuple[str, ...]]:
+    robot = UrRobot(RobotConfig(model="UR10e", host=host, control=control), folder / "log")
     await robot.connect()
-
-    async def heart() -> None:
-        while True:
-            robot.heartbeat()
-            await asyncio.sleep(0.03)
-
-    beating = asyncio.create_task(heart())
     context = SessionContext(robot, admin)
+    beating = asyncio.create_task(context.heart())
     rows, disturbed = [], 0
-    for way in ("both", "control process", "dashboard"):
+    for way in ("both", "control process", "dashboard", "no heartbeat"):
         times: Times = defaultdict(list)
         while len(times["first deceleration"]) < count:
             try:
@@ -134,11 +160,17 @@ async def measure(host: str, admin: AdminClient, folder: Path, count: int) -> li
                 disturbed += 1
                 await robot.stop("disturbed")
                 await robot.idle()
-        rows += [(way, event, str(len(ms)), *_spread(ms)) for event, ms in times.items()]
+        rows += [(control, way, event, str(len(ms)), *_spread(ms)) for event, ms in times.items()]
     beating.cancel()
     await robot.close()
     rows.append(
-        ("–", "trials repeated: the machine held up the session before the STOP", str(disturbed), *"––––")
+        (
+            control,
+            "–",
+            "trials repeated: the machine held up the session before the STOP",
+            str(disturbed),
+            *"––––",
+        )
     )
     return rows
 
@@ -155,8 +187,10 @@ def run() -> str:
         start_controller("UR10e") as controller,
         controller.admin() as admin,
     ):
-        rows = asyncio.run(measure(controller.host, admin, Path(folder), trials(TRIALS)))
-    return table(("path", "from the call until", "n", "p50 ms", "p90", "p99", "max"), rows)
+        rows = []
+        for control in get_args(ControlPath):
+            rows += asyncio.run(measure(controller.host, admin, Path(folder), trials(TRIALS), control))
+    return table(("control", "path", "from the call until", "n", "p50 ms", "p90", "p99", "max"), rows)
 
 
 if __name__ == "__main__":

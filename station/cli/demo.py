@@ -29,7 +29,7 @@ from station.cell.session_folder import CALIBRATION_FILE, default_root
 from station.cell.status import MotionPreview
 from station.cli.console import AsJson, Headless, err, out
 from station.cli.progress import SessionProgress
-from station.cli.serve import GigE, Mounting, Noise, Scene, Seed, require_choices
+from station.cli.serve import Control, GigE, Mounting, Noise, Scene, Seed, require_choices
 from station.operate.motion import carry_out, wait_until_idle
 from station.protocol.client import Client
 from station.protocol.verbs import Lease, MakePlan, Purpose
@@ -60,6 +60,7 @@ def demo_command(
     headless: Headless = False,
     as_json: AsJson = False,
     time_scale: Annotated[float, typer.Option(hidden=True)] = 1.0,
+    control: Control = None,
 ) -> None:
     """Run the whole job on a simulated cell and compare with the truth.
 
@@ -68,7 +69,7 @@ def demo_command(
 
     Exit codes: 0 done, 1 failed, 3 poses missing, 4 a gate failed.
     """
-    require_choices(scene=scene, noise=noise, mount=mount)
+    require_choices(scene=scene, noise=noise, mount=mount, control=control)
     if output is not None and output.exists() and not output.is_dir():
         raise ConfigError(f"--out {output} is a file.", code="not-a-folder", remedy="Name a folder.")
     if gige and not is_isolated():
@@ -79,6 +80,7 @@ def demo_command(
     cell: dict[str, Any] = {"seed": seed, "scene": scene, "mount": mount, "noise": noise}
     arguments = [part for name, value in cell.items() for part in (f"--{name}", str(value))]
     arguments += ["--time-scale", str(time_scale), *(["--gige"] if gige else [])]
+    arguments += ["--control", control] if control else []
     progress, started_s = SessionProgress(err, quiet=headless or as_json), time.monotonic()
     result = cell | asyncio.run(_run(folder, arguments, poses, seed, progress))
     if as_json:

@@ -13,6 +13,7 @@ from typing import Annotated, get_args
 import typer
 
 from recordings.schema.messages import Mount
+from station.cell.config import ControlPath
 from station.cell.errors import ConfigError
 from station.cell.process import DAEMON_NICENESS, go_before_others
 from station.cell.session_folder import default_root
@@ -20,12 +21,14 @@ from station.cell.socket_folder import default_socket
 from station.devices.cell import Cell
 from station.simulation.cell import NoiseLevel, SceneName
 
-_RANGES = {"scene": SceneName, "noise": NoiseLevel, "mount": Mount}
+_RANGES = {"scene": SceneName, "noise": NoiseLevel, "mount": Mount, "control": ControlPath}
 Seed = Annotated[int, typer.Option(help="Simulated: seed of camera pose, board pose, intrinsics, noise")]
 Scene = Annotated[str, typer.Option(help="Simulated: paper, blog or paper-binned (640×512)")]
 Noise = Annotated[str, typer.Option(help="Simulated: low, mid or high")]
 Mounting = Annotated[str, typer.Option("--mount", help="Simulated: eye-in-hand or eye-to-hand")]
 GigE = Annotated[bool, typer.Option("--gige", help="Simulated: the camera over GigE Vision packets")]
+
+Control = Annotated[str | None, typer.Option("--control", hidden=True)]
 
 
 def serve_command(
@@ -45,6 +48,7 @@ def serve_command(
         bool, typer.Option("--hardware-trigger", help="Simulated: a trigger box fires the camera")
     ] = False,
     frame_rate_hz: Annotated[float, typer.Option(hidden=True)] = 0.0,
+    control: Control = None,
     robot: Annotated[str, typer.Option(hidden=True)] = "UR10",
     time_scale: Annotated[float, typer.Option(hidden=True)] = 1.0,
     end_with_stdin: Annotated[bool, typer.Option("--end-with-stdin", hidden=True)] = False,
@@ -60,7 +64,7 @@ def serve_command(
             code="usage",
             remedy="Give one of --config FILE (a real cell), --simulate, --replay RECORDING.",
         )
-    require_choices(scene=scene, noise=noise, mount=mount)
+    require_choices(scene=scene, noise=noise, mount=mount, control=control)
     log_to_stderr()
     place = root or default_root()
     # What only one kind of cell needs is loaded only for it.
@@ -82,16 +86,17 @@ def serve_command(
             gige,
             hardware_trigger,
             frame_rate_hz,
+            control,  # type: ignore[arg-type]
             robot,
         )
         cell = simulated_cell(options, place / "simulation")
     asyncio.run(serve_cell(cell, place, socket or default_socket(), end_with_stdin))
 
 
-def require_choices(**chosen: str) -> None:
-    """ConfigError for a word that is not one of the offered ones."""
+def require_choices(**chosen: str | None) -> None:
+    """ConfigError for a word that is not one of the offered ones; None is no choice."""
     for name, word in chosen.items():
-        if word not in (known := get_args(_RANGES[name])):
+        if word is not None and word not in (known := get_args(_RANGES[name])):
             raise ConfigError(
                 f"--{name} {word} is unknown.", code="usage", remedy=f"Choose one of {', '.join(known)}."
             )

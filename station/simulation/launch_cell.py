@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 import msgspec
 
 from recordings.schema.messages import Mount
-from station.cell.config import StationConfig, TriggerConfig
+from station.cell.config import ControlPath, StationConfig, TriggerConfig
 from station.cell.errors import ConfigError, StationError
 from station.devices.base import Camera, Trigger
 from station.devices.cell import Cell
@@ -39,6 +39,8 @@ class SimulationOptions:
     frame_rate_hz: float = 0.0
     """With `gige`: free-running at this rate. Drawing takes longer than a frame, so its pictures are numbered
     ones of the board as the camera sees it from where the arm starts."""
+    control: ControlPath | None = None
+    """What drives the arm; None = what is installed."""
     robot: str = "UR10"
     """Another arm at the same place; its own start shows the board for seed 0."""
     free_space_bytes: int = 200_000_000
@@ -61,6 +63,9 @@ def simulated_cell(options: SimulationOptions, folder: Path) -> Cell:
         truth.robot_model, truth=truth_file, time_scale=options.time_scale, log=folder / "controller.log"
     )
     config = cell_config(truth, controller.host)
+    config = msgspec.structs.replace(
+        config, robot=msgspec.structs.replace(config.robot, control=options.control)
+    )
     capture = msgspec.structs.replace(config.capture, free_space_bytes=options.free_space_bytes)
     robot = msgspec.structs.replace(config.robot, model=options.robot)
     config = msgspec.structs.replace(config, capture=capture, robot=robot)

@@ -96,14 +96,7 @@ class StillnessMonitor:
             speeds = np.abs([s.joint_speeds_rad_s for s in self._states.copy()]).max(axis=0)
             joint = f"joint {JOINT_NAMES[int(speeds.argmax())]}"
         checks = (
-            (
-                found.max_joint_speed_rad_s,
-                limits.joint_speed_rad_s,
-                _DEG,
-                f"joint {joint} moves at",
-                "°/s",
-                2,
-            ),
+            (speed_rad_s, limits.joint_speed_rad_s, _DEG, f"{joint} moves at", "°/s", 2),
             (found.position_scatter_m, limits.position_m, 1000.0, "the flange scatters by", " mm", 3),
             (found.rotation_scatter_rad, limits.rotation_rad, _DEG, "the flange turns by", "°", 4),
             (found.image_motion_px, limits.image_motion_px, 1.0, "the image moves by", " px", 2),

@@ -71,7 +71,7 @@ def test_a_shaking_arm_is_measured() -> None:
     assert found.max_joint_speed_rad_s == pytest.approx(0.001 * 2 * math.pi * 8, rel=0.02)
     radius_m = math.hypot(0.5723 + 0.1157, 0.612)  # of the flange about the shoulder, roughly
     assert found.position_scatter_m == pytest.approx(0.001 * radius_m, rel=0.5)
-    assert "shoulder moves at 2.8" in m.unrest(found) and "scatters by" in m.unrest(found)
+    assert m.unrest(found).startswith("joint shoulder moves at 2.8") and "scatters by" in m.unrest(found)
     assert not m.at_rest
     m.add(state(1.0))
     assert not m.at_rest  # it rests now, but not for long enough

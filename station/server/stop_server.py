@@ -79,9 +79,8 @@ class StopServer:
             link.bind(str(self._socket_path))
         except OSError as error:
             link.close()
-            raise StationError(
-                f"{self._socket_path}: the socket for STOP cannot be made ({error})."
-            ) from None
+            text = f"{self._socket_path}: the socket for STOP cannot be made ({error})."
+            raise StationError(text, code="socket") from None
         finally:
             os.umask(old)
         self._link = link

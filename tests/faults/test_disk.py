@@ -55,11 +55,11 @@ def test_27_a_killed_session_is_listed_as_unsealed_until_it_is_recovered(tmp_pat
     (folder / "whole.mcap").unlink()
     (folder / "session.mcap.part").write_bytes(data[: len(data) // 2])
     (listed,) = list_sessions(tmp_path)
-    assert not listed["sealed"]
+    assert not listed.sealed
     recover_recording(folder)
     (listed,) = list_sessions(tmp_path)
-    assert listed["sealed"]
-    assert listed["recording"] == str(folder / "session.mcap")
+    assert listed.sealed
+    assert listed.recording == str(folder / "session.mcap")
 
 
 def test_27_a_damaged_state_file_hides_no_recording(tmp_path: Path) -> None:
@@ -67,7 +67,7 @@ def test_27_a_damaged_state_file_hides_no_recording(tmp_path: Path) -> None:
     write_small(folder / "session.mcap")
     (folder / "session.json").write_bytes(b'{"name": "\xff"}')
     (listed,) = list_sessions(tmp_path)
-    assert listed["sealed"]
+    assert listed.sealed
 
 
 @pytest.mark.process

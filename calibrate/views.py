@@ -25,7 +25,7 @@ class BoardView:
     board_points: Array
     """(k, 3) detected corners in `board`, metres (z = 0)."""
     pixels: Array
-    """(k, 2) the same corners in the picture."""
+    """(k, 2) the same corners in the image."""
     joints_rad: Array | None = None
     """(6,) or None where no joints were recorded."""
     camera_from_board: Array | None = None

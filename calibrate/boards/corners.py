@@ -1,4 +1,4 @@
-"""Grids of corners in a picture: spacing, regularity, handedness, and sub-pixel refinement."""
+"""Grids of corners in an image: spacing, regularity, handedness, and sub-pixel refinement."""
 
 from __future__ import annotations
 
@@ -31,14 +31,14 @@ def to_grey(image: NDArray[Any]) -> Grey:
         bits = next(b for b in (8, 10, 12, 16) if int(image.max(initial=0)) < 1 << b)
         image = (image >> (bits - 8)).astype(np.uint8)
     if image.dtype != np.uint8:
-        raise ValueError(f"a picture of {image.dtype} is not supported; 8 or 16 bits are")
+        raise ValueError(f"an image of {image.dtype} is not supported; 8 or 16 bits are")
     if image.ndim == 3:
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGR2GRAY))
     return np.ascontiguousarray(image)
 
 
 def equalise(grey: Grey) -> Grey:
-    """Spread contrast over the whole picture; for finding, not for measuring."""
+    """Spread contrast over the whole image; for finding, not for measuring."""
     return np.asarray(cv2.createCLAHE(clipLimit=4.0, tileGridSize=(8, 8)).apply(grey))
 
 
@@ -152,7 +152,7 @@ def square_contrast(means: Array, mean_grey: float) -> float:
     """Compare squares at odd and even places: brightness difference over the spread; > 0: first is dark.
 
     means: those of `square_means`. Value in about -1 … 1; near 0 the colours decide nothing. A single
-    square is compared with the picture's `mean_grey`.
+    square is compared with the image's `mean_grey`.
     """
     odd = np.indices(means.shape).sum(axis=0) % 2 == 1
     if odd.all() or not odd.any():

@@ -1,4 +1,4 @@
-"""One picture in, the board's points out; says why when there are none."""
+"""One image in, the board's points out; says why when there are none."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Cause = Literal[
 
 @dataclass(frozen=True, eq=False)
 class Detection:
-    """The board as one picture shows it."""
+    """The board as one image shows it."""
 
     cause: Cause
     """Cause for a program; empty when the board was found."""
@@ -51,12 +51,12 @@ class Detection:
     width: int
     height: int
     sharpness: float
-    """Mean squared Laplacian over the variance of the grey values, on the board (whole picture if none); NaN
+    """Mean squared Laplacian over the variance of the grey values, on the board (whole image if none); NaN
     when not asked for."""
     saturated: float
     """Share of pixels at the upper end of the scale there, 0 … 1; NaN when not asked for."""
     coverage: float
-    """Share of the picture inside the outline of the points, 0 … 1."""
+    """Share of the image inside the outline of the points, 0 … 1."""
 
     @property
     def found(self) -> bool:
@@ -74,7 +74,7 @@ def detect(
 
     image: (h, w) uint8 or uint16, or (h, w, 3) BGR. `thorough=False` leaves out the slow attempts and the
     search for the reason (previews), `with_quality=False` the sharpness and the saturation. Raises BoardError
-    for an impossible board; a picture without a board is an answer, not an error.
+    for an impossible board; an image without a board is an answer, not an error.
     """
     check_board(spec)
     grey = to_grey(image)

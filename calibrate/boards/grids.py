@@ -1,7 +1,7 @@
 """Boards without markers: chessboard corners by several detectors, and circle grids.
 
-A tilted circle's picture is an ellipse whose centre is not the picture of the circle's centre. How far apart
-the two are follows from the board's plane and the circles' radius, which is measured in the picture.
+A tilted circle's image is an ellipse whose centre is not the image of the circle's centre. How far apart
+the two are follows from the board's plane and the circles' radius, which is measured in the image.
 J. Heikkilä, "Geometric camera calibration using circular control points" (2000).
 """
 
@@ -38,7 +38,7 @@ def find_chessboard(grey: Grey, spec: BoardSpec, thorough: bool = True) -> Array
     """Find all inner corners in board order, (rows·columns, 2) pixels, or None.
 
     The colours of the squares decide the orientation where they can; otherwise the order is one of the turns
-    after which the board looks the same. `thorough=False` makes one quick attempt on a smaller picture.
+    after which the board looks the same. `thorough=False` makes one quick attempt on a smaller image.
     """
     for found in _attempts(grey, (spec.columns, spec.rows), thorough):
         if found is None:
@@ -92,7 +92,7 @@ def _orient(grey: Grey, grid: Array, spec: BoardSpec) -> Array:
     turns = (0, 1, 2, 3) if spec.columns == spec.rows else (0, 2)
     if len(looks_same_turns(spec)) == len(turns):
         return grid
-    # Among the turns that the colours allow, the first corner nearest the picture's top left.
+    # Among the turns that the colours allow, the first corner nearest the image's top left.
     means, grey_level = square_means(grey, grid), float(cv2.mean(grey)[0])
     dark_first = [t for t in turns if square_contrast(np.rot90(means, t), grey_level) > 0] or turns
     return min((np.rot90(grid, t) for t in dark_first), key=lambda c: float(c[0, 0].sum()))
@@ -133,10 +133,10 @@ def find_circles(grey: Grey, spec: BoardSpec) -> Array | None:
         else cv2.CALIB_CB_SYMMETRIC_GRID
     )
     largest = grey.size / (spec.columns * spec.rows)
-    for picture in (grey, cv2.bitwise_not(grey)):
+    for image in (grey, cv2.bitwise_not(grey)):
         for clustering in (0, cv2.CALIB_CB_CLUSTERING):
             found, centres = cv2.findCirclesGrid(
-                picture,
+                image,
                 (spec.columns, spec.rows),
                 flags=kind | clustering,
                 blobDetector=_blobs(largest),

@@ -17,9 +17,9 @@ from recordings.schema.messages import BoardSpec
 _FEW_MARKERS = 0.7
 """Share of the markers of the board."""
 _SMALL_MARKER_PX, _ENLARGED, _LARGEST_SIDE_PX = 20.0, 3.0, 6000
-"""Markers with shorter sides are read in an enlarged picture, unless that would be larger than this."""
+"""Markers with shorter sides are read in an enlarged image, unless that would be larger than this."""
 _SMALLEST_PERIMETER = 0.03
-"""Perimeter of a marker over the longer side of the picture; OpenCV's own."""
+"""Perimeter of a marker over the longer side of the image; OpenCV's own."""
 _NEAR_SHARE, _FAR_MOVES = 0.025, 4.0
 """A corner ran away where the refinement moves it farther from the prediction than this share of the spacing
 and than so many times the middle one."""
@@ -39,7 +39,7 @@ def charuco_board(spec: BoardSpec) -> Any:
 def find_charuco(grey: Grey, spec: BoardSpec, thorough: bool = True) -> tuple[Indices, Array]:
     """Find point indices (k,) and pixels (k, 2) of chessboard corners.
 
-    `thorough`: where few markers are seen, the dark parts of the picture are brightened; where those are
+    `thorough`: where few markers are seen, the dark parts of the image are brightened; where those are
     small or none, it is enlarged.
     """
     board = charuco_board(spec)
@@ -62,7 +62,7 @@ def find_charuco(grey: Grey, spec: BoardSpec, thorough: bool = True) -> tuple[In
 def _markers(
     grey: Grey, spec: BoardSpec, plane_of: dict[int, Any], smallest: float = _SMALLEST_PERIMETER
 ) -> list[tuple[Any, Any]]:
-    """Corners on the board and in the picture of every marker of the board that is seen."""
+    """Corners on the board and in the image of every marker of the board that is seen."""
     markers, ids, _ = marker_detector(spec.dictionary or "", 1, smallest).detectMarkers(grey)
     found = [] if ids is None else ids.ravel().tolist()
     return [(plane_of[i], marker) for i, marker in zip(found, markers, strict=False) if i in plane_of]
@@ -128,7 +128,7 @@ def _snap_to_corners(
 def is_saddle(grey: Grey, corners: Array, across: Array, down: Array) -> NDArray[np.bool_]:
     """Tell chessboard corners: round them bright and dark alternate twice, opposite sides alike.
 
-    corners, across, down: (n, 2); the ring is a circle on the board, and these its half axes in the picture.
+    corners, across, down: (n, 2); the ring is a circle on the board, and these its half axes in the image.
     """
     angles = np.arange(16) * (2 * np.pi / 16)
     circle = np.cos(angles)[:, None] * across[:, None] + np.sin(angles)[:, None] * down[:, None]
@@ -200,15 +200,13 @@ _BENT_PX = 60.0
 def find_tag(grey: Grey, spec: BoardSpec, thorough: bool = True) -> tuple[Indices, Array]:
     """Find point indices (4,) and pixels (4, 2) of the tag's corners, or none of either.
 
-    `thorough`: where it is not seen, the dark parts of the picture are brightened.
+    `thorough`: where it is not seen, the dark parts of the image are brightened.
     """
     quick, other = (marker_detector(tag_dictionary(spec), 1), _quad_detector(tag_dictionary(spec)))
     attempts = [(quick, grey), (other, grey)]
     if thorough:
         attempts.append((other, equalise(grey)))
-    corners = next(
-        (seen for each, picture in attempts if (seen := _seen(each, picture, spec)) is not None), None
-    )
+    corners = next((seen for each, image in attempts if (seen := _seen(each, image, spec)) is not None), None)
     if corners is None:
         return NOTHING
     return np.arange(4), fit_sides(grey, corners)[_ROW_BY_ROW]

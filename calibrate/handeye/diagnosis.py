@@ -20,7 +20,7 @@ _LOOSER = 0.01
 
 
 def judge_lens(fit: CellFit, distance_m: float) -> Finding:
-    """Judge a given lens by its pictures and the robot's motion."""
+    """Judge a given lens by its images and the robot's motion."""
     state, prior = fit.estimate.state, fit.priors.lens
     places = np.arange(Layout.of(state).lens.start, Layout.of(state).lens.stop)
     return _judge(fit, places, intrinsics_vector(state.camera) - prior.mean, prior.sigma, distance_m)

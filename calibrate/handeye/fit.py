@@ -123,13 +123,13 @@ def fit_moved(views: ViewSet, priors: Priors, poses: PoseViews, at: int, moved: 
 
 
 def require_plausible_noise(found: Estimate) -> None:
-    """Raise PosesDisagreeError where robot and pictures have nothing to do with each other."""
+    """Raise PosesDisagreeError where robot and images have nothing to do with each other."""
     robot_m, robot_rad = found.scales.robot
     if found.used.sum() < FEWEST_USED:
-        raise PosesDisagreeError("Robot poses and pictures disagree in nearly every view.")
+        raise PosesDisagreeError("Robot poses and images disagree in nearly every view.")
     if robot_m > MAX_ROBOT_M or robot_rad > MAX_ROBOT_RAD:
         raise PosesDisagreeError(
-            f"Robot poses and pictures disagree by {robot_m * 1e3:.0f} mm, "
+            f"Robot poses and images disagree by {robot_m * 1e3:.0f} mm, "
             f"{np.degrees(robot_rad):.1f}° per axis."
         )
 

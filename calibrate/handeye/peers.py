@@ -30,13 +30,13 @@ from calibrate.handeye.estimate import estimate
 from calibrate.handeye.linear import Scales
 from calibrate.handeye.metrics import (
     HeldOut,
-    board_places,
     board_spread,
     distance_in_sigmas,
     held_out_pairs,
     held_out_views,
     mean_pose,
     motion_errors,
+    placed_boards,
 )
 from calibrate.handeye.observations import SHAPE, State, observe_views
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
@@ -127,7 +127,7 @@ def _reprojection_only(views: ViewSet) -> Array:
     priors = Priors(lens, BoardTolerance(_EXACT, _EXACT))
     shares = np.array([1.0, *[1e-12] * 3])
     scales = Scales(np.array([_EXACT, _EXACT]), 1.0, 1.0, 1.0, shares)
-    Y = mean_pose(board_places(H, C, X))
+    Y = mean_pose(placed_boards(H, C, X))
     start = State(X, Y, C, views.camera, np.zeros(len(SHAPE)), np.zeros(0))
     return estimate(observed, start, priors, scales, fit_scales=False).state.X
 
@@ -197,7 +197,7 @@ def reprojection_px(views: ViewSet, X: Array) -> float | None:
         return None
     H, C = mount_poses(views.base_from_flange, views.mount), views.camera_from_board
     camera_from_place = inverse(H @ X)
-    Y = mean_pose(board_places(H, C, X))
+    Y = mean_pose(placed_boards(H, C, X))
     best = np.inf
     for _ in range(_STEPS):
         C = camera_from_place @ Y

@@ -162,7 +162,7 @@ _SETTLED = 0.3
 
 @dataclass(frozen=True, eq=False)
 class PoseViews:
-    """The recording with each picture reduced to a board pose."""
+    """The recording with each image reduced to a board pose."""
 
     mount: Mount
     flange: Array

@@ -1,4 +1,4 @@
-"""Priors on lens, board and arm: knowledge from before the pictures are looked at."""
+"""Priors on lens, board and arm: knowledge from before the images are looked at."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ class LensPrior:
 
     @classmethod
     def unknown(cls, camera: CameraModel) -> LensPrior:
-        """Describe a lens of which only the model is known: it is found from the same pictures."""
+        """Describe a lens of which only the model is known: it is found from the same images."""
         start = intrinsics_vector(camera)
         names = intrinsics_names(camera)
         mean = np.zeros(len(names))

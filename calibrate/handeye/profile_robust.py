@@ -52,7 +52,7 @@ _ENOUGH = 0.9
 _NOISY_M, _NOISY_RAD = 0.002, float(np.radians(0.3))
 """Noise of the robot that is more than an arm's."""
 _FREE_FOCAL = 0.02
-"""1σ of the focal length of a lens that was found from the same pictures, relative, for other readings."""
+"""1σ of the focal length of a lens that was found from the same images, relative, for other readings."""
 
 
 def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
@@ -80,8 +80,8 @@ def solve_robust_profile(views: ViewSet, options: SolveOptions) -> Solution:
         session, after_move = ask()
         fit = after_move or fit
     if fit is None:
-        text = f"{disagree} {explain_text(session, views)}"
-        raise PosesDisagreeError(text, session.reading.value) from None
+        remedy = explain_text(session, views)
+        raise PosesDisagreeError(str(disagree), session.reading.value, remedy=remedy) from None
     solution = _describe(fit, options, watch)
     if session.reading is Reading.AS_RECORDED and _doubtful(solution):
         session, after_move = ask()
@@ -162,7 +162,7 @@ def _describe(fit: CellFit, options: SolveOptions, watch: Stopwatch) -> Solution
         kept=tuple(replace(views.views[i], camera_from_board=C[i]) for i in used),
         turned=tuple(indices[i] for i in fit.turned),
         weights={index: float(w) for index, w in zip(indices, weight, strict=True)},
-        in_doubt={indices[i]: float(1 - found.chances[i, 0]) for i in used if found.chances[i, 0] <= FULL},
+        suspects={indices[i]: float(1 - found.chances[i, 0]) for i in used if found.chances[i, 0] <= FULL},
         cross_validation=folds,
         lens_finding=lens_finding,
         lens_covariance=found.covariance[at.lens, at.lens] if seen else None,
@@ -238,7 +238,7 @@ def _holdout(fit: CellFit) -> HoldoutScore | None:
 
 def _remarks(fit: CellFit, solution: Solution, session: Explanation) -> tuple[Remark, ...]:
     found, arm = fit.estimate, solution.arm
-    suspects = ", ".join(f"{index + 1} (P(outlier) {p:.2f})" for index, p in solution.in_doubt.items())
+    suspects = ", ".join(f"{index + 1} (P(outlier) {p:.2f})" for index, p in solution.suspects.items())
     systematic = (
         f"Robot residuals follow the posture: {arm.size_mm if arm else 0.0:.2f} mm or mrad in the arm's "
         "kinematic table, or a bracket that bends. Have the arm calibrated, and stiffen the bracket."

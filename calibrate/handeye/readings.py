@@ -1,6 +1,6 @@
 """Other readings of a whole recording: what explains all views at once, before any single one is blamed.
 
-Poses in another convention, pictures that belong to their neighbours' poses, squares of another size,
+Poses in another convention, images that belong to their neighbours' poses, squares of another size,
 something moved half-way: each is a reading of the same views, fitted like the recording as it stands
 (`poses`) and compared with it by evidence.
 """
@@ -30,7 +30,7 @@ from calibrate.views import ViewSet
 _CLEAR = 10.0
 """Log evidence beyond chance by which another reading has to win."""
 _MOST_VIEWS = 60
-"""Most views that are read, evenly spread (neighbours for shifted pictures)."""
+"""Most views that are read, evenly spread (neighbours for shifted images)."""
 _LARGEST_SHIFT = 3
 _FEWEST_PER_PART = 4
 _LOST_VIEW = 15.0
@@ -72,7 +72,7 @@ class Explanation:
     log_evidence_gain: float
     """Over the recording as it stands."""
     at: int = 0
-    """Place of the first view after a change; pictures by which they are shifted."""
+    """Place of the first view after a change; images by which they are shifted."""
     factor: float = 1.0
     """True over configured size of the squares, or focal length, of the later part where it changed."""
     share: float = 1.0
@@ -174,17 +174,17 @@ def _refocused(boards: BoardPoses, later: NDArray[np.bool_]) -> BoardPoses:
 
 
 def _mirrored(boards: BoardPoses) -> BoardPoses:
-    """Board poses of mirrored pictures: x of the camera and of the board change their sign."""
+    """Board poses of mirrored images: x of the camera and of the board change their sign."""
     mirror = np.diag([-1.0, 1.0, 1.0, 1.0])
     motion = boards.motion * [-1.0, 1.0, 1.0, 1.0, -1.0, -1.0]
     return replace(boards, C=mirror @ boards.C @ mirror, motion=motion)
 
 
 def _shifted(views: PoseViews, shift: int) -> PoseViews:
-    """Picture i with pose i + shift."""
+    """Image i with pose i + shift."""
     n = len(views)
-    pictures = np.arange(max(0, -shift), n - max(0, shift))
-    return replace(views.part(pictures), flange=views.flange[pictures + shift])
+    images = np.arange(max(0, -shift), n - max(0, shift))
+    return replace(views.part(images), flange=views.flange[images + shift])
 
 
 def _rotations(change: Callable[[Array], Array]) -> Callable[[Array], Array]:

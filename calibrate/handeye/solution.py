@@ -40,7 +40,7 @@ class SolveOptions:
     profile: Profile = "robust"
     seed: int = 0
     intrinsics_from_same_pictures: bool = False
-    """The camera model was fitted to these very pictures: nothing is known of the lens beforehand."""
+    """The camera model was fitted to these very images: nothing is known of the lens beforehand."""
     lens_sigma: tuple[float, ...] | None = None
     """1σ of a given lens in the order of `projection.intrinsics_names`; None: the usual 0.2 %."""
     board: BoardTolerance = field(default_factory=BoardTolerance)
@@ -155,7 +155,7 @@ class Solution:
     """Views whose corner order was turned by 180° to agree with the others, and kept."""
     weights: dict[int, float] = field(default_factory=dict)
     """Pose number → what the view counts for, 1 fully … 0."""
-    in_doubt: dict[int, float] = field(default_factory=dict)
+    suspects: dict[int, float] = field(default_factory=dict)
     """Used views that count in part, by pose number: the chance that they are wrong."""
     session: Explanation = field(default_factory=lambda: Explanation(Reading.AS_RECORDED, 0.0))
     """Reading of the recording as a whole."""

@@ -15,11 +15,11 @@ from calibrate.handeye.axxb.pairs import consecutive_pairs, mount_poses
 from calibrate.handeye.axxb.paper import solve_paper
 from calibrate.handeye.metrics import (
     HELD_OUT,
-    board_places,
     board_spread,
     mean_pose,
     median_distance_m,
     observe,
+    placed_boards,
     point_error_m,
     require_motion,
     score_holdout,
@@ -148,7 +148,7 @@ def solve_paper_profile(views: ViewSet, options: SolveOptions) -> Solution:
         parent_from_child=Transform(*camera_frames(views.mount), X),
         covariance=covariance,
         confidence_threshold=float(6 * stats.f.ppf(0.95, 6, max(6 * len(fit) - 6, 1))),
-        board_place=Transform(*board_frames(views.mount), mean_pose(board_places(H, C, X))),
+        board_place=Transform(*board_frames(views.mount), mean_pose(placed_boards(H, C, X))),
         camera=views.camera,
         rms_px=None,
         used=tuple(indices),

@@ -38,7 +38,7 @@ class Intrinsics:
     view_rms_px: dict[int, float]
     """Pose number → rms over its corners."""
     sigma: dict[str, float]
-    """1σ of each parameter by the pictures alone: fx fy cx cy in pixels, the others plain."""
+    """1σ of each parameter by the images alone: fx fy cx cy in pixels, the others plain."""
     dropped: dict[int, str] = field(default_factory=dict)
     """Pose number → why its corners were left out of the fit."""
 
@@ -98,7 +98,7 @@ def calibrate_intrinsics(views: ViewSet, model: LensModel = "plumb_bob") -> Intr
 def _fit(views: ViewSet, model: LensModel) -> LensFit:
     if model == "equidistant":
         return fit_lens(views, _first_fisheye(views))
-    fit = fit_lens(views, first_guess(views))
+    fit = fit_lens(views, initial_camera(views))
     if model == "plumb_bob":
         return fit
     start = msgspec.structs.replace(
@@ -108,7 +108,7 @@ def _fit(views: ViewSet, model: LensModel) -> LensFit:
 
 
 def _first_fisheye(views: ViewSet) -> CameraModel:
-    """Start from OpenCV, which copes with boards at the edge of a wide picture."""
+    """Start from OpenCV, which copes with boards at the edge of a wide image."""
     object_points = [v.board_points.reshape(-1, 1, 3) for v in views]
     pixels = [v.pixels.reshape(-1, 1, 2) for v in views]
     flags = cv2.fisheye.CALIB_RECOMPUTE_EXTRINSIC | cv2.fisheye.CALIB_FIX_SKEW
@@ -175,8 +175,8 @@ def fit_lens(views: ViewSet, start: CameraModel) -> LensFit:
     return _judged(observed, blocks, prior, camera, C)
 
 
-def first_guess(views: ViewSet) -> CameraModel:
-    """Guess the focal length from the boards' shapes in the pictures; centre in the middle, no distortion."""
+def initial_camera(views: ViewSet) -> CameraModel:
+    """Guess the focal length from the boards' shapes in the images; centre in the middle, no distortion."""
     size = (views.camera.width, views.camera.height)
     points = [view.board_points.astype(np.float32) for view in views]
     pixels = [view.pixels.astype(np.float32) for view in views]

@@ -1,4 +1,4 @@
-"""Pictures of a board, and pixels with the lens taken out."""
+"""Images of a board, and pixels with the lens taken out."""
 
 from __future__ import annotations
 

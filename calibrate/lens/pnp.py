@@ -32,7 +32,7 @@ _DAMPING, _LARGEST_DAMPING = 1e-6, 1e6
 
 @dataclass(frozen=True, eq=False)
 class Candidate:
-    """One reading of a picture."""
+    """One reading of an image."""
 
     camera_from_board: Array
     turn: int
@@ -42,7 +42,7 @@ class Candidate:
 def solve_pnp(views: ViewSet, board: BoardSpec | None = None) -> ViewSet:
     """Add `camera_from_board` to the views, points relabelled where a turned reading fits better.
 
-    Two things are ambiguous in one picture: which way round a symmetric board lies (only when `board` is
+    Two things are ambiguous in one image: which way round a symmetric board lies (only when `board` is
     given) and, for a small board far away, towards which side it is tilted. All views together decide, by
     their agreement with the robot's motion. Raises BadViewsError when a view has no pose at all.
     """
@@ -65,7 +65,7 @@ def solve_pnp(views: ViewSet, board: BoardSpec | None = None) -> ViewSet:
 
 
 def candidate_poses(view: BoardView, camera: CameraModel, board: BoardSpec | None) -> list[Candidate]:
-    """List poses that explain the picture equally well, best first, in every turn that looks the same."""
+    """List poses that explain the image equally well, best first, in every turn that looks the same."""
     return _candidates(ViewSet("eye-in-hand", (view,), camera), board)[0]
 
 
@@ -102,7 +102,7 @@ def _planar_poses(views: ViewSet) -> list[list[Array]]:
 
 
 def _credible_px(best_px: Array) -> Array:
-    """The largest rms of a pose that explains a picture as well as the best one does."""
+    """The largest rms of a pose that explains an image as well as the best one does."""
     return np.maximum(1.5 * best_px, best_px + 0.05)
 
 

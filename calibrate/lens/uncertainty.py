@@ -1,4 +1,4 @@
-"""Uncertainty of the lens over the picture: pixels by which a fixed direction may be shown wrongly.
+"""Uncertainty of the lens over the image: pixels by which a fixed direction may be shown wrongly.
 
 Lens and camera poses are one fit: a wrong principal point is mostly made good by turned cameras. What stays
 after the best turn is what counts, as in mrcal's projection uncertainty (D. Kogan, mrcal's documentation,
@@ -25,7 +25,7 @@ class LensUncertainty:
     covariance: Array
     """(p, p) of `projection.intrinsics_names`."""
     sigma_px: Array
-    """(rows, columns) over the picture, borders included: root of the mean squared shift, 1σ."""
+    """(rows, columns) over the image, borders included: root of the mean squared shift, 1σ."""
 
     @property
     def figures(self) -> dict[str, float]:
@@ -37,7 +37,7 @@ class LensUncertainty:
 
 
 def lens_uncertainty(camera: CameraModel, covariance: Array, seen: Array) -> LensUncertainty:
-    """Propagate the lens's covariance (p, p) to the picture; seen: (m, 2) all corners that were seen, px.
+    """Propagate the lens's covariance (p, p) to the image; seen: (m, 2) all corners that were seen, px.
 
     J being how a pixel moves by the lens, T how by a turn, Σ the covariance of the lens: σ² = trace(S Σ Sᵀ),
     S = J + T φ, and φ the turn by the lens that makes S least over the corners seen.

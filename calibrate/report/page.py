@@ -294,8 +294,8 @@ def _views(job: SolvedRecording) -> Iterator[str]:
         caption = f"pose {view.index + 1}{name}" + (f", {px:.2f} px" if px is not None else "")
         if view.index in rejected:
             caption += ", rejected"
-        elif view.index in job.solution.in_doubt:
-            caption += f", suspect: P(outlier) {job.solution.in_doubt[view.index]:.0%}"
+        elif view.index in job.solution.suspects:
+            caption += f", suspect: P(outlier) {job.solution.suspects[view.index]:.0%}"
         mark = "out" if view.index in rejected else "in"
         cells.append(f'<div class="{mark}">{html.figure(html.picture(jpeg, caption), caption)}</div>')
     yield html.paragraph(

@@ -100,7 +100,7 @@ def test_they_are_shown_in_the_terminal_and_in_the_report(solved_real: SolvedRec
 
 def test_a_picture_of_a_view_in_doubt_says_so_in_the_report(solved_real: SolvedRecording) -> None:
     index = solved_real.solution.used[3]
-    doubted = replace(solved_real, solution=replace(solved_real.solution, in_doubt={index: 0.37}))
+    doubted = replace(solved_real, solution=replace(solved_real.solution, suspects={index: 0.37}))
     said = "P(outlier) 37%"
     captions = [line for line in report_page(doubted).splitlines() if said in line]
     assert len(captions) == 1 and f"pose {index + 1}" in captions[0]

@@ -67,7 +67,7 @@ def test_the_stated_region_is_wider_for_fewer_views_with_and_without_the_arm(cou
     views = worn_cell(np.random.default_rng(2), 0.4).views.select(list(range(count)))
     solution = solve_views(views, options)
     assert (solution.arm is None) == (options is WITHOUT)
-    counted = sum(1 - solution.in_doubt.get(index, 0.0) for index in solution.used)
+    counted = sum(1 - solution.suspects.get(index, 0.0) for index in solution.used)
     expected = 6 * stats.f.ppf(0.95, 6, 3 * counted - 5)
     assert solution.confidence_threshold == pytest.approx(expected, rel=0.03)
     assert solution.confidence_threshold > 1.04 * stats.chi2.ppf(0.95, 6)

@@ -37,7 +37,7 @@ def test_no_good_view_of_a_clean_cell_is_rejected_or_doubted(mount):
         shape = tuple(np.random.default_rng(seed).normal(size=5) * [0.003, 0.003, 5e-4, 5e-4, 5e-4])
         views = real_cell(np.random.default_rng(seed), 15, noise, mount=mount, shape=shape).views
         solution = solve_views(views, QUICK)
-        assert (solution.rejected, solution.in_doubt, len(solution.used)) == ((), {}, 15)
+        assert (solution.rejected, solution.suspects, len(solution.used)) == ((), {}, 15)
         assert np.mean(list(solution.weights.values())) > 0.8
 
 
@@ -102,9 +102,9 @@ def test_the_farther_off_a_view_the_less_it_counts_and_doubt_is_said():
     for size in np.arange(0.0, 14.0, 1.0):
         solution = solve_views(nudged(c.views, [7], size * SIGMA[None]), QUICK)
         weights.append(solution.weights[7])
-        rejected, doubted = 7 not in solution.used, 7 in solution.in_doubt
+        rejected, doubted = 7 not in solution.used, 7 in solution.suspects
         assert not (rejected and doubted)
-        assert ("suspect-views" in {remark.code for remark in solution.warnings}) == bool(solution.in_doubt)
+        assert ("suspect-views" in {remark.code for remark in solution.warnings}) == bool(solution.suspects)
         states.append("bad" if rejected else "in doubt" if doubted else "good")
     assert states[0] == "good" and "in doubt" in states
     assert weights[0] > 0.8 and weights[-1] < 0.2

@@ -66,12 +66,11 @@ def drawn_from_the_priors(seed, mount):
     return real_cell(rng, 20, MID, mount=mount, camera=true, stated=lens, shape=shape)
 
 
-@MOUNTS
-def test_the_stated_region_holds_the_truth_as_often_as_it_says(mount):
-    """30 cells a mounting, at 95 %: 24 or fewer inside has a chance of one in ten thousand."""
+def test_the_stated_region_holds_the_truth_as_often_as_it_says():
+    """30 cells at 95 %: 24 or fewer inside has a chance of one in ten thousand."""
     squares, held = [], 0
     for seed in range(30):
-        cell = drawn_from_the_priors(seed, mount)
+        cell = drawn_from_the_priors(seed, ("eye-in-hand", "eye-to-hand")[seed % 2])
         solution = solve_views(cell.views, QUICK)
         assert solution.rejected == ()
         squares.append(sigmas_of(solution, cell.X))
@@ -80,10 +79,10 @@ def test_the_stated_region_holds_the_truth_as_often_as_it_says(mount):
     assert 3.5 < np.mean(squares) < 9.5  # six for a true covariance
 
 
-@MOUNTS
-def test_the_region_holds_the_truth_with_a_lens_of_the_same_pictures(mount):
+def test_the_region_holds_the_truth_with_a_lens_of_the_same_pictures():
     held = 0
     for seed in range(20):
+        mount = ("eye-in-hand", "eye-to-hand")[seed % 2]
         cell = make_cell(np.random.default_rng(seed), 20, MID, mount=mount, refit_camera=True)
         held += inside(solve_views(cell.views, SAME), cell.X)
     assert held >= 16
@@ -200,11 +199,3 @@ def test_every_seed_ends_in_the_same_camera():
     found = [solve_views(views, replace(QUICK, seed=seed)) for seed in range(4)]
     for solution in found[1:]:
         np.testing.assert_allclose(solution.matrix, found[0].matrix, atol=1e-6)
-
-
-def test_the_same_input_gives_the_same_bits():
-    views = make_cell(np.random.default_rng(6), 12, MID).views
-    first, second = (solve_views(views, SolveOptions()) for _ in range(2))
-    for name in ("matrix", "covariance", "lens_covariance"):
-        assert getattr(first, name).tobytes() == getattr(second, name).tobytes()
-    assert first.weights == second.weights

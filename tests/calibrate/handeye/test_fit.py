@@ -5,11 +5,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from calibrate.geometry import inverse, perturb
+from calibrate.geometry import inverse, perturb, pose, rotation_exp, transform_points
 from calibrate.handeye.readings import Reading
 from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.quality.gates import GateInputs, judge
-from tests.calibrate.cells import MID, error_mm_deg, inside, make_cell, with_flange
+from tests.calibrate.cells import MID, changed, error_mm_deg, inside, make_cell, with_flange
 
 OPTIONS = SolveOptions(holdout=True, folds=True)
 SLIP = np.array([0.02, -0.015, 0.01, 0.02, 0.03, -0.02])
@@ -97,3 +97,26 @@ def test_a_camera_that_moved_near_the_end_never_passes(at):
     views, X, _ = moved_cell(1, "eye-in-hand", "camera", at)
     solution = solve_views(views, OPTIONS)
     assert inside(solution, X) or [g.name for g in judge(solution, GateInputs()) if not g.passed]
+
+
+QUICK = SolveOptions(holdout=False, folds=False)
+
+
+def half_turn(view):
+    return pose(rotation_exp([0, 0, np.pi]), [*view.board_points[:, :2].max(axis=0), 0.0])
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_half_turned_boards_are_set_right_and_used(mount):
+    cell = make_cell(np.random.default_rng(0), 20, MID, mount=mount)
+    views = changed(
+        cell.views,
+        [2, 9, 15],
+        board_points=lambda v: transform_points(half_turn(v), v.board_points),
+        camera_from_board=lambda v: v.camera_from_board @ half_turn(v),
+    )
+    solution, straight = solve_views(views, QUICK), solve_views(cell.views, QUICK)
+    assert (solution.turned, straight.turned) == ((2, 9, 15), ())
+    assert solution.rejected == () and min(solution.weights.values()) > 0.3
+    np.testing.assert_allclose(solution.matrix, straight.matrix, atol=1e-6)
+    np.testing.assert_allclose(solution.covariance, straight.covariance, rtol=1e-3, atol=1e-15)

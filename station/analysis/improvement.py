@@ -20,7 +20,6 @@ from calibrate.geometry import (
     difference,
     inverse,
     perturb,
-    pose_from_quaternion,
 )
 from calibrate.handeye.information import MeasurementNoise
 from calibrate.projection import project
@@ -29,7 +28,15 @@ from station.cell.config import PoseGuess, StationConfig
 from station.cell.errors import LimitError, RefusedError
 from station.cell.limits import check_plan
 from station.cell.plan import Plan
-from station.cell.scene import Scene, cell_geometry, flange_poses, geometry_from, guess_from, scene_of
+from station.cell.scene import (
+    Scene,
+    cell_geometry,
+    flange_poses,
+    geometry_from,
+    guess_from,
+    guess_matrix,
+    scene_of,
+)
 from station.plan.choose import informations, objective_for, sigma_of
 from station.plan.planner import PlanOptions, plan_scene
 from station.plan.visibility import outline, visible
@@ -127,7 +134,7 @@ def better_guesses(config: StationConfig, lens_is_known: bool, seen: Sequence[Ca
 
 
 def _require_agreement(guess: PoseGuess, X: Array) -> None:
-    off = difference(X, pose_from_quaternion(guess.translation_m, guess.rotation_xyzw))
+    off = difference(X, guess_matrix(guess))
     sigmas = np.repeat([guess.sigma_m, guess.sigma_rad], 3)
     if (np.abs(off) <= _CONTRADICTION * sigmas).all():
         return

@@ -7,6 +7,7 @@ margin of zero means "touching after the wanted clearance was taken off".
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal, NamedTuple
 
 import numpy as np
 
@@ -64,25 +65,10 @@ def body_segments(geometry: CellGeometry, joints_rad: Array) -> tuple[Array, Arr
     frames = link_frames(model, joints_rad)
     o, z = frames[:, :, :3, 3], frames[:, :, :3, 2]
     upper, fore = _SIDEWAYS_M.get(model.name, (1.2 * model.d_m[3], 0.2 * model.d_m[3]))
-    fore_end = o[:, 3] + fore * z[:, 2]
-    starts = [
-        o[:, 0],
-        o[:, 1],
-        o[:, 1] + upper * z[:, 1],
-        o[:, 2] + fore * z[:, 2],
-        fore_end,
-        o[:, 4],
-        o[:, 5],
-    ]
-    ends = [
-        o[:, 1],
-        o[:, 1] + upper * z[:, 1],
-        o[:, 2] + upper * z[:, 2],
-        fore_end,
-        o[:, 4],
-        o[:, 5],
-        o[:, 6],
-    ]
+    upper_start, upper_end = o[:, 1] + upper * z[:, 1], o[:, 2] + upper * z[:, 2]
+    fore_start, fore_end = o[:, 2] + fore * z[:, 2], o[:, 3] + fore * z[:, 2]
+    starts = [o[:, 0], o[:, 1], upper_start, fore_start, fore_end, o[:, 4], o[:, 5]]
+    ends = [o[:, 1], upper_start, upper_end, fore_end, o[:, 4], o[:, 5], o[:, 6]]
     radii = list(np.asarray(model.link_radius_m)[[0, 0, 1, 2, 3, 4, 5]])
     for solid in geometry.solids:
         points = transform_points(frames[:, 6], np.array([solid.from_m, solid.to_m]))
@@ -100,10 +86,6 @@ def gap_to_arm(geometry: CellGeometry, joints_rad: Array, starts: Array, ends: A
     return np.asarray((gap - radii[bodies]).min(axis=1))
 
 
-_JOINTS_BEHIND = (0, 1, 2, 3, 4, 5, 6)
-"""How many joints move each of ARM_BODIES; solids on the flange move with all six."""
-
-
 def surface_speeds(geometry: CellGeometry, joints_rad: Array, joint_speeds_rad_s: Array) -> Array:
     """(n, 6) and (n, 6) or (6,) → (n, k) m/s: the fastest point of every body's surface at both of its ends.
 
@@ -116,7 +98,7 @@ def surface_speeds(geometry: CellGeometry, joints_rad: Array, joint_speeds_rad_s
     none = np.zeros_like(turns[:, :1])
     turning = np.concatenate([none, np.cumsum(turns, axis=1)], axis=1)
     carried = np.concatenate([none, np.cumsum(np.cross(turns, frames[:, :6, :3, 3]), axis=1)], axis=1)
-    behind = list(_JOINTS_BEHIND) + [6] * len(geometry.solids)
+    behind = [*range(7), *[6] * len(geometry.solids)]  # joints that move each body
     points, by, radius = [starts, ends], behind * 2, [radii, radii]
     if geometry.watched_m:
         points.append(transform_points(frames[:, 6], np.array(geometry.watched_m)))
@@ -166,77 +148,55 @@ def segment_distance(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
     return np.asarray(np.sqrt(np.einsum("...i,...i->...", gap, gap)))
 
 
-def margins(geometry: CellGeometry, joints_rad: Array) -> tuple[Array, tuple[str, ...]]:
-    """Joints (n, 6) → margins (n, m) in metres, negative = violated, and the m names of what they are."""
+class Contact(NamedTuple):
+    """Two things that must keep apart, or a point and a side of the workspace."""
+
+    body: str
+    other: str
+    kind: Literal["self", "obstacle", "plane", "workspace"]
+
+    def __str__(self) -> str:
+        if self.kind == "workspace":
+            return f"{self.body} outside the workspace box, {self.other}"
+        return f"{self.body} against {'the ' if self.kind == 'obstacle' else ''}{self.other}"
+
+
+def margins(geometry: CellGeometry, joints_rad: Array) -> tuple[Array, tuple[Contact, ...]]:
+    """Joints (n, 6) → margins (n, m) in metres, negative = violated, and the m contacts they belong to."""
     joints_rad = np.asarray(joints_rad, dtype=float).reshape(-1, 6)
     starts, ends, radii = body_segments(geometry, joints_rad)
-    columns: list[Array] = []
-    names: list[str] = []
-    for gap, labels in (
-        _self_margins(geometry, starts, ends, radii),
-        _obstacle_margins(geometry, starts, ends, radii),
-        _plane_margins(geometry, starts, ends, radii),
-        _workspace_margins(geometry, joints_rad),
-    ):
-        if labels:
-            columns.append(gap)
-            names += labels
-    return np.concatenate(columns, axis=1), tuple(names)
-
-
-def _self_margins(
-    geometry: CellGeometry, starts: Array, ends: Array, radii: Array
-) -> tuple[Array, list[str]]:
-    solids = range(len(ARM_BODIES), len(geometry.body_names))
+    limits, names, movers = geometry.limits, geometry.body_names, slice(2, None)
+    solids = range(len(ARM_BODIES), len(names))
     pairs = [*_SELF_PAIRS, *((body, solid) for solid in solids for body in _SELF_BODIES_FOR_TOOL)]
     first, second = (list(side) for side in zip(*pairs, strict=True))
     gap = segment_distance(starts[:, first], ends[:, first], starts[:, second], ends[:, second])
-    labels = [f"{geometry.body_names[a]} against {geometry.body_names[b]}" for a, b in pairs]
-    return gap - radii[first] - radii[second], labels
-
-
-def _obstacle_margins(
-    geometry: CellGeometry, starts: Array, ends: Array, radii: Array
-) -> tuple[Array, list[str]]:
-    if not geometry.obstacles:
-        return np.zeros((len(starts), 0)), []
-    o0 = np.array([o.from_m for o in geometry.obstacles])
-    o1 = np.array([o.to_m for o in geometry.obstacles])
-    thickness = np.array([o.radius_m for o in geometry.obstacles])
-    movers = slice(2, None)
-    gap = segment_distance(starts[:, movers, None], ends[:, movers, None], o0, o1) - thickness
-    gap = gap.min(axis=2) - radii[movers] - geometry.obstacle_clearance_m
-    name = geometry.obstacles[0].name
-    return gap, [f"{body} against the {name}" for body in geometry.body_names[movers]]
-
-
-def _plane_margins(
-    geometry: CellGeometry, starts: Array, ends: Array, radii: Array
-) -> tuple[Array, list[str]]:
-    columns, labels = [], []
-    movers = slice(2, None)
-    for plane in geometry.limits.planes:
+    columns = [gap - radii[first] - radii[second]]
+    contacts = [Contact(names[a], names[b], "self") for a, b in pairs]
+    if geometry.obstacles:
+        o0 = np.array([o.from_m for o in geometry.obstacles])
+        o1 = np.array([o.to_m for o in geometry.obstacles])
+        thickness = np.array([o.radius_m for o in geometry.obstacles])
+        gap = segment_distance(starts[:, movers, None], ends[:, movers, None], o0, o1) - thickness
+        columns.append(gap.min(axis=2) - radii[movers] - geometry.obstacle_clearance_m)
+        contacts += [Contact(body, geometry.obstacles[0].name, "obstacle") for body in names[movers]]
+    for plane in limits.planes:
         normal = np.array(plane.normal) / np.linalg.norm(plane.normal)
         height = np.minimum((starts - plane.point_m) @ normal, (ends - plane.point_m) @ normal)
         # The upper arm's near end is the shoulder, which stands where it was bolted down.
         height[:, 2] = (ends[:, 2] - plane.point_m) @ normal
-        columns.append(height[:, movers] - radii[movers] - geometry.limits.clearance_m)
-        labels += [f"{body} against {plane.name}" for body in geometry.body_names[movers]]
-    return np.concatenate(columns, axis=1) if columns else np.zeros((len(starts), 0)), labels
-
-
-def _workspace_margins(geometry: CellGeometry, joints_rad: Array) -> tuple[Array, list[str]]:
-    low, high = geometry.limits.workspace_min_m, geometry.limits.workspace_max_m
-    if low is None and high is None:
-        return np.zeros((len(joints_rad), 0)), []
-    watched = np.array([(0.0, 0.0, 0.0), *geometry.watched_m])
-    points = transform_points(link_frames(geometry.model, joints_rad)[:, 6], watched)
-    columns, labels = [], []
-    for sign, bound, word in ((1.0, low, "below its minimum"), (-1.0, high, "above its maximum")):
-        if bound is not None:
-            columns.append((sign * (points - bound)).min(axis=1))
-            labels += [f"flange or camera outside the workspace box, {axis} {word}" for axis in "xyz"]
-    return np.concatenate(columns, axis=1), labels
+        columns.append(height[:, movers] - radii[movers] - limits.clearance_m)
+        contacts += [Contact(body, plane.name, "plane") for body in names[movers]]
+    if limits.workspace_min_m is not None or limits.workspace_max_m is not None:
+        watched = np.array([(0.0, 0.0, 0.0), *geometry.watched_m])
+        points = transform_points(link_frames(geometry.model, joints_rad)[:, 6], watched)
+        for sign, bound, side in (
+            (1.0, limits.workspace_min_m, "below its minimum"),
+            (-1.0, limits.workspace_max_m, "above its maximum"),
+        ):
+            if bound is not None:
+                columns.append((sign * (points - bound)).min(axis=1))
+                contacts += [Contact("flange or camera", f"{axis} {side}", "workspace") for axis in "xyz"]
+    return np.concatenate(columns, axis=1), tuple(contacts)
 
 
 def plate(name: str, frame: Array, low_m: Array, high_m: Array, rods: int = 5) -> tuple[Capsule, ...]:

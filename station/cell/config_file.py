@@ -46,8 +46,10 @@ def load_config(path: Path) -> tuple[StationConfig, bytes]:
         content = path.read_bytes()
     except OSError as error:
         raise ConfigError(
-            f"{path}: {error.strerror}. Write one with `station doctor --example > {path.name}`, or leave "
-            "it out: without a configuration the station runs a simulated cell."
+            f"{path}: {error.strerror}",
+            code="unreadable-config",
+            remedy=f"Write one with `station doctor --example > {path.name}`, or leave it out: without a "
+            "configuration the station runs a simulated cell.",
         ) from None
     try:
         config = strict_yaml.load(content, StationConfig)
@@ -61,7 +63,8 @@ def load_config(path: Path) -> tuple[StationConfig, bytes]:
 
 def _report(path: Path, problems: list[str]) -> ConfigError:
     count = f"{len(problems)} problem{'s' if len(problems) > 1 else ''}"
-    return ConfigError("\n".join([f"{path}: {count}. Nothing was started.", *(f"  {p}" for p in problems)]))
+    text = "\n".join([f"{path}: {count}. Nothing was started.", *(f"  {p}" for p in problems)])
+    return ConfigError(text, code="invalid-config", problems=len(problems))
 
 
 def _meaning_problems(config: StationConfig) -> Iterator[str]:

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from calibrate.geometry import Array, difference
 from calibrate.kinematics import JOINT_NAMES, forward
-from station.cell.collision import CellGeometry, margins, moving_points, surface_speeds
+from station.cell.collision import CellGeometry, Contact, margins, moving_points, surface_speeds
 from station.cell.plan import Plan, PlannedPose
 
 SPEED_CAP_M_S = 0.25
@@ -43,6 +43,9 @@ class Problem:
     limit: str
     text: str
     joint: str = ""
+    """The joint or body that breaks it."""
+    what: str = ""
+    """Clearance: which two things come too close."""
 
     def __str__(self) -> str:
         return f"{self.pose}: {self.text}"
@@ -134,8 +137,8 @@ def check_path(
     if np.abs(target - start).max() > _LONGEST_TURN_RAD:
         return _refused(name, problems)
     samples = sample_path(geometry, start, target, SPACING_M)
-    gaps, labels = margins(geometry, samples)
-    problems += _margin_problems(leaving(gaps - SPACING_M / 2), labels, name)
+    gaps, contacts = margins(geometry, samples)
+    problems += _margin_problems(leaving(gaps - SPACING_M / 2), contacts, name)
     speed, acceleration, duration, peak = allowed_speed(geometry, samples)
     flange = forward(geometry.model, samples)[:, :3, 3]
     return MoveCheck(
@@ -175,27 +178,18 @@ def _joint_problems(geometry: CellGeometry, start: Array, target: Array, name: s
     problems = []
     for i, joint in enumerate(JOINT_NAMES):
         if not low[i] - 1e-9 <= target[i] <= high[i] + 1e-9:
-            problems.append(
-                Problem(
-                    name,
-                    "joint range",
-                    f"{joint} would stand at {np.rad2deg(target[i]):.1f}°, allowed is "
-                    f"{np.rad2deg(low[i]):.0f}° to {np.rad2deg(high[i]):.0f}°",
-                    joint,
-                )
+            text = (
+                f"{joint} would stand at {np.rad2deg(target[i]):.1f}° "
+                f"(limit {np.rad2deg(low[i]):.0f}° to {np.rad2deg(high[i]):.0f}°)"
             )
-        turn = abs(target[i] - start[i])
-        if turn > geometry.limits.joint_step_rad + 1e-9:
-            problems.append(
-                Problem(
-                    name,
-                    "joint step",
-                    f"{joint} would turn {np.rad2deg(turn):.0f}° in one move, allowed is "
-                    f"{np.rad2deg(geometry.limits.joint_step_rad):.0f}° (limits.joint_step_rad); "
-                    "put a pose in between or choose the same arm branch",
-                    joint,
-                )
+            problems.append(Problem(name, "joint range", text, joint))
+        turn, step = abs(target[i] - start[i]), geometry.limits.joint_step_rad
+        if turn > step + 1e-9:
+            text = (
+                f"{joint} would turn {np.rad2deg(turn):.0f}° in one move (limit {np.rad2deg(step):.0f}°, "
+                "limits.joint_step_rad). Add a pose in between or choose the same arm branch"
             )
+            problems.append(Problem(name, "joint step", text, joint))
     return problems
 
 
@@ -213,23 +207,20 @@ def leaving(gaps: Array) -> Array:
     return np.where(excused, 0.0, gaps)
 
 
-def _margin_problems(gaps: Array, labels: Sequence[str], name: str) -> list[Problem]:
+def _margin_problems(gaps: Array, contacts: Sequence[Contact], name: str) -> list[Problem]:
     problems = []
-    for label in dict.fromkeys(labels):
-        alike = [column for column, other in enumerate(labels) if other == label]  # a plate is several rods
+    for contact in dict.fromkeys(contacts):
+        alike = [
+            column for column, other in enumerate(contacts) if other == contact
+        ]  # a plate is several rods
         gap = gaps[:, alike].min(axis=1)
         at = int(np.argmin(gap))
-        if gap[at] >= 0:
-            continue
-        where = "at the target" if at == len(gaps) - 1 else f"after {at / (len(gaps) - 1):.0%} of the way"
-        problems.append(
-            Problem(
-                name,
-                "clearance",
-                f"{label}, {-1000 * gap[at]:.0f} mm too close {where}",
-                label.split(" against ")[0],
+        if gap[at] < 0:
+            where = (
+                "at the target" if at == len(gaps) - 1 else f"after {at / (len(gaps) - 1):.0%} of the path"
             )
-        )
+            text = f"{contact}, {-1000 * gap[at]:.0f} mm too close {where}"
+            problems.append(Problem(name, "clearance", text, contact.body, str(contact)))
     return problems
 
 
@@ -261,18 +252,18 @@ def with_plan_speeds(geometry: CellGeometry, plan: Plan) -> CellGeometry:
 
 
 def _plan_problems(plan: Plan, geometry: CellGeometry) -> list[Problem]:
-    problems = []
+    wrong = []
     if not plan.poses:
-        problems.append(Problem("plan", "poses", "it has no poses"))
+        wrong.append(("poses", "it has no poses"))
     if not (plan.joint_speed_rad_s > 0 and plan.joint_acceleration_rad_s2 > 0):
-        problems.append(Problem("plan", "speed", "its joint speed and acceleration must be above zero"))
+        wrong.append(("speed", "its joint speed and acceleration must be above zero"))
     if plan.robot != geometry.model.name:
-        text = f"it was made for a {plan.robot}, the cell has a {geometry.model.name}; make a new plan"
-        problems.append(Problem("plan", "robot", text))
+        wrong.append(
+            ("robot", f"made for a {plan.robot}, the cell has a {geometry.model.name}. Make a new plan")
+        )
     if geometry.mount not in (None, plan.mount):
-        text = f"it was made for {plan.mount}, the cell is {geometry.mount}; make a new plan"
-        problems.append(Problem("plan", "mount", text))
-    return problems
+        wrong.append(("mount", f"made for {plan.mount}, the cell is {geometry.mount}. Make a new plan"))
+    return [Problem("plan", limit, text) for limit, text in wrong]
 
 
 def _flange_problems(geometry: CellGeometry, pose: PlannedPose, name: str) -> list[Problem]:
@@ -283,7 +274,7 @@ def _flange_problems(geometry: CellGeometry, pose: PlannedPose, name: str) -> li
     if off_m <= _FLANGE_TOLERANCE_M and off_rad <= _FLANGE_TOLERANCE_RAD:
         return []
     text = (
-        f"joints and expected flange pose differ by {1000 * off_m:.1f} mm and {np.rad2deg(off_rad):.2f}°; "
-        "was one of them edited, or is the plan for another arm model?"
+        f"joints and expected flange pose differ by {1000 * off_m:.1f} mm and {np.rad2deg(off_rad):.2f}°. "
+        "Make a new plan for this arm model, or delete base_from_flange"
     )
     return [Problem(name, "flange pose", text)]

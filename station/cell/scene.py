@@ -20,7 +20,7 @@ from calibrate.geometry import (
 from calibrate.kinematics import MODELS, DhDeltas, RobotModel, forward
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
 from station.cell.collision import CellGeometry, gap_to_arm, plate
-from station.cell.config import Capsule, PoseGuess, StationConfig, vector3
+from station.cell.config import Capsule, PoseGuess, RobotConfig, StationConfig, Vector3, vector3
 from station.cell.errors import ConfigError, LimitError
 from station.cell.limits import SPACING_M
 from station.cell.plan import Plan
@@ -82,34 +82,43 @@ def board_extent(board: BoardSpec) -> tuple[Array, Array]:
 def scene_of(config: StationConfig) -> Scene:
     """The scene that the configuration describes. ConfigError names what is missing."""
     if config.robot.model not in MODELS:
-        raise ConfigError(f"robot.model '{config.robot.model}' is unknown; known are {', '.join(MODELS)}")
+        raise ConfigError(
+            f"robot.model '{config.robot.model}' is unknown",
+            code="unknown-robot-model",
+            remedy=f"Use one of {', '.join(MODELS)}.",
+        )
     camera, mount_guess, place_guess = config.camera.model, config.camera_guess, config.board_guess
     if camera is None or camera.matrix is None:
         raise ConfigError(
-            "planning needs a rough lens: give camera.model with width, height and matrix "
-            "(focal length in pixels = lens mm / pixel size mm; the centre = half the picture)"
+            "planning needs rough intrinsics",
+            code="no-lens",
+            remedy="Give camera.model with width, height and matrix (focal length in pixels = lens mm / "
+            "pixel size mm; the centre = half the image).",
         )
     if mount_guess is None or place_guess is None:
         missing = "camera_guess" if mount_guess is None else "board_guess"
         raise ConfigError(
-            f"planning needs {missing} in the configuration; or let `station bootstrap` find it"
+            f"planning needs {missing} in the configuration",
+            code="no-guess",
+            remedy="Add it, or let `station bootstrap` find it.",
+            missing=missing,
         )
-    X, Y = (pose_from_quaternion(g.translation_m, g.rotation_xyzw) for g in (mount_guess, place_guess))
     return Scene(
         config.mount,
         camera,
         config.board,
-        X,
-        Y,
-        cell_geometry(config),
-        _sigmas(mount_guess),
-        _sigmas(place_guess),
-        config.working_distance_m,
+        X=guess_matrix(mount_guess),
+        Y=guess_matrix(place_guess),
+        geometry=cell_geometry(config),
+        x_sigma=(mount_guess.sigma_m, mount_guess.sigma_rad),
+        y_sigma=(place_guess.sigma_m, place_guess.sigma_rad),
+        working_distance_m=config.working_distance_m,
     )
 
 
-def _sigmas(guess: PoseGuess) -> tuple[float, float]:
-    return guess.sigma_m, guess.sigma_rad
+def guess_matrix(guess: PoseGuess) -> Array:
+    """(4, 4)"""
+    return pose_from_quaternion(guess.translation_m, guess.rotation_xyzw)
 
 
 def guess_from(matrix: Array, sigma_m: float, sigma_rad: float) -> PoseGuess:
@@ -121,17 +130,21 @@ def guess_from(matrix: Array, sigma_m: float, sigma_rad: float) -> PoseGuess:
 
 def cell_geometry(config: StationConfig) -> CellGeometry:
     """Geometry for checks before motion; uses the guesses where there are any, and their sigmas."""
-    guesses = config.camera_guess, config.board_guess
-    X, Y = (None if g is None else pose_from_quaternion(g.translation_m, g.rotation_xyzw) for g in guesses)
-    camera_m, board_m = (0.0 if g is None else g.sigma_m for g in guesses)
-    return geometry_of(config, X, Y, camera_m, board_m)
+    camera, board = config.camera_guess, config.board_guess
+    return geometry_of(
+        config,
+        None if camera is None else guess_matrix(camera),
+        None if board is None else guess_matrix(board),
+        0.0 if camera is None else camera.sigma_m,
+        0.0 if board is None else board.sigma_m,
+    )
 
 
-def arm_model(config: StationConfig) -> RobotModel:
+def arm_model(robot: RobotConfig) -> RobotModel:
     """The configured arm, with its factory calibration where it is given."""
-    model = MODELS[config.robot.model]
-    if (deltas := config.robot.kinematics) is not None:
-        model = model.calibrated(DhDeltas(deltas.a_m, deltas.d_m, deltas.alpha_rad, deltas.theta_rad))
+    model = MODELS[robot.model]
+    if (k := robot.kinematics) is not None:
+        model = model.calibrated(DhDeltas(k.a_m, k.d_m, k.alpha_rad, k.theta_rad))
     return model
 
 
@@ -151,7 +164,7 @@ def geometry_of(
     limits = config.limits
     solids = limits.solids
     obstacles: tuple[Capsule, ...] = ()
-    watched: tuple[tuple[float, float, float], ...] = ()
+    watched: tuple[Vector3, ...] = ()
     clearance = limits.clearance_m
     if config.mount == "eye-in-hand":
         if X is not None:
@@ -172,7 +185,7 @@ def geometry_of(
         if X is not None:
             obstacles = (camera_body("camera", X),)
             clearance = limits.clearance_m + 2 * camera_doubt_m
-    model = arm_model(config)
+    model = arm_model(config.robot)
     return CellGeometry(model, limits, solids, obstacles, clearance, watched, config.mount)
 
 
@@ -188,9 +201,12 @@ def require_kept_clear(config: StationConfig) -> None:
     if guess is None or drawn or guess.sigma_m <= _MOST_DOUBT_M:
         return
     raise LimitError(
-        f"{name} is known to {1000 * guess.sigma_m:.0f} mm only (sigma_m), and the checks keep clear of "
-        f"{1000 * _MOST_DOUBT_M:.0f} mm: moves of a plan might touch something. Let `station bootstrap` find "
-        "it, or measure it better"
+        f"{name} is known to {1000 * guess.sigma_m:.0f} mm only (limit {1000 * _MOST_DOUBT_M:.0f} mm, sigma_m): "
+        "moves of a plan might touch something",
+        code="guess-too-rough",
+        remedy="Let `station bootstrap` find it, or measure it better.",
+        sigma_m=guess.sigma_m,
+        limit_m=_MOST_DOUBT_M,
     )
 
 
@@ -222,23 +238,19 @@ def geometry_from(config: StationConfig, standing_rad: ArrayLike) -> CellGeometr
     there: the nearest mount by its sigmas that has room takes its place, as thick as the guessed one was. A
     guess that is sharp enough for its thickness to cover its doubt is taken as it is.
     """
-    guess, place = config.camera_guess, config.board_guess
+    guess, board = config.camera_guess, config.board_guess
     cell = cell_geometry(config)
     if guess is None or config.mount != "eye-in-hand" or config.limits.solids or covers_its_doubt(guess):
         return cell
     draws = np.random.default_rng(0).normal(size=(_DRAWS, 6))
     draws[0] = 0.0
     nearest = draws[np.argsort((draws**2).sum(axis=1))] * np.repeat([guess.sigma_m, guess.sigma_rad], 3)
-    mounts = perturb(pose_from_quaternion(guess.translation_m, guess.rotation_xyzw), nearest)
-    room_m = _room_m(cell, np.asarray(standing_rad, dtype=float), mounts, camera_radius_m(guess.sigma_m))
+    mounts = perturb(guess_matrix(guess), nearest)
+    standing = np.asarray(standing_rad, dtype=float)
+    ends = camera_ends(forward(cell.model, standing) @ mounts)
+    room_m = gap_to_arm(cell, standing, ends[:, 0], ends[:, 1]) - camera_radius_m(guess.sigma_m)
     roomy = np.flatnonzero(room_m >= SPACING_M)
     if room_m[0] >= SPACING_M / 2 or len(roomy) == 0:  # what the check of a path wants
         return cell
-    Y = None if place is None else pose_from_quaternion(place.translation_m, place.rotation_xyzw)
-    return geometry_of(config, mounts[roomy[0]], Y, guess.sigma_m, 0.0 if place is None else place.sigma_m)
-
-
-def _room_m(cell: CellGeometry, standing_rad: Array, mounts: Array, radius_m: float) -> Array:
-    """(n,) distance from the arm where it stands to a camera at each mount (n, 4, 4)."""
-    ends = camera_ends(forward(cell.model, standing_rad) @ mounts)
-    return gap_to_arm(cell, standing_rad, ends[:, 0], ends[:, 1]) - radius_m
+    Y, board_m = (None, 0.0) if board is None else (guess_matrix(board), board.sigma_m)
+    return geometry_of(config, mounts[roomy[0]], Y, guess.sigma_m, board_m)

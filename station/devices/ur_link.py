@@ -11,11 +11,12 @@ import logging
 import time
 from collections.abc import Callable
 
-from calibrate.kinematics import MODELS, DhDeltas
+from calibrate.kinematics import MODELS
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import RobotIdentity, RobotState
 from station.cell.config import RobotConfig
 from station.cell.errors import RobotError, StaleStateError, StationError
+from station.cell.scene import arm_model
 from station.devices.ur_condition import safety_stop
 from station.devices.ur_dashboard import Dashboard, DashboardError
 from station.devices.ur_primary import Installation, PrimaryReader
@@ -38,9 +39,7 @@ class UrLink:
         if config.model not in MODELS:
             raise RobotError(f"unknown robot.model {config.model!r}; known: {', '.join(sorted(MODELS))}")
         self.config = config
-        self.model = MODELS[config.model]
-        if (k := config.kinematics) is not None:
-            self.model = self.model.calibrated(DhDeltas(k.a_m, k.d_m, k.alpha_rad, k.theta_rad))
+        self.model = arm_model(config)
         self.remote: bool | None = None
         """Remote control is on; None where there is no such switch (CB3)."""
         self.program = ""

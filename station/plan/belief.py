@@ -14,13 +14,12 @@ from calibrate.geometry import (
     difference,
     inverse,
     perturb,
-    pose_from_quaternion,
 )
 from calibrate.kinematics import forward
 from recordings.schema.messages import Mount
 from station.cell.config import StationConfig
 from station.cell.errors import ConfigError
-from station.cell.scene import arm_model, guess_from
+from station.cell.scene import arm_model, guess_from, guess_matrix
 
 GOOD_M, GOOD_RAD = 0.006, 0.02
 """A belief this sharp (1 sigma per axis) is enough to plan from."""
@@ -66,8 +65,15 @@ class Belief:
 
 def believe(config: StationConfig, glimpses: Sequence[Glimpse]) -> Belief:
     """The mount that guess and pictures make most likely. ConfigError without `camera_guess`."""
-    guess, prior = _prior(config)
-    model = arm_model(config)
+    if (known := config.camera_guess) is None:
+        raise ConfigError(
+            "bootstrap needs camera_guess: a rough mount, good to about 30° and 100 mm",
+            code="no-guess",
+            remedy="Add it to the configuration.",
+            missing="camera_guess",
+        )
+    guess, prior = guess_matrix(known), np.repeat([known.sigma_m, known.sigma_rad], 3)
+    model = arm_model(config.robot)
     seen = [(forward(model, g.joints_rad), g.camera_from_board) for g in glimpses]
 
     def residuals(delta: Array) -> Array:
@@ -85,9 +91,7 @@ def improved_config(config: StationConfig, glimpses: Sequence[Glimpse]) -> Stati
     """The configuration with mount and board place as the glimpses show them: what the plan is made from."""
     belief = believe(config, glimpses)
     taught = glimpses[0]
-    place = board_place(
-        config.mount, forward(arm_model(config), taught.joints_rad), belief.X, taught.camera_from_board
-    )
+    place = board_seen(config, taught, belief.X)
     # The board's place inherits the mount's doubt over the taught distance.
     distance_m = float(np.linalg.norm(taught.camera_from_board[:3, 3]))
     sigma_m = float(np.hypot(belief.sigma_m, distance_m * belief.sigma_rad))
@@ -103,13 +107,12 @@ def expected_after(
 ) -> Array:
     """Covariance (6, 6) of X expected after one more glimpse from `target`."""
     taught = glimpses[0]
-    E = forward(arm_model(config), taught.joints_rad)
     C = seen_from(config, taught, belief.X, target[None])[0]
     step = 1e-5
     columns = []
     for delta in np.eye(6) * step:
         X = perturb(belief.X, delta)
-        place = board_place(config.mount, E, X, taught.camera_from_board)
+        place = board_seen(config, taught, X)
         columns.append(_misfit(board_place(config.mount, target, X, C), place) / step)
     J = np.stack(columns, axis=1)
     return np.asarray(np.linalg.inv(np.linalg.inv(belief.covariance) + J.T @ J))
@@ -126,22 +129,18 @@ def board_place(mount: Mount, base_from_flange: Array, X: Array, camera_from_boa
     return np.asarray(inverse(base_from_flange) @ X @ camera_from_board)
 
 
+def board_seen(config: StationConfig, glimpse: Glimpse, X: Array) -> Array:
+    """The board's place as one glimpse shows it, if the mount is X."""
+    E = forward(arm_model(config.robot), glimpse.joints_rad)
+    return board_place(config.mount, E, X, glimpse.camera_from_board)
+
+
 def seen_from(config: StationConfig, taught: Glimpse, X: Array, targets: Array) -> Array:
     """camera_from_board (n, 4, 4) at the targets, if the mount is X."""
-    E = forward(arm_model(config), taught.joints_rad)
-    Y = board_place(config.mount, E, X, taught.camera_from_board)
+    Y = board_seen(config, taught, X)
     if config.mount == "eye-in-hand":
         return np.asarray(inverse(targets @ X) @ Y)
     return np.asarray(inverse(X) @ targets @ Y)
-
-
-def _prior(config: StationConfig) -> tuple[Array, Array]:
-    """The configured mount (4, 4) and its sigmas (6,)."""
-    guess = config.camera_guess
-    if guess is None:
-        raise ConfigError("bootstrap needs camera_guess: a rough mount, good to about 30° and 100 mm")
-    X = pose_from_quaternion(guess.translation_m, guess.rotation_xyzw)
-    return X, np.repeat([guess.sigma_m, guess.sigma_rad], 3)
 
 
 def _misfit(place: Array, reference: Array) -> Array:

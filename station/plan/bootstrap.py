@@ -23,10 +23,10 @@ from calibrate.kinematics import RobotModel, forward, inverse_nearest
 from station.cell.collision import CellGeometry, margins
 from station.cell.config import StationConfig
 from station.cell.errors import LimitError
-from station.cell.limits import SPACING_M, Problem, check_path, joint_bounds
+from station.cell.limits import SPACING_M, check_path, joint_bounds
 from station.cell.plan import PlannedPose
 from station.cell.scene import Scene, arm_model, geometry_from, geometry_of
-from station.plan.belief import Belief, Glimpse, believe, board_place, expected_after, seen_from, spread_of
+from station.plan.belief import Belief, Glimpse, believe, board_seen, expected_after, seen_from, spread_of
 from station.plan.order import move_times
 from station.plan.visibility import outline, planned_pose, visible
 
@@ -53,7 +53,7 @@ def next_move(config: StationConfig, glimpses: Sequence[Glimpse]) -> PlannedPose
     LimitError when no move is safe for every mount that is still possible, or when hardly any mount within
     the guess fits with where the arm stands. Each move needs its own go.
     """
-    model, moves = arm_model(config), len(glimpses) - 1
+    model, moves = arm_model(config.robot), len(glimpses) - 1
     belief = believe(config, glimpses)
     if moves >= MOVES_MAX or (moves >= MOVES_MIN and belief.good):
         return None
@@ -118,13 +118,8 @@ def _in_the_way(cells: Sequence[CellGeometry], here: Array, targets: Sequence[Ar
         else:
             checks = (check_path(cell, here, joints).problems for cell in cells)
             problems = next((found for found in checks if found), ())
-            broken.update({_limit_of(problem) for problem in problems} or {"the camera coming nearer"})
+            broken.update({p.what or f"the {p.limit}" for p in problems} or {"the camera coming nearer"})
     return " and ".join(limit for limit, _ in broken.most_common(2))
-
-
-def _limit_of(problem: Problem) -> str:
-    """'forearm against table', 'the joint range'"""
-    return problem.text.split(",")[0] if problem.limit == "clearance" else f"the {problem.limit}"
 
 
 def _no_move(belief: Belief, in_view: int, in_the_way: str) -> str:
@@ -151,17 +146,15 @@ def _possible(
     Impossible is a mount with which camera or board would be in the arm's way where it has stood.
     """
     taught, stood = glimpses[0], np.array([g.joints_rad for g in glimpses])
-    E = forward(arm_model(config), taught.joints_rad)
     without = margins(geometry_of(config, None, None), stood)[1]
     draws = rng.multivariate_normal(np.zeros(6), belief.covariance, _DRAWS, method="eigh")
     draws[0] = 0.0
     mounts: list[Array] = []
     cells: list[CellGeometry] = []
     for X in perturb(belief.X, draws):
-        place = board_place(config.mount, E, X, taught.camera_from_board)
-        cell = as_taught(geometry_of(config, X, place), taught.joints_rad)
-        gaps, labels = margins(cell, stood)
-        new = [column for column, label in enumerate(labels) if label not in without]
+        cell = as_taught(geometry_of(config, X, board_seen(config, taught, X)), taught.joints_rad)
+        gaps, contacts = margins(cell, stood)
+        new = [column for column, contact in enumerate(contacts) if contact not in without]
         if gaps[:, new].min(initial=np.inf) >= SPACING_M / 2:
             mounts.append(X)
             cells.append(cell)
@@ -175,9 +168,8 @@ def as_taught(cell: CellGeometry, taught_rad: Array) -> CellGeometry:
 
     Such a mount is possible, since a person jogged the arm there, so it must be kept clear of too.
     """
-    [name] = {obstacle.name for obstacle in cell.obstacles}
-    gaps, labels = margins(cell, taught_rad)
-    near_m = min(gap for gap, label in zip(gaps[0], labels, strict=True) if label.endswith(f" the {name}"))
+    gaps, contacts = margins(cell, taught_rad)
+    near_m = min(gap for gap, contact in zip(gaps[0], contacts, strict=True) if contact.kind == "obstacle")
     if near_m >= SPACING_M / 2:
         return cell
     return replace(cell, obstacle_clearance_m=max(0.0, (near_m + cell.obstacle_clearance_m) / 2))
@@ -185,7 +177,7 @@ def as_taught(cell: CellGeometry, taught_rad: Array) -> CellGeometry:
 
 def _targets(config: StationConfig, taught: Glimpse, belief: Belief) -> Array:
     """Flange poses (n, 4, 4) around the taught one: small turns about board, camera or wrists, and away."""
-    model = arm_model(config)
+    model = arm_model(config.robot)
     E = forward(model, taught.joints_rad)
     C = taught.camera_from_board
     points = board_points(config.board)
@@ -253,7 +245,7 @@ def _stays_in_view(
 
 def _keeps_away(config: StationConfig, taught: Glimpse, samples: Array, here: Array, joints: Array) -> bool:
     """Whether for every possible mount the camera comes no nearer on the way than it was taught, or is."""
-    way = forward(arm_model(config), here + np.linspace(0, 1, _ON_THE_WAY)[:, None] * (joints - here))
+    way = forward(arm_model(config.robot), here + np.linspace(0, 1, _ON_THE_WAY)[:, None] * (joints - here))
     taught_m = float(_away_m(config, taught.camera_from_board))
     for X in samples:
         away_m = _away_m(config, seen_from(config, taught, X, way))
@@ -272,12 +264,11 @@ def _away_m(config: StationConfig, camera_from_board: Array) -> Array:
 def _described(
     config: StationConfig, taught: Glimpse, belief: Belief, moves: int, joints: Array
 ) -> PlannedPose:
-    E = forward(arm_model(config), taught.joints_rad)
-    place = board_place(config.mount, E, belief.X, taught.camera_from_board)
+    place = board_seen(config, taught, belief.X)
     camera = config.camera.model
     assert camera is not None
     scene = Scene(
         config.mount, camera, config.board, belief.X, place, geometry_of(config, belief.X, place, 0.0)
     )
-    made = planned_pose(scene, moves, joints, forward(arm_model(config), joints), None)
+    made = planned_pose(scene, moves, joints, forward(arm_model(config.robot), joints), None)
     return msgspec.structs.replace(made, name=f"bootstrap {moves + 1}", why=f"find the mount: {made.why}")

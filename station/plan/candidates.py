@@ -13,7 +13,7 @@ from calibrate.boards.model import board_points
 from calibrate.geometry import Array, pose, rotation_exp
 from calibrate.kinematics import inverse_many, singularity_measure
 from calibrate.projection import camera_matrix
-from station.cell.collision import margins
+from station.cell.collision import Contact, margins
 from station.cell.limits import joint_bounds
 from station.cell.scene import Scene
 from station.plan.order import move_times
@@ -126,22 +126,21 @@ def _checks(
         ),
         ARM_IN_SIGHT: sees_past_the_arm(scene, joints, base_from_flange),
     }
-    gaps, labels = margins(scene.geometry, joints)
-    for label, gap in zip(labels, gaps.T, strict=True):
-        name = _limit_of(label, scene)
+    gaps, contacts = margins(scene.geometry, joints)
+    for contact, gap in zip(contacts, gaps.T, strict=True):
+        name = _limit_of(contact)
         good = np.asarray(gap >= _PATH_RESERVE_M)
         checks[name] = checks[name] & good if name in checks else good
     return checks, gaps.min(axis=1)
 
 
-def _limit_of(label: str, scene: Scene) -> str:
-    """'forearm against table' → 'the table'; bodies of the arm against each other are one limit."""
-    _, against, other = label.partition(" against ")
-    if not against:
+def _limit_of(contact: Contact) -> str:
+    """The name of a limit; bodies of the arm against each other are one."""
+    if contact.kind == "workspace":
         return "the workspace box"
-    if other in scene.geometry.body_names:
+    if contact.kind == "self":
         return "the arm touching itself or its tool"
-    return "the " + other.removeprefix("the ")
+    return "the " + contact.other.removeprefix("the ")
 
 
 def _all_branches(scene: Scene, flange: Array, near: Array | None) -> tuple[NDArray[np.intp], Array]:

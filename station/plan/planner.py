@@ -125,11 +125,11 @@ def _reach(scene: Scene, count: int) -> str:
 
 
 def _start_is_cut_off(scene: Scene, wanted: int, usable: int, possible: int, start: Array) -> str:
-    gaps, labels = margins(scene.geometry, start)
+    gaps, contacts = margins(scene.geometry, start)
     reason = ""
     if gaps.min() < 0:
         worst = int(gaps[0].argmin())
-        reason = f" The arm stands too close already: {labels[worst]}, {-1000 * gaps[0, worst]:.0f} mm."
+        reason = f" The arm stands too close already: {contacts[worst]}, {-1000 * gaps[0, worst]:.0f} mm."
     return (
         f"{possible} poses are possible, but from where the arm stands free direct moves lead to only "
         f"{usable} that belong together; {wanted} are wanted.{reason} Jog the arm to where the camera looks "

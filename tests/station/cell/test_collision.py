@@ -39,26 +39,26 @@ def test_segment_distance_is_the_smallest_over_all_pairs_of_points(a0, a1, b0, b
 
 @pytest.mark.parametrize("name", sorted(MODELS))
 def test_an_arm_at_ease_touches_nothing_of_itself(name):
-    gaps, labels = margins(CellGeometry(MODELS[name], LimitsConfig()), UPRIGHT)
-    assert gaps.min() > 0, labels[gaps[0].argmin()]
+    gaps, contacts = margins(CellGeometry(MODELS[name], LimitsConfig()), UPRIGHT)
+    assert gaps.min() > 0, contacts[gaps[0].argmin()]
 
 
 def test_a_folded_wrist_runs_into_the_forearm():
     camera = Capsule("camera", (0.0, 0.0, 0.1), (0.0, 0.0, 0.18), 0.04)
     geometry = CellGeometry(MODELS["UR10"], LimitsConfig(), solids=(camera,))
     folded = np.deg2rad([0.0, -90.0, -90.0, 45.0, -135.0, 0.0])
-    gaps, labels = margins(geometry, np.array([UPRIGHT, folded]))
+    gaps, contacts = margins(geometry, np.array([UPRIGHT, folded]))
     assert gaps[0].min() > 0
     assert gaps[1].min() < 0
-    assert labels[gaps[1].argmin()] == "forearm against camera"
+    assert contacts[gaps[1].argmin()] == ("forearm", "camera", "self")
 
 
 def test_every_two_bodies_that_can_meet_are_held_against_each_other():
     """Neighbours always touch; a wrist and the one after the next are as far apart as they were built."""
-    _, labels = margins(CellGeometry(MODELS["UR10"], LimitsConfig()), UPRIGHT)
+    _, contacts = margins(CellGeometry(MODELS["UR10"], LimitsConfig()), UPRIGHT)
     apart = {(a, b) for b in range(len(ARM_BODIES)) for a in range(b - 1)}
     built = {(0, 2), (3, 5), (4, 6)}
-    assert set(labels) == {f"{ARM_BODIES[a]} against {ARM_BODIES[b]}" for a, b in apart - built}
+    assert set(contacts) == {(ARM_BODIES[a], ARM_BODIES[b], "self") for a, b in apart - built}
 
 
 def test_a_stretched_arm_lies_where_the_makers_model_shows_it():
@@ -89,10 +89,10 @@ def test_a_plane_is_named_with_the_body_that_breaks_it():
     table = Plane("table", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
     geometry = CellGeometry(MODELS["UR10"], LimitsConfig(planes=(table,)))
     low = np.deg2rad([0.0, -10.0, 40.0, -120.0, -90.0, 0.0])
-    gaps, labels = margins(geometry, np.array([UPRIGHT, low]))
-    broken = {label for label, gap in zip(labels, gaps[1], strict=True) if gap < 0}
+    gaps, contacts = margins(geometry, np.array([UPRIGHT, low]))
+    broken = {contact for contact, gap in zip(contacts, gaps[1], strict=True) if gap < 0}
     assert gaps[0].min() > 0
-    assert "forearm against table" in broken
+    assert ("forearm", "table", "plane") in broken
 
 
 def test_margins_are_distances_less_radii_and_clearance():
@@ -109,19 +109,19 @@ def test_margins_are_distances_less_radii_and_clearance():
         obstacles=(Capsule("ball", ball_at, ball_at, 0.02),),
         obstacle_clearance_m=0.1,
     )
-    gaps, labels = margins(geometry, UPRIGHT)
-    margin = dict(zip(labels, gaps[0], strict=True))
-    assert margin["wrist 3 against table"] == pytest.approx(min(wrist[2], flange[2]) + 0.2 - 0.045 - 0.03)
-    assert margin["wrist 3 against the ball"] == pytest.approx(0.3 - 0.02 - 0.045 - 0.1)
-    assert margin["camera against the ball"] == pytest.approx(0.3 - 0.18 - 0.02 - 0.04 - 0.1)
+    gaps, contacts = margins(geometry, UPRIGHT)
+    margin = dict(zip(contacts, gaps[0], strict=True))
+    assert margin["wrist 3", "table", "plane"] == pytest.approx(min(wrist[2], flange[2]) + 0.2 - 0.045 - 0.03)
+    assert margin["wrist 3", "ball", "obstacle"] == pytest.approx(0.3 - 0.02 - 0.045 - 0.1)
+    assert margin["camera", "ball", "obstacle"] == pytest.approx(0.3 - 0.18 - 0.02 - 0.04 - 0.1)
     share = np.linspace(0, 1, 1001)[:, None]
     along_camera = flange + (0.1 + 0.08 * share) * ahead
     column = frames[0, :3, 3] + share * (frames[1, :3, 3] - frames[0, :3, 3])
     apart_m = np.linalg.norm(along_camera[:, None] - column[None], axis=2).min()
-    assert margin["base column against camera"] == pytest.approx(apart_m - 0.09 - 0.04, abs=1e-3)
+    assert margin["base column", "camera", "self"] == pytest.approx(apart_m - 0.09 - 0.04, abs=1e-3)
     assert gap_to_arm(
         CellGeometry(MODELS["UR10"], LimitsConfig()), UPRIGHT, along_camera[:1], along_camera[-1:]
-    )[0] == pytest.approx(min(margin[f"{body} against camera"] for body in ARM_BODIES[:5]) + 0.04)
+    )[0] == pytest.approx(min(margin[body, "camera", "self"] for body in ARM_BODIES[:5]) + 0.04)
 
 
 def test_the_workspace_box_holds_for_flange_and_camera():
@@ -129,9 +129,9 @@ def test_the_workspace_box_holds_for_flange_and_camera():
     tight = LimitsConfig(workspace_min_m=tuple(at - 0.01), workspace_max_m=tuple(at + 0.01))
     gaps, _ = margins(CellGeometry(MODELS["UR10"], tight), UPRIGHT)
     assert gaps.min() > 0
-    gaps, labels = margins(CellGeometry(MODELS["UR10"], tight, watched_m=((0.0, 0.0, 0.2),)), UPRIGHT)
+    gaps, contacts = margins(CellGeometry(MODELS["UR10"], tight, watched_m=((0.0, 0.0, 0.2),)), UPRIGHT)
     assert gaps.min() == pytest.approx(-0.19, abs=0.01)
-    assert "workspace" in labels[gaps[0].argmin()]
+    assert contacts[gaps[0].argmin()].kind == "workspace"
 
 
 def test_a_plate_covers_its_whole_area():

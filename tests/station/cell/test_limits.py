@@ -85,7 +85,7 @@ def test_an_obstacle_between_two_good_poses_is_found():
     problems = check_path(geometry, left, right, "pose 7").problems
     assert problems
     assert all(p.pose == "pose 7" and p.limit == "clearance" for p in problems)
-    assert any("wrist 3 against the post" in str(p) and "of the way" in str(p) for p in problems)
+    assert "wrist 3 against the post" in {problem.what for problem in problems}
 
 
 def test_a_plate_of_several_rods_is_one_problem():
@@ -94,9 +94,11 @@ def test_a_plate_of_several_rods_is_one_problem():
     limits = LimitsConfig(planes=(Plane("table", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0)),))
     cell = CellGeometry(MODELS["UR10"], limits, solids=board)
     down = (0.0, -0.4, 1.4, -2.6, -1.57, 0.0)
-    gaps, labels = margins(cell, np.array([down]))
-    worst_m = min(gap for gap, label in zip(gaps[0], labels, strict=True) if label == "board against table")
-    [told] = [p.text for p in check_path(cell, down, down).problems if "board against table" in p.text]
+    gaps, contacts = margins(cell, np.array([down]))
+    worst_m = min(
+        gap for gap, contact in zip(gaps[0], contacts, strict=True) if contact == ("board", "table", "plane")
+    )
+    [told] = [p.text for p in check_path(cell, down, down).problems if p.what == "board against table"]
     assert told.startswith(f"board against table, {-1000 * (worst_m - SPACING_M / 2):.0f} mm too close")
 
 
@@ -121,7 +123,6 @@ def test_a_plan_for_the_other_mount_is_refused():
     cell = CellGeometry(MODELS["UR10"], LimitsConfig(), mount="eye-to-hand")
     [problem] = check_plan(plan_of(REST), REST, cell).problems
     assert problem.limit == "mount"
-    assert "made for eye-in-hand, the cell is eye-to-hand; make a new plan" in str(problem)
 
 
 def test_joint_range_and_step_name_the_joint():
@@ -156,8 +157,8 @@ def test_an_arm_that_stands_too_close_may_leave_but_not_come_nearer():
     def cell(clearance_m):
         return CellGeometry(MODELS["UR10"], LimitsConfig(planes=(table,), clearance_m=clearance_m))
 
-    gaps, labels = margins(cell(1e-9), REST)
-    lowest = min(gap for gap, label in zip(gaps[0], labels, strict=True) if "table" in label)
+    gaps, contacts = margins(cell(1e-9), REST)
+    lowest = min(gap for gap, contact in zip(gaps[0], contacts, strict=True) if contact.other == "table")
     near = cell(float(lowest) + 0.03)
     up, down = REST + np.array([0, 0.3, 0, 0, 0, 0]), REST - np.array([0, 0.05, 0, 0, 0, 0])
     assert [gap.min() > 0 for gap in margins(near, np.array([REST, up, down]))[0]] == [False, True, False]
@@ -185,7 +186,7 @@ def test_check_plan_names_pose_robot_and_edited_flange():
     assert len(good.moves) == 2
     assert good.duration_s > 0 and good.path_m > 0
     wrong = check_plan(plan_of(REST, robot="UR5"), REST, FREE)
-    assert any("UR5" in str(p) and "UR10" in str(p) for p in wrong.problems)
+    assert [problem.limit for problem in wrong.problems] == ["robot"]
     assert check_plan(plan_of(), REST, FREE).problems[0].limit == "poses"
     flange = forward(MODELS["UR10"], REST)
     flange[0, 3] += 0.02
@@ -193,8 +194,7 @@ def test_check_plan_names_pose_robot_and_edited_flange():
         plan_of(REST).poses[0], base_from_flange=tuple(map(tuple, flange.tolist()))
     )
     problems = check_plan(msgspec.structs.replace(plan_of(), poses=(edited,)), REST, FREE).problems
-    assert [p.limit for p in problems] == ["flange pose"]
-    assert "pose 1 (p0)" in str(problems[0]) and "20.0 mm" in str(problems[0])
+    assert [(p.limit, p.pose) for p in problems] == [("flange pose", "pose 1 (p0)")]
 
 
 @pytest.mark.parametrize(("by_m", "by_rad", "refused"), [(0.0018, 0.0045, 0), (0.0022, 0, 1), (0, 0.0055, 1)])

@@ -95,7 +95,7 @@ def test_a_plan_of_the_other_mount_fails_the_check_with_1(made, tmp_path):
     (tmp_path / "cell.yaml").write_bytes(msgspec.yaml.encode(config))
     result = run("--config", tmp_path / "cell.yaml", "--check", made[1]["plan.yaml"])
     assert result.returncode == 1
-    assert "it was made for eye-in-hand, the cell is eye-to-hand; make a new plan" in result.stdout
+    assert "made for eye-in-hand, the cell is eye-to-hand" in result.stdout
 
 
 def test_a_list_from_elsewhere_is_checked_like_any_plan(tmp_path):

@@ -60,8 +60,8 @@ def test_a_board_nearer_than_wanted_is_possible():
 
 def test_where_the_taught_view_is_nearer_than_wanted_half_of_that_distance_is_kept():
     bare = replace(geometry_of(config(), X, Y), obstacle_clearance_m=0.0)
-    gaps, labels = margins(bare, TAUGHT)
-    nearest_m = min(gap for gap, label in zip(gaps[0], labels, strict=True) if label.endswith(" the board"))
+    gaps, contacts = margins(bare, TAUGHT)
+    nearest_m = min(gap for gap, contact in zip(gaps[0], contacts, strict=True) if contact.kind == "obstacle")
     wants_more = as_taught(replace(bare, obstacle_clearance_m=nearest_m + 0.2), TAUGHT)
     wants_less = as_taught(replace(bare, obstacle_clearance_m=nearest_m - 0.05), TAUGHT)
     assert wants_more.obstacle_clearance_m == pytest.approx(nearest_m / 2)

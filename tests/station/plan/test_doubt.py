@@ -35,14 +35,14 @@ def test_what_hangs_on_a_guess_stays_clear_of_the_arm_when_the_guess_is_three_si
     doubted = cell_geometry(config)
     joints = np.random.default_rng(1).uniform(-2.5, 2.5, (300, 6))
     name = "camera" if mount == "eye-in-hand" else "board"
-    gaps, labels = margins(doubted, joints)
-    columns = [i for i, label in enumerate(labels) if label.endswith(f"against {name}")]
+    gaps, contacts = margins(doubted, joints)
+    columns = [i for i, contact in enumerate(contacts) if contact.other == name]
     for way in np.vstack([np.eye(3), -np.eye(3)]):
         shift = np.concatenate([0.015 * way, np.zeros(3)])
         there = guess_from(perturb(X if name == "camera" else Y, shift), 0.0, 0.0)
         moved = msgspec.structs.replace(config, **{f"{name}_guess": there})
         true_gaps, same = margins(cell_geometry(moved), joints)
-        assert same == labels
+        assert same == contacts
         assert (gaps[:, columns] <= true_gaps[:, columns] + 1e-9).all()
 
 

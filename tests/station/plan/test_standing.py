@@ -25,8 +25,8 @@ def beside_the_forearm(beside_m):
 
 
 def room_m(cell):
-    gaps, labels = margins(cell, TAUGHT)
-    return min(gap for gap, label in zip(gaps[0], labels, strict=True) if label.endswith("against camera"))
+    gaps, contacts = margins(cell, TAUGHT)
+    return min(gap for gap, contact in zip(gaps[0], contacts, strict=True) if contact.other == "camera")
 
 
 def test_a_rough_guess_inside_the_arm_gives_way_to_a_mount_that_has_room():

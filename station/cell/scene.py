@@ -201,7 +201,7 @@ def require_kept_clear(config: StationConfig) -> None:
     if guess is None or drawn or guess.sigma_m <= _MOST_DOUBT_M:
         return
     raise LimitError(
-        f"{name} is known to {1000 * guess.sigma_m:.0f} mm only (limit {1000 * _MOST_DOUBT_M:.0f} mm, sigma_m): "
+        f"{name} is known to {1000 * guess.sigma_m:.0f} mm only (limit {1000 * _MOST_DOUBT_M:.0f} mm): "
         "moves of a plan might touch something",
         code="guess-too-rough",
         remedy="Let `station bootstrap` find it, or measure it better.",

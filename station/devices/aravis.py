@@ -18,7 +18,7 @@ from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices.aravis_device import GenicamDevice
 from station.devices.base import Trigger
-from station.devices.frames import CameraCounts, DeviceClock, FrameCounter, StreamCounts
+from station.devices.frames import RETAKE, CameraCounts, DeviceClock, FrameCounter, StreamCounts
 
 T = TypeVar("T")
 _CLOCK_READINGS = 8
@@ -33,7 +33,9 @@ class AravisCamera:
 
     def __init__(self, config: CameraConfig, trigger: Trigger | None = None) -> None:
         if config.trigger == "hardware" and trigger is None:
-            raise CameraError("camera.trigger is 'hardware' but no trigger box is configured")
+            raise CameraError(
+                "camera.trigger is 'hardware' but no trigger box is configured", code="no-trigger"
+            )
         self._config = config
         self._trigger = trigger
         self._device: GenicamDevice | None = None
@@ -41,12 +43,8 @@ class AravisCamera:
         self._busy = asyncio.Lock()
         self._clock = DeviceClock()
         self._newest: Image | None = None
-        self._identity = CameraIdentity(driver="aravis")
+        self.identity = CameraIdentity(driver="aravis")
         self.counter = FrameCounter()
-
-    @property
-    def identity(self) -> CameraIdentity:
-        return self._identity
 
     @property
     def clock(self) -> ClockFit | None:
@@ -60,7 +58,7 @@ class AravisCamera:
     async def open(self) -> CameraIdentity:
         async with self._busy:
             await self._run(self._open)
-        return self._identity
+        return self.identity
 
     async def settings(self) -> dict[str, Any]:
         """As the camera reports them now."""
@@ -128,7 +126,7 @@ class AravisCamera:
 
     def _open(self) -> None:
         device = GenicamDevice(self._config)
-        self._identity = device.open(self._identity.serial)
+        self.identity = device.open(self.identity.serial)
         self._device = device
         self.counter.restart()
         self._clock.restart()
@@ -138,7 +136,7 @@ class AravisCamera:
     def _live(self) -> GenicamDevice:
         """The device; opened again, by its serial, after it was lost."""
         if self._device is None:
-            raise CameraError("the camera is not open")
+            raise CameraError("the camera is not open", code="not-open")
         if self._device.lost:
             self._device.close()
             self._open()
@@ -162,8 +160,10 @@ class AravisCamera:
             picture = device.frame(timeout_s)
         if picture is None:
             raise CameraError(
-                f"the camera sent no picture within {timeout_s:g} s of its trigger; take this pose again "
-                "(with hardware trigger: check the line)"
+                f"the camera sent no image within {timeout_s:g} s of its trigger",
+                code="no-image",
+                remedy=f"{RETAKE} With a hardware trigger, check its line.",
+                limit_s=timeout_s,
             )
         return picture
 

@@ -13,7 +13,7 @@ from recordings.schema.clocks import monotonic_from_wall_ns
 from recordings.schema.messages import CameraIdentity, Image, Stamps
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
-from station.devices.frames import DeviceClock, StreamCounts
+from station.devices.frames import RETAKE, DeviceClock, StreamCounts
 from station.devices.pixels import bits_per_pixel, decode
 
 if TYPE_CHECKING:
@@ -31,10 +31,6 @@ _STREAM_PRIORITY = -15
 _LATCH_WAIT_S = 0.02
 _POP_S = 0.1
 """So often a waiting capture looks whether the camera was lost."""
-_INSTALL = (
-    "GenICam cameras need Debian's python3-gi and gir1.2-aravis-0.8 (apt install both, then make the venv "
-    "again with --system-site-packages)"
-)
 Region = tuple[int, int, int, int]
 """x, y, width, height, pixels"""
 _EXPOSURE_TOLERANCE = 0.02
@@ -50,7 +46,12 @@ def _aravis() -> tuple[Any, Any]:
             gi.require_version("Aravis", "0.8")
             from gi.repository import Aravis, GLib
     except (ImportError, ValueError) as error:
-        raise CameraError(f"{_INSTALL}: {error}") from error
+        raise CameraError(
+            f"GenICam cameras need Debian's python3-gi and gir1.2-aravis-0.8 ({error})",
+            code="no-aravis",
+            remedy="Run apt install python3-gi gir1.2-aravis-0.8, then make the venv again with "
+            "--system-site-packages.",
+        ) from error
     return Aravis, GLib
 
 
@@ -200,8 +201,7 @@ class GenicamDevice:
         end_s = time.monotonic() + timeout_s
         buffer = None
         while buffer is None:
-            if self.lost:
-                raise CameraError(f"{self._name} is gone (cable, power?); it is opened again when it is back")
+            self._require_alive()
             left_s = end_s - time.monotonic()
             if left_s <= 0:
                 return None
@@ -227,13 +227,17 @@ class GenicamDevice:
         if buffer.get_status() != self._aravis.BufferStatus.SUCCESS:
             raise CameraError(
                 f"frame {buffer.get_frame_id()} came incomplete ({buffer.get_status().value_nick}): packets "
-                "were lost; check cable, network card and packet size, and take this pose again"
+                "were lost",
+                code="frame-incomplete",
+                remedy="Check cable, network card and packet size, and take this pose again.",
             )
         width, height = buffer.get_image_width(), buffer.get_image_height()
         if (width, height) != self._region[2:]:
             raise CameraError(
                 f"frame {buffer.get_frame_id()} came as {width}×{height}, set were {self._region[2]}×"
-                f"{self._region[3]}: another program changes the camera's settings; take this pose again"
+                f"{self._region[3]}: another program changes the camera's settings",
+                code="settings-changed",
+                remedy=RETAKE,
             )
         wall_ns = buffer.get_system_timestamp()
         image = decode(buffer.get_data(), width, height, self._config.pixel_format)
@@ -251,20 +255,23 @@ class GenicamDevice:
             pixel_format="BGR8" if image.ndim == 3 else self._config.pixel_format,
         )
 
-    @property
-    def _name(self) -> str:
-        return f"camera {self.identity.model} {self.identity.serial}".rstrip()
+    def _require_alive(self) -> None:
+        if self.lost:
+            raise CameraError(
+                f"camera {self.identity.model} {self.identity.serial} is gone",
+                code="camera-gone",
+                remedy="Check cable and power; it is opened again when it is back.",
+            )
 
     @contextmanager
     def _explained(self, doing: str) -> Iterator[None]:
-        if self.lost:
-            raise CameraError(f"{self._name} is gone (cable, power?); it is opened again when it is back")
+        self._require_alive()
         try:
             yield
         except self._glib.Error as error:
             gone = (self._aravis.DeviceError.TIMEOUT, self._aravis.DeviceError.NOT_CONNECTED)
             self._lost |= any(error.matches(self._aravis.device_error_quark(), code) for code in gone)
-            raise CameraError(f"{doing} failed: {error.message}") from error
+            raise CameraError(f"{doing} failed: {error.message}", code="camera-refused") from error
 
 
 def _threads() -> set[int]:
@@ -297,9 +304,13 @@ def _find(aravis: Any, wanted: str) -> str:
         found.append(f"{names[3]} {names[0]} at {names[1]}")
     if len(found) == 1 and not wanted:
         return str(aravis.get_device_id(0))
-    listed = "; ".join(found) or "none"
-    which = f"no camera '{wanted}'" if wanted else "which camera? set camera.device"
-    raise CameraError(f"{which}: found {listed}. Check power, cable and network, or give its IP address")
+    which = f"no camera '{wanted}'" if wanted else "camera.device must name one camera"
+    raise CameraError(
+        f"{which}: found {'; '.join(found) or 'none'}",
+        code="no-camera",
+        remedy="Check power, cable and network, or give its IP address.",
+        found=len(found),
+    )
 
 
 def apply_settings(aravis: Any, camera: Any, config: CameraConfig) -> Region:
@@ -355,8 +366,13 @@ def require_settings(camera: Any, wanted: CameraConfig, region: Region) -> tuple
     ):
         raise CameraError(
             f"the camera stands at {exposure_us:g} µs, {gain_db:g} dB, region {actual}; set were "
-            f"{wanted.exposure_us:g} µs, {wanted.gain_db:g} dB, region {region}: the "
-            "camera cannot do that, or another program changes its settings"
+            f"{wanted.exposure_us:g} µs, {wanted.gain_db:g} dB, region {region}",
+            code="settings-changed",
+            remedy="Ask for what the camera can do, and end other programs that use it.",
+            exposure_us=exposure_us,
+            wanted_exposure_us=wanted.exposure_us,
+            gain_db=gain_db,
+            wanted_gain_db=wanted.gain_db,
         )
     return exposure_us, gain_db
 

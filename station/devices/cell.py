@@ -74,8 +74,9 @@ def _camera(config: StationConfig, trigger: Trigger | None) -> tuple[Camera, Sou
         return AravisCamera(config.camera, trigger), "real"
     # A recorded or rendered picture beside an arm that really moves would be a wrong calibration.
     raise ConfigError(
-        f"camera.driver '{config.camera.driver}' shows no real picture and never runs beside a real arm: "
-        "use 'aravis', or `station serve --simulate`"
+        f"camera.driver '{config.camera.driver}' shows no real image and never runs beside a real arm",
+        code="unreal-camera",
+        remedy="Use 'aravis', or `station serve --simulate`.",
     )
 
 

@@ -14,6 +14,7 @@ LAST_FRAME_ID = 65_535
 """GigE Vision block ids run from 1 to this and start over at 1; 0 means "no frame"."""
 UNKNOWN_READOUT_S = 0.05
 READINGS_KEPT = 200
+RETAKE = "Take this pose again."
 
 
 class StreamCounts(msgspec.Struct, frozen=True):
@@ -82,23 +83,30 @@ class FrameCounter:
         last_id, last_pulse = self._last_id, self._last_pulse
         self._last_id, self._last_pulse = frame_id, pulse_count
         if not 1 <= frame_id <= LAST_FRAME_ID:
-            raise CameraError(f"the camera numbered a frame {frame_id}; frame ids are 1 … {LAST_FRAME_ID}")
+            raise CameraError(
+                f"the camera numbered a frame {frame_id}; frame ids are 1 … {LAST_FRAME_ID}", code="frame-id"
+            )
         frames = 1 if last_id is None else frames_between(last_id, frame_id)
         pulses = 1 if last_pulse is None or pulse_count is None else pulse_count - last_pulse
         if frames == 0:
             self.unexpected += 1
-            raise CameraError(f"the camera sent frame {frame_id} twice; take this pose again")
+            raise CameraError(f"the camera sent frame {frame_id} twice", code="frame-twice", remedy=RETAKE)
         if frames > 1 and frames > pulses:
             self.missing += frames - 1
             raise CameraError(
-                f"frames {next_frame_id(last_id or 0)} … were lost before frame {frame_id}: which picture "
-                "belongs to this pose is not certain; take it again"
+                f"frames {next_frame_id(last_id or 0)} … were lost before frame {frame_id}: which image "
+                "belongs to this pose is not certain",
+                code="frames-lost",
+                remedy=RETAKE,
+                frames=frames - 1,
             )
         if pulses != 1:
             self.unexpected += 1
             raise CameraError(
-                f"the trigger box counted {pulses} pulses for one picture (noise on the trigger line?); "
-                "take this pose again"
+                f"the trigger box counted {pulses} pulses for one image",
+                code="pulse-count",
+                remedy=f"{RETAKE} If it returns, look for noise on the trigger line.",
+                pulses=pulses,
             )
         self.frames += sequenced
         self.seen += 1
@@ -128,12 +136,14 @@ class FrameCounter:
         self.unexpected += frames
         self.restart()
         return CameraError(
-            f"{frames} frame(s) came without a trigger (noise on the trigger line, or a double exposure); "
-            "take this pose again"
+            f"{frames} frame(s) came without a trigger (noise on the trigger line, or a double exposure)",
+            code="surplus-frames",
+            remedy=RETAKE,
+            frames=frames,
         )
 
 
-class _Reading(NamedTuple):
+class _ClockReading(NamedTuple):
     device_s: float
     offset_ns: float
     """Host monotonic minus device time, at the middle of the round trip."""
@@ -148,13 +158,13 @@ class DeviceClock:
     """
 
     def __init__(self) -> None:
-        self._readings: deque[_Reading] = deque(maxlen=READINGS_KEPT)
+        self._readings: deque[_ClockReading] = deque(maxlen=READINGS_KEPT)
 
     def reading(self, device_ns: int, asked_monotonic_ns: int, answered_monotonic_ns: int) -> None:
         """The device showed `device_ns` at some moment between asking and the answer."""
         half_ns = (answered_monotonic_ns - asked_monotonic_ns) / 2
         offset_ns = float(asked_monotonic_ns - device_ns) + half_ns
-        self._readings.append(_Reading(device_ns / 1e9, offset_ns, half_ns / 1e9))
+        self._readings.append(_ClockReading(device_ns / 1e9, offset_ns, half_ns / 1e9))
 
     def restart(self) -> None:
         self._readings.clear()
@@ -180,7 +190,7 @@ class DeviceClock:
         )
 
 
-def _drift(readings: list[_Reading]) -> tuple[float, float]:
+def _drift(readings: list[_ClockReading]) -> tuple[float, float]:
     """Host seconds per device second minus 1, and how far it can be off."""
     span_s = readings[-1].device_s - readings[0].device_s
     third = max(1, len(readings) // 3)

@@ -37,7 +37,11 @@ FORMATS = (
 def bits_per_pixel(pixel_format: str) -> int:
     """On the wire. CameraError for a format that is not supported."""
     if pixel_format not in FORMATS:
-        raise CameraError(f"pixel format '{pixel_format}' is not supported; choose from {', '.join(FORMATS)}")
+        raise CameraError(
+            f"pixel format '{pixel_format}' is not supported",
+            code="pixel-format",
+            remedy=f"Choose from {', '.join(FORMATS)}.",
+        )
     if pixel_format in ("RGB8", "BGR8"):
         return 24
     if pixel_format == "Mono10p":
@@ -54,7 +58,12 @@ def decode(data: bytes, width: int, height: int, pixel_format: str) -> Image:
     """
     size = (width * height * bits_per_pixel(pixel_format) + 7) // 8
     if len(data) < size:
-        raise CameraError(f"a picture of {len(data)} bytes came, {size} are needed for {pixel_format}")
+        raise CameraError(
+            f"an image of {len(data)} bytes came, {size} are needed for {pixel_format}",
+            code="image-size",
+            size_bytes=len(data),
+            needed_bytes=size,
+        )
     raw = np.frombuffer(data, np.uint8, size)
     if pixel_format == "Mono8":
         return raw.reshape(height, width)

@@ -64,27 +64,31 @@ class Played(NamedTuple):
     """When it was taken, counted from the first."""
 
 
-class Source(NamedTuple):
+class PlayedSource(NamedTuple):
     name: str
     identity: CameraIdentity
     frames: Iterator[Played]
     """In order; raises CameraError at a picture that cannot be read."""
 
 
-def open_source(path: Path) -> Source:
+def open_source(path: Path) -> PlayedSource:
     """Raises CameraError with the remedy."""
     if not path.exists():
-        raise CameraError(f"nothing to play at {path}: camera.device names a folder, a video or a recording")
+        raise CameraError(
+            f"nothing to play at {path}",
+            code="nothing-to-play",
+            remedy="Name a folder, a video or a recording in camera.device.",
+        )
     if path.is_dir() and not any(path.glob("*.mcap")):
         files = sorted(p for p in path.iterdir() if p.suffix.lower() in PICTURE_SUFFIXES)
         if not files:
-            raise CameraError(f"no pictures in {path} ({', '.join(PICTURE_SUFFIXES)})")
-        return Source(path.name, _identity("folder", path), _folder(files))
+            raise CameraError(f"no images in {path} ({', '.join(PICTURE_SUFFIXES)})", code="nothing-to-play")
+        return PlayedSource(path.name, _identity("folder", path), _folder(files))
     if path.suffix.lower() in VIDEO_SUFFIXES:
         capture = cv2.VideoCapture(str(path))
         if not capture.isOpened():
-            raise CameraError(f"{path} is not a video that OpenCV can read")
-        return Source(path.name, _identity("video", path), _video(path, capture))
+            raise CameraError(f"{path} is not a video that OpenCV can read", code="unreadable-video")
+        return PlayedSource(path.name, _identity("video", path), _video(path, capture))
     return _recording(path)
 
 
@@ -96,7 +100,11 @@ def _folder(files: list[Path]) -> Iterator[Played]:
     for number, file in enumerate(files):
         image = cv2.imread(str(file), cv2.IMREAD_UNCHANGED)
         if image is None:
-            raise CameraError(f"{file} is not a picture that OpenCV can read; repair or remove it")
+            raise CameraError(
+                f"{file} is not an image that OpenCV can read",
+                code="unreadable-image",
+                remedy="Repair or remove it.",
+            )
         if image.ndim == 3 and image.shape[2] == 4:
             image = cv2.cvtColor(image, cv2.COLOR_BGRA2BGR)
         wide = "Mono16" if image.dtype.itemsize == 2 else "Mono8"
@@ -117,15 +125,15 @@ def _video(path: Path, capture: cv2.VideoCapture) -> Iterator[Played]:
     finally:
         capture.release()
     if number == 0:
-        raise CameraError(f"{path} has no readable frame")
+        raise CameraError(f"{path} has no readable frame", code="unreadable-video")
 
 
-def _recording(path: Path) -> Source:
+def _recording(path: Path) -> PlayedSource:
     try:
         recording = open_recording(path)
         info = recording.info
     except RecordingError as error:
-        raise CameraError(f"{path} cannot be played: {error}") from error
+        raise CameraError(f"{path} cannot be played: {error}", code="unreadable-recording") from error
 
     def frames() -> Iterator[Played]:
         first_ns: int | None = None
@@ -135,11 +143,13 @@ def _recording(path: Path) -> Source:
                 first_ns = taken_ns if first_ns is None else first_ns
                 yield Played(picture, max(0.0, (taken_ns - first_ns) / 1e9))
         except RecordingError as error:
-            raise CameraError(f"{path} cannot be played further: {error}") from error
+            raise CameraError(
+                f"{path} cannot be played further: {error}", code="unreadable-recording"
+            ) from error
 
     camera = info.camera_identity
     identity = CameraIdentity(camera.vendor, camera.model, camera.serial, "playback")
-    return Source(info.name, identity, frames())
+    return PlayedSource(info.name, identity, frames())
 
 
 class PlaybackCamera:
@@ -151,43 +161,39 @@ class PlaybackCamera:
     def __init__(self, config: CameraConfig, robot: PlaybackRobot | None = None) -> None:
         self._config = config
         self._robot = robot
-        self._source: Source | None = None
+        self._source: PlayedSource | None = None
         self._newest: Image | None = None
         self._frame_id = 0
         self._taken = 0
         self._start_s: float | None = None
         self._busy = asyncio.Lock()
-        self._identity = CameraIdentity(driver="playback")
-
-    @property
-    def identity(self) -> CameraIdentity:
-        return self._identity
-
-    @property
-    def clock(self) -> ClockFit | None:
-        return _HOST_CLOCK
+        self.identity = CameraIdentity(driver="playback")
+        self.clock: ClockFit | None = _HOST_CLOCK
 
     def counts(self) -> CameraCounts:
         return CameraCounts(frames=self._taken)
 
     async def open(self) -> CameraIdentity:
         self._source = await asyncio.to_thread(open_source, Path(self._config.device))
-        self._identity = self._source.identity
+        self.identity = self._source.identity
         self._start_s = None
-        return self._identity
+        return self.identity
 
     async def capture(self, timeout_s: float = 5.0) -> Image:
         """The next picture; CameraError at the end, or when it is not due within `timeout_s`."""
         async with self._busy:
             if self._source is None:
-                raise CameraError("nothing is being played; open the camera first")
+                raise CameraError("nothing is being played", code="not-open", remedy="Open the camera first.")
             if self._robot is not None:
                 picture = await asyncio.to_thread(self._robot.picture)
             else:
                 played = await asyncio.to_thread(next, self._source.frames, None)
                 if played is None:
                     raise CameraError(
-                        f"'{self._source.name}' is at its end after {self._taken} pictures; open it again"
+                        f"'{self._source.name}' is at its end after {self._taken} images",
+                        code="played-out",
+                        remedy="Open it again.",
+                        images=self._taken,
                     )
                 await self._wait_for(played, timeout_s)
                 picture = played.picture
@@ -229,7 +235,13 @@ class PlaybackCamera:
         left_s = self._start_s + played.at_s / self._config.playback_pace - now_s
         if left_s > timeout_s:
             await asyncio.sleep(timeout_s)
-            raise CameraError(f"the next picture was taken {left_s:.0f} s later; raise camera.playback_pace")
+            raise CameraError(
+                f"the next image was taken {left_s:.0f} s later",
+                code="no-image",
+                remedy="Raise camera.playback_pace.",
+                left_s=left_s,
+                limit_s=timeout_s,
+            )
         await asyncio.sleep(max(0.0, left_s))
 
 
@@ -245,9 +257,11 @@ class PlaybackRobot:
             self._recording: Recording = open_recording(recording)
             self.views: list[View] = self._recording.views()
         except RecordingError as error:
-            raise RobotError(f"{recording} cannot be played: {error}") from error
+            raise RobotError(f"{recording} cannot be played: {error}", code="unreadable-recording") from error
         if not self.views or any(v.joints_rad is None for v in self.views):
-            raise RobotError(f"{recording} has no joints for every view: it plays as a camera only")
+            raise RobotError(
+                f"{recording} has no joints for every view: it plays as a camera only", code="no-joints"
+            )
         self._lock = threading.Lock()
         self._from = self._to = self.views[0]
         self._move_start_s = -MOVE_S
@@ -255,27 +269,9 @@ class PlaybackRobot:
         self._callbacks: list[Callable[[RobotState], None]] = []
         self._ending = threading.Event()
         self._thread: threading.Thread | None = None
-        self._controlled = False
-
-    @property
-    def identity(self) -> RobotIdentity:
-        return self._recording.info.robot
-
-    @property
-    def control(self) -> bool:
-        return self._controlled
-
-    @property
-    def control_path(self) -> str:
-        return ""
-
-    @property
-    def notice(self) -> str:
-        return ""
-
-    @property
-    def remote(self) -> bool | None:
-        return None
+        self.control = False
+        self.identity = self._recording.info.robot
+        self.control_path, self.notice, self.remote = "", "", None
 
     def plan(self) -> Plan:
         """The recorded poses as a plan."""
@@ -288,11 +284,11 @@ class PlaybackRobot:
         """Of the view the arm stands at; CameraError between two, or when it cannot be decoded."""
         view, moving = self._standing()
         if moving:
-            raise CameraError("playback has pictures only from where the recorded arm stood")
+            raise CameraError("playback has images only from where the recorded arm stood", code="no-image")
         try:
             return self._recording.image(view)
         except RecordingError as error:
-            raise CameraError(str(error)) from error
+            raise CameraError(error.text, code=error.code, remedy=error.remedy, **error.values) from error
 
     async def connect(self) -> RobotIdentity:
         if self._thread is None:
@@ -309,7 +305,7 @@ class PlaybackRobot:
     def at(self, host_monotonic_ns: int) -> RobotState:
         age_s = (time.monotonic_ns() - host_monotonic_ns) / 1e9
         if not -0.01 <= age_s <= 10.0:
-            raise StaleStateError(f"no played state {age_s:.1f} s ago")
+            raise StaleStateError(f"no played state {age_s:.1f} s ago", age_s=age_s)
         with self._lock:
             before, after, fraction = self._from, self._to, self._fraction(host_monotonic_ns / 1e9)
         a, b = np.array(before.joints_rad), np.array(after.joints_rad)
@@ -329,7 +325,7 @@ class PlaybackRobot:
             robot_mode=7,
             safety_mode=1,
             safety_status_bits=1,
-            runtime_state=2 if self._controlled else 1,
+            runtime_state=2 if self.control else 1,
             robot_status_bits=1,
             speed_scaling=1.0,
             target_speed_fraction=1.0,
@@ -341,16 +337,18 @@ class PlaybackRobot:
     def check(self) -> None: ...
 
     async def start_control(self) -> None:
-        self._controlled = True
+        self.control = True
 
     async def move(self, joints_rad: Sequence[float], speed_rad_s: float, acceleration_rad_s2: float) -> None:
         """RobotError where the recording was never at these joints."""
         target = np.asarray(joints_rad, dtype=float)
         off = [float(np.abs(np.array(v.joints_rad) - target).max()) for v in self.views]
         nearest = int(np.argmin(off))
-        if not self._controlled or off[nearest] > _SAME_JOINTS_RAD:
-            reason = "it has no go" if not self._controlled else "the recorded arm never stood there"
-            raise RobotError(f"playback cannot move to these joints: {reason}")
+        if not self.control or off[nearest] > _SAME_JOINTS_RAD:
+            reason, code = "the recorded arm never stood there", "not-recorded"
+            if not self.control:
+                reason, code = "motion is not approved", "no-control"
+            raise RobotError(f"playback cannot move to these joints: {reason}", code=code)
         with self._lock:
             self._from, self._to, self._halted_at = self._to, self.views[nearest], None
             self._move_start_s = time.monotonic()
@@ -362,10 +360,10 @@ class PlaybackRobot:
         with self._lock:
             if self._fraction(time.monotonic()) < 1 and self._halted_at is None:
                 self._halted_at = self._fraction(time.monotonic())
-        self._controlled = False
+        self.control = False
 
     async def end_control(self) -> None:
-        self._controlled = False
+        self.control = False
 
     async def close(self) -> None:
         self._ending.set()
@@ -405,8 +403,9 @@ def playback_cell(recording: Path) -> Cell:
         recorded = strict_yaml.load(content, StationConfig)
     except (RecordingError, strict_yaml.StrictYamlError) as error:
         raise ConfigError(
-            f"{recording} holds no usable {CONFIG_NAME} of a station ({error}): it cannot be replayed as a "
-            "cell. `calibrate solve` and Foxglove need none"
+            f"{recording} holds no usable {CONFIG_NAME} of a station ({error}): it cannot be replayed",
+            code="no-config",
+            remedy="`calibrate solve` and Foxglove need none.",
         ) from error
     camera = msgspec.structs.replace(
         recorded.camera, driver="playback", device=str(recording), trigger="software", playback_pace=0.0

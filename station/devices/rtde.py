@@ -24,6 +24,8 @@ Value = bool | int | float | tuple[float, ...] | tuple[int, ...]
 class RtdeError(RobotError):
     """The bytes on the connection are not RTDE, or a variable was refused."""
 
+    code = "rtde"
+
 
 class PacketType(IntEnum):
     PROTOCOL_VERSION = ord("V")
@@ -87,7 +89,7 @@ class RuntimeState(IntEnum):
     RESUMING = 5
 
 
-class RobotStatus(IntFlag):
+class RobotStatusBits(IntFlag):
     """The bits of `robot_status_bits`."""
 
     POWER_ON = 1 << 0
@@ -159,7 +161,7 @@ class Recipe:
     def __post_init__(self) -> None:
         refused = [n for n, t in zip(self.names, self.types, strict=True) if t not in DATA_TYPES]
         if refused:
-            raise RtdeError(f"the controller refused {', '.join(refused)}")
+            raise RtdeError(f"the controller refused {', '.join(refused)}", code="rtde-variables")
         codes = "".join(DATA_TYPES[t].code * DATA_TYPES[t].count for t in self.types)
         object.__setattr__(self, "packer", struct.Struct(">HBB" + codes))
 
@@ -172,7 +174,10 @@ class Recipe:
         if len(payload) != self.packer.size - HEADER.size:
             raise RtdeError(
                 f"a data packet of recipe {self.id} has {len(payload)} bytes, "
-                f"expected {self.packer.size - HEADER.size}"
+                f"expected {self.packer.size - HEADER.size}",
+                code="rtde-size",
+                size_bytes=len(payload),
+                expected_bytes=self.packer.size - HEADER.size,
             )
         return self.packer.unpack(HEADER.pack(self.packer.size, PacketType.DATA) + payload)[3:]
 

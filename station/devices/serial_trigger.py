@@ -117,7 +117,9 @@ class SerialTrigger:
     async def light(self, level: float) -> None:
         """0 = off, 1 = full. TriggerError where there is no light. Opening sets `config.light_level`."""
         if self._config.mode != "box":
-            raise TriggerError(f"trigger.mode '{self._config.mode}' has no light; it needs a trigger box")
+            raise TriggerError(
+                f"trigger.mode '{self._config.mode}' has no light; it needs a trigger box", code="no-light"
+            )
         await self._run(partial(self._set_light, level))
 
     async def close(self) -> None:
@@ -139,8 +141,9 @@ class SerialTrigger:
             self._port = self._open_port(self._config.port)
         except (OSError, ValueError) as error:
             raise TriggerError(
-                f"trigger port {self._config.port} cannot be opened ({error}); is the box plugged in, "
-                "and is this user in the group dialout?"
+                f"trigger port {self._config.port} cannot be opened ({error})",
+                code="trigger-port",
+                remedy="Plug the box in, and put this user into the group dialout.",
             ) from error
         self._lines = LineReader()
         self._count = self._first_count = 0
@@ -161,16 +164,20 @@ class SerialTrigger:
             try:
                 product, protocol, serial = self._ask("ID?", "ID", 3, timeout_s=ANSWER_TIMEOUT_S / 2)
                 break
-            except _NoAnswerError as error:
+            except _BoxSilentError as error:
                 if time.monotonic() > end_s:
                     raise TriggerError(
-                        f"what is on {self._config.port} does not answer like a trigger box: wrong port, or "
-                        "another device? A udev rule gives the box a name of its own (docs/trigger-box.md)"
+                        f"what is on {self._config.port} does not answer like a trigger box",
+                        code="no-trigger-box",
+                        remedy="Check trigger.port; a udev rule gives the box a name of its own "
+                        "(docs/trigger-box.md).",
                     ) from error
         if (product, protocol) != (PRODUCT, PROTOCOL):
             raise TriggerError(
                 f"{self._config.port} is a '{product}' with protocol {protocol}, not a {PRODUCT} with "
-                f"protocol {PROTOCOL}; check trigger.port"
+                f"protocol {PROTOCOL}",
+                code="no-trigger-box",
+                remedy="Check trigger.port.",
             )
         self._boot_id, count, _ = self._status()
         self._count = self._first_count = count
@@ -186,12 +193,16 @@ class SerialTrigger:
         asked_ns = time.monotonic_ns()
         try:
             boot_id, count, device_us = self._ask(f"FIRE {self._config.pulse_us}", "FIRED", 3)
-        except _NoAnswerError:
+        except _BoxSilentError:
             # Whether the camera was triggered decides what its next frame belongs to: ask.
             before = self._count
             self._settle_count(*self._status()[:2])
             if (self._count - before) != 1:
-                raise TriggerError("the trigger box did not confirm a pulse; take this pose again") from None
+                raise TriggerError(
+                    "the trigger box did not confirm a pulse",
+                    code="pulse-count",
+                    remedy="Take this pose again.",
+                ) from None
             return TriggerPulse(self._count, 0, asked_ns)
         answered_ns = time.monotonic_ns()
         self._settle_count(boot_id, _number(count))
@@ -201,8 +212,9 @@ class SerialTrigger:
         if boot_id != self._boot_id:
             self._disconnect()
             raise TriggerError(
-                "the trigger box restarted (power, cable?): its count is void, and the picture belongs to no "
-                "known pulse; check its supply"
+                "the trigger box restarted: the image belongs to no known pulse",
+                code="trigger-restarted",
+                remedy="Check its power; retake the pose.",
             )
         self._count += (count - self._count) % _COUNTS
 
@@ -210,8 +222,8 @@ class SerialTrigger:
         """Boot id, pulses so far, light in permille."""
         try:
             boot_id, count, light = self._ask("STATUS?", "STATUS", 3)
-        except _NoAnswerError as error:
-            raise TriggerError(f"trigger box lost: {error}") from error
+        except _BoxSilentError as error:
+            raise TriggerError(f"trigger box lost: {error}", code="trigger-lost") from error
         return boot_id, _number(count), _number(light)
 
     def _ask(self, request: str, answer: str, fields: int, timeout_s: float = ANSWER_TIMEOUT_S) -> list[str]:
@@ -227,19 +239,25 @@ class SerialTrigger:
                 texts = self._lines.feed(port.read(port.in_waiting or 1))
                 if self._lines.bad_lines - bad_before > BAD_LINES_LIMIT:
                     raise TriggerError(
-                        f"more than {BAD_LINES_LIMIT} garbled lines for one answer from {self._config.port}: "
-                        "wrong baud rate, a bad cable, or not a trigger box"
+                        f"more than {BAD_LINES_LIMIT} garbled lines for one answer from {self._config.port}",
+                        code="garbled-lines",
+                        remedy="Check the cable, and that this is a trigger box.",
+                        limit=BAD_LINES_LIMIT,
                     )
                 for text in texts:
                     words = text.split()
                     if words[:1] == [answer] and len(words) == fields + 1:
                         return words[1:]
                     if words[:1] == ["ERR"]:
-                        raise TriggerError(f"the trigger box refused '{request}': {text[4:]}")
+                        raise TriggerError(
+                            f"the trigger box refused '{request}': {text[4:]}", code="trigger-refused"
+                        )
         except (OSError, termios.error) as error:  # pyserial's SerialException is an OSError
             self._disconnect()
-            raise TriggerError(f"trigger box lost: {self._config.port} is gone ({error})") from error
-        raise _NoAnswerError(f"no answer to '{request}' within {timeout_s:g} s on {self._config.port}")
+            raise TriggerError(
+                f"trigger box lost: {self._config.port} is gone ({error})", code="trigger-lost"
+            ) from error
+        raise _BoxSilentError(f"no answer to '{request}' within {timeout_s:g} s on {self._config.port}")
 
     def _pulse_line(self) -> TriggerPulse:
         port = self._require_port()
@@ -251,13 +269,17 @@ class SerialTrigger:
             setattr(port, line, False)
         except (OSError, termios.error) as error:
             self._disconnect()
-            raise TriggerError(f"the adapter on {self._config.port} is gone ({error})") from error
+            raise TriggerError(
+                f"the adapter on {self._config.port} is gone ({error})", code="trigger-lost"
+            ) from error
         self._count += 1
         return TriggerPulse(self._count, fired_ns // 1000, fired_ns)
 
     def _require_port(self) -> Any:
         if self._port is None:
-            raise TriggerError("the trigger box is not open (or was lost); open it again")
+            raise TriggerError(
+                "the trigger box is not open, or was lost", code="not-open", remedy="Open it again."
+            )
         return self._port
 
     def _disconnect(self) -> None:
@@ -266,13 +288,13 @@ class SerialTrigger:
             port.close()
 
 
-class _NoAnswerError(TriggerError):
-    pass
+class _BoxSilentError(TriggerError):
+    code = "no-answer"
 
 
 def _number(text: str) -> int:
     if not text.isdecimal():
-        raise TriggerError(f"the trigger box sent '{text}' where a number belongs")
+        raise TriggerError(f"the trigger box sent '{text}' where a number belongs", code="garbled-lines")
     return int(text)
 
 

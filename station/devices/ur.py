@@ -22,6 +22,8 @@ from station.cell.errors import RobotError, SafetyStopError, StaleStateError
 from station.devices.rtde import RuntimeState
 from station.devices.ur_child import REFUSALS, ControlChild
 from station.devices.ur_condition import (
+    APPROVE_AGAIN,
+    STALE_S,
     foreign_program,
     not_powered,
     program_ended,
@@ -30,8 +32,8 @@ from station.devices.ur_condition import (
     watchdog_cause,
 )
 from station.devices.ur_dashboard import STOP, Dashboard, came
-from station.devices.ur_link import UrLink, link_lost_words
-from station.devices.ur_moves import STALE_S, MoveWatch, check_goal
+from station.devices.ur_link import UrLink, link_lost
+from station.devices.ur_moves import MoveWatch, check_goal
 
 log = logging.getLogger(__name__)
 
@@ -45,11 +47,10 @@ rests: at its fastest it brakes for 0.26 s."""
 PROGRAM_START_NS = 200_000_000
 LEFTOVER_WAIT_NS = 2_000_000_000
 CLOSE_WAIT_S = 0.5
-LOCAL_CONTROL = "the robot is in local control: switch the pendant to Remote (top right), then give a new go"
 KEPT = 64
 
 
-class Heart:
+class HeartbeatMonitor:
     def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
         self._now_s = now_s
         self._beats_s: deque[float] = deque(maxlen=KEPT)
@@ -79,7 +80,7 @@ def library_installed() -> bool:
 def control_trouble(path: str, real: bool) -> tuple[str, str]:
     """What speaks against driving an arm that way, and what to do; empty: nothing."""
     if path == "ur_rtde" and not library_installed():
-        return "ur_rtde is not installed", REFUSALS["ur-rtde-missing"]
+        return "ur_rtde is not installed", REFUSALS["ur-rtde-missing"][1]
     if path == "script" and real:
         return (
             "the station's own script drives the arm: not yet accepted on a real arm",
@@ -97,10 +98,11 @@ class UrRobot(UrLink):
         """What a person should know while a move is under way, though it is no fault; empty = nothing."""
         self._log_path = log_dir / "control.log"
         self._child: ControlChild | None = None
-        self._controls = False
+        self.control = False
+        """The control program runs and obeys us."""
         self._moving = False
         self._stop_reason = self._link_loss = ""
-        self._heart = Heart()
+        self._heart = HeartbeatMonitor()
         self._played_s = 0.0
         """When the control program was last seen playing, in a move."""
         self._background: set[asyncio.Task[Any]] = set()
@@ -110,15 +112,8 @@ class UrRobot(UrLink):
         return control_path(self.config)
 
     @property
-    def control(self) -> bool:
-        """The control program runs and obeys us."""
-        return self._controls
-
-    @property
     def control_pid(self) -> int | None:
         return self._child.pid if self._child is not None else None
-
-    # -- control ----------------------------------------------------------------------------------------
 
     async def start_control(self) -> None:
         """Spawns the control process, which loads its program; returns when that heard a first heartbeat.
@@ -126,28 +121,28 @@ class UrRobot(UrLink):
         Only in answer to a go. Raises RobotError.
         """
         if self._child is not None:
-            raise RobotError("control is already started")
+            raise RobotError("control is already started", code="control-started")
         self._stop_reason = ""
         await self.idle()  # a child that is still ending holds the registers
         await self.fresh()
         self.check()
         await self._may_start()
         if why := self._why_stopped():
-            raise RobotError(f"stopped before control started{why}")
+            raise _stopped(f" before control started{why}")
         child = self._child = ControlChild.spawn(self.config.host, self._log_path, self.control_path)
         try:
             tcp = await child.ready()
             if self._why_stopped():
-                raise RobotError("stopped")
+                raise _stopped()
             if tcp is not None and self._tool is not None:
                 self._tool.agree((tcp[0], tcp[1], tcp[2], tcp[3], tcp[4], tcp[5]))
             await self._heard(child)
         except BaseException as error:
             await self.end_control()
             if (why := self._why_stopped()) and isinstance(error, RobotError):
-                raise RobotError(f"stopped while control was starting{why}") from None
+                raise _stopped(f" while control was starting{why}") from None
             raise
-        self._controls = True
+        self.control = True
 
     async def _heard(self, child: ControlChild) -> None:
         """Raises what kept the program from taking the first heartbeat."""
@@ -163,7 +158,7 @@ class UrRobot(UrLink):
         self.remote = await fresh.remote()
         state = await self.fresh()
         if self.remote is False:
-            raise RobotError(LOCAL_CONTROL)
+            raise _local_control()
         self.program = await fresh.ask("programState")
         trouble = safety_stop(state) or not_powered(state) or foreign_program(state, self.program)
         if trouble is not None:
@@ -177,13 +172,11 @@ class UrRobot(UrLink):
 
     async def end_control(self) -> None:
         """Stops the script and ends the child."""
-        child, self._child, self._controls = self._child, None, False
+        child, self._child, self.control = self._child, None, False
         if child is None:
             return
         await child.end()
         await self._stop_leftover_program()
-
-    # -- moving -----------------------------------------------------------------------------------------
 
     async def move(self, joints_rad: Sequence[float], speed_rad_s: float, acceleration_rad_s2: float) -> None:
         """Moves the joints and returns when arrived. Whatever else ends it stops the arm and control.
@@ -193,17 +186,21 @@ class UrRobot(UrLink):
         """
         check_goal(joints_rad, speed_rad_s, acceleration_rad_s2, self.model.joint_limit_rad)
         child = self._child
-        if child is None or not self._controls:
-            raise RobotError(f"control is not started{self._why_stopped()}: a person's go starts it")
+        if child is None or not self.control:
+            raise RobotError(
+                f"control is not started{self._why_stopped()}",
+                code="no-control",
+                remedy="Approve motion first.",
+            )
         if self._moving:
-            raise RobotError("a move is already under way")
+            raise RobotError("a move is already under way", code="moving")
         self._moving, self._link_loss = True, ""
         try:
             await self.fresh()
             await child.heard()
             self.check()
             if self._child is not child:
-                raise RobotError("stopped")  # while we waited
+                raise _stopped()  # while we waited
             sample = self.newest()
             self._played_s = time.monotonic()
             watch = MoveWatch(sample.state.joints_rad, joints_rad, sample.operation, self._played_s)
@@ -220,7 +217,7 @@ class UrRobot(UrLink):
     async def _follow(self, watch: MoveWatch, child: ControlChild) -> None:
         while True:
             if self._stop_reason:
-                raise RobotError(f"stopped: {self._stop_reason}")
+                raise _stopped(f": {self._stop_reason}")
             sample = self.newest()
             if sample.state.runtime_state == RuntimeState.PLAYING:
                 self._played_s = sample.state.stamps.host_monotonic_ns / 1e9
@@ -235,20 +232,20 @@ class UrRobot(UrLink):
         if not isinstance(error, RobotError):
             return error
         if self._stop_reason:
-            return RobotError(f"stopped: {self._stop_reason}")
+            return _stopped(f": {self._stop_reason}")
         reader = self.reader
         state = reader.newest.state if reader is not None and reader.newest is not None else None
         stop = safety_stop(state) or not_powered(state) if state is not None else None
         if stop is not None:
             return stop
         if self._link_loss:  # the link may be on its way back already
-            return StaleStateError(link_lost_words(self._link_loss))
+            return link_lost(self._link_loss)
         if reader is None or state is None:
             return error
         if reader.ended is not None or isinstance(error, StaleStateError):
             pause_s = self._heart.worst_s(time.monotonic() - self.age_s() - OUTLIVED_S[self.control_path])
             busy = watchdog_cause(pause_s, 0.0) if reader.ended is None else None
-            return busy or StaleStateError(self._stale_words(self.age_s()))
+            return busy or self.stale(self.age_s())
         refused = child.kicks_refused and state.runtime_state == RuntimeState.PLAYING  # it tells no more yet
         if state.runtime_state != RuntimeState.STOPPED and not refused:
             return error
@@ -273,9 +270,7 @@ class UrRobot(UrLink):
             with contextlib.suppress(RobotError, TimeoutError):
                 async with asyncio.timeout(0.3):
                     self.remote = await self.dashboard.remote()
-        return RobotError(LOCAL_CONTROL) if self.remote is False else error
-
-    # -- stopping ---------------------------------------------------------------------------------------
+        return _local_control() if self.remote is False else error
 
     async def stop(self, reason: str) -> None:
         """Decelerates now, by both paths; idempotent, in any state, never raises. Control ends with it.
@@ -283,7 +278,7 @@ class UrRobot(UrLink):
         Without control of ours the dashboard's stop is sent all the same: it ends a foreign program too.
         """
         self._stop_reason = self._stop_reason or reason
-        child, self._child, self._controls = self._child, None, False
+        child, self._child, self.control = self._child, None, False
         reply: asyncio.Future[str] | None = None
         try:
             if child is not None:
@@ -352,7 +347,7 @@ class UrRobot(UrLink):
         """Between moves: a program, a process or a switch that failed ends control, and says why."""
         await super().supervise_more()
         child = self._child
-        if child is None or not self._controls or self._moving:
+        if child is None or not self.control or self._moving:
             return
         try:
             child.check()
@@ -366,9 +361,9 @@ class UrRobot(UrLink):
         """What state stream and dashboard say against the control program. StaleStateError without both."""
         state = self.newest().state
         if self.age_s() > STALE_S:
-            return StaleStateError(self._stale_words(self.age_s()))
+            return self.stale(self.age_s())
         if self.remote is False:
-            return RobotError(LOCAL_CONTROL)
+            return _local_control()
         return safety_stop(state) or not_powered(state) or program_not_running(state)
 
     async def close(self) -> None:
@@ -389,3 +384,15 @@ class UrRobot(UrLink):
         task = asyncio.get_running_loop().create_task(work)
         self._background.add(task)
         task.add_done_callback(self._background.discard)
+
+
+def _stopped(how: str = "") -> RobotError:
+    return RobotError(f"stopped{how}", code="stopped")
+
+
+def _local_control() -> RobotError:
+    return RobotError(
+        "the robot is in local control",
+        code="local-control",
+        remedy=f"Switch the pendant to Remote (top right), {APPROVE_AGAIN}.",
+    )

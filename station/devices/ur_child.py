@@ -18,6 +18,7 @@ from typing import Any, BinaryIO
 
 from station.cell.config import ControlPath
 from station.cell.errors import RobotError
+from station.devices.ur_condition import APPROVE_AGAIN
 
 log = logging.getLogger(__name__)
 
@@ -33,17 +34,28 @@ STOP_DECELERATION = 2.0
 """The script reads it as m/s² of the tool for an asynchronous stop (see docs/safety.md)."""
 
 REFUSALS = {
-    "registers-in-use": "another program controls the robot (its RTDE registers are in use): close that "
-    "program, or the field bus on the pendant, then try again",
-    "local-control": "the robot is in local control: switch the pendant to Remote (top right), "
-    "then try again",
-    "script-not-started": "the control program did not start: power on, release the brakes, clear the "
-    "pendant's messages",
-    "program-playing": "another program is playing on the robot: stop it on the pendant, then try again",
-    "ur-rtde-missing": "the library ur_rtde is not installed (it exists for Python 3.10 to 3.12 on x86-64): "
-    "install it, or set robot.control: script in the configuration",
+    "registers-in-use": (
+        "another program controls the robot (its RTDE registers are in use)",
+        "Close that program, or the field bus on the pendant, then try again.",
+    ),
+    "local-control": (
+        "the robot is in local control",
+        "Switch the pendant to Remote (top right), then try again.",
+    ),
+    "script-not-started": (
+        "the control program did not start",
+        "Power on, release the brakes, clear the pendant's messages.",
+    ),
+    "program-playing": (
+        "another program is playing on the robot",
+        "Stop it on the pendant, then try again.",
+    ),
+    "ur-rtde-missing": (
+        "the library ur_rtde is not installed (it exists for Python 3.10 to 3.12 on x86-64)",
+        "Install it, or set robot.control: script in the configuration.",
+    ),
 }
-"""By the code of the control process's refusal: what a person can do."""
+"""By the code of the control process's refusal: what it is, what a person can do."""
 
 
 class ControlChild:
@@ -91,8 +103,9 @@ class ControlChild:
         except OSError as error:
             ours.close()
             raise RobotError(
-                f"the control process, which logs to {log_path}, cannot be started ({error}): make room on "
-                "this computer's disk or in its memory, then give a new go"
+                f"the control process, which logs to {log_path}, cannot be started ({error})",
+                code="control-process",
+                remedy=f"Make room on this computer's disk or in its memory, {APPROVE_AGAIN}.",
             ) from None
         return cls(process, ours, log_path)
 
@@ -108,17 +121,18 @@ class ControlChild:
         except TimeoutError:
             self.kill()
             await self.reap()
-            raise RobotError(
-                f"the control process was not ready within {timeout_s:g} s and was killed; "
-                f"see {self._log_path}"
+            raise self._trouble(
+                f"the control process was not ready within {timeout_s:g} s and was killed", limit_s=timeout_s
             ) from None
         self._beat_ns = 0  # beats that waited for it to be ready are no sign of hanging
-        if "refused" in answer:
+        if "refused" in answer or "died" in answer:
             self.kill()
             await self.reap()
-            code, text = str(answer.get("code", "")), str(answer["refused"])
-            words = REFUSALS.get(code, f"control could not start: {text}")
-            raise RobotError(words + self.epitaph(), code=code)
+            if "died" in answer:
+                raise self._death()
+            code = str(answer.get("code", "control"))
+            text, remedy = REFUSALS.get(code, (f"control could not start: {answer['refused']}", ""))
+            raise RobotError(text + self.exit_description(), code=code, remedy=remedy)
         return tuple(answer["tcp"]) if answer.get("tcp") else None
 
     async def heard(self) -> None:
@@ -133,12 +147,12 @@ class ControlChild:
         except TimeoutError:
             self.check(patience_s=HEARD_S / 2)
             raise RobotError(
-                f"no heartbeat of the session reached the control process within {HEARD_S:g} s: look for "
-                f"what loads this computer; see {self._log_path}"
+                f"no heartbeat of the session reached the control process within {HEARD_S:g} s",
+                code="no-heartbeat",
+                remedy=f"Reduce the load of this computer; see {self._log_path}.",
+                limit_s=HEARD_S,
             ) from None
         self.check()
-
-    # -- requests ---------------------------------------------------------------------------------------
 
     def beat(self) -> None:
         """Passes the session loop's heartbeat on. Never blocks: a child that does not read gets none."""
@@ -160,18 +174,20 @@ class ControlChild:
         }
         try:
             if not self._send(request):
-                raise RobotError(f"the control process takes no requests{self.epitaph()}")
+                raise self._trouble(f"the control process takes no requests{self.exit_description()}")
             async with asyncio.timeout(ACKNOWLEDGE_S):
                 reply = await answer
         except TimeoutError:
-            raise RobotError(
-                f"the control process did not acknowledge the move within {ACKNOWLEDGE_S:g} s; "
-                f"see {self._log_path}"
+            raise self._trouble(
+                f"the control process did not acknowledge the move within {ACKNOWLEDGE_S:g} s",
+                limit_s=ACKNOWLEDGE_S,
             ) from None
         finally:
             self._moves.pop(self._number, None)
+        if "died" in reply:
+            raise self._death()
         if not reply["ok"]:
-            raise RobotError(f"the move was not started: {reply['error']}")
+            raise RobotError(f"the move was not started: {reply['error']}", code="move-refused")
 
     def stop(self) -> None:
         """Puts the stop on the wire to the child, now. Never raises."""
@@ -180,14 +196,21 @@ class ControlChild:
     def check(self, patience_s: float = ACKNOWLEDGE_S) -> None:
         """Raises RobotError when the process died, hangs, or its script takes no kicks."""
         if self.gone.is_set():
-            raise RobotError(f"the control process died{self.epitaph()}; see {self._log_path}")
+            raise self._death()
         if self._beat_ns > self._answered_ns and time.monotonic_ns() - self._beat_ns > patience_s * 1e9:
-            raise RobotError(f"the control process hangs, its watchdog stops the arm; see {self._log_path}")
+            raise self._trouble("the control process hangs, its watchdog stops the arm")
         if self.kicks_refused:
             raise RobotError(
                 "the watchdog of the control program could not be kicked: the session was busy for too long, "
-                "or the program stopped"
+                "or the program stopped",
+                code="watchdog",
             )
+
+    def _death(self) -> RobotError:
+        return self._trouble(f"the control process died{self.exit_description()}")
+
+    def _trouble(self, text: str, **values: float) -> RobotError:
+        return RobotError(text, code="control-process", remedy=f"See {self._log_path}.", **values)
 
     def _send(self, request: dict[str, Any]) -> bool:
         try:
@@ -195,8 +218,6 @@ class ControlChild:
         except OSError:  # full, or closed
             return False
         return True
-
-    # -- the end ----------------------------------------------------------------------------------------
 
     async def end(self, timeout_s: float = END_S) -> None:
         """Ends script and process in good order, by force when that takes too long. Reaps it."""
@@ -231,7 +252,7 @@ class ControlChild:
                 return
             await asyncio.sleep(0.005)
 
-    def epitaph(self) -> str:
+    def exit_description(self) -> str:
         """How it died, in words; empty while it lives or after a normal end."""
         code = self._process.poll()
         if code is None or code == 0:
@@ -239,8 +260,6 @@ class ControlChild:
         if code < 0:
             return f" (signal {-code}, {signal.Signals(-code).name})"
         return f" (exit code {code})"
-
-    # -- answers ----------------------------------------------------------------------------------------
 
     def _receive(self) -> None:
         try:
@@ -275,10 +294,9 @@ class ControlChild:
             self._channel.close()
         self.gone.set()
         self._news.set()
-        died = {"ok": False, "error": "the control process died", "refused": "the control process died"}
         for waiter in (*self._moves.values(), self._ready):
             if not waiter.done():
-                waiter.set_result(died)
+                waiter.set_result({"died": True})
         if not self.stop_acknowledged.done():
             self.stop_acknowledged.set_result(None)
 

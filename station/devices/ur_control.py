@@ -39,7 +39,7 @@ LIBRARY_WORDS = {
 """What ur_rtde's refusals say, in small letters; it has no codes."""
 
 
-class ControlServer:
+class MotionServer:
     def __init__(self, control: Any, channel: socket.socket) -> None:
         self._control = control
         self._channel = channel
@@ -134,7 +134,7 @@ def main(path: str, host: str, descriptor: int, parent_pid: int) -> NoReturn:
         code = error.code if isinstance(error, RobotError) else "control"
         channel.send(json.dumps({"refused": str(error), "code": code}).encode())
         os._exit(1)
-    server = ControlServer(control, channel)
+    server = MotionServer(control, channel)
     try:
         tcp: list[float] | None = control.getTCPOffset()
     except RuntimeError:

@@ -26,6 +26,8 @@ LINE_LIMIT = 4096
 class DashboardError(RobotError):
     """The dashboard is silent, gone or does not speak its protocol."""
 
+    code = "dashboard"
+
 
 def in_words(error: OSError | ValueError) -> str:
     """'Connection refused': asyncio's own words are numbers, and repeat the address."""
@@ -63,14 +65,19 @@ class Dashboard:
                 reader, writer = await asyncio.open_connection(host, PORT, limit=LINE_LIMIT)
                 greeting = await reader.readline()
             if b"Dashboard Server" not in greeting:
-                raise DashboardError(f"{where}: unexpected greeting {greeting[:80]!r}; is this a robot?")
+                raise DashboardError(
+                    f"{where}: unexpected greeting {greeting[:80]!r}", remedy="Check the robot's address."
+                )
             return cls(host, reader, writer)
         except BaseException as error:
             if writer is not None:
                 writer.transport.abort()
             if isinstance(error, TimeoutError):
-                words = f"no answer within {timeout_s:g} s; is this the robot?"
-                raise DashboardError(f"{where}: {words}") from None
+                raise DashboardError(
+                    f"{where}: no answer within {timeout_s:g} s",
+                    remedy="Check the robot's address.",
+                    limit_s=timeout_s,
+                ) from None
             if isinstance(error, OSError | ValueError):
                 raise DashboardError(f"{where}: {connect_trouble(error, 'Dashboard Server')}") from None
             raise
@@ -99,7 +106,8 @@ class Dashboard:
         except TimeoutError:
             self._break("silent")
             raise DashboardError(
-                f"dashboard of {self._host}: no reply to {command!r} within {timeout_s:g} s"
+                f"dashboard of {self._host}: no reply to {command!r} within {timeout_s:g} s",
+                limit_s=timeout_s,
             ) from None
 
     async def remote(self) -> bool | None:

@@ -17,7 +17,7 @@ from recordings.schema.messages import RobotIdentity, RobotState
 from station.cell.config import RobotConfig
 from station.cell.errors import RobotError, StaleStateError, StationError
 from station.cell.scene import arm_model
-from station.devices.ur_condition import safety_stop
+from station.devices.ur_condition import HICCUP_S, STALE_S, safety_stop
 from station.devices.ur_dashboard import Dashboard, DashboardError
 from station.devices.ur_primary import Installation, PrimaryReader
 from station.devices.ur_probe import SCRIPT_PORT, ProbeResult, RobotLock, check_port, identify, lock_name
@@ -26,8 +26,6 @@ from station.devices.ur_tool import TcpCheck, check_payload
 
 log = logging.getLogger(__name__)
 
-STALE_S = 0.1
-PATIENCE_S = 0.25
 FIRST_STATE_S = 4.0
 SUPERVISE_S = 0.2
 RECONNECT_S = (0.2, 0.5, 1.0, 2.0)
@@ -37,7 +35,11 @@ class UrLink:
     def __init__(self, config: RobotConfig) -> None:
         """Raises RobotError for an unknown model."""
         if config.model not in MODELS:
-            raise RobotError(f"unknown robot.model {config.model!r}; known: {', '.join(sorted(MODELS))}")
+            raise RobotError(
+                f"unknown robot.model {config.model!r}",
+                code="unknown-robot-model",
+                remedy=f"Use one of {', '.join(sorted(MODELS))}.",
+            )
         self.config = config
         self.model = arm_model(config)
         self.remote: bool | None = None
@@ -51,7 +53,7 @@ class UrLink:
         """Connections that ended by themselves."""
         self._ended_reader: StateReader | None = None
         self._lock: RobotLock | None = None
-        self._identity = RobotIdentity(model=config.model)
+        self.identity = RobotIdentity(model=config.model)
         self._subscribers: list[Callable[[RobotState], None]] = []
         self._primary: PrimaryReader | None = None
         self._tool: TcpCheck | None = None
@@ -60,18 +62,14 @@ class UrLink:
         self._trouble: RobotError | None = None
         self._supervisor: asyncio.Task[None] | None = None
 
-    # -- connecting -------------------------------------------------------------------------------------
-
-    @property
-    def identity(self) -> RobotIdentity:
-        return self._identity
-
     async def connect(self) -> RobotIdentity:
         """Reads identity and starts the state stream; changes nothing on the robot. Raises RobotError."""
         if self._supervisor is not None:
-            return self._identity
+            return self.identity
         if not self.config.host:
-            raise RobotError("robot.host is empty: give the robot's address in the configuration")
+            raise RobotError(
+                "robot.host is empty", code="no-host", remedy="Give the robot's address in the configuration."
+            )
         try:
             await self._open()
         except BaseException:
@@ -79,7 +77,7 @@ class UrLink:
             self._unlock()
             raise
         self._supervisor = asyncio.create_task(self._supervise(), name="robot supervisor")
-        return self._identity
+        return self.identity
 
     async def _open(self) -> None:
         host = self.config.host
@@ -96,7 +94,11 @@ class UrLink:
             async with asyncio.timeout(FIRST_STATE_S):
                 first = await asyncio.wrap_future(reader.started)
         except TimeoutError:
-            raise RobotError(f"{host}: RTDE answers, but no state came within {FIRST_STATE_S:g} s") from None
+            raise RobotError(
+                f"{host}: RTDE answers, but no state came within {FIRST_STATE_S:g} s",
+                code="no-state",
+                limit_s=FIRST_STATE_S,
+            ) from None
         self._primary = PrimaryReader(host)
         installation = await self._primary.first()
         if installation.tcp_offset is None:
@@ -109,18 +111,21 @@ class UrLink:
         wanted, host = self.config, self.config.host
         if found.model and found.model != wanted.model:
             raise RobotError(
-                f"the robot at {host} is a {found.model}, the configuration says {wanted.model}: correct "
-                "robot.model or robot.host"
+                f"the robot at {host} is a {found.model}, the configuration says {wanted.model}",
+                code="other-model",
+                remedy="Correct robot.model or robot.host.",
             )
         if wanted.serial and found.serial and found.serial != wanted.serial:
             raise RobotError(
-                f"the robot at {host} has serial {found.serial}, the configuration says {wanted.serial}: "
-                "correct robot.serial or robot.host"
+                f"the robot at {host} has serial {found.serial}, the configuration says {wanted.serial}",
+                code="other-robot",
+                remedy="Correct robot.serial or robot.host.",
             )
-        if self._lock is not None and found.serial != self._identity.serial:
+        if self._lock is not None and found.serial != self.identity.serial:
             raise RobotError(
-                f"another robot (serial {found.serial}) answers at {host} now: finish this session, then "
-                "start the station's daemon anew"
+                f"another robot (serial {found.serial}) answers at {host} now",
+                code="robot-exchanged",
+                remedy="Finish this session, then start the station's daemon anew.",
             )
         self.remote, self.program = found.remote, found.program
 
@@ -134,7 +139,7 @@ class UrLink:
             self._tool = TcpCheck(self.model, calibrated, first.state, installation)
         else:
             self._tool.check(first.state, installation)
-        self._identity = RobotIdentity(
+        self.identity = RobotIdentity(
             model=self.config.model,
             serial=found.serial,
             controller_version=".".join(map(str, reader.version)),
@@ -168,8 +173,6 @@ class UrLink:
         if dashboard is not None:
             await dashboard.close()
 
-    # -- the state --------------------------------------------------------------------------------------
-
     def subscribe(self, callback: Callable[[RobotState], None]) -> None:
         """Every sample, in order, at the full rate, from the reader's thread: the callback must be quick."""
         self._subscribers.append(callback)
@@ -191,7 +194,7 @@ class UrLink:
         """Whatever came last, however old. Raises StaleStateError when nothing ever came."""
         sample = self.reader.newest if self.reader is not None else None
         if sample is None:
-            raise StaleStateError(f"no connection to the robot at {self.config.host}")
+            raise StaleStateError(f"no connection to the robot at {self.config.host}", code="not-connected")
         return sample
 
     def age_s(self) -> float:
@@ -205,12 +208,12 @@ class UrLink:
         """Newest state; StaleStateError when older than 100 ms or its controller time stands still."""
         sample, age_s = self.newest(), self.age_s()
         if age_s > STALE_S or not self.connected:
-            raise StaleStateError(self._stale_words(age_s))
+            raise self.stale(age_s)
         return sample.state
 
     async def fresh(self) -> RobotState:
         """`latest`, but lets a hiccup of this computer pass. StaleStateError after 0.25 s."""
-        give_up_s = time.monotonic() + PATIENCE_S
+        give_up_s = time.monotonic() + HICCUP_S
         while True:
             try:
                 return self.latest()
@@ -219,19 +222,22 @@ class UrLink:
                     raise
             await asyncio.sleep(0.005)
 
-    def _stale_words(self, age_s: float) -> str:
+    def stale(self, age_s: float) -> StaleStateError:
+        """Why the newest state is too old."""
         reader = self.reader
         assert reader is not None
         if reader.ended is not None:
-            return link_lost_words(reader.ended)
+            return link_lost(reader.ended)
+        text, remedy = f"no news from the robot for {age_s * 1000:.0f} ms", "Check cable and network."
         if reader.stands_still:
-            return f"the controller's clock stands still since {age_s * 1000:.0f} ms: restart the controller"
-        return f"no news from the robot for {age_s * 1000:.0f} ms: check cable and network"
+            text = f"the controller's clock stands still since {age_s * 1000:.0f} ms"
+            remedy = "Restart the controller."
+        return StaleStateError(text, remedy=remedy, age_s=age_s, limit_s=STALE_S)
 
     def at(self, host_monotonic_ns: int) -> RobotState:
         """State interpolated at a host time within the last 10 s; StaleStateError outside."""
         if self.reader is None:
-            raise StaleStateError("not connected to the robot")
+            raise StaleStateError("not connected to the robot", code="not-connected")
         return state_at(self.reader.history.copy(), self.clock(), host_monotonic_ns)
 
     def clock(self) -> ClockFit | None:
@@ -250,8 +256,6 @@ class UrLink:
             check_payload(self.newest().payload, self._payload)
         if self._trouble is not None:
             raise self._trouble
-
-    # -- supervision ------------------------------------------------------------------------------------
 
     def _reader_ended(self, reader: StateReader, why: str) -> None:
         """Once for each reader: its own word may come after the supervision saw it."""
@@ -279,7 +283,7 @@ class UrLink:
                 failures, self._trouble = 0, None
             except StationError as error:
                 failures += 1
-                self._trouble = error if isinstance(error, RobotError) else RobotError(str(error))
+                self._trouble = RobotError(error.text, code=error.code, remedy=error.remedy, **error.values)
             except Exception:
                 failures += 1
                 log.exception("the robot's supervision failed; it goes on")
@@ -304,8 +308,12 @@ class UrLink:
                 self.remote = await self.dashboard.remote()
 
 
-def link_lost_words(why: str) -> str:
-    return f"connection to the robot lost ({why}): check cable, network and controller"
+def link_lost(why: str) -> StaleStateError:
+    return StaleStateError(
+        f"connection to the robot lost ({why})",
+        code="link-lost",
+        remedy="Check cable, network and controller.",
+    )
 
 
 def _call(loop: asyncio.AbstractEventLoop, function: Callable[..., None], *arguments: object) -> None:

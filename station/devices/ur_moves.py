@@ -14,9 +14,14 @@ from dataclasses import dataclass, field
 
 from recordings.schema.messages import RobotState, Vector6
 from station.cell.errors import RobotError, StaleStateError
-from station.devices.ur_condition import not_powered, program_not_running, safety_stop
+from station.devices.ur_condition import (
+    APPROVE_AGAIN,
+    HICCUP_S,
+    not_powered,
+    program_not_running,
+    safety_stop,
+)
 
-STALE_S = 0.25
 ARRIVED_RAD = 0.01
 STRAYED_RAD = 0.05
 """Further beside the straight way than any arm that follows it: 65 mm at 1.3 m."""
@@ -34,13 +39,24 @@ def check_goal(
 ) -> None:
     """Raises RobotError: ur_rtde sends NaN and wrong lengths to the controller as they are."""
     if len(joints_rad) != 6 or not all(math.isfinite(q) and abs(q) <= limit_rad for q in joints_rad):
-        raise RobotError(f"not six joint angles within ± {limit_rad:.2f} rad: {list(joints_rad)}")
+        raise RobotError(
+            f"not six joint angles within ± {limit_rad:.2f} rad: {list(joints_rad)}",
+            code="bad-goal",
+            limit_rad=limit_rad,
+        )
     if not 0 < speed_rad_s <= JOINT_SPEED_LIMIT_RAD_S:
-        raise RobotError(f"joint speed {speed_rad_s} rad/s is not within 0…{JOINT_SPEED_LIMIT_RAD_S}")
+        raise RobotError(
+            f"joint speed {speed_rad_s} rad/s is not within 0…{JOINT_SPEED_LIMIT_RAD_S}",
+            code="bad-goal",
+            speed_rad_s=speed_rad_s,
+            limit_rad_s=JOINT_SPEED_LIMIT_RAD_S,
+        )
     if not 0 < acceleration_rad_s2 <= JOINT_ACCELERATION_LIMIT_RAD_S2:
         raise RobotError(
-            f"joint acceleration {acceleration_rad_s2} rad/s² is not within "
-            f"0…{JOINT_ACCELERATION_LIMIT_RAD_S2}"
+            f"acceleration {acceleration_rad_s2} rad/s² is not within 0…{JOINT_ACCELERATION_LIMIT_RAD_S2}",
+            code="bad-goal",
+            acceleration_rad_s2=acceleration_rad_s2,
+            limit_rad_s2=JOINT_ACCELERATION_LIMIT_RAD_S2,
         )
 
 
@@ -84,9 +100,12 @@ class MoveWatch:
 
     def step(self, state: RobotState, word: int, age_s: float, now_s: float) -> bool:
         """True when arrived. `age_s`: of the newest state. Raises what ended the move otherwise."""
-        if age_s > STALE_S:
+        if age_s > HICCUP_S:
             raise StaleStateError(
-                f"no news from the robot for {age_s * 1000:.0f} ms during a move: check cable and network"
+                f"no news from the robot for {age_s * 1000:.0f} ms during a move",
+                remedy="Check cable and network.",
+                age_s=age_s,
+                limit_s=HICCUP_S,
             )
         trouble = safety_stop(state) or not_powered(state) or program_not_running(state)
         if trouble is not None:
@@ -94,8 +113,13 @@ class MoveWatch:
         joint, off_rad = beside(self.start_rad, self.target_rad, state.joints_rad)
         if off_rad > STRAYED_RAD:
             raise RobotError(
-                f"the arm left the way that was checked: joint {joint + 1} is {math.degrees(off_rad):.1f}° "
-                "beside it. Something else commands the arm, or pushes it; look at the cell"
+                f"the arm is off the checked path: joint {joint + 1} by {math.degrees(off_rad):.1f}° "
+                f"(limit {math.degrees(STRAYED_RAD):.1f}°)",
+                code="off-path",
+                remedy="Look at the cell: something else commands the arm, or pushes it.",
+                joint=joint + 1,
+                off_rad=off_rad,
+                limit_rad=STRAYED_RAD,
             )
         distances = [abs(q - t) for q, t in zip(state.joints_rad, self.target_rad, strict=True)]
         distance_rad = max(distances)
@@ -112,10 +136,14 @@ class MoveWatch:
             return True
         if self._ended_s is None:
             self._ended_s = now_s
-        if now_s - self._ended_s > STALE_S:
+        if now_s - self._ended_s > HICCUP_S:
             raise RobotError(
-                f"the move ended {distance_rad:.3f} rad short on joint {joint + 1}: "
-                "something else commanded or stopped the arm"
+                f"the move ended {distance_rad:.3f} rad short on joint {joint + 1}: something else commanded "
+                "or stopped the arm",
+                code="ended-short",
+                joint=joint + 1,
+                distance_rad=distance_rad,
+                limit_rad=ARRIVED_RAD,
             )
         return False
 
@@ -127,14 +155,18 @@ class MoveWatch:
             self.notice = "the speed slider on the pendant is at 0: the arm waits for it"
             if idle_s > SLIDER_ZERO_S:
                 raise RobotError(
-                    f"the speed slider on the pendant stood at 0 for {SLIDER_ZERO_S:g} s: raise it, "
-                    "then give a new go"
+                    f"the speed slider on the pendant stood at 0 for {SLIDER_ZERO_S:g} s",
+                    code="slider-zero",
+                    remedy=f"Raise it, {APPROVE_AGAIN}.",
+                    limit_s=SLIDER_ZERO_S,
                 )
             return
         if fraction < 0.995:
             self.notice = f"speed slider at {fraction * 100:.0f} %"
         if idle_s > NO_PROGRESS_S:
             raise RobotError(
-                f"the arm has not moved for {NO_PROGRESS_S:g} s although a move is under way; "
-                "look at the pendant"
+                f"the arm has not moved for {NO_PROGRESS_S:g} s although a move is under way",
+                code="no-progress",
+                remedy="Look at the pendant.",
+                limit_s=NO_PROGRESS_S,
             )

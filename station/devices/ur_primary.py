@@ -57,6 +57,8 @@ class Installation:
 class PrimaryError(RobotError):
     """What comes from port 30001 is not the primary interface."""
 
+    code = "primary-interface"
+
 
 def pack_state(tcp_pose: Sequence[float], tcp_offset: Sequence[float], dh: DhParameters | None) -> bytes:
     """A robot state message with these sub-packages only."""
@@ -79,7 +81,7 @@ def read_state(payload: bytes) -> Installation:
     while at + _HEADER.size <= len(payload):
         size, kind = _HEADER.unpack_from(payload, at)
         if size < _HEADER.size or at + size > len(payload):
-            raise PrimaryError(f"a sub-package of the robot state claims {size} bytes")
+            raise PrimaryError(f"a sub-package of the robot state claims {size} bytes", size_bytes=size)
         body = payload[at + _HEADER.size : at + size]
         if kind == CARTESIAN_INFO and len(body) >= _CARTESIAN.size:
             offset = _six(_CARTESIAN.unpack_from(body)[6:])
@@ -147,5 +149,9 @@ class PrimaryReader:
 async def _message(reader: asyncio.StreamReader) -> tuple[int, bytes]:
     size, kind = _HEADER.unpack(await reader.readexactly(_HEADER.size))
     if not _HEADER.size <= size <= MESSAGE_LIMIT:
-        raise PrimaryError(f"a message on port {PORT} claims {size} bytes; is this a robot?")
+        raise PrimaryError(
+            f"a message on port {PORT} claims {size} bytes",
+            remedy="Check the robot's address.",
+            size_bytes=size,
+        )
     return kind, await reader.readexactly(size - _HEADER.size)

@@ -33,10 +33,6 @@ class ProbeResult:
     answers: bool = True
     """Anything does, at any port."""
 
-    @property
-    def is_e_series(self) -> bool:
-        return bool(self.version) and self.version[0] >= 5
-
 
 async def probe(host: str) -> ProbeResult:
     """Asks all ports at once; takes at most a few seconds and never raises."""
@@ -87,9 +83,8 @@ async def _ask_dashboard(host: str) -> ProbeResult:
 
 async def check_port(host: str, port: int) -> None:
     """Raises RobotError unless something accepts a connection there within 2 s."""
-    problem = await _port_problem(host, port)
-    if problem:
-        raise RobotError(problem)
+    if problem := await _port_problem(host, port):
+        raise RobotError(problem, code="port-closed")
 
 
 async def _port_problem(host: str, port: int) -> str:
@@ -121,8 +116,9 @@ class RobotLock:
         except OSError as error:
             self._held.close()
             raise RobotError(
-                f"robot {name} is owned by another station on this computer ({_owner(address) or error}): "
-                "use that one, or end it first"
+                f"robot {name} is owned by another station on this computer ({_owner(address) or error})",
+                code="robot-owned",
+                remedy="Use that one, or end it first.",
             ) from None
 
     def release(self) -> None:

@@ -98,8 +98,6 @@ class StateReader(threading.Thread):
         self._wall_set_ns = 0
         """When the wall clock was last seen to have been set (host monotonic)."""
 
-    # -- the life of a connection ---------------------------------------------------------------------
-
     def run(self) -> None:
         why = "closed here"
         try:
@@ -148,8 +146,6 @@ class StateReader(threading.Thread):
         recipe = link.outputs(self.rate_hz, names)
         link.start()
         return recipe
-
-    # -- the stream -------------------------------------------------------------------------------------
 
     def _follow(self, link: socket.socket, rtde: RtdeLink, recipe: Recipe) -> None:
         link.setsockopt(socket.SOL_SOCKET, SO_TIMESTAMPNS, 1)
@@ -243,14 +239,18 @@ def _wall_ahead_ns() -> int:
 def state_at(history: Sequence[RobotState], clock: ClockFit | None, host_monotonic_ns: int) -> RobotState:
     """Interpolated at a host time; modes and bits are the older neighbour's. StaleStateError outside."""
     if clock is None or len(history) < 2:
-        raise StaleStateError("too few robot states yet to tell where the arm was")
+        raise StaleStateError("too few robot states yet to tell where the arm was", code="no-history")
     controller_s = clock.to_device_s(host_monotonic_ns)
     right = bisect_left(history, controller_s, key=lambda s: s.stamps.controller_s)
     if right == len(history):
         late_s = controller_s - history[-1].stamps.controller_s
-        raise StaleStateError(f"the newest robot state is {late_s * 1000:.0f} ms older than the asked time")
+        raise StaleStateError(
+            f"the newest robot state is {late_s * 1000:.0f} ms older than the asked time", late_s=late_s
+        )
     if right == 0 and history[0].stamps.controller_s > controller_s:
-        raise StaleStateError("the asked time lies before the robot states that are kept (10 s)")
+        raise StaleStateError(
+            "the asked time lies before the robot states that are kept (10 s)", code="no-history"
+        )
     before, after = history[max(right - 1, 0)], history[max(right, 1)]
     span_s = after.stamps.controller_s - before.stamps.controller_s
     fraction = (controller_s - before.stamps.controller_s) / span_s

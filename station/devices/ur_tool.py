@@ -29,9 +29,9 @@ FACTORY_LIMIT = (0.02, math.radians(2.0))
 LONGEST_M = 1.0
 PAYLOAD_TOLERANCE_KG = 0.005
 CENTRE_TOLERANCE_M = 0.001
-_MODEL_REMEDY = "check robot.model and robot.kinematics in the configuration"
+_MODEL_REMEDY = "Check robot.model and robot.kinematics in the configuration."
 _CHANGED = "the TCP offset on the pendant was changed during the session"
-_CHANGED_REMEDY = "set it back, or finish this session and start the station's daemon anew"
+_CHANGED_REMEDY = "Set it back, or finish this session and start the station's daemon anew."
 
 
 class TcpCheck:
@@ -50,8 +50,12 @@ class TcpCheck:
         length_m = float(np.linalg.norm(self._first[:3, 3]))
         if length_m > LONGEST_M:
             raise RobotError(
-                f"the controller's tool pose lies {length_m:.2f} m from the flange pose of a {model.name}: "
-                "wrong robot.model, or a wrong TCP on the pendant (Installation → TCP)"
+                f"the controller's tool pose lies {length_m:.2f} m from the flange pose of a {model.name} "
+                f"(limit {LONGEST_M:g} m)",
+                code="tcp-too-far",
+                remedy="Correct robot.model, or the TCP on the pendant (Installation → TCP).",
+                distance_m=length_m,
+                limit_m=LONGEST_M,
             )
         if self._stated is not None:
             self.agree(self._stated)
@@ -65,7 +69,7 @@ class TcpCheck:
         assert self._stated is not None
         ours, theirs = (forward(m, first.joints_rad) for m in (self._model, model))
         what = f"the controller's own kinematics are not those of a {self._model.name}"
-        _compare(theirs, ours, FACTORY_LIMIT, what, _MODEL_REMEDY)
+        _compare(theirs, ours, FACTORY_LIMIT, what, "other-kinematics", _MODEL_REMEDY)
         own = _flange_from_tcp(model, first)
         if _exceeds(difference(own, _pose(self._stated)), CALIBRATED_TOLERANCE):
             log.warning("the kinematics stated by the controller do not explain its tool pose; using ours")
@@ -84,14 +88,14 @@ class TcpCheck:
     def agree(self, stated: Vector6) -> None:
         """Raises RobotError unless the offset that the controller states explains its tool pose."""
         what = "our flange pose and the controller's tool pose do not fit its TCP offset"
-        _compare(self._first, _pose(stated), self._tolerance, what, _MODEL_REMEDY)
+        _compare(self._first, _pose(stated), self._tolerance, what, "tcp-mismatch", _MODEL_REMEDY)
 
     def check(self, state: RobotState, installation: Installation) -> None:
         """Raises RobotError when the TCP on the pendant is another one than at connect."""
         if self._stated is not None and installation.tcp_offset is not None:
             now = _pose(installation.tcp_offset)
-            _compare(now, _pose(self._stated), STATED_TOLERANCE, _CHANGED, _CHANGED_REMEDY)
-        _compare(self._derive(state), self._first, self._tolerance, _CHANGED, _CHANGED_REMEDY)
+            _compare(now, _pose(self._stated), STATED_TOLERANCE, _CHANGED, "tcp-changed", _CHANGED_REMEDY)
+        _compare(self._derive(state), self._first, self._tolerance, _CHANGED, "tcp-changed", _CHANGED_REMEDY)
 
     def _derive(self, state: RobotState) -> Array:
         return _flange_from_tcp(self._model, state)
@@ -103,7 +107,12 @@ def check_payload(now: Payload, first: Payload) -> None:
     if abs(now.mass_kg - first.mass_kg) > PAYLOAD_TOLERANCE_KG or centre_off_m > CENTRE_TOLERANCE_M:
         raise RobotError(
             f"the payload on the pendant was changed during the session ({first.mass_kg:.2f} → "
-            f"{now.mass_kg:.2f} kg, its centre by {1000 * centre_off_m:.0f} mm): {_CHANGED_REMEDY}"
+            f"{now.mass_kg:.2f} kg, its centre by {1000 * centre_off_m:.0f} mm)",
+            code="payload-changed",
+            remedy=_CHANGED_REMEDY,
+            before_kg=first.mass_kg,
+            now_kg=now.mass_kg,
+            centre_off_m=centre_off_m,
         )
 
 
@@ -135,10 +144,18 @@ def _exceeds(delta: Array, tolerance: tuple[float, float]) -> bool:
     return bool(np.linalg.norm(delta[:3]) > tolerance[0] or np.linalg.norm(delta[3:]) > tolerance[1])
 
 
-def _compare(found: Array, reference: Array, tolerance: tuple[float, float], what: str, remedy: str) -> None:
+def _compare(
+    found: Array, reference: Array, tolerance: tuple[float, float], what: str, code: str, remedy: str
+) -> None:
     delta = difference(found, reference)
     if _exceeds(delta, tolerance):
-        shift_mm, turn_rad = float(np.linalg.norm(delta[:3])) * 1000, float(np.linalg.norm(delta[3:]))
+        shift_m, turn_rad = float(np.linalg.norm(delta[:3])), float(np.linalg.norm(delta[3:]))
         raise RobotError(
-            f"TCP mix-up: {what} (by {shift_mm:.1f} mm, {math.degrees(turn_rad):.2f}°): {remedy}"
+            f"TCP mix-up: {what} (by {shift_m * 1000:.1f} mm, {math.degrees(turn_rad):.2f}°)",
+            code=code,
+            remedy=remedy,
+            shift_m=shift_m,
+            limit_m=tolerance[0],
+            turn_rad=turn_rad,
+            limit_rad=tolerance[1],
         )

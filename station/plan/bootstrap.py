@@ -60,7 +60,7 @@ def next_move(config: StationConfig, glimpses: Sequence[Glimpse]) -> PlannedPose
     rng = np.random.default_rng(moves)
     samples, cells = _possible(config, glimpses, belief, rng)
     if len(cells) < _FEWEST:
-        raise LimitError(_not_here(belief, len(cells)))
+        raise _not_here(belief, len(cells))
     here = glimpses[-1].joints_rad
     allowed = geometry_from(config, here)  # what the daemon would refuse is no move
     in_view: list[Array] = []
@@ -73,7 +73,7 @@ def next_move(config: StationConfig, glimpses: Sequence[Glimpse]) -> PlannedPose
             way_is_free = _free_in_all(cells, here, passed[place])
             if way_is_free and _keeps_away(config, glimpses[0], samples, here, passed[place]):
                 return _described(config, glimpses[0], belief, moves, passed[place])
-    raise LimitError(_no_move(belief, len(in_view), _in_the_way([allowed, *cells], here, in_view)))
+    raise _no_move(belief, len(in_view), _in_the_way([allowed, *cells], here, in_view))
 
 
 def _passing(cell: CellGeometry, here: Array, targets: Array) -> Array:
@@ -96,13 +96,18 @@ def _free_in_all(cells: list[CellGeometry], here: Array, joints: Array) -> bool:
     return True
 
 
-def _not_here(belief: Belief, possible: int) -> str:
-    """Why, and what to do, when the guess does not go with the arm's posture."""
-    return (
+def _not_here(belief: Belief, possible: int) -> LimitError:
+    """The guess does not go with the arm's posture."""
+    return LimitError(
         f"Of {_DRAWS} camera mounts within the guess ({1000 * belief.sigma_m:.0f} mm, "
-        f"{belief.sigma_deg:.0f}°) only {possible} fit with where the arm stands: with the others camera or "
-        "board would touch the arm or what is around it. No move can be checked. Correct camera_guess, its "
-        "sigmas or the board's size, or teach a view with more room around the arm."
+        f"{belief.sigma_deg:.0f}°) "
+        f"only {possible} fit with where the arm stands (limit {_FEWEST}): with the others camera or board "
+        "would "
+        "touch something",
+        code="no-mount-fits",
+        remedy="Correct camera_guess, its sigmas or the board's size, or teach a view with more room.",
+        possible=possible,
+        limit=_FEWEST,
     )
 
 
@@ -122,19 +127,25 @@ def _in_the_way(cells: Sequence[CellGeometry], here: Array, targets: Sequence[Ar
     return " and ".join(limit for limit, _ in broken.most_common(2))
 
 
-def _no_move(belief: Belief, in_view: int, in_the_way: str) -> str:
-    """Why, and what to do: `in_view` targets keep the board in the picture, none of them is free to reach."""
+def _no_move(belief: Belief, in_view: int, in_the_way: str) -> LimitError:
+    """`in_view` targets keep the board in the image, none of them is free to reach."""
     mount = f"camera mount within the guess ({1000 * belief.sigma_m:.0f} mm, {belief.sigma_deg:.0f}°)"
     if in_view == 0:
-        return (
-            f"No small move keeps the board in the picture, and the camera no nearer, for every {mount}. "
-            "Teach a view with the board in the middle of the picture and filling less of it, or measure the "
-            "mount better (camera_guess)."
+        return LimitError(
+            f"No small move keeps the board in the image, and the camera no nearer, for every {mount}",
+            code="board-leaves-image",
+            remedy="Teach a view with the board in the middle of the image and filling less of it, or "
+            "measure "
+            "camera_guess better.",
         )
-    return (
-        f"{in_view} small moves keep the board in the picture, but none is free for every {mount}; mostly "
-        f"in the way: {in_the_way}. Teach a view with more room around the arm, correct `limits`, or measure "
-        "the mount better (camera_guess)."
+    return LimitError(
+        f"{in_view} small moves keep the board in the image, but none is free for every {mount}; mostly in "
+        "the "
+        f"way: {in_the_way}",
+        code="no-free-move",
+        remedy="Teach a view with more room around the arm, correct `limits`, or measure camera_guess "
+        "better.",
+        in_the_way=in_the_way,
     )
 
 

@@ -55,9 +55,8 @@ def save_plan(plan: Plan, path: Path) -> None:
     try:
         write_atomically(path, text.encode(), ASKED_FOR)
     except OSError as error:
-        raise ConfigError(
-            f"cannot write the plan to {path}: {error.strerror}; choose another folder"
-        ) from error
+        text = f"cannot write the plan to {path}: {error.strerror}"
+        raise ConfigError(text, code="plan-not-written", remedy="Choose another folder.") from error
 
 
 def load_plan(path: Path) -> Plan:
@@ -78,16 +77,26 @@ def parse_plan(content: bytes, name: str = "plan") -> Plan:
 
 def _report(name: str, problems: list[str]) -> ConfigError:
     count = f"{len(problems)} problem{'s' if len(problems) > 1 else ''}"
-    return ConfigError("\n".join([f"{name}: {count}", *(f"  {problem}" for problem in problems)]))
+    text = "\n".join([f"{name}: {count}", *(f"  {problem}" for problem in problems)])
+    return ConfigError(text, code="invalid-plan", problems=len(problems))
+
+
+def _bad_list(text: str, remedy: str = "") -> ConfigError:
+    return ConfigError(text, code="invalid-list", remedy=remedy)
 
 
 def _read(path: Path) -> bytes:
     try:
         if path.stat().st_size > strict_yaml.LIMIT_BYTES:
-            raise ConfigError(f"{path} is larger than {strict_yaml.LIMIT_BYTES // 1024} kB: not a plan")
+            raise ConfigError(
+                f"{path} is larger than {strict_yaml.LIMIT_BYTES // 1024} kB: not a plan",
+                code="plan-too-large",
+                limit_bytes=strict_yaml.LIMIT_BYTES,
+            )
         return path.read_bytes()
     except OSError as error:
-        raise ConfigError(f"cannot read {path}: {error.strerror}; is the name right?") from None
+        text = f"cannot read {path}: {error.strerror}"
+        raise ConfigError(text, code="unreadable-plan", remedy="Check the name.") from None
 
 
 def _value_problems(plan: Plan) -> list[str]:
@@ -126,12 +135,15 @@ def taught_plan(path: Path, robot: str, mount: Mount) -> Plan:
     if (of.robot.model, of.mount) != (robot, mount):
         raise ConfigError(
             f"{path} is of a {of.robot.model or 'nameless arm'}, {of.mount}; this cell has a {robot}, "
-            f"{mount}: its poses are no plan for it"
+            f"{mount}: its poses are no plan for it",
+            code="other-cell",
         )
     views = recording.views()
     taught = [(view.name, view.joints_rad) for view in views if view.joints_rad is not None]
     if not taught or len(taught) < len(views):
-        raise ConfigError(f"{path} holds {len(views)} poses, {len(taught)} of them with the arm's joints")
+        raise ConfigError(
+            f"{path} holds {len(views)} poses, {len(taught)} of them with the arm's joints", code="no-joints"
+        )
     poses = tuple(_plain_pose(robot, name, np.array(joints), "as taught") for name, joints in taught)
     plan = Plan(robot=robot, mount=mount, poses=poses, note=f"taught: the poses of {path.name}")
     if problems := _value_problems(plan):
@@ -152,22 +164,24 @@ def import_list(path: Path, robot: str, mount: Mount, near_joints_rad: Sequence[
     try:
         rows = list(csv.reader(_read(path).decode("utf-8-sig").splitlines()))
     except UnicodeDecodeError:
-        raise ConfigError(f"{path} is not a text file; a list is CSV") from None
+        raise _bad_list(f"{path} is not a text file", "Save the list as CSV.") from None
     if not rows:
-        raise ConfigError(
-            f"{path} is empty; the first row must name the columns, e.g. {','.join(_JOINTS_DEG)}"
+        raise _bad_list(
+            f"{path} is empty", f"Name the columns in its first row, e.g. {','.join(_JOINTS_DEG)}."
         )
     header = [column.strip() for column in rows[0]]
     named, columns = header[:1] == ["name"], header[1:] if header[:1] == ["name"] else header
     if columns not in (_JOINTS_DEG, _JOINTS_RAD, _POSE):
-        raise ConfigError(
-            f"{path}, row 1: the columns are {','.join(header)!r}; wanted is {','.join(_JOINTS_DEG)} or "
-            f"{','.join(_JOINTS_RAD)} or {','.join(_POSE)}, with `name` before them if you like and commas "
-            "between them"
+        raise _bad_list(
+            f"{path}, row 1: the columns are {','.join(header)!r}",
+            f"Name them {','.join(_JOINTS_DEG)} or {','.join(_JOINTS_RAD)} or {','.join(_POSE)}, with commas "
+            "between them and `name` first if you like.",
         )
     if columns == _POSE and near_joints_rad is None:
         raise ConfigError(
-            f"{path} lists flange poses: give --start with the arm's joints to choose its branch"
+            f"{path} lists flange poses, which several arm branches reach",
+            code="start-needed",
+            remedy="Give --start with the arm's joints.",
         )
     poses: list[PlannedPose] = []
     near = np.asarray(near_joints_rad if near_joints_rad is not None else np.zeros(6), dtype=float)
@@ -186,13 +200,13 @@ def import_list(path: Path, robot: str, mount: Mount, near_joints_rad: Sequence[
 
 def _numbers(cells: list[str], wanted: int, where: str) -> list[float]:
     if len(cells) != wanted:
-        raise ConfigError(f"{where}: {len(cells)} numbers, wanted are {wanted}")
+        raise _bad_list(f"{where}: {len(cells)} numbers, wanted are {wanted}")
     try:
         values = [float(cell) for cell in cells]
     except ValueError as error:
-        raise ConfigError(f"{where}: {error}; write numbers with a point, 0.25") from error
+        raise _bad_list(f"{where}: {error}", "Write numbers with a point, 0.25.") from error
     if not np.isfinite(values).all():
-        raise ConfigError(f"{where}: a value is not a finite number")
+        raise _bad_list(f"{where}: a value is not a finite number")
     return values
 
 
@@ -202,10 +216,10 @@ def _row_joints(values: list[float], columns: list[str], robot: str, near: Array
     if columns == _JOINTS_RAD:
         return np.array(values)
     if np.linalg.norm(values[3:]) < 1e-6:
-        raise ConfigError(f"{where}: the quaternion is zero; no rotation is 0,0,0,1")
+        raise _bad_list(f"{where}: the quaternion is zero", "Write no rotation as 0,0,0,1.")
     joints = inverse_nearest(MODELS[robot], pose_from_quaternion(values[:3], values[3:]), near)
     if joints is None:
-        raise ConfigError(f"{where}: the {robot} cannot reach this flange pose; are lengths in metres?")
+        raise _bad_list(f"{where}: the {robot} cannot reach this flange pose", "Write lengths in metres.")
     return joints
 
 

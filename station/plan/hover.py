@@ -15,7 +15,7 @@ import numpy as np
 
 from calibrate.boards.model import board_points
 from calibrate.files.calibration import Calibration
-from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
+from calibrate.geometry import Array, difference, pose, rotation_exp, transform_points
 from calibrate.kinematics import RobotModel, forward, inverse_all, jacobian
 from calibrate.quality.board_now import found_points, locate_board, offset_covariance
 from calibrate.views import BoardView
@@ -57,12 +57,6 @@ class Hover:
     base_from_board: Array
     outward: Array
     """(3,) unit normal in `board`, to the side that the camera sees."""
-
-
-def board_from_tip(base_from_board: Array, base_from_flange: Array, pointer: PointerConfig) -> Array:
-    """The tip (3,) in `board`, metres."""
-    tip = transform_points(base_from_flange, np.array(pointer.tip_m))
-    return transform_points(inverse(base_from_board), tip)
 
 
 def least_standoff_m(doubt_m: float) -> float:
@@ -128,8 +122,11 @@ def plan_hover(
     if not standoff_m >= least_m:
         raise LimitError(
             f"{1000 * standoff_m:.0f} mm above the board is too near: {1000 * CLEARANCE_M:.0f} mm are kept "
-            f"whatever is uncertain, so the tip stays at least {np.ceil(1000 * least_m):.0f} mm away "
-            "(--standoff-mm); the rest is done by hand"
+            f"whatever is uncertain (limit {np.ceil(1000 * least_m):.0f} mm)",
+            code="standoff-too-small",
+            remedy="Give a larger --standoff-mm; the rest is done by hand.",
+            standoff_m=standoff_m,
+            limit_m=least_m,
         )
     geometry = hover_geometry(config, X, base_from_board, doubt_m, pointer)
     point = board_points(config.board)[corner]

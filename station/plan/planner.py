@@ -39,15 +39,16 @@ _BLIND = 0.5
 _TRIES = 12
 """Camera poses looked at per wanted member of the pool; most fall to the guess's uncertainty."""
 _REMEDIES = {
-    NOT_IN_PICTURE: "measure camera_guess and board_guess better, use a smaller board or a wider lens",
-    "the joint range": "widen limits.joints_min_rad and joints_max_rad, or turn the board",
-    "singular postures": "move the board sideways, so that the arm need not stretch or fold",
-    ARM_IN_SIGHT: "turn the board to face the camera, or mount the camera so "
-    "that it looks away from the arm (is camera_guess right?)",
-    "the workspace box": "widen limits.workspace_min_m and workspace_max_m, or move the board to its middle",
-    "the arm touching itself or its tool": "check limits.solids, or move the board further from the base",
-    "the board": "lower limits.board_clearance_m, measure board_guess better (its sigma counts), or turn it",
-    "the camera": "work further from the camera, or measure camera_guess better (its sigma counts)",
+    NOT_IN_PICTURE: "Measure camera_guess and board_guess better, use a smaller board or a wider lens.",
+    "the joint range": "Widen limits.joints_min_rad and joints_max_rad, or turn the board.",
+    "singular postures": "Move the board sideways, so that the arm need not stretch or fold.",
+    ARM_IN_SIGHT: "Turn the board to face the camera, mount the camera so that it looks away from the arm, "
+    "or "
+    "correct camera_guess.",
+    "the workspace box": "Widen limits.workspace_min_m and workspace_max_m, or move the board to its middle.",
+    "the arm touching itself or its tool": "Check limits.solids, or move the board further from the base.",
+    "the board": "Lower limits.board_clearance_m, measure board_guess better (its sigma counts), or turn it.",
+    "the camera": "Work further from the camera, or measure camera_guess better (its sigma counts).",
 }
 
 _BACKWARDS = -0.3
@@ -56,84 +57,93 @@ _KEYHOLE = 10
 """Hidden views for each free one, from which on the free ones hang on the guess's last millimetres."""
 
 
-def explain_shortage(scene: Scene, wanted: int, group: Pool, found: Pool, start: Array | None) -> str:
-    """One paragraph for a person: `group` is what is usable, `found` all that passes pose by pose."""
+def explain_shortage(scene: Scene, wanted: int, group: Pool, found: Pool, start: Array | None) -> LimitError:
+    """Why there is no plan: `group` is what is usable, `found` all that passes pose by pose."""
+    counts = {"possible": len(group), "wanted": wanted}
     if looks_back(scene, found):
-        return _looks_back_text(scene, found.alone[ARM_IN_SIGHT])
+        angle_deg = float(np.rad2deg(np.arccos(np.clip(scene.X[2, 2], -1.0, 1.0))))
+        return LimitError(
+            f"The camera looks back at the arm: camera_guess's z axis is {angle_deg:.0f}° away from where "
+            "the "
+            f"flange points, and in {found.alone[ARM_IN_SIGHT]} postures the arm would hide the board",
+            code="camera-looks-back",
+            remedy="Turn camera_guess by 180° about its x or y axis, if its z axis does not point out of the "
+            "lens.",
+            **counts,
+        )
     if start is not None and len(found) >= wanted and len(group) < wanted:
-        return _start_is_cut_off(scene, wanted, len(group), len(found), start)
-    sentences = [
-        f"Only {len(group)} of the wanted {wanted} poses are possible."
-        if len(group)
-        else "No pose is possible."
+        return _start_is_cut_off(scene, counts, len(found), start)
+    few = f"Only {len(group)} of the wanted {wanted} poses are possible"
+    few = few if len(group) else "No pose is possible"
+    lost, alone = found.lost, found.alone
+    if lost[OUT_OF_REACH] > 2 * len(found) and lost[OUT_OF_REACH] >= alone.total():
+        return _out_of_reach(scene, few, counts, lost[OUT_OF_REACH])
+    binding = []
+    if not alone.total() and lost[NOT_IN_PICTURE] > max(lost.values(), default=0) / 2:
+        binding.append(NOT_IN_PICTURE)
+    ranked = alone if alone.total() else lost
+    binding += [
+        limit
+        for limit, count in ranked.most_common(2)
+        if count and limit not in (NOT_IN_PICTURE, OUT_OF_REACH)
     ]
-    if found.lost[OUT_OF_REACH] > 2 * len(found) and found.lost[OUT_OF_REACH] >= sum(found.alone.values()):
-        sentences.append(_reach(scene, found.lost[OUT_OF_REACH]))
-        return " ".join(sentences)
-    if not found.alone.total() and found.lost[NOT_IN_PICTURE] > max(found.lost.values(), default=0) / 2:
-        sentences.append(f"Mostly {NOT_IN_PICTURE} for what the guess allows: {_REMEDIES[NOT_IN_PICTURE]}.")
-    ranked = found.alone if found.alone.total() else found.lost
-    for limit, count in ranked.most_common(2):
-        if count and limit not in (NOT_IN_PICTURE, OUT_OF_REACH):
-            gain = f"without it {count} more would be" if found.alone.total() else f"it forbids {count}"
-            sentences.append(f"What binds is {limit}: {gain}; {_remedy(limit)}.")
-    return " ".join(sentences)
+    gains = [
+        f"{limit} ({'costs' if alone.total() else 'forbids'} {ranked[limit]} poses)" for limit in binding
+    ]
+    return LimitError(
+        f"{few}. Limiting constraint: {', '.join(gains) or 'none alone'}",
+        code="too-few-poses",
+        remedy=" ".join(_remedy(limit) for limit in binding),
+        constraints=", ".join(binding),
+        **counts,
+    )
 
 
 def _remedy(limit: str) -> str:
-    return _REMEDIES.get(
-        limit,
-        f"move the board away from {limit}, or correct limits.planes (or is board_guess turned over? The "
-        "board's z axis points into the board)",
+    other = (
+        f"Move the board away from {limit}, or correct limits.planes and board_guess (the board's z axis "
+        "points into the board)."
     )
+    return _REMEDIES.get(limit, other)
 
 
 def looks_back(scene: Scene, found: Pool) -> bool:
     """Whether the guessed camera looks back at the arm, which hides the board from nearly everywhere."""
-    hidden = found.alone[ARM_IN_SIGHT]
     backwards = scene.mount == "eye-in-hand" and scene.X[2, 2] < _BACKWARDS
-    return bool(backwards and hidden > _KEYHOLE * len(found))
+    return bool(backwards and found.alone[ARM_IN_SIGHT] > _KEYHOLE * len(found))
 
 
-def _looks_back_text(scene: Scene, hidden: int) -> str:
-    angle_deg = np.rad2deg(np.arccos(np.clip(scene.X[2, 2], -1.0, 1.0)))
-    return (
-        "The camera looks away from the board, back at the arm: by camera_guess its line of sight (z axis) "
-        f"is {angle_deg:.0f}° away from where the flange points, and in {hidden} postures the arm itself "
-        "would stand between camera and board. The z axis points out of the lens: if it is turned over, "
-        "turn camera_guess by 180° about its x or y axis."
-    )
-
-
-def _reach(scene: Scene, count: int) -> str:
+def _out_of_reach(scene: Scene, few: str, counts: dict[str, int], beyond: int) -> LimitError:
     model = scene.geometry.model
     arm_m = abs(model.a_m[1]) + abs(model.a_m[2]) + model.d_m[4]
+    thing, centre = "camera", scene.X[:3, 3]
     if scene.mount == "eye-in-hand":
-        centre, thing, guess = (
-            transform_points(scene.Y, board_points(scene.board).mean(axis=0)),
-            "board",
-            "board_guess",
-        )
-    else:
-        centre, thing, guess = scene.X[:3, 3], "camera", "camera_guess"
+        thing, centre = "board", transform_points(scene.Y, board_points(scene.board).mean(axis=0))
     away_m = float(np.linalg.norm(centre - [0.0, 0.0, model.d_m[0]]))
-    return (
-        f"What binds is the arm's reach: {count} views of the board lie beyond it. The {thing} stands "
-        f"{away_m:.2f} m from the {model.name}'s shoulder, the arm reaches {arm_m:.2f} m; bring the {thing} "
-        f"nearer, turn it towards the arm, or correct {guess}."
+    return LimitError(
+        f"{few}: {beyond} views of the board lie beyond the arm's reach. The {thing} stands {away_m:.2f} m "
+        "from "
+        f"the {model.name}'s shoulder (limit {arm_m:.2f} m)",
+        code="out-of-reach",
+        remedy=f"Bring the {thing} nearer, turn it towards the arm, or correct {thing}_guess.",
+        distance_m=away_m,
+        limit_m=float(arm_m),
+        **counts,
     )
 
 
-def _start_is_cut_off(scene: Scene, wanted: int, usable: int, possible: int, start: Array) -> str:
+def _start_is_cut_off(scene: Scene, counts: dict[str, int], passing: int, start: Array) -> LimitError:
     gaps, contacts = margins(scene.geometry, start)
-    reason = ""
-    if gaps.min() < 0:
-        worst = int(gaps[0].argmin())
-        reason = f" The arm stands too close already: {contacts[worst]}, {-1000 * gaps[0, worst]:.0f} mm."
-    return (
-        f"{possible} poses are possible, but from where the arm stands free direct moves lead to only "
-        f"{usable} that belong together; {wanted} are wanted.{reason} Jog the arm to where the camera looks "
-        "at the board from the middle of the room it may use, and plan again."
+    worst = int(gaps[0].argmin())
+    near = f"; {contacts[worst]}, {-1000 * gaps[0, worst]:.0f} mm too close" if gaps.min() < 0 else ""
+    return LimitError(
+        f"{passing} poses are possible, but from where the arm stands free direct moves lead to only "
+        f"{counts['possible']} of the wanted {counts['wanted']}{near}",
+        code="start-cut-off",
+        remedy="Jog the arm to where the camera looks at the board from the middle of the room it may use, "
+        "and "
+        "plan again.",
+        **counts,
     )
 
 
@@ -229,7 +239,7 @@ def candidate_pool(
     assert best is not None
     group, found, note = best
     if len(group) < options.count or looks_back(scene, found):
-        raise LimitError(explain_shortage(scene, options.count, group, found, start))
+        raise explain_shortage(scene, options.count, group, found, start)
     return group, [note] if note else []
 
 
@@ -275,7 +285,7 @@ def _choose_and_order(
                 return plan
         gone = places[blocked]
         left, picked = np.setdiff1d(left, gone), [p for p in places if p not in gone]
-    raise LimitError(explain_shortage(scene, options.count, pool.take(left), pool, start))
+    raise explain_shortage(scene, options.count, pool.take(left), pool, start)
 
 
 def _chosen(
@@ -317,7 +327,7 @@ def _failing(plan: Plan, start: Array | None, scene: Scene) -> list[int]:
     check = check_plan(plan, start, scene.geometry)
     failing = [place for place, move in enumerate(check.moves) if move.problems]
     if check.problems and not failing:
-        raise LimitError("\n".join(map(str, check.problems)))
+        raise LimitError("\n".join(map(str, check.problems)), code="plan-breaks-limits")
     return failing
 
 

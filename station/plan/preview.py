@@ -1,4 +1,4 @@
-"""A plan as a picture file: arm, frusta and board in space; coverage and expected error beside them."""
+"""A plan to look at: a picture file, a scene that other viewers play, a sketch in the terminal."""
 
 from __future__ import annotations
 
@@ -6,8 +6,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array, transform_points
@@ -27,12 +25,15 @@ _WIDTH, _ROWS = 78, 11
 _ARM: Colour = (0.6, 0.6, 0.65, 0.8)
 _CAMERA: Colour = (0.1, 0.4, 0.9, 1.0)
 _BOARD: Colour = (0.1, 0.1, 0.1, 1.0)
-_WAY: Colour = (1.0, 0.5, 0.0, 1.0)
+_PATH: Colour = (1.0, 0.5, 0.0, 1.0)
 _STEPS_PER_MOVE = 10
 
 
 def save_picture(scene: Scene, plan: Plan, path: Path) -> None:
     """Writes the preview as PNG, SVG or PDF, by the name's ending. ConfigError when that cannot be."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg  # slow to import, seldom wanted
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(12, 6.5), layout="constrained")
     FigureCanvasAgg(figure)
     grid = figure.add_gridspec(2, 2, width_ratios=[1.5, 1])
@@ -42,42 +43,41 @@ def save_picture(scene: Scene, plan: Plan, path: Path) -> None:
     try:
         figure.savefig(path, dpi=110)
     except (OSError, ValueError) as error:
-        raise ConfigError(f"cannot write the picture {path}: {error}; name it something.png") from error
+        text = f"cannot write the picture {path}: {error}"
+        raise ConfigError(text, code="picture-not-written", remedy="Name it something.png.") from error
+
+
+def _placed(scene: Scene, plan: Plan) -> tuple[Array, Array, Array]:
+    """Cameras and boards, (n, 4, 4) or (1, 4, 4), and the path (n, 3) of what moves."""
+    flange = flange_poses(scene, plan)
+    in_hand = scene.mount == "eye-in-hand"
+    cameras = flange @ scene.X if in_hand else scene.X[None]
+    boards = scene.Y[None] if in_hand else flange @ scene.Y
+    return cameras, boards, (cameras if len(cameras) > 1 else boards)[:, :3, 3]
 
 
 def _draw_space(axes: Any, scene: Scene, plan: Plan) -> None:
-    flange = flange_poses(scene, plan)
+    cameras, boards, path = _placed(scene, plan)
     joints = np.array([pose.joints_rad for pose in plan.poses])
     for number in np.linspace(0, len(plan.poses) - 1, min(_SHOWN_ARMS, len(plan.poses))).astype(int):
         starts, ends, radii = body_segments(scene.geometry, joints[number][None])
         for start, end, radius in zip(starts[0], ends[0], radii, strict=True):
-            axes.plot(
-                *np.stack([start, end], axis=1),
-                color="0.55",
-                lw=160 * radius,
-                alpha=0.25,
-                solid_capstyle="round",
-            )
-    cameras = flange @ scene.X if scene.mount == "eye-in-hand" else scene.X[None]
-    boards = scene.Y[None] if scene.mount == "eye-in-hand" else flange @ scene.Y
+            look = {"color": "0.55", "lw": 160 * radius, "alpha": 0.25, "solid_capstyle": "round"}
+            axes.plot(*np.stack([start, end], axis=1), **look)
     for camera in cameras:
         for line in camera_frustum(scene, camera):
             axes.plot(*line.T, color="tab:blue", lw=0.8)
     for board in boards:
-        outline = printed_outline(scene, board)
-        axes.plot(*outline.T, color="k", lw=1.5 if len(boards) == 1 else 0.6)
-    way = (cameras if len(cameras) > 1 else boards)[:, :3, 3]
-    axes.plot(*way.T, color="tab:orange", lw=1.0)
-    for number, point in enumerate(way):
+        axes.plot(*printed_outline(scene, board).T, color="k", lw=1.5 if len(boards) == 1 else 0.6)
+    axes.plot(*path.T, color="tab:orange", lw=1.0)
+    for number, point in enumerate(path):
         axes.text(*point, str(number + 1), fontsize=6)
     axes.set(
         xlabel="x m", ylabel="y m", zlabel="z m", title=f"{plan.robot}, {plan.mount}, {len(plan.poses)} poses"
     )
     everything = np.vstack([cameras[:, :3, 3], boards[:, :3, 3], np.zeros((1, 3))])
-    middle, half = (
-        (everything.max(0) + everything.min(0)) / 2,
-        max(float(np.ptp(everything, axis=0).max()) / 2, 0.3),
-    )
+    middle = (everything.max(0) + everything.min(0)) / 2
+    half = max(float(np.ptp(everything, axis=0).max()) / 2, 0.3)
     for setter, centre in zip((axes.set_xlim, axes.set_ylim, axes.set_zlim), middle, strict=True):
         setter(centre - half, centre + half)
     axes.set_box_aspect((1, 1, 1))
@@ -101,8 +101,7 @@ def printed_outline(scene: Scene, base_from_board: Array) -> Array:
 
 
 def _draw_coverage(axes: Any, scene: Scene, plan: Plan) -> None:
-    pixels = expected_pixels(scene, plan)
-    for view in pixels:
+    for view in expected_pixels(scene, plan):
         axes.plot(view[:, 0], view[:, 1], ".", ms=1.5)
     axes.set(xlim=(0, scene.camera.width), ylim=(scene.camera.height, 0), title="board points in the picture")
     axes.set_aspect("equal")
@@ -161,22 +160,18 @@ def sketch(scene: Scene, plan: Plan) -> str:
 
 
 def _picture_panel(scene: Scene, plan: Plan) -> list[str]:
-    columns, rows = 34, _ROWS
-    counts = coverage_grid(scene, plan, columns, rows)
-    top = max(float(counts.max()), 1.0)
-    shade = np.ceil((len(_SHADES) - 1) * counts / top).astype(int)
-    body = ["│" + "".join(_SHADES[s] for s in row) + "│" for row in shade]
+    counts = coverage_grid(scene, plan, 34, _ROWS)
+    shade = np.ceil((len(_SHADES) - 1) * counts / max(float(counts.max()), 1.0)).astype(int)
     empty = int((coverage_grid(scene, plan, 4, 4) == 0).sum())
-    title = f"board points in the picture, {16 - empty}/16 filled"
-    return [title, "┌" + "─" * columns + "┐", *body, "└" + "─" * columns + "┘"]
+    title = f"board points in the image, {16 - empty}/16 filled"
+    return _framed(title, ["".join(_SHADES[s] for s in row) for row in shade])
 
 
 def _camera_panel(scene: Scene, plan: Plan) -> list[str]:
-    columns, rows = 33, _ROWS
     """Camera centres over the board plane, numbered in order of visit."""
+    columns, rows = 33, _ROWS
     centres = board_from_cameras(scene, plan)
-    middle = transform_points(np.eye(4), board_points(scene.board)).mean(axis=0)
-    offset = centres[:, :2] - middle[:2]
+    offset = centres[:, :2] - board_points(scene.board).mean(axis=0)[:2]
     reach = max(float(np.abs(offset).max()), 0.05)
     cells = [[" "] * columns for _ in range(rows)]
     cells[rows // 2][columns // 2] = "#"
@@ -185,9 +180,12 @@ def _camera_panel(scene: Scene, plan: Plan) -> list[str]:
         column = round((x / reach + 1) / 2 * (columns - 2))
         for k, letter in enumerate(f"{number + 1}"):
             cells[row][min(column + k, columns - 1)] = letter
-    title = f"camera over the board (#), ±{1000 * reach:.0f} mm"
-    body = ["│" + "".join(row) + "│" for row in cells]
-    return [title, "┌" + "─" * columns + "┐", *body, "└" + "─" * columns + "┘"]
+    return _framed(f"camera over the board (#), ±{1000 * reach:.0f} mm", ["".join(row) for row in cells])
+
+
+def _framed(title: str, rows: list[str]) -> list[str]:
+    line = "─" * len(rows[0])
+    return [title, f"┌{line}┐", *(f"│{row}│" for row in rows), f"└{line}┘"]
 
 
 def _bar(value: float, values: list[float]) -> str:
@@ -212,13 +210,10 @@ def save_scene(scene: Scene, plan: Plan, path: Path) -> None:
 
 
 def _fixed(scene: Scene, plan: Plan) -> list[Entity]:
-    flange = flange_poses(scene, plan)
-    cameras = flange @ scene.X if scene.mount == "eye-in-hand" else scene.X[None]
-    boards = scene.Y[None] if scene.mount == "eye-in-hand" else flange @ scene.Y
+    cameras, boards, path = _placed(scene, plan)
     frusta = tuple(Line(edge, _CAMERA, 0.001) for camera in cameras for edge in camera_frustum(scene, camera))
     outlines = tuple(Line(printed_outline(scene, board), _BOARD, 0.002) for board in boards)
-    way = (cameras if len(cameras) > 1 else boards)[:, :3, 3]
-    return [Entity("plan", "base", (*frusta, *outlines, Line(way, _WAY, 0.002)))]
+    return [Entity("plan", "base", (*frusta, *outlines, Line(path, _PATH, 0.002)))]
 
 
 def _moving(scene: Scene, joints: Array, text: str) -> list[Entity]:

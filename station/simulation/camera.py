@@ -17,13 +17,14 @@ from recordings.schema.messages import CameraIdentity, Image, Stamps
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices.base import Trigger
-from station.devices.frames import CameraCounts, DeviceClock, FrameCounter
+from station.devices.frames import RETAKE, CameraCounts, DeviceClock, FrameCounter
 from station.simulation.cell import CellTruth
 
 START_TIMEOUT_S = 20.0
 _ANSWER_S = 5.0
 _CLOCK_READINGS = 8
 _PIPE_LIMIT = 4 * 2**20
+_REOPEN = "Open it again."
 
 
 class RenderedCamera:
@@ -116,9 +117,8 @@ class RenderedCamera:
                 frame = await asyncio.wait_for(self._frames.get(), timeout_s)
             except TimeoutError:
                 self.counter.lost(pulse)
-                raise CameraError(
-                    f"the camera sent no picture within {timeout_s:g} s of its trigger; take this pose again"
-                ) from None
+                text = f"the camera sent no image within {timeout_s:g} s of its trigger"
+                raise CameraError(text, code="no-image", remedy=RETAKE, limit_s=timeout_s) from None
             if isinstance(frame, CameraError):
                 raise frame
             sequence = self.counter.accept(frame.frame_id, pulse)
@@ -172,7 +172,8 @@ class RenderedCamera:
         if (frame.exposure_us, frame.gain_db) != (self._exposure_us, self._gain_db):
             raise CameraError(
                 f"the camera exposed {frame.exposure_us:g} µs at {frame.gain_db:g} dB, set were "
-                f"{self._exposure_us:g} µs at {self._gain_db:g} dB; something else changes its settings"
+                f"{self._exposure_us:g} µs at {self._gain_db:g} dB; something else changes its settings",
+                code="settings-changed",
             )
 
     def _drain(self) -> int:
@@ -199,14 +200,15 @@ class RenderedCamera:
         try:
             answer = await asyncio.wait_for(self._answers.get(), timeout_s)
         except TimeoutError:
-            raise CameraError(f"the rendered camera does not answer within {timeout_s:g} s") from None
+            text = f"the rendered camera does not answer within {timeout_s:g} s"
+            raise CameraError(text, code="camera-silent", limit_s=timeout_s) from None
         if isinstance(answer, CameraError):
             raise answer
         return answer
 
     def _write(self, request: dict[str, Any]) -> None:
         if self._process is None or self._process.stdin is None or self._process.returncode is not None:
-            raise CameraError("the rendered camera is not open or has ended; open it again")
+            raise CameraError("the rendered camera is not open or has ended", code="not-open", remedy=_REOPEN)
         self._process.stdin.write(json.dumps(request).encode() + b"\n")
 
     async def _read(self, process: asyncio.subprocess.Process) -> None:
@@ -221,13 +223,13 @@ class RenderedCamera:
                     case "preview":
                         self._answers.put_nowait(await _picture(process.stdout, header))
                     case "error":
-                        error = CameraError(f"the rendered camera: {header['text']}")
+                        error = CameraError(f"the rendered camera: {header['text']}", code="camera-refused")
                         (self._frames if header["cmd"] == "trigger" else self._answers).put_nowait(error)
                     case _:
                         self._answers.put_nowait(header)
         except (asyncio.IncompleteReadError, ConnectionError):
             pass  # it ended within a frame
-        gone = CameraError("the camera is gone (its process ended); open it again")
+        gone = CameraError("the camera is gone (its process ended)", code="camera-gone", remedy=_REOPEN)
         self._frames.put_nowait(gone)
         self._answers.put_nowait(gone)
 

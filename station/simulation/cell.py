@@ -61,5 +61,7 @@ def read_truth(path: Path) -> CellTruth:
         return msgspec.json.decode(path.read_bytes(), type=CellTruth)
     except (OSError, msgspec.DecodeError) as error:
         raise ConfigError(
-            f"{path}: no truth of a simulated cell ({error}); make one with make_cell"
+            f"{path}: no truth of a simulated cell ({error})",
+            code="no-truth",
+            remedy="Make one with make_cell.",
         ) from error

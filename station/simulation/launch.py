@@ -1,4 +1,4 @@
-"""Starts a simulated controller as a child process on a free loopback address."""
+"""Simulated devices as child processes: the controller, on a free loopback address, and the GigE camera."""
 
 from __future__ import annotations
 
@@ -12,31 +12,30 @@ import sys
 import tempfile
 import time
 from pathlib import Path
-from types import TracebackType
-from typing import Any
+from typing import Any, Self
 
 from station.cell.errors import CameraError, RobotError
 from station.simulation.netns import is_isolated
 
+ADMIN_PORT = 29990
 ATTEMPTS = 5
 ADDRESS_TAKEN = 1
 """Exit code of a controller that cannot listen on its address."""
 STOP_TIMEOUT_S = 3.0
 END_TIMEOUT_S = 0.5
-PORT = 29990
-_STOP_TIMEOUT_S = 3.0
 
 
 class AdminClient:
-    """One connection; blocking, with a timeout on every call. Not for use from two threads at once."""
+    """One connection to a controller's admin port; blocking, with a timeout on every call, for one thread."""
 
     def __init__(self, host: str, timeout_s: float = 5.0) -> None:
         """Raises RobotError when nothing listens there."""
         self.host = host
         try:
-            self._socket = socket.create_connection((host, PORT), timeout_s)
+            self._socket = socket.create_connection((host, ADMIN_PORT), timeout_s)
         except OSError as error:
-            raise RobotError(f"no simulated controller answers on {host}:{PORT} ({error})") from error
+            text = f"no simulated controller answers on {host}:{ADMIN_PORT} ({error})"
+            raise RobotError(text, code="no-simulation") from error
         self._lines = self._socket.makefile("rb")
 
     def ask(self, cmd: str, **arguments: Any) -> dict[str, Any]:
@@ -45,63 +44,62 @@ class AdminClient:
             self._socket.sendall(json.dumps({"cmd": cmd, **arguments}).encode() + b"\n")
             line = self._lines.readline()
         except OSError as error:
-            raise RobotError(f"the simulated controller on {self.host} does not answer ({error})") from error
+            text = f"the simulated controller on {self.host} does not answer ({error})"
+            raise RobotError(text, code="no-simulation") from error
         if not line:
-            raise RobotError(f"the simulated controller on {self.host} has ended")
+            raise RobotError(f"the simulated controller on {self.host} has ended", code="no-simulation")
         answer: dict[str, Any] = json.loads(line)
         if not answer.pop("ok"):
-            raise RobotError(f"the simulated controller refused {answer['error']}")
+            raise RobotError(f"the simulated controller refused {answer['error']}", code="simulation-refused")
         return answer
 
     def close(self) -> None:
         self._lines.close()
         self._socket.close()
 
-    def __enter__(self) -> AdminClient:
+    def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
         self.close()
 
 
-class SimulatedController:
+class ChildProcess:
     """A running child. It ends with `stop`, with the `with` block, and when this process dies."""
 
-    def __init__(self, host: str, process: subprocess.Popen[bytes]) -> None:
-        self.host = host
+    def __init__(self, process: subprocess.Popen[bytes]) -> None:
         self.process = process
 
     @property
     def running(self) -> bool:
         return self.process.poll() is None
 
+    def stop(self, timeout_s: float = STOP_TIMEOUT_S) -> None:
+        """Ends the child, by force if it does not listen. Idempotent."""
+        for pipe in (self.process.stdin, self.process.stdout):
+            if pipe is not None:
+                pipe.close()  # it ends with its input
+        try:
+            self.process.wait(timeout_s)
+        except subprocess.TimeoutExpired:
+            self.process.kill()
+            self.process.wait()
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.stop()
+
+
+class SimulatedController(ChildProcess):
+    def __init__(self, host: str, process: subprocess.Popen[bytes]) -> None:
+        super().__init__(process)
+        self.host = host
+
     def admin(self) -> AdminClient:
         """A new connection to the admin port. Raises RobotError."""
         return AdminClient(self.host)
-
-    def stop(self, timeout_s: float = STOP_TIMEOUT_S) -> None:
-        """Ends the child, by force if it does not listen. Idempotent."""
-        if self.running:
-            self.process.terminate()
-            try:
-                self.process.wait(timeout_s)
-            except subprocess.TimeoutExpired:
-                self.process.kill()
-                self.process.wait()
-        for pipe in (self.process.stdin, self.process.stdout, self.process.stderr):
-            if pipe is not None:
-                pipe.close()
-
-    def __enter__(self) -> SimulatedController:
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        self.stop()
 
 
 def start_controller(
@@ -123,19 +121,15 @@ def start_controller(
     command += ["--time-scale", str(time_scale), *options]
     if truth is not None:
         command += ["--truth", str(truth)]
-    attempts = 1 if host is not None else ATTEMPTS
-    while True:
-        attempts -= 1
-        address = host or _random_loopback()
+    for attempt in range(ATTEMPTS, 0, -1):
+        address = host or f"127.{random.randint(1, 254)}.{random.randint(0, 255)}.{random.randint(1, 254)}"
         child, problem = _start([*command, "--host", address], timeout_s, log)
         if not problem:
             return SimulatedController(address, child)
-        if child.returncode != ADDRESS_TAKEN or attempts == 0:
-            raise RobotError(f"the simulated {model} did not start: {problem}")
-
-
-def _random_loopback() -> str:
-    return f"127.{random.randint(1, 254)}.{random.randint(0, 255)}.{random.randint(1, 254)}"
+        if host is not None or child.returncode != ADDRESS_TAKEN or attempt == 1:
+            break
+    text = f"the simulated {model} did not start: {problem}"
+    raise RobotError(text, code="simulation-not-started", exit_code=child.returncode)
 
 
 def _start(command: list[str], timeout_s: float, log: Path | None) -> tuple[subprocess.Popen[bytes], str]:
@@ -147,19 +141,14 @@ def _start(command: list[str], timeout_s: float, log: Path | None) -> tuple[subp
         )
         if b'"ready": true' in _read_line(child, timeout_s):
             return child, ""
-        _end(child)
+        try:
+            child.wait(END_TIMEOUT_S)  # it may be ending by itself
+        except subprocess.TimeoutExpired:
+            child.kill()
+        child.communicate()
         stderr.seek(said_before)
         words = stderr.read().decode(errors="replace").strip()
     return child, words or f"no ready line within {timeout_s:g} s"
-
-
-def _end(child: subprocess.Popen[bytes]) -> None:
-    """Waits for a child that is ending by itself, or kills it; closes its pipes."""
-    try:
-        child.wait(END_TIMEOUT_S)
-    except subprocess.TimeoutExpired:
-        child.kill()
-    child.communicate()
 
 
 def _read_line(child: subprocess.Popen[bytes], timeout_s: float) -> bytes:
@@ -179,14 +168,9 @@ def _read_line(child: subprocess.Popen[bytes], timeout_s: float) -> bytes:
     return line
 
 
-class SimulatedGige:
-    """A running child; it ends with `stop`, with the `with` block, and when this process dies."""
-
-    def __init__(self, process: subprocess.Popen[str]) -> None:
-        self.process = process
-
+class SimulatedGige(ChildProcess):
     def inject(self, fault: str, value: Any = None) -> None:
-        """A fault of `camera_faults`, or `packet-loss` with a share of packets; then it is in force."""
+        """A fault of `CameraFaults`, or `packet-loss` with a share of packets; then it is in force."""
         self._ask(fault, value)
 
     def sent(self) -> int:
@@ -195,29 +179,12 @@ class SimulatedGige:
 
     def _ask(self, name: str, value: Any = None) -> dict[str, Any]:
         assert self.process.stdin is not None and self.process.stdout is not None
-        self.process.stdin.write(json.dumps({"name": name, "value": value}) + "\n")
+        self.process.stdin.write(json.dumps({"name": name, "value": value}).encode() + b"\n")
         self.process.stdin.flush()
         answer = self.process.stdout.readline()
         if not answer:
-            raise CameraError(f"the GigE simulator ended on the fault '{name}'")
+            raise CameraError(f"the GigE simulator ended on the fault '{name}'", code="no-simulation")
         return dict(json.loads(answer))
-
-    def stop(self) -> None:
-        """Idempotent."""
-        for pipe in (self.process.stdin, self.process.stdout):
-            if pipe is not None:
-                pipe.close()
-        try:
-            self.process.wait(_STOP_TIMEOUT_S)
-        except subprocess.TimeoutExpired:
-            self.process.kill()
-            self.process.wait()
-
-    def __enter__(self) -> SimulatedGige:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
 
 
 def start_gige(
@@ -225,26 +192,25 @@ def start_gige(
     *,
     truth: Path | None = None,
     serial: str = "SIM00000",
-    address: str = "127.0.0.1",
     numbered: bool = False,
 ) -> SimulatedGige:
-    """Blocking until it listens; call it outside an event loop. CameraError with its last words.
+    """Starts the camera on 127.0.0.1 and waits until it listens; blocking, call it outside an event loop.
 
-    Refused where there is any network interface but `lo`: GigE discovery broadcasts on all of them.
+    CameraError where there is any network interface but `lo`: GigE discovery broadcasts on all of them.
     """
     if not is_isolated():
         raise CameraError(
-            "the GigE simulator runs only in a network namespace with nothing but lo: "
-            "start the program with `python -m station.simulation.netns` in `unshare --net`"
+            "the GigE simulator runs only in a network namespace with nothing but lo",
+            code="not-isolated",
+            remedy="Start the program with `python -m station.simulation.netns` in `unshare --net`.",
         )
-    command = [sys.executable, "-m", "station.simulation.gige", "--address", address, "--serial", serial]
+    command = [sys.executable, "-m", "station.simulation.gige", "--serial", serial]
     command += ["--numbered"] if numbered else ["--controller-host", controller_host]
     command += [] if truth is None else ["--truth", str(truth)]
-    process = subprocess.Popen(
-        command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True, start_new_session=True
-    )
+    process = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, start_new_session=True)
     assert process.stdout is not None
     if not process.stdout.readline():
-        process.wait()
-        raise CameraError("the GigE simulator did not start; what it said is above")
+        process.communicate()
+        text = "the GigE simulator did not start; what it said is above"
+        raise CameraError(text, code="simulation-not-started")
     return SimulatedGige(process)

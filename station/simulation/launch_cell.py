@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -53,14 +54,23 @@ def simulated_cell(options: SimulationOptions, folder: Path) -> Cell:
     from station.simulation.scenes import cell_config
 
     if options.frame_rate_hz and (options.hardware_trigger or not options.gige):
-        raise ConfigError("a simulated camera runs freely only over GigE, and without a trigger box")
+        raise ConfigError(
+            "a simulated camera runs freely only over GigE, and without a trigger box",
+            code="simulation-options",
+        )
     folder.mkdir(parents=True, exist_ok=True)
     truth = make_cell(options.scene, options.seed, options.noise, options.mount)
     truth = msgspec.structs.replace(truth, robot_model=options.robot)
     truth_file = folder / "truth.json"
     write_truth(truth, truth_file)
-    controller = start_controller(
-        truth.robot_model, truth=truth_file, time_scale=options.time_scale, log=folder / "controller.log"
+    ends = ExitStack()
+    controller = ends.enter_context(
+        start_controller(
+            truth.robot_model,
+            truth=truth_file,
+            time_scale=options.time_scale,
+            log=folder / "controller.log",
+        )
     )
     config = cell_config(truth, controller.host)
     config = msgspec.structs.replace(
@@ -69,54 +79,32 @@ def simulated_cell(options: SimulationOptions, folder: Path) -> Cell:
     capture = msgspec.structs.replace(config.capture, free_space_bytes=options.free_space_bytes)
     robot = msgspec.structs.replace(config.robot, model=options.robot)
     config = msgspec.structs.replace(config, capture=capture, robot=robot)
+    box: SimulatedTriggerBox | None = None
+    trigger: Trigger | None = None
     try:
-        wires = _Wires(options.hardware_trigger)
-        config = wires.configured(config)
-        config, camera, camera_ended = _camera(options, config, truth, truth_file, wires)
+        if options.hardware_trigger:
+            from station.devices.serial_trigger import SerialTrigger
+            from station.simulation.trigger import SimulatedTriggerBox
+
+            box = ends.enter_context(SimulatedTriggerBox())
+            camera_config = msgspec.structs.replace(config.camera, trigger="hardware")
+            config = msgspec.structs.replace(config, camera=camera_config, trigger=TriggerConfig(box.port))
+            trigger = SerialTrigger(TriggerConfig(box.port))
+        config, camera, pulse = _camera(options, config, truth, truth_file, trigger, ends)
     except StationError:
-        controller.stop()
+        ends.close()
         raise
-
-    def ended() -> None:
-        wires.end()
-        camera_ended()
-        controller.stop()
-
+    if box is not None:
+        box.on_pulse = pulse
     return Cell(
         config=config,
         robot=UrRobot(config.robot, folder),
         camera=camera,
         source="simulated",
-        trigger=wires.trigger,
+        trigger=trigger,
         attachments={"truth.json": truth_file.read_bytes()},
-        ended=ended,
+        ended=ends.close,
     )
-
-
-class _Wires:
-    """The trigger box, its serial line and the wire from its output to the camera; or none of it."""
-
-    def __init__(self, wanted: bool) -> None:
-        self.camera: Callable[[], None] = lambda: None
-        """The far end of the wire"""
-        self._box: SimulatedTriggerBox | None = None
-        self.trigger: Trigger | None = None
-        if wanted:
-            from station.devices.serial_trigger import SerialTrigger
-            from station.simulation.trigger import SimulatedTriggerBox
-
-            self._box = SimulatedTriggerBox(on_pulse=lambda: self.camera())
-            self.trigger = SerialTrigger(TriggerConfig(self._box.port))
-
-    def configured(self, config: StationConfig) -> StationConfig:
-        if self._box is None:
-            return config
-        camera = msgspec.structs.replace(config.camera, trigger="hardware")
-        return msgspec.structs.replace(config, camera=camera, trigger=TriggerConfig(self._box.port))
-
-    def end(self) -> None:
-        if self._box is not None:
-            self._box.unplug()
 
 
 def _camera(
@@ -124,21 +112,23 @@ def _camera(
     config: StationConfig,
     truth: CellTruth,
     truth_file: Path,
-    wires: _Wires,
+    trigger: Trigger | None,
+    ends: ExitStack,
 ) -> tuple[StationConfig, Camera, Callable[[], None]]:
-    """The configuration with the camera it is about, and what ends its processes."""
+    """The configuration with the camera it is about, and what an edge on its trigger line does."""
     if not options.gige:
         from station.simulation.camera import RenderedCamera
 
-        rendered = RenderedCamera(truth, config.robot.host, config.camera, wires.trigger)
-        wires.camera = rendered.pulse
-        return config, rendered, lambda: None
+        rendered = RenderedCamera(truth, config.robot.host, config.camera, trigger)
+        return config, rendered, rendered.pulse
     from station.devices.aravis import AravisCamera
     from station.simulation.launch import start_gige
 
     free = options.frame_rate_hz > 0
     serial = f"SIM{options.seed:05d}"
-    simulator = start_gige(config.robot.host, truth=truth_file, serial=serial, numbered=free)
+    simulator = ends.enter_context(
+        start_gige(config.robot.host, truth=truth_file, serial=serial, numbered=free)
+    )
     # The simulator has no test packets to negotiate the packet size with; loopback carries the largest.
     over_gige = msgspec.structs.replace(
         config.camera, driver="aravis", device="127.0.0.1", packet_size=GIGE_PACKET_BYTES
@@ -148,5 +138,4 @@ def _camera(
             over_gige, trigger="free-running", frame_rate_hz=options.frame_rate_hz
         )
     config = msgspec.structs.replace(config, camera=over_gige)
-    wires.camera = lambda: simulator.inject("pulse")
-    return config, AravisCamera(over_gige, wires.trigger), simulator.stop
+    return config, AravisCamera(over_gige, trigger), lambda: simulator.inject("pulse")

@@ -31,7 +31,8 @@ def isolated_command(command: list[str]) -> list[str]:
     """The same command inside a namespace of its own. StationError where `unshare` is missing."""
     unshare = shutil.which("unshare")
     if unshare is None:
-        raise StationError("the GigE simulator needs 'unshare' (apt install util-linux)")
+        remedy = "Run apt install util-linux."
+        raise StationError("the GigE simulator needs 'unshare'", code="no-unshare", remedy=remedy)
     # Without root a user namespace gives the right to make a network namespace.
     rights = [] if os.geteuid() == 0 else ["--map-root-user"]
     return [unshare, *rights, "--net", sys.executable, "-m", "station.simulation.netns", *command]
@@ -47,7 +48,8 @@ def isolated_thread() -> Iterator[None]:
     with Path("/proc/thread-self/ns/net").open("rb") as before:
         if libc.unshare(_CLONE_NEWNET) != 0:
             reason = os.strerror(ctypes.get_errno())
-            raise StationError(f"no network namespace of its own for the GigE simulator: {reason}")
+            text = f"no network namespace of its own for the GigE simulator: {reason}"
+            raise StationError(text, code="no-namespace")
         try:
             bring_lo_up()
             yield

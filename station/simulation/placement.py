@@ -90,7 +90,7 @@ def place_moving_camera(
         start = _comfortable_start(scene, base_from_camera @ inverse(X), rng)
         if start is not None and _sees(scene, start) and _roomy(scene, start, rng):
             return Placement(X, Y, start)
-    raise ConfigError(f"no place found for a camera turned by\n{camera_turn}\ntake another seed")
+    raise ConfigError("no place found for the camera", code="no-placement", remedy="Take another seed.")
 
 
 def place_fixed_camera(board: BoardSpec, camera: CameraModel, rng: np.random.Generator) -> Placement:
@@ -111,7 +111,7 @@ def place_fixed_camera(board: BoardSpec, camera: CameraModel, rng: np.random.Gen
         start = _comfortable_start(scene, flange, rng)
         if start is not None and _sees(scene, start) and _roomy(scene, start, rng):
             return Placement(X, Y, start)
-    raise ConfigError("no place found for a camera beside the cell; take another seed")
+    raise ConfigError("no place found beside the cell", code="no-placement", remedy="Take another seed.")
 
 
 def _camera_looking_down(rng: np.random.Generator) -> Array:

@@ -43,7 +43,7 @@ class Light:
 
 
 @dataclass(frozen=True, eq=False)
-class _Lens:
+class _LensTable:
     """The ray (x, y, 1) of each pixel centre, its change per pixel, and the vignetting."""
 
     x: Floats
@@ -109,7 +109,7 @@ def scaled(camera: CameraModel, factor: float) -> CameraModel:
 
 
 @lru_cache(maxsize=4)
-def _lens(camera: CameraModel) -> _Lens:
+def _lens(camera: CameraModel) -> _LensTable:
     if camera.matrix is None:
         raise ValueError("the camera has no matrix")
     if camera.distortion_model == "equidistant":
@@ -123,7 +123,7 @@ def _lens(camera: CameraModel) -> _Lens:
     corner = np.hypot(camera.width / 2, camera.height / 2)
     radius = np.hypot(u - camera.width / 2, v - camera.height / 2) / corner
     vignetting = 1.0 - VIGNETTING * radius**2
-    return _Lens(x.astype(np.float32), y.astype(np.float32), vignetting.astype(np.float32))
+    return _LensTable(x.astype(np.float32), y.astype(np.float32), vignetting.astype(np.float32))
 
 
 def _window(
@@ -166,7 +166,7 @@ def _window(
 
 
 def _reflectance(
-    lens: _Lens, window: tuple[slice, slice], camera_from_board: Array, printed: BoardPrint
+    lens: _LensTable, window: tuple[slice, slice], camera_from_board: Array, printed: BoardPrint
 ) -> Floats:
     """Mean reflectance over each pixel of the window."""
     plane_from_ray = np.asarray(np.linalg.inv(camera_from_board[:3, [0, 1, 3]]), dtype=float)

@@ -38,14 +38,14 @@ _GUESS_M, _GUESS_RAD = 0.004, 0.02
 """Error of the guesses, 1 sigma per axis"""
 
 
-class _Scene(NamedTuple):
+class _PublishedScene(NamedTuple):
     board: BoardSpec
     camera: CameraModel
     mount: Array
     """Published flange_from_camera"""
 
 
-class _Noise(NamedTuple):
+class _CellNoise(NamedTuple):
     robot_sigma_m: float
     robot_sigma_rad: float
     dh_sigma_m: float
@@ -55,9 +55,9 @@ class _Noise(NamedTuple):
 
 
 _NOISE = {
-    "low": _Noise(5.0e-5, 8.7e-5, 0.0, 0.0, 2.0, 0.7),
-    "mid": _Noise(1.0e-4, 1.7e-4, 1.0e-4, 1.0e-4, 4.0, 0.9),
-    "high": _Noise(2.0e-4, 3.5e-4, 3.0e-4, 3.0e-4, 7.0, 1.2),
+    "low": _CellNoise(5.0e-5, 8.7e-5, 0.0, 0.0, 2.0, 0.7),
+    "mid": _CellNoise(1.0e-4, 1.7e-4, 1.0e-4, 1.0e-4, 4.0, 0.9),
+    "high": _CellNoise(2.0e-4, 3.5e-4, 3.0e-4, 3.0e-4, 7.0, 1.2),
 }
 
 
@@ -68,8 +68,11 @@ def make_cell(
     scenes = {"paper": _paper_scene, "blog": _blog_scene, "paper-binned": _paper_binned_scene}
     if scene not in scenes or noise not in _NOISE or mount not in ("eye-in-hand", "eye-to-hand"):
         raise ConfigError(
-            f"no simulated cell '{scene}' with noise '{noise}' and mount '{mount}'; there are the scenes "
-            f"{', '.join(scenes)}, the noise levels {', '.join(_NOISE)}, eye-in-hand and eye-to-hand"
+            f"no simulated cell '{scene}' with noise '{noise}' and mount '{mount}'",
+            code="unknown-cell",
+            remedy=f"Scenes are {', '.join(scenes)}, noise levels {', '.join(_NOISE)}, mounts eye-in-hand "
+            "and "
+            "eye-to-hand.",
         )
     rng = np.random.default_rng([2026, seed])
     published = scenes[scene]()
@@ -89,7 +92,7 @@ def make_cell(
     return _with_noise(truth, _NOISE[noise], rng)
 
 
-def _paper_scene() -> _Scene:
+def _paper_scene() -> _PublishedScene:
     focal_px = 8.0 / 0.0048
     camera = CameraModel(
         width=1280,
@@ -98,10 +101,10 @@ def _paper_scene() -> _Scene:
         distortion=(-0.092, 0.118, 0.0004, -0.0003, 0.0),
     )
     rows = np.array(PAPER_X)
-    return _Scene(PAPER_BOARD, camera, pose(project_to_rotation(rows[:, :3]), rows[:, 3]))
+    return _PublishedScene(PAPER_BOARD, camera, pose(project_to_rotation(rows[:, :3]), rows[:, 3]))
 
 
-def _paper_binned_scene() -> _Scene:
+def _paper_binned_scene() -> _PublishedScene:
     """The paper's scene with 2 × 2 pixels read as one: small recordings."""
     paper = _paper_scene()
     assert paper.camera.matrix is not None
@@ -111,7 +114,7 @@ def _paper_binned_scene() -> _Scene:
     return paper._replace(camera=msgspec.structs.replace(paper.camera, width=640, height=512, matrix=binned))
 
 
-def _blog_scene() -> _Scene:
+def _blog_scene() -> _PublishedScene:
     """X is the blog's `Hand-Eye` frame, RPY(0, −15, 0)° at (0.1, 0, 0) m on the flange.
 
     RobWork's camera looks along −z of `Hand-Eye-Sim`, which is `Hand-Eye` rolled by 180°. The blog's own
@@ -123,11 +126,13 @@ def _blog_scene() -> _Scene:
         height=720,
         matrix=((float(focal_px), 0.0, 480.0), (0.0, float(focal_px), 360.0), (0.0, 0.0, 1.0)),
     )
-    return _Scene(BLOG_BOARD, camera, pose(rotation_exp([0.0, np.deg2rad(-15.0), 0.0]), [0.1, 0.0, 0.0]))
+    return _PublishedScene(
+        BLOG_BOARD, camera, pose(rotation_exp([0.0, np.deg2rad(-15.0), 0.0]), [0.1, 0.0, 0.0])
+    )
 
 
 def _place(
-    published: _Scene, camera: CameraModel, seed: int, mount: Mount, rng: np.random.Generator
+    published: _PublishedScene, camera: CameraModel, seed: int, mount: Mount, rng: np.random.Generator
 ) -> Placement:
     if mount == "eye-to-hand":
         return place_fixed_camera(published.board, camera, rng)
@@ -155,7 +160,7 @@ def _other_lens(camera: CameraModel, rng: np.random.Generator) -> CameraModel:
     )
 
 
-def _with_noise(truth: CellTruth, level: _Noise, rng: np.random.Generator) -> CellTruth:
+def _with_noise(truth: CellTruth, level: _CellNoise, rng: np.random.Generator) -> CellTruth:
     spread = 1.0 if truth.seed == 0 else float(rng.uniform(0.8, 1.2))
 
     def deltas(sigma: float) -> Vector6:

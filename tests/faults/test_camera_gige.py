@@ -22,6 +22,7 @@ from station.devices.aravis import AravisCamera
 from station.simulation import genicam
 from station.simulation.gige import numbered_picture
 from station.simulation.launch import SimulatedGige, start_gige
+from tests.codes import raises
 from tests.faults.lossy_wire import LossyWire
 
 pytestmark = pytest.mark.gige
@@ -40,13 +41,13 @@ async def test_18_an_incomplete_frame_is_refused_and_the_next_one_good(server: S
     try:
         await camera.capture()
         server.inject("packet-loss", 0.5)
-        with pytest.raises(CameraError, match=r"came incomplete|no picture within"):
+        with pytest.raises(CameraError, check=lambda error: error.code in ("frame-incomplete", "no-image")):
             await camera.capture(timeout_s=2.0)
         server.inject("packet-loss", 0.0)
         assert (await camera.capture()).pixels.shape == (1024, 1280)
         assert camera.counter.missing == 1
         server.inject("packet-loss", 0.03)
-        with pytest.raises(CameraError, match="came incomplete"):
+        with raises("frame-incomplete"):
             await camera.capture(timeout_s=2.0)
         counts = camera.counts().stream
         assert counts.missing_packets > 0 and counts.incomplete >= 1 and counts.complete == 2
@@ -88,7 +89,7 @@ async def test_19_frames_nobody_asked_for_are_noticed(server: SimulatedGige) -> 
         await camera.capture()
         server.inject("pulse")
         await asyncio.sleep(0.3)
-        with pytest.raises(CameraError, match=r"1 frame\(s\) came without a trigger"):
+        with raises("surplus-frames", frames=1):
             await camera.capture()
         await camera.capture()
     finally:
@@ -99,14 +100,10 @@ async def test_23_settings_changed_behind_our_back_are_refused(server: Simulated
     camera = AravisCamera(CONFIG)
     await camera.open()
     try:
-        for register, value, words in (
-            (genicam.EXPOSURE, 4000, "4000 µs"),
-            (genicam.GAIN, 100, "10 dB"),
-            (genicam.WIDTH, 640, "640"),
-        ):
+        for register, value in ((genicam.EXPOSURE, 4000), (genicam.GAIN, 100), (genicam.WIDTH, 640)):
             before = {genicam.EXPOSURE: 10_000, genicam.GAIN: 0, genicam.WIDTH: 1280}[register]
             server.inject("register", [register, value])
-            with pytest.raises(CameraError, match=words):
+            with raises("settings-changed"):
                 await camera.capture()
             server.inject("register", [register, before])
         await camera.capture()
@@ -129,7 +126,7 @@ async def test_23_a_stream_ends_when_settings_are_changed_and_passes_no_picture_
 
     await camera.open()
     try:
-        with pytest.raises(CameraError, match="640"):
+        with raises("settings-changed"):
             await asyncio.wait_for(camera.stream(keep, threading.Event()), 20)
         assert len(sizes) >= 5 and set(sizes) == {(1024, 1280)}
     finally:
@@ -153,7 +150,7 @@ async def test_an_unplugged_camera_is_gone_and_comes_back_by_its_serial(server: 
 
         beating = asyncio.create_task(beat())
         start_s = time.monotonic()
-        with pytest.raises(CameraError, match=r"gone|failed|no picture"):
+        with pytest.raises(CameraError):
             await camera.capture(timeout_s=4.0)
         assert time.monotonic() - start_s < 8
         assert beats > 50, "the daemon's loop goes on while Aravis waits"

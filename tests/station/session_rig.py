@@ -4,24 +4,21 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Awaitable, Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import msgspec
 import numpy as np
-import pytest
 
 from calibrate.boards.model import board_points
 from calibrate.geometry import rotation_log
 from calibrate.kinematics import MODELS, forward
-from recordings.errors import CodedError
 from recordings.reader import Recording, open_recording
 from recordings.schema.messages import CameraIdentity, Image, RobotIdentity, RobotState, Stamps
 from station.analysis.worker import BoardDetection, sight
 from station.cell.config import StationConfig
-from station.cell.errors import CameraError, RefusedError, RobotError, StaleStateError
+from station.cell.errors import CameraError, RobotError, StaleStateError
 from station.cell.status import DetectionStatus, Event, StationState
 from station.devices.base import Robot
 from station.devices.cell import Cell
@@ -233,14 +230,6 @@ def memory_config() -> StationConfig:
     capture = msgspec.structs.replace(config.capture, free_space_bytes=1, time_bound_s=1.0)
     stillness = msgspec.structs.replace(config.stillness, timeout_s=0.8)
     return msgspec.structs.replace(config, capture=capture, stillness=stillness)
-
-
-@contextmanager
-def raises(code: str, kind: type[CodedError] = RefusedError) -> Iterator[pytest.ExceptionInfo[CodedError]]:
-    """As `pytest.raises`, by the error's code."""
-    with pytest.raises(kind) as caught:
-        yield caught
-    assert caught.value.code == code, caught.value
 
 
 class Rig:

@@ -19,12 +19,12 @@ from station.cell.limits import point_speed_m_s
 from station.cell.status import HoverOffer, StationStatus
 from station.cell.status import StationState as S
 from station.operate.touch_test import read_offset_mm, tip_on_board_m
-from station.plan.hover import SPEED_M_S, board_from_tip, hover_geometry
+from station.plan.hover import SPEED_M_S, hover_geometry
 from station.protocol.client import Client
 from station.simulation.cell import CellTruth, write_truth
 from station.simulation.placement import board_centre
 from station.simulation.scenes import cell_config
-from tests.station.hover_cell import POINTER, SIGMA_M, SIGMA_RAD, calibration_of
+from tests.station.hover_cell import POINTER, SIGMA_M, SIGMA_RAD, board_from_tip, calibration_of
 from tests.system.conftest import TRUTH, SystemRig, status_when
 
 pytestmark = pytest.mark.process

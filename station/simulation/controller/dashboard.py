@@ -78,29 +78,13 @@ class DashboardConnection(Connection):
 
 
 def _answers(robot: SimulatedRobot) -> dict[str, Callable[[str], str]]:
-    def stop(_: str) -> str:
-        robot.stop_program("dashboard stop")
-        return "Stopped"
+    def does(reply: str, *actions: Callable[[], object]) -> Callable[[str], str]:
+        def answer(_: str) -> str:
+            for action in actions:
+                action()
+            return reply
 
-    def power_on(_: str) -> str:
-        robot.power_on()
-        return "Powering on"
-
-    def power_off(_: str) -> str:
-        robot.power_off()
-        return "Powering off"
-
-    def brake_release(_: str) -> str:
-        robot.power_on()
-        robot.release_brakes()
-        return "Brake releasing"
-
-    def unlock(_: str) -> str:
-        return "Protective stop releasing" if robot.unlock() else UNLOCK_TOO_EARLY
-
-    def shutdown(_: str) -> str:
-        robot.power_off()
-        return "Shutting down"
+        return answer
 
     def program_state(_: str) -> str:
         words = {RuntimeState.PLAYING: "PLAYING", RuntimeState.PAUSED: "PAUSED"}
@@ -108,7 +92,7 @@ def _answers(robot: SimulatedRobot) -> dict[str, Callable[[str], str]]:
         return f"{words.get(robot.runtime_state, 'STOPPED')} {name}"
 
     answers: dict[str, Callable[[str], str]] = {
-        "stop": stop,
+        "stop": does("Stopped", lambda: robot.stop_program("dashboard stop")),
         "play": lambda _: "Starting program" if robot.play_program() else "Failed to execute: play",
         "pause": lambda _: "Pausing program" if robot.pause_program() else "Failed to execute: pause",
         "load": lambda name: f"File not found: {name}",
@@ -117,23 +101,25 @@ def _answers(robot: SimulatedRobot) -> dict[str, Callable[[str], str]]:
         "safetymode": lambda _: f"Safetymode: {robot.safety_mode.name}",
         "safetystatus": lambda _: f"Safetystatus: {robot.safety_mode.name}",
         "programState": program_state,
-        "get loaded program": lambda _: "No program loaded",
-        "get robot model": lambda _: robot.settings.model.rstrip("e"),
-        "get serial number": lambda _: robot.settings.serial,
-        "PolyscopeVersion": lambda _: _version(robot),
-        "version": lambda _: _version(robot),
-        "isProgramSaved": lambda _: "true <unnamed>",
-        "power on": power_on,
-        "power off": power_off,
-        "brake release": brake_release,
-        "unlock protective stop": unlock,
-        "close safety popup": lambda _: "closing safety popup",
-        "close popup": lambda _: "closing popup",
-        "popup": lambda _: "showing popup",
-        "addToLog": lambda _: "Added log message",
-        "restart safety": lambda _: "Restarting safety",
-        "quit": lambda _: "Disconnected",
-        "shutdown": shutdown,
+        "get loaded program": does("No program loaded"),
+        "get robot model": does(robot.settings.model.rstrip("e")),
+        "get serial number": does(robot.settings.serial),
+        "PolyscopeVersion": does(_version(robot)),
+        "version": does(_version(robot)),
+        "isProgramSaved": does("true <unnamed>"),
+        "power on": does("Powering on", robot.power_on),
+        "power off": does("Powering off", robot.power_off),
+        "brake release": does("Brake releasing", robot.power_on, robot.release_brakes),
+        "unlock protective stop": lambda _: (
+            "Protective stop releasing" if robot.unlock() else UNLOCK_TOO_EARLY
+        ),
+        "close safety popup": does("closing safety popup"),
+        "close popup": does("closing popup"),
+        "popup": does("showing popup"),
+        "addToLog": does("Added log message"),
+        "restart safety": does("Restarting safety"),
+        "quit": does("Disconnected"),
+        "shutdown": does("Shutting down", robot.power_off),
     }
     if robot.settings.is_e_series:
         answers["is in remote control"] = lambda _: str(robot.remote).lower()

@@ -40,8 +40,6 @@ class SimulatedRobot(ControllerState):
         self._silence_s = 0.0
         self._hands: Motion | None = None
 
-    # -- one cycle ----------------------------------------------------------------------------------
-
     def tick(self, monotonic_ns: int, late: bool = False) -> None:
         """One cycle; `monotonic_ns` is when it is due. `late`: many cycles run at once because this
         process was held up; such time does not count as the client's silence."""
@@ -120,8 +118,6 @@ class SimulatedRobot(ControllerState):
                 self.outputs.set("actual_digital_output_bits", before & ~mask | wanted & mask)
                 self.journal.note("rtde", f"{kind}_output", mask=mask >> first_bit, value=wanted >> first_bit)
 
-    # -- the program --------------------------------------------------------------------------------
-
     @property
     def safe(self) -> bool:
         return self.safety_mode in (SafetyMode.NORMAL, SafetyMode.REDUCED)
@@ -191,8 +187,6 @@ class SimulatedRobot(ControllerState):
         self._silence_s = 0.0
         return True
 
-    # -- safety and power ---------------------------------------------------------------------------
-
     def protective_stop(self, reason: str) -> None:
         """The arm rests at once; only `unlock` brings it back, and only after 5 s."""
         self.journal.note("controller", "protective stop", reason=reason)
@@ -251,8 +245,6 @@ class SimulatedRobot(ControllerState):
         if mode != self.safety_mode:
             self._safety_since_s = self.time_s
         self.safety_mode = mode
-
-    # -- the truth ----------------------------------------------------------------------------------
 
     def true_flange(self, joints: Six, miss: Six) -> Rigid:
         """base_from_flange with the arm's real lengths and its repeatability error."""

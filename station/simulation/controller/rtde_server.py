@@ -97,8 +97,6 @@ class RtdeConnection(Connection):
     def closed(self) -> None:
         self._server.release(self)
 
-    # -- handshake: exactly one reply per request -------------------------------------------------------
-
     def _protocol_version(self, payload: bytes) -> bytes:
         (version,) = struct.unpack(">H", payload)
         return bytes([version == PROTOCOL_VERSION])
@@ -143,8 +141,6 @@ class RtdeConnection(Connection):
     def _pause(self, payload: bytes) -> bytes:
         self._playing = False
         return b"\x01"
-
-    # -- data -------------------------------------------------------------------------------------------
 
     def _data(self, payload: bytes) -> None:
         number = payload[0] if payload else 0

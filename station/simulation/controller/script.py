@@ -151,8 +151,6 @@ class ControlScript:
         self._last_realtime = 0
         self._commands = self._table()
 
-    # -- the loop -----------------------------------------------------------------------------------
-
     def begin(self) -> None:
         self._word.finish()
         self._put_int(0, READY)
@@ -230,8 +228,6 @@ class ControlScript:
             61: lambda: self._put_int(1, self._has_solution(self._doubles(6, 6))),
         }
 
-    # -- registers ----------------------------------------------------------------------------------
-
     def _doubles(self, first: int, count: int) -> Six:
         first += self._offset_double
         return tuple(
@@ -250,8 +246,6 @@ class ControlScript:
 
     def _put_rigid(self, T: Rigid) -> None:
         self._put_doubles(to_pose(T))
-
-    # -- motion -------------------------------------------------------------------------------------
 
     def _to_joints(self, joints: Six) -> MakePath:
         _check(joints)
@@ -322,8 +316,6 @@ class ControlScript:
         else:
             arm.brake(deceleration)
         self._until = lambda: not arm.moving
-
-    # -- settings and questions ---------------------------------------------------------------------
 
     def _set_tcp(self) -> None:
         pose = self._doubles(0, 6)

@@ -12,7 +12,7 @@ from collections import Counter, deque
 from dataclasses import dataclass
 from typing import Any
 
-from station.devices.rtde import RobotMode, RobotStatus, RuntimeState, SafetyMode, SafetyStatus
+from station.devices.rtde import RobotMode, RobotStatusBits, RuntimeState, SafetyMode, SafetyStatus
 from station.simulation.controller.arm import Arm, History
 from station.simulation.controller.kinematics import (
     TABLES,
@@ -160,7 +160,9 @@ class ControllerState(ABC):
         out.set("runtime_state", self.runtime_state)
         powered = self.robot_mode in (RobotMode.POWER_ON, RobotMode.IDLE, RobotMode.RUNNING)
         playing = self.runtime_state == RuntimeState.PLAYING
-        bits = (RobotStatus.POWER_ON if powered else 0) | (RobotStatus.PROGRAM_RUNNING if playing else 0)
+        bits = (RobotStatusBits.POWER_ON if powered else 0) | (
+            RobotStatusBits.PROGRAM_RUNNING if playing else 0
+        )
         out.set("robot_status_bits", bits)
         out.set("joint_mode", *(_JOINT_MODE.get(self.robot_mode, 239),) * 6)
 

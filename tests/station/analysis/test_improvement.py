@@ -14,7 +14,7 @@ from station.analysis.estimation import CapturedView
 from station.analysis.improvement import better_guesses
 from station.plan.planner import make_plan
 from station.simulation.scenes import cell_config, make_cell
-from tests.station.session_rig import raises
+from tests.codes import raises
 
 
 @pytest.fixture(scope="module", params=["eye-in-hand", "eye-to-hand"])

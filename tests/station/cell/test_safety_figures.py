@@ -24,7 +24,7 @@ PROMISES = (Path(__file__).parents[3] / "docs" / "safety.md").read_text()
         (ur_moves.JOINT_ACCELERATION_LIMIT_RAD_S2, 1.5, "refuses more than 1.05 rad/s or 1.5 rad/s²"),
         (1 / ur_control.WATCHDOG_HZ, 0.2, "silent for 0.2 s"),
         (ur_control.BEAT_FRESH_NS / 1e9, 0.1, "silent for 0.2 s"),
-        (ur_moves.STALE_S, 0.25, "no fresh state for 0.25 s in mid-move"),
+        (ur_condition.HICCUP_S, 0.25, "no fresh state for 0.25 s in mid-move"),
         (supervisor.LOST_ROUNDS * supervisor.STATUS_TICKS * supervisor.TICK_S, 1.0, "(1 s at rest)"),
         (stillness.REST_PATIENCE_S, 1.0, "(1 s at rest)"),
         (ur_moves.STRAYED_RAD, 0.05, "(by 0.05 rad)"),

@@ -13,7 +13,7 @@ from recordings.schema.messages import RobotState, Stamps
 from station.cell.config import StillnessConfig
 from station.cell.errors import StaleStateError
 from station.cell.stillness import NotStillError, StillnessMonitor
-from tests.station.session_rig import raises
+from tests.codes import raises
 
 HOME = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
 REST = RobotState(

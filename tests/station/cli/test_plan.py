@@ -36,7 +36,7 @@ def test_a_plan_is_made_shown_and_saved(made):
     result, files = made
     assert result.returncode == 0, result.stderr
     assert "12 poses" in result.stdout and "check: passed" in result.stdout
-    assert "board points in the picture" in result.stdout
+    assert "board points in the image" in result.stdout
     assert len(load_plan(files["plan.yaml"]).poses) == 12
     assert files["plan.png"].read_bytes()[:4] == b"\x89PNG"
 

@@ -15,7 +15,6 @@ import pytest
 
 from recordings.schema.messages import Image
 from station.cell.config import CameraConfig
-from station.cell.errors import CameraError
 from station.devices.aravis import AravisCamera
 from station.devices.base import TriggerPulse
 from station.devices.frames import mid_exposure, next_frame_id
@@ -23,6 +22,7 @@ from station.devices.pixels import decode, encode
 from station.simulation import genicam
 from station.simulation.gige import numbered_picture
 from station.simulation.launch import SimulatedGige, start_gige
+from tests.codes import raises
 
 pytestmark = pytest.mark.gige
 ADDRESS = CameraConfig(device="127.0.0.1", packet_size=8996)
@@ -67,7 +67,7 @@ async def test_a_camera_is_found_by_serial_address_or_name(server: SimulatedGige
 
 
 async def test_an_unknown_camera_is_refused_with_what_was_found(server: SimulatedGige) -> None:
-    with pytest.raises(CameraError, match=r"no camera 'KJ0043': found MER-131-75GM KJ0042 at 127\.0\.0\.1"):
+    with raises("no-camera"):
         await AravisCamera(CameraConfig(device="KJ0043")).open()
 
 
@@ -88,19 +88,19 @@ async def test_settings_are_made_and_read_back(server: SimulatedGige) -> None:
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "code"),
     [
-        ({"region": (0, 0, 5000, 512)}, "Width"),
-        ({"exposure_us": 5.0}, "ExposureTime"),
-        ({"gain_db": 60.0}, "Gain"),
-        ({"pixel_format": "Mono16"}, "Mono16"),
-        ({"pixel_format": "YUV422"}, "not supported"),
+        ({"region": (0, 0, 5000, 512)}, "camera-refused"),
+        ({"exposure_us": 5.0}, "camera-refused"),
+        ({"gain_db": 60.0}, "camera-refused"),
+        ({"pixel_format": "Mono16"}, "camera-refused"),
+        ({"pixel_format": "YUV422"}, "pixel-format"),
     ],
 )
 async def test_what_the_camera_cannot_do_is_refused(
-    server: SimulatedGige, change: dict[str, Any], words: str
+    server: SimulatedGige, change: dict[str, Any], code: str
 ) -> None:
-    with pytest.raises(CameraError, match=words):
+    with raises(code):
         await AravisCamera(CameraConfig(device="127.0.0.1", **change)).open()
 
 
@@ -175,18 +175,18 @@ async def test_hardware_trigger_pairs_by_the_boxs_count(server: SimulatedGige) -
     async with Opened(CameraConfig(device="127.0.0.1", trigger="hardware"), box) as camera:
         assert [(await camera.capture()).trigger_count for _ in range(3)] == [101, 102, 103]
         box.count += 1  # a pulse that nobody asked for
-        with pytest.raises(CameraError, match="2 pulses for one picture"):
+        with raises("pulse-count"):
             await camera.capture()
         assert (await camera.capture()).trigger_count == 106
         box.wired = False
-        with pytest.raises(CameraError, match="no picture within"):
+        with raises("no-image"):
             await camera.capture(timeout_s=0.3)
         box.wired = True
         assert number_of(await camera.capture()) == 5
 
 
 def test_hardware_trigger_needs_a_box() -> None:
-    with pytest.raises(CameraError, match="no trigger box"):
+    with raises("no-trigger"):
         AravisCamera(CameraConfig(trigger="hardware"))
 
 
@@ -219,12 +219,12 @@ async def test_without_pygobject_the_operator_is_told_what_to_install(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(sys.modules, "gi", None)
-    with pytest.raises(CameraError, match="apt install"):
+    with raises("no-aravis"):
         await AravisCamera(CameraConfig()).open()
 
 
 async def test_no_camera_at_all(lonely_network: None) -> None:
-    with pytest.raises(CameraError, match="opening the camera failed"):
+    with raises("camera-refused"):
         await AravisCamera(CameraConfig(device="127.0.0.9")).open()
 
 
@@ -253,7 +253,7 @@ async def test_a_usb_camera_that_was_pulled_out_is_opened_again(server: Simulate
         device._camera.get_device().leave_control()
         device._camera = Unplugged(device._camera, error)
         assert not device.lost
-        with pytest.raises(CameraError, match="triggering the camera failed: Not connected"):
+        with raises("camera-refused"):
             await camera.capture()
         assert device.lost
         second = await camera.capture()
@@ -269,6 +269,6 @@ async def test_a_refused_setting_does_not_count_as_a_lost_camera(server: Simulat
         code = aravis.DeviceError.INVALID_PARAMETER
         error = glib.Error.new_literal(aravis.device_error_quark(), "Invalid", code)
         device._camera = Unplugged(device._camera, error)
-        with pytest.raises(CameraError, match="Invalid"):
+        with raises("camera-refused"):
             await camera.capture()
         assert not device.lost

@@ -16,6 +16,7 @@ from station.devices.aravis import AravisCamera
 from station.devices.aravis_device import GenicamDevice, apply_settings, require_settings
 from station.devices.base import TriggerPulse
 from station.devices.frames import DeviceClock
+from tests.codes import raises
 
 REGION = (0, 0, 1280, 1024)
 
@@ -76,7 +77,7 @@ def test_a_camera_that_is_gone_is_not_waited_for(device: Any) -> None:
         try_pop_buffer=lambda: None, timeout_pop_buffer=lambda microseconds: None
     )
     device._lost = True
-    with pytest.raises(CameraError, match="is gone"):
+    with raises("camera-gone"):
         device.fresh_frame(60.0)
 
 
@@ -136,14 +137,14 @@ async def test_a_frame_that_nobody_asked_for_costs_the_pose_not_the_next() -> No
     device = Device()
     camera = opened(device, CameraConfig(trigger="software"))
     device.surplus = 2
-    with pytest.raises(CameraError, match=r"2 frame.* without a trigger"):
+    with raises("surplus-frames"):
         await camera.capture()
     await camera.close()
 
 
 async def test_a_camera_that_was_not_opened_says_so() -> None:
     camera = AravisCamera(CameraConfig())
-    with pytest.raises(CameraError, match="not open"):
+    with raises("not-open"):
         await camera.capture()
     await camera.close()
 
@@ -191,7 +192,7 @@ def test_another_exposure_gain_or_region_than_asked_for_is_refused(
 ) -> None:
     wanted = CameraConfig(exposure_us=1000.0, gain_db=0.0)
     assert require_settings(Settable(1010.0, 0.1, REGION), wanted, REGION) == (1010.0, 0.1)
-    with pytest.raises(CameraError, match="set were 1000 µs"):
+    with raises("settings-changed"):
         require_settings(Settable(exposure_us, gain_db, region), wanted, REGION)
 
 

@@ -6,15 +6,14 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-import pytest
 
 from calibrate.kinematics import MODELS, forward
 from recordings.schema.messages import CameraModel, Image, RobotIdentity, SessionInfo, Stamps, View
 from recordings.writer import RecordingWriter
 from station.cell.config import PAPER_BOARD, CameraConfig, RobotConfig, StationConfig
-from station.cell.errors import ConfigError, RobotError
 from station.cli.serve import serve_command
 from station.devices.playback import playback_cell
+from tests.codes import raises
 
 CONFIG = StationConfig(
     robot=RobotConfig(model="UR10", host="192.168.1.9", serial="R1"),
@@ -50,18 +49,18 @@ async def test_it_plays_the_recorded_poses_and_can_reach_no_hardware(tmp_path: P
 
 
 def test_what_cannot_be_replayed_says_why(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match=r"config\.yaml"):
+    with raises("no-config"):
         playback_cell(record(tmp_path / "imported.mcap", None))
-    with pytest.raises(ConfigError, match=r"config\.yaml"):
+    with raises("no-config"):
         playback_cell(record(tmp_path / "odd.mcap", b"robot: {arms: 3}"))
-    with pytest.raises(RobotError, match="no joints"):
+    with raises("no-joints"):
         playback_cell(record(tmp_path / "poses.mcap", msgspec.yaml.encode(CONFIG), joints=False))
-    with pytest.raises(RobotError, match="cannot be played"):
+    with raises("unreadable-recording"):
         playback_cell(tmp_path / "none.mcap")
 
 
 def test_exactly_one_cell_is_served(tmp_path: Path) -> None:
-    with pytest.raises(ConfigError, match="one of"):
+    with raises("station"):
         serve_command(simulate=True, replay=tmp_path)
-    with pytest.raises(ConfigError, match="one of"):
+    with raises("station"):
         serve_command()

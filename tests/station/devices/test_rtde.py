@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import struct
 
-import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -13,11 +12,11 @@ from station.devices.rtde import (
     PacketReader,
     PacketType,
     Recipe,
-    RtdeError,
     join_names,
     packet,
     split_names,
 )
+from tests.codes import raises
 
 MOVE = Recipe(
     1,
@@ -72,7 +71,7 @@ def test_packets_survive_any_segmentation(packets: list[tuple[PacketType, bytes]
 
 
 def test_an_impossible_size_is_refused() -> None:
-    with pytest.raises(RtdeError, match="not RTDE"):
+    with raises("rtde"):
         PacketReader().feed(b"\x00\x02U")
 
 
@@ -94,12 +93,12 @@ def test_recipes_round_trip(types: list[str], data: st.DataObject) -> None:
 
 
 def test_a_packet_of_the_wrong_length_is_refused() -> None:
-    with pytest.raises(RtdeError, match="recipe 1 has 2 bytes, expected 73"):
+    with raises("rtde-size"):
         MOVE.unpack(b"\x01\x00")
 
 
 def test_a_refused_variable_is_named() -> None:
-    with pytest.raises(RtdeError, match="refused nonsense"):
+    with raises("rtde-variables"):
         Recipe(1, ("timestamp", "nonsense"), ("DOUBLE", "NOT_FOUND"))
 
 

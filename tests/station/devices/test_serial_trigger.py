@@ -11,10 +11,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from station.cell.config import TriggerConfig
-from station.cell.errors import TriggerError
 from station.devices import serial_trigger
 from station.devices.serial_trigger import LINE_LIMIT, LineReader, SerialTrigger, checksum, frame
 from station.simulation.trigger import SimulatedTriggerBox
+from tests.codes import raises
 
 
 @pytest.fixture(autouse=True)
@@ -61,20 +61,20 @@ async def test_the_configured_light_is_on_from_the_start(box: SimulatedTriggerBo
 
 
 async def test_a_missing_port_names_port_and_remedy() -> None:
-    with pytest.raises(TriggerError, match=r"/dev/no-such-box.*dialout"):
+    with raises("trigger-port"):
         await SerialTrigger(TriggerConfig(port="/dev/no-such-box")).open()
 
 
 async def test_a_closed_box_is_refused_and_can_be_opened_again(trigger: SerialTrigger) -> None:
     await trigger.close()
-    with pytest.raises(TriggerError, match="not open"):
+    with raises("not-open"):
         await trigger.fire()
     await trigger.open()
     assert (await trigger.fire()).count == 1
 
 
 async def test_the_port_is_ours_alone(box: SimulatedTriggerBox, trigger: SerialTrigger) -> None:
-    with pytest.raises(TriggerError, match="cannot be opened"):
+    with raises("trigger-port"):
         await SerialTrigger(TriggerConfig(port=box.port)).open()
 
 
@@ -90,7 +90,7 @@ async def test_an_answer_cut_short_is_settled_by_the_boxs_own_count(
 async def test_a_pulse_width_the_box_cannot_do_is_refused(box: SimulatedTriggerBox) -> None:
     device = SerialTrigger(TriggerConfig(port=box.port, pulse_us=5))
     await device.open()
-    with pytest.raises(TriggerError, match="refused 'FIRE 5'"):
+    with raises("trigger-refused"):
         await device.fire()
     await device.close()
 
@@ -122,10 +122,10 @@ async def test_a_plain_adapter_pulses_its_line(mode: str) -> None:
     assert [(await device.fire()).count for _ in range(2)] == [1, 2]
     assert [(name, level) for name, level, _ in adapter.edges] == [(mode, True), (mode, False)] * 2
     assert adapter.edges[1][2] - adapter.edges[0][2] >= 0.02
-    with pytest.raises(TriggerError, match="no light"):
+    with raises("no-light"):
         await device.light(1.0)
     adapter.pulled = True
-    with pytest.raises(TriggerError, match="is gone"):
+    with raises("trigger-lost"):
         await device.fire()
     await device.close()
 

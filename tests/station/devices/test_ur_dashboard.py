@@ -11,6 +11,7 @@ import pytest
 
 from station.devices.ur_dashboard import PORT, Dashboard, DashboardError
 from station.devices.ur_probe import identify, probe
+from tests.codes import raises
 
 GREETING = b"Connected: Universal Robots Dashboard Server\n"
 Serve = Callable[..., Awaitable[str]]
@@ -61,7 +62,7 @@ async def test_the_e_series_leaves_its_letter_out(serve: Serve) -> None:
     dashboard = await Dashboard.open(await serve(E_SERIES))
     found = await identify(dashboard)
     assert (found.model, found.serial, found.version) == ("UR10e", "20195500001", (5, 11, 1, 108318))
-    assert found.remote is False and found.is_e_series
+    assert found.remote is False and found.version[0] == 5
     await dashboard.close()
 
 
@@ -86,9 +87,9 @@ async def test_something_else_on_the_port(serve: Serve, greeting: bytes) -> None
 async def test_a_reply_that_is_too_late_breaks_the_connection(serve: Serve) -> None:
     dashboard = await Dashboard.open(await serve(E_SERIES, silent_after=1))
     await dashboard.ask("programState")
-    with pytest.raises(DashboardError, match=r"no reply to 'programState' within 0.1 s"):
+    with raises("dashboard"):
         await dashboard.ask("programState", timeout_s=0.1)
-    with pytest.raises(DashboardError, match="gone"):
+    with raises("dashboard"):
         await dashboard.ask("programState")
     assert not dashboard.alive
     await dashboard.close()

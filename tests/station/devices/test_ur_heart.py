@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from station.devices.ur import Heart
+from station.devices.ur import HeartbeatMonitor
 
 
 class Clock:
@@ -19,8 +19,8 @@ def clock() -> Clock:
     return Clock()
 
 
-def beating(clock: Clock, *pauses_s: float) -> Heart:
-    heart = Heart(clock)
+def beating(clock: Clock, *pauses_s: float) -> HeartbeatMonitor:
+    heart = HeartbeatMonitor(clock)
     heart.beat()
     for pause_s in pauses_s:
         clock.now_s += pause_s
@@ -45,4 +45,4 @@ def test_a_pause_that_began_before_is_none_of_it(clock: Clock) -> None:
 
 
 def test_a_heart_that_never_beat_has_no_pause(clock: Clock) -> None:
-    assert Heart(clock).worst_s(since_s=0.0) == 0.0
+    assert HeartbeatMonitor(clock).worst_s(since_s=0.0) == 0.0

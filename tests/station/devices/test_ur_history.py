@@ -8,8 +8,8 @@ import pytest
 
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import RobotState, Stamps
-from station.cell.errors import StaleStateError
 from station.devices.ur_state import state_at
+from tests.codes import raises
 from tests.station.devices.test_ur_moves import STATE
 
 HOST_S, WALL_S = 500.0, 9_000.0
@@ -65,11 +65,11 @@ def test_an_arm_at_rest_keeps_its_pose_to_the_bit() -> None:
 
 
 def test_what_lies_outside_of_the_samples_is_not_guessed() -> None:
-    with pytest.raises(StaleStateError, match="10 ms older than the asked time"):
+    with raises("stale-state"):
         state_at(HISTORY, CLOCK, host_ns(10.042))
-    with pytest.raises(StaleStateError, match="before the robot states that are kept"):
+    with raises("no-history"):
         state_at(HISTORY, CLOCK, host_ns(9.99))
-    with pytest.raises(StaleStateError, match="too few"):
+    with raises("no-history"):
         state_at(HISTORY, None, host_ns(10.0))
-    with pytest.raises(StaleStateError, match="too few"):
+    with raises("no-history"):
         state_at(HISTORY[:1], CLOCK, host_ns(10.0))

@@ -10,9 +10,9 @@ import msgspec
 import pytest
 
 from station.cell.config import RobotConfig
-from station.cell.errors import RobotError
 from station.devices.ur_link import UrLink
 from station.devices.ur_probe import ProbeResult, RobotLock
+from tests.codes import raises
 
 CONFIG = RobotConfig(model="UR10", host="127.0.0.1", serial="2016")
 
@@ -37,16 +37,16 @@ def test_a_listener_that_fails_is_dropped_alone(link: Any) -> None:
 
 
 @pytest.mark.parametrize(
-    ("found", "said"),
+    ("found", "code"),
     [
-        (ProbeResult(model="UR5", serial="2016"), "is a UR5, the configuration says UR10"),
-        (ProbeResult(model="UR10", serial="1999"), "has serial 1999, the configuration says 2016"),
+        (ProbeResult(model="UR5", serial="2016"), "other-model"),
+        (ProbeResult(model="UR10", serial="1999"), "other-robot"),
     ],
 )
-def test_another_robot_than_configured_is_refused(link: Any, found: ProbeResult, said: str) -> None:
+def test_another_robot_than_configured_is_refused(link: Any, found: ProbeResult, code: str) -> None:
     link._check_identity(ProbeResult(model="UR10", serial="2016"))
     link._check_identity(ProbeResult())  # an old controller does not say
-    with pytest.raises(RobotError, match=said):
+    with raises(code):
         link._check_identity(found)
 
 
@@ -54,9 +54,9 @@ def test_another_robot_than_before_is_refused_when_the_link_comes_back(tmp_path:
     link: Any = UrLink(msgspec.structs.replace(CONFIG, serial=""))
     link._check_identity(ProbeResult(serial="2016"))
     link._lock = RobotLock("2016-test")
-    link._identity = msgspec.structs.replace(link.identity, serial="2016")
+    link.identity = msgspec.structs.replace(link.identity, serial="2016")
     link._check_identity(ProbeResult(serial="2016"))
-    with pytest.raises(RobotError, match=r"another robot .*1999.* start the station.s daemon anew"):
+    with raises("robot-exchanged"):
         link._check_identity(ProbeResult(serial="1999"))
     link._unlock()
 
@@ -75,7 +75,7 @@ async def test_a_dashboard_that_is_gone_is_opened_again(link: Any, dead: Any) ->
 
 
 async def test_a_robot_that_cannot_be_asked_for_is_named(tmp_path: Path) -> None:
-    with pytest.raises(RobotError, match=r"unknown robot.model 'UR7'; known: .*UR10"):
+    with raises("unknown-robot-model"):
         UrLink(RobotConfig(model="UR7", host="127.0.0.1"))  # type: ignore[arg-type]
-    with pytest.raises(RobotError, match=r"robot.host is empty"):
+    with raises("no-host"):
         await UrLink(RobotConfig(model="UR10", host="")).connect()

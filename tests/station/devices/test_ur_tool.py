@@ -9,16 +9,15 @@ import pytest
 from calibrate.geometry import pose_from_rotvec, rotation_log
 from calibrate.kinematics import MODELS, DhDeltas, RobotModel, forward
 from recordings.schema.messages import RobotState, Vector6
-from station.cell.errors import RobotError
 from station.devices.ur_primary import (
     PACKED_HEADER_BYTES,
     DhParameters,
     Installation,
-    PrimaryError,
     pack_state,
     read_state,
 )
 from station.devices.ur_tool import TcpCheck
+from tests.codes import raises
 
 UR10 = MODELS["UR10"]
 NO_TOOL: Vector6 = (0.0,) * 6
@@ -58,14 +57,14 @@ def test_without_words_the_offset_is_derived() -> None:
 
 @pytest.mark.parametrize("arm", ["UR5", "UR10e"])
 def test_the_wrong_model_is_noticed(arm: str) -> None:
-    with pytest.raises(RobotError, match=r"not those of a UR10 .* check robot.model"):
+    with raises("other-kinematics"):
         TcpCheck(UR10, False, sample(MODELS[arm], HERE, TOOL), stated(MODELS[arm], TOOL))
-    with pytest.raises(RobotError, match=r"do not fit its TCP offset .* check robot.model"):
+    with raises("tcp-mismatch"):
         TcpCheck(UR10, False, sample(MODELS[arm], HERE, TOOL), Installation(TOOL))
 
 
 def test_a_tool_that_is_not_the_stated_one_is_noticed() -> None:
-    with pytest.raises(RobotError, match="do not fit its TCP offset"):
+    with raises("tcp-mismatch"):
         TcpCheck(UR10, False, sample(UR10, HERE, TOOL), Installation(NO_TOOL))
 
 
@@ -74,7 +73,7 @@ def test_factory_calibration_is_no_mix_up_and_makes_the_check_fine() -> None:
     check = TcpCheck(UR10, False, sample(arm, HERE, TOOL), stated(arm, TOOL))
     check.check(sample(arm, THERE, TOOL), stated(arm, TOOL))
     moved = (TOOL[0] + 0.001, *TOOL[1:])
-    with pytest.raises(RobotError, match="changed during the session"):
+    with raises("tcp-changed"):
         check.check(sample(arm, THERE, moved), stated(arm, TOOL))
 
 
@@ -82,13 +81,13 @@ def test_with_the_nominal_table_alone_the_check_is_coarse_but_there() -> None:
     arm = UR10.calibrated(FACTORY)
     check = TcpCheck(UR10, False, sample(arm, HERE, TOOL), Installation())
     check.check(sample(arm, THERE, TOOL), Installation())
-    with pytest.raises(RobotError, match="changed"):
+    with raises("tcp-changed"):
         check.check(sample(arm, THERE, (TOOL[0] + 0.015, *TOOL[1:])), Installation())
 
 
 def test_the_coarse_check_sees_a_turned_tool_too() -> None:
     check = TcpCheck(UR10, False, sample(UR10, HERE, TOOL), Installation())
-    with pytest.raises(RobotError, match="changed"):
+    with raises("tcp-changed"):
         check.check(sample(UR10, HERE, (*TOOL[:5], TOOL[5] + 0.03)), Installation())
 
 
@@ -97,19 +96,19 @@ def test_with_a_configured_table_the_check_is_fine_without_the_controllers_words
     check = TcpCheck(arm, True, sample(arm, HERE, TOOL), Installation())
     check.check(sample(arm, THERE, TOOL), Installation())
     for moved in ((TOOL[0] + 0.001, *TOOL[1:]), (*TOOL[:5], TOOL[5] + 0.003)):
-        with pytest.raises(RobotError, match="changed"):
+        with raises("tcp-changed"):
             check.check(sample(arm, THERE, moved), Installation())
 
 
 def test_a_tool_of_more_than_a_metre_is_a_mix_up() -> None:
     long: Vector6 = (0.0, 0.0, 1.05, 0.0, 0.0, 0.0)
-    with pytest.raises(RobotError, match=r"lies 1\.05 m from the flange"):
+    with raises("tcp-too-far"):
         TcpCheck(UR10, False, sample(UR10, HERE, long), stated(UR10, long))
 
 
 def test_a_changed_statement_is_noticed_before_the_arm_shows_it() -> None:
     check = TcpCheck(UR10, False, sample(UR10, HERE, TOOL), stated(UR10, TOOL))
-    with pytest.raises(RobotError, match="set it back"):
+    with raises("tcp-changed"):
         check.check(sample(UR10, HERE, TOOL), stated(UR10, (*TOOL[:5], 0.5001)))
 
 
@@ -123,5 +122,5 @@ def test_statements_survive_the_wire() -> None:
 @pytest.mark.parametrize("cut", range(1, 60, 7))
 def test_a_damaged_message_is_refused(cut: int) -> None:
     message = pack_state(NO_TOOL, TOOL, None)[PACKED_HEADER_BYTES:-cut]
-    with pytest.raises(PrimaryError, match="claims 101 bytes"):
+    with raises("primary-interface"):
         read_state(message)

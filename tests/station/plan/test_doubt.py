@@ -11,11 +11,11 @@ import pytest
 from calibrate.geometry import perturb
 from calibrate.kinematics import forward
 from station.cell.collision import margins
-from station.cell.errors import LimitError
 from station.cell.scene import cell_geometry, guess_from, scene_of
 from station.plan.planner import make_plan
 from station.plan.visibility import outline, uncertain_pixels
 from station.simulation.scenes import cell_config, make_cell
+from tests.codes import raises
 
 
 def config_of(mount="eye-in-hand", sigma_m=0.005):
@@ -57,7 +57,7 @@ def test_a_guess_that_is_not_kept_clear_of_makes_no_plan(mount, name):
     truth, config, X, Y = config_of(mount)
     rough = guess_from(X if name == "camera" else Y, 0.06, 0.3)
     config = msgspec.structs.replace(config, **{f"{name}_guess": rough})
-    with pytest.raises(LimitError, match=f"{name}_guess is known to 60 mm only.*station bootstrap"):
+    with raises("guess-too-rough"):
         make_plan(config, start_joints_rad=truth.start_joints_rad)
 
 

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from calibrate.boards.model import board_points
-from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
 from calibrate.kinematics import MODELS, forward
 from calibrate.quality.board_now import locate_board, offset_covariance
@@ -22,14 +21,14 @@ from station.plan.hover import (
     SPEED_M_S,
     HoverQuestion,
     answer_hover,
-    board_from_tip,
     least_standoff_m,
     outer_corners,
     plan_hover,
 )
 from station.simulation.cell import CellTruth
 from station.simulation.scenes import cell_config, make_cell
-from tests.station.hover_cell import POINTER, ROBOT_M, ROBOT_RAD, calibration_of, seen_from
+from tests.codes import raises
+from tests.station.hover_cell import POINTER, ROBOT_M, ROBOT_RAD, board_from_tip, calibration_of, seen_from
 
 ROBOT, CAMERA = RobotIdentity(model="UR10", serial="R"), CameraIdentity("c", "1", "rendered")
 STANDOFF_M = 0.08
@@ -96,11 +95,11 @@ def test_the_tip_stands_over_the_true_corner_and_nothing_comes_near(
 def test_nearer_than_50_mm_is_impossible() -> None:
     truth = make_cell()
     for standoff_m in (0.0499, 0.055, 0.0, -0.1, math.nan):
-        with pytest.raises(LimitError, match="too near"):
+        with raises("standoff-too-small"):
             asked(truth, 0, standoff_m=standoff_m)
     assert least_standoff_m(0.0) > CLEARANCE_M
     # What is not known is kept away from, too.
-    with pytest.raises(LimitError, match="too near"):
+    with raises("standoff-too-small"):
         X, place = np.array(truth.camera_mount), np.array(truth.board_place)
         plan_hover(cell_config(truth), X, place, NORMAL, 0, 0.08, 0.03, POINTER, truth.start_joints_rad)
 
@@ -118,14 +117,14 @@ def test_three_sigma_and_the_arms_own_miss_are_kept_away_from() -> None:
     least_m = 0.05 + 0.005 + 0.005 + 3 * worst_m + 0.004
     near, far = (HoverQuestion(0, least_m + by, POINTER, start, 0.004) for by in (-1e-5, 1e-5))
     assert answer_hover(config, calibration, view, far).hover.standoff_m == far.standoff_m
-    with pytest.raises(LimitError, match="too near"):
+    with raises("standoff-too-small"):
         answer_hover(config, calibration, view, near)
 
 
 def test_an_unreachable_corner_is_said() -> None:
     truth = make_cell()
     X, place = np.array(truth.camera_mount), pose(np.eye(3), [0.0, 2.5, 0.0]) @ np.array(truth.board_place)
-    with pytest.raises(LimitError, match="out of the arm's reach"):
+    with raises("corner-out-of-reach"):
         plan_hover(
             cell_config(truth),
             X,
@@ -145,7 +144,7 @@ def test_a_way_through_something_is_refused_with_its_name() -> None:
     low = msgspec.structs.replace(config.limits, workspace_max_m=(2.0, 2.0, 0.15))
     config = msgspec.structs.replace(config, limits=low)
     X, place = np.array(truth.camera_mount), np.array(truth.board_place)
-    with pytest.raises(LimitError, match="workspace") as refused:
+    with raises("corner-path-blocked") as refused:
         plan_hover(config, X, place, NORMAL, 0, 0.08, 0.0, POINTER, truth.start_joints_rad)
     assert (refused.value.code, refused.value.values) == ("corner-path-blocked", {"corner": 0})
 
@@ -184,7 +183,7 @@ def test_a_board_still_on_the_flange_is_noticed() -> None:
     truth = make_cell(mount="eye-to-hand")
     E = forward(MODELS["UR10"], truth.start_joints_rad)
     view = seen_from(truth, E, E @ np.array(truth.board_place))
-    with pytest.raises(BadViewsError, match="still on the flange"):
+    with raises("calibration"):
         locate_board(calibration_of(truth, ROBOT, CAMERA), view, truth.board)
 
 

@@ -28,7 +28,8 @@ from station.server import dispatch
 from station.server.approval import Process, process
 from station.server.control import ControlServer, Peer
 from station.server.dispatch import SessionDispatcher
-from tests.station.session_rig import POSES, NewRig, Rig, raises
+from tests.codes import raises
+from tests.station.session_rig import POSES, NewRig, Rig
 
 See = Callable[[int], Process | None]
 

@@ -16,7 +16,7 @@ from station.session.lease import (
     MotionApproval,
 )
 from station.session.queue import PlanRevision, PoseQueue
-from tests.station.session_rig import raises
+from tests.codes import raises
 
 HERE = (0.0, -1.5, 1.5, -1.5, -1.5, 0.0)
 PLAN = "ab" * 32

@@ -13,7 +13,8 @@ from station.cell.status import StationState as S
 from station.protocol.verbs import VERBS
 from station.server.control import Peer
 from station.server.dispatch import SessionDispatcher
-from tests.station.session_rig import POSES, Rig, raises
+from tests.codes import raises
+from tests.station.session_rig import POSES, Rig
 
 ANNA, BERT = Peer(1, 100, 0, 0), Peer(2, 101, 0, 0)
 ARGUMENTS: dict[str, dict[str, Any]] = {

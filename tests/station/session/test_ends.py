@@ -20,7 +20,8 @@ from station.cli.attended import STOP_ANSWER_S
 from station.protocol.verbs import Purpose
 from station.session import session
 from station.session.recording import SessionRecording
-from tests.station.session_rig import POSES, HeldDisk, Rig, raises
+from tests.codes import raises
+from tests.station.session_rig import POSES, HeldDisk, Rig
 
 
 @pytest.fixture

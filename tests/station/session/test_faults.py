@@ -13,7 +13,8 @@ from station.cell.errors import RobotError, SafetyStopError
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose
 from station.session.recording import SessionRecording
-from tests.station.session_rig import POSES, NewRig, Rig, crash, raises, sealed
+from tests.codes import raises
+from tests.station.session_rig import POSES, NewRig, Rig, crash, sealed
 
 
 async def test_a_bad_picture_is_taken_again_and_then_the_pose_fails_alone(rig: Rig) -> None:

@@ -16,7 +16,8 @@ from station.protocol.verbs import Drop, Purpose
 from station.session import freedrive
 from station.session.queue import PoseQueue
 from station.session.recording import SessionRecording
-from tests.station.session_rig import POSES, Rig, raises, sealed
+from tests.codes import raises
+from tests.station.session_rig import POSES, Rig, sealed
 
 
 async def test_a_free_hand_records_without_control(bare_rig: Rig) -> None:

@@ -16,11 +16,12 @@ from station.analysis.worker import BoardDetection
 from station.cell.errors import LimitError, RefusedError, RobotError, StaleStateError
 from station.cell.status import DetectionStatus, HoverOffer
 from station.cell.status import StationState as S
-from station.plan.hover import SPEED_M_S, board_from_tip
+from station.plan.hover import SPEED_M_S
 from station.protocol.verbs import Hover
 from station.session.touch_test import OVER_CORNER
-from tests.station.hover_cell import POINTER, calibration_of, seen_from
-from tests.station.session_rig import TRUTH, Rig, raises
+from tests.codes import raises
+from tests.station.hover_cell import POINTER, board_from_tip, calibration_of, seen_from
+from tests.station.session_rig import TRUTH, Rig
 
 BOARD = np.array(TRUTH.board_place)
 

@@ -25,16 +25,8 @@ from station.cell.status import StationState as S
 from station.plan.planner import make_plan
 from station.protocol.verbs import Purpose, Skip
 from station.session.queue import PoseQueue
-from tests.station.session_rig import (
-    TRUTH,
-    NewRig,
-    Rig,
-    WorkerInThisProcess,
-    crash,
-    memory_config,
-    raises,
-    sealed,
-)
+from tests.codes import raises
+from tests.station.session_rig import TRUTH, NewRig, Rig, WorkerInThisProcess, crash, memory_config, sealed
 
 POSES, BEFORE = 12, 7
 

@@ -10,8 +10,9 @@ import pytest
 from recordings.errors import RecordingError
 from station.cell.status import StationState as S
 from station.protocol.verbs import Purpose, Retake, Skip
+from tests.codes import raises
 from tests.durability import disk_order
-from tests.station.session_rig import POSES, NewRig, Rig, crash, raises, sealed
+from tests.station.session_rig import POSES, NewRig, Rig, crash, sealed
 
 
 def under_way(rig: Rig, moves: int) -> bool:

@@ -13,7 +13,8 @@ from station.cell.plan import Plan
 from station.cell.status import StationState as S
 from station.protocol.verbs import Drop, Purpose
 from station.session import run, session
-from tests.station.session_rig import POSES, HeldDisk, Rig, raises
+from tests.codes import raises
+from tests.station.session_rig import POSES, HeldDisk, Rig
 
 
 class HeldStart:

@@ -36,7 +36,7 @@ async def test_what_holds_an_arm_at_rest_is_told(rig: Rig, monkeypatch: pytest.M
     assert held() == ""
     stopped = msgspec.structs.replace(good(), safety_mode=SafetyMode.PROTECTIVE_STOP)
     monkeypatch.setattr(rig.arm, "latest", lambda: stopped)
-    await rig.until_true(lambda: held().startswith("protective stop: find"))
+    await rig.until_true(lambda: held().startswith("protective stop:"))
     assert "acknowledge" not in held()  # nothing is latched here
     off = msgspec.structs.replace(good(), robot_mode=RobotMode.POWER_OFF)
     monkeypatch.setattr(rig.arm, "latest", lambda: off)

@@ -8,7 +8,7 @@ from station.cell.plan import Plan, PlannedPose
 from station.cell.status import PoseState
 from station.session import queue as module
 from station.session.queue import BUSY, PoseQueue
-from tests.station.session_rig import raises
+from tests.codes import raises
 
 
 def queue_of(count: int = 4) -> PoseQueue:

@@ -21,7 +21,8 @@ from station.server.control import ControlServer
 from station.server.dispatch import SessionDispatcher
 from station.session import monitor, supervisor
 from station.session.recording import SessionRecording
-from tests.station.session_rig import POSES, HeldDisk, NewRig, Rig, raises
+from tests.codes import raises
+from tests.station.session_rig import POSES, HeldDisk, NewRig, Rig
 
 
 class Gate:

@@ -15,7 +15,8 @@ from station.cell.errors import LimitError, RobotError
 from station.cell.plan import Plan
 from station.cell.status import StationState as S
 from station.protocol.verbs import Add, Drop, Purpose, Reorder, Retake, Skip
-from tests.station.session_rig import POSES, HeldDisk, Rig, raises, sealed
+from tests.codes import raises
+from tests.station.session_rig import POSES, HeldDisk, Rig, sealed
 
 WHOLE_POSE = [S.MOVING, S.SETTLING, S.CAPTURING, S.WRITING]
 

@@ -18,7 +18,8 @@ from station.cell.status import DetectionStatus
 from station.cell.status import StationState as S
 from station.plan.files import SWINGS, sweep_plan
 from station.protocol.verbs import Drop, Purpose, Skip
-from tests.station.session_rig import TRUTH, CameraInMemory, Rig, raises, sealed
+from tests.codes import raises
+from tests.station.session_rig import TRUTH, CameraInMemory, Rig, sealed
 
 
 @pytest.fixture

@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from station.devices.rtde import PacketType, RtdeError, packet
+from station.devices.rtde import PacketType, packet
+from tests.codes import raises
 
 pytestmark = pytest.mark.process
 HOME = [0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0]
@@ -93,7 +94,7 @@ def test_inputs_are_claimed_until_the_link_ends(controller, rtde, admin) -> None
     first, second = rtde(running), rtde(running)
     assert first.inputs("input_int_register_0", "input_double_register_0").id == 1
     assert first.inputs("input_int_register_0").id == 2, "one client may use a register in many recipes"
-    with pytest.raises(RtdeError, match="refused input_int_register_0"):
+    with raises("rtde-variables"):
         second.inputs("input_int_register_0", "input_int_register_1")
     first.close()
     ask = admin(running)

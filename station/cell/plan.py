@@ -29,10 +29,10 @@ class PlannedPose(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknow
     """Expected flange pose; checked against the arm's kinematics."""
     view: ExpectedView | None = None
     why: str = ""
-    guided: bool = False
-    """A hand brought the arm there."""
     predicted_sigma_m: float | None = None
     """Expected sigma of X's translation after this pose."""
+    guided: bool = False
+    """A hand brought the arm there."""
 
 
 class Plan(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):

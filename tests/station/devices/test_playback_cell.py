@@ -60,7 +60,7 @@ def test_what_cannot_be_replayed_says_why(tmp_path: Path) -> None:
 
 
 def test_exactly_one_cell_is_served(tmp_path: Path) -> None:
-    with raises("station"):
+    with raises("usage"):
         serve_command(simulate=True, replay=tmp_path)
-    with raises("station"):
+    with raises("usage"):
         serve_command()

@@ -183,7 +183,7 @@ def test_a_board_still_on_the_flange_is_noticed() -> None:
     truth = make_cell(mount="eye-to-hand")
     E = forward(MODELS["UR10"], truth.start_joints_rad)
     view = seen_from(truth, E, E @ np.array(truth.board_place))
-    with raises("calibration"):
+    with raises("board-on-flange"):
         locate_board(calibration_of(truth, ROBOT, CAMERA), view, truth.board)
 
 

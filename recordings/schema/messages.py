@@ -49,7 +49,7 @@ class BoardSpec(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_de
     dictionary: str | None = None
     legacy: bool = False
     radon_marker: bool = False
-    """A chessboard with OpenCV's three-dot marker."""
+    """No effect: of files of earlier versions."""
     tag_id: int = msgspec.field(default=0, name="id")
     """Number of a single tag in its dictionary."""
     square_tolerance: float | None = None
@@ -71,6 +71,7 @@ class RobotIdentity(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omi
     """flange_from_tcp as on the pendant: x y z [m], rotation vector [rad]. Kept beside, never mixed in."""
     payload_kg: float = 0.0
     safety_checksum: str = ""
+    """No effect: of files of earlier versions."""
 
 
 class CameraIdentity(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):

@@ -91,7 +91,7 @@ def test_a_cut_file_is_refused_at_every_length(real_file: Path) -> None:
     ],
 )
 def test_other_files_are_refused_in_words(content: bytes) -> None:
-    with pytest.raises(CalibrationFileError, match=r"here\.yaml") as refused:
+    with pytest.raises(CalibrationFileError) as refused:
         decode_calibration(content, "here.yaml")
     assert refused.value.code in ("not-a-calibration", "damaged-calibration", "calibration-file")
 

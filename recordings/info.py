@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
-from recordings.mcap import MessageIndex
+from recordings.mcap.contents import MessageIndex
 from recordings.reader import Recording
 from recordings.schema.messages import SINGLE_TAGS, BoardSpec
 from recordings.schema.topics import Topic

@@ -20,10 +20,10 @@ from recordings.errors import BadImageError, CorruptRecordingError
 from recordings.files import is_attachment_name, is_session_name
 from recordings.images import ImageError, decode_image, raw_array
 from recordings.manifest import PARTS_LIMIT
-from recordings.mcap import Message, MessageIndex, open_file, scan_file
-from recordings.mcap.contents import joined
+from recordings.mcap.contents import MessageIndex, joined
 from recordings.mcap.records import BadRecordError, require_crc
-from recordings.mcap.source import ShortFileError
+from recordings.mcap.scan import open_file, scan_file
+from recordings.mcap.source import Message, ShortFileError
 from recordings.schema.definitions import (
     FORMATS,
     RECOVERY_RECORD,

@@ -13,8 +13,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from recordings.mcap import Source
-from recordings.mcap.source import UNPACKED_START
+from recordings.mcap.source import UNPACKED_START, Source
 from recordings.schema.clocks import DRIFT_SPAN_S, ClockEstimator
 from recordings.schema.messages import Stamps
 

@@ -22,7 +22,9 @@ from recordings.importers.messages import (
     ros_image_stamp_ns,
     ros_types,
 )
-from recordings.mcap import Contents, Source, open_file, scan_file
+from recordings.mcap.contents import Contents
+from recordings.mcap.scan import open_file, scan_file
+from recordings.mcap.source import Source
 from recordings.schema.definitions import SESSION_RECORDS
 
 _RESCUE = "mcap recover FILE, with the mcap command line tool"

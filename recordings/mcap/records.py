@@ -42,11 +42,6 @@ class BadRecordError(ValueError):
     """A record that breaks the format; the message says how, the caller knows where."""
 
 
-class Header(NamedTuple):
-    profile: str
-    library: str
-
-
 class Schema(NamedTuple):
     id: int
     name: str
@@ -141,11 +136,12 @@ class Cursor:
             raise BadRecordError(f"{len(self._content) - self.position} bytes are left over in the record")
 
 
-def parse_header(content: memoryview, exact: bool = False) -> Header:
+def parse_header(content: memoryview, exact: bool = False) -> str:
+    """Returns the profile."""
     cursor = Cursor(content)
-    record = Header(cursor.text(), cursor.text())
+    profile, _ = cursor.text(), cursor.text()
     cursor.end(exact)
-    return record
+    return profile
 
 
 def parse_schema(content: memoryview) -> Schema:

@@ -11,7 +11,6 @@ from __future__ import annotations
 import hashlib
 import os
 import stat
-import struct
 from array import array
 from collections.abc import Callable
 from pathlib import Path
@@ -48,8 +47,6 @@ _BLOCK_BYTES = 256 * 1024
 _AHEAD_BYTES = 64 * 1024
 """Read with a large record: what lies between it and the next one."""
 _HEADER_LIMIT_BYTES = 64 * 1024
-_PLAIN_CHUNK = struct.Struct("<BQQQQIIQ")
-"""Record head and content of an uncompressed chunk, up to its records."""
 _FORBIDDEN = {Opcode.HEADER, Opcode.FOOTER, Opcode.STATISTICS, Opcode.CHUNK_INDEX, Opcode.ATTACHMENT_INDEX,
               Opcode.METADATA_INDEX, Opcode.SUMMARY_OFFSET}  # fmt: skip
 """Known kinds that have no place among the data."""
@@ -198,7 +195,7 @@ class _Scan:
         start = position + RECORD_HEAD.size
         if opcode != Opcode.HEADER or length > min(_HEADER_LIMIT_BYTES, self._data_limit - start):
             raise BadRecordError("the header is missing")
-        self.contents.profile = parse_header(memoryview(self._block)[start : start + length]).profile
+        self.contents.profile = parse_header(memoryview(self._block)[start : start + length])
         return start + int(length)
 
     def _data_record(self, position: int) -> int:
@@ -240,17 +237,14 @@ class _Scan:
 
     def _chunk(self, at: int, end: int, content: memoryview) -> None:
         self.contents.chunks += 1
-        if len(content) >= _PLAIN_CHUNK.size - RECORD_HEAD.size:
-            _, _, _, _, size, crc, name_length, stored = _PLAIN_CHUNK.unpack_from(self._block, at)
-            if name_length == 0 and stored == end - at - _PLAIN_CHUNK.size:
-                start = at + _PLAIN_CHUNK.size
-                self._check(memoryview(self._block)[start:end], size, crc)
-                self._records(self._block, start, end, self._places)
-                return
         head = parse_chunk_head(content)
+        packed = content[head.data_offset :]
+        if not head.compression:
+            self._check(packed, head.uncompressed_size, head.crc)
+            self._records(self._block, at + RECORD_HEAD.size + head.data_offset, end, self._places)
+            return
         if head.uncompressed_size > CHUNK_LIMIT_BYTES:
             raise BadRecordError(f"a chunk unpacks to {head.uncompressed_size} bytes: more than is read here")
-        packed = content[head.data_offset :]
         records = unpack(packed, head.compression, head.uncompressed_size)
         self._check(memoryview(records), head.uncompressed_size, head.crc)
         offset = self._base + at + RECORD_HEAD.size + head.data_offset

@@ -268,11 +268,7 @@ def _orphans(found: Salvage) -> tuple[set[int], list[str]]:
 
 
 def _write(
-    file: McapFile,
-    found: Salvage,
-    session: dict[str, str],
-    dropped: set[int],
-    losses: tuple[str, ...],
+    file: McapFile, found: Salvage, session: dict[str, str], dropped: set[int], losses: tuple[str, ...]
 ) -> None:
     """The good chunks' messages, as they were, into a new finished file."""
     file.start()

@@ -157,16 +157,9 @@ class RecordingSegment:
                 f"{self.path} at byte {place}: image {sequence} {error}", image=sequence, at_byte=place
             ) from error
         image.flags.writeable = False
-        return Image(
-            pixels=image,
-            stamps=facts.stamps,
-            frame_id=facts.frame_id,
-            sequence=facts.sequence,
-            exposure_us=facts.exposure_us,
-            gain_db=facts.gain_db,
-            pixel_format=facts.pixel_format,
-            trigger_count=facts.trigger_count,
-        )
+        told = msgspec.structs.asdict(facts)
+        del told["width"], told["height"]
+        return Image(pixels=image, **told)
 
     def _decoded_image(self, topic: Topic, address: int, width: int, height: int) -> NDArray[Any]:
         message = self._image_message(topic, address)

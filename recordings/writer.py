@@ -20,13 +20,7 @@ from typing import Any, Self
 import msgspec
 
 from recordings.errors import RecordingError, disk_error, exists_error, recover_line
-from recordings.files import (
-    PART_SUFFIX,
-    is_attachment_name,
-    is_session_name,
-    rename_new,
-    sync_folder,
-)
+from recordings.files import PART_SUFFIX, is_attachment_name, is_session_name, rename_new, sync_folder
 from recordings.images import ImageError, encode_png, read_header
 from recordings.mcap.records import with_crc
 from recordings.mcap.writer import McapFile, Piece
@@ -122,17 +116,9 @@ class RecordingWriter:
                 width_px=width,
                 height_px=height,
             )
-        facts = PictureFacts(
-            stamps=image.stamps,
-            frame_id=image.frame_id,
-            sequence=image.sequence,
-            width=width,
-            height=height,
-            exposure_us=image.exposure_us,
-            gain_db=image.gain_db,
-            pixel_format=image.pixel_format,
-            trigger_count=image.trigger_count,
-        )
+        told = msgspec.structs.asdict(image)
+        del told["pixels"]
+        facts = PictureFacts(width=width, height=height, **told)
         time_ns = self._time_ns(image.stamps, image.sequence)
         try:
             topic, pieces = self._image(image, encoded, time_ns)

@@ -39,8 +39,7 @@ def export_command(
     recording: Rec,
     output: Annotated[Path, typer.Option("-o", "--output", help="The folder to write; it must not exist.")],
     to: Annotated[
-        Target,
-        typer.Option("--to", help="folder: images and poses, for `import`; csv: tables; ros2: a bag."),
+        Target, typer.Option("--to", help="folder: images and poses, for `import`; csv: tables; ros2: a bag.")
     ],
     json_: Json = False,
 ) -> None:

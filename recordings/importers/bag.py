@@ -19,28 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recordings.errors import ImportSourceError
-from recordings.images import (
-    KEPT_FORMATS,
-    ImageError,
-    decode_image,
-    encode_png,
-    pixel_format_of,
-    read_header,
-)
+from recordings.images import KEPT_FORMATS, ImageError, decode_image, encode_png, pixel_format_of, read_header
 from recordings.importers.bags import Bag, open_bag
 from recordings.importers.dataset import DATASET_FILE, Dataset, read_dataset, vector6
 from recordings.importers.messages import Array, ImageMessage, Joints, Progress
 from recordings.importers.selection import Selection, Wanted, select
 from recordings.importers.stops import Limits, Stop, find_stops
-from recordings.schema.messages import (
-    CameraModel,
-    Image,
-    Matrix4,
-    RobotState,
-    Stamps,
-    Vector6,
-    View,
-)
+from recordings.schema.messages import CameraModel, Image, Matrix4, RobotState, Stamps, Vector6, View
 from recordings.writer import RecordingWriter, derived_recording
 
 PAIR_WITHIN_S = 0.05

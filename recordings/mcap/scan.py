@@ -53,10 +53,7 @@ _FORBIDDEN = {Opcode.HEADER, Opcode.FOOTER, Opcode.STATISTICS, Opcode.CHUNK_INDE
 
 
 def scan_file(
-    descriptor: int,
-    path: Path,
-    rescue: str = "",
-    progress: Callable[[int], None] = lambda bytes_done: None,
+    descriptor: int, path: Path, rescue: str = "", progress: Callable[[int], None] = lambda bytes_done: None
 ) -> tuple[Contents, Source, str]:
     """Proves the open file → (what it holds, where to read it, its SHA-256).
 

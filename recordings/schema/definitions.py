@@ -90,14 +90,7 @@ def _fields(struct: type[msgspec.Struct]) -> list[_Field]:
     return [_field(f) for f in node.fields if (struct, f.name) not in _FILLED_IN_BY_READER]
 
 
-_STRUCTS: tuple[type[msgspec.Struct], ...] = (
-    Stamps,
-    Stillness,
-    RobotState,
-    PictureFacts,
-    View,
-    CaptureEvent,
-)
+_STRUCTS: tuple[type[msgspec.Struct], ...] = (Stamps, Stillness, RobotState, PictureFacts, View, CaptureEvent)
 _PLAN = {struct: _fields(struct) for struct in _STRUCTS}
 
 

@@ -55,11 +55,7 @@ def chunk(
     return record(
         Opcode.CHUNK,
         struct.pack(
-            "<QQQI",
-            5,
-            5,
-            len(records) if size is None else size,
-            zlib.crc32(records) if crc is None else crc,
+            "<QQQI", 5, 5, len(records) if size is None else size, zlib.crc32(records) if crc is None else crc
         )
         + text(compression)
         + struct.pack("<Q", len(content))

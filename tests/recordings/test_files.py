@@ -115,10 +115,7 @@ def test_evil_names_are_refused(tmp_path: Path, name: str) -> None:
     with refused("session-name"):
         RecordingWriter(tmp_path / "a.mcap", make_info(name=name))
     assert list(tmp_path.iterdir()) == []
-    with (
-        RecordingWriter(tmp_path / "b.mcap", make_info()) as writer,
-        refused("attachment-name"),
-    ):
+    with RecordingWriter(tmp_path / "b.mcap", make_info()) as writer, refused("attachment-name"):
         writer.attach(name, "text/plain", b"")
 
 

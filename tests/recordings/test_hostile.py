@@ -36,12 +36,7 @@ from tests.recordings.crafted import (
     text,
     write,
 )
-from tests.recordings.small_recording import (
-    make_info,
-    make_state,
-    make_view,
-    refused,
-)
+from tests.recordings.small_recording import make_info, make_state, make_view, refused
 
 STATE_SCHEMA = schema(1, Topic.ROBOT_STATE)
 STATE_CHANNEL = channel(1, 1, "/robot/state")

@@ -156,10 +156,7 @@ def test_large_pictures_go_out_uncopied_and_are_identical_for_other_readers_too(
 
 
 def test_a_view_never_points_at_nothing(tmp_path: Path) -> None:
-    with (
-        RecordingWriter(tmp_path / "a.mcap", make_info()) as writer,
-        refused("no-image"),
-    ):
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer, refused("no-image"):
         writer.view(make_view(4))
 
 

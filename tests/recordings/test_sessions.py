@@ -115,8 +115,5 @@ def test_a_part_that_never_got_anything_is_set_aside_and_the_session_goes_on(tmp
 
 def test_a_session_that_is_still_written_is_refused(tmp_path: Path) -> None:
     write_small(tmp_path / "session.mcap")
-    with (
-        RecordingWriter(tmp_path / "session-2.mcap", make_info(part=2)),
-        refused("unfinished-recording"),
-    ):
+    with RecordingWriter(tmp_path / "session-2.mcap", make_info(part=2)), refused("unfinished-recording"):
         open_recording(tmp_path)

@@ -6,10 +6,12 @@ These are the types that every room shares. How they lie in the file is `schema`
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 import msgspec
-from numpy.typing import NDArray
+
+if TYPE_CHECKING:  # commands that only ask the daemon do not load numpy
+    from numpy.typing import NDArray
 
 Mount = Literal["eye-in-hand", "eye-to-hand"]
 Source = Literal["real", "simulated", "playback", "imported"]

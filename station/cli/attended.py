@@ -72,7 +72,7 @@ class Attended:
         )
 
     async def status(self) -> StationStatus:
-        """How it stands now; by a new connection, whose statuses did not wait while a person was asked."""
+        """The status now, by a new connection: no status waited there while a person was asked."""
         return await status_now(self._socket)
 
     async def carry_out(self, purpose: Purpose) -> Outcome:

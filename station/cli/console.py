@@ -1,4 +1,4 @@
-"""What the commands share: results go to stdout, everything else to stderr; their common options."""
+"""Consoles and options of all commands: results go to stdout, everything else to stderr."""
 
 from __future__ import annotations
 

@@ -137,7 +137,7 @@ def skip_command(pose: PoseNumber, socket: Socket = None) -> None:
 
 
 def _why(socket: Path | None, pose: int) -> str:
-    """What became of a pose, as the daemon says it."""
+    """The daemon's words on a pose."""
     return next((p.reason for p in status_of(socket).session.poses if p.index == pose - 1), "")
 
 

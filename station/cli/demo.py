@@ -147,7 +147,7 @@ async def _run(
 
 
 async def approve_simulated(_: MotionPreview) -> bool:
-    """For a cell that `simulated_daemon` started: nothing real moves."""
+    """Approve a motion of a cell that `simulated_daemon` started: nothing real moves."""
     return True
 
 

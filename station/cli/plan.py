@@ -111,7 +111,7 @@ def _cell(config: Path | None, scene: str, start: str | None) -> tuple[StationCo
 
 
 def _scene(cell: StationConfig, needed: bool) -> Scene | None:
-    """What can be drawn and forecast. Checking needs none: None where the configuration says too little."""
+    """The scene to draw and forecast. Checking needs none: None where the configuration says too little."""
     try:
         return scene_of(cell)
     except ConfigError:
@@ -193,7 +193,7 @@ def _summary(plan: Plan, told: Plan, outcome: PlanCheck) -> dict[str, Any]:
 
 
 def _goal_text(plan: Plan, goal_m: float) -> str:
-    """When the goal of accuracy should be reached; empty for plans that expect nothing."""
+    """A sentence on when the goal of accuracy is reached; empty for plans without a forecast."""
     sigmas = [pose.predicted_sigma_m for pose in plan.poses]
     if not sigmas or sigmas[-1] is None:
         return ""

@@ -47,7 +47,7 @@ class SessionProgress:
         self._bar.stop()
 
     def skip(self, status: StationStatus) -> None:
-        """What this status tells happened before: it is not said again."""
+        """Skip the events of this status: they happened before."""
         if status.events:
             self._last = status.events[-1]
 

@@ -88,7 +88,7 @@ def ensure_daemon(socket: Path) -> Path:
 
 
 def tell_what_goes_on(socket: Path) -> None:
-    """Who closed the screen is told that the daemon has not ended, and how to end it."""
+    """Tell a person who closed the screen that the daemon goes on, and how to end it."""
     with connection(AF_UNIX) as link:
         try:
             link.connect(str(socket))

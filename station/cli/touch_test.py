@@ -89,7 +89,7 @@ async def _visit(
 
 
 class _Visit:
-    """Who guides the tip: the person at this terminal."""
+    """The person at this terminal, who guides the tip."""
 
     def __init__(
         self, shell: Attended, board: Any, corners: list[int] | None, pointer_m: float | None, quiet: bool

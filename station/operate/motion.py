@@ -22,7 +22,7 @@ Watcher = Callable[[StationStatus], None]
 Approve = Callable[[MotionPreview], Awaitable[bool]]
 """Show a person what would move; True: they approve exactly this motion."""
 HASH_DIGITS = 12
-"""Of a plan's hash are shown; fewer approve nothing."""
+"""Digits of a plan's hash that are shown; fewer approve nothing."""
 CONNECT_WAIT_S = 30.0
 PREPARE_S = 200.0
 """Poses may be planned for it: seconds on a quick computer, minutes on a busy one."""
@@ -43,12 +43,12 @@ class Link(Protocol):
         """The full status now and at every change; ends when the daemon is gone."""
 
     def outdate(self) -> None:
-        """What is known is older than what was just asked: `statuses` begins with the next change."""
+        """Forget the known status, which is older than the last call: `statuses` begins with the next one."""
 
 
 @dataclass(frozen=True)
 class Outcome:
-    """How a session came to rest."""
+    """The end of a session, or its standstill."""
 
     status: StationStatus
 
@@ -123,7 +123,7 @@ async def approved_motion(
 
 
 def motion_facts(preview: MotionPreview) -> list[tuple[str, str]]:
-    """What a person approves, as names and facts to show."""
+    """Names and facts of a motion that a person approves."""
     turn_deg = math.degrees(preview.largest_step_rad)
     return [
         ("What", f"{preview.purpose}, {preview.poses} pose{'s' * (preview.poses != 1)}"),
@@ -157,7 +157,7 @@ def not_approved() -> RefusedError:
 
 
 async def watched(link: Link, watch: Watcher, finish_with_loss: bool = False) -> Outcome:
-    """How the session that was just started comes to rest; `finish_with_loss`: although poses failed."""
+    """Watch a session until it rests; `finish_with_loss`: finish it although poses failed."""
     status = await _until_rest(link, watch)
     if status.state is StationState.PAUSED and finish_with_loss and status.session.captured:
         await link.call(Finish())

@@ -66,7 +66,7 @@ class Hovering:
         return np.asarray(1000 * (self.tip_m[:2] - self.offer.corner_m))
 
     def instructions(self, board: BoardSpec) -> str:
-        """What the person does now."""
+        """Tell the person what to do now."""
         origin, x_end, _, y_end = outer_corners(board)
         return (
             f"The tip stands {1000 * abs(float(self.tip_m[2])):.0f} mm above corner {self.offer.corner}. "
@@ -131,9 +131,9 @@ async def _arrival(link: Link, offer: HoverOffer) -> Hovering:
 
 
 def touch_told(hovering: Hovering, said: str, status: StationStatus | None) -> Touch:
-    """What a person typed, or, when they typed nothing, what the arm's position says. RefusedError.
+    """The offset that a person typed, or, when they typed nothing, that the arm's position tells.
 
-    `status`: as the arm stands now; None: not known.
+    `status`: as the arm stands now; None: not known. Raises RefusedError.
     """
     if said:
         return touch_of(hovering, told_offset_mm(hovering, two_numbers(said)), "told by a person")
@@ -169,12 +169,12 @@ def tip_on_board_m(offer: HoverOffer, base_from_flange: Matrix4 | Array) -> Arra
 
 
 def told_offset_mm(hovering: Hovering, told_mm: Array) -> Array:
-    """What a person saw when the tip came down straight, less what the arm itself knows it was beside."""
+    """(2,) the offset seen when the tip came down straight, less what the arm knows it stood beside."""
     return np.asarray(told_mm - hovering.beside_mm)
 
 
 def read_offset_mm(offer: HoverOffer, touching_m: Array) -> Array:
-    """With the tip on the true corner: the other way round, the tip sent there would miss it by as much."""
+    """(2,) the offset read with the tip on the true corner: the tip sent there would miss it by as much."""
     height_m = abs(float(touching_m[2]))
     if height_m > _TOUCHING_M:
         raise RefusedError(
@@ -216,7 +216,7 @@ def two_numbers(said: str) -> Array:
 def touch_of(
     hovering: Hovering, offset_mm: Array, found: Literal["told by a person", "read from the arm"]
 ) -> Touch:
-    """For the calibration file."""
+    """The entry of the calibration file."""
     offer = hovering.offer
     x, y = offer.corner_m
     return Touch(

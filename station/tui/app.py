@@ -66,7 +66,7 @@ SILENT = (
 
 
 def freeze_startup() -> None:
-    """What was loaded stays loaded: looking through it again and again would make STOP wait (~100 ms)."""
+    """Keep what was loaded out of garbage collection, which would make STOP wait (~100 ms)."""
     gc.collect()
     gc.freeze()
 
@@ -212,7 +212,7 @@ class StationApp(ResultsDesk):
             await asyncio.sleep(RECONNECT_S)
 
     def hear(self, silent_s: float | None) -> None:
-        """For how long the daemon has not answered; None: it does."""
+        """Hear for how long the daemon has not answered; None: it does."""
         if silent_s is None and self.silent_s is None:
             return
         self.silent_s = silent_s
@@ -268,7 +268,7 @@ class StationApp(ResultsDesk):
 
     @work(exit_on_error=False)
     async def greet(self, status: StationStatus) -> None:
-        """Who starts for the first time, or without a robot, sees first what is missing."""
+        """Show what is missing to a person who starts for the first time, or without a robot."""
         if status.playback:
             return
         missing = status.state is StationState.DISCONNECTED
@@ -277,7 +277,7 @@ class StationApp(ResultsDesk):
             await self.switch_mode("checklist")
 
     def common_actions(self) -> list[str]:
-        """What has a key on every screen; a playback adds its own."""
+        """Actions that have a key on every screen; a playback adds its own."""
         return [binding.action for binding in StationApp.BINDINGS if isinstance(binding, Binding)]
 
     def get_key_display(self, binding: Binding) -> str:

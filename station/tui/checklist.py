@@ -70,6 +70,6 @@ class ChecklistScreen(StationScreen):
         self.query_one("#checklist", Static).update(Group(checklist_table(answer), Text(words, style="bold")))
 
     def look_again(self) -> None:
-        """What is missing is looked for again by itself; what is there is left in peace."""
+        """Check again while something is missing; what is there is left in peace."""
         if self._missing and self.is_current:
             self.action_refresh_checks()

@@ -61,15 +61,15 @@ class Desk(App[None]):
     stop_unconnected: Callable[[], bool] = staticmethod(lambda: False)
     """Sends STOP where there is no connection (`protocol.stop_client.send_stop`); False: nobody listens."""
     silent_s: float | None = None
-    """For how long the daemon has not answered; None while it does."""
+    """Seconds without an answer from the daemon; None while it answers."""
     trouble = ""
-    """Why what is shown is not how it is: no daemon, or one that does not answer."""
+    """Reason why the screen is old: no daemon, or one that does not answer."""
     busy = ""
-    """What the daemon is at work on for this screen; empty: nothing that takes long."""
+    """Long work of the daemon for this screen, in words; empty: none."""
     graphics: Graphics | None = None
-    """How the terminal draws images; None: half blocks only."""
+    """The terminal's own graphics; None: half blocks only."""
     _own_id: int | None = None
-    """How the daemon knows this connection, once it had control."""
+    """The daemon's number of this connection, once it had control."""
     _newest: StationStatus | None = None
     _news = asyncio.Event()
 
@@ -79,7 +79,7 @@ class Desk(App[None]):
         return None if self.link is None else self.link.root
 
     def common_actions(self) -> list[str]:
-        """What has a key on every screen."""
+        """Actions that have a key on every screen."""
         return []
 
     def playing(self) -> bool:
@@ -124,7 +124,7 @@ class Desk(App[None]):
             yield seen
 
     def tell_newest(self, status: StationStatus) -> None:
-        """For `statuses`, before the screens' own slower pace."""
+        """Hand a status to `statuses`, before the screens' own slower pace."""
         self._newest = status
         self._news.set()
         self._news = asyncio.Event()
@@ -143,7 +143,7 @@ class Desk(App[None]):
         return None
 
     async def ask(self, verb: Verb[R], *, timeout_s: float = ANSWER_S) -> R | None:
-        """As `call`, with a notice in place of an error."""
+        """Call a verb; a notice takes the place of an error."""
         return await self.attempt(self.call(verb, timeout_s=timeout_s))
 
     @work(group="command", exit_on_error=False)
@@ -252,14 +252,14 @@ class Desk(App[None]):
 
 
 def told(problem: CodedError | OSError) -> str:
-    """What happened, and what to do about it on a screen."""
+    """The text of an error with the remedy that a screen offers."""
     if isinstance(problem, OSError) or problem.code not in REMEDIES:
         return str(problem)
     return f"{problem.text.rstrip('.')}. {REMEDIES[problem.code]}"
 
 
 def busy_words(verb: Verb[Any]) -> str:
-    """What takes the daemon seconds, or minutes on a busy computer; empty: an answer comes at once."""
+    """Words for a verb that takes seconds, or minutes on a busy computer; empty: it is answered at once."""
     match verb:
         case verbs.MakePlan():
             return f"Planning {verb.poses} poses … Nothing moves."

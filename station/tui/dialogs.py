@@ -69,7 +69,7 @@ class ConfirmMotion(Confirm):
 
 
 def motion_text(preview: MotionPreview) -> str:
-    """What a person approves, one fact a line; long ones go on below themselves."""
+    """The facts of a motion, one a line; long ones go on below themselves."""
     lines = (
         textwrap.fill(text, WIDTH, initial_indent=f"{name:<{INDENT}}", subsequent_indent=" " * INDENT)
         for name, text in motion_facts(preview)
@@ -78,7 +78,7 @@ def motion_text(preview: MotionPreview) -> str:
 
 
 class ChooseFormat(ModalScreen[str | None]):
-    """Which other program shall read a calibration."""
+    """Choice of an export format."""
 
     BINDINGS: ClassVar[list[BindingType]] = [Binding("escape", "dismiss(None)", "Cancel")]
 
@@ -94,7 +94,7 @@ class ChooseFormat(ModalScreen[str | None]):
 
 
 class Reason(ModalScreen[str]):
-    """Why a person installs a calibration that is refused; empty: they do not."""
+    """A person's reason to install a calibration that is refused; empty: they do not."""
 
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("escape", "dismiss('')", "Cancel", tooltip="Install nothing")
@@ -123,7 +123,7 @@ class Reason(ModalScreen[str]):
 
 
 class Help(ModalScreen[None]):
-    """What a screen is for, and every key with what it does. Scrolls where it does not fit."""
+    """The purpose of a screen, and every key with what it does. Scrolls where it does not fit."""
 
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("escape,f1,enter", "dismiss(None)", "Close", tooltip="Close this help")

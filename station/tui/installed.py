@@ -1,4 +1,4 @@
-"""What is installed on this cell, and what was: rolled back, or replaced by another."""
+"""The installed calibration of this cell, and those that were: rolled back, or replaced by another."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ Marks = frozenset[tuple[str, int]]
 
 @dataclass(frozen=True)
 class Ended:
-    """How a calibration that was installed stopped being it."""
+    """The end of an installed calibration."""
 
     calibration: Calibration
     how: str
@@ -38,7 +38,7 @@ class Installed:
     """The newest end last, one for each solve; without what is installed again."""
 
     def word(self, session: str) -> str:
-        """For a session whose calibration is or was installed; else empty."""
+        """State of a session whose calibration is or was installed; else empty."""
         if self.now is not None and self.now.provenance.session == session:
             return "INSTALLED"
         ends = [end.how for end in self.ended if end.calibration.provenance.session == session]
@@ -49,7 +49,7 @@ class Installed:
 
 
 def read_installed(root: Path) -> Installed:
-    """For a thread: reading many of them takes a moment."""
+    """Read all of it, in a thread: many files take a moment."""
     try:
         now = load_installed(root, allow_simulated=True)
     except CalibrationError:
@@ -115,7 +115,7 @@ def marks(root: Path) -> Marks:
 
 
 def _mark(path: Path) -> tuple[str, int]:
-    """When it was changed itself: a folder by what came into it or left it, a link by where it leads."""
+    """Path and time of its own change: a folder by what came or left, a link by where it leads."""
     try:
         return str(path), path.lstat().st_mtime_ns
     except OSError:

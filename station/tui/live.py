@@ -18,7 +18,7 @@ from station.tui.words import POSE_MARKS, clock
 
 _STYLES = {"debug": "dim", "info": "", "warning": "bold", "error": "bold reverse"}
 _FOLDERS = re.compile(r"(?<!\S)/\S*/(?=[^/\s]+/[^/\s]+)")
-"""Of an absolute path all but its last two names."""
+"""All but the last two names of an absolute path."""
 _WORDS = {"debug": "", "info": "", "warning": "WARN ", "error": "ERROR "}
 
 
@@ -32,7 +32,7 @@ def event_text(event: Event, width: int = 0) -> Text:
 
 
 class Events(Static):
-    """As many of the newest events as fit."""
+    """The newest events, as many as fit."""
 
     status: reactive[StationStatus | None] = reactive(None)
 

@@ -47,7 +47,7 @@ def row_of(pose: PoseStatus) -> tuple[str, ...]:
 
 
 def detail_of(pose: PoseStatus) -> str:
-    """What the table has no room for."""
+    """One pose in words, with what the table has no room for."""
     seen = "" if pose.corners is None else f" {pose.corners} corners in attempt {pose.attempt}."
     why = f" {pose.why}." if pose.why and pose.reason else ""
     return f"{pose.name}: {pose.reason or pose.why}.{why}{seen}"

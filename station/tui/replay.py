@@ -92,7 +92,7 @@ class ReplayLink:
         )
 
     def outdate(self) -> None:
-        """What is shown is never older than the recording."""
+        """Do nothing: a recording is never outdated."""
 
     async def statuses(self) -> AsyncIterator[StationStatus]:
         """Until the end, which stays on the screen."""
@@ -120,7 +120,7 @@ class ReplayLink:
         self._at_s = min(max(0.0, self._at_s + by_s), self._timeline.duration_s)
 
     def step(self, by: int) -> None:
-        """To the next image (1) or the one before (-1), and stay there."""
+        """Go to the next image (1) or the one before (-1), and stay there."""
         self.paused = True
         self._at_s = self._timeline.image_s(self._at_s, by)
 
@@ -196,7 +196,7 @@ class Timeline:
         self._ahead: RobotState | None = next(self._states, None)
 
     def image_s(self, at_s: float, by: int) -> float:
-        """When the next image (`by` 1) or the one before (-1) was taken, seen from `at_s`."""
+        """Time of the next image (`by` 1) or the one before (-1), seen from `at_s`."""
         done = sum(time_s <= at_s for time_s in self._times_s)
         if by > 0:
             return self._times_s[done] if done < len(self._times_s) else self.duration_s
@@ -290,7 +290,7 @@ class Timeline:
 
 
 def _times_s(views: list[View]) -> list[float]:
-    """When each was taken, since the first."""
+    """Time of each view since the first."""
     stamps = [view.stamps.host_monotonic_ns for view in views]
     if len(set(stamps)) < len(stamps):
         return [i * WITHOUT_CLOCK_S for i in range(len(stamps))]

@@ -62,7 +62,7 @@ def verdict_text(
     for passed, words in (
         *((False, words) for words in objections),
         *((agrees(touch), f"touch test, {touch_text(touch)}") for touch in touches),
-        *((gate.passed, f"{gate.name}: {gate.text}") for gate in gates),
+        *((gate.passed, gate.text) for gate in gates),
     ):
         text.append(f"\n[{'ok' if passed else 'FAIL'}] ", style="" if passed else "bold reverse")
         text.append(words)

@@ -203,7 +203,7 @@ class ResultsDesk(Desk):
             self.notify(str(refusal), title="Not installed", severity="error", timeout=20, markup=False)
 
     async def _install(self, path: str, reason: str) -> CalibrationError | None:
-        """Why not; None when it is installed."""
+        """Install; return the refusal, None when it is installed."""
         cell: Cell = "simulated" if self.status is not None and self.status.simulated else "real"
         try:
             await asyncio.to_thread(install, Path(path), state_root(path), cell=cell, override=reason)

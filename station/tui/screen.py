@@ -1,4 +1,4 @@
-"""What every screen has: the bar on top, the reason below it, the keys at the bottom."""
+"""The frame of every screen: the bar on top, the reason below it, the keys at the bottom."""
 
 from __future__ import annotations
 
@@ -84,12 +84,12 @@ class StationScreen(Screen[None]):
             part.status = status  # type: ignore[attr-defined]
 
     def say_busy(self, words: str) -> None:
-        """What the daemon is at work on for this screen; empty: nothing."""
+        """Say what the daemon is at work on for this screen; empty: nothing."""
         for line in self.query(ReasonLine):
             line.busy = words
 
     def doubt(self, trouble: str, silent_s: float | None) -> None:
-        """Why what stands here is old (empty: it is not), and for how long the daemon has not answered."""
+        """Say why the screen is old (empty: it is not), and for how long the daemon has not answered."""
         self.set_class(bool(trouble), "-old")
         for bar in self.query(StatusBar):
             bar.silent_s = silent_s

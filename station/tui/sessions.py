@@ -27,7 +27,7 @@ COLUMNS = ("session", "source", "views", "size", "state", "calibration")
 
 
 class SessionsScreen(StationScreen):
-    """What was recorded, and what became of it."""
+    """Past recordings and their calibrations."""
 
     HELP = (
         "Past recordings. Solving runs in its own process; the daemon and a running capture go on. Home and "

@@ -47,7 +47,7 @@ FEW_COLOURS = ("linux", "vt100", "vt220", "ansi")
 
 
 def chosen_theme() -> str:
-    """What the operator asked for; on a console with 16 colours those of the terminal itself."""
+    """The theme asked for by name; on a console with 16 colours the terminal's own colours."""
     asked = os.environ.get("TEXTUAL_THEME", "")
     if asked in BUILTIN_THEMES or asked in {theme.name for theme in THEMES}:
         return asked

@@ -36,7 +36,7 @@ POINTER = "pointer's length in mm; empty: as configured, or as on the pendant"
 
 
 class ChooseCorner(ModalScreen[int | None]):
-    """Which corner is next, and by which pointer. None: no more of them."""
+    """Choice of the next corner and of the pointer. None: no more corners."""
 
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("escape", "dismiss(None)", "End", tooltip="No more corners")
@@ -46,7 +46,7 @@ class ChooseCorner(ModalScreen[int | None]):
         super().__init__()
         self._board, self._found = board, found
         self.pointer_mm = pointer_mm
-        """As typed; empty: the configured one, or the tool set on the pendant."""
+        """Text of the input; empty: the configured pointer, or the tool set on the pendant."""
 
     def compose(self) -> ComposeResult:
         with Vertical(id="dialog"):
@@ -132,7 +132,7 @@ class Touching(ModalScreen[Touch | None]):
 
 
 class _Visit:
-    """Who guides the tip: the person in front of this screen."""
+    """The person in front of this screen, who guides the tip."""
 
     def __init__(self, desk: Desk, board: BoardSpec) -> None:
         self._desk, self._board, self._pointer_mm = desk, board, ""
@@ -160,7 +160,7 @@ class _Visit:
 
 
 async def run_touch_test(desk: Desk, path: Path) -> bool:
-    """As many corners as the person wants. True when something was written into the file."""
+    """Visit corners until the person ends it. True when something was written into the file."""
 
     calibration = await desk.attempt(asyncio.to_thread(read_calibration, path))
     if calibration is None:

@@ -1,4 +1,4 @@
-"""How numbers and states are said to a person: millimetres and degrees begin here."""
+"""Words for numbers and states: millimetres and degrees begin here."""
 
 from __future__ import annotations
 

@@ -102,7 +102,7 @@ def test_a_disk_that_is_nearly_full_is_not_left_out() -> None:
 
 @pytest.mark.parametrize(
     ("state", "key"),
-    [(StationState.FREE_DRIVE, "F2"), (StationState.PAUSED, "F5"), (StationState.FAULT, "F8 after a look")],
+    [(StationState.FREE_DRIVE, "F2"), (StationState.PAUSED, "F5"), (StationState.FAULT, "F8 acknowledges")],
 )
 async def test_the_reason_names_the_next_key(link: FakeLink, state: StationState, key: str) -> None:
     link.show(idle(state, "why"))

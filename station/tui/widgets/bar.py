@@ -14,12 +14,12 @@ _ALARM = {StationState.STOPPED, StationState.FAULT, StationState.DISCONNECTED}
 STOP_KEY = "F12=STOP"
 LEVELS = 6
 _NEXT = {
-    StationState.STOPPED: "F8 after a look at the cell",
-    StationState.FAULT: "F8 after a look at the cell",
+    StationState.STOPPED: "F8 acknowledges",
+    StationState.FAULT: "F8 acknowledges",
     StationState.PAUSED: "F5 continues, F7 finishes",
     StationState.FREE_DRIVE: "F2 captures an image here, F3 ends it",
 }
-"""Which key is next. The daemon's own sentence is for shells too."""
+"""The next key by state. The daemon's own sentence is for shells too."""
 _AT_REST = {StationState.IDLE, StationState.PAUSED, StationState.FREE_DRIVE}
 NO_DAEMON = " NO DAEMON: trying again every second. To stop the arm use the pendant."
 
@@ -94,7 +94,7 @@ def _parts(status: StationStatus, level: int) -> list[str]:
 
 
 def said_of(status: StationStatus) -> str:
-    """Why it does not work, what comes next by itself, and which key is next."""
+    """Reason of a standstill, what comes next by itself, and the next key."""
     held, next_key = "", _NEXT.get(status.state, "")
     if status.state in _AT_REST and status.robot.held:  # elsewhere the reason says it
         held, next_key = status.robot.held, next_key and f"then {next_key}"
@@ -107,13 +107,13 @@ def _is_well(status: StationStatus) -> bool:
 
 
 class ReasonLine(Static):
-    """Why the station is not working, in a sentence, with what to do; hidden while all is well."""
+    """The reason of a standstill in a sentence, with what to do; hidden while all is well."""
 
     status: reactive[StationStatus | None] = reactive(None)
     trouble: reactive[str] = reactive("")
     """Stands before what the daemon said last."""
     busy: reactive[str] = reactive("")
-    """What takes long and was asked for here."""
+    """Long work that was asked for here."""
     _reason = ""
 
     def watch_trouble(self) -> None:

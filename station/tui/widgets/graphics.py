@@ -29,7 +29,7 @@ from station.tui.themes import ANSI_THEMES, chosen_theme
 SWITCH = "STATION_PICTURES"
 """`blocks`: never; `sharp`: over ssh too, where STOP's key and every picture share one line."""
 SHARE = 0.04
-"""Of one core at most, for drawing pictures: the dearer one is, the seldomer they come."""
+"""Largest share of one core for drawing images: the dearer one is, the seldomer they come."""
 PERIOD_S = 0.5
 """Between two pictures at least: the terminal has to draw them too."""
 GREYS = 16
@@ -42,7 +42,7 @@ _HIDDEN = ((ControlType.CURSOR_FORWARD, 0),)
 
 
 def detect() -> Graphics | None:
-    """What this terminal draws; None: half blocks. It is asked, so only before the screen reads its keys."""
+    """Ask the terminal what it draws; None: half blocks. Only before the screen reads its keys."""
     wish = os.environ.get(SWITCH, "")
     remote = "SSH_TTY" in os.environ or "SSH_CONNECTION" in os.environ
     if wish == "blocks" or (remote and wish != "sharp") or chosen_theme() in ANSI_THEMES:
@@ -116,7 +116,7 @@ class Graphics:
         return size.width * self._cell[0], size.height * self._cell[1]
 
     def draw(self, picture: NDArray[np.uint8], corners: NDArray[np.float64], size: Size) -> SharpPicture:
-        """As large as it fits into `size` cells. `corners`: (n, 2), shares of the sides. For a thread."""
+        """Draw an image into `size` cells. `corners`: (n, 2), shares of the sides. For a thread."""
         from PIL import Image  # comes with textual-image
 
         begun_s = time.thread_time()

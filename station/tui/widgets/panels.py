@@ -128,7 +128,7 @@ def progress_lines(status: StationStatus) -> list[str]:
 
 
 def _counted(session: SessionStatus) -> list[str]:
-    """How far the session is while no pose is being taken, and what comes next."""
+    """Progress of a session while no pose is under way, and what comes next."""
     if not session.poses:
         return ["no plan loaded"]
     if not session.name:

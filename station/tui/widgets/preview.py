@@ -34,7 +34,7 @@ OLD = "OLD IMAGE"
 SMALLEST = (16, 16)
 """Pixels of an image that nobody will see."""
 FEW_SHADES = " ░▒▓█"
-"""For a console with 16 colours, whose backgrounds have no greys: one shade a cell."""
+"""Shades of a console with 16 colours, whose backgrounds have no greys: one a cell."""
 
 
 class Preview(Widget):
@@ -92,7 +92,7 @@ class Preview(Widget):
         self._next_s = time.monotonic() + max(PERIOD_S, self._sharp.spent_s / SHARE)
 
     def _graphics(self) -> Graphics | None:
-        """How this terminal draws images; None while half blocks are due."""
+        """The terminal's own graphics; None while half blocks are due."""
         graphics = cast(Desk, self.app).graphics
         if graphics is None or self.old or not self.screen.is_active or not graphics.ready():
             return None

@@ -42,7 +42,7 @@ def test_an_option_answers_to_its_former_name_too(command: str) -> None:
     ("argument", "foreign"),
     [
         ("--help", ("numpy", "scipy", "cv2", "textual", "calibrate", "station.operate", "asyncio")),
-        ("status", ("scipy", "cv2", "textual", "calibrate", "station.simulation", "station.plan")),
+        ("status", ("numpy", "scipy", "cv2", "textual", "calibrate", "station.simulation", "station.plan")),
         ("capture", ("textual", "gi", "serial", "rtde_control", "station.simulation", "station.session")),
     ],
 )

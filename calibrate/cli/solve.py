@@ -23,7 +23,7 @@ from calibrate.cli.output import (
 )
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Touch, write_calibration
-from calibrate.files.formatting import summary
+from calibrate.files.formatting import PEER_HEAD, peer_cells, summary
 from calibrate.files.install import install_line, load_installed
 from calibrate.geometry import rotation_log
 from calibrate.handeye.solution import PeerResult, camera_frames
@@ -183,19 +183,9 @@ def compare(
             }
         )
         return
-    table = Table("method", "e_t mm", "e_R", "spread mm", "spread °", "px", "σ from ours", "ms", "", box=None)
+    table = Table(*PEER_HEAD, box=None)
     for peer in results:
-        table.add_row(
-            peer.name,
-            _number(peer.e_t_m, 1e3, 3),
-            _number(peer.e_R, 1, 5),
-            _number(peer.board_spread_m, 1e3, 3),
-            _number(peer.board_spread_rad, float(np.degrees(1)), 4),
-            _number(peer.reprojection_px, 1, 3),
-            _number(peer.distance_sigma, 1, 1),
-            _number(peer.time_ms, 1, 1),
-            peer.note,
-        )
+        table.add_row(*peer_cells(peer))
     out.print(table)
     out.print(f"\nX, {' from '.join(camera_frames(prepared.views.mount))}:")
     out.print(_table_of_X(results))
@@ -220,7 +210,3 @@ def peer_plain(peer: Any) -> dict[str, Any]:
         if not key.startswith("samples_")
     }
     return {key: float(value) if isinstance(value, np.floating) else value for key, value in plain.items()}
-
-
-def _number(value: float | None, factor: float, digits: int) -> str:
-    return "-" if value is None else f"{value * factor:.{digits}f}"

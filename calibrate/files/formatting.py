@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import TYPE_CHECKING
 
 import numpy as np
 from rich.console import Group, RenderableType
@@ -15,6 +16,9 @@ from calibrate.files.calibration import Calibration, Override
 from calibrate.files.verification import agrees, touch_text
 from calibrate.geometry import difference
 from calibrate.results import BoardShape
+
+if TYPE_CHECKING:
+    from calibrate.handeye.solution import PeerResult
 
 _STAMPS = {
     "simulated": "SIMULATED: made without a robot or a camera",
@@ -167,3 +171,21 @@ def pose_difference(first: Calibration, second: Calibration) -> tuple[float, flo
     covariance = np.array(first.covariance) + np.array(second.covariance)
     sigmas = float(np.sqrt(delta @ np.linalg.pinv(covariance, hermitian=True) @ delta))
     return float(np.linalg.norm(delta[:3]) * 1e3), float(np.degrees(np.linalg.norm(delta[3:]))), sigmas
+
+
+PEER_HEAD = ("method", "e_t mm", "e_R", "spread mm", "spread °", "px", "σ from ours", "ms", "")
+
+
+def peer_cells(peer: PeerResult) -> tuple[str, ...]:
+    """One row under PEER_HEAD."""
+    numbers = (
+        (peer.e_t_m, 1e3, 3),
+        (peer.e_R, 1.0, 5),
+        (peer.board_spread_m, 1e3, 3),
+        (peer.board_spread_rad, float(np.degrees(1)), 4),
+        (peer.reprojection_px, 1.0, 3),
+        (peer.distance_sigma, 1.0, 1),
+        (peer.time_ms, 1.0, 1),
+    )
+    cells = ("–" if value is None else f"{value * factor:.{digits}f}" for value, factor, digits in numbers)
+    return (peer.name, *cells, peer.note)

@@ -1,0 +1,1 @@
+"""Gates, drift check, touch test and sweep. Nothing here writes a calibration."""

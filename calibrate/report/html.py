@@ -79,7 +79,3 @@ def figure(svg: str, caption: str) -> str:
 
 def picture(jpeg: bytes, alt: str) -> str:
     return f'<img alt="{escape(alt)}" src="data:image/jpeg;base64,{base64.b64encode(jpeg).decode()}">'
-
-
-def number(value: float | None, digits: int = 3, factor: float = 1.0) -> str:
-    return "–" if value is None else f"{value * factor:.{digits}f}"

@@ -13,7 +13,14 @@ import numpy as np
 from calibrate.boards.corners import to_grey
 from calibrate.boards.model import describe_board
 from calibrate.files.calibration import Touch, write_output
-from calibrate.files.formatting import cell_sentences, pose_text, source_stamp, verdict_text
+from calibrate.files.formatting import (
+    PEER_HEAD,
+    cell_sentences,
+    peer_cells,
+    pose_text,
+    source_stamp,
+    verdict_text,
+)
 from calibrate.files.verification import agrees, touch_text
 from calibrate.geometry import Array
 from calibrate.handeye.corners import bent_points
@@ -216,21 +223,7 @@ def _methods(peers: Sequence[PeerResult]) -> Iterator[str]:
     if not peers:
         return
     yield html.heading("All methods on the same views")
-    rows = [
-        (
-            peer.name,
-            html.number(peer.e_t_m, 4, 1e3),
-            html.number(peer.e_R, 6),
-            html.number(peer.board_spread_m, 3, 1e3),
-            html.number(peer.board_spread_rad, 4, float(np.degrees(1))),
-            html.number(peer.distance_sigma, 1),
-            html.number(peer.time_ms, 0),
-            peer.note,
-        )
-        for peer in peers
-    ]
-    head = ("method", "e_t, mm", "e_R", "board spread, mm", "board spread, °", "σ from ours", "ms", "")
-    yield html.table(head, rows, (1, 2, 3, 4, 5, 6))
+    yield html.table(PEER_HEAD, map(peer_cells, peers), range(1, 8))
 
 
 def _lens(job: SolvedRecording) -> Iterator[str]:

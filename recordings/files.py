@@ -139,3 +139,13 @@ def require_free_space(folder: Path, reserve_bytes: int) -> int:
 def bytes_text(count: int) -> str:
     """For people: 4.0 GB, 120 MB."""
     return f"{count / 1e9:.1f} GB" if count >= 1_000_000_000 else f"{count / 1e6:.0f} MB"
+
+
+def state_root(root: Path | None = None) -> Path:
+    """State folder of the station: `root`, $STATE_DIRECTORY (systemd), or the XDG state folder."""
+    if root is not None:
+        return root
+    if state := os.environ.get("STATE_DIRECTORY", "").split(":")[0]:
+        return Path(state)
+    base = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
+    return Path(base) / "calibration-station"

@@ -18,7 +18,8 @@ from calibrate.files import install as installing
 from calibrate.files.calibration import Calibration, Lens, read_calibration, write_output
 from calibrate.files.exports import FORMATS, FrameNames
 from calibrate.files.formatting import override_text, pose_difference, pose_text, summary, verdict_text
-from calibrate.files.versions import InstalledVersion, installed_versions, read_log, state_root
+from calibrate.files.versions import InstalledVersion, installed_versions, read_log
+from recordings.files import state_root
 
 Root = Annotated[
     Path | None,

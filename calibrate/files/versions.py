@@ -31,7 +31,7 @@ from calibrate.files.calibration import (
     read_calibration,
 )
 from calibrate.files.lines import append_line, read_lines
-from recordings.files import sync_folder, write_atomically
+from recordings.files import state_root, sync_folder, write_atomically
 
 Action = Literal["install", "rollback", "verify"]
 _NAME = re.compile(r"(\d{4,})-[0-9a-f]{8}\.yaml")
@@ -61,16 +61,6 @@ class LogEntry(msgspec.Struct, frozen=True, omit_defaults=True):
     change: str = ""
     """Against what was installed before; for "verify" what was found."""
     reason: str = ""
-
-
-def state_root(root: Path | None = None) -> Path:
-    """State folder of the station: `root`, $STATE_DIRECTORY (systemd), or the XDG state folder."""
-    if root is not None:
-        return root
-    if state := os.environ.get("STATE_DIRECTORY", "").split(":")[0]:
-        return Path(state)
-    base = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
-    return Path(base) / "calibration-station"
 
 
 def installed_versions(root: Path | None = None) -> list[InstalledVersion]:

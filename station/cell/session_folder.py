@@ -7,7 +7,6 @@ ROOT/active                           names the session that runs; still there a
 
 from __future__ import annotations
 
-import os
 import time
 from pathlib import Path
 from typing import Literal
@@ -57,14 +56,6 @@ class SessionSummary(msgspec.Struct, frozen=True):
     sealed: bool
     calibration: str
     """Path of the file that was made of it; empty: none."""
-
-
-def default_root() -> Path:
-    """systemd's state folder, else the user's (XDG)."""
-    if state := os.environ.get("STATE_DIRECTORY", "").split(":")[0]:
-        return Path(state)
-    base = os.environ.get("XDG_STATE_HOME") or str(Path.home() / ".local" / "state")
-    return Path(base) / "calibration-station"
 
 
 def new_session_folder(root: Path, cell: str) -> Path:

@@ -23,9 +23,10 @@ from rich.text import Text
 
 from calibrate.geometry import difference
 from recordings.errors import ErrorReport
+from recordings.files import state_root
 from recordings.reader import open_recording
 from station.cell.errors import ConfigError, StationError
-from station.cell.session_folder import CALIBRATION_FILE, default_root
+from station.cell.session_folder import CALIBRATION_FILE
 from station.cell.status import MotionPreview
 from station.cli.console import AsJson, Headless, err, out
 from station.cli.progress import SessionProgress
@@ -76,7 +77,7 @@ def demo_command(
         # Discovery broadcasts on every network: the same command again, where there is only loopback.
         command = isolated_command([sys.executable, "-m", "station.cli", *sys.argv[1:]])
         os.execv(command[0], command)
-    folder = output or default_root() / "demo" / time.strftime("%Y%m%d-%H%M%S")
+    folder = output or state_root() / "demo" / time.strftime("%Y%m%d-%H%M%S")
     cell: dict[str, Any] = {"seed": seed, "scene": scene, "mount": mount, "noise": noise}
     arguments = [part for name, value in cell.items() for part in (f"--{name}", str(value))]
     arguments += ["--time-scale", str(time_scale), *(["--gige"] if gige else [])]

@@ -14,8 +14,8 @@ from typing import Annotated
 
 import typer
 
+from recordings.files import state_root
 from station.cell.errors import StationError
-from station.cell.session_folder import default_root
 from station.cell.socket_folder import default_socket
 from station.cli.console import Socket
 from station.protocol.client import DaemonGoneError, ask
@@ -63,7 +63,7 @@ def ensure_daemon(socket: Path) -> Path:
     """The socket of a daemon that answers; starts one where none does. StationError when that fails."""
     if _answers(socket):
         return socket
-    root = default_root()
+    root = state_root()
     config = find_config()
     what = ["--simulate"] if config is None else ["--config", str(config)]
     cell = "a SIMULATED cell (no configuration found)" if config is None else f"the cell of {config}"

@@ -12,11 +12,11 @@ from typing import Annotated, get_args
 
 import typer
 
+from recordings.files import state_root
 from recordings.schema.messages import Mount
 from station.cell.config import ControlPath
 from station.cell.errors import ConfigError
 from station.cell.process import DAEMON_NICENESS, go_before_others
-from station.cell.session_folder import default_root
 from station.cell.socket_folder import default_socket
 from station.devices.cell import Cell
 from station.simulation.cell import NoiseLevel, SceneName
@@ -66,7 +66,7 @@ def serve_command(
         )
     require_choices(scene=scene, noise=noise, mount=mount, control=control)
     log_to_stderr()
-    place = root or default_root()
+    place = state_root(root)
     # What only one kind of cell needs is loaded only for it.
     if config is not None:
         cell = _real_cell(config, place)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.scene import Noise, make_cell, pose_arrays
+from benchmarks.scene import CellNoise, make_cell, pose_arrays
 from benchmarks.trials import rms, rms_spread, table, trials
 from calibrate.geometry import Array, difference
 from calibrate.handeye.axxb.peer_methods import HAND_EYE, opencv_hand_eye
@@ -18,7 +18,7 @@ def run() -> str:
     count = trials(TRIALS)
     errors: dict[str, list[tuple[float, float]]] = {}
     for seed in range(count):
-        cell = make_cell(np.random.default_rng(seed), 25, Noise(0.1, 0.0, 0.0), scene="blog")
+        cell = make_cell(np.random.default_rng(seed), 25, CellNoise(0.1, 0.0, 0.0), scene="blog")
         found: dict[str, Array] = {"ours": solve_views(cell.views, _OPTIONS).matrix}
         for name in ("Tsai-Lenz", "Park-Martin", "Daniilidis"):
             found[name] = opencv_hand_eye(*pose_arrays(cell.views), HAND_EYE[name])

@@ -40,7 +40,7 @@ class Row:
 
 
 @dataclass(frozen=True)
-class Trial:
+class CoverageTrial:
     """One cell, solved and judged."""
 
     closed: tuple[str, ...]
@@ -97,7 +97,7 @@ def run() -> str:
     return text + "\n\n" + table(HEADER, rows)
 
 
-def measure(task: tuple[int, Mount, int]) -> Trial:
+def measure(task: tuple[int, Mount, int]) -> CoverageTrial:
     place, mount, seed = task
     row = ROWS[place]
     rng = np.random.default_rng([41, place, MOUNTS.index(mount), seed])
@@ -106,7 +106,7 @@ def measure(task: tuple[int, Mount, int]) -> Trial:
             cell = imperfect_cell(rng, mount, row.wrong, row.known, row.model)
             solution = solve_views(cell.views, SolveOptions(intrinsics_from_same_pictures=not row.known.lens))
     except CalibrationError as problem:
-        return Trial((problem.hypothesis or type(problem).__name__,))
+        return CoverageTrial((problem.hypothesis or type(problem).__name__,))
     used = set(solution.used)
     seen = picture_coverage(cell.views.select([k for k, v in enumerate(cell.views) if v.index in used]))
     gates = judge(solution, GateInputs(None if row.known.lens else seen))
@@ -119,7 +119,7 @@ def measure(task: tuple[int, Mount, int]) -> Trial:
         for gate in gates
         if not gate.passed
     )
-    return Trial(
+    return CoverageTrial(
         closed,
         square,
         square <= solution.confidence_threshold,
@@ -129,12 +129,12 @@ def measure(task: tuple[int, Mount, int]) -> Trial:
     )
 
 
-def line(row: Row, mount: Mount, found: Sequence[Trial]) -> list[str]:
+def line(row: Row, mount: Mount, found: Sequence[CoverageTrial]) -> list[str]:
     solved = [trial for trial in found if trial.square is not None]
     squares = np.array([trial.square for trial in solved])
     closed = Counter(name for trial in found for name in trial.closed)
 
-    def percent(count: int, of: Sequence[Trial]) -> str:
+    def percent(count: int, of: Sequence[CoverageTrial]) -> str:
         return f"{100 * count / max(len(of), 1):.1f}"
 
     return [

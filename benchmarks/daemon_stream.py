@@ -69,7 +69,7 @@ class Checked:
 
 
 @dataclass
-class Outcome:
+class StreamOutcome:
     asked_fps: float
     sessions: int
     checked: Checked
@@ -98,7 +98,7 @@ HEADER = (
 )
 
 
-def row(o: Outcome) -> str:
+def row(o: StreamOutcome) -> str:
     """Of the table under `HEADER`."""
     c = o.checked
     cells = (
@@ -115,13 +115,13 @@ def run() -> str:
     return "\n".join([f"| {HEADER.replace('|', ' | ')} |", "|" + "---|" * (HEADER.count("|") + 1), *rows])
 
 
-def measure(fps: float, seconds: float) -> Outcome:
+def measure(fps: float, seconds: float) -> StreamOutcome:
     """In a network namespace of its own. RuntimeError with its last words."""
     command = [sys.executable, "-m", "benchmarks.daemon_stream", str(fps), str(seconds)]
     done = subprocess.run(isolated_command(command), capture_output=True, text=True, check=False)
     if done.returncode != 0:
         raise RuntimeError(done.stderr[-2000:])
-    return msgspec.json.decode(done.stdout.splitlines()[-1], type=Outcome)
+    return msgspec.json.decode(done.stdout.splitlines()[-1], type=StreamOutcome)
 
 
 def verify(path: Path) -> Checked:
@@ -175,11 +175,11 @@ def long_sweep(status: StationStatus, seconds: float) -> Plan:
     return msgspec.structs.replace(once, poses=tuple(poses))
 
 
-async def stream(fps: float, seconds: float, root: Path) -> Outcome:
+async def stream(fps: float, seconds: float, root: Path) -> StreamOutcome:
     verifier = ProcessPoolExecutor(1, initializer=step_behind_others)
     verifier.submit(int).result()  # forked before there is much to share
     arguments = ["--gige", "--frame-rate-hz", str(fps), "--robot", "UR10e"]
-    outcome = Outcome(fps, 0, Checked(), 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    outcome = StreamOutcome(fps, 0, Checked(), 0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     waiting: list[Path] = []
     verified: list[Future[Checked]] = []
     async with simulated_daemon(root, arguments) as socket, await Client.connect(socket) as client:

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from benchmarks.scene import LEVELS, Cell, Noise, make_cell
+from benchmarks.scene import LEVELS, CellNoise, SceneCell, make_cell
 from benchmarks.trials import rms, rms_spread, share_spread, table, trials
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array, difference
@@ -89,7 +89,7 @@ def _rows(level: str, views: int, lens: str, count: int) -> list[list[str]]:
     ]
 
 
-def bound(cell: Cell, noise: Noise, free: bool) -> Array:
+def bound(cell: SceneCell, noise: CellNoise, free: bool) -> Array:
     """(6, 6) inverse Fisher information of X at the truth, the board's shape known, the lens unless free."""
     each = view_information(
         cell.views.mount,
@@ -104,7 +104,7 @@ def bound(cell: Cell, noise: Noise, free: bool) -> Array:
     return covariance_of(each.sum(axis=0)[:unknown, :unknown])[:6, :6]
 
 
-def solve(cell: Cell, free: bool) -> list[Solution]:
+def solve(cell: SceneCell, free: bool) -> list[Solution]:
     """One solution for each of BOARDS."""
     views, sigma = cell.views, None
     if free:

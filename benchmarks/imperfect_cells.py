@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
-from benchmarks.scene import MID, Noise, grid
+from benchmarks.scene import MID, CellNoise, grid
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
 from calibrate.kinematics import MODELS, DhDeltas, forward, inverse_nearest
 from calibrate.lens.intrinsics import LensModel, calibrate_intrinsics
@@ -112,7 +112,7 @@ def imperfect_cell(
     known: Known | None = None,
     model: LensModel = "plumb_bob",
     views: int = 25,
-    noise: Noise = MID,
+    noise: CellNoise = MID,
 ) -> ImperfectCell:
     """One cell. CalibrationError where its lens cannot be found."""
     wrong, known = wrong or Imperfection(), known or Known()

@@ -44,7 +44,7 @@ _BOARD_MOVED = pose(rotation_exp([0.0, 0.02, 0.05]), [0.03, -0.02, 0.01])
 
 
 @dataclass(frozen=True, eq=False)
-class Session:
+class MadeSession:
     """What a user would hand to `recordings import`."""
 
     description: dict[str, Any]
@@ -77,7 +77,7 @@ class Said:
 @dataclass(frozen=True)
 class Mistake:
     name: str
-    make: Callable[[Session], Session]
+    make: Callable[[MadeSession], MadeSession]
     causes: tuple[str, ...]
     """Hypotheses that are true of it. Some mistakes are the same to the data: inverted poses and the other
     mounting; in eye-to-hand a board that slipped on the flange and a changed TCP."""
@@ -121,14 +121,14 @@ def named_truly(mistake: Mistake, said: Said) -> bool:
     return re.search(mistake.words, said.text, re.IGNORECASE) is not None
 
 
-def _half(session: Session) -> slice:
+def _half(session: MadeSession) -> slice:
     return slice(len(session.poses) // 2, None)
 
 
-def _with_poses(change: Callable[[Session, Array], None]) -> Callable[[Session], Session]:
+def _with_poses(change: Callable[[MadeSession, Array], None]) -> Callable[[MadeSession], MadeSession]:
     """A mistake in the poses; `change` works on a copy of them."""
 
-    def make(session: Session) -> Session:
+    def make(session: MadeSession) -> MadeSession:
         poses = session.poses.copy()
         change(session, poses)
         return replace(session, poses=poses)
@@ -136,48 +136,48 @@ def _with_poses(change: Callable[[Session, Array], None]) -> Callable[[Session],
     return make
 
 
-def _swap(session: Session, poses: Array) -> None:
+def _swap(session: MadeSession, poses: Array) -> None:
     poses[list(_SWAPPED)] = poses[list(reversed(_SWAPPED))]
 
 
-def _millimetres(session: Session, poses: Array) -> None:
+def _millimetres(session: MadeSession, poses: Array) -> None:
     poses[:, :3, 3] *= 1e3
 
 
-def _invert(session: Session, poses: Array) -> None:
+def _invert(session: MadeSession, poses: Array) -> None:
     poses[:] = inverse(poses)
 
 
-def _vector_as_angles(session: Session, poses: Array) -> None:
+def _vector_as_angles(session: MadeSession, poses: Array) -> None:
     poses[:, :3, :3] = Rotation.from_euler("xyz", rotation_log(poses[:, :3, :3])).as_matrix()
 
 
-def _change_tcp(session: Session, poses: Array) -> None:
+def _change_tcp(session: MadeSession, poses: Array) -> None:
     poses[_half(session)] = poses[_half(session)] @ pose(np.eye(3), [0.0, 0.0, _TCP_M])
 
 
-def _move_board(session: Session, poses: Array) -> None:
+def _move_board(session: MadeSession, poses: Array) -> None:
     """The same as if, with these poses, the pictures showed the board elsewhere."""
     part = poses[_half(session)]
     in_hand = session.description["mount"] == "eye-in-hand"
     poses[_half(session)] = _BOARD_MOVED @ part if in_hand else part @ _BOARD_MOVED
 
 
-def _shift(session: Session) -> Session:
+def _shift(session: MadeSession) -> MadeSession:
     return replace(session, names=session.names[1:], poses=session.poses[:-1])
 
 
-def _w_first(session: Session) -> Session:
+def _w_first(session: MadeSession) -> MadeSession:
     return replace(session, quaternion_order=(3, 0, 1, 2))
 
 
-def _other_mount(session: Session) -> Session:
+def _other_mount(session: MadeSession) -> MadeSession:
     other = {"eye-in-hand": "eye-to-hand", "eye-to-hand": "eye-in-hand"}
     return replace(session, description=session.description | {"mount": other[session.description["mount"]]})
 
 
-def _size(factor: float) -> Callable[[Session], Session]:
-    def make(session: Session) -> Session:
+def _size(factor: float) -> Callable[[MadeSession], MadeSession]:
+    def make(session: MadeSession) -> MadeSession:
         board = dict(session.description["board"])
         for key in ("square_m", "marker_m"):
             if key in board:
@@ -187,11 +187,11 @@ def _size(factor: float) -> Callable[[Session], Session]:
     return make
 
 
-def _mirror(session: Session) -> Session:
+def _mirror(session: MadeSession) -> MadeSession:
     return replace(session, edit=dict.fromkeys(range(len(session.names)), lambda image: image[:, ::-1]))
 
 
-def _refocus(session: Session) -> Session:
+def _refocus(session: MadeSession) -> MadeSession:
     return replace(session, edit=dict.fromkeys(range(len(session.names))[_half(session)], _zoomed_out))
 
 
@@ -277,14 +277,16 @@ def _try(source: Path, mistake: Mistake) -> Said:
         return what_is_said(folder, Path(temporary) / "recording.mcap")
 
 
-def _session(source: Path) -> Session:
+def _session(source: Path) -> MadeSession:
     read_dataset(source / DATASET_FILE)  # an understandable error, should the set be broken
     rows, _ = read_poses(source)
     description = yaml.safe_load((source / "dataset.yaml").read_text())
-    return Session(description, [row.image for row in rows], np.array([row.base_from_flange for row in rows]))
+    return MadeSession(
+        description, [row.image for row in rows], np.array([row.base_from_flange for row in rows])
+    )
 
 
-def _write(session: Session, source: Path, folder: Path) -> None:
+def _write(session: MadeSession, source: Path, folder: Path) -> None:
     folder.mkdir()
     (folder / "dataset.yaml").write_text(yaml.safe_dump(session.description))
     with (folder / "poses.csv").open("w", newline="") as file:

@@ -49,7 +49,7 @@ class Spoilt:
 
 
 @dataclass(frozen=True)
-class Trial:
+class OutlierTrial:
     passed: bool
     reading: str
     """What was named; where nothing was solved, the error's own name."""
@@ -95,7 +95,7 @@ def run() -> str:
     return text + "\n\n" + table(HEADER, rows)
 
 
-def measure(task: tuple[str, float, Mount, int]) -> Trial:
+def measure(task: tuple[str, float, Mount, int]) -> OutlierTrial:
     name, share, mount, seed = task
     rng = np.random.default_rng([43, seed, MOUNTS.index(mount), int(100 * share), *name.encode()])
     with single_threaded_opencv():
@@ -109,7 +109,7 @@ def measure(task: tuple[str, float, Mount, int]) -> Trial:
         except CalibrationError as problem:
             named = problem.hypothesis or type(problem).__name__
             truly = named == spoilt.reading.value
-            return Trial(False, named, oracle, truly, bool(problem.hypothesis) and not truly)
+            return OutlierTrial(False, named, oracle, truly, bool(problem.hypothesis) and not truly)
         reading = solution.session.reading
         accepted = None
         if reading in (Reading.BOARD_MOVED, Reading.CAMERA_MOVED):
@@ -120,7 +120,7 @@ def measure(task: tuple[str, float, Mount, int]) -> Trial:
     truly, falsely = _named(solution, spoilt, set(bad.tolist()))
     covered = square <= solution.confidence_threshold
     ours = _error(solution.matrix, spoilt.X)
-    return Trial(passed, reading.value, oracle, truly, falsely, ours, covered, accepted)
+    return OutlierTrial(passed, reading.value, oracle, truly, falsely, ours, covered, accepted)
 
 
 def _bad_views(name: str, share: float, seed: int, rng: np.random.Generator) -> Places:
@@ -155,12 +155,12 @@ def _error(X: Array, truth: Array) -> tuple[float, float]:
     return float(np.linalg.norm(delta[:3])), float(np.linalg.norm(delta[3:]))
 
 
-def line(name: str, share: float, mount: Mount, found: Sequence[Trial]) -> list[str]:
+def line(name: str, share: float, mount: Mount, found: Sequence[OutlierTrial]) -> list[str]:
     plain = Reading.AS_RECORDED.value
     taken = [t for t in found if t.ours is not None and t.reading == plain]
     accepted = [t for t in found if t.accepted is not None]
 
-    def percent(count: int, of: Sequence[Trial]) -> str:
+    def percent(count: int, of: Sequence[OutlierTrial]) -> str:
         return f"{100 * count / len(of):.0f}" if of else "-"
 
     ours = np.array([t.ours for t in taken]).reshape(-1, 2)

@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from benchmarks.scene import Cell, Noise, make_cell, pose_arrays
+from benchmarks.scene import CellNoise, SceneCell, make_cell, pose_arrays
 from benchmarks.trials import rms, table, trials
 from calibrate.geometry import Array, difference
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, consecutive_pairs
@@ -31,7 +31,7 @@ from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.views import ViewSet
 
 TRIALS = 200
-NOISE = Noise(0.2, 0.88e-3, np.radians(0.064))
+NOISE = CellNoise(0.2, 0.88e-3, np.radians(0.064))
 _FITTED = 19
 _OPTIONS = SolveOptions(intrinsics_from_same_pictures=True, holdout=False, folds=False)
 
@@ -65,7 +65,7 @@ def run() -> str:
     return text + "\n\n" + table(header, rows)
 
 
-def _methods(cell: Cell) -> dict[str, Method]:
+def _methods(cell: SceneCell) -> dict[str, Method]:
     """Pairs: the paper's 18 for its own two methods, all pairs of the same 19 views for the others."""
     methods: dict[str, Method] = {
         "the true X": lambda views, pairs, seed: cell.X,

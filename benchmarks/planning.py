@@ -34,7 +34,7 @@ from calibrate.geometry import Array, difference, perturb, pose, rotation_exp
 from calibrate.handeye.corners import bent_points
 from calibrate.handeye.estimate import estimate
 from calibrate.handeye.information import MeasurementNoise
-from calibrate.handeye.observations import SHAPE, Observations, State, extent_of
+from calibrate.handeye.observations import SHAPE, CellState, Observations, extent_of
 from calibrate.handeye.priors import LensPrior, Priors
 from calibrate.kinematics import forward
 from calibrate.projection import project
@@ -181,7 +181,7 @@ def x_error(cell: RandomCell, flange: Array, rng: np.random.Generator) -> Array:
     points = np.einsum("nij,nkj->nki", C[:, :3, :3], board) + C[:, None, :3, 3]
     pixels = project(CAMERA, points).pixels + rng.normal(0, NOISE.pixel_px, (n, k, 2))
     # From where the boards truly were: starting where the arm says would set its noise to zero at first.
-    start = State(cell.X, cell.Y, C, CAMERA, np.zeros(len(SHAPE)), np.zeros(0))
+    start = CellState(cell.X, cell.Y, C, CAMERA, np.zeros(len(SHAPE)), np.zeros(0))
     found = estimate(replace(observed, pixels=pixels), start, _PRIORS)
     return difference(found.state.X, cell.X)
 

@@ -29,15 +29,15 @@ from recordings.schema.messages import CameraModel, Mount
 
 
 @dataclass(frozen=True)
-class Noise:
+class CellNoise:
     corner_px: float
     robot_m: float
     robot_rad: float
 
 
-LOW = Noise(0.1, 0.05e-3, np.radians(0.005))
-MID = Noise(0.2, 0.3e-3, np.radians(0.03))
-HIGH = Noise(0.5, 1e-3, np.radians(0.1))
+LOW = CellNoise(0.1, 0.05e-3, np.radians(0.005))
+MID = CellNoise(0.2, 0.3e-3, np.radians(0.03))
+HIGH = CellNoise(0.5, 1e-3, np.radians(0.1))
 LEVELS = {"low": LOW, "mid": MID, "high": HIGH}
 
 PAPER_CAMERA = CameraModel(
@@ -55,7 +55,7 @@ BLOG_X = pose(rotation_exp([0, np.radians(-15), 0]), [0.1, 0, 0])
 
 
 @dataclass(frozen=True, eq=False)
-class Cell:
+class SceneCell:
     views: ViewSet
     """As measured: noisy corners and robot poses, PnP done with `views.camera`."""
     X: Array
@@ -71,14 +71,14 @@ class Cell:
 def make_cell(
     rng: np.random.Generator,
     views: int = 25,
-    noise: Noise = LOW,
+    noise: CellNoise = LOW,
     *,
     scene: str = "paper",
     mount: Mount = "eye-in-hand",
     X: Array | None = None,
     refit_camera: bool = False,
     with_pnp: bool = True,
-) -> Cell:
+) -> SceneCell:
     """One cell; `X` None = the scene's own. `refit_camera`: intrinsics by Zhang from the same corners.
 
     with_pnp False: true board poses instead, for callers that find them themselves.
@@ -96,7 +96,7 @@ def make_cell(
     pixels = seen + rng.normal(size=seen.shape) * noise.corner_px
     known = zhang(board, pixels, camera) if refit_camera else camera
     seen_from = None if with_pnp else C
-    return Cell(view_set(measured, board, pixels, known, mount, seen_from), X, Y, camera, flange, C)
+    return SceneCell(view_set(measured, board, pixels, known, mount, seen_from), X, Y, camera, flange, C)
 
 
 def grid(columns: int, rows: int, square_m: float) -> Array:

@@ -37,7 +37,7 @@ Times = dict[str, list[float]]
 """Milliseconds since the call, by what happened."""
 
 
-class SessionContext:
+class LatencyRig:
     """One arm that swings its base joint to and fro."""
 
     def __init__(self, robot: UrRobot, admin: AdminClient) -> None:
@@ -97,7 +97,7 @@ class SessionContext:
         return next((e["monotonic_ns"] for e in entries if (e["source"], e["verb"]) == (source, verb)), None)
 
 
-async def trial(context: SessionContext, way: str, times: Times) -> None:
+async def trial(context: LatencyRig, way: str, times: Times) -> None:
     move = await context.cruise()
     robot = context.robot
     child, dashboard = robot._child, robot.dashboard
@@ -137,7 +137,7 @@ async def trial(context: SessionContext, way: str, times: Times) -> None:
     note(context, begun_ns, times)
 
 
-def note(context: SessionContext, begun_ns: int, times: Times) -> None:
+def note(context: LatencyRig, begun_ns: int, times: Times) -> None:
     shorter_ns, still_ns = context.deceleration_ns()
     times["first deceleration"].append((shorter_ns - begun_ns) / 1e6)
     times["rest"].append((still_ns - begun_ns) / 1e6)
@@ -148,7 +148,7 @@ async def measure(
 ) -> list[tuple[str, ...]]:
     robot = UrRobot(RobotConfig(model="UR10e", host=host, control=control), folder / "log")
     await robot.connect()
-    context = SessionContext(robot, admin)
+    context = LatencyRig(robot, admin)
     beating = asyncio.create_task(context.heart())
     rows, disturbed = [], 0
     for way in ("both", "control process", "dashboard", "no heartbeat"):

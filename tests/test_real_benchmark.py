@@ -10,7 +10,7 @@ from benchmarks.mistakes import MISTAKES, Mistake, Said, named_truly
 from benchmarks.real import charge, geometric_mean, left_out_error_m, paired_bootstrap
 from benchmarks.real_methods import calibration_rs, opencv, ours
 from benchmarks.real_sets import _GOOD_VIEWS, RealSet
-from benchmarks.scene import Noise, make_cell
+from benchmarks.scene import CellNoise, make_cell
 from calibrate.geometry import difference
 from recordings.schema.messages import BoardKind, BoardSpec, Mount
 
@@ -45,7 +45,7 @@ def test_good_views_are_numbered_within_their_set() -> None:
 
 @pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
 def test_every_method_answers_in_our_frames_and_predicts_the_board(mount: Mount) -> None:
-    cell = make_cell(np.random.default_rng(3), 14, Noise(0.02, 1e-5, 1e-5), mount=mount)
+    cell = make_cell(np.random.default_rng(3), 14, CellNoise(0.02, 1e-5, 1e-5), mount=mount)
     board, views = BoardSpec(BoardKind.CHESSBOARD, 7, 6, 0.025), cell.views
     answers = {"ours": ours(views, board)} | opencv(views, board) | calibration_rs(views, board)
     assert len(answers) == 1 + 2 * 7 + 1, "the lens is given: OpenCV's seven twice"

@@ -16,7 +16,7 @@ from calibrate.errors import BadViewsError
 from calibrate.geometry import Array
 from calibrate.handeye.corners import corner_distance, corner_residuals
 from calibrate.handeye.linear import GAIN, ROBOT_PRIOR_COUNT, STUDENT, WIDE, Fit, Linear, Scales, first_scales
-from calibrate.handeye.observations import Observations, State
+from calibrate.handeye.observations import CellState, Observations
 from calibrate.handeye.priors import Priors
 
 MAX_STEPS = 15
@@ -30,7 +30,7 @@ _SETTLED = 0.01
 
 @dataclass(frozen=True, eq=False)
 class Estimate:
-    state: State
+    state: CellState
     scales: Scales
     chances: Array
     """(n, K) of the classes, per view."""
@@ -69,7 +69,7 @@ class Estimate:
 
 def estimate(
     observed: Observations,
-    start: State,
+    start: CellState,
     priors: Priors,
     scales: Scales | None = None,
     wide: float = WIDE,
@@ -119,7 +119,7 @@ def estimate(
     )
 
 
-def corner_weights(observed: Observations, state: State, sigma_px: float) -> Array:
+def corner_weights(observed: Observations, state: CellState, sigma_px: float) -> Array:
     """Weigh corners (n, k) by Student's t about the model; 0 for padding."""
     if not observed.has_pixels:
         return observed.present

@@ -13,7 +13,7 @@ from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses
 from calibrate.handeye.axxb.robust import GlobalResult, solve_global
 from calibrate.handeye.estimate import Estimate, estimate
 from calibrate.handeye.metrics import require_motion
-from calibrate.handeye.observations import SHAPE, Moved, Observations, Places, State, observe_views
+from calibrate.handeye.observations import SHAPE, CellState, Moved, Observations, Places, observe_views
 from calibrate.handeye.poses import BoardPoses, PoseViews, agreed_start, fit_poses
 from calibrate.handeye.priors import Priors
 from calibrate.views import BoardView, ViewSet
@@ -59,7 +59,7 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
     start = agreed_start(H, BoardPoses.known(C), seed, certified.X)
     views, turned = set_boards_right(views, start.X, start.Y)
     observed, C = observe_views(views), views.camera_from_board
-    state = State(start.X, start.Y, C, views.camera, np.zeros(len(SHAPE)), np.zeros(0))
+    state = CellState(start.X, start.Y, C, views.camera, np.zeros(len(SHAPE)), np.zeros(0))
     found = _likeliest(observed, state, priors)
     require_plausible_noise(found)
     log_bayes, arm = None, table_motion(views) if with_table else None
@@ -77,7 +77,7 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
     return CellFit(views, turned, observed, priors, found, log_bayes, known, pairs, certified)
 
 
-def _likeliest(observed: Observations, start: State, priors: Priors) -> Estimate:
+def _likeliest(observed: Observations, start: CellState, priors: Priors) -> Estimate:
     """Try two starts of the noise; the narrow one, which finds bad views, must be clearly likelier."""
     found = estimate(observed, start, priors)
     narrow = estimate(observed, start, priors, wide=_NARROW)
@@ -107,7 +107,7 @@ def fit_moved(views: ViewSet, priors: Priors, poses: PoseViews, at: int, moved: 
         ) from None
     # The later value is the one that holds now: `second` is that of the views before.
     observed = replace(observe_views(views), later=~later, moved=moved)
-    state = State(
+    state = CellState(
         start.X[-1],
         start.Y[-1],
         views.camera_from_board,

@@ -15,7 +15,7 @@ import numpy as np
 
 from calibrate.geometry import Array, inverse
 from calibrate.handeye.linear import Linear
-from calibrate.handeye.observations import SHAPE, Layout, Observations, State, extent_of
+from calibrate.handeye.observations import SHAPE, CellState, Layout, Observations, extent_of
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from calibrate.projection import camera_matrix
 from recordings.schema.messages import CameraModel, Mount
@@ -61,7 +61,7 @@ def view_information(
         np.ones((n, k)),
         extent=extent_of(board_points),
     )
-    state = State(X, Y, C, camera, np.zeros(len(SHAPE)), np.zeros(0))
+    state = CellState(X, Y, C, camera, np.zeros(len(SHAPE)), np.zeros(0))
     linear = Linear.at(observed, state, observed.present, information=1.0)
     robot = np.repeat([noise.robot_m, noise.robot_rad], 3) ** 2
     W = np.linalg.inv(noise.pixel_px**2 * linear.B + np.diag(robot))
@@ -75,7 +75,7 @@ def view_information(
 
 def prior_information(camera: CameraModel, lens_known: bool, board: BoardTolerance) -> Array:
     """Compute the information (p, p) before any view: lens (`LensPrior`) and board's tolerance."""
-    state = State(np.eye(4), np.eye(4), np.zeros((0, 4, 4)), camera, np.zeros(len(SHAPE)), np.zeros(0))
+    state = CellState(np.eye(4), np.eye(4), np.zeros((0, 4, 4)), camera, np.zeros(len(SHAPE)), np.zeros(0))
     lens = LensPrior.given(camera) if lens_known else LensPrior.unknown(camera)
     N = Priors(lens, board).linearise(state, 0.0).N
     at = Layout.of(state)

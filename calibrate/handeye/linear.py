@@ -16,7 +16,13 @@ import numpy as np
 
 from calibrate.geometry import Array, perturb
 from calibrate.handeye.corners import CornerBlocks, linearise_corners
-from calibrate.handeye.observations import Layout, Observations, State, flange_derivatives, flange_residuals
+from calibrate.handeye.observations import (
+    CellState,
+    Layout,
+    Observations,
+    flange_derivatives,
+    flange_residuals,
+)
 from calibrate.handeye.priors import Quadratic
 
 _ROUNDS = 8
@@ -179,7 +185,7 @@ class Linear:
 
     @classmethod
     def at(
-        cls, observed: Observations, state: State, weights: Array, information: float = _INFORMATION
+        cls, observed: Observations, state: CellState, weights: Array, information: float = _INFORMATION
     ) -> Linear:
         """Linearise at `state`; weights (n, k), and information of a corner over a normal one's."""
         at, n = Layout.of(state), len(observed)

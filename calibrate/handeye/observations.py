@@ -44,7 +44,7 @@ class Observations:
     extent: Array = field(default_factory=lambda: np.array([[0.0, 0.0], [1.0, 1.0]]))
     """(2, 2) middle and half size of all corners seen, metres: what the board's bends refer to."""
     later: NDArray[np.bool_] | None = None
-    """(n,) the views after something was moved (`State.second`); None where nothing was."""
+    """(n,) the views after something was moved (`CellState.second`); None where nothing was."""
     moved: Moved = "board"
     """Camera (X has a second value) or board (Y has)."""
 
@@ -69,7 +69,7 @@ class Observations:
 
 
 @dataclass(frozen=True, eq=False)
-class State:
+class CellState:
     """A value of every unknown."""
 
     X: Array
@@ -95,15 +95,15 @@ class State:
             return np.where(later, self.second, self.X), self.Y
         return self.X, np.where(later, self.second, self.Y)
 
-    def of_views(self, places: Places) -> State:
+    def of_views(self, places: Places) -> CellState:
         """Select the board poses of these views."""
         return replace(self, C=self.C[places])
 
-    def with_boards(self, C: Array) -> State:
+    def with_boards(self, C: Array) -> CellState:
         """Replace the board poses by others (m, 4, 4)."""
         return replace(self, C=C)
 
-    def moved(self, step: Array, by_view: Array) -> State:
+    def moved(self, step: Array, by_view: Array) -> CellState:
         """Take a step (G,) in the order of `Layout`, and (n, 6) for C."""
         at = Layout.of(self)
         camera = with_intrinsics_vector(self.camera, intrinsics_vector(self.camera) + step[at.lens])
@@ -132,7 +132,7 @@ class Layout:
     size: int
 
     @classmethod
-    def of(cls, state: State) -> Layout:
+    def of(cls, state: CellState) -> Layout:
         lens = 12 + len(intrinsics_names(state.camera))
         shape = lens + len(SHAPE)
         table = shape + len(state.table)
@@ -173,7 +173,7 @@ def implied_flange(mount: Mount, X: Array, Y: Array, C: Array) -> Array:
     return np.asarray(X @ C @ inverse(Y))
 
 
-def flange_residuals(observed: Observations, state: State) -> Array:
+def flange_residuals(observed: Observations, state: CellState) -> Array:
     """Compute [δt, δφ] (n, 6) in base, implied minus recorded flange, without errors of the arm's table."""
     X, Y = state.poses(observed)
     miss = difference(implied_flange(observed.mount, X, Y, state.C), observed.flange)

@@ -38,7 +38,7 @@ from calibrate.handeye.metrics import (
     motion_errors,
     placed_boards,
 )
-from calibrate.handeye.observations import SHAPE, State, observe_views
+from calibrate.handeye.observations import SHAPE, CellState, observe_views
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from calibrate.handeye.profile_robust import solve_robust_profile
 from calibrate.handeye.solution import PeerResult, Solution, SolveOptions
@@ -128,7 +128,7 @@ def _reprojection_only(views: ViewSet) -> Array:
     shares = np.array([1.0, *[1e-12] * 3])
     scales = Scales(np.array([_EXACT, _EXACT]), 1.0, 1.0, 1.0, shares)
     Y = mean_pose(placed_boards(H, C, X))
-    start = State(X, Y, C, views.camera, np.zeros(len(SHAPE)), np.zeros(0))
+    start = CellState(X, Y, C, views.camera, np.zeros(len(SHAPE)), np.zeros(0))
     return estimate(observed, start, priors, scales, fit_scales=False).state.X
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from calibrate.geometry import Array
-from calibrate.handeye.observations import SHAPE, Layout, State
+from calibrate.handeye.observations import SHAPE, CellState, Layout
 from calibrate.projection import intrinsics_names, intrinsics_vector
 from recordings.schema.messages import BoardSpec, CameraModel
 
@@ -100,7 +100,7 @@ class Priors:
     lens: LensPrior
     board: BoardTolerance = field(default_factory=BoardTolerance)
 
-    def linearise(self, state: State, table: float) -> Quadratic:
+    def linearise(self, state: CellState, table: float) -> Quadratic:
         """Linearise around `state`, for errors of the kinematic table of size `table` (mm and mrad)."""
         at = Layout.of(state)
         N, right = np.zeros((at.size, at.size)), np.zeros(at.size)

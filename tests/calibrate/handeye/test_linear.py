@@ -8,9 +8,9 @@ import pytest
 from calibrate.geometry import perturb
 from calibrate.handeye.corners import corner_residuals
 from calibrate.handeye.linear import Linear, Scales, first_scales
-from calibrate.handeye.observations import Layout, State, flange_residuals, observe_views
+from calibrate.handeye.observations import CellState, Layout, flange_residuals, observe_views
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
-from tests.calibrate.cells import LENSES, MID, Noise, changed, make_cell, real_cell
+from tests.calibrate.cells import LENSES, MID, CellNoise, changed, make_cell, real_cell
 
 ONE_CLASS = np.array([1.0, 1e-300, 1e-300, 1e-300])
 VIEWS = 5
@@ -25,7 +25,7 @@ def setting(mount, moved=None, with_table=False):
         cell.views, [2], pixels=lambda v: v.pixels[:25], board_points=lambda v: v.board_points[:25]
     )
     observed = observe_views(views)
-    state = State(
+    state = CellState(
         perturb(cell.X, 1e-3 * rng.normal(size=6)),
         perturb(cell.Y, 1e-3 * rng.normal(size=6)),
         perturb(views.camera_from_board, 1e-4 * rng.normal(size=(VIEWS, 6))),
@@ -122,7 +122,7 @@ def test_noise_scales_come_out_as_they_went_in():
     for seed in range(12):
         cell = make_cell(np.random.default_rng(seed), 25, MID)
         observed = observe_views(cell.views)
-        state = State(cell.X, cell.Y, cell.views.camera_from_board, cell.camera, np.zeros(5), np.zeros(0))
+        state = CellState(cell.X, cell.Y, cell.views.camera_from_board, cell.camera, np.zeros(5), np.zeros(0))
         linear = Linear.at(observed, state, observed.present)
         prior = Priors(LensPrior.given(cell.camera, np.full(9, 1e-6)), BoardTolerance(1e-7, 1e-8))
         scales = first_scales(linear)
@@ -134,13 +134,13 @@ def test_noise_scales_come_out_as_they_went_in():
 
 
 def test_an_unclear_view_costs_information_but_never_more_than_it_tells():
-    cell = make_cell(np.random.default_rng(0), 12, Noise(0.1, 1e-4, 1e-4))
+    cell = make_cell(np.random.default_rng(0), 12, CellNoise(0.1, 1e-4, 1e-4))
     observed = observe_views(cell.views)
     for size in (0.0, 4.0, 100.0):
         flange = observed.flange.copy()
         flange[3] = perturb(flange[3], size * np.repeat([1e-4, 1e-4], 3))
         seen = replace(observed, flange=flange)
-        state = State(cell.X, cell.Y, cell.views.camera_from_board, cell.camera, np.zeros(5), np.zeros(0))
+        state = CellState(cell.X, cell.Y, cell.views.camera_from_board, cell.camera, np.zeros(5), np.zeros(0))
         linear = Linear.at(seen, state, seen.present)
         prior = Priors(LensPrior.given(cell.camera), BoardTolerance()).linearise(state, 0.0)
         solved = linear.solve(prior, first_scales(linear))

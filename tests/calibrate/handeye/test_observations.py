@@ -7,8 +7,8 @@ from hypothesis import strategies as st
 
 from calibrate.geometry import difference, perturb, pose, random_rotation
 from calibrate.handeye.observations import (
+    CellState,
     Observations,
-    State,
     flange_derivatives,
     flange_residuals,
     implied_flange,
@@ -58,5 +58,5 @@ def test_a_moved_cell_has_two_places_and_no_residual_at_either(mount, moved):
     )
     empty = np.zeros((6, 1, 3)), np.zeros((6, 1, 2)), np.zeros((6, 1))
     observed = Observations(mount, flange, *empty, later=later, moved=moved)
-    state = State(X, Y, C, CameraModel(640, 480), np.zeros(5), np.zeros(0), second)
+    state = CellState(X, Y, C, CameraModel(640, 480), np.zeros(5), np.zeros(0), second)
     np.testing.assert_allclose(flange_residuals(observed, state), 0, atol=1e-12)

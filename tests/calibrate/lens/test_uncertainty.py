@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from benchmarks.scene import Noise, make_cell, zhang
+from benchmarks.scene import CellNoise, make_cell, zhang
 from calibrate.geometry import Array, rotation_exp
 from calibrate.lens.intrinsics import fit_lens
 from calibrate.lens.model import undistort
@@ -39,7 +39,7 @@ def shift_after_best_turn(true: CameraModel, found: CameraModel, seen: Array, pl
 
 def test_it_is_the_scatter_of_repeated_calibrations() -> None:
     noise = 0.2
-    cell = make_cell(np.random.default_rng(4), 15, Noise(noise, 0.0, 0.0))
+    cell = make_cell(np.random.default_rng(4), 15, CellNoise(noise, 0.0, 0.0))
     board = cell.views.views[0].board_points
     exact = np.array([project_pixels(cell.camera, board @ C[:3, :3].T + C[:3, 3]) for C in cell.C])
     rng = np.random.default_rng(5)

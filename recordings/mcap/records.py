@@ -17,6 +17,7 @@ MAGIC = b"\x89MCAP0\r\n"
 RECORD_HEAD = struct.Struct("<BQ")
 MESSAGE_HEAD = struct.Struct("<HIQQ")
 FOOTER = struct.Struct("<QQI")
+_CHUNK_HEAD = struct.Struct("<QQQI")
 FOOTER_BYTES = RECORD_HEAD.size + FOOTER.size
 
 
@@ -162,7 +163,7 @@ def parse_channel(content: memoryview) -> Channel:
 def parse_chunk_head(content: memoryview) -> ChunkHead:
     """Everything before the records; they must fill the rest of the content exactly."""
     cursor = Cursor(content)
-    start, end, size, crc = cursor.uint(8), cursor.uint(8), cursor.uint(8), cursor.uint(4)
+    start, end, size, crc = _CHUNK_HEAD.unpack(cursor.bytes(_CHUNK_HEAD.size))
     compression = cursor.text()
     stored = cursor.uint(8)
     offset = cursor.position

@@ -18,8 +18,8 @@ from station.simulation.controller.urscript import (
     ScriptRuntimeError,
     ScriptSyntaxError,
     Thread,
-    parse,
 )
+from station.simulation.controller.urscript_parser import parse
 
 KILLED_RAD_S2 = 40.0
 """Deceleration of an arm whose moving thread was killed and that nobody stops: very sudden."""

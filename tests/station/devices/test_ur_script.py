@@ -28,7 +28,7 @@ from station.devices.ur_script import (
 from station.simulation.controller.programs import Upload
 from station.simulation.controller.robot import SimulatedRobot
 from station.simulation.controller.state import Journal, Settings
-from station.simulation.controller.urscript import PURE, parse
+from station.simulation.controller.urscript_parser import parse
 from station.simulation.launch import AdminClient, SimulatedController
 
 HOME = (0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0)
@@ -44,14 +44,7 @@ MAY_CALL = {
 
 
 def test_the_script_calls_nothing_else_than_this() -> None:
-    class Anything(dict[str, Callable[..., None]]):
-        def __contains__(self, name: object) -> bool:
-            return True
-
-        def __getitem__(self, name: str) -> Callable[..., None]:
-            return lambda *arguments, **named: None
-
-    program = parse(script(1), Anything.fromkeys([*MAY_CALL, *PURE], lambda *arguments, **named: None))
+    program = parse(script(1), dict.fromkeys(MAY_CALL, lambda *arguments, **named: None))
     assert {call.name for call in program.all_calls()} == MAY_CALL
 
 
@@ -65,10 +58,10 @@ def test_the_script_waits_as_long_as_the_watchdog_would() -> None:
 class Registers:
     """A controller in which the script runs; packets are written by hand."""
 
-    def __init__(self, left_by_others: int = SEQUENCE, model: str = "UR10") -> None:
+    def __init__(self, left_by_others: int = SEQUENCE, verb: Verb = Verb.NONE, model: str = "UR10") -> None:
         self.robot = SimulatedRobot(Settings(model=model, start_joints_rad=HOME), Journal())
         self.sequence, self.keepalive = left_by_others, 5
-        self.verb, self.numbers = Verb.NONE, (0.0,) * 8
+        self.verb, self.numbers = verb, (0.0,) * 8
         self.packet()
         self.robot.upload(Upload("station_control", script(SEQUENCE)))
         self.run(0.1)
@@ -127,8 +120,9 @@ def test_nothing_moves_at_the_start() -> None:
     assert made.plays and made.state is State.WAITING and made.robot.arm.command == HOME
 
 
-def test_registers_that_somebody_else_left_are_not_obeyed() -> None:
-    made = Registers(left_by_others=77)
+@pytest.mark.parametrize("verb", [Verb.NONE, Verb.ARM, Verb.MOVE])
+def test_registers_that_somebody_else_left_are_not_obeyed(verb: Verb) -> None:
+    made = Registers(left_by_others=77, verb=verb)
     assert not made.plays and made.robot.arm.command == HOME
 
 

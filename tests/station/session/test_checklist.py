@@ -26,6 +26,26 @@ async def test_a_robot_that_is_there_is_ok(rig: Rig) -> None:
 
 
 @pytest.mark.parametrize(
+    ("path", "source", "installed", "state"),
+    [
+        ("ur_rtde", "real", True, "ok"),
+        ("ur_rtde", "real", False, "failed"),
+        ("script", "real", False, "warning"),  # not yet accepted
+        ("script", "simulated", False, "ok"),
+        ("", "playback", False, "skipped"),
+    ],
+)
+async def test_what_drives_the_arm_is_said(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, path: str, source: str, installed: bool, state: str
+) -> None:
+    monkeypatch.setattr("station.devices.ur.library_installed", lambda: installed)
+    rig.arm.control_path = path
+    object.__setattr__(rig.session.context.cell, "source", source)
+    found = next(c for c in await checklist(rig.session.context, {}) if c.name == "control")
+    assert found.state == state and bool(found.remedy) == (state in ("failed", "warning"))
+
+
+@pytest.mark.parametrize(
     ("host", "remedy"),
     [
         ("", "give robot.host in the configuration"),

@@ -175,15 +175,15 @@ def test_ctrl_c_at_the_question_is_a_no_at_once(monkeypatch: pytest.MonkeyPatch)
     [
         (("serve",), 2, "usage"),
         (("serve", "--simulate", "--scene", "moon"), 2, "usage"),
-        (("serve", "--config", "absent.yaml"), 2, "configuration"),
+        (("serve", "--config", "absent.yaml"), 2, "unreadable-config"),
         (("status", "--socket", "/nowhere/s"), 1, "no-daemon"),
         (("capture",), 2, "usage"),
-        (("capture", "--plan", "absent.yaml"), 2, "configuration"),
+        (("capture", "--plan", "absent.yaml"), 2, "unreadable-plan"),
         (("tui",), 1, "no-terminal"),
         (("demo", "--out", __file__), 2, "not-a-folder"),
         (("plan", "--start", "1,2,3"), 2, "usage"),
         (("plan", "--check", "a", "--from-list", "b"), 2, "usage"),
-        (("bootstrap", "--config", "absent.yaml"), 2, "configuration"),
+        (("bootstrap", "--config", "absent.yaml"), 2, "unreadable-config"),
     ],
 )
 def test_what_a_person_can_cause_has_a_code(args: tuple[str, ...], exit_code: int, code: str) -> None:

@@ -43,7 +43,7 @@ from station.cell.errors import LimitError
 from station.cell.limits import allowed_speed, check_plan, sample_path
 from station.cell.plan import Plan, PlannedPose
 from station.cell.scene import Scene, guess_from, scene_of
-from station.plan.belief import Glimpse, improved_config
+from station.plan.belief import BootstrapView, improved_config
 from station.plan.bootstrap import next_move
 from station.plan.choose import choose, informations, objective_for
 from station.plan.planner import PlanOptions, candidate_pool, plan_scene
@@ -196,11 +196,11 @@ def _bootstrap(cell: RandomCell, result: CellResult, rng: np.random.Generator, s
     wrong = pose(rotation_exp(unit() * np.deg2rad(30)) @ cell.X[:3, :3], cell.X[:3, 3] + 0.1 * unit())
     config = msgspec.structs.replace(cell.config, camera_guess=guess_from(wrong, 0.06, 0.3), board_guess=None)
 
-    def glimpse(joints: Sequence[float]) -> Glimpse:
+    def glimpse(joints: Sequence[float]) -> BootstrapView:
         C = cell.camera_from_board(forward(ARM, joints))
         result.boot_unseen += not shows_board(C)
         seen = perturb(C, rng.normal(size=6) * np.repeat([4e-4, 8e-4], 3))
-        return Glimpse(np.array(joints), seen)
+        return BootstrapView(np.array(joints), seen)
 
     def require_passing(pose: PlannedPose) -> None:
         """LimitError where the daemon, which knows the wrong guess only, would refuse."""
@@ -209,7 +209,7 @@ def _bootstrap(cell: RandomCell, result: CellResult, rng: np.random.Generator, s
         if problems:
             raise LimitError(f"the daemon would refuse: {problems[0]}")
 
-    glimpses: list[Glimpse] = []
+    glimpses: list[BootstrapView] = []
     try:
         require_passing(PlannedPose("taught", tuple(cell.start)))
         glimpses.append(glimpse(cell.start.tolist()))

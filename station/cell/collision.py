@@ -40,7 +40,7 @@ _SIDEWAYS_M = {
 
 @dataclass(frozen=True, eq=False)
 class CellGeometry:
-    """What the checks need to know of a cell. Frames: `base` for obstacles, `flange` for solids."""
+    """A cell as the checks know it. Frames: `base` for obstacles, `flange` for solids."""
 
     model: RobotModel
     limits: LimitsConfig
@@ -52,7 +52,7 @@ class CellGeometry:
     watched_m: tuple[tuple[float, float, float], ...] = ()
     """Further points in `flange` (camera centre, board corners) that speed and workspace limits hold for."""
     mount: Mount | None = None
-    """What a plan must be made for; None: not known."""
+    """Mounting that a plan must be made for; None: not known."""
     body_names: tuple[str, ...] = field(init=False)
 
     def __post_init__(self) -> None:

@@ -82,9 +82,9 @@ class CameraConfig(Section, frozen=True):
     playback_pace: float = 0.0
     """playback: 0 = as fast as asked, 1 = at its own pace."""
     model: CameraModel | None = None
-    """Known intrinsics; None = found from the session's pictures."""
+    """Known intrinsics; None = found from the session's images."""
     model_is_rough: bool = False
-    """`model` is only good enough to plan with; the lens is found from the session's pictures."""
+    """`model` is only good enough to plan with; the lens is found from the session's images."""
 
 
 class TriggerConfig(Section, frozen=True):
@@ -113,7 +113,7 @@ class Plane(Section, frozen=True):
 
 class LimitsConfig(Section, frozen=True):
     speed_m_s: float = 0.25
-    """Of any modelled point of arm, tool or camera; code caps it at 0.25."""
+    """Speed of any modelled point of arm, tool or camera; code caps it at 0.25."""
     joint_speed_rad_s: float = 0.6
     joint_acceleration_rad_s2: float = 1.0
     joint_step_rad: float = 3.2

@@ -68,7 +68,7 @@ def _report(path: Path, problems: list[str]) -> ConfigError:
 
 
 def _meaning_problems(config: StationConfig) -> Iterator[str]:
-    """What types cannot say: ranges, and things that must fit each other."""
+    """Finds what types cannot say: ranges, and things that must fit each other."""
     limits, robot, camera = config.limits, config.robot, config.camera
     if robot.model not in MODELS:
         yield f"robot.model: '{robot.model}' is not known; one of {', '.join(MODELS)}"
@@ -123,7 +123,7 @@ def _number_problems(config: StationConfig) -> Iterator[str]:
 
 
 def _solid_problems(config: StationConfig) -> Iterator[str]:
-    """Of what hangs on the flange: a body that is too thin would be no body to the checks."""
+    """Finds bodies on the flange that are too thin to be bodies to the checks."""
     for solid in config.limits.solids:
         if not solid.radius_m > 0:
             yield f"limits.solids: '{solid.name}': radius_m must be above 0, not {solid.radius_m}"

@@ -58,7 +58,7 @@ class MoveCheck:
     name: str
     problems: tuple[Problem, ...]
     joint_speed_rad_s: float
-    """Of the leading joint: with it no modelled point exceeds the speed limit."""
+    """Speed of the leading joint: with it no modelled point exceeds the speed limit."""
     joint_acceleration_rad_s2: float
     duration_s: float
     path_m: float
@@ -66,9 +66,9 @@ class MoveCheck:
     step_rad: float
     """Turn of the leading joint."""
     top_speed_m_s: float
-    """Of the fastest modelled point, with the trapezoid's true peak."""
+    """Speed of the fastest modelled point, with the trapezoid's true peak."""
     margin_m: float
-    """Smallest distance to any limit along the way."""
+    """Smallest distance to any limit along the path."""
 
 
 @dataclass(frozen=True)
@@ -197,7 +197,7 @@ def leaving(gaps: Array) -> Array:
     """Margins (..., samples, c) along paths, where an arm that already stands too close may move away.
 
     A margin that starts negative counts as zero for as long as it only grows, and grows fast enough to be
-    gone at the end of the way: sliding along a wall is no retreat.
+    gone at the end of the path: sliding along a wall is no retreat.
     """
     growing = np.diff(gaps, axis=-2, prepend=gaps[..., :1, :]) > -1e-4
     left = 1.0 - np.linspace(0.0, 1.0, gaps.shape[-2])[:, None]

@@ -11,7 +11,7 @@ from recordings.schema.messages import Matrix4, Mount, Vector6
 
 
 class ExpectedView(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
-    """How the board should look from here, by the guess the plan was made with."""
+    """Expected look of the board from here, by the guess the plan was made with."""
 
     distance_m: float
     tilt_rad: float
@@ -19,7 +19,7 @@ class ExpectedView(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unkno
     roll_rad: float
     centre_px: tuple[float, float]
     coverage: float
-    """Share of the picture that the board's outline fills, 0…1."""
+    """Share of the image that the board's outline fills, 0…1."""
 
 
 class PlannedPose(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_fields=True):
@@ -47,9 +47,9 @@ class Plan(msgspec.Struct, frozen=True, omit_defaults=True, forbid_unknown_field
     seed: int | None = None
     note: str = ""
     motion: Literal["stops", "sweep"] = "stops"
-    """sweep: the arm swings through the poses without a stop for a picture, while the camera runs."""
+    """sweep: the arm swings through the poses without a stop for a image, while the camera runs."""
 
 
 def plan_sha256(plan: Plan) -> str:
-    """What a go is bound to: hash of everything that decides the motion, independent of file layout."""
+    """Hash of everything that decides the motion, independent of file layout: an approval is bound to it."""
     return hashlib.sha256(msgspec.json.encode(plan, order="deterministic")).hexdigest()

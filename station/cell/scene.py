@@ -1,4 +1,4 @@
-"""What the planner believes of a cell: camera mount, board place and solids, from the configuration."""
+"""The cell as configured: camera and board pose with their uncertainty, solids and obstacles."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from station.cell.plan import Plan
 
 _CAMERA_BODY_M, _CAMERA_RADIUS_M = 0.05, 0.035
 _DOUBT = 3.0
-"""What hangs on a guess is thickened by so many sigmas: nothing else keeps a wrong mount off the arm."""
+"""Sigmas by which a body on a guess is thickened: nothing else keeps a wrong mount off the arm."""
 _MOST_DOUBT_M = 0.03
 """A camera thicker than this could not stand beside any wrist; bootstrap is for guesses that are worse."""
 _DRAWS = 2000
@@ -216,7 +216,7 @@ def covers_its_doubt(guess: PoseGuess) -> bool:
 
 
 def camera_radius_m(sigma_m: float) -> float:
-    """Of a camera on the flange whose place is known to `sigma_m`."""
+    """Radius of a camera on the flange whose place is known to `sigma_m`."""
     return _CAMERA_RADIUS_M + _thicker_m(sigma_m)
 
 

@@ -29,7 +29,7 @@ from station.cell.socket_folder import default_socket
 from station.cli.console import Headless, Socket, err, out
 from station.cli.session import load_into, session
 from station.operate.motion import wait_until_idle
-from station.plan.belief import Glimpse, believe, improved_config
+from station.plan.belief import BootstrapView, believe, improved_config
 from station.plan.bootstrap import MOVES_MAX, MOVES_MIN, next_move
 from station.protocol.client import Client
 from station.protocol.verbs import Purpose
@@ -99,12 +99,12 @@ def bootstrap_command(
 
 def _make_moves(
     cell: StationConfig, socket: Path | None, headless: bool, config_sha256: str = ""
-) -> list[Glimpse]:
+) -> list[BootstrapView]:
     """The taught view and those after each move: each a session of its own, with its own approval."""
     path = socket or default_socket()
     taught = asyncio.run(_standing(path, cell.mount))
     move: PlannedPose | None = PlannedPose("taught", taught, why="an image where the arm stands")
-    glimpses: list[Glimpse] = []
+    glimpses: list[BootstrapView] = []
     views: ViewSet | None = None
     while move is not None:
         before = glimpses[-1].joints_rad if glimpses else np.array(taught)
@@ -119,7 +119,7 @@ def _make_moves(
         err.print(Text.assemble((move.name, "bold"), f"{of}: {move.why}"))
         joints, views = _take(cell, move, views, path, headless, config_sha256)
         glimpses = [
-            Glimpse(q, C)
+            BootstrapView(q, C)
             for q, C in zip(
                 [*(g.joints_rad for g in glimpses), joints],
                 solve_pnp(views, cell.board).camera_from_board,

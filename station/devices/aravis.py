@@ -61,7 +61,7 @@ class AravisCamera:
         return self.identity
 
     async def settings(self) -> dict[str, Any]:
-        """As the camera reports them now."""
+        """Reads the settings back from the camera."""
         async with self._busy:
             return await self._run(lambda: self._live().settings())
 
@@ -71,7 +71,7 @@ class AravisCamera:
             return self._newest
 
     async def glimpse(self) -> Image | None:
-        """Triggered as every picture is, by the box too."""
+        """Triggered as every image is, by the box too."""
         async with self._busy:
             return await self._one(_GLIMPSE_S, sequenced=False)
 
@@ -92,7 +92,7 @@ class AravisCamera:
         )
 
     async def preview(self) -> Image | None:
-        """A fresh picture where the camera is idle and can be triggered by software, else the newest one."""
+        """A fresh image where the camera is idle and can be triggered by software, else the newest one."""
         if self._busy.locked() or self._config.trigger == "hardware":
             return self._newest
         async with self._busy:

@@ -25,9 +25,9 @@ STREAM_BUFFERS = 128
 FRAME_RETENTION_S = 0.5
 """So long a frame may wait for its last packets before it is given up as incomplete."""
 SOCKET_BUFFER_BYTES = 32 * 2**20
-"""Of packets that wait in the kernel; it gives what net.core.rmem_max permits."""
+"""Size of the kernel's packet queue; it gives what net.core.rmem_max permits."""
 _STREAM_PRIORITY = -15
-"""Of Aravis's receiving thread: the kernel keeps a fifth of a second of packets, then frames are lost."""
+"""Niceness of Aravis's receiving thread: the kernel keeps a fifth of a second of packets."""
 _LATCH_WAIT_S = 0.02
 _POP_S = 0.1
 """So often a waiting capture looks whether the camera was lost."""
@@ -109,7 +109,7 @@ class GenicamDevice:
             _hurry(_threads() - before)
             if self._camera.is_gv_device():
                 self._stream.set_property("frame-retention", round(FRAME_RETENTION_S * 1e6))
-                # By itself Aravis asks for the size of one picture, whatever the system would permit.
+                # By itself Aravis asks for the size of one image, whatever the system would permit.
                 self._stream.set_property("socket-buffer", self._aravis.GvStreamSocketBuffer.FIXED)
                 self._stream.set_property("socket-buffer-size", SOCKET_BUFFER_BYTES)
             payload = self._camera.get_payload()
@@ -343,7 +343,7 @@ def apply_settings(aravis: Any, camera: Any, config: CameraConfig) -> Region:
 
 
 def read_settings(camera: Any) -> dict[str, Any]:
-    """As the camera tells them now; JSON types only."""
+    """Reads the settings back; JSON types only."""
     x, y, width, height = _region(camera)
     return {
         "pixel_format": camera.get_pixel_format_as_string(),

@@ -1,4 +1,4 @@
-"""What the session needs of a device. Real, simulated and played-back devices are equals behind these."""
+"""The protocols behind which real, simulated and played-back devices are equals for the session."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from station.devices.frames import CameraCounts
 
 
 class Robot(Protocol):
-    """An arm. Connecting is read-only; only `start_control` (by a go) replaces the robot's program."""
+    """An arm. Connecting is read-only; only `start_control` (by an approval) replaces the robot's program."""
 
     @property
     def identity(self) -> RobotIdentity: ...
@@ -29,7 +29,7 @@ class Robot(Protocol):
 
     @property
     def notice(self) -> str:
-        """What a person should know while a move is under way, though it is no fault; empty = nothing."""
+        """Notice to a person while a move is under way, though it is no fault; empty = nothing."""
 
     @property
     def remote(self) -> bool | None:
@@ -54,7 +54,7 @@ class Robot(Protocol):
         """Raises RobotError for what speaks against capturing now: safety stop, stale state, TCP changed."""
 
     async def start_control(self) -> None:
-        """Spawns the control child. Only in answer to a go. RobotError with remedy when refused."""
+        """Spawns the control child. Only in answer to a motion approval. RobotError when refused."""
 
     async def move(self, joints_rad: Sequence[float], speed_rad_s: float, acceleration_rad_s2: float) -> None:
         """Moves the joints and returns when arrived. RobotError, SafetyStopError, StaleStateError."""
@@ -89,30 +89,30 @@ class Camera(Protocol):
         """Since it was made. At once, from any thread."""
 
     async def settings(self) -> dict[str, Any]:
-        """As the camera reports them now, for the recording; JSON types only. Raises CameraError.
+        """Settings that the camera reports now, for the recording; JSON types only. Raises CameraError.
 
-        `region`, where it has one: x, y, width, height of its pictures.
+        `region`, where it has one: x, y, width, height of its images.
         """
 
     async def glimpse(self) -> Image | None:
-        """A picture exposed after this call, of any size, that takes no number and is never recorded.
+        """A image exposed after this call, of any size, that takes no number and is never recorded.
 
-        None where there is no such thing (played pictures). Raises CameraError within about a second.
+        None where there is no such thing (played images). Raises CameraError within about a second.
         """
 
     async def preview(self) -> Image | None:
-        """A recent picture for the screen; None when there is none. Never recorded."""
+        """A recent image for the screen; None when there is none. Never recorded."""
 
     async def close(self) -> None: ...
 
 
 @runtime_checkable
 class StreamingCamera(Protocol):
-    """A camera that can also send pictures at its own pace."""
+    """A camera that can also send images at its own pace."""
 
     @property
     def free_running(self) -> bool:
-        """It does so; else every picture is triggered."""
+        """It does so; else every image is triggered."""
 
     async def stream(self, callback: Callable[[Image], None], stop: threading.Event) -> None:
         """Every frame, in order, from a thread of its own, until `stop` is set. Raises CameraError."""

@@ -25,7 +25,7 @@ class Cell:
     """`real` only when arm and camera both are."""
     trigger: Trigger | None = None
     config_text: bytes = b""
-    """As it was read, for the recording."""
+    """The file's bytes, for the recording."""
     attachments: dict[str, bytes] = field(default_factory=dict)
     """More for every recording of this cell: a simulated one's truth."""
     plan: Plan | None = None
@@ -47,7 +47,7 @@ class Cell:
 
     @property
     def camera_model(self) -> CameraModel | None:
-        """Trustworthy intrinsics only; None where they are to be found from the pictures."""
+        """Trustworthy intrinsics only; None where they are to be found from the images."""
         return None if self.config.camera.model_is_rough else self.config.camera.model
 
 
@@ -72,7 +72,7 @@ def _camera(config: StationConfig, trigger: Trigger | None) -> tuple[Camera, Sou
         from station.devices.aravis import AravisCamera
 
         return AravisCamera(config.camera, trigger), "real"
-    # A recorded or rendered picture beside an arm that really moves would be a wrong calibration.
+    # A recorded or rendered image beside an arm that really moves would be a wrong calibration.
     raise ConfigError(
         f"camera.driver '{config.camera.driver}' shows no real image and never runs beside a real arm",
         code="unreal-camera",

@@ -18,7 +18,7 @@ RETAKE = "Take this pose again."
 
 
 class StreamCounts(msgspec.Struct, frozen=True):
-    """What the network did to a camera's frames since it was opened."""
+    """The network's effects on a camera's frames since it was opened."""
 
     complete: int = 0
     incomplete: int = 0
@@ -31,7 +31,7 @@ class StreamCounts(msgspec.Struct, frozen=True):
 
 
 class CameraCounts(msgspec.Struct, frozen=True):
-    """What became of a camera's frames, for the status."""
+    """Counts of a camera's frames, for the status."""
 
     frames: int = 0
     """Came, glimpses and previews included"""
@@ -47,7 +47,7 @@ def next_frame_id(frame_id: int) -> int:
 
 
 def frames_between(earlier_id: int, later_id: int) -> int:
-    """How many frames `later_id` comes after `earlier_id`: 1 for the next one, 0 for the same."""
+    """Number of frames from `earlier_id` to `later_id`: 1 for the next one, 0 for the same."""
     return (later_id - earlier_id) % LAST_FRAME_ID
 
 
@@ -66,7 +66,7 @@ class FrameCounter:
         self.seen = 0
         """Accepted, previews included."""
         self.paired = 0
-        """Of them, those that a pulse of the trigger box was counted for."""
+        """Those accepted for a pulse of the trigger box."""
         self._last_id: int | None = None
         self._last_pulse: int | None = None
 

@@ -1,4 +1,4 @@
-"""Pixel formats as GenICam names them: bytes from the wire to pictures, and back for the simulated camera."""
+"""Pixel formats as GenICam names them: bytes from the wire to images, and back for the simulated camera."""
 
 from __future__ import annotations
 
@@ -94,7 +94,7 @@ def _unpack(raw: NDArray[np.uint8], count: int, pixel_format: str) -> NDArray[np
 
 
 def encode(grey: NDArray[np.uint8], pixel_format: str) -> bytes:
-    """A grey picture as a camera would send it; colour formats carry grey."""
+    """A grey image as a camera would send it; colour formats carry grey."""
     wide = grey.astype(np.uint16)
     if bits_per_pixel(pixel_format) == 8:
         return grey.tobytes()

@@ -1,4 +1,4 @@
-"""Plays pictures as a camera, and a recording as camera and robot together.
+"""Plays images as a camera, and a recording as camera and robot together.
 
 Nothing played is ever taken for real: its driver is `playback`, and so is the source of what is recorded.
 """
@@ -50,7 +50,7 @@ _HOST_CLOCK = ClockFit(
     samples=1,
     span_s=0.0,
 )
-"""Played pictures are stamped by the host's own clock."""
+"""Played images are stamped by the host's own clock."""
 PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff", ".pgm", ".ppm")
 VIDEO_SUFFIXES = (".avi", ".mp4", ".mkv", ".mov", ".mpg", ".mpeg")
 FOLDER_RATE_HZ = 10.0
@@ -68,7 +68,7 @@ class PlayedSource(NamedTuple):
     name: str
     identity: CameraIdentity
     frames: Iterator[Played]
-    """In order; raises CameraError at a picture that cannot be read."""
+    """In order; raises CameraError at a image that cannot be read."""
 
 
 def open_source(path: Path) -> PlayedSource:
@@ -180,7 +180,7 @@ class PlaybackCamera:
         return self.identity
 
     async def capture(self, timeout_s: float = 5.0) -> Image:
-        """The next picture; CameraError at the end, or when it is not due within `timeout_s`."""
+        """The next image; CameraError at the end, or when it is not due within `timeout_s`."""
         async with self._busy:
             if self._source is None:
                 raise CameraError("nothing is being played", code="not-open", remedy="Open the camera first.")
@@ -212,11 +212,11 @@ class PlaybackCamera:
         return {"device": self._config.device, "pace": self._config.playback_pace}
 
     async def glimpse(self) -> Image | None:
-        """None: a played picture was taken once, how it moved then cannot be seen in it."""
+        """None: a played image was taken once, how it moved then cannot be seen in it."""
         return None
 
     async def preview(self) -> Image | None:
-        """The newest picture; with a robot, what it looks at now."""
+        """The newest image; with a robot, what it looks at now."""
         if self._robot is not None and self._source is not None:
             try:
                 return await asyncio.to_thread(self._robot.picture)
@@ -248,7 +248,7 @@ class PlaybackCamera:
 class PlaybackRobot:
     """`station.devices.base.Robot` that stands where the recorded arm stood.
 
-    It can move only to joints that the recording has a picture from.
+    It can move only to joints that the recording has a image from.
     """
 
     def __init__(self, recording: Path) -> None:
@@ -281,7 +281,7 @@ class PlaybackRobot:
         return Plan(self.identity.model, self._recording.info.mount, poses, note="playback")
 
     def picture(self) -> Image:
-        """Of the view the arm stands at; CameraError between two, or when it cannot be decoded."""
+        """Image of the view the arm stands at; CameraError between two, or when it cannot be decoded."""
         view, moving = self._standing()
         if moving:
             raise CameraError("playback has images only from where the recorded arm stood", code="no-image")
@@ -375,7 +375,7 @@ class PlaybackRobot:
             return self._to, self._fraction(time.monotonic()) < 1
 
     def _fraction(self, at_s: float) -> float:
-        """Of the current move, 0 … 1."""
+        """Share of the current move, 0 … 1."""
         if self._halted_at is not None:
             return self._halted_at
         return float(np.clip((at_s - self._move_start_s) / MOVE_S, 0.0, 1.0))

@@ -79,7 +79,7 @@ class SafetyStatus(IntFlag):
 
 
 class RuntimeState(IntEnum):
-    """Of the program; it runs only when PLAYING."""
+    """State of the program; it runs only when PLAYING."""
 
     STOPPING = 0
     STOPPED = 1
@@ -101,7 +101,7 @@ class RobotStatusBits(IntFlag):
 @dataclass(frozen=True)
 class DataType:
     code: str
-    """Of `struct`, for one element."""
+    """`struct`'s code for one element."""
     count: int = 1
 
 
@@ -156,7 +156,7 @@ class Recipe:
     names: tuple[str, ...]
     types: tuple[str, ...]
     packer: struct.Struct = field(init=False, repr=False, compare=False)
-    """Of a whole data packet: size, type, recipe id, then every element in order."""
+    """A whole data packet: size, type, recipe id, then every element in order."""
 
     def __post_init__(self) -> None:
         refused = [n for n, t in zip(self.names, self.types, strict=True) if t not in DATA_TYPES]
@@ -182,7 +182,7 @@ class Recipe:
         return self.packer.unpack(HEADER.pack(self.packer.size, PacketType.DATA) + payload)[3:]
 
     def unpack(self, payload: bytes) -> dict[str, Value]:
-        """As `unpack_elements`, by name; vectors as tuples."""
+        """Elements by name; vectors as tuples."""
         elements = self.unpack_elements(payload)
         values: dict[str, Value] = {}
         start = 0

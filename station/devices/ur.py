@@ -1,4 +1,4 @@
-"""A Universal Robots arm behind `station.devices.base.Robot`: one control process per go, two ways to stop.
+"""A Universal Robots arm behind `devices.base.Robot`: one control process per approval, two ways to stop.
 
 Everything here runs in one event loop and returns to it within milliseconds; the state stream has its own
 thread, ur_rtde its own process. Safety rules and what each fault does: docs/safety.md, docs/faults.md.
@@ -95,7 +95,7 @@ class UrRobot(UrLink):
     def __init__(self, config: RobotConfig, log_dir: Path) -> None:
         super().__init__(config)
         self.notice = ""
-        """What a person should know while a move is under way, though it is no fault; empty = nothing."""
+        """Notice to a person while a move is under way, though it is no fault; empty = nothing."""
         self._log_path = log_dir / "control.log"
         self._child: ControlChild | None = None
         self.control = False
@@ -118,7 +118,7 @@ class UrRobot(UrLink):
     async def start_control(self) -> None:
         """Spawns the control process, which loads its program; returns when that heard a first heartbeat.
 
-        Only in answer to a go. Raises RobotError.
+        Only in answer to a motion approval. Raises RobotError.
         """
         if self._child is not None:
             raise RobotError("control is already started", code="control-started")
@@ -358,7 +358,7 @@ class UrRobot(UrLink):
             raise
 
     def _program_trouble(self) -> RobotError | None:
-        """What state stream and dashboard say against the control program. StaleStateError without both."""
+        """What state stream and dashboard say against the control program; StaleStateError without news."""
         state = self.newest().state
         if self.age_s() > STALE_S:
             return self.stale(self.age_s())

@@ -1,4 +1,4 @@
-"""The parent's side of the control process: one per go, deadlines on everything, killed on doubt."""
+"""The parent's side of the control process: one per approval, deadlines on everything, killed on doubt."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ class ControlChild:
         self._loop = asyncio.get_running_loop()
         self._ready: asyncio.Future[dict[str, Any]] = self._loop.create_future()
         self._kicked_ns = 0
-        """Of the newest heartbeat that kicked the watchdog."""
+        """Time of the newest heartbeat that kicked the watchdog."""
         self._news = asyncio.Event()
         self._moves: dict[int, asyncio.Future[dict[str, Any]]] = {}
         self._number = 0
@@ -253,7 +253,7 @@ class ControlChild:
             await asyncio.sleep(0.005)
 
     def exit_description(self) -> str:
-        """How it died, in words; empty while it lives or after a normal end."""
+        """Signal or exit code; empty while it lives or after a normal end."""
         code = self._process.poll()
         if code is None or code == 0:
             return ""

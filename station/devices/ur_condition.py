@@ -1,4 +1,4 @@
-"""What a robot state means for a person: why the arm cannot or must not move, and what to do about it."""
+"""Robot states in a person's terms: why the arm cannot or must not move, and what to do about it."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def not_powered(state: RobotState) -> RobotError | None:
 
 
 def program_not_running(state: RobotState) -> RobotError | None:
-    """Of our own control script, which must play as long as control lives."""
+    """Finds our own control script not playing, as it must while control lives."""
     return None if state.runtime_state == RuntimeState.PLAYING else program_ended(state.runtime_state)
 
 

@@ -58,7 +58,7 @@ class UrLink:
         self._primary: PrimaryReader | None = None
         self._tool: TcpCheck | None = None
         self._payload: Payload | None = None
-        """As of connect."""
+        """The payload at connect."""
         self._trouble: RobotError | None = None
         self._supervisor: asyncio.Task[None] | None = None
 
@@ -198,7 +198,7 @@ class UrLink:
         return sample
 
     def age_s(self) -> float:
-        """Of the newest sample; a controller time that stands still makes none."""
+        """Age of the newest sample; a controller time that stands still makes none."""
         sample = self.reader.newest if self.reader is not None else None
         if sample is None:
             return float("inf")

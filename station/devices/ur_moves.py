@@ -24,7 +24,7 @@ from station.devices.ur_condition import (
 
 ARRIVED_RAD = 0.01
 STRAYED_RAD = 0.05
-"""Further beside the straight way than any arm that follows it: 65 mm at 1.3 m."""
+"""Further beside the straight path than any arm that follows it: 65 mm at 1.3 m."""
 PROGRESS_RAD = 5e-4
 NO_PROGRESS_S = 3.0
 SLIDER_ZERO_S = 10.0
@@ -69,7 +69,7 @@ def is_running(word: int) -> bool:
 
 
 def beside(start_rad: Vector6, target_rad: Sequence[float], joints_rad: Vector6) -> tuple[int, float]:
-    """The joint that is furthest from the straight way, counted from 0, and by how much (rad).
+    """The joint that is furthest from the straight path, counted from 0, and by how much (rad).
 
     A joint move is straight in joint space, all joints in step: that is what the check of its path assumes.
     """
@@ -90,7 +90,7 @@ class MoveWatch:
     """The word before the move was asked for."""
     begun_s: float
     notice: str = ""
-    """What a person should know now, though it is no fault; empty = nothing."""
+    """Notice to a person, though it is no fault; empty = nothing."""
     _last_progress_s: float = field(init=False)
     _distance_rad: float = field(init=False, default=float("inf"))
     _ended_s: float | None = field(init=False, default=None)

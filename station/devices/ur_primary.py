@@ -55,7 +55,7 @@ class Installation:
 
 
 class PrimaryError(RobotError):
-    """What comes from port 30001 is not the primary interface."""
+    """Port 30001 does not speak the primary interface."""
 
     code = "primary-interface"
 
@@ -110,7 +110,7 @@ class PrimaryReader:
         self._task = asyncio.create_task(self._run(), name=f"installation of {host}")
 
     async def first(self) -> Installation:
-        """What the controller states; empty when it says nothing in time (a firewalled or old one)."""
+        """Waits for the first statement; empty when none comes in time (a firewalled or old controller)."""
         with contextlib.suppress(TimeoutError):
             async with asyncio.timeout(FIRST_S):
                 await self._first.wait()

@@ -21,7 +21,7 @@ CONNECT_S = 2.0
 
 @dataclass(frozen=True)
 class ProbeResult:
-    """What the dashboard says. Empty or None where this controller has no answer."""
+    """The dashboard's answers. Empty or None where this controller has none."""
 
     model: str = ""
     serial: str = ""
@@ -29,7 +29,7 @@ class ProbeResult:
     remote: bool | None = None
     program: str = ""
     problems: tuple[str, ...] = field(default=())
-    """What is wrong, each with its remedy; empty = reachable and complete."""
+    """Problems, each with its remedy; empty = reachable and complete."""
     answers: bool = True
     """Anything does, at any port."""
 
@@ -61,7 +61,7 @@ async def identify(dashboard: Dashboard) -> ProbeResult:
 
 
 def lock_name(host: str, serial: str) -> str:
-    """What the single-owner lock is called. Simulated controllers share a serial but not an address."""
+    """Name of the single-owner lock. Simulated controllers share a serial but not an address."""
     try:
         loopback = ipaddress.ip_address(host).is_loopback
     except ValueError:

@@ -53,11 +53,11 @@ PAYLOAD_SINCE = {3: (3, 11), 5: (5, 5)}
 
 
 class Payload(NamedTuple):
-    """What the pendant says hangs on the flange."""
+    """The payload on the flange as set on the pendant."""
 
     mass_kg: float = 0.0
     centre_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    """Of gravity, in `flange`."""
+    """Centre of gravity, in `flange`."""
 
 
 class Sample(NamedTuple):

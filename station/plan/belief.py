@@ -1,4 +1,4 @@
-"""What a few pictures of the board say about a badly known camera mount, and how sure that is."""
+"""Estimate of a badly known camera pose from a few images of the board, with its uncertainty."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ from station.cell.scene import arm_model, guess_from, guess_matrix
 GOOD_M, GOOD_RAD = 0.006, 0.02
 """A belief this sharp (1 sigma per axis) is enough to plan from."""
 _PLACE_M, _PLACE_RAD = 0.002, 0.003
-"""How far the board's place may be off as seen through one picture and the arm; generous."""
+"""Generous sigma of the board's pose as seen through one image and the arm."""
 _LEVER_M = 0.5
 
 
 @dataclass(frozen=True, eq=False)
-class Glimpse:
-    """One picture of the bootstrap; the first is the taught one."""
+class BootstrapView:
+    """One image of the bootstrap; the first is the taught one."""
 
     joints_rad: Array
     camera_from_board: Array
@@ -38,8 +38,8 @@ class Glimpse:
 
 
 @dataclass(frozen=True, eq=False)
-class Belief:
-    """What is known of the mount X."""
+class CameraPoseEstimate:
+    """The mount X and its uncertainty."""
 
     X: Array
     covariance: Array
@@ -63,8 +63,8 @@ class Belief:
         return self.sigma_m <= GOOD_M and self.sigma_rad <= GOOD_RAD
 
 
-def believe(config: StationConfig, glimpses: Sequence[Glimpse]) -> Belief:
-    """The mount that guess and pictures make most likely. ConfigError without `camera_guess`."""
+def believe(config: StationConfig, glimpses: Sequence[BootstrapView]) -> CameraPoseEstimate:
+    """The mount that guess and images make most likely. ConfigError without `camera_guess`."""
     if (known := config.camera_guess) is None:
         raise ConfigError(
             "bootstrap needs camera_guess: a rough mount, good to about 30° and 100 mm",
@@ -82,12 +82,12 @@ def believe(config: StationConfig, glimpses: Sequence[Glimpse]) -> Belief:
         return np.concatenate([delta / prior, *(_misfit(place, places[0]) for place in places[1:])])
 
     if len(glimpses) < 2:
-        return Belief(guess, np.diag(prior**2))
+        return CameraPoseEstimate(guess, np.diag(prior**2))
     fit = least_squares(residuals, np.zeros(6), x_scale=prior)
-    return Belief(perturb(guess, fit.x), np.linalg.inv(fit.jac.T @ fit.jac))
+    return CameraPoseEstimate(perturb(guess, fit.x), np.linalg.inv(fit.jac.T @ fit.jac))
 
 
-def improved_config(config: StationConfig, glimpses: Sequence[Glimpse]) -> StationConfig:
+def improved_config(config: StationConfig, glimpses: Sequence[BootstrapView]) -> StationConfig:
     """The configuration with mount and board place as the glimpses show them: what the plan is made from."""
     belief = believe(config, glimpses)
     taught = glimpses[0]
@@ -103,7 +103,7 @@ def improved_config(config: StationConfig, glimpses: Sequence[Glimpse]) -> Stati
 
 
 def expected_after(
-    config: StationConfig, glimpses: Sequence[Glimpse], belief: Belief, target: Array
+    config: StationConfig, glimpses: Sequence[BootstrapView], belief: CameraPoseEstimate, target: Array
 ) -> Array:
     """Covariance (6, 6) of X expected after one more glimpse from `target`."""
     taught = glimpses[0]
@@ -129,13 +129,13 @@ def board_place(mount: Mount, base_from_flange: Array, X: Array, camera_from_boa
     return np.asarray(inverse(base_from_flange) @ X @ camera_from_board)
 
 
-def board_seen(config: StationConfig, glimpse: Glimpse, X: Array) -> Array:
+def board_seen(config: StationConfig, glimpse: BootstrapView, X: Array) -> Array:
     """The board's place as one glimpse shows it, if the mount is X."""
     E = forward(arm_model(config.robot), glimpse.joints_rad)
     return board_place(config.mount, E, X, glimpse.camera_from_board)
 
 
-def seen_from(config: StationConfig, taught: Glimpse, X: Array, targets: Array) -> Array:
+def seen_from(config: StationConfig, taught: BootstrapView, X: Array, targets: Array) -> Array:
     """camera_from_board (n, 4, 4) at the targets, if the mount is X."""
     Y = board_seen(config, taught, X)
     if config.mount == "eye-in-hand":

@@ -1,8 +1,8 @@
 """From one taught view of the board to a first camera mount and board place, by a few small safe moves.
 
 The mount is known only to about 30° and 100 mm. Each move is chosen so that for every mount the views so
-far allow, the board is in the picture at its end, the camera comes no nearer to the board than it was
-taught, on the way too, and nothing comes too close. After each picture the belief is updated; when it is good
+far allow, the board is in the image at its end, the camera comes no nearer to the board than it was
+taught, on the way too, and nothing comes too close. After each image the belief is updated; when it is good
 enough the plan is made.
 """
 
@@ -26,7 +26,15 @@ from station.cell.errors import LimitError
 from station.cell.limits import SPACING_M, check_path, joint_bounds
 from station.cell.plan import PlannedPose
 from station.cell.scene import Scene, arm_model, geometry_from, geometry_of
-from station.plan.belief import Belief, Glimpse, believe, board_seen, expected_after, seen_from, spread_of
+from station.plan.belief import (
+    BootstrapView,
+    CameraPoseEstimate,
+    believe,
+    board_seen,
+    expected_after,
+    seen_from,
+    spread_of,
+)
 from station.plan.order import move_times
 from station.plan.visibility import outline, planned_pose, visible
 
@@ -40,14 +48,14 @@ _BORDER_PX = 15.0
 _ASKED = 20
 """Refused moves that are asked what is in their way."""
 _NEARER_M = 0.001
-"""What counts as not nearer."""
+"""Tolerance of "not nearer"."""
 _ON_THE_WAY = 17
 """Places along a move where that is looked at; in between the way bends by tenths of a millimetre."""
 _MOST_TURN_RAD = 1.0
 """No joint turns further in one move: another posture of the arm is no small move."""
 
 
-def next_move(config: StationConfig, glimpses: Sequence[Glimpse]) -> PlannedPose | None:
+def next_move(config: StationConfig, glimpses: Sequence[BootstrapView]) -> PlannedPose | None:
     """The next small move from the last glimpse, or None when the belief is good enough or five are made.
 
     LimitError when no move is safe for every mount that is still possible, or when hardly any mount within
@@ -96,7 +104,7 @@ def _free_in_all(cells: list[CellGeometry], here: Array, joints: Array) -> bool:
     return True
 
 
-def _not_here(belief: Belief, possible: int) -> LimitError:
+def _not_here(belief: CameraPoseEstimate, possible: int) -> LimitError:
     """The guess does not go with the arm's posture."""
     return LimitError(
         f"Of {_DRAWS} camera mounts within the guess ({1000 * belief.sigma_m:.0f} mm, "
@@ -112,7 +120,7 @@ def _not_here(belief: Belief, possible: int) -> LimitError:
 
 
 def _in_the_way(cells: Sequence[CellGeometry], here: Array, targets: Sequence[Array]) -> str:
-    """What the moves to these flange poses (4, 4) break most often; a sample of them is looked at."""
+    """Names the limits that moves to these flange poses (4, 4) break most often, by a sample of them."""
     broken: Counter[str] = Counter()
     for target in targets[:: 1 + len(targets) // _ASKED]:
         joints = inverse_nearest(cells[0].model, target, here)
@@ -127,7 +135,7 @@ def _in_the_way(cells: Sequence[CellGeometry], here: Array, targets: Sequence[Ar
     return " and ".join(limit for limit, _ in broken.most_common(2))
 
 
-def _no_move(belief: Belief, in_view: int, in_the_way: str) -> LimitError:
+def _no_move(belief: CameraPoseEstimate, in_view: int, in_the_way: str) -> LimitError:
     """`in_view` targets keep the board in the image, none of them is free to reach."""
     mount = f"camera mount within the guess ({1000 * belief.sigma_m:.0f} mm, {belief.sigma_deg:.0f}°)"
     if in_view == 0:
@@ -150,7 +158,10 @@ def _no_move(belief: Belief, in_view: int, in_the_way: str) -> LimitError:
 
 
 def _possible(
-    config: StationConfig, glimpses: Sequence[Glimpse], belief: Belief, rng: np.random.Generator
+    config: StationConfig,
+    glimpses: Sequence[BootstrapView],
+    belief: CameraPoseEstimate,
+    rng: np.random.Generator,
 ) -> tuple[Array, list[CellGeometry]]:
     """Mounts (n, 4, 4) that are still possible, n at most 40, and the cells with them.
 
@@ -186,7 +197,7 @@ def as_taught(cell: CellGeometry, taught_rad: Array) -> CellGeometry:
     return replace(cell, obstacle_clearance_m=max(0.0, (near_m + cell.obstacle_clearance_m) / 2))
 
 
-def _targets(config: StationConfig, taught: Glimpse, belief: Belief) -> Array:
+def _targets(config: StationConfig, taught: BootstrapView, belief: CameraPoseEstimate) -> Array:
     """Flange poses (n, 4, 4) around the taught one: small turns about board, camera or wrists, and away."""
     model = arm_model(config.robot)
     E = forward(model, taught.joints_rad)
@@ -239,7 +250,7 @@ def _turned(E: Array, turn: Array, pivot: Array) -> Array:
 
 
 def _stays_in_view(
-    config: StationConfig, taught: Glimpse, samples: Array, targets: Array
+    config: StationConfig, taught: BootstrapView, samples: Array, targets: Array
 ) -> NDArray[np.bool_]:
     """(n,) whether for every possible mount the board is wholly seen and the camera no nearer than taught."""
     camera = config.camera.model
@@ -254,8 +265,10 @@ def _stays_in_view(
     return good
 
 
-def _keeps_away(config: StationConfig, taught: Glimpse, samples: Array, here: Array, joints: Array) -> bool:
-    """Whether for every possible mount the camera comes no nearer on the way than it was taught, or is."""
+def _keeps_away(
+    config: StationConfig, taught: BootstrapView, samples: Array, here: Array, joints: Array
+) -> bool:
+    """Whether for every possible mount the camera comes no nearer on the path than it was taught, or is."""
     way = forward(arm_model(config.robot), here + np.linspace(0, 1, _ON_THE_WAY)[:, None] * (joints - here))
     taught_m = float(_away_m(config, taught.camera_from_board))
     for X in samples:
@@ -273,7 +286,7 @@ def _away_m(config: StationConfig, camera_from_board: Array) -> Array:
 
 
 def _described(
-    config: StationConfig, taught: Glimpse, belief: Belief, moves: int, joints: Array
+    config: StationConfig, taught: BootstrapView, belief: CameraPoseEstimate, moves: int, joints: Array
 ) -> PlannedPose:
     place = board_seen(config, taught, belief.X)
     camera = config.camera.model

@@ -26,13 +26,13 @@ _PATH_RESERVE_M = 0.01
 """Poses stand this far from every limit, so that moves between neighbours have room."""
 _HUBS = 6
 _NEARLY_ALL = 0.85
-"""Of the branch: no other hub needs to be looked at."""
+"""Share of the branch from which on no other hub needs to be looked at."""
 _REACH_RAD = 2.6
 """Members turn no joint further than this from the hub: no flips of the wrist, no wound-up cables."""
 
 
 @dataclass(frozen=True, eq=False)
-class Pool:
+class CandidateSet:
     """Candidates that passed everything, of all arm branches: a pose may appear once per branch."""
 
     joints_rad: Array
@@ -46,14 +46,14 @@ class Pool:
     margin_m: Array
     """(n,)"""
     lost: Counter[str] = field(default_factory=Counter)
-    """How many others a limit forbids (a pose may break several)."""
+    """Number of others that a limit forbids (a pose may break several)."""
     alone: Counter[str] = field(default_factory=Counter)
-    """How many others would be possible without this one limit."""
+    """Number of others that would be possible without this one limit."""
 
     def __len__(self) -> int:
         return len(self.joints_rad)
 
-    def take(self, places: NDArray[np.intp]) -> Pool:
+    def take(self, places: NDArray[np.intp]) -> CandidateSet:
         return replace(
             self,
             joints_rad=self.joints_rad[places],
@@ -93,7 +93,7 @@ def find_candidates(
     rng: np.random.Generator,
     near_joints_rad: Array | None,
     tries: int | None = None,
-) -> Pool:
+) -> CandidateSet:
     """All arm branches of camera poses that pass view, reach, joints and clearance.
 
     `tries` (None: `count`) camera poses are looked at; the first `count` of those that show the board go on.
@@ -110,14 +110,14 @@ def find_candidates(
     failing = np.sum([~good for good in checks.values()], axis=0)
     alone = Counter({name: int((~good & (failing == 1)).sum()) for name, good in checks.items()})
     lost += Counter({name: int((~good).sum()) for name, good in checks.items()})
-    kept = Pool(joints, flange[rows], views[rows], branch_of(scene, joints), worst, lost, alone)
+    kept = CandidateSet(joints, flange[rows], views[rows], branch_of(scene, joints), worst, lost, alone)
     return kept.take(np.flatnonzero(keep))
 
 
 def _checks(
     scene: Scene, view: ViewRange, joints: Array, base_from_flange: Array
 ) -> tuple[dict[str, NDArray[np.bool_]], Array]:
-    """What joints (n, 6) must pass, by name, each (n,); and the smallest margin (n,)."""
+    """Checks joints (n, 6): results by name, each (n,), and the smallest margin (n,)."""
     low, high = joint_bounds(scene.geometry)
     checks: dict[str, NDArray[np.bool_]] = {
         "the joint range": np.asarray(((joints >= low) & (joints <= high)).all(axis=1)),
@@ -176,7 +176,9 @@ def branch_of(scene: Scene, joints_rad: Array) -> Array:
     return np.asarray((reach > 0) * 4 + elbow * 2 + wrist * 1)
 
 
-def best_group(scene: Scene, found: Pool, start: Array | None, wanted: int, plenty: int) -> Pool:
+def best_group(
+    scene: Scene, found: CandidateSet, start: Array | None, wanted: int, plenty: int
+) -> CandidateSet:
     """A group of at most `wanted`: of the branch nearest to the start that has `plenty`, or else the largest.
 
     With a start, only groups count that it has a free direct move into. Empty when there is none.
@@ -196,7 +198,7 @@ def best_group(scene: Scene, found: Pool, start: Array | None, wanted: int, plen
     return best
 
 
-def _best_of_branch(scene: Scene, branch: Pool, start: Array | None) -> Pool:
+def _best_of_branch(scene: Scene, branch: CandidateSet, start: Array | None) -> CandidateSet:
     groups = [branch.take(np.zeros(0, dtype=int))]
     for hub in _hubs(branch.joints_rad, start):
         free = np.isfinite(_moves(scene, hub, branch.joints_rad))

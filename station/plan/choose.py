@@ -17,14 +17,14 @@ from station.cell.scene import Scene
 
 Criterion = Literal["A", "D"]
 _LENS_SHARE = {"A": 0.02, "D": 0.2}
-"""Weight of the lens, so that the picture is covered."""
+"""Weight of the lens, so that the image is covered."""
 _ENOUGH_TO_RANK, _SHORTLIST = 8, 60
 """With so many views known the first order ranks further ones well; so many of them are then looked at."""
 
 
 @dataclass(frozen=True, eq=False)
 class Objective:
-    """How good a set of views is: smaller is better. Works on information matrices (..., p, p)."""
+    """Cost of a set of views: smaller is better. Works on information matrices (..., p, p)."""
 
     criterion: Criterion
     lever_m: float
@@ -32,7 +32,7 @@ class Objective:
     prior: Array
     """(p, p) what is known beforehand."""
     lens: slice | None
-    """Places of a lens that is found from the same pictures; None where it is known."""
+    """Places of a lens that is found from the same images; None where it is known."""
 
     def __call__(self, information: Array) -> Array:
         covariance, share = covariance_of(information, self.prior), _LENS_SHARE[self.criterion]

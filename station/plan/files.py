@@ -29,10 +29,10 @@ SWINGS = 8
 JOINT_SPEED_RAD_S = 0.3
 JOINT_ACCELERATION_RAD_S2 = 0.6
 WRIST_SWING_RAD = 0.30
-"""Of wrist 3, to either side: it turns the picture (or the board) nearly in its place."""
+"""Swing of wrist 3 to either side: it turns the image (or the board) nearly in its place."""
 _TILT_RAD = 0.05
 _SHARES = (1.0, -1.0, 0.6, -0.8, 1.0, -0.5, 0.8)
-"""Of the full swing; unequal ones, so that no offset looks like a period."""
+"""Shares of the full swing; unequal ones, so that no offset looks like a period."""
 
 
 class _Dumper(yaml.SafeDumper):  # type: ignore[misc]  # yaml has no types
@@ -100,7 +100,7 @@ def _read(path: Path) -> bytes:
 
 
 def _value_problems(plan: Plan) -> list[str]:
-    """What types cannot say."""
+    """Finds what types cannot say."""
     problems = []
     if plan.robot not in MODELS:
         problems.append(f"robot '{plan.robot}' is unknown; known are {', '.join(MODELS)}")
@@ -126,7 +126,7 @@ def _value_problems(plan: Plan) -> list[str]:
 
 
 def taught_plan(path: Path, robot: str, mount: Mount) -> Plan:
-    """The poses of a recording's pictures, guided by hand or driven to, as a plan, in their order.
+    """The poses of a recording's images, guided by hand or driven to, as a plan, in their order.
 
     ConfigError when they are of another arm or mount or without joints; RecordingError when it is not whole.
     """

@@ -1,4 +1,4 @@
-"""Where the flange must go so that the pointer stands over a corner of the board, and the way there.
+"""Where the flange must go so that the pointer stands over a corner of the board, and the path there.
 
 A check of a calibration that needs no mathematics to believe: the tip stands where the calibration says the
 corner is, a safe way above it; a person guides it down by hand and sees how far off it is. The station itself
@@ -28,7 +28,7 @@ from station.cell.plan import Plan, PlannedPose
 from station.cell.scene import board_extent, geometry_of
 
 CLEARANCE_M = 0.05
-"""Nothing that moves comes nearer to the board, on the way or at the end."""
+"""Nothing that moves comes nearer to the board, on the path or at the end."""
 SPEED_M_S = 0.05
 APPROACH_M = 0.15
 """The arm comes from here, along the board's normal, and leaves the same way."""
@@ -47,7 +47,7 @@ _TRIED_WAYS = 60
 
 @dataclass(frozen=True, eq=False)
 class Hover:
-    """One way to one place over the board; what a go for it is bound to."""
+    """One path to one place over the board; a motion approval for it is bound to it."""
 
     plan: Plan
     check: PlanCheck
@@ -113,7 +113,7 @@ def plan_hover(
     pointer: PointerConfig,
     start_joints_rad: Vector6,
 ) -> Hover:
-    """The shortest free way over a corner, from where the arm stands. LimitError says what is in the way.
+    """Plans the shortest free path over a corner, from where the arm stands. LimitError says what blocks it.
 
     X: flange_from_camera or base_from_camera of the calibration. Two moves: to a point `APPROACH_M` over the
     corner, then straight down the normal to the standoff.
@@ -210,7 +210,7 @@ def _ways(
 
 
 def _free_ends(geometry: CellGeometry, ways: list[tuple[Array, Array]]) -> list[tuple[Array, Array]]:
-    """Those ways whose two stops keep every clearance; the path between is not looked at."""
+    """Those paths whose two stops keep every clearance; what lies between is not looked at."""
     if not ways:
         return []
     gaps = margins(geometry, np.array(ways).reshape(-1, 6))[0].min(axis=1).reshape(-1, 2).min(axis=1)
@@ -262,7 +262,7 @@ def _plan(config: StationConfig, model: RobotModel, corner: int, high: Array, lo
 
 @dataclass(frozen=True, eq=False)
 class HoverQuestion:
-    """What is asked for: plain data that crosses into the worker."""
+    """The request: plain data that crosses into the worker."""
 
     corner: int
     standoff_m: float
@@ -270,7 +270,7 @@ class HoverQuestion:
     joints_rad: Vector6
     """Where the arm stands."""
     model_miss_m: float
-    """How far the arm's own flange position is from the configured kinematics, there."""
+    """Distance of the arm's own flange position from the configured kinematics, there."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,7 +284,7 @@ class HoverAnswer:
 def answer_hover(
     config: StationConfig, calibration: Calibration, view: BoardView, question: HoverQuestion
 ) -> HoverAnswer:
-    """From one picture of the board to a checked way. LimitError, BadViewsError."""
+    """Answers with a checked path, from one image of the board. LimitError, BadViewsError."""
     now = locate_board(calibration, view, config.board)
     points = found_points(calibration, config.board)
     tip = np.array(question.pointer.tip_m)

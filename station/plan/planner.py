@@ -23,7 +23,7 @@ from station.plan.candidates import (
     ARM_IN_SIGHT,
     NOT_IN_PICTURE,
     OUT_OF_REACH,
-    Pool,
+    CandidateSet,
     best_group,
     find_candidates,
 )
@@ -35,7 +35,7 @@ Progress = Callable[[str, float], None]
 POOL_SIZE = 1200
 """Against 480, both errors are 4 to 6 % smaller (forecast on random cells)."""
 _BLIND = 0.5
-"""A move without the board in the picture counts as so much longer when the order is chosen."""
+"""A move without the board in the image counts as so much longer when the order is chosen."""
 _TRIES = 12
 """Camera poses looked at per wanted member of the pool; most fall to the guess's uncertainty."""
 _REMEDIES = {
@@ -57,7 +57,9 @@ _KEYHOLE = 10
 """Hidden views for each free one, from which on the free ones hang on the guess's last millimetres."""
 
 
-def explain_shortage(scene: Scene, wanted: int, group: Pool, found: Pool, start: Array | None) -> LimitError:
+def explain_shortage(
+    scene: Scene, wanted: int, group: CandidateSet, found: CandidateSet, start: Array | None
+) -> LimitError:
     """Why there is no plan: `group` is what is usable, `found` all that passes pose by pose."""
     counts = {"possible": len(group), "wanted": wanted}
     if looks_back(scene, found):
@@ -107,7 +109,7 @@ def _remedy(limit: str) -> str:
     return _REMEDIES.get(limit, other)
 
 
-def looks_back(scene: Scene, found: Pool) -> bool:
+def looks_back(scene: Scene, found: CandidateSet) -> bool:
     """Whether the guessed camera looks back at the arm, which hides the board from nearly everywhere."""
     backwards = scene.mount == "eye-in-hand" and scene.X[2, 2] < _BACKWARDS
     return bool(backwards and found.alone[ARM_IN_SIGHT] > _KEYHOLE * len(found))
@@ -154,7 +156,7 @@ class PlanOptions:
     criterion: Criterion = "A"
     noise: MeasurementNoise = field(default_factory=MeasurementNoise)
     free_intrinsics: bool = True
-    """The lens is calibrated from the same pictures."""
+    """The lens is calibrated from the same images."""
     view: ViewRange | None = None
     """None = by the lens and the board's size."""
     pool: int = POOL_SIZE
@@ -172,7 +174,7 @@ def make_plan(
 ) -> Plan:
     """A plan of `count` poses for the configured cell. Deterministic by seed; takes seconds.
 
-    `lens_known`: the pictures need not tell the lens too, as when an installed calibration is checked.
+    `lens_known`: the images need not tell the lens too, as when an installed calibration is checked.
     ConfigError when the configuration lacks what planning needs; LimitError when there is no such plan,
     saying which limit binds and what to change.
     """
@@ -226,9 +228,9 @@ def _start_roll(scene: Scene, start: Array | None) -> float | None:
 
 def candidate_pool(
     scene: Scene, options: PlanOptions, start: Array | None, rng: np.random.Generator
-) -> tuple[Pool, list[str]]:
+) -> tuple[CandidateSet, list[str]]:
     """Candidates of the best branch. LimitError with the reason when the widest range has too few."""
-    best: tuple[Pool, Pool, str] | None = None
+    best: tuple[CandidateSet, CandidateSet, str] | None = None
     for view, note in _relaxed(options.view or view_range(scene), _start_roll(scene, start)):
         found = find_candidates(scene, view, 2 * options.pool, rng, start, _TRIES * options.pool)
         group = best_group(scene, found, start, options.pool, 3 * options.count)
@@ -246,13 +248,13 @@ def candidate_pool(
 def _choose_and_order(
     scene: Scene,
     options: PlanOptions,
-    pool: Pool,
+    pool: CandidateSet,
     start: Array | None,
     rng: np.random.Generator,
     progress: Progress,
     captured: Array | None,
 ) -> Plan:
-    """The checked plan. Poses that no free way leads to leave the pool, and the choice is made again."""
+    """The checked plan. Poses that no free path leads to leave the set, and the choice is made again."""
     objective = objective_for(scene, options.criterion, options.free_intrinsics)
     information = informations(scene, pool.base_from_flange, options.noise)
     known: Array | None = None
@@ -261,7 +263,7 @@ def _choose_and_order(
     left = np.arange(len(pool))
     picked: list[int] = []
     while len(left) >= options.count:
-        # The first choice is polished; when poses without a free way leave, only their places are filled.
+        # The first choice is polished; when poses without a free path leave, only their places are filled.
         kept = tuple(int(k) for k in np.flatnonzero(np.isin(left, picked)))
         chosen = _chosen(
             information[left],

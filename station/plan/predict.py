@@ -1,4 +1,4 @@
-"""How good X will be: from a plan alone, after each captured pose, and which pose would help most next."""
+"""Predicted error of X: from a plan alone, after each captured pose, and the best next pose."""
 
 from __future__ import annotations
 
@@ -52,7 +52,7 @@ class AdviceOptions:
     pool: int = 150
     seed: int = 0
     onward_rad: Sequence[float] | None = None
-    """Joints of the pose after it: the way on to it must be free too."""
+    """Joints of the pose after it: the path on to it must be free too."""
 
 
 def with_forecast(scene: Scene, plan: Plan) -> tuple[Plan, tuple[str, ...]]:
@@ -86,7 +86,7 @@ def forecast_views(
 
 
 def _whole(scene: Scene, base_from_flange: Array) -> NDArray[np.bool_]:
-    """(n,) whether every point of the board is in the picture, by the guess."""
+    """(n,) whether every point of the board is in the image, by the guess."""
     return visible(scene.camera, scene.seen(base_from_flange, board_points(scene.board)), 0.0)
 
 
@@ -117,7 +117,7 @@ def advise(
     best = _best_free(scene, stops, pool.joints_rad, objective(known + gains))
     if best is None:
         return Advice(
-            now, False, f"{state}; no free way from here to a pose that helps: jog the arm and ask again"
+            now, False, f"{state}; no free path from here to a pose that helps: jog the arm and ask again"
         )
     missing = _missing(known, gains, goal_m=goal_m, scene=scene, free_intrinsics=options.free_intrinsics)
     after = sigma_of(known + gains[best], objective)[0]
@@ -131,7 +131,7 @@ def advise(
 
 
 def _best_free(scene: Scene, stops: Sequence[Array], joints_rad: Array, scores: Array) -> int | None:
-    """Row of the joints (n, 6) with the lowest score whose ways to the stops (6,) are free; few are tried."""
+    """Row of the joints (n, 6) with the lowest score and free paths to the stops (6,); few are tried."""
     for place in np.argsort(scores, kind="stable")[:_TRIES]:
         if not any(check_path(scene.geometry, stop, joints_rad[place]).problems for stop in stops):
             return int(place)
@@ -139,7 +139,7 @@ def _best_free(scene: Scene, stops: Sequence[Array], joints_rad: Array, scores: 
 
 
 def _missing(known: Array, gains: Array, goal_m: float, scene: Scene, free_intrinsics: bool) -> int | None:
-    """How many greedily chosen further poses reach the goal."""
+    """Counts the greedily chosen further poses that reach the goal."""
     objective = objective_for(scene, "A", free_intrinsics)
     total = known
     for count in range(1, _FURTHER_POSES + 1):

@@ -84,7 +84,7 @@ def _draw_space(axes: Any, scene: Scene, plan: Plan) -> None:
 
 
 def camera_frustum(scene: Scene, base_from_camera: Array) -> list[Array]:
-    """Edges of the picture's pyramid, polylines (m, 3) in `base`."""
+    """Edges of the image's pyramid, polylines (m, 3) in `base`."""
     K = camera_matrix(scene.camera)
     w, h = scene.camera.width, scene.camera.height
     rays = np.array([[u, v, 1.0] for u, v in ((0, 0), (w, 0), (w, h), (0, h))]) @ np.linalg.inv(K).T
@@ -119,7 +119,7 @@ def _draw_error(axes: Any, plan: Plan) -> None:
 
 
 def expected_pixels(scene: Scene, plan: Plan) -> Array:
-    """Where every board point is expected in every picture, (n, k, 2) pixels; NaN behind the camera."""
+    """Where every board point is expected in every image, (n, k, 2) pixels; NaN behind the camera."""
     points = board_points(scene.board)
     seen = scene.seen(flange_poses(scene, plan), points)
     pixels = project(scene.camera, np.maximum(seen.reshape(-1, 3), [-np.inf, -np.inf, 1e-3])).pixels
@@ -128,7 +128,7 @@ def expected_pixels(scene: Scene, plan: Plan) -> Array:
 
 
 def coverage_grid(scene: Scene, plan: Plan, columns: int, rows: int) -> Array:
-    """How many board points fall into each cell of the picture, (rows, columns)."""
+    """Counts the board points in each cell of the image, (rows, columns)."""
     pixels = expected_pixels(scene, plan).reshape(-1, 2)
     pixels = pixels[np.isfinite(pixels).all(axis=1)]
     size = scene.camera.width, scene.camera.height

@@ -1,4 +1,4 @@
-"""Is the whole board in the picture: through the lens, for a wrong guess, and past the arm."""
+"""Is the whole board in the image: through the lens, for a wrong guess, and past the arm."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from station.cell.plan import ExpectedView, PlannedPose
 from station.cell.scene import Scene, board_extent
 
 _ON_THE_WAY = 7
-"""Pictures looked at along a move."""
+"""Images looked at along a move."""
 
 
 @dataclass(frozen=True)
@@ -32,22 +32,22 @@ class ViewRange:
     """Either way from `roll_centre_rad`."""
     roll_centre_rad: float = 0.0
     off_centre: float = 0.35
-    """Share of half the picture that the board's centre may be away from the picture's centre."""
+    """Share of half the image that the board's centre may be away from the image's centre."""
     border_px: float = 12.0
     doubt: float = 3.5
     """So many standard deviations of its pixels, as the guesses' sigmas make them, every corner of the board
-    keeps from the picture's edge beyond `border_px`."""
+    keeps from the image's edge beyond `border_px`."""
     smallest_singular: float = 0.03
 
 
 _NEAR_FILL, _FAR_FILL = 0.64, 0.40
-"""Share of the picture's width or height that the board's outline fills, at the nearest and farthest."""
+"""Share of the image's width or height that the board's outline fills, at the nearest and farthest."""
 _FOCUS = (0.6, 1.6)
-"""Pictures are sharp within these multiples of the working distance."""
+"""Images are sharp within these multiples of the working distance."""
 
 
 def view_range(scene: Scene) -> ViewRange:
-    """Distances at which the board fills the picture well, as far as they lie near the working distance."""
+    """Distances at which the board fills the image well, as far as they lie near the working distance."""
     K = camera_matrix(scene.camera)
     points = board_points(scene.board)
     size_m = (points.max(axis=0) - points.min(axis=0))[:2] + scene.board.square_m
@@ -61,19 +61,19 @@ def view_range(scene: Scene) -> ViewRange:
 
 
 def visible(camera: CameraModel, points: Array, border_px: float) -> NDArray[np.bool_]:
-    """Points (n, k, 3) in `camera` → (n,) whether all lie inside the picture, true lens included."""
+    """Points (n, k, 3) in `camera` → (n,) whether all lie inside the image, true lens included."""
     in_front = points[..., 2] > 0.02
     safe = np.where(in_front[..., None], points, [0.0, 0.0, 1.0])
     pixels = project(camera, safe).pixels
     size = np.array([camera.width, camera.height]) - 1
     inside = ((pixels >= border_px) & (pixels <= size - border_px)).all(axis=-1)
-    # Far off the axis a distortion polynomial folds points back into the picture.
+    # Far off the axis a distortion polynomial folds points back into the image.
     radius = np.linalg.norm(safe[..., :2] / safe[..., 2:], axis=-1)
     return np.asarray((inside & in_front & (radius < lens_radius(camera))).all(axis=1))
 
 
 def lens_radius(camera: CameraModel) -> float:
-    """Largest normalised radius up to which the lens model grows, at most 1.3 times the picture's corner."""
+    """Largest normalised radius up to which the lens model grows, at most 1.3 times the image's corner."""
     K = camera_matrix(camera)
     corner = np.hypot(camera.width, camera.height) / (2 * min(K[0, 0], K[1, 1]))
     radii = np.linspace(0, 1.3 * corner, 200)
@@ -84,7 +84,7 @@ def lens_radius(camera: CameraModel) -> float:
 
 
 def seen_for_certain(scene: Scene, base_from_flange: Array, view: ViewRange) -> NDArray[np.bool_]:
-    """(n,) whether the whole board is in the picture, and stays so when the guesses are wrong.
+    """(n,) whether the whole board is in the image, and stays so when the guesses are wrong.
 
     Every point of the outline keeps `border_px` and `doubt` standard deviations of its pixel from the edge.
     """
@@ -99,7 +99,7 @@ def seen_for_certain(scene: Scene, base_from_flange: Array, view: ViewRange) -> 
 
 
 def uncertain_pixels(scene: Scene, base_from_flange: Array, points: Array) -> tuple[Array, Array]:
-    """Board points (k, 3) in n pictures: pixels and their standard deviations, (n, k, 2) each.
+    """Board points (k, 3) in n images: pixels and their standard deviations, (n, k, 2) each.
 
     First order. An error of the camera's place or of the board's moves a point alike in all directions; a
     turn of the camera moves it about the camera, a turn of the board about the board's origin.
@@ -116,7 +116,7 @@ def uncertain_pixels(scene: Scene, base_from_flange: Array, points: Array) -> tu
 
 
 def blind_share(scene: Scene, joints_from: Array, joints_to: Array) -> Array:
-    """(n,) share of the way, 0…1, that joint moves (n, 6) → (n, 6) do not show the whole board."""
+    """(n,) share of the path, 0…1, that joint moves (n, 6) → (n, 6) do not show the whole board."""
     steps = np.linspace(0, 1, _ON_THE_WAY + 2)[1:-1]
     paths = joints_from[:, None] + steps[:, None] * (joints_to - joints_from)[:, None]
     flange = forward(scene.geometry.model, paths.reshape(-1, 6))
@@ -150,7 +150,7 @@ def sees_past_the_arm(scene: Scene, joints_rad: Array, base_from_flange: Array) 
 
 
 def expected_view(scene: Scene, base_from_flange: Array) -> ExpectedView:
-    """How the board should look from a flange pose (4, 4), by the scene's guess."""
+    """Predicts how the board looks from a flange pose (4, 4), by the scene's guess."""
     camera_from_board = scene.camera_from_board(base_from_flange)
     points = board_points(scene.board)
     low, high = board_extent(scene.board)

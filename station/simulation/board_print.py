@@ -1,4 +1,4 @@
-"""What is printed on a board: albedo as a function of the place on it.
+"""The print on a board: albedo as a function of the place on it.
 
 The place (0, 0) and the directions are those of the board's points: x to the right, y down, z into the
 board. Markers are laid out by OpenCV's own board classes, so that its detectors see what they expect.

@@ -40,7 +40,7 @@ LASTING = ("illumination", "exposure", "clock-step", "cover", "board", "ringing"
 
 
 class Ringing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """The camera's bracket nods about the picture's x axis, dying away from its injection on."""
+    """The camera's bracket nods about the image's x axis, dying away from its injection on."""
 
     amplitude_rad: float
     frequency_hz: float = 7.0
@@ -97,12 +97,12 @@ class CameraFaults:
         return due
 
     def bracket(self, host_monotonic_ns: int) -> Array:
-        """Of the camera as it is now from the camera as it should be, (4, 4)."""
+        """Transform (4, 4) of the camera as it is now from the camera as it should be."""
         angle_rad = self._ringing.angle_rad(host_monotonic_ns) if self._ringing is not None else 0.0
         return pose_from_rotvec((0.0, 0.0, 0.0), (angle_rad, 0.0, 0.0))
 
     def cover(self, picture: NDArray[np.uint8]) -> None:
-        """Something dark lies over the left share of the picture, in place."""
+        """Something dark lies over the left share of the image, in place."""
         picture[:, : round(self._covered * picture.shape[1])] = 20
 
 

@@ -1,4 +1,4 @@
-"""A GigE Vision camera in a process of its own: Aravis's fake camera, fed with rendered pictures.
+"""A GigE Vision camera in a process of its own: Aravis's fake camera, fed with rendered images.
 
 It speaks the real control and stream protocols over loopback. Run it only in a network namespace that has
 nothing but `lo`, for discovery broadcasts. Faults are JSON lines on standard input, as for the rendered
@@ -41,7 +41,7 @@ _FILL = ctypes.CFUNCTYPE(
     None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_uint32, ctypes.c_uint32, ctypes.c_uint32
 )
 Source = Callable[[int, int, float, float], tuple[NDArray[np.uint8], int]]
-"""(width, height, exposure_us, gain_db) → grey picture (height, width) and device time (ns) of its start"""
+"""(width, height, exposure_us, gain_db) → grey image (height, width) and device time (ns) of its start"""
 
 
 class GigeCamera:
@@ -168,7 +168,7 @@ def _library() -> Any:
 
 
 def rendered_source(camera: CameraProcess) -> Source:
-    """Pictures of the simulated cell at the moment they are asked for."""
+    """Images of the simulated cell at the moment they are asked for."""
     last = [np.full((camera.truth.camera.height, camera.truth.camera.width), 20, np.uint8)]
 
     def source(width: int, height: int, exposure_us: float, gain_db: float) -> tuple[NDArray[np.uint8], int]:
@@ -219,7 +219,7 @@ def numbered_picture(
 
 
 def still_picture(truth: CellTruth) -> NDArray[np.uint8]:
-    """What the camera sees from where the arm starts, without noise: the same bits every time."""
+    """Image from where the arm starts, without noise: the same bits every time."""
     camera = CameraProcess(truth, "", truth.exposure_us, truth.gain_db)
     flange = forward(MODELS[truth.robot_model], truth.start_joints_rad)
     return render(truth.camera, truth.board, camera.camera_from_board(flange))

@@ -174,7 +174,7 @@ class SimulatedGige(ChildProcess):
         self._ask(fault, value)
 
     def sent(self) -> int:
-        """Numbered pictures that went out so far, plus the number of the first."""
+        """Numbered images that went out so far, plus the number of the first."""
         return int(self._ask("sent")["number"])
 
     def _ask(self, name: str, value: Any = None) -> dict[str, Any]:

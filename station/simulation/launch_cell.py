@@ -38,7 +38,7 @@ class SimulationOptions:
     hardware_trigger: bool = False
     """A trigger box on a pseudo terminal fires the camera."""
     frame_rate_hz: float = 0.0
-    """With `gige`: free-running at this rate. Drawing takes longer than a frame, so its pictures are numbered
+    """With `gige`: free-running at this rate. Drawing takes longer than a frame, so its images are numbered
     ones of the board as the camera sees it from where the arm starts."""
     control: ControlPath | None = None
     """What drives the arm; None = what is installed."""

@@ -27,7 +27,7 @@ TABLE = Plane("table", (0.0, 0.0, 0.0), (0.0, 0.0, 1.0))
 _ATTEMPTS = 400
 _TRIED_VIEWS = 60
 _NEEDED_SHARE = 0.4
-"""Of the tried views, reachable on the start's own arm branch."""
+"""Share of the tried views that the start's own arm branch reaches."""
 _START_MARGIN_M = 0.015
 _START_SINGULARITY = 0.08
 

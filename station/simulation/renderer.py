@@ -1,4 +1,4 @@
-"""Pictures of a board as a camera with a known lens would take them.
+"""Images of a board as a camera with a known lens would take them.
 
 Every pixel is followed back through the lens to the board: no textures are warped, so corners lie where
 `cv2.projectPoints` puts them. Pixels that hold an edge are the mean of sub-pixel samples.
@@ -19,11 +19,11 @@ from station.simulation.board_print import BoardPrint, Floats, board_print
 
 TABLE_ALBEDO = 0.30
 FULL_SCALE_US = 10_000.0
-"""At this exposure, gain 0 dB and illumination 1, albedo 1 in the picture's centre gives WHITE_LEVEL."""
+"""At this exposure, gain 0 dB and illumination 1, albedo 1 in the image's centre gives WHITE_LEVEL."""
 WHITE_LEVEL = 235.0
 BLACK_LEVEL = 3.0
 VIGNETTING = 0.18
-"""Light lost in the picture's far corners."""
+"""Light lost in the image's far corners."""
 _SAMPLES, _STRIDE = 13, 5
 """Sub-pixel samples of a pixel with an edge: a Fibonacci lattice, each in a row and a column of its own. An
 edge along the rows of a square grid passes all samples of a row at once: 0.06 px in a corner with 4×4."""
@@ -58,9 +58,9 @@ def render(
     light: Light | None = None,
     rng: np.random.Generator | None = None,
 ) -> NDArray[np.uint8]:
-    """(height, width) mono8 picture; `camera_from_board` (4, 4) at mid-exposure.
+    """(height, width) mono8 image; `camera_from_board` (4, 4) at mid-exposure.
 
-    Without `rng` the picture is free of noise. ValueError for a transform that is not rigid or a camera
+    Without `rng` the image is free of noise. ValueError for a transform that is not rigid or a camera
     without a matrix.
     """
     if not is_rigid(camera_from_board):
@@ -129,7 +129,7 @@ def _lens(camera: CameraModel) -> _LensTable:
 def _window(
     camera: CameraModel, board: BoardSpec, camera_from_board: Array, margin_px: int
 ) -> tuple[slice, slice] | None:
-    """Rows and columns that may show the sheet; None where it is out of the picture."""
+    """Rows and columns that may show the sheet; None where it is out of the image."""
     x0, y0, x1, y1 = board_print(board).sheet_m
     along = np.linspace(0.0, 1.0, 9)
     x, y = x0 + along * (x1 - x0), y0 + along * (y1 - y0)
@@ -153,7 +153,7 @@ def _window(
     pixels, _ = cv2.projectPoints(
         points, rotation, camera_from_board[:3, 3], np.array(camera.matrix), np.array(camera.distortion)
     )
-    # A point far outside the picture may be folded back by the distortion polynomial: look everywhere then.
+    # A point far outside the image may be folded back by the distortion polynomial: look everywhere then.
     if np.abs(in_camera[:, :2] / in_camera[:, 2:]).max() > 1.0:
         return whole
     low = np.floor(pixels.reshape(-1, 2).min(axis=0)).astype(int) - margin_px

@@ -183,7 +183,7 @@ def _with_noise(truth: CellTruth, level: _CellNoise, rng: np.random.Generator) -
 
 
 def cell_config(truth: CellTruth, host: str = "") -> StationConfig:
-    """What an operator with a tape measure would write down: guesses of mount, board and lens, all a bit off.
+    """Configuration of an operator with a tape measure: guesses of mount, board and lens, all a bit off.
 
     `host`: the simulated controller. The same truth gives the same configuration.
     """

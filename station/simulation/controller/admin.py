@@ -94,7 +94,7 @@ def stall_dash(machine: Machine, on: bool = True) -> None:
 
 
 def black_hole(machine: Machine, on: bool = True, ports: list[str] | None = None) -> None:
-    """As a cable pulled out: links carry nothing, connecting hangs."""
+    """A cable pulled out: links carry nothing, connecting hangs."""
     for service in machine.chosen(ports):
         service.black_hole(on)
 
@@ -263,7 +263,7 @@ async def truth(machine: Machine, at_monotonic_ns: int | None = None) -> dict[st
 
 
 def state(machine: Machine) -> dict[str, Any]:
-    """What the controller is doing now."""
+    """The controller's state now."""
     robot = machine.robot
     return {
         "model": robot.settings.model,

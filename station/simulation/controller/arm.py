@@ -12,7 +12,7 @@ from station.simulation.controller.paths import Braking, Path, Profile, Trapezoi
 LAG_S = 0.015
 """Time constant with which the true joints follow the commanded ones."""
 SCALE_PER_S = 5.0
-"""How fast the speed scaling follows the slider or a pause."""
+"""Rate at which the speed scaling follows the slider or a pause."""
 PROGRAM_END_RAD_S2 = 4.0
 """Deceleration when the program ends under a motion."""
 ZERO: Six = (0.0,) * 6
@@ -38,7 +38,7 @@ class Motion:
 
 @dataclass
 class Vibration:
-    """Of one joint, about its rest; `decay_s` None = for ever."""
+    """Oscillation of one joint about its rest; `decay_s` None = for ever."""
 
     amplitude_rad: float
     frequency_hz: float

@@ -16,7 +16,7 @@ from station.simulation.controller.script_ports import primary_service, script_s
 from station.simulation.controller.state import Journal, Settings
 
 CHUNK = 25
-"""Cycles run in one go when behind; sockets are read in between."""
+"""Cycles run at once when behind; sockets are read in between."""
 LATE_CYCLES = 4
 """More cycles behind than this: the process was held up, and the cycles count as late."""
 

@@ -198,7 +198,7 @@ class SimulatedRobot(ControllerState):
             self.runtime_state = RuntimeState.PAUSED
 
     def unlock(self) -> bool:
-        """Of a protective stop. False within 5 s of its start."""
+        """Ends a protective stop. False within 5 s of its start."""
         if self.safety_mode != SafetyMode.PROTECTIVE_STOP:
             return True
         if self.time_s - self._safety_since_s < UNLOCK_AFTER_S:

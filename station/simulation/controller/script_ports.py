@@ -33,7 +33,7 @@ def script_services(host: str, robot: SimulatedRobot) -> list[Service]:
 
 
 class PrimaryConnection(ScriptConnection):
-    """What it states are the controller's beliefs: the nominal table, never the true arm's lengths."""
+    """States the controller's beliefs: the nominal table, never the true arm's lengths."""
 
     def opened(self) -> None:
         table = self._robot.table

@@ -1,4 +1,4 @@
-"""What the controller is at one moment: settings, registers, arm and modes, published once per cycle.
+"""The controller's state: settings, registers, arm and modes, published once per cycle.
 
 Programs see and change this; `robot` adds what the controller does by itself.
 """

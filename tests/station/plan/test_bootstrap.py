@@ -9,7 +9,7 @@ import pytest
 from calibrate.geometry import difference, inverse, pose, rotation_exp, transform_points
 from calibrate.kinematics import MODELS, forward
 from station.cell.scene import guess_from
-from station.plan.belief import Glimpse, believe, improved_config
+from station.plan.belief import BootstrapView, believe, improved_config
 from station.plan.bootstrap import MOVES_MAX, MOVES_MIN, next_move
 from station.plan.planner import make_plan
 from station.plan.visibility import outline, visible
@@ -50,7 +50,7 @@ class Cell:
         seen = pose(
             rotation_exp(self.rng.normal(0, 8e-4, 3)) @ C[:3, :3], C[:3, 3] + self.rng.normal(0, 4e-4, 3)
         )
-        return Glimpse(np.array(joints), seen)
+        return BootstrapView(np.array(joints), seen)
 
     def run(self):
         glimpses = [self.glimpse(self.truth.start_joints_rad)]
@@ -114,6 +114,6 @@ def test_when_no_move_is_safe_it_says_what_is_in_the_way(change, code):
     else:
         C = glimpse.camera_from_board.copy()
         C[0, 3] += 0.5
-        glimpse = Glimpse(start, C)
+        glimpse = BootstrapView(start, C)
     with raises(code):
         next_move(config, [glimpse])

@@ -17,7 +17,7 @@ from station.cell.config import PAPER_BOARD, CameraConfig, LimitsConfig, Plane, 
 from station.cell.limits import check_path
 from station.cell.scene import geometry_from, geometry_of, guess_from
 from station.plan import bootstrap
-from station.plan.belief import Glimpse
+from station.plan.belief import BootstrapView
 from station.plan.bootstrap import as_taught, next_move
 from station.plan.visibility import outline
 from tests.codes import raises
@@ -28,7 +28,7 @@ X = pose(rotation_exp([-0.261, 0.808, 2.537]), [0.014, -0.078, 0.076])
 Y = pose(rotation_exp([-2.482, 1.616, 0.196]), [0.604, -0.537, 0.234])
 WRONG = pose(rotation_exp([0.152, 0.643, 2.156]), [0.089, -0.084, 0.142])
 """X turned by 30° and shifted by 100 mm."""
-GLIMPSE = Glimpse(TAUGHT, inverse(forward(ARM, TAUGHT) @ X) @ Y)
+GLIMPSE = BootstrapView(TAUGHT, inverse(forward(ARM, TAUGHT) @ X) @ Y)
 LENS = CameraModel(1280, 1024, ((1667.0, 0.0, 639.5), (0.0, 1667.0, 511.5), (0.0, 0.0, 1.0)), (-0.09, 0.11))
 
 

@@ -30,6 +30,8 @@ class DhDeltas:
 
 @dataclass(frozen=True)
 class RobotModel:
+    """Kinematic table and limits of a UR arm."""
+
     name: str
     a_m: tuple[float, ...]
     d_m: tuple[float, ...]

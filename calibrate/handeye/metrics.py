@@ -18,6 +18,8 @@ _MIN_SECOND_AXIS_RAD = np.radians(0.3)
 
 @dataclass(frozen=True, eq=False)
 class Observability:
+    """Weakest direction of X and the motions behind it."""
+
     weakest_direction: Array
     """(6,) unit [δt, δφ] in X's parent frame, rotation weighed at the working distance."""
     weakest_text: str

@@ -133,19 +133,13 @@ class Layout:
 
     @classmethod
     def of(cls, state: CellState) -> Layout:
-        lens = 12 + len(intrinsics_names(state.camera))
-        shape = lens + len(SHAPE)
-        table = shape + len(state.table)
-        size = table + 6 * (state.second is not None)
-        return cls(
-            slice(0, 6),
-            slice(6, 12),
-            slice(12, lens),
-            slice(lens, shape),
-            slice(shape, table),
-            slice(table, size),
-            size,
-        )
+        """Lay out the unknowns of `state` one after the other."""
+        lens, second = len(intrinsics_names(state.camera)), 6 * (state.second is not None)
+        sizes = (6, 6, lens, len(SHAPE), len(state.table), second)
+        ends = np.cumsum(sizes).tolist()
+        slices = [slice(end - size, end) for size, end in zip(sizes, ends, strict=True)]
+        X, Y, at_lens, shape, table, at_second = slices
+        return cls(X, Y, at_lens, shape, table, at_second, ends[-1])
 
 
 def observe_views(views: ViewSet) -> Observations:

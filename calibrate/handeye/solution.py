@@ -37,6 +37,8 @@ Profile = Literal["robust", "paper"]
 
 @dataclass(frozen=True)
 class SolveOptions:
+    """Choices of one solve."""
+
     profile: Profile = "robust"
     seed: int = 0
     intrinsics_from_same_pictures: bool = False

@@ -32,6 +32,8 @@ _FISHEYE_STEPS = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 60, 1e-9)
 
 @dataclass(frozen=True, eq=False)
 class Intrinsics:
+    """Estimated intrinsics and their errors."""
+
     camera: CameraModel
     rms_px: float
     """RMS of the corners' distances from where the lens shows them; without dropped views."""

@@ -26,7 +26,7 @@ TOLERANCE = 1e-6
 FLOOR = 1e-8
 """Share of the form's trace below which an objective counts as zero in the relative gap."""
 _UNIQUE = 1e-9
-"""Of the form's trace."""
+"""Share of the form's trace: a second eigenvalue below it means another minimum."""
 
 
 @dataclass(frozen=True)

@@ -18,8 +18,9 @@ from station.cell.status import StationState as S
 from station.devices.ur import UrRobot
 from station.protocol.verbs import Purpose
 from station.simulation.launch import AdminClient, SimulatedController
+from tests.codes import raises
 from tests.conftest import asked
-from tests.station.session_rig import TRUTH, Rig, raises
+from tests.station.session_rig import TRUTH, Rig
 
 pytestmark = pytest.mark.process
 HOME = np.array(TRUTH.start_joints_rad)

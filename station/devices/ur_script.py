@@ -206,7 +206,7 @@ class ScriptControl:
     def __init__(self, host: str) -> None:
         """Uploads the script and waits until it answers.
 
-        Raises RobotError `registers-in-use`, `program-playing`, `script-not-started`; RtdeError, OSError.
+        Raises RobotError `registers-in-use`, `no-state`, `program-playing`, `script-not-started`; OSError.
         """
         self._told = Told(-1.0, RuntimeState.STOPPED, 0, 0, ())
         self._told_s = time.monotonic()
@@ -238,7 +238,8 @@ class ScriptControl:
         self._link.setblocking(False)
         sequence = random.randrange(1, 2**30)  # an answer left by an earlier script is never ours
         self._write(sequence, Verb.NONE)
-        self._wait(lambda: self._samples > SETTLE_SAMPLES, HANDSHAKE_S)
+        if not self._wait(lambda: self._samples > SETTLE_SAMPLES, HANDSHAKE_S):
+            raise RtdeError(f"no robot state came within {HANDSHAKE_S:g} s", code="no-state")
         if self._told.program not in (RuntimeState.STOPPED, RuntimeState.STOPPING):
             raise RobotError("a program is playing on the robot", code="program-playing")
         with socket.create_connection((host, SCRIPT_PORT), HANDSHAKE_S) as upload:

@@ -320,6 +320,7 @@ def test_a_script_that_is_lost_stays_lost(
     [
         ({"cmd": "in_use", "inputs": [f"input_double_register_{FIRST_REGISTER}"]}, "registers-in-use"),
         ({"cmd": "foreign"}, "program-playing"),
+        ({"cmd": "stall"}, "no-state"),
         ({"cmd": "power_off"}, "script-not-started"),
     ],
 )
@@ -337,8 +338,9 @@ def test_a_start_is_refused(
     with pytest.raises(RobotError) as caught:
         connect(running.host)
     assert caught.value.code == code
+    assert uploads(admin) == (code == "script-not-started")
     if code == "program-playing":
-        assert uploads(admin) == 0 and admin.ask("state")["program"] == "palletising.urp"
+        assert admin.ask("state")["program"] == "palletising.urp"
 
 
 @pytest.mark.process

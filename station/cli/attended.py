@@ -18,7 +18,7 @@ from station.cli.console import err
 from station.cli.progress import SessionProgress
 from station.operate.motion import (
     HASH_DIGITS,
-    Outcome,
+    SessionOutcome,
     carry_out,
     motion_facts,
     not_approved,
@@ -75,7 +75,7 @@ class Attended:
         """The status now, by a new connection: no status waited there while a person was asked."""
         return await status_now(self._socket)
 
-    async def carry_out(self, purpose: Purpose) -> Outcome:
+    async def carry_out(self, purpose: Purpose) -> SessionOutcome:
         """One session, until it rests."""
         self.progress.skip(await self.status())
         # One pose more never ends a session that has others left.
@@ -90,7 +90,7 @@ class Attended:
                 headless=not self.interactive,
             )
 
-    async def watch(self, started: object) -> Outcome:
+    async def watch(self, started: object) -> SessionOutcome:
         """A session that was just started, until it rests. RefusedError when it was not `started`."""
         if not started:
             raise not_approved()

@@ -20,7 +20,7 @@ from station.cell.status import StationStatus
 from station.cli.attended import attended
 from station.cli.console import AsJson, Headless, Socket, err, out
 from station.operate.drift_check import POSES, check_arguments, start_drift_check
-from station.operate.motion import Outcome, wait_until_idle
+from station.operate.motion import SessionOutcome, wait_until_idle
 from station.plan.files import load_plan, sweep_plan
 from station.protocol.client import Client
 from station.protocol.verbs import LoadPlan, Purpose
@@ -110,7 +110,7 @@ def drift_check_command(
     Exit codes: 0 PASS, 4 FAIL, 1 no recording or nothing installed, 2 usage.
     """
 
-    async def captured() -> Outcome:
+    async def captured() -> SessionOutcome:
         async with attended(socket, headless, approve) as shell:
             standing = await shell.status()
             shell.progress.skip(standing)
@@ -149,7 +149,7 @@ async def session(
     approved: str = "",
     quiet: bool = False,
     before: Callable[[Client], Awaitable[None]] | None = None,
-) -> Outcome:
+) -> SessionOutcome:
     """One session, approved by a person here or by the hash of what was approved."""
     async with attended(socket, headless, approved, quiet) as shell:
         if before is not None:
@@ -157,7 +157,7 @@ async def session(
         return await shell.carry_out(purpose)
 
 
-def _finish(outcome: Outcome, as_json: bool) -> None:
+def _finish(outcome: SessionOutcome, as_json: bool) -> None:
     if as_json:
         poses = {"planned": outcome.planned, "captured": outcome.captured}
         state = outcome.status.state.value

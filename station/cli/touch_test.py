@@ -72,7 +72,7 @@ async def _visit(
     standoff_m: float,
     pointer_m: float | None,
     quiet: bool,
-) -> _Visit:
+) -> _ShellToucher:
     async with attended(socket) as shell:
         if quiet and not (await shell.status()).simulated:
             raise RefusedError(
@@ -80,7 +80,7 @@ async def _visit(
             )
         root = shell.client.root
         found = read_calibration(file) if file else load_installed(root, allow_simulated=True)
-        visit = _Visit(shell, found.board, corners, pointer_m, quiet)
+        visit = _ShellToucher(shell, found.board, corners, pointer_m, quiet)
         try:
             await touch_test(shell.client, visit, file, standoff_m)
         finally:
@@ -88,7 +88,7 @@ async def _visit(
     return visit
 
 
-class _Visit:
+class _ShellToucher:
     """The person at this terminal, who guides the tip."""
 
     def __init__(

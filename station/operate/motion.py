@@ -47,7 +47,7 @@ class Link(Protocol):
 
 
 @dataclass(frozen=True)
-class Outcome:
+class SessionOutcome:
     """The end of a session, or its standstill."""
 
     status: StationStatus
@@ -145,7 +145,7 @@ async def carry_out(
     *,
     finish_with_loss: bool = False,
     headless: bool = False,
-) -> Outcome:
+) -> SessionOutcome:
     """One session from its approval until it rests. RefusedError when the daemon or the person says no."""
     if not await prepared_motion(link, purpose, approve, headless=headless):
         raise not_approved()
@@ -156,14 +156,14 @@ def not_approved() -> RefusedError:
     return RefusedError("Nothing moved: the motion was not approved.", code="not-approved")
 
 
-async def watched(link: Link, watch: Watcher, finish_with_loss: bool = False) -> Outcome:
+async def watched(link: Link, watch: Watcher, finish_with_loss: bool = False) -> SessionOutcome:
     """Watch a session until it rests; `finish_with_loss`: finish it although poses failed."""
     status = await _until_rest(link, watch)
     if status.state is StationState.PAUSED and finish_with_loss and status.session.captured:
         await link.call(Finish())
         link.outdate()
         status = await _until_rest(link, watch)
-    return Outcome(status)
+    return SessionOutcome(status)
 
 
 async def _until_rest(link: Link, watch: Watcher) -> StationStatus:

@@ -29,7 +29,7 @@ from station.protocol.states import RUNNING
 from station.protocol.stop_client import send_stop
 from station.protocol.verbs import Lease, Sessions, Watch
 from station.tui.checklist import ChecklistScreen
-from station.tui.desk import Link
+from station.tui.desk import ScreenLink
 from station.tui.dialogs import Help
 from station.tui.live import LiveScreen, LogScreen
 from station.tui.plan import PlanScreen
@@ -41,9 +41,9 @@ from station.tui.screen import StationScreen
 from station.tui.sessions import SessionsScreen
 from station.tui.themes import THEMES, chosen_theme
 from station.tui.widgets.graphics import detect
-from station.tui.widgets.preview import Preview
+from station.tui.widgets.preview import PreviewPane
 
-Connect = Callable[[], Awaitable[Link]]
+Connect = Callable[[], Awaitable[ScreenLink]]
 LISTEN_S = 0.5
 SILENT_S = 2.0
 """A working daemon answers within milliseconds, on a busy computer within some hundred."""
@@ -82,7 +82,7 @@ SCREEN_TOOLTIPS = {
 }
 
 
-async def listen(link: Link, tell: Callable[[float | None], None]) -> None:
+async def listen(link: ScreenLink, tell: Callable[[float | None], None]) -> None:
     """Ask something small again and again; ends with the link. A daemon that hangs keeps its socket open.
 
     `tell` hears for how many seconds it has not answered, and None when it did.
@@ -249,7 +249,7 @@ class StationApp(ResultsDesk):
             link = screen.link if isinstance(screen, ReplayScreen) else self.link
             if link is None or not isinstance(screen, LiveScreen):
                 continue
-            for preview in screen.query(Preview):
+            for preview in screen.query(PreviewPane):
                 with contextlib.suppress(OSError, StationError):
                     await preview.fetch(link)
 
@@ -314,7 +314,7 @@ class ReplayApp(Player, StationApp):
     BINDINGS: ClassVar[list[BindingType]] = [*Player.BINDINGS]
 
     def __init__(self, link: ReplayLink) -> None:
-        async def connect() -> Link:
+        async def connect() -> ScreenLink:
             return link
 
         super().__init__(connect)
@@ -324,7 +324,7 @@ class ReplayApp(Player, StationApp):
 def run(socket: Path, who: str = "") -> None:
     """Opens the screen on the daemon that serves `socket` and returns when it is closed."""
 
-    async def connect() -> Link:
+    async def connect() -> ScreenLink:
         return await Client.connect(socket, who)
 
     app = StationApp(connect)

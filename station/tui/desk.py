@@ -38,7 +38,7 @@ BUSY: dict[Purpose, str] = {
 }
 
 
-class Link(motion.Link, Protocol):
+class ScreenLink(motion.Link, Protocol):
     """A connection: `station.protocol.client.Client`, a recording, or a test's own."""
 
     async def close(self) -> None: ...
@@ -56,7 +56,7 @@ class Desk(App[None]):
     """The newest status; it outlives the daemon."""
     serves = True
     """A station stands behind this screen, not a recording alone."""
-    link: Link | None = None
+    link: ScreenLink | None = None
     """The connection while there is one."""
     stop_unconnected: Callable[[], bool] = staticmethod(lambda: False)
     """Sends STOP where there is no connection (`protocol.stop_client.send_stop`); False: nobody listens."""
@@ -71,7 +71,11 @@ class Desk(App[None]):
     _own_id: int | None = None
     """The daemon's number of this connection, once it had control."""
     _newest: StationStatus | None = None
-    _news = asyncio.Event()
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._news = asyncio.Event()
+        """Set, and replaced, with every new status."""
 
     @property
     def root(self) -> Path | None:
@@ -111,7 +115,7 @@ class Desk(App[None]):
             if words:
                 self.tell_busy("")
 
-    async def _take_control(self, link: Link) -> None:
+    async def _take_control(self, link: ScreenLink) -> None:
         self._own_id = (await link.call(verbs.Lease("take"))).client_id
 
     async def statuses(self) -> AsyncIterator[StationStatus]:
@@ -166,7 +170,7 @@ class Desk(App[None]):
 
     async def start(self, begun: Awaitable[R]) -> R | None:
         """A flow that begins with a motion; None when it did not come to that."""
-        if (started := await self.attempt(begun)) or None:
+        if started := await self.attempt(begun):
             self.clear_notifications()  # they were of the time before
         return started
 

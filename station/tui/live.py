@@ -13,7 +13,7 @@ from textual.widgets import RichLog, Static
 from station.cell.status import Event, StationStatus
 from station.tui.screen import StationScreen
 from station.tui.widgets import panels
-from station.tui.widgets.preview import Preview
+from station.tui.widgets.preview import PreviewPane
 from station.tui.words import POSE_MARKS, clock
 
 _STYLES = {"debug": "dim", "info": "", "warning": "bold", "error": "bold reverse"}
@@ -66,7 +66,7 @@ class LiveScreen(StationScreen):
     def body(self) -> ComposeResult:
         with Horizontal(id="live"):
             with Vertical(id="live-left"):
-                yield Preview(id="preview")
+                yield PreviewPane(id="preview")
                 yield panels.Panel("Detection", panels.detection_lines, id="detection")
                 yield panels.Panel("Pose", panels.progress_lines, id="progress")
             with Vertical(id="live-right"):

@@ -95,7 +95,7 @@ class StationScreen(Screen[None]):
             bar.silent_s = silent_s
         for line in self.query(ReasonLine):
             line.trouble = trouble
-        for part in self.query("Panel, Preview"):
+        for part in self.query("Panel, PreviewPane"):
             part.old = bool(trouble)  # type: ignore[attr-defined]
 
 

@@ -131,7 +131,7 @@ class Touching(ModalScreen[Touch | None]):
         self.dismiss(None)
 
 
-class _Visit:
+class _ScreenToucher:
     """The person in front of this screen, who guides the tip."""
 
     def __init__(self, desk: Desk, board: BoardSpec) -> None:
@@ -165,7 +165,7 @@ async def run_touch_test(desk: Desk, path: Path) -> bool:
     calibration = await desk.attempt(asyncio.to_thread(read_calibration, path))
     if calibration is None:
         return False
-    person = _Visit(desk, calibration.board)
+    person = _ScreenToucher(desk, calibration.board)
     await desk.attempt(touch_test(desk, person, path))
     if not person.found:
         return False

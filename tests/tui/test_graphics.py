@@ -28,7 +28,7 @@ from station.tui.app import StationApp
 from station.tui.dialogs import ConfirmMotion
 from station.tui.widgets import graphics as graphics_module
 from station.tui.widgets.graphics import SWITCH, Graphics, SharpPicture, detect
-from station.tui.widgets.preview import Preview
+from station.tui.widgets.preview import PreviewPane
 from tests.tui.conftest import FakeLink, app_on, idle, opened, until
 
 CELL = (8, 17)
@@ -59,7 +59,7 @@ def sharp_app(link: FakeLink, graphics: Graphics) -> StationApp:
 
 def lines_of(pilot: Pilot[None]) -> list[str]:
     """What the preview would write to the terminal, control sequences included."""
-    preview = pilot.app.screen_stack[0].query_one(Preview)
+    preview = pilot.app.screen_stack[0].query_one(PreviewPane)
     strips = preview.render_lines(Region(0, 0, *preview.size))
     return ["".join(segment.text for segment in strip) for strip in strips]
 
@@ -73,7 +73,7 @@ async def test_the_picture_fills_whole_cells_and_comes_after_the_last_line(
 ) -> None:
     async with sharp_app(link, sixels).run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: sharp(pilot))
-        preview = pilot.app.screen.query_one(Preview)
+        preview = pilot.app.screen.query_one(PreviewPane)
         *others, last = lines_of(pilot)
         assert len(others) + 1 == preview.size.height
         assert not any("\x1bP" in line for line in others)
@@ -238,7 +238,7 @@ async def test_a_status_repaints_only_what_it_changes(
 
 async def test_until_the_next_picture_is_due_only_the_smallest_is_asked_for(link: FakeLink) -> None:
     async with app_on(link).run_test(size=(160, 48)) as pilot:
-        preview = pilot.app.screen.query_one(Preview)
+        preview = pilot.app.screen.query_one(PreviewPane)
         await until(pilot, lambda: preview._image is not None)
         shown = preview._image
         preview._next_s = time.monotonic() + 3600.0

@@ -17,7 +17,7 @@ from station.protocol import verbs
 from station.tui.app import ReplayApp
 from station.tui.replay import END_TEXT, NO_ESTIMATE, ReplayLink, Timeline
 from station.tui.replay_screen import ReplayScreen
-from station.tui.widgets.preview import Preview
+from station.tui.widgets.preview import PreviewPane
 from tests.recordings.small_recording import make_info, make_picture, make_view
 from tests.tui.conftest import FakeLink, app_on, idle, summary, text_of, until
 
@@ -57,7 +57,7 @@ async def test_it_plays_to_its_end_with_pictures_and_marks(link: FakeLink) -> No
         assert "PLAYBACK" in text_of(pilot.app, "#bar")
         assert END_TEXT in text_of(pilot.app, "#reason")
         assert text_of(pilot.app, "#estimate").split("\n") == ["25 views", NO_ESTIMATE]
-        preview = pilot.app.screen.query_one(Preview)
+        preview = pilot.app.screen.query_one(PreviewPane)
         await until(pilot, lambda: preview._image is not None and len(preview._corners) == 42)
 
 

@@ -11,7 +11,7 @@ from station.protocol.client import DaemonGoneError
 from station.tui import app as attendance
 from station.tui.app import SILENT, StationApp
 from station.tui.desk import STOP_UNHEARD
-from station.tui.widgets.preview import OLD, Preview
+from station.tui.widgets.preview import OLD, PreviewPane
 from tests.tui.conftest import FakeLink, app_on, idle, opened, text_of, until
 
 
@@ -25,7 +25,7 @@ async def test_a_daemon_that_does_not_answer_is_announced_and_what_it_said_is_ol
     link.show(idle(StationState.MOVING))
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: "MOVING" in text_of(pilot.app, "#bar"))
-        preview = pilot.app.screen.query_one(Preview)
+        preview = pilot.app.screen.query_one(PreviewPane)
         await until(pilot, lambda: preview._image is not None)
         link.silent.set()
         await until(pilot, lambda: "NO ANSWER" in text_of(pilot.app, "#bar"))

@@ -14,7 +14,7 @@ from station.tui.dialogs import Help
 from station.tui.live import LiveScreen
 from station.tui.plan import NO_PLAN, PlanScreen
 from station.tui.themes import chosen_theme
-from station.tui.widgets.preview import Preview
+from station.tui.widgets.preview import PreviewPane
 from tests.tui.conftest import FakeLink, app_on, idle, opened, text_of, until
 
 MISSING = [Check("robot", "failed", "no answer", "switch it on")]
@@ -142,7 +142,7 @@ async def test_the_picture_needs_no_grey_background_on_a_console(
 ) -> None:
     monkeypatch.setenv("TEXTUAL_THEME", theme)
     async with app_on(link).run_test(size=(80, 24)) as pilot:
-        preview = pilot.app.screen.query_one(Preview)
+        preview = pilot.app.screen.query_one(PreviewPane)
         await until(pilot, lambda: preview._image is not None)
         text = "".join(preview.render_line(y).text for y in range(preview.size.height))
         assert set(text) - {" ", "+"} <= set(marks)

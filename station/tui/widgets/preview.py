@@ -21,7 +21,7 @@ from textual.strip import Strip
 from textual.widget import Widget
 
 from station.protocol import verbs
-from station.tui.desk import Desk, Link
+from station.tui.desk import Desk, ScreenLink
 from station.tui.widgets.graphics import PERIOD_S, SHARE, Graphics, SharpPicture
 
 Grey = NDArray[np.uint8]
@@ -37,13 +37,13 @@ FEW_SHADES = " ░▒▓█"
 """Shades of a console with 16 colours, whose backgrounds have no greys: one a cell."""
 
 
-class Preview(Widget):
+class PreviewPane(Widget):
     """The last image it was given; scales with its own size, keeps the aspect ratio.
 
     Half blocks are drawn whenever something may stand over the image: a terminal's own graphics hide text.
     """
 
-    DEFAULT_CSS = "Preview { width: 1fr; height: 1fr; }"
+    DEFAULT_CSS = "PreviewPane { width: 1fr; height: 1fr; }"
 
     old: reactive[bool] = reactive(False)
     """The camera may see something else by now; written across the picture."""
@@ -59,7 +59,7 @@ class Preview(Widget):
         self._next_s = 0.0
         """Not before: drawing takes no more than its share of the computer."""
 
-    async def fetch(self, link: Link) -> None:
+    async def fetch(self, link: ScreenLink) -> None:
         """Ask for an image and show it. What the daemon sees in it stands in the status, shown or not.
 
         Until the next one may be drawn the smallest will do: a large one is dear to send and to read.

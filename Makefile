@@ -8,7 +8,7 @@ PYTHON ?= $(or $(SYSTEM_PYTHON),python3)
 VENV_FLAGS := $(if $(SYSTEM_PYTHON),--system-site-packages,)
 READY := $(VENV)/.ready
 
-.PHONY: help venv demo demo-gige test foreign check bench soak install install-files uninstall clean
+.PHONY: help venv demo demo-gige test foreign check bench pages soak install install-files uninstall clean
 help:  ## list the commands
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
@@ -58,6 +58,9 @@ foreign: $(FOREIGN)/.ready  ## our files judged by other people's programs, and 
 bench: $(READY)  ## the benchmarks; tables go to benchmarks/README.md
 	$(BIN)/python -m benchmarks
 
+pages: $(READY)  ## the pages of docs/ that are made from the sources
+	for page in api errors protocol; do $(BIN)/python docs/$$page.py > docs/$$page.md; done
+
 soak: $(READY)  ## the long runs that CI shortens
 	$(BIN)/python -m pytest -m soak --timeout 3600
 
@@ -71,10 +74,13 @@ UNITS := station.service station-tui@.service calibrate@.service
 
 install: install-files  ## install programs, units and users' definitions below PREFIX (/usr/local) and /etc
 	$(PYTHON) -m venv $(VENV_FLAGS) $(DESTDIR)$(APP)
-	$(DESTDIR)$(APP)/bin/python -m pip --disable-pip-version-check install --quiet -c constraints.txt .
+	$(DESTDIR)$(APP)/bin/python -m pip --disable-pip-version-check install --quiet -c constraints.txt '.[station]'
 	sed -i '1s|^#!$(DESTDIR)$(APP)|#!$(APP)|' $(addprefix $(DESTDIR)$(APP)/bin/,station calibrate recordings)
 	install -d $(DESTDIR)$(PREFIX)/bin
 	for name in station calibrate recordings; do ln -sf $(APP)/bin/$$name $(DESTDIR)$(PREFIX)/bin/$$name; done
+	install -d $(DESTDIR)$(PREFIX)/share/man/man1
+	for name in station calibrate recordings; do \
+		$(DESTDIR)$(APP)/bin/python docs/man.py $$name > $(DESTDIR)$(PREFIX)/share/man/man1/$$name.1; done
 	@echo "Next: systemd/README.md (users, configuration, start)."
 
 install-files:  # the part of install that needs no network
@@ -94,6 +100,7 @@ uninstall:  ## stop the services and remove what install put there; configuratio
 	$(if $(DESTDIR),,-systemctl stop 'station-tui@*' 'calibrate@*' 2>/dev/null)
 	rm -rf $(DESTDIR)$(APP) $(DESTDIR)$(DOC)
 	rm -f $(addprefix $(DESTDIR)$(PREFIX)/bin/,station calibrate recordings)
+	rm -f $(addsuffix .1,$(addprefix $(DESTDIR)$(PREFIX)/share/man/man1/,station calibrate recordings))
 	rm -f $(addprefix $(DESTDIR)$(SYSCONFDIR)/systemd/system/,$(UNITS))
 	rm -f $(DESTDIR)$(SYSCONFDIR)/sysusers.d/station.conf $(DESTDIR)$(SYSCONFDIR)/tmpfiles.d/station.conf
 	rm -f $(DESTDIR)$(SYSCONFDIR)/udev/rules.d/60-station.rules

@@ -1,4 +1,4 @@
-"""Prints docs/protocol.md from the table of verbs: `python docs/protocol.py > docs/protocol.md`."""
+"""Prints docs/protocol.md from the table of verbs: `make pages`."""
 
 from __future__ import annotations
 

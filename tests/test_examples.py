@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 import typer
 
-from calibrate.cli.app import app as calibrate_app
+from calibrate.cli.app import CALIBRATE
 from recordings.cli.app import RECORDINGS
 from station.cli.app import STATION
 
 PROGRAMS = {
-    "calibrate": calibrate_app,
+    "calibrate": CALIBRATE,
     "recordings": RECORDINGS,
     "station": STATION,
 }

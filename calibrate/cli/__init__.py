@@ -10,7 +10,7 @@ def main() -> None:
     # Before numpy is loaded: small matrices are faster on one thread, and the same to the bit on any machine
     # with the same processor, whatever its number of cores.
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    from calibrate.cli.app import app
+    from calibrate.cli.app import CALIBRATE
     from recordings.cli.lazy import run
 
-    run("calibrate", app)
+    run("calibrate", CALIBRATE)

@@ -93,7 +93,7 @@ COMMANDS = {
         ("calibrate sweep sweep.mcap", "calibrate sweep sweep.mcap --calibration cell.yaml"),
     ),
 }
-app = LazyGroup(
+CALIBRATE = LazyGroup(
     COMMANDS,
     help="From a recording to a calibration that can be trusted, installed and undone.\n\n"
     "First: calibrate solve REC -o cell.yaml --report cell.html, then calibrate install cell.yaml. Your own "

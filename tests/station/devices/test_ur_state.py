@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import math
 import time
 from collections.abc import Callable, Iterator
@@ -133,7 +134,11 @@ def test_a_port_that_is_no_rtde_is_refused() -> None:
             writer.write(b"\x00\x01HTTP/1.1 400 Bad Request")
             await writer.drain()
             writer.close()
+            with contextlib.suppress(ConnectionError):
+                await writer.wait_closed()
+            gone.set()
 
+        gone = asyncio.Event()
         server = await asyncio.start_server(babble, "127.91.7.3", 30004)
         reader = StateReader("127.91.7.3", lambda _: None, lambda _: None)
         reader.start()
@@ -143,6 +148,7 @@ def test_a_port_that_is_no_rtde_is_refused() -> None:
             return str(error)
         finally:
             await asyncio.to_thread(reader.close)
+            await gone.wait()
             server.close()
         return ""
 

@@ -1,0 +1,40 @@
+"""Pages made from the sources are fresh, and what they list is what was meant."""
+
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.mark.parametrize("page", ["api", "errors", "protocol"])
+def test_a_made_page_is_fresh(page: str) -> None:
+    """`make pages` makes them anew."""
+    command = [sys.executable, ROOT / "docs" / f"{page}.py"]
+    made = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
+    assert made.stdout == (ROOT / "docs" / f"{page}.md").read_text()
+
+
+def test_every_error_has_a_code_of_its_own_kind() -> None:
+    cells = re.findall(r"^\| `(.+?)` \|", (ROOT / "docs" / "errors.md").read_text(), re.MULTILINE)
+    codes = [code for cell in cells for code in cell.split(" / ")]
+    assert len(codes) > 100
+    assert all(re.fullmatch("[a-z0-9]+(-[a-z0-9]+)*", code) for code in codes)
+    assert not {"failed", "recording", "calibration", "station"} & set(codes)
+
+
+@pytest.mark.parametrize("program", ["station", "calibrate", "recordings"])
+def test_a_manual_page_names_every_command(program: str) -> None:
+    done = subprocess.run(
+        [sys.executable, ROOT / "docs" / "man.py", program], capture_output=True, text=True, check=True
+    )
+    asked = subprocess.run(
+        [sys.executable, "-m", f"{program}.cli", "--help"], capture_output=True, text=True, check=True
+    )
+    commands = re.findall(r"^\.SS \w+ ([\w-]+)$", done.stdout, re.MULTILINE)
+    assert len(commands) > 3 and all(command in asked.stdout for command in commands)

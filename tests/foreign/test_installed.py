@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
 import sys
 import tarfile
-import venv
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -36,14 +37,31 @@ def packed(tmp_path_factory: pytest.TempPathFactory, tracked: list[str]) -> Path
     return source / "dist"
 
 
-@pytest.fixture(scope="module")
-def installed(packed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def lowest() -> list[str]:
+    """The core dependencies as old as they may be."""
+    core = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["dependencies"]
+    return [re.sub(r">=([\d.]+).*", r"==\1.*", requirement) for requirement in core]
+
+
+def another_python() -> str:
+    """A newer one than this, where the machine has one that runs."""
+    for minor in range(14, sys.version_info.minor, -1):
+        found = shutil.which(f"python3.{minor}")
+        if found and subprocess.run([found, "-c", "import ensurepip"], capture_output=True).returncode == 0:
+            return found
+    pytest.skip("no newer Python here")
+
+
+@pytest.fixture(scope="module", params=["pinned", "lowest", "another Python"])
+def installed(request: pytest.FixtureRequest, packed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Programs of a venv with the wheel and no extra."""
     folder = tmp_path_factory.mktemp("installed")
-    venv.create(folder, with_pip=True)
+    python = another_python() if request.param == "another Python" else sys.executable
+    subprocess.run([python, "-m", "venv", folder], check=True, capture_output=True)
     [wheel] = packed.glob("*.whl")
+    versions = lowest() if request.param == "lowest" else ["-c", ROOT / "constraints.txt"]
     install = ("-m", "pip", "--disable-pip-version-check", "install", "--quiet", "--only-binary=:all:")
-    command = [folder / "bin/python", *install, "-c", ROOT / "constraints.txt", wheel]
+    command = [folder / "bin/python", *install, *versions, wheel]
     subprocess.run(command, check=True, cwd=folder, capture_output=True)
     return folder / "bin"
 

@@ -131,6 +131,7 @@ class Cell:
         with suppress(RobotError):
             async with asyncio.timeout(timeout_s):
                 await move
+        await asyncio.sleep(0)  # a move that has just ended tells its callback in the next turn
         error = move.exception()
         assert isinstance(error, RobotError), error
         clock_late_s = self.clock_late_s()

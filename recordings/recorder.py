@@ -26,6 +26,7 @@ from recordings.schema.messages import (
     Matrix4,
     RobotState,
     SessionInfo,
+    Stamps,
     View,
 )
 from recordings.schema.viewing import DETECTED, Marks
@@ -134,9 +135,11 @@ class Recorder:
         if sequence not in self._dropped_images:
             self._put(_Item(lambda: self._writer.marks(sequence, marks), _SMALL_BYTES))
 
-    def frame(self, parent: str, child: str, parent_from_child: Matrix4) -> None:
+    def frame(
+        self, parent: str, child: str, parent_from_child: Matrix4, stamps: Stamps | None = None
+    ) -> None:
         """Where something stays that is known now, for viewers."""
-        self._put(_Item(lambda: self._writer.frame(parent, child, parent_from_child), _SMALL_BYTES))
+        self._put(_Item(lambda: self._writer.frame(parent, child, parent_from_child, stamps), _SMALL_BYTES))
 
     def attach(self, name: str, media_type: str, content: bytes) -> None:
         self._put(_Item(lambda: self._writer.attach(name, media_type, content), len(content)))

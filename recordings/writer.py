@@ -168,10 +168,13 @@ class RecordingWriter:
         time_ns = self._images[sequence]
         self._show(Topic.SCENE, scene_update(entities, time_ns), time_ns)
 
-    def frame(self, parent: str, child: str, parent_from_child: Matrix4) -> None:
-        """A transform that does not change from here on, for viewers: where the camera is, say."""
-        message = viewing.frame_transform(parent, child, parent_from_child, self._start_ns)
-        self._show(Topic.FIXED_TRANSFORM, message, self._start_ns)
+    def frame(
+        self, parent: str, child: str, parent_from_child: Matrix4, stamps: Stamps | None = None
+    ) -> None:
+        """A transform of what does not move, as known from then on (None: from the start), for viewers."""
+        time_ns = self._start_ns if stamps is None else self._time_ns(stamps)
+        message = viewing.frame_transform(parent, child, parent_from_child, time_ns)
+        self._show(Topic.FIXED_TRANSFORM, message, time_ns)
 
     def _show(self, topic: Topic, message: Any, time_ns: int) -> None:
         self._add(topic, [message.SerializeToString()], time_ns)

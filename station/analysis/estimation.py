@@ -21,7 +21,7 @@ from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
-from station.cell.config import StationConfig
+from station.cell.config import StationConfig, matrix4
 from station.cell.errors import StationError
 from station.cell.scene import scene_of
 from station.cell.status import EstimateStatus
@@ -69,6 +69,8 @@ def running_estimate(
     return msgspec.structs.replace(
         blank,
         translation_mm=(round(x, 2), round(y, 2), round(z, 2)),
+        camera_pose=matrix4(X),
+        board_pose=matrix4(Y),
         sigma_translation_mm=round(1000 * sigma_m, 3),
         sigma_rotation_deg=round(math.degrees(sigma_rad), 4),
         enough=sigma_m <= goal_m,

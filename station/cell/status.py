@@ -155,6 +155,10 @@ class EstimateStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     translation_mm: tuple[float, float, float] | None = None
     sigma_translation_mm: float | None = None
     sigma_rotation_deg: float | None = None
+    camera_pose: Matrix4 | None = None
+    """Of the camera in the flange (eye-in-hand) or the base."""
+    board_pose: Matrix4 | None = None
+    """Of the board in the base (eye-in-hand) or the flange."""
     goal_mm: float | None = None
     enough: bool = False
     advice: str = ""

@@ -25,14 +25,16 @@ from recordings.schema.messages import (
     CameraModel,
     CaptureEvent,
     Image,
+    Matrix4,
     RobotState,
     SessionInfo,
     Stamps,
     View,
-    matrix_from_quaternion,
 )
+from station.cell.config import matrix4
 from station.cell.errors import CameraError
 from station.cell.plan import Plan
+from station.cell.scene import guess_matrix
 from station.cell.session_folder import (
     SessionState,
     clear_active,
@@ -184,15 +186,22 @@ class SessionRecording:
         for name, content in self._cell.attachments.items():
             recorder.attach(name, "application/json", content)
         recorder.camera_model(info.camera)
-        in_hand = config.mount == "eye-in-hand"
-        for guess, parent, child in (
-            (config.camera_guess, "flange" if in_hand else "base", "camera"),
-            (config.board_guess, "base" if in_hand else "flange", "board"),
-        ):
-            if guess is not None:
-                at, turn = list(guess.translation_m), list(guess.rotation_xyzw)
-                recorder.frame(parent, child, matrix_from_quaternion(at, turn))
         self.recorder = recorder
+        camera, board = (
+            None if guess is None else matrix4(guess_matrix(guess))
+            for guess in (config.camera_guess, config.board_guess)
+        )
+        self.show_frames(camera, board)
+
+    def show_frames(
+        self, camera: Matrix4 | None, board: Matrix4 | None, stamps: Stamps | None = None
+    ) -> None:
+        """Write where camera and board are, as known from `stamps` on, for viewers."""
+        in_hand = self._cell.config.mount == "eye-in-hand"
+        camera_parent, board_parent = ("flange", "base") if in_hand else ("base", "flange")
+        for matrix, parent, child in ((camera, camera_parent, "camera"), (board, board_parent, "board")):
+            if matrix is not None and self.recorder is not None:
+                self.recorder.frame(parent, child, matrix, stamps)
 
     def _session_camera(self, image: Image | None) -> CameraModel:
         """Known intrinsics, or at least the size of the images."""

@@ -27,6 +27,7 @@ from station.protocol.verbs import Purpose
 from station.session.context import SessionContext
 from station.session.interrupted import look_back
 from station.session.queue import PlanRevision, PoseQueue
+from station.session.recording import stamps_now
 
 _SHARPER = 4.0
 """So many times sharper the mount must be known than when the plan was made, to speak of it."""
@@ -206,6 +207,9 @@ class Estimator:
             if hint and not context.store.status.estimate.improve:
                 context.store.event("replan-helps", hint)
             context.store.update(estimate=msgspec.structs.replace(estimate, improve=hint))
+            if (recording := context.recording) is not None:
+                with contextlib.suppress(RecordingError):  # a full disk ends the run, not this look
+                    recording.show_frames(estimate.camera_pose, estimate.board_pose, stamps_now())
 
     async def _estimate(self, camera: CameraModel) -> EstimateStatus:
         """With advice on the next pose, where one more would help."""

@@ -7,8 +7,11 @@ import subprocess
 import sys
 from pathlib import Path
 
+import numpy as np
 import pytest
 
+from calibrate.files.calibration import read_calibration
+from recordings.reader import open_recording
 from station.cli.demo import DemoError, _solve
 
 
@@ -25,6 +28,11 @@ def test_the_demo_finds_the_truth(tmp_path: Path) -> None:
     assert result["truth_error"]["rotation_deg"] <= 0.05
     for name in ("recording", "calibration", "report"):
         assert Path(result[name]).is_file()
+    # The recording's own growing estimate, which viewers show as frames.
+    shown = open_recording(Path(result["recording"])).segments[-1].fixed_frames
+    solved = read_calibration(Path(result["calibration"]))
+    assert np.allclose(np.array(shown["flange", "camera"])[:3, 3], solved.transform.matrix[:3, 3], atol=5e-3)
+    assert ("base", "board") in shown
 
 
 async def test_a_solve_that_failed_says_why_under_one_name(tmp_path: Path) -> None:

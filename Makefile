@@ -31,8 +31,9 @@ demo: $(READY)  ## the whole job with no hardware: simulated UR10 and camera to 
 demo-gige: $(READY)  ## the same, with the camera over real GigE Vision inside a network namespace
 	@$(BIN)/station demo --gige
 
-test: $(READY)  ## all tests
-	$(BIN)/python -m pytest -n 2 --dist worksteal
+# Three workers on two cores: many tests wait for an arm that moves in real time.
+test: $(READY)  ## all tests of our own
+	$(BIN)/python -m pytest -n 3 --dist worksteal --ignore tests/foreign
 
 check: $(READY)  ## ruff, mypy strict, import contracts
 	$(BIN)/ruff check .
@@ -53,7 +54,7 @@ $(FOREIGN)/.ready: $(READY) tests/foreign/requirements.txt
 	@touch $@
 
 foreign: $(FOREIGN)/.ready  ## our files judged by other people's programs, and theirs read by ours
-	$(BIN)/python -m pytest -n 2 tests/foreign
+	$(BIN)/python -m pytest -n 2 --dist loadfile tests/foreign
 
 bench: $(READY)  ## the benchmarks; tables go to benchmarks/README.md
 	$(BIN)/python -m benchmarks

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections import deque
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
@@ -17,6 +16,7 @@ from calibrate.geometry import is_rigid
 from calibrate.results import RejectedView
 from calibrate.views import BoardView, ViewSet
 from recordings.errors import BadImageError
+from recordings.files import usable_cores
 from recordings.reader import Recording
 from recordings.schema.messages import BoardSpec, CameraModel, View
 
@@ -130,7 +130,7 @@ def _detect_all(
     threads: int | None,
 ) -> Iterator[tuple[View, Detection | BadImageError]]:
     """In the order of the views, with at most a few pictures in memory."""
-    workers = threads or max(1, len(os.sched_getaffinity(0)))
+    workers = threads or usable_cores()
     total = len(recording.views())
     waiting: deque[tuple[View, Future[Detection]]] = deque()
     done = 0

@@ -141,6 +141,12 @@ def bytes_text(count: int) -> str:
     return f"{count / 1e9:.1f} GB" if count >= 1_000_000_000 else f"{count / 1e6:.0f} MB"
 
 
+def usable_cores() -> int:
+    """How many cores this process may use; all of the machine's where the system does not say (macOS)."""
+    affinity = getattr(os, "sched_getaffinity", None)
+    return len(affinity(0)) if affinity else os.cpu_count() or 1
+
+
 def state_root(root: Path | None = None) -> Path:
     """State folder of the station: `root`, $STATE_DIRECTORY (systemd), or the XDG state folder."""
     if root is not None:

@@ -26,6 +26,7 @@ from calibrate.files.calibration import content_sha256, encode_calibration, writ
 from calibrate.files.lines import append_line, read_lines
 from calibrate.pipeline import JobOptions, SolvedRecording, solve_recording
 from recordings.errors import RecordingError
+from recordings.files import usable_cores
 
 RESULTS = "results.jsonl"
 _ATTEMPTS = 2
@@ -182,7 +183,7 @@ def _result(recording: str, key: str, job: SolvedRecording, name: str) -> BatchR
 
 def _pool_solver(workers: int | None, limits: Limits) -> Solver:
     """Processes of this machine. A killed worker costs a new pool, no recording."""
-    count = workers or len(os.sched_getaffinity(0))
+    count = workers or usable_cores()
 
     def solve(todo: Sequence[Task], options: JobOptions) -> Iterator[Solved]:
         attempts: dict[str, int] = {key: 0 for _, key in todo}

@@ -52,14 +52,15 @@ def another_python() -> str:
     pytest.skip("no newer Python here")
 
 
-@pytest.fixture(scope="module", params=["pinned", "lowest", "another Python"])
+@pytest.fixture(scope="module", params=["pinned", "newest", "lowest", "another Python"])
 def installed(request: pytest.FixtureRequest, packed: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Programs of a venv with the wheel and no extra."""
     folder = tmp_path_factory.mktemp("installed")
     python = another_python() if request.param == "another Python" else sys.executable
     subprocess.run([python, "-m", "venv", folder], check=True, capture_output=True)
     [wheel] = packed.glob("*.whl")
-    versions = lowest() if request.param == "lowest" else ["-c", ROOT / "constraints.txt"]
+    pins = ["-c", ROOT / "constraints.txt"]
+    versions = {"lowest": lowest(), "newest": []}.get(request.param, pins)
     install = ("-m", "pip", "--disable-pip-version-check", "install", "--quiet", "--only-binary=:all:")
     command = [folder / "bin/python", *install, *versions, wheel]
     subprocess.run(command, check=True, cwd=folder, capture_output=True)

@@ -42,8 +42,6 @@ from recordings.schema.topics import Topic, schema_bytes, schema_name
 ATTACHMENT_LIMIT_BYTES = 16 * 1024 * 1024
 SHOWN_PERIOD_NS = 40_000_000
 """Viewers get the arm at 25 Hz; the states themselves are kept at their full rate."""
-_SYNC = getattr(os, "fdatasync", os.fsync)
-"""macOS has no fdatasync."""
 KEPT_IN_MEMORY_BYTES = 256 * 2**20
 """Limit per file: a session of single images stays for the solve that follows."""
 _FREE_SPACE = "Nothing is left of it: free space or name another disk, and begin again."
@@ -362,7 +360,7 @@ class BackgroundSync:
     def _sync(self) -> None:
         start_s = time.monotonic()
         try:
-            _SYNC(self._descriptor)
+            getattr(os, "fdatasync", os.fsync)(self._descriptor)  # macOS has no fdatasync
             surplus = os.fstat(self._descriptor).st_size - KEPT_IN_MEMORY_BYTES
             if surplus > 0 and hasattr(os, "posix_fadvise"):  # a length of 0 would mean all of it
                 os.posix_fadvise(self._descriptor, 0, surplus, os.POSIX_FADV_DONTNEED)

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import struct
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
@@ -16,6 +15,9 @@ from recordings.mcap import checksum
 IMAGE_LIMIT_BYTES = 36 * 1024 * 1024
 """Decoded size above which no image is read or written: bounds the reader's memory."""
 SIDE_LIMIT_PX = 16384
+
+Pixels = NDArray[np.uint8 | np.uint16]
+"""(height, width), or (height, width, 3) as BGR."""
 
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _JPEG_SIZES = {0xC0, 0xC1, 0xC2}
@@ -119,7 +121,7 @@ def _check_png_chunks(data: bytes) -> None:
     raise ImageError("the PNG is cut (no end block)")
 
 
-def decode_image(data: bytes, width: int, height: int) -> NDArray[Any]:
+def decode_image(data: bytes, width: int, height: int) -> Pixels:
     """Compressed bytes → (height, width) uint8/uint16 or (height, width, 3) uint8 BGR, as stored.
 
     The size in the header must be the expected one before anything is decoded. Raises ImageError.
@@ -135,13 +137,13 @@ def decode_image(data: bytes, width: int, height: int) -> NDArray[Any]:
         raise ImageError(f"cannot be decoded ({error.err})") from error
     if image is None or image.shape[:2] != (height, width):
         raise ImageError("cannot be decoded")
-    decoded: NDArray[Any] = np.asarray(image)
+    decoded: Pixels = np.asarray(image)
     if decoded.ndim == 3 and decoded.dtype == np.uint16:
         return np.asarray(np.right_shift(decoded, 8), np.uint8)
     return decoded
 
 
-def encode_png(image: NDArray[Any]) -> bytes:
+def encode_png(image: Pixels) -> bytes:
     """Lossless. Level 1 with run lengths: fastest, and nearly the smallest on noisy images."""
     options = [cv2.IMWRITE_PNG_COMPRESSION, 1, cv2.IMWRITE_PNG_STRATEGY, cv2.IMWRITE_PNG_STRATEGY_RLE]
     done, data = cv2.imencode(".png", image, options)
@@ -150,12 +152,12 @@ def encode_png(image: NDArray[Any]) -> bytes:
     return data.tobytes()
 
 
-def pixel_format_of(pixels: NDArray[Any]) -> str:
+def pixel_format_of(pixels: Pixels) -> str:
     """GenICam's name for an array as recordings hold it."""
     return "BGR8" if pixels.ndim == 3 else "Mono8" if pixels.itemsize == 1 else "Mono16"
 
 
-def raw_encoding(image: NDArray[Any], pixel_format: str) -> str:
+def raw_encoding(image: Pixels, pixel_format: str) -> str:
     """The name foxglove.RawImage uses for this array's layout. ImageError for any other array."""
     if image.ndim == 2 and image.dtype == np.uint8:
         bayer = _BAYER.match(pixel_format)
@@ -171,10 +173,10 @@ def raw_encoding(image: NDArray[Any], pixel_format: str) -> str:
     raise ImageError(f"an image of shape {image.shape} and type {image.dtype} cannot be recorded")
 
 
-def raw_array(data: bytes, encoding: str, width: int, height: int) -> NDArray[Any]:
+def raw_array(data: bytes, encoding: str, width: int, height: int) -> Pixels:
     """The array (read-only, no copy) that a RawImage's bytes are. Raises ImageError."""
     shape: tuple[int, ...] = (height, width)
-    kind = np.dtype("<u2") if encoding == "mono16" else np.dtype("u1")
+    kind: np.dtype[np.uint8 | np.uint16] = np.dtype("<u2") if encoding == "mono16" else np.dtype("u1")
     if encoding == "bgr8":
         shape = (height, width, 3)
     elif encoding not in ("mono8", "mono16") and not encoding.startswith("bayer_"):

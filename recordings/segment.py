@@ -14,11 +14,10 @@ from foxglove_schemas_protobuf.CompressedImage_pb2 import CompressedImage
 from foxglove_schemas_protobuf.FrameTransform_pb2 import FrameTransform
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from google.protobuf.message import DecodeError
-from numpy.typing import NDArray
 
 from recordings.errors import BadImageError, CorruptRecordingError
 from recordings.files import is_attachment_name, is_session_name
-from recordings.images import ImageError, decode_image, raw_array
+from recordings.images import ImageError, Pixels, decode_image, raw_array
 from recordings.manifest import PARTS_LIMIT
 from recordings.mcap.contents import MessageIndex, joined
 from recordings.mcap.records import BadRecordError, require_crc
@@ -161,7 +160,7 @@ class RecordingSegment:
         del told["width"], told["height"]
         return Image(pixels=image, **told)
 
-    def _decoded_image(self, topic: Topic, address: int, width: int, height: int) -> NDArray[Any]:
+    def _decoded_image(self, topic: Topic, address: int, width: int, height: int) -> Pixels:
         message = self._image_message(topic, address)
         data = message.data
         if topic is Topic.COMPRESSED_IMAGE:

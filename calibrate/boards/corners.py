@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.geometry import Array
+from recordings.images import Pixels
 
 Grey = NDArray[np.uint8]
 
@@ -25,7 +26,7 @@ _SMOOTH_FROM_PX = 9.5
 """Below this spacing the smoothing would mix a corner with its neighbours."""
 
 
-def to_grey(image: NDArray[Any]) -> Grey:
+def to_grey(image: Pixels) -> Grey:
     """Convert (h, w) or (h, w, 3 BGR), uint8 or uint16, to (h, w) uint8; 10, 12, 16 bits by the maximum."""
     if image.dtype == np.uint16:
         bits = next(b for b in (8, 10, 12, 16) if int(image.max(initial=0)) < 1 << b)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import cv2
 import numpy as np
@@ -14,6 +14,7 @@ from calibrate.boards.grids import find_chessboard, find_circles, other_size
 from calibrate.boards.markers import find_april_grid, find_charuco, find_tag
 from calibrate.boards.model import board_points, check_board, describe_board, fixes_a_plane
 from calibrate.geometry import Array
+from recordings.images import Pixels
 from recordings.schema.messages import SINGLE_TAGS, BoardKind, BoardSpec
 
 FEWEST_POINTS = 6
@@ -67,9 +68,7 @@ class Detection:
         return len(self.indices)
 
 
-def detect(
-    image: NDArray[Any], spec: BoardSpec, thorough: bool = True, with_quality: bool = True
-) -> Detection:
+def detect(image: Pixels, spec: BoardSpec, thorough: bool = True, with_quality: bool = True) -> Detection:
     """Find the board to sub-pixel accuracy.
 
     image: (h, w) uint8 or uint16, or (h, w, 3) BGR. `thorough=False` leaves out the slow attempts and the

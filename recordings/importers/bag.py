@@ -11,15 +11,21 @@ from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from recordings.errors import ImportSourceError
-from recordings.images import KEPT_FORMATS, ImageError, decode_image, encode_png, pixel_format_of, read_header
+from recordings.images import (
+    KEPT_FORMATS,
+    ImageError,
+    Pixels,
+    decode_image,
+    encode_png,
+    pixel_format_of,
+    read_header,
+)
 from recordings.importers.bags import Bag, open_bag
 from recordings.importers.dataset import DATASET_FILE, Dataset, read_dataset, vector6
 from recordings.importers.messages import Array, ImageMessage, Joints, Progress
@@ -262,7 +268,7 @@ def _size(image: ImageMessage) -> tuple[int, int]:
     return header.width, header.height
 
 
-def _pixels(image: ImageMessage, place: int) -> tuple[NDArray[Any], bytes | None]:
+def _pixels(image: ImageMessage, place: int) -> tuple[Pixels, bytes | None]:
     """(array as recordings hold it, file bytes to keep). ImportSourceError for what no camera here writes."""
     try:
         if image.encoding == "compressed":

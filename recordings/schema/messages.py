@@ -6,12 +6,12 @@ These are the types that every room shares. How they lie in the file is `schema`
 from __future__ import annotations
 
 from enum import StrEnum
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import msgspec
 
 if TYPE_CHECKING:  # commands that only ask the daemon do not load numpy
-    from numpy.typing import NDArray
+    from recordings.images import Pixels
 
 Mount = Literal["eye-in-hand", "eye-to-hand"]
 Source = Literal["real", "simulated", "playback", "imported"]
@@ -145,7 +145,7 @@ class RobotState(msgspec.Struct, frozen=True):
 class Image(msgspec.Struct, frozen=True, eq=False):
     """One frame as the camera gave it."""
 
-    pixels: NDArray[Any]
+    pixels: Pixels
     """(height, width) uint8 or uint16, or (height, width, 3) uint8 BGR"""
     stamps: Stamps
     """device_ns: the camera's clock at the start of exposure; host: first packet received."""

@@ -19,7 +19,7 @@ from foxglove_schemas_protobuf.PointsAnnotation_pb2 import PointsAnnotation
 from foxglove_schemas_protobuf.RawImage_pb2 import RawImage
 from numpy.typing import NDArray
 
-from recordings.images import raw_encoding
+from recordings.images import Pixels, raw_encoding
 from recordings.mcap.writer import Piece
 from recordings.schema.messages import (
     CameraModel,
@@ -53,7 +53,7 @@ def _stamp(message: Any, time_ns: int) -> None:
     message.timestamp.seconds, message.timestamp.nanos = divmod(time_ns, _NS)
 
 
-def raw_image(image: NDArray[Any], pixel_format: str, time_ns: int) -> list[Piece]:
+def raw_image(image: Pixels, pixel_format: str, time_ns: int) -> list[Piece]:
     """An image as it came: the message in pieces, the pixels not copied. ImageError for odd arrays."""
     encoding = raw_encoding(image, pixel_format)
     pixels = np.ascontiguousarray(image).data.cast("B")
@@ -204,7 +204,7 @@ def image_annotations(marks: Sequence[Marks], text: str, time_ns: int) -> Any:
     return message
 
 
-def drawn(image: NDArray[Any], marks: Sequence[Marks], text: str) -> bytes:
+def drawn(image: Pixels, marks: Sequence[Marks], text: str) -> bytes:
     """The image as JPEG with marks and text in its pixels."""
     if image.dtype == np.uint16:
         image = np.asarray(image / max(1, int(image.max()) >> 8), np.uint8)

@@ -6,13 +6,13 @@ All levels are shares of full scale, 0 … 1. It assumes a linear sensor, as mac
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from calibrate.geometry import Array
+from recordings.images import Pixels
 
 TARGET_WHITE = 0.75
 """The board's white: bright, with room for uneven light before it saturates."""
@@ -44,7 +44,7 @@ class ExposureAdvice:
 
 
 def assess(
-    image: NDArray[Any],
+    image: Pixels,
     corners: Array | None,
     exposure_us: float,
     gain_db: float,
@@ -76,7 +76,7 @@ def assess(
     return ExposureAdvice(wanted_us, wanted_db, white, black, saturated, blur_px, tuple(warnings))
 
 
-def _levels(image: NDArray[Any]) -> NDArray[np.float32]:
+def _levels(image: Pixels) -> NDArray[np.float32]:
     grey = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) if image.ndim == 3 else image
     if grey.dtype == np.uint8:
         return grey.astype(np.float32) / np.float32(255)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from recordings.images import Pixels
 from station.cell.plan import ExpectedView
 
 WIDTH_PX = 640
@@ -33,7 +33,7 @@ def board_box(view: ExpectedView | None, width: int, height: int) -> Box | None:
     return (left, top, right, bottom) if right - left > 0.1 and bottom - top > 0.1 else None
 
 
-def image_motion(images: Sequence[NDArray[Any]], full_width: int = 0, box: Box | None = None) -> float | None:
+def image_motion(images: Sequence[Pixels], full_width: int = 0, box: Box | None = None) -> float | None:
     """Largest shift of the newest image against the others, px of an image `full_width` wide (0 = this).
 
     By phase correlation (Kuglin & Hines 1975) under a Hann window: 0 within 0.05 px where nothing moves, a
@@ -51,7 +51,7 @@ def image_motion(images: Sequence[NDArray[Any]], full_width: int = 0, box: Box |
     return float(scale * max(np.hypot(x, y) for x, y in shifts))
 
 
-def _reduced(image: NDArray[Any], box: Box | None) -> NDArray[np.float32]:
+def _reduced(image: Pixels, box: Box | None) -> NDArray[np.float32]:
     """Grey, 0…255, at most `WIDTH_PX` wide."""
     height, width = image.shape[:2]
     if box is not None:
@@ -59,10 +59,11 @@ def _reduced(image: NDArray[Any], box: Box | None) -> NDArray[np.float32]:
         image = image[
             round(top * height) : round(bottom * height), round(left * width) : round(right * width)
         ]
+    grey: NDArray[np.floating | np.integer] = image
     if image.dtype == np.uint16:
-        image = image.astype(np.float32) / 257.0
+        grey = image.astype(np.float32) / 257.0
     if image.ndim == 3:
-        image = cv2.cvtColor(image, cv2.COLOR_BGR2GRAY)
+        grey = cv2.cvtColor(grey, cv2.COLOR_BGR2GRAY)
     scale = min(1.0, WIDTH_PX / width)
-    small = cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
+    small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     return np.asarray(small, dtype=np.float32)

@@ -11,7 +11,7 @@ from concurrent.futures.process import BrokenProcessPool
 from functools import partial
 from multiprocessing import get_context
 from multiprocessing.process import BaseProcess
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from station.analysis.worker import start_worker, warm_up
 from station.cell.errors import StationError
@@ -41,7 +41,9 @@ class Workers:
         """Returns when the worker has loaded what it needs (about a second)."""
         await self.call(warm_up)
 
-    async def call(self, function: Callable[..., R], *args: Any, timeout_s: float = 60.0, **named: Any) -> R:
+    async def call(
+        self, function: Callable[..., R], *args: object, timeout_s: float = 60.0, **named: object
+    ) -> R:
         """The function's result or exception. WorkerError when the process fails or is too slow.
 
         `timeout_s`: from when its turn comes and the worker is there, so that no call ends another one.

@@ -10,7 +10,6 @@ import multiprocessing
 import os
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -20,6 +19,7 @@ from calibrate.boards.detect import detect
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array
 from recordings.errors import RecordingError
+from recordings.images import Pixels
 from recordings.reader import open_recording
 from recordings.schema.messages import BoardSpec, CameraModel, Vector6
 from station.analysis.estimation import CapturedView
@@ -60,7 +60,7 @@ def warm_up() -> int:
 
 
 def sight(
-    image: NDArray[Any],
+    image: Pixels,
     board: BoardSpec,
     camera: CameraModel | None,
     thorough: bool = True,

@@ -6,7 +6,7 @@ import asyncio
 import shlex
 import sys
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import typer
@@ -194,7 +194,7 @@ def board_command(context: typer.Context) -> None:
     raise typer.Exit(done.returncode)
 
 
-def _command(socket: Path | None, verb: Verb[Any]) -> None:
+def _command(socket: Path | None, verb: Verb[object]) -> None:
     """A command of whoever has control: takes it when it is free, and gives it back."""
 
     async def once() -> None:

@@ -42,6 +42,8 @@ START_TIMEOUT_S = 120.0
 END_TIMEOUT_S = 15.0
 SOLVE_TIMEOUT_S = 300.0
 _GATE_FAILED = 4
+Result = dict[str, Any]
+"""JSON: of `calibrate solve`, and our own."""
 
 
 class DemoError(StationError):
@@ -78,7 +80,7 @@ def demo_command(
         command = isolated_command([sys.executable, "-m", "station.cli", *sys.argv[1:]])
         os.execv(command[0], command)
     folder = output or state_root() / "demo" / time.strftime("%Y%m%d-%H%M%S")
-    cell: dict[str, Any] = {"seed": seed, "scene": scene, "mount": mount, "noise": noise}
+    cell: Result = {"seed": seed, "scene": scene, "mount": mount, "noise": noise}
     arguments = [part for name, value in cell.items() for part in (f"--{name}", str(value))]
     arguments += ["--time-scale", str(time_scale), *(["--gige"] if gige else [])]
     arguments += ["--control", control] if control else []
@@ -95,7 +97,7 @@ def demo_command(
         raise typer.Exit(3)
 
 
-def _show_demo(result: dict[str, Any], duration_s: float) -> None:
+def _show_demo(result: Result, duration_s: float) -> None:
     error, sigma, poses = result["truth_error"], result["sigma"], result["poses"]
     table = Table(title=f"SIMULATED cell, seed {result['seed']}: {result['mount']}, {result['scene']} scene")
     for heading in ("", "translation", "rotation"):
@@ -112,7 +114,7 @@ def _show_demo(result: dict[str, Any], duration_s: float) -> None:
 
 async def _run(
     folder: Path, arguments: list[str], poses: int, seed: int, progress: SessionProgress
-) -> dict[str, Any]:
+) -> Result:
     """Return what `--json` prints of it. `arguments`: of `station serve`. Raises StationError."""
     folder.mkdir(parents=True, exist_ok=True)
     progress.say(f"starting a simulated cell: {' '.join(arguments)}")
@@ -189,7 +191,7 @@ async def simulated_daemon(root: Path, arguments: list[str]) -> AsyncIterator[Pa
         shutil.rmtree(place, ignore_errors=True)
 
 
-async def _solve(recording: Path, calibration: Path, report: Path) -> dict[str, Any]:
+async def _solve(recording: Path, calibration: Path, report: Path) -> Result:
     """`calibrate solve` in a process of its own, as an operator's laptop would run it."""
     command = [sys.executable, "-m", "calibrate.cli", "solve", str(recording), "--json"]
     command += ["--output", str(calibration), "--report", str(report)]
@@ -210,7 +212,7 @@ async def _solve(recording: Path, calibration: Path, report: Path) -> dict[str, 
             said = words.decode(errors="replace").strip()
             raise DemoError(said or f"`calibrate solve` ended with {child.returncode}.") from None
         raise DemoError(problem.text, code=problem.code, remedy=problem.remedy, **problem.values)
-    result: dict[str, Any] = json.loads(out)
+    result: Result = json.loads(out)
     return result
 
 

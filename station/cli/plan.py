@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import msgspec
 import numpy as np
@@ -174,7 +174,7 @@ def _made(
         )
 
 
-def _summary(plan: Plan, told: Plan, outcome: PlanCheck) -> dict[str, Any]:
+def _summary(plan: Plan, told: Plan, outcome: PlanCheck) -> dict[str, object]:
     """`told`: the plan with its forecast."""
     last = told.poses[-1].predicted_sigma_m
     return {

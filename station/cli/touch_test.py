@@ -6,7 +6,7 @@ import asyncio
 import json
 from collections.abc import Awaitable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 from rich.text import Text
@@ -15,6 +15,7 @@ from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Touch, read_calibration
 from calibrate.files.install import load_installed
 from calibrate.files.verification import touch_text
+from recordings.schema.messages import BoardSpec
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import HoverOffer, MotionPreview
 from station.cli.attended import Attended, ask_person, attended, ctrl_c_at_once
@@ -92,12 +93,17 @@ class _ShellToucher:
     """The person at this terminal, who guides the tip."""
 
     def __init__(
-        self, shell: Attended, board: Any, corners: list[int] | None, pointer_m: float | None, quiet: bool
+        self,
+        shell: Attended,
+        board: BoardSpec,
+        corners: list[int] | None,
+        pointer_m: float | None,
+        quiet: bool,
     ) -> None:
         self._shell, self._board, self._pointer_m, self._quiet = shell, board, pointer_m, quiet
         self._left = list(corners or outer_corners(board))
         self.wanted = len(self._left)
-        self.rows: list[dict[str, Any]] = []
+        self.rows: list[dict[str, object]] = []
         self._touches: list[Touch] = []
 
     async def next_corner(self) -> int | None:
@@ -156,7 +162,7 @@ class _ShellToucher:
                 err.print(f"  {touch_text(touch)}")
 
 
-def _row(hovering: Hovering) -> dict[str, Any]:
+def _row(hovering: Hovering) -> dict[str, object]:
     offer = hovering.offer
     return {
         "corner": offer.corner,

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from functools import partial
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import msgspec
 
@@ -60,7 +60,7 @@ class AravisCamera:
             await self._run(self._open)
         return self.identity
 
-    async def settings(self) -> dict[str, Any]:
+    async def settings(self) -> dict[str, object]:
         """Reads the settings back from the camera."""
         async with self._busy:
             return await self._run(lambda: self._live().settings())

@@ -132,7 +132,7 @@ class GenicamDevice:
         except self._glib.Error:
             self._lost = True
 
-    def settings(self) -> dict[str, Any]:
+    def settings(self) -> dict[str, object]:
         """Read back from the camera now, for the recording."""
         with self._explained("reading the camera's settings"):
             return read_settings(self._camera)
@@ -342,7 +342,7 @@ def apply_settings(aravis: Any, camera: Any, config: CameraConfig) -> Region:
     return region
 
 
-def read_settings(camera: Any) -> dict[str, Any]:
+def read_settings(camera: Any) -> dict[str, object]:
     """Reads the settings back; JSON types only."""
     x, y, width, height = _region(camera)
     return {

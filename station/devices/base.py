@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from typing import Any, Protocol, runtime_checkable
+from typing import Protocol, runtime_checkable
 
 import msgspec
 
@@ -88,7 +88,7 @@ class Camera(Protocol):
     def counts(self) -> CameraCounts:
         """Since it was made. At once, from any thread."""
 
-    async def settings(self) -> dict[str, Any]:
+    async def settings(self) -> dict[str, object]:
         """Settings that the camera reports now, for the recording; JSON types only. Raises CameraError.
 
         `region`, where it has one: x, y, width, height of its images.

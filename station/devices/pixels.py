@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from recordings.images import Pixels
 from station.cell.errors import CameraError
-
-Image = NDArray[Any]
 
 # OpenCV names a mosaic by the second row's second and third pixel, GenICam by the first row's first two.
 _BAYER = {
@@ -51,7 +48,7 @@ def bits_per_pixel(pixel_format: str) -> int:
     return 16 if pixel_format in ("Mono10", "Mono12", "Mono16") else 8
 
 
-def decode(data: bytes, width: int, height: int, pixel_format: str) -> Image:
+def decode(data: bytes, width: int, height: int, pixel_format: str) -> Pixels:
     """(height, width) uint8 or uint16 (10 and 12 bits keep their values), or (height, width, 3) uint8 BGR.
 
     Colour mosaics are interpolated. CameraError when there are too few bytes.
@@ -74,7 +71,7 @@ def decode(data: bytes, width: int, height: int, pixel_format: str) -> Image:
     if pixel_format == "RGB8":
         return np.ascontiguousarray(raw.reshape(height, width, 3)[:, :, ::-1])
     if pixel_format in _BAYER:
-        return cv2.cvtColor(raw.reshape(height, width), _BAYER[pixel_format])
+        return np.asarray(cv2.cvtColor(raw.reshape(height, width), _BAYER[pixel_format]), np.uint8)
     return _unpack(raw, width * height, pixel_format).reshape(height, width)
 
 

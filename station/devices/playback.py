@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple, cast
 
 import cv2
 import msgspec
@@ -19,6 +19,7 @@ import numpy as np
 from calibrate.geometry import interpolate, pose_from_rotvec, rotation_log
 from recordings import strict_yaml
 from recordings.errors import RecordingError
+from recordings.images import Pixels
 from recordings.reader import Recording, open_recording
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import (
@@ -109,7 +110,8 @@ def _folder(files: list[Path]) -> Iterator[Played]:
             image = cv2.cvtColor(image, cv2.COLOR_BGRA2BGR)
         wide = "Mono16" if image.dtype.itemsize == 2 else "Mono8"
         pixel_format = "BGR8" if image.ndim == 3 else wide
-        yield Played(Image(image, Stamps(), 0, number, pixel_format=pixel_format), number / FOLDER_RATE_HZ)
+        pixels = cast(Pixels, image)
+        yield Played(Image(pixels, Stamps(), 0, number, pixel_format=pixel_format), number / FOLDER_RATE_HZ)
 
 
 def _video(path: Path, capture: cv2.VideoCapture) -> Iterator[Played]:
@@ -120,7 +122,8 @@ def _video(path: Path, capture: cv2.VideoCapture) -> Iterator[Played]:
             good, image = capture.read()
             if not good:
                 break
-            yield Played(Image(image, Stamps(), 0, number, pixel_format="BGR8"), number / rate_hz)
+            pixels = np.asarray(image, np.uint8)
+            yield Played(Image(pixels, Stamps(), 0, number, pixel_format="BGR8"), number / rate_hz)
             number += 1
     finally:
         capture.release()
@@ -208,7 +211,7 @@ class PlaybackCamera:
             self._taken += 1
             return self._newest
 
-    async def settings(self) -> dict[str, Any]:
+    async def settings(self) -> dict[str, object]:
         return {"device": self._config.device, "pace": self._config.playback_pace}
 
     async def glimpse(self) -> Image | None:

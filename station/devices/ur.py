@@ -105,7 +105,7 @@ class UrRobot(UrLink):
         self._heart = HeartbeatMonitor()
         self._played_s = 0.0
         """When the control program was last seen playing, in a move."""
-        self._background: set[asyncio.Task[Any]] = set()
+        self._background: set[asyncio.Task[object]] = set()
 
     @property
     def control_path(self) -> ControlPath:
@@ -380,7 +380,7 @@ class UrRobot(UrLink):
     def _why_stopped(self) -> str:
         return f" ({self._stop_reason})" if self._stop_reason else ""
 
-    def _later(self, work: Coroutine[Any, Any, Any]) -> None:
+    def _later(self, work: Coroutine[object, object, object]) -> None:
         task = asyncio.get_running_loop().create_task(work)
         self._background.add(task)
         task.add_done_callback(self._background.discard)

@@ -66,7 +66,7 @@ class MotionServer:
                 self._control.stopScript()
                 return
 
-    def answer(self, reply: dict[str, Any]) -> None:
+    def answer(self, reply: dict[str, object]) -> None:
         self._channel.send(json.dumps(reply).encode())
 
     def _fresh(self) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -16,6 +16,10 @@ from station.cell.errors import ConfigError
 from station.cell.limits import check_plan
 from station.cell.plan import Plan
 from station.cell.scene import Scene, board_extent, flange_poses
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from mpl_toolkits.mplot3d import Axes3D
 
 _FRUSTUM_M = 0.06
 _SHOWN_ARMS = 3
@@ -56,7 +60,7 @@ def _placed(scene: Scene, plan: Plan) -> tuple[Array, Array, Array]:
     return cameras, boards, (cameras if len(cameras) > 1 else boards)[:, :3, 3]
 
 
-def _draw_space(axes: Any, scene: Scene, plan: Plan) -> None:
+def _draw_space(axes: Axes3D, scene: Scene, plan: Plan) -> None:
     cameras, boards, path = _placed(scene, plan)
     joints = np.array([pose.joints_rad for pose in plan.poses])
     for number in np.linspace(0, len(plan.poses) - 1, min(_SHOWN_ARMS, len(plan.poses))).astype(int):
@@ -100,14 +104,14 @@ def printed_outline(scene: Scene, base_from_board: Array) -> Array:
     return transform_points(base_from_board, np.array([*flat, flat[0]], dtype=float))
 
 
-def _draw_coverage(axes: Any, scene: Scene, plan: Plan) -> None:
+def _draw_coverage(axes: Axes, scene: Scene, plan: Plan) -> None:
     for view in expected_pixels(scene, plan):
         axes.plot(view[:, 0], view[:, 1], ".", ms=1.5)
     axes.set(xlim=(0, scene.camera.width), ylim=(scene.camera.height, 0), title="board points in the picture")
     axes.set_aspect("equal")
 
 
-def _draw_error(axes: Any, plan: Plan) -> None:
+def _draw_error(axes: Axes, plan: Plan) -> None:
     sigmas = [1000 * pose.predicted_sigma_m for pose in plan.poses if pose.predicted_sigma_m is not None]
     axes.set(xlabel="poses taken", title="expected error of the camera's place, mm (1σ)")
     if sigmas:

@@ -316,10 +316,10 @@ class Part(Verb[Done], frozen=True):
     base64: str = ""
 
 
-class Whole(Verb[Any], frozen=True):
+class Whole(Verb[object], frozen=True):
     """Carry out the request whose pieces were sent, and return its result."""
 
     control = False
 
 
-VERBS: dict[str, type[Verb[Any]]] = {kind.verb(): kind for kind in Verb.__subclasses__()}
+VERBS: dict[str, type[Verb[object]]] = {kind.verb(): kind for kind in Verb.__subclasses__()}

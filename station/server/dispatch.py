@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import os
 from collections.abc import Awaitable, Callable, Coroutine
-from typing import Any
 
 import msgspec
 
@@ -54,12 +53,12 @@ class SessionDispatcher:
         cell = session.context.cell
         self._rule = ApprovalRule(cell.config.approval, cell.simulated, see)
         self._callers: dict[int, _Caller] = {}
-        self._leaving: set[asyncio.Task[None]] = set()
+        self._leaving: set[asyncio.Task[object]] = set()
         self._names: dict[int, str] = {}
         """Users by their number, once they were looked up."""
         self._methods = {name: getattr(self, f"_{name}") for name in VERBS.keys() - CONNECTION}
 
-    def stop_now(self, peer: Peer) -> Awaitable[None]:
+    def stop_now(self, peer: Peer) -> Awaitable[object]:
         """STOP is on its way to the arm before anything else is looked at."""
         caller = self._callers.get(peer.client_id) or _Caller(peer)  # the house may be full: nobody is kept
         return self._to_the_end(self._session.stop(caller.who))
@@ -85,7 +84,7 @@ class SessionDispatcher:
         self._callers.pop(peer.client_id, None)
         self._to_the_end(self._session.lease_lost(peer.client_id))
 
-    def _to_the_end(self, work: Coroutine[Any, Any, Any]) -> asyncio.Future[None]:
+    def _to_the_end(self, work: Coroutine[object, object, object]) -> asyncio.Future[object]:
         """A client that leaves takes its requests with it, but not these."""
         task = asyncio.create_task(work)
         self._leaving.add(task)

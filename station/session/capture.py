@@ -7,13 +7,12 @@ import contextlib
 import logging
 import time
 from collections import deque
-from typing import Any
 
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from calibrate.geometry import Array, inverse, pose_from_rotvec
+from recordings.images import Pixels
 from recordings.schema.messages import Image, RobotState, Stamps, Stillness, Vector6, View
 from station.analysis.estimation import CapturedView
 from station.analysis.image_motion import board_box, image_motion
@@ -233,7 +232,7 @@ class ImageWatch:
 
     def __init__(self, context: SessionContext, index: int) -> None:
         self._context, self._index = context, index
-        self._images: deque[tuple[int, NDArray[Any]]] = deque(maxlen=IMAGES)
+        self._images: deque[tuple[int, Pixels]] = deque(maxlen=IMAGES)
         self._found: tuple[int, ImageMotion] | None = None
         """With the time before which none of its images began."""
         self._blind = False

@@ -88,7 +88,9 @@ async def _camera_check(context: SessionContext, troubles: dict[str, str]) -> Ch
         return Check("camera", "warning", f"{camera.identity.model}: no image", remedy)
     # A preview may be smaller than what is captured.
     height, width = image.pixels.shape[:2]
-    width, height = settings.get("region", (0, 0, width, height))[2:]
+    match settings.get("region"):
+        case [_, _, width, height]:
+            pass
     return Check("camera", "ok", f"{camera.identity.model} {camera.identity.serial}, {width}×{height}")
 
 

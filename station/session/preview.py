@@ -5,12 +5,11 @@ from __future__ import annotations
 import asyncio
 import base64
 import time
-from typing import Any
 
 import cv2
 import numpy as np
-from numpy.typing import NDArray
 
+from recordings.images import Pixels
 from recordings.schema.messages import Image
 from station.analysis.pool import WorkerError
 from station.analysis.worker import BoardDetection, sight
@@ -73,7 +72,7 @@ class Previewer:
             context.store.update(detection=sighting.status)
 
     def _encode(
-        self, image: NDArray[Any], sighting: BoardDetection | None, width: int, height: int
+        self, image: Pixels, sighting: BoardDetection | None, width: int, height: int
     ) -> PreviewImage:
         scale = min(width / image.shape[1], height / image.shape[0], 1.0)
         size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Coroutine
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import msgspec
 import numpy as np
@@ -70,7 +70,7 @@ def software() -> dict[str, str]:
     return found
 
 
-async def to_the_end(work: Coroutine[Any, Any, R]) -> R:
+async def to_the_end(work: Coroutine[object, object, R]) -> R:
     """Finishes `work` even when cancelled. STOP halts the arm, never the disk."""
     writing = asyncio.ensure_future(work)
     try:
@@ -155,7 +155,7 @@ class SessionRecording:
         await self.save_state(queue)
 
     def _open(
-        self, plan: Plan, plan_sha256: str, first_image: Image | None, settings: dict[str, Any]
+        self, plan: Plan, plan_sha256: str, first_image: Image | None, settings: dict[str, object]
     ) -> None:
         config = self._cell.config
         require_free_space(self.folder, config.capture.free_space_bytes)

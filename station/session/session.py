@@ -12,7 +12,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import msgspec
 
@@ -319,7 +319,7 @@ class Session:
         count = len(plan.poses)
         self.store.event("plan-loaded", f"plan of {count} poses loaded", poses=count)
 
-    async def edit(self, verb: type[Verb[Any]], client_id: int, change: Callable[[PoseQueue], R]) -> R:
+    async def edit(self, verb: type[Verb[object]], client_id: int, change: Callable[[PoseQueue], R]) -> R:
         """Retake, skip, reorder, add, drop: voids a waiting approval.
 
         RecordingError: it is done, but not on the disk.
@@ -351,13 +351,13 @@ class Session:
         self.permit(verbs.Record, client_id)
         return await self.freedrive.record()
 
-    def permit(self, verb: type[Verb[Any]], client_id: int) -> None:
+    def permit(self, verb: type[Verb[object]], client_id: int) -> None:
         """RefusedError unless the table of verbs allows it to this client now."""
         if verb.control:
             self.leases.require(client_id)
         self._require_state(verb)
 
-    def _require_state(self, verb: type[Verb[Any]]) -> None:
+    def _require_state(self, verb: type[Verb[object]]) -> None:
         if (refusal := verb.refusal(self.store.state)) is not None:
             raise refusal
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import time
 from collections.abc import Callable
-from typing import Any
 
 import msgspec
 
@@ -45,7 +44,7 @@ class StatusStore:
         """The recording keeps what people are told."""
         self._listeners.append(listener)
 
-    def update(self, **sections: Any) -> None:
+    def update(self, **sections: object) -> None:
         changed = {k: v for k, v in sections.items() if getattr(self.status, k) != v}
         if changed:
             self.status = msgspec.structs.replace(self.status, **changed)
@@ -55,7 +54,7 @@ class StatusStore:
                 except Exception:  # who only looks on must not come between STOP and the arm
                     log.exception("a watcher of the status failed")
 
-    def update_session(self, **fields: Any) -> None:
+    def update_session(self, **fields: object) -> None:
         self.update(session=msgspec.structs.replace(self.status.session, **fields))
 
     def enter(self, state: StationState, reason: str | CodedError = "", cause: str = "") -> None:

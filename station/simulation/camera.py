@@ -7,7 +7,6 @@ import contextlib
 import json
 import sys
 import time
-from typing import Any
 
 import msgspec
 import numpy as np
@@ -19,6 +18,7 @@ from station.cell.errors import CameraError
 from station.devices.base import Trigger
 from station.devices.frames import RETAKE, CameraCounts, DeviceClock, FrameCounter
 from station.simulation.cell import CellTruth
+from station.simulation.launch import Json
 
 START_TIMEOUT_S = 20.0
 _ANSWER_S = 5.0
@@ -47,7 +47,7 @@ class RenderedCamera:
         self._process: asyncio.subprocess.Process | None = None
         self._reader: asyncio.Task[None] | None = None
         self._frames: asyncio.Queue[Image | CameraError] = asyncio.Queue()
-        self._answers: asyncio.Queue[Image | dict[str, Any] | CameraError] = asyncio.Queue()
+        self._answers: asyncio.Queue[Image | Json | CameraError] = asyncio.Queue()
         self._asking = asyncio.Lock()
         self._device_clock = DeviceClock()
         self.counter = FrameCounter()
@@ -125,7 +125,7 @@ class RenderedCamera:
             self._check_settings(frame)
             return msgspec.structs.replace(frame, sequence=sequence, trigger_count=pulse)
 
-    async def settings(self) -> dict[str, Any]:
+    async def settings(self) -> dict[str, object]:
         return {
             "pixel_format": "Mono8",
             "region": [0, 0, self._truth.camera.width, self._truth.camera.height],
@@ -145,7 +145,7 @@ class RenderedCamera:
         except CameraError:
             return None
 
-    async def inject(self, fault: str, value: Any = None) -> None:
+    async def inject(self, fault: str, value: object = None) -> None:
         """Arms a fault of `camera_faults`; 'unplugged' ends the process."""
         if fault == "unplugged":
             self._write({"cmd": "fault", "name": fault})
@@ -189,11 +189,11 @@ class RenderedCamera:
         if isinstance(answer, dict):
             self._device_clock.reading(answer["device_ns"], asked_ns, time.monotonic_ns())
 
-    async def _ask(self, request: dict[str, Any], timeout_s: float) -> Image | dict[str, Any]:
+    async def _ask(self, request: Json, timeout_s: float) -> Image | Json:
         async with self._asking:
             return await self._ask_locked(request, timeout_s)
 
-    async def _ask_locked(self, request: dict[str, Any], timeout_s: float) -> Image | dict[str, Any]:
+    async def _ask_locked(self, request: Json, timeout_s: float) -> Image | Json:
         while not self._answers.empty():
             self._answers.get_nowait()  # an answer that came after its deadline
         self._write(request)
@@ -206,7 +206,7 @@ class RenderedCamera:
             raise answer
         return answer
 
-    def _write(self, request: dict[str, Any]) -> None:
+    def _write(self, request: Json) -> None:
         if self._process is None or self._process.stdin is None or self._process.returncode is not None:
             raise CameraError("the rendered camera is not open or has ended", code="not-open", remedy=_REOPEN)
         self._process.stdin.write(json.dumps(request).encode() + b"\n")
@@ -234,7 +234,7 @@ class RenderedCamera:
         self._answers.put_nowait(gone)
 
 
-async def _picture(stream: asyncio.StreamReader, header: dict[str, Any]) -> Image:
+async def _picture(stream: asyncio.StreamReader, header: Json) -> Image:
     data = await stream.readexactly(header["bytes"])
     return Image(
         pixels=np.frombuffer(data, np.uint8).reshape(header["height"], header["width"]),

@@ -22,7 +22,7 @@ from calibrate.geometry import Array, inverse, pose_from_rotvec
 from recordings.schema.messages import BoardSpec, CameraModel
 from station.cell.errors import RobotError
 from station.simulation.cell import CellTruth
-from station.simulation.launch import AdminClient
+from station.simulation.launch import AdminClient, Json
 from station.simulation.renderer import Light, render, scaled
 
 TRIGGER_LATENCY_NS = 150_000
@@ -33,7 +33,7 @@ FIRST_FRAME_ID = 65_520
 PREVIEW_SCALE = 0.5
 
 
-Message = tuple[dict[str, Any], NDArray[np.uint8] | None]
+Message = tuple[Json, NDArray[np.uint8] | None]
 ONE_SHOT = ("missed-trigger", "lost-frame", "double-frame")
 """value: how often, 1 if none is given"""
 LASTING = ("illumination", "exposure", "clock-step", "cover", "board", "ringing")
@@ -136,7 +136,7 @@ class CameraProcess:
             + self.faults.clock_step_ns
         )
 
-    def answer(self, request: dict[str, Any]) -> list[Message]:
+    def answer(self, request: Json) -> list[Message]:
         """Messages to send back, each with its pixels or None. Raises RobotError without a controller."""
         match request["cmd"]:
             case "trigger":
@@ -163,7 +163,7 @@ class CameraProcess:
 
     def _frame(
         self, kind: str, start_ns: int, camera: CameraModel, frame_id: int
-    ) -> tuple[dict[str, Any], NDArray[np.uint8]]:
+    ) -> tuple[Json, NDArray[np.uint8]]:
         exposure_us = self.faults.exposure_us or self.exposure_us
         picture = self.picture(start_ns, camera)
         arrival_ns = start_ns + round(exposure_us * 1000) + READOUT_NS
@@ -236,7 +236,7 @@ def serve(lines: BinaryIO, out: BinaryIO) -> None:
             _send(out, {"kind": "error", "cmd": request["cmd"], "text": str(error)}, None)
 
 
-def _send(out: BinaryIO, header: dict[str, Any], pixels: NDArray[np.uint8] | None) -> None:
+def _send(out: BinaryIO, header: Json, pixels: NDArray[np.uint8] | None) -> None:
     if pixels is None:
         out.write(json.dumps(header).encode() + b"\n")
     else:

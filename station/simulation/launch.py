@@ -17,6 +17,8 @@ from typing import Any, Self
 from station.cell.errors import CameraError, RobotError
 from station.simulation.netns import is_isolated
 
+Json = dict[str, Any]
+"""One line of what parent and child tell each other."""
 ADMIN_PORT = 29990
 ATTEMPTS = 5
 ADDRESS_TAKEN = 1
@@ -38,7 +40,7 @@ class AdminClient:
             raise RobotError(text, code="no-simulation") from error
         self._lines = self._socket.makefile("rb")
 
-    def ask(self, cmd: str, **arguments: Any) -> dict[str, Any]:
+    def ask(self, cmd: str, **arguments: object) -> Json:
         """The answer's fields. Raises RobotError when the command is refused or the simulation is gone."""
         try:
             self._socket.sendall(json.dumps({"cmd": cmd, **arguments}).encode() + b"\n")
@@ -48,7 +50,7 @@ class AdminClient:
             raise RobotError(text, code="no-simulation") from error
         if not line:
             raise RobotError(f"the simulated controller on {self.host} has ended", code="no-simulation")
-        answer: dict[str, Any] = json.loads(line)
+        answer: Json = json.loads(line)
         if not answer.pop("ok"):
             raise RobotError(f"the simulated controller refused {answer['error']}", code="simulation-refused")
         return answer
@@ -169,7 +171,7 @@ def _read_line(child: subprocess.Popen[bytes], timeout_s: float) -> bytes:
 
 
 class SimulatedGige(ChildProcess):
-    def inject(self, fault: str, value: Any = None) -> None:
+    def inject(self, fault: str, value: object = None) -> None:
         """A fault of `CameraFaults`, or `packet-loss` with a share of packets; then it is in force."""
         self._ask(fault, value)
 
@@ -177,7 +179,7 @@ class SimulatedGige(ChildProcess):
         """Numbered images that went out so far, plus the number of the first."""
         return int(self._ask("sent")["number"])
 
-    def _ask(self, name: str, value: Any = None) -> dict[str, Any]:
+    def _ask(self, name: str, value: object = None) -> Json:
         assert self.process.stdin is not None and self.process.stdout is not None
         self.process.stdin.write(json.dumps({"name": name, "value": value}).encode() + b"\n")
         self.process.stdin.flush()

@@ -13,7 +13,7 @@ import time
 from collections.abc import Awaitable, Callable, Iterable
 from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import msgspec
 from textual import events, work
@@ -116,7 +116,7 @@ class StationApp(ResultsDesk):
 
     TITLE = "Calibration station"
     CSS_PATH = "station.tcss"
-    MODES: ClassVar[dict[str, Any]] = {
+    MODES = {  # noqa: RUF012 - declared by App
         "live": LiveScreen,
         "plan": PlanScreen,
         "result": ResultScreen,
@@ -294,7 +294,7 @@ class StationApp(ResultsDesk):
             common = [binding for kind in ours for binding in vars(kind).get("BINDINGS", [])]
             self.push_screen(Help(screen.HELP or "", [*own, *common]))
 
-    def get_system_commands(self, screen: Screen[Any]) -> Iterable[SystemCommand]:
+    def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
         """Every key's action by name too; what moves the arm asks the same question from here."""
         yield from super().get_system_commands(screen)
         own = vars(type(screen)).get("BINDINGS", []) if isinstance(screen, StationScreen) else []

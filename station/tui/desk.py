@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
 from pathlib import Path
-from typing import Any, Protocol, TypeVar
+from typing import Protocol, TypeVar
 
 from textual import work
 from textual.app import App
@@ -151,7 +151,7 @@ class Desk(App[None]):
         return await self.attempt(self.call(verb, timeout_s=timeout_s))
 
     @work(group="command", exit_on_error=False)
-    async def send(self, verb: Verb[Any]) -> None:
+    async def send(self, verb: Verb[object]) -> None:
         """A wish of one of the screens."""
         await self.ask(verb)
 
@@ -262,7 +262,7 @@ def told(problem: CodedError | OSError) -> str:
     return f"{problem.text.rstrip('.')}. {REMEDIES[problem.code]}"
 
 
-def busy_words(verb: Verb[Any]) -> str:
+def busy_words(verb: Verb[object]) -> str:
     """Words for a verb that takes seconds, or minutes on a busy computer; empty: it is answered at once."""
     match verb:
         case verbs.MakePlan():

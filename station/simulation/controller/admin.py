@@ -10,7 +10,6 @@ import json
 import time
 from collections.abc import Awaitable, Callable, Sequence
 from math import inf, isfinite
-from typing import Any
 
 from station.simulation.controller.arm import Vibration
 from station.simulation.controller.kinematics import DhTable, Six
@@ -24,7 +23,7 @@ PORT = 29990
 LINE_LIMIT = 1_000_000
 TRUTH_WAIT_S = 2.0
 
-Command = Callable[..., Awaitable[dict[str, Any] | None] | dict[str, Any] | None]
+Command = Callable[..., Awaitable[dict[str, object] | None] | dict[str, object] | None]
 HAND_RAD_S2 = 2.0
 
 
@@ -65,7 +64,7 @@ def power_off(machine: Machine) -> None:
     machine.robot.power_off()
 
 
-def drop(machine: Machine, how: Cut = "fin", ports: list[str] | None = None) -> dict[str, Any]:
+def drop(machine: Machine, how: Cut = "fin", ports: list[str] | None = None) -> dict[str, object]:
     """Cuts every connection of these ports (rtde, script, dashboard; all if none named) by fin or rst."""
     if how not in ("fin", "rst"):
         raise ValueError(f"how is fin or rst, not {how}")
@@ -169,7 +168,7 @@ def dh(
     )
 
 
-def unlock(machine: Machine) -> dict[str, Any]:
+def unlock(machine: Machine) -> dict[str, object]:
     """A person clears the protective stop (refused within 5 s of it). Not in the dashboard's log."""
     return {"unlocked": machine.robot.unlock()}
 
@@ -185,12 +184,12 @@ def stop_program(machine: Machine) -> None:
     machine.robot.stop_program("pendant")
 
 
-def pause(machine: Machine) -> dict[str, Any]:
+def pause(machine: Machine) -> dict[str, object]:
     """Pause pressed on the pendant."""
     return {"paused": machine.robot.pause_program()}
 
 
-def play(machine: Machine) -> dict[str, Any]:
+def play(machine: Machine) -> dict[str, object]:
     """Play pressed on the pendant: a paused program goes on."""
     return {"playing": machine.robot.play_program()}
 
@@ -224,12 +223,12 @@ def payload(machine: Machine, kg: float, cog_m: list[float] | None = None) -> No
     machine.robot.payload_cog = numbers("cog_m", cog_m, 3)
 
 
-def jog(machine: Machine, joints_rad: list[float], speed_rad_s: float = 0.5) -> dict[str, Any]:
+def jog(machine: Machine, joints_rad: list[float], speed_rad_s: float = 0.5) -> dict[str, object]:
     """Moves the arm with the pendant's arrows. Refused while a program plays or the arm has no power."""
     return hand_move(machine, [joints_rad], speed_rad_s)
 
 
-def hand_move(machine: Machine, path: list[list[float]], speed_rad_s: float = 0.5) -> dict[str, Any]:
+def hand_move(machine: Machine, path: list[list[float]], speed_rad_s: float = 0.5) -> dict[str, object]:
     """A person leads the arm through these joints (free-drive), the fastest joint at speed_rad_s."""
     robot = machine.robot
     corners = [numbers("path", corner, 6) for corner in path]
@@ -244,7 +243,7 @@ def hand_move(machine: Machine, path: list[list[float]], speed_rad_s: float = 0.
     return {"length_rad": length_rad}
 
 
-async def truth(machine: Machine, at_monotonic_ns: int | None = None) -> dict[str, Any]:
+async def truth(machine: Machine, at_monotonic_ns: int | None = None) -> dict[str, object]:
     """Where the arm truly was at a time of the host's monotonic clock (now, if none is given; waits up to
     2 s for a time to come): joints_rad [6], base_from_flange [4][4], miss [6] = [δt m, δφ rad] of it."""
     at_ns = time.monotonic_ns() if at_monotonic_ns is None else at_monotonic_ns
@@ -262,7 +261,7 @@ async def truth(machine: Machine, at_monotonic_ns: int | None = None) -> dict[st
     }
 
 
-def state(machine: Machine) -> dict[str, Any]:
+def state(machine: Machine) -> dict[str, object]:
     """The controller's state now."""
     robot = machine.robot
     return {
@@ -289,7 +288,7 @@ def state(machine: Machine) -> dict[str, Any]:
     }
 
 
-def stats(machine: Machine) -> dict[str, Any]:
+def stats(machine: Machine) -> dict[str, object]:
     """Cycles, packets sent and skipped, lateness of cycles against their grid, CPU time of this process."""
     clock, rtde = machine.clock, machine.rtde
     return {
@@ -302,19 +301,19 @@ def stats(machine: Machine) -> dict[str, Any]:
     }
 
 
-def log(machine: Machine, since_monotonic_ns: int = 0) -> dict[str, Any]:
+def log(machine: Machine, since_monotonic_ns: int = 0) -> dict[str, object]:
     """entries: every dashboard and script command, upload and RTDE write since that time (the newest 20 000);
     counts: how often each came, of all time."""
     journal = machine.robot.journal
     return {"entries": journal.entries(since_monotonic_ns), "counts": journal.counts}
 
 
-def list_commands(_: Machine) -> dict[str, Any]:
+def list_commands(_: Machine) -> dict[str, object]:
     """This list."""
     return {"commands": {name: " ".join((c.__doc__ or "").split()) for name, c in COMMANDS.items()}}
 
 
-_NAMED: tuple[Any, ...] = (
+_NAMED: tuple[Command, ...] = (
     pstop, estop, safeguard, power_off, drop, stall, freeze, mute, stall_dash, black_hole, restart, late,
     delay, lose, in_use, vibrate, offset, dh,
     unlock, run, stop_program, pause, play, foreign, slider, remote, tcp, payload, jog, hand_move,
@@ -341,7 +340,7 @@ class AdminServer:
         finally:
             writer.close()
 
-    async def _answer(self, line: bytes) -> dict[str, Any]:
+    async def _answer(self, line: bytes) -> dict[str, object]:
         try:
             request = json.loads(line)
             name = request.pop("cmd")

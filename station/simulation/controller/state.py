@@ -10,7 +10,6 @@ import time
 from abc import ABC, abstractmethod
 from collections import Counter, deque
 from dataclasses import dataclass
-from typing import Any
 
 from station.devices.rtde import RobotMode, RobotStatusBits, RuntimeState, SafetyMode, SafetyStatus
 from station.simulation.controller.arm import Arm, History
@@ -76,13 +75,15 @@ class Journal:
     """The newest entries in full; counts per (source, verb) of all of them, never forgotten."""
 
     def __init__(self) -> None:
-        self._entries: deque[dict[str, Any]] = deque(maxlen=ENTRIES)
+        self._entries: deque[tuple[int, dict[str, object]]] = deque(maxlen=ENTRIES)
         self._counts: Counter[str] = Counter()
 
-    def note(self, source: str, verb: str, **details: Any) -> None:
+    def note(self, source: str, verb: str, **details: object) -> None:
         """source: dashboard, script, upload, rtde or controller (what it did by itself)."""
         self._counts[f"{source}: {verb}"] += 1
-        self._entries.append({"monotonic_ns": time.monotonic_ns(), "source": source, "verb": verb, **details})
+        now_ns = time.monotonic_ns()
+        entry = {"monotonic_ns": now_ns, "source": source, "verb": verb, **details}
+        self._entries.append((now_ns, entry))
 
     def count(self, source: str, verb: str) -> None:
         """For what comes many times a second: counted only."""
@@ -92,8 +93,8 @@ class Journal:
     def counts(self) -> dict[str, int]:
         return dict(self._counts)
 
-    def entries(self, since_ns: int = 0) -> list[dict[str, Any]]:
-        return [e for e in self._entries if e["monotonic_ns"] >= since_ns]
+    def entries(self, since_ns: int = 0) -> list[dict[str, object]]:
+        return [entry for at_ns, entry in self._entries if at_ns >= since_ns]
 
 
 class ControllerState(ABC):

@@ -256,7 +256,7 @@ def evaluate_all(nodes: Sequence[Node], frame: Frame) -> Generator[None, None, l
 
 # -- values ---------------------------------------------------------------------------------------------
 
-_ARITHMETIC: dict[str, Callable[[Any, Any], Any]] = {
+_ARITHMETIC: dict[str, Callable[[float, float], float]] = {
     "+": operator.add, "-": operator.sub, "*": operator.mul, "/": operator.truediv, "%": operator.mod,
 }  # fmt: skip
 _ORDER: dict[str, Callable[[float, float], bool]] = {

@@ -12,13 +12,13 @@ import sys
 import termios
 import time
 import tty
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
-from rich.console import Console
+from rich.console import Console, RenderableType
 from rich.segment import ControlType, Segment
 from rich.style import Style
 from textual.geometry import Size
@@ -74,7 +74,7 @@ def _draws_sixels(stdin: int, stdout: int) -> bool:
     return b"4" in found.group(1).split(b";")
 
 
-def _sixel_image() -> Any:
+def _sixel_image() -> Callable[..., RenderableType] | None:
     """textual-image's class; None when it is not installed.
 
     The library asks the terminal while it is imported, waits a tenth of a second for each letter, and leaves
@@ -82,7 +82,8 @@ def _sixel_image() -> Any:
     """
     terminal, sys.__stdout__ = sys.__stdout__, None  # type: ignore[misc]
     try:
-        return importlib.import_module("textual_image.renderable").SixelImage
+        image: Callable[..., RenderableType] = importlib.import_module("textual_image.renderable").SixelImage
+        return image
     except ImportError:
         return None
     finally:
@@ -102,7 +103,7 @@ def cell_pixels() -> tuple[int, int] | None:
 class Graphics:
     """Turns pictures into sixels. `image` is `textual_image.renderable.SixelImage`."""
 
-    def __init__(self, image: type[Any]) -> None:
+    def __init__(self, image: Callable[..., RenderableType]) -> None:
         self._image = image
         self._cell = cell_pixels() or (10, 20)
         self._console = Console()

@@ -1,0 +1,162 @@
+"""The GenICam driver judged by a camera that does not share Aravis with it: `tests.gige_vision`."""
+
+from __future__ import annotations
+
+import asyncio
+import itertools
+import random
+import time
+from collections.abc import AsyncIterator, Callable, Iterable, Iterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+import numpy as np
+import pytest
+
+from station.cell.config import CameraConfig
+from station.cell.errors import CameraError
+from station.devices.aravis import AravisCamera
+from station.devices.pixels import decode, encode
+from station.simulation.gige import numbered_picture
+from tests.codes import raises
+from tests.gige_vision import description
+from tests.gige_vision.camera import EmulatedCamera, Packets
+
+pytestmark = pytest.mark.gige
+SIZE = (640, 480)
+
+
+@pytest.fixture
+def emulated(lonely_network: None) -> Iterator[EmulatedCamera]:
+    with EmulatedCamera(serial="EMU7", size=SIZE) as camera:
+        yield camera
+
+
+@asynccontextmanager
+async def opened(**config: Any) -> AsyncIterator[AravisCamera]:
+    camera = AravisCamera(CameraConfig(**({"device": "127.0.0.1", "exposure_us": 1000.0} | config)))
+    try:
+        await camera.open()
+        yield camera
+    finally:
+        await camera.close()
+
+
+async def to_the_bit(emulated: EmulatedCamera, camera: AravisCamera, frames: int) -> None:
+    """So many captures, each the picture that was exposed for it."""
+    for _ in range(frames):
+        number = emulated.frames
+        image = await camera.capture(timeout_s=10.0)
+        assert np.array_equal(image.pixels, numbered_picture(number, *SIZE)), number
+
+
+@pytest.mark.parametrize("device", ["", "EMU7", "Emulated"])
+async def test_it_is_found_by_discovery_and_described_by_its_own_zipped_xml(
+    emulated: EmulatedCamera, device: str
+) -> None:
+    async with opened(device=device) as camera:
+        assert (camera.identity.vendor, camera.identity.model) == ("Judge", "Emulated")
+        assert camera.identity.serial == "EMU7" and emulated.controlled
+    assert not emulated.controlled, "control is given back"
+
+
+async def test_what_was_set_is_in_the_cameras_registers(emulated: EmulatedCamera) -> None:
+    async with opened(region=(32, 16, 320, 240), exposure_us=1234.5, gain_db=3.5) as camera:
+        assert (await camera.capture()).pixels.shape == (240, 320)
+        assert (emulated.number(description.EXPOSURE), emulated.number(description.GAIN)) == (1234.5, 3.5)
+        places = (description.OFFSET_X, description.OFFSET_Y, description.WIDTH, description.HEIGHT)
+        assert [emulated.register(a) for a in places] == [32, 16, 320, 240]
+        automatics = (description.EXPOSURE_AUTO, description.GAIN_AUTO)
+        assert [emulated.register(a) for a in automatics] == [0, 0]
+
+
+@pytest.mark.parametrize("name", list(description.PIXEL_FORMATS))
+async def test_every_pixel_format_arrives(emulated: EmulatedCamera, name: str) -> None:
+    async with opened(pixel_format=name) as camera:
+        image = await camera.capture()
+    sent = encode(np.ascontiguousarray(numbered_picture(0, *SIZE)), name)
+    assert np.array_equal(image.pixels, decode(sent, *SIZE, name))
+
+
+@pytest.mark.parametrize("mtu", [1500, 4000, 9000])
+async def test_the_largest_packet_that_arrives_is_found(emulated: EmulatedCamera, mtu: int) -> None:
+    emulated.mtu = mtu
+    async with opened() as camera:
+        size = emulated.register(description.PACKET_SIZE) & 0xFFFF
+        assert mtu - 16 < size <= mtu, size
+        await to_the_bit(emulated, camera, 2)
+
+
+def loss(share: float) -> Callable[[Packets], Packets]:
+    chance = random.Random(0)
+    return lambda packets: [p for p in packets if chance.random() >= share]
+
+
+def reordered(packets: Packets) -> Packets:
+    random.Random(len(packets)).shuffle(packets)
+    return packets
+
+
+def doubled(packets: Packets) -> Iterable[bytes]:
+    return itertools.chain.from_iterable((p, p) for p in packets)
+
+
+@pytest.mark.parametrize("mangle", [loss(0.002), loss(0.05), reordered, doubled])
+async def test_loss_other_order_and_copies_cost_no_bit(
+    emulated: EmulatedCamera, monkeypatch: pytest.MonkeyPatch, mangle: Callable[[Packets], Packets]
+) -> None:
+    # The emulator is a thread of this process: on a busy computer it needs its time to send again.
+    monkeypatch.setattr("station.devices.aravis_device.FRAME_RETENTION_S", 5.0)
+    emulated.mtu = 1500  # more packets, more to lose
+    async with opened() as camera:
+        emulated.mangle = mangle
+        await to_the_bit(emulated, camera, 10)
+        counts = camera.counts().stream
+    assert counts.incomplete == counts.missing_packets == 0
+    assert emulated.resent > 0 or mangle in (reordered, doubled)
+    assert emulated.resent <= counts.resend_requests
+
+
+async def test_packets_that_are_gone_for_good_cost_one_frame(emulated: EmulatedCamera) -> None:
+    async with opened() as camera:
+        await to_the_bit(emulated, camera, 1)
+        emulated.mangle = lambda packets: packets[:5] + packets[6:]
+        emulated.forgets = True
+        with raises("frame-incomplete"):
+            await camera.capture()
+        emulated.mangle, emulated.forgets = list, False
+        await to_the_bit(emulated, camera, 2)
+        assert emulated.unavailable > 0 and camera.counts().missing == 1
+
+
+async def test_a_trigger_that_is_acknowledged_and_ignored_gives_no_picture(emulated: EmulatedCamera) -> None:
+    async with opened() as camera:
+        emulated.acknowledges_only = True
+        with raises("no-image"):
+            await camera.capture(timeout_s=0.3)
+        emulated.acknowledges_only = False
+        await to_the_bit(emulated, camera, 1)
+
+
+async def test_a_camera_that_somebody_else_controls_is_refused(emulated: EmulatedCamera) -> None:
+    async with opened() as camera:
+        with raises("camera-refused"):
+            async with opened():
+                pass
+        await to_the_bit(emulated, camera, 1)
+    assert emulated.refused > 0
+
+
+async def test_control_is_lost_with_the_heartbeat_and_taken_again(emulated: EmulatedCamera) -> None:
+    async with opened() as camera:
+        await to_the_bit(emulated, camera, 1)
+        emulated.frozen = True
+        with pytest.raises(CameraError):
+            await camera.capture(timeout_s=0.5)
+        until_s = time.monotonic() + 10.0
+        while emulated.controlled and time.monotonic() < until_s:
+            await asyncio.sleep(0.05)
+        assert not emulated.controlled, "the camera gives up a client that is silent"
+        emulated.frozen = False
+        await asyncio.sleep(1.5)  # Aravis asks once a second whether it still has control
+        await to_the_bit(emulated, camera, 1)

@@ -20,8 +20,8 @@ from calibrate.errors import CalibrationError
 from calibrate.geometry import Array, perturb, transform_points
 from calibrate.kinematics import forward
 from calibrate.projection import project
-from station.analysis.estimation import CapturedView
 from station.analysis.improvement import improve
+from station.analysis.worker import CapturedView
 from station.cell.errors import StationError
 from station.cell.plan import Plan
 from station.cell.scene import scene_of

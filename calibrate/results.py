@@ -3,7 +3,11 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import msgspec
+import numpy as np
+from numpy.typing import NDArray
 
 
 class RejectedView(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -47,3 +51,28 @@ class BoardShape(msgspec.Struct, frozen=True):
     """x against y of the print."""
     bend_m: tuple[float, float, float]
     sigma: tuple[float, float, float, float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class PeerResult:
+    """One row of `calibrate compare`: the same views through another method."""
+
+    name: str
+    matrix: NDArray[np.float64] | None
+    """(4, 4); None where the method failed (see `note`)."""
+    e_t_m: float | None = None
+    e_R: float | None = None
+    samples_e_t_m: NDArray[np.float64] | None = None
+    samples_e_R: NDArray[np.float64] | None = None
+    board_spread_m: float | None = None
+    board_spread_rad: float | None = None
+    reprojection_px: float | None = None
+    """Root mean square with the robot's poses taken as exact and the best board place for this X."""
+    distance_sigma: float | None = None
+    """Distance from ours, sigmas of ours."""
+    time_ms: float = 0.0
+    note: str = ""
+    on_box: tuple[str, ...] = ()
+    """The paper's method: components of X on the box of equation 22. Such an X is wrong."""
+    rigid: bool = True
+    """False where the method's raw matrix is not a rigid transform."""

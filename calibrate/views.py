@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from calibrate.errors import BadViewsError
 from calibrate.geometry import Array
 from recordings.schema.messages import CameraModel, Mount
 
@@ -73,3 +74,22 @@ class ViewSet:
         if any(v.camera_from_board is None for v in self.views):
             raise ValueError("camera_from_board is not known yet: run PnP first")
         return np.array([v.camera_from_board for v in self.views]).reshape(-1, 4, 4)
+
+
+def require_no_copies(views: ViewSet) -> None:
+    """Raise BadViewsError for a view that is in the set twice: it tells nothing, and halves the variance."""
+    first: dict[bytes, BoardView] = {}
+    for view in views:
+        seen = view.pixels if len(view.pixels) else np.asarray(view.camera_from_board)
+        key = view.base_from_flange.tobytes() + seen.tobytes()
+        if key in first:
+            other = first[key]
+            raise BadViewsError(
+                f"Views {other.index + 1} ({other.name}) and {view.index + 1} ({view.name}) are one: "
+                "their robot poses and corners agree to the last bit.",
+                code="view-twice",
+                remedy=f"Solve with --without {view.index + 1}, or remove it and import again.",
+                view=view.index + 1,
+                other=other.index + 1,
+            )
+        first[key] = view

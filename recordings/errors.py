@@ -10,8 +10,6 @@ from pathlib import Path
 
 import msgspec
 
-from recordings.plain_text import plain_text
-
 Value = str | float | int | bool | None
 
 
@@ -56,12 +54,6 @@ class CodedError(Exception):
     @property
     def data(self) -> ErrorData:
         return ErrorData(self.code, self.text, self.remedy, dict(self.values))
-
-
-def printed(problem: Exception) -> str:
-    """An error as all commands print it: without a full stop at its end."""
-    said = plain_text(str(problem))
-    return said[:-1] if said.endswith(".") and not said.endswith((" .", "/.", "..")) else said
 
 
 class RecordingError(CodedError):

@@ -28,3 +28,9 @@ def plain_data(value: Any) -> Any:
     if isinstance(value, list | tuple):
         return [plain_data(item) for item in value]
     return value
+
+
+def printed(problem: Exception) -> str:
+    """An error as all commands print it: without a full stop at its end."""
+    said = plain_text(str(problem))
+    return said[:-1] if said.endswith(".") and not said.endswith((" .", "/.", "..")) else said

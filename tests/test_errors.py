@@ -12,7 +12,8 @@ import pytest
 import calibrate.cli
 import recordings.cli
 import station.cli
-from recordings.errors import RecordingError, printed
+from recordings.errors import RecordingError
+from recordings.plain_text import printed
 from tests.command_line import call
 
 

@@ -26,8 +26,9 @@ from calibrate.files.calibration import Touch, write_calibration
 from calibrate.files.formatting import PEER_HEAD, peer_cells, summary
 from calibrate.files.install import install_line, load_installed
 from calibrate.geometry import rotation_log
-from calibrate.handeye.solution import PeerResult, camera_frames
+from calibrate.handeye.solution import camera_frames
 from calibrate.pipeline import JobOptions, SolvedRecording, prepare_views, solve_recording, solver_options
+from calibrate.results import PeerResult
 
 Rec = Annotated[Path, typer.Argument(help="A recording (.mcap) or a session folder", show_default=False)]
 GATE_FAILED = 4

@@ -18,7 +18,7 @@ from calibrate.geometry import difference
 from calibrate.results import BoardShape
 
 if TYPE_CHECKING:
-    from calibrate.handeye.solution import PeerResult
+    from calibrate.results import PeerResult
 
 _STAMPS = {
     "simulated": "SIMULATED: made without a robot or a camera",

@@ -27,10 +27,10 @@ if TYPE_CHECKING:
     from calibrate.handeye.information import view_information as view_information
     from calibrate.handeye.peers import compare_all as compare_all
     from calibrate.handeye.priors import BoardTolerance as BoardTolerance
-    from calibrate.handeye.solution import PeerResult as PeerResult
     from calibrate.handeye.solution import Solution as Solution
     from calibrate.handeye.solution import SolveOptions as SolveOptions
     from calibrate.handeye.solve import solve_views as solve_views
+    from calibrate.results import PeerResult as PeerResult
     from calibrate.views import BoardView as BoardView
     from calibrate.views import ViewSet as ViewSet
 
@@ -38,7 +38,7 @@ _MODULES = {
     "BoardTolerance": "calibrate.handeye.priors",
     "BoardView": "calibrate.views",
     "MeasurementNoise": "calibrate.handeye.information",
-    "PeerResult": "calibrate.handeye.solution",
+    "PeerResult": "calibrate.results",
     "Solution": "calibrate.handeye.solution",
     "SolveOptions": "calibrate.handeye.solution",
     "ViewSet": "calibrate.views",

@@ -41,9 +41,10 @@ from calibrate.handeye.metrics import (
 from calibrate.handeye.observations import SHAPE, CellState, observe_views
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
 from calibrate.handeye.profile_robust import solve_robust_profile
-from calibrate.handeye.solution import PeerResult, Solution, SolveOptions
+from calibrate.handeye.solution import Solution, SolveOptions
 from calibrate.handeye.solve import require_solvable
 from calibrate.projection import intrinsics_vector
+from calibrate.results import PeerResult
 from calibrate.views import ViewSet
 
 Method = Callable[[ViewSet], Array]

@@ -4,7 +4,6 @@ Lengths in metres, angles in radians; every sigma and covariance is of `geometry
 [δt, δφ] in the parent frame of X.
 """
 
-# ruff: noqa: N815  (e_t and e_R are written as the paper writes them)
 from __future__ import annotations
 
 from dataclasses import dataclass, field
@@ -203,28 +202,3 @@ class Solution:
     def sigma_rotation_rad(self) -> float:
         """Root mean squared angle of the rotation's error."""
         return float(np.sqrt(np.trace(self.covariance[3:, 3:])))
-
-
-@dataclass(frozen=True, eq=False)
-class PeerResult:
-    """One row of `calibrate compare`: the same views through another method."""
-
-    name: str
-    matrix: Array | None
-    """(4, 4); None where the method failed (see `note`)."""
-    e_t_m: float | None = None
-    e_R: float | None = None
-    samples_e_t_m: Array | None = None
-    samples_e_R: Array | None = None
-    board_spread_m: float | None = None
-    board_spread_rad: float | None = None
-    reprojection_px: float | None = None
-    """Root mean square with the robot's poses taken as exact and the best board place for this X."""
-    distance_sigma: float | None = None
-    """Distance from ours, sigmas of ours."""
-    time_ms: float = 0.0
-    note: str = ""
-    on_box: tuple[str, ...] = ()
-    """The paper's method: components of X on the box of equation 22. Such an X is wrong."""
-    rigid: bool = True
-    """False where the method's raw matrix is not a rigid transform."""

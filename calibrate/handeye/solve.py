@@ -28,7 +28,7 @@ from calibrate.handeye.profile_robust import solve_robust_profile
 from calibrate.handeye.solution import Remark, Solution, SolveOptions, board_frames, camera_frames
 from calibrate.projection import camera_matrix
 from calibrate.stopwatch import Stopwatch
-from calibrate.views import BoardView, ViewSet
+from calibrate.views import BoardView, ViewSet, require_no_copies
 
 __all__ = ["Solution", "SolveOptions", "solve_views"]
 
@@ -102,25 +102,6 @@ def _require_view(view: BoardView, fewest_corners: int) -> None:
     require(corners >= fewest_corners, "corners", f"{corners} corners (minimum {fewest_corners})")
     finite = np.isfinite(view.pixels).all() and np.isfinite(view.board_points).all()
     require(bool(finite), "corners", "a corner is not finite")
-
-
-def require_no_copies(views: ViewSet) -> None:
-    """Raise BadViewsError for a view that is in the set twice: it tells nothing, and halves the variance."""
-    first: dict[bytes, BoardView] = {}
-    for view in views:
-        seen = view.pixels if len(view.pixels) else np.asarray(view.camera_from_board)
-        key = view.base_from_flange.tobytes() + seen.tobytes()
-        if key in first:
-            other = first[key]
-            raise BadViewsError(
-                f"Views {other.index + 1} ({other.name}) and {view.index + 1} ({view.name}) are one: "
-                "their robot poses and corners agree to the last bit.",
-                code="view-twice",
-                remedy=f"Solve with --without {view.index + 1}, or remove it and import again.",
-                view=view.index + 1,
-                other=other.index + 1,
-            )
-        first[key] = view
 
 
 def solve_paper_profile(views: ViewSet, options: SolveOptions) -> Solution:

@@ -20,9 +20,8 @@ from calibrate.files.calibration import Calibration
 from calibrate.geometry import Array, difference, inverse, perturb
 from calibrate.handeye.corners import bent_points, boards_by_corners
 from calibrate.handeye.observations import extent_of, observe_views
-from calibrate.handeye.solve import require_no_copies
 from calibrate.lens.model import project
-from calibrate.views import ViewSet
+from calibrate.views import ViewSet, require_no_copies
 from recordings.schema.messages import CameraModel
 
 FEWEST_VIEWS = 3

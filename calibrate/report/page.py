@@ -25,11 +25,11 @@ from calibrate.files.verification import agrees, touch_text
 from calibrate.geometry import Array
 from calibrate.handeye.corners import bent_points
 from calibrate.handeye.observations import SHAPE, observe_views
-from calibrate.handeye.solution import PeerResult
 from calibrate.lens.model import project
 from calibrate.lens.pnp import solve_pnp
 from calibrate.pipeline import SolvedRecording
 from calibrate.report import html, plots
+from calibrate.results import PeerResult
 
 _PICTURES_LIMIT = 60
 _WIDTH_PX = 480

@@ -14,8 +14,8 @@ from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
 from recordings.cli.terminal import examples, print_what_it_can
-from recordings.errors import CodedError, ErrorReport, printed
-from recordings.plain_text import plain_text
+from recordings.errors import CodedError, ErrorReport
+from recordings.plain_text import plain_text, printed
 
 _HELP_KEYS = {"help_option_names": ["-h", "--help"]}
 _EXTRAS = {

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING, Literal
 import msgspec
 
 if TYPE_CHECKING:  # commands that only ask the daemon do not load numpy
-    from recordings.images import Pixels
+    import numpy as np
+    from numpy.typing import NDArray
 
 Mount = Literal["eye-in-hand", "eye-to-hand"]
 Source = Literal["real", "simulated", "playback", "imported"]
@@ -145,7 +146,7 @@ class RobotState(msgspec.Struct, frozen=True):
 class Image(msgspec.Struct, frozen=True, eq=False):
     """One frame as the camera gave it."""
 
-    pixels: Pixels
+    pixels: NDArray[np.uint8 | np.uint16]
     """(height, width) uint8 or uint16, or (height, width, 3) uint8 BGR"""
     stamps: Stamps
     """device_ns: the camera's clock at the start of exposure; host: first packet received."""

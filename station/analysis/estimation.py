@@ -5,12 +5,11 @@ from __future__ import annotations
 import contextlib
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import cv2
 import msgspec
 import numpy as np
-from numpy.typing import NDArray
 
 from calibrate.boards.model import board_points
 from calibrate.errors import CalibrationError
@@ -21,6 +20,7 @@ from calibrate.lens.intrinsics import calibrate_intrinsics
 from calibrate.lens.pnp import solve_pnp
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import BoardSpec, CameraModel, Mount
+from station.analysis.worker import CapturedView
 from station.cell.config import StationConfig, matrix4
 from station.cell.errors import StationError
 from station.cell.scene import scene_of
@@ -30,20 +30,6 @@ from station.plan.predict import Advice, AdviceOptions, advise
 FEWEST_VIEWS = 4
 FEWEST_FOR_LENS = 6
 COVERAGE_ROWS, COVERAGE_COLUMNS = 4, 6
-
-
-@dataclass(frozen=True, eq=False)
-class CapturedView:
-    """A view that counts."""
-
-    index: int
-    """The pose number."""
-    base_from_flange: Array
-    """(4, 4)"""
-    indices: NDArray[np.intp]
-    """(k,) rows of `board_points`"""
-    pixels: Array
-    """(k, 2)"""
 
 
 def running_estimate(

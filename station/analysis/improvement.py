@@ -23,7 +23,8 @@ from calibrate.geometry import (
 )
 from calibrate.handeye.information import MeasurementNoise
 from calibrate.projection import project
-from station.analysis.estimation import FEWEST_FOR_LENS, CapturedView, quick_sigma, solve_quickly
+from station.analysis.estimation import FEWEST_FOR_LENS, quick_sigma, solve_quickly
+from station.analysis.worker import CapturedView
 from station.cell.config import PoseGuess, StationConfig
 from station.cell.errors import LimitError, RefusedError
 from station.cell.limits import check_plan

@@ -13,7 +13,6 @@ from multiprocessing import get_context
 from multiprocessing.process import BaseProcess
 from typing import TypeVar
 
-from station.analysis.worker import start_worker, warm_up
 from station.cell.errors import StationError
 
 log = logging.getLogger(__name__)
@@ -30,7 +29,9 @@ class WorkerError(StationError):
 class Workers:
     """Calls run one after the other, in the order they were made."""
 
-    def __init__(self) -> None:
+    def __init__(self, initializer: Callable[[], None], warm_up: Callable[[], object]) -> None:
+        """`initializer` runs in each new process first, then `warm_up`, which loads what is needed."""
+        self._initializer, self._warm_up = initializer, warm_up
         self._pool: ProcessPoolExecutor | None = None
         self._turn = asyncio.Lock()
         self._closed = False
@@ -39,7 +40,7 @@ class Workers:
 
     async def start(self) -> None:
         """Returns when the worker has loaded what it needs (about a second)."""
-        await self.call(warm_up)
+        await self.call(self._warm_up)
 
     async def call(
         self, function: Callable[..., R], *args: object, timeout_s: float = 60.0, **named: object
@@ -55,8 +56,10 @@ class Workers:
                     raise WorkerError("The station is ending.", code="station-ending")
                 pool = self._pool
                 if pool is None:
-                    pool = self._pool = ProcessPoolExecutor(1, get_context("spawn"), initializer=start_worker)
-                    await self._ask(pool, START_S, partial(warm_up))
+                    pool = self._pool = ProcessPoolExecutor(
+                        1, get_context("spawn"), initializer=self._initializer
+                    )
+                    await self._ask(pool, START_S, partial(self._warm_up))
                 return await self._ask(pool, timeout_s, partial(function, *args, **named))
         finally:
             self.waiting -= 1

@@ -22,7 +22,6 @@ from recordings.errors import RecordingError
 from recordings.images import Pixels
 from recordings.reader import open_recording
 from recordings.schema.messages import BoardSpec, CameraModel, Vector6
-from station.analysis.estimation import CapturedView
 from station.analysis.exposure import assess
 from station.cell.config import StationConfig
 from station.cell.limits import PlanCheck, check_plan
@@ -128,3 +127,17 @@ def _distance_and_tilt(
 def check_run(config: StationConfig, plan: Plan, start_joints_rad: Vector6) -> PlanCheck:
     """Checks the whole path, from where the arm is."""
     return check_plan(plan, start_joints_rad, geometry_from(config, start_joints_rad))
+
+
+@dataclass(frozen=True, eq=False)
+class CapturedView:
+    """A view that counts."""
+
+    index: int
+    """The pose number."""
+    base_from_flange: Array
+    """(4, 4)"""
+    indices: NDArray[np.intp]
+    """(k,) rows of `board_points`"""
+    pixels: Array
+    """(k, 2)"""

@@ -14,11 +14,12 @@ from calibrate.geometry import (
     inverse,
     perturb,
     pose_from_quaternion,
+    pose_from_rotvec,
     quaternion_from_matrix,
     transform_points,
 )
 from calibrate.kinematics import MODELS, DhDeltas, RobotModel, forward
-from recordings.schema.messages import BoardSpec, CameraModel, Mount
+from recordings.schema.messages import BoardSpec, CameraModel, Mount, RobotState, Vector6
 from station.cell.collision import CellGeometry, gap_to_arm, plate
 from station.cell.config import Capsule, PoseGuess, RobotConfig, StationConfig, Vector3, vector3
 from station.cell.errors import ConfigError, LimitError
@@ -254,3 +255,9 @@ def geometry_from(config: StationConfig, standing_rad: ArrayLike) -> CellGeometr
         return cell
     Y, board_m = (None, 0.0) if board is None else (guess_matrix(board), board.sigma_m)
     return geometry_of(config, mounts[roomy[0]], Y, guess.sigma_m, board_m)
+
+
+def flange_pose(state: RobotState, tcp_offset: Vector6) -> Array:
+    """base_from_flange (4, 4): the controller's own tool pose without the tool."""
+    base_from_tcp = pose_from_rotvec(state.tcp_pose[:3], state.tcp_pose[3:])
+    return np.asarray(base_from_tcp @ inverse(pose_from_rotvec(tcp_offset[:3], tcp_offset[3:])))

@@ -21,6 +21,8 @@ from recordings.schema.messages import RobotState, Stillness
 from station.cell.config import StillnessConfig
 from station.cell.errors import StaleStateError, StationError
 
+JOGGED_RAD = 0.01
+
 _DEG = math.degrees(1.0)
 POLL_S = 0.02
 NEWS_POLL_S = 0.01

@@ -30,7 +30,7 @@ from station.cell.session_folder import CALIBRATION_FILE
 from station.cell.status import MotionPreview
 from station.cli.console import AsJson, Headless, err, out
 from station.cli.progress import SessionProgress
-from station.cli.serve import Control, GigE, Mounting, Noise, Scene, Seed, require_choices
+from station.cli.simulated import Control, GigE, Mounting, Noise, Scene, Seed, require_choices
 from station.operate.motion import carry_out, wait_until_idle
 from station.protocol.client import Client
 from station.protocol.verbs import Lease, MakePlan, Purpose

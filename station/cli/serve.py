@@ -8,27 +8,16 @@ import logging
 import os
 import sys
 from pathlib import Path
-from typing import Annotated, get_args
+from typing import Annotated
 
 import typer
 
 from recordings.files import state_root
-from recordings.schema.messages import Mount
-from station.cell.config import ControlPath
 from station.cell.errors import ConfigError
 from station.cell.process import DAEMON_NICENESS, go_before_others
 from station.cell.socket_folder import default_socket
+from station.cli.simulated import Control, GigE, Mounting, Noise, Scene, Seed, require_choices
 from station.devices.cell import Cell
-from station.simulation.cell import NoiseLevel, SceneName
-
-_RANGES = {"scene": SceneName, "noise": NoiseLevel, "mount": Mount, "control": ControlPath}
-Seed = Annotated[int, typer.Option(help="Simulated: seed of camera pose, board pose, intrinsics, noise")]
-Scene = Annotated[str, typer.Option(help="Simulated: paper, blog or paper-binned (640×512)")]
-Noise = Annotated[str, typer.Option(help="Simulated: low, mid or high")]
-Mounting = Annotated[str, typer.Option("--mount", help="Simulated: eye-in-hand or eye-to-hand")]
-GigE = Annotated[bool, typer.Option("--gige", help="Simulated: the camera over GigE Vision packets")]
-
-Control = Annotated[str | None, typer.Option("--control", hidden=True)]
 
 
 def serve_command(
@@ -91,15 +80,6 @@ def serve_command(
         )
         cell = simulated_cell(options, place / "simulation")
     asyncio.run(serve_cell(cell, place, socket or default_socket(), end_with_stdin))
-
-
-def require_choices(**chosen: str | None) -> None:
-    """ConfigError for a word that is not one of the offered ones; None is no choice."""
-    for name, word in chosen.items():
-        if word is not None and word not in (known := get_args(_RANGES[name])):
-            raise ConfigError(
-                f"--{name} {word} is unknown.", code="usage", remedy=f"Choose one of {', '.join(known)}."
-            )
 
 
 def _real_cell(config: Path, root: Path) -> Cell:

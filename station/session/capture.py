@@ -11,15 +11,14 @@ from collections import deque
 import msgspec
 import numpy as np
 
-from calibrate.geometry import Array, inverse, pose_from_rotvec
 from recordings.images import Pixels
-from recordings.schema.messages import Image, RobotState, Stamps, Stillness, Vector6, View
-from station.analysis.estimation import CapturedView
+from recordings.schema.messages import Image, RobotState, Stamps, Stillness, View
 from station.analysis.image_motion import board_box, image_motion
 from station.analysis.pool import WorkerError
-from station.analysis.worker import BoardDetection, sight
+from station.analysis.worker import BoardDetection, CapturedView, sight
 from station.cell.config import matrix4
 from station.cell.errors import CameraError, StaleStateError, StationError
+from station.cell.scene import flange_pose
 from station.cell.status import PoseState, StationState
 from station.cell.stillness import ImageMotion, RestingCheck
 from station.devices.frames import mid_exposure
@@ -117,12 +116,6 @@ async def _state_at(context: SessionContext, host_monotonic_ns: int) -> RobotSta
             if time.monotonic() > deadline_s:
                 raise
             await asyncio.sleep(0.01)
-
-
-def flange_pose(state: RobotState, tcp_offset: Vector6) -> Array:
-    """base_from_flange (4, 4): the controller's own tool pose without the tool."""
-    base_from_tcp = pose_from_rotvec(state.tcp_pose[:3], state.tcp_pose[3:])
-    return np.asarray(base_from_tcp @ inverse(pose_from_rotvec(tcp_offset[:3], tcp_offset[3:])))
 
 
 def _view(

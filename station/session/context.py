@@ -6,11 +6,14 @@ import contextlib
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import numpy as np
+
+from calibrate.kinematics import forward
 from recordings.errors import RecordingError
 from recordings.recover import recover_recording
-from recordings.schema.messages import RobotState
-from station.analysis.estimation import CapturedView
+from recordings.schema.messages import RobotState, Vector6
 from station.analysis.pool import Workers
+from station.analysis.worker import CapturedView
 from station.cell.collision import CellGeometry
 from station.cell.errors import RefusedError
 from station.cell.status import Event, SessionStatus, StationState
@@ -137,3 +140,12 @@ class SessionContext:
             source=self.cell.source,
             **named,
         )
+
+
+def displacement(context: SessionContext, before: Vector6, after: Vector6) -> str:
+    """'84 mm and 22°' of the flange."""
+    poses = forward(context.geometry.model, [before, after])
+    distance_m = float(np.linalg.norm(poses[1, :3, 3] - poses[0, :3, 3]))
+    cosine = (np.trace(poses[0, :3, :3].T @ poses[1, :3, :3]) - 1) / 2
+    angle = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
+    return f"{1000 * distance_m:.0f} mm and {angle:.0f}°"

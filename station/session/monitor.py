@@ -18,6 +18,7 @@ from station.analysis.pool import WorkerError
 from station.cell.config import matrix4
 from station.cell.errors import CameraError, RobotError, StationError
 from station.cell.limits import SPEED_CAP_M_S, point_speed_m_s
+from station.cell.scene import flange_pose
 from station.cell.session_folder import CALIBRATION_FILE
 from station.cell.status import (
     CameraStatus,
@@ -29,7 +30,6 @@ from station.cell.status import (
 )
 from station.devices.ur_condition import mode_word, program_word, safety_word, what_holds
 from station.protocol.states import RUNNING
-from station.session.capture import flange_pose
 from station.session.context import SessionContext
 
 log = logging.getLogger(__name__)

@@ -19,15 +19,17 @@ from recordings.schema.messages import CameraModel
 from station.analysis.estimation import next_best, next_best_text, running_estimate
 from station.analysis.improvement import FEWEST_LEFT, FEWEST_VIEWS, Improvement, improve
 from station.analysis.pool import WorkerError
+from station.analysis.worker import seen_before
 from station.cell.errors import RefusedError
 from station.cell.status import EstimateStatus
 from station.cell.stillness import RestingCheck
 from station.plan.predict import Advice
 from station.protocol.verbs import Purpose
 from station.session.context import SessionContext
-from station.session.interrupted import look_back
 from station.session.queue import PlanRevision, PoseQueue
 from station.session.recording import stamps_now
+
+_LOOK_BACK_S = 120.0
 
 _SHARPER = 4.0
 """So many times sharper the mount must be known than when the plan was made, to speak of it."""
@@ -231,3 +233,22 @@ class Estimator:
         flange = np.array([view.base_from_flange for view in seen])
         text = await context.workers.call(next_best_text, config, flange, joints, timeout_s=_ESTIMATE_S)
         return msgspec.structs.replace(estimate, advice=text or estimate.advice)
+
+
+async def look_back(context: SessionContext) -> None:
+    """Reads what the images from before a restart show, for the estimate and the next pose.
+
+    Read from the recording, which is made whole first; nothing when it is known already.
+    """
+    recording, queue = context.recording, context.queue
+    if recording is None or recording.recorder is not None or context.seen or queue is None or not queue.done:
+        return
+    try:
+        await context.recover_segments(recording)
+        found = await context.workers.call(
+            seen_before, recording.whole, context.cell.config.board, timeout_s=_LOOK_BACK_S
+        )
+    except (RecordingError, WorkerError) as error:
+        context.store.problem(error, said="the estimate begins anew, without the images so far: {}")
+        return
+    context.seen.update({view.index: view for view in found})

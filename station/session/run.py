@@ -22,13 +22,12 @@ from station.cell.errors import (
 from station.cell.limits import check_path, with_plan_speeds
 from station.cell.scene import geometry_from
 from station.cell.status import Event, StationState
-from station.cell.stillness import NotStillError, RestingCheck
+from station.cell.stillness import JOGGED_RAD, NotStillError, RestingCheck
 from station.session.capture import PoseFailedError, take_pose
 from station.session.context import RunRequests, SessionContext
 from station.session.lease import MotionApproval, require_start
 from station.session.queue import BUSY
-from station.session.recording import to_the_end
-from station.session.supervisor import JOGGED_RAD
+from station.session.recording import SessionRecording, to_the_end
 
 log = logging.getLogger(__name__)
 
@@ -298,3 +297,25 @@ def unmark_busy(context: SessionContext) -> None:
         if status.state in BUSY:
             queue.mark(status.index, "planned", "interrupted")
     context.show_poses()
+
+
+async def close_or_seal(context: SessionContext) -> None:
+    """Finishes: of an open recording the end is written, an interrupted one is made whole."""
+    recording = context.require_recording()
+    try:
+        if recording.recorder is None:  # nothing was added since the crash
+            context.store.enter(StationState.SEALING)
+            await to_the_end(_make_whole(context, recording))
+        else:
+            await seal(context)
+    except (RecordingError, StationError) as error:
+        recording.abandon()
+        context.store.problem(error, "error", said="not finished: {}")
+        if context.store.state is not StationState.STOPPED:
+            context.store.enter(StationState.FAULT, f"Recording: {error}", error.code)
+
+
+async def _make_whole(context: SessionContext, recording: SessionRecording) -> None:
+    await context.recover_segments(recording)
+    await recording.save_state(context.require_queue(), recording.whole)
+    sealed(context, recording.whole)

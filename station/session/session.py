@@ -18,9 +18,11 @@ import msgspec
 
 from recordings.errors import RecordingError
 from station.analysis.pool import Workers
+from station.analysis.worker import start_worker, warm_up
 from station.cell.errors import RefusedError, RobotError
 from station.cell.plan import Plan
 from station.cell.scene import cell_geometry
+from station.cell.session_folder import interrupted_session
 from station.cell.status import HoverOffer, Lease, MotionPreview, StationState, StationStatus
 from station.cell.stillness import StillnessMonitor
 from station.devices.cell import Cell
@@ -30,14 +32,13 @@ from station.protocol.states import RUNNING
 from station.protocol.verbs import Purpose, Verb
 from station.session.context import RunRequests, SessionContext
 from station.session.freedrive import Freedrive
-from station.session.interrupted import close_or_seal, find_interrupted
 from station.session.lease import ApprovalManager, LeaseManager, MotionApproval
 from station.session.monitor import DeviceConnector
 from station.session.preview import Previewer
 from station.session.queue import PoseQueue
-from station.session.recording import Logbook
+from station.session.recording import Logbook, SessionRecording
 from station.session.replan import Estimator, Replanner
-from station.session.run import Run, unmark_busy
+from station.session.run import Run, close_or_seal, unmark_busy
 from station.session.store import StatusStore
 from station.session.summary import begun_anew, poses_to_drive, summarise
 from station.session.supervisor import SessionSupervisor
@@ -68,7 +69,9 @@ class Session:
             StationStatus(simulated=cell.simulated, playback=playback, cell=config.name, mount=config.mount)
         )
         monitor = StillnessMonitor(geometry.model, config.stillness)
-        self.context = SessionContext(cell, geometry, self.store, Workers(), monitor, root)
+        self.context = SessionContext(
+            cell, geometry, self.store, Workers(start_worker, warm_up), monitor, root
+        )
         self.leases = LeaseManager()
         self.approvals = ApprovalManager(time.monotonic)
         self.supervisor = SessionSupervisor(self.context, self._jogged, ticked, self._void, first)
@@ -373,3 +376,31 @@ class Session:
 
 def _still_ending(what: str) -> RefusedError:
     return RefusedError(f"{what} is still ending", code="still-ending", remedy="Try again in a moment.")
+
+
+def find_interrupted(context: SessionContext) -> None:
+    """Brings its poses back and stands in `stopped` until a person looked. Nothing moves."""
+    found = interrupted_session(context.root)
+    if found is None:
+        return
+    folder, state = found
+    if state.source != context.cell.source:
+        context.store.event(
+            "interrupted-elsewhere",
+            f"Session {folder.name} of a {state.source} cell is unfinished and cannot continue here: this "
+            f"cell is {context.cell.source}. `recordings recover {folder}` saves it.",
+            "warning",
+        )
+        return
+    context.queue = PoseQueue(state.plan, state.poses)
+    context.recording = SessionRecording(
+        context.root, context.cell, folder, state.parts, state.elapsed_s, state.check
+    )
+    reason = (
+        f"The daemon ended during session {folder.name}; its {context.queue.done} poses are on the disk. "
+        "Look at the arm, acknowledge, then resume or finish."
+    )
+    context.store.enter(StationState.STOPPED, reason, "interrupted")
+    context.show_poses()
+    context.store.update_session(elapsed_s=state.elapsed_s, check=state.check)
+    context.store.event("interrupted", reason, "warning", captured=context.queue.done)

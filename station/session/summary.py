@@ -16,10 +16,9 @@ from station.cell.status import MotionPreview
 from station.cell.stillness import RestingCheck
 from station.devices.ur import control_trouble
 from station.protocol.verbs import Purpose
-from station.session.context import SessionContext
+from station.session.context import SessionContext, displacement
 from station.session.lease import ApprovalManager
 from station.session.queue import PlanRevision, PoseQueue
-from station.session.supervisor import displacement
 
 POSE_OVERHEAD_S = 0.8
 """Settle, expose, look, write: what a stop takes beside the move."""

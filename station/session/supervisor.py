@@ -14,12 +14,12 @@ from collections.abc import Callable
 
 import numpy as np
 
-from calibrate.kinematics import forward
 from recordings.schema.messages import Vector6
 from station.cell.errors import RobotError, StaleStateError
 from station.cell.status import StationState
+from station.cell.stillness import JOGGED_RAD
 from station.protocol.states import RUNNING
-from station.session.context import SessionContext
+from station.session.context import SessionContext, displacement
 from station.session.monitor import Monitor
 
 log = logging.getLogger(__name__)
@@ -28,7 +28,6 @@ TICK_S = 0.02
 STATUS_TICKS = 5
 LOST_ROUNDS = 10
 """A resting arm may be silent for this many status rounds (1 s); a moving one never."""
-JOGGED_RAD = 0.01
 RESTING_RAD_S = 0.01
 LAGS_KEPT = 3000
 
@@ -127,12 +126,3 @@ class SessionSupervisor:
         if np.abs(np.subtract(joints, self._rest_joints)).max() > JOGGED_RAD:
             self._jogged(displacement(context, self._rest_joints, joints))
             self._rest_joints = joints
-
-
-def displacement(context: SessionContext, before: Vector6, after: Vector6) -> str:
-    """'84 mm and 22°' of the flange."""
-    poses = forward(context.geometry.model, [before, after])
-    distance_m = float(np.linalg.norm(poses[1, :3, 3] - poses[0, :3, 3]))
-    cosine = (np.trace(poses[0, :3, :3].T @ poses[1, :3, :3]) - 1) / 2
-    angle = float(np.degrees(np.arccos(np.clip(cosine, -1, 1))))
-    return f"{1000 * distance_m:.0f} mm and {angle:.0f}°"

@@ -24,16 +24,15 @@ from station.analysis.worker import sight
 from station.cell.config import PointerConfig, matrix4
 from station.cell.errors import LimitError, RefusedError, RobotError
 from station.cell.plan import plan_sha256
+from station.cell.scene import flange_pose
 from station.cell.status import HoverOffer, MotionPreview, StationState
-from station.cell.stillness import NotStillError, RestingCheck
+from station.cell.stillness import JOGGED_RAD, NotStillError, RestingCheck
 from station.plan.hover import Hover, HoverAnswer, HoverQuestion, answer_hover, least_standoff_m
 from station.protocol import verbs
-from station.session.capture import flange_pose
-from station.session.context import SessionContext
+from station.session.context import SessionContext, displacement
 from station.session.lease import MotionApproval
 from station.session.run import Run
 from station.session.summary import motion_preview, motion_warnings
-from station.session.supervisor import JOGGED_RAD, displacement
 
 OVER_CORNER = "over-corner"
 """Cause of the state after a path over a corner: the tip stands there."""

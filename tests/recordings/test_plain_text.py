@@ -14,9 +14,9 @@ from rich.text import Text
 from calibrate.files.calibration import CalibrationFileError, decode_calibration
 from recordings.cli import main as recordings_main
 from recordings.cli.console import plain_console
-from recordings.errors import RecordingError, printed
+from recordings.errors import RecordingError
 from recordings.importers.dataset import Dataset
-from recordings.plain_text import plain_data, plain_text
+from recordings.plain_text import plain_data, plain_text, printed
 from recordings.strict_yaml import StrictYamlError, load, load_plain
 from station.protocol import client
 from tests.command_line import call

@@ -10,8 +10,8 @@ from calibrate.boards.model import board_points
 from calibrate.geometry import difference, inverse, pose_from_quaternion, transform_points
 from calibrate.kinematics import MODELS, forward
 from calibrate.projection import project
-from station.analysis.estimation import CapturedView
 from station.analysis.improvement import better_guesses
+from station.analysis.worker import CapturedView
 from station.plan.planner import make_plan
 from station.simulation.scenes import cell_config, make_cell
 from tests.codes import raises

@@ -13,6 +13,7 @@ import pytest
 
 from station.analysis.estimation import running_estimate
 from station.analysis.pool import WorkerError, Workers
+from station.analysis.worker import start_worker, warm_up
 from station.cell.errors import RobotError
 from station.cell.session_folder import SessionState
 from station.cell.status import StationState as S
@@ -244,7 +245,7 @@ def _hang(seconds: float) -> None:
 async def test_a_worker_that_hangs_is_ended_without_holding_up_the_loop(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    workers = Workers()
+    workers = Workers(start_worker, warm_up)
     await workers.call(_hang, 0.0)
     assert workers._pool is not None
     for process in workers._pool._processes.values():

@@ -13,6 +13,7 @@ import pytest
 
 from recordings.recorder import Recorder
 from station.analysis.pool import WorkerError, Workers
+from station.analysis.worker import start_worker, warm_up
 from station.cell.errors import LimitError, StationError
 from station.cell.plan import Plan
 from station.cell.status import StationState as S
@@ -251,7 +252,7 @@ async def test_speeds_that_are_none_are_refused_before_a_go(
 
 
 async def test_a_call_that_hangs_costs_its_own_answer_only() -> None:
-    workers = Workers()
+    workers = Workers(start_worker, warm_up)
     try:
         await workers.start()
         slow = asyncio.ensure_future(workers.call(time.sleep, 1.0))
@@ -266,7 +267,7 @@ async def test_a_call_that_hangs_costs_its_own_answer_only() -> None:
 
 
 async def test_a_call_that_waits_when_the_station_ends_starts_no_worker() -> None:
-    workers = Workers()
+    workers = Workers(start_worker, warm_up)
     await workers.start()
     running = asyncio.ensure_future(workers.call(time.sleep, 30.0))
     behind = asyncio.ensure_future(workers.call(time.sleep, 0.0))

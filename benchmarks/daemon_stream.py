@@ -24,11 +24,11 @@ import numpy as np
 
 from benchmarks.processes import DaemonUsage, daemon_of_this_process, put_before_others, step_behind_others
 from recordings.reader import open_recording
+from recordings.schema.frame_ids import frames_between
 from recordings.segment import RecordingSegment
 from station.cell.plan import Plan, PlannedPose
 from station.cell.status import StationState, StationStatus
 from station.cli.demo import approve_simulated, simulated_daemon
-from station.devices.frames import frames_between
 from station.operate.motion import carry_out, wait_until_idle
 from station.plan.files import sweep_plan
 from station.protocol.client import Client
@@ -139,7 +139,7 @@ def verify(path: Path) -> Checked:
 
 def _pictures(part: RecordingSegment, still: np.ndarray) -> Checked:
     checked = Checked()
-    last: tuple[int, int] | None = None
+    last: tuple[int, int | None] | None = None
     first_ns = 0
     for sequence in part.image_sequences():
         picture = part.image(sequence)
@@ -149,6 +149,7 @@ def _pictures(part: RecordingSegment, still: np.ndarray) -> Checked:
         if last is None:
             first_ns = picture.stamps.device_ns
         else:
+            assert last[1] is not None and picture.frame_id is not None
             same &= frames_between(last[1], picture.frame_id) == number - last[0]
             checked.reordered += number <= last[0]
             checked.lost += max(0, number - last[0] - 1)

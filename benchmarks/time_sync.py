@@ -21,7 +21,6 @@ from calibrate.geometry import difference
 from calibrate.kinematics import MODELS, forward
 from recordings.schema.messages import Image
 from station.cell.config import RobotConfig
-from station.devices.frames import mid_exposure
 from station.devices.ur import UrRobot
 from station.simulation.camera import RenderedCamera
 from station.simulation.cell import CellTruth, write_truth
@@ -96,10 +95,8 @@ async def one(
     robot: UrRobot, camera: RenderedCamera, host: str, truth: CellTruth
 ) -> tuple[float, float, float, float, float]:
     picture = await camera.capture()
-    stamps = picture.stamps
-    middle_ns, bound_s = mid_exposure(
-        stamps.device_ns, stamps.host_monotonic_ns, picture.exposure_us, camera.clock
-    )
+    assert picture.time is not None
+    middle_ns, bound_s = picture.time.host_monotonic_ns, picture.time.bound_s
     state = robot.at(middle_ns)
     true_ns = true_middle_ns(picture, truth)
     true_joints = (await asyncio.to_thread(ask_truth, host, true_ns))["joints_rad"]

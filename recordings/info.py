@@ -7,6 +7,7 @@ from typing import Any
 
 from recordings.mcap.contents import MessageIndex
 from recordings.reader import Recording
+from recordings.schema.frame_ids import frames_between, guess_ids
 from recordings.schema.messages import SINGLE_TAGS, BoardSpec
 from recordings.schema.topics import Topic
 from recordings.segment import RecordingSegment
@@ -16,8 +17,6 @@ _SHORTEST_SPAN_S = 0.01
 """Messages that all came at once have no rate."""
 _SETTINGS_LIMIT = 1000
 """Different exposures or gains that are listed."""
-_FRAME_ID_WRAP = 65535
-"""GigE Vision frame ids go 1 … 65535 and start at 1 again."""
 
 
 def recording_info(recording: Recording) -> dict[str, Any]:
@@ -119,18 +118,21 @@ def _image_stream(recording: Recording) -> dict[str, Any] | None:
     exposures: set[float] = set()
     gains: set[float] = set()
     formats: set[str] = set()
+    bounds_s: dict[str, float] = {}
     for segment in recording.segments:
         before: int | None = None
+        ids = guess_ids(fact.frame_id for fact in segment.image_facts())
         for fact in segment.image_facts():
             count += 1
-            if before is not None:
-                step = fact.frame_id - before
-                jumps += (step + _FRAME_ID_WRAP if step < 0 else step) != 1
+            if before is not None and fact.frame_id is not None:
+                jumps += frames_between(before, fact.frame_id, ids) != 1
             before = fact.frame_id
             for found, value in ((exposures, fact.exposure_us), (gains, fact.gain_db)):
                 if math.isfinite(value) and len(found) < _SETTINGS_LIMIT:
                     found.add(value)
             formats.add(fact.pixel_format)
+            if fact.time is not None:
+                bounds_s[fact.time.source] = max(fact.time.bound_s, bounds_s.get(fact.time.source, 0.0))
     if not count:
         return None
     return {
@@ -139,6 +141,7 @@ def _image_stream(recording: Recording) -> dict[str, Any] | None:
         "exposure_us": sorted(exposures),
         "gain_db": sorted(gains),
         "pixel_formats": sorted(formats),
+        "time_bounds_s": bounds_s,
     }
 
 

@@ -35,6 +35,7 @@ from recordings.schema.definitions import (
 from recordings.schema.messages import (
     CameraModel,
     CaptureEvent,
+    ClockReading,
     Image,
     Matrix4,
     RobotState,
@@ -134,6 +135,10 @@ class RecordingSegment:
 
     def image_facts(self) -> Iterator[PictureFacts]:
         return self._decoded(Topic.PICTURE_FACTS, PictureFacts)
+
+    def clock_readings(self) -> Iterator[ClockReading]:
+        """Readings of the camera's clock, raw, in order."""
+        return self._decoded(Topic.CLOCK_READING, ClockReading)
 
     def image_sequences(self) -> list[int]:
         """Sequences of all images, in file order."""

@@ -30,6 +30,7 @@ from recordings.schema.definitions import FORMATS, SESSION_RECORDS, PictureFacts
 from recordings.schema.messages import (
     CameraModel,
     CaptureEvent,
+    ClockReading,
     Image,
     Matrix4,
     RobotState,
@@ -117,19 +118,27 @@ class RecordingWriter:
                 height_px=height,
             )
         told = msgspec.structs.asdict(image)
-        del told["pixels"]
+        del told["pixels"], told["clock_readings"]
         facts = PictureFacts(width=width, height=height, **told)
         time_ns = self._time_ns(image.stamps, image.sequence)
         try:
             topic, pieces = self._image(image, encoded, time_ns)
         except ImageError as error:
             raise RecordingError(f"Image {image.sequence} {error}", code="bad-image") from error
+        for reading in image.clock_readings:
+            self.clock_reading(reading)
         for part_of_it in (Topic.PICTURE_FACTS, topic):  # declared first: the two lie in one chunk
             self._channel(part_of_it)
         self._add(Topic.PICTURE_FACTS, [encode(facts)], time_ns, image.sequence, more=True)
         self._add(topic, pieces, time_ns, image.sequence)
         self._images[image.sequence] = time_ns
         self.flush()
+
+    def clock_reading(self, reading: ClockReading) -> None:
+        """Of the camera's clock; those that an image brings along come with the image."""
+        self._add(
+            Topic.CLOCK_READING, [encode(reading)], self._time_ns(Stamps(host_wall_ns=reading.host_wall_ns))
+        )
 
     def _image(self, image: Image, encoded: bytes | None, time_ns: int) -> tuple[Topic, list[Piece]]:
         if encoded is None and self._lossless_png:

@@ -142,6 +142,8 @@ def _info_rows(facts: dict[str, Any]) -> Iterator[tuple[str, str]]:
         yield "robot states", f"{states['count']} at {rate}, {gaps}"
     if images := facts["pictures"]:
         yield "images", _images_text(images)
+        for source, bound_s in images["time_bounds_s"].items():
+            yield "image time", f"by {source}, within {1000 * bound_s:.2f} ms of mid-exposure"
     for name, clock in facts["clocks"].items():
         if clock:
             yield f"{name} clock", _clock_text(clock)

@@ -31,6 +31,9 @@ def write_excerpt(recording: Recording, output: Path, window_s: float = 0.5) -> 
         for state in recording.robot_states():
             if _near(state, kept_ns, window_s):
                 writer.robot_state(state)
+        for segment in recording.segments:
+            for reading in segment.clock_readings():
+                writer.clock_reading(reading)
         for sequence, (view, image) in enumerate(recording.images()):
             writer.image(msgspec.structs.replace(image, sequence=sequence))
             writer.view(msgspec.structs.replace(view, picture_sequence=sequence, part=1))

@@ -17,7 +17,7 @@ from recordings.files import sync_folder
 from recordings.images import encode_png
 from recordings.importers.dataset import DATASET_FILE, HEADER, JOINTS, POSES_FILE
 from recordings.reader import Recording
-from recordings.schema.messages import Stamps, View
+from recordings.schema.messages import ClockReading, Stamps, View
 from recordings.schema.viewing import quaternion_xyzw
 
 _EXTENSIONS = {"png": "png", "jpeg": "jpg"}
@@ -107,8 +107,20 @@ def _write_tables(recording: Recording, folder: Path) -> None:
     _write_csv(folder / "robot_states.csv", header, states)
     facts = [fact for segment in recording.segments for fact in segment.image_facts()]
     columns = ["sequence", "frame_id", "width", "height", "exposure_us", "gain_db", "pixel_format"]
-    rows = ([*_values(fact.stamps), *(getattr(fact, column) for column in columns)] for fact in facts)
-    _write_csv(folder / "pictures.csv", [*_STAMPS, *columns], rows)
+    told = ["middle_host_monotonic_ns", "time_bound_s", "time_source"]
+    rows = (
+        [
+            *_values(fact.stamps),
+            *(getattr(fact, column) for column in columns),
+            *([""] * len(told) if fact.time is None else msgspec.structs.astuple(fact.time)),
+        ]
+        for fact in facts
+    )
+    _write_csv(folder / "pictures.csv", [*_STAMPS, *columns, *told], rows)
+    readings = (
+        list(msgspec.structs.astuple(r)) for segment in recording.segments for r in segment.clock_readings()
+    )
+    _write_csv(folder / "camera_clock.csv", list(ClockReading.__struct_fields__), readings)
     _write_views(recording, folder)
     events = ([*_values(e.stamps), e.level, e.kind, e.pose_index, e.detail] for e in recording.events())
     _write_csv(folder / "events.csv", [*_STAMPS, "level", "kind", "pose_index", "detail"], events)

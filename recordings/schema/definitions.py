@@ -1,8 +1,8 @@
 """The project's own messages in protobuf: one message per struct of `messages`, derived from its fields.
 
-int → int64, float → double, str → string, tuple of floats → repeated double (a matrix row by row),
-struct → message, `| None` → optional. Field numbers are the order of the struct's fields, so a new field goes
-at the end with a default; `tests/recordings/test_schema.py` freezes the numbers. The schema
+bool → bool, int → int64, float → double, str → string, tuple of floats → repeated double (a matrix row by
+row), struct → message, `| None` → optional. Field numbers are the order of the struct's fields, so a new
+field goes at the end with a default; `tests/recordings/test_schema.py` freezes the numbers. The schema
 travels inside every file, and the reader refuses one that says something else than these.
 """
 
@@ -17,7 +17,15 @@ from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from google.protobuf.message import DecodeError
 from msgspec import inspect
 
-from recordings.schema.messages import CaptureEvent, RobotState, Stamps, Stillness, View
+from recordings.schema.messages import (
+    CaptureEvent,
+    ClockReading,
+    FrameTime,
+    RobotState,
+    Stamps,
+    Stillness,
+    View,
+)
 
 FORMATS = ("station-recording/1", "station-recording/2")
 """Formats that are read, oldest first; the newest is written."""
@@ -34,7 +42,7 @@ class PictureFacts(msgspec.Struct, frozen=True, omit_defaults=True):
     """Facts that a foxglove image has no place for; written right before it, same sequence."""
 
     stamps: Stamps
-    frame_id: int
+    frame_id: int | None
     sequence: int
     width: int
     height: int
@@ -42,6 +50,7 @@ class PictureFacts(msgspec.Struct, frozen=True, omit_defaults=True):
     gain_db: float = 0.0
     pixel_format: str = "Mono8"
     trigger_count: int | None = None
+    time: FrameTime | None = None
 
 
 class SchemaError(ValueError):
@@ -76,6 +85,7 @@ def _field(field: inspect.Field) -> _Field:
         kind = "matrix" if isinstance(node.item_type, inspect.VarTupleType) else "vector"
         return _Field(field.name, kind, _Descriptor.TYPE_DOUBLE, optional)
     scalar: dict[Any, int] = {
+        inspect.BoolType: _Descriptor.TYPE_BOOL,
         inspect.IntType: _Descriptor.TYPE_INT64,
         inspect.FloatType: _Descriptor.TYPE_DOUBLE,
         inspect.StrType: _Descriptor.TYPE_STRING,
@@ -90,7 +100,16 @@ def _fields(struct: type[msgspec.Struct]) -> list[_Field]:
     return [_field(f) for f in node.fields if (struct, f.name) not in _FILLED_IN_BY_READER]
 
 
-_STRUCTS: tuple[type[msgspec.Struct], ...] = (Stamps, Stillness, RobotState, PictureFacts, View, CaptureEvent)
+_STRUCTS: tuple[type[msgspec.Struct], ...] = (
+    Stamps,
+    Stillness,
+    RobotState,
+    FrameTime,
+    PictureFacts,
+    ClockReading,
+    View,
+    CaptureEvent,
+)
 _PLAN = {struct: _fields(struct) for struct in _STRUCTS}
 
 
@@ -205,8 +224,7 @@ def _from_proto(struct: type[msgspec.Struct], message: Any) -> dict[str, Any]:
             assert field.struct is not None
             content[field.name] = _from_proto(field.struct, value)
         elif field.kind == "scalar":
-            if not field.optional or message.HasField(field.name):
-                content[field.name] = value
+            content[field.name] = None if field.optional and not message.HasField(field.name) else value
         elif value or not field.optional:
             content[field.name] = _rows(value) if field.kind == "matrix" else tuple(value)
     return content

@@ -125,6 +125,36 @@ class Stamps(msgspec.Struct, frozen=True, omit_defaults=True):
     device_ns: int = 0
 
 
+TimeSource = Literal["ptp", "chunk", "latched", "trigger", "arrival"]
+"""How a frame's time is known, best first.
+
+ptp: the camera's clock follows this computer's (IEEE 1588). chunk: stamp and exposure came with the frame,
+and its clock is read by round trips. latched: the same clock, with the stamp of the transport. trigger: the
+pulse of the trigger box and a measured delay. arrival: it came after its exposure, and after its trigger.
+"""
+
+
+class FrameTime(msgspec.Struct, frozen=True):
+    """The middle of a frame's exposure on the host's monotonic clock."""
+
+    host_monotonic_ns: int
+    bound_s: float
+    """95 % bound of the error"""
+    source: TimeSource
+
+
+class ClockReading(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One reading of a camera's clock, as it was: it showed `device_ns` between question and answer."""
+
+    asked_monotonic_ns: int
+    answered_monotonic_ns: int
+    device_ns: int
+    host_wall_ns: int = 0
+    """Host wall clock at the answer; 0 = not read"""
+    synchronized: bool = False
+    """The camera says that its clock is locked by PTP"""
+
+
 class RobotState(msgspec.Struct, frozen=True):
     """One sample of the controller, at its full rate. Joint order: base … wrist 3, rad."""
 
@@ -150,7 +180,8 @@ class Image(msgspec.Struct, frozen=True, eq=False):
     """(height, width) uint8 or uint16, or (height, width, 3) uint8 BGR"""
     stamps: Stamps
     """device_ns: the camera's clock at the start of exposure; host: first packet received."""
-    frame_id: int
+    frame_id: int | None
+    """As the transport numbers frames; None where it does not"""
     sequence: int
     """Counts from 0 in this recording, never wraps."""
     exposure_us: float = 0.0
@@ -158,6 +189,10 @@ class Image(msgspec.Struct, frozen=True, eq=False):
     pixel_format: str = "Mono8"
     """GenICam's name of the pixel format."""
     trigger_count: int | None = None
+    time: FrameTime | None = None
+    """Middle of the exposure; every camera gives it. None: recorded before there was such a thing."""
+    clock_readings: tuple[ClockReading, ...] = ()
+    """Readings of the camera's clock since the frame before; empty when read from a recording."""
 
 
 class Stillness(msgspec.Struct, frozen=True, omit_defaults=True):

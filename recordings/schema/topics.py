@@ -18,12 +18,13 @@ from google.protobuf.message import DecodeError
 from mcap_protobuf.schema import build_file_descriptor_set
 
 from recordings.schema.definitions import PictureFacts, message_class
-from recordings.schema.messages import CaptureEvent, RobotState, View
+from recordings.schema.messages import CaptureEvent, ClockReading, RobotState, View
 
 
 class Topic(StrEnum):
     ROBOT_STATE = "/robot/state"
     PICTURE_FACTS = "/camera/frame"
+    CLOCK_READING = "/camera/clock"
     RAW_IMAGE = "/camera/image"
     COMPRESSED_IMAGE = "/camera/image/compressed"
     CAMERA_CALIBRATION = "/camera/calibration"
@@ -41,6 +42,7 @@ class Topic(StrEnum):
 _MESSAGES: dict[Topic, Any] = {
     Topic.ROBOT_STATE: message_class(RobotState),
     Topic.PICTURE_FACTS: message_class(PictureFacts),
+    Topic.CLOCK_READING: message_class(ClockReading),
     Topic.RAW_IMAGE: RawImage,
     Topic.COMPRESSED_IMAGE: CompressedImage,
     Topic.CAMERA_CALIBRATION: CameraCalibration,

@@ -8,7 +8,7 @@ from typing import Literal
 import msgspec
 
 from recordings.errors import Value
-from recordings.schema.messages import Matrix4, Mount, Source, Vector6
+from recordings.schema.messages import Matrix4, Mount, Source, TimeSource, Vector6
 
 
 class StationState(StrEnum):
@@ -138,6 +138,8 @@ class ClockStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     camera_offset_ms: float | None = None
     camera_bound_ms: float | None = None
     camera_drift_ppm: float | None = None
+    camera_source: TimeSource | None = None
+    """How the time of a frame is known; `camera_bound_ms` is that time's bound."""
 
 
 class TriggerStatus(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -12,13 +12,12 @@ from typing import TypeVar
 
 import msgspec
 
-from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import CameraIdentity, Image
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices.aravis_device import GenicamDevice
 from station.devices.base import Trigger
-from station.devices.frames import RETAKE, CameraCounts, DeviceClock, FrameCounter, StreamCounts
+from station.devices.frames import RETAKE, CameraCounts, FrameClock, FrameCounter, FrameTiming, StreamCounts
 
 T = TypeVar("T")
 _CLOCK_READINGS = 8
@@ -41,14 +40,14 @@ class AravisCamera:
         self._device: GenicamDevice | None = None
         self._worker: ThreadPoolExecutor | None = None
         self._busy = asyncio.Lock()
-        self._clock = DeviceClock()
+        self._clock = FrameClock()
         self._newest: Image | None = None
         self.identity = CameraIdentity(driver="aravis")
         self.counter = FrameCounter()
 
     @property
-    def clock(self) -> ClockFit | None:
-        return self._clock.fit
+    def timing(self) -> FrameTiming | None:
+        return self._clock.timing
 
     def counts(self) -> CameraCounts:
         """The network's since the camera was opened (again)."""
@@ -77,7 +76,7 @@ class AravisCamera:
 
     async def _one(self, timeout_s: float, *, sequenced: bool) -> Image:
         exposure_us, gain_db = await self._run(self._prepare)
-        pulse = None
+        pulse, asked_ns = None, None if self.free_running else time.monotonic_ns()
         if self._config.trigger == "hardware":
             assert self._trigger is not None
             pulse = (await self._trigger.fire()).count
@@ -87,9 +86,10 @@ class AravisCamera:
             self.counter.lost(pulse)
             raise
         sequence = self.counter.accept(picture.frame_id, pulse, sequenced=sequenced)
-        return msgspec.structs.replace(
+        told = msgspec.structs.replace(
             picture, sequence=sequence, exposure_us=exposure_us, gain_db=gain_db, trigger_count=pulse
         )
+        return self._clock.timed(told, asked_ns=asked_ns)
 
     async def preview(self) -> Image | None:
         """A fresh image where the camera is idle and can be triggered by software, else the newest one."""
@@ -129,9 +129,10 @@ class AravisCamera:
         self.identity = device.open(self.identity.serial)
         self._device = device
         self.counter.restart()
+        self.counter.ids = device.frame_ids
         self._clock.restart()
         for _ in range(_CLOCK_READINGS):
-            device.latch(self._clock)
+            device.latch(self._clock.readings)
 
     def _live(self) -> GenicamDevice:
         """The device; opened again, by its serial, after it was lost."""
@@ -146,7 +147,7 @@ class AravisCamera:
         device = self._live()
         if not self.free_running and (extra := device.drain()):
             raise self.counter.surplus(extra)
-        device.latch(self._clock)
+        device.latch(self._clock.readings)
         return device.check_settings()
 
     def _take(self, timeout_s: float) -> Image:
@@ -183,7 +184,8 @@ class AravisCamera:
                 continue  # incomplete: the next frame's id shows the gap, and the counter counts it
             if picture is not None:
                 sequence = self.counter.follow(picture.frame_id)
-                self._newest = msgspec.structs.replace(
+                told = msgspec.structs.replace(
                     picture, sequence=sequence, exposure_us=exposure_us, gain_db=gain_db
                 )
+                self._newest = self._clock.timed(told)
                 callback(self._newest)

@@ -10,10 +10,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from recordings.schema.clocks import monotonic_from_wall_ns
-from recordings.schema.messages import CameraIdentity, Image, Stamps
+from recordings.schema.frame_ids import FrameIds
+from recordings.schema.frame_time import DeviceClock
+from recordings.schema.messages import CameraIdentity, ClockReading, Image, Stamps
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
-from station.devices.frames import RETAKE, DeviceClock, StreamCounts
+from station.devices.frames import RETAKE, StreamCounts
 from station.devices.pixels import bits_per_pixel, decode
 
 if TYPE_CHECKING:
@@ -80,6 +82,17 @@ class GenicamDevice:
         if self._controls and camera is not None and not camera.get_device().is_controller():
             self._lost = True
         return self._lost
+
+    @property
+    def frame_ids(self) -> FrameIds:
+        """How its transport numbers frames."""
+        mode = "GevGVSPExtendedIDMode"
+        camera = self._camera
+        if not camera.is_gv_device() or (
+            camera.is_feature_available(mode) and camera.get_string(mode) == "On"
+        ):
+            return FrameIds.WIDE
+        return FrameIds.BLOCK
 
     def open(self, serial: str = "") -> CameraIdentity:
         """Finds, sets up and starts the camera. `serial`: only this very one."""
@@ -158,10 +171,10 @@ class GenicamDevice:
                 device_ns = self._to_ns(self._camera.get_integer(value))
                 while device_ns == self._latched_ns and time.monotonic_ns() < asked_ns + _LATCH_WAIT_S * 1e9:
                     device_ns = self._to_ns(self._camera.get_integer(value))
-                answered_ns = time.monotonic_ns()
+                answered_ns, wall_ns = time.monotonic_ns(), time.time_ns()
             if device_ns != self._latched_ns:
                 self._latched_ns = device_ns
-                clock.reading(device_ns, asked_ns, answered_ns)
+                clock.add(ClockReading(asked_ns, answered_ns, device_ns, wall_ns))
             return
 
     def _to_ns(self, ticks: int) -> int:
@@ -248,12 +261,19 @@ class GenicamDevice:
                 host_wall_ns=wall_ns,
                 device_ns=buffer.get_timestamp(),
             ),
-            frame_id=buffer.get_frame_id(),
+            frame_id=self._frame_id(buffer),
             sequence=0,
             exposure_us=self._config.exposure_us,
             gain_db=self._config.gain_db,
             pixel_format="BGR8" if image.ndim == 3 else self._config.pixel_format,
         )
+
+    def _frame_id(self, buffer: Any) -> int | None:
+        """GigE Vision's block id 0 says that there is none; the upper half of 64 bits reads as negative."""
+        number = int(buffer.get_frame_id())
+        if number == 0 and self._camera.is_gv_device():
+            return None
+        return number if number < 1 << 63 else number - (1 << 64)
 
     def _require_alive(self) -> None:
         if self.lost:

@@ -10,7 +10,7 @@ import msgspec
 
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import CameraIdentity, Image, RobotIdentity, RobotState
-from station.devices.frames import CameraCounts
+from station.devices.frames import CameraCounts, FrameTiming
 
 
 class Robot(Protocol):
@@ -79,11 +79,14 @@ class Camera(Protocol):
         """Raises CameraError with the remedy."""
 
     async def capture(self, timeout_s: float = 5.0) -> Image:
-        """One trigger, one frame. Raises CameraError; never returns an older frame."""
+        """One trigger, one frame, with its `time`. Raises CameraError; never returns an older frame.
+
+        `frames.FrameClock` finds the time; a camera of another kind fills in source and bound by itself.
+        """
 
     @property
-    def clock(self) -> ClockFit | None:
-        """The camera's clock against the host's; None while not known. For `frames.mid_exposure`."""
+    def timing(self) -> FrameTiming | None:
+        """How surely its frames are placed in time now; None while not known. At once, from any thread."""
 
     def counts(self) -> CameraCounts:
         """Since it was made. At once, from any thread."""

@@ -2,18 +2,14 @@
 
 from __future__ import annotations
 
-from collections import deque
-from typing import NamedTuple
-
 import msgspec
 
-from recordings.schema.clocks import DRIFT_SPAN_S, UNFITTED_DRIFT, ClockFit
+from recordings.schema.clocks import ClockFit
+from recordings.schema.frame_ids import LAST_BLOCK_ID, FrameIds, frames_between
+from recordings.schema.frame_time import UNKNOWN_READOUT_S, DeviceClock, by_arrival, by_clock
+from recordings.schema.messages import FrameTime, Image, TimeSource
 from station.cell.errors import CameraError
 
-LAST_FRAME_ID = 65_535
-"""GigE Vision block ids run from 1 to this and start over at 1; 0 means "no frame"."""
-UNKNOWN_READOUT_S = 0.05
-READINGS_KEPT = 200
 RETAKE = "Take this pose again."
 
 
@@ -42,23 +38,16 @@ class CameraCounts(msgspec.Struct, frozen=True):
     stream: StreamCounts = StreamCounts()
 
 
-def next_frame_id(frame_id: int) -> int:
-    return frame_id % LAST_FRAME_ID + 1
-
-
-def frames_between(earlier_id: int, later_id: int) -> int:
-    """Number of frames from `earlier_id` to `later_id`: 1 for the next one, 0 for the same."""
-    return (later_id - earlier_id) % LAST_FRAME_ID
-
-
 class FrameCounter:
     """Accepts a frame only as the answer to the one outstanding trigger.
 
-    One trigger, then one frame with the next frame id. After any disagreement the count starts afresh with
-    the next frame, so that one lost frame costs one pose and no more.
+    One trigger, then one frame with the next frame id, where the transport numbers frames. After any
+    disagreement the count starts afresh with the next frame: one lost frame costs one pose and no more.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, ids: FrameIds = FrameIds.WIDE) -> None:
+        self.ids = ids
+        """Set by the driver that knows the transport."""
         self.frames = 0
         """Accepted; the newest one's sequence number is one less."""
         self.missing = 0
@@ -74,7 +63,7 @@ class FrameCounter:
         """The camera was opened or acquisition started anew: the next frame id may be any."""
         self._last_id = self._last_pulse = None
 
-    def accept(self, frame_id: int, pulse_count: int | None = None, *, sequenced: bool = True) -> int:
+    def accept(self, frame_id: int | None, pulse_count: int | None = None, *, sequenced: bool = True) -> int:
         """The frame's sequence number. `pulse_count`: of the trigger box, for its trigger.
 
         `sequenced=False`: a preview, which takes no sequence number.
@@ -82,20 +71,23 @@ class FrameCounter:
         """
         last_id, last_pulse = self._last_id, self._last_pulse
         self._last_id, self._last_pulse = frame_id, pulse_count
-        if not 1 <= frame_id <= LAST_FRAME_ID:
-            raise CameraError(
-                f"the camera numbered a frame {frame_id}; frame ids are 1 … {LAST_FRAME_ID}", code="frame-id"
-            )
-        frames = 1 if last_id is None else frames_between(last_id, frame_id)
+        frames = self._step(last_id, frame_id)
         pulses = 1 if last_pulse is None or pulse_count is None else pulse_count - last_pulse
+        if frames is None:
+            self.unexpected += 1
+            raise CameraError(
+                f"the camera numbers frames anew: {frame_id} came after {last_id}",
+                code="frame-ids-restarted",
+                remedy=RETAKE,
+            )
         if frames == 0:
             self.unexpected += 1
             raise CameraError(f"the camera sent frame {frame_id} twice", code="frame-twice", remedy=RETAKE)
         if frames > 1 and frames > pulses:
             self.missing += frames - 1
             raise CameraError(
-                f"frames {next_frame_id(last_id or 0)} … were lost before frame {frame_id}: which image "
-                "belongs to this pose is not certain",
+                f"{frames - 1} frame(s) were lost between {last_id} and {frame_id}: which image belongs to "
+                "this pose is not certain",
                 code="frames-lost",
                 remedy=RETAKE,
                 frames=frames - 1,
@@ -113,14 +105,24 @@ class FrameCounter:
         self.paired += pulse_count is not None
         return self.frames - 1
 
-    def follow(self, frame_id: int) -> int:
+    def follow(self, frame_id: int | None) -> int:
         """Free-running: the sequence number; gaps are only counted."""
-        if self._last_id is not None:
-            self.missing += max(0, frames_between(self._last_id, frame_id) - 1)
+        frames = self._step(self._last_id, frame_id)
+        self.missing += max(0, (frames or 0) - 1)
+        self.unexpected += frames is None
         self._last_id = frame_id
         self.frames += 1
         self.seen += 1
         return self.frames - 1
+
+    def _step(self, last_id: int | None, frame_id: int | None) -> int | None:
+        if last_id is None or frame_id is None:
+            return 1
+        if last_id == frame_id == 0:
+            return 1  # two zeros: this camera numbers nothing
+        if frame_id > LAST_BLOCK_ID:  # extended ids of a camera that does not announce them
+            self.ids = FrameIds.WIDE
+        return frames_between(last_id, frame_id, self.ids)
 
     def counts(self, stream: StreamCounts | None = None) -> CameraCounts:
         return CameraCounts(self.seen, self.missing, self.paired, stream or StreamCounts())
@@ -143,80 +145,68 @@ class FrameCounter:
         )
 
 
-class _ClockReading(NamedTuple):
-    device_s: float
-    offset_ns: float
-    """Host monotonic minus device time, at the middle of the round trip."""
-    half_s: float
-    """Half the round trip: the offset is wrong by this at most."""
+class FrameTiming(msgspec.Struct, frozen=True):
+    """How surely a camera's frames are placed in time, for doctor and screen."""
+
+    source: TimeSource
+    bound_s: float
+    """95 % bound of the newest frame's time, or of one taken now"""
+    clock: ClockFit | None = None
+    """The camera's clock against the host's; None where it has none that can be read"""
+    impossible: int = 0
+    """Frames whose stamp lay before their trigger or after their arrival: it is no start of exposure"""
 
 
-class DeviceClock:
-    """A camera's clock, read over the wire. The bound holds whatever the delays there and back were.
+class FrameClock:
+    """Gives a camera's frames their times, from the best source that the frame itself bears out.
 
-    The newest good reading gives the offset, the quickest ones early and late in the window the drift.
+    For a camera's driver, which feeds it readings of the camera's clock where there is one.
     """
 
     def __init__(self) -> None:
-        self._readings: deque[_ClockReading] = deque(maxlen=READINGS_KEPT)
-
-    def reading(self, device_ns: int, asked_monotonic_ns: int, answered_monotonic_ns: int) -> None:
-        """The device showed `device_ns` at some moment between asking and the answer."""
-        half_ns = (answered_monotonic_ns - asked_monotonic_ns) / 2
-        offset_ns = float(asked_monotonic_ns - device_ns) + half_ns
-        self._readings.append(_ClockReading(device_ns / 1e9, offset_ns, half_ns / 1e9))
+        self.readings = DeviceClock()
+        self._newest: FrameTime | None = None
+        self._impossible = 0
+        self._opened = False
 
     def restart(self) -> None:
-        self._readings.clear()
+        """The camera was opened: its clock may be another."""
+        self.readings.restart()
+        self._newest, self._impossible, self._opened = None, 0, True
 
     @property
-    def fit(self) -> ClockFit | None:
-        """None before the first reading."""
-        readings = list(self._readings)
-        if not readings:
-            return None
-        drift, doubt = _drift(readings)
-        now_s = readings[-1].device_s
-        best = min(readings, key=lambda r: r.half_s + doubt * (now_s - r.device_s))
-        return ClockFit(
-            reference_s=best.device_s,
-            offset_ns=best.offset_ns,
-            drift=drift,
-            residual_s=0.0,
-            drift_uncertainty=doubt,
-            latency_s=best.half_s,
-            samples=len(readings),
-            span_s=0.0,
-        )
+    def timing(self) -> FrameTiming | None:
+        """None before the camera was opened."""
+        fit = self.readings.fit
+        if self._newest is not None:
+            return FrameTiming(self._newest.source, self._newest.bound_s, fit, self._impossible)
+        if fit is None:
+            return FrameTiming("arrival", UNKNOWN_READOUT_S / 2) if self._opened else None
+        return FrameTiming("ptp" if self.readings.synchronized else "latched", fit.bound_s, fit)
+
+    def timed(self, image: Image, *, asked_ns: int | None = None, chunk: bool = False) -> Image:
+        """The image with its time and the readings since the one before.
+
+        `asked_ns`: host time just before its trigger; None = it came by itself. `chunk`: stamp and exposure
+        came with the frame.
+        """
+        arrived = by_arrival(image.stamps.host_monotonic_ns, image.exposure_us, asked_ns)
+        fit = self.readings.fit
+        self._newest = arrived
+        if fit is not None and image.stamps.device_ns:
+            source: TimeSource = "chunk" if chunk else "latched"
+            if self.readings.synchronized:
+                source = "ptp"
+            told = by_clock(image.stamps.device_ns, image.exposure_us, fit, source)
+            if _possible(told, image, asked_ns):
+                self._newest = told
+            else:
+                self._impossible += 1
+        return msgspec.structs.replace(image, time=self._newest, clock_readings=self.readings.take_fresh())
 
 
-def _drift(readings: list[_ClockReading]) -> tuple[float, float]:
-    """Host seconds per device second minus 1, and how far it can be off."""
-    span_s = readings[-1].device_s - readings[0].device_s
-    third = max(1, len(readings) // 3)
-    early, late = (min(part, key=lambda r: r.half_s) for part in (readings[:third], readings[-third:]))
-    apart_s = late.device_s - early.device_s
-    if span_s < DRIFT_SPAN_S or apart_s <= 0:
-        return 0.0, UNFITTED_DRIFT
-    doubt = (early.half_s + late.half_s) / apart_s
-    if doubt >= UNFITTED_DRIFT:
-        return 0.0, UNFITTED_DRIFT
-    return (late.offset_ns - early.offset_ns) / 1e9 / apart_s, doubt
-
-
-def mid_exposure(
-    start_device_ns: int, arrival_monotonic_ns: int, exposure_us: float, clock: ClockFit | None
-) -> tuple[int, float]:
-    """Host monotonic time (ns) of the middle of an exposure, and its 95 % bound (s).
-
-    `start_device_ns`: the camera's clock at the start of exposure, 0 = it has none. By the camera's clock
-    where it is known; else from the first packet's arrival, of which all that is known is that it comes
-    after the exposure, by `UNKNOWN_READOUT_S` at most.
-    """
-    half_ns = round(exposure_us * 500)
-    if clock is not None and start_device_ns:
-        device_s = start_device_ns / 1e9
-        beyond_s = clock.drift_uncertainty * abs(device_s - clock.reference_s)
-        return clock.to_host_ns(device_s) + half_ns, clock.bound_s + beyond_s
-    readout_ns = round(UNKNOWN_READOUT_S * 1e9)
-    return arrival_monotonic_ns - readout_ns // 2 - half_ns, readout_ns / 2e9
+def _possible(told: FrameTime, image: Image, asked_ns: int | None) -> bool:
+    """An exposure begins after its trigger, and ends before its first packet arrives."""
+    half_ns, bound_ns = image.exposure_us * 500, told.bound_s * 1e9
+    ended = told.host_monotonic_ns + half_ns - bound_ns <= image.stamps.host_monotonic_ns
+    return ended and (asked_ns is None or told.host_monotonic_ns - half_ns + bound_ns >= asked_ns)

@@ -24,6 +24,7 @@ from recordings.reader import Recording, open_recording
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import (
     CameraIdentity,
+    FrameTime,
     Image,
     RobotIdentity,
     RobotState,
@@ -35,19 +36,20 @@ from station.cell.config import CameraConfig, StationConfig, vector6
 from station.cell.errors import CameraError, ConfigError, RobotError, StaleStateError
 from station.cell.plan import Plan, PlannedPose
 from station.devices.cell import Cell
-from station.devices.frames import CameraCounts, next_frame_id
+from station.devices.frames import CameraCounts, FrameTiming
 
 STATE_RATE_HZ = 100.0
 MOVE_S = 0.2
 """Every move takes this long, whatever the recorded one took."""
 _SAME_JOINTS_RAD = 0.02
+_STAMP_BOUND_S = 1e-6
 _HOST_CLOCK = ClockFit(
     reference_s=0.0,
     offset_ns=0.0,
     drift=0.0,
     residual_s=0.0,
     drift_uncertainty=0.0,
-    latency_s=1e-6,
+    latency_s=_STAMP_BOUND_S,
     samples=1,
     span_s=0.0,
 )
@@ -171,7 +173,7 @@ class PlaybackCamera:
         self._start_s: float | None = None
         self._busy = asyncio.Lock()
         self.identity = CameraIdentity(driver="playback")
-        self.clock: ClockFit | None = _HOST_CLOCK
+        self.timing = FrameTiming("latched", _STAMP_BOUND_S, _HOST_CLOCK)
 
     def counts(self) -> CameraCounts:
         return CameraCounts(frames=self._taken)
@@ -200,13 +202,14 @@ class PlaybackCamera:
                     )
                 await self._wait_for(played, timeout_s)
                 picture = played.picture
-            self._frame_id = next_frame_id(self._frame_id)
+            self._frame_id += 1
             now_ns = time.monotonic_ns()
             self._newest = msgspec.structs.replace(
                 picture,
                 stamps=Stamps(host_monotonic_ns=now_ns, host_wall_ns=time.time_ns(), device_ns=now_ns),
                 frame_id=self._frame_id,
                 sequence=self._taken,
+                time=FrameTime(now_ns, _STAMP_BOUND_S, "latched"),
             )
             self._taken += 1
             return self._newest

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from recordings.images import Pixels
-from recordings.schema.messages import Image, RobotState, Stamps, Stillness, View
+from recordings.schema.messages import FrameTime, Image, RobotState, Stamps, Stillness, View
 from station.analysis.image_motion import board_box, image_motion
 from station.analysis.pool import WorkerError
 from station.analysis.worker import BoardDetection, CapturedView, sight
@@ -21,7 +21,6 @@ from station.cell.errors import CameraError, StaleStateError, StationError
 from station.cell.scene import flange_pose
 from station.cell.status import PoseState, StationState
 from station.cell.stillness import ImageMotion, RestingCheck
-from station.devices.frames import mid_exposure
 from station.session.context import SessionContext
 from station.session.recording import to_the_end
 
@@ -56,13 +55,12 @@ async def take_pose(context: SessionContext, index: int, attempt: int) -> None:
     _phase(context, index, StationState.CAPTURING, "capturing")
     image = context.require_recording().number(await take_image(context, index))
     show_frame(context, image)
-    device_ns, arrival_ns = image.stamps.device_ns, image.stamps.host_monotonic_ns
-    clock = context.cell.camera.clock
-    mid_ns, camera_bound_s = mid_exposure(device_ns, arrival_ns, image.exposure_us, clock)
-    state = await _state_at(context, mid_ns)
+    if image.time is None:
+        raise PoseFailedError("The camera's driver gave an image without a time.", code="no-time")
+    state = await _state_at(context, image.time.host_monotonic_ns)
     await resting.news()
     context.stillness.require_rest(state)
-    view = _view(context, index, attempt, image, state, still, camera_bound_s)
+    view = _view(context, index, attempt, image, state, still, image.time)
     _require_bound(context, view)
     _phase(context, index, StationState.WRITING, "writing")
     await to_the_end(_write(context, index, image, view))
@@ -125,10 +123,10 @@ def _view(
     image: Image,
     state: RobotState,
     still: Stillness,
-    camera_bound_s: float,
+    time: FrameTime,
 ) -> View:
     robot_clock = context.cell.robot.clock()
-    bound_s = camera_bound_s + (robot_clock.bound_s if robot_clock else 0.0)
+    bound_s = time.bound_s + (robot_clock.bound_s if robot_clock else 0.0)
     exposure_ns = state.stamps.host_monotonic_ns
     return View(
         index=index,

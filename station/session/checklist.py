@@ -127,13 +127,27 @@ def _disk_check(context: SessionContext) -> Check:
 
 
 def _clock_check(context: SessionContext) -> Check:
-    fits = {"controller": context.cell.robot.clock(), "camera": context.cell.camera.clock}
-    known = {name: fit for name, fit in fits.items() if fit is not None}
-    if not known:
-        return Check("clocks", "warning", "not known yet", "wait a few seconds and check again")
-    text = ", ".join(f"{name} ±{1000 * fit.bound_s:.2f} ms" for name, fit in known.items())
-    if max(fit.bound_s for fit in known.values()) > CLOCK_BOUND_S:
-        return Check(
-            "clocks", "warning", text, "the computer or the network is too busy: poses may be refused"
-        )
+    """`ok` only when both are known, and together within the limit that poses are refused by."""
+    robot, frames = context.cell.robot.clock(), context.cell.camera.timing
+    if robot is None or frames is None:
+        known = "controller" if robot is not None else "camera" if frames is not None else "neither"
+        return Check("clocks", "warning", f"known: {known}", "wait a few seconds and check again")
+    bound_s, limit_s = robot.bound_s + frames.bound_s, context.cell.config.capture.time_bound_s
+    text = (
+        f"controller ±{1000 * robot.bound_s:.2f} ms, frames ±{1000 * frames.bound_s:.2f} ms ({frames.source})"
+    )
+    if frames.impossible:
+        text += f", {frames.impossible} impossible stamps"
+        remedy = "the camera does not stamp the start of exposure: check its timestamp settings, then sweep"
+        return Check("clocks", "warning", text, remedy)
+    if bound_s > limit_s:
+        if frames.clock is None:
+            remedy = (
+                "this camera's clock cannot be read, so poses would be refused: use a hardware trigger, or "
+                f"raise capture.time_bound_s above {bound_s:.3f} (harmless while the arm stands)"
+            )
+            return Check("clocks", "failed", text, remedy)
+        return Check("clocks", "failed", text, "reduce the load of this computer or its network")
+    if bound_s > CLOCK_BOUND_S or frames.source == "arrival":
+        return Check("clocks", "warning", text, "the computer or the network is busy, or a clock is not read")
     return Check("clocks", "ok", text)

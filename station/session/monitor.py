@@ -186,8 +186,12 @@ class Monitor:
         self._context.store.update_session(calibration=solved)
 
     def _clock(self) -> ClockStatus:
-        robot, camera = self._context.cell.robot.clock(), self._context.cell.camera.clock
-        return ClockStatus(*_clock_facts(robot), *_clock_facts(camera))
+        robot, frames = self._context.cell.robot.clock(), self._context.cell.camera.timing
+        if frames is None:
+            return ClockStatus(*_clock_facts(robot))
+        offset_ms, _, drift_ppm = _clock_facts(frames.clock)
+        bound_ms = round(1000 * frames.bound_s, 2)
+        return ClockStatus(*_clock_facts(robot), offset_ms, bound_ms, drift_ppm, frames.source)
 
 
 def _wall_ahead_ns() -> int:

@@ -11,12 +11,12 @@ import time
 import msgspec
 import numpy as np
 
-from recordings.schema.clocks import ClockFit
-from recordings.schema.messages import CameraIdentity, Image, Stamps
+from recordings.schema.frame_ids import FrameIds
+from recordings.schema.messages import CameraIdentity, ClockReading, Image, Stamps
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices.base import Trigger
-from station.devices.frames import RETAKE, CameraCounts, DeviceClock, FrameCounter
+from station.devices.frames import RETAKE, CameraCounts, FrameClock, FrameCounter, FrameTiming
 from station.simulation.cell import CellTruth
 from station.simulation.launch import Json
 
@@ -49,8 +49,8 @@ class RenderedCamera:
         self._frames: asyncio.Queue[Image | CameraError] = asyncio.Queue()
         self._answers: asyncio.Queue[Image | Json | CameraError] = asyncio.Queue()
         self._asking = asyncio.Lock()
-        self._device_clock = DeviceClock()
-        self.counter = FrameCounter()
+        self._clock = FrameClock()
+        self.counter = FrameCounter(FrameIds.BLOCK)
 
     @property
     def identity(self) -> CameraIdentity:
@@ -62,8 +62,8 @@ class RenderedCamera:
         )
 
     @property
-    def clock(self) -> ClockFit | None:
-        return self._device_clock.fit
+    def timing(self) -> FrameTiming | None:
+        return self._clock.timing
 
     def counts(self) -> CameraCounts:
         return self.counter.counts()
@@ -84,7 +84,7 @@ class RenderedCamera:
         )
         self._frames, self._answers = asyncio.Queue(), asyncio.Queue()
         self.counter.restart()
-        self._device_clock.restart()
+        self._clock.restart()
         self._reader = asyncio.create_task(self._read(self._process))
         setup = {
             "truth": msgspec.to_builtins(self._truth),
@@ -108,7 +108,7 @@ class RenderedCamera:
             await self._read_clock()
             if not self._frames.empty():
                 raise self.counter.surplus(self._drain())
-            pulse = None
+            pulse, asked_ns = None, time.monotonic_ns()
             if self._trigger is None:
                 self._write({"cmd": "trigger"})
             else:
@@ -123,7 +123,8 @@ class RenderedCamera:
                 raise frame
             sequence = self.counter.accept(frame.frame_id, pulse)
             self._check_settings(frame)
-            return msgspec.structs.replace(frame, sequence=sequence, trigger_count=pulse)
+            told = msgspec.structs.replace(frame, sequence=sequence, trigger_count=pulse)
+            return self._clock.timed(told, asked_ns=asked_ns)
 
     async def settings(self) -> dict[str, object]:
         return {
@@ -187,7 +188,8 @@ class RenderedCamera:
         asked_ns = time.monotonic_ns()
         answer = await self._ask_locked({"cmd": "clock"}, _ANSWER_S)
         if isinstance(answer, dict):
-            self._device_clock.reading(answer["device_ns"], asked_ns, time.monotonic_ns())
+            answered_ns, wall_ns = time.monotonic_ns(), time.time_ns()
+            self._clock.readings.add(ClockReading(asked_ns, answered_ns, answer["device_ns"], wall_ns))
 
     async def _ask(self, request: Json, timeout_s: float) -> Image | Json:
         async with self._asking:

@@ -195,7 +195,9 @@ class NumberedSource:
         self, width: int, height: int, exposure_us: float, gain_db: float
     ) -> tuple[NDArray[np.uint8], int]:
         self.next_number += 1
-        return numbered_picture(self.next_number - 1, width, height, self._still), self._clock()
+        begun_ns = self._clock()
+        time.sleep(exposure_us / 1e6)
+        return numbered_picture(self.next_number - 1, width, height, self._still), begun_ns
 
 
 _noise: dict[tuple[int, int], NDArray[np.uint8]] = {}

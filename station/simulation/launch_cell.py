@@ -135,7 +135,10 @@ def _camera(
     )
     if free:
         over_gige = msgspec.structs.replace(
-            over_gige, trigger="free-running", frame_rate_hz=options.frame_rate_hz
+            over_gige,
+            trigger="free-running",
+            frame_rate_hz=options.frame_rate_hz,
+            exposure_us=min(over_gige.exposure_us, 0.5e6 / options.frame_rate_hz),
         )
     config = msgspec.structs.replace(config, camera=over_gige)
     return config, AravisCamera(over_gige, trigger), lambda: simulator.inject("pulse")

@@ -8,7 +8,8 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from station.devices.frames import DeviceClock, mid_exposure
+from recordings.schema.frame_time import DeviceClock, by_arrival, by_clock
+from recordings.schema.messages import ClockReading
 from station.simulation.camera import RenderedCamera
 
 
@@ -21,11 +22,9 @@ async def test_24_an_ntp_step_of_an_hour_moves_no_mid_exposure(
     monkeypatch.setattr(time, "time_ns", lambda: true_time_ns() + 3600 * 10**9)
     asked_ns = time.monotonic_ns()
     after = await camera.capture()
-    stamps = after.stamps
-    middle_ns, bound_s = mid_exposure(
-        stamps.device_ns, stamps.host_monotonic_ns, after.exposure_us, camera.clock
-    )
-    assert asked_ns - bound_s * 1e9 < middle_ns < time.monotonic_ns()
+    stamps, told = after.stamps, after.time
+    assert told is not None and told.source == "latched"
+    assert asked_ns - told.bound_s * 1e9 < told.host_monotonic_ns < time.monotonic_ns()
     stepped_s = (stamps.host_wall_ns - before.stamps.host_wall_ns) / 1e9
     assert 3600 < stepped_s < 3630, "the wall clock is recorded as it was"
 
@@ -43,7 +42,7 @@ def simulated_readings(
     for second in range(seconds):
         asked_ns = start_ns + second * 10**9
         there_ns, back_ns = (int(200_000 + rng.exponential(150_000)) for _ in range(2))
-        clock.reading(device_at(asked_ns + there_ns), asked_ns, asked_ns + there_ns + back_ns)
+        clock.add(ClockReading(asked_ns, asked_ns + there_ns + back_ns, device_at(asked_ns + there_ns)))
     return clock, device_at
 
 
@@ -56,17 +55,17 @@ def test_25_offset_and_drift_are_within_their_bound(drift_ppm: float) -> None:
         fit = clock.fit
         assert fit is not None and abs(-fit.drift_ppm - drift_ppm) < 25
         host_ns = 10**12 + int(rng.uniform(20, 60) * 1e9)
-        estimated_ns, bound_s = mid_exposure(device_at(host_ns), 0, 0.0, fit)
-        inside += abs(estimated_ns - host_ns) / 1e9 <= bound_s
-        assert bound_s < 0.003
+        told = by_clock(device_at(host_ns), 0.0, fit, "latched")
+        inside += abs(told.host_monotonic_ns - host_ns) / 1e9 <= told.bound_s
+        assert told.bound_s < 0.003
     assert inside >= 93
 
 
 def test_25_without_readings_the_bound_says_how_little_is_known() -> None:
     """The session refuses a pose whose bound is over its limit of 5 ms."""
-    middle_ns, bound_s = mid_exposure(123, 10**12, 10_000, None)
-    assert bound_s == 0.025
-    assert abs(middle_ns - (10**12 - 5_000_000)) <= 0.025e9
+    told = by_arrival(10**12, 10_000)
+    assert told.bound_s == 0.025 and told.source == "arrival"
+    assert abs(told.host_monotonic_ns - (10**12 - 5_000_000)) <= 0.025e9
 
 
 def test_25_a_camera_that_restarts_its_clock_is_followed() -> None:

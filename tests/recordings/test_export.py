@@ -78,6 +78,7 @@ def test_tables_hold_every_value_in_full_precision(tmp_path: Path) -> None:
         "pictures": 2,
         "views": 2,
         "events": 0,
+        "camera_clock": 0,
     }
     state = tables["robot_states"][3]
     assert float(state["shoulder_rad"]) == make_state(3).joints_rad[1]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from mcap.reader import make_reader
@@ -12,7 +13,7 @@ from mcap_protobuf.decoder import DecoderFactory
 
 from recordings.images import encode_png
 from recordings.reader import open_recording
-from recordings.schema.messages import CameraModel, CaptureEvent, Image, Stamps
+from recordings.schema.messages import CameraModel, CaptureEvent, ClockReading, FrameTime, Image, Stamps
 from recordings.writer import RecordingWriter
 from tests.recordings.small_recording import (
     HEIGHT,
@@ -56,6 +57,19 @@ def test_pictures_are_identical_to_the_bit_and_carry_their_facts(small: Path) ->
             "trigger_count",
         ):
             assert getattr(picture, name) == getattr(expected, name)
+
+
+def test_times_of_frames_and_raw_readings_of_the_cameras_clock_come_back(tmp_path: Path) -> None:
+    readings = (ClockReading(1, 3, 2, START_NS, synchronized=True), ClockReading(4, 6, 50))
+    times = [FrameTime(7, 0.001, "chunk"), None]
+    writer = RecordingWriter(tmp_path / "small.mcap", make_info())
+    for sequence, told in enumerate(times):
+        picture = msgspec.structs.replace(make_picture(sequence), time=told, frame_id=None)
+        writer.image(msgspec.structs.replace(picture, clock_readings=() if sequence else readings))
+    (segment,) = open_recording(writer.finish()).segments
+    assert tuple(segment.clock_readings()) == readings
+    assert [segment.image(n).time for n in (0, 1)] == times == [f.time for f in segment.image_facts()]
+    assert segment.image(0).frame_id is None
 
 
 @pytest.mark.parametrize("lossless_png", [False, True])

@@ -18,7 +18,15 @@ from recordings.schema.definitions import (
     message_class,
     schema_difference,
 )
-from recordings.schema.messages import CaptureEvent, RobotState, Stamps, Stillness, View
+from recordings.schema.messages import (
+    CaptureEvent,
+    ClockReading,
+    FrameTime,
+    RobotState,
+    Stamps,
+    Stillness,
+    View,
+)
 from recordings.schema.topics import Topic, schema_bytes
 from tests.recordings.small_recording import make_state, make_view
 
@@ -29,7 +37,9 @@ FROZEN = {
         "stamps joints_rad joint_speeds_rad_s target_joints_rad tcp_pose robot_mode safety_mode "
         "safety_status_bits runtime_state robot_status_bits speed_scaling target_speed_fraction"
     ),
-    PictureFacts: "stamps frame_id sequence width height exposure_us gain_db pixel_format trigger_count",
+    PictureFacts: "stamps frame_id sequence width height exposure_us gain_db pixel_format trigger_count time",
+    FrameTime: "host_monotonic_ns bound_s source",
+    ClockReading: "asked_monotonic_ns answered_monotonic_ns device_ns host_wall_ns synchronized",
     View: (
         "index name picture_sequence base_from_flange joints_rad attempt stamps time_bound_s stillness "
         "source_file note"

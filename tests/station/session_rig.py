@@ -15,14 +15,21 @@ from calibrate.boards.model import board_points
 from calibrate.geometry import rotation_log
 from calibrate.kinematics import MODELS, forward
 from recordings.reader import Recording, open_recording
-from recordings.schema.messages import CameraIdentity, Image, RobotIdentity, RobotState, Stamps
+from recordings.schema.messages import (
+    CameraIdentity,
+    FrameTime,
+    Image,
+    RobotIdentity,
+    RobotState,
+    Stamps,
+)
 from station.analysis.worker import BoardDetection, sight
 from station.cell.config import StationConfig
 from station.cell.errors import CameraError, RobotError, StaleStateError
 from station.cell.status import DetectionStatus, Event, StationState
 from station.devices.base import Robot
 from station.devices.cell import Cell
-from station.devices.frames import CameraCounts
+from station.devices.frames import CameraCounts, FrameTiming
 from station.protocol.verbs import Purpose
 from station.session import Session
 from station.simulation.scenes import cell_config, make_cell
@@ -150,12 +157,16 @@ class ArmInMemory:
         self.log.append("close")
 
 
+BOUND_S = 0.025
+"""Of every image's time"""
+
+
 class CameraInMemory:
     """Grey pictures of the right size; `fail` says why there is none, as often as it is listed."""
 
     def __init__(self) -> None:
         self.identity = CameraIdentity(model="double", serial="1", driver="rendered")
-        self.clock = None
+        self.timing = FrameTiming("arrival", BOUND_S)
         self.fail: list[str] = []
         self.taken = 0
         self.jumps = 0
@@ -173,13 +184,14 @@ class CameraInMemory:
         if self.fail:
             raise CameraError(self.fail.pop(0))
         self.taken += 1
-        shape = (TRUTH.camera.height, TRUTH.camera.width)
+        shape, now_ns = (TRUTH.camera.height, TRUTH.camera.width), time.monotonic_ns()
         return Image(
             pixels=np.full(shape, 90, np.uint8),
-            stamps=Stamps(time.monotonic_ns(), time.time_ns(), device_ns=time.monotonic_ns()),
+            stamps=Stamps(now_ns, time.time_ns(), device_ns=now_ns),
             frame_id=self.taken,
             sequence=0,
             exposure_us=1000.0,
+            time=FrameTime(now_ns - 500_000, BOUND_S, "arrival"),
         )
 
     async def settings(self) -> dict[str, object]:

@@ -8,8 +8,8 @@ import msgspec
 import pytest
 
 from recordings.reader import open_recording
+from recordings.schema.frame_ids import frames_between
 from station.cli.demo import approve_simulated, simulated_daemon
-from station.devices.frames import frames_between
 from station.operate.motion import carry_out, wait_until_idle
 from station.plan.planner import make_plan
 from station.protocol.client import Client

@@ -77,7 +77,13 @@ def device_lines(status: StationStatus) -> list[str]:
     lines.append(_line("record", recording, False if recorder.error else recorder.recording or None))
     known_ms = [ms for ms in (bounds.camera_bound_ms, bounds.controller_bound_ms) if ms is not None]
     if known_ms:
-        lines.append(_line("clocks", f"± {sum(known_ms):.1f} ms", sum(known_ms) < CLOCKS_POOR_MS))
+        lines.append(
+            _line(
+                "clocks",
+                f"±{sum(known_ms):.1f}ms {bounds.camera_source or ''}",
+                sum(known_ms) < CLOCKS_POOR_MS,
+            )
+        )
     return lines
 
 

@@ -2,38 +2,106 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 
 from recordings.schema.clocks import UNFITTED_DRIFT
-from station.devices.frames import LAST_FRAME_ID, DeviceClock, FrameCounter, mid_exposure
+from recordings.schema.frame_ids import LAST_BLOCK_ID, FrameIds
+from recordings.schema.frame_time import DeviceClock, by_arrival, by_clock
+from recordings.schema.messages import ClockReading, FrameTime, Image, Stamps
+from station.devices.frames import FrameClock, FrameCounter, FrameTiming
 
 MS = 1_000_000
 
 
 def read(clock: DeviceClock, device_s: float, host_s: float, half_s: float) -> None:
     """The device showed `device_s` when the host showed `host_s`, give or take `half_s`."""
-    clock.reading(round(device_s * 1e9), round((host_s - half_s) * 1e9), round((host_s + half_s) * 1e9))
+    asked_ns, answered_ns = round((host_s - half_s) * 1e9), round((host_s + half_s) * 1e9)
+    clock.add(ClockReading(asked_ns, answered_ns, round(device_s * 1e9)))
 
 
 def test_without_a_clock_the_exposure_ended_within_fifty_ms_before_the_arrival() -> None:
-    assert mid_exposure(0, 1000 * MS, 20_000.0, None) == ((1000 - 25 - 10) * MS, 0.025)
+    assert by_arrival(1000 * MS, 20_000.0) == FrameTime((1000 - 25 - 10) * MS, 0.025, "arrival")
 
 
-def test_a_clock_is_of_no_use_to_a_picture_without_a_stamp() -> None:
-    clock = DeviceClock()
-    read(clock, 1.0, 501.0, 0.0001)
-    assert mid_exposure(0, 1000 * MS, 20_000.0, clock.fit) == mid_exposure(0, 1000 * MS, 20_000.0, None)
+def test_a_trigger_bounds_the_exposure_from_the_other_side() -> None:
+    assert by_arrival(1000 * MS, 20_000.0, 970 * MS) == FrameTime(985 * MS, 0.005, "arrival")
+    assert by_arrival(1000 * MS, 20_000.0, 700 * MS).bound_s == 0.14, (
+        "later than any readout takes: not known"
+    )
 
 
 def test_by_the_cameras_clock_half_the_exposure_is_added_and_the_bound_grows_with_time() -> None:
     clock = DeviceClock()
     read(clock, 1.0, 501.0, 0.0001)
-    at_ns, bound_s = mid_exposure(1_000_000_000, 0, 20_000.0, clock.fit)
-    assert at_ns == pytest.approx(501_010 * MS, abs=10)
-    assert bound_s == pytest.approx(0.0001)
-    at_ns, bound_s = mid_exposure(11_000_000_000, 0, 20_000.0, clock.fit)
-    assert at_ns == pytest.approx(511_010 * MS, abs=10)
-    assert bound_s == pytest.approx(0.0001 + 10 * UNFITTED_DRIFT)
+    assert clock.fit is not None
+    told = by_clock(1_000_000_000, 20_000.0, clock.fit, "latched")
+    assert told.host_monotonic_ns == pytest.approx(501_010 * MS, abs=10)
+    assert told.bound_s == pytest.approx(0.0001)
+    told = by_clock(11_000_000_000, 20_000.0, clock.fit, "latched")
+    assert told.host_monotonic_ns == pytest.approx(511_010 * MS, abs=10)
+    assert told.bound_s == pytest.approx(0.0001 + 10 * UNFITTED_DRIFT)
+
+
+def frame(device_ms: int, arrival_ms: int) -> Image:
+    stamps = Stamps(host_monotonic_ns=arrival_ms * MS, device_ns=device_ms * MS)
+    return Image(np.zeros((1, 1), np.uint8), stamps, 1, 0, exposure_us=20_000.0)
+
+
+def test_a_frame_is_placed_by_the_best_source_that_it_bears_out() -> None:
+    """The camera's clock is 500 s behind the host's."""
+    clock = FrameClock()
+    assert clock.timing is None
+    clock.restart()
+    assert clock.timing == FrameTiming("arrival", 0.025), "open, and its clock cannot be read"
+    read(clock.readings, 0.9, 500.9, 0.0001)
+    assert clock.timing.source == "latched"
+    good = clock.timed(frame(1000, 501_040), asked_ns=500_999 * MS)
+    assert good.time == FrameTime(501_010 * MS, pytest.approx(0.00011), "latched")
+    assert len(good.clock_readings) == 1 and not clock.timed(good).clock_readings, "each is recorded once"
+    chunk = clock.timed(frame(1000, 501_040), asked_ns=500_999 * MS, chunk=True)
+    assert chunk.time is not None and chunk.time.source == "chunk"
+    for device_ms in (998, 1025):  # before its trigger; still exposing when its first packet came
+        wrong = clock.timed(frame(device_ms, 501_040), asked_ns=500_999 * MS)
+        assert wrong.time == by_arrival(501_040 * MS, 20_000.0, 500_999 * MS)
+    assert clock.timing is not None and clock.timing.impossible == 2
+    no_stamp = clock.timed(frame(0, 501_040))
+    assert no_stamp.time is not None and no_stamp.time.source == "arrival"
+
+
+WALL_NS = 1_750_000_000_000_000_000
+
+
+def ptp_reading(second: int, ahead_ns: int, *, locked: bool = True) -> ClockReading:
+    """A round trip of 400 µs, answered `second` s after the start; the camera is ahead of the wall clock."""
+    asked_ns, there_ns = second * 10**9, 100_000 + 20_000 * (second % 5)
+    return ClockReading(
+        asked_ns,
+        asked_ns + 400_000,
+        WALL_NS + asked_ns + there_ns + ahead_ns,
+        WALL_NS + asked_ns + 400_000,
+        locked,
+    )
+
+
+@pytest.mark.parametrize("whole_s", [0, 37])
+def test_ptp_is_believed_where_every_round_trip_bears_it_out(whole_s: int) -> None:
+    clock = DeviceClock(ptp_reading(k, whole_s * 10**9) for k in range(10))
+    fit = clock.fit
+    assert clock.synchronized and fit is not None and fit.drift == 0 and fit.bound_s < 0.0004
+    start_ns = 12_345_678_901
+    told = by_clock(WALL_NS + start_ns + whole_s * 10**9, 0.0, fit, "ptp")
+    assert abs(told.host_monotonic_ns - start_ns) < 1000, "PTP stamps of 1.7e18 ns lose no more than 1 µs"
+
+
+def test_a_camera_that_follows_another_master_is_placed_by_round_trips() -> None:
+    for readings in (
+        [ptp_reading(k, 3_000_000) for k in range(10)],  # 3 ms from this computer's clock
+        [ptp_reading(k, 100_000 * k) for k in range(10)],  # runs away from it
+        [ptp_reading(k, 0, locked=k != 4) for k in range(10)],  # lost its master
+    ):
+        clock = DeviceClock(readings)
+        assert not clock.synchronized and clock.fit is not None and clock.fit.bound_s > 0.0001
 
 
 def test_readings_too_slow_to_tell_a_drift_tell_none() -> None:
@@ -57,15 +125,15 @@ def test_the_newest_good_reading_counts_not_the_newest() -> None:
 
 
 def test_gaps_of_a_free_running_camera_are_counted_across_the_end_of_its_numbers() -> None:
-    counter = FrameCounter()
-    numbers = [counter.follow(frame_id) for frame_id in (LAST_FRAME_ID - 4, LAST_FRAME_ID - 1, 1, 2)]
+    counter = FrameCounter(FrameIds.BLOCK)
+    numbers = [counter.follow(frame_id) for frame_id in (LAST_BLOCK_ID - 4, LAST_BLOCK_ID - 1, 1, 2)]
     assert numbers == [0, 1, 2, 3]
     assert counter.missing == 2 + 1
     assert counter.counts().frames == 4
 
 
 def test_after_a_loss_any_number_may_be_the_next_and_the_pulses_go_on_from_there() -> None:
-    counter = FrameCounter()
+    counter = FrameCounter(FrameIds.BLOCK)
     counter.accept(1, pulse_count=10)
     counter.lost(pulse_count=11)
     assert counter.accept(7, pulse_count=12) == 1

@@ -12,8 +12,7 @@ from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import Image, RobotIdentity, RobotState, Stamps, Vector6
 from station.cell.errors import RobotError
 from station.cell.status import StationState as S
-from station.devices.frames import UNKNOWN_READOUT_S, mid_exposure
-from tests.station.session_rig import POSES, Rig, sealed
+from tests.station.session_rig import BOUND_S, POSES, Rig, sealed
 
 TOOL: Vector6 = (0.01, -0.02, 0.15, 0.0, 0.3, 0.5)
 
@@ -62,8 +61,7 @@ async def test_it_is_the_pose_of_mid_exposure(rig: Rig, monkeypatch: pytest.Monk
     views = sealed(rig).views()
     assert len(views) == POSES
     for view, picture in zip(views, pictures, strict=True):
-        stamps = picture.stamps
-        middle_ns, _ = mid_exposure(stamps.device_ns, stamps.host_monotonic_ns, picture.exposure_us, None)
+        stamps, middle_ns = picture.stamps, picture.time.host_monotonic_ns if picture.time else 0
         assert view.stamps.host_monotonic_ns == middle_ns
         assert view.stamps.device_ns == stamps.device_ns + round(500 * picture.exposure_us) > stamps.device_ns
         assert view.joints_rad[0] == pytest.approx(turned[middle_ns], abs=1e-12)
@@ -77,7 +75,7 @@ async def test_the_time_bound_is_the_cameras_and_the_robots(
     monkeypatch.setattr(rig.arm, "clock", lambda: robot_clock)
     await rig.give_go()
     await rig.until(S.IDLE)
-    expected_s = UNKNOWN_READOUT_S / 2 + robot_clock.bound_s
+    expected_s = BOUND_S + robot_clock.bound_s
     assert [view.time_bound_s for view in sealed(rig).views()] == [pytest.approx(expected_s)] * POSES
 
 

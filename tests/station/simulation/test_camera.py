@@ -13,7 +13,6 @@ import pytest
 from calibrate.boards.detect import detect
 from calibrate.geometry import inverse
 from recordings.schema.messages import Image
-from station.devices import frames
 from station.simulation.camera import RenderedCamera
 from station.simulation.cell import CellTruth, write_truth
 from station.simulation.launch import AdminClient, SimulatedController
@@ -23,9 +22,9 @@ from tests.codes import raises
 pytestmark = pytest.mark.process
 
 
-def mid_exposure(picture: Image, camera: RenderedCamera) -> tuple[int, float]:
-    stamps = picture.stamps
-    return frames.mid_exposure(stamps.device_ns, stamps.host_monotonic_ns, picture.exposure_us, camera.clock)
+def mid_exposure(picture: Image) -> tuple[int, float]:
+    assert picture.time is not None and picture.time.source == "latched"
+    return picture.time.host_monotonic_ns, picture.time.bound_s
 
 
 @pytest.fixture
@@ -54,7 +53,7 @@ async def test_pictures_show_the_board_from_the_true_pose_at_mid_exposure(
 ) -> None:
     picture = await camera.capture()
     assert picture.pixels.shape == (1024, 1280) and picture.pixels.dtype == np.uint8
-    middle_ns, bound_s = mid_exposure(picture, camera)
+    middle_ns, bound_s = mid_exposure(picture)
     assert 0 < bound_s < 0.02
     with AdminClient(arm.host) as admin:
         flange = np.array(admin.ask("truth", at_monotonic_ns=middle_ns)["base_from_flange"])
@@ -82,8 +81,7 @@ async def test_frames_are_numbered_over_the_wrap_and_stamped_by_the_cameras_own_
     # The clock runs at its own rate since the computer was started: after half a day that is a second.
     told = host * (1 + 1e-6 * cell.camera_clock_drift_ppm) + cell.camera_clock_offset_ns
     assert np.abs(device - told).max() < 1e9, "another epoch than the host's"
-    assert camera.clock is not None
-    middle_ns, bound_s = mid_exposure(pictures[-1], camera)
+    middle_ns, bound_s = mid_exposure(pictures[-1])
     true_middle_ns = host[-1] - 13_300_000 - 5_000_000  # readout and half the exposure of this camera
     assert abs(middle_ns - true_middle_ns) / 1e9 < bound_s < 0.02
 

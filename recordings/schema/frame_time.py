@@ -1,0 +1,166 @@
+"""When a frame was exposed: the middle of its exposure on the host's clock, with a bound and a source.
+
+Live cameras and offline work share this, so that times can be derived again from a recording's raw readings.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable
+from typing import NamedTuple
+
+from recordings.schema.clocks import DRIFT_LIMIT, DRIFT_SPAN_S, UNFITTED_DRIFT, ClockFit
+from recordings.schema.messages import ClockReading, FrameTime, TimeSource
+
+READINGS_KEPT = 200
+UNKNOWN_READOUT_S = 0.05
+"""Longest time from the end of an exposure to its first packet, where nothing else limits it."""
+PTP_ERROR_S = 50e-6
+"""Two clocks of a working PTP network agree to better than this."""
+TAI_OFFSETS_S = (37, 0)
+"""PTP counts TAI, since 2017 ahead of UTC by 37 s; masters without leap seconds count UTC."""
+
+
+class _Reading(NamedTuple):
+    device_s: float
+    offset_ns: float
+    """Host monotonic minus device time, at the middle of the round trip."""
+    half_s: float
+    """Half the round trip: the offset is wrong by this at most."""
+    raw: ClockReading
+
+
+class DeviceClock:
+    """A camera's clock, read over the wire. The bound holds whatever the delays there and back were.
+
+    The newest good reading gives the offset, the quickest ones early and late in the window the drift.
+    """
+
+    def __init__(self, readings: Iterable[ClockReading] = ()) -> None:
+        self._readings: deque[_Reading] = deque(maxlen=READINGS_KEPT)
+        self._fresh: list[ClockReading] = []
+        for reading in readings:
+            self.add(reading)
+
+    def add(self, reading: ClockReading) -> None:
+        """A reading that no earlier one agrees with begins anew: the clock was set or started again."""
+        half_ns = (reading.answered_monotonic_ns - reading.asked_monotonic_ns) / 2
+        # Difference of integers first: stamps of 1.7e18 ns have no room in a float.
+        offset_ns = float(reading.asked_monotonic_ns - reading.device_ns) + half_ns
+        new = _Reading(reading.device_ns / 1e9, offset_ns, half_ns / 1e9, reading)
+        if self._readings and _apart(self._readings[-1], new):
+            self._readings.clear()
+        self._readings.append(new)
+        self._fresh = [*self._fresh[1 - READINGS_KEPT :], reading]
+
+    def restart(self) -> None:
+        self._readings.clear()
+        self._fresh = []
+
+    def take_fresh(self) -> tuple[ClockReading, ...]:
+        """Readings that were not taken before, oldest first: each is recorded once."""
+        fresh, self._fresh = tuple(self._fresh), []
+        return fresh
+
+    @property
+    def fit(self) -> ClockFit | None:
+        """By PTP where the readings bear it out, else by the round trips; None before the first reading."""
+        readings = list(self._readings)
+        if not readings:
+            return None
+        return _synchronized(readings) or _by_round_trips(readings)
+
+    @property
+    def synchronized(self) -> bool:
+        """`fit` is by PTP."""
+        readings = list(self._readings)
+        return bool(readings) and _synchronized(readings) is not None
+
+
+def _apart(earlier: _Reading, later: _Reading) -> bool:
+    """No drift that a quartz can have explains both."""
+    passed_s = later.device_s - earlier.device_s
+    apart_s = abs(later.offset_ns - earlier.offset_ns) / 1e9
+    return passed_s < 0 or apart_s > earlier.half_s + later.half_s + DRIFT_LIMIT * passed_s
+
+
+def _by_round_trips(readings: list[_Reading]) -> ClockFit:
+    drift, doubt = _drift(readings)
+    now_s = readings[-1].device_s
+    best = min(readings, key=lambda r: r.half_s + doubt * (now_s - r.device_s))
+    return _fit(readings, best.device_s, best.offset_ns, drift, doubt, best.half_s)
+
+
+def _fit(
+    readings: list[_Reading], at_s: float, offset_ns: float, drift: float, doubt: float, bound_s: float
+) -> ClockFit:
+    return ClockFit(
+        reference_s=at_s,
+        offset_ns=offset_ns,
+        drift=drift,
+        residual_s=0.0,
+        drift_uncertainty=doubt,
+        latency_s=bound_s,
+        samples=len(readings),
+        span_s=0.0,
+    )
+
+
+def _drift(readings: list[_Reading]) -> tuple[float, float]:
+    """Host seconds per device second minus 1, and how far it can be off."""
+    span_s = readings[-1].device_s - readings[0].device_s
+    third = max(1, len(readings) // 3)
+    early, late = (min(part, key=lambda r: r.half_s) for part in (readings[:third], readings[-third:]))
+    apart_s = late.device_s - early.device_s
+    if span_s < DRIFT_SPAN_S or apart_s <= 0:
+        return 0.0, UNFITTED_DRIFT
+    doubt = (early.half_s + late.half_s) / apart_s
+    if doubt >= UNFITTED_DRIFT:
+        return 0.0, UNFITTED_DRIFT
+    return (late.offset_ns - early.offset_ns) / 1e9 / apart_s, doubt
+
+
+def _synchronized(readings: list[_Reading]) -> ClockFit | None:
+    """The camera's clock is the host's wall clock, plus TAI's whole seconds; None where a reading denies it.
+
+    A camera may follow a master that this computer does not: only what every round trip bears out counts. All
+    that they leave open is the bound.
+    """
+    if not all(r.raw.synchronized and r.raw.host_wall_ns for r in readings):
+        return None
+    spans = []
+    for _, _, _, raw in readings:
+        ahead_ns = raw.device_ns - raw.host_wall_ns
+        trip_ns = raw.answered_monotonic_ns - raw.asked_monotonic_ns
+        spans.append((ahead_ns / 1e9 - PTP_ERROR_S, (ahead_ns + trip_ns) / 1e9 + PTP_ERROR_S))
+    low_s, high_s = max(low for low, _ in spans), min(high for _, high in spans)
+    for whole_s in TAI_OFFSETS_S:
+        if low_s <= whole_s <= high_s:
+            newest = readings[-1].raw
+            # Steps of the wall clock would move device and wall together, not the monotonic clock.
+            wall_ahead_ns = newest.host_wall_ns - newest.answered_monotonic_ns
+            offset_ns = -float(wall_ahead_ns + whole_s * 1_000_000_000)
+            bound_s = max(high_s - whole_s, whole_s - low_s)
+            return _fit(readings, readings[-1].device_s, offset_ns, 0.0, 0.0, bound_s)
+    return None
+
+
+def by_clock(start_device_ns: int, exposure_us: float, fit: ClockFit, source: TimeSource) -> FrameTime:
+    """`start_device_ns`: the camera's clock at the start of the exposure."""
+    device_s = start_device_ns / 1e9
+    beyond_s = fit.drift_uncertainty * abs(device_s - fit.reference_s)
+    return FrameTime(fit.to_host_ns(device_s) + round(exposure_us * 500), fit.bound_s + beyond_s, source)
+
+
+def by_arrival(
+    arrival_ns: int, exposure_us: float, asked_ns: int | None = None, readout_s: float = UNKNOWN_READOUT_S
+) -> FrameTime:
+    """From the first packet's arrival: the exposure began after it was asked for, and ended before.
+
+    `asked_ns`: just before its trigger; None = not triggered, then `readout_s` is what can lie between.
+    """
+    exposure_ns = round(exposure_us * 1000)
+    latest_ns = arrival_ns - exposure_ns
+    earliest_ns = latest_ns - round(readout_s * 1e9) if asked_ns is None else min(asked_ns, latest_ns)
+    middle_ns = (earliest_ns + latest_ns) // 2 + exposure_ns // 2
+    return FrameTime(middle_ns, (latest_ns - earliest_ns) / 2e9, "arrival")

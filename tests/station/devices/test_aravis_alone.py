@@ -9,13 +9,13 @@ from typing import Any
 
 import pytest
 
+from recordings.schema.frame_time import DeviceClock
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices import aravis_device
 from station.devices.aravis import AravisCamera
 from station.devices.aravis_device import GenicamDevice, apply_settings, require_settings
 from station.devices.base import TriggerPulse
-from station.devices.frames import DeviceClock
 from tests.codes import raises
 
 REGION = (0, 0, 1280, 1024)
@@ -52,11 +52,10 @@ def device(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 def shown_ns(device: Any, camera: Clockwork) -> list[int]:
     """What the clock was told, one latch."""
-    told: list[int] = []
     device._camera = camera
-    clock: Any = SimpleNamespace(reading=lambda device_ns, asked, answered: told.append(device_ns))
+    clock = DeviceClock()
     device.latch(clock)
-    return told
+    return [reading.device_ns for reading in clock.take_fresh()]
 
 
 def test_a_time_that_an_earlier_client_latched_is_not_now(device: Any) -> None:

@@ -24,7 +24,7 @@ from calibrate.files.calibration import (
     Proof,
     Provenance,
     Quality,
-    Session,
+    SessionReading,
     Sigma,
     TableError,
     ViewQuality,
@@ -157,7 +157,7 @@ def _quality(
         cross_validation=None
         if folds is None
         else Folds(folds.rms_m * 1e3, folds.rms_rad * _DEG, folds.claimed_m * 1e3, folds.folds),
-        session=Session(reading, next((r.text for r in solution.warnings if r.code == reading), "")),
+        session=SessionReading(reading, next((r.text for r in solution.warnings if r.code == reading), "")),
         arm=None
         if arm is None
         else Arm(

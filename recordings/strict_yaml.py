@@ -27,7 +27,7 @@ T = TypeVar("T")
 
 
 @dataclass(frozen=True)
-class Problem:
+class YamlProblem:
     line: int
     """From 1; 0 = the whole file."""
     where: str
@@ -42,7 +42,7 @@ class Problem:
 class StrictYamlError(ValueError):
     """Everything that is wrong with one file."""
 
-    def __init__(self, problems: list[Problem]) -> None:
+    def __init__(self, problems: list[YamlProblem]) -> None:
         super().__init__("\n".join(map(str, problems)))
         self.problems = problems
 
@@ -89,7 +89,7 @@ def load_plain(content: bytes) -> Any:
             _refuse_orders(event)
         return yaml.load(content, yaml.CSafeLoader)
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
-        raise StrictYamlError([Problem(0, "", f"not YAML ({' '.join(str(error).split())})")]) from None
+        raise StrictYamlError([YamlProblem(0, "", f"not YAML ({' '.join(str(error).split())})")]) from None
 
 
 for _tag, _pattern, _first in (
@@ -113,25 +113,25 @@ def load(content: bytes, kind: type[T], under: str = "") -> T:
     `under`: where the file has this key, only what stands below it is read.
     """
     if len(content) > LIMIT_BYTES:
-        raise StrictYamlError([Problem(0, "", f"larger than {LIMIT_BYTES // 1024} kB")])
+        raise StrictYamlError([YamlProblem(0, "", f"larger than {LIMIT_BYTES // 1024} kB")])
     try:
         loader = _Loader(content)
         node, where = _below(loader.get_single_node(), under)
-        problems = list(_problems(node, kind, where)) if node else [Problem(0, "", "the file is empty")]
+        problems = list(_problems(node, kind, where)) if node else [YamlProblem(0, "", "the file is empty")]
         if problems:
             raise StrictYamlError(problems)
         plain = loader.construct_document(node)
     except yaml.MarkedYAMLError as error:
         line = error.problem_mark.line + 1 if error.problem_mark else 0
-        raise StrictYamlError([Problem(line, "", str(error.problem))]) from None
+        raise StrictYamlError([YamlProblem(line, "", str(error.problem))]) from None
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError, OverflowError) as error:
         if isinstance(error, StrictYamlError):
             raise
-        raise StrictYamlError([Problem(0, "", f"not YAML: {' '.join(str(error).split())}")]) from None
+        raise StrictYamlError([YamlProblem(0, "", f"not YAML: {' '.join(str(error).split())}")]) from None
     try:
         return msgspec.convert(plain, kind)
     except msgspec.ValidationError as error:
-        raise StrictYamlError([Problem(0, "", str(error))]) from None
+        raise StrictYamlError([YamlProblem(0, "", str(error))]) from None
 
 
 def _below(root: yaml.Node | None, key: str) -> tuple[yaml.Node | None, str]:
@@ -143,7 +143,7 @@ def _below(root: yaml.Node | None, key: str) -> tuple[yaml.Node | None, str]:
     return root, ""
 
 
-def _problems(node: yaml.Node, kind: Any, where: str) -> Iterator[Problem]:
+def _problems(node: yaml.Node, kind: Any, where: str) -> Iterator[YamlProblem]:
     """Walks the tree beside the type, so that one report names every wrong key and value."""
     line = node.start_mark.line + 1
     options = [k for k in _options(kind) if k is not NoneType]
@@ -160,7 +160,7 @@ def _problems(node: yaml.Node, kind: Any, where: str) -> Iterator[Problem]:
             for i, child in enumerate(node.value):
                 yield from _problems(child, item[0], f"{where}[{i}]")
         elif len(node.value) != len(item):
-            yield Problem(line, where, f"{len(item)} values are needed, {len(node.value)} are here")
+            yield YamlProblem(line, where, f"{len(item)} values are needed, {len(node.value)} are here")
         else:
             for i, (child, child_kind) in enumerate(zip(node.value, item, strict=True)):
                 yield from _problems(child, child_kind, f"{where}[{i}]")
@@ -168,7 +168,7 @@ def _problems(node: yaml.Node, kind: Any, where: str) -> Iterator[Problem]:
         yield from _leaf_problems(node, kind, where)
 
 
-def _struct_problems(node: yaml.MappingNode, kind: type[msgspec.Struct], where: str) -> Iterator[Problem]:
+def _struct_problems(node: yaml.MappingNode, kind: type[msgspec.Struct], where: str) -> Iterator[YamlProblem]:
     hints = get_type_hints(kind)
     fields = {f.encode_name: f for f in msgspec.structs.fields(kind)}
     seen: set[str] = set()
@@ -176,20 +176,20 @@ def _struct_problems(node: yaml.MappingNode, kind: type[msgspec.Struct], where: 
         name, line = str(key.value), key.start_mark.line + 1
         inside = f"{where}.{name}" if where else name
         if name in seen:
-            yield Problem(line, inside, "stands here twice")
+            yield YamlProblem(line, inside, "stands here twice")
         elif name not in fields:
             near = difflib.get_close_matches(name, fields, n=1)
             hint = f"did you mean '{near[0]}'?" if near else f"known here: {', '.join(fields)}"
-            yield Problem(line, inside, f"unknown key; {hint}")
+            yield YamlProblem(line, inside, f"unknown key; {hint}")
         else:
             yield from _problems(value, hints[fields[name].name], inside)
         seen.add(name)
     for name, field in fields.items():
         if field.required and name not in seen:
-            yield Problem(node.start_mark.line + 1, f"{where}.{name}" if where else name, "is missing")
+            yield YamlProblem(node.start_mark.line + 1, f"{where}.{name}" if where else name, "is missing")
 
 
-def _leaf_problems(node: yaml.Node, kind: Any, where: str) -> Iterator[Problem]:
+def _leaf_problems(node: yaml.Node, kind: Any, where: str) -> Iterator[YamlProblem]:
     line = node.start_mark.line + 1
     loader = _Loader("")
     value = loader.construct_object(node, deep=True)
@@ -201,10 +201,10 @@ def _leaf_problems(node: yaml.Node, kind: Any, where: str) -> Iterator[Problem]:
         said = f"must be one of {', '.join(words)}" if words else str(error)
         if any(isinstance(option, type) and issubclass(option, msgspec.Struct) for option in _options(kind)):
             said = "fields are needed here, each as key: value"
-        yield Problem(line, where, said + found)
+        yield YamlProblem(line, where, said + found)
         return
     if isinstance(value, float) and not math.isfinite(value):
-        yield Problem(line, where, "is not a finite number")
+        yield YamlProblem(line, where, "is not a finite number")
 
 
 def _words(kind: Any) -> tuple[Any, ...]:

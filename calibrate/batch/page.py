@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
 from calibrate.batch.run import BatchResult
-from calibrate.batch.trends import HEAD, NOT_FOLLOWED, Cell, place, quiet_text, rows
+from calibrate.batch.trends import HEAD, NOT_FOLLOWED, CellHistory, place, quiet_text, rows
 from calibrate.geometry import difference
 from calibrate.report import html
 from calibrate.report.plots import STYLE, new_figure, svg_text
@@ -20,7 +20,7 @@ _FINDINGS_LISTED = 3
 _COLOURS = ("#0969da", "#1a7f37", "#bc4c00")
 
 
-def fleet_page(results: Sequence[BatchResult], cells: Sequence[Cell]) -> str:
+def fleet_page(results: Sequence[BatchResult], cells: Sequence[CellHistory]) -> str:
     """The findings, then one section per cell, then what could not be solved."""
     solved = sum(result.solved for result in results)
     count = f"{len(cells)} cell{'s' * (len(cells) != 1)}"
@@ -36,7 +36,7 @@ def fleet_page(results: Sequence[BatchResult], cells: Sequence[Cell]) -> str:
     )
 
 
-def _findings(cells: Sequence[Cell]) -> Iterator[str]:
+def _findings(cells: Sequence[CellHistory]) -> Iterator[str]:
     moved = [cell for cell in cells if cell.findings]
     if not moved:
         kind = "verdict good" if not cells or any(cell.followed for cell in cells) else "stamp"
@@ -52,7 +52,7 @@ def _findings(cells: Sequence[Cell]) -> Iterator[str]:
     yield f'<div class="verdict bad"><strong>{title}</strong>{items}</div>'
 
 
-def _section(cell: Cell) -> Iterator[str]:
+def _section(cell: CellHistory) -> Iterator[str]:
     yield html.heading(cell.name)
     if not cell.followed:
         yield html.paragraph(NOT_FOLLOWED, "warning")
@@ -71,7 +71,7 @@ def _unsolved(results: Sequence[BatchResult]) -> Iterator[str]:
         yield html.table(("recording", "why"), failed)
 
 
-def place_over_time(cell: Cell) -> str:
+def place_over_time(cell: CellHistory) -> str:
     """SVG: translation (mm) and rotation (°) of X since the first session, by axis, with sigmas."""
     first = place(cell.sessions[0])
     delta = np.array([difference(place(session), first) for session in cell.sessions])

@@ -49,7 +49,7 @@ NOT_FOLLOWED = (
 
 
 @dataclass(frozen=True)
-class Cell:
+class CellHistory:
     """One robot with one camera in one mount, by their serial numbers."""
 
     name: str
@@ -70,7 +70,7 @@ class Cell:
         return [whole] if whole.real else []
 
 
-def cells(results: Iterable[BatchResult]) -> tuple[Cell, ...]:
+def cells(results: Iterable[BatchResult]) -> tuple[CellHistory, ...]:
     """Solved results grouped by robot, camera and mount; by name."""
     groups: dict[str, list[BatchResult]] = {}
     for result in results:
@@ -82,7 +82,7 @@ def cells(results: Iterable[BatchResult]) -> tuple[Cell, ...]:
         sessions = sorted(groups[name], key=lambda r: (r.recorded_wall_ns, r.recording))
         followed = sessions[0].robot not in _UNNAMED_ROBOT
         steps = pairwise(sessions) if followed else ()
-        found.append(Cell(name, tuple(sessions), tuple(_move(a, b) for a, b in steps), followed))
+        found.append(CellHistory(name, tuple(sessions), tuple(_move(a, b) for a, b in steps), followed))
     return tuple(found)
 
 
@@ -102,14 +102,14 @@ def place(result: BatchResult) -> Array:
     return pose(matrix_from_quaternion(np.array(result.rotation_xyzw)), np.array(result.translation_m))
 
 
-def quiet_text(found: Sequence[Cell]) -> str:
+def quiet_text(found: Sequence[CellHistory]) -> str:
     """When nobody's camera moved: or that nothing could be compared."""
     if found and not any(cell.followed for cell in found):
         return "No camera was followed."
     return "No camera moved by more than chance explains."
 
 
-def trends_text(found: Sequence[Cell]) -> str:
+def trends_text(found: Sequence[CellHistory]) -> str:
     """Plain text: findings first, then one table per cell."""
     lines = [f"{cell.name}: {finding.text}" for cell in found for finding in cell.findings]
     lines = lines or [quiet_text(found)]
@@ -130,7 +130,7 @@ HEAD = (
 )
 
 
-def rows(cell: Cell) -> list[tuple[str, ...]]:
+def rows(cell: CellHistory) -> list[tuple[str, ...]]:
     """Table rows under HEAD; the last column holds MOVED and the gates that failed."""
     found: list[tuple[str, ...]] = []
     for session, move in zip_longest(cell.sessions, (None, *cell.moves)):

@@ -11,7 +11,7 @@ import typer
 
 from calibrate.batch.cluster import Cluster, cluster_solver
 from calibrate.batch.run import BatchResult, Solver, run_batch
-from calibrate.batch.trends import Cell, cells, trends_text
+from calibrate.batch.trends import CellHistory, cells, trends_text
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
 from calibrate.cli.job import GatesFile, MemoryLimit, Profile, ProfileName, Seed, TimeLimit
 from calibrate.cli.output import AsJson, OutputError, err, out, progress_bar
@@ -73,7 +73,7 @@ def batch(
         raise typer.Exit(DONE_WITH_LOSS)
 
 
-def _tell(results: list[BatchResult], found: tuple[Cell, ...], output: Path) -> None:
+def _tell(results: list[BatchResult], found: tuple[CellHistory, ...], output: Path) -> None:
     good = sum(result.passed for result in results)
     failed = [result for result in results if not result.solved]
     out.print(

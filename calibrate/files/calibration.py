@@ -127,7 +127,7 @@ class Folds(msgspec.Struct, frozen=True):
     folds: int
 
 
-class Session(msgspec.Struct, frozen=True):
+class SessionReading(msgspec.Struct, frozen=True):
     """Reading of the recording as a whole."""
 
     hypothesis: str
@@ -170,7 +170,7 @@ class Quality(msgspec.Struct, frozen=True, omit_defaults=True):
     """True over stated size."""
     board: BoardShape | None = None
     cross_validation: Folds | None = None
-    session: Session | None = None
+    session: SessionReading | None = None
     arm: Arm | None = None
     robot_systematics: str = ""
     """No effect: of files from before version 0.2; see `arm`."""

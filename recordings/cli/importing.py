@@ -18,7 +18,7 @@ from recordings.importers.bag import PAIR_WITHIN_S, import_bag
 from recordings.importers.dataset import DATASET_FILE, POSES_FILE
 from recordings.importers.folder import import_folder
 from recordings.importers.selection import Wanted
-from recordings.importers.stops import POSITION_M, ROTATION_RAD, Limits
+from recordings.importers.stops import POSITION_M, ROTATION_RAD, StandstillLimits
 from recordings.plain_text import plain_text
 
 
@@ -68,7 +68,7 @@ def import_command(
             facts = {"recording": str(target or ""), "views": done.images, "bytes": done.size_bytes}
         else:
             wanted = Wanted(image_topic, pose_topic, base, flange)
-            limits = Limits(still_mm / 1e3, math.radians(still_deg))
+            limits = StandstillLimits(still_mm / 1e3, math.radians(still_deg))
             plan = import_bag(source, target, dataset, wanted, limits, pair_within, progress)
             facts = {"recording": str(target or ""), "views": plan.stops, "bytes": plan.bytes_written}
             facts["bag"] = dataclasses.asdict(plan)

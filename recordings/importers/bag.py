@@ -30,7 +30,7 @@ from recordings.importers.bags import Bag, open_bag
 from recordings.importers.dataset import DATASET_FILE, Dataset, read_dataset, vector6
 from recordings.importers.messages import Array, ImageMessage, Joints, Progress
 from recordings.importers.selection import Selection, Wanted, select
-from recordings.importers.stops import Limits, Stop, find_stops
+from recordings.importers.stops import Standstill, StandstillLimits, find_stops
 from recordings.schema.messages import CameraModel, Image, Matrix4, RobotState, Stamps, Vector6, View
 from recordings.writer import RecordingWriter, derived_recording
 
@@ -72,7 +72,7 @@ def import_bag(
     output: Path | None,
     description: Path | None = None,
     wanted: Wanted = Wanted(),  # noqa: B008 - frozen
-    limits: Limits = Limits(),  # noqa: B008 - frozen
+    limits: StandstillLimits = StandstillLimits(),  # noqa: B008 - frozen
     pair_within_s: float = PAIR_WITHIN_S,
     progress: Progress = lambda text, done, total: None,
 ) -> BagPlan:
@@ -128,7 +128,7 @@ def _plan(
     chosen: Selection,
     described: Dataset | None,
     images: int,
-    stops: list[Stop],
+    stops: list[Standstill],
     passed: dict[str, int],
 ) -> BagPlan:
     given = described is not None and described.camera is not None
@@ -151,7 +151,7 @@ def _plan(
 def _write(
     bag: Bag,
     chosen: Selection,
-    stops: list[Stop],
+    stops: list[Standstill],
     described: Dataset,
     description_bytes: bytes,
     source: Path,
@@ -237,7 +237,7 @@ def _joints_at(
 
 
 def _write_view(
-    writer: RecordingWriter, index: int, stop: Stop, message: ImageMessage, joints_rad: Vector6 | None
+    writer: RecordingWriter, index: int, stop: Standstill, message: ImageMessage, joints_rad: Vector6 | None
 ) -> None:
     pixels, encoded = _pixels(message, stop.place)
     stamps = Stamps(host_wall_ns=stop.stamp_ns, device_ns=stop.stamp_ns)

@@ -33,7 +33,7 @@ _SHOWN_EVERY = 64
 
 
 @dataclass(frozen=True)
-class Topic:
+class BagTopic:
     """A topic with messages of a kind that an import can use."""
 
     name: str
@@ -66,7 +66,7 @@ class Bag:
 
     def __init__(self, storage: _Storage, progress: Progress) -> None:
         self._storage, self._progress = storage, progress
-        topics: dict[str, Topic] = {}
+        topics: dict[str, BagTopic] = {}
         self.others: list[str] = []
         """Topics of kinds that are not used here."""
         for name, encoding, schema, messages in storage.declared:
@@ -74,7 +74,7 @@ class Bag:
                 self.others.append(f"{name} ({schema or 'no schema'}, {encoding})")
             else:
                 before = topics[name].messages if name in topics else 0
-                topics[name] = Topic(name, kind, encoding, schema, before + messages)
+                topics[name] = BagTopic(name, kind, encoding, schema, before + messages)
         self.topics = list(topics.values())
         self._by_name = topics
         self._total = sum(topic.messages for topic in self.topics)

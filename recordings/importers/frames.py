@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recordings.errors import ImportSourceError
-from recordings.importers.messages import Array, Frame
+from recordings.importers.messages import Array, FrameMessage
 
 SAMPLES_LIMIT = 4_000_000
 """Limit over all frames together: 64 bytes each."""
@@ -51,7 +51,7 @@ class FrameTree:
         self.edges: dict[tuple[str, str], Edge] = {}
         self._samples = 0
 
-    def add(self, frames: Iterable[Frame]) -> None:
+    def add(self, frames: Iterable[FrameMessage]) -> None:
         for frame in frames:
             numbers = (*frame.position_m, *frame.rotation_xyzw)
             length = float(np.linalg.norm(frame.rotation_xyzw))

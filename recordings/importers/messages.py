@@ -55,7 +55,7 @@ class ImageMessage:
 
 
 @dataclass(frozen=True)
-class Camera:
+class CameraMessage:
     frame: str
     model: CameraModel
 
@@ -69,7 +69,7 @@ class Joints:
 
 
 @dataclass(frozen=True)
-class Frame:
+class FrameMessage:
     """parent_from_child at one time; PoseStamped: of the thing that moves, in `parent`."""
 
     stamp_ns: int
@@ -79,7 +79,7 @@ class Frame:
     rotation_xyzw: tuple[float, float, float, float]
 
 
-Value = ImageMessage | Camera | Joints | list[Frame]
+Value = ImageMessage | CameraMessage | Joints | list[FrameMessage]
 
 
 CDR, PROTOBUF = "cdr", "protobuf"
@@ -151,8 +151,8 @@ def ros_image_stamp_ns(data: bytes, time_ns: int) -> int:
     return int(seconds * _NS + nanoseconds) or time_ns
 
 
-def _frame(stamp_ns: int, parent: str, child: str, at: Any, turn: Any) -> Frame:
-    return Frame(stamp_ns, parent, child, (at.x, at.y, at.z), (turn.x, turn.y, turn.z, turn.w))
+def _frame(stamp_ns: int, parent: str, child: str, at: Any, turn: Any) -> FrameMessage:
+    return FrameMessage(stamp_ns, parent, child, (at.x, at.y, at.z), (turn.x, turn.y, turn.z, turn.w))
 
 
 def _from_foxglove(schema: str, message: Any, time_ns: int) -> Value:
@@ -167,7 +167,7 @@ def _from_foxglove(schema: str, message: Any, time_ns: int) -> Value:
     if schema == "foxglove.CompressedImage":
         return ImageMessage(stamp_ns, frame, 0, 0, "compressed", 0, message.data)
     if schema == "foxglove.CameraCalibration":
-        return Camera(frame, camera_model_of(message))
+        return CameraMessage(frame, camera_model_of(message))
     if schema == "foxglove.JointStates":
         joints = message.joints
         speeds = tuple(j.velocity for j in joints) if all(j.HasField("velocity") for j in joints) else ()
@@ -179,7 +179,7 @@ def _foxglove_stamp(message: Any, time_ns: int) -> int:
     return int(message.timestamp.seconds * _NS + message.timestamp.nanos) or time_ns
 
 
-def _foxglove_frame(message: Any, time_ns: int) -> Frame:
+def _foxglove_frame(message: Any, time_ns: int) -> FrameMessage:
     names = (message.parent_frame_id, message.child_frame_id)
     return _frame(_foxglove_stamp(message, time_ns), *names, message.translation, message.rotation)
 
@@ -203,7 +203,7 @@ def _from_ros(schema: str, message: Any, time_ns: int) -> Value:
         return ImageMessage(stamp_ns, frame, 0, 0, "compressed", 0, message.data.tobytes())
     if schema == "sensor_msgs/msg/CameraInfo":
         size = (message.width, message.height)
-        return Camera(frame, intrinsics(*size, message.k, message.d, message.distortion_model))
+        return CameraMessage(frame, intrinsics(*size, message.k, message.d, message.distortion_model))
     if schema == "sensor_msgs/msg/JointState":
         speeds = tuple(map(float, message.velocity))
         return Joints(stamp_ns, tuple(message.name), tuple(map(float, message.position)), speeds)
@@ -214,6 +214,6 @@ def _ros_stamp(header: Any, time_ns: int) -> int:
     return int(header.stamp.sec * _NS + header.stamp.nanosec) or time_ns
 
 
-def _ros_frame(message: Any, time_ns: int) -> Frame:
+def _ros_frame(message: Any, time_ns: int) -> FrameMessage:
     names, moved = (message.header.frame_id, message.child_frame_id), message.transform
     return _frame(_ros_stamp(message.header, time_ns), *names, moved.translation, moved.rotation)

@@ -8,9 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from recordings.errors import ImportSourceError
-from recordings.importers.bags import Bag, Topic
+from recordings.importers.bags import Bag, BagTopic
 from recordings.importers.frames import FrameTree, Track
-from recordings.importers.messages import Array, Camera, Frame, Joints, Kind
+from recordings.importers.messages import Array, CameraMessage, FrameMessage, Joints, Kind
 from recordings.schema.messages import CameraModel, Vector6
 
 _UR_ORDER = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
@@ -31,7 +31,7 @@ class Wanted:
 class Selection:
     """Topics and frames of a bag that are imported."""
 
-    image: Topic
+    image: BagTopic
     camera: CameraModel | None
     """Intrinsics from the bag's camera calibration."""
     track: Track
@@ -87,11 +87,11 @@ def select(bag: Bag, wanted: Wanted) -> Selection:
     return Selection(image, _camera(bag, image), track, said, _joints(bag))
 
 
-def _of(bag: Bag, kind: Kind) -> list[Topic]:
+def _of(bag: Bag, kind: Kind) -> list[BagTopic]:
     return [topic for topic in bag.topics if topic.kind is kind and topic.messages]
 
 
-def _one(bag: Bag, kind: Kind, name: str | None, option: str) -> Topic:
+def _one(bag: Bag, kind: Kind, name: str | None, option: str) -> BagTopic:
     topics = _of(bag, kind)
     there = ", ".join(f"{t.name} ({t.schema}, {t.messages})" for t in topics) or "none"
     if name is not None:
@@ -119,17 +119,17 @@ def _from_poses(bag: Bag, topic: str) -> tuple[Track, str]:
             text, remedy = f"The poses on {topic} are in several frames", "Export one of them."
             raise ImportSourceError(text, code="several-frames", remedy=remedy)
         pose = frames[0]
-        tree.add([Frame(pose.stamp_ns, base, _POSE_CHILD, pose.position_m, pose.rotation_xyzw)])
+        tree.add([FrameMessage(pose.stamp_ns, base, _POSE_CHILD, pose.position_m, pose.rotation_xyzw)])
     return tree.track(base.lstrip("/"), _POSE_CHILD), f"poses on {topic} in {base}"
 
 
-def _camera(bag: Bag, image: Topic) -> CameraModel | None:
+def _camera(bag: Bag, image: BagTopic) -> CameraModel | None:
     """The calibration nearest to the image topic's name; its last message."""
     cameras = _of(bag, Kind.CAMERA)
     if not cameras:
         return None
 
-    def common(topic: Topic) -> int:
+    def common(topic: BagTopic) -> int:
         pairs = zip(topic.name.split("/"), image.name.split("/"), strict=False)
         return next((n for n, (a, b) in enumerate(pairs) if a != b), 99)
 
@@ -138,7 +138,7 @@ def _camera(bag: Bag, image: Topic) -> CameraModel | None:
         return None  # another camera's, for all that is known
     last = None
     for value in bag.values(nearest.name):
-        assert isinstance(value, Camera)
+        assert isinstance(value, CameraMessage)
         last = value.model
     return last
 

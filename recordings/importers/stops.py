@@ -26,7 +26,7 @@ NEW_STOP_RAD = 0.001
 
 
 @dataclass(frozen=True)
-class Limits:
+class StandstillLimits:
     """Limits of standing still; other people's arms report with more noise."""
 
     position_m: float = POSITION_M
@@ -34,7 +34,7 @@ class Limits:
 
 
 @dataclass(frozen=True, eq=False)
-class Stop:
+class Standstill:
     place: int
     """Index of the image on its topic."""
     stamp_ns: int
@@ -48,9 +48,9 @@ def find_stops(
     track: Track,
     images_ns: NDArray[np.int64],
     speeds: tuple[NDArray[np.int64], Array] | None,
-    limits: Limits,
+    limits: StandstillLimits,
     pair_within_s: float,
-) -> tuple[list[Stop], dict[str, int]]:
+) -> tuple[list[Standstill], dict[str, int]]:
     """(one image of each stop, how many images were passed over for which reason).
 
     `speeds`: stamps and the fastest joint's speed. Of several images of one stop the last one is taken: the
@@ -60,7 +60,7 @@ def find_stops(
     period_s = float(np.median(np.diff(stamps))) / 1e9 if len(stamps) > 1 else np.inf
     window_s = max(WINDOW_S, LEAST_SAMPLES * period_s)
     passed = {"moving": 0, "no pose near": 0, "same stop": 0}
-    stops: list[Stop] = []
+    stops: list[Standstill] = []
     moved = True
     for place in np.argsort(images_ns, kind="stable").tolist():
         time_ns = int(images_ns[place])
@@ -74,7 +74,7 @@ def find_stops(
             moved = True
             continue
         T = track.at(np.array([time_ns]))[0]
-        stop = Stop(place, time_ns, T, still, bound_s)
+        stop = Standstill(place, time_ns, T, still, bound_s)
         if stops and not moved and _same(stops[-1].base_from_flange, T):
             passed["same stop"] += 1
             stops[-1] = stop
@@ -113,7 +113,7 @@ def _stillness(
     )
 
 
-def _rests(still: Stillness, limits: Limits) -> bool:
+def _rests(still: Stillness, limits: StandstillLimits) -> bool:
     return (
         still.max_joint_speed_rad_s <= JOINT_SPEED_RAD_S
         and still.position_scatter_m <= limits.position_m

@@ -188,7 +188,7 @@ class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     source: Source = "real"
 
 
-class Lease(msgspec.Struct, frozen=True, omit_defaults=True):
+class LeaseStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     holder: str = ""
     """'anna on tty1 (pid 4711)'; empty = free"""
     client_id: int | None = None
@@ -271,7 +271,7 @@ class StationStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     clock: ClockStatus = ClockStatus()
     session: SessionStatus = SessionStatus()
     estimate: EstimateStatus = EstimateStatus()
-    lease: Lease = Lease()
+    lease: LeaseStatus = LeaseStatus()
     go: MotionPreview | None = None
     """A go that waits for a person's confirmation."""
     loop_lag_ms: float = 0.0

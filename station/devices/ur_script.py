@@ -40,7 +40,7 @@ STALE_S = 0.5
 """Without news for so long the script counts as lost. The session gives up sooner."""
 
 
-class Verb(IntEnum):
+class Command(IntEnum):
     """What the script obeys. Any other number ends it."""
 
     NONE = 0
@@ -172,7 +172,7 @@ def script(sequence: int) -> str:
     return SCRIPT.format(
         r=FIRST_REGISTER, sequence=sequence, joint_limit=2 * math.pi, speed_limit=JOINT_SPEED_LIMIT_RAD_S,
         acceleration_limit=JOINT_ACCELERATION_LIMIT_RAD_S2, silence=SILENCE_S, stop=STOP_RAD_S2,
-        arm=int(Verb.ARM), move=int(Verb.MOVE), waiting=int(State.WAITING), armed=int(State.ARMED),
+        arm=int(Command.ARM), move=int(Command.MOVE), waiting=int(State.WAITING), armed=int(State.ARMED),
         moving=int(State.MOVING), ended=int(State.ENDED),
     )  # fmt: skip
 
@@ -214,7 +214,7 @@ class ScriptControl:
         self._samples = 0
         self._lost = self._broken = False
         self._keepalive = 0
-        self._command: tuple[int, Verb, Sequence[float]] = (0, Verb.NONE, (0.0,) * 8)
+        self._command: tuple[int, Command, Sequence[float]] = (0, Command.NONE, (0.0,) * 8)
         self._link = socket.create_connection((host, PORT), HANDSHAKE_S)
         try:
             self._start(host)
@@ -237,7 +237,7 @@ class ScriptControl:
             self._take(kind, payload)
         self._link.setblocking(False)
         sequence = random.randrange(1, 2**30)  # an answer left by an earlier script is never ours
-        self._write(sequence, Verb.NONE)
+        self._write(sequence, Command.NONE)
         if not self._wait(lambda: self._samples > SETTLE_SAMPLES, HANDSHAKE_S):
             raise RtdeError(f"no robot state came within {HANDSHAKE_S:g} s", code="no-state")
         if self._told.program not in (RuntimeState.STOPPED, RuntimeState.STOPPING):
@@ -256,7 +256,7 @@ class ScriptControl:
 
     def setWatchdog(self, minimum_hz: float) -> bool:
         """From now on the script lives only as long as its keepalive advances; the time is its own."""
-        return self._ask(Verb.ARM)
+        return self._ask(Command.ARM)
 
     def kickWatchdog(self) -> bool:
         """Sends the next keepalive. False, and none is sent, when the script is lost."""
@@ -268,20 +268,20 @@ class ScriptControl:
 
     def moveJ(self, q: Sequence[float], speed: float, acceleration: float, asynchronous: bool) -> bool:
         """True when the script has taken the move. Speeds beyond its own limits are lowered to them."""
-        return self._ask(Verb.MOVE, (*q, speed, acceleration))
+        return self._ask(Command.MOVE, (*q, speed, acceleration))
 
     def stopJ(self, deceleration: float, asynchronous: bool) -> None:
         """The script brakes the joints with its own deceleration, then ends. Waits a moment for its word."""
-        sequence = self._write(self._command[0] + 1, Verb.STOP)
+        sequence = self._write(self._command[0] + 1, Command.STOP)
         self._wait(lambda: self._told.answer == sequence or not self._plays(), STOP_ANSWER_S)
 
     def stopScript(self) -> None:
-        self._write(self._command[0] + 1, Verb.END)
+        self._write(self._command[0] + 1, Command.END)
         self._wait(lambda: not self._plays(), END_S)
 
     # -- the connection ---------------------------------------------------------------------------------
 
-    def _ask(self, verb: Verb, numbers: Sequence[float] = (0.0,) * 8) -> bool:
+    def _ask(self, verb: Command, numbers: Sequence[float] = (0.0,) * 8) -> bool:
         """A verb and the script's answer. Without one the script is lost."""
         if not self._alive():
             return False
@@ -304,9 +304,9 @@ class ScriptControl:
         """A program that was only paused must find STOP when it goes on, not a move that nobody waits for."""
         if not self._lost:
             self._lost = True
-            self._write(self._command[0] + 1, Verb.STOP)
+            self._write(self._command[0] + 1, Command.STOP)
 
-    def _write(self, sequence: int, verb: Verb, numbers: Sequence[float] = (0.0,) * 8) -> int:
+    def _write(self, sequence: int, verb: Command, numbers: Sequence[float] = (0.0,) * 8) -> int:
         """One packet, that acts as a whole. A connection that does not take it at once is lost."""
         self._command = (sequence, verb, numbers)
         try:

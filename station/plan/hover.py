@@ -46,7 +46,7 @@ _TRIED_WAYS = 60
 
 
 @dataclass(frozen=True, eq=False)
-class Hover:
+class HoverPath:
     """One path to one place over the board; a motion approval for it is bound to it."""
 
     plan: Plan
@@ -112,7 +112,7 @@ def plan_hover(
     doubt_m: float,
     pointer: PointerConfig,
     start_joints_rad: Vector6,
-) -> Hover:
+) -> HoverPath:
     """Plans the shortest free path over a corner, from where the arm stands. LimitError says what blocks it.
 
     X: flange_from_camera or base_from_camera of the calibration. Two moves: to a point `APPROACH_M` over the
@@ -137,7 +137,7 @@ def plan_hover(
         plan = _plan(config, geometry.model, corner, high, low)
         check = check_plan(plan, start_joints_rad, geometry)
         if not check.problems:
-            return Hover(plan, check, geometry, corner, standoff_m, base_from_board, outward)
+            return HoverPath(plan, check, geometry, corner, standoff_m, base_from_board, outward)
         refused = refused or check
     where = f"corner {corner} with the tip {1000 * standoff_m:.0f} mm above it"
     if refused is None:
@@ -275,7 +275,7 @@ class HoverQuestion:
 
 @dataclass(frozen=True, eq=False)
 class HoverAnswer:
-    hover: Hover
+    hover: HoverPath
     offset_covariance: Array
     """(3, 3) of tip minus corner in `board`, m²."""
     board_moved_m: float

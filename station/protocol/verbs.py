@@ -147,7 +147,7 @@ class Watch(Verb[Done], frozen=True):
     control = False
 
 
-class Lease(Verb[status.Lease], frozen=True):
+class Lease(Verb[status.LeaseStatus], frozen=True):
     """Take or release control; `lost`: nobody is at the screen that has it."""
 
     control = False

@@ -11,7 +11,7 @@ import msgspec
 from station.cell.errors import RefusedError
 from station.cell.session_folder import SessionSummary, list_sessions
 from station.cell.socket_folder import user_name
-from station.cell.status import HoverOffer, Lease, MotionPreview
+from station.cell.status import HoverOffer, LeaseStatus, MotionPreview
 from station.protocol import verbs
 from station.protocol.verbs import VERBS, Purpose
 from station.server.approval import Applicant, ApprovalRule, Process, process
@@ -115,7 +115,7 @@ class SessionDispatcher:
         caller.introduce(await self._name(caller.uid), args.who)
         return verbs.Welcome(software()["calibration-station"], os.getpid(), str(self._session.context.root))
 
-    async def _lease(self, caller: _Caller, args: verbs.Lease) -> Lease:
+    async def _lease(self, caller: _Caller, args: verbs.Lease) -> LeaseStatus:
         if args.action == "take":
             return self._session.take_lease(caller.client_id, caller.who)
         ending = self._session.release_lease if args.action == "release" else self._session.lease_lost

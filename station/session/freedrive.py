@@ -27,7 +27,7 @@ NEW_PLACE_RAD = 0.1
 WATCH_PERIOD_S = 0.1
 
 
-class Freedrive:
+class FreedriveCapture:
     """Nothing here moves the arm, so nothing here needs an approval."""
 
     def __init__(self, context: SessionContext) -> None:

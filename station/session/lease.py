@@ -11,8 +11,8 @@ import numpy as np
 from recordings.errors import Value
 from recordings.schema.messages import Vector6
 from station.cell.errors import RefusedError
-from station.cell.status import Lease, MotionPreview
-from station.plan.hover import Hover
+from station.cell.status import LeaseStatus, MotionPreview
+from station.plan.hover import HoverPath
 from station.protocol.verbs import Purpose
 from station.session.queue import PlanRevision
 
@@ -25,12 +25,12 @@ class LeaseManager:
     """At most one client has control."""
 
     def __init__(self) -> None:
-        self.lease = Lease()
+        self.lease = LeaseStatus()
 
-    def take(self, client_id: int, who: str, wall_ns: int) -> Lease:
+    def take(self, client_id: int, who: str, wall_ns: int) -> LeaseStatus:
         """Taking it again is fine. RefusedError names who has it."""
         if self.lease.client_id is None:
-            self.lease = Lease(holder=who, client_id=client_id, since_wall_ns=wall_ns)
+            self.lease = LeaseStatus(holder=who, client_id=client_id, since_wall_ns=wall_ns)
         self.require(client_id)
         return self.lease
 
@@ -38,7 +38,7 @@ class LeaseManager:
         """True when this client had it."""
         if self.lease.client_id != client_id:
             return False
-        self.lease = Lease()
+        self.lease = LeaseStatus()
         return True
 
     def require(self, client_id: int) -> None:
@@ -70,7 +70,7 @@ class MotionApproval:
     """None: a touch test."""
     replanned: PlanRevision | None = None
     """Poses that take the place of the session's with this approval."""
-    hover: Hover | None = None
+    hover: HoverPath | None = None
     """A path over one corner of the board instead of poses of the plan."""
     approval: str = ""
     """Who approved it, and how."""
@@ -99,7 +99,7 @@ class ApprovalManager:
         summary: MotionPreview,
         client_id: int,
         poses: tuple[int, ...],
-        hover: Hover | None = None,
+        hover: HoverPath | None = None,
         purpose: Purpose | None = None,
         replanned: PlanRevision | None = None,
     ) -> MotionApproval:

@@ -23,7 +23,7 @@ from station.cell.errors import RefusedError, RobotError
 from station.cell.plan import Plan
 from station.cell.scene import cell_geometry
 from station.cell.session_folder import interrupted_session
-from station.cell.status import HoverOffer, Lease, MotionPreview, StationState, StationStatus
+from station.cell.status import HoverOffer, LeaseStatus, MotionPreview, StationState, StationStatus
 from station.cell.stillness import StillnessMonitor
 from station.devices.cell import Cell
 from station.plan.planner import make_plan
@@ -31,7 +31,7 @@ from station.protocol import verbs
 from station.protocol.states import RUNNING
 from station.protocol.verbs import Purpose, Verb
 from station.session.context import RunRequests, SessionContext
-from station.session.freedrive import Freedrive
+from station.session.freedrive import FreedriveCapture
 from station.session.lease import ApprovalManager, LeaseManager, MotionApproval
 from station.session.monitor import DeviceConnector
 from station.session.preview import Previewer
@@ -77,7 +77,7 @@ class Session:
         self.supervisor = SessionSupervisor(self.context, self._jogged, ticked, self._void, first)
         self.devices = DeviceConnector(self.context)
         self.previews = Previewer(self.context)
-        self.freedrive = Freedrive(self.context)
+        self.freedrive = FreedriveCapture(self.context)
         self._replanner = Replanner(self.context)
         self._estimator = Estimator(self.context, self._replanner.hint)
         self._touch_tests = TouchTestPlanner(self.context)
@@ -276,7 +276,7 @@ class Session:
 
     # -- control, plan, freedrive ------------------------------------------------------------------------
 
-    def take_lease(self, client_id: int, who: str) -> Lease:
+    def take_lease(self, client_id: int, who: str) -> LeaseStatus:
         lease = self.leases.take(client_id, who, time.time_ns())
         self.store.update(lease=lease)
         return lease

@@ -27,7 +27,7 @@ from station.cell.plan import plan_sha256
 from station.cell.scene import flange_pose
 from station.cell.status import HoverOffer, MotionPreview, StationState
 from station.cell.stillness import JOGGED_RAD, NotStillError, RestingCheck
-from station.plan.hover import Hover, HoverAnswer, HoverQuestion, answer_hover, least_standoff_m
+from station.plan.hover import HoverAnswer, HoverPath, HoverQuestion, answer_hover, least_standoff_m
 from station.protocol import verbs
 from station.session.context import SessionContext, displacement
 from station.session.lease import MotionApproval
@@ -60,7 +60,7 @@ class TouchTestPlanner:
         self._context = context
         self._board: _BoardSeen | None = None
 
-    async def prepare(self, request: verbs.Hover) -> tuple[Hover, HoverOffer]:
+    async def prepare(self, request: verbs.Hover) -> tuple[HoverPath, HoverOffer]:
         """RefusedError, LimitError, RobotError and CameraError say what is in the way. Nothing moves."""
         context = self._context
         robot, config = context.cell.robot, context.cell.config
@@ -231,7 +231,7 @@ def _offer(
 class HoverRun(Run):
     """Carries out one approval over a corner: two moves, no image, nothing recorded."""
 
-    def __init__(self, context: SessionContext, go: MotionApproval, hover: Hover) -> None:
+    def __init__(self, context: SessionContext, go: MotionApproval, hover: HoverPath) -> None:
         self._context, self._go, self._hover = context, go, hover
         self._geometry, self._failures = hover.geometry, 0
 

@@ -14,7 +14,7 @@ from recordings.cli import main
 from recordings.importers.bag import import_bag
 from recordings.importers.messages import ros_types
 from recordings.importers.selection import Wanted
-from recordings.importers.stops import JOINT_SPEED_RAD_S, LEAST_SAMPLES, Limits
+from recordings.importers.stops import JOINT_SPEED_RAD_S, LEAST_SAMPLES, StandstillLimits
 from recordings.reader import open_recording
 from station.cell.config import StillnessConfig
 from station.cell.stillness import LEAST_SAMPLES as STATION_LEAST_SAMPLES
@@ -112,7 +112,7 @@ def test_the_stops_come_with_their_picture_and_the_right_pose(
 
 
 def test_the_rule_for_standing_is_the_stations() -> None:
-    ours, theirs = Limits(), StillnessConfig()
+    ours, theirs = StandstillLimits(), StillnessConfig()
     assert (ours.position_m, ours.rotation_rad) == (theirs.position_m, theirs.rotation_rad)
     assert (theirs.joint_speed_rad_s, STATION_LEAST_SAMPLES) == (JOINT_SPEED_RAD_S, LEAST_SAMPLES)
 

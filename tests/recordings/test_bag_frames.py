@@ -8,14 +8,14 @@ from scipy.spatial.transform import Rotation
 
 from recordings.errors import ImportSourceError
 from recordings.importers.frames import FrameTree
-from recordings.importers.messages import Frame
-from recordings.importers.stops import Limits, find_stops
+from recordings.importers.messages import FrameMessage
+from recordings.importers.stops import StandstillLimits, find_stops
 
 
-def frame(stamp_ns: int, parent: str, child: str, T: np.ndarray) -> Frame:
+def frame(stamp_ns: int, parent: str, child: str, T: np.ndarray) -> FrameMessage:
     x, y, z = T[:3, 3].tolist()
     qx, qy, qz, qw = Rotation.from_matrix(T[:3, :3]).as_quat().tolist()
-    return Frame(stamp_ns, parent, child, (x, y, z), (qx, qy, qz, qw))
+    return FrameMessage(stamp_ns, parent, child, (x, y, z), (qx, qy, qz, qw))
 
 
 def random_pose(seed: int) -> np.ndarray:
@@ -57,7 +57,7 @@ def test_the_nearest_report_of_every_moving_link_counts() -> None:
 @pytest.mark.parametrize("q", [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.1), (np.nan, 0.0, 0.0, 1.0)])
 def test_what_is_no_rotation_is_refused(q: tuple[float, float, float, float]) -> None:
     with pytest.raises(ImportSourceError):
-        FrameTree().add([Frame(0, "base", "flange", (0.0, 0.0, 0.0), q)])
+        FrameTree().add([FrameMessage(0, "base", "flange", (0.0, 0.0, 0.0), q)])
 
 
 def test_frames_that_never_move_are_no_arm() -> None:
@@ -76,5 +76,5 @@ def test_an_arm_that_drifts_slowly_does_not_stand() -> None:
         tree.add([frame(n * 10_000_000, "base", "flange", T)])
     images = np.array([1_000_000_000, 2_000_000_000], np.int64)
     track = tree.track("base", "flange")
-    assert find_stops(track, images, None, Limits(), 0.05)[0] == []
-    assert len(find_stops(track, images, None, Limits(position_m=0.001), 0.05)[0]) == 1
+    assert find_stops(track, images, None, StandstillLimits(), 0.05)[0] == []
+    assert len(find_stops(track, images, None, StandstillLimits(position_m=0.001), 0.05)[0]) == 1

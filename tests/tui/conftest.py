@@ -21,7 +21,7 @@ from textual.widgets import Static
 from station.cell.session_folder import SessionSummary
 from station.cell.status import (
     CameraStatus,
-    Lease,
+    LeaseStatus,
     MotionPreview,
     PoseStatus,
     RobotStatus,
@@ -67,7 +67,7 @@ class FakeLink:
         self.answers: dict[str, Any] = {
             "prepare": SUMMARY,
             "preview": _image(),
-            "lease": Lease("me", 7),
+            "lease": LeaseStatus("me", 7),
             "sessions": [summary("s-0")],
         }
         self.silent = asyncio.Event()

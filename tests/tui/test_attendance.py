@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from textual import events
 
-from station.cell.status import Lease, StationState, StationStatus
+from station.cell.status import LeaseStatus, StationState, StationStatus
 from station.protocol import verbs
 from station.tui import app as attendance
 from tests.tui.conftest import FakeLink, app_on, idle, text_of, until
@@ -15,7 +15,7 @@ LOST = verbs.Lease("lost")
 
 
 def commanded(state: StationState, client_id: int = 7) -> StationStatus:
-    return msgspec.structs.replace(idle(state), lease=Lease("anna on pts/1", client_id))
+    return msgspec.structs.replace(idle(state), lease=LeaseStatus("anna on pts/1", client_id))
 
 
 @pytest.mark.parametrize(

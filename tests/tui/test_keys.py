@@ -7,7 +7,7 @@ import pytest
 from textual.widgets import Static
 
 from station.cell.errors import RefusedError
-from station.cell.status import Lease, StationState, StationStatus
+from station.cell.status import LeaseStatus, StationState, StationStatus
 from station.protocol import verbs
 from station.tui.dialogs import Confirm, ConfirmMotion
 from tests.tui.conftest import SUMMARY, FakeLink, app_on, idle, opened, text_of, until
@@ -175,7 +175,7 @@ async def test_stop_works_in_the_command_palette(link: FakeLink) -> None:
 
 def commanded(state: StationState) -> StationStatus:
     """By the screen that `FakeLink` tells it is client 7."""
-    return msgspec.structs.replace(idle(state), lease=Lease("anna on tty1", 7))
+    return msgspec.structs.replace(idle(state), lease=LeaseStatus("anna on tty1", 7))
 
 
 @pytest.mark.parametrize("key", ["ctrl+q", "f4"])

@@ -22,7 +22,7 @@ MakePath = Callable[[Six], Path]
 SPAN_S = 15.0
 
 
-class Motion:
+class JointMotion:
     """One way from here to there. `done` once the arm's command rests at its end."""
 
     def __init__(self, make_path: MakePath, speed: float, acceleration: float) -> None:
@@ -51,7 +51,7 @@ class Vibration:
         return self.amplitude_rad * fade * sin(2 * pi * self.frequency_hz * self.time_s)
 
 
-class Arm:
+class SimulatedArm:
     """Joints that move in time. Speeds in rad/s of simulated time; `scale` is slider × pause."""
 
     def __init__(self, table: DhTable, joints_rad: Six, draw_miss: Callable[[], Six]) -> None:
@@ -63,8 +63,8 @@ class Arm:
         self._lagged = joints_rad
         self.actual_speed = ZERO
         self.scale = 1.0
-        self.motion: Motion | None = None
-        self._next: Motion | None = None
+        self.motion: JointMotion | None = None
+        self._next: JointMotion | None = None
         self._draw_miss = draw_miss
         self.miss = draw_miss()
         """(6,) [δt (m), δφ (rad)] by which the true flange misses its pose now."""
@@ -78,9 +78,9 @@ class Arm:
     def moving(self) -> bool:
         return self.motion is not None
 
-    def start(self, make_path: MakePath, speed: float, acceleration: float) -> Motion:
+    def start(self, make_path: MakePath, speed: float, acceleration: float) -> JointMotion:
         """Goes there; from a running motion it comes to rest first. Raises UnreachableError."""
-        motion = Motion(make_path, speed, acceleration)
+        motion = JointMotion(make_path, speed, acceleration)
         if self.motion is None:
             self._begin(motion)
         else:
@@ -89,7 +89,7 @@ class Arm:
             self._next = motion
         return motion
 
-    def _begin(self, motion: Motion) -> None:
+    def _begin(self, motion: JointMotion) -> None:
         motion.path = motion.make_path(self.command)
         motion.profile = Trapezoid(motion.path.length, motion.speed, motion.acceleration)
         self.motion = motion
@@ -153,7 +153,7 @@ class Arm:
             self.command_speed = ZERO
         self._lag(dt_s)
 
-    def _follow(self, motion: Motion, dt_s: float) -> None:
+    def _follow(self, motion: JointMotion, dt_s: float) -> None:
         assert motion.path is not None and motion.profile is not None
         motion.elapsed_s += dt_s * (1.0 if motion.braking else self.scale)
         profile = motion.profile
@@ -171,7 +171,7 @@ class Arm:
         if motion.elapsed_s >= profile.duration_s:
             self._end(motion)
 
-    def _end(self, motion: Motion) -> None:
+    def _end(self, motion: JointMotion) -> None:
         motion.done = True
         following = self._next
         self.motion = self._next = None

@@ -6,7 +6,7 @@ from collections.abc import Generator
 from contextlib import suppress
 from math import isfinite
 
-from station.simulation.controller.arm import Motion
+from station.simulation.controller.arm import JointMotion
 from station.simulation.controller.kinematics import Six, from_pose
 from station.simulation.controller.paths import JointPath, LinePath, Path
 from station.simulation.controller.programs import ScriptError
@@ -14,7 +14,7 @@ from station.simulation.controller.state import ControllerState
 from station.simulation.controller.urscript import (
     Builtin,
     Pose,
-    Run,
+    ScriptRun,
     ScriptRuntimeError,
     ScriptSyntaxError,
     Thread,
@@ -34,10 +34,10 @@ class InterpretedProgram:
     def __init__(self, robot: ControllerState, name: str, text: str) -> None:
         self.name = name
         self._robot = robot
-        self._run = Run(parse(text, self._builtins()))
+        self._run = ScriptRun(parse(text, self._builtins()))
         self._mover: Thread | None = None
         """The thread that controls the arm."""
-        self._orphan: Motion | None = None
+        self._orphan: JointMotion | None = None
         """A motion whose thread was killed in this cycle."""
 
     def begin(self) -> None:
@@ -160,7 +160,7 @@ class InterpretedProgram:
         if self._mover not in (None, self._run.thread):
             raise ScriptRuntimeError(f"{name}: another thread is already controlling the robot")
 
-    def _hold(self, motion: Motion) -> Wait:
+    def _hold(self, motion: JointMotion) -> Wait:
         """Waits for its end. A thread killed meanwhile leaves it to whoever stops it in the same cycle."""
         self._mover, self._orphan = self._run.thread, None
         try:

@@ -9,7 +9,7 @@ from collections import deque
 from math import inf
 
 from station.devices.rtde import RobotMode, RuntimeState, SafetyMode
-from station.simulation.controller.arm import PROGRAM_END_RAD_S2, MakePath, Motion
+from station.simulation.controller.arm import PROGRAM_END_RAD_S2, JointMotion, MakePath
 from station.simulation.controller.interpreted import InterpretedProgram, interpreted
 from station.simulation.controller.kinematics import (
     Rigid,
@@ -38,7 +38,7 @@ class SimulatedRobot(ControllerState):
         self._starting: tuple[int, Program] | None = None
         self._safety_since_s = -inf
         self._silence_s = 0.0
-        self._hands: Motion | None = None
+        self._hands: JointMotion | None = None
 
     def tick(self, monotonic_ns: int, late: bool = False) -> None:
         """One cycle; `monotonic_ns` is when it is due. `late`: many cycles run at once because this

@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from math import isfinite
 
-from station.simulation.controller.arm import Arm, MakePath, Motion
+from station.simulation.controller.arm import JointMotion, MakePath, SimulatedArm
 from station.simulation.controller.kinematics import (
     JOINT_LIMIT_RAD,
     Rigid,
@@ -88,11 +88,11 @@ class Operation:
     """Moves and progress marks, one after the other. With a word it reports itself there, from the cycle
     after it was asked for; the arm begins at once."""
 
-    def __init__(self, arm: Arm, steps: list[MoveStep | int], word: AsyncWord | None) -> None:
+    def __init__(self, arm: SimulatedArm, steps: list[MoveStep | int], word: AsyncWord | None) -> None:
         self._arm = arm
         self._steps = list(steps)
         self._word = word
-        self._motion: Motion | None = None
+        self._motion: JointMotion | None = None
         self._started = word is None
         if self._steps and isinstance(self._steps[0], MoveStep):
             self._begin_move()

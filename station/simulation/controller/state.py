@@ -12,7 +12,7 @@ from collections import Counter, deque
 from dataclasses import dataclass
 
 from station.devices.rtde import RobotMode, RobotStatusBits, RuntimeState, SafetyMode, SafetyStatus
-from station.simulation.controller.arm import Arm, History
+from station.simulation.controller.arm import History, SimulatedArm
 from station.simulation.controller.kinematics import (
     TABLES,
     DhTable,
@@ -105,7 +105,7 @@ class ControllerState(ABC):
         self.table = TABLES[settings.model]
         self.true_table: DhTable = self.table.plus(*settings.dh_delta)
         self._random = random.Random(settings.seed)
-        self.arm = Arm(self.table, settings.start_joints_rad, self._draw_miss)
+        self.arm = SimulatedArm(self.table, settings.start_joints_rad, self._draw_miss)
         self.tcp: Six = (0.0,) * 6
         self.payload_kg = 0.0
         self.payload_cog: Six = (0.0,) * 3

@@ -1,8 +1,8 @@
 """An interpreter of URScript: a text becomes a program that runs cycle by cycle.
 
-`urscript_parser` reads a text, `Run` runs it: in every `step`, one controller cycle, each thread goes on
-until it waits. What a call does is one table of builtins: a Python function each, with the script's own
-argument names. One that takes controller time is a generator which yields once per cycle.
+`urscript_parser` reads a text, `ScriptRun` runs it: in every `step`, one controller cycle, each thread
+goes on until it waits. What a call does is one table of builtins: a Python function each, with the
+script's own argument names. One that takes controller time is a generator which yields once per cycle.
 
 Rules (Universal Robots, "The URScript Programming Language"): a name without `local` or `global` is the
 global of that name where there is one, else local. Inner functions read the variables of those around them.
@@ -64,7 +64,7 @@ class Thread:
         self._steps.close()
 
 
-class Run:
+class ScriptRun:
     """A program under way, one `step` per controller cycle."""
 
     def __init__(self, program: Function) -> None:
@@ -114,7 +114,7 @@ class Frame:
 
     __slots__ = ("depth", "function", "outer", "run", "variables")
 
-    def __init__(self, function: Function, outer: Frame | None, run: Run, depth: int) -> None:
+    def __init__(self, function: Function, outer: Frame | None, run: ScriptRun, depth: int) -> None:
         self.function, self.outer, self.run, self.depth = function, outer, run, depth
         self.variables: dict[str, Value] = {}
 

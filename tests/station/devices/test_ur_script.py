@@ -20,9 +20,9 @@ from station.devices.ur_script import (
     FIRST_REGISTER,
     SILENCE_S,
     STALE_S,
+    Command,
     ScriptControl,
     State,
-    Verb,
     script,
 )
 from station.simulation.controller.programs import Upload
@@ -58,7 +58,9 @@ def test_the_script_waits_as_long_as_the_watchdog_would() -> None:
 class Registers:
     """A controller in which the script runs; packets are written by hand."""
 
-    def __init__(self, left_by_others: int = SEQUENCE, verb: Verb = Verb.NONE, model: str = "UR10") -> None:
+    def __init__(
+        self, left_by_others: int = SEQUENCE, verb: Command = Command.NONE, model: str = "UR10"
+    ) -> None:
         self.robot = SimulatedRobot(Settings(model=model, start_joints_rad=HOME), Journal())
         self.sequence, self.keepalive = left_by_others, 5
         self.verb, self.numbers = verb, (0.0,) * 8
@@ -108,7 +110,7 @@ class Registers:
 
 def cruising(model: str = "UR10") -> Registers:
     made = Registers(model=model)
-    assert made.say(Verb.ARM) == 1 and made.say(Verb.MOVE) == 1
+    assert made.say(Command.ARM) == 1 and made.say(Command.MOVE) == 1
     made.run(0.6)
     assert made.speed_rad_s == pytest.approx(0.5)
     return made
@@ -120,8 +122,8 @@ def test_nothing_moves_at_the_start() -> None:
     assert made.plays and made.state is State.WAITING and made.robot.arm.command == HOME
 
 
-@pytest.mark.parametrize("verb", [Verb.NONE, Verb.ARM, Verb.MOVE])
-def test_registers_that_somebody_else_left_are_not_obeyed(verb: Verb) -> None:
+@pytest.mark.parametrize("verb", [Command.NONE, Command.ARM, Command.MOVE])
+def test_registers_that_somebody_else_left_are_not_obeyed(verb: Command) -> None:
     made = Registers(left_by_others=77, verb=verb)
     assert not made.plays and made.robot.arm.command == HOME
 
@@ -132,15 +134,15 @@ def test_a_move_is_taken_once_told_in_the_word_and_finished() -> None:
     made.run(2.0)
     assert made.state is State.ARMED and made.word == 1 << 24
     assert made.robot.arm.command == GOAL and made.robot.journal.counts["script: movej"] == 1
-    assert made.say(Verb.MOVE, HOME) == 1 and made.word == 2 << 24 | 1 << 15
+    assert made.say(Command.MOVE, HOME) == 1 and made.word == 2 << 24 | 1 << 15
 
 
 def test_a_move_is_refused_before_it_is_armed_and_while_one_is_under_way() -> None:
     made = Registers()
-    assert made.say(Verb.MOVE) == -1
+    assert made.say(Command.MOVE) == -1
     made.run(0.5)
-    assert made.robot.arm.command == HOME and made.say(Verb.ARM) == 1 and made.say(Verb.MOVE) == 1
-    assert made.say(Verb.MOVE, HOME) == -1
+    assert made.robot.arm.command == HOME and made.say(Command.ARM) == 1 and made.say(Command.MOVE) == 1
+    assert made.say(Command.MOVE, HOME) == -1
     assert made.plays
 
 
@@ -160,16 +162,16 @@ def test_numbers_that_are_no_move_are_refused(
     goal: tuple[float, ...], speed: float, acceleration: float
 ) -> None:
     made = Registers()
-    made.say(Verb.ARM)
-    assert made.say(Verb.MOVE, goal, speed, acceleration) == -1
+    made.say(Command.ARM)
+    assert made.say(Command.MOVE, goal, speed, acceleration) == -1
     made.run(0.3)
     assert made.robot.arm.command == HOME and made.state is State.ARMED
 
 
 def test_speed_and_acceleration_have_a_limit_of_the_scripts_own() -> None:
     made = Registers()
-    made.say(Verb.ARM)
-    assert made.say(Verb.MOVE, (3.0, *GOAL[1:]), 50.0, 50.0) == 1
+    made.say(Command.ARM)
+    assert made.say(Command.MOVE, (3.0, *GOAL[1:]), 50.0, 50.0) == 1
     fastest = 0.0
     for _ in range(100):
         before = made.speed_rad_s
@@ -200,7 +202,7 @@ def test_a_keepalive_now_and_then_is_enough() -> None:
     assert made.plays
 
 
-@pytest.mark.parametrize("verb", [Verb.STOP, Verb.END, 77])
+@pytest.mark.parametrize("verb", [Command.STOP, Command.END, 77])
 def test_every_other_verb_brakes_and_ends(verb: int) -> None:
     made = cruising()
     assert made.say(verb) == 1
@@ -212,7 +214,7 @@ def test_every_other_verb_brakes_and_ends(verb: int) -> None:
 
 def test_a_script_that_does_not_move_ends_without_a_stop() -> None:
     made = Registers()
-    made.say(Verb.END)
+    made.say(Command.END)
     assert not made.plays and "script: stopj" not in made.robot.journal.counts
 
 
@@ -361,6 +363,6 @@ def test_nothing_is_written_behind_half_a_packet() -> None:
     control._inputs = type("Recipe", (), {"pack": lambda self, values: json.dumps(values).encode() * 100})()
     ours.setblocking(False)
     for n in range(1000):
-        control._write(n, Verb.MOVE)
+        control._write(n, Command.MOVE)
     assert control._lost and control._broken and ours.fileno() == -1
     theirs.close()

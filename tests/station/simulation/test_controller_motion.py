@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from station.simulation.controller.arm import Arm, Vibration
+from station.simulation.controller.arm import SimulatedArm, Vibration
 from station.simulation.controller.kinematics import TABLES, Six, compose, forward, from_pose
 from station.simulation.controller.paths import JointPath, LinePath, PolylinePath, Trapezoid, UnreachableError
 
@@ -21,16 +21,16 @@ TOOL = from_pose((0.0, 0.0, 0.1, 0.0, 0.0, 0.0))
 positive = st.floats(0.01, 10.0)
 
 
-def make_arm() -> Arm:
-    return Arm(UR10, HOME, lambda: (0.0,) * 6)
+def make_arm() -> SimulatedArm:
+    return SimulatedArm(UR10, HOME, lambda: (0.0,) * 6)
 
 
-def run(arm: Arm, seconds: float, scale: float = 1.0) -> None:
+def run(arm: SimulatedArm, seconds: float, scale: float = 1.0) -> None:
     for _ in range(round(seconds / DT)):
         arm.step(DT, scale)
 
 
-def go(arm: Arm, goal: Six, speed: float = 1.0, acceleration: float = 2.0) -> None:
+def go(arm: SimulatedArm, goal: Six, speed: float = 1.0, acceleration: float = 2.0) -> None:
     arm.start(lambda start: JointPath(start, goal), speed, acceleration)
 
 
@@ -114,7 +114,7 @@ def test_impossible_goals_are_refused_before_anything_moves() -> None:
 
 def test_a_line_that_leaves_the_reach_freezes_the_arm() -> None:
     """Both ends are in reach; between them the line crosses the cylinder no wrist centre can enter."""
-    arm = Arm(UR10, (0.0, -1.0, 1.9, -2.4, -1.5, 0.0), lambda: (0.0,) * 6)
+    arm = SimulatedArm(UR10, (0.0, -1.0, 1.9, -2.4, -1.5, 0.0), lambda: (0.0,) * 6)
     first = forward(UR10, arm.command)
     goal = compose(from_pose((0.0, 0.0, 0.0, 0.0, 0.0, pi)), first)
     goal = (*first[:3], goal[3], *first[4:7], goal[7], *first[8:])
@@ -257,7 +257,7 @@ def test_every_stop_misses_differently_and_never_jumps() -> None:
     def draw() -> Six:
         return (next(draws), *(0.0,) * 5)
 
-    arm = Arm(UR10, HOME, draw)
+    arm = SimulatedArm(UR10, HOME, draw)
     assert arm.miss[0] == 1.0
     go(arm, (0.5, *HOME[1:]))
     seen = [arm.miss[0]]

@@ -14,7 +14,7 @@ from station.simulation.controller import urscript, urscript_parser
 from station.simulation.controller.urscript import (
     PURE,
     Pose,
-    Run,
+    ScriptRun,
     ScriptRuntimeError,
     ScriptSyntaxError,
 )
@@ -27,7 +27,7 @@ class Tape:
     def __init__(self, text: str) -> None:
         self.said: list[Any] = []
         self.killed = 0
-        self.run = Run(parse(text, {"say": self.said.append, "sync": self._sync, "wait": self._wait}))
+        self.run = ScriptRun(parse(text, {"say": self.said.append, "sync": self._sync, "wait": self._wait}))
 
     def _sync(self) -> Any:
         yield

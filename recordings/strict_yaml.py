@@ -33,10 +33,12 @@ class YamlProblem:
     where: str
     """'limits.speed_m_s'"""
     text: str
+    remedy: str = ""
 
     def __str__(self) -> str:
         place = f"line {self.line}: " if self.line else ""
-        return f"{place}{self.where + ': ' if self.where else ''}{self.text}"
+        said = f"{place}{self.where + ': ' if self.where else ''}{self.text}"
+        return f"{said.rstrip('.')}. {self.remedy}" if self.remedy else said
 
 
 class StrictYamlError(ValueError):
@@ -105,6 +107,56 @@ _Loader.add_constructor("tag:yaml.org,2002:float", lambda _, node: _float(node.v
 
 def _float(text: str) -> float:
     return float(text.replace(".inf", "inf").replace(".nan", "nan"))
+
+
+@dataclass(frozen=True)
+class Examined:
+    """A file's data as far as they can be read."""
+
+    plain: Any
+    """Without the keys, at most two deep, in which something is wrong."""
+    lines: dict[str, int]
+    """'limits.speed_m_s' to its line"""
+    problems: list[Problem]
+
+
+def examine(content: bytes, kind: type[Any]) -> Examined:
+    """Read what can be read, for a report that does not end at the first kind of problem.
+
+    Raises StrictYamlError where the file is no YAML at all.
+    """
+    try:
+        load(content, kind)
+        problems = []
+    except StrictYamlError as error:
+        problems = error.problems
+    try:
+        node = _Loader(content).get_single_node()
+        plain = _Loader(content).get_single_data()
+    except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError, OverflowError):
+        raise StrictYamlError(problems) from None
+    if not isinstance(plain, dict) or len(content) > LIMIT_BYTES:
+        raise StrictYamlError(problems)
+    for problem in problems:
+        section, _, key = re.sub(r"\[.*", "", problem.where).partition(".")
+        inside = plain.get(section)
+        if key and isinstance(inside, dict):
+            inside.pop(key.partition(".")[0], None)
+        else:
+            plain.pop(section, None)
+    return Examined(plain, dict(_lines(node, "")), problems)
+
+
+def _lines(node: yaml.Node, where: str) -> Iterator[tuple[str, int]]:
+    if isinstance(node, yaml.MappingNode):
+        for key, value in node.value:
+            inside = f"{where}.{key.value}" if where else str(key.value)
+            yield inside, key.start_mark.line + 1
+            yield from _lines(value, inside)
+    elif isinstance(node, yaml.SequenceNode):
+        for i, child in enumerate(node.value):
+            yield f"{where}[{i}]", child.start_mark.line + 1
+            yield from _lines(child, f"{where}[{i}]")
 
 
 def load(content: bytes, kind: type[T], under: str = "") -> T:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -22,7 +23,7 @@ from calibrate.files.formatting import (
     verdict_text,
 )
 from calibrate.files.verification import agrees, touch_text
-from calibrate.geometry import Array
+from calibrate.geometry import Array, difference
 from calibrate.handeye.corners import bent_points
 from calibrate.handeye.observations import SHAPE, observe_views
 from calibrate.lens.model import project
@@ -82,6 +83,7 @@ def _verdict(job: SolvedRecording) -> Iterator[str]:
     yield f"<h1>Calibration of {html.escape(job.recording.info.name)}</h1>"
     if stamp := source_stamp(calibration):
         yield f'<div class="stamp">{html.escape(stamp)}. It is not installed on a real cell.</div>'
+    yield html.paragraph(rehearsal_text(job))
     expected = " ".join(gate.text for gate in quality.failed)
     if good and quality.predicted_error_mm is not None and quality.working_distance_m is not None:
         distance_mm = quality.working_distance_m * 1000
@@ -93,6 +95,27 @@ def _verdict(job: SolvedRecording) -> Iterator[str]:
     )
     for warning in quality.warnings:
         yield html.paragraph(warning, "warning")
+
+
+def rehearsal_text(job: SolvedRecording) -> str:
+    """What a rehearsal says of the real run; empty: this was none.
+
+    The simulated cell's truth is known, so the error that was really made stands beside the predicted one.
+    """
+    attachments, quality = job.recording.attachments(), job.calibration.quality
+    if "rehearsal.json" not in attachments or quality.predicted_error_mm is None:
+        return ""
+    about = json.loads(attachments["rehearsal.json"])
+    true_X = np.array(json.loads(attachments["truth.json"])["camera_mount"])
+    off = difference(job.calibration.transform.matrix, true_X)
+    distance_mm = 1000 * (quality.working_distance_m or 0.0)
+    reached = f"{quality.predicted_error_mm:.2f} mm at {distance_mm:.0f} mm (1σ)"
+    repeats = f"{about['robot_sigma_mm']:.2g} mm and {about['robot_sigma_deg']:.2g}° (1σ per axis)"
+    off_deg = np.degrees(np.linalg.norm(off[3:]))
+    return (
+        f"Rehearsal of {about['configuration']}. The real run should reach {reached}, if its arm repeats to "
+        f"{repeats}. The simulated run was off by {1000 * np.linalg.norm(off[:3]):.2f} mm and {off_deg:.3f}°."
+    )
 
 
 def _result(job: SolvedRecording) -> Iterator[str]:

@@ -2,20 +2,37 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import numpy as np
 
-from calibrate.boards.model import BoardError, check_board
+from calibrate.boards.model import BoardError, board_points, check_board
+from calibrate.geometry import Array, pose_from_quaternion, quaternion_from_matrix, transform_points
 from calibrate.kinematics import MODELS
 from recordings import strict_yaml
-from station.cell.config import PoseGuess, StationConfig
+from recordings.schema.messages import BoardSpec
+from recordings.strict_yaml import Problem
+from station.cell.config import Plane, PoseGuess, StationConfig
 from station.cell.errors import ConfigError
 from station.cell.limits import SPEED_CAP_M_S
 
 LARGEST_SQUARE_M, LARGEST_REACH_M = 0.5, 5.0
 """Beyond these somebody wrote millimetres."""
+SMALLEST_SQUARE_M = 0.001
+"""Below this somebody wrote kilometres, or a factor too many."""
+METRES = "Give metres."
+_FIELD_OF_VIEW = (np.deg2rad(2.0), np.deg2rad(150.0))
+"""A lens outside of this sees no board: its focal length is in other units than pixels."""
+_FOCAL_LENGTH = (
+    "Give pixels: the lens's focal length in mm / the pixel's size in mm (8 mm / 0.0048 mm = 1667)."
+)
+_FACING = 0.3
+"""Cosine from which a printed side faces something."""
 
 _ABOVE_ZERO = {
     "limits": (
@@ -40,97 +57,273 @@ _ABOVE_ZERO = {
 }
 
 
+@dataclass(frozen=True)
+class ConfigReport:
+    """Everything that can be said of a configuration file before anything is started."""
+
+    content: bytes
+    config: StationConfig | None
+    """None while `wrong` has something."""
+    wrong: tuple[Problem, ...]
+    """With these nothing is started."""
+    missing: tuple[Problem, ...]
+    """What planning poses needs besides; capture by hand does without."""
+
+
 def load_config(path: Path) -> tuple[StationConfig, bytes]:
     """(configuration, the file's bytes). Raises ConfigError (exit code 2) listing all problems."""
+    report = examine_config(path)
+    if report.config is None:
+        raise config_error(path, report.wrong)
+    return report.config, report.content
+
+
+def config_error(path: Path, problems: tuple[Problem, ...]) -> ConfigError:
+    """All problems of the file in one error."""
+    count = f"{len(problems)} problem{'s' if len(problems) > 1 else ''}"
+    text = "\n".join([f"{path}: {count}. Nothing was started.", *(f"  {problem}" for problem in problems)])
+    return ConfigError(text, code="invalid-config", problems=len(problems))
+
+
+def examine_config(path: Path) -> ConfigReport:
+    """Find every problem of the file at once, of whatever kind. ConfigError where it cannot be read."""
     try:
         content = path.read_bytes()
     except OSError as error:
         raise ConfigError(
             f"{path}: {error.strerror}",
             code="unreadable-config",
-            remedy=f"Write one with `station doctor --example > {path.name}`, or leave it out: without a "
-            "configuration the station runs a simulated cell.",
+            remedy="Write one with `station new`, or leave it out: the station then runs a simulated cell.",
         ) from None
     try:
-        config = strict_yaml.load(content, StationConfig)
+        found = strict_yaml.examine(content, StationConfig)
     except strict_yaml.StrictYamlError as error:
-        raise _report(path, [str(problem) for problem in error.problems]) from None
-    problems = list(_meaning_problems(config))
-    if problems:
-        raise _report(path, problems)
-    return config, content
+        raise config_error(path, tuple(error.problems)) from None
+    config, known = _readable(found.plain)
+
+    def placed(problems: Iterator[Problem]) -> tuple[Problem, ...]:
+        kept = (problem for problem in problems if _section(problem) in known)
+        return tuple(replace(problem, line=_line(found.lines, problem.where)) for problem in kept)
+
+    meant, missing = placed(_meaning_problems(config)), placed(_planning_problems(config))
+    told = {problem.where for problem in found.problems}
+    wrong = (*found.problems, *(problem for problem in meant if problem.where not in told))
+    wrong = tuple(sorted(wrong, key=lambda problem: problem.line))
+    return ConfigReport(content, None if wrong else config, wrong, missing)
 
 
-def _report(path: Path, problems: list[str]) -> ConfigError:
-    count = f"{len(problems)} problem{'s' if len(problems) > 1 else ''}"
-    text = "\n".join([f"{path}: {count}. Nothing was started.", *(f"  {p}" for p in problems)])
-    return ConfigError(text, code="invalid-config", problems=len(problems))
+def _section(problem: Problem) -> str:
+    return re.split(r"[.\[]", problem.where)[0]
 
 
-def _meaning_problems(config: StationConfig) -> Iterator[str]:
+def _line(lines: dict[str, int], where: str) -> int:
+    """The line of a key, or of what it stands in; 0 where the file has neither."""
+    while where and where not in lines:
+        where = re.sub(r"[.\[]?[^.\[]*$", "", where)
+    return lines.get(where, 0)
+
+
+def _readable(plain: dict[str, Any]) -> tuple[StationConfig, set[str]]:
+    """The configuration with stand-ins for sections that cannot be read, and the names of the others."""
+    stand_ins: dict[str, Any] = {
+        "robot": {},
+        "camera": {},
+        "board": {"kind": "chessboard", "columns": 7, "rows": 6, "square_m": 0.025},
+    }
+    known = set(StationConfig.__struct_fields__)
+    values: dict[str, Any] = {}
+    for field in msgspec.structs.fields(StationConfig):
+        name = field.encode_name
+        try:
+            values[name] = msgspec.convert(plain[name], field.type) if name in plain else None
+        except msgspec.ValidationError:
+            known.discard(name)
+            values[name] = None
+        if values[name] is None and name not in plain:
+            known -= {name} & stand_ins.keys()
+        if values[name] is None and name in stand_ins:
+            values[name] = msgspec.convert(stand_ins[name], field.type)
+        elif values[name] is None:
+            del values[name]
+    return StationConfig(**values), known
+
+
+def _meaning_problems(config: StationConfig) -> Iterator[Problem]:
     """Finds what types cannot say: ranges, and things that must fit each other."""
     limits, robot, camera = config.limits, config.robot, config.camera
     if robot.model not in MODELS:
-        yield f"robot.model: '{robot.model}' is not known; one of {', '.join(MODELS)}"
+        yield Problem(0, "robot.model", f"'{robot.model}' is not known; one of {', '.join(MODELS)}")
     if not robot.host:
-        yield "robot.host: the controller's address is missing"
+        yield Problem(
+            0,
+            "robot.host",
+            "the controller's address is missing",
+            "Read it on the pendant: menu (top right) → About, or Settings → System → Network.",
+        )
     yield from _number_problems(config)
     yield from _solid_problems(config)
     if not 0 < limits.speed_m_s <= SPEED_CAP_M_S:
-        yield f"limits.speed_m_s: {limits.speed_m_s} must be above 0 and at most {SPEED_CAP_M_S}"
+        text = f"{limits.speed_m_s} must be above 0 and at most {SPEED_CAP_M_S}"
+        yield Problem(0, "limits.speed_m_s", text, "Give metres per second.")
     least, most = limits.joints_min_rad, limits.joints_max_rad
     if least and most and any(a > b for a, b in zip(least, most, strict=True)):
-        yield "limits.joints_min_rad must not be above joints_max_rad for any joint"
+        yield Problem(0, "limits.joints_min_rad", "must not be above joints_max_rad for any joint")
     low, high = limits.workspace_min_m, limits.workspace_max_m
     if low and high and any(a >= b for a, b in zip(low, high, strict=True)):
-        yield "limits.workspace_min_m must be below workspace_max_m in x, y and z"
-    for plane in limits.planes:
+        yield Problem(0, "limits.workspace_min_m", "must be below workspace_max_m in x, y and z")
+    for place, plane in enumerate(limits.planes):
         if np.linalg.norm(plane.normal) < 1e-6:
-            yield f"limits.planes: the normal of '{plane.name}' is zero"
+            text = f"the normal of '{plane.name}' is zero"
+            yield Problem(0, f"limits.planes[{place}].normal", text, "A table has [0, 0, 1].")
     if camera.trigger == "hardware" and config.trigger is None:
-        yield "camera.trigger: hardware needs a section 'trigger' with the box's port"
+        text = "hardware needs a section 'trigger' with the box's port"
+        yield Problem(0, "camera.trigger", text, "Add `trigger: {port: /dev/ttyACM0}`, or choose software.")
     try:
         check_board(config.board)
     except BoardError as problem:
-        yield str(problem)
-    if config.board.square_m > LARGEST_SQUARE_M:
-        yield f"board.square_m: {config.board.square_m} m is no board's square; lengths are in metres"
+        yield Problem(0, "board", problem.text.removeprefix("board: "), problem.remedy)
+    else:
+        yield from _square_problems(config.board)
     if not 0 < config.working_distance_m <= LARGEST_REACH_M:
-        yield f"working_distance_m: {config.working_distance_m} is out of reach; lengths are in metres"
+        text = f"{config.working_distance_m} is out of reach; lengths are in metres"
+        yield Problem(0, "working_distance_m", text)
     yield from _guess_problems(config)
+    yield from _lens_problems(config)
 
 
-def _guess_problems(config: StationConfig) -> Iterator[str]:
-    for name in ("camera_guess", "board_guess"):
-        guess: PoseGuess | None = getattr(config, name)
-        if guess is not None and np.linalg.norm(guess.translation_m) > LARGEST_REACH_M:
-            yield f"{name}.translation_m: further than {LARGEST_REACH_M} m; lengths are in metres"
-        if guess is not None and not 0.9 < float(np.linalg.norm(guess.rotation_xyzw)) < 1.1:
-            yield f"{name}.rotation_xyzw: its length must be 1 (x, y, z, w)"
-        if guess is not None and min(guess.sigma_m, guess.sigma_rad) < 0:
-            yield f"{name}: sigma_m and sigma_rad must not be below 0; what hangs on it is thickened by them"
+def _square_problems(board: BoardSpec) -> Iterator[Problem]:
+    if board.square_m > LARGEST_SQUARE_M:
+        text = f"{board.square_m:g} m is no board's square; lengths are in metres"
+        yield Problem(
+            0, "board.square_m", text, f"Squares of {board.square_m:g} mm are {board.square_m / 1000:g}."
+        )
+    elif board.square_m < SMALLEST_SQUARE_M:
+        yield Problem(0, "board.square_m", f"{board.square_m:g} m is no board's square", METRES)
 
 
-def _number_problems(config: StationConfig) -> Iterator[str]:
+def _lens_problems(config: StationConfig) -> Iterator[Problem]:
+    """A focal length in millimetres or metres, a centre outside the image."""
+    model = config.camera.model
+    if model is None or model.matrix is None:
+        return
+    where = "camera.model.matrix"
+    for name, focal_px, size_px in (
+        ("fx", model.matrix[0][0], model.width),
+        ("fy", model.matrix[1][1], model.height),
+    ):
+        view = 2 * np.arctan2(size_px / 2, focal_px) if focal_px > 0 else np.pi
+        if not _FIELD_OF_VIEW[0] <= view <= _FIELD_OF_VIEW[1]:
+            text = f"{name} = {focal_px:g} px would be a field of view of {np.rad2deg(view):.0f}°"
+            yield Problem(0, where, text, _FOCAL_LENGTH)
+            return
+    cx, cy = model.matrix[0][2], model.matrix[1][2]
+    if not (0 < cx < model.width and 0 < cy < model.height):
+        text = f"the centre {cx:g}, {cy:g} lies outside the image of {model.width} × {model.height}"
+        yield Problem(0, where, text, f"Give pixels: about {model.width / 2:g}, {model.height / 2:g}.")
+
+
+def _guess_problems(config: StationConfig) -> Iterator[Problem]:
+    known = {"camera_guess": config.camera_guess, "board_guess": config.board_guess}
+    for name, guess in known.items():
+        if guess is None:
+            continue
+        if np.linalg.norm(guess.translation_m) > LARGEST_REACH_M:
+            known[name] = None
+            text = f"further than {LARGEST_REACH_M} m; lengths are in metres"
+            yield Problem(0, f"{name}.translation_m", text)
+        if not 0.9 < float(np.linalg.norm(guess.rotation_xyzw)) < 1.1:
+            known[name] = None
+            remedy = "`station new` finds it without one."
+            yield Problem(0, f"{name}.rotation_xyzw", "its length must be 1 (x, y, z, w)", remedy)
+        if min(guess.sigma_m, guess.sigma_rad) < 0:
+            text = "sigma_m and sigma_rad must not be below 0; what hangs on it is thickened by them"
+            yield Problem(0, name, text)
+    if known["board_guess"] is not None and (problem := board_turned_away(config)):
+        yield problem
+    elif known["camera_guess" if config.mount == "eye-to-hand" else "board_guess"] is not None:
+        yield from _reach_problems(config)
+
+
+def board_turned_away(config: StationConfig) -> Problem | None:
+    """The board by its guess shows its printed side to a keep-out plane, or to the flange that holds it."""
+    guess = config.board_guess
+    if guess is None:
+        return None
+    Y = pose_from_quaternion(guess.translation_m, guess.rotation_xyzw)
+    centre = transform_points(Y, board_points(config.board).mean(axis=0))
+    into_m = config.working_distance_m * Y[:3, 2]
+    front, back = centre - into_m, centre + into_m
+    planes = config.limits.planes
+    faced = next((plane.name for plane in planes if _behind(plane, front) > 0), "")
+    turned = bool(faced) and all(_behind(plane, back) <= 0 for plane in planes)
+    if config.mount == "eye-to-hand":
+        faced, turned = "flange", bool(Y[2, 2] > _FACING and centre[2] >= 0)
+    if not turned:
+        return None
+    x, y, z, w = (float(v) for v in quaternion_from_matrix(Y[:3, :3] @ np.diag([1.0, -1.0, -1.0])))
+    return Problem(
+        0,
+        "board_guess.rotation_xyzw",
+        f"the board lies upside down: its printed side faces the {faced}",
+        f"The board's z axis points into the board. Turned over: [{x:.4g}, {y:.4g}, {z:.4g}, {w:.4g}].",
+    )
+
+
+def _behind(plane: Plane, point: Array) -> float:
+    """How far a point lies behind a keep-out plane, m."""
+    normal = np.asarray(plane.normal) / max(float(np.linalg.norm(plane.normal)), 1e-9)
+    return float(normal @ (np.asarray(plane.point_m) - point))
+
+
+def _reach_problems(config: StationConfig) -> Iterator[Problem]:
+    """The board, or a camera beside the arm, is further away than the arm can look."""
+    in_hand = config.mount == "eye-in-hand"
+    name = "board_guess" if in_hand else "camera_guess"
+    guess: PoseGuess | None = getattr(config, name)
+    model = MODELS.get(config.robot.model)
+    if guess is None or model is None:
+        return
+    arm_m = abs(model.a_m[1]) + abs(model.a_m[2]) + model.d_m[3] + model.d_m[4] + model.d_m[5]
+    away_m = float(np.linalg.norm(np.subtract(guess.translation_m, [0.0, 0.0, model.d_m[0]])))
+    limit_m = arm_m + 1.6 * config.working_distance_m
+    if away_m > limit_m:
+        thing = "board" if in_hand else "camera"
+        text = f"the {thing} is {away_m:.2f} m from the {model.name}'s shoulder (limit {limit_m:.2f} m)"
+        remedy = f"Bring the {thing} within the arm's reach, or correct the guess."
+        yield Problem(0, f"{name}.translation_m", text, remedy)
+
+
+def _planning_problems(config: StationConfig) -> Iterator[Problem]:
+    """What planning needs and capture by hand does not."""
+    model = config.camera.model
+    if model is None or model.matrix is None:
+        yield Problem(0, "camera.model", "planning needs a rough lens (width, height, matrix)", _FOCAL_LENGTH)
+    for name, what in (("camera_guess", "where the camera is"), ("board_guess", "where the board is")):
+        if getattr(config, name) is None:
+            yield Problem(0, name, f"is missing: planning needs to know {what}", "`station new` finds it.")
+
+
+def _number_problems(config: StationConfig) -> Iterator[Problem]:
     for section, names in _ABOVE_ZERO.items():
         part = getattr(config, section)
         for name in names if part is not None else ():
             if not getattr(part, name) > 0:
-                yield f"{section}.{name}: {getattr(part, name)} must be above 0"
+                yield Problem(0, f"{section}.{name}", f"{getattr(part, name)} must be above 0")
     for name in ("retries", "free_space_bytes"):
         if (value := getattr(config.capture, name)) < 0:
-            yield f"capture.{name}: {value} must not be below 0"
+            yield Problem(0, f"capture.{name}", f"{value} must not be below 0")
 
 
-def _solid_problems(config: StationConfig) -> Iterator[str]:
+def _solid_problems(config: StationConfig) -> Iterator[Problem]:
     """Finds bodies on the flange that are too thin to be bodies to the checks."""
-    for solid in config.limits.solids:
+    for place, solid in enumerate(config.limits.solids):
+        where = f"limits.solids[{place}]"
         if not solid.radius_m > 0:
-            yield f"limits.solids: '{solid.name}': radius_m must be above 0, not {solid.radius_m}"
+            yield Problem(0, where, f"'{solid.name}': radius_m must be above 0, not {solid.radius_m}")
         if np.abs([*solid.from_m, *solid.to_m, solid.radius_m]).max() > LARGEST_REACH_M:
-            yield f"limits.solids: '{solid.name}' reaches further than {LARGEST_REACH_M} m; metres are meant"
+            yield Problem(0, where, f"'{solid.name}' reaches further than {LARGEST_REACH_M} m", METRES)
     pointer = config.pointer
     if pointer is not None and np.linalg.norm(pointer.along) < 1e-6:
-        yield "pointer.along: its length is zero"
+        yield Problem(0, "pointer.along", "its length is zero")
     if pointer is not None and np.linalg.norm(pointer.tip_m) > LARGEST_REACH_M:
-        yield f"pointer.tip_m: further than {LARGEST_REACH_M} m; lengths are in metres"
+        yield Problem(0, "pointer.tip_m", f"further than {LARGEST_REACH_M} m; lengths are in metres")

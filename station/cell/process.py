@@ -13,6 +13,13 @@ DAEMON_NICENESS = -5
 _PR_SET_PDEATHSIG = 1
 
 
+def waited_share(pressure: Path = Path("/proc/pressure/cpu")) -> float:
+    """Share of the last 10 s, 0…1, in which programs waited for a processor (Linux's PSI); 0: not known."""
+    with contextlib.suppress(OSError, ValueError, IndexError):
+        return float(pressure.read_text().split("avg10=")[1].split()[0]) / 100
+    return 0.0
+
+
 def die_with_parent(parent_pid: int) -> None:
     """Has the kernel kill this process when the thread that started it ends."""
     ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)

@@ -24,6 +24,7 @@ STATION = LazyGroup(
             "Own the cell and serve it on a Unix socket.",
             (
                 "station serve --config station.yaml  # then, in another terminal: station",
+                "station serve --config station.yaml --rehearse  # the same with no hardware",
                 "station serve --simulate --mount eye-to-hand --noise mid",
                 "station serve --replay session.mcap",
             ),
@@ -32,7 +33,7 @@ STATION = LazyGroup(
             "station.cli.plan:plan_command",
             "Make a pose plan, or check one. Nothing moves.",
             (
-                "station plan --config station.yaml --start 0,-94,-90,-86,90,0 -o plan.yaml",
+                "station plan --config station.yaml -o plan.yaml  # from where the arm stands",
                 "station plan --config station.yaml --check plan.yaml --picture plan.png",
             ),
         ),

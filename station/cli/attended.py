@@ -52,6 +52,16 @@ class Attended:
         self.moving = yes
         return yes
 
+    async def plans_here(self, refusal: StationError) -> bool:
+        """Ask whether to plan again from where the arm stands; the plan's file stays as it is."""
+        err.print(refusal.text, style="yellow")
+        try:
+            with ctrl_c_at_once():
+                return typer.confirm("Plan again from here? Nothing moves.", default=True, err=True)
+        except typer.Abort:
+            err.print()
+            return False
+
     def _decides(self, preview: MotionPreview) -> bool:
         if self._approved:
             if not preview.plan_sha256.startswith(self._approved) or len(self._approved) < HASH_DIGITS:
@@ -88,6 +98,7 @@ class Attended:
                 self.progress,
                 finish_with_loss=to_the_end,
                 headless=not self.interactive,
+                plans_here=self.plans_here if self.interactive else None,
             )
 
     async def watch(self, started: object) -> SessionOutcome:

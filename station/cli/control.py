@@ -158,17 +158,25 @@ def doctor_command(
         print((Path(__file__).parent / "example.yaml").read_text(), end="")
         return
     if config is not None:
-        from station.cell.config_file import load_config
+        from station.cell.config_file import config_error, examine_config
         from station.devices.ur import control_path, control_trouble
 
-        found, _ = load_config(config)
+        report = examine_config(config)
+        if report.config is None:
+            raise config_error(config, (*report.wrong, *report.missing))
+        found = report.config
         path = control_path(found.robot)
+        state = "incomplete" if report.missing else "good"
         out.print(
-            f"{config}: good; {found.robot.model} at {found.robot.host}, {found.mount}, control by {path}"
+            f"{config}: {state}; {found.robot.model} at {found.robot.host}, {found.mount}, control by {path}"
         )
+        for problem in report.missing:
+            out.print(Text.assemble(("MISSING", "red"), f" {problem}"))
         if words := ": ".join(filter(None, control_trouble(path, real=True))):
             out.print(words)
         out.print(f"next: station serve --config {shlex.quote(str(config))}, then station doctor beside it")
+        if report.missing:
+            raise typer.Exit(1)
         return
     checks = ask(socket or default_socket(), Doctor())
     good = all(check.state != "failed" for check in checks)

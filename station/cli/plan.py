@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import json
 from pathlib import Path
 from typing import Annotated
@@ -13,19 +15,25 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
+from recordings.errors import printed
+from recordings.schema.messages import Vector6
 from station.cell.config import StationConfig
 from station.cell.config_file import load_config
-from station.cell.errors import ConfigError, LimitError
+from station.cell.errors import ConfigError, LimitError, StationError
 from station.cell.limits import PlanCheck, check_plan
 from station.cell.plan import Plan, plan_sha256
 from station.cell.scene import Scene, cell_geometry, geometry_from, scene_of
-from station.cli.console import AsJson, err, out
+from station.cell.socket_folder import default_socket
+from station.cli.console import AsJson, Socket, err, out
+from station.operate.motion import status_now
 from station.plan.choose import Criterion
 from station.plan.files import import_list, load_plan, save_plan, taught_plan
 from station.plan.planner import make_plan
 from station.plan.predict import with_forecast
 from station.plan.preview import save_picture, save_scene, sketch
 
+_ASK_S = 3.0
+"""A daemon that serves answers within milliseconds, on a busy computer within a second."""
 _NOTHING_KNOWN_M = 0.05
 """A larger expected error says no more than that there are too few poses yet."""
 
@@ -41,11 +49,13 @@ def plan_command(
         Path | None, typer.Option(help="Recording whose poses, guided by hand say, become the plan")
     ] = None,
     start: Annotated[
-        str | None, typer.Option(help="Joints where the arm stands, degrees: 0,-90,90,…")
+        str | None,
+        typer.Option(help="Joints where the arm stands, degrees: 0,-90,90,…; without it the arm is asked"),
     ] = None,
     poses: Annotated[int, typer.Option(min=3, max=200, help="How many")] = 25,
     seed: Annotated[int, typer.Option(help="The same seed gives the same plan")] = 0,
     scene: Annotated[str, typer.Option(help="Simulated cell: paper or blog")] = "paper",
+    socket: Socket = None,
     d_optimal: Annotated[
         bool, typer.Option("--d-optimal", help="Smallest error ellipsoid, not smallest error")
     ] = False,
@@ -63,6 +73,8 @@ def plan_command(
     if output is not None and check is None:
         _require_replaceable(output)
     cell, standing = _cell(config, scene, start)
+    if config is not None and standing is None:
+        standing = asked_standing(cell, socket or default_socket())
     criterion: Criterion = "D" if d_optimal else "A"
     plan = _given(cell, standing, check, from_list, taught)
     plan = plan or _made(cell, standing, poses, seed, criterion, quiet=as_json)
@@ -108,6 +120,41 @@ def _cell(config: Path | None, scene: str, start: str | None) -> tuple[StationCo
 
     truth = make_cell(scene, 0, "low", "eye-in-hand")  # type: ignore[arg-type]
     return cell_config(truth), standing or list(truth.start_joints_rad)
+
+
+def asked_standing(cell: StationConfig, socket: Path) -> list[float] | None:
+    """Joints where the arm stands: by the daemon that serves this cell, else by the arm itself, only reading.
+
+    None, and a line that says so, where neither answers.
+    """
+    with contextlib.suppress(StationError, OSError, TimeoutError):
+        status = asyncio.run(asyncio.wait_for(status_now(socket), _ASK_S))
+        ours = (status.cell, status.mount) == (cell.name, cell.mount)
+        if ours and status.robot.model == cell.robot.model and status.robot.joints_rad is not None:
+            return list(status.robot.joints_rad)
+    try:
+        return list(asyncio.run(_read_joints(cell)))
+    except StationError as problem:
+        err.print(
+            f"Where the arm stands is not known ({printed(problem)}): the plan begins at its first pose. The "
+            "way there is checked before it moves.",
+            style="yellow",
+        )
+        return None
+
+
+async def _read_joints(cell: StationConfig) -> Vector6:
+    """By the read-only half of the driver. Raises RobotError."""
+    from station.devices.ur_link import UrLink
+    from station.devices.ur_probe import RTDE_PORT, check_port
+
+    await check_port(cell.robot.host, RTDE_PORT)
+    link = UrLink(cell.robot)
+    try:
+        await link.connect()
+        return link.latest().joints_rad
+    finally:
+        await link.close()
 
 
 def _scene(cell: StationConfig, needed: bool) -> Scene | None:

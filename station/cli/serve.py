@@ -7,6 +7,7 @@ import json
 import logging
 import os
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -22,6 +23,9 @@ from station.devices.cell import Cell
 
 def serve_command(
     config: Annotated[Path | None, typer.Option(help="The cell's configuration")] = None,
+    rehearse: Annotated[
+        bool, typer.Option("--rehearse", help="Simulate the devices of --config; connect to none of them")
+    ] = False,
     simulate: Annotated[bool, typer.Option("--simulate", help="A simulated cell, marked so")] = False,
     replay: Annotated[Path | None, typer.Option(help="Play this recording as a cell")] = None,
     socket: Annotated[
@@ -46,6 +50,9 @@ def serve_command(
 
     Nothing moves without a person's approval. Runs until Ctrl-C or SIGTERM, which stop the arm, finish the
     recording, and end the daemon.
+
+    With --rehearse the configuration's limits, guesses, board and plan are used with a simulated arm and a
+    rendered camera, marked SIMULATED. What it makes lies in `rehearsal` below the state folder.
     """
     if [simulate, config is not None, replay is not None].count(True) != 1:
         raise ConfigError(
@@ -53,11 +60,21 @@ def serve_command(
             code="usage",
             remedy="Give one of --config FILE (a real cell), --simulate, --replay RECORDING.",
         )
+    if rehearse and config is None:
+        raise ConfigError(
+            "--rehearse needs the cell to rehearse.", code="usage", remedy="Give --config FILE too."
+        )
     require_choices(scene=scene, noise=noise, mount=mount, control=control)
     log_to_stderr()
     place = state_root(root)
     # What only one kind of cell needs is loaded only for it.
-    if config is not None:
+    if config is not None and rehearse:
+        from station.cell.config_file import load_config
+        from station.simulation.rehearsal import FOLDER, rehearsed_cell
+
+        place /= FOLDER
+        cell = rehearsed_cell(load_config(config)[0], str(config), place / "simulation", seed)
+    elif config is not None:
         cell = _real_cell(config, place)
     elif replay is not None:
         from station.devices.playback import playback_cell
@@ -87,7 +104,7 @@ def _real_cell(config: Path, root: Path) -> Cell:
     from station.devices.cell import configured_cell
 
     loaded, text = load_config(config)
-    return configured_cell(loaded, text, root)
+    return replace(configured_cell(loaded, text, root), config_path=str(config.absolute()))
 
 
 async def serve_cell(cell: Cell, root: Path, socket: Path, end_with_stdin: bool) -> None:

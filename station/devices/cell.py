@@ -26,6 +26,8 @@ class Cell:
     trigger: Trigger | None = None
     config_text: bytes = b""
     """The file's bytes, for the recording."""
+    config_path: str = ""
+    """The file, for commands that are suggested; empty: there is none."""
     attachments: dict[str, bytes] = field(default_factory=dict)
     """More for every recording of this cell: a simulated one's truth."""
     plan: Plan | None = None

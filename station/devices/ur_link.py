@@ -16,6 +16,7 @@ from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import RobotIdentity, RobotState
 from station.cell.config import RobotConfig
 from station.cell.errors import RobotError, StaleStateError, StationError
+from station.cell.process import waited_share
 from station.cell.scene import arm_model
 from station.devices.ur_condition import HICCUP_S, STALE_S, safety_stop
 from station.devices.ur_dashboard import Dashboard, DashboardError
@@ -28,6 +29,8 @@ log = logging.getLogger(__name__)
 
 FIRST_STATE_S = 4.0
 SUPERVISE_S = 0.2
+_BUSY_SHARE = 0.5
+"""Of the time that programs wait for a processor: from then on a gap is more likely ours than the cable's."""
 RECONNECT_S = (0.2, 0.5, 1.0, 2.0)
 
 
@@ -228,11 +231,22 @@ class UrLink:
         assert reader is not None
         if reader.ended is not None:
             return link_lost(reader.ended)
-        text, remedy = f"no news from the robot for {age_s * 1000:.0f} ms", "Check cable and network."
+        text, remedy, code = (
+            f"no news from the robot for {age_s * 1000:.0f} ms",
+            "Check cable and network.",
+            "",
+        )
+        if (waited := waited_share()) >= _BUSY_SHARE:
+            remedy = (
+                f"Reduce the load of this computer: programs wait for it {waited:.0%} of the time. {remedy}"
+            )
+        if reader.waits_unread():
+            text = f"this computer was too busy for {age_s * 1000:.0f} ms to read the robot's state"
+            remedy, code = "Reduce the load of this computer.", "computer-busy"
         if reader.stands_still:
             text = f"the controller's clock stands still since {age_s * 1000:.0f} ms"
             remedy = "Restart the controller."
-        return StaleStateError(text, remedy=remedy, age_s=age_s, limit_s=STALE_S)
+        return StaleStateError(text, code=code, remedy=remedy, age_s=age_s, limit_s=STALE_S)
 
     def at(self, host_monotonic_ns: int) -> RobotState:
         """State interpolated at a host time within the last 10 s; StaleStateError outside."""

@@ -93,6 +93,7 @@ class StateReader(threading.Thread):
         """Why the connection is over; None while it lives."""
         self._on_state = on_state
         self._on_end = on_end
+        self._link: socket.socket | None = None
         self._stop_read, self._stop_write = socket.socketpair()
         self._wall_ahead_ns = _wall_ahead_ns()
         self._wall_set_ns = 0
@@ -107,7 +108,9 @@ class StateReader(threading.Thread):
                 link.settimeout(HANDSHAKE_S)
                 link.connect((self.host, PORT))
                 rtde = RtdeLink(link)
-                self._follow(link, rtde, self._handshake(rtde))
+                recipe = self._handshake(rtde)
+                self._link = link
+                self._follow(link, rtde, recipe)
         except TimeoutError:
             why = f"no answer from {self.host}:{PORT} within {HANDSHAKE_S:g} s"
         except ConnectionResetError:
@@ -128,6 +131,14 @@ class StateReader(threading.Thread):
         """Ends the thread; returns when it has ended (milliseconds, or the connect timeout)."""
         self.request_end()
         self.join(HANDSHAKE_S + 1.0)
+
+    def waits_unread(self) -> bool:
+        """Data that came is not read yet: this computer is busy, and the network is not to blame."""
+        link = self._link
+        with contextlib.suppress(OSError, ValueError):
+            if link is not None and link.fileno() >= 0:
+                return bool(select.select([link], [], [], 0)[0])
+        return False
 
     def request_end(self) -> None:
         with contextlib.suppress(OSError):

@@ -12,15 +12,17 @@ from typing import Protocol, TypeVar
 
 import msgspec
 
-from station.cell.errors import RefusedError
+from station.cell.errors import RefusedError, StationError
 from station.cell.status import MotionPreview, StationState, StationStatus
 from station.protocol.client import ANSWER_S, Client, DaemonGoneError
-from station.protocol.verbs import Finish, Go, Prepare, Purpose, Verb
+from station.protocol.verbs import PLANNED_ELSEWHERE, Finish, GetPlan, Go, MakePlan, Prepare, Purpose, Verb
 
 R = TypeVar("R")
 Watcher = Callable[[StationStatus], None]
 Approve = Callable[[MotionPreview], Awaitable[bool]]
 """Show a person what would move; True: they approve exactly this motion."""
+PlansHere = Callable[[StationError], Awaitable[bool]]
+"""Show a person why the plan is refused; True: they want it made again from where the arm stands."""
 HASH_DIGITS = 12
 """Digits of a plan's hash that are shown; fewer approve nothing."""
 CONNECT_WAIT_S = 30.0
@@ -100,10 +102,27 @@ async def wait_until_idle(link: Link) -> StationStatus:
 
 
 async def prepared_motion(
-    link: Link, purpose: Purpose, approve: Approve, *, changes: tuple[str, ...] = (), headless: bool = False
+    link: Link,
+    purpose: Purpose,
+    approve: Approve,
+    *,
+    changes: tuple[str, ...] = (),
+    headless: bool = False,
+    plans_here: PlansHere | None = None,
 ) -> bool:
-    """Check the whole path, then as `approved_motion`. `changes`: what else an approval changes."""
-    preview = await link.call(Prepare(purpose), timeout_s=PREPARE_S)
+    """Check the whole path, then as `approved_motion`. `changes`: what else an approval changes.
+
+    `plans_here`: who is asked whether to plan again where the plan was made from another posture.
+    """
+    try:
+        preview = await link.call(Prepare(purpose), timeout_s=PREPARE_S)
+    except StationError as refusal:
+        if refusal.code != PLANNED_ELSEWHERE or plans_here is None or not await plans_here(refusal):
+            raise
+        if (plan := (await link.call(GetPlan())).plan) is None:
+            raise
+        await link.call(MakePlan(max(4, len(plan.poses)), plan.seed or 0), timeout_s=PREPARE_S)
+        preview = await link.call(Prepare(purpose), timeout_s=PREPARE_S)
     preview = msgspec.structs.replace(preview, changes=(*changes, *preview.changes))
     return await approved_motion(link, preview, approve, headless)
 
@@ -145,9 +164,10 @@ async def carry_out(
     *,
     finish_with_loss: bool = False,
     headless: bool = False,
+    plans_here: PlansHere | None = None,
 ) -> SessionOutcome:
     """One session from its approval until it rests. RefusedError when the daemon or the person says no."""
-    if not await prepared_motion(link, purpose, approve, headless=headless):
+    if not await prepared_motion(link, purpose, approve, headless=headless, plans_here=plans_here):
         raise not_approved()
     return await watched(link, watch, finish_with_loss)
 

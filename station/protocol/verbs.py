@@ -123,6 +123,10 @@ class Check(msgspec.Struct, frozen=True):
     remedy: str = ""
 
 
+PLANNED_ELSEWHERE = "planned-elsewhere"
+"""Code of a refused plan: all that is not free is the way from where the arm stands to its first pose."""
+
+
 class Purpose(StrEnum):
     """The aim of a motion that is prepared."""
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+import shlex
 from typing import Any
 
 import msgspec
@@ -12,10 +14,11 @@ from recordings.schema.messages import Vector6
 from station.analysis.worker import check_run
 from station.cell.errors import LimitError, RefusedError
 from station.cell.limits import PlanCheck
+from station.cell.plan import Plan
 from station.cell.status import MotionPreview
 from station.cell.stillness import RestingCheck
 from station.devices.ur import control_trouble
-from station.protocol.verbs import Purpose
+from station.protocol.verbs import PLANNED_ELSEWHERE, Purpose
 from station.session.context import SessionContext, displacement
 from station.session.lease import ApprovalManager
 from station.session.queue import PlanRevision, PoseQueue
@@ -76,7 +79,7 @@ async def summarise(
     plan = msgspec.structs.replace(queue.plan, poses=tuple(queue.pose(index) for index in poses))
     check: PlanCheck = await context.workers.call(check_run, context.cell.config, plan, start)
     if check.problems:
-        raise LimitError(_problem_text(check), code="plan", problems=len(check.problems))
+        raise await _refused(context, plan, check, start)
     first = plan.poses[0].joints_rad
     return motion_preview(
         check,
@@ -104,6 +107,30 @@ def motion_preview(
         start_joints_rad=start_joints_rad,
         **said,
     )
+
+
+async def _refused(context: SessionContext, plan: Plan, check: PlanCheck, start: Vector6) -> LimitError:
+    """The plan is not free; where only the way to its first pose is not, it was made from another posture."""
+    refused = LimitError(_problem_text(check), code="plan", problems=len(check.problems))
+    if plan.motion == "sweep" or not plan.poses or len(check.problems) > len(check.moves[0].problems):
+        return refused
+    cell, first_rad = context.cell, plan.poses[0].joints_rad
+    if (await context.workers.call(check_run, cell.config, plan, first_rad)).problems:
+        return refused
+    command = ""
+    if cell.config_path:
+        command = f": `station plan --config {shlex.quote(cell.config_path)} -o plan.yaml`"
+    return LimitError(
+        f"The plan was made from another posture. The arm stands at {_degrees(start)}; from there "
+        f"to {check.moves[0].name} at {_degrees(first_rad)} {check.problems[0].text}",
+        code=PLANNED_ELSEWHERE,
+        remedy=f"Plan again from here{command}.",
+        problems=len(check.problems),
+    )
+
+
+def _degrees(joints_rad: Vector6) -> str:
+    return ", ".join(f"{math.degrees(q):.0f}" for q in joints_rad) + "°"
 
 
 def _problem_text(check: PlanCheck) -> str:

@@ -168,6 +168,10 @@ class Desk(App[None]):
         question: Confirm = ConfirmMotion(preview)
         return await self.push_screen_wait(question)
 
+    async def plans_here(self, refusal: StationError) -> bool:
+        """Offer to plan again from where the arm stands."""
+        return await self.push_screen_wait(Confirm("Plan again from here?", refusal.text, yes="Plan"))
+
     async def start(self, begun: Awaitable[R]) -> R | None:
         """A flow that begins with a motion; None when it did not come to that."""
         if started := await self.attempt(begun):
@@ -197,7 +201,7 @@ class Desk(App[None]):
         """`run` goes on with a session that is paused."""
         paused = self.status is not None and self.status.state is StationState.PAUSED
         wanted = Purpose.RESUME if purpose == Purpose.RUN and paused else Purpose(purpose)
-        await self.start(prepared_motion(self, wanted, self.approves))
+        await self.start(prepared_motion(self, wanted, self.approves, plans_here=self.plans_here))
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_ask(self, verb: str) -> None:

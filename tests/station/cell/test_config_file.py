@@ -4,13 +4,18 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import msgspec
 import pytest
 
 import station
-from station.cell.config_file import load_config
+from recordings.schema.messages import Mount
+from station.cell.config_file import ConfigReport, examine_config, load_config
 from station.cell.errors import ConfigError
+from station.cli import main
 from station.devices.cell import configured_cell
+from station.simulation.scenes import cell_config, make_cell
 from tests.codes import raises
+from tests.command_line import call
 
 GOOD = """\
 robot: {model: UR10, host: 192.0.2.10}
@@ -46,7 +51,7 @@ def test_a_missing_file_says_what_to_do(tmp_path: Path) -> None:
         ("normal: [0, 0, 1]", "normal: [0, 0, 0]", "'table' is zero"),
         ("device: KJ001", "device: KJ001, trigger: hardware", "section 'trigger'"),
         ("host: 192.0.2.10", "host: ''", "robot.host"),
-        ("square_m: 0.025", "square_m: 25", "lengths are in metres"),
+        ("square_m: 0.025", "square_m: 25", "Write 25 mm as 0.025"),
         ("speed_m_s: 0.2", "speed_mm_s: 200", "did you mean 'speed_m_s'"),
         ("speed_m_s: 0.2", "board_clearance_m: -0.1", "limits.board_clearance_m: -0.1 must be above 0"),
         ("speed_m_s: 0.2", "clearance_m: 0.0", "limits.clearance_m: 0.0 must be above 0"),
@@ -60,7 +65,7 @@ def test_a_missing_file_says_what_to_do(tmp_path: Path) -> None:
         (
             "speed_m_s: 0.2",
             "workspace_min_m: [-1, -1, 0.5]\n  workspace_max_m: [1, 1, 0.5]",
-            "workspace_min_m must be below workspace_max_m",
+            "must be below workspace_max_m",
         ),
         ("square_m: 0.025", "square_m: 0", "board: square_m = 0"),
         ("rows: 6", "rows: 1", "board: 7 × 1"),
@@ -154,3 +159,68 @@ def test_pictures_that_are_not_real_never_stand_beside_a_real_arm(tmp_path: Path
     path.write_text(GOOD.replace("driver: aravis", "driver: rendered"))
     with raises("unreal-camera"):
         configured_cell(*load_config(path), tmp_path)
+
+
+UPSIDE_DOWN = """\
+robot: {model: UR10, host: 192.0.2.10}
+camera:
+  model: {width: 1280, height: 1024, matrix: [[8.0, 0, 640], [0, 8.0, 512], [0, 0, 1]]}
+  exposur_us: 3
+board: {kind: chessboard, columns: 7, rows: 6, square_m: 0.025}
+board_guess: {translation_m: [0.7, 0, 0], rotation_xyzw: [0, 0, 0, 1]}
+limits:
+  planes: [{name: table, point_m: [0, 0, -0.02], normal: [0, 0, 1]}]
+"""
+
+
+def examined(tmp_path: Path, text: str) -> ConfigReport:
+    path = tmp_path / "station.yaml"
+    path.write_text(text)
+    return examine_config(path)
+
+
+def test_problems_of_every_kind_come_at_once_with_line_and_remedy(tmp_path: Path) -> None:
+    """A wrong key, a focal length in mm, a board upside down, and a guess that is missing."""
+    report = examined(tmp_path, UPSIDE_DOWN)
+    assert [(problem.line, problem.where) for problem in report.wrong] == [
+        (3, "camera.model.matrix"),
+        (4, "camera.exposur_us"),
+        (6, "board_guess.rotation_xyzw"),
+    ]
+    assert [problem.where for problem in report.missing] == ["camera_guess"]
+    assert all(problem.remedy for problem in (report.wrong[0], report.wrong[2], *report.missing))
+
+
+def test_the_remedy_of_a_board_that_lies_upside_down_mends_it(tmp_path: Path) -> None:
+    text = UPSIDE_DOWN.replace("[8.0, 0, 640], [0, 8.0, 512]", "[1667, 0, 640], [0, 1667, 512]")
+    [problem] = examined(tmp_path, text.replace("  exposur_us: 3\n", "")).wrong
+    turned = problem.remedy.split(": ")[-1].rstrip(".")
+    mended = text.replace("[0, 0, 0, 1]", turned).replace("  exposur_us: 3\n", "")
+    assert examined(tmp_path, mended).config is not None
+
+
+@pytest.mark.parametrize("seed", range(2))
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_no_cell_that_works_has_a_problem(mount: Mount, seed: int, tmp_path: Path) -> None:
+    config = cell_config(make_cell("paper", seed, "low", mount), "192.0.2.10")
+    report = examined(tmp_path, msgspec.yaml.encode(config).decode())
+    assert not report.wrong and not report.missing
+
+
+def test_a_lens_in_metres_a_centre_in_millimetres_and_a_board_out_of_reach(tmp_path: Path) -> None:
+    good = UPSIDE_DOWN.replace("  exposur_us: 3\n", "").replace("[0, 0, 0, 1]", "[1, 0, 0, 0]")
+    for matrix in ("[0.008, 0, 640], [0, 0.008, 512]", "[1667, 0, 3.2], [0, 1667, -2.1]"):
+        report = examined(tmp_path, good.replace("[8.0, 0, 640], [0, 8.0, 512]", matrix))
+        assert [problem.where for problem in report.wrong] == ["camera.model.matrix"]
+    near = good.replace("[8.0, 0, 640], [0, 8.0, 512]", "[1667, 0, 640], [0, 1667, 512]")
+    assert not examined(tmp_path, near).wrong
+    far = examined(tmp_path, near.replace("[0.7, 0, 0]", "[2.9, 0, 0]"))
+    assert [problem.where for problem in far.wrong] == ["board_guess.translation_m"]
+
+
+def test_doctor_counts_what_is_missing_as_missing(tmp_path: Path) -> None:
+    path = tmp_path / "station.yaml"
+    path.write_text(GOOD)
+    assert call(main, "doctor", "--config", str(path)).returncode == 1
+    path.write_text(UPSIDE_DOWN)
+    assert call(main, "doctor", "--config", str(path)).returncode == 2

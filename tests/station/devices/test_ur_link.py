@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import socket
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -10,8 +11,10 @@ import msgspec
 import pytest
 
 from station.cell.config import RobotConfig
+from station.cell.process import waited_share
 from station.devices.ur_link import UrLink
 from station.devices.ur_probe import ProbeResult, RobotLock
+from station.devices.ur_state import StateReader
 from tests.codes import raises
 
 CONFIG = RobotConfig(model="UR10", host="127.0.0.1", serial="2016")
@@ -79,3 +82,24 @@ async def test_a_robot_that_cannot_be_asked_for_is_named(tmp_path: Path) -> None
         UrLink(RobotConfig(model="UR7", host="127.0.0.1"))  # type: ignore[arg-type]
     with raises("no-host"):
         await UrLink(RobotConfig(model="UR10", host="")).connect()
+
+
+def test_news_that_wait_unread_are_no_matter_of_the_cable(link: Any) -> None:
+    """The kernel has the robot's data; this program had no time to read them."""
+    ours, robots = socket.socketpair()
+    with ours, robots:
+        reader = StateReader("192.0.2.10", lambda state: None, lambda why: None)
+        reader._link = ours
+        link.reader = reader
+        assert link.stale(0.2).code == "stale-state"
+        robots.send(b"news")
+        assert link.stale(0.2).code == "computer-busy"
+        reader.request_end()
+        reader._stop_read.close()
+
+
+def test_the_share_of_time_that_programs_wait_is_the_kernels(tmp_path: Path) -> None:
+    pressure = tmp_path / "cpu"
+    assert waited_share(pressure) == 0.0
+    pressure.write_text("some avg10=97.54 avg60=91.66 avg300=80.04 total=10610028320\n")
+    assert waited_share(pressure) == 0.9754

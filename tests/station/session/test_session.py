@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import logging
+import math
 from pathlib import Path
 
 import msgspec
@@ -277,3 +278,20 @@ async def test_a_sealed_session_is_not_added_to(rig: Rig, purpose: str) -> None:
     await rig.until(S.IDLE)
     with raises("no-session"):
         await rig.session.prepare(1, purpose, 0)
+
+
+async def test_a_plan_from_another_posture_is_told_from_one_that_is_not_free(
+    rig: Rig, small_plan: Plan
+) -> None:
+    """Wrist 3 once round: the way to the first pose is refused, the plan itself is good."""
+    once = -math.copysign(2 * math.pi, small_plan.poses[0].joints_rad[5])
+    turned = tuple(
+        msgspec.structs.replace(
+            pose, joints_rad=(*pose.joints_rad[:5], pose.joints_rad[5] + once), base_from_flange=None
+        )
+        for pose in small_plan.poses[:2]
+    )
+    rig.session.load_plan(1, msgspec.structs.replace(small_plan, poses=turned))
+    with raises("planned-elsewhere", LimitError):
+        await rig.session.prepare(1, Purpose.RUN)
+    assert "move" not in rig.arm.log

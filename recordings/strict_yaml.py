@@ -117,7 +117,7 @@ class Examined:
     """Without the keys, at most two deep, in which something is wrong."""
     lines: dict[str, int]
     """'limits.speed_m_s' to its line"""
-    problems: list[Problem]
+    problems: list[YamlProblem]
 
 
 def examine(content: bytes, kind: type[Any]) -> Examined:

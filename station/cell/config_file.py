@@ -16,7 +16,7 @@ from calibrate.geometry import Array, pose_from_quaternion, quaternion_from_matr
 from calibrate.kinematics import MODELS
 from recordings import strict_yaml
 from recordings.schema.messages import BoardSpec
-from recordings.strict_yaml import Problem
+from recordings.strict_yaml import YamlProblem
 from station.cell.config import Plane, PoseGuess, StationConfig
 from station.cell.errors import ConfigError
 from station.cell.limits import SPEED_CAP_M_S
@@ -64,9 +64,9 @@ class ConfigReport:
     content: bytes
     config: StationConfig | None
     """None while `wrong` has something."""
-    wrong: tuple[Problem, ...]
+    wrong: tuple[YamlProblem, ...]
     """With these nothing is started."""
-    missing: tuple[Problem, ...]
+    missing: tuple[YamlProblem, ...]
     """What planning poses needs besides; capture by hand does without."""
 
 
@@ -78,7 +78,7 @@ def load_config(path: Path) -> tuple[StationConfig, bytes]:
     return report.config, report.content
 
 
-def config_error(path: Path, problems: tuple[Problem, ...]) -> ConfigError:
+def config_error(path: Path, problems: tuple[YamlProblem, ...]) -> ConfigError:
     """All problems of the file in one error."""
     count = f"{len(problems)} problem{'s' if len(problems) > 1 else ''}"
     text = "\n".join([f"{path}: {count}. Nothing was started.", *(f"  {problem}" for problem in problems)])
@@ -101,7 +101,7 @@ def examine_config(path: Path) -> ConfigReport:
         raise config_error(path, tuple(error.problems)) from None
     config, known = _readable(found.plain)
 
-    def placed(problems: Iterator[Problem]) -> tuple[Problem, ...]:
+    def placed(problems: Iterator[YamlProblem]) -> tuple[YamlProblem, ...]:
         kept = (problem for problem in problems if _section(problem) in known)
         return tuple(replace(problem, line=_line(found.lines, problem.where)) for problem in kept)
 
@@ -112,7 +112,7 @@ def examine_config(path: Path) -> ConfigReport:
     return ConfigReport(content, None if wrong else config, wrong, missing)
 
 
-def _section(problem: Problem) -> str:
+def _section(problem: YamlProblem) -> str:
     return re.split(r"[.\[]", problem.where)[0]
 
 
@@ -148,13 +148,13 @@ def _readable(plain: dict[str, Any]) -> tuple[StationConfig, set[str]]:
     return StationConfig(**values), known
 
 
-def _meaning_problems(config: StationConfig) -> Iterator[Problem]:
+def _meaning_problems(config: StationConfig) -> Iterator[YamlProblem]:
     """Finds what types cannot say: ranges, and things that must fit each other."""
     limits, robot, camera = config.limits, config.robot, config.camera
     if robot.model not in MODELS:
-        yield Problem(0, "robot.model", f"'{robot.model}' is not known; one of {', '.join(MODELS)}")
+        yield YamlProblem(0, "robot.model", f"'{robot.model}' is not known; one of {', '.join(MODELS)}")
     if not robot.host:
-        yield Problem(
+        yield YamlProblem(
             0,
             "robot.host",
             "the controller's address is missing",
@@ -164,44 +164,46 @@ def _meaning_problems(config: StationConfig) -> Iterator[Problem]:
     yield from _solid_problems(config)
     if not 0 < limits.speed_m_s <= SPEED_CAP_M_S:
         text = f"{limits.speed_m_s} must be above 0 and at most {SPEED_CAP_M_S}"
-        yield Problem(0, "limits.speed_m_s", text, "Give metres per second.")
+        yield YamlProblem(0, "limits.speed_m_s", text, "Give metres per second.")
     least, most = limits.joints_min_rad, limits.joints_max_rad
     if least and most and any(a > b for a, b in zip(least, most, strict=True)):
-        yield Problem(0, "limits.joints_min_rad", "must not be above joints_max_rad for any joint")
+        yield YamlProblem(0, "limits.joints_min_rad", "must not be above joints_max_rad for any joint")
     low, high = limits.workspace_min_m, limits.workspace_max_m
     if low and high and any(a >= b for a, b in zip(low, high, strict=True)):
-        yield Problem(0, "limits.workspace_min_m", "must be below workspace_max_m in x, y and z")
+        yield YamlProblem(0, "limits.workspace_min_m", "must be below workspace_max_m in x, y and z")
     for place, plane in enumerate(limits.planes):
         if np.linalg.norm(plane.normal) < 1e-6:
             text = f"the normal of '{plane.name}' is zero"
-            yield Problem(0, f"limits.planes[{place}].normal", text, "A table has [0, 0, 1].")
+            yield YamlProblem(0, f"limits.planes[{place}].normal", text, "A table has [0, 0, 1].")
     if camera.trigger == "hardware" and config.trigger is None:
         text = "hardware needs a section 'trigger' with the box's port"
-        yield Problem(0, "camera.trigger", text, "Add `trigger: {port: /dev/ttyACM0}`, or choose software.")
+        yield YamlProblem(
+            0, "camera.trigger", text, "Add `trigger: {port: /dev/ttyACM0}`, or choose software."
+        )
     try:
         check_board(config.board)
     except BoardError as problem:
-        yield Problem(0, "board", problem.text.removeprefix("board: "), problem.remedy)
+        yield YamlProblem(0, "board", problem.text.removeprefix("board: "), problem.remedy)
     else:
         yield from _square_problems(config.board)
     if not 0 < config.working_distance_m <= LARGEST_REACH_M:
         text = f"{config.working_distance_m} is out of reach; lengths are in metres"
-        yield Problem(0, "working_distance_m", text)
+        yield YamlProblem(0, "working_distance_m", text)
     yield from _guess_problems(config)
     yield from _lens_problems(config)
 
 
-def _square_problems(board: BoardSpec) -> Iterator[Problem]:
+def _square_problems(board: BoardSpec) -> Iterator[YamlProblem]:
     if board.square_m > LARGEST_SQUARE_M:
         text = f"{board.square_m:g} m is no board's square; lengths are in metres"
-        yield Problem(
+        yield YamlProblem(
             0, "board.square_m", text, f"Squares of {board.square_m:g} mm are {board.square_m / 1000:g}."
         )
     elif board.square_m < SMALLEST_SQUARE_M:
-        yield Problem(0, "board.square_m", f"{board.square_m:g} m is no board's square", METRES)
+        yield YamlProblem(0, "board.square_m", f"{board.square_m:g} m is no board's square", METRES)
 
 
-def _lens_problems(config: StationConfig) -> Iterator[Problem]:
+def _lens_problems(config: StationConfig) -> Iterator[YamlProblem]:
     """A focal length in millimetres or metres, a centre outside the image."""
     model = config.camera.model
     if model is None or model.matrix is None:
@@ -214,15 +216,15 @@ def _lens_problems(config: StationConfig) -> Iterator[Problem]:
         view = 2 * np.arctan2(size_px / 2, focal_px) if focal_px > 0 else np.pi
         if not _FIELD_OF_VIEW[0] <= view <= _FIELD_OF_VIEW[1]:
             text = f"{name} = {focal_px:g} px would be a field of view of {np.rad2deg(view):.0f}°"
-            yield Problem(0, where, text, _FOCAL_LENGTH)
+            yield YamlProblem(0, where, text, _FOCAL_LENGTH)
             return
     cx, cy = model.matrix[0][2], model.matrix[1][2]
     if not (0 < cx < model.width and 0 < cy < model.height):
         text = f"the centre {cx:g}, {cy:g} lies outside the image of {model.width} × {model.height}"
-        yield Problem(0, where, text, f"Give pixels: about {model.width / 2:g}, {model.height / 2:g}.")
+        yield YamlProblem(0, where, text, f"Give pixels: about {model.width / 2:g}, {model.height / 2:g}.")
 
 
-def _guess_problems(config: StationConfig) -> Iterator[Problem]:
+def _guess_problems(config: StationConfig) -> Iterator[YamlProblem]:
     known = {"camera_guess": config.camera_guess, "board_guess": config.board_guess}
     for name, guess in known.items():
         if guess is None:
@@ -230,21 +232,21 @@ def _guess_problems(config: StationConfig) -> Iterator[Problem]:
         if np.linalg.norm(guess.translation_m) > LARGEST_REACH_M:
             known[name] = None
             text = f"further than {LARGEST_REACH_M} m; lengths are in metres"
-            yield Problem(0, f"{name}.translation_m", text)
+            yield YamlProblem(0, f"{name}.translation_m", text)
         if not 0.9 < float(np.linalg.norm(guess.rotation_xyzw)) < 1.1:
             known[name] = None
             remedy = "`station new` finds it without one."
-            yield Problem(0, f"{name}.rotation_xyzw", "its length must be 1 (x, y, z, w)", remedy)
+            yield YamlProblem(0, f"{name}.rotation_xyzw", "its length must be 1 (x, y, z, w)", remedy)
         if min(guess.sigma_m, guess.sigma_rad) < 0:
             text = "sigma_m and sigma_rad must not be below 0; what hangs on it is thickened by them"
-            yield Problem(0, name, text)
+            yield YamlProblem(0, name, text)
     if known["board_guess"] is not None and (problem := board_turned_away(config)):
         yield problem
     elif known["camera_guess" if config.mount == "eye-to-hand" else "board_guess"] is not None:
         yield from _reach_problems(config)
 
 
-def board_turned_away(config: StationConfig) -> Problem | None:
+def board_turned_away(config: StationConfig) -> YamlProblem | None:
     """The board by its guess shows its printed side to a keep-out plane, or to the flange that holds it."""
     guess = config.board_guess
     if guess is None:
@@ -261,7 +263,7 @@ def board_turned_away(config: StationConfig) -> Problem | None:
     if not turned:
         return None
     x, y, z, w = (float(v) for v in quaternion_from_matrix(Y[:3, :3] @ np.diag([1.0, -1.0, -1.0])))
-    return Problem(
+    return YamlProblem(
         0,
         "board_guess.rotation_xyzw",
         f"the board lies upside down: its printed side faces the {faced}",
@@ -275,7 +277,7 @@ def _behind(plane: Plane, point: Array) -> float:
     return float(normal @ (np.asarray(plane.point_m) - point))
 
 
-def _reach_problems(config: StationConfig) -> Iterator[Problem]:
+def _reach_problems(config: StationConfig) -> Iterator[YamlProblem]:
     """The board, or a camera beside the arm, is further away than the arm can look."""
     in_hand = config.mount == "eye-in-hand"
     name = "board_guess" if in_hand else "camera_guess"
@@ -290,40 +292,40 @@ def _reach_problems(config: StationConfig) -> Iterator[Problem]:
         thing = "board" if in_hand else "camera"
         text = f"the {thing} is {away_m:.2f} m from the {model.name}'s shoulder (limit {limit_m:.2f} m)"
         remedy = f"Bring the {thing} within the arm's reach, or correct the guess."
-        yield Problem(0, f"{name}.translation_m", text, remedy)
+        yield YamlProblem(0, f"{name}.translation_m", text, remedy)
 
 
-def _planning_problems(config: StationConfig) -> Iterator[Problem]:
+def _planning_problems(config: StationConfig) -> Iterator[YamlProblem]:
     """What planning needs and capture by hand does not."""
     model = config.camera.model
     if model is None or model.matrix is None:
-        yield Problem(0, "camera.model", "planning needs a rough lens (width, height, matrix)", _FOCAL_LENGTH)
+        yield YamlProblem(0, "camera.model", "planning needs a rough lens (matrix)", _FOCAL_LENGTH)
     for name, what in (("camera_guess", "where the camera is"), ("board_guess", "where the board is")):
         if getattr(config, name) is None:
-            yield Problem(0, name, f"is missing: planning needs to know {what}", "`station new` finds it.")
+            yield YamlProblem(0, name, f"is missing: planning asks {what}", "`station new` finds it.")
 
 
-def _number_problems(config: StationConfig) -> Iterator[Problem]:
+def _number_problems(config: StationConfig) -> Iterator[YamlProblem]:
     for section, names in _ABOVE_ZERO.items():
         part = getattr(config, section)
         for name in names if part is not None else ():
             if not getattr(part, name) > 0:
-                yield Problem(0, f"{section}.{name}", f"{getattr(part, name)} must be above 0")
+                yield YamlProblem(0, f"{section}.{name}", f"{getattr(part, name)} must be above 0")
     for name in ("retries", "free_space_bytes"):
         if (value := getattr(config.capture, name)) < 0:
-            yield Problem(0, f"capture.{name}", f"{value} must not be below 0")
+            yield YamlProblem(0, f"capture.{name}", f"{value} must not be below 0")
 
 
-def _solid_problems(config: StationConfig) -> Iterator[Problem]:
+def _solid_problems(config: StationConfig) -> Iterator[YamlProblem]:
     """Finds bodies on the flange that are too thin to be bodies to the checks."""
     for place, solid in enumerate(config.limits.solids):
         where = f"limits.solids[{place}]"
         if not solid.radius_m > 0:
-            yield Problem(0, where, f"'{solid.name}': radius_m must be above 0, not {solid.radius_m}")
+            yield YamlProblem(0, where, f"'{solid.name}': radius_m must be above 0, not {solid.radius_m}")
         if np.abs([*solid.from_m, *solid.to_m, solid.radius_m]).max() > LARGEST_REACH_M:
-            yield Problem(0, where, f"'{solid.name}' reaches further than {LARGEST_REACH_M} m", METRES)
+            yield YamlProblem(0, where, f"'{solid.name}' reaches further than {LARGEST_REACH_M} m", METRES)
     pointer = config.pointer
     if pointer is not None and np.linalg.norm(pointer.along) < 1e-6:
-        yield Problem(0, "pointer.along", "its length is zero")
+        yield YamlProblem(0, "pointer.along", "its length is zero")
     if pointer is not None and np.linalg.norm(pointer.tip_m) > LARGEST_REACH_M:
-        yield Problem(0, "pointer.tip_m", f"further than {LARGEST_REACH_M} m; lengths are in metres")
+        yield YamlProblem(0, "pointer.tip_m", f"further than {LARGEST_REACH_M} m; lengths are in metres")

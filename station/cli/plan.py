@@ -15,7 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
-from recordings.errors import printed
+from recordings.plain_text import printed
 from recordings.schema.messages import Vector6
 from station.cell.config import StationConfig
 from station.cell.config_file import load_config

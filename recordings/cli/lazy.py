@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import io
 import os
 import sys
 from collections.abc import Mapping
@@ -13,7 +14,6 @@ import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.main import get_command
 
-from recordings.cli.terminal import examples, print_what_it_can
 from recordings.errors import CodedError, ErrorReport
 from recordings.plain_text import plain_text, printed
 
@@ -136,3 +136,15 @@ def run(name: str, group: LazyGroup) -> None:
         where = problem.filename or "the output"
         print(plain_text(f"{name}: {where}: {problem.strerror or problem}"), file=sys.stderr)
         sys.exit(1)
+
+
+def print_what_it_can() -> None:
+    """Letters that the terminal's encoding lacks (°, σ, ✓ in Latin-1) become question marks, not an error."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="replace")
+
+
+def examples(*commands: str) -> str:
+    """The end of a command's help (`epilog`): commands as a person types them, a remark behind `#`."""
+    return "Examples:\n" + "\n".join(f"- `{command}`" for command in commands)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from recordings.cli.lazy import LazyCommand, LazyGroup
-from recordings.cli.terminal import examples
+from recordings.cli.lazy import LazyCommand, LazyGroup, examples
 
 _APPROVED = {"--go": "--approve"}
 

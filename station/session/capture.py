@@ -13,9 +13,8 @@ import numpy as np
 
 from recordings.images import Pixels
 from recordings.schema.messages import FrameTime, Image, RobotState, Stamps, Stillness, View
-from station.analysis.image_motion import board_box, image_motion
 from station.analysis.pool import WorkerError
-from station.analysis.worker import BoardDetection, CapturedView, sight
+from station.analysis.worker import BoardDetection, CapturedView, board_box, image_motion, sight
 from station.cell.config import matrix4
 from station.cell.errors import CameraError, StaleStateError, StationError
 from station.cell.scene import flange_pose

@@ -9,7 +9,7 @@ import pytest
 
 from calibrate.boards.detect import detect
 from recordings.schema.messages import BoardKind, BoardSpec
-from station.analysis.exposure import assess
+from station.analysis.worker import assess
 from station.cell.config import PAPER_BOARD
 from station.simulation.camera import RenderedCamera
 from tests.codes import raises

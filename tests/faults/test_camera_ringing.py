@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from station.analysis.image_motion import image_motion
+from station.analysis.worker import image_motion
 from station.simulation.camera import RenderedCamera
 from station.simulation.scenes import make_cell
 

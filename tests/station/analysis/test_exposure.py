@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array, transform_points
 from recordings.schema.messages import CameraModel
-from station.analysis.exposure import ExposureAdvice, assess
+from station.analysis.worker import ExposureAdvice, assess
 from station.cell.config import PAPER_BOARD
 from station.simulation.placement import seen_from
 from station.simulation.renderer import Light, render

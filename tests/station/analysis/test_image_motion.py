@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from recordings.reader import open_recording
-from station.analysis.image_motion import board_box, image_motion
+from station.analysis.worker import board_box, image_motion
 from station.cell.config import StillnessConfig
 from station.cell.errors import CameraError
 from station.cell.plan import ExpectedView

@@ -25,10 +25,11 @@ from calibrate.lens.uncertainty import LensUncertainty, lens_uncertainty
 from calibrate.load import FEWEST_VIEWS, LoadedViews, Progress, load_views, without_views
 from calibrate.projection import intrinsics_names
 from calibrate.quality.gates import GateInputs, GateLimits, judge
+from calibrate.quality.sweep import at_time_offset
 from calibrate.stopwatch import Stopwatch
 from calibrate.views import ViewSet
 from recordings.reader import Recording, open_recording
-from recordings.schema.messages import BoardSpec, CameraModel
+from recordings.schema.messages import BoardSpec, CameraModel, TimeCorrection
 
 _WORST_VIEW_PX = 20.0
 
@@ -56,6 +57,8 @@ class JobOptions:
     working_distance_m: float | None = None
     without: tuple[int, ...] = ()
     """Numbers, from 1, of the poses that a person leaves out."""
+    time_offset: TimeCorrection | None = None
+    """Poses are read from the robot states so much later than the frames' times."""
     threads: int | None = None
     """Threads of the board detection; the result does not depend on it."""
 
@@ -134,6 +137,9 @@ def _prepare(path: Path, options: JobOptions, progress: Progress | None, fewest:
     loaded = load_views(recording, board, camera, progress, options.threads, fewest)
     if options.without:
         loaded = without_views(loaded, options.without, fewest)
+    if options.time_offset is not None:
+        moved = at_time_offset(recording, loaded.views, options.time_offset.offset_s)
+        loaded = replace(loaded, views=moved)
     watch.lap("detect")
     views, intrinsics = loaded.views, None
     if views.camera.matrix is None:

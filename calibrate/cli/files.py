@@ -15,7 +15,7 @@ from calibrate.lens.intrinsics import LensModel
 from calibrate.lens.model import distortion
 from calibrate.projection import camera_matrix
 from recordings import strict_yaml
-from recordings.schema.messages import BoardSpec, CameraModel
+from recordings.schema.messages import BoardSpec, CameraModel, TimeCorrection
 
 _LIMIT_BYTES = strict_yaml.LIMIT_BYTES
 T = TypeVar("T")
@@ -50,6 +50,11 @@ def read_camera(path: Path) -> CameraModel:
     camera_matrix(camera)
     distortion(camera)
     return camera
+
+
+def read_time_offset(path: Path) -> TimeCorrection:
+    """Read what `calibrate sweep -o` wrote, or any YAML with `time_offset:` in it."""
+    return _strictly(path, TimeCorrection, "time_offset")
 
 
 def read_lens_sigma(path: Path) -> dict[str, float]:

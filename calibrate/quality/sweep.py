@@ -4,14 +4,16 @@ For any X the flange and the camera (or the board on the flange) turn by equal a
 so the angles of the robot, taken later or earlier until they fit those of the images, give the offset with
 no calibration at hand. The arm must speed up and slow down: at constant speed every offset fits.
 
-Robot states and pictures are placed by the controller's and the camera's own clocks, each tied to the host's
-by its quickest messages: a busy computer delays arrivals, and never advances one. The offset that is found
-therefore holds the exposure, readout and transport of the quickest picture.
+What is tested is the very time that a pose uses: each frame's own, `Image.time`. Robot states are placed by
+the controller's clock, tied to the host's by its quickest messages: a busy computer delays arrivals, never
+advances one. Recordings of earlier versions have no frame times: their pictures are placed by the camera's
+clock, tied likewise, and the offset holds the exposure, readout and transport of the quickest picture.
 """
 
 from __future__ import annotations
 
 import math
+from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
@@ -22,12 +24,12 @@ from scipy.spatial.transform import Rotation, Slerp
 from calibrate.boards.detect import detect
 from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, DegenerateMotionError, TooFewViewsError
-from calibrate.geometry import Array, pose_from_rotvec, rotation_angle
+from calibrate.geometry import Array, inverse, pose_from_rotvec, rotation_angle
 from calibrate.lens.pnp import candidate_poses
-from calibrate.views import BoardView
+from calibrate.views import BoardView, ViewSet
 from recordings.errors import BadImageError
 from recordings.reader import Recording
-from recordings.schema.messages import CameraModel, Image
+from recordings.schema.messages import CameraModel, Image, TimeSource
 
 FEWEST_PICTURES = 12
 LIMIT_S = 0.2
@@ -49,13 +51,22 @@ _MOMENT_S = 0.05
 @dataclass(frozen=True)
 class TimeOffset:
     offset_s: float
-    """A picture stamped t was taken at t + offset on the robot's clock."""
+    """A frame of time t was taken at t + offset on the robot's clock."""
     sigma_s: float
     rms_rad: float
     """Residual of the compared angles."""
     pairs: int
     lost: tuple[str, ...] = ()
     """Pictures that could not be used, each in words"""
+    source: TimeSource | None = None
+    """How most frames' times are known; None in recordings without frame times"""
+    bound_s: float | None = None
+    """Largest 95 % bound of those times"""
+
+    @property
+    def agrees(self) -> bool:
+        """The frame times are right as far as this sweep can tell, at 95 %."""
+        return abs(self.offset_s) <= 1.96 * self.sigma_s
 
 
 def sweep_time_offset(recording: Recording, camera: CameraModel | None = None) -> TimeOffset:
@@ -72,6 +83,7 @@ def sweep_time_offset(recording: Recording, camera: CameraModel | None = None) -
             remedy="Give a calibration of this camera: calibrate sweep --calibration FILE.",
         )
     robot_s, flange = _robot(recording)
+    told = [facts.time for part in recording.segments for facts in part.image_facts() if facts.time]
     lost: list[str] = []
     seen = list(_seen(recording, camera, lost))
     if len(robot_s) < 2 or len(seen) < FEWEST_PICTURES:
@@ -89,12 +101,47 @@ def sweep_time_offset(recording: Recording, camera: CameraModel | None = None) -
             remedy="Capture one: station capture --sweep.",
         )
     found = estimate_time_offset(robot_s, flange, times, poses)
-    return replace(found, sigma_s=math.hypot(found.sigma_s, UNSEEN_DELAY_S), lost=tuple(lost))
+    sources = Counter(time.source for time in told).most_common(1)
+    return replace(
+        found,
+        sigma_s=math.hypot(found.sigma_s, UNSEEN_DELAY_S),
+        lost=tuple(lost),
+        source=sources[0][0] if sources else None,
+        bound_s=max((time.bound_s for time in told), default=None),
+    )
+
+
+def at_time_offset(recording: Recording, views: ViewSet, offset_s: float) -> ViewSet:
+    """Views with the flange poses that the robot states show `offset_s` later.
+
+    A view without a host time keeps its pose: nothing tells when it was taken. Raises BadViewsError for a
+    recording without robot states.
+    """
+    robot_s, tcp = _robot(recording)
+    if len(robot_s) < 2:
+        raise BadViewsError(
+            f"{recording.path} holds no robot states: its poses cannot be moved in time.", code="no-states"
+        )
+    rotations, tool = Slerp(robot_s, Rotation.from_matrix(tcp[:, :3, :3])), recording.info.robot.tcp_offset
+    flange_from_tcp = pose_from_rotvec(tool[:3], tool[3:])
+    taken = {view.index: view.stamps.host_monotonic_ns / 1e9 for view in recording.views()}
+    moved = []
+    for view in views.views:
+        at_s = taken[view.index] + offset_s
+        if taken[view.index] and robot_s[0] <= at_s <= robot_s[-1]:
+            pose = np.eye(4)
+            pose[:3, :3] = rotations(at_s).as_matrix()
+            pose[:3, 3] = [np.interp(at_s, robot_s, axis) for axis in tcp[:, :3, 3].T]
+            view = replace(view, base_from_flange=pose @ inverse(flange_from_tcp))
+        moved.append(view)
+    return replace(views, views=tuple(moved))
 
 
 def _robot(recording: Recording) -> tuple[Array, Array]:
     """Host times (n,) s and base_from_tcp (n, 4, 4): any frame on the flange turns as the flange does."""
     states = list(recording.robot_states())
+    if not states:
+        return np.zeros(0), np.zeros((0, 4, 4))
     arrivals = np.array([s.stamps.host_monotonic_ns for s in states]) / 1e9
     times = on_host(np.array([s.stamps.controller_s for s in states]), arrivals)
     tcp = np.array([s.tcp_pose for s in states]).reshape(-1, 6)
@@ -135,15 +182,17 @@ def on_host(device_s: Array, arrivals_s: Array) -> Array:
 
 
 def _seen(recording: Recording, camera: CameraModel, lost: list[str]) -> Iterator[tuple[float, Array]]:
-    """Time of the start of exposure and camera_from_board of each picture that shows the board.
+    """Time and camera_from_board of each picture that shows the board.
 
     `lost` takes what is said of pictures that cannot be decoded.
     """
     board = recording.info.board
-    stamps = [facts.stamps for part in recording.segments for facts in part.image_facts()]
-    taken_s = on_host(
-        np.array([s.device_ns for s in stamps]) / 1e9, np.array([s.host_monotonic_ns for s in stamps]) / 1e9
-    )
+    facts = [facts for part in recording.segments for facts in part.image_facts()]
+    taken_s = np.array([f.time.host_monotonic_ns if f.time else np.nan for f in facts]) / 1e9
+    if np.isnan(taken_s).any():
+        stamps = [f.stamps for f in facts]
+        arrivals_s = np.array([s.host_monotonic_ns for s in stamps]) / 1e9
+        taken_s = on_host(np.array([s.device_ns for s in stamps]) / 1e9, arrivals_s)
     for picture, time_s in zip(_pictures(recording), taken_s, strict=True):
         if isinstance(picture, BadImageError):
             lost.append(str(picture))

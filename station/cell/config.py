@@ -7,7 +7,15 @@ from typing import Literal
 
 import msgspec
 
-from recordings.schema.messages import BoardKind, BoardSpec, CameraModel, Matrix4, Mount, Vector6
+from recordings.schema.messages import (
+    BoardKind,
+    BoardSpec,
+    CameraModel,
+    Matrix4,
+    Mount,
+    TimeCorrection,
+    Vector6,
+)
 
 Vector3 = tuple[float, float, float]
 
@@ -79,6 +87,8 @@ class CameraConfig(Section, frozen=True):
     """x, y, width, height"""
     packet_size: int | None = None
     """None = negotiated"""
+    time_offset: TimeCorrection | None = None
+    """What a sweep measured (`calibrate sweep -o`): added to the frames' times of the same source."""
     playback_pace: float = 0.0
     """playback: 0 = as fast as asked, 1 = at its own pace."""
     model: CameraModel | None = None

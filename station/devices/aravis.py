@@ -17,7 +17,15 @@ from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices.aravis_device import GenicamDevice
 from station.devices.base import Trigger
-from station.devices.frames import RETAKE, CameraCounts, FrameClock, FrameCounter, FrameTiming, StreamCounts
+from station.devices.frames import (
+    RETAKE,
+    CameraCounts,
+    FrameClock,
+    FrameCounter,
+    FrameTiming,
+    StreamCounts,
+    TriggerPulse,
+)
 
 T = TypeVar("T")
 _CLOCK_READINGS = 8
@@ -40,7 +48,7 @@ class AravisCamera:
         self._device: GenicamDevice | None = None
         self._worker: ThreadPoolExecutor | None = None
         self._busy = asyncio.Lock()
-        self._clock = FrameClock()
+        self._clock = FrameClock(config.time_offset)
         self._newest: Image | None = None
         self.identity = CameraIdentity(driver="aravis")
         self.counter = FrameCounter()
@@ -76,20 +84,22 @@ class AravisCamera:
 
     async def _one(self, timeout_s: float, *, sequenced: bool) -> Image:
         exposure_us, gain_db = await self._run(self._prepare)
-        pulse, asked_ns = None, None if self.free_running else time.monotonic_ns()
+        pulse: TriggerPulse | None = None
+        asked_ns = None if self.free_running else time.monotonic_ns()
         if self._config.trigger == "hardware":
             assert self._trigger is not None
-            pulse = (await self._trigger.fire()).count
+            pulse = await self._trigger.fire()
+        count = None if pulse is None else pulse.count
         try:
             picture = await self._run(partial(self._take, timeout_s))
         except CameraError:
-            self.counter.lost(pulse)
+            self.counter.lost(count)
             raise
-        sequence = self.counter.accept(picture.frame_id, pulse, sequenced=sequenced)
+        sequence = self.counter.accept(picture.frame_id, count, sequenced=sequenced)
         told = msgspec.structs.replace(
-            picture, sequence=sequence, exposure_us=exposure_us, gain_db=gain_db, trigger_count=pulse
+            picture, sequence=sequence, exposure_us=exposure_us, gain_db=gain_db, trigger_count=count
         )
-        return self._clock.timed(told, asked_ns=asked_ns)
+        return self._clock.timed(told, asked_ns=asked_ns, pulse=pulse)
 
     async def preview(self) -> Image | None:
         """A fresh image where the camera is idle and can be triggered by software, else the newest one."""

@@ -6,11 +6,9 @@ import threading
 from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 
-import msgspec
-
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import CameraIdentity, Image, RobotIdentity, RobotState
-from station.devices.frames import CameraCounts, FrameTiming
+from station.devices.frames import CameraCounts, FrameTiming, TriggerPulse
 
 
 class Robot(Protocol):
@@ -119,12 +117,6 @@ class StreamingCamera(Protocol):
 
     async def stream(self, callback: Callable[[Image], None], stop: threading.Event) -> None:
         """Every frame, in order, from a thread of its own, until `stop` is set. Raises CameraError."""
-
-
-class TriggerPulse(msgspec.Struct, frozen=True):
-    count: int
-    device_us: int
-    host_monotonic_ns: int
 
 
 class Trigger(Protocol):

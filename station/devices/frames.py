@@ -6,8 +6,14 @@ import msgspec
 
 from recordings.schema.clocks import ClockFit
 from recordings.schema.frame_ids import LAST_BLOCK_ID, FrameIds, frames_between
-from recordings.schema.frame_time import UNKNOWN_READOUT_S, DeviceClock, by_arrival, by_clock
-from recordings.schema.messages import FrameTime, Image, TimeSource
+from recordings.schema.frame_time import (
+    UNKNOWN_READOUT_S,
+    DeviceClock,
+    by_arrival,
+    by_clock,
+    by_trigger,
+)
+from recordings.schema.messages import FrameTime, Image, TimeCorrection, TimeSource
 from station.cell.errors import CameraError
 
 RETAKE = "Take this pose again."
@@ -157,14 +163,24 @@ class FrameTiming(msgspec.Struct, frozen=True):
     """Frames whose stamp lay before their trigger or after their arrival: it is no start of exposure"""
 
 
+class TriggerPulse(msgspec.Struct, frozen=True):
+    count: int
+    device_us: int
+    host_monotonic_ns: int
+    bound_s: float = 0.0
+    """The pulse began within this of `host_monotonic_ns`"""
+
+
 class FrameClock:
     """Gives a camera's frames their times, from the best source that the frame itself bears out.
 
     For a camera's driver, which feeds it readings of the camera's clock where there is one.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, correction: TimeCorrection | None = None, trigger_delay_us: float = 0.0) -> None:
+        """`correction`: of a sweep, for one source. `trigger_delay_us`: set in the camera."""
         self.readings = DeviceClock()
+        self._correction, self._delay_us = correction, trigger_delay_us
         self._newest: FrameTime | None = None
         self._impossible = 0
         self._opened = False
@@ -184,25 +200,43 @@ class FrameClock:
             return FrameTiming("arrival", UNKNOWN_READOUT_S / 2) if self._opened else None
         return FrameTiming("ptp" if self.readings.synchronized else "latched", fit.bound_s, fit)
 
-    def timed(self, image: Image, *, asked_ns: int | None = None, chunk: bool = False) -> Image:
+    def timed(
+        self,
+        image: Image,
+        *,
+        asked_ns: int | None = None,
+        pulse: TriggerPulse | None = None,
+        chunk: bool = False,
+    ) -> Image:
         """The image with its time and the readings since the one before.
 
-        `asked_ns`: host time just before its trigger; None = it came by itself. `chunk`: stamp and exposure
-        came with the frame.
+        `asked_ns`: host time just before its trigger; None = it came by itself. `pulse`: of the trigger box.
+        `chunk`: stamp and exposure came with the frame.
         """
-        arrived = by_arrival(image.stamps.host_monotonic_ns, image.exposure_us, asked_ns)
-        fit = self.readings.fit
-        self._newest = arrived
+        arrival_ns, fit = image.stamps.host_monotonic_ns, self.readings.fit
+        self._newest = by_arrival(arrival_ns, image.exposure_us, asked_ns)
+        if pulse is not None:
+            fired = pulse.host_monotonic_ns, pulse.bound_s
+            by_box = by_trigger(*fired, self._delay_us, image.exposure_us, arrival_ns)
+            self._newest = self._corrected(by_box, known_bound_s=pulse.bound_s)
         if fit is not None and image.stamps.device_ns:
             source: TimeSource = "chunk" if chunk else "latched"
             if self.readings.synchronized:
                 source = "ptp"
-            told = by_clock(image.stamps.device_ns, image.exposure_us, fit, source)
+            told = self._corrected(by_clock(image.stamps.device_ns, image.exposure_us, fit, source))
             if _possible(told, image, asked_ns):
                 self._newest = told
             else:
                 self._impossible += 1
         return msgspec.structs.replace(image, time=self._newest, clock_readings=self.readings.take_fresh())
+
+    def _corrected(self, told: FrameTime, known_bound_s: float | None = None) -> FrameTime:
+        """`known_bound_s`: what is left of the bound once a sweep has measured the rest."""
+        measured = self._correction
+        if measured is None or measured.source != told.source:
+            return told
+        bound_s = (told.bound_s if known_bound_s is None else known_bound_s) + 2 * measured.sigma_s
+        return FrameTime(told.host_monotonic_ns + round(measured.offset_s * 1e9), bound_s, told.source)
 
 
 def _possible(told: FrameTime, image: Image, asked_ns: int | None) -> bool:

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 
 from station.cell.config import TriggerConfig
 from station.cell.errors import TriggerError
-from station.devices.base import TriggerPulse
+from station.devices.frames import TriggerPulse
 
 T = TypeVar("T")
 ANSWER_TIMEOUT_S = 1.0
@@ -203,10 +203,13 @@ class SerialTrigger:
                     code="pulse-count",
                     remedy="Take this pose again.",
                 ) from None
-            return TriggerPulse(self._count, 0, asked_ns)
+            bound_s = (time.monotonic_ns() - asked_ns) / 2e9
+            return TriggerPulse(self._count, 0, asked_ns + round(bound_s * 1e9), bound_s)
         answered_ns = time.monotonic_ns()
         self._settle_count(boot_id, _number(count))
-        return TriggerPulse(self._count, _number(device_us), (asked_ns + answered_ns) // 2)
+        return TriggerPulse(
+            self._count, _number(device_us), (asked_ns + answered_ns) // 2, (answered_ns - asked_ns) / 2e9
+        )
 
     def _settle_count(self, boot_id: str, count: int) -> None:
         if boot_id != self._boot_id:
@@ -265,6 +268,7 @@ class SerialTrigger:
         try:
             fired_ns = time.monotonic_ns()
             setattr(port, line, True)
+            half_ns = (time.monotonic_ns() - fired_ns) // 2
             time.sleep(self._config.pulse_us / 1e6)
             setattr(port, line, False)
         except (OSError, termios.error) as error:
@@ -273,7 +277,7 @@ class SerialTrigger:
                 f"the adapter on {self._config.port} is gone ({error})", code="trigger-lost"
             ) from error
         self._count += 1
-        return TriggerPulse(self._count, fired_ns // 1000, fired_ns)
+        return TriggerPulse(self._count, fired_ns // 1000, fired_ns + half_ns, half_ns / 1e9)
 
     def _require_port(self) -> Any:
         if self._port is None:

@@ -16,7 +16,7 @@ from recordings.schema.messages import CameraIdentity, ClockReading, Image, Stam
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices.base import Trigger
-from station.devices.frames import RETAKE, CameraCounts, FrameClock, FrameCounter, FrameTiming
+from station.devices.frames import RETAKE, CameraCounts, FrameClock, FrameCounter, FrameTiming, TriggerPulse
 from station.simulation.cell import CellTruth
 from station.simulation.launch import Json
 
@@ -49,7 +49,7 @@ class RenderedCamera:
         self._frames: asyncio.Queue[Image | CameraError] = asyncio.Queue()
         self._answers: asyncio.Queue[Image | Json | CameraError] = asyncio.Queue()
         self._asking = asyncio.Lock()
-        self._clock = FrameClock()
+        self._clock = FrameClock(None if config is None else config.time_offset)
         self.counter = FrameCounter(FrameIds.BLOCK)
 
     @property
@@ -108,23 +108,25 @@ class RenderedCamera:
             await self._read_clock()
             if not self._frames.empty():
                 raise self.counter.surplus(self._drain())
-            pulse, asked_ns = None, time.monotonic_ns()
+            pulse: TriggerPulse | None = None
+            asked_ns = time.monotonic_ns()
             if self._trigger is None:
                 self._write({"cmd": "trigger"})
             else:
-                pulse = (await self._trigger.fire()).count
+                pulse = await self._trigger.fire()
             try:
                 frame = await asyncio.wait_for(self._frames.get(), timeout_s)
             except TimeoutError:
-                self.counter.lost(pulse)
+                self.counter.lost(None if pulse is None else pulse.count)
                 text = f"the camera sent no image within {timeout_s:g} s of its trigger"
                 raise CameraError(text, code="no-image", remedy=RETAKE, limit_s=timeout_s) from None
             if isinstance(frame, CameraError):
                 raise frame
-            sequence = self.counter.accept(frame.frame_id, pulse)
+            count = None if pulse is None else pulse.count
+            sequence = self.counter.accept(frame.frame_id, count)
             self._check_settings(frame)
-            told = msgspec.structs.replace(frame, sequence=sequence, trigger_count=pulse)
-            return self._clock.timed(told, asked_ns=asked_ns)
+            told = msgspec.structs.replace(frame, sequence=sequence, trigger_count=count)
+            return self._clock.timed(told, asked_ns=asked_ns, pulse=pulse)
 
     async def settings(self) -> dict[str, object]:
         return {

@@ -10,15 +10,18 @@ import numpy as np
 import pytest
 
 import recordings
+from calibrate.cli.files import read_time_offset
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import Array, inverse, rotation_log
 from calibrate.kinematics import MODELS, forward
-from calibrate.quality.sweep import on_host, sweep_time_offset
+from calibrate.quality.sweep import at_time_offset, on_host, sweep_time_offset
+from calibrate.views import BoardView, ViewSet
+from recordings import strict_yaml
 from recordings.images import encode_png
 from recordings.reader import open_recording
-from recordings.schema.messages import CameraModel, Image, RobotState, SessionInfo, Stamps
+from recordings.schema.messages import CameraModel, FrameTime, Image, RobotState, SessionInfo, Stamps, View
 from recordings.writer import RecordingWriter
-from station.cell.config import PAPER_BOARD
+from station.cell.config import PAPER_BOARD, CameraConfig, matrix4
 from station.simulation.renderer import Light, render, scaled
 from station.simulation.scenes import make_cell
 from tests.calibrate.calling import raises_code, run
@@ -35,8 +38,14 @@ def joints(t: Array) -> Array:
     return np.asarray(CELL.start_joints_rad) + wave + 0.01 * np.sin(3.1 * t[:, None])
 
 
-def record(path: Path, pictures: int, lens: CameraModel = LENS, broken: int | None = None) -> Path:
-    """`broken`: the picture that is a PNG cut short."""
+def record(
+    path: Path,
+    pictures: int,
+    lens: CameraModel = LENS,
+    broken: int | None = None,
+    time_error_s: float | None = None,
+) -> Path:
+    """`broken`: the picture that is a PNG cut short. `time_error_s`: of the frame times; None = no times."""
     info = SessionInfo("sweep", "eye-in-hand", "simulated", PAPER_BOARD, lens)
     rng = np.random.default_rng(4)
     model = MODELS[CELL.robot_model]
@@ -56,7 +65,10 @@ def record(path: Path, pictures: int, lens: CameraModel = LENS, broken: int | No
                 start_ns + round((t + LATENCY_S) * 1e9), 10**18, device_ns=DEVICE_EPOCH_NS + round(t * 1e9)
             )
             cut = encode_png(image)[:-2000] if k == broken else None
-            writer.image(Image(image, stamps, k + 1, k), cut)
+            told = None
+            if time_error_s is not None:
+                told = FrameTime(start_ns + round((t + time_error_s) * 1e9), 0.001, "latched")
+            writer.image(Image(image, stamps, k + 1, k, time=told), cut)
         return writer.finish()
 
 
@@ -64,6 +76,36 @@ def test_the_latency_of_the_camera_is_found(tmp_path: Path) -> None:
     found = sweep_time_offset(open_recording(record(tmp_path / "sweep.mcap", 60)))
     assert found.offset_s == pytest.approx(-LATENCY_S, abs=max(4 * found.sigma_s, 1e-4))
     assert found.sigma_s < 0.005 and found.pairs > 50
+
+
+@pytest.mark.parametrize("error_s", [0.0, -0.005])
+def test_it_tests_the_very_time_of_the_frames(tmp_path: Path, error_s: float) -> None:
+    """0 within its sigma where the times are right; arrivals and the camera's own stamps play no part."""
+    found = sweep_time_offset(open_recording(record(tmp_path / "sweep.mcap", 60, time_error_s=error_s)))
+    assert found.offset_s == pytest.approx(-error_s, abs=3 * found.sigma_s) and found.sigma_s < 0.0005
+    assert (found.source, found.bound_s, found.agrees) == ("latched", 0.001, error_s == 0)
+
+
+def test_what_it_measured_goes_into_the_configuration_and_into_a_solve(tmp_path: Path) -> None:
+    recording = record(tmp_path / "sweep.mcap", 40, time_error_s=0.02)
+    done = run("sweep", recording, "-o", "offset.yaml", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    told = read_time_offset(tmp_path / "offset.yaml")
+    assert told.offset_s == pytest.approx(-0.02, abs=4 * told.sigma_s)
+    assert (told.source, told.recording_sha256) == ("latched", open_recording(recording).sha256)
+    assert strict_yaml.load((tmp_path / "offset.yaml").read_bytes(), CameraConfig).time_offset == told
+
+
+def test_views_are_moved_to_where_the_arm_was_then(tmp_path: Path) -> None:
+    path = record(tmp_path / "sweep.mcap", 3, time_error_s=0.0)
+    recording = open_recording(path)
+    model = MODELS[CELL.robot_model]
+    stamps = Stamps(10**12 + 700_000_000)
+    view = View(0, "a", 0, matrix4(np.eye(4)), stamps=stamps)
+    recording.views = lambda: [view]  # type: ignore[method-assign]
+    views = ViewSet("eye-in-hand", (BoardView(0, "a", np.eye(4), np.zeros((4, 3)), np.zeros((4, 2))),), LENS)
+    (moved,) = at_time_offset(recording, views, 0.05)
+    assert np.allclose(moved.base_from_flange, forward(model, joints(np.array([0.75])))[0], atol=1e-5)
 
 
 def test_a_sweep_needs_a_lens_and_pictures(tmp_path: Path) -> None:

@@ -17,7 +17,7 @@ from recordings.schema.frame_ids import frames_between
 from recordings.schema.messages import Image
 from station.cell.config import CameraConfig
 from station.devices.aravis import AravisCamera
-from station.devices.base import TriggerPulse
+from station.devices.frames import TriggerPulse
 from station.devices.pixels import decode, encode
 from station.simulation import genicam
 from station.simulation.gige import numbered_picture

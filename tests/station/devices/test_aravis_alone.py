@@ -15,7 +15,7 @@ from station.cell.errors import CameraError
 from station.devices import aravis_device
 from station.devices.aravis import AravisCamera
 from station.devices.aravis_device import GenicamDevice, apply_settings, require_settings
-from station.devices.base import TriggerPulse
+from station.devices.frames import TriggerPulse
 from tests.codes import raises
 
 REGION = (0, 0, 1280, 1024)

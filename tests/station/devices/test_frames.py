@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import msgspec
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from recordings.schema.clocks import UNFITTED_DRIFT
 from recordings.schema.frame_ids import LAST_BLOCK_ID, FrameIds
 from recordings.schema.frame_time import DeviceClock, by_arrival, by_clock
-from recordings.schema.messages import ClockReading, FrameTime, Image, Stamps
-from station.devices.frames import FrameClock, FrameCounter, FrameTiming
+from recordings.schema.messages import ClockReading, FrameTime, Image, Stamps, TimeCorrection
+from station.devices.frames import FrameClock, FrameCounter, FrameTiming, TriggerPulse
+from tests.codes import raises
 
 MS = 1_000_000
 
@@ -67,6 +71,28 @@ def test_a_frame_is_placed_by_the_best_source_that_it_bears_out() -> None:
     assert clock.timing is not None and clock.timing.impossible == 2
     no_stamp = clock.timed(frame(0, 501_040))
     assert no_stamp.time is not None and no_stamp.time.source == "arrival"
+
+
+def test_a_sweep_corrects_the_source_that_it_measured_and_no_other() -> None:
+    measured = TimeCorrection(offset_s=-0.002, sigma_s=0.0001, source="latched")
+    clock, other = FrameClock(measured), FrameClock(msgspec.structs.replace(measured, source="chunk"))
+    for each in (clock, other):
+        read(each.readings, 0.9, 500.9, 0.0001)
+    plain = other.timed(frame(1000, 501_040)).time
+    assert plain == FrameTime(501_010 * MS, pytest.approx(0.00011), "latched")
+    assert clock.timed(frame(1000, 501_040)).time == FrameTime(
+        501_008 * MS, pytest.approx(0.00031), "latched"
+    )
+
+
+def test_without_a_clock_the_pulse_of_the_trigger_box_tells_and_a_sweep_narrows_it() -> None:
+    """The box fired at 501.000 s ± 1 ms, the camera waits 2 ms, exposes 20 ms and reads out for 13 ms."""
+    pulse = TriggerPulse(1, 0, 501_000 * MS, 0.001)
+    rough = FrameClock(trigger_delay_us=2000.0).timed(frame(0, 501_035), asked_ns=500_999 * MS, pulse=pulse)
+    assert rough.time == FrameTime(501_012 * MS, pytest.approx(0.014), "trigger"), "it may wait 13 ms more"
+    measured = TimeCorrection(0.0004, 0.0001, "trigger")
+    known = FrameClock(measured, 2000.0).timed(frame(0, 501_035), asked_ns=500_999 * MS, pulse=pulse)
+    assert known.time == FrameTime(501_012 * MS + 400_000, pytest.approx(0.0012), "trigger")
 
 
 WALL_NS = 1_750_000_000_000_000_000
@@ -130,6 +156,34 @@ def test_gaps_of_a_free_running_camera_are_counted_across_the_end_of_its_numbers
     assert numbers == [0, 1, 2, 3]
     assert counter.missing == 2 + 1
     assert counter.counts().frames == 4
+
+
+@given(
+    st.sampled_from([(FrameIds.BLOCK, 1, 65_535), (FrameIds.WIDE, 0, 1 << 64), (FrameIds.WIDE, 0, 1 << 16)]),
+    st.integers(0, 1 << 33),
+    st.lists(st.integers(0, 30_000), max_size=60),
+)
+def test_every_loss_is_counted_and_no_other(
+    numbering: tuple[FrameIds, int, int], start: int, gaps: list[int]
+) -> None:
+    """Ids of 16 bits from 1 and from 0, and of 64 bits: whatever the start, wraps cost nothing."""
+    ids, first, size = numbering
+    counter, count = FrameCounter(ids), start
+    counter.follow(first + start % size)
+    for gap in gaps:
+        count += 1 + gap
+        counter.follow(first + count % size)
+    assert (counter.missing, counter.unexpected) == (sum(gaps), 0)
+
+
+def test_extended_ids_are_noticed_and_missing_ones_cost_nothing() -> None:
+    extended = FrameCounter(FrameIds.BLOCK)
+    assert [extended.accept(n) for n in (65_534, 65_535, 65_536, 65_537)] == [0, 1, 2, 3]
+    for silent in (None, 0):
+        counter = FrameCounter()
+        assert [counter.accept(silent) for _ in range(3)] == [0, 1, 2]
+    with raises("frame-ids-restarted"):
+        extended.accept(3)
 
 
 def test_after_a_loss_any_number_may_be_the_next_and_the_pulses_go_on_from_there() -> None:

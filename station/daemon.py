@@ -1,4 +1,4 @@
-"""`station serve`: one process that owns the cell: session, control socket, systemd, signals."""
+"""`station serve`: one process that makes and owns the cell: session, control socket, systemd, signals."""
 
 from __future__ import annotations
 
@@ -13,8 +13,11 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from station.cell.errors import RobotError
+from recordings.schema.messages import Source
+from station.cell.config import StationConfig
+from station.cell.errors import ConfigError, RobotError
 from station.cell.status import StationState
+from station.devices.base import Camera, Trigger
 from station.devices.cell import Cell
 from station.server.control import ControlServer
 from station.server.dispatch import SessionDispatcher
@@ -150,3 +153,40 @@ class Daemon:
         if text != self._said:
             self._said = text
             notify(f"STATUS={text}")
+
+
+def configured_cell(config: StationConfig, text: bytes, log_dir: Path) -> Cell:
+    """Nothing is connected yet. ConfigError for devices that must not be combined."""
+    from station.devices.ur import UrRobot
+
+    trigger = _trigger(config)
+    camera, source = _camera(config, trigger)
+    return Cell(
+        config=config,
+        robot=UrRobot(config.robot, log_dir),
+        camera=camera,
+        source=source,
+        trigger=trigger,
+        config_text=text,
+    )
+
+
+def _camera(config: StationConfig, trigger: Trigger | None) -> tuple[Camera, Source]:
+    if config.camera.driver == "aravis":
+        from station.devices.aravis import AravisCamera
+
+        return AravisCamera(config.camera, trigger), "real"
+    # A recorded or rendered image beside an arm that really moves would be a wrong calibration.
+    raise ConfigError(
+        f"camera.driver '{config.camera.driver}' shows no real image and never runs beside a real arm",
+        code="unreal-camera",
+        remedy="Use 'aravis', or `station serve --simulate`.",
+    )
+
+
+def _trigger(config: StationConfig) -> Trigger | None:
+    if config.trigger is None:
+        return None
+    from station.devices.serial_trigger import SerialTrigger
+
+    return SerialTrigger(config.trigger)

@@ -101,7 +101,7 @@ def serve_command(
 
 def _real_cell(config: Path, root: Path) -> Cell:
     from station.cell.config_file import load_config
-    from station.devices.cell import configured_cell
+    from station.daemon import configured_cell
 
     loaded, text = load_config(config)
     return replace(configured_cell(loaded, text, root), config_path=str(config.absolute()))

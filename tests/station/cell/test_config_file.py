@@ -12,7 +12,7 @@ from recordings.schema.messages import Mount
 from station.cell.config_file import ConfigReport, examine_config, load_config
 from station.cell.errors import ConfigError
 from station.cli import main
-from station.devices.cell import configured_cell
+from station.daemon import configured_cell
 from station.simulation.scenes import cell_config, make_cell
 from tests.codes import raises
 from tests.command_line import call

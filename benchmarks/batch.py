@@ -11,7 +11,8 @@ from pathlib import Path
 
 from benchmarks.offline import make_recording
 from benchmarks.trials import trials
-from calibrate.batch.run import BatchResult, Progress, Solved, Solver, Task, run_batch, solve_one
+from calibrate.batch import BatchResult
+from calibrate.batch.run import Progress, Solved, Solver, Task, run_batch, solve_one
 from calibrate.bounds import Limits
 from calibrate.pipeline import JobOptions
 

@@ -12,7 +12,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from calibrate.batch.run import BatchError, BatchResult, Solved, Solver, Task, solve_one
+from calibrate.batch import BatchResult
+from calibrate.batch.run import BatchError, Solved, Solver, Task, solve_one
 from calibrate.bounds import Limits
 from calibrate.document import software_versions
 from calibrate.pipeline import JobOptions

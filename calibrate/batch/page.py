@@ -9,7 +9,7 @@ import matplotlib
 import numpy as np
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
-from calibrate.batch.run import BatchResult
+from calibrate.batch import BatchResult
 from calibrate.batch.trends import HEAD, NOT_FOLLOWED, CellHistory, place, quiet_text, rows
 from calibrate.geometry import difference
 from calibrate.report import html

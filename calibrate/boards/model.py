@@ -201,3 +201,10 @@ def describe_board(spec: BoardSpec) -> str:
     elif spec.kind is BoardKind.APRIL_GRID:
         text += f", gap {(spec.marker_m or 0) * 1000:g} mm"
     return text
+
+
+def outer_corners(board: BoardSpec) -> tuple[int, ...]:
+    """The four points nearest to the board's own corners: rows of `board_points`."""
+    points = board_points(board)[:, :2]
+    scores = points @ np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]).T
+    return tuple(dict.fromkeys(int(row) for row in scores.argmin(axis=0)))

@@ -9,8 +9,9 @@ from typing import Annotated
 import msgspec
 import typer
 
+from calibrate.batch import BatchResult
 from calibrate.batch.cluster import Cluster, cluster_solver
-from calibrate.batch.run import BatchResult, Solver, run_batch
+from calibrate.batch.run import Solver, run_batch
 from calibrate.batch.trends import CellHistory, cells, trends_text
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
 from calibrate.cli.job import GatesFile, MemoryLimit, Profile, ProfileName, Seed, TimeLimit

@@ -31,6 +31,12 @@ from recordings.schema.messages import (
     Source,
 )
 
+_STAMPS = {
+    "simulated": "SIMULATED: made without a robot or a camera",
+    "playback": "PLAYBACK: the pictures were played back",
+    "imported": "IMPORTED: pictures and poses of unknown origin",
+}
+
 FORMAT: Literal["handeye-calibration/1"] = "handeye-calibration/1"
 _LIMIT_BYTES = 4 * 1024 * 1024
 Vector3 = tuple[float, float, float]
@@ -419,3 +425,8 @@ def write_output(path: Path, content: bytes) -> None:
         write_atomically(path, content, ASKED_FOR)
     except OSError as problem:
         raise CalibrationFileError(f"{path} cannot be written: {problem.strerror or problem}.") from None
+
+
+def source_stamp(calibration: Calibration) -> str:
+    """Stamp for everything that shows a calibration of no real cell; else empty."""
+    return _STAMPS.get(calibration.source, "")

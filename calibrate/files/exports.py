@@ -19,8 +19,7 @@ import numpy as np
 import yaml
 
 from calibrate.errors import CalibrationError
-from calibrate.files.calibration import Calibration
-from calibrate.files.formatting import source_stamp
+from calibrate.files.calibration import Calibration, source_stamp
 from calibrate.geometry import Array, inverse, pose, rotation_log
 from calibrate.lens.model import distortion
 from calibrate.projection import camera_matrix

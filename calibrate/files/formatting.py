@@ -12,24 +12,13 @@ from rich.text import Text
 from scipy.spatial.transform import Rotation
 
 from calibrate.boards.model import describe_board
-from calibrate.files.calibration import Calibration, Override
+from calibrate.files.calibration import Calibration, Override, source_stamp
 from calibrate.files.verification import agrees, touch_text
 from calibrate.geometry import difference
 from calibrate.results import BoardShape
 
 if TYPE_CHECKING:
     from calibrate.results import PeerResult
-
-_STAMPS = {
-    "simulated": "SIMULATED: made without a robot or a camera",
-    "playback": "PLAYBACK: the pictures were played back",
-    "imported": "IMPORTED: pictures and poses of unknown origin",
-}
-
-
-def source_stamp(calibration: Calibration) -> str:
-    """Stamp for everything that shows a calibration of no real cell; else empty."""
-    return _STAMPS.get(calibration.source, "")
 
 
 def verdict_text(calibration: Calibration) -> str:

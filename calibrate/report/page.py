@@ -13,15 +13,8 @@ import numpy as np
 
 from calibrate.boards.corners import to_grey
 from calibrate.boards.model import describe_board
-from calibrate.files.calibration import Touch, write_output
-from calibrate.files.formatting import (
-    PEER_HEAD,
-    cell_sentences,
-    peer_cells,
-    pose_text,
-    source_stamp,
-    verdict_text,
-)
+from calibrate.files.calibration import Touch, source_stamp, write_output
+from calibrate.files.formatting import PEER_HEAD, cell_sentences, peer_cells, pose_text, verdict_text
 from calibrate.files.verification import agrees, touch_text
 from calibrate.geometry import Array, difference
 from calibrate.handeye.corners import bent_points

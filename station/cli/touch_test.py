@@ -11,6 +11,7 @@ from typing import Annotated
 import typer
 from rich.text import Text
 
+from calibrate.boards.model import outer_corners
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Touch, read_calibration
 from calibrate.files.install import load_installed
@@ -28,7 +29,6 @@ from station.operate.touch_test import (
     touch_test,
     touch_told,
 )
-from station.plan.hover import outer_corners
 
 
 def touch_test_command(

@@ -12,6 +12,7 @@ from typing import Literal, Protocol
 
 import numpy as np
 
+from calibrate.boards.model import outer_corners
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Touch
 from calibrate.files.install import load_installed
@@ -22,7 +23,6 @@ from recordings.schema.messages import BoardSpec, Matrix4
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import HoverOffer, MotionPreview, StationState, StationStatus
 from station.operate.motion import Link, approved_motion
-from station.plan.hover import outer_corners
 from station.protocol.client import DaemonGoneError
 from station.protocol.verbs import Hover
 

@@ -13,13 +13,13 @@ from dataclasses import dataclass, replace
 import msgspec
 import numpy as np
 
-from calibrate.boards.model import board_points
+from calibrate.boards.model import board_points, outer_corners
 from calibrate.files.calibration import Calibration
 from calibrate.geometry import Array, difference, pose, rotation_exp, transform_points
 from calibrate.kinematics import RobotModel, forward, inverse_all, jacobian
 from calibrate.quality.board_now import found_points, locate_board, offset_covariance
 from calibrate.views import BoardView
-from recordings.schema.messages import BoardSpec, Vector6
+from recordings.schema.messages import Vector6
 from station.cell.collision import CellGeometry, margins, plate
 from station.cell.config import Capsule, PointerConfig, StationConfig, matrix4, vector3, vector6
 from station.cell.errors import LimitError
@@ -62,13 +62,6 @@ class HoverPath:
 def least_standoff_m(doubt_m: float) -> float:
     """Smallest standoff of the tip; `doubt_m`: how far board and tip may be off, all told."""
     return CLEARANCE_M + _PLATE_M + _CHECKED_M + doubt_m
-
-
-def outer_corners(board: BoardSpec) -> tuple[int, ...]:
-    """The four points nearest to the board's own corners: rows of `board_points`."""
-    points = board_points(board)[:, :2]
-    scores = points @ np.array([[1.0, 1.0], [-1.0, 1.0], [-1.0, -1.0], [1.0, -1.0]]).T
-    return tuple(dict.fromkeys(int(row) for row in scores.argmin(axis=0)))
 
 
 def hover_target(

@@ -16,14 +16,13 @@ from textual.screen import ModalScreen
 from textual.widgets import Input, Label, OptionList, Static
 from textual.widgets.option_list import Option
 
-from calibrate.boards.model import board_points
+from calibrate.boards.model import board_points, outer_corners
 from calibrate.files.calibration import Touch, read_calibration
 from calibrate.files.verification import touch_text
 from recordings.schema.messages import BoardSpec
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import HoverOffer, MotionPreview
 from station.operate.touch_test import Hovering, note_touches, touch_test, touch_told
-from station.plan.hover import outer_corners
 from station.tui.desk import Desk, told
 from station.tui.installed import state_root
 

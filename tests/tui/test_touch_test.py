@@ -10,13 +10,13 @@ import pytest
 from textual.pilot import Pilot
 from textual.widgets import Input, OptionList, Static
 
+from calibrate.boards.model import outer_corners
 from calibrate.files.calibration import read_calibration, write_calibration
 from calibrate.files.install import install, load_installed
 from calibrate.geometry import inverse
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.cell.errors import RefusedError
 from station.cell.status import HoverOffer, RobotStatus, StationState, StationStatus
-from station.plan.hover import outer_corners
 from station.protocol import verbs
 from station.tui.dialogs import ConfirmMotion
 from station.tui.touch_test import ChooseCorner, Touching

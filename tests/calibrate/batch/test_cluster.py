@@ -15,8 +15,9 @@ from pathlib import Path
 
 import pytest
 
+from calibrate.batch import BatchResult
 from calibrate.batch.cluster import Cluster, ClusterError, cluster_solver
-from calibrate.batch.run import BatchError, BatchResult, Solved, Task, read_results, run_batch
+from calibrate.batch.run import BatchError, Solved, Task, read_results, run_batch
 from calibrate.pipeline import JobOptions
 from tests.calibrate.batch.test_run import in_this_process
 from tests.calibrate.calling import raises_code

@@ -11,7 +11,8 @@ from pathlib import Path
 import pytest
 
 from benchmarks.batch import worker_pids
-from calibrate.batch.run import BatchResult, Solved, Task, batch_key, read_results, run_batch, solve_one
+from calibrate.batch import BatchResult
+from calibrate.batch.run import Solved, Task, batch_key, read_results, run_batch, solve_one
 from calibrate.bounds import Limits
 from calibrate.pipeline import JobOptions
 

@@ -8,7 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
-from calibrate.boards.model import board_points
+from calibrate.boards.model import board_points, outer_corners
 from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp, transform_points
 from calibrate.kinematics import MODELS, forward
 from calibrate.quality.board_now import locate_board, offset_covariance
@@ -22,7 +22,6 @@ from station.plan.hover import (
     HoverQuestion,
     answer_hover,
     least_standoff_m,
-    outer_corners,
     plan_hover,
 )
 from station.simulation.cell import CellTruth

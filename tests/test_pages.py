@@ -5,9 +5,12 @@ from __future__ import annotations
 import re
 import subprocess
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import pytest
+
+from tests.command_line import call
 
 ROOT = Path(__file__).parents[1]
 
@@ -33,8 +36,6 @@ def test_a_manual_page_names_every_command(program: str) -> None:
     done = subprocess.run(
         [sys.executable, ROOT / "docs" / "man.py", program], capture_output=True, text=True, check=True
     )
-    asked = subprocess.run(
-        [sys.executable, "-m", f"{program}.cli", "--help"], capture_output=True, text=True, check=True
-    )
+    asked = call(import_module(f"{program}.cli").main, "--help")
     commands = re.findall(r"^\.SS \w+ ([\w-]+)$", done.stdout, re.MULTILINE)
     assert len(commands) > 3 and all(command in asked.stdout for command in commands)

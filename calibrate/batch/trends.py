@@ -8,7 +8,7 @@ from datetime import UTC, datetime
 from itertools import pairwise, zip_longest
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from calibrate.batch import BatchResult
 from calibrate.geometry import Array, difference, matrix_from_quaternion, pose
@@ -158,6 +158,6 @@ def _move(earlier: BatchResult, later: BatchResult) -> Move:
     covariance = np.array(earlier.covariance) + np.array(later.covariance)
     square = max(0.0, float(delta @ np.linalg.pinv(covariance, hermitian=True) @ delta))
     freedom = max(3 * min(earlier.views, later.views) - 6, 3)
-    limit = float(6 * stats.f.ppf(1 - _FALSE_ALARM, 6, freedom))
+    limit = float(6 * special.fdtri(6, freedom, 1 - _FALSE_ALARM))
     distance_mm, angle_deg = np.linalg.norm(delta[:3]) * 1e3, np.degrees(np.linalg.norm(delta[3:]))
     return Move(earlier, later, float(distance_mm), float(angle_deg), float(np.sqrt(square)), square > limit)

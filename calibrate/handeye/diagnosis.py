@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array, difference, skew
@@ -41,11 +41,12 @@ def _judge(fit: CellFit, places: Array, miss: Array, sigma: Array, distance_m: f
     values, vectors = np.linalg.eigh((left + left.T) / 2)
     told = values > 1e-3
     square = float(((vectors.T @ (miss * root))[told] ** 2 / values[told]).sum())
-    log_chance = float(stats.chi2.logsf(square, max(int(told.sum()), 1)))
+    with np.errstate(divide="ignore"):
+        log_chance = float(np.log(special.chdtrc(max(int(told.sum()), 1), square)))
     if log_chance < -600:
         sigmas = float(np.sqrt(-2 * log_chance))
     else:
-        sigmas = float(stats.norm.isf(np.exp(log_chance) / 2))
+        sigmas = -float(special.ndtri(np.exp(log_chance) / 2))
     precision = np.zeros(len(covariance))
     precision[places] = (1 - _LOOSER) * sigma**-2.0
     step = np.zeros(len(covariance))
@@ -127,7 +128,7 @@ def _explain(fit: CellFit, implied: Array, place: int, places: Places) -> Reject
 
 
 def _chance(residual: Array, covariance: Array) -> float:
-    return float(stats.chi2.sf(residual @ np.linalg.solve(covariance, residual), len(residual)))
+    return float(special.chdtrc(len(residual), residual @ np.linalg.solve(covariance, residual)))
 
 
 FOLDS = 5
@@ -157,7 +158,7 @@ def cross_validate(fit: CellFit, seed: int) -> CrossValidation | None:
     distance = np.linalg.norm(missed[:, :3], axis=1)
     expected = np.trace(claimed[:, :3, :3], axis1=1, axis2=2)
     freedom = 3 * len(full)
-    limit = float(np.sqrt(stats.f.isf(_CALLED_TOO_SMALL, freedom, max(freedom - 6, 1))))
+    limit = float(np.sqrt(special.fdtri(freedom, max(freedom - 6, 1), 1 - _CALLED_TOO_SMALL)))
     return CrossValidation(
         float(np.sqrt((distance**2).mean())),
         float(np.sqrt((missed[:, 3:] ** 2).sum(axis=1).mean())),

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy import stats
+from scipy import special
 
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array
@@ -64,7 +64,7 @@ class Estimate:
     def threshold(self) -> float:
         """95 % region δᵀ C⁻¹ δ: 6·F(6, ν), ν = 3n - 6 of the n views that count."""
         freedom = 3.0 * float(self.chances[:, 0].sum()) - 6.0 + ROBOT_PRIOR_COUNT
-        return float(6 * stats.f.ppf(0.95, 6, max(freedom, 1.0)))
+        return float(6 * special.fdtri(6, max(freedom, 1.0), 0.95))
 
 
 def estimate(

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from calibrate.errors import BadViewsError, TooFewViewsError
 from calibrate.geometry import Array, Transform, is_rigid
@@ -128,7 +128,7 @@ def solve_paper_profile(views: ViewSet, options: SolveOptions) -> Solution:
         profile="paper",
         parent_from_child=Transform(*camera_frames(views.mount), X),
         covariance=covariance,
-        confidence_threshold=float(6 * stats.f.ppf(0.95, 6, max(6 * len(fit) - 6, 1))),
+        confidence_threshold=float(6 * special.fdtri(6, max(6 * len(fit) - 6, 1), 0.95)),
         board_place=Transform(*board_frames(views.mount), mean_pose(placed_boards(H, C, X))),
         camera=views.camera,
         rms_px=None,

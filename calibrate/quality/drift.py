@@ -12,7 +12,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, TooFewViewsError
@@ -156,7 +156,7 @@ def judge_shift(views: ViewSet, installed: Array, covariance: Array, noise: Nois
     total = fitted + covariance
     statistic = float(shift @ np.linalg.solve(total, shift))
     nu = noise.degrees_of_freedom
-    threshold = float(6 * stats.f.ppf(1 - FALSE_ALARM, 6, nu))
+    threshold = float(6 * special.fdtri(6, nu, 1 - FALSE_ALARM))
     power_translation, power_rotation = powers(total, nu)
     enough = min(power_translation, power_rotation) >= POWER
     return DriftCheck(
@@ -165,7 +165,7 @@ def judge_shift(views: ViewSet, installed: Array, covariance: Array, noise: Nois
         covariance=total,
         statistic=statistic,
         threshold=threshold,
-        p_value=float(stats.f.sf(statistic / 6, 6, nu)),
+        p_value=float(special.fdtrc(6, nu, statistic / 6)),
         power_translation=power_translation,
         power_rotation=power_rotation,
         views_needed=len(views) if enough else _views_needed(fitted, covariance, len(views), nu),
@@ -194,13 +194,13 @@ def powers(covariance: Array, nu: float) -> tuple[float, float]:
     After a true shift d, δᵀ S⁻¹ δ / 6 follows the non-central F(6, nu) of noncentrality dᵀ S⁻¹ d.
     """
     weight: Any = np.linalg.inv(covariance)
-    threshold = stats.f.ppf(1 - FALSE_ALARM, 6, nu)
+    threshold = special.fdtri(6, nu, 1 - FALSE_ALARM)
 
     def power(block: Array, size: float) -> float:
         noncentrality = size**2 * float(np.linalg.eigvalsh(block)[0])
         if noncentrality < 1e-6:  # where SciPy's ncf is not to be trusted
             return FALSE_ALARM
-        return float(stats.ncf.sf(threshold, 6, nu, noncentrality))
+        return 1 - float(special.ncfdtr(6, nu, noncentrality, threshold))
 
     return power(weight[:3, :3], SHIFT_M), power(weight[3:, 3:], TURN_RAD)
 

@@ -39,10 +39,9 @@ def test_the_camera_is_found_with_an_unknown_lens(solved: SolvedRecording) -> No
     assert solved.calibration.source == "simulated"
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
-def test_a_symmetric_board_solves_by_the_robots_motion(tmp_path: Path, mount: str) -> None:
+def test_a_symmetric_board_solves_by_the_robots_motion(tmp_path: Path) -> None:
     """Every picture is read one of two ways; a single wrong one would miss by half a turn."""
-    scene = Scene(board=SYMMETRIC_BOARD, mount=mount, seed=3, roll_rad=3.1)  # type: ignore[arg-type]
+    scene = Scene(board=SYMMETRIC_BOARD, mount="eye-to-hand", seed=3, roll_rad=3.1)
     path = write_session(tmp_path / "s.mcap", scene, known_lens=True)
     views = load_views(open_recording(path)).views
     prepared = prepare_views(path)
@@ -85,7 +84,7 @@ def test_another_board_or_lens_can_be_tried_on_the_old_pictures(real_session_fil
 
 
 def test_a_wrong_board_is_refused_with_what_was_seen(tmp_path: Path) -> None:
-    path = write_session(tmp_path / "s.mcap", Scene(views=4))
+    path = write_session(tmp_path / "s.mcap", Scene(views=2))
     with raises_code(TooFewViewsError, "too-few-views", views=0):
         solve_recording(path, JobOptions(board=BoardSpec(BoardKind.CHESSBOARD, 9, 6, 0.025)))
 

@@ -122,7 +122,7 @@ async def test_an_unplugged_camera_is_gone_and_comes_back_by_its_serial(server: 
         with pytest.raises(CameraError):
             await camera.capture(timeout_s=4.0)
         assert time.monotonic() - start_s < 8
-        assert beats > 50, "the daemon's loop goes on while Aravis waits"
+        assert beats >= 20 * (time.monotonic() - start_s) - 1, "the loop goes on while Aravis waits"
         beating.cancel()
         with start_gige(numbered=True, serial="KJ0042"):
             assert (await camera.capture()).pixels.shape == (1024, 1280)
@@ -132,7 +132,7 @@ async def test_an_unplugged_camera_is_gone_and_comes_back_by_its_serial(server: 
 
 
 _LOST_AND_FORGOTTEN = """
-import gc, sys, time
+import ctypes, gc, time
 from station.cell.config import CameraConfig
 from station.devices.aravis_device import GenicamDevice
 from station.simulation.launch import start_gige
@@ -143,10 +143,10 @@ with start_gige(numbered=True, serial="KJ0042") as server:
     device._stream = None
     gc.collect()
     server.process.kill()
-    sys.setswitchinterval(100)  # a handler called in Aravis's thread has to wait for the loop below
-    until_s = time.monotonic() + 10.0  # Aravis gives up the camera in 4 to 7 s
-    while time.monotonic() < until_s:
-        pass
+    # Aravis gives up the camera in 4 to 7 s. A handler called in its thread has to wait: this sleep keeps the
+    # interpreter to itself.
+    ctypes.PyDLL(None).usleep(8_000_000)
+    time.sleep(0.1)
     assert device.lost
     device._camera = None  # the last reference of ours
 time.sleep(1)

@@ -20,7 +20,7 @@ pytestmark = pytest.mark.process
 
 Make = Callable[..., Awaitable[Any]]
 CYCLE_LIMIT_S = 5.0
-WARM_UP = 10
+WARM_UP = 6
 
 
 def descriptors() -> int:
@@ -80,9 +80,8 @@ async def run_cycles(c: Any, count: int) -> None:
     assert growth_mb < 5 + 0.01 * count, f"grew by {growth_mb:.1f} MB in {count} cycles"
 
 
-@pytest.mark.timeout(120)
-async def test_fifty_cycles(cell: Make) -> None:
-    await run_cycles(await cell(control=False), 50)
+async def test_twenty_cycles(cell: Make) -> None:
+    await run_cycles(await cell(control=False), 20)
 
 
 @pytest.mark.soak

@@ -17,6 +17,7 @@ from station.cell.plan import Plan, PlannedPose
 from station.cell.status import StationState as S
 from station.devices.ur import UrRobot
 from station.protocol.verbs import Purpose
+from station.simulation.cell import write_truth
 from station.simulation.launch import AdminClient, SimulatedController
 from tests.codes import raises
 from tests.conftest import asked
@@ -36,11 +37,9 @@ async def cell(
     controller: Callable[..., SimulatedController], control_path: ControlPath, tmp_path: Path
 ) -> AsyncIterator[tuple[Rig, AdminClient]]:
     """A session in `idle` with the plan loaded, and the controller's back door."""
-    running = await asyncio.to_thread(controller, "UR10")
+    write_truth(TRUTH, tmp_path / "truth.json")
+    running = await asyncio.to_thread(controller, "UR10", truth=tmp_path / "truth.json")
     admin = running.admin()
-    admin.ask("jog", joints_rad=HOME.tolist())
-    while np.abs(np.array(admin.ask("state")["joints_rad"]) - HOME).max() > 1e-6:
-        await asyncio.sleep(0.02)
     robot = UrRobot(RobotConfig("UR10", running.host, control=control_path), tmp_path / "log")
     rig = Rig(tmp_path / "root", robot=robot)
     await rig.start()
@@ -52,6 +51,10 @@ async def cell(
     admin.close()
 
 
+def joints(admin: AdminClient) -> np.ndarray:
+    return np.array(admin.ask("state")["joints_rad"])
+
+
 async def test_07_an_arm_jogged_while_paused_voids_the_go(cell: tuple[Rig, AdminClient]) -> None:
     rig, admin = cell
     await rig.give_go()
@@ -61,7 +64,7 @@ async def test_07_an_arm_jogged_while_paused_voids_the_go(cell: tuple[Rig, Admin
     await rig.until_true(lambda: rig.session._run is not None and rig.session._run.done())
     summary = await rig.session.prepare(1, Purpose.RESUME)
     await asyncio.sleep(0.3)  # it was seen at rest
-    state = np.array(admin.ask("state")["joints_rad"])
+    state = joints(admin)
     begun_s = time.monotonic()
     admin.ask("jog", joints_rad=(state + 0.1).tolist())
     await rig.until_true(lambda: bool(rig.told("jogged")))
@@ -69,9 +72,10 @@ async def test_07_an_arm_jogged_while_paused_voids_the_go(cell: tuple[Rig, Admin
     uploads = asked(admin, "upload")
     with raises("approval-used"):
         rig.session.go(1, summary.token)
-    await asyncio.sleep(1.0)
+    await rig.until_true(lambda: np.abs(joints(admin) - state - 0.1).max() < 1e-3)
+    await asyncio.sleep(0.3)
     assert asked(admin, "upload") == uploads and rig.state is S.PAUSED
-    assert np.abs(np.array(admin.ask("state")["joints_rad"]) - state - 0.1).max() < 1e-3
+    assert np.abs(joints(admin) - state - 0.1).max() < 1e-3
 
 
 async def test_an_unreachable_pose_is_refused_before_anything_is_sent(cell: tuple[Rig, AdminClient]) -> None:
@@ -81,4 +85,4 @@ async def test_an_unreachable_pose_is_refused_before_anything_is_sent(cell: tupl
     with raises("plan", LimitError):
         await rig.session.prepare(1, Purpose.RUN)
     assert asked(admin, "upload") == 0
-    assert np.abs(np.array(admin.ask("state")["joints_rad"]) - HOME).max() < 1e-3
+    assert np.abs(joints(admin) - HOME).max() < 1e-3

@@ -38,8 +38,8 @@ PROGRAM = (sys.executable, "-m", "tests.system.cell_daemon")
 
 @pytest.fixture(scope="session")
 def short_plan() -> Plan:
-    """Four poses, driven slowly enough to be caught in mid-move."""
-    plan = make_plan(cell_config(TRUTH), start_joints_rad=TRUTH.start_joints_rad, seed=5, count=4)
+    """Three poses, driven slowly enough to be caught in mid-move."""
+    plan = make_plan(cell_config(TRUTH), start_joints_rad=TRUTH.start_joints_rad, seed=5, count=3)
     return msgspec.structs.replace(plan, joint_speed_rad_s=0.4)
 
 

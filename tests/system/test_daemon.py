@@ -24,39 +24,35 @@ pytestmark = pytest.mark.process
 
 
 @both_paths
-async def test_stop_from_a_watcher_halts_the_arm_and_is_latched(rig: SystemRig, short_plan: Plan) -> None:
-    daemon = await rig.daemon()
-    async with await daemon.client() as anna, await daemon.client() as bert:
-        await go(anna, short_plan)
-        await rig.moving()
-        pressed_s = time.monotonic()
-        await bert.request("stop")
-        answered_s = time.monotonic() - pressed_s - rig.late_s(pressed_s)
-        stopped_s = await rig.at_rest()
-        assert answered_s < 0.3
-        assert stopped_s < 1.0
-        status = await status_when(anna, lambda s: s.state is S.STOPPED)
-        assert "STOP by" in status.reason
-        await rig.stays_at_rest()
-        await anna.request("acknowledge")
-        await go(anna, None, "resume")
-        done = await status_when(anna, lambda s: bool(s.session.recording))
-        assert len(open_recording(Path(done.session.recording)).views()) == 4
-
-
-@both_paths
-async def test_a_killed_operator_stops_the_arm(rig: SystemRig, short_plan: Plan) -> None:
+async def test_a_killed_operator_stops_the_arm_and_stop_from_a_watcher_is_latched(
+    rig: SystemRig, short_plan: Plan
+) -> None:
     daemon = await rig.daemon()
     anna = await daemon.client()
-    async with await daemon.client() as watcher:
+    async with await daemon.client() as bert:
         await go(anna, short_plan)
         await rig.moving()
         anna._writer.transport.abort()  # what the kernel does to a killed screen
         assert await rig.at_rest() < 1.0
-        status = await status_when(watcher, lambda s: s.state is S.PAUSED)
-        assert "connection" in status.reason
-        assert not status.lease.holder
+        status = await status_when(bert, lambda s: s.state is S.PAUSED)
+        assert (status.cause, status.lease.holder) == ("control-lost", "")
         await rig.stays_at_rest()
+        async with await daemon.client() as cleo:
+            await go(cleo, None, "resume")
+            await rig.moving()
+            pressed_s = time.monotonic()
+            await bert.request("stop")
+            answered_s = time.monotonic() - pressed_s - rig.late_s(pressed_s)
+            stopped_s = await rig.at_rest()
+            assert answered_s < 0.3
+            assert stopped_s < 1.0
+            status = await status_when(cleo, lambda s: s.state is S.STOPPED)
+            assert status.cause == "stop"
+            await rig.stays_at_rest()
+            await cleo.request("acknowledge")
+            await go(cleo, None, "resume")
+            done = await status_when(cleo, lambda s: bool(s.session.recording))
+        assert len(open_recording(Path(done.session.recording)).views()) == len(short_plan.poses)
     await anna.close()
 
 
@@ -67,13 +63,29 @@ def children_of(pid: int) -> list[Path]:
 
 
 @both_paths
-async def test_a_killed_daemon_stops_the_arm_and_the_next_one_waits_for_a_person(
+async def test_a_daemon_that_hangs_is_killed_or_told_to_end_stops_the_arm(
     rig: SystemRig, short_plan: Plan
 ) -> None:
     first = await rig.daemon()
+    assert first.notified is not None
     async with await first.client() as anna:
         await go(anna, short_plan)
         await status_when(anna, lambda s: s.session.captured == 1)
+        await rig.moving()
+        heard = first.notified.heard()
+        assert "READY=1" in heard and "WATCHDOG=1" in heard
+        # It hangs: no word to systemd, and it waits for a person when it goes on.
+        first.process.send_signal(signal.SIGSTOP)
+        assert await rig.at_rest() < 1.5
+        first.notified.heard()
+        await asyncio.sleep(1.2)
+        assert "WATCHDOG=1" not in first.notified.heard()
+        first.process.send_signal(signal.SIGCONT)
+        status = await status_when(anna, lambda s: s.state in (S.FAULT, S.STOPPED))
+        assert status.cause
+        await rig.stays_at_rest()
+        await anna.request("acknowledge")
+        await go(anna, None, "resume")
         await rig.moving()
         children = children_of(first.process.pid)
         assert len(children) >= 2, "worker and control process"
@@ -82,63 +94,28 @@ async def test_a_killed_daemon_stops_the_arm_and_the_next_one_waits_for_a_person
         async with asyncio.timeout(5):
             while any(child.is_dir() for child in children):
                 await asyncio.sleep(0.05)
+    # The next one waits for a person, goes on with the same session, and seals it when it is told to end.
     second = await rig.daemon()
     async with await second.client() as anna:
         status = await status_when(anna, lambda s: s.state is S.STOPPED)
-        assert status.session.captured >= 1
+        captured = status.session.captured
+        assert captured >= 1
         await rig.stays_at_rest()
-        await status_when(anna, lambda s: s.robot.connected)
+        await status_when(anna, lambda s: s.robot.connected and s.camera.connected)
         await anna.request("lease", action="take")
         await anna.request("acknowledge")
-        await anna.request("finish")
-        done = await status_when(anna, lambda s: bool(s.session.recording))
-        assert len(open_recording(Path(done.session.recording)).views()) == status.session.captured
-
-
-@both_paths
-async def test_a_daemon_that_hangs_stops_the_arm_and_goes_silent(rig: SystemRig, short_plan: Plan) -> None:
-    daemon = await rig.daemon()
-    assert daemon.notified is not None
-    async with await daemon.client() as anna:
-        await go(anna, short_plan)
+        await go(anna, None, "resume")
         await rig.moving()
-        heard = daemon.notified.heard()
-        assert "READY=1" in heard and "WATCHDOG=1" in heard
-        daemon.process.send_signal(signal.SIGSTOP)
-        assert await rig.at_rest() < 1.5
-        daemon.notified.heard()
-        await asyncio.sleep(1.2)
-        assert "WATCHDOG=1" not in daemon.notified.heard()
-        daemon.process.send_signal(signal.SIGCONT)
-        status = await status_when(anna, lambda s: s.state in (S.FAULT, S.STOPPED))
-        assert status.reason
-        await rig.stays_at_rest()
-
-
-@both_paths
-async def test_sigterm_stops_the_arm_then_seals_then_ends(rig: SystemRig, short_plan: Plan) -> None:
-    daemon = await rig.daemon()
-    assert daemon.notified is not None
-    async with await daemon.client() as anna:
-        await go(anna, short_plan)
-        running = await status_when(anna, lambda s: s.session.captured == 1)
-        await rig.moving()
-        daemon.notified.heard()  # room for what comes now: the queue of a datagram socket is short
         begun_s = time.monotonic()
-        daemon.process.terminate()
+        second.process.terminate()
         assert await rig.at_rest() < 1.0
-        await asyncio.to_thread(daemon.process.wait, 20)
+        await asyncio.to_thread(second.process.wait, 20)
         assert time.monotonic() - begun_s - rig.late_s(begun_s) < 5.0
-    assert daemon.process.returncode == 0
-    folder = Path(running.session.folder)
+    assert second.process.returncode == 0
+    folder = Path(status.session.folder)
     assert not list(folder.glob("*.part"))
-    views = len(open_recording(folder).views())
-    assert views >= 1
-    words = (rig.root / "daemon-1.log").read_text()
-    order = [words.index(text) for text in ("The station is ending", "finished before the end", ": ended")]
-    assert order == sorted(order)
-    assert daemon.notified.heard()[-1] == "STOPPING=1"
-    assert not daemon.socket.exists()
+    assert len(open_recording(folder).views()) >= captured
+    assert not second.socket.exists()
 
 
 async def test_one_station_per_socket_and_per_robot(rig: SystemRig) -> None:

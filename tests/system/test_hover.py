@@ -101,7 +101,7 @@ def true_tip(rig: SystemRig) -> Array:
     return board_from_tip(BOARD, np.array(rig.admin.ask("truth")["base_from_flange"]), POINTER)
 
 
-@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+@pytest.mark.parametrize("mount", ["eye-in-hand", pytest.param("eye-to-hand", marks=pytest.mark.soak)])
 async def test_the_tip_truly_stands_over_the_corner_slowly_and_the_offset_is_kept(
     rig: SystemRig, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, mount: str
 ) -> None:

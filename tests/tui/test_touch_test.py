@@ -97,56 +97,32 @@ async def test_nothing_moves_without_a_go_of_its_own(link: FakeLink, calibration
         assert "go" not in link.verbs
 
 
-async def test_what_is_told_goes_into_the_file(link: FakeLink, calibration: Path) -> None:
+async def test_what_is_told_goes_into_the_file_and_the_installed_one(
+    link: FakeLink, calibration: Path
+) -> None:
+    root = calibration.parents[2]
+    install(calibration, root, cell="simulated")
+    origin, x_end, _, y_end = outer_corners(TRUTH.board)
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await hover(pilot, link, calibration)
         assert verbs.Go(SUMMARY.token, SUMMARY.plan_sha256) in link.asked
         link.show(at(0.1, 0, 80))
         await until(pilot, lambda: "80 mm above" in shown(pilot, "#touch-text"))
-        await pilot.press(*"nonsense", "enter")
-        await until(pilot, lambda: "two numbers" in shown(pilot, "#dialog-problem"))
-        pilot.app.screen.query_one(Input).value = "0.3,-0.2"
-        await pilot.press("enter")
-        await until(pilot, lambda: isinstance(pilot.app.screen, ChooseCorner))
-        await pilot.press("escape")
-        await until(pilot, lambda: "touch test, corner" in text_of(pilot.app, "#verdict"))
-        (touch,) = read_calibration(calibration).verification
-        assert touch.offset_mm == pytest.approx((0.2, -0.2), abs=1e-6)
-        assert touch.found == "told by a person"
-
-
-async def test_what_is_found_of_the_installed_one_is_noted_there_too(
-    link: FakeLink, calibration: Path
-) -> None:
-    root = calibration.parents[2]
-    install(calibration, root, cell="simulated")
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await hover(pilot, link, calibration)
-        link.show(at(0.1, 0, 80))
-        await until(pilot, lambda: "80 mm above" in shown(pilot, "#touch-text"))
-        pilot.app.screen.query_one(Input).value = "9,0"
-        await pilot.press("enter")
-        await until(pilot, lambda: isinstance(pilot.app.screen, ChooseCorner))
-        await pilot.press("escape")
-        await until(pilot, lambda: load_installed(root, allow_simulated=True).verification != [])
-        assert load_installed(root, allow_simulated=True) == read_calibration(calibration)
-
-
-async def test_the_next_corner_is_marked_and_the_boards_axes_are_told(
-    link: FakeLink, calibration: Path
-) -> None:
-    origin, x_end, _, y_end = outer_corners(TRUTH.board)
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await hover(pilot, link, calibration)
-        link.show(at(0.1, 0, 80))
-        await until(pilot, lambda: "80 mm above" in shown(pilot, "#touch-text"))
         axes = f"x (from corner {origin} to {x_end}) and y (from {origin} to {y_end})"
         assert axes in shown(pilot, "#touch-text")
+        await pilot.press(*"nonsense", "enter")
+        await until(pilot, lambda: shown(pilot, "#dialog-problem"))
         pilot.app.screen.query_one(Input).value = "0.3,-0.2"
         await pilot.press("enter")
         await until(pilot, lambda: isinstance(pilot.app.screen, ChooseCorner))
         await until(pilot, lambda: pilot.app.screen.query(OptionList))
-        assert pilot.app.screen.query_one(OptionList).highlighted == 1
+        assert pilot.app.screen.query_one(OptionList).highlighted == 1, "the next corner"
+        await pilot.press("escape")
+        await until(pilot, lambda: load_installed(root, allow_simulated=True).verification != [])
+        (touch,) = read_calibration(calibration).verification
+        assert touch.offset_mm == pytest.approx((0.2, -0.2), abs=1e-6)
+        assert touch.found == "told by a person"
+        assert load_installed(root, allow_simulated=True) == read_calibration(calibration)
 
 
 async def test_or_is_read_from_the_arm_once_the_tip_is_on_the_corner(

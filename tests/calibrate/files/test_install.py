@@ -222,7 +222,14 @@ def test_a_kill_at_any_system_call_leaves_old_or_new(  # type: ignore[no-untyped
     for name, place in calls:
         root = tmp_path / "kill"
         shutil.copytree(template, root, symlinks=True)
-        inject = ("-o", "/dev/null", "-e", f"inject={name}:signal=KILL:when={place}")
+        inject = (
+            "-o",
+            "/dev/null",
+            "-e",
+            f"trace={_SYSCALLS}",
+            "-e",
+            f"inject={name}:signal=KILL:when={place}",
+        )
         assert _traced(program, new, root, *inject) != 0, f"{name} {place} was not reached"
         found = load_installed(root)
         assert found in results.values(), (name, place)

@@ -67,38 +67,37 @@ def drawn_from_the_priors(seed, mount):
 
 
 def test_the_stated_region_holds_the_truth_as_often_as_it_says():
-    """30 cells at 95 %: 24 or fewer inside has a chance of one in ten thousand."""
+    """20 cells at 95 %: 15 or fewer inside has a chance of two in a thousand."""
     squares, held = [], 0
-    for seed in range(30):
+    for seed in range(20):
         cell = drawn_from_the_priors(seed, ("eye-in-hand", "eye-to-hand")[seed % 2])
         solution = solve_views(cell.views, QUICK)
         assert solution.rejected == ()
         squares.append(sigmas_of(solution, cell.X))
         held += inside(solution, cell.X)
-    assert held >= 25
+    assert held >= 16
     assert 3.5 < np.mean(squares) < 9.5  # six for a true covariance
 
 
 def test_the_region_holds_the_truth_with_a_lens_of_the_same_pictures():
     held = 0
-    for seed in range(20):
+    for seed in range(12):
         mount = ("eye-in-hand", "eye-to-hand")[seed % 2]
         cell = make_cell(np.random.default_rng(seed), 20, MID, mount=mount, refit_camera=True)
         held += inside(solve_views(cell.views, SAME), cell.X)
-    assert held >= 16
+    assert held >= 10
 
 
 def test_smooth_corner_errors_are_in_the_claim():
     """What iid noise would call certain: errors that vary slowly over each picture of the board."""
-    held, truer = 0, []
-    for seed in range(15):
+    held = 0
+    for seed in range(10):
         rng = np.random.default_rng([3, seed])
         cell = real_cell(rng, 20, LOW, bias_px=0.3)
         solution = solve_views(cell.views, QUICK)
         assert solution.noise.corner_px > 2 * LOW.corner_px
         held += inside(solution, cell.X)
-        truer.append(sigmas_of(solution, cell.X))
-    assert held >= 11
+    assert held >= 8
 
 
 SHAPE = (0.005, 0.006, 0.0008, -0.0006, 0.0004)
@@ -149,7 +148,7 @@ def test_a_measured_board_earns_a_smaller_error():
 
 def test_it_beats_the_certified_pair_solution_clearly():
     ours, pairs = [], []
-    for seed in range(10):
+    for seed in range(6):
         cell = make_cell(np.random.default_rng(seed), 25, LOW)
         ours.append(error_mm_deg(solve_views(cell.views, QUICK).matrix, cell.X)[0])
         start = solve_global(all_pairs(cell.views.base_from_flange, cell.views.camera_from_board), 0)

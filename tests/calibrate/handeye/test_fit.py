@@ -31,7 +31,7 @@ def moved_cell(seed, mount, what, at, views=24, size=1.0):
 @pytest.mark.parametrize("what", ["camera", "board"])
 def test_an_accepted_move_gives_the_camera_of_now_within_its_stated_error(mount, what):
     held = 0
-    for seed, at in enumerate((12, 9, 14)):
+    for seed, at in enumerate((12, 9)):
         views, X, Y = moved_cell(seed, mount, what, at)
         solution = solve_views(views, replace(OPTIONS, accept_move=True))
         reading = Reading.CAMERA_MOVED if what == "camera" else Reading.BOARD_MOVED
@@ -42,7 +42,7 @@ def test_an_accepted_move_gives_the_camera_of_now_within_its_stated_error(mount,
         assert [g.name for g in judge(solution, GateInputs()) if not g.passed] == []
         assert error_mm_deg(solution.board_place.matrix, Y)[0] < 3.0
         held += inside(solution, X)
-    assert held >= 2
+    assert held == 2
 
 
 def test_a_move_that_nobody_accepts_is_named_and_does_not_pass():

@@ -78,8 +78,7 @@ def shell(short_folder: Path, tmp_path: Path) -> Iterator[Shell]:
         daemon.stdout.close()
 
 
-def test_one_pose_more_leaves_the_session_open(shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Where nobody is there to say how it goes on, every other command seals what it got."""
+def test_sessions_from_the_shell(shell: Shell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: dict[str, bool] = {}
 
     async def carry_out(
@@ -88,13 +87,14 @@ def test_one_pose_more_leaves_the_session_open(shell: Shell, monkeypatch: pytest
         asked[purpose] = finish_with_loss
         raise RefusedError("seen enough", code="seen")
 
-    monkeypatch.setattr(attended, "carry_out", carry_out)
-    for command in ("next-pose", "replan", "resume"):
-        assert shell.refused(command, "--headless") == "seen"
+    # One pose more leaves the session open: where nobody is there to say how it goes on, every other command
+    # finishes what it got.
+    with monkeypatch.context() as patched:
+        patched.setattr(attended, "carry_out", carry_out)
+        for command in ("next-pose", "replan", "resume"):
+            assert shell.refused(command, "--headless") == "seen"
     assert asked == {"best": False, "improve": True, "resume": True}
 
-
-def test_a_session_from_the_shell(shell: Shell, tmp_path: Path) -> None:
     plan = tmp_path / "plan.yaml"
     assert shell("plan", "--poses", "4", "-o", str(plan), "--json")[0] == 0
 
@@ -115,16 +115,12 @@ def test_a_session_from_the_shell(shell: Shell, tmp_path: Path) -> None:
     assert shell.refused("pause") == "wrong-state"
     assert shell.ask("stop")[0] == 0
     assert shell.state()["state"] == "stopped"
-    code, out, _ = shell.ask("acknowledge")
-    assert code == 0 and out.startswith("idle SIMULATED")
+    assert shell.ask("acknowledge")[0] == 0 and shell.state()["state"] == "idle"
     assert shell.ask("retake", "9")[0] == 1
     assert shell.ask("retake", "2")[0] == 0 and shell.state()["session"]["poses"][1]["kept"]
     assert shell.ask("skip", "2")[0] == 0 and "kept" not in shell.state()["session"]["poses"][1]
 
-
-def test_ctrl_c_is_stop(shell: Shell, tmp_path: Path) -> None:
-    plan = tmp_path / "plan.yaml"
-    assert shell("plan", "--poses", "8", "-o", str(plan), "--json")[0] == 0
+    # Ctrl-C is STOP.
     command = [sys.executable, "-m", "station.cli", "capture", "--plan", str(plan), "--headless"]
     capture = subprocess.Popen(
         [*command, "--socket", str(shell.socket)], stdin=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True
@@ -134,11 +130,9 @@ def test_ctrl_c_is_stop(shell: Shell, tmp_path: Path) -> None:
         assert time.monotonic() < give_up_s
     capture.send_signal(signal.SIGINT)
     said = capture.communicate(timeout=20)[1]
-    assert capture.returncode == 130
-    assert "STOP: the arm was stopped" in said and "station acknowledge" in said
+    assert capture.returncode == 130 and "station acknowledge" in said
     status = shell.state()
-    assert status["state"] == "stopped"
-    assert "STOP by" in status["reason"]
+    assert (status["state"], status["cause"]) == ("stopped", "stop")
 
 
 async def test_ctrl_c_without_an_answer_says_what_to_do(capsys: pytest.CaptureFixture[str]) -> None:

@@ -59,7 +59,7 @@ class Cell:
         return glimpses
 
 
-@pytest.mark.parametrize(("seed", "mount"), [(1, "eye-in-hand"), (11, "eye-in-hand"), (2, "eye-to-hand")])
+@pytest.mark.parametrize(("seed", "mount"), [(11, "eye-in-hand"), (2, "eye-to-hand")])
 def test_a_full_plan_is_reached_from_a_bad_guess(seed, mount):
     cell = Cell(seed, mount)
     glimpses = cell.run()

@@ -32,7 +32,7 @@ result = {}
 HOME = [0.0, -1.5708, 1.5708, -1.5708, -1.5708, 0.0]
 NEAR = [0.2, -1.5, 1.5, -1.5, -1.5, 0.1]
 FAR = [1.2, -1.5, 1.5, -1.5, -1.5, 0.1]
-def until(what, timeout_s=3.0):
+def until(what, timeout_s=10.0):
     end = time.monotonic() + timeout_s
     while not what():
         if time.monotonic() > end:

@@ -23,6 +23,8 @@ from tests.command_line import call
         (calibrate.cli.main, ("show", "none.yaml")),
         (calibrate.cli.main, ("solve", "none.mcap")),
         (recordings.cli.main, ("info", "none.mcap")),
+        (recordings.cli.main, ("recover", "none.mcap")),
+        (recordings.cli.main, ("import", "none", "-o", "out.mcap")),
         (station.cli.main, ("status", "--socket", "none")),
         (station.cli.main, ("doctor", "--config", "none.yaml")),
         (station.cli.main, ("plan", "--check", "none.yaml")),
@@ -53,7 +55,7 @@ def test_an_error_begins_with_the_name_of_its_command(
 )
 def test_help_may_be_asked_for_shortly(main: Callable[[], None], asked: tuple[str, ...]) -> None:
     done = call(main, *asked)
-    assert done.returncode == 0 and "Usage" in done.stdout
+    assert done.returncode == 0 and done.stdout and not done.stderr
 
 
 @pytest.mark.parametrize("command", ["calibrate.cli solve", "station.cli plan", "recordings.cli info"])
@@ -61,7 +63,7 @@ def test_a_terminal_without_our_letters_gets_what_it_can_show(command: str) -> N
     latin = {"PATH": "/usr/bin:/bin", "LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0"}
     asked = [sys.executable, "-m", *command.split(), "--help"]
     done = subprocess.run(asked, env=latin, capture_output=True)
-    assert done.returncode == 0 and b"Traceback" not in done.stderr and b"Usage" in done.stdout
+    assert done.returncode == 0 and done.stdout and not done.stderr
 
 
 @pytest.mark.parametrize(

@@ -86,7 +86,7 @@ def test_what_needs_too_much_memory_is_ended_with_a_name(eater: str) -> None:
 
 
 def test_other_errors_pass_unchanged() -> None:
-    with pytest.raises(cv2.error, match="resize"), bounded():
+    with pytest.raises(cv2.error), bounded():
         cv2.resize(np.zeros((0, 0), np.uint8), (1, 1))
     with bounded(60, 4096):
         assert signal.getitimer(signal.ITIMER_REAL)[0] > 0

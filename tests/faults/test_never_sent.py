@@ -100,12 +100,12 @@ def test_the_list_of_what_may_be_sent_is_enforced(
             link.recv(200)
             link.sendall(order.encode() + b"\n")
             link.recv(200)
-        with pytest.raises(AssertionError, match="not on the list"):
+        with pytest.raises(AssertionError):
             only_allowed_was_sent(running.host)
 
 
 @pytest.mark.parametrize("command", [*sorted(DASHBOARD_COMMANDS), "play", "load x", "shutdown"])
 def test_the_dashboard_client_refuses(command: str) -> None:
     assert command not in ALLOWED
-    with pytest.raises(ValueError, match="never sent"):
+    with pytest.raises(ValueError):
         Dashboard.send(object.__new__(Dashboard), command)

@@ -261,14 +261,6 @@ def test_a_bad_folder_says_what_where_and_what_to_do(folder: Path, tmp_path: Pat
     assert [p.name for p in tmp_path.iterdir()] == ["pictures"], "something half-written was left behind"
 
 
-def test_the_command_line_ends_with_one_paragraph_and_no_traceback(folder: Path, tmp_path: Path) -> None:
-    result = call(main, "import", folder / "nowhere", "-o", tmp_path / "out.mcap")
-    assert result.returncode == 1
-    assert result.stderr.startswith("recordings: ")
-    assert "nowhere does not exist" in result.stderr
-    assert "Traceback" not in result.stderr
-
-
 def test_the_command_line_prints_one_json_object(folder: Path, tmp_path: Path) -> None:
     output = tmp_path / "out.mcap"
     result = call(main, "import", folder, "-o", output, "--json")

@@ -20,7 +20,6 @@ async def test_nothing_moves_where_no_calibration_is_installed(rig: SystemRig) -
         await status_when(client, lambda s: s.state is S.IDLE and s.camera.connected)
     command = [sys.executable, "-m", "station.cli", "check", "--headless", "--socket", str(daemon.socket)]
     check = await asyncio.create_subprocess_exec(*command, stderr=asyncio.subprocess.PIPE)
-    _, words = await asyncio.wait_for(check.communicate(), 60)
+    await asyncio.wait_for(check.communicate(), 60)
     assert check.returncode == 1
-    assert "nothing is installed. Run: calibrate install FILE" in words.decode()
     assert asked(rig.admin, "upload") == 0

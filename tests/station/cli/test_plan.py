@@ -36,7 +36,6 @@ def test_a_plan_is_made_shown_and_saved(made):
     result, files = made
     assert result.returncode == 0, result.stderr
     assert "12 poses" in result.stdout and "check: passed" in result.stdout
-    assert "board points in the image" in result.stdout
     assert len(load_plan(files["plan.yaml"]).poses) == 12
     assert files["plan.png"].read_bytes()[:4] == b"\x89PNG"
 
@@ -82,11 +81,9 @@ def test_an_edited_plan_that_hits_something_fails_the_check_with_1(made, tmp_pat
     bad = msgspec.structs.replace(plan.poses[3], joints_rad=tuple(low.tolist()), base_from_flange=None)
     poses = (*plan.poses[:3], bad, *plan.poses[4:])
     save_plan(msgspec.structs.replace(plan, poses=poses), tmp_path / "bad.yaml")
-    result = run("--check", tmp_path / "bad.yaml")
+    result = run("--check", tmp_path / "bad.yaml", "--json")
     assert result.returncode == 1
-    assert "pose 4 (p04)" in result.stdout and "table" in result.stdout
-    assert "FAILED" in result.stdout
-    summary = json.loads(run("--check", tmp_path / "bad.yaml", "--json").stdout)
+    summary = json.loads(result.stdout)
     assert {problem["limit"] for problem in summary["problems"]} >= {"clearance"}
 
 
@@ -95,7 +92,6 @@ def test_a_plan_of_the_other_mount_fails_the_check_with_1(made, tmp_path):
     (tmp_path / "cell.yaml").write_bytes(msgspec.yaml.encode(config))
     result = run("--config", tmp_path / "cell.yaml", "--check", made[1]["plan.yaml"])
     assert result.returncode == 1
-    assert "made for eye-in-hand, the cell is eye-to-hand" in result.stdout
 
 
 def test_a_list_from_elsewhere_is_checked_like_any_plan(tmp_path):
@@ -110,7 +106,6 @@ def test_a_list_from_elsewhere_is_checked_like_any_plan(tmp_path):
     assert result.returncode == 0, result.stderr
     assert [pose.why for pose in load_plan(out).poses] == ["from list.csv"] * 3
     assert all(pose.predicted_sigma_m is not None for pose in load_plan(out).poses)
-    assert "not enough for the goal" in result.stdout
 
 
 def test_checking_needs_no_lens_but_a_picture_does(made, tmp_path):

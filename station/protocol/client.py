@@ -89,10 +89,10 @@ class Client:
         self._task = asyncio.create_task(self._read(), name="client-read")
 
     @classmethod
-    async def connect(cls, path: Path, who: str = "", timeout_s: float = CONNECT_S) -> Client:
+    async def connect(cls, path: Path, who: str = "") -> Client:
         """Raises DaemonGoneError with the remedy when nobody serves there."""
         try:
-            async with asyncio.timeout(timeout_s):
+            async with asyncio.timeout(CONNECT_S):
                 reader, writer = await asyncio.open_unix_connection(str(path), limit=_ANSWER_LIMIT_BYTES)
         except (FileNotFoundError, ConnectionRefusedError):
             raise DaemonGoneError(
@@ -111,7 +111,7 @@ class Client:
         client = cls(path, reader, writer)
         try:
             who = who or who_am_i()
-            hello = await client.call(Hello(who), timeout_s=timeout_s)
+            hello = await client.call(Hello(who), timeout_s=CONNECT_S)
         except StationError:
             await client.close()
             raise

@@ -5,20 +5,15 @@
 
 from __future__ import annotations
 
-import ctypes
 import fcntl
 import os
 import shutil
 import socket
 import struct
 import sys
-from collections.abc import Iterator
-from contextlib import contextmanager
-from pathlib import Path
 
 from station.cell.errors import StationError
 
-_CLONE_NEWNET = 0x40000000
 _SIOCGIFFLAGS, _SIOCSIFFLAGS, _IFF_UP = 0x8913, 0x8914, 0x1
 
 
@@ -36,25 +31,6 @@ def isolated_command(command: list[str]) -> list[str]:
     # Without root a user namespace gives the right to make a network namespace.
     rights = [] if os.geteuid() == 0 else ["--map-root-user"]
     return [unshare, *rights, "--net", sys.executable, "-m", "station.simulation.netns", *command]
-
-
-@contextmanager
-def isolated_thread() -> Iterator[None]:
-    """The calling thread, and the threads and children it starts, in a namespace with only `lo`.
-
-    Needs root; StationError otherwise.
-    """
-    libc = ctypes.CDLL(None, use_errno=True)
-    with Path("/proc/thread-self/ns/net").open("rb") as before:
-        if libc.unshare(_CLONE_NEWNET) != 0:
-            reason = os.strerror(ctypes.get_errno())
-            text = f"no network namespace of its own for the GigE simulator: {reason}"
-            raise StationError(text, code="no-namespace")
-        try:
-            bring_lo_up()
-            yield
-        finally:
-            libc.setns(before.fileno(), _CLONE_NEWNET)
 
 
 def bring_lo_up() -> None:

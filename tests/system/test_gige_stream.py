@@ -8,7 +8,7 @@ from benchmarks.daemon_stream import HEADER, measure, row
 from station.cell.config import CameraConfig
 from station.cell.errors import StationError
 from station.devices.aravis_device import GenicamDevice
-from station.simulation.netns import isolated_thread
+from tests.isolated_network import isolated_thread
 
 pytestmark = pytest.mark.process
 

@@ -20,6 +20,10 @@ WIDE = (
     "AUTOMATIC MODE SAFEGUARD REMOTE│18/25│212 GB│    F12=STOP"
 )
 
+SCRIPTED = " MOVING SIMULATED UR10│0.21/0.25 m/s│NORMAL REMOTE│18/25│by own script│212 GB│    F12=STOP"
+
+LIBRARY = " MOVING SIMULATED UR10│0.21/0.25 m/s│NORMAL REMOTE│18/25 6:02│212 GB│             F12=STOP"
+
 
 def working(state: StationState = StationState.MOVING) -> StationStatus:
     status = idle(state)
@@ -34,6 +38,10 @@ def long_one() -> StationStatus:
         ROBOT, model="UR10e Series 5 (lab bench)", safety="AUTOMATIC MODE SAFEGUARD"
     )
     return msgspec.structs.replace(status, robot=robot)
+
+
+def driven_by(path: str) -> StationStatus:
+    return msgspec.structs.replace(working(), robot=msgspec.structs.replace(ROBOT, control_path=path))
 
 
 def played() -> StationStatus:
@@ -59,6 +67,8 @@ def played() -> StationStatus:
             120,
             WIDE,
         ),
+        (driven_by("script"), 90, SCRIPTED),
+        (driven_by("ur_rtde"), 90, LIBRARY),
         (played(), 80, " PLAYBACK, no live arm: MOVING SIMULATED UR10│18/25 6:02│212 GB free│   F12=STOP"),
     ],
 )

@@ -13,6 +13,8 @@ from station.tui.words import STATE_WORDS, duration, size
 _ALARM = {StationState.STOPPED, StationState.FAULT, StationState.DISCONNECTED}
 STOP_KEY = "F12=STOP"
 LEVELS = 6
+DRIVEN_BY = {"ur_rtde": "by ur_rtde", "script": "by own script"}
+"""What drives the arm. The own script, not yet accepted on a real arm, stays longer as the line narrows."""
 _NEXT = {
     StationState.STOPPED: "F8 acknowledges",
     StationState.FAULT: "F8 acknowledges",
@@ -86,6 +88,8 @@ def _parts(status: StationStatus, level: int) -> list[str]:
             " ".join(p for p in (robot.safety or "-", where) if p),
             progress,
         ]
+        if robot.control_path and level < (4 if robot.control_path == "script" else 1):
+            parts.append(DRIVEN_BY[robot.control_path])
     if level < 3 and status.recorder.free_bytes is not None:
         parts.append(size(status.recorder.free_bytes) + " free" * (level < 1))
     if level < 1 and status.lease.holder:

@@ -8,7 +8,8 @@
         print(gate.name, gate.passed, gate.value, gate.limit, gate.unit)
     write_calibration(job.calibration, Path("cell.yaml"))
     install(Path("cell.yaml"), Path("state"), cell="simulated")
-    calibration = load_installed(Path("state"), allow_simulated=True)
+    calibration = load_installed(Path("state"), allow_simulated=True)  # refused when it is in doubt
+    print(calibration.validity.state, calibration.validity.since)
     flange_from_camera = calibration.transform.matrix  # (4, 4), metres
 
 Errors are `CalibrationError`s with `code`, `values` and `remedy`. Names are loaded at their first use. The
@@ -26,8 +27,15 @@ if TYPE_CHECKING:
     from calibrate.files.calibration import write_calibration as write_calibration
     from calibrate.files.exports import export as export
     from calibrate.files.install import install as install
-    from calibrate.files.install import load_installed as load_installed
     from calibrate.files.install import rollback as rollback
+    from calibrate.files.install import set_validity as set_validity
+    from calibrate.files.loader import InstallationChange as InstallationChange
+    from calibrate.files.loader import InstalledCalibration as InstalledCalibration
+    from calibrate.files.loader import load_installed as load_installed
+    from calibrate.files.loader import watch as watch
+    from calibrate.files.validity import Validity as Validity
+    from calibrate.files.validity import ValidityReason as ValidityReason
+    from calibrate.files.validity import ValidityState as ValidityState
     from calibrate.geometry import Transform as Transform
     from calibrate.pipeline import JobOptions as JobOptions
     from calibrate.pipeline import SolvedRecording as SolvedRecording
@@ -35,19 +43,26 @@ if TYPE_CHECKING:
     from calibrate.quality.gates import GateLimits as GateLimits
 
 _MODULES = {
+    "InstallationChange": "files.loader",
     "Calibration": "files.calibration",
     "CalibrationError": "errors",
     "Gate": "files.calibration",
     "GateLimits": "quality.gates",
+    "InstalledCalibration": "files.loader",
     "JobOptions": "pipeline",
+    "ValidityReason": "files.validity",
     "SolvedRecording": "pipeline",
     "Transform": "geometry",
+    "Validity": "files.validity",
+    "ValidityState": "files.validity",
     "export": "files.exports",
     "install": "files.install",
-    "load_installed": "files.install",
+    "load_installed": "files.loader",
     "read_calibration": "files.calibration",
     "rollback": "files.install",
+    "set_validity": "files.install",
     "solve_recording": "pipeline",
+    "watch": "files.loader",
     "write_calibration": "files.calibration",
 }
 __all__ = list(_MODULES)

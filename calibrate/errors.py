@@ -58,3 +58,15 @@ class GateFailedError(CalibrationError):
 
     code = "gate-failed"
     exit_code = 4
+
+
+class CalibrationFileError(CalibrationError):
+    """A calibration file is missing, damaged, or of another format."""
+
+    code = "calibration-file"
+
+
+class InstallError(CalibrationError):
+    """Refused or failed: what was installed before still is, or the message says what is now."""
+
+    code = "install"

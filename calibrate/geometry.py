@@ -12,7 +12,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.spatial.transform import Rotation
 
 Array = NDArray[np.float64]
 
@@ -183,6 +182,8 @@ def project_to_rotation(M: Array) -> Array:
 
 def quaternion_from_matrix(R: ArrayLike) -> Array:
     """Convert (..., 3, 3) to quaternions (..., 4) x, y, z, w with w >= 0."""
+    from scipy.spatial.transform import Rotation  # half of a second that programs with a camera need not wait
+
     M = np.asarray(R, dtype=float)
     q = Rotation.from_matrix(M.reshape(-1, 3, 3)).as_quat(canonical=True)
     return np.asarray(q.reshape(*M.shape[:-2], 4))
@@ -190,6 +191,8 @@ def quaternion_from_matrix(R: ArrayLike) -> Array:
 
 def matrix_from_quaternion(quaternion_xyzw: ArrayLike) -> Array:
     """Convert quaternions (..., 4) x, y, z, w (any positive norm) to (..., 3, 3)."""
+    from scipy.spatial.transform import Rotation
+
     q = np.asarray(quaternion_xyzw, dtype=float)
     return np.asarray(Rotation.from_quat(q.reshape(-1, 4)).as_matrix().reshape(*q.shape[:-1], 3, 3))
 

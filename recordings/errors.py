@@ -6,14 +6,14 @@
 from __future__ import annotations
 
 import shlex
+from dataclasses import dataclass, field
 from pathlib import Path
-
-import msgspec
 
 Value = str | float | int | bool | None
 
 
-class ErrorData(msgspec.Struct, frozen=True, omit_defaults=True):
+@dataclass(frozen=True)  # no msgspec: programs that only use the camera import this
+class ErrorData:
     """An error on the wire, in a status and in `--json`."""
 
     code: str
@@ -22,11 +22,12 @@ class ErrorData(msgspec.Struct, frozen=True, omit_defaults=True):
     """Description for a person: what happened, and where."""
     remedy: str = ""
     """Next step, for a person."""
-    values: dict[str, Value] = {}
+    values: dict[str, Value] = field(default_factory=dict)
     """Measured figures and limits; each name ends in its unit."""
 
 
-class ErrorReport(msgspec.Struct, frozen=True):
+@dataclass(frozen=True)
+class ErrorReport:
     """What a command with `--json` prints when it fails."""
 
     error: ErrorData

@@ -14,12 +14,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
 from types import NoneType, UnionType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
-import msgspec
 import yaml
 
 from recordings.plain_text import ORDERS
+
+if TYPE_CHECKING:  # `load_plain` does without, and so do programs that only use a camera
+    import msgspec
 
 LIMIT_BYTES = 256 * 1024
 _NEST_LIMIT = 20
@@ -164,6 +166,8 @@ def load(content: bytes, kind: type[T], under: str = "") -> T:
 
     `under`: where the file has this key, only what stands below it is read.
     """
+    import msgspec
+
     if len(content) > LIMIT_BYTES:
         raise StrictYamlError([YamlProblem(0, "", f"larger than {LIMIT_BYTES // 1024} kB")])
     try:
@@ -197,6 +201,8 @@ def _below(root: yaml.Node | None, key: str) -> tuple[yaml.Node | None, str]:
 
 def _problems(node: yaml.Node, kind: Any, where: str) -> Iterator[YamlProblem]:
     """Walks the tree beside the type, so that one report names every wrong key and value."""
+    import msgspec
+
     line = node.start_mark.line + 1
     options = [k for k in _options(kind) if k is not NoneType]
     if node.tag.endswith(":null") and len(options) < len(_options(kind)):
@@ -221,8 +227,10 @@ def _problems(node: yaml.Node, kind: Any, where: str) -> Iterator[YamlProblem]:
 
 
 def _struct_problems(node: yaml.MappingNode, kind: type[msgspec.Struct], where: str) -> Iterator[YamlProblem]:
+    from msgspec.structs import fields as fields_of
+
     hints = get_type_hints(kind)
-    fields = {f.encode_name: f for f in msgspec.structs.fields(kind)}
+    fields = {f.encode_name: f for f in fields_of(kind)}
     seen: set[str] = set()
     for key, value in node.value:
         name, line = str(key.value), key.start_mark.line + 1
@@ -242,6 +250,8 @@ def _struct_problems(node: yaml.MappingNode, kind: type[msgspec.Struct], where: 
 
 
 def _leaf_problems(node: yaml.Node, kind: Any, where: str) -> Iterator[YamlProblem]:
+    import msgspec
+
     line = node.start_mark.line + 1
     loader = _Loader("")
     value = loader.construct_object(node, deep=True)

@@ -23,8 +23,9 @@ import msgspec
 from calibrate.batch import BatchResult
 from calibrate.bounds import Limits, bounded
 from calibrate.errors import CalibrationError
-from calibrate.files.calibration import content_sha256, encode_calibration, write_output
+from calibrate.files.calibration import encode_calibration, write_output
 from calibrate.files.lines import append_line, read_lines
+from calibrate.files.loader import content_sha256
 from calibrate.pipeline import JobOptions, SolvedRecording, solve_recording
 from recordings.errors import RecordingError
 from recordings.files import usable_cores

@@ -37,7 +37,7 @@ class CellKind(StrEnum):
 
 
 def named_or_installed(file: Path | None, root: Path | None) -> Calibration:
-    return installing.load_installed(root, allow_simulated=True) if file is None else read_calibration(file)
+    return installing.installed_calibration(root) if file is None else read_calibration(file)
 
 
 def show(file: Named = None, root: Root = None, as_json: AsJson = False) -> None:

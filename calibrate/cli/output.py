@@ -13,8 +13,8 @@ import msgspec
 import typer
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from calibrate.errors import CalibrationError
-from calibrate.files.calibration import FORMAT, CalibrationFileError, read_calibration
+from calibrate.errors import CalibrationError, CalibrationFileError
+from calibrate.files.calibration import FORMAT, read_calibration
 from calibrate.load import Progress as LoadProgress
 from recordings.cli.console import plain_console
 from recordings.mcap.records import MAGIC

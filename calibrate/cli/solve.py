@@ -24,7 +24,7 @@ from calibrate.cli.output import (
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Touch, write_calibration
 from calibrate.files.formatting import PEER_HEAD, peer_cells, summary
-from calibrate.files.install import install_line, load_installed
+from calibrate.files.install import install_line, installed_calibration
 from calibrate.geometry import rotation_log
 from calibrate.handeye.solution import camera_frames
 from calibrate.pipeline import JobOptions, SolvedRecording, prepare_views, solve_recording, solver_options
@@ -152,7 +152,7 @@ def _write_report(job: SolvedRecording, target: Path, options: JobOptions, root:
 def _touches(job: SolvedRecording, root: Path | None) -> list[Touch]:
     """Touch tests of the installed calibration, when it is of this recording."""
     try:
-        installed = load_installed(root, allow_simulated=True)
+        installed = installed_calibration(root)
     except CalibrationError:
         return []
     same = installed.provenance.recording_sha256 == job.calibration.provenance.recording_sha256

@@ -6,8 +6,6 @@ of `geometry.perturb`'s delta.
 
 from __future__ import annotations
 
-import hashlib
-import shlex
 from pathlib import Path
 from typing import Any, Literal
 
@@ -15,12 +13,11 @@ import msgspec
 import numpy as np
 import yaml
 
-from calibrate.errors import CalibrationError
-from calibrate.geometry import Transform, is_rigid, matrix_from_quaternion
+from calibrate.errors import CalibrationFileError
+from calibrate.files.loader import check_result, content_sha256, proven_plain, read_bounded
+from calibrate.geometry import Transform
 from calibrate.results import BoardShape, HoldoutScore, RejectedView
-from recordings import strict_yaml
-from recordings.files import ASKED_FOR, write_atomically
-from recordings.mcap.records import MAGIC
+from recordings.files import ASKED_FOR, MAIN_CAMERA, write_atomically
 from recordings.schema.messages import (
     BoardSpec,
     CameraIdentity,
@@ -38,15 +35,8 @@ _STAMPS = {
 }
 
 FORMAT: Literal["handeye-calibration/1"] = "handeye-calibration/1"
-_LIMIT_BYTES = 4 * 1024 * 1024
 Vector3 = tuple[float, float, float]
 Verdict = Literal["PASS", "PASS WITH A REASON", "FAIL"]
-
-
-class CalibrationFileError(CalibrationError):
-    """A calibration file is missing, damaged, or of another format."""
-
-    code = "calibration-file"
 
 
 class FramePose(msgspec.Struct, frozen=True):
@@ -298,17 +288,16 @@ class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):
         return self.result.transform
 
     @property
+    def camera_name(self) -> str:
+        """Name under which it installs."""
+        return self.camera.name or MAIN_CAMERA
+
+    @property
     def verdict(self) -> Verdict:
         """Verdict of the gates, or of the person who overrode one."""
         if self.override is not None:
             return "PASS WITH A REASON"
         return "FAIL" if self.quality.failed else "PASS"
-
-
-def content_sha256(plain: dict[str, Any]) -> str:
-    """Over everything but `sha256` and `created`, independent of layout."""
-    content = {key: value for key, value in plain.items() if key not in ("sha256", "created")}
-    return hashlib.sha256(msgspec.json.encode(content, order="deterministic")).hexdigest()
 
 
 def encode_calibration(calibration: Calibration) -> bytes:
@@ -331,87 +320,18 @@ def encode_calibration(calibration: Calibration) -> bytes:
 
 def decode_calibration(content: bytes, where: str) -> Calibration:
     """Prove and parse a file's bytes; CalibrationFileError says what is wrong."""
-    if content.startswith(MAGIC):
-        solve = f"calibrate solve {shlex.quote(where)}"
-        raise CalibrationFileError(
-            f"{where} is a recording, no calibration file.",
-            code="not-a-calibration",
-            remedy=f"First run: {solve}",
-        )
-    if len(content) > _LIMIT_BYTES:
-        raise CalibrationFileError(
-            f"{where}: larger than any calibration file.",
-            code="not-a-calibration",
-            size_bytes=len(content),
-            limit_bytes=_LIMIT_BYTES,
-        )
-    try:
-        plain = strict_yaml.load_plain(content)
-    except strict_yaml.StrictYamlError as problem:
-        raise CalibrationFileError(
-            f"{where}: damaged, or no calibration file: {problem}.", code="damaged-calibration"
-        ) from None
-    if not isinstance(plain, dict) or plain.get("format") != FORMAT:
-        found = plain.get("format") if isinstance(plain, dict) else None
-        raise CalibrationFileError(
-            f"{where}: not a calibration file: format is {found!r}, expected {FORMAT!r}.",
-            code="not-a-calibration",
-            remedy="Give one that `calibrate solve` wrote.",
-        )
-    try:
-        hash_now = content_sha256(plain)
-    except (TypeError, ValueError) as problem:
-        raise CalibrationFileError(f"{where}: damaged ({problem}).", code="damaged-calibration") from None
-    if plain.pop("sha256", None) != hash_now:
-        raise CalibrationFileError(
-            f"{where}: the content does not fit its hash: it was edited by hand or damaged.",
-            code="damaged-calibration",
-            remedy="Use the original, or solve the recording again.",
-        )
+    plain = proven_plain(content, where)
     try:
         calibration = msgspec.convert(plain, Calibration)
     except msgspec.ValidationError as problem:
         raise CalibrationFileError(f"{where}: {problem}.") from None
-    _check_result(calibration, where)
+    check_result(plain, where)
     return calibration
-
-
-def _check_result(calibration: Calibration, where: str) -> None:
-    """Raise CalibrationFileError (code `contradiction`) for a result that no solve can have written."""
-    result, matrix = calibration.result, np.array(calibration.result.matrix)
-    parent = "flange" if calibration.mount == "eye-in-hand" else "base"
-    quaternion, covariance = np.array(result.rotation_xyzw), np.array(calibration.covariance)
-    wrong = ""
-    if (result.parent_frame, result.child_frame) != (parent, "camera"):
-        wrong = f"{calibration.mount} with {result.parent_frame}_from_{result.child_frame}"
-    elif matrix.shape != (4, 4) or not is_rigid(matrix) or abs(np.linalg.norm(quaternion) - 1) > 1e-6:
-        wrong = "the result is not a rigid transform"
-    elif (
-        np.abs(matrix_from_quaternion(quaternion) - matrix[:3, :3]).max() > 1e-9
-        or np.abs(matrix[:3, 3] - np.array(result.translation_m)).max() > 1e-12
-    ):
-        wrong = "matrix, translation and quaternion do not agree"
-    elif covariance.shape != (6, 6) or not np.isfinite(covariance).all():
-        wrong = "the covariance is not 6 × 6 finite numbers"
-    else:
-        rounding = 1e-9 * float(np.abs(covariance).max())
-        skew = np.abs(covariance - covariance.T).max()
-        if skew > rounding or np.linalg.eigvalsh(covariance).min() < -rounding:
-            wrong = "the covariance is not symmetric and positive"
-    if wrong:
-        raise CalibrationFileError(
-            f"{where}: {wrong}.", code="contradiction", remedy="Solve the recording again."
-        )
 
 
 def read_calibration(path: Path) -> Calibration:
     """Read and verify a calibration file. Raises CalibrationFileError."""
-    try:
-        with path.open("rb") as file:
-            content = file.read(_LIMIT_BYTES + 1)
-    except OSError as problem:
-        raise CalibrationFileError(f"{path}: {problem.strerror or problem}.") from None
-    return decode_calibration(content, str(path))
+    return decode_calibration(read_bounded(path), str(path))
 
 
 def write_calibration(calibration: Calibration, path: Path) -> None:

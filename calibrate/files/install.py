@@ -1,31 +1,50 @@
-"""Install a calibration, load it in other programs, and roll back. Its folder: `versions`."""
+"""Install a calibration, roll back, and say whether it still holds. Its folder: `versions`."""
 
 from __future__ import annotations
 
 import shlex
+from collections.abc import Callable
+from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal
 
 import msgspec
 import numpy as np
 
-from calibrate.errors import GateFailedError
+from calibrate.errors import GateFailedError, InstallError
 from calibrate.files.calibration import Calibration, Gate, Override, read_calibration
+from calibrate.files.hooks import HookEvent, announce
+from calibrate.files.lines import append_line
+from calibrate.files.loader import (
+    calibrations_folder,
+    current_validity,
+    current_version,
+    readable_folder,
+)
+from calibrate.files.validity import FILE as VALIDITY_FILE
+from calibrate.files.validity import (
+    CheckKind,
+    Validity,
+    ValidityReason,
+    ValidityState,
+    read_validity,
+    time_text,
+    unrecorded,
+)
 from calibrate.files.verification import agrees, touch_text
 from calibrate.files.versions import (
     InstalledVersion,
-    InstallError,
     add_version,
     before_current,
-    calibrations_folder,
     installed_versions,
     locked,
     make_current,
     no_such_version,
-    readable_folder,
     who,
 )
 from calibrate.geometry import difference
+from recordings.files import MAIN_CAMERA
 from recordings.schema.messages import Source
 
 Cell = Literal["real", "imported", "simulated"]
@@ -49,28 +68,13 @@ class InstallGateError(GateFailedError, InstallError):
     code = "gate-failed"
 
 
-def load_installed(root: Path | None = None, allow_simulated: bool = False) -> Calibration:
-    """Load the installed calibration, verified: the call for programs that use the camera.
+def installed_calibration(root: Path | None = None, camera: str = MAIN_CAMERA) -> Calibration:
+    """Everything in the installed calibration file, whatever its source and validity.
 
-    `calibration.transform` is `flange_from_camera` (eye-in-hand) or `base_from_camera` (eye-to-hand), with
-    both frame names in it; `calibration.intrinsics.model` is the lens. Raises InstallError when nothing is
-    installed or when it is simulated and that was not asked for, CalibrationFileError when it is damaged.
+    Raises InstallError when nothing is installed, CalibrationFileError when it is damaged. Programs that use
+    the camera call `load_installed`.
     """
-    current = readable_folder(root) / "current"
-    if not current.exists():
-        raise InstallError(
-            f"{current}: nothing is installed.",
-            code="nothing-installed",
-            remedy="Run: calibrate install FILE",
-        )
-    calibration = read_calibration(current)
-    if _CELL_OF[calibration.source] == "simulated" and not allow_simulated:
-        raise InstallError(
-            f"{current}: the installed calibration is {calibration.source}, not of a real cell.",
-            code="not-real",
-            source=calibration.source,
-        )
-    return calibration
+    return read_calibration(current_version(readable_folder(root, camera))[1])
 
 
 def install(
@@ -78,22 +82,31 @@ def install(
     root: Path | None = None,
     *,
     cell: Cell = "real",
+    camera: str = "",
     override: str = "",
     robot_serial: str = "",
     camera_serial: str = "",
+    max_age_days: float | None = None,
 ) -> InstalledVersion:
-    """Make the calibration file `path` the current one.
+    """Make the calibration file `path` the current one of its camera, and run the hooks.
 
     `cell`: what kind of cell this root belongs to; a real one takes nothing simulated, played back or
-    imported, and no override changes that. `override`: a person's reason to install although a gate failed
-    or robot or camera differ; it goes into the file. `robot_serial`, `camera_serial`: of the cell's own
-    configuration, when known. Raises InstallError (also as exit code 4 for a gate) or CalibrationFileError.
+    imported, and no override changes that. `camera`: its name in the cell; empty: as in the file.
+    `override`: a person's reason to install although a gate failed or robot or camera differ; it goes into
+    the file. `robot_serial`, `camera_serial`: of the cell's own configuration, when known. `max_age_days`:
+    age of the last proof from which it is in doubt; None: the rule of the one before, 0: no rule.
+
+    Raises InstallError (also as exit code 4 for a gate) or CalibrationFileError.
     """
     calibration = read_calibration(path)
-    with locked(calibrations_folder(root)):
-        before = _installed_before(root)
+    camera = camera or calibration.camera_name
+    folder = calibrations_folder(root, camera)
+    with locked(folder):
+        before = _installed_before(root, camera)
         _refuse_foreign_source(calibration, before, cell, path)
         objections = _objections(calibration, before, robot_serial, camera_serial)
+        if calibration.camera.name and calibration.camera.name != camera:
+            objections.append(f"It is of the camera named {calibration.camera.name}, not {camera}.")
         objections += [f"Touch test, {touch_text(t)}." for t in calibration.verification if not agrees(t)]
         failed = [f"{gate.name}: {gate.text}" for gate in _failed_gates(calibration, before)]
         overridden = [*objections, *failed]
@@ -111,19 +124,56 @@ def install(
             taken = Override(override.strip(), who(), overridden)
             calibration = msgspec.structs.replace(calibration, override=taken)
         change = change_text(before, calibration)
-        return add_version(root, calibration, "install", change, override.strip())
+        validity = _first_validity(calibration, _max_age_days(folder, max_age_days))
+        made = add_version(folder, calibration, "install", validity, change, override.strip())
+    return _announced(root, camera, "install", made)
 
 
-def rollback(root: Path | None = None, to: int | None = None, reason: str = "") -> InstalledVersion:
+def _first_validity(calibration: Calibration, max_age_days: float | None) -> Validity:
+    """Validity of what is being installed: proven by its own views, unless something speaks against it."""
+    state, reason = ValidityState.VALID, ValidityReason("installed")
+    if calibration.source == "imported":
+        text = "Pictures and poses are of unknown origin. Check it in the cell."
+        state, reason = ValidityState.UNVERIFIED, ValidityReason("imported", text)
+    elif calibration.override is not None:
+        text = f"Installed by override: {calibration.override.reason}"
+        state, reason = ValidityState.UNVERIFIED, ValidityReason("override", text)
+    now = datetime.now(UTC)
+    recorded_ns = calibration.provenance.recorded_wall_ns
+    proven = time_text(datetime.fromtimestamp(recorded_ns / 1e9, UTC)) if recorded_ns else calibration.created
+    return Validity(0, state, time_text(now), reason, who(), proven, max_age_days)
+
+
+def _max_age_days(folder: Path, asked: float | None) -> float | None:
+    """The cell's rule: as asked, else as it was."""
+    if asked is not None:
+        return asked or None
+    recorded = read_validity(folder)
+    newest = list(recorded.values())[-1:]
+    return newest[0].max_age_days if newest else None
+
+
+def _announced(
+    root: Path | None, camera: str, event: HookEvent, version: InstalledVersion
+) -> InstalledVersion:
+    """The version with what the hooks said of it."""
+    assert version.validity is not None
+    return replace(version, hooks=announce(root, camera, event, version.validity))
+
+
+def rollback(
+    root: Path | None = None, to: int | None = None, reason: str = "", *, camera: str = MAIN_CAMERA
+) -> InstalledVersion:
     """Switch back: to the calibration before the current one, or to generation `to`. As `install` does.
 
-    `reason`: may be empty. Raises InstallError.
+    What is rolled back to is unverified until a check passes, or in doubt if it was. `reason`: may be empty.
+    Raises InstallError.
     """
     if reason.strip():
         _require_words(reason)
-    folder = calibrations_folder(root)
+    folder = calibrations_folder(root, camera)
     with locked(folder):
-        known = installed_versions(root)
+        known = installed_versions(root, camera)
         current = next((g for g in known if g.current), None)
         if to is None:
             older = before_current(known)
@@ -139,8 +189,89 @@ def rollback(root: Path | None = None, to: int | None = None, reason: str = "") 
                 generation=target.number,
             )
         before = None if current is None else current.calibration
-        make_current(root, target, "rollback", change_text(before, target.calibration), reason)
-    return InstalledVersion(target.number, target.path, True, target.calibration)
+        change = change_text(before, target.calibration)
+        validity = _validity_again(target, _max_age_days(folder, None))
+        made = make_current(folder, target, "rollback", validity, change, reason)
+    return _announced(root, camera, "rollback", made)
+
+
+def _validity_again(target: InstalledVersion, max_age_days: float | None) -> Validity:
+    """Validity of a version that becomes the current one again: nobody looked after it meanwhile."""
+    was = target.validity or unrecorded(target.number)
+    if was.state is ValidityState.IN_DOUBT or target.current:
+        return replace(was, max_age_days=max_age_days)
+    text = "Rolled back to. Run a drift check."
+    now = time_text(datetime.now(UTC))
+    state = ValidityState.UNVERIFIED
+    return Validity(
+        target.number, state, now, ValidityReason("rolled-back", text), who(), was.verified, max_age_days
+    )
+
+
+def set_validity(
+    root: Path | None,
+    state: ValidityState,
+    reason: ValidityReason,
+    *,
+    camera: str = MAIN_CAMERA,
+    version: int | None = None,
+) -> Validity:
+    """Say that the installed calibration of `camera` is valid, unverified, in doubt or withdrawn, and why.
+
+    The record grows by a line and the hooks run. `version`: the one that was judged; InstallError
+    (`other-version`) where another is installed by now, and `nothing-installed` where nothing is. VALID makes
+    now the time of the last proof.
+    """
+    now = time_text(datetime.now(UTC))
+
+    def change(before: Validity) -> Validity:
+        since = before.since if before.state is state else now
+        verified = now if state is ValidityState.VALID else before.verified
+        return replace(before, state=state, since=since, reason=reason, who=who(), verified=verified)
+
+    return _change_validity(root, camera, version, change)
+
+
+def note_check(
+    root: Path | None,
+    kind: CheckKind,
+    reason: ValidityReason,
+    *,
+    passed: bool,
+    sensitive: bool,
+    when: datetime,
+    camera: str = MAIN_CAMERA,
+    version: int | None = None,
+) -> Validity:
+    """Let a check change the validity by the rules of `Validity.after_check`; as `set_validity` otherwise."""
+    return _change_validity(
+        root, camera, version, lambda v: v.after_check(kind, passed, sensitive, when, reason, who())
+    )
+
+
+def _change_validity(
+    root: Path | None, camera: str, version: int | None, change: Callable[[Validity], Validity]
+) -> Validity:
+    folder = calibrations_folder(root, camera)
+    current_version(readable_folder(root, camera))  # nothing is made where nothing is installed
+    with locked(folder):
+        number, _ = current_version(folder)
+        if version not in (None, number):
+            raise InstallError(
+                f"{folder}: version {number} is installed by now, version {version} was judged.",
+                code="other-version",
+                version=number,
+                judged=version,
+            )
+        shown = current_validity(folder)
+        before = read_validity(folder).get(number, shown)
+        after = change(before)
+        if after != before:
+            append_line(folder / VALIDITY_FILE, after)
+    told = after.at(datetime.now(UTC))
+    if told.state is not shown.state:
+        announce(root, camera, told.state.value, told)
+    return told
 
 
 def reason_problem(reason: str) -> str:
@@ -157,7 +288,7 @@ def _require_words(reason: str) -> None:
 
 def objections_beside(calibration: Calibration, root: Path | None = None) -> list[str]:
     """Objections against following the installed one: another robot, camera or mounting, or less certain."""
-    before = _installed_before(root)
+    before = _installed_before(root, calibration.camera_name)
     regression = _regression(calibration, before)
     return [*_objections(calibration, before, "", ""), *([regression.text] if regression else [])]
 
@@ -171,9 +302,9 @@ def change_text(before: Calibration | None, after: Calibration) -> str:
     return f"{np.linalg.norm(delta[:3]) * 1000:.3f} mm, {degrees:.4f}° from the one before"
 
 
-def _installed_before(root: Path | None) -> Calibration | None:
+def _installed_before(root: Path | None, camera: str) -> Calibration | None:
     """The current one; where that is damaged, the newest that is whole, so that the checks still hold."""
-    known = [g for g in installed_versions(root) if g.calibration is not None]
+    known = [g for g in installed_versions(root, camera) if g.calibration is not None]
     current = [g for g in known if g.current]
     return (current or known)[-1].calibration if known else None
 

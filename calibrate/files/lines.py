@@ -11,8 +11,8 @@ import msgspec
 S = TypeVar("S", bound=msgspec.Struct)
 
 
-def append_line(path: Path, entry: msgspec.Struct) -> None:
-    """Raises OSError. Whatever a crash left half-written is ended first."""
+def append_line(path: Path, entry: object) -> None:
+    """Append a struct or dataclass. Raises OSError. What a crash left half-written is ended first."""
     with path.open("a+b") as file:
         if file.tell() > 0:
             file.seek(-1, os.SEEK_END)

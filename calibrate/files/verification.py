@@ -8,20 +8,20 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 import msgspec
 import numpy as np
 
+from calibrate.errors import InstallError
 from calibrate.files.calibration import Calibration, Touch, read_calibration, write_calibration
-from calibrate.files.versions import (
-    InstalledVersion,
-    InstallError,
-    add_version,
-    calibrations_folder,
-    installed_versions,
-    locked,
-)
+from calibrate.files.hooks import announce
+from calibrate.files.loader import calibrations_folder
+from calibrate.files.validity import ValidityReason, read_validity, unrecorded
+from calibrate.files.versions import InstalledVersion, add_version, installed_versions, locked, who
+from recordings.files import MAIN_CAMERA
 
 HAND_MM = 0.3
 """1 sigma per axis of reading an offset or meeting a corner by hand and eye."""
@@ -57,14 +57,17 @@ def note_in_file(path: Path, touches: Sequence[Touch]) -> Calibration:
     return calibration
 
 
-def note_installed(root: Path | None, touches: Sequence[Touch]) -> InstalledVersion:
+def note_installed(
+    root: Path | None, touches: Sequence[Touch], camera: str = MAIN_CAMERA
+) -> InstalledVersion:
     """Add them to the installed calibration: a new version, for versions never change.
 
-    Raises InstallError where no whole calibration is installed, or the folder or the disk does not allow it.
+    A corner that is missed puts it in doubt, and hooks are told when that changes. Raises InstallError where
+    no whole calibration is installed, or the folder or the disk does not allow it.
     """
-    folder = calibrations_folder(root)
+    folder = calibrations_folder(root, camera)
     with locked(folder):
-        current = next((g for g in installed_versions(root) if g.current), None)
+        current = next((g for g in installed_versions(root, camera) if g.current), None)
         if current is None or current.calibration is None:
             raise InstallError(
                 f"{folder}: no whole calibration is installed, so nothing was noted.",
@@ -73,7 +76,20 @@ def note_installed(root: Path | None, touches: Sequence[Touch]) -> InstalledVers
             )
         calibration = _with_touches(current.calibration, touches)
         found = "; ".join(touch_text(touch) for touch in touches)
-        return add_version(root, calibration, "verify", found)
+        before = read_validity(folder).get(current.number) or unrecorded(current.number)
+        worst = max(map(touch_sigmas, touches), default=0.0)
+        reason = ValidityReason(
+            "touch-test",
+            f"Touch test: {found}.",
+            {"worst_sigmas": round(worst, 2), "limit_sigmas": round(LIMIT_SIGMAS, 2)},
+        )
+        now = datetime.now(UTC)
+        passed = all(map(agrees, touches))
+        validity = before.after_check("touch-test", passed, False, now, reason, who())
+        made = add_version(folder, calibration, "verify", validity, found)
+    if validity.state is not before.state:
+        made = replace(made, hooks=announce(root, camera, validity.state.value, made.validity or validity))
+    return made
 
 
 def _with_touches(calibration: Calibration, touches: Sequence[Touch]) -> Calibration:

@@ -3,6 +3,9 @@
     ROOT/calibrations/gen/0007-1a2b3c4d.yaml     every calibration ever installed, never changed
     ROOT/calibrations/current -> gen/0007-…      what consumers read
     ROOT/calibrations/log.jsonl                  who switched to what, when and why
+    ROOT/calibrations/validity.jsonl             whether each still holds (`validity`)
+
+Camera `main` lies there, any other in ROOT/calibrations/cameras/NAME (`loader.calibrations_folder`).
 
 Whoever loses power or is killed at any moment finds the old calibration or the new one.
 """
@@ -15,32 +18,23 @@ import os
 import re
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Literal, NoReturn
 
 import msgspec
 
-from calibrate.errors import CalibrationError
-from calibrate.files.calibration import (
-    Calibration,
-    CalibrationFileError,
-    decode_calibration,
-    encode_calibration,
-    read_calibration,
-)
+from calibrate.errors import CalibrationFileError, InstallError
+from calibrate.files.calibration import Calibration, decode_calibration, encode_calibration, read_calibration
+from calibrate.files.hooks import HookRun
 from calibrate.files.lines import append_line, read_lines
-from recordings.files import state_root, sync_folder, write_atomically
+from calibrate.files.loader import VERSION_NAME, readable_folder
+from calibrate.files.validity import FILE as VALIDITY_FILE
+from calibrate.files.validity import Validity, ValidityState, read_validity, time_text, unrecorded
+from recordings.files import MAIN_CAMERA, sync_folder, write_atomically
 
 Action = Literal["install", "rollback", "verify"]
-_NAME = re.compile(r"(\d{4,})-[0-9a-f]{8}\.yaml")
-
-
-class InstallError(CalibrationError):
-    """Refused or failed: what was installed before still is, or the message says what is now."""
-
-    code = "install"
 
 
 @dataclass(frozen=True)
@@ -51,6 +45,10 @@ class InstalledVersion:
     calibration: Calibration | None
     """Content; None when the file is damaged (`problem`)."""
     problem: str = ""
+    validity: Validity | None = None
+    """Whether it holds now; of one that is not current: as when it was replaced."""
+    hooks: tuple[HookRun, ...] = ()
+    """Programs that were run for this change."""
 
 
 class LogEntry(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -63,16 +61,16 @@ class LogEntry(msgspec.Struct, frozen=True, omit_defaults=True):
     reason: str = ""
 
 
-def installed_versions(root: Path | None = None) -> list[InstalledVersion]:
+def installed_versions(root: Path | None = None, camera: str = MAIN_CAMERA) -> list[InstalledVersion]:
     """List everything ever installed, oldest first; damaged files are listed with their problem.
 
     InstallError where the folder may not be looked into.
     """
-    folder = readable_folder(root)
-    current = _current_name(folder)
+    folder = readable_folder(root, camera)
+    current, recorded, now = _current_name(folder), read_validity(folder), datetime.now(UTC)
     found = []
     for path in sorted((folder / "gen").glob("*.yaml")):
-        match = _NAME.fullmatch(path.name)
+        match = VERSION_NAME.fullmatch(path.name)
         if match is None:
             continue
         calibration, problem = None, ""
@@ -80,7 +78,10 @@ def installed_versions(root: Path | None = None) -> list[InstalledVersion]:
             calibration = read_calibration(path)
         except CalibrationFileError as damage:
             problem = str(damage)
-        found.append(InstalledVersion(int(match[1]), path, path.name == current, calibration, problem))
+        number, is_current = int(match[1]), path.name == current
+        validity = recorded.get(number) or unrecorded(number)
+        validity = validity.at(now) if is_current else validity
+        found.append(InstalledVersion(number, path, is_current, calibration, problem, validity))
     return sorted(found, key=lambda version: version.number)
 
 
@@ -94,47 +95,50 @@ def same_solve(one: Calibration, other: Calibration | None) -> bool:
 def before_current(known: list[InstalledVersion]) -> InstalledVersion | None:
     """The newest whole one before the current one that is of another solve; None when there is none.
 
-    A check by hand makes a version too: going back to the same numbers would undo nothing.
+    A check by hand makes a version too: going back to the same numbers would undo nothing. What was withdrawn
+    is passed over.
     """
     current = next((version for version in known if version.current), None)
     for older in reversed(known):
         if current is None or older.number >= current.number or older.calibration is None:
             continue
-        if not same_solve(older.calibration, current.calibration):
+        withdrawn = older.validity is not None and older.validity.state is ValidityState.WITHDRAWN
+        if not withdrawn and not same_solve(older.calibration, current.calibration):
             return older
     return None
 
 
-def read_log(root: Path | None = None) -> list[LogEntry]:
+def read_log(root: Path | None = None, camera: str = MAIN_CAMERA) -> list[LogEntry]:
     """Oldest first."""
-    return read_lines(readable_folder(root) / "log.jsonl", LogEntry)
+    return read_lines(readable_folder(root, camera) / "log.jsonl", LogEntry)
 
 
 def add_version(
-    root: Path | None, calibration: Calibration, action: Action, change: str, reason: str = ""
+    folder: Path, calibration: Calibration, action: Action, validity: Validity, change: str, reason: str = ""
 ) -> InstalledVersion:
     """A new version with this content becomes the current one and is logged. Inside `locked` only.
 
     It is on the disk, whole, and read back before anything points to it. InstallError, CalibrationFileError.
     """
-    folder = calibrations_folder(root)
     content = encode_calibration(calibration)
     number = _next_number(folder)
     path = folder / "gen" / f"{number:04d}-{_content_name(content)}.yaml"
     write_atomically(path, content)
     decode_calibration(path.read_bytes(), str(path))
-    make_current(root, InstalledVersion(number, path, True, calibration), action, change, reason)
-    return InstalledVersion(number, path, True, calibration)
+    version = InstalledVersion(number, path, True, calibration)
+    return make_current(folder, version, action, validity, change, reason)
 
 
 def make_current(
-    root: Path | None, version: InstalledVersion, action: Action, change: str, reason: str = ""
-) -> None:
-    """Switches to it, and writes that down. In `locked` only. InstallError where it does not read back."""
-    folder = calibrations_folder(root)
+    folder: Path, version: InstalledVersion, action: Action, validity: Validity, change: str, reason: str = ""
+) -> InstalledVersion:
+    """Switch to it with this validity; log it. In `locked` only. InstallError: it does not read back."""
+    validity = replace(validity, version=version.number)
+    append_line(folder / VALIDITY_FILE, validity)  # before anybody can ask for it
     _switch(folder, version.path.name, version.path.read_bytes())
     entry = LogEntry(_now_text(), action, version.number, who(), change, reason)
     append_line(folder / "log.jsonl", entry)
+    return replace(version, current=True, validity=validity)
 
 
 def _content_name(content: bytes) -> str:
@@ -145,24 +149,6 @@ def _content_name(content: bytes) -> str:
     return found[1].decode()
 
 
-def calibrations_folder(root: Path | None) -> Path:
-    return state_root(root) / "calibrations"
-
-
-def readable_folder(root: Path | None) -> Path:
-    """Folder of the calibrations; InstallError where it may not be looked into."""
-    folder = calibrations_folder(root)
-    try:
-        (folder / "gen").exists()
-    except PermissionError as problem:
-        raise InstallError(
-            f"{folder}: {problem.strerror}.",
-            code="state-folder",
-            remedy="Name another state folder with --root.",
-        ) from None
-    return folder
-
-
 def _current_name(folder: Path) -> str:
     try:
         return (folder / "current").readlink().name
@@ -171,7 +157,7 @@ def _current_name(folder: Path) -> str:
 
 
 def _next_number(folder: Path) -> int:
-    numbers = [int(m[1]) for p in (folder / "gen").iterdir() if (m := _NAME.fullmatch(p.name))]
+    numbers = [int(m[1]) for p in (folder / "gen").iterdir() if (m := VERSION_NAME.fullmatch(p.name))]
     return max(numbers, default=0) + 1
 
 
@@ -230,7 +216,7 @@ def no_such_version(folder: Path, number: int, known: list[InstalledVersion]) ->
 
 
 def _now_text() -> str:
-    return datetime.now(UTC).isoformat(timespec="seconds")
+    return time_text(datetime.now(UTC))
 
 
 def who() -> str:

@@ -10,8 +10,9 @@ import msgspec
 import numpy as np
 from scipy import special
 
+from calibrate.errors import InstallError
 from calibrate.files.lines import append_line, read_lines
-from calibrate.files.versions import InstallError, calibrations_folder
+from calibrate.files.loader import calibrations_folder
 from calibrate.quality.drift import DriftCheck
 
 _FEWEST_FOR_TREND = 5

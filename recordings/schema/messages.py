@@ -83,6 +83,8 @@ class CameraIdentity(msgspec.Struct, frozen=True, forbid_unknown_fields=True, om
     serial: str = ""
     driver: str = ""
     """aravis, playback, rendered, imported"""
+    name: str = ""
+    """Of the cell's cameras; empty: the cell's only or first one, `main`."""
 
 
 class CameraModel(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):

@@ -7,6 +7,7 @@ from typing import Literal
 
 import msgspec
 
+from recordings.files import MAIN_CAMERA
 from recordings.schema.messages import (
     BoardKind,
     BoardSpec,
@@ -74,6 +75,8 @@ class RobotConfig(Section, frozen=True):
 
 
 class CameraConfig(Section, frozen=True):
+    name: str = MAIN_CAMERA
+    """Of the cell's cameras: its calibrations are installed under it; a-z, 0-9 and -."""
     driver: Literal["aravis", "playback", "rendered"] = "aravis"
     device: str = ""
     """aravis: serial, IP address or name. playback: a folder, video or recording."""
@@ -169,6 +172,13 @@ class CaptureConfig(Section, frozen=True):
     """The session is good enough when the expected error of X (1 sigma of its translation) is below this."""
 
 
+class ValidityConfig(Section, frozen=True):
+    """When an installed calibration is in doubt by itself."""
+
+    max_age_days: float | None = None
+    """Oldest that the last proof may be: a calibration, or a drift check that passed; None: no limit."""
+
+
 class ApprovalConfig(Section, frozen=True):
     """Users by their names; who may connect at all is the socket's group."""
 
@@ -194,6 +204,7 @@ class StationConfig(Section, frozen=True):
     stillness: StillnessConfig = StillnessConfig()
     capture: CaptureConfig = CaptureConfig()
     approval: ApprovalConfig = ApprovalConfig()
+    validity: ValidityConfig = ValidityConfig()
     working_distance_m: float = 0.5
     pointer: PointerConfig | None = None
     """None = the pendant's tool centre point, along its z axis."""

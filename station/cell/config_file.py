@@ -15,6 +15,7 @@ from calibrate.boards.model import BoardError, board_points, check_board
 from calibrate.geometry import Array, pose_from_quaternion, quaternion_from_matrix, transform_points
 from calibrate.kinematics import MODELS
 from recordings import strict_yaml
+from recordings.files import is_session_name
 from recordings.schema.messages import BoardSpec
 from recordings.strict_yaml import YamlProblem
 from station.cell.config import Plane, PoseGuess, StationConfig
@@ -175,6 +176,10 @@ def _meaning_problems(config: StationConfig) -> Iterator[YamlProblem]:
         if np.linalg.norm(plane.normal) < 1e-6:
             text = f"the normal of '{plane.name}' is zero"
             yield YamlProblem(0, f"limits.planes[{place}].normal", text, "A table has [0, 0, 1].")
+    if not is_session_name(camera.name):
+        yield YamlProblem(0, "camera.name", f"'{camera.name}' must be 1 to 40 of a-z, 0-9 and -")
+    if (days := config.validity.max_age_days) is not None and not days > 0:
+        yield YamlProblem(0, "validity.max_age_days", f"{days} must be above 0", "Give days.")
     if camera.trigger == "hardware" and config.trigger is None:
         text = "hardware needs a section 'trigger' with the box's port"
         yield YamlProblem(

@@ -14,7 +14,7 @@ from rich.text import Text
 from calibrate.boards.model import outer_corners
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Touch, read_calibration
-from calibrate.files.install import load_installed
+from calibrate.files.install import installed_calibration
 from calibrate.files.verification import touch_text
 from recordings.schema.messages import BoardSpec
 from station.cell.errors import RefusedError, StationError
@@ -80,7 +80,7 @@ async def _visit(
                 "Nothing moved: --json prompts nobody, and is for simulated cells only.", code="no-person"
             )
         root = shell.client.root
-        found = read_calibration(file) if file else load_installed(root, allow_simulated=True)
+        found = read_calibration(file) if file else installed_calibration(root)
         visit = _ShellToucher(shell, found.board, corners, pointer_m, quiet)
         try:
             await touch_test(shell.client, visit, file, standoff_m)

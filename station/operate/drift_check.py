@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from calibrate.files.install import load_installed
+from calibrate.files.install import installed_calibration
 from station.cell.status import SessionStatus, StationState, StationStatus
 from station.operate.motion import PREPARE_S, Approve, Link, prepared_motion
 from station.protocol.verbs import GetPlan, LoadPlan, MakePlan, Purpose
@@ -22,7 +22,7 @@ async def start_drift_check(
     A loaded plan that was never run is named in the question, and loaded again where nothing was started.
     Raises CalibrationError before anything is planned when nothing is installed below the daemon's root.
     """
-    load_installed(link.root, allow_simulated=True)
+    installed_calibration(link.root, link.camera)
     before = (await link.call(GetPlan())).plan if _never_run(status) else None
     lost = 0 if before is None else len(before.poses)
     changes = () if before is None else (f"replaces the loaded plan of {lost} poses, which was never run",)

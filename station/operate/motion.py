@@ -38,6 +38,10 @@ class Link(Protocol):
     def root(self) -> Path | None:
         """Below which the daemon keeps sessions and what is installed."""
 
+    @property
+    def camera(self) -> str:
+        """Name of the daemon's camera."""
+
     async def call(self, verb: Verb[R], *, timeout_s: float = ANSWER_S) -> R:
         """The verb's result. RefusedError with the daemon's code; StationError when it is gone."""
 

@@ -15,10 +15,11 @@ import numpy as np
 from calibrate.boards.model import outer_corners
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Touch
-from calibrate.files.install import load_installed
+from calibrate.files.install import installed_calibration
 from calibrate.files.verification import note_in_file, note_installed
 from calibrate.files.versions import same_solve
 from calibrate.geometry import Array, inverse, transform_points
+from recordings.files import MAIN_CAMERA
 from recordings.schema.messages import BoardSpec, Matrix4
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import HoverOffer, MotionPreview, StationState, StationStatus
@@ -143,22 +144,25 @@ def touch_told(hovering: Hovering, said: str, status: StationStatus | None) -> T
     return touch_of(hovering, read_offset_mm(hovering.offer, tip), "read from the arm")
 
 
-def note_touches(root: Path | None, file: Path | None, touches: list[Touch]) -> str:
+def note_touches(
+    root: Path | None, file: Path | None, touches: list[Touch], camera: str = MAIN_CAMERA
+) -> str:
     """Keep what was found in the file, and in the installed calibration of the same solve; where, in words.
 
-    `file`: None: the installed one alone. Raises CalibrationError, OSError.
+    `file`: None: the installed one of `camera` alone. Raises CalibrationError, OSError.
     """
     words = []
     if file is not None:
         noted = note_in_file(file, touches)
+        camera = noted.camera_name
         words.append(f"Written into {file}")
         try:
-            now = load_installed(root, allow_simulated=True)
+            now = installed_calibration(root, camera)
         except CalibrationError:
             now = None
         if not same_solve(noted, now):
             return words[0]
-    made = note_installed(root, touches)
+    made = note_installed(root, touches, camera)
     return " and ".join([*words, f"into the installed calibration, now version {made.number}"])
 
 

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import msgspec
 
 from recordings.errors import ErrorData
+from recordings.files import MAIN_CAMERA
 from recordings.plain_text import plain_data
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import StationStatus
@@ -84,6 +85,7 @@ class Client:
         self._gone = False
         self.root: Path | None = None
         """Below which the daemon keeps sessions and what is installed."""
+        self.camera = MAIN_CAMERA
         self._one_at_a_time = asyncio.Lock()
         """Pieces of two long requests must not mix."""
         self._task = asyncio.create_task(self._read(), name="client-read")
@@ -115,7 +117,7 @@ class Client:
         except StationError:
             await client.close()
             raise
-        client.root = Path(hello.root)
+        client.root, client.camera = Path(hello.root), hello.camera
         return client
 
     async def call(self, verb: Verb[R], *, timeout_s: float = ANSWER_S) -> R:

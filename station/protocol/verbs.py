@@ -13,6 +13,7 @@ from typing import Annotated, Any, ClassVar, Generic, Literal, TypeVar, get_args
 
 import msgspec
 
+from recordings.files import MAIN_CAMERA
 from station.cell import status
 from station.cell.errors import RefusedError
 from station.cell.plan import Plan, PlannedPose
@@ -87,6 +88,8 @@ class Welcome(msgspec.Struct, frozen=True):
     pid: int
     root: str
     """Folder of the sessions and of what is installed."""
+    camera: str = MAIN_CAMERA
+    """Name of the daemon's camera: under it its calibrations are installed."""
 
 
 class LoadedPlan(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -113,7 +113,12 @@ class SessionDispatcher:
 
     async def _hello(self, caller: _Caller, args: verbs.Hello) -> verbs.Welcome:
         caller.introduce(await self._name(caller.uid), args.who)
-        return verbs.Welcome(software()["calibration-station"], os.getpid(), str(self._session.context.root))
+        return verbs.Welcome(
+            software()["calibration-station"],
+            os.getpid(),
+            str(self._session.context.root),
+            self._session.context.cell.config.camera.name,
+        )
 
     async def _lease(self, caller: _Caller, args: verbs.Lease) -> LeaseStatus:
         if args.action == "take":

@@ -18,7 +18,7 @@ import numpy as np
 
 from calibrate.geometry import Array
 from recordings.errors import RecordingError
-from recordings.files import EMPTY_SUFFIX, PART_SUFFIX, require_free_space
+from recordings.files import EMPTY_SUFFIX, MAIN_CAMERA, PART_SUFFIX, require_free_space
 from recordings.manifest import enter_part, read_manifest
 from recordings.recorder import Recorder
 from recordings.schema.messages import (
@@ -159,6 +159,7 @@ class SessionRecording:
     ) -> None:
         config = self._cell.config
         require_free_space(self.folder, config.capture.free_space_bytes)
+        name = "" if config.camera.name == MAIN_CAMERA else config.camera.name
         info = SessionInfo(
             name=self.name,
             mount=config.mount,
@@ -166,7 +167,7 @@ class SessionRecording:
             board=config.board,
             camera=self._session_camera(first_image),
             robot=self._cell.robot.identity,
-            camera_identity=self._cell.camera.identity,
+            camera_identity=msgspec.structs.replace(self._cell.camera.identity, name=name),
             part=self.segment,
             created_wall_ns=time.time_ns(),
             plan_sha256=plan_sha256,

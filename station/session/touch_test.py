@@ -15,7 +15,7 @@ import numpy as np
 from calibrate.boards.model import board_points
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, read_calibration
-from calibrate.files.install import load_installed
+from calibrate.files.install import installed_calibration
 from calibrate.geometry import pose_from_rotvec
 from calibrate.kinematics import forward
 from calibrate.views import BoardView
@@ -100,7 +100,7 @@ class TouchTestPlanner:
             if request.calibration:
                 found = read_calibration(Path(request.calibration))
             else:
-                found = load_installed(self._context.root, allow_simulated=cell.simulated)
+                found = installed_calibration(self._context.root, cell.config.camera.name)
         except CalibrationError as error:
             raise _refused(error) from error
         robot, camera = cell.robot.identity, cell.camera.identity

@@ -12,6 +12,7 @@ from textual.app import App
 from textual.reactive import reactive
 
 from recordings.errors import CodedError
+from recordings.files import MAIN_CAMERA
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import MotionPreview, SessionStatus, StationState, StationStatus
 from station.operate import motion
@@ -81,6 +82,11 @@ class Desk(App[None]):
     def root(self) -> Path | None:
         """Below which the daemon keeps sessions and what is installed."""
         return None if self.link is None else self.link.root
+
+    @property
+    def camera(self) -> str:
+        """Name of the daemon's camera."""
+        return MAIN_CAMERA if self.link is None else self.link.camera
 
     def common_actions(self) -> list[str]:
         """Actions that have a key on every screen."""

@@ -11,8 +11,9 @@ from pathlib import Path
 
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, read_calibration
-from calibrate.files.install import load_installed
-from calibrate.files.versions import LogEntry, calibrations_folder, read_log, same_solve
+from calibrate.files.install import installed_calibration
+from calibrate.files.loader import calibrations_folder
+from calibrate.files.versions import LogEntry, read_log, same_solve
 
 LOOK_S = 2.0
 Marks = frozenset[tuple[str, int]]
@@ -51,7 +52,7 @@ class Installed:
 def read_installed(root: Path) -> Installed:
     """Read all of it, in a thread: many files take a moment."""
     try:
-        now = load_installed(root, allow_simulated=True)
+        now = installed_calibration(root)
     except CalibrationError:
         now = None
     ended: list[Ended] = []

@@ -16,6 +16,7 @@ import numpy as np
 from calibrate.boards.detect import detect
 from calibrate.geometry import pose_from_rotvec
 from recordings.errors import RecordingError
+from recordings.files import MAIN_CAMERA
 from recordings.plain_text import plain_text
 from recordings.reader import open_recording
 from recordings.schema.messages import CaptureEvent, RobotState, View
@@ -62,6 +63,7 @@ class ReplayLink:
     """
 
     root: Path | None = None
+    camera = MAIN_CAMERA
 
     def __init__(self, path: Path, pace: float = 1.0) -> None:
         try:

@@ -11,7 +11,8 @@ import pytest
 from rich.table import Table
 from rich.text import Text
 
-from calibrate.files.calibration import CalibrationFileError, decode_calibration
+from calibrate.errors import CalibrationFileError
+from calibrate.files.calibration import decode_calibration
 from recordings.cli import main as recordings_main
 from recordings.cli.console import plain_console
 from recordings.errors import RecordingError

@@ -10,8 +10,9 @@ from textual.pilot import Pilot
 from textual.widgets import DataTable
 
 from calibrate.files.calibration import write_calibration
-from calibrate.files.install import install, load_installed, rollback
-from calibrate.files.versions import add_version, calibrations_folder, locked, who
+from calibrate.files.install import install, rollback
+from calibrate.files.verification import note_installed
+from calibrate.files.versions import who
 from station.cell.errors import StationError
 from station.tui import result, sessions
 from station.tui.app import StationApp
@@ -113,9 +114,7 @@ async def test_a_calibration_that_was_taken_back_says_so_and_who_did_it(link: Fa
 
 def test_a_check_by_hand_is_no_end_of_what_is_installed(root: Path) -> None:
     put(root, "s-1")
-    with locked(calibrations_folder(root)):
-        touched = msgspec.structs.replace(load_installed(root, True), verification=[OFF])
-        add_version(root, touched, "verify", "")
+    note_installed(root, [OFF])
     assert read_installed(root).word("s-1") == "INSTALLED"
     put(root, "s-2")
     (end,) = read_installed(root).ended

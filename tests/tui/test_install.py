@@ -12,7 +12,7 @@ from textual.widgets import Input, OptionList, Static
 
 from calibrate.files.calibration import Override, Touch, write_calibration
 from calibrate.files.exports import FORMATS
-from calibrate.files.install import install, load_installed
+from calibrate.files.install import install, installed_calibration
 from calibrate.files.verification import note_installed
 from calibrate.files.versions import installed_versions
 from recordings.schema.messages import CameraIdentity, RobotIdentity
@@ -80,7 +80,7 @@ async def test_who_overrules_gives_a_reason(link: FakeLink, calibration: Path) -
         pilot.app.screen.query_one(Input).value = "measured with the tape"
         await pilot.press("enter")
         await until(pilot, lambda: "Installed" in said(pilot))
-    override = load_installed(calibration.parents[2], allow_simulated=True).override
+    override = installed_calibration(calibration.parents[2]).override
     assert override is not None and override.reason == "measured with the tape"
 
 
@@ -107,7 +107,7 @@ async def test_going_back_names_both_and_asks(link: FakeLink, calibration: Path)
         assert "Before: version 1" in body
         await pilot.press("tab", "enter")
         await until(pilot, lambda: "installed again" in said(pilot))
-    assert load_installed(calibration.parents[2], allow_simulated=True) == GOOD
+    assert installed_calibration(calibration.parents[2]) == GOOD
 
 
 def test_a_calibration_that_was_installed_all_the_same_says_by_whom_and_why() -> None:

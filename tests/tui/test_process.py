@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 import pytest
 
-from calibrate.files.install import load_installed
+from calibrate.files.install import installed_calibration
 from recordings.reader import open_recording
 from station.cell.plan import Plan
 from station.plan.planner import make_plan
@@ -143,7 +143,7 @@ async def test_run_stop_resume_finish_solve_install(desk_with: MakeDesk) -> None
     screen.press("tab", "enter")
     await shows(screen, "Installed", 60.0)
 
-    installed = load_installed(desk.rig.root, allow_simulated=True)
+    installed = installed_calibration(desk.rig.root)
     assert installed.source == "simulated"
     recording = open_recording(next((desk.rig.root / "sessions").glob("*/")))
     assert len(recording.views()) >= ENOUGH

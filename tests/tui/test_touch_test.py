@@ -12,7 +12,7 @@ from textual.widgets import Input, OptionList, Static
 
 from calibrate.boards.model import outer_corners
 from calibrate.files.calibration import read_calibration, write_calibration
-from calibrate.files.install import install, load_installed
+from calibrate.files.install import install, installed_calibration
 from calibrate.geometry import inverse
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.cell.errors import RefusedError
@@ -118,11 +118,11 @@ async def test_what_is_told_goes_into_the_file_and_the_installed_one(
         await until(pilot, lambda: pilot.app.screen.query(OptionList))
         assert pilot.app.screen.query_one(OptionList).highlighted == 1, "the next corner"
         await pilot.press("escape")
-        await until(pilot, lambda: load_installed(root, allow_simulated=True).verification != [])
+        await until(pilot, lambda: installed_calibration(root).verification != [])
         (touch,) = read_calibration(calibration).verification
         assert touch.offset_mm == pytest.approx((0.2, -0.2), abs=1e-6)
         assert touch.found == "told by a person"
-        assert load_installed(root, allow_simulated=True) == read_calibration(calibration)
+        assert installed_calibration(root) == read_calibration(calibration)
 
 
 async def test_or_is_read_from_the_arm_once_the_tip_is_on_the_corner(

@@ -8,10 +8,17 @@ from pathlib import Path
 import msgspec
 import pytest
 
+from calibrate.errors import InstallError
 from calibrate.files.calibration import Touch, read_calibration
-from calibrate.files.install import install, load_installed, objections_beside, reason_problem, rollback
+from calibrate.files.install import (
+    install,
+    installed_calibration,
+    objections_beside,
+    reason_problem,
+    rollback,
+)
 from calibrate.files.verification import note_installed
-from calibrate.files.versions import InstallError, before_current, installed_versions
+from calibrate.files.versions import before_current, installed_versions
 from tests.calibrate.calling import raises_code
 
 MakeFile = Callable[..., Path]
@@ -48,7 +55,7 @@ def test_going_back_passes_the_checks_by_hand_of_the_same_solve(make_file: MakeF
     note_installed(tmp_path, [HAND])
     assert [g.number for g in installed_versions(tmp_path)] == [1, 2, 3]
     assert rollback(tmp_path).number == 1
-    assert load_installed(tmp_path).result == read_calibration(first).result
+    assert installed_calibration(tmp_path).result == read_calibration(first).result
 
 
 def test_a_check_by_hand_alone_is_nothing_to_go_back_to(make_file: MakeFile, tmp_path: Path) -> None:
@@ -61,7 +68,7 @@ def test_a_check_by_hand_alone_is_nothing_to_go_back_to(make_file: MakeFile, tmp
 
 def test_what_speaks_against_it_beside_its_gates_is_known_before(make_file: MakeFile, tmp_path: Path) -> None:
     install(make_file(), tmp_path)
-    now = load_installed(tmp_path)
+    now = installed_calibration(tmp_path)
     assert objections_beside(now, tmp_path) == []
     assert objections_beside(now, tmp_path / "empty") == []
     error_mm = now.quality.predicted_error_mm

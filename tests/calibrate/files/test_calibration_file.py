@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 import yaml
 
+from calibrate.errors import CalibrationFileError
 from calibrate.files.calibration import (
-    CalibrationFileError,
     decode_calibration,
     encode_calibration,
     read_calibration,

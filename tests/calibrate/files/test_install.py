@@ -14,15 +14,11 @@ import numpy as np
 import pytest
 
 from calibrate.cli import main
-from calibrate.files.calibration import (
-    Calibration,
-    CalibrationFileError,
-    Gate,
-    Touch,
-    read_calibration,
-)
-from calibrate.files.install import InstallGateError, install, install_line, load_installed, rollback
-from calibrate.files.versions import InstallError, installed_versions, read_log
+from calibrate.errors import CalibrationFileError, InstallError
+from calibrate.files.calibration import Gate, Touch, read_calibration
+from calibrate.files.install import InstallGateError, install, install_line, installed_calibration, rollback
+from calibrate.files.loader import load_installed
+from calibrate.files.versions import installed_versions, read_log
 from calibrate.pipeline import SolvedRecording
 from tests.calibrate.calling import raises_code
 from tests.command_line import call
@@ -41,12 +37,12 @@ def test_install_list_rollback(make_file, tmp_path: Path) -> None:  # type: igno
     first, second = make_file(), make_file(0.001)
     install(first, root)
     install(second, root)
-    assert load_installed(root).result == read_calibration(second).result
+    assert installed_calibration(root).result == read_calibration(second).result
     assert [(g.number, g.current) for g in installed_versions(root)] == [(1, False), (2, True)]
     rollback(root)
-    assert load_installed(root).result == read_calibration(first).result
+    assert installed_calibration(root).result == read_calibration(first).result
     rollback(root, to=2)
-    assert load_installed(root).result == read_calibration(second).result
+    assert installed_calibration(root).result == read_calibration(second).result
     assert [entry.action for entry in read_log(root)] == ["install", "install", "rollback", "rollback"]
     assert read_log(root)[1].change.startswith("1.000 mm, 0.0000°")
     assert (root / "calibrations/current").is_symlink()
@@ -54,7 +50,7 @@ def test_install_list_rollback(make_file, tmp_path: Path) -> None:  # type: igno
 
 def test_nothing_installed_and_nothing_older_are_said(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     with raises_code(InstallError, "nothing-installed"):
-        load_installed(tmp_path)
+        installed_calibration(tmp_path)
     install(make_file(), tmp_path)
     with raises_code(InstallError, "nothing-older"):
         rollback(tmp_path)
@@ -95,7 +91,7 @@ def test_a_failed_gate_needs_a_persons_reason_which_goes_into_the_file(  # type:
     with pytest.raises(InstallGateError):
         install(path, tmp_path / "s", override="   ")
     install(path, tmp_path / "s", override="line is down, checked with a pointer")
-    override = load_installed(tmp_path / "s").override
+    override = installed_calibration(tmp_path / "s").override
     assert override is not None
     assert override.reason == "line is down, checked with a pointer"
     assert "holdout_share" in override.overridden[0]
@@ -147,7 +143,7 @@ def test_identity_is_still_checked_when_the_current_file_is_damaged(  # type: ig
     with raises_code(InstallError, "objection"):
         install(make_file(robot=robot), root)
     install(make_file(0.002), root)
-    assert load_installed(root).result.translation_m[0] == pytest.approx(
+    assert installed_calibration(root).result.translation_m[0] == pytest.approx(
         solved_real.calibration.result.translation_m[0] + 0.002
     )
 
@@ -158,7 +154,7 @@ def test_an_unwritable_place_is_said(make_file, tmp_path: Path) -> None:  # type
         install(make_file(), tmp_path / "file")
 
 
-@pytest.mark.parametrize("look", [installed_versions, read_log, load_installed])
+@pytest.mark.parametrize("look", [installed_versions, read_log, installed_calibration])
 def test_a_place_that_may_not_be_looked_into_is_said(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, look: Callable[[Path], object]
 ) -> None:
@@ -231,12 +227,12 @@ def test_a_kill_at_any_system_call_leaves_old_or_new(  # type: ignore[no-untyped
             f"inject={name}:signal=KILL:when={place}",
         )
         assert _traced(program, new, root, *inject) != 0, f"{name} {place} was not reached"
-        found = load_installed(root)
+        found = installed_calibration(root)
         assert found in results.values(), (name, place)
         seen.append("new" if found == results["new"] else "old")
         assert all(not g.problem for g in installed_versions(root)), (name, place)
         install(new, root)  # what a person does next works
-        assert load_installed(root) == results["new"]
+        assert installed_calibration(root) == results["new"]
         shutil.rmtree(root)
     assert seen == sorted(seen, reverse=True), "it went back"
     assert {"old", "new"} == set(seen)
@@ -272,7 +268,7 @@ def _touching_calls(program: str, new: Path, template: Path, tmp_path: Path) -> 
 
 def test_consumers_get_frames_in_the_name(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     install(make_file(), tmp_path)
-    calibration: Calibration = load_installed(tmp_path)
+    calibration = load_installed(tmp_path)
     assert (calibration.transform.parent, calibration.transform.child) == ("flange", "camera")
     assert calibration.intrinsics.model.width == 480
     assert (tmp_path / "calibrations/current").readlink().parts[0] == "gen"
@@ -296,14 +292,14 @@ def test_a_much_less_certain_one_replaces_no_better_one_without_a_reason(  # typ
     assert made.calibration is not None and made.calibration.override is not None
     assert "no_worse" in made.calibration.override.overridden[0]
     rollback(root)
-    assert load_installed(root).quality == hardly
+    assert installed_calibration(root).quality == hardly
 
 
 def test_without_a_predicted_error_the_sigmas_are_compared(make_file, tmp_path: Path) -> None:  # type: ignore[no-untyped-def]
     root = tmp_path / "s"
     install(make_file(), root)
-    sigma = load_installed(root).sigma
-    quality = msgspec.structs.replace(load_installed(root).quality, predicted_error_mm=None)
+    sigma = installed_calibration(root).sigma
+    quality = msgspec.structs.replace(installed_calibration(root).quality, predicted_error_mm=None)
     vague = msgspec.structs.replace(sigma, translation_mm=3 * sigma.translation_mm)
     with raises_code(InstallGateError, "gate-failed", gates=1, objections=0):
         install(make_file(quality=quality, sigma=vague), root)

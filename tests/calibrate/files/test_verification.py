@@ -9,11 +9,12 @@ import msgspec
 import pytest
 from rich.console import Console
 
-from calibrate.files.calibration import CalibrationFileError, Touch, read_calibration, write_calibration
+from calibrate.errors import CalibrationFileError, InstallError
+from calibrate.files.calibration import Touch, read_calibration, write_calibration
 from calibrate.files.formatting import summary
-from calibrate.files.install import install, load_installed, rollback
+from calibrate.files.install import install, installed_calibration, rollback
 from calibrate.files.verification import agrees, note_in_file, note_installed, touch_sigmas, touch_text
-from calibrate.files.versions import InstallError, installed_versions, read_log
+from calibrate.files.versions import installed_versions, read_log
 from calibrate.pipeline import SolvedRecording
 from calibrate.report.page import report_page
 from tests.calibrate.calling import raises_code
@@ -56,7 +57,7 @@ def test_entries_go_into_a_file_and_stay_when_it_is_installed(file: Path, tmp_pa
     assert after.verification == [GOOD, GOOD]
     assert msgspec.structs.replace(after, verification=[]) == before
     install(file, tmp_path / "s")
-    assert load_installed(tmp_path / "s").verification == [GOOD, GOOD]
+    assert installed_calibration(tmp_path / "s").verification == [GOOD, GOOD]
 
 
 def test_entries_for_the_installed_one_make_a_new_generation(file: Path, tmp_path: Path) -> None:
@@ -65,11 +66,11 @@ def test_entries_for_the_installed_one_make_a_new_generation(file: Path, tmp_pat
         note_installed(root, [GOOD])
     install(file, root)
     note_installed(root, [GOOD])
-    assert load_installed(root).verification == [GOOD]
+    assert installed_calibration(root).verification == [GOOD]
     assert [g.number for g in installed_versions(root)] == [1, 2]
     assert read_log(root)[-1].action == "verify"
     rollback(root, to=1)  # by its number: going back alone leads to another solve
-    assert load_installed(root).verification == []
+    assert installed_calibration(root).verification == []
 
 
 def test_hands_that_disagree_keep_it_from_being_installed(file: Path, tmp_path: Path) -> None:

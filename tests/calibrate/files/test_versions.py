@@ -8,12 +8,15 @@ import msgspec
 import numpy as np
 import pytest
 
+from calibrate.errors import CalibrationFileError, InstallError
 from calibrate.files import versions as module
-from calibrate.files.calibration import CalibrationFileError, FramePose, read_calibration, write_calibration
-from calibrate.files.install import change_text, install, load_installed, rollback
-from calibrate.files.versions import InstallError, installed_versions, read_log
+from calibrate.files.calibration import FramePose, read_calibration, write_calibration
+from calibrate.files.install import change_text, install, installed_calibration, rollback
+from calibrate.files.lines import append_line
+from calibrate.files.versions import installed_versions, read_log
 from calibrate.geometry import Transform, perturb
 from calibrate.pipeline import SolvedRecording
+from recordings.files import write_atomically
 from tests.calibrate.calling import raises_code
 from tests.durability import disk_order
 
@@ -30,6 +33,7 @@ def test_nothing_points_to_a_calibration_before_it_is_on_the_disk(  # type: igno
         f"sync {temporary}",
         f"rename {temporary} {made}",
         "sync gen",
+        "sync validity.jsonl",
         "rename current.new current",
         "sync calibrations",
         "sync log.jsonl",
@@ -57,7 +61,7 @@ def test_what_does_not_read_back_as_written_is_not_installed(  # type: ignore[no
         monkeypatch.setattr(module, "write_atomically", lambda path, content: write(path, content[:-40]))
         with pytest.raises(CalibrationFileError):
             install(new, root)
-        assert load_installed(root) == read_calibration(old)
+        assert installed_calibration(root) == read_calibration(old)
     else:
         read = Path.read_bytes
         monkeypatch.setattr(
@@ -68,17 +72,22 @@ def test_what_does_not_read_back_as_written_is_not_installed(  # type: ignore[no
     assert len(read_log(root)) == 1
 
 
-@pytest.mark.parametrize(("fails", "switched"), [("write_atomically", False), ("append_line", True)])
+@pytest.mark.parametrize(
+    ("fails", "switched"), [("0002-", False), ("validity.jsonl", False), ("log.jsonl", True)]
+)
 def test_a_full_disk_says_what_is_installed_now(  # type: ignore[no-untyped-def]
     make_file, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, fails: str, switched: bool
 ) -> None:
     """The log is written last: when that fails, the switch has been made."""
     install(make_file(0.0), tmp_path / "root")
 
-    def full(*_: object) -> None:
-        raise OSError(28, "No space left on device")
+    def full(path: Path, content: object) -> None:
+        if path.name.startswith(fails):
+            raise OSError(28, "No space left on device")
+        (append_line if path.suffix == ".jsonl" else write_atomically)(path, content)  # type: ignore[operator]
 
-    monkeypatch.setattr(f"calibrate.files.versions.{fails}", full)
+    for name in ("write_atomically", "append_line"):
+        monkeypatch.setattr(f"calibrate.files.versions.{name}", full)
     with raises_code(InstallError, "install-io", switched=switched):
         install(make_file(1e-4), tmp_path / "root")
     current = next(g.number for g in installed_versions(tmp_path / "root") if g.current)

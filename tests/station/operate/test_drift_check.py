@@ -22,6 +22,7 @@ LOADED = Plan("UR10", "eye-in-hand", (PlannedPose("p1", (0.0,) * 6),) * 3)
 
 class FakeLink:
     root = Path("root")
+    camera = "main"
 
     def __init__(self, *told: StationStatus) -> None:
         self.asked: list[verbs.Verb[Any]] = []
@@ -63,7 +64,7 @@ def loaded(*attempts: int) -> StationStatus:
 
 @pytest.fixture(autouse=True)
 def installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drift_check, "load_installed", lambda root, allow_simulated: None)
+    monkeypatch.setattr(drift_check, "installed_calibration", lambda root, camera: None)
 
 
 @pytest.mark.parametrize(("attempts", "named"), [((), False), ((0, 0, 0), True), ((1, 0, 0), False)])
@@ -90,10 +91,10 @@ async def test_it_is_loaded_again_where_nothing_was_started(refused: type[verbs.
 
 
 async def test_nothing_is_planned_where_nothing_is_installed(monkeypatch: pytest.MonkeyPatch) -> None:
-    def nothing(root: Path, allow_simulated: bool) -> None:
+    def nothing(root: Path, camera: str) -> None:
         raise CalibrationError("nothing is installed")
 
-    monkeypatch.setattr(drift_check, "load_installed", nothing)
+    monkeypatch.setattr(drift_check, "installed_calibration", nothing)
     link = FakeLink()
     with pytest.raises(CalibrationError):
         await start_drift_check(link, loaded(), Person().approves)

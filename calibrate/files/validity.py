@@ -1,0 +1,148 @@
+"""Validity of an installed calibration: valid, unverified, in doubt or withdrawn; since when, and why.
+
+    …/validity.jsonl     one line for each install, check, doubt and withdrawal; the newest of a version holds
+
+The standard library is enough here: programs that only use the camera read it too (`loader`).
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, replace
+from datetime import UTC, datetime, timedelta
+from enum import StrEnum
+from pathlib import Path
+from typing import Literal
+
+FILE = "validity.jsonl"
+CheckKind = Literal["drift-check", "touch-test", "watch"]
+
+
+class ValidityState(StrEnum):
+    VALID = "valid"
+    UNVERIFIED = "unverified"
+    """Nothing contradicts it, and nothing has proven it since."""
+    IN_DOUBT = "in-doubt"
+    """A check contradicts it, robot or camera differ, or the last proof is too old."""
+    WITHDRAWN = "withdrawn"
+    """A person took it out of use."""
+
+
+@dataclass(frozen=True)
+class ValidityReason:
+    """Cause of a state."""
+
+    code: str
+    """installed, override, imported, rolled-back, no-record, drift-check, touch-test, watch, robot-changed,
+    camera-changed, too-old, withdrawn; more may come."""
+    text: str = ""
+    """Figures and what to do, for people."""
+    values: dict[str, str | float | int | bool | None] = field(default_factory=dict)
+    """Measured figures and limits; each name ends in its unit."""
+
+
+@dataclass(frozen=True)
+class Validity:
+    """State of one installed version. Times are UTC in ISO format."""
+
+    version: int
+    state: ValidityState
+    since: str
+    reason: ValidityReason
+    who: str = ""
+    verified: str = ""
+    """Time of the last proof: the views it was solved from, or a check that passed."""
+    max_age_days: float | None = None
+    """Rule of the cell: the oldest that the last proof may be; None: none."""
+
+    def at(self, now: datetime) -> Validity:
+        """The state at that time: in doubt once the last proof is older than the cell's rule allows."""
+        proven = parse_time(self.verified)
+        if self.max_age_days is None or proven is None or self.state is ValidityState.WITHDRAWN:
+            return self
+        due = proven + timedelta(days=self.max_age_days)
+        if now <= due or self.state is ValidityState.IN_DOUBT:
+            return self
+        age_days = (now - proven) / timedelta(days=1)
+        text = f"The last proof is {age_days:.1f} days old (limit {self.max_age_days:g}). Run a drift check."
+        limits: dict[str, str | float | int | bool | None] = {
+            "age_days": round(age_days, 3),
+            "limit_days": self.max_age_days,
+        }
+        reason = ValidityReason("too-old", text, limits)
+        return replace(self, state=ValidityState.IN_DOUBT, since=time_text(due), reason=reason)
+
+    def after_check(
+        self, kind: CheckKind, passed: bool, sensitive: bool, when: datetime, reason: ValidityReason, who: str
+    ) -> Validity:
+        """The state after a check of kind `kind` on views taken at `when`.
+
+        A failure puts it in doubt, a pass makes it valid. A pass that could have missed what another check
+        saw (`sensitive` false) only lifts the doubt of its own kind; otherwise it stays unverified. Views
+        from before the last proof tell nothing of today, and no check brings back what was withdrawn.
+        """
+        proven = parse_time(self.verified)
+        if self.state is ValidityState.WITHDRAWN or (proven is not None and when < proven):
+            return self
+        doubted = self.state is ValidityState.IN_DOUBT
+        changed = replace(self, reason=reason, who=who)
+        if not passed:
+            since = self.since if doubted else time_text(when)
+            return replace(changed, state=ValidityState.IN_DOUBT, since=since)
+        if sensitive or (doubted and self.reason.code == kind):
+            since = self.since if self.state is ValidityState.VALID else time_text(when)
+            return replace(changed, state=ValidityState.VALID, since=since, verified=time_text(when))
+        return replace(changed, state=ValidityState.UNVERIFIED) if doubted else self
+
+
+def validity_text(validity: Validity) -> str:
+    """'in doubt since 2026-11-22 04:50 UTC: FAIL: camera shift 3.02 mm …', for people."""
+    words = validity.state.replace("-", " ")
+    if validity.state is ValidityState.VALID:
+        return f"{words}, verified {_shown(validity.verified)}"
+    by = f" by {validity.who}" if validity.state is ValidityState.WITHDRAWN and validity.who else ""
+    why = f": {validity.reason.text}" if validity.reason.text else ""
+    return f"{words} since {_shown(validity.since)}{by}{why}"
+
+
+def read_validity(folder: Path) -> dict[int, Validity]:
+    """What was recorded last of each version, as it was then (`Validity.at` tells what it is now).
+
+    OSError as it comes; lines that are cut or of another shape are left out.
+    """
+    path = folder / FILE
+    lines = path.read_bytes().splitlines() if path.exists() else []
+    return {entry.version: entry for line in lines if (entry := _parse(line)) is not None}
+
+
+def unrecorded(version: int, installed: str = "") -> Validity:
+    """Validity of a version from before there was a record; `installed`: when it was, where that is known."""
+    text = "Installed before validity was recorded. Run a drift check."
+    return Validity(version, ValidityState.UNVERIFIED, installed, ValidityReason("no-record", text))
+
+
+def _parse(line: bytes) -> Validity | None:
+    try:
+        plain = json.loads(line)
+        reason = ValidityReason(**plain.pop("reason"))
+        return Validity(**plain | {"state": ValidityState(plain["state"]), "reason": reason})
+    except (ValueError, TypeError, KeyError, AttributeError):
+        return None
+
+
+def time_text(when: datetime) -> str:
+    return when.astimezone(UTC).isoformat(timespec="seconds")
+
+
+def parse_time(text: str) -> datetime | None:
+    """None where it is no time; one without a zone is UTC."""
+    try:
+        found = datetime.fromisoformat(text)
+    except ValueError:
+        return None
+    return found if found.tzinfo is not None else found.replace(tzinfo=UTC)
+
+
+def _shown(iso: str) -> str:
+    when = parse_time(iso)
+    return "an unknown time" if when is None else f"{when.astimezone(UTC):%Y-%m-%d %H:%M} UTC"

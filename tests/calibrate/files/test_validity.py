@@ -1,0 +1,327 @@
+"""Whether an installed calibration still holds: what sets it, what clears it, and who is told."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable
+from datetime import UTC, datetime, timedelta
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from calibrate import load_installed, watch
+from calibrate.errors import CalibrationFileError, InstallError
+from calibrate.files import hooks
+from calibrate.files.calibration import Touch
+from calibrate.files.hooks import HookRun
+from calibrate.files.install import install, installed_calibration, note_check, rollback, set_validity
+from calibrate.files.lines import read_lines
+from calibrate.files.loader import cameras, canonical_json
+from calibrate.files.validity import CheckKind, Validity, ValidityReason, ValidityState
+from calibrate.files.verification import note_installed
+from calibrate.files.versions import installed_versions
+from tests.calibrate.calling import raises_code
+
+MakeFile = Callable[..., Path]
+V, U, D, W = ValidityState.VALID, ValidityState.UNVERIFIED, ValidityState.IN_DOUBT, ValidityState.WITHDRAWN
+MOVED = ValidityReason("drift-check", "Camera shift 3.00 mm.", {"shift_mm": 3.0})
+KNOCKED = ValidityReason("withdrawn", "A pallet hit the camera.")
+
+
+@pytest.fixture
+def root(make_file: MakeFile, tmp_path: Path) -> Path:
+    install(make_file(), tmp_path / "s")
+    return tmp_path / "s"
+
+
+def check(root: Path, passed: bool, sensitive: bool = True, kind: CheckKind = "drift-check") -> Validity:
+    when = datetime.now(UTC) + timedelta(seconds=2)
+    return note_check(root, kind, MOVED, passed=passed, sensitive=sensitive, when=when)
+
+
+def touch(offset_mm: float) -> Touch:
+    return Touch(0, (0.0, 0.0), (offset_mm, 0.0), (0.1, 0.1), "told by a person", "anna", "2026-01-01")
+
+
+def test_what_is_installed_is_valid_until_a_check_contradicts_it_and_again_when_one_passes(
+    root: Path,
+) -> None:
+    assert load_installed(root, require_valid=True).validity.state is V
+    assert check(root, passed=False).state is D
+    doubted = load_installed(root, require_valid=False)
+    assert doubted.validity.reason == MOVED
+    for require in (None, True):
+        with raises_code(InstallError, "calibration-in-doubt", version=1, reason="drift-check"):
+            load_installed(root, require_valid=require)
+    assert check(root, passed=True).state is V
+    assert load_installed(root).validity.verified > doubted.validity.verified
+
+
+def test_a_pass_that_could_have_missed_the_shift_proves_nothing(root: Path) -> None:
+    check(root, passed=False)
+    since = load_installed(root, require_valid=False).validity.since
+    assert check(root, passed=True, sensitive=False, kind="touch-test").state is U
+    with raises_code(InstallError, "calibration-unverified", since=since):
+        load_installed(root, require_valid=True)
+    assert load_installed(root).validity.state is U
+
+
+def test_old_views_tell_nothing_of_today(root: Path) -> None:
+    long_ago = datetime(2020, 1, 1, tzinfo=UTC)
+    note_check(root, "drift-check", MOVED, passed=False, sensitive=True, when=long_ago)
+    assert load_installed(root).validity.state is V
+
+
+def test_what_a_person_withdrew_no_check_brings_back_and_no_rollback_finds(
+    root: Path, make_file: MakeFile
+) -> None:
+    set_validity(root, W, KNOCKED)
+    assert check(root, passed=True).state is W
+    with raises_code(InstallError, "calibration-withdrawn", reason="withdrawn"):
+        load_installed(root)
+    install(make_file(0.001), root)
+    assert load_installed(root).validity.state is V
+    with raises_code(InstallError, "nothing-older"):
+        rollback(root)
+    rollback(root, to=1)  # a person who names it means it
+    assert load_installed(root).validity.state is U
+
+
+def test_what_is_rolled_back_to_is_unverified_or_still_in_doubt(root: Path, make_file: MakeFile) -> None:
+    check(root, passed=False)
+    install(make_file(0.001), root)
+    install(make_file(0.002), root)
+    rollback(root)
+    assert load_installed(root).validity.reason.code == "rolled-back"
+    rollback(root)
+    assert load_installed(root, require_valid=False).validity.state is D
+
+
+def test_a_missed_corner_puts_it_in_doubt_and_a_met_one_clears_that(root: Path) -> None:
+    assert note_installed(root, [touch(0.1)]).validity.state is V  # type: ignore[union-attr]
+    note_installed(root, [touch(0.1), touch(5.0)])
+    found = load_installed(root, require_valid=False)
+    assert (found.version, found.validity.state, found.validity.reason.code) == (3, D, "touch-test")
+    note_installed(root, [touch(0.2)])
+    assert load_installed(root).validity.state is V
+
+
+@pytest.mark.parametrize(("source", "override"), [("imported", ""), ("real", "the hand slipped")])
+def test_what_nobody_vouches_for_is_unverified(
+    make_file: MakeFile, tmp_path: Path, source: str, override: str
+) -> None:
+    path = make_file(source=source, verification=[touch(5.0)] if override else [])
+    cell = "imported" if source == "imported" else "real"
+    install(path, tmp_path / "s", cell=cell, override=override)  # type: ignore[arg-type]
+    assert load_installed(tmp_path / "s").validity.state is U
+
+
+def test_a_root_from_before_validity_was_recorded_is_unverified(root: Path) -> None:
+    (root / "calibrations/validity.jsonl").unlink()
+    found = load_installed(root).validity
+    assert (found.state, found.reason.code) == (U, "no-record")
+    assert check(root, passed=True).state is V
+
+
+@pytest.mark.parametrize("kind", ["robot", "camera"])
+def test_another_device_than_the_calibrated_one_is_a_doubt(root: Path, kind: str) -> None:
+    serial = getattr(load_installed(root), kind).serial
+    assert load_installed(root, **{f"{kind}_serial": serial}).validity.state is V
+    with raises_code(InstallError, "calibration-in-doubt", reason=f"{kind}-changed"):
+        load_installed(root, **{f"{kind}_serial": "another"})
+
+
+def test_the_cells_own_rule_puts_an_old_proof_in_doubt(make_file: MakeFile, tmp_path: Path) -> None:
+    root = tmp_path / "s"
+    install(make_file(), root, max_age_days=30.0)
+    now = datetime.now(UTC)
+    proven = Validity(1, V, "", ValidityReason("installed"), verified=now.isoformat(), max_age_days=30.0)
+    assert proven.at(now + timedelta(days=29)).state is V
+    late = proven.at(now + timedelta(days=31))
+    assert (late.state, late.reason.code, late.reason.values["limit_days"]) == (D, "too-old", 30.0)
+    install(make_file(0.001), root)
+    kept = load_installed(root, require_valid=False).validity
+    assert (kept.state, kept.max_age_days) == (D, 30.0), "the rule is the cell's; the views are of 2023"
+    install(make_file(0.002), root, max_age_days=0)
+    assert load_installed(root).validity.max_age_days is None
+
+
+def test_a_check_judges_the_version_that_it_was_made_on(root: Path, make_file: MakeFile) -> None:
+    install(make_file(0.001), root)
+    with raises_code(InstallError, "other-version", version=2, judged=1):
+        set_validity(root, D, MOVED, version=1)
+    assert load_installed(root).validity.state is V
+
+
+def test_nothing_is_made_where_nothing_is_installed(tmp_path: Path) -> None:
+    with raises_code(InstallError, "nothing-installed"):
+        set_validity(tmp_path, W, KNOCKED)
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- several cameras ---
+def test_each_camera_has_its_own(root: Path, make_file: MakeFile) -> None:
+    install(make_file(0.001), root, camera="wrist")
+    install(make_file(0.002), root, camera="wrist")
+    assert cameras(root) == ["main", "wrist"]
+    set_validity(root, D, MOVED, camera="wrist")
+    assert load_installed(root).validity.state is V
+    with raises_code(InstallError, "calibration-in-doubt", camera="wrist"):
+        load_installed(root, camera="wrist")
+    rollback(root, camera="wrist")
+    assert load_installed(root, camera="wrist").version == 1
+    assert [len(installed_versions(root, name)) for name in cameras(root)] == [1, 2]
+    for bad in ("../main", "Wrist", ""):
+        with raises_code(InstallError, "camera-name"):
+            load_installed(root, camera=bad)
+
+
+# --- the light loader ---
+numbers = st.floats(allow_nan=False, allow_infinity=False) | st.sampled_from(
+    [1e-5, -1.5e-5, 1e16, 1e-6, 5e-324]
+)
+plain = st.recursive(
+    st.none() | st.booleans() | st.integers(-(2**63), 2**64 - 1) | numbers | st.text(),
+    lambda inside: st.lists(inside) | st.dictionaries(st.text(), inside),
+)
+
+
+@given(plain)
+def test_the_hash_is_over_the_same_bytes_as_ever(value: object) -> None:
+    assert canonical_json(value).encode() == msgspec.json.encode(value, order="deterministic")
+
+
+def test_it_loads_with_numpy_and_yaml_alone_and_says_the_same(root: Path) -> None:
+    program = """
+import sys
+class Refuse:
+    def find_spec(self, name, path=None, target=None):
+        if name.split(".")[0] in ("msgspec", "scipy", "cv2", "mcap", "google", "typer", "rich", "zstandard"):
+            raise ImportError(name)
+sys.meta_path.insert(0, Refuse())
+from pathlib import Path
+from calibrate import load_installed
+found = load_installed(Path(sys.argv[1]))
+print(*found.transform.matrix.ravel().tolist(), *found.intrinsics.matrix.ravel().tolist())
+print(found.validity.state)
+"""
+    done = subprocess.run(
+        [sys.executable, "-c", program, root], capture_output=True, text=True, check=True, timeout=60
+    )
+    full = installed_calibration(root)
+    said = done.stdout.split()
+    assert said.pop() == "valid"
+    told = np.array(said, float)
+    assert np.array_equal(told[:16], full.transform.matrix.ravel())
+    assert np.array_equal(told[16:], np.array(full.intrinsics.matrix).ravel())
+    light = load_installed(root)
+    assert light.intrinsics.model == full.intrinsics.model
+    assert np.array_equal(light.covariance, np.array(full.covariance))
+
+
+def test_a_damaged_file_is_never_loaded(root: Path) -> None:
+    path = load_installed(root).path
+    path.write_bytes(path.read_bytes().replace(b"translation_m: [", b"translation_m: [1", 1))
+    with raises_code(CalibrationFileError, "damaged-calibration"):
+        load_installed(root)
+
+
+def test_whoever_watches_hears_of_install_doubt_and_rollback(root: Path, make_file: MakeFile) -> None:
+    changes = watch(root, poll_s=0.01, stop_s=20)
+    heard = []
+    steps: list[Callable[[], object]] = [
+        lambda: install(make_file(0.001), root),
+        lambda: check(root, passed=False),
+        lambda: check(root, passed=True),
+        lambda: rollback(root),
+        lambda: (root / "calibrations/current").unlink(),
+    ]
+    for step in steps:
+        timer = threading.Timer(0.1, step)
+        timer.start()
+        heard.append(next(changes))
+        timer.join()
+    assert [change.event for change in heard] == [
+        "installed",
+        "in-doubt",
+        "valid",
+        "rolled-back",
+        "unreadable",
+    ]
+    assert heard[3].installed is not None and heard[3].installed.validity.state is U
+    assert heard[4].problem is not None and heard[4].problem.code == "nothing-installed"
+
+
+# --- hooks ---
+def hook(root: Path, name: str, text: str, mode: int = 0o755) -> Path:
+    folder = root / "hooks"
+    folder.mkdir(mode=0o755, exist_ok=True)
+    path = folder / name
+    path.write_text(f"#!/bin/sh\n{text}\n")
+    path.chmod(mode)
+    return path
+
+
+def test_hooks_run_in_order_with_what_happened_and_their_output_is_kept(
+    root: Path, make_file: MakeFile
+) -> None:
+    hook(root, "10-tell", 'echo "$1 $CALIBRATION_CAMERA $CALIBRATION_VERSION $CALIBRATION_STATE"')
+    hook(root, "20-fail", "echo no; exit 3")
+    made = install(make_file(0.001), root)
+    assert [(run.program, run.exit_code, run.output) for run in made.hooks] == [
+        ("10-tell", 0, "install main 2 valid\n"),
+        ("20-fail", 3, "no\n"),
+    ]
+    check(root, passed=False)
+    check(root, passed=False)  # no change, nobody is told
+    rollback(root)
+    kept = read_lines(root / "calibrations/hooks.jsonl", HookRun)
+    assert [(run.event, run.program) for run in kept[::2]] == [
+        ("install", "10-tell"),
+        ("in-doubt", "10-tell"),
+        ("rollback", "10-tell"),
+    ]
+
+
+def test_a_hook_that_hangs_is_ended_with_its_children(
+    root: Path, make_file: MakeFile, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(hooks, "TIME_LIMIT_S", 0.3)
+    hook(root, "hangs", "sleep 60 & echo $!; wait")
+    begun_s = time.monotonic()
+    (run,) = install(make_file(0.001), root).hooks
+    assert time.monotonic() - begun_s < 20
+    assert run.exit_code is None and run.problem
+    child = Path(f"/proc/{int(run.output)}/stat")
+    assert not child.exists() or child.read_text().rpartition(")")[2].split()[0] == "Z"
+
+
+@pytest.mark.parametrize("open_to", ["folder", "program", "link", "owner"])
+def test_what_others_could_have_put_there_is_not_run(
+    root: Path, make_file: MakeFile, tmp_path: Path, open_to: str
+) -> None:
+    path = hook(root, "10-tell", f"touch {tmp_path}/ran")
+    if open_to == "folder":
+        path.parent.chmod(0o775)
+    elif open_to == "program":
+        path.chmod(0o757)
+    elif open_to == "link":
+        path.rename(tmp_path / "elsewhere")
+        path.symlink_to(tmp_path / "elsewhere")
+    else:
+        try:
+            os.chown(path, 65534, 65534)
+        except PermissionError:
+            pytest.skip("only root can give a file away")
+    (run,) = install(make_file(0.001), root).hooks
+    assert run.exit_code is None and run.problem
+    assert not (tmp_path / "ran").exists()
+    assert load_installed(root).version == 2, "the calibration is installed all the same"

@@ -12,6 +12,7 @@ from typing import TypeVar
 
 import msgspec
 
+from recordings.schema.frame_time import by_arrival, by_clock
 from recordings.schema.messages import CameraIdentity, Image
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
@@ -26,7 +27,6 @@ from station.devices.frames import (
     StreamCounts,
     TriggerPulse,
 )
-from station.devices.genicam_settings import CHUNKS, TIME_CHUNKS
 
 T = TypeVar("T")
 _CLOCK_READINGS = 8
@@ -49,7 +49,7 @@ class AravisCamera:
         self._device: GenicamDevice | None = None
         self._worker: ThreadPoolExecutor | None = None
         self._busy = asyncio.Lock()
-        self._clock = FrameClock(config.time_offset, config.trigger_delay_us)
+        self._clock = FrameClock(config.time_offset)
         self._newest: Image | None = None
         self.identity = CameraIdentity(driver="aravis")
         self.counter = FrameCounter()
@@ -84,7 +84,7 @@ class AravisCamera:
             return await self._one(_GLIMPSE_S, sequenced=False)
 
     async def _one(self, timeout_s: float, *, sequenced: bool) -> Image:
-        await self._run(self._prepare)
+        exposure_us, gain_db = await self._run(self._prepare)
         pulse: TriggerPulse | None = None
         asked_ns = None if self.free_running else time.monotonic_ns()
         if self._config.trigger == "hardware":
@@ -97,12 +97,10 @@ class AravisCamera:
             self.counter.lost(count)
             raise
         sequence = self.counter.accept(picture.frame_id, count, sequenced=sequenced)
-        told = msgspec.structs.replace(picture, sequence=sequence, trigger_count=count)
-        chunks = self._live().chunks
-        if not chunks.issuperset(CHUNKS):  # held before the exposure: they must hold after it, too
-            exposure_us, gain_db = await self._run(lambda: self._live().check_settings())
-            told = msgspec.structs.replace(told, exposure_us=exposure_us, gain_db=gain_db)
-        return self._clock.timed(told, asked_ns=asked_ns, pulse=pulse, chunk=chunks.issuperset(TIME_CHUNKS))
+        told = msgspec.structs.replace(
+            picture, sequence=sequence, exposure_us=exposure_us, gain_db=gain_db, trigger_count=count
+        )
+        return self._clock.timed(told, asked_ns=asked_ns, pulse=pulse)
 
     async def preview(self) -> Image | None:
         """A fresh image where the camera is idle and can be triggered by software, else the newest one."""
@@ -167,7 +165,7 @@ class AravisCamera:
         device = self._live()
         if self.free_running:
             self.counter.restart()
-            picture = device.fresh_frame(timeout_s)
+            picture = device.fresh_frame(timeout_s, partial(self._began_since, time.monotonic_ns()))
         else:
             if self._config.trigger == "software":
                 device.trigger()
@@ -180,6 +178,14 @@ class AravisCamera:
                 limit_s=timeout_s,
             )
         return picture
+
+    def _began_since(self, asked_ns: int, picture: Image) -> bool:
+        """A frame that came by itself was not being exposed already when it was asked for."""
+        fit, exposure_us = self._clock.readings.fit, picture.exposure_us
+        told = by_arrival(picture.stamps.host_monotonic_ns, exposure_us)
+        if fit is not None and picture.stamps.device_ns:
+            told = by_clock(picture.stamps.device_ns, exposure_us, fit, "latched")
+        return told.host_monotonic_ns - exposure_us * 500 - told.bound_s * 1e9 >= asked_ns
 
     def _stream_frames(self, callback: Callable[[Image], None], stop: threading.Event) -> None:
         device = self._live()
@@ -197,9 +203,8 @@ class AravisCamera:
                 continue  # incomplete: the next frame's id shows the gap, and the counter counts it
             if picture is not None:
                 sequence = self.counter.follow(picture.frame_id)
-                told = msgspec.structs.replace(picture, sequence=sequence)
-                chunk = device.chunks.issuperset(TIME_CHUNKS)
-                if not chunk:
-                    told = msgspec.structs.replace(told, exposure_us=exposure_us, gain_db=gain_db)
-                self._newest = self._clock.timed(told, chunk=chunk)
+                told = msgspec.structs.replace(
+                    picture, sequence=sequence, exposure_us=exposure_us, gain_db=gain_db
+                )
+                self._newest = self._clock.timed(told)
                 callback(self._newest)

@@ -176,11 +176,16 @@ def _camera(config: StationConfig, trigger: Trigger | None) -> tuple[Camera, Sou
         from station.devices.aravis import AravisCamera
 
         return AravisCamera(config.camera, trigger), "real"
+    if config.camera.driver == "webcam":
+        from station.devices.webcam import WebcamCamera, require_device
+
+        require_device(config.camera)
+        return WebcamCamera(config.camera), "real"
     # A recorded or rendered image beside an arm that really moves would be a wrong calibration.
     raise ConfigError(
         f"camera.driver '{config.camera.driver}' shows no real image and never runs beside a real arm",
         code="unreal-camera",
-        remedy="Use 'aravis', or `station serve --simulate`.",
+        remedy="Use 'aravis' or 'webcam', or `station serve --simulate`.",
     )
 
 

@@ -60,7 +60,7 @@ async def take_pose(context: SessionContext, index: int, attempt: int) -> None:
     await resting.news()
     context.stillness.require_rest(state)
     view = _view(context, index, attempt, image, state, still, image.time)
-    _require_bound(context, view)
+    _require_bound(context, view, image)
     _phase(context, index, StationState.WRITING, "writing")
     await to_the_end(_write(context, index, image, view))
 
@@ -145,14 +145,17 @@ def _view(
     )
 
 
-def _require_bound(context: SessionContext, view: View) -> None:
+def _require_bound(context: SessionContext, view: View, image: Image) -> None:
     limit_s = context.cell.config.capture.time_bound_s
     if view.time_bound_s is not None and view.time_bound_s > limit_s:
+        clockless = image.time is not None and image.time.source == "arrival"
         raise PoseFailedError(
             f"Image time known to ±{1000 * view.time_bound_s:.1f} ms (limit {1000 * limit_s:.1f} ms, "
             "capture.time_bound_s).",
             code="time-unsure",
-            remedy="Reduce this computer's load.",
+            remedy="The camera's clock cannot be read: raise the limit, the arm is at rest."
+            if clockless
+            else "Reduce this computer's load.",
             bound_s=view.time_bound_s,
             limit_s=limit_s,
         )

@@ -1,0 +1,328 @@
+"""Webcams and other cameras of the system, through `cv2.VideoCapture`: for those who start with these.
+
+No trigger and no clock: pictures come by themselves, and when they were exposed is known only by their
+arrival, to ±0.1 s.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import threading
+import time
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+from pathlib import Path
+from typing import TypeVar
+
+import cv2
+import msgspec
+import numpy as np
+
+from recordings.schema.frame_time import by_arrival
+from recordings.schema.messages import CameraIdentity, Image, Stamps
+from station.cell.config import CameraConfig
+from station.cell.errors import CameraError, ConfigError
+from station.devices.frames import RETAKE, CameraCounts, FrameTiming
+
+T = TypeVar("T")
+LATENCY_S = 0.2
+"""Assumed, not measured: readout, compression, USB and the driver take no longer than this."""
+_GLIMPSE_S = 1.0
+_OPEN_S = 20.0
+_PATIENCE_S = 0.5
+_CHECK_S = 1.0
+"""So often settings are read while frames come by themselves."""
+_EXPOSURE_UNIT_US = 100.0
+"""Of V4L2's absolute exposure"""
+_MANUAL_EXPOSURE = 1
+_FOUND_AT_S = 1.0
+"""A stamp of the driver that is older is none of the monotonic clock."""
+_SYSTEM = Path("/sys/class/video4linux")
+
+
+class WebcamCamera:
+    """`station.devices.base.Camera` and `StreamingCamera` over `config.device`: a number or a path."""
+
+    def __init__(self, config: CameraConfig) -> None:
+        if config.trigger == "hardware":
+            raise CameraError(
+                "a webcam has no trigger line",
+                code="no-trigger",
+                remedy="Set camera.trigger to software or free-running.",
+            )
+        self._config = config
+        self._video: cv2.VideoCapture | None = None
+        self._worker: ThreadPoolExecutor | None = None
+        self._newest: Image | None = None
+        self._fixed: dict[str, float] = {}
+        """Exposure and focus as they were when it was opened; what the camera has not is not in it"""
+        self._frames = self._seen = self._missing = 0
+        self.identity = CameraIdentity(driver="webcam")
+
+    @property
+    def timing(self) -> FrameTiming | None:
+        return FrameTiming("arrival", LATENCY_S / 2) if self._video is not None else None
+
+    def counts(self) -> CameraCounts:
+        return CameraCounts(frames=self._seen, missing=self._missing)
+
+    async def open(self) -> CameraIdentity:
+        await self._run(self._open, _OPEN_S)
+        return self.identity
+
+    async def capture(self, timeout_s: float = 5.0) -> Image:
+        """A frame whose exposure began after this call, which costs `LATENCY_S` more than a frame."""
+        try:
+            image = await self._run(partial(self._fresh, timeout_s), timeout_s)
+        except CameraError:
+            self._missing += 1
+            raise
+        self._newest = self._numbered(image)
+        return self._newest
+
+    async def settings(self) -> dict[str, object]:
+        return await self._run(self._settings, _GLIMPSE_S)
+
+    async def glimpse(self) -> Image | None:
+        return await self._run(partial(self._fresh, _GLIMPSE_S), _GLIMPSE_S)
+
+    async def preview(self) -> Image | None:
+        try:
+            return await self.glimpse()
+        except CameraError:
+            return self._newest
+
+    @property
+    def free_running(self) -> bool:
+        return self._config.trigger == "free-running"
+
+    async def stream(self, callback: Callable[[Image], None], stop: threading.Event) -> None:
+        await self._run(partial(self._stream_frames, callback, stop))
+
+    async def close(self) -> None:
+        if self._worker is None:
+            return
+        worker, self._worker = self._worker, None
+        await asyncio.get_running_loop().run_in_executor(worker, self._release)
+        worker.shutdown(wait=False)
+
+    async def _run(self, job: Callable[[], T], timeout_s: float | None = None) -> T:
+        """In the one thread that calls the driver, which may be stuck in it for ten seconds."""
+        if self._worker is None:
+            self._worker = ThreadPoolExecutor(1, "webcam")
+        running = asyncio.get_running_loop().run_in_executor(self._worker, job)
+        done, _ = await asyncio.wait({running}, timeout=timeout_s and timeout_s + _PATIENCE_S)
+        if not done:
+            running.cancel()
+            raise self._late(timeout_s or 0.0)
+        return running.result()
+
+    def _late(self, timeout_s: float) -> CameraError:
+        return CameraError(
+            f"webcam {self._config.device} gave no image within {timeout_s:g} s",
+            code="no-image",
+            remedy=f"{RETAKE} Check the camera's cable, and end other programs that use it.",
+            limit_s=timeout_s,
+        )
+
+    def _open(self) -> None:
+        self._release()
+        device = self._config.device or "0"
+        video = cv2.VideoCapture(int(device) if device.isdecimal() else device)
+        if not video.isOpened():
+            raise CameraError(
+                f"no webcam at {device}",
+                code="no-camera",
+                remedy="Check its cable and camera.device (ls /dev/v4l/by-id), the group 'video', and other "
+                "programs that use it.",
+            )
+        found = _identity(device)
+        if self.identity.serial not in ("", found.serial):
+            raise CameraError(
+                f"{device} is another camera now: {found.model} {found.serial} for {self.identity.model} "
+                f"{self.identity.serial}",
+                code="other-camera",
+                remedy="Name it by its link in /dev/v4l/by-id.",
+            )
+        self._video, self.identity = video, found
+        try:
+            self._set_up(video)
+        except CameraError:
+            self._release()
+            raise
+
+    def _set_up(self, video: cv2.VideoCapture) -> None:
+        config, wanted = self._config, _wanted_size(self._config)
+        if wanted is not None:
+            video.set(cv2.CAP_PROP_FRAME_WIDTH, wanted[0])
+            video.set(cv2.CAP_PROP_FRAME_HEIGHT, wanted[1])
+        if config.frame_rate_hz is not None:
+            video.set(cv2.CAP_PROP_FPS, config.frame_rate_hz)
+        video.set(cv2.CAP_PROP_AUTOFOCUS, 0)
+        if "focus" in self._fixed:  # opened again: the lens must be the one of the pictures before
+            video.set(cv2.CAP_PROP_FOCUS, self._fixed["focus"])
+        if video.set(cv2.CAP_PROP_AUTO_EXPOSURE, _MANUAL_EXPOSURE):
+            video.set(cv2.CAP_PROP_EXPOSURE, config.exposure_us / _EXPOSURE_UNIT_US)
+        if video.get(cv2.CAP_PROP_AUTOFOCUS) > 0:
+            raise CameraError(
+                "the webcam's autofocus cannot be switched off: each picture would have another lens",
+                code="autofocus",
+                remedy="Switch it off with the maker's program, or use another camera.",
+            )
+        size = round(video.get(cv2.CAP_PROP_FRAME_WIDTH)), round(video.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        if wanted not in (None, size):
+            raise CameraError(
+                f"the webcam gives {size[0]}×{size[1]}, asked were {wanted}",
+                code="camera-refused",
+                remedy="Set camera.region to a size that `v4l2-ctl --list-formats-ext` shows.",
+            )
+        self._fixed = _readable(video)
+
+    def _release(self) -> None:
+        video, self._video = self._video, None
+        if video is not None:
+            video.release()
+
+    def _live(self) -> cv2.VideoCapture:
+        """The device; opened again after it was lost."""
+        if self._video is None:
+            if not self.identity.serial:
+                raise CameraError("the camera is not open", code="not-open")
+            self._open()
+        assert self._video is not None
+        return self._video
+
+    def _settings(self) -> dict[str, object]:
+        video = self._live()
+        width, height = video.get(cv2.CAP_PROP_FRAME_WIDTH), video.get(cv2.CAP_PROP_FRAME_HEIGHT)
+        return {
+            "pixel_format": "Mono8" if self._config.pixel_format.startswith("Mono") else "BGR8",
+            "region": [0, 0, round(width), round(height)],
+            "frame_rate_hz": video.get(cv2.CAP_PROP_FPS),
+            **_readable(video),
+        }
+
+    def _fresh(self, timeout_s: float) -> Image:
+        """The first frame that cannot have begun before now, whatever waited in the driver's queue."""
+        asked_ns, video = time.monotonic_ns(), self._live()
+        self._check(video)
+        while time.monotonic_ns() < asked_ns + timeout_s * 1e9:
+            arrived_ns = self._grab(video)
+            if arrived_ns - round(self._exposure_us() * 1000) - LATENCY_S * 1e9 >= asked_ns:
+                return self._image(video, arrived_ns)
+        raise self._late(timeout_s)
+
+    def _check(self, video: cv2.VideoCapture) -> None:
+        now = _readable(video)
+        if now != self._fixed:
+            raise CameraError(
+                f"the webcam stands at {now}, set were {self._fixed}: something else changes it",
+                code="settings-changed",
+                remedy=RETAKE,
+            )
+
+    def _grab(self, video: cv2.VideoCapture) -> int:
+        """Host monotonic time (ns) when the next frame came: by the driver's stamp where it has one."""
+        if not video.grab():
+            self._release()
+            raise CameraError(
+                f"webcam {self._config.device} is gone",
+                code="camera-gone",
+                remedy="Check its cable; it is opened again when it is back.",
+            )
+        now_ns = time.monotonic_ns()
+        stamp_ns = round(video.get(cv2.CAP_PROP_POS_MSEC) * 1e6)
+        return stamp_ns if 0 <= now_ns - stamp_ns < _FOUND_AT_S * 1e9 else now_ns
+
+    def _image(self, video: cv2.VideoCapture, arrived_ns: int) -> Image:
+        good, pixels = video.retrieve()
+        if not good:
+            raise CameraError(
+                "a picture of the webcam cannot be decoded", code="frame-incomplete", remedy=RETAKE
+            )
+        self._seen += 1
+        if grey := self._config.pixel_format.startswith("Mono"):
+            pixels = cv2.cvtColor(pixels, cv2.COLOR_BGR2GRAY) if pixels.ndim == 3 else pixels
+        age_ns = time.monotonic_ns() - arrived_ns
+        exposure_us = self._exposure_us()
+        return Image(
+            pixels=np.ascontiguousarray(pixels),
+            stamps=Stamps(host_monotonic_ns=arrived_ns, host_wall_ns=time.time_ns() - age_ns),
+            frame_id=None,
+            sequence=0,
+            exposure_us=exposure_us,
+            pixel_format="Mono8" if grey else "BGR8",
+            time=by_arrival(arrived_ns, exposure_us, readout_s=LATENCY_S),
+        )
+
+    def _exposure_us(self) -> float:
+        """0 where the camera does not say."""
+        return self._fixed.get("exposure_us", 0.0)
+
+    def _numbered(self, image: Image) -> Image:
+        self._frames += 1
+        return msgspec.structs.replace(image, sequence=self._frames - 1)
+
+    def _stream_frames(self, callback: Callable[[Image], None], stop: threading.Event) -> None:
+        image, checked_s = self._fresh(_OPEN_S), time.monotonic()
+        while not stop.is_set():
+            self._newest = self._numbered(image)
+            callback(self._newest)
+            video = self._live()
+            if time.monotonic() - checked_s >= _CHECK_S:
+                self._check(video)
+                checked_s = time.monotonic()
+            image = self._image(video, self._grab(video))
+
+
+def require_device(config: CameraConfig) -> None:
+    """ConfigError for a file or an address: a film beside an arm that moves would be a wrong calibration."""
+    if config.device and not config.device.isdecimal() and not config.device.startswith("/dev/"):
+        raise ConfigError(
+            f"camera.device '{config.device}' is no webcam",
+            code="unreal-camera",
+            remedy="Give its number, or its link in /dev/v4l/by-id.",
+        )
+
+
+def _wanted_size(config: CameraConfig) -> tuple[int, int] | None:
+    """Width, height; CameraError for a part of the image, which a webcam cannot send."""
+    if config.region is None:
+        return (config.model.width, config.model.height) if config.model is not None else None
+    x, y, width, height = config.region
+    if (x, y) != (0, 0):
+        raise CameraError(
+            f"a webcam has no region that begins at {x}, {y}",
+            code="camera-refused",
+            remedy="Begin camera.region with 0, 0.",
+        )
+    return width, height
+
+
+def _readable(video: cv2.VideoCapture) -> dict[str, float]:
+    """Exposure (µs) and focus (the camera's own unit), where it has them: OpenCV says -1 or 0 for none."""
+    known = {
+        "exposure_us": video.get(cv2.CAP_PROP_EXPOSURE) * _EXPOSURE_UNIT_US,
+        "focus": video.get(cv2.CAP_PROP_FOCUS),
+    }
+    automatic = video.get(cv2.CAP_PROP_AUTO_EXPOSURE) not in (-1, 0, _MANUAL_EXPOSURE)
+    return {name: value for name, value in known.items() if value > 0 and not (automatic and name != "focus")}
+
+
+def _identity(device: str) -> CameraIdentity:
+    """By what the kernel knows of it; a device without a serial number is named by its path."""
+    node = f"video{device}" if device.isdecimal() else Path(device).resolve().name
+
+    def told(name: str) -> str:
+        try:
+            return (_SYSTEM / node / name).read_text(encoding="utf-8", errors="replace").strip()
+        except OSError:
+            return ""
+
+    return CameraIdentity(
+        vendor=told("device/../manufacturer"),
+        model=told("name") or "webcam",
+        serial=told("device/../serial") or node,
+        driver="webcam",
+    )

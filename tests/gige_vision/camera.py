@@ -71,9 +71,9 @@ class EmulatedCamera:
         self.ids = iter(itertools.cycle(range(1, 65_536)) if ids is None else ids)
         if extended_ids and ids is None:
             self.ids = itertools.count()
-        self.device_ns: Callable[[], int] = lambda: time.monotonic_ns() + 7_000_000_000_000
-        """The free-running clock, ns"""
-        self.ptp_ns: Callable[[], int] = time.time_ns
+        self.device_ns: Callable[[int], int] = lambda host_ns: host_ns + 7_000_000_000_000
+        """The free-running clock at a host monotonic time, ns"""
+        self.ptp_ns: Callable[[int], int] = lambda host_ns: host_ns + time.time_ns() - time.monotonic_ns()
         """The clock while IEEE 1588 is on, ns"""
         self.mangle: Callable[[Packets], Iterable[bytes]] = lambda packets: packets
         """What the wire makes of a frame's packets when they are sent first: loss, order, copies."""
@@ -157,11 +157,11 @@ class EmulatedCamera:
     def ptp(self) -> bool:
         return bool(self.register(at.GVCP_CONFIGURATION) & _PTP_ENABLE)
 
-    def _ticks(self) -> int:
+    def _ticks(self, host_ns: int) -> int:
         """The clock as stamps and latch show it; IEEE 1588 counts nanoseconds."""
         if self.ptp:
-            return self.ptp_ns()
-        return self.device_ns() * self._tick_hz // 1_000_000_000
+            return self.ptp_ns(host_ns)
+        return self.device_ns(host_ns) * self._tick_hz // 1_000_000_000
 
     def _fill(self, extended_ids: bool) -> None:
         width, height = self.size
@@ -265,7 +265,7 @@ class EmulatedCamera:
         self._memory[address : address + len(data)] = data
         match address:
             case at.TIMESTAMP_CONTROL if value & _LATCH:
-                self.set_register(at.TIMESTAMP, self._ticks(), 8)
+                self.set_register(at.TIMESTAMP, self._ticks(time.monotonic_ns()), 8)
             case at.PACKET_SIZE if value & _FIRE_TEST:
                 self.set_register(at.PACKET_SIZE, value & ~_FIRE_TEST)
                 if value & 0xFFFF <= self.mtu:
@@ -337,7 +337,8 @@ class EmulatedCamera:
     def _frame(self) -> None:
         exposure_us = self.number(at.EXPOSURE)
         time.sleep(self.number(at.TRIGGER_DELAY) * 1e-6 * bool(self.register(at.TRIGGER_MODE)))
-        start_ns, ticks = time.monotonic_ns(), self._ticks()
+        start_ns = time.monotonic_ns()
+        ticks = self._ticks(start_ns)
         width, height = self.register(at.WIDTH), self.register(at.HEIGHT)
         grey = self.picture(self.frames, width, height)
         self._ended.wait(max(0.0, exposure_us * 1e-6 - (time.monotonic_ns() - start_ns) / 1e9))

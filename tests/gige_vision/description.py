@@ -30,7 +30,8 @@ PIXEL_FORMATS = {
     "RGB8": 0x02180014, "BGR8": 0x02180015,
 }  # fmt: skip
 CHUNKS = {"Image": 0x0001, "Timestamp": 0xA001, "ExposureTime": 0xA002, "FrameID": 0xA003, "Gain": 0xA004}
-TRIGGER_SOURCES = {"Software": 0, "Line1": 1, "Line2": 2, "Line3": 3}
+TRIGGER_SOURCES = {"Software": 0, "Line0": 1, "Line1": 2, "Line2": 3, "Line3": 4}
+_LINES = {name: number for name, number in TRIGGER_SOURCES.items() if number}
 _AUTO = {"Off": 0, "Once": 1, "Continuous": 2}
 _PORT = ["Initializing", "Faulty", "Disabled", "Listening", "PreMaster", "Master", "Passive", "Uncalibrated"]
 PTP_STATES = {name: number for number, name in enumerate([*_PORT, "Slave"], 1)}
@@ -67,7 +68,7 @@ def genicam_xml(serial: str) -> str:
         _enumeration("TriggerActivation", TRIGGER_ACTIVATION, {"RisingEdge": 0, "FallingEdge": 1}),
         _float("TriggerDelay", TRIGGER_DELAY, 0.0, 1e6, "us"),
         _command("TriggerSoftware", TRIGGER_SOFTWARE, 1),
-        _enumeration("LineSelector", LINE_SELECTOR, {"Line1": 1, "Line2": 2, "Line3": 3}),
+        _enumeration("LineSelector", LINE_SELECTOR, _LINES),
         _enumeration("LineMode", LINE_MODE, {"Input": 0, "Output": 1}),
         _enumeration("LineSource", LINE_SOURCE, {"Off": 0, "ExposureActive": 1}),
         _boolean("LineInverter", LINE_INVERTER),

@@ -1,0 +1,174 @@
+"""Every camera driver, ready to be opened: what `test_camera_drivers.py` judges. A new driver adds itself."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import AsyncIterator, Callable
+from contextlib import AbstractAsyncContextManager, ExitStack, asynccontextmanager
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import cv2
+import msgspec
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from recordings.schema.messages import CameraModel, Image
+from station.cell.config import CameraConfig, TriggerConfig
+from station.devices import webcam
+from station.devices.aravis import AravisCamera
+from station.devices.base import Camera, Trigger
+from station.devices.playback import PlaybackCamera
+from station.devices.serial_trigger import SerialTrigger
+from station.devices.webcam import WebcamCamera
+from station.simulation.camera import RenderedCamera
+from station.simulation.launch import SimulatedController
+from station.simulation.scenes import make_cell
+from station.simulation.trigger import SimulatedTriggerBox
+from tests.gige_vision.camera import EmulatedCamera
+
+SIZE = (320, 240)
+VideoCapture = cv2.VideoCapture
+FILM_FPS = 100.0
+FILM_LATENCY_S = 0.15
+
+
+@dataclass(frozen=True)
+class Driver:
+    """One driver and what stands behind it."""
+
+    camera: Camera
+    trigger: Trigger | None = None
+    """Opened before the camera, closed after it"""
+    silence: Callable[[], AbstractAsyncContextManager[object]] | None = None
+    """While it lasts the camera sends nothing; None: this one cannot be late"""
+    streams: Callable[[], Camera] | None = None
+    """Another camera over the same device, free-running; None: there is no such thing"""
+    truth_ns: Callable[[Image], tuple[int, int]] | None = None
+    """Host monotonic begin and end of its exposure, where what stands behind it knows"""
+    ends: ExitStack = field(default_factory=ExitStack)
+
+
+def rendered(request: pytest.FixtureRequest) -> Driver:
+    truth = make_cell(seed=3)
+    arm: SimulatedController = request.getfixturevalue("arm")
+    lens = CameraModel(*SIZE, matrix=((300.0, 0.0, 160.0), (0.0, 300.0, 120.0), (0.0, 0.0, 1.0)))
+    camera = RenderedCamera(msgspec.structs.replace(truth, camera=lens), arm.host)
+
+    @asynccontextmanager
+    async def silence() -> AsyncIterator[None]:
+        await camera.inject("missed-trigger")
+        yield
+
+    return Driver(camera, silence=silence)
+
+
+def playback(request: pytest.FixtureRequest) -> Driver:
+    folder: Path = request.getfixturevalue("tmp_path")
+    for number in range(20):
+        cv2.imwrite(str(folder / f"{number:02}.png"), np.full(SIZE[::-1], 10 * number, np.uint8))
+    return Driver(PlaybackCamera(CameraConfig(driver="playback", device=str(folder))))
+
+
+def aravis(request: pytest.FixtureRequest) -> Driver:
+    """GigE Vision packets of the camera that does not share Aravis."""
+    request.getfixturevalue("lonely_network")
+    ends = ExitStack()
+    device = ends.enter_context(EmulatedCamera(size=SIZE))
+    config = CameraConfig(device="127.0.0.1", exposure_us=1000.0)
+    free = msgspec.structs.replace(config, trigger="free-running", frame_rate_hz=100.0)
+    return Driver(
+        AravisCamera(config),
+        None,
+        lambda: silent(device),
+        lambda: AravisCamera(free),
+        exposure_of(device),
+        ends,
+    )
+
+
+def trigger_box(request: pytest.FixtureRequest) -> Driver:
+    """The same camera, each picture fired by a box on a serial line."""
+    request.getfixturevalue("lonely_network")
+    ends = ExitStack()
+    device = ends.enter_context(EmulatedCamera(size=SIZE))
+    box = ends.enter_context(SimulatedTriggerBox(device.pulse))
+    config = CameraConfig(device="127.0.0.1", exposure_us=1000.0, trigger="hardware")
+    trigger = SerialTrigger(TriggerConfig(box.port))
+    return Driver(
+        AravisCamera(config, trigger), trigger, lambda: silent(device), None, exposure_of(device), ends
+    )
+
+
+def exposure_of(device: EmulatedCamera) -> Callable[[Image], tuple[int, int]]:
+    return lambda image: device.exposed_ns[(image.frame_id or 0) - 1]
+
+
+@asynccontextmanager
+async def silent(device: EmulatedCamera) -> AsyncIterator[None]:
+    device.acknowledges_only = True
+    yield
+    device.acknowledges_only = False
+
+
+class Film:
+    """`cv2.VideoCapture` on a film that runs as a webcam does: frames are due, asked for or not."""
+
+    stopped = False
+
+    def __init__(self, path: str) -> None:
+        self._video, self._due_s = VideoCapture(path), 0.0
+
+    def grab(self) -> bool:
+        while Film.stopped:
+            time.sleep(0.02)
+        now_s = time.monotonic()
+        self._due_s = max(self._due_s + 1 / FILM_FPS, now_s - 4 / FILM_FPS)  # four wait in the driver's queue
+        time.sleep(max(0.0, self._due_s - now_s))
+        return self._video.grab() or (self._video.set(cv2.CAP_PROP_POS_FRAMES, 0) and self._video.grab())
+
+    def retrieve(self) -> tuple[bool, NDArray[np.uint8]]:
+        """With the time of the exposure in the first eight pixels."""
+        good, pixels = self._video.retrieve()
+        exposed_ns = round((self._due_s - FILM_LATENCY_S) * 1e9)
+        pixels[0, :8] = np.frombuffer(exposed_ns.to_bytes(8, "little"), np.uint8)[:, None]
+        return good, pixels
+
+    def __getattr__(self, name: str) -> object:
+        return getattr(self._video, name)
+
+
+def film(request: pytest.FixtureRequest) -> Driver:
+    """The webcam's driver over a film in real time: no machine of ours has a webcam."""
+    path: Path = request.getfixturevalue("tmp_path") / "film.avi"
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"MJPG"), FILM_FPS, SIZE)
+    for number in range(50):
+        writer.write(np.full((*SIZE[::-1], 3), 5 * number, np.uint8))
+    writer.release()
+    request.getfixturevalue("monkeypatch").setattr(webcam.cv2, "VideoCapture", Film)
+    config = CameraConfig(driver="webcam", device=str(path))
+
+    @asynccontextmanager
+    async def silence() -> AsyncIterator[None]:
+        Film.stopped = True
+        yield
+        Film.stopped = False
+
+    def streams() -> Camera:
+        return WebcamCamera(msgspec.structs.replace(config, trigger="free-running"))
+
+    def exposure(image: Image) -> tuple[int, int]:
+        exposed_ns = int.from_bytes(image.pixels[0, :8].tobytes(), "little")
+        return exposed_ns, exposed_ns
+
+    return Driver(WebcamCamera(config), None, silence, streams, exposure)
+
+
+DRIVERS: dict[str, Callable[[pytest.FixtureRequest], Driver]] = {
+    "rendered": rendered,
+    "playback": playback,
+    "aravis": aravis,
+    "aravis with a trigger box": trigger_box,
+    "webcam": film,
+}

@@ -1,0 +1,189 @@
+"""What the session relies on, held against every camera driver: `camera_drivers.DRIVERS`.
+
+docs/write-a-driver.md says how a new one gets in.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import threading
+import time
+from collections.abc import AsyncIterator, Iterator
+from contextlib import asynccontextmanager, suppress
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from recordings.schema.messages import Image
+from station.cell.errors import CameraError
+from station.devices.base import Camera, StreamingCamera
+from station.simulation.launch import SimulatedController, start_controller
+from tests.station.devices.camera_drivers import DRIVERS, Driver
+
+pytestmark = [pytest.mark.gige, pytest.mark.process]
+LATE_S = 0.3
+
+
+@pytest.fixture(scope="module")
+def arm(request: pytest.FixtureRequest) -> Iterator[SimulatedController]:
+    """What a rendered camera looks from; in the network of the others, where there is one."""
+    with suppress(pytest.skip.Exception):
+        request.getfixturevalue("lonely_network")
+    with start_controller() as running:
+        yield running
+
+
+@pytest.fixture(params=list(DRIVERS))
+def driver(request: pytest.FixtureRequest) -> Iterator[Driver]:
+    made = DRIVERS[request.param](request)
+    with made.ends:
+        yield made
+
+
+@asynccontextmanager
+async def opened(driver: Driver, camera: Camera | None = None) -> AsyncIterator[Camera]:
+    camera = camera or driver.camera
+    if driver.trigger is not None:
+        await driver.trigger.open()
+    try:
+        identity = await camera.open()
+        assert identity == camera.identity and identity.driver and identity.model and identity.serial
+        yield camera
+    finally:
+        await camera.close()
+        if driver.trigger is not None:
+            await driver.trigger.close()
+
+
+def require_sound(image: Image) -> None:
+    """Pixels of a kind that can be recorded, and a time that says how good it is."""
+    pixels = image.pixels
+    assert pixels.dtype in (np.uint8, np.uint16) and pixels.flags.c_contiguous and pixels.size
+    colour = pixels.ndim == 3
+    assert (colour and pixels.shape[2] == 3) == (image.pixel_format == "BGR8")
+    assert colour or image.pixel_format.startswith(("Mono", "Bayer"))
+    assert (pixels.dtype == np.uint16) == image.pixel_format.startswith(("Mono10", "Mono12", "Mono16"))
+    assert image.stamps.host_monotonic_ns and image.stamps.host_wall_ns
+    assert image.time is not None and 0 < image.time.bound_s < 1
+
+
+def require_answer(driver: Driver, image: Image, asked_ns: int, answered_ns: int) -> None:
+    """It was exposed and came between question and answer, and its time is within its bound of the truth."""
+    assert image.time is not None
+    assert asked_ns <= image.stamps.host_monotonic_ns <= answered_ns
+    middle_ns, bound_ns = image.time.host_monotonic_ns, image.time.bound_s * 1e9
+    assert asked_ns - bound_ns <= middle_ns <= answered_ns + bound_ns
+    if driver.truth_ns is not None:
+        began_ns, ended_ns = driver.truth_ns(image)
+        assert asked_ns <= began_ns <= ended_ns <= image.stamps.host_monotonic_ns
+        assert abs(middle_ns - (began_ns + ended_ns) / 2) <= bound_ns
+
+
+async def test_a_camera_that_is_not_open_says_so_and_can_be_closed(driver: Driver) -> None:
+    assert driver.camera.counts().frames == 0
+    await driver.camera.close()
+    with pytest.raises(CameraError):
+        await driver.camera.capture(timeout_s=1.0)
+    await driver.camera.close()
+
+
+async def test_each_capture_is_one_new_picture_with_its_time(driver: Driver) -> None:
+    async with opened(driver) as camera:
+        images, kept = [], []
+        for _ in range(4):
+            asked_ns = time.monotonic_ns()
+            image = await camera.capture()
+            require_sound(image)
+            require_answer(driver, image, asked_ns, time.monotonic_ns())
+            images.append(image)
+            kept.append(image.pixels.copy())
+        assert [image.sequence for image in images] == [0, 1, 2, 3]
+        ids = [image.frame_id for image in images if image.frame_id is not None]
+        assert len(set(ids)) == len(ids) in (0, 4)
+        arrivals = [image.stamps.host_monotonic_ns for image in images]
+        assert all(a < b for a, b in pairwise(arrivals))
+        assert all(np.array_equal(i.pixels, k) for i, k in zip(images, kept, strict=True)), "a buffer reused"
+        counts, timing = camera.counts(), camera.timing
+        assert counts.frames >= 4 and counts.missing == 0
+        assert timing is not None and images[-1].time is not None
+        assert timing.source == images[-1].time.source
+        settings = json.loads(json.dumps(await camera.settings()))
+        if "region" in settings:
+            assert tuple(settings["region"][2:]) == images[0].pixels.shape[1::-1]
+
+
+async def test_looks_take_no_number_and_do_not_disturb_a_capture(driver: Driver) -> None:
+    async with opened(driver) as camera:
+        first = await camera.capture()
+        asked_ns = time.monotonic_ns()
+        glimpse = await camera.glimpse()
+        if glimpse is not None:
+            assert glimpse.pixels.size and glimpse.stamps.host_monotonic_ns >= asked_ns
+        second, shown, looked = await asyncio.gather(camera.capture(), camera.preview(), camera.glimpse())
+        assert (first.sequence, second.sequence) == (0, 1)
+        assert all(image is None or image.pixels.size for image in (shown, looked))
+        assert (await camera.capture()).sequence == 2
+
+
+async def test_a_picture_that_does_not_come_is_an_error_in_time_and_the_next_one_good(driver: Driver) -> None:
+    if driver.silence is None:
+        pytest.skip("what is played is never late")
+    async with opened(driver) as camera:
+        await camera.capture()
+        beats = 0
+
+        async def beat() -> None:
+            nonlocal beats
+            while True:
+                await asyncio.sleep(0.01)
+                beats += 1
+
+        beating = asyncio.create_task(beat())
+        async with driver.silence():
+            begun_s = time.monotonic()
+            with pytest.raises(CameraError):
+                await camera.capture(timeout_s=LATE_S)
+            assert time.monotonic() - begun_s < LATE_S + 2.0
+        beating.cancel()
+        assert beats >= 5, "the daemon's loop goes on meanwhile"
+        assert camera.counts().missing == 1
+        asked_ns = time.monotonic_ns()
+        image = await camera.capture()
+        assert image.sequence == 1
+        require_answer(driver, image, asked_ns, time.monotonic_ns())
+
+
+async def test_a_camera_that_was_closed_is_the_same_one_when_opened_again(driver: Driver) -> None:
+    async with opened(driver) as camera:
+        serial = camera.identity.serial
+        assert (await camera.capture()).sequence == 0
+    async with opened(driver) as camera:
+        image = await camera.capture()
+        assert camera.identity.serial == serial and image.sequence == 1, "numbers go on"
+
+
+async def test_what_comes_by_itself_comes_in_order_until_told_to_end(driver: Driver) -> None:
+    if driver.streams is None:
+        pytest.skip("every picture of this one is triggered")
+    images: list[Image] = []
+    stop = threading.Event()
+
+    def keep(image: Image) -> None:
+        images.append(image)
+        if len(images) == 10:
+            stop.set()
+
+    async with opened(driver, driver.streams()) as camera:
+        assert isinstance(camera, StreamingCamera) and camera.free_running
+        await asyncio.wait_for(camera.stream(keep, stop), 20.0)
+        asked_ns = time.monotonic_ns()
+        newest = await camera.capture()
+        require_answer(driver, newest, asked_ns, time.monotonic_ns())
+    assert [image.sequence for image in images] == list(range(len(images))) and len(images) >= 10
+    assert newest.sequence == len(images)
+    for image in images:
+        require_sound(image)
+    arrivals = [image.stamps.host_monotonic_ns for image in images]
+    assert all(a < b for a, b in pairwise(arrivals))

@@ -87,10 +87,25 @@ class CameraConfig(Section, frozen=True):
     """free-running: None = the camera's own"""
     exposure_us: float = 10_000.0
     gain_db: float = 0.0
+    gain: float | None = None
+    """In the camera's own unit, instead of `gain_db`: for cameras that know no dB."""
     region: tuple[int, int, int, int] | None = None
     """x, y, width, height"""
     packet_size: int | None = None
     """None = negotiated"""
+    packet_delay_us: float | None = None
+    """Between packets; None = none, and more after each frame that lost some"""
+    trigger_line: str = "Line0"
+    """hardware: the input that the box is wired to"""
+    trigger_activation: Literal["RisingEdge", "FallingEdge", "AnyEdge", "LevelHigh", "LevelLow"] = (
+        "RisingEdge"
+    )
+    trigger_delay_us: float = 0.0
+    invert_trigger_line: bool = False
+    exposure_line: str = ""
+    """Output that is active while the camera exposes; empty = none"""
+    ptp: bool = False
+    """The camera's clock follows the network's master (IEEE 1588)"""
     time_offset: TimeCorrection | None = None
     """What a sweep measured (`calibrate sweep -o`): added to the frames' times of the same source."""
     playback_pace: float = 0.0

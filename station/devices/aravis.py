@@ -27,6 +27,7 @@ from station.devices.frames import (
     StreamCounts,
     TriggerPulse,
 )
+from station.devices.genicam_settings import CHUNKS, TIME_CHUNKS
 
 T = TypeVar("T")
 _CLOCK_READINGS = 8
@@ -49,7 +50,7 @@ class AravisCamera:
         self._device: GenicamDevice | None = None
         self._worker: ThreadPoolExecutor | None = None
         self._busy = asyncio.Lock()
-        self._clock = FrameClock(config.time_offset)
+        self._clock = FrameClock(config.time_offset, config.trigger_delay_us)
         self._newest: Image | None = None
         self.identity = CameraIdentity(driver="aravis")
         self.counter = FrameCounter()
@@ -84,7 +85,7 @@ class AravisCamera:
             return await self._one(_GLIMPSE_S, sequenced=False)
 
     async def _one(self, timeout_s: float, *, sequenced: bool) -> Image:
-        exposure_us, gain_db = await self._run(self._prepare)
+        await self._run(self._prepare)
         pulse: TriggerPulse | None = None
         asked_ns = None if self.free_running else time.monotonic_ns()
         if self._config.trigger == "hardware":
@@ -97,10 +98,12 @@ class AravisCamera:
             self.counter.lost(count)
             raise
         sequence = self.counter.accept(picture.frame_id, count, sequenced=sequenced)
-        told = msgspec.structs.replace(
-            picture, sequence=sequence, exposure_us=exposure_us, gain_db=gain_db, trigger_count=count
-        )
-        return self._clock.timed(told, asked_ns=asked_ns, pulse=pulse)
+        told = msgspec.structs.replace(picture, sequence=sequence, trigger_count=count)
+        chunks = self._live().chunks
+        if not chunks.issuperset(CHUNKS):  # held before the exposure: they must hold after it, too
+            exposure_us, gain_db = await self._run(lambda: self._live().check_settings())
+            told = msgspec.structs.replace(told, exposure_us=exposure_us, gain_db=gain_db)
+        return self._clock.timed(told, asked_ns=asked_ns, pulse=pulse, chunk=chunks.issuperset(TIME_CHUNKS))
 
     async def preview(self) -> Image | None:
         """A fresh image where the camera is idle and can be triggered by software, else the newest one."""
@@ -203,8 +206,9 @@ class AravisCamera:
                 continue  # incomplete: the next frame's id shows the gap, and the counter counts it
             if picture is not None:
                 sequence = self.counter.follow(picture.frame_id)
-                told = msgspec.structs.replace(
-                    picture, sequence=sequence, exposure_us=exposure_us, gain_db=gain_db
-                )
-                self._newest = self._clock.timed(told)
+                told = msgspec.structs.replace(picture, sequence=sequence)
+                chunk = device.chunks.issuperset(TIME_CHUNKS)
+                if not chunk:
+                    told = msgspec.structs.replace(told, exposure_us=exposure_us, gain_db=gain_db)
+                self._newest = self._clock.timed(told, chunk=chunk)
                 callback(self._newest)

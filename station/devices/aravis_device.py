@@ -16,6 +16,13 @@ from recordings.schema.messages import CameraIdentity, ClockReading, Image, Stam
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices.frames import RETAKE, StreamCounts
+from station.devices.genicam_settings import (
+    Applied,
+    apply_settings,
+    read_settings,
+    require_exposed,
+    require_settings,
+)
 from station.devices.pixels import bits_per_pixel, decode
 
 if TYPE_CHECKING:
@@ -33,10 +40,8 @@ _STREAM_PRIORITY = -15
 _LATCH_WAIT_S = 0.02
 _POP_S = 0.1
 """So often a waiting capture looks whether the camera was lost."""
-Region = tuple[int, int, int, int]
-"""x, y, width, height, pixels"""
-_EXPOSURE_TOLERANCE = 0.02
-_GAIN_TOLERANCE_DB = 0.2
+LEAST_FRAMES_HZ = 4.0
+"""Gaps between packets that are negotiated never make a frame slower than this."""
 
 
 def _aravis() -> tuple[Any, Any]:
@@ -65,7 +70,9 @@ class GenicamDevice:
         self._aravis, self._glib = _aravis()
         self._camera: Any = None
         self._stream: Any = None
-        self._region: Region = (0, 0, 0, 0)
+        self._applied: Applied | None = None
+        self._parser: Any = None
+        self._ptp_status = ""
         self._latched_ns: int | None = None
         self._controls = False
         self._lost = False
@@ -115,7 +122,9 @@ class GenicamDevice:
                 driver="aravis",
             )
         with self._explained("setting up the camera"):
-            self._region = apply_settings(self._aravis, self._camera, self._config)
+            self._applied = apply_settings(self._aravis, self._camera, self._config)
+            self._parser = self._camera.create_chunk_parser() if self._applied.chunks else None
+            self._ptp_status = self._find_ptp_status()
         with self._explained("starting the camera"):
             before = _threads()
             self._stream = self._camera.create_stream(None, None)
@@ -151,9 +160,39 @@ class GenicamDevice:
             return read_settings(self._camera)
 
     def check_settings(self) -> tuple[float, float]:
-        """Exposure (µs) and gain (dB) as they are; CameraError when they are not what was asked for."""
+        """Exposure (µs) and gain (dB) as they are; CameraError when they are not what was asked for.
+
+        A gain in another unit is 0 dB here: it stands in the settings.
+        """
+        applied = self._require_applied()
         with self._explained("reading the camera's settings"):
-            return require_settings(self._camera, self._config, self._region)
+            exposure_us, gain = require_settings(self._camera, self._config.exposure_us, applied)
+        return exposure_us, gain if applied.gain_in_db else 0.0
+
+    def _require_applied(self) -> Applied:
+        if self._applied is None:
+            raise CameraError("the camera is not open", code="not-open")
+        return self._applied
+
+    @property
+    def chunks(self) -> frozenset[str]:
+        """What comes with every frame, of `genicam_settings.CHUNKS`."""
+        return frozenset() if self._applied is None else self._applied.chunks
+
+    def _find_ptp_status(self) -> str:
+        """Name of the feature that tells of IEEE 1588; empty where it is off or there is none."""
+        for switch, status in (("PtpEnable", "PtpStatus"), ("GevIEEE1588", "GevIEEE1588Status")):
+            if all(self._camera.is_feature_available(name) for name in (switch, status)):
+                return status if self._camera.get_boolean(switch) else ""
+        return ""
+
+    def _synchronized(self) -> bool:
+        """The camera says that it follows a master, or is the master that this computer may follow."""
+        if not self._ptp_status:
+            return False
+        if self._ptp_status == "PtpStatus" and self._camera.is_feature_available("PtpDataSetLatch"):
+            self._camera.execute_command("PtpDataSetLatch")
+        return self._camera.get_string(self._ptp_status) in ("Slave", "Master")
 
     def latch(self, clock: DeviceClock) -> None:
         """One reading of the camera's clock, where it has one that can be latched."""
@@ -172,12 +211,14 @@ class GenicamDevice:
                 while device_ns == self._latched_ns and time.monotonic_ns() < asked_ns + _LATCH_WAIT_S * 1e9:
                     device_ns = self._to_ns(self._camera.get_integer(value))
                 answered_ns, wall_ns = time.monotonic_ns(), time.time_ns()
+                synchronized = self._synchronized()
             if device_ns != self._latched_ns:
                 self._latched_ns = device_ns
-                clock.add(ClockReading(asked_ns, answered_ns, device_ns, wall_ns))
+                clock.add(ClockReading(asked_ns, answered_ns, device_ns, wall_ns, synchronized))
             return
 
     def _to_ns(self, ticks: int) -> int:
+        """Read anew: with IEEE 1588 the same clock ticks nanoseconds."""
         feature = "GevTimestampTickFrequency"
         rate_hz = self._camera.get_integer(feature) if self._camera.is_feature_available(feature) else 0
         return ticks if rate_hz in (0, 1_000_000_000) else round(ticks * 1e9 / rate_hz)
@@ -240,7 +281,9 @@ class GenicamDevice:
         return None
 
     def _picture(self, buffer: Any) -> Image:
+        applied = self._require_applied()
         if buffer.get_status() != self._aravis.BufferStatus.SUCCESS:
+            self._calm_down()
             raise CameraError(
                 f"frame {buffer.get_frame_id()} came incomplete ({buffer.get_status().value_nick}): packets "
                 "were lost",
@@ -248,28 +291,57 @@ class GenicamDevice:
                 remedy="Check cable, network card and packet size, and take this pose again.",
             )
         width, height = buffer.get_image_width(), buffer.get_image_height()
-        if (width, height) != self._region[2:]:
+        if (width, height) != applied.region[2:]:
             raise CameraError(
-                f"frame {buffer.get_frame_id()} came as {width}×{height}, set were {self._region[2]}×"
-                f"{self._region[3]}: another program changes the camera's settings",
+                f"frame {buffer.get_frame_id()} came as {width}×{height}, set were {applied.region[2]}×"
+                f"{applied.region[3]}: another program changes the camera's settings",
                 code="settings-changed",
                 remedy=RETAKE,
             )
         wall_ns = buffer.get_system_timestamp()
+        arrival_ns = monotonic_from_wall_ns(wall_ns)
+        device_ns, exposure_us, gain = self._told(buffer, applied)
         image = decode(buffer.get_data(), width, height, self._config.pixel_format)
         return Image(
             pixels=image,
-            stamps=Stamps(
-                host_monotonic_ns=monotonic_from_wall_ns(wall_ns),
-                host_wall_ns=wall_ns,
-                device_ns=buffer.get_timestamp(),
-            ),
+            stamps=Stamps(host_monotonic_ns=arrival_ns, host_wall_ns=wall_ns, device_ns=device_ns),
             frame_id=self._frame_id(buffer),
             sequence=0,
-            exposure_us=self._config.exposure_us,
-            gain_db=self._config.gain_db,
+            exposure_us=exposure_us,
+            gain_db=gain if applied.gain_in_db else 0.0,
             pixel_format="BGR8" if image.ndim == 3 else self._config.pixel_format,
         )
+
+    def _told(self, buffer: Any, applied: Applied) -> tuple[int, float, float]:
+        """Stamp (ns), exposure (µs) and gain of a frame: its own, as far as it brings them along."""
+        device_ns, exposure_us, gain = int(buffer.get_timestamp()), self._config.exposure_us, applied.gain
+        if not applied.chunks:
+            return device_ns, exposure_us, gain
+        with self._explained("reading what came with the frame"):
+            if "Timestamp" in applied.chunks:
+                device_ns = self._to_ns(self._parser.get_integer_value(buffer, "ChunkTimestamp"))
+            if "ExposureTime" in applied.chunks:
+                exposure_us = float(self._parser.get_float_value(buffer, "ChunkExposureTime"))
+            if "Gain" in applied.chunks:
+                gain = float(self._parser.get_float_value(buffer, "ChunkGain"))
+        require_exposed(exposure_us, gain, self._config.exposure_us, applied)
+        return device_ns, exposure_us, gain
+
+    def _calm_down(self) -> None:
+        """After a frame that lost packets: longer gaps between them, where none were configured."""
+        camera, config = self._camera, self._config
+        if config.packet_delay_us is not None or config.trigger == "free-running":
+            return
+        if not camera.is_gv_device() or not camera.is_feature_available("GevSCPD"):
+            return
+        with suppress(self._glib.Error):  # more than this camera can: what there is must do
+            size = camera.gv_get_packet_size()
+            packets = camera.get_payload() // size + 1
+            gap_ns = max(
+                2 * camera.gv_get_packet_delay(), 8 * size
+            )  # at first as long as a packet, at 1 Gbit/s
+            if packets * (gap_ns + 8 * size) * LEAST_FRAMES_HZ <= 1e9:
+                camera.gv_set_packet_delay(gap_ns)
 
     def _frame_id(self, buffer: Any) -> int | None:
         """GigE Vision's block id 0 says that there is none; the upper half of 64 bits reads as negative."""
@@ -334,72 +406,3 @@ def _find(aravis: Any, wanted: str) -> str:
         remedy="Check power, cable and network, or give its IP address.",
         found=len(found),
     )
-
-
-def apply_settings(aravis: Any, camera: Any, config: CameraConfig) -> Region:
-    """Everything the configuration says, automatics off; the region that was set."""
-    camera.set_range_check_policy(aravis.RangeCheckPolicy.ENABLE)
-    camera.stop_acquisition()
-    camera.clear_triggers()
-    for automatic in ("ExposureAuto", "GainAuto"):
-        if camera.is_feature_available(automatic):
-            camera.set_string(automatic, "Off")
-    camera.set_pixel_format_from_string(config.pixel_format)
-    # Cameras keep the region of whoever used them last.
-    region: Region = config.region or (0, 0, *camera.get_sensor_size())
-    camera.set_region(*region)
-    camera.set_exposure_time(config.exposure_us)
-    if camera.is_gain_available():
-        camera.set_gain(config.gain_db)
-    if camera.is_gv_device():
-        if config.packet_size is None:
-            camera.gv_auto_packet_size()
-        else:
-            camera.gv_set_packet_size(config.packet_size)
-    camera.set_acquisition_mode(aravis.AcquisitionMode.CONTINUOUS)
-    if config.trigger == "free-running":
-        if config.frame_rate_hz is not None:
-            camera.set_frame_rate(config.frame_rate_hz)
-    else:
-        camera.set_trigger("Software" if config.trigger == "software" else "Line0")
-    return region
-
-
-def read_settings(camera: Any) -> dict[str, object]:
-    """Reads the settings back; JSON types only."""
-    x, y, width, height = _region(camera)
-    return {
-        "pixel_format": camera.get_pixel_format_as_string(),
-        "region": [x, y, width, height],
-        "exposure_us": camera.get_exposure_time(),
-        "gain_db": camera.get_gain() if camera.is_gain_available() else 0.0,
-        "packet_size": camera.gv_get_packet_size() if camera.is_gv_device() else None,
-    }
-
-
-def require_settings(camera: Any, wanted: CameraConfig, region: Region) -> tuple[float, float]:
-    """Exposure (µs) and gain (dB) as they are; CameraError when they are not what was asked for."""
-    exposure_us = float(camera.get_exposure_time())
-    gain_db = float(camera.get_gain()) if camera.is_gain_available() else 0.0
-    actual = _region(camera)
-    if (
-        abs(exposure_us - wanted.exposure_us) > _EXPOSURE_TOLERANCE * wanted.exposure_us
-        or abs(gain_db - wanted.gain_db) > _GAIN_TOLERANCE_DB
-        or actual != region
-    ):
-        raise CameraError(
-            f"the camera stands at {exposure_us:g} µs, {gain_db:g} dB, region {actual}; set were "
-            f"{wanted.exposure_us:g} µs, {wanted.gain_db:g} dB, region {region}",
-            code="settings-changed",
-            remedy="Ask for what the camera can do, and end other programs that use it.",
-            exposure_us=exposure_us,
-            wanted_exposure_us=wanted.exposure_us,
-            gain_db=gain_db,
-            wanted_gain_db=wanted.gain_db,
-        )
-    return exposure_us, gain_db
-
-
-def _region(camera: Any) -> Region:
-    found = camera.get_region()
-    return found.x, found.y, found.width, found.height

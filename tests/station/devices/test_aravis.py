@@ -84,6 +84,11 @@ async def test_settings_are_made_and_read_back(server: SimulatedGige) -> None:
             "exposure_us": 5000.0,
             "gain_db": 3.0,
             "packet_size": 4000,
+            "gain": 3.0,
+            "gain_unit": "dB",
+            "packet_delay_us": 0.0,
+            "TriggerSource": "Software",
+            "TriggerActivation": "RisingEdge",
         }
 
 

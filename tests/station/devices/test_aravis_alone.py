@@ -14,8 +14,9 @@ from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices import aravis_device
 from station.devices.aravis import AravisCamera
-from station.devices.aravis_device import GenicamDevice, apply_settings, require_settings
+from station.devices.aravis_device import GenicamDevice
 from station.devices.frames import TriggerPulse
+from station.devices.genicam_settings import Applied, apply_settings, require_settings
 from tests.codes import raises
 
 REGION = (0, 0, 1280, 1024)
@@ -83,7 +84,7 @@ def test_a_camera_that_is_gone_is_not_waited_for(device: Any) -> None:
 class Device:
     """In place of `GenicamDevice`."""
 
-    lost, surplus = False, 0
+    lost, surplus, chunks = False, 0, frozenset[str]()
 
     def latch(self, clock: DeviceClock) -> None: ...
 
@@ -151,8 +152,11 @@ async def test_a_camera_that_was_not_opened_says_so() -> None:
 class Settable:
     """In place of `Aravis.Camera`: notes what is set and tells of what stands."""
 
-    def __init__(self, exposure_us: float, gain_db: float, region: tuple[int, int, int, int]) -> None:
+    def __init__(
+        self, exposure_us: float, gain_db: float, region: tuple[int, int, int, int], unit: str = "dB"
+    ) -> None:
         self._stands = exposure_us, gain_db, region
+        self._node = SimpleNamespace(get_unit=lambda: unit)
         self.set: dict[str, tuple[Any, ...]] = {}
 
     def get_exposure_time(self) -> float:
@@ -163,6 +167,15 @@ class Settable:
 
     def get_region(self) -> Any:
         return SimpleNamespace(**dict(zip(("x", "y", "width", "height"), self._stands[2], strict=True)))
+
+    def get_device(self) -> Any:
+        return SimpleNamespace(get_feature=lambda name: self._node)
+
+    def get_gain_bounds(self) -> tuple[float, float]:
+        return 36.0, 512.0
+
+    def are_chunks_available(self) -> bool:
+        return False
 
     def get_sensor_size(self) -> tuple[int, int]:
         return 1280, 1024
@@ -189,22 +202,34 @@ class Settable:
 def test_another_exposure_gain_or_region_than_asked_for_is_refused(
     exposure_us: float, gain_db: float, region: tuple[int, int, int, int]
 ) -> None:
-    wanted = CameraConfig(exposure_us=1000.0, gain_db=0.0)
-    assert require_settings(Settable(1010.0, 0.1, REGION), wanted, REGION) == (1010.0, 0.1)
+    applied = Applied(REGION, 0.0, True, frozenset())
+    assert require_settings(Settable(1010.0, 0.1, REGION), 1000.0, applied) == (1010.0, 0.1)
     with raises("settings-changed"):
-        require_settings(Settable(exposure_us, gain_db, region), wanted, REGION)
+        require_settings(Settable(exposure_us, gain_db, region), 1000.0, applied)
+
+
+LIBRARY = SimpleNamespace(
+    RangeCheckPolicy=SimpleNamespace(ENABLE=1), AcquisitionMode=SimpleNamespace(CONTINUOUS="continuous")
+)
 
 
 @pytest.mark.parametrize(
-    ("trigger", "line"), [("software", ("Software",)), ("hardware", ("Line0",)), ("free-running", None)]
+    ("trigger", "line"), [("software", ("Software",)), ("hardware", ("Line2",)), ("free-running", None)]
 )
 def test_the_whole_sensor_is_set_with_the_right_trigger_and_automatics_off(trigger: Any, line: Any) -> None:
-    library = SimpleNamespace(
-        RangeCheckPolicy=SimpleNamespace(ENABLE=1), AcquisitionMode=SimpleNamespace(CONTINUOUS="continuous")
-    )
     camera = Settable(1000.0, 0.0, REGION)
-    assert apply_settings(library, camera, CameraConfig(trigger=trigger)) == REGION
+    config = CameraConfig(trigger=trigger, trigger_line="Line2")
+    assert apply_settings(LIBRARY, camera, config).region == REGION
     assert camera.set["set_region"] == REGION and camera.set.get("set_trigger") == line
     assert camera.set["set_string ExposureAuto"] == ("ExposureAuto", "Off")
     assert camera.set["set_string GainAuto"] == ("GainAuto", "Off")
     assert camera.set["set_acquisition_mode"] == ("continuous",)
+
+
+def test_a_gain_that_is_not_in_db_is_asked_for_in_the_cameras_unit() -> None:
+    camera = Settable(1000.0, 0.0, REGION, unit="steps")
+    with raises("gain-unit", low=36.0, high=512.0):
+        apply_settings(LIBRARY, camera, CameraConfig(gain_db=6.0))
+    assert apply_settings(LIBRARY, camera, CameraConfig()).gain == 36.0, "0 dB: as little as there is"
+    assert apply_settings(LIBRARY, camera, CameraConfig(gain=100.0)).gain == 100.0
+    assert not apply_settings(LIBRARY, camera, CameraConfig(gain=100.0)).gain_in_db

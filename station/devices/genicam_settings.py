@@ -1,0 +1,217 @@
+"""A GenICam camera's settings by its features: made, read back, and proven. Needs no Aravis of its own."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+from station.cell.config import CameraConfig
+from station.cell.errors import CameraError
+
+Region = tuple[int, int, int, int]
+"""x, y, width, height, pixels"""
+_EXPOSURE_TOLERANCE = 0.02
+_GAIN_TOLERANCE = 0.2
+"""dB, or the camera's unit"""
+TIME_CHUNKS = ("Timestamp", "ExposureTime")
+CHUNKS = (*TIME_CHUNKS, "Gain")
+"""What a frame can bring along of itself"""
+
+
+class Applied(NamedTuple):
+    """What the camera was set to."""
+
+    region: Region
+    gain: float
+    """In the camera's unit"""
+    gain_in_db: bool
+    chunks: frozenset[str]
+    """Those of CHUNKS that come with every frame"""
+
+
+def apply_settings(aravis: Any, camera: Any, config: CameraConfig) -> Applied:
+    """Everything the configuration says, automatics off. Raises CameraError for what it cannot do."""
+    camera.set_range_check_policy(aravis.RangeCheckPolicy.ENABLE)
+    camera.stop_acquisition()
+    camera.clear_triggers()
+    for automatic in ("ExposureAuto", "GainAuto"):
+        if camera.is_feature_available(automatic):
+            camera.set_string(automatic, "Off")
+    camera.set_pixel_format_from_string(config.pixel_format)
+    # Cameras keep the region of whoever used them last.
+    region: Region = config.region or (0, 0, *camera.get_sensor_size())
+    camera.set_region(*region)
+    camera.set_exposure_time(config.exposure_us)
+    gain = 0.0
+    if camera.is_gain_available():
+        gain = _wanted_gain(camera, config)
+        camera.set_gain(gain)
+    if camera.is_gv_device():
+        if config.packet_size is None:
+            camera.gv_auto_packet_size()
+        else:
+            camera.gv_set_packet_size(config.packet_size)
+        if camera.is_feature_available("GevSCPD"):
+            camera.gv_set_packet_delay(round(1000 * (config.packet_delay_us or 0.0)))
+    camera.set_acquisition_mode(aravis.AcquisitionMode.CONTINUOUS)
+    if config.trigger == "free-running":
+        if config.frame_rate_hz is not None:
+            camera.set_frame_rate(config.frame_rate_hz)
+    else:
+        _set_trigger(camera, config)
+    if config.exposure_line:
+        _set_line(camera, config.exposure_line, {"LineMode": "Output", "LineSource": "ExposureActive"})
+    if config.ptp:
+        for feature in ("PtpEnable", "GevIEEE1588"):
+            if camera.is_feature_available(feature):
+                camera.set_boolean(feature, True)
+                break
+        else:
+            raise _cannot("follow IEEE 1588", "camera.ptp")
+    return Applied(region, gain, _knows_db(camera), _set_chunks(aravis, camera))
+
+
+def _set_chunks(aravis: Any, camera: Any) -> frozenset[str]:
+    """Lets frames bring their own stamp and settings, where the camera can."""
+    if not camera.are_chunks_available():
+        return frozenset()
+    offered = set(camera.dup_available_enumerations_as_strings("ChunkSelector"))
+    wanted = [name for name in CHUNKS if name in offered]
+    camera.set_chunk_mode(bool(wanted))
+    for name in wanted:
+        camera.set_chunk_state(name, True)
+    return frozenset(wanted)
+
+
+def _set_trigger(camera: Any, config: CameraConfig) -> None:
+    """One trigger per frame, with delay and edge: cameras keep those of whoever used them last."""
+    hardware = config.trigger == "hardware"
+    camera.set_trigger(config.trigger_line if hardware else "Software")
+    delay_us = config.trigger_delay_us if hardware else 0.0
+    delays = [name for name in ("TriggerDelay", "TriggerDelayAbs") if camera.is_feature_available(name)]
+    if delays:
+        camera.set_float(delays[0], delay_us)
+    elif delay_us:
+        raise _cannot("delay its trigger", "camera.trigger_delay_us")
+    if not hardware:
+        return
+    if camera.is_feature_available("TriggerActivation"):
+        camera.set_string("TriggerActivation", config.trigger_activation)
+    elif config.trigger_activation != "RisingEdge":
+        raise _cannot(f"trigger on {config.trigger_activation}", "camera.trigger_activation")
+    _set_line(camera, config.trigger_line, {"LineMode": "Input"}, inverted=config.invert_trigger_line)
+
+
+def _set_line(camera: Any, line: str, values: dict[str, str], inverted: bool = False) -> None:
+    """Settings of one line; an input of a camera that has no LineSelector needs none."""
+    output = values["LineMode"] == "Output"
+    if not camera.is_feature_available("LineSelector"):
+        if output or inverted:
+            raise _cannot(
+                f"set up {line}", "camera.exposure_line" if output else "camera.invert_trigger_line"
+            )
+        return
+    camera.set_string("LineSelector", line)
+    for name, value in values.items():
+        if camera.is_feature_available(name) and camera.get_string(name) != value:
+            camera.set_string(name, value)
+    if camera.is_feature_available("LineInverter"):
+        camera.set_boolean("LineInverter", inverted)
+    elif inverted:
+        raise _cannot(f"invert {line}", "camera.invert_trigger_line")
+
+
+def _cannot(what: str, key: str) -> CameraError:
+    return CameraError(
+        f"this camera cannot {what}", code="camera-cannot", remedy=f"Leave {key} out of the configuration."
+    )
+
+
+def gain_unit(camera: Any) -> str:
+    """As the camera names it: dB, or something else; empty = it names none."""
+    for name in ("Gain", "GainRaw", "GainAbs"):
+        if camera.is_feature_available(name):
+            node = camera.get_device().get_feature(name)
+            return str(node.get_unit() or "") if hasattr(node, "get_unit") else ""
+    return ""
+
+
+def _knows_db(camera: Any) -> bool:
+    return gain_unit(camera).strip().lower() == "db"
+
+
+def _wanted_gain(camera: Any, config: CameraConfig) -> float:
+    """In the camera's unit. 0 dB of a camera without dB is the least that it amplifies."""
+    if config.gain is not None:
+        return config.gain
+    if _knows_db(camera):
+        return config.gain_db
+    low, high = camera.get_gain_bounds()
+    if config.gain_db:
+        unit = gain_unit(camera) or "a unit of its own"
+        raise CameraError(
+            f"this camera counts gain in {unit} from {low:g} to {high:g}, not in dB",
+            code="gain-unit",
+            remedy="Give camera.gain in its unit instead of camera.gain_db.",
+            low=low,
+            high=high,
+        )
+    return float(low)
+
+
+def read_settings(camera: Any) -> dict[str, object]:
+    """Reads the settings back; JSON types only."""
+    x, y, width, height = _region(camera)
+    gain = camera.get_gain() if camera.is_gain_available() else 0.0
+    told: dict[str, object] = {
+        "pixel_format": camera.get_pixel_format_as_string(),
+        "region": [x, y, width, height],
+        "exposure_us": camera.get_exposure_time(),
+        "gain_db": gain if _knows_db(camera) else 0.0,
+        "gain": gain,
+        "gain_unit": gain_unit(camera),
+        "packet_size": camera.gv_get_packet_size() if camera.is_gv_device() else None,
+    }
+    for name in ("TriggerSource", "TriggerActivation", "DeviceFirmwareVersion", "PtpStatus"):
+        if camera.is_feature_available(name):
+            told[name] = camera.get_string(name)
+    if camera.is_gv_device() and camera.is_feature_available("GevSCPD"):
+        told["packet_delay_us"] = camera.gv_get_packet_delay() / 1000
+    return told
+
+
+def require_settings(camera: Any, wanted_us: float, applied: Applied) -> tuple[float, float]:
+    """Exposure (µs) and gain (its unit) as they are; CameraError when they are not what was asked for."""
+    exposure_us = float(camera.get_exposure_time())
+    gain = float(camera.get_gain()) if camera.is_gain_available() else 0.0
+    require_exposed(exposure_us, gain, wanted_us, applied)
+    if (actual := _region(camera)) != applied.region:
+        raise _changed(exposure_us, gain, wanted_us, applied, f"; region {actual}, set {applied.region}")
+    return exposure_us, gain
+
+
+def require_exposed(exposure_us: float, gain: float, wanted_us: float, applied: Applied) -> None:
+    """CameraError when a frame says that it was exposed otherwise."""
+    off_us = abs(exposure_us - wanted_us)
+    if off_us > _EXPOSURE_TOLERANCE * wanted_us or abs(gain - applied.gain) > _GAIN_TOLERANCE:
+        raise _changed(exposure_us, gain, wanted_us, applied)
+
+
+def _changed(
+    exposure_us: float, gain: float, wanted_us: float, applied: Applied, more: str = ""
+) -> CameraError:
+    unit = " dB" if applied.gain_in_db else ""
+    return CameraError(
+        f"the camera stands at {exposure_us:g} µs, gain {gain:g}{unit}; set were {wanted_us:g} µs, gain "
+        f"{applied.gain:g}{unit}{more}",
+        code="settings-changed",
+        remedy="Ask for what the camera can do, and end other programs that use it.",
+        exposure_us=exposure_us,
+        wanted_exposure_us=wanted_us,
+        gain=gain,
+        wanted_gain=applied.gain,
+    )
+
+
+def _region(camera: Any) -> Region:
+    found = camera.get_region()
+    return found.x, found.y, found.width, found.height

@@ -1,0 +1,127 @@
+"""When frames were exposed, as the driver tells it, judged by a camera that knows: `tests.gige_vision`."""
+
+from __future__ import annotations
+
+import itertools
+import time
+from collections.abc import AsyncIterator
+from contextlib import asynccontextmanager
+from typing import Any
+
+import pytest
+
+from recordings.schema.messages import Image
+from station.cell.config import CameraConfig
+from station.devices.aravis import AravisCamera
+from tests.codes import raises
+from tests.gige_vision import description
+from tests.gige_vision.camera import EmulatedCamera
+
+pytestmark = pytest.mark.gige
+
+
+@asynccontextmanager
+async def opened(emulated: EmulatedCamera, **config: Any) -> AsyncIterator[AravisCamera]:
+    with emulated:
+        camera = AravisCamera(CameraConfig(**({"device": "127.0.0.1", "exposure_us": 4000.0} | config)))
+        try:
+            await camera.open()
+            yield camera
+        finally:
+            await camera.close()
+
+
+def error_s(emulated: EmulatedCamera, image: Image) -> float:
+    """The told middle of the exposure against the true one."""
+    assert image.time is not None
+    begun_ns, ended_ns = emulated.exposed_ns[-1]
+    return (image.time.host_monotonic_ns - (begun_ns + ended_ns) / 2) / 1e9
+
+
+def emulator(**options: Any) -> EmulatedCamera:
+    return EmulatedCamera(serial="EMU7", size=(320, 240), **options)
+
+
+async def test_stamp_and_exposure_of_the_chunks_place_a_frame(lonely_network: None) -> None:
+    emulated = emulator()
+    async with opened(emulated) as camera:
+        for _ in range(5):
+            image = await camera.capture()
+            assert image.time is not None and image.time.source == "chunk"
+            assert abs(error_s(emulated, image)) <= image.time.bound_s + 0.001
+        emulated.chunk_exposure_us = 6000.0
+        with raises("settings-changed", exposure_us=6000.0, wanted_exposure_us=4000.0):
+            await camera.capture()
+
+
+@pytest.mark.parametrize("stamp_error_ms", [-2000, 2000])
+async def test_a_stamp_that_cannot_be_is_not_believed(lonely_network: None, stamp_error_ms: int) -> None:
+    emulated = emulator()
+    async with opened(emulated) as camera:
+        emulated.stamp_error_ns = stamp_error_ms * 1_000_000
+        image = await camera.capture()
+        assert image.time is not None and image.time.source == "arrival"
+        assert abs(error_s(emulated, image)) <= image.time.bound_s
+        assert camera.timing is not None and camera.timing.impossible == 1
+
+
+async def test_a_camera_locked_by_ptp_to_this_computer_needs_no_fit(lonely_network: None) -> None:
+    emulated = emulator()
+    emulated.ptp_ns = lambda: time.time_ns() + 37_000_000_000  # TAI, as PTP counts
+    emulated.set_register(description.PTP_STATUS, description.PTP_STATES["Slave"])
+    async with opened(emulated, ptp=True) as camera:
+        image = await camera.capture()
+        assert image.time is not None and image.time.source == "ptp"
+        assert abs(error_s(emulated, image)) <= image.time.bound_s + 0.001
+        emulated.ptp_ns = lambda: time.time_ns() + 37_040_000_000  # its master is another than ours
+        await camera.close()
+        await camera.open()
+        image = await camera.capture()
+        assert image.time is not None and image.time.source == "chunk"
+
+
+@pytest.mark.parametrize("first", [0, 1, 65_530, 2**40])
+async def test_extended_ids_count_on_beyond_sixteen_bits(lonely_network: None, first: int) -> None:
+    emulated = emulator(extended_ids=True, ids=itertools.count(first))
+    async with opened(emulated, exposure_us=100.0) as camera:
+        ids = [(await camera.capture()).frame_id for _ in range(10)]
+    assert ids == list(range(first, first + 10)) or (first == 0 and ids[1:] == list(range(1, 10)))
+
+
+async def test_a_frame_that_lost_packets_widens_their_gaps(lonely_network: None) -> None:
+    emulated = emulator()
+    async with opened(emulated) as camera:
+        assert emulated.register(description.PACKET_DELAY) == 0
+        emulated.mangle = lambda packets: packets[:5] + packets[6:]
+        emulated.forgets = True
+        for gap_ns in (72_000, 144_000):
+            with raises("frame-incomplete"):
+                await camera.capture()
+            size = emulated.register(description.PACKET_SIZE) & 0xFFFF
+            assert emulated.register(description.PACKET_DELAY) * 8 == pytest.approx(
+                gap_ns * size / 9000, rel=0.01
+            )
+
+
+async def test_lines_delay_edge_and_gap_are_set_as_configured(lonely_network: None) -> None:
+    class Box:
+        async def fire(self) -> Any: ...
+
+    emulated = emulator()
+    config = {
+        "trigger": "hardware", "trigger_line": "Line2", "trigger_activation": "FallingEdge",
+        "trigger_delay_us": 250.0, "invert_trigger_line": True, "exposure_line": "Line3",
+        "packet_delay_us": 8.0,
+    }  # fmt: skip
+    with emulated:
+        camera = AravisCamera(CameraConfig(device="127.0.0.1", **config), Box())  # type: ignore[arg-type]
+        await camera.open()
+        settings = await camera.settings()
+        await camera.close()
+    assert emulated.register(description.TRIGGER_SOURCE) == description.TRIGGER_SOURCES["Line2"]
+    assert emulated.register(description.TRIGGER_ACTIVATION) == 1
+    assert emulated.number(description.TRIGGER_DELAY) == 250.0
+    assert emulated.register(description.LINE_SELECTOR) == 3, "the output was set up last"
+    assert emulated.register(description.LINE_SOURCE) == 1 and emulated.register(description.LINE_MODE) == 1
+    assert emulated.register(description.PACKET_DELAY) == 1000, "ticks of 8 ns"
+    assert settings["TriggerSource"] == "Line2" and settings["TriggerActivation"] == "FallingEdge"

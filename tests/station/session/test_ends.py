@@ -72,7 +72,7 @@ async def test_pause_during_a_hand_guided_picture_ends_free_drive(
 
 async def test_free_drive_switched_on_twice_watches_once(guided: Rig) -> None:
     def watchers() -> int:
-        return sum("Freedrive._watch" in str(task.get_coro()) for task in asyncio.all_tasks())
+        return sum("FreedriveCapture._watch" in str(task.get_coro()) for task in asyncio.all_tasks())
 
     for _ in range(3):
         await guided.session.switch_free_drive(1, True, auto=True)

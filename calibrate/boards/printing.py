@@ -23,7 +23,7 @@ from calibrate.boards.model import (
     tag_dictionary,
 )
 from calibrate.geometry import Array
-from recordings.schema.messages import BoardKind, BoardSpec
+from recordings.schema.messages import SINGLE_TAGS, BoardKind, BoardSpec
 
 _MARGIN_MM = 7.0
 _FOOT_MM = 16.0
@@ -88,13 +88,26 @@ def board_sheet(spec: BoardSpec, paper: str | None = None) -> Sheet:
     ruler_y = y + height + _MARGIN_MM
     length = int(min(max(width, 60.0), 150.0) // 10) * 10
     says = f"{describe_board(spec)}. The bar is {length} mm: measure it, and one square, before use."
+    marks, letters = _origin(spec, x, y)
     return Sheet(
         sheet_w,
         sheet_h,
-        np.concatenate([_moved(squares, x, y), _moved(_ruler(length), x, ruler_y)]),
+        np.concatenate([_moved(squares, x, y), _moved(_ruler(length), x, ruler_y), marks]),
         _moved(circles, x, y),
-        ((x, ruler_y + 5.0, says), (x, ruler_y + 9.5, _yaml(spec))),
+        ((x, ruler_y + 5.0, says), (x, ruler_y + 9.5, _yaml(spec)), *letters),
     )
+
+
+def _origin(spec: BoardSpec, x: float, y: float) -> tuple[Array, tuple[tuple[float, float, str], ...]]:
+    """Marks in the margins where the lines through the board's origin leave the pattern, with their axes.
+
+    Tags and grids of tags say by their numbers where they begin: no marks.
+    """
+    if spec.kind in (BoardKind.APRIL_GRID, *SINGLE_TAGS):
+        return np.zeros((0, 4)), ()
+    at = spec.square_m * 1000
+    ticks = np.array([[x + at - 0.15, y - 4.5, 0.3, 3.0], [x - 4.5, y + at - 0.15, 3.0, 0.3]])
+    return ticks, ((x + at + 1.0, y - 2.0, "x → from the origin"), (x - 5.0, y + at + 3.5, "y ↓"))
 
 
 def _paper(paper: str, need_w: float, need_h: float, spec: BoardSpec) -> tuple[float, float]:

@@ -107,6 +107,11 @@ STATION = LazyGroup(
                 "station touch-test cell.yaml --corner 0 --corner 20",
             ),
         ),
+        "new": LazyCommand(
+            "station.cli.new:new_command",
+            "Set up a cell in a wizard that only reads.",
+            ("station new", "station new -o station.yaml"),
+        ),
         "bootstrap": LazyCommand(
             "station.cli.bootstrap:bootstrap_command",
             "Find camera pose and board pose by 3 to 5 small moves.",
@@ -127,8 +132,8 @@ STATION = LazyGroup(
     help="A calibration station for a robot cell. Without a command: the operator screen.",
     epilog=examples(
         "station demo  # first time: everything, with no hardware",
-        "station doctor --example > station.yaml  # a cell: its configuration",
-        "station serve --config station.yaml  # then, in another terminal: station",
+        "station new  # a cell: its configuration, and a rehearsal of it",
+        "station  # the screen of the cell",
         "station plan --config station.yaml -o plan.yaml  # without a screen",
         "station capture --plan plan.yaml  # then: calibrate solve RECORDING",
     )

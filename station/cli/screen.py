@@ -59,12 +59,15 @@ def find_config() -> Path | None:
     return next((place for place in places if place.is_file()), None)
 
 
-def ensure_daemon(socket: Path) -> Path:
-    """The socket of a daemon that answers; starts one where none does. StationError when that fails."""
-    if _answers(socket):
+def ensure_daemon(socket: Path, config: Path | None = None) -> Path:
+    """The socket of a daemon that answers; starts one where none does. StationError when that fails.
+
+    `config`: the cell to serve; None: that of `find_config`.
+    """
+    if answers(socket):
         return socket
     root = state_root()
-    config = find_config()
+    config = config or find_config()
     what = ["--simulate"] if config is None else ["--config", str(config)]
     cell = "a SIMULATED cell (no configuration found)" if config is None else f"the cell of {config}"
     print(f"No daemon serves {socket}: starting one for {cell} …", file=sys.stderr)
@@ -80,7 +83,7 @@ def ensure_daemon(socket: Path) -> Path:
         )
     give_up_s = time.monotonic() + START_WAIT_S
     while time.monotonic() < give_up_s and child.poll() is None:
-        if _answers(socket):
+        if answers(socket):
             return socket
         time.sleep(0.2)
     tail = "\n".join(log.read_text(errors="replace").splitlines()[-3:])
@@ -101,7 +104,7 @@ def tell_what_goes_on(socket: Path) -> None:
     print(f"The station goes on without this screen. `station` opens it again{ends}.")
 
 
-def _answers(socket: Path) -> bool:
+def answers(socket: Path) -> bool:
     try:
         ask(socket, GetPlan())
     except DaemonGoneError:

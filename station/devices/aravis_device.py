@@ -381,6 +381,16 @@ def _hurry(threads: set[int]) -> None:
                 os.setpriority(os.PRIO_PROCESS, thread, _STREAM_PRIORITY)
 
 
+def found_cameras() -> list[tuple[str, str, str]]:
+    """Model, serial number and address of every camera that answers. Raises CameraError without Aravis."""
+    aravis, _ = _aravis()
+    aravis.update_device_list()
+    return [
+        (aravis.get_device_model(i), aravis.get_device_serial_nbr(i), aravis.get_device_address(i) or "")
+        for i in range(aravis.get_n_devices())
+    ]
+
+
 def _find(aravis: Any, wanted: str) -> str:
     """Aravis's id of the camera with this serial, address or name; of the only one when none is wanted."""
     if wanted.count(".") == 3 and wanted.replace(".", "").isdigit():

@@ -9,6 +9,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import gc
+import subprocess
+import sys
 import time
 from collections.abc import Awaitable, Callable, Iterable
 from functools import partial
@@ -294,9 +296,16 @@ class StationApp(ResultsDesk):
             common = [binding for kind in ours for binding in vars(kind).get("BINDINGS", [])]
             self.push_screen(Help(screen.HELP or "", [*own, *common]))
 
+    @work(exclusive=True, group="command", exit_on_error=False)
+    async def action_new_cell(self) -> None:
+        """The wizard in this terminal's place; this screen comes back when it is left."""
+        with self.suspend():
+            await asyncio.to_thread(subprocess.run, [sys.executable, "-m", "station.cli", "new"], check=False)
+
     def get_system_commands(self, screen: Screen[object]) -> Iterable[SystemCommand]:
         """Every key's action by name too; what moves the arm asks the same question from here."""
         yield from super().get_system_commands(screen)
+        yield SystemCommand("New cell", "Set up a robot, a camera and a board", self.action_new_cell)
         own = vars(type(screen)).get("BINDINGS", []) if isinstance(screen, StationScreen) else []
         for place, bindings in ((screen, own), (self, self.BINDINGS)):
             for binding in (b for b in bindings if isinstance(b, Binding) and b.tooltip):

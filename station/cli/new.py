@@ -1,0 +1,219 @@
+"""`station new`: set up a cell in a wizard that only reads; then rehearse it, or open it."""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+import sys
+import tempfile
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+
+from calibrate.kinematics import MODELS
+from recordings.files import state_root
+from recordings.schema.messages import Image, RobotIdentity, RobotState
+from station.cell.config import CameraConfig, RobotConfig
+from station.cell.errors import RobotError, StationError
+from station.cell.socket_folder import default_socket
+from station.cli.console import err
+from station.cli.screen import answers, ensure_daemon, tell_what_goes_on
+from station.devices.aravis import AravisCamera
+from station.devices.aravis_device import found_cameras
+from station.devices.ur_condition import what_holds
+from station.devices.ur_dashboard import STOP, DashboardError
+from station.devices.ur_link import UrLink
+from station.devices.ur_probe import probe
+from station.operate.new_cell import ArmReader, CameraReader, FoundCamera, default_place
+
+SERVICES = (
+    "From PolyScope 5.17 on: ☰ → Settings → Security → Services, enable Dashboard Server, RTDE and the "
+    "primary and secondary client interfaces."
+)
+READY_S = 60.0
+
+
+class LinkedArm:
+    """`new_cell.ArmReader` over the read-only half of the driver."""
+
+    def __init__(self, link: UrLink) -> None:
+        self._link = link
+
+    @property
+    def identity(self) -> RobotIdentity:
+        return self._link.identity
+
+    @property
+    def remote(self) -> bool | None:
+        return self._link.remote
+
+    def latest(self) -> RobotState:
+        return self._link.latest()
+
+    def trouble(self) -> str:
+        try:
+            state = self._link.latest()
+        except RobotError as problem:
+            return str(problem)
+        return what_holds(state)
+
+    async def stop(self) -> None:
+        dashboard = self._link.dashboard
+        if dashboard is not None and dashboard.alive:
+            try:
+                await dashboard.ask(STOP)
+            except DashboardError as problem:
+                err.print(str(problem))
+
+    async def close(self) -> None:
+        await self._link.close()
+
+
+class GenicamReader:
+    """`new_cell.CameraReader` over the GenICam driver."""
+
+    def __init__(self, device: str) -> None:
+        self._config = CameraConfig(device=device)
+        self._camera = AravisCamera(self._config)
+        self._changing = asyncio.Lock()
+
+    @property
+    def exposure_us(self) -> float:
+        return self._config.exposure_us
+
+    async def open(self) -> None:
+        await self._camera.open()
+
+    async def glimpse(self) -> Image | None:
+        async with self._changing:
+            return await self._camera.glimpse()
+
+    async def expose(self, exposure_us: float) -> None:
+        if exposure_us == self._config.exposure_us:
+            return
+        async with self._changing:
+            await self._camera.close()
+            self._config = msgspec.structs.replace(self._config, exposure_us=round(exposure_us, 1))
+            self._camera = AravisCamera(self._config)
+            await self._camera.open()
+
+    async def close(self) -> None:
+        await self._camera.close()
+
+
+class RealHardware:
+    """The devices of this computer's network."""
+
+    async def arm(self, host: str) -> ArmReader:
+        """`host` may be followed by the model, for a controller that does not tell it."""
+        address, _, told = host.partition(" ")
+        found = await probe(address)
+        if not found.answers:
+            raise RobotError(
+                f"No robot answers at {address}",
+                code="no-robot",
+                remedy="Switch it on, plug in its cable, and compare its address (pendant: ☰ → About).",
+            )
+        if found.problems:
+            who = found.model or "something that is no UR robot"
+            raise RobotError(
+                f"{who} answers at {address}, but not whole: {found.problems[0]}",
+                code="robot-incomplete",
+                remedy=SERVICES,
+            )
+        model = told or found.model
+        if model not in MODELS:
+            raise RobotError(
+                f"The controller at {address} does not tell its model",
+                code="unknown-robot-model",
+                remedy=f"Type it after the address, e.g. {address} UR10; known are {', '.join(MODELS)}.",
+            )
+        link = UrLink(RobotConfig(model=model, host=address))
+        await link.connect()
+        return LinkedArm(link)
+
+    async def cameras(self) -> tuple[FoundCamera, ...]:
+        return tuple(
+            FoundCamera("aravis", serial or address, f"{model} {serial}")
+            for model, serial, address in await asyncio.to_thread(found_cameras)
+        )
+
+    async def camera(self, found: FoundCamera) -> CameraReader:
+        reader = GenicamReader(found.device)
+        await reader.open()
+        return reader
+
+
+def new_command(
+    output: Annotated[
+        Path | None, typer.Option("--output", "-o", help="The configuration; default: where `station` looks")
+    ] = None,
+    root: Annotated[Path | None, typer.Option(help="State folder: keeps what was found so far")] = None,
+) -> None:
+    """Set up a cell in a wizard that only reads.
+
+    Robot, camera, board, four views guided by hand, limits; then it writes a configuration. Your hand
+    moves the arm, by the pendant's own Freedrive. Every step can be left and taken up again.
+
+    At the end F9 rehearses the whole job in simulation, and Enter opens the cell.
+    """
+    if not sys.stdout.isatty() or not sys.stdin.isatty():
+        raise StationError(
+            "The wizard needs a terminal.",
+            code="no-terminal",
+            remedy="Without one write a configuration: `station doctor --example`.",
+        )
+    from station.tui.new_cell import run
+
+    place = output or default_place()
+    match run(RealHardware(), state_root(root), place.absolute()):
+        case "rehearse":
+            _rehearse(place, root)
+        case "serve":
+            _serve(place)
+
+
+def _serve(config: Path) -> None:
+    from station.tui.app import run
+
+    socket = default_socket()
+    if answers(socket):
+        raise StationError(
+            f"Another station serves {socket} already.",
+            code="already-served",
+            remedy="End it first: closing its screen tells how.",
+        )
+    run(ensure_daemon(socket, config))
+    tell_what_goes_on(socket)
+
+
+def _rehearse(config: Path, root: Path | None) -> None:
+    """The rehearsal's own daemon lives as long as its screen."""
+    from station.tui.app import run
+
+    with tempfile.TemporaryDirectory(prefix="rehearsal-") as folder:
+        socket, log = Path(folder) / "s.sock", Path(folder) / "daemon.log"
+        what = ["serve", "--config", str(config), "--rehearse", "--socket", str(socket), "--end-with-stdin"]
+        what += [] if root is None else ["--root", str(root)]
+        err.print(f"Starting the rehearsal of {config}: SIMULATED, nothing real moves …")
+        with log.open("wb") as words:
+            daemon = subprocess.Popen(
+                [sys.executable, "-m", "station.cli", *what],
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=words,
+                start_new_session=True,
+            )
+        try:
+            assert daemon.stdout is not None
+            if not daemon.stdout.readline():
+                raise StationError(
+                    f"The rehearsal did not start: {log.read_text(errors='replace').strip()[-600:]}",
+                    code="no-daemon",
+                )
+            run(socket)
+        finally:
+            daemon.communicate(timeout=READY_S)
+    err.print(f"The rehearsal has ended. `station new` opens the wizard again; {config} is as it was.")

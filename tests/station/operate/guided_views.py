@@ -1,0 +1,70 @@
+"""Views as a person would guide them, of a simulated cell: straight on, tilted three ways, turned."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from calibrate.boards.model import board_points
+from calibrate.geometry import Array, inverse, pose, rotation_exp, transform_points
+from calibrate.kinematics import MODELS, forward, inverse_nearest
+from calibrate.projection import project
+from recordings.schema.messages import RobotIdentity
+from station.cell.config import matrix4, vector6
+from station.operate.new_cell import Draft, FoundCamera, GuidedView
+from station.simulation.cell import CellTruth
+
+NEARER_M = (0.0, 0.02, -0.05, 0.06, 0.0)
+TILTS = ((0.0, 0.0, 0.0), (0.45, 0.0, 0.1), (-0.2, 0.45, 0.0), (-0.3, -0.35, 0.3), (0.2, -0.4, -0.6))
+
+
+def guided_joints(truth: CellTruth) -> list[Array]:
+    """Joints (6,) near the start from which the camera sees the board tilted in several ways."""
+    model = MODELS[truth.robot_model]
+    X, Y = np.array(truth.camera_mount), np.array(truth.board_place)
+    start = np.array(truth.start_joints_rad)
+    flange = forward(model, start)
+    in_hand = truth.mount == "eye-in-hand"
+    first = inverse(flange @ X) @ Y if in_hand else inverse(X) @ flange @ Y
+    middle = transform_points(first, board_points(truth.board).mean(axis=0))
+    found = []
+    for tilt, nearer_m in zip(TILTS, NEARER_M, strict=True):
+        R = rotation_exp(np.array(tilt))
+        away = middle * (1 + nearer_m / middle[2])
+        seen = pose(R, away - R @ middle) @ first
+        wanted = Y @ inverse(X @ seen) if in_hand else X @ seen @ inverse(Y)
+        joints = inverse_nearest(model, wanted, found[-1] if found else start)
+        if joints is not None:
+            found.append(np.asarray(joints))
+    return found
+
+
+def seen_by_hand(truth: CellTruth, joints: Array, noise_px: float = 0.1, seed: int = 0) -> GuidedView:
+    """What the true camera sees from there."""
+    rng = np.random.default_rng(seed)
+    flange = forward(MODELS[truth.robot_model], joints)
+    X, Y = np.array(truth.camera_mount), np.array(truth.board_place)
+    seen = inverse(flange @ X) @ Y if truth.mount == "eye-in-hand" else inverse(X) @ flange @ Y
+    points = board_points(truth.board)
+    pixels = project(truth.camera, transform_points(seen, points)).pixels
+    pixels = pixels + rng.normal(0, noise_px, pixels.shape)
+    return GuidedView(
+        vector6(joints),
+        matrix4(flange),
+        tuple(range(len(points))),
+        tuple((float(x), float(y)) for x, y in pixels),
+    )
+
+
+def draft_of(truth: CellTruth, views: int = 4) -> Draft:
+    """The draft of a person who did everything right."""
+    taken = [seen_by_hand(truth, q, seed=k) for k, q in enumerate(guided_joints(truth)[:views])]
+    return Draft(
+        host="127.0.0.9",
+        robot=RobotIdentity(model=truth.robot_model, serial="2026"),
+        camera=FoundCamera("aravis", "SIM", "camera SIM"),
+        width=truth.camera.width,
+        height=truth.camera.height,
+        mount=truth.mount,
+        board=truth.board,
+        views=tuple(taken),
+    )

@@ -1,0 +1,104 @@
+"""What the wizard finds from guided views, and what it says of wrong answers."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+
+from calibrate.geometry import difference
+from recordings.schema.messages import Mount
+from station.cell.config import matrix4
+from station.cell.config_file import load_config
+from station.cell.scene import scene_of
+from station.operate import new_cell as flow
+from station.operate.new_cell import Draft, Step
+from station.plan.planner import PlanOptions, candidate_pool
+from station.simulation.scenes import make_cell
+from tests.codes import raises
+from tests.station.operate.guided_views import draft_of
+
+MOUNTS: tuple[Mount, ...] = ("eye-in-hand", "eye-to-hand")
+
+
+@pytest.fixture(scope="module", params=MOUNTS)
+def done(request: pytest.FixtureRequest) -> tuple[Draft, object]:
+    truth = make_cell("paper", seed=3, noise="mid", mount=request.param)
+    return draft_of(truth), truth
+
+
+def test_four_views_give_mounting_board_and_lens(done: tuple[Draft, object]) -> None:
+    draft, truth = done
+    found = flow.find_cell(draft)
+    assert found is not None and found.good and flow.enough(draft)
+    for guess, true in ((found.X, truth.camera_mount), (found.Y, truth.board_place)):
+        off = difference(guess, np.array(true))
+        assert np.linalg.norm(off[:3]) < 3 * found.sigma_m
+        assert np.linalg.norm(off[3:]) < 3 * found.sigma_rad
+    assert found.camera.matrix is not None
+    assert abs(found.camera.matrix[0][0] / truth.camera.matrix[0][0] - 1) < 0.02
+
+
+def test_a_wrong_answer_is_told_by_its_step(done: tuple[Draft, object]) -> None:
+    draft, _ = done
+    other: Mount = "eye-to-hand" if draft.mount == "eye-in-hand" else "eye-in-hand"
+    mounted = flow.find_cell(msgspec.structs.replace(draft, mount=other))
+    assert mounted is not None and mounted.other_fits and not mounted.good
+    board = msgspec.structs.replace(draft.board, square_m=1.05 * draft.board.square_m)
+    sized = flow.find_cell(msgspec.structs.replace(draft, board=board))
+    assert sized is not None and abs(sized.scale * 1.05 - 1) < 0.01 and sized.warning and not sized.other_fits
+    moved = np.array(draft.views[-1].base_from_flange)
+    moved[:3, 3] += [0.03, 0.0, 0.02]
+    last = msgspec.structs.replace(draft.views[-1], base_from_flange=matrix4(moved))
+    shifted = flow.find_cell(msgspec.structs.replace(draft, views=(*draft.views[:-1], last)))
+    assert shifted is not None and shifted.scale == 1.0 and shifted.warning and not shifted.other_fits
+
+
+def test_a_view_from_where_one_was_taken_is_none(done: tuple[Draft, object]) -> None:
+    draft, _ = done
+    first = np.array(draft.views[0].base_from_flange)
+    assert flow.what_is_missing(msgspec.structs.replace(draft, views=()), first).new
+    one = msgspec.structs.replace(draft, views=draft.views[:1])
+    assert not flow.what_is_missing(one, first).new
+    assert flow.what_is_missing(one, np.array(draft.views[1].base_from_flange)).new
+    assert not flow.what_is_missing(draft, first).text
+
+
+def test_turns_about_one_axis_are_not_enough(done: tuple[Draft, object]) -> None:
+    draft, _ = done
+    again = tuple(draft.views[k] for k in (0, 1, 0, 1))
+    assert not flow.enough(msgspec.structs.replace(draft, views=again))
+
+
+def test_what_was_written_is_read_back_and_can_be_planned(done: tuple[Draft, object], tmp_path: Path) -> None:
+    draft, _ = done
+    path = tmp_path / "deep" / "station.yaml"
+    made = flow.write_config(draft, path)
+    config, content = load_config(path)
+    assert config == made
+    assert content.count(b"#") >= 6
+    group, _ = candidate_pool(scene_of(config), PlanOptions(), None, np.random.default_rng(0))
+    assert len(group) >= 75
+    flow.write_config(draft, path)
+    assert (tmp_path / "deep" / "station.yaml.before").read_bytes() == content
+
+
+def test_it_is_taken_up_where_it_was_left(done: tuple[Draft, object], tmp_path: Path) -> None:
+    draft, _ = done
+    assert flow.next_step(flow.load_draft(tmp_path)) is Step.ROBOT
+    flow.save_draft(tmp_path, draft)
+    again = flow.load_draft(tmp_path)
+    assert again == draft and flow.next_step(again) is Step.LIMITS
+    assert flow.next_step(draft.without_views(board=draft.board)) is Step.VIEWS
+    (tmp_path / flow.DRAFT_FILE).write_text("{")
+    assert flow.load_draft(tmp_path) == Draft()
+
+
+def test_a_board_is_typed_as_people_write_it() -> None:
+    board = flow.read_board("8×5 30mm")
+    assert (board.columns, board.rows, board.square_m) == (8, 5, 0.03)
+    for wrong in ("", "8x5", "8 5 30", "8x5 0.03", "2x5 30", "8x5 30 4"):
+        with raises("no-board-typed"):
+            flow.read_board(wrong)

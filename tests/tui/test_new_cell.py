@@ -1,0 +1,129 @@
+"""The wizard before a simulated cell whose mounting, board, lens and place differ from every default."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections.abc import Callable
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from textual.pilot import Pilot
+from textual.widgets import Static
+
+from calibrate.geometry import difference
+from recordings.schema.messages import BoardKind, BoardSpec
+from station.cell.config_file import load_config
+from station.cell.scene import guess_matrix
+from station.operate.new_cell import STEPS, Step, load_draft
+from station.simulation.cell import CellTruth, write_truth
+from station.simulation.launch import SimulatedController, start_controller
+from station.simulation.scenes import make_cell
+from station.tui.new_cell import NewCell
+from tests.station.operate.guided_views import guided_joints
+from tests.tui.new_cell_rig import SimulatedHardware
+
+pytestmark = pytest.mark.process
+UNTIL_S = 60.0
+
+
+def other_cell() -> CellTruth:
+    """Nothing as in any default: another board, mounting, lens and place."""
+    truth = make_cell("paper-binned", seed=11, noise="mid")
+    board = BoardSpec(kind=BoardKind.CHESSBOARD, columns=8, rows=5, square_m=0.023)
+    return msgspec.structs.replace(truth, board=board)
+
+
+async def until(pilot: Pilot[object], condition: Callable[[], object], what: str) -> None:
+    give_up_s = time.monotonic() + UNTIL_S
+    while not condition():
+        if time.monotonic() > give_up_s:
+            app = pilot.app
+            assert isinstance(app, NewCell)
+            said = [str(app.query_one(part, Static).render()) for part in ("#live", "#problem", "#bar")]
+            pytest.fail("\n".join([what, *said]))
+        await pilot.pause(0.05)
+
+
+class Operator:
+    """Counts what a person does."""
+
+    def __init__(self, pilot: Pilot[object], app: NewCell, controller: SimulatedController) -> None:
+        self.pilot, self.app, self.controller = pilot, app, controller
+        self.keys = self.guided = 0
+
+    async def press(self, *keys: str) -> None:
+        self.keys += len(keys)
+        await self.pilot.press(*keys)
+
+    async def type(self, text: str) -> None:
+        await self.press(*("space" if c == " " else "full_stop" if c == "." else c for c in text))
+
+    async def until_step(self, step: Step) -> None:
+        await until(self.pilot, lambda: self.app.step is step, f"{step} did not come, it is {self.app.step}")
+
+    async def guide(self, joints: np.ndarray) -> None:
+        """A hand leads the arm, by the simulator's side door."""
+        self.guided += 1
+
+        def lead() -> None:
+            with self.controller.admin() as admin:
+                admin.ask("hand_move", path=[joints.tolist()], speed_rad_s=1.0)
+                while admin.ask("state")["moving"]:
+                    time.sleep(0.05)
+
+        await asyncio.to_thread(lead)
+
+
+async def test_from_an_address_to_a_configuration(tmp_path: Path) -> None:
+    truth = other_cell()
+    write_truth(truth, tmp_path / "truth.json")
+    with start_controller(truth.robot_model, truth=tmp_path / "truth.json") as controller:
+        app = NewCell(SimulatedHardware(truth, controller.host), tmp_path, tmp_path / "station.yaml")
+        async with app.run_test(size=(120, 36)) as pilot:
+            person = Operator(pilot, app, controller)
+            await person.type(controller.host)
+            await person.press("enter")
+            await person.until_step(Step.CAMERA)
+            await until(pilot, lambda: app._camera is not None, "no camera was opened")
+            await person.press("enter")
+            await person.until_step(Step.MOUNTING)
+            await person.press("enter")
+            await person.until_step(Step.BOARD)
+            await person.type("8x5 23")
+            await person.press("enter")
+            await until(pilot, lambda: app._seen is not None and app._seen[1].found, "the board is not seen")
+            await person.press("enter")
+            await person.until_step(Step.VIEWS)
+            for joints in guided_joints(truth)[1:]:  # it stands at the first one
+                if app.step is not Step.VIEWS:
+                    break
+                before = len(app.draft.views)
+                await person.guide(joints)
+                await until(
+                    pilot,
+                    lambda before=before: len(app.draft.views) > before or app.step is not Step.VIEWS,
+                    "no view was taken",
+                )
+            await person.until_step(Step.LIMITS)
+            await person.press("enter")
+            await person.until_step(Step.SAVE)
+            await person.press("enter")
+            await until(pilot, lambda: app.draft.written, "nothing was written")
+            await person.press("enter")
+        assert app.return_value == "serve"
+        with controller.admin() as admin:
+            counts = admin.ask("log")["counts"]
+    assert not {"upload", "play", "load"} & counts.keys(), counts
+    print(f"{person.keys} keys, {person.guided} views guided")
+    config, content = load_config(tmp_path / "station.yaml")
+    assert config.board == truth.board and config.mount == truth.mount
+    assert config.camera_guess is not None and config.board_guess is not None
+    for guess, true in ((config.camera_guess, truth.camera_mount), (config.board_guess, truth.board_place)):
+        off = difference(guess_matrix(guess), np.array(true))
+        assert np.linalg.norm(off[:3]) < 3 * guess.sigma_m and np.linalg.norm(off[3:]) < 3 * guess.sigma_rad
+    assert b"# " in content
+    assert person.keys <= 40
+    assert load_draft(tmp_path).written and len(STEPS) == 7

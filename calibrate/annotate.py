@@ -86,7 +86,7 @@ def annotate(
             writer.view(msgspec.structs.replace(view, picture_sequence=sequence, part=1))
             text = _text(found[sequence])
             writer.marks(sequence, marks[sequence], text)
-            writer.drawn_image(sequence, drawn(picture.pixels, marks[sequence], text))
+            writer.drawn_image(sequence, drawn(picture.viewable(), marks[sequence], text))
         pairs = zip(recording.views(), found, strict=True)
         cameras = [_camera_entity(calibration, camera, view, residual) for view, residual in pairs]
         writer.scene(0, [_board_entity(calibration), *cameras])

@@ -164,7 +164,7 @@ def _detect_all(
 def _decode_and_detect(recording: Recording, view: View, spec: BoardSpec, camera: CameraModel) -> Detection:
     picture = recording.image(view)
     _check_size(view, picture.pixels.shape[1], picture.pixels.shape[0], camera)
-    return detect(picture.pixels, spec, with_quality=False)
+    return detect(picture.viewable(), spec, with_quality=False)
 
 
 def _check_size(view: View, width: int, height: int, camera: CameraModel) -> None:

@@ -22,7 +22,13 @@ Pixels = NDArray[np.uint8 | np.uint16]
 _PNG_MAGIC = b"\x89PNG\r\n\x1a\n"
 _JPEG_SIZES = {0xC0, 0xC1, 0xC2}
 """Baseline, extended and progressive; the other start-of-frame kinds no camera writes."""
-_BAYER = re.compile(r"Bayer(RG|BG|GB|GR)8$")
+_BAYER = {
+    "BayerRG8": ("bayer_rggb8", cv2.COLOR_BayerRGGB2BGR),
+    "BayerBG8": ("bayer_bggr8", cv2.COLOR_BayerBGGR2BGR),
+    "BayerGB8": ("bayer_gbrg8", cv2.COLOR_BayerGBRG2BGR),
+    "BayerGR8": ("bayer_grbg8", cv2.COLOR_BayerGRBG2BGR),
+}
+"""Colour mosaics: foxglove's name, and OpenCV's way to BGR"""
 
 
 KEPT_FORMATS = ("png", "jpeg")
@@ -160,17 +166,27 @@ def pixel_format_of(pixels: Pixels) -> str:
 def raw_encoding(image: Pixels, pixel_format: str) -> str:
     """The name foxglove.RawImage uses for this array's layout. ImageError for any other array."""
     if image.ndim == 2 and image.dtype == np.uint8:
-        bayer = _BAYER.match(pixel_format)
-        return (
-            {"RG": "bayer_rggb8", "BG": "bayer_bggr8", "GB": "bayer_gbrg8", "GR": "bayer_grbg8"}[bayer[1]]
-            if bayer
-            else "mono8"
-        )
+        return _BAYER[pixel_format][0] if pixel_format in _BAYER else "mono8"
     if image.ndim == 2 and image.dtype == np.uint16:
         return "mono16"
     if image.ndim == 3 and image.shape[2] == 3 and image.dtype == np.uint8:
         return "bgr8"
     raise ImageError(f"an image of shape {image.shape} and type {image.dtype} cannot be recorded")
+
+
+def viewable(pixels: Pixels, pixel_format: str) -> Pixels:
+    """What people and detectors look at: a colour mosaic interpolated to BGR, everything else as it is."""
+    if pixel_format in _BAYER and pixels.ndim == 2:
+        return np.asarray(cv2.cvtColor(pixels, _BAYER[pixel_format][1]))
+    return pixels
+
+
+def eight_bits(pixels: Pixels, pixel_format: str) -> NDArray[np.uint8]:
+    """The same for a screen: Mono10 … Mono16 by their highest bits."""
+    if pixels.dtype == np.uint8:
+        return np.asarray(pixels, np.uint8)
+    bits = int("".join(filter(str.isdigit, pixel_format)) or 16)
+    return np.asarray(np.minimum(pixels >> max(bits - 8, 0), 255), np.uint8)
 
 
 def raw_array(data: bytes, encoding: str, width: int, height: int) -> Pixels:

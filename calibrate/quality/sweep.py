@@ -197,7 +197,7 @@ def _seen(recording: Recording, camera: CameraModel, lost: list[str]) -> Iterato
         if isinstance(picture, BadImageError):
             lost.append(str(picture))
             continue
-        found = detect(picture.pixels, board, thorough=False)
+        found = detect(picture.viewable(), board, thorough=False)
         if not found.found:
             continue
         view = BoardView(

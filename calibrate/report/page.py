@@ -297,7 +297,9 @@ def _views(job: SolvedRecording) -> Iterator[str]:
         if detection is None:  # its picture cannot be decoded: the table above says so
             continue
         found = detection.pixels
-        jpeg = drawn_view(job.recording.image(view).pixels, found, modelled.get(view.index, (found, None))[1])
+        jpeg = drawn_view(
+            job.recording.image(view).viewable(), found, modelled.get(view.index, (found, None))[1]
+        )
         px = job.solution.residual_px.get(view.index)
         name = "" if view.name == str(view.index) else f": {view.name}"
         caption = f"pose {view.index + 1}{name}" + (f", {px:.2f} px" if px is not None else "")

@@ -80,7 +80,7 @@ def _write_image(recording: Recording, view: View, folder: Path) -> list[Any]:
     """The stored file where there is one, else a lossless PNG; returns the pose's row."""
     image = recording.image(view)
     stored = recording.stored_image(view)
-    extension, data = ("png", encode_png(image.pixels)) if stored is None else stored
+    extension, data = ("png", encode_png(image.viewable())) if stored is None else stored
     name = f"images/{view.index:03d}.{_EXTENSIONS.get(extension, extension)}"
     (folder / name).write_bytes(data)
     T = view.base_from_flange

@@ -126,7 +126,7 @@ def seen_before(path: Path, board: BoardSpec) -> list[CapturedView]:
     recording, seen = open_recording(path), []
     for view in recording.views():
         with contextlib.suppress(RecordingError):
-            found = detect(recording.image(view).pixels, board)
+            found = detect(recording.image(view).viewable(), board)
             if found.found:
                 flange = np.array(view.base_from_flange)
                 seen.append(CapturedView(view.index, flange, found.indices, found.pixels))

@@ -2,20 +2,13 @@
 
 from __future__ import annotations
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from recordings.images import Pixels
 from station.cell.errors import CameraError
 
-# OpenCV names a mosaic by the second row's second and third pixel, GenICam by the first row's first two.
-_BAYER = {
-    "BayerRG8": cv2.COLOR_BayerRGGB2BGR,
-    "BayerGR8": cv2.COLOR_BayerGRBG2BGR,
-    "BayerGB8": cv2.COLOR_BayerGBRG2BGR,
-    "BayerBG8": cv2.COLOR_BayerBGGR2BGR,
-}
+_BAYER = ("BayerRG8", "BayerGR8", "BayerGB8", "BayerBG8")
 FORMATS = (
     "Mono8",
     "Mono10",
@@ -51,7 +44,7 @@ def bits_per_pixel(pixel_format: str) -> int:
 def decode(data: bytes, width: int, height: int, pixel_format: str) -> Pixels:
     """(height, width) uint8 or uint16 (10 and 12 bits keep their values), or (height, width, 3) uint8 BGR.
 
-    Colour mosaics are interpolated. CameraError when there are too few bytes.
+    A colour mosaic stays as it came. CameraError when there are too few bytes.
     """
     size = (width * height * bits_per_pixel(pixel_format) + 7) // 8
     if len(data) < size:
@@ -62,7 +55,7 @@ def decode(data: bytes, width: int, height: int, pixel_format: str) -> Pixels:
             needed_bytes=size,
         )
     raw = np.frombuffer(data, np.uint8, size)
-    if pixel_format == "Mono8":
+    if pixel_format == "Mono8" or pixel_format in _BAYER:
         return raw.reshape(height, width)
     if pixel_format in ("Mono10", "Mono12", "Mono16"):
         return raw.view("<u2").reshape(height, width)
@@ -70,8 +63,6 @@ def decode(data: bytes, width: int, height: int, pixel_format: str) -> Pixels:
         return raw.reshape(height, width, 3)
     if pixel_format == "RGB8":
         return np.ascontiguousarray(raw.reshape(height, width, 3)[:, :, ::-1])
-    if pixel_format in _BAYER:
-        return np.asarray(cv2.cvtColor(raw.reshape(height, width), _BAYER[pixel_format]), np.uint8)
     return _unpack(raw, width * height, pixel_format).reshape(height, width)
 
 

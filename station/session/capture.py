@@ -192,7 +192,7 @@ async def _sighting(context: SessionContext, image: Image, index: int) -> BoardD
     config = context.cell.config
     try:
         return await context.workers.call(
-            sight, image.pixels, config.board, config.camera.model, timeout_s=SIGHT_TIMEOUT_S
+            sight, image.viewable(), config.board, config.camera.model, timeout_s=SIGHT_TIMEOUT_S
         )
     except WorkerError as error:
         context.store.problem(error, "warning", index, "the image was not looked at: {}")
@@ -288,7 +288,7 @@ class ImageWatch:
                     raise
                 continue
             if image is not None:
-                self._images.append((asked_ns, image.pixels))
+                self._images.append((asked_ns, image.viewable()))
             return image is not None
         return False
 

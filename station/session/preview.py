@@ -9,7 +9,7 @@ import time
 import cv2
 import numpy as np
 
-from recordings.images import Pixels
+from recordings.images import eight_bits
 from recordings.schema.messages import Image
 from station.analysis.pool import WorkerError
 from station.analysis.worker import BoardDetection, sight
@@ -45,7 +45,7 @@ class Previewer:
             return PreviewImage()
         low, high = SIDES
         width, height = min(max(width, low), high), min(max(height, low), high)
-        return await asyncio.to_thread(self._encode, self._picture.pixels, self._sighting, width, height)
+        return await asyncio.to_thread(self._encode, self._picture, self._sighting, width, height)
 
     async def _take(self) -> None:
         context = self._context
@@ -62,7 +62,7 @@ class Previewer:
         try:
             exposure = (image.exposure_us, image.gain_db) if image.exposure_us else None
             sighting = await context.workers.call(
-                sight, image.pixels, config.board, config.camera.model, False, exposure, timeout_s=5.0
+                sight, image.viewable(), config.board, config.camera.model, False, exposure, timeout_s=5.0
             )
         except WorkerError:
             sighting = None
@@ -71,13 +71,10 @@ class Previewer:
         if sighting is not None and context.store.state is not StationState.WRITING:
             context.store.update(detection=sighting.status)
 
-    def _encode(
-        self, image: Pixels, sighting: BoardDetection | None, width: int, height: int
-    ) -> PreviewImage:
+    def _encode(self, taken: Image, sighting: BoardDetection | None, width: int, height: int) -> PreviewImage:
+        image = eight_bits(taken.viewable(), taken.pixel_format)
         scale = min(width / image.shape[1], height / image.shape[0], 1.0)
         size = (max(1, round(image.shape[1] * scale)), max(1, round(image.shape[0] * scale)))
-        if image.dtype != np.uint8:
-            image = (image >> 8).astype(np.uint8)
         small = cv2.resize(image, size, interpolation=cv2.INTER_AREA)
         for quality in _QUALITIES:
             ok, jpeg = cv2.imencode(".jpg", small, [cv2.IMWRITE_JPEG_QUALITY, quality])

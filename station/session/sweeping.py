@@ -34,7 +34,7 @@ class SweepRun(Run):
         context, config = self._context, self._context.cell.config
         image = await take_image(context)
         seen = await context.workers.call(
-            sight, image.pixels, config.board, config.camera.model, timeout_s=SIGHT_TIMEOUT_S
+            sight, image.viewable(), config.board, config.camera.model, timeout_s=SIGHT_TIMEOUT_S
         )
         if not seen.status.found:
             raise CameraError(

@@ -163,7 +163,7 @@ class TouchTestPlanner:
             raise RefusedError(text, code="arm-moved", remedy="Leave it at rest, then retry.")
         board = context.cell.config.board
         sighting = await context.workers.call(
-            sight, image.pixels, board, calibration.intrinsics.model, timeout_s=_SIGHT_S
+            sight, image.viewable(), board, calibration.intrinsics.model, timeout_s=_SIGHT_S
         )
         if not sighting.status.found:
             raise RefusedError(

@@ -17,6 +17,7 @@ from calibrate.boards.detect import detect
 from calibrate.geometry import pose_from_rotvec
 from recordings.errors import RecordingError
 from recordings.files import MAIN_CAMERA
+from recordings.images import eight_bits
 from recordings.plain_text import plain_text
 from recordings.reader import open_recording
 from recordings.schema.messages import CaptureEvent, RobotState, View
@@ -144,10 +145,11 @@ class ReplayLink:
 
     def _look(self, view: View, width: int, height: int) -> PreviewImage:
         try:
-            image = self._timeline.recording.image(view).pixels
+            taken = self._timeline.recording.image(view)
         except RecordingError as error:
             self._seen = DetectionStatus(reason=str(error))
             return PreviewImage()
+        image = taken.viewable()
         seen = detect(image, self._timeline.recording.info.board, thorough=False)
         self._seen = DetectionStatus(
             found=seen.found,
@@ -158,8 +160,7 @@ class ReplayLink:
             saturated=round(float(seen.saturated), 4),
             coverage=round(float(seen.coverage), 4),
         )
-        if image.dtype != np.uint8:
-            image = (image >> 8).astype(np.uint8)
+        image = eight_bits(image, taken.pixel_format)
         rows, columns = image.shape[:2]
         scale = min(width / columns, height / rows, 1.0)
         size = (round(columns * scale), round(rows * scale))

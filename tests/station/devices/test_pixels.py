@@ -6,6 +6,7 @@ import cv2
 import numpy as np
 import pytest
 
+from recordings.images import eight_bits, viewable
 from station.devices.pixels import FORMATS, decode, encode
 from tests.codes import raises
 
@@ -42,8 +43,17 @@ def test_colours_of_a_mosaic_are_where_genicam_says(name: str) -> None:
     row = [name[0], name[1]]
     other = {"RG": "GB", "BG": "GR", "GR": "BG", "GB": "RG"}[name]
     tile = np.array([[max(colour[c]) for c in row], [max(colour[c]) for c in other]], np.uint8)
-    image = decode(np.tile(tile, (8, 8)).tobytes(), 16, 16, f"Bayer{name}8")
-    assert np.allclose(image[4:12, 4:12], [50, 100, 200], atol=1)
+    sent = np.tile(tile, (8, 8))
+    mosaic = decode(sent.tobytes(), 16, 16, f"Bayer{name}8")
+    assert np.array_equal(mosaic, sent), "it stays as it came"
+    assert np.allclose(viewable(mosaic, f"Bayer{name}8")[4:12, 4:12], [50, 100, 200], atol=1)
+
+
+@pytest.mark.parametrize("name", ["Mono8", "Mono10", "Mono10Packed", "Mono12", "Mono12p", "Mono16"])
+def test_previews_are_as_bright_as_the_image(name: str) -> None:
+    grey = np.arange(256, dtype=np.uint8).reshape(16, 16)
+    shown = eight_bits(decode(encode(grey, name), 16, 16, name), name)
+    assert np.array_equal(shown, grey)
 
 
 def test_a_short_picture_and_an_unknown_format_are_refused() -> None:

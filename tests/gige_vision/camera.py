@@ -73,7 +73,7 @@ class EmulatedCamera:
             self.ids = itertools.count()
         self.device_ns: Callable[[int], int] = lambda host_ns: host_ns + 7_000_000_000_000
         """The free-running clock at a host monotonic time, ns"""
-        self.ptp_ns: Callable[[int], int] = lambda host_ns: host_ns + time.time_ns() - time.monotonic_ns()
+        self.ptp_ns: Callable[[], int] = time.time_ns
         """The clock while IEEE 1588 is on, ns"""
         self.mangle: Callable[[Packets], Iterable[bytes]] = lambda packets: packets
         """What the wire makes of a frame's packets when they are sent first: loss, order, copies."""
@@ -158,9 +158,9 @@ class EmulatedCamera:
         return bool(self.register(at.GVCP_CONFIGURATION) & _PTP_ENABLE)
 
     def _ticks(self, host_ns: int) -> int:
-        """The clock as stamps and latch show it; IEEE 1588 counts nanoseconds."""
+        """The clock as stamps and latch show it; with IEEE 1588 on it is nanoseconds of now."""
         if self.ptp:
-            return self.ptp_ns(host_ns)
+            return self.ptp_ns()
         return self.device_ns(host_ns) * self._tick_hz // 1_000_000_000
 
     def _fill(self, extended_ids: bool) -> None:

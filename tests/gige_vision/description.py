@@ -30,8 +30,8 @@ PIXEL_FORMATS = {
     "RGB8": 0x02180014, "BGR8": 0x02180015,
 }  # fmt: skip
 CHUNKS = {"Image": 0x0001, "Timestamp": 0xA001, "ExposureTime": 0xA002, "FrameID": 0xA003, "Gain": 0xA004}
-TRIGGER_SOURCES = {"Software": 0, "Line0": 1, "Line1": 2, "Line2": 3, "Line3": 4}
-_LINES = {name: number for name, number in TRIGGER_SOURCES.items() if number}
+TRIGGER_SOURCES = {"Software": 0, "Line1": 1, "Line2": 2, "Line3": 3, "Line0": 4}
+_LINES = {f"Line{number}": number for number in range(4)}
 _AUTO = {"Off": 0, "Once": 1, "Continuous": 2}
 _PORT = ["Initializing", "Faulty", "Disabled", "Listening", "PreMaster", "Master", "Passive", "Uncalibrated"]
 PTP_STATES = {name: number for number, name in enumerate([*_PORT, "Slave"], 1)}

@@ -26,7 +26,7 @@ COMMANDS = {
     ),
     "show": LazyCommand(
         f"{_FILES}:show",
-        "Show a calibration: verdict, result, gates.",
+        "Show a calibration: verdict, result, gates; of the installed one whether it still holds.",
         ("calibrate show  # the installed one", "calibrate show cell.yaml"),
     ),
     "diff": LazyCommand(
@@ -59,6 +59,16 @@ COMMANDS = {
         f"{_FILES}:rollback",
         "Go back to an older installed calibration.",
         ("calibrate rollback --reason 'camera was knocked'", "calibrate rollback 3"),
+    ),
+    "withdraw": LazyCommand(
+        f"{_FILES}:withdraw",
+        "Take the installed calibration out of use.",
+        ("calibrate withdraw 'a pallet hit the camera'",),
+    ),
+    "metrics": LazyCommand(
+        "calibrate.cli.metrics:metrics",
+        "Print the state of the installed calibrations for Prometheus.",
+        ("calibrate metrics", "calibrate metrics -o /var/lib/node_exporter/calibration.prom"),
     ),
     "drift-check": LazyCommand(
         "calibrate.cli.drift_check:drift_check",

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
@@ -13,14 +14,33 @@ from calibrate.cli.job import Threads
 from calibrate.cli.output import AsJson, OutputError, detection_progress, out, print_json
 from calibrate.errors import BadViewsError
 from calibrate.files.calibration import Calibration, Provenance
-from calibrate.files.versions import installed_versions
+from calibrate.files.formatting import VALIDITY_STYLES
+from calibrate.files.install import note_check
+from calibrate.files.loader import current_version, readable_folder
+from calibrate.files.validity import Validity, ValidityReason, validity_text
 from calibrate.pipeline import JobOptions, prepare_views
 from calibrate.quality.checks import CheckEntry, Trend, append_check, earlier_results, find_trend, read_checks
 from calibrate.quality.drift import FEWEST_VIEWS, POWER, DriftCheck, check_drift
+from recordings.files import MAIN_CAMERA, state_root
+from recordings.reader import open_recording
 from recordings.schema.messages import SessionInfo
 
 DRIFTED = 4
 OWN_VIEWS = "INVALID: {recording} is the calibration's source. Capture new views: `station drift-check`."
+
+
+class OtherCellError(OutputError):
+    """The views are of another cell, robot or camera than the calibration."""
+
+    code = "other-cell"
+
+    @property
+    def device(self) -> str:
+        """robot or camera; empty when more than that differs."""
+        differs = str(self.values.get("differs", ""))
+        return differs if differs in ("robot", "camera") else ""
+
+
 MOST_DISAGREEMENT = 3.0
 _BY_CHANCE = 0.001
 """A smaller p is not worth a second look."""
@@ -45,18 +65,35 @@ def drift_check(
 
     Exit codes: 0 PASS, 4 FAIL, 1 views or files unusable (the calibration's source, say), 2 wrong options.
     """
-    calibration = named_or_installed(calibration_file, root)
+    camera = ""
+    if calibration_file is None:
+        camera = open_recording(recording).info.camera_identity.name or MAIN_CAMERA
+    calibration, _ = named_or_installed(calibration_file, root, camera)
     options = JobOptions(camera=calibration.intrinsics.model, threads=threads)
     with detection_progress() as progress:
         prepared = prepare_views(recording, options, progress, fewest=FEWEST_VIEWS)
     info = prepared.recording.info
-    _require_same_cell(recording, info, calibration)
+    try:
+        _require_same_cell(recording, info, calibration)
+    except OtherCellError as other:
+        if calibration_file is None:
+            _doubt_devices(recording, info, root, camera, other)
+        raise
     result = check_drift(prepared.views, calibration)
     own = _is_origin(prepared.recording.sha256, info, calibration.provenance)
-    before, trend = ([], None) if own or calibration_file is not None else _log(result, info, root)
+    judged = not own and calibration_file is None
+    before, trend = _log(result, info, root, camera) if judged else ([], None)
+    validity = _judge(result, info, root, camera) if judged else None
     proves_nothing = own and result.passed
     if as_json:
-        print_json({**_plain(result, trend), "passed": result.passed and not own, "own_views": own})
+        print_json(
+            {
+                **_plain(result, trend),
+                "passed": result.passed and not own,
+                "own_views": own,
+                "validity": validity,
+            }
+        )
     elif proves_nothing:
         out.print(OWN_VIEWS.format(recording=recording), style="yellow")
     else:
@@ -65,18 +102,67 @@ def drift_check(
             out.print(f"Earlier drift checks: {sum(before)} of {len(before)} passed.")
         if trend is not None:
             out.print(trend.text, style="yellow")
+        if validity is not None:
+            style = VALIDITY_STYLES[validity.state]
+            out.print(f"The installed calibration is {validity_text(validity)}", style=style)
     if not result.passed:
         raise typer.Exit(DRIFTED)
     if proves_nothing:
         raise typer.Exit(BadViewsError.exit_code)
 
 
-def _log(result: DriftCheck, info: SessionInfo, root: Path | None) -> tuple[list[bool], Trend | None]:
+def _log(
+    result: DriftCheck, info: SessionInfo, root: Path | None, camera: str
+) -> tuple[list[bool], Trend | None]:
     """Log the check: results of the earlier ones of the installed calibration, and the trend with it."""
-    number = next((g.number for g in installed_versions(root) if g.current), 0)
-    before = earlier_results(read_checks(root), number)
-    append_check(CheckEntry.of(result, info.created_wall_ns / 1e9 or time.time(), number, info.name), root)
-    return before, find_trend(read_checks(root), number)
+    number, _ = current_version(readable_folder(root, camera))
+    before = earlier_results(read_checks(root, camera), number)
+    append_check(CheckEntry.of(result, _taken(info).timestamp(), number, info.name), root, camera)
+    return before, find_trend(read_checks(root, camera), number)
+
+
+def _taken(info: SessionInfo) -> datetime:
+    """When the views were taken; now where the recording does not say."""
+    return datetime.fromtimestamp(info.created_wall_ns / 1e9 or time.time(), UTC)
+
+
+def _judge(result: DriftCheck, info: SessionInfo, root: Path | None, camera: str) -> Validity:
+    """Let the check put the installed calibration in doubt, or clear it."""
+    verdict = "PASS" if result.passed else "FAIL"
+    reason = ValidityReason(
+        "drift-check",
+        f"Drift check {verdict}: camera shift {result.shift_mm:.2f} mm, {result.shift_deg:.3f}° "
+        f"(p = {result.p_value:.1e}).",
+        {
+            "recording": info.name,
+            "shift_mm": round(result.shift_mm, 4),
+            "shift_deg": round(result.shift_deg, 5),
+            "p_value": result.p_value,
+            "power": round(result.power, 4),
+        },
+    )
+    sensitive = result.power >= POWER
+    return note_check(
+        root,
+        "drift-check",
+        reason,
+        passed=result.passed,
+        sensitive=sensitive,
+        when=_taken(info),
+        camera=camera,
+    )
+
+
+def _doubt_devices(
+    recording: Path, info: SessionInfo, root: Path | None, camera: str, other: OtherCellError
+) -> None:
+    """A session of this very cell with another robot or camera: what is installed is of the one before."""
+    own = recording.resolve().is_relative_to((state_root(root) / "sessions").resolve())
+    if own and other.device:
+        reason = ValidityReason(f"{other.device}-changed", other.text, dict(other.values))
+        note_check(
+            root, "drift-check", reason, passed=False, sensitive=True, when=_taken(info), camera=camera
+        )
 
 
 def _is_origin(sha256: str, info: SessionInfo, provenance: Provenance) -> bool:
@@ -95,11 +181,12 @@ def _require_same_cell(recording: Path, info: SessionInfo, calibration: Calibrat
         ("camera", *_serials(info.camera_identity.serial, calibration.camera.serial)),
     ):
         if not same:
-            raise OutputError(
+            raise OtherCellError(
                 f"{recording} has {name} {new}, the calibration {known}: that is no drift.",
-                code="other-cell",
                 remedy="Calibrate the new one.",
                 differs=name,
+                found=str(new),
+                calibrated=str(known),
             )
 
 

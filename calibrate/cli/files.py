@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, NamedTuple, TypeVar, get_args
 
 import msgspec
 import numpy as np
@@ -63,13 +63,26 @@ def read_lens_sigma(path: Path) -> dict[str, float]:
     return dict(read_calibration(path).intrinsics.sigma) if plain.get("format") == FORMAT else {}
 
 
-def read_cell_serials(path: Path) -> tuple[str, str]:
-    """(robot's, camera's) serial number of a station's configuration; empty where it names none."""
+class CellFacts(NamedTuple):
+    """What a station's configuration says of its calibrations; empty or None where it says nothing."""
+
+    robot_serial: str
+    camera_serial: str
+    camera: str
+    max_age_days: float | None
+
+
+def read_cell(path: Path) -> CellFacts:
+    """Read them from a station's configuration. Raises InputFileError."""
     plain = _read(path, "a station's configuration")
-    robot, camera = plain.get("robot"), plain.get("camera")
-    if not isinstance(robot, dict) or not isinstance(camera, dict):
+    robot, camera, rule = plain.get("robot"), plain.get("camera"), plain.get("validity") or {}
+    if not isinstance(robot, dict) or not isinstance(camera, dict) or not isinstance(rule, dict):
         raise InputFileError(f"{path}: no station configuration, robot and camera are missing.")
-    return str(robot.get("serial") or ""), str(camera.get("serial") or "")
+    days = rule.get("max_age_days")
+    if not isinstance(days, int | float | None):
+        raise InputFileError(f"{path}: validity.max_age_days {days!r} is no number of days.")
+    robot_serial, camera_serial = (str(device.get("serial") or "") for device in (robot, camera))
+    return CellFacts(robot_serial, camera_serial, str(camera.get("name") or ""), days)
 
 
 def _camera_info(path: Path, plain: dict[str, Any]) -> CameraModel:

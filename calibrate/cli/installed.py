@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from enum import StrEnum
+from itertools import groupby
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -11,15 +12,18 @@ import numpy as np
 import typer
 from rich.table import Column, Table
 
-from calibrate.cli.files import read_cell_serials
+from calibrate.cli.files import CellFacts, read_cell
 from calibrate.cli.output import AsJson, OutputError, check_target, err, out, print_json
 from calibrate.files import exports
 from calibrate.files import install as installing
 from calibrate.files.calibration import Calibration, Lens, read_calibration, write_output
 from calibrate.files.exports import FORMATS, FrameNames
 from calibrate.files.formatting import override_text, pose_difference, pose_text, summary, verdict_text
-from calibrate.files.versions import InstalledVersion, installed_versions, read_log
-from recordings.files import state_root
+from calibrate.files.lines import read_lines
+from calibrate.files.loader import cameras, current_validity, readable_folder
+from calibrate.files.validity import Validity, ValidityReason, ValidityState, validity_text
+from calibrate.files.versions import InstalledVersion, LogEntry, installed_versions, read_log
+from recordings.files import MAIN_CAMERA, state_root
 
 Root = Annotated[
     Path | None,
@@ -27,6 +31,8 @@ Root = Annotated[
 ]
 _FORMATS_HELP = "; ".join(f"{name}: {kind.says}" for name, kind in FORMATS.items())
 FormatName = StrEnum("FormatName", {name.replace("-", "_"): name for name in FORMATS})  # type: ignore[misc]
+_TOLD_OF_OLD = (ValidityState.IN_DOUBT, ValidityState.WITHDRAWN)
+CameraName = Annotated[str, typer.Option("--camera", help="Name of the camera, in a cell with several")]
 Named = Annotated[Path | None, typer.Argument(help="A calibration file; default: the installed one")]
 
 
@@ -36,27 +42,37 @@ class CellKind(StrEnum):
     simulated = "simulated"
 
 
-def named_or_installed(file: Path | None, root: Path | None) -> Calibration:
-    return installing.installed_calibration(root) if file is None else read_calibration(file)
+def named_or_installed(
+    file: Path | None, root: Path | None, camera: str = MAIN_CAMERA
+) -> tuple[Calibration, Validity | None]:
+    """The calibration, and of the installed one its validity."""
+    if file is not None:
+        return read_calibration(file), None
+    folder = readable_folder(root, camera)
+    return installing.installed_calibration(root, camera), current_validity(folder)
 
 
-def show(file: Named = None, root: Root = None, as_json: AsJson = False) -> None:
-    """Show a calibration: verdict, result, gates."""
-    calibration = named_or_installed(file, root)
+def show(
+    file: Named = None, root: Root = None, camera: CameraName = MAIN_CAMERA, as_json: AsJson = False
+) -> None:
+    """Show a calibration: verdict, result, gates; of the installed one whether it still holds."""
+    calibration, validity = named_or_installed(file, root, camera)
     if as_json:
-        print_json(msgspec.to_builtins(calibration))
+        plain = msgspec.to_builtins(calibration)
+        print_json(plain if validity is None else plain | {"validity": validity})
     else:
-        out.print(summary(calibration))
+        out.print(summary(calibration, validity))
 
 
 def diff(
     first: Annotated[Path, typer.Argument(help="A calibration file")],
     second: Named = None,
     root: Root = None,
+    camera: CameraName = MAIN_CAMERA,
     as_json: AsJson = False,
 ) -> None:
     """Compare two calibrations with their uncertainty."""
-    a, b = read_calibration(first), named_or_installed(second, root)
+    a, (b, validity) = read_calibration(first), named_or_installed(second, root, camera)
     if a.mount != b.mount:
         raise OutputError(
             f"{first} is {a.mount}, the other is {b.mount}: there is nothing to compare.", code="other-mount"
@@ -87,6 +103,8 @@ def diff(
     ]
     for name, say in rows:
         table.add_row(name, say(a), say(b))
+    if validity is not None:
+        table.add_row("installed", "", validity_text(validity))
     out.print(table)
     # Six numbers: 3.55σ are exceeded by chance in 5 % of honest pairs (chi-square, 6 degrees).
     judged = f"{'more than' if sigmas > 3.55 else 'within'} their uncertainty"
@@ -107,13 +125,25 @@ def export(
     output: Annotated[Path | None, typer.Option("-o", "--output", help="Default: stdout")] = None,
     base: Annotated[str, typer.Option(help="Name of the robot's base there")] = FrameNames.base,
     flange: Annotated[str, typer.Option(help="Name of its flange")] = FrameNames.flange,
-    camera: Annotated[str, typer.Option(help="Name of the camera's optical frame")] = FrameNames.camera,
-    body: Annotated[str, typer.Option(help="Name of the camera's body frame")] = FrameNames.body,
+    frame: Annotated[
+        str, typer.Option("--camera", help="Name of the camera's optical frame (default: NAME_optical_frame)")
+    ] = "",
+    body: Annotated[str, typer.Option(help="Name of its body frame (default: NAME_link)")] = "",
+    camera: Annotated[
+        str, typer.Option("--of", help="Name of the camera, in a cell with several")
+    ] = MAIN_CAMERA,
     root: Root = None,
 ) -> None:
-    """Write a calibration in another program's format."""
-    calibration = named_or_installed(file, root)
-    text = exports.export(calibration, str(to.value), FrameNames(base, flange, camera, body))
+    """Write a calibration in another program's format.
+
+    The file says whether the installed calibration still holds; a warning on stderr does where it does not.
+    """
+    calibration, validity = named_or_installed(file, root, camera)
+    names = FrameNames.of_camera(calibration.camera_name)
+    frames = FrameNames(base, flange, frame or names.camera, body or names.body, validity)
+    text = exports.export(calibration, str(to.value), frames)
+    if validity is not None and validity.state is not ValidityState.VALID:
+        err.print(f"Warning: the calibration is {validity_text(validity)}", style="yellow")
     if output is None:
         typer.echo(text, nl=False)
         return
@@ -129,7 +159,12 @@ def install(
         typer.Option(help="Kind of cell the root belongs to; others than real need --root"),
     ] = CellKind.real,
     cell_config: Annotated[
-        Path | None, typer.Option(help="The station's configuration: check its robot and camera")
+        Path | None, typer.Option(help="The station's configuration: its robot, camera and oldest proof")
+    ] = None,
+    camera: Annotated[str, typer.Option(help="Name of the camera (default: as in the file)")] = "",
+    max_age_days: Annotated[
+        float | None,
+        typer.Option(min=0, help="In doubt when the last proof is older (default: as before; 0: never)"),
     ] = None,
     override: Annotated[
         str, typer.Option(help="Reason to install in spite of a refusal; kept in the file")
@@ -146,66 +181,107 @@ def install(
     """
     if root is None and cell is not CellKind.real:
         raise OutputError(f"{cell} needs its own folder.", code="root-missing", remedy="Name it with --root.")
-    robot_serial, camera_serial = ("", "") if cell_config is None else read_cell_serials(cell_config)
+    facts = CellFacts("", "", "", None) if cell_config is None else read_cell(cell_config)
     made = installing.install(
         file,
         root,
         cell=cell.value,
+        camera=camera or facts.camera,
         override=override,
-        robot_serial=robot_serial,
-        camera_serial=camera_serial,
+        robot_serial=facts.robot_serial,
+        camera_serial=facts.camera_serial,
+        max_age_days=facts.max_age_days if max_age_days is None else max_age_days,
     )
-    _switched(made, root, as_json)
+    _switched(made, as_json)
 
 
 def rollback(
     to: Annotated[int | None, typer.Argument(help="Version number; default: the one before")] = None,
     root: Root = None,
+    camera: CameraName = MAIN_CAMERA,
     reason: Annotated[str, typer.Option(help="Reason, kept in the log")] = "",
     as_json: AsJson = False,
 ) -> None:
     """Go back to an older installed calibration.
 
-    The one before, or a version of `calibrate list`.
+    The one before, or a version of `calibrate list`. It is unverified then, until a drift check passes.
     """
-    _switched(installing.rollback(root, to, reason), root, as_json)
+    _switched(installing.rollback(root, to, reason, camera=camera), as_json)
 
 
-def _switched(version: InstalledVersion, root: Path | None, as_json: bool) -> None:
-    stable = state_root(root) / "calibrations" / "current"
+def withdraw(
+    reason: Annotated[str, typer.Argument(help="Why it must not be used; kept, and told to programs")],
+    root: Root = None,
+    camera: CameraName = MAIN_CAMERA,
+    as_json: AsJson = False,
+) -> None:
+    """Take the installed calibration out of use.
+
+    Programs are refused it from now on. Installing another, or `calibrate rollback NUMBER`, ends that; no
+    check does.
+    """
+    if problem := installing.reason_problem(reason):
+        raise OutputError(problem, code="reason-too-short")
+    cause = ValidityReason("withdrawn", reason.strip())
+    validity = installing.set_validity(root, ValidityState.WITHDRAWN, cause, camera=camera)
     if as_json:
-        print_json({"generation": version.number, "path": str(version.path), "current": str(stable)})
+        print_json(validity)
+    else:
+        out.print(f"Camera {camera}, version {validity.version}: {validity_text(validity)}")
+
+
+def _switched(version: InstalledVersion, as_json: bool) -> None:
+    folder = version.path.parents[1]
+    stable = folder / "current"
+    if as_json:
+        plain = {"generation": version.number, "path": str(version.path), "current": str(stable)}
+        print_json(plain | {"validity": version.validity, "hooks": version.hooks})
         return
-    log = read_log(root)
+    log = read_lines(folder / "log.jsonl", LogEntry)
     out.print(f"Installed: version {version.number}, {stable}", soft_wrap=True)
     if log and log[-1].change:
         out.print(f"Change: {log[-1].change}")
+    if version.validity is not None:
+        out.print(f"Validity: {validity_text(version.validity)}")
+    for run in version.hooks:
+        if run.failed:
+            why = run.problem or f"exit code {run.exit_code}"
+            err.print(f"Hook {run.program}: {why} Output: {folder / 'hooks.jsonl'}", style="yellow")
 
 
-def list_installed(root: Root = None, as_json: AsJson = False) -> None:
+def list_installed(
+    root: Root = None,
+    camera: Annotated[str, typer.Option(help="One camera only (default: all of the cell)")] = "",
+    as_json: AsJson = False,
+) -> None:
     """List every calibration that was installed here.
 
-    Oldest first; → marks the current one.
+    Oldest first; → marks the current one, and says whether it still holds.
     """
-    known = installed_versions(root)
+    names = [camera] if camera else cameras(root)
+    known = [(name, version) for name in names for version in installed_versions(root, name)]
     if as_json:
-        print_json([_plain(version) for version in known])
+        print_json([_plain(name, version) for name, version in known])
         return
     if not known:
         err.print(f"Nothing is installed in {state_root(root)}. Run: calibrate install FILE")
         return
-    for version in known:
-        mark = "→" if version.current else " "
-        lines = _lines(version)
-        out.print(f"{mark} {version.number:>3}  " + "\n       ".join(lines), soft_wrap=True)
+    for name, versions in groupby(known, lambda pair: pair[0]):
+        if names != [MAIN_CAMERA]:
+            out.print(f"Camera {name}", style="bold")
+        for _, version in versions:
+            mark = "→" if version.current else " "
+            out.print(f"{mark} {version.number:>3}  " + "\n       ".join(_lines(version)), soft_wrap=True)
 
 
 def _lines(version: InstalledVersion) -> list[str]:
-    calibration = version.calibration
+    calibration, validity = version.calibration, version.validity
     if calibration is None:
         return [version.problem]
     made = f"{calibration.provenance.session}, solved {calibration.created}"
-    return [made, pose_text(calibration), _verdict_text(calibration)]
+    told = version.current or (validity is not None and validity.state in _TOLD_OF_OLD)
+    held = [validity_text(validity)] if validity is not None and told else []
+    return [made, pose_text(calibration), _verdict_text(calibration), *held]
 
 
 def _verdict_text(calibration: Calibration) -> str:
@@ -221,9 +297,10 @@ def history_rows(root: Path | None) -> list[tuple[str, str, str, str]]:
     ]
 
 
-def _plain(version: InstalledVersion) -> dict[str, Any]:
+def _plain(camera: str, version: InstalledVersion) -> dict[str, Any]:
     calibration = version.calibration
     return {
+        "camera": camera,
         "generation": version.number,
         "current": version.current,
         "path": str(version.path),
@@ -232,4 +309,5 @@ def _plain(version: InstalledVersion) -> dict[str, Any]:
         "created": None if calibration is None else calibration.created,
         "source": None if calibration is None else calibration.source,
         "sigma": None if calibration is None else msgspec.to_builtins(calibration.sigma),
+        "validity": None if version.validity is None else msgspec.to_builtins(version.validity),
     }

@@ -20,9 +20,11 @@ import yaml
 
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, source_stamp
+from calibrate.files.validity import Validity, validity_text
 from calibrate.geometry import Array, inverse, pose, rotation_log
 from calibrate.lens.model import distortion
 from calibrate.projection import camera_matrix
+from recordings.files import MAIN_CAMERA
 
 BODY_FROM_OPTICAL: Array = pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
 
@@ -46,19 +48,27 @@ class FrameNames:
     flange: str = "tool0"
     camera: str = "camera_optical_frame"
     body: str = "camera_link"
+    validity: Validity | None = None
+    """Of the installed calibration, for the file's comment; None: of a file that may never be installed."""
+
+    @classmethod
+    def of_camera(cls, name: str) -> FrameNames:
+        """Names of the frames of this camera of a cell: those of `main` have no name of their own."""
+        return cls() if name == MAIN_CAMERA else cls(camera=f"{name}_optical_frame", body=f"{name}_link")
 
     def parent(self, calibration: Calibration) -> str:
         return self.flange if calibration.mount == "eye-in-hand" else self.base
 
 
-def comment(calibration: Calibration) -> str:
+def comment(calibration: Calibration, frames: FrameNames) -> str:
     """One line on where this comes from, stamped where it must be.
 
     One line whatever the file says: the rest of a name must not become a line of a launch file or a script.
     """
     stamp = source_stamp(calibration)
-    origin = " ".join(f"{calibration.provenance.session}, solved {calibration.created}".split())
-    return f"{stamp}. {origin}" if stamp else origin
+    origin = f"{calibration.provenance.session}, solved {calibration.created}"
+    held = "" if frames.validity is None else validity_text(frames.validity)
+    return " ".join(". ".join(filter(None, (stamp, origin, held))).split())
 
 
 def ros_camera_info(calibration: Calibration, frames: FrameNames) -> str:
@@ -75,7 +85,7 @@ def ros_camera_info(calibration: Calibration, frames: FrameNames) -> str:
         "rectification_matrix": _matrix(np.eye(3)),
         "projection_matrix": _matrix(np.hstack([K, np.zeros((3, 1))])),
     }
-    return _commented_yaml(calibration, plain, default_flow_style=None, width=120)
+    return _commented_yaml(calibration, frames, plain, default_flow_style=None, width=120)
 
 
 def _matrix(values: Array) -> dict[str, object]:
@@ -83,8 +93,10 @@ def _matrix(values: Array) -> dict[str, object]:
     return {"rows": rows, "cols": cols, "data": values.ravel().tolist()}
 
 
-def _commented_yaml(calibration: Calibration, plain: dict[str, Any], **layout: Any) -> str:
-    return f"# {comment(calibration)}\n{yaml.safe_dump(plain, sort_keys=False, **layout)}"
+def _commented_yaml(
+    calibration: Calibration, frames: FrameNames, plain: dict[str, Any], **layout: Any
+) -> str:
+    return f"# {comment(calibration, frames)}\n{yaml.safe_dump(plain, sort_keys=False, **layout)}"
 
 
 def easy_handeye2(calibration: Calibration, frames: FrameNames) -> str:
@@ -107,7 +119,7 @@ def easy_handeye2(calibration: Calibration, frames: FrameNames) -> str:
             "rotation": dict(zip("xyzw", calibration.result.rotation_xyzw, strict=True)),
         },
     }
-    return _commented_yaml(calibration, plain)
+    return _commented_yaml(calibration, frames, plain)
 
 
 def _publisher_arguments(calibration: Calibration, frames: FrameNames) -> list[str]:
@@ -120,13 +132,13 @@ def _publisher_arguments(calibration: Calibration, frames: FrameNames) -> list[s
 
 def ros_static_transform(calibration: Calibration, frames: FrameNames) -> str:
     arguments = shlex.join(_publisher_arguments(calibration, frames))
-    return f"# {comment(calibration)}\nros2 run tf2_ros static_transform_publisher {arguments}\n"
+    return f"# {comment(calibration, frames)}\nros2 run tf2_ros static_transform_publisher {arguments}\n"
 
 
 def ros_launch(calibration: Calibration, frames: FrameNames) -> str:
     node = re.sub(r"\W", "_", frames.camera, flags=re.ASCII)  # all that ROS allows in a node's name
     listed = ",\n".join(f"                {part!r}" for part in _publisher_arguments(calibration, frames))
-    return f'''# {comment(calibration)}
+    return f'''# {comment(calibration, frames)}
 from launch import LaunchDescription
 from launch_ros.actions import Node
 
@@ -146,7 +158,7 @@ def generate_launch_description():
 
 
 def urdf(calibration: Calibration, frames: FrameNames) -> str:
-    note = re.sub("-(?=-)", "- ", comment(calibration))  # no -- inside a comment of XML
+    note = re.sub("-(?=-)", "- ", comment(calibration, frames))  # no -- inside a comment of XML
     parent = frames.parent(calibration)
     return (
         f"<!-- {note} -->\n"
@@ -185,7 +197,7 @@ def opencv(calibration: Calibration, frames: FrameNames) -> str:
     storage = cv2.FileStorage(
         "memory.yml", cv2.FILE_STORAGE_WRITE | cv2.FILE_STORAGE_MEMORY | cv2.FILE_STORAGE_FORMAT_YAML
     )
-    storage.writeComment(comment(calibration))
+    storage.writeComment(comment(calibration, frames))
     storage.write("mount", calibration.mount)
     storage.write("source", calibration.source)
     result = calibration.result
@@ -200,7 +212,10 @@ def opencv(calibration: Calibration, frames: FrameNames) -> str:
 
 
 def plain_json(calibration: Calibration, frames: FrameNames) -> str:
-    return msgspec.json.format(msgspec.json.encode(calibration)).decode() + "\n"
+    plain = msgspec.to_builtins(calibration)
+    if frames.validity is not None:
+        plain["validity"] = msgspec.to_builtins(frames.validity)
+    return msgspec.json.format(msgspec.json.encode(plain)).decode() + "\n"
 
 
 def ur_tool(calibration: Calibration, frames: FrameNames) -> str:
@@ -217,7 +232,7 @@ def ur_tool(calibration: Calibration, frames: FrameNames) -> str:
     pose = ", ".join(repr(float(v)) for v in (x / 1000, y / 1000, z / 1000, rx, ry, rz))
     call = f"set_tcp(p[{pose}])" if in_hand else f"camera = p[{pose}]"
     return (
-        f"# {comment(calibration)}\n# {what}\n"
+        f"# {comment(calibration, frames)}\n# {what}\n"
         f"X  {x:.3f} mm\nY  {y:.3f} mm\nZ  {z:.3f} mm\n"
         f"RX {rx:.6f} rad\nRY {ry:.6f} rad\nRZ {rz:.6f} rad\n"
         f"# the same in URScript (metres):\n{call}\n"

@@ -13,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from calibrate.boards.model import describe_board
 from calibrate.files.calibration import Calibration, Override, source_stamp
+from calibrate.files.validity import Validity, ValidityState, validity_text
 from calibrate.files.verification import agrees, touch_text
 from calibrate.geometry import difference
 from calibrate.results import BoardShape
@@ -40,10 +41,21 @@ def pose_text(calibration: Calibration) -> str:
     return f"{x:.3f}  {y:.3f}  {z:.3f} mm,  roll {roll:.4f}°  pitch {pitch:.4f}°  yaw {yaw:.4f}°"
 
 
-def summary(calibration: Calibration) -> RenderableType:
-    """For a rich console, 80 columns and more."""
+VALIDITY_STYLES = {
+    ValidityState.VALID: "green",
+    ValidityState.UNVERIFIED: "yellow",
+    ValidityState.IN_DOUBT: "bold red",
+    ValidityState.WITHDRAWN: "bold red",
+}
+
+
+def summary(calibration: Calibration, validity: Validity | None = None) -> RenderableType:
+    """For a rich console, 80 columns and more. `validity`: of the installed one."""
     style = "bold red" if calibration.verdict == "FAIL" else "bold green"
     parts: list[RenderableType] = [Text(verdict_text(calibration), style=style)]
+    if validity is not None:
+        shown = f"Installed: {validity_text(validity)}"
+        parts.append(Text(shown, style=VALIDITY_STYLES[validity.state]))
     if source_stamp(calibration):
         parts.append(Text(source_stamp(calibration), style="bold yellow"))
     if calibration.override is not None:

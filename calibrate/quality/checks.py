@@ -14,6 +14,7 @@ from calibrate.errors import InstallError
 from calibrate.files.lines import append_line, read_lines
 from calibrate.files.loader import calibrations_folder
 from calibrate.quality.drift import DriftCheck
+from recordings.files import MAIN_CAMERA
 
 _FEWEST_FOR_TREND = 5
 _TREND_P = 0.01
@@ -45,9 +46,9 @@ class CheckEntry(msgspec.Struct, frozen=True):
         )
 
 
-def append_check(entry: CheckEntry, root: Path | None = None) -> None:
+def append_check(entry: CheckEntry, root: Path | None = None, camera: str = MAIN_CAMERA) -> None:
     """Raises InstallError when the state folder cannot be written."""
-    folder = calibrations_folder(root)
+    folder = calibrations_folder(root, camera)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         append_line(folder / "checks.jsonl", entry)
@@ -57,9 +58,9 @@ def append_check(entry: CheckEntry, root: Path | None = None) -> None:
         ) from None
 
 
-def read_checks(root: Path | None = None) -> list[CheckEntry]:
+def read_checks(root: Path | None = None, camera: str = MAIN_CAMERA) -> list[CheckEntry]:
     """Oldest first."""
-    return read_lines(calibrations_folder(root) / "checks.jsonl", CheckEntry)
+    return read_lines(calibrations_folder(root, camera) / "checks.jsonl", CheckEntry)
 
 
 def earlier_results(history: Sequence[CheckEntry], generation: int) -> list[bool]:

@@ -29,6 +29,8 @@ class Keys(Footer):
         self._common = set(common)
 
     def compose(self) -> ComposeResult:
+        if not self.app.screen_stack:  # between two modes, or while the app closes: it is asked for again
+            return
         shown = [active for active in self.screen.active_bindings.values() if active.binding.show]
         for common in (False, True):
             line = [active for active in shown if (active.binding.action in self._common) is common]

@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import cv2
@@ -33,21 +34,23 @@ def old_file(solved_real: SolvedRecording, tmp_path: Path) -> Path:
 def test_what_takes_too_long_is_ended_with_a_name() -> None:
     begun_s = time.monotonic()
     with raises_code(SolveLimitError, "time-limit", limit_s=0.1), bounded(0.1, 0):
-        while time.monotonic() - begun_s < 10:
-            pass
+        _work(10)
     assert time.monotonic() - begun_s < 5
     assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
 
 
+def _work(duration_s: float) -> None:
+    """A function of its own: Python 3.13 leaves a loop's last jump out of the `with` that it stands in."""
+    begun_s = time.monotonic()
+    while time.monotonic() - begun_s < duration_s:
+        pass
+
+
 def test_a_handler_that_swallows_the_first_alarm_meets_the_next() -> None:
     with pytest.raises(SolveLimitError), bounded(0.05, 0):
-        try:
-            while True:
-                pass
-        except CalibrationError:
-            pass
-        while True:
-            pass
+        with suppress(CalibrationError):
+            _work(10)
+        _work(10)
 
 
 def test_an_alarm_while_the_block_ends_leaves_nothing_behind(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -251,6 +251,8 @@ class Rig:
         """`robot`: in place of the arm in memory."""
         self.arm, self.camera, self.worker = ArmInMemory(), CameraInMemory(), WorkerInThisProcess()
         robot = robot or self.arm
+        if source == "playback":
+            self.arm.control_path = ""  # nothing drives a recorded arm
         cell = Cell(memory_config(), robot, self.camera, source, attachments={"truth.json": b"{}"})
         self.session = Session(cell, root)
         self.session.context.workers = self.worker  # type: ignore[assignment]

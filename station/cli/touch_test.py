@@ -79,13 +79,13 @@ async def _visit(
             raise RefusedError(
                 "Nothing moved: --json prompts nobody, and is for simulated cells only.", code="no-person"
             )
-        root = shell.client.root
-        found = read_calibration(file) if file else installed_calibration(root)
+        root, camera = shell.client.root, shell.client.camera
+        found = read_calibration(file) if file else installed_calibration(root, camera)
         visit = _ShellToucher(shell, found.board, corners, pointer_m, quiet)
         try:
             await touch_test(shell.client, visit, file, standoff_m)
         finally:
-            visit.write(root, file)
+            visit.write(root, file, camera)
     return visit
 
 
@@ -151,11 +151,11 @@ class _ShellToucher:
             err.print(touch_text(touch))
             return
 
-    def write(self, root: Path | None, file: Path | None) -> None:
+    def write(self, root: Path | None, file: Path | None, camera: str) -> None:
         if not self._touches:
             return
         try:
-            out.print(note_touches(root, file, self._touches))
+            out.print(note_touches(root, file, self._touches, camera))
         except (CalibrationError, OSError) as problem:
             err.print(Text.assemble(("Not written", "red"), f": {problem}"))
             for touch in self._touches:

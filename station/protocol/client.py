@@ -86,6 +86,7 @@ class Client:
         self.root: Path | None = None
         """Below which the daemon keeps sessions and what is installed."""
         self.camera = MAIN_CAMERA
+        self.max_age_days: float | None = None
         self._one_at_a_time = asyncio.Lock()
         """Pieces of two long requests must not mix."""
         self._task = asyncio.create_task(self._read(), name="client-read")
@@ -118,6 +119,7 @@ class Client:
             await client.close()
             raise
         client.root, client.camera = Path(hello.root), hello.camera
+        client.max_age_days = hello.max_age_days
         return client
 
     async def call(self, verb: Verb[R], *, timeout_s: float = ANSWER_S) -> R:

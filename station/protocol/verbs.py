@@ -90,6 +90,8 @@ class Welcome(msgspec.Struct, frozen=True):
     """Folder of the sessions and of what is installed."""
     camera: str = MAIN_CAMERA
     """Name of the daemon's camera: under it its calibrations are installed."""
+    max_age_days: float | None = None
+    """Oldest proof of a calibration, by the cell's own rule; None: none."""
 
 
 class LoadedPlan(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -113,12 +113,10 @@ class SessionDispatcher:
 
     async def _hello(self, caller: _Caller, args: verbs.Hello) -> verbs.Welcome:
         caller.introduce(await self._name(caller.uid), args.who)
-        return verbs.Welcome(
-            software()["calibration-station"],
-            os.getpid(),
-            str(self._session.context.root),
-            self._session.context.cell.config.camera.name,
-        )
+        context = self._session.context
+        config, version = context.cell.config, software()["calibration-station"]
+        rule_days = config.validity.max_age_days
+        return verbs.Welcome(version, os.getpid(), str(context.root), config.camera.name, rule_days)
 
     async def _lease(self, caller: _Caller, args: verbs.Lease) -> LeaseStatus:
         if args.action == "take":

@@ -42,6 +42,9 @@ BUSY: dict[Purpose, str] = {
 class ScreenLink(motion.Link, Protocol):
     """A connection: `station.protocol.client.Client`, a recording, or a test's own."""
 
+    max_age_days: float | None
+    """Oldest proof of a calibration by the cell's rule; None: none."""
+
     async def close(self) -> None: ...
 
 
@@ -87,6 +90,11 @@ class Desk(App[None]):
     def camera(self) -> str:
         """Name of the daemon's camera."""
         return MAIN_CAMERA if self.link is None else self.link.camera
+
+    @property
+    def max_age_days(self) -> float | None:
+        """Oldest proof of a calibration by the cell's rule."""
+        return None if self.link is None else self.link.max_age_days
 
     def common_actions(self) -> list[str]:
         """Actions that have a key on every screen."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
 from functools import lru_cache
@@ -12,8 +13,11 @@ from pathlib import Path
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, read_calibration
 from calibrate.files.install import installed_calibration
-from calibrate.files.loader import calibrations_folder
+from calibrate.files.loader import calibrations_folder, current_validity
+from calibrate.files.validity import FILE as VALIDITY_FILE
+from calibrate.files.validity import Validity, ValidityState
 from calibrate.files.versions import LogEntry, read_log, same_solve
+from recordings.files import MAIN_CAMERA
 
 LOOK_S = 2.0
 Marks = frozenset[tuple[str, int]]
@@ -37,42 +41,51 @@ class Installed:
     now: Calibration | None = None
     ended: tuple[Ended, ...] = ()
     """The newest end last, one for each solve; without what is installed again."""
+    validity: Validity | None = None
+    """Whether `now` still holds."""
 
     def word(self, session: str) -> str:
         """State of a session whose calibration is or was installed; else empty."""
         if self.now is not None and self.now.provenance.session == session:
-            return "INSTALLED"
+            return self.held
         ends = [end.how for end in self.ended if end.calibration.provenance.session == session]
         return ends[-1] if ends else ""
+
+    @property
+    def held(self) -> str:
+        """INSTALLED, and what speaks against using it."""
+        if self.validity is None or self.validity.state is ValidityState.VALID:
+            return "INSTALLED"
+        return f"INSTALLED, {self.validity.state.replace('-', ' ')}"
 
     def end_of(self, calibration: Calibration) -> Ended | None:
         return next((end for end in self.ended if same_solve(end.calibration, calibration)), None)
 
 
-def read_installed(root: Path) -> Installed:
-    """Read all of it, in a thread: many files take a moment."""
-    try:
-        now = installed_calibration(root)
-    except CalibrationError:
-        now = None
+def read_installed(root: Path, camera: str = MAIN_CAMERA) -> Installed:
+    """Read all of one camera, in a thread: many files take a moment."""
+    now, validity = None, None
+    with suppress(CalibrationError):
+        now = installed_calibration(root, camera)
+        validity = current_validity(calibrations_folder(root, camera))
     ended: list[Ended] = []
     try:
-        log = read_log(root)
+        log = read_log(root, camera)
     except OSError:
         log = []
     for before, entry in pairwise(log):
-        was = _generation(root, before.generation)
+        was = _generation(root, camera, before.generation)
         if was is None or entry.generation == before.generation or entry.action == "verify":
             continue  # a check by hand goes into a generation of its own, of the same solve
         how = "rolled back" if entry.action == "rollback" else "replaced"
         ended = [end for end in ended if not same_solve(end.calibration, was)]
         ended.append(Ended(was, how, _by(entry)))
-    return Installed(now, tuple(end for end in ended if not same_solve(end.calibration, now)))
+    return Installed(now, tuple(end for end in ended if not same_solve(end.calibration, now)), validity)
 
 
-def _generation(root: Path, number: int) -> Calibration | None:
+def _generation(root: Path, camera: str, number: int) -> Calibration | None:
     """None when it is damaged or gone."""
-    return next(map(_read, (calibrations_folder(root) / "gen").glob(f"{number:04d}-*.yaml")), None)
+    return next(map(_read, (calibrations_folder(root, camera) / "gen").glob(f"{number:04d}-*.yaml")), None)
 
 
 @lru_cache(maxsize=256)
@@ -106,7 +119,8 @@ def marks(root: Path) -> Marks:
 
     Other screens and commands record, solve, install and roll back meanwhile.
     """
-    found = {_mark(calibrations_folder(root) / "current")}
+    folders = [calibrations_folder(root), *(root / "calibrations" / "cameras").glob("*")]
+    found = {_mark(folder / name) for folder in folders for name in ("current", VALIDITY_FILE)}
     try:
         with os.scandir(root / "sessions") as entries:
             found |= {_mark(Path(entry.path)) for entry in entries}

@@ -65,6 +65,7 @@ class ReplayLink:
 
     root: Path | None = None
     camera = MAIN_CAMERA
+    max_age_days: float | None = None
 
     def __init__(self, path: Path, pace: float = 1.0) -> None:
         try:

@@ -18,6 +18,7 @@ from textual.widgets import Static
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, read_calibration
 from calibrate.files.install import objections_beside
+from calibrate.files.validity import ValidityState, validity_text
 from calibrate.files.verification import agrees, touch_text
 from calibrate.files.versions import same_solve
 from calibrate.geometry import difference
@@ -51,11 +52,14 @@ def verdict_text(
     ]
     against = [words for words in against if not words.startswith("0 ")]
     stamp = "" if calibration.source == "real" else f"{calibration.source.upper()}: never for a real cell\n"
-    ready = "INSTALLED" if installed else end.how.upper() if end else "READY TO INSTALL"
+    ready = state.held if installed else end.how.upper() if end else "READY TO INSTALL"
     head = ", ".join(against) + f": {REASONED[installed]}" if against else ready
     text = Text().append(stamp, "bold").append(f"{head}\n", "bold reverse" if against else "bold")
     if installed and state.now is not None and (taken := state.now.override) is not None:
         text.append(f"Override by {taken.who}: “{taken.reason}”\n")
+    if installed and state.validity is not None:
+        doubted = state.validity.state is not ValidityState.VALID
+        text.append(f"{validity_text(state.validity)}\n", "bold reverse" if doubted else "")
     if end is not None:
         text.append(f"{ended_words(end)}. i installs it again\n")
     text.append(f"session {calibration.provenance.session}\n")
@@ -184,8 +188,8 @@ class ResultScreen(StationScreen):
         if path:
             try:
                 root = state_root(path)
-                self._state = await asyncio.to_thread(read_installed, root)
                 found = await asyncio.to_thread(read_calibration, Path(path))
+                self._state = await asyncio.to_thread(read_installed, root, found.camera_name)
                 objections = await asyncio.to_thread(objections_beside, found, root)
             except CalibrationError as problem:
                 why = str(problem)

@@ -9,6 +9,7 @@ import asyncio
 import os
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
@@ -22,16 +23,16 @@ from textual.widgets import Button, Label, RichLog
 
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import read_calibration
-from calibrate.files.exports import FORMATS, export
+from calibrate.files.exports import FORMATS, FrameNames, export
 from calibrate.files.install import Cell, install, rollback
-from calibrate.files.versions import InstalledVersion, before_current, installed_versions
+from calibrate.files.versions import InstalledVersion, before_current, installed_versions, same_solve
 from recordings.files import ASKED_FOR, write_atomically
 from station.cell.session_folder import CALIBRATION_FILE
 from station.cell.status import SessionStatus
 from station.operate.drift_check import check_arguments, recorded, start_drift_check
 from station.tui.desk import Desk
 from station.tui.dialogs import ChooseFormat, Confirm, Reason
-from station.tui.installed import local, state_root
+from station.tui.installed import local, read_installed, state_root
 from station.tui.touch_test import run_touch_test
 from station.tui.words import duration
 
@@ -206,17 +207,30 @@ class ResultsDesk(Desk):
         """Install; return the refusal, None when it is installed."""
         cell: Cell = "simulated" if self.status is not None and self.status.simulated else "real"
         try:
-            await asyncio.to_thread(install, Path(path), state_root(path), cell=cell, override=reason)
+            made = await asyncio.to_thread(
+                install,
+                Path(path),
+                state_root(path),
+                cell=cell,
+                override=reason,
+                max_age_days=self.max_age_days,
+            )
         except CalibrationError as refusal:
             return refusal
         self.notify("Installed. Key b on this screen goes back to the one before.")
+        self._say_hooks(made)
         return None
 
     @work(exclusive=True, group="job", exit_on_error=False)
     async def roll_back(self, path: str) -> None:
         """Ask, naming both, then switch back to the calibration before the installed one."""
         root = state_root(path)
-        known = installed_versions(root)
+        try:
+            camera = read_calibration(Path(path)).camera_name
+        except CalibrationError as problem:
+            self.notify(str(problem), severity="error", markup=False)
+            return
+        known = installed_versions(root, camera)
         current = next((g for g in known if g.current), None)
         older = before_current(known)
         if current is None or older is None:
@@ -228,8 +242,16 @@ class ResultsDesk(Desk):
             Confirm("Go back to the calibration before?", body, yes="Go back")
         ):
             return
-        if await self.attempt(asyncio.to_thread(rollback, root)) is not None:
-            self.notify("The calibration before is installed again.")
+        made = await self.attempt(asyncio.to_thread(rollback, root, camera=camera))
+        if made is not None:
+            self.notify("The calibration before is installed again; a drift check proves it (4, k).")
+            self._say_hooks(made)
+
+    def _say_hooks(self, version: InstalledVersion) -> None:
+        for run in version.hooks:
+            if run.failed:
+                why = run.problem or f"exit code {run.exit_code}"
+                self.notify(f"{run.program}: {why}", title="A hook failed", severity="warning", markup=False)
 
     @work(exclusive=True, group="job", exit_on_error=False)
     async def export(self, path: str) -> None:
@@ -239,7 +261,12 @@ class ResultsDesk(Desk):
         output = Path(path).with_name(f"calibration-{chosen}{FORMATS[chosen].suffix}")
 
         def write() -> Path:
-            text = export(read_calibration(Path(path)), chosen)
+            calibration, root = read_calibration(Path(path)), state_root(path)
+            names = FrameNames.of_camera(calibration.camera_name)
+            installed = read_installed(root, calibration.camera_name)
+            if same_solve(calibration, installed.now):
+                names = replace(names, validity=installed.validity)
+            text = export(calibration, chosen, names)
             write_atomically(output, text.encode(), ASKED_FOR)
             return output
 

@@ -81,7 +81,9 @@ class SessionsScreen(StationScreen):
         if answer is None:
             self._marks = frozenset()
             return  # why was said; what was known stays
-        installed = Installed() if root is None else await asyncio.to_thread(read_installed, root)
+        installed = (
+            Installed() if root is None else await asyncio.to_thread(read_installed, root, self.desk.camera)
+        )
         at = self._sessions[self.table.cursor_row].name if self._sessions else ""
         self._sessions = answer
         self.query_one("#sessions-none").display = not self._sessions

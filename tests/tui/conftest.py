@@ -60,6 +60,8 @@ class FakeLink:
     """Answers like a daemon in a good mood; `refuse` maps verbs to errors."""
 
     root: Path | None = None
+    camera = "main"
+    max_age_days: float | None = None
 
     def __init__(self) -> None:
         self.asked: list[Verb[Any]] = []

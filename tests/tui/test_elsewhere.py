@@ -68,10 +68,10 @@ async def test_the_list_of_sessions_names_what_is_installed_now(link: FakeLink, 
         put(root, "s-2")
         await until(pilot, lambda: states() == ["INSTALLED", "replaced"])
         rollback(root)
-        await until(pilot, lambda: states() == ["rolled back", "INSTALLED"])
+        await until(pilot, lambda: states() == ["rolled back", "INSTALLED, unverified"])
         link.answers["sessions"] = [summary("s-3"), *link.answers["sessions"]]
         (root / "sessions" / "s-3").mkdir()
-        await until(pilot, lambda: states() == ["-", "rolled back", "INSTALLED"])
+        await until(pilot, lambda: states() == ["-", "rolled back", "INSTALLED, unverified"])
         assert table.cursor_row == 2
 
 
@@ -115,7 +115,7 @@ async def test_a_calibration_that_was_taken_back_says_so_and_who_did_it(link: Fa
 def test_a_check_by_hand_is_no_end_of_what_is_installed(root: Path) -> None:
     put(root, "s-1")
     note_installed(root, [OFF])
-    assert read_installed(root).word("s-1") == "INSTALLED"
+    assert read_installed(root).word("s-1") == "INSTALLED, in doubt"
     put(root, "s-2")
     (end,) = read_installed(root).ended
     assert (end.how, end.calibration.verification) == ("replaced", [OFF])

@@ -13,6 +13,7 @@ from textual.widgets import Input, OptionList, Static
 from calibrate.files.calibration import Override, Touch, write_calibration
 from calibrate.files.exports import FORMATS
 from calibrate.files.install import install, installed_calibration
+from calibrate.files.validity import Validity, ValidityReason, ValidityState
 from calibrate.files.verification import note_installed
 from calibrate.files.versions import installed_versions
 from recordings.schema.messages import CameraIdentity, RobotIdentity
@@ -163,3 +164,12 @@ async def test_the_formats_say_who_reads_them(link: FakeLink, calibration: Path)
         await pilot.press("enter")
         await until(pilot, lambda: "Written" in said(pilot))
     assert calibration.with_name("calibration-ros-camera-info.yaml").is_file()
+
+
+def test_a_calibration_that_no_longer_holds_says_so_where_it_said_installed() -> None:
+    reason = ValidityReason("drift-check", "Drift check FAIL: camera shift 3.00 mm.")
+    doubt = Validity(1, ValidityState.IN_DOUBT, "2026-11-22T04:50:00+00:00", reason)
+    state = Installed(GOOD, validity=doubt)
+    head, told, *_ = verdict_text(GOOD, state).plain.splitlines()[1:]
+    assert head == state.word(GOOD.provenance.session) == "INSTALLED, in doubt"
+    assert reason.text in told

@@ -13,10 +13,12 @@ import msgspec
 import numpy as np
 import pytest
 
+from calibrate import load_installed
+from calibrate.errors import InstallError
 from calibrate.files.calibration import read_calibration, write_calibration
 from recordings.exporters.excerpt import write_excerpt
 from recordings.reader import open_recording
-from tests.calibrate.calling import refused, run
+from tests.calibrate.calling import raises_code, refused, run
 from tests.calibrate.sessions import Scene, write_session
 
 GATE_KEYS = {"name", "passed", "value", "limit", "unit", "text", "remedy"}
@@ -98,6 +100,8 @@ def test_solve_install_check_diff_rollback(real_session_file: Path, real_file: P
     installed = run("install", second, "--json", cwd=tmp_path)
     assert json.loads(installed.stdout)["generation"] == 2
     assert run("drift-check", real_session_file, cwd=tmp_path).returncode == 4
+    assert run("drift-check", new, cwd=tmp_path).returncode == 4
+    _everything_says_that_it_is_in_doubt(tmp_path)
     apart = json.loads(run("diff", real_file, "--json", cwd=tmp_path).stdout)
     assert apart["translation_mm"] == pytest.approx(20.0, abs=1e-6)
     assert run("rollback", "--reason", "moved", cwd=tmp_path).returncode == 0
@@ -108,6 +112,24 @@ def test_solve_install_check_diff_rollback(real_session_file: Path, real_file: P
     assert run("list", cwd=tmp_path).stdout.count(session) == 2
     text = run("export", "--to", "urdf", cwd=tmp_path)
     assert text.stdout.count("<joint") == 2
+
+
+def _everything_says_that_it_is_in_doubt(folder: Path) -> None:
+    listed = json.loads(run("list", "--json", cwd=folder).stdout)
+    assert [row["validity"]["state"] for row in listed] == ["valid", "in-doubt"]
+    shown = json.loads(run("show", "--json", cwd=folder).stdout)["validity"]
+    assert (shown["state"], shown["reason"]["code"], shown["version"]) == ("in-doubt", "drift-check", 2)
+    assert shown["reason"]["values"]["shift_mm"] == pytest.approx(20, abs=2)
+    for form in ("ros-camera-info", "easy-handeye2", "urdf", "ros-launch", "opencv", "ur-tool", "json"):
+        exported = run("export", "--to", form, cwd=folder)
+        assert "in doubt" in exported.stdout or '"in-doubt"' in exported.stdout, form
+        assert "in doubt" in exported.stderr, form
+    assert 'calibration_validity{camera="main",state="in-doubt"} 1' in run("metrics", cwd=folder).stdout
+    with raises_code(InstallError, "calibration-in-doubt"):
+        load_installed(folder / "state/calibration-station")
+    withdrawn = run("withdraw", "a pallet hit the camera", "--json", cwd=folder)
+    assert json.loads(withdrawn.stdout)["state"] == "withdrawn"
+    refused(run("withdraw", "xxx", cwd=folder), 2, "reason-too-short")
 
 
 def test_simulated_never_installs_on_a_real_cell(session_file: Path, tmp_path: Path) -> None:

@@ -17,9 +17,12 @@ from calibrate.files.calibration import (
     FORMAT,
     Arm,
     Calibration,
+    CorrectedArm,
+    DhTable,
     Folds,
     FramePose,
     Gate,
+    HeldOutViews,
     Lens,
     Proof,
     Provenance,
@@ -31,7 +34,9 @@ from calibrate.files.calibration import (
     Views,
     ViewWeight,
 )
-from calibrate.handeye.solution import Remark, Solution
+from calibrate.geometry import Transform
+from calibrate.handeye.arm import HELD, PARAMETERS
+from calibrate.handeye.solution import Remark, Solution, TableResult
 from calibrate.lens.intrinsics import Intrinsics
 from calibrate.lens.pnp import view_rms_px
 from calibrate.lens.uncertainty import LensUncertainty
@@ -56,14 +61,22 @@ def make_calibration(
 ) -> Calibration:
     """`options`: the choices that differ from the defaults."""
     info = recording.info
+    arm = None if solution.arm is None else solution.arm.result
+    X, covariance = solution.parent_from_child, solution.covariance
+    if arm is not None and solution.arm is not None and solution.arm.detected:
+        # Without its table that X is worse than one that knows nothing of it.
+        X, covariance = Transform(X.parent, X.child, arm.for_uncorrected), arm.uncorrected_covariance
     return Calibration(
         format=FORMAT,
         created=datetime.now(UTC).isoformat(timespec="seconds"),
         source=info.source,
         mount=solution.mount,
-        result=FramePose.of(solution.parent_from_child),
-        sigma=Sigma(solution.sigma_translation_m * 1e3, solution.sigma_rotation_rad * _DEG),
-        covariance=tuple(tuple(row) for row in solution.covariance.tolist()),
+        result=FramePose.of(X),
+        sigma=Sigma(
+            1e3 * float(np.sqrt(np.trace(covariance[:3, :3]))),
+            _DEG * float(np.sqrt(np.trace(covariance[3:, 3:]))),
+        ),
+        covariance=tuple(tuple(row) for row in covariance.tolist()),
         confidence_threshold=float(solution.confidence_threshold),
         board_place=FramePose.of(solution.board_place),
         intrinsics=_lens(views, intrinsics, solution),
@@ -88,6 +101,33 @@ def make_calibration(
             recorded_wall_ns=info.created_wall_ns,
             plan_sha256=info.plan_sha256,
         ),
+        arm_table=None if arm is None else _arm_table(solution, arm),
+    )
+
+
+def _arm_table(solution: Solution, arm: TableResult) -> CorrectedArm:
+    assert solution.arm is not None
+    X, held_out = solution.parent_from_child, None
+    if arm.held_out_m is not None:
+        without, with_table = 1e3 * np.sqrt(np.nanmean(arm.held_out_m**2, axis=1))
+        seen = int(np.isfinite(arm.held_out_m[0]).sum())
+        held_out = HeldOutViews(float(without), float(with_table), seen)
+    own = Transform(f"corrected_{X.parent}", X.child, X.matrix)
+    return CorrectedArm(
+        offered=arm.offered,
+        model=arm.nominal.name,
+        nominal=DhTable.of(arm.nominal),
+        nominal_source="factory" if arm.factory else "published",
+        errors=[TableError(name, *solution.arm.errors[name]) for name in PARAMETERS],
+        held=HELD,
+        covariance=tuple(tuple(row) for row in arm.covariance.tolist()),
+        with_table_mm=1e3 * arm.with_table_m,
+        without_table_mm=1e3 * arm.without_table_m,
+        if_measured_mm={name: 1e3 * value for name, value in arm.if_measured_m.items()},
+        held_out=held_out,
+        refused=arm.refused or "",
+        corrected=DhTable.of(arm.corrected) if arm.offered else None,
+        result=FramePose.of(own) if arm.offered else None,
     )
 
 

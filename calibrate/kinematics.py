@@ -1,18 +1,22 @@
 """Kinematics of Universal Robots arms: forward, all analytic inverses, Jacobian, singularity measure.
 
-Standard Denavit-Hartenberg: frame i from i-1 is Rz(q_i) Tz(d_i) Tx(a_i) Rx(alpha_i). Frame 6 is the
-flange; `base` is the controller's base frame. Lengths in metres, angles in radians. Parameters: Universal
-Robots, "DH parameters for calculations of kinematics and dynamics".
+Standard Denavit-Hartenberg: frame i from i-1 is Rz(q_i) Tz(d_i) Tx(a_i) Rx(alpha_i), and after it, for axes
+that are nearly parallel, Ry(beta_i) (S. Hayati, 1983; nominally 0). Frame 6 is the flange; `base` is the
+controller's base frame. Lengths in metres, angles in radians. Parameters: Universal Robots, "DH parameters
+for calculations of kinematics and dynamics". Needs NumPy only.
 """
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from calibrate.geometry import Array
+if TYPE_CHECKING:  # that module needs SciPy
+    from calibrate.geometry import Array
 
 _ALPHA = (np.pi / 2, 0.0, 0.0, np.pi / 2, -np.pi / 2, 0.0)
 JOINT_NAMES = ("base", "shoulder", "elbow", "wrist 1", "wrist 2", "wrist 3")
@@ -26,6 +30,7 @@ class DhDeltas:
     d_m: tuple[float, ...] = (0.0,) * 6
     alpha_rad: tuple[float, ...] = (0.0,) * 6
     theta_rad: tuple[float, ...] = (0.0,) * 6
+    beta_rad: tuple[float, ...] = (0.0,) * 6
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,7 @@ class RobotModel:
     """'CB3' or 'e-Series'"""
     alpha_rad: tuple[float, ...] = _ALPHA
     theta_offset_rad: tuple[float, ...] = (0.0,) * 6
+    beta_rad: tuple[float, ...] = (0.0,) * 6
     joint_limit_rad: float = 2 * np.pi
     """Joints turn within ± this."""
     link_radius_m: tuple[float, ...] = field(default=(0.09, 0.075, 0.06, 0.05, 0.05, 0.045))
@@ -56,6 +62,7 @@ class RobotModel:
             d_m=add(self.d_m, deltas.d_m),
             alpha_rad=add(self.alpha_rad, deltas.alpha_rad),
             theta_offset_rad=add(self.theta_offset_rad, deltas.theta_rad),
+            beta_rad=add(self.beta_rad, deltas.beta_rad),
         )
 
 
@@ -93,13 +100,72 @@ def link_frames(model: RobotModel, joints_rad: ArrayLike) -> Array:
         step[..., 2, 1], step[..., 2, 2] = sa, ca
         step[..., 0, 3], step[..., 1, 3], step[..., 2, 3] = model.a_m[i] * ct, model.a_m[i] * st, model.d_m[i]
         step[..., 3, 3] = 1.0
+        if model.beta_rad[i]:
+            cb, sb = np.cos(model.beta_rad[i]), np.sin(model.beta_rad[i])
+            x, z = step[..., 0].copy(), step[..., 2].copy()
+            step[..., 0], step[..., 2] = cb * x - sb * z, sb * x + cb * z
         frames[..., i + 1, :, :] = frames[..., i, :, :] @ step
     return frames
+
+
+def with_near_axes(model: RobotModel) -> RobotModel:
+    """Restate a table whose d2 and d3 are far off, so that no frame lies far from the arm: they become 0.
+
+    A factory calibration states the common normal of two axes that are parallel to within a milliradian: it
+    lies metres away, and theta turns with it. Here the normal is replaced by a turn beta. Same flange.
+    """
+    if not any(model.d_m[1:3]):
+        return model
+    a, d, alpha = list(model.a_m), list(model.d_m), list(model.alpha_rad)
+    theta, beta = list(model.theta_offset_rad), list(model.beta_rad)
+    for i in (1, 2):
+        zero = replace(
+            model, a_m=tuple(a), d_m=tuple(d), alpha_rad=tuple(alpha), theta_offset_rad=tuple(theta),
+            beta_rad=tuple(beta),
+        )  # fmt: skip
+        frames = link_frames(zero, np.zeros(6))
+        step = np.linalg.inv(frames[i]) @ frames[i + 1]
+        axis, point = step[:3, 2], step[:3, 3]
+        along = point[2] / axis[2]
+        foot = point - along * axis  # where the next axis passes the plane of this joint
+        sign = -1.0 if model.a_m[i] < 0 else 1.0
+        theta[i] = float(np.arctan2(sign * foot[1], sign * foot[0]))
+        a[i], d[i] = float(sign * np.hypot(foot[0], foot[1])), 0.0
+        turned = _turn_z(theta[i]).T @ step[:3, :3]
+        alpha[i] = float(np.arctan2(-turned[1, 2], np.hypot(turned[0, 2], turned[2, 2])))
+        beta[i] = float(np.arctan2(turned[0, 2], turned[2, 2]))
+        ca, sa, cb, sb = np.cos(alpha[i]), np.sin(alpha[i]), np.cos(beta[i]), np.sin(beta[i])
+        tilt = np.array([[cb, 0.0, sb], [sa * sb, ca, -sa * cb], [-ca * sb, sa, ca * cb]])
+        rest = tilt.T @ turned  # a turn about the next axis
+        theta[i + 1] += float(np.arctan2(rest[1, 0], rest[0, 0]))
+        d[i + 1] += float(along)
+    return replace(
+        model, a_m=tuple(a), d_m=tuple(d), alpha_rad=tuple(alpha), theta_offset_rad=tuple(theta),
+        beta_rad=tuple(beta),
+    )  # fmt: skip
+
+
+def _turn_z(angle: float) -> Array:
+    c, s = np.cos(angle), np.sin(angle)
+    return np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def forward(model: RobotModel, joints_rad: ArrayLike) -> Array:
     """Compute base_from_flange (..., 4, 4) of joints (..., 6)."""
     return np.asarray(link_frames(model, joints_rad)[..., 6, :, :])
+
+
+TABLE_COLUMNS = ("a_m", "d_m", "alpha_rad", "theta_rad", "beta_rad")
+
+
+def base_from_flange(table: Mapping[str, Sequence[float]], joints_rad: ArrayLike) -> Array:
+    """Compute the flange (..., 4, 4) of joints (..., 6) by a calibration file's `arm_table.corrected`.
+
+    table: a_m, d_m, alpha_rad, theta_rad, beta_rad of six numbers each. The result maps
+    `corrected_flange` into `corrected_base`: it belongs to `arm_table.result` alone, never to another X.
+    """
+    a, d, alpha, theta, beta = (tuple(table[name]) for name in TABLE_COLUMNS)
+    return forward(RobotModel("corrected", a, d, "", alpha, theta, beta), joints_rad)
 
 
 def jacobian(model: RobotModel, joints_rad: ArrayLike) -> Array:

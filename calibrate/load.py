@@ -7,18 +7,26 @@ from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
+import msgspec
 import numpy as np
 
 from calibrate.boards.detect import Detection, detect
 from calibrate.boards.model import board_points
 from calibrate.errors import BadViewsError, MirroredImagesError, SquaresCountedError, TooFewViewsError
 from calibrate.geometry import is_rigid
+from calibrate.kinematics import MODELS, RobotModel
 from calibrate.results import RejectedView
 from calibrate.views import BoardView, ViewSet
 from recordings.errors import BadImageError
 from recordings.files import usable_cores
 from recordings.reader import Recording
-from recordings.schema.messages import BoardSpec, CameraModel, View
+from recordings.schema.messages import (
+    ARM_KINEMATICS_NAME,
+    ArmKinematics,
+    BoardSpec,
+    CameraModel,
+    View,
+)
 
 FEWEST_VIEWS = 4
 Progress = Callable[[int, int, str], None]
@@ -92,8 +100,31 @@ def load_views(
         model.distortion,
         model.distortion_model,
     )
-    found = ViewSet(info.mount, tuple(views), model, info.robot.model)
+    found = ViewSet(info.mount, tuple(views), model, info.robot.model, _calibrated_arm(recording))
     return LoadedViews(found, spec, pictures, tuple(missing), seen, recording.losses)
+
+
+def _calibrated_arm(recording: Recording) -> RobotModel | None:
+    """Read the maker's calibration of the arm, where the recording states it."""
+    content = recording.attachments().get(ARM_KINEMATICS_NAME)
+    if content is None:
+        return None
+    try:
+        stated = msgspec.json.decode(content, type=ArmKinematics)
+        published = MODELS[stated.model]
+    except (msgspec.DecodeError, KeyError) as problem:
+        raise BadViewsError(
+            f"{recording.path}: {ARM_KINEMATICS_NAME} is no table of a known arm ({problem}).",
+            code="arm-kinematics",
+            remedy="Export the recording to a folder and import it again without the robot's model.",
+        ) from None
+    return replace(
+        published,
+        a_m=stated.a_m,
+        d_m=stated.d_m,
+        alpha_rad=stated.alpha_rad,
+        theta_offset_rad=stated.theta_rad,
+    )
 
 
 def without_views(loaded: LoadedViews, numbers: tuple[int, ...], fewest: int = FEWEST_VIEWS) -> LoadedViews:

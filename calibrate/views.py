@@ -9,6 +9,7 @@ import numpy as np
 
 from calibrate.errors import BadViewsError
 from calibrate.geometry import Array
+from calibrate.kinematics import RobotModel
 from recordings.schema.messages import CameraModel, Mount
 
 _NOMINAL_MATRIX = ((600.0, 0.0, 320.0), (0.0, 600.0, 240.0), (0.0, 0.0, 1.0))
@@ -42,6 +43,8 @@ class ViewSet:
     camera: CameraModel
     """matrix is None until intrinsics are known."""
     robot_model: str = "unknown"
+    arm: RobotModel | None = None
+    """The arm's table as its maker calibrated it; None: the published one of `robot_model`."""
 
     @classmethod
     def from_poses(cls, mount: Mount, base_from_flange: Array, camera_from_board: Array) -> ViewSet:

@@ -111,6 +111,7 @@ def solve_json(job: SolvedRecording) -> dict[str, Any]:
         "board": quality.get("board"),
         "session": quality.get("session"),
         "arm": quality.get("arm"),
+        "arm_table": plain.get("arm_table"),
         "solve_ms": sum(job.stage_ms.values()),
     }
 

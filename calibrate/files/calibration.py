@@ -12,10 +12,12 @@ from typing import Any, Literal
 import msgspec
 import numpy as np
 import yaml
+from numpy.typing import ArrayLike
 
 from calibrate.errors import CalibrationFileError
-from calibrate.files.loader import check_result, content_sha256, proven_plain, read_bounded
+from calibrate.files.loader import check_result, content_sha256, proven_plain, read_bounded, refused_table
 from calibrate.geometry import Transform
+from calibrate.kinematics import RobotModel, base_from_flange
 from calibrate.results import BoardShape, HoldoutScore, RejectedView
 from recordings.files import ASKED_FOR, MAIN_CAMERA, write_atomically
 from recordings.schema.messages import (
@@ -26,6 +28,7 @@ from recordings.schema.messages import (
     Mount,
     RobotIdentity,
     Source,
+    Vector6,
 )
 
 _STAMPS = {
@@ -144,6 +147,72 @@ class Arm(msgspec.Struct, frozen=True):
     log_bayes: float
     size_mm: float
     table: list[TableError]
+
+
+class DhTable(msgspec.Struct, frozen=True):
+    """A kinematic table, joint 1 first: frame i from i-1 is Rz(q + theta) Tz(d) Tx(a) Rx(alpha) Ry(beta)."""
+
+    a_m: Vector6
+    d_m: Vector6
+    alpha_rad: Vector6
+    theta_rad: Vector6
+    beta_rad: Vector6
+
+    @classmethod
+    def of(cls, model: RobotModel) -> DhTable:
+        columns = (model.a_m, model.d_m, model.alpha_rad, model.theta_offset_rad, model.beta_rad)
+        return cls(*columns)  # type: ignore[arg-type]
+
+
+class HeldOutViews(msgspec.Struct, frozen=True):
+    """Views predicted from those taken elsewhere: rms distance by which the board's middle was missed."""
+
+    without_table_mm: float
+    with_table_mm: float
+    views: int
+
+
+class CorrectedArm(msgspec.Struct, frozen=True, omit_defaults=True):
+    """X and the arm's table as one result. `corrected` and `result` are there only where it is offered.
+
+    The X of this table serves no other: its frames are `corrected_base` and `corrected_flange`, which chain
+    with `base_from_flange` here and with nothing else. The file's own `result` serves the arm as it is.
+    """
+
+    offered: bool
+    model: str
+    nominal: DhTable
+    """That the recorded flanges follow."""
+    nominal_source: Literal["published", "factory"]
+    errors: list[TableError]
+    held: dict[str, str]
+    """Parameter that keeps its nominal value → why."""
+    covariance: tuple[tuple[float, ...], ...]
+    """(24, 24) of X's [δt, δφ] and of `errors`, in that order; metres, radians."""
+    with_table_mm: float
+    """1σ of a point over the arm's workspace, working distance ahead."""
+    without_table_mm: float
+    """The same for the uncorrected arm with `result` of the file."""
+    if_measured_mm: dict[str, float] = {}
+    """`with_table_mm` if this (board, intrinsics) were known to 0.02 %."""
+    held_out: HeldOutViews | None = None
+    refused: str = ""
+    """Why it is not offered: no-evidence, no-joints, not-nominal, not-better."""
+    corrected: DhTable | None = None
+    result: FramePose | None = None
+    """corrected_flange_from_camera (eye-in-hand) or corrected_base_from_camera."""
+
+    def base_from_flange(self, joints_rad: ArrayLike) -> Transform:
+        """Compute corrected_base_from_corrected_flange of joints (6,). Raises as `installable`."""
+        table, _ = self.installable()
+        flange = base_from_flange(msgspec.structs.asdict(table), joints_rad)
+        return Transform("corrected_base", "corrected_flange", flange)
+
+    def installable(self) -> tuple[DhTable, Transform]:
+        """Return the table and the X that belongs to it. CalibrationFileError if not offered."""
+        if not self.offered or self.corrected is None or self.result is None:
+            raise refused_table(self.refused)
+        return self.corrected, self.result.transform
 
 
 class Quality(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -281,10 +350,12 @@ class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):
     override: Override | None = None
     verification: list[Touch] = []
     """Checks by hand, oldest first; see `verification`."""
+    arm_table: CorrectedArm | None = None
+    """Where the arm's model is known. `result` is then for the arm as it is, without this table."""
 
     @property
     def transform(self) -> Transform:
-        """flange_from_camera or base_from_camera."""
+        """flange_from_camera or base_from_camera, for the arm as it is."""
         return self.result.transform
 
     @property

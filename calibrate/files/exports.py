@@ -19,9 +19,11 @@ import numpy as np
 import yaml
 
 from calibrate.errors import CalibrationError
-from calibrate.files.calibration import Calibration, source_stamp
+from calibrate.files.calibration import Calibration, DhTable, source_stamp
+from calibrate.files.loader import content_sha256
 from calibrate.files.validity import Validity, validity_text
-from calibrate.geometry import Array, inverse, pose, rotation_log
+from calibrate.geometry import Array, inverse, pose, rotation_exp, rotation_log
+from calibrate.kinematics import MODELS, RobotModel, link_frames
 from calibrate.lens.model import distortion
 from calibrate.projection import camera_matrix
 from recordings.files import MAIN_CAMERA
@@ -182,13 +184,17 @@ def _roll_pitch_yaw(R: Array) -> tuple[float, float, float]:
 
 
 def _joint(parent: str, child: str, matrix: Array) -> str:
-    xyz = " ".join(repr(float(v)) for v in matrix[:3, 3])
-    rpy = " ".join(repr(float(v)) for v in _roll_pitch_yaw(matrix[:3, :3]))
     return (
         f'<joint name={quoteattr(f"{child}_joint")} type="fixed">\n'
         f"  <parent link={quoteattr(parent)}/>\n  <child link={quoteattr(child)}/>\n"
-        f'  <origin xyz="{xyz}" rpy="{rpy}"/>\n</joint>\n'
+        f"  {_origin(matrix)}\n</joint>\n"
     )
+
+
+def _origin(matrix: Array) -> str:
+    xyz = " ".join(repr(float(v)) for v in matrix[:3, 3])
+    rpy = " ".join(repr(float(v)) for v in _roll_pitch_yaw(matrix[:3, :3]))
+    return f'<origin xyz="{xyz}" rpy="{rpy}"/>'
 
 
 def opencv(calibration: Calibration, frames: FrameNames) -> str:
@@ -239,6 +245,91 @@ def ur_tool(calibration: Calibration, frames: FrameNames) -> str:
     )
 
 
+_LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+
+
+def link_origins(table: DhTable) -> Array:
+    """Compute the fixed transforms (6, 4, 4) before each joint's turn about z, as URDF chains them.
+
+    Raises ExportError where the table moves the flange behind the last joint, which that chain cannot say.
+    """
+    a, d, alpha, theta, beta = (getattr(table, name) for name in table.__struct_fields__)
+    model, after = RobotModel("corrected", a, d, "", alpha, theta, beta), [a[5], alpha[5], beta[5]]
+    if np.abs(after).max() > 1e-12:
+        raise ExportError("The table has a, alpha or beta of joint 6.", code="table-behind-joint-6")
+    frames, behind, found = link_frames(model, np.zeros(6)), np.eye(4), []
+    for i in range(6):
+        step = inverse(frames[i]) @ frames[i + 1]
+        turned = pose(rotation_exp([0.0, 0.0, theta[i]]), [0.0, 0.0, d[i]])
+        found.append(behind @ turned)
+        behind = inverse(turned) @ step
+    return np.array(found)
+
+
+def _of_table(calibration: Calibration, frames: FrameNames) -> tuple[Array, str]:
+    """The corrected arm's origins (6, 4, 4), and a comment with the one X that belongs to them."""
+    if calibration.arm_table is None:
+        raise ExportError(
+            "This calibration holds no table of an arm.",
+            code="no-arm-table",
+            remedy="Solve a recording of a robot whose model is known.",
+        )
+    table, X = calibration.arm_table.installable()
+    values = " ".join(repr(float(v)) for v in (*X.translation_m, *X.quaternion_xyzw))
+    note = (
+        f"{comment(calibration)}\n{calibration.arm_table.model}: use it only with this camera pose, and this "
+        "camera pose only with it:\n"
+        f"{frames.parent(calibration)} {frames.camera} (x y z, qx qy qz qw) {values}"
+    )
+    return link_origins(table), note
+
+
+def ur_kinematics(calibration: Calibration, frames: FrameNames) -> str:
+    """`kinematics_params_file` of ROS 2's ur_description: x y z, and URDF's roll pitch yaw, of each link."""
+    origins, note = _of_table(calibration, frames)
+    names = ("x", "y", "z", "roll", "pitch", "yaw")
+    plain: dict[str, Any] = {
+        link: dict(zip(names, (*T[:3, 3].tolist(), *_roll_pitch_yaw(T[:3, :3])), strict=True))
+        for link, T in zip(_LINKS, origins, strict=True)
+    }
+    # The driver compares it with the controller's own table and says that they differ: they do.
+    plain["hash"] = f"calib_station_{content_sha256(plain)[:16]}"
+    commented = "".join(f"# {line}\n" for line in note.splitlines())
+    return commented + str(yaml.safe_dump({"kinematics": plain}, sort_keys=False))
+
+
+def arm_urdf(calibration: Calibration, frames: FrameNames) -> str:
+    """A whole URDF: the arm with corrected origins (no shapes), and the camera of this table."""
+    origins, note = _of_table(calibration, frames)
+    assert calibration.arm_table is not None
+    _, X = calibration.arm_table.installable()
+    note = re.sub("-(?=-)", "- ", note)
+    limit = MODELS[calibration.arm_table.model].joint_limit_rad
+    links = [frames.base, *(f"{link}_link" for link in _LINKS), frames.flange, frames.body, frames.camera]
+    parts = [f"<link name={quoteattr(link)}/>" for link in links]
+    for name, parent, child, T in zip(_JOINTS, links, links[1:], origins, strict=False):
+        parts.append(
+            f'<joint name="{name}_joint" type="revolute">\n  <parent link={quoteattr(parent)}/>\n'
+            f"  <child link={quoteattr(child)}/>\n  {_origin(T)}\n"
+            f'  <axis xyz="0 0 1"/>\n'
+            f'  <limit lower="{-limit}" upper="{limit}" effort="0" velocity="0"/>\n</joint>'
+        )
+    parts.append(_joint("wrist_3_link", frames.flange, np.eye(4)))
+    parent = frames.parent(calibration)
+    parts.append(_joint(parent, frames.body, X.matrix @ inverse(BODY_FROM_OPTICAL)))
+    parts.append(_joint(frames.body, frames.camera, BODY_FROM_OPTICAL))
+    name = quoteattr(f"{calibration.arm_table.model}_corrected")
+    return f"<!-- {note} -->\n<robot name={name}>\n" + "\n".join(parts) + "\n</robot>\n"
+
+
+def arm_json(calibration: Calibration, frames: FrameNames) -> str:
+    """Only the arm's table and the X that belongs to it."""
+    _of_table(calibration, frames)
+    plain = {"of": comment(calibration), "mount": calibration.mount, "arm_table": calibration.arm_table}
+    return msgspec.json.format(msgspec.json.encode(plain)).decode() + "\n"
+
+
 class Format(NamedTuple):
     suffix: str
     says: str
@@ -255,6 +346,9 @@ FORMATS: dict[str, Format] = {
     "easy-handeye2": Format(".calib", "easy_handeye2 calibration", easy_handeye2),
     "opencv": Format(".yml", "OpenCV FileStorage: transform and intrinsics", opencv),
     "json": Format(".json", "everything, as JSON", plain_json),
+    "ur-kinematics": Format(".yaml", "the corrected arm for ROS 2's ur_description", ur_kinematics),
+    "arm-urdf": Format(".urdf", "URDF of the corrected arm and its camera", arm_urdf),
+    "arm-json": Format(".json", "the corrected arm and the X that belongs to it", arm_json),
     "ur-tool": Format(".txt", "camera as tool (TCP) or feature on the UR pendant", ur_tool),
 }
 

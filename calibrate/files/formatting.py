@@ -16,6 +16,8 @@ from calibrate.files.calibration import Calibration, Override, source_stamp
 from calibrate.files.validity import Validity, ValidityState, validity_text
 from calibrate.files.verification import agrees, touch_text
 from calibrate.geometry import difference
+from calibrate.handeye.priors import BoardTolerance
+from calibrate.handeye.solution import MEASURED
 from calibrate.results import BoardShape
 
 if TYPE_CHECKING:
@@ -64,7 +66,7 @@ def summary(calibration: Calibration, validity: Validity | None = None) -> Rende
     for touch in calibration.verification:
         style = "green" if agrees(touch) else "bold red"
         parts.append(Text(f"Touch test, {touch.wall}, {touch.who}: {touch_text(touch)}", style=style))
-    parts += [Text(sentence) for sentence in cell_sentences(calibration)]
+    parts += [Text(said) for said in (*cell_sentences(calibration), *arm_sentences(calibration))]
     parts += [Text(f"! {warning}", style="yellow") for warning in calibration.quality.warnings]
     for view in calibration.views.rejected:
         parts.append(Text(f"- view {view.index + 1} ({view.name}) rejected: {view.reason}"))
@@ -141,11 +143,60 @@ def cell_sentences(calibration: Calibration) -> list[str]:
         sentences += _board(quality.board, calibration.board.square_m * 1e3)
     shares = sorted(quality.error_shares.items(), key=lambda item: -item[1])
     if shares and shares[0][1] > _COSTLY and (name := shares[0][0]) in _REMEDIES:
-        label = name.replace("_", " ")
-        sentences.append(
-            f"{label.capitalize()} make up {shares[0][1]:.0%} of the variance: {_REMEDIES[name]}."
-        )
+        label, remedy, arm = name.replace("_", " "), _REMEDIES[name], calibration.arm_table
+        if name == "kinematics" and arm is not None and arm.offered:
+            remedy = "use the corrected table"
+        sentences.append(f"{label.capitalize()} make up {shares[0][1]:.0%} of the variance: {remedy}.")
     return sentences
+
+
+_REFUSED = {
+    "no-joints": "the joints were not recorded",
+    "not-nominal": "the recorded flanges do not follow the nominal table: let the station reach port "
+    "30001 of the controller, which states the factory calibration",
+    "not-better": "it does not help on poses elsewhere",
+}
+_WORTH_SAYING = 0.85
+"""What would limit the table is named where knowing it leaves less than this share of the error."""
+
+
+def arm_sentences(calibration: Calibration) -> Iterator[str]:
+    """Say what the arm's table brings, what leaving it out costs, what limits it; nothing of a good arm."""
+    arm = calibration.arm_table
+    if arm is None or arm.refused == "no-evidence":
+        return
+    distance_mm = 1e3 * (calibration.quality.working_distance_m or 0.0)
+    point = f"a point {distance_mm:.0f} mm ahead" if calibration.mount == "eye-in-hand" else "the tool"
+    yield (
+        f"Over the arm's workspace {point} is placed to {arm.with_table_mm:.2f} mm (1σ) with the arm's "
+        f"corrected table, to {arm.without_table_mm:.2f} mm without it."
+    )
+    if arm.held_out is not None:
+        yield (
+            f"Views predicted from poses elsewhere: {arm.held_out.with_table_mm:.2f} mm with the table, "
+            f"{arm.held_out.without_table_mm:.2f} mm without ({arm.held_out.views} views)."
+        )
+    if arm.offered:
+        yield (
+            "Where points far from the board count, give the robot program the corrected table (calibrate "
+            "export --to ur-kinematics). The installed camera pose is the best for the arm as it is."
+        )
+    else:
+        yield f"The arm's table is not offered: {_REFUSED.get(arm.refused, arm.refused)}."
+    limits = sorted(arm.if_measured_mm.items(), key=lambda item: item[1])
+    if limits and limits[0][1] < _WORTH_SAYING * arm.with_table_mm:
+        what, left_mm = limits[0]
+        stated = calibration.board.square_tolerance or BoardTolerance().square
+        known = f"The board's length is known to {stated:.2%}" if what == "board" else "The lens is the limit"
+        yield (
+            f"{known}: {_MEASURE[what]} to {MEASURED:.2%} and the workspace error falls from "
+            f"{arm.with_table_mm:.2f} to {left_mm:.2f} mm."
+        )
+    elif arm.offered:
+        yield "More poses would lower it further: station plan --for arm."
+
+
+_MEASURE = {"board": "measure it (board: square_tolerance)", "intrinsics": "calibrate its focal length"}
 
 
 def _board(board: BoardShape, square_mm: float) -> Iterator[str]:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from calibrate.errors import CalibrationError, CalibrationFileError, InstallError
 from calibrate.files.validity import (
@@ -33,6 +34,7 @@ from calibrate.files.validity import (
     validity_text,
 )
 from calibrate.geometry import Array, Transform, is_rigid, skew
+from calibrate.kinematics import TABLE_COLUMNS, base_from_flange
 from recordings import strict_yaml
 from recordings.files import MAIN_CAMERA, is_session_name, state_root
 
@@ -239,6 +241,30 @@ class InstalledLens:
 
 
 @dataclass(frozen=True, eq=False)
+class InstalledArm:
+    """The arm's table with the X that belongs to it: their frames chain with each other and nothing else."""
+
+    transform: Transform
+    """corrected_flange_from_camera (eye-in-hand) or corrected_base_from_camera (eye-to-hand), metres."""
+    table: dict[str, list[float]]
+    """a_m, d_m, alpha_rad, theta_rad, beta_rad: see `calibrate.kinematics`."""
+
+    def base_from_flange(self, joints_rad: ArrayLike) -> Transform:
+        """Compute corrected_base_from_corrected_flange, metres, of joints (6,), radians."""
+        return Transform("corrected_base", "corrected_flange", base_from_flange(self.table, joints_rad))
+
+
+def refused_table(reason: str) -> CalibrationFileError:
+    """Make the error of a calibration that offers no table of the arm."""
+    return CalibrationFileError(
+        f"This calibration offers no table of the arm ({reason}).",
+        code="table-not-offered",
+        remedy="Use its result, for the arm as it is, or record poses of station plan --for arm.",
+        reason=reason,
+    )
+
+
+@dataclass(frozen=True, eq=False)
 class InstalledCalibration:
     """What a program needs of an installed calibration. The whole file: `read_calibration(self.path)`."""
 
@@ -252,9 +278,21 @@ class InstalledCalibration:
 
     @cached_property
     def transform(self) -> Transform:
-        """flange_from_camera (eye-in-hand) or base_from_camera (eye-to-hand), metres."""
+        """flange_from_camera (eye-in-hand) or base_from_camera (eye-to-hand), metres; for the arm as it is."""
         result = self.plain["result"]
         return Transform(result["parent_frame"], result["child_frame"], np.array(result["matrix"], float))
+
+    @cached_property
+    def corrected_arm(self) -> InstalledArm:
+        """The arm's corrected table with the X that belongs to it. CalibrationFileError if not offered."""
+        found = self.plain.get("arm_table") or {"refused": "the arm's model is not known"}
+        if not found.get("offered"):
+            raise refused_table(str(found.get("refused", "")))
+        result = found["result"]
+        return InstalledArm(
+            Transform(result["parent_frame"], result["child_frame"], np.array(result["matrix"], float)),
+            found["corrected"],
+        )
 
     @cached_property
     def covariance(self) -> Array:
@@ -408,10 +446,27 @@ def check_result(plain: dict[str, Any], where: str) -> None:
         asymmetry = np.abs(covariance - covariance.T).max()
         if asymmetry > rounding or np.linalg.eigvalsh(covariance).min() < -rounding:
             wrong = "the covariance is not symmetric and positive"
+    wrong = wrong or _wrong_table(plain.get("arm_table"), parent)
     if wrong:
         raise CalibrationFileError(
             f"{where}: {wrong}.", code="contradiction", remedy="Solve the recording again."
         )
+
+
+def _wrong_table(arm: dict[str, Any] | None, parent: str) -> str:
+    """Tell what is wrong with an offered table of the arm; empty when nothing is."""
+    if arm is None or not (arm["offered"] or arm.get("result") or arm.get("corrected")):
+        return ""
+    result = arm.get("result") or {}
+    frames = (result.get("parent_frame"), result.get("child_frame"))
+    if not arm["offered"] or not arm.get("corrected") or frames != (f"corrected_{parent}", "camera"):
+        return "the arm's table and its X do not belong together"
+    numbers = [np.array(arm["corrected"][key], float) for key in TABLE_COLUMNS]
+    if not is_rigid(np.array(result["matrix"], float)) or not all(
+        column.shape == (6,) and np.isfinite(column).all() for column in numbers
+    ):
+        return "the arm's table or its X holds impossible numbers"
+    return ""
 
 
 def _rotation(quaternion_xyzw: Array) -> Array:

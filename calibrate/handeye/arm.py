@@ -11,7 +11,7 @@ small, and the stated uncertainty of one with errors is not.
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -20,7 +20,15 @@ from calibrate.handeye.estimate import Estimate, corner_weights
 from calibrate.handeye.linear import Linear, LinearSolution
 from calibrate.handeye.observations import Observations
 from calibrate.handeye.priors import Priors
-from calibrate.kinematics import MODELS, RobotModel, forward, inverse_many, link_frames
+from calibrate.kinematics import (
+    MODELS,
+    DhDeltas,
+    RobotModel,
+    forward,
+    inverse_many,
+    link_frames,
+    with_near_axes,
+)
 from calibrate.views import ViewSet
 from recordings.schema.messages import Mount
 
@@ -33,6 +41,12 @@ PARAMETERS = (
     "beta3",
 )
 """Names of the 18 errors, true minus nominal: a and d in metres, angles in radians."""
+HELD = {
+    **dict.fromkeys(("d1", "theta1"), "the place of the board, or of the camera beside the cell, takes it"),
+    **dict.fromkeys(("a6", "d6", "alpha6", "theta6"), "the pose of what the flange carries takes it"),
+    **dict.fromkeys(("d2", "d3"), "the axes of joints 2, 3 and 4 are parallel: only d2 + d3 + d4 counts"),
+}
+"""The other errors of a table, and why each is held at its nominal value."""
 FLEX = tuple(f"flex {row}{column}" for row in "xyz" for column in "xyz")
 """Names of a bracket's compliance, radians: turn about `row` for gravity along `column` of the flange."""
 RELATIVE_SIGMA = np.array([3**0.5 if name == "d4" else 1.0 for name in PARAMETERS])
@@ -41,19 +55,42 @@ _SAME_M, _SAME_RAD = 0.02, float(np.radians(2.0))
 """Recorded joints and flange belong together when the nominal table agrees within this."""
 
 
-def table_motion(views: ViewSet) -> Array | None:
-    """Compute the motion [δt, δφ] (n, 6, 18) of the flange, in base, by each of `PARAMETERS`.
+@dataclass(frozen=True, eq=False)
+class ArmPostures:
+    """The arm in every view."""
 
-    From the recorded joints, else from inverse kinematics of the recorded flanges in one branch that reaches
-    them all. None where the robot's model is unknown or its nominal table does not reach the flanges.
+    model: RobotModel
+    """The nominal table, that the recorded flanges follow."""
+    joints_rad: Array
+    """(n, 6)"""
+    recorded: bool
+    """False: by inverse kinematics in one branch, which serves X, but need not be the arm's own."""
+
+
+def arm_postures(views: ViewSet) -> ArmPostures | None:
+    """Read the recorded joints, else find one branch of inverse kinematics that reaches all recorded flanges.
+
+    None where the robot's model is unknown or its nominal table does not reach the flanges.
     """
-    model = MODELS.get(views.robot_model)
-    if model is None:
+    published = MODELS.get(views.robot_model)
+    if published is None:
         return None
+    model = published if views.arm is None else with_near_axes(views.arm)
     joints = _recorded_joints(views, model)
-    if joints is None:
-        joints = _joints_of_one_branch(model, views.base_from_flange)
-    return None if joints is None else by_parameters(model, joints)
+    if joints is not None:
+        return ArmPostures(model, joints, True)
+    joints = _joints_of_one_branch(published, views.base_from_flange)
+    return None if joints is None else ArmPostures(model, joints, False)
+
+
+def corrected_model(nominal: RobotModel, errors: Array) -> RobotModel:
+    """Add errors (18,), in the order of `PARAMETERS`, to a table."""
+    named = dict(zip(PARAMETERS, errors.tolist(), strict=True))
+
+    def column(kind: str) -> tuple[float, ...]:
+        return tuple(named.get(f"{kind}{joint}", 0.0) for joint in range(1, 7))
+
+    return nominal.calibrated(DhDeltas(*(column(kind) for kind in ("a", "d", "alpha", "theta", "beta"))))
 
 
 def flex_motion(mount: Mount, flange: Array, held: Array) -> Array:
@@ -91,10 +128,11 @@ def _joints_of_one_branch(model: RobotModel, flanges: Array) -> Array | None:
 
 
 def by_parameters(model: RobotModel, joints_rad: Array) -> Array:
-    """Compute `table_motion` for joints (n, 6) of a known model.
+    """Compute the motion [δt, δφ] (n, 6, 18) of the flange, in base, by each of `PARAMETERS`.
 
-    Standard convention: theta and d act about and along z of the frame before the joint; alpha and a about
-    and along x, beta about y, of the frame after it.
+    model: a table whose axes are near (`kinematics.with_near_axes`); joints_rad: (n, 6). Standard convention:
+    theta and d act about and along z of the frame before the joint; alpha and a about and along x, beta about
+    y, of the frame after it.
     """
     frames = link_frames(model, joints_rad)
     z, before = frames[:, :6, :3, 2], frames[:, :6, :3, 3]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 from scipy import special
 
@@ -167,6 +169,35 @@ def cross_validate(fit: CellFit, seed: int) -> CrossValidation | None:
         FOLDS,
         dict(zip(full.tolist(), distance.tolist(), strict=True)),
     )
+
+
+def held_out_elsewhere(fit: CellFit, joints_rad: Array) -> Array | None:
+    """Predict views from those taken elsewhere: by how much the middle of the board is missed, metres.
+
+    (2, n): without and with the errors of the arm's table; NaN for views that do not count fully. The arm's
+    postures (n, 6) are cut in FOLDS along their longest axis. None where a fold determines nothing.
+    """
+    full = np.flatnonzero(fit.estimate.chances[:, 0] > FULL)
+    if len(full) < 2 * FOLDS:
+        return None
+    spread = joints_rad[full] - joints_rad[full].mean(axis=0)
+    order = full[np.argsort(spread @ np.linalg.svd(spread)[2][0], kind="stable")]
+    bare = replace(
+        fit,
+        estimate=replace(fit.plain, scales=fit.estimate.scales),
+        observed=replace(fit.observed, table=None),
+    )
+    missed = np.full((2, len(fit.views)), np.nan)
+    for way, one in enumerate((bare, fit)):
+        at_board = _at_board(one)
+        for left_out in np.array_split(order, FOLDS):
+            try:
+                residual, _ = _predict(one, np.sort(left_out))
+            except (BadViewsError, np.linalg.LinAlgError):
+                return None
+            off = (at_board[np.sort(left_out)] @ residual[..., None])[:, :3, 0]
+            missed[way, np.sort(left_out)] = np.linalg.norm(off, axis=1)
+    return missed
 
 
 def _predict(fit: CellFit, left_out: Places) -> tuple[Array, Array]:

@@ -8,7 +8,14 @@ import numpy as np
 
 from calibrate.errors import BadViewsError, PosesDisagreeError
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp, transform_points
-from calibrate.handeye.arm import RELATIVE_SIGMA, allow_for_table, flex_motion, table_motion
+from calibrate.handeye.arm import (
+    RELATIVE_SIGMA,
+    ArmPostures,
+    allow_for_table,
+    arm_postures,
+    by_parameters,
+    flex_motion,
+)
 from calibrate.handeye.axxb.pairs import Pairs, all_pairs, mount_poses
 from calibrate.handeye.axxb.robust import GlobalResult, solve_global
 from calibrate.handeye.estimate import Estimate, estimate
@@ -42,8 +49,10 @@ class CellFit:
     estimate: Estimate
     log_bayes: float | None
     """Log evidence of systematic errors of arm and bracket; None where they were not modelled."""
-    arm_known: bool
-    """Errors of the arm's kinematic table are among them."""
+    arm: ArmPostures | None
+    """None where errors of the arm's kinematic table are not among them."""
+    plain: Estimate
+    """The estimate without them."""
     pairs: Pairs
     """Pairs of the views that count; after a move, of those after it."""
     certified: GlobalResult
@@ -62,19 +71,23 @@ def fit_cell(views: ViewSet, priors: Priors, seed: int, with_table: bool = True)
     state = CellState(start.X, start.Y, C, views.camera, np.zeros(len(SHAPE)), np.zeros(0))
     found = _likeliest(observed, state, priors)
     require_plausible_noise(found)
-    log_bayes, arm = None, table_motion(views) if with_table else None
+    log_bayes, arm, plain = None, arm_postures(views) if with_table else None, found
     if with_table and len(views) >= FEWEST_FOR_TABLE:
         held = found.state.X if views.mount == "eye-in-hand" else found.state.Y
         flex = flex_motion(views.mount, views.base_from_flange, held)
-        motion = flex if arm is None else np.concatenate([arm * RELATIVE_SIGMA, flex], axis=2)
+        motion = flex if arm is None else np.concatenate([_table_motion(arm), flex], axis=2)
         try:
             found, log_bayes = allow_for_table(replace(observed, table=motion), found, priors)
             observed = replace(observed, table=motion)
         except np.linalg.LinAlgError:
             pass
     pairs, certified = _certify(views, found, np.flatnonzero(found.used), seed)
-    known = log_bayes is not None and arm is not None
-    return CellFit(views, turned, observed, priors, found, log_bayes, known, pairs, certified)
+    arm = None if log_bayes is None else arm
+    return CellFit(views, turned, observed, priors, found, log_bayes, arm, plain, pairs, certified)
+
+
+def _table_motion(arm: ArmPostures) -> Array:
+    return np.asarray(by_parameters(arm.model, arm.joints_rad) * RELATIVE_SIGMA)
 
 
 def _likeliest(observed: Observations, start: CellState, priors: Priors) -> Estimate:
@@ -119,7 +132,7 @@ def fit_moved(views: ViewSet, priors: Priors, poses: PoseViews, at: int, moved: 
     found = estimate(observed, state, priors)
     require_plausible_noise(found)
     pairs, certified = _certify(views, found, np.flatnonzero(found.used & later), seed)
-    return CellFit(views, (), observed, priors, found, None, False, pairs, certified)
+    return CellFit(views, (), observed, priors, found, None, None, found, pairs, certified)
 
 
 def require_plausible_noise(found: Estimate) -> None:

@@ -2,7 +2,8 @@
 
 The model is the estimate's own (`handeye.linear`): corner noise, and on every robot pose an independent error
 that is a nuisance of its own view. Parameter order: δX (6), δY (6), the lens (`projection.intrinsics_names`),
-the board's shape (`handeye.observations.SHAPE`). Deltas are those of `geometry.perturb`.
+the board's shape (`handeye.observations.SHAPE`), and the errors of the arm's table (`handeye.arm.PARAMETERS`,
+over `RELATIVE_SIGMA`) where their motion is given. Deltas are those of `geometry.perturb`.
 X = flange_from_camera, Y = base_from_board (eye-in-hand), or X = base_from_camera, Y = flange_from_board
 (eye-to-hand).
 """
@@ -14,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from calibrate.geometry import Array, inverse
+from calibrate.handeye.arm import PARAMETERS
 from calibrate.handeye.linear import Linear
 from calibrate.handeye.observations import SHAPE, CellState, Layout, Observations, extent_of
 from calibrate.handeye.priors import BoardTolerance, LensPrior, Priors
@@ -43,10 +45,12 @@ def view_information(
     Y: Array,
     board_points: Array,
     noise: MeasurementNoise,
+    table: Array | None = None,
 ) -> Array:
     """Compute each view's information (n, p, p), the whole board (k, 3) seen from flange poses (n, 4, 4).
 
-    The view's own robot error is marginalised, so views simply add.
+    The view's own robot error is marginalised, so views simply add. `table`: (n, 6, q) motion of the flange
+    by each error of the arm's table.
     """
     n, k = len(base_from_flange), len(board_points)
     if mount == "eye-in-hand":
@@ -59,9 +63,10 @@ def view_information(
         np.broadcast_to(board_points, (n, k, 3)),
         np.zeros((n, k, 2)),
         np.ones((n, k)),
-        extent=extent_of(board_points),
+        table,
+        extent_of(board_points),
     )
-    state = CellState(X, Y, C, camera, np.zeros(len(SHAPE)), np.zeros(0))
+    state = CellState(X, Y, C, camera, np.zeros(len(SHAPE)), _no_errors(table))
     linear = Linear.at(observed, state, observed.present, information=1.0)
     robot = np.repeat([noise.robot_m, noise.robot_rad], 3) ** 2
     W = np.linalg.inv(noise.pixel_px**2 * linear.B + np.diag(robot))
@@ -73,11 +78,26 @@ def view_information(
     return np.asarray(information)
 
 
-def prior_information(camera: CameraModel, lens_known: bool, board: BoardTolerance) -> Array:
-    """Compute the information (p, p) before any view: lens (`LensPrior`) and board's tolerance."""
-    state = CellState(np.eye(4), np.eye(4), np.zeros((0, 4, 4)), camera, np.zeros(len(SHAPE)), np.zeros(0))
-    lens = LensPrior.given(camera) if lens_known else LensPrior.unknown(camera)
-    N = Priors(lens, board).linearise(state, 0.0).N
+def _no_errors(table: Array | None) -> Array:
+    return np.zeros(0 if table is None else table.shape[2])
+
+
+def prior_information(
+    camera: CameraModel,
+    lens_known: bool,
+    board: BoardTolerance,
+    table_mm: float = 0.0,
+    lens: LensPrior | None = None,
+) -> Array:
+    """Compute the information (p, p) before any view: lens (`LensPrior`) and board's tolerance.
+
+    `table_mm`: 1σ, mm and mrad, of errors of the arm's table; 0: none are modelled. `lens`: what is known of
+    it, instead of the usual.
+    """
+    errors = np.zeros(len(PARAMETERS) if table_mm else 0)
+    state = CellState(np.eye(4), np.eye(4), np.zeros((0, 4, 4)), camera, np.zeros(len(SHAPE)), errors)
+    lens = lens or (LensPrior.given(camera) if lens_known else LensPrior.unknown(camera))
+    N = Priors(lens, board).linearise(state, table_mm).N
     at = Layout.of(state)
     N[np.arange(12), np.arange(12)] += np.tile(_POSE_PRECISION, 2)
     N[at.lens.start, at.lens.start] += (_FOCAL_SHARE * camera_matrix(camera)[0, 0]) ** -2.0

@@ -43,6 +43,7 @@ from calibrate.handeye.solution import (
     board_frames,
     camera_frames,
 )
+from calibrate.handeye.workspace import table_result
 from calibrate.results import BoardShape, HoldoutScore
 from calibrate.stopwatch import Stopwatch
 from calibrate.views import ViewSet
@@ -170,7 +171,7 @@ def _describe(fit: CellFit, options: SolveOptions, watch: Stopwatch) -> Solution
         board_finding=board_finding,
         noise=NoiseScales(found.scales.tau_px, *(float(s) for s in found.scales.robot)),
         error_shares=error_shares(fit),
-        arm=_arm(fit, found.covariance[at.table, at.table]),
+        arm=_arm(fit, found.covariance[at.table, at.table], options, distance),
         predicted_error_m=point_error_m(state.X, covariance, distance),
         working_distance_m=distance,
         board_spread_m=spread_m,
@@ -201,15 +202,18 @@ def _board(fit: CellFit, covariance: Array) -> BoardShape:
     return BoardShape(scale, anisotropy, tuple(bend), tuple(np.sqrt(np.diag(covariance)).tolist()))
 
 
-def _arm(fit: CellFit, covariance: Array) -> ArmTable | None:
+def _arm(fit: CellFit, covariance: Array, options: SolveOptions, distance_m: float) -> ArmTable | None:
     if fit.log_bayes is None:
         return None
-    names = (*PARAMETERS, *FLEX) if fit.arm_known else FLEX
+    names = (*PARAMETERS, *FLEX) if fit.arm is not None else FLEX
     unit = np.concatenate([RELATIVE_SIGMA, np.ones(len(FLEX))])[-len(names) :]
     value = unit * fit.estimate.state.table
     sigma = unit * np.sqrt(np.maximum(np.diag(covariance), 0.0))
     errors = dict(zip(names, zip(value.tolist(), sigma.tolist(), strict=True), strict=True))
-    return ArmTable(fit.log_bayes, fit.estimate.scales.table, errors, fit.arm_known)
+    found = ArmTable(fit.log_bayes, fit.estimate.scales.table, errors, fit.arm is not None)
+    if fit.arm is None:
+        return found
+    return replace(found, result=table_result(fit, fit.arm, found.detected, distance_m, options.folds))
 
 
 def _holdout(fit: CellFit) -> HoldoutScore | None:
@@ -239,10 +243,11 @@ def _holdout(fit: CellFit) -> HoldoutScore | None:
 def _remarks(fit: CellFit, solution: Solution, session: Explanation) -> tuple[Remark, ...]:
     found, arm = fit.estimate, solution.arm
     suspects = ", ".join(f"{index + 1} (P(outlier) {p:.2f})" for index, p in solution.suspects.items())
+    offered = arm is not None and arm.result is not None and arm.result.offered
     systematic = (
         f"Robot residuals follow the posture: {arm.size_mm if arm else 0.0:.2f} mm or mrad in the arm's "
-        "kinematic table, or a bracket that bends. Have the arm calibrated, and stiffen the bracket."
-    )
+        "kinematic table, or a bracket that bends. "
+    ) + ("Use the corrected table." if offered else "Have the arm calibrated, and stiffen the bracket.")
     as_recorded = session.reading is Reading.AS_RECORDED
     said = (
         (not as_recorded, session.reading.value, explain_text(session, fit.views)),

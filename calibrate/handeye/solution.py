@@ -16,6 +16,7 @@ from calibrate.handeye.axxb.certificate import Certificate
 from calibrate.handeye.metrics import Observability
 from calibrate.handeye.priors import BoardTolerance
 from calibrate.handeye.readings import Explanation, Reading
+from calibrate.kinematics import RobotModel
 from calibrate.results import BoardShape, HoldoutScore, RejectedView
 from calibrate.views import BoardView
 from recordings.schema.messages import CameraModel, Mount
@@ -108,6 +109,44 @@ class NoiseScales:
     robot_rad: float
 
 
+@dataclass(frozen=True, eq=False)
+class TableResult:
+    """X and the arm's table as one result, and the X for an arm that stays uncorrected."""
+
+    nominal: RobotModel
+    """The table that the recorded flanges follow."""
+    factory: bool
+    """It is the maker's calibration of this arm, not the published table."""
+    corrected: RobotModel
+    covariance: Array
+    """(24, 24) of X, as in `Solution.parent_from_child`, and of the errors in the order of `PARAMETERS`."""
+    for_uncorrected: Array
+    """(4, 4) the X that serves the uncorrected arm best, over the workspace and where the views are."""
+    uncorrected_covariance: Array
+    """(6, 6)"""
+    with_table_m: float
+    """1σ of a point over the workspace."""
+    without_table_m: float
+    """The same for the uncorrected arm with `for_uncorrected`."""
+    if_measured_m: dict[str, float]
+    """`with_table_m` if this (board, intrinsics) were known to `MEASURED`."""
+    held_out_m: Array | None
+    """(2, n) distance by which the views were missed by those taken elsewhere: without, with the table."""
+    refused: TableRefusal | None
+    """Reason why the table is not offered; None where it is."""
+
+    @property
+    def offered(self) -> bool:
+        return self.refused is None
+
+
+TableRefusal = Literal["no-evidence", "no-joints", "not-nominal", "not-better"]
+"""No clear evidence; joints by inverse kinematics; recorded flanges do not follow the nominal table; the
+table does not help on poses elsewhere."""
+MEASURED = 2e-4
+"""Relative 1σ of what was measured with care."""
+
+
 @dataclass(frozen=True)
 class ArmTable:
     """Systematic errors of the robot: of the arm's kinematic table, and of a bracket that bends."""
@@ -120,6 +159,8 @@ class ArmTable:
     """Name → value and 1σ, metres or radians. Only their sum at the flange is known well, not each one."""
     arm_known: bool = True
     """False: the arm's model is not known, only the bracket is modelled."""
+    result: TableResult | None = None
+    """None where the arm's model is not known."""
 
     @property
     def detected(self) -> bool:

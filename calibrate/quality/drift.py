@@ -103,9 +103,15 @@ def check_drift(views: ViewSet, calibration: Calibration) -> DriftCheck:
     """
     require_no_copies(views)
     views = with_found_shape(views, calibration)
-    return judge_shift(
-        views, calibration.transform.matrix, np.array(calibration.covariance), Noise.of(calibration)
-    )
+    X, covariance, arm = calibration.transform, np.array(calibration.covariance), calibration.arm_table
+    joints = [view.joints_rad for view in views if view.joints_rad is not None]
+    if arm is not None and arm.offered and len(joints) == len(views):
+        _, X = arm.installable()
+        covariance = np.array(arm.covariance)[:6, :6]
+        flanges = [arm.base_from_flange(q).matrix for q in joints]
+        corrected = (replace(v, base_from_flange=F) for v, F in zip(views, flanges, strict=True))
+        views = replace(views, views=tuple(corrected))
+    return judge_shift(views, X.matrix, covariance, Noise.of(calibration))
 
 
 def with_found_shape(views: ViewSet, calibration: Calibration) -> ViewSet:

@@ -14,7 +14,14 @@ import numpy as np
 from calibrate.boards.corners import to_grey
 from calibrate.boards.model import describe_board
 from calibrate.files.calibration import Touch, source_stamp, write_output
-from calibrate.files.formatting import PEER_HEAD, cell_sentences, peer_cells, pose_text, verdict_text
+from calibrate.files.formatting import (
+    PEER_HEAD,
+    arm_sentences,
+    cell_sentences,
+    peer_cells,
+    pose_text,
+    verdict_text,
+)
 from calibrate.files.verification import agrees, touch_text
 from calibrate.geometry import Array, difference
 from calibrate.handeye.corners import bent_points
@@ -61,6 +68,7 @@ def report_page(
             *_error(job),
             *_residuals(job),
             *_holdout(job, peers),
+            *_arm(job),
             *_methods(peers),
             *_lens(job),
             *_views(job),
@@ -233,6 +241,33 @@ def _holdout(job: SolvedRecording, peers: Sequence[PeerResult]) -> Iterator[str]
         "Curves of methods far worse than most leave the picture.",
     )
     yield html.paragraph(score.note, "note")
+
+
+def _arm(job: SolvedRecording) -> Iterator[str]:
+    sentences = list(arm_sentences(job.calibration))
+    if not sentences:
+        return
+    yield html.heading("The arm")
+    for sentence in sentences:
+        yield html.paragraph(sentence)
+    arm, table = job.solution.arm, job.calibration.arm_table
+    if arm is None or arm.result is None or table is None:
+        return
+    if arm.result.held_out_m is not None:
+        without_m, with_table_m = arm.result.held_out_m
+        yield html.figure(
+            plots.held_out_over_workspace(job.views.base_from_flange[:, :3, 3], without_m, with_table_m),
+            "Each view predicted from views taken elsewhere: by how much the board's middle is missed, where "
+            "the flange stood.",
+        )
+    rows = [
+        (error.parameter, f"{1e3 * error.value:+.3f}", f"{1e3 * error.sigma:.3f}") for error in table.errors
+    ]
+    yield html.table(("parameter", "error, mm or mrad", "1σ"), rows, (1, 2))
+    held = ", ".join(table.held)
+    yield html.paragraph(
+        f"Held at the {table.nominal_source} value, because others take them: {held}.", "note"
+    )
 
 
 def _methods(peers: Sequence[PeerResult]) -> Iterator[str]:

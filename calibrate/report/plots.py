@@ -66,6 +66,30 @@ def residuals_by_view(
         return svg_text(figure)
 
 
+def held_out_over_workspace(flange_m: Array, without_m: Array, with_table_m: Array) -> str:
+    """Held-out error without and with the arm's table (n,) where the flange stood (n, 3), from two sides."""
+    largest = float(np.nanmax([without_m, with_table_m], initial=1e-6))
+    with matplotlib.rc_context(STYLE):
+        figure, axes = new_figure(10, 3.8, 2)
+        away = np.hypot(flange_m[:, 0], flange_m[:, 1])
+        for axis, x, y, names in (
+            (axes[0], flange_m[:, 0], flange_m[:, 1], ("x of base, m", "y of base, m")),
+            (axes[1], away, flange_m[:, 2], ("distance from the base's axis, m", "z of base, m")),
+        ):
+            for miss, colour, label in (
+                (without_m, _ORANGE, "without"),
+                (with_table_m, _BLUE, "with the table"),
+            ):
+                size = 300 * np.nan_to_num(miss) / largest
+                axis.scatter(x, y, s=size, facecolors="none", edgecolors=colour, linewidths=1.3, label=label)
+            axis.set(xlabel=names[0], ylabel=names[1], aspect="equal", adjustable="datalim")
+            axis.margins(0.2)
+        beside = {"loc": "center left", "bbox_to_anchor": (1.02, 0.5)}
+        title = f"area: error,\nlargest {1e3 * largest:.2f} mm"
+        axes[1].legend(fontsize=8, markerscale=0.5, title=title, **beside)
+        return svg_text(figure)
+
+
 def residual_scatter(misses: Array, pixels: Array, camera: CameraModel) -> str:
     """Residuals of the corners (n, 2) px: round zero, and over the image as arrows."""
     with matplotlib.rc_context(STYLE):

@@ -79,6 +79,21 @@ class RobotIdentity(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omi
     """No effect: of files of earlier versions."""
 
 
+ARM_KINEMATICS_NAME = "arm-kinematics.json"
+"""Attachment of a recording: `ArmKinematics`."""
+
+
+class ArmKinematics(msgspec.Struct, frozen=True):
+    """The arm's table as its maker calibrated it: standard Denavit-Hartenberg, joint 1 first."""
+
+    model: str
+    source: Literal["controller", "configuration"]
+    a_m: Vector6
+    d_m: Vector6
+    alpha_rad: Vector6
+    theta_rad: Vector6
+
+
 class CameraIdentity(msgspec.Struct, frozen=True, forbid_unknown_fields=True, omit_defaults=True):
     vendor: str = ""
     model: str = "unknown"

@@ -21,6 +21,8 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
+from calibrate.files.calibration import read_calibration
+from calibrate.files.formatting import arm_sentences
 from calibrate.geometry import difference
 from recordings.errors import ErrorReport
 from recordings.files import state_root
@@ -32,6 +34,7 @@ from station.cli.console import AsJson, Headless, err, out
 from station.cli.progress import SessionProgress
 from station.cli.simulated import Control, GigE, Mounting, Noise, Scene, Seed, require_choices
 from station.operate.motion import carry_out, wait_until_idle
+from station.plan.choose import Aim
 from station.protocol.client import Client
 from station.protocol.verbs import Lease, MakePlan, Purpose
 from station.simulation.cell import CellTruth
@@ -110,6 +113,8 @@ def _show_demo(result: Result, duration_s: float) -> None:
     out.print(Text.assemble(taken, verdict, f", {duration_s:.0f} s in all"))
     for name in ("recording", "calibration", "report"):
         out.print(f"{name:<12} {result[name]}")
+    for sentence in result["arm"]["sentences"]:
+        out.print(sentence)
 
 
 async def _run(
@@ -118,6 +123,8 @@ async def _run(
     """Return what `--json` prints of it. `arguments`: of `station serve`. Raises StationError."""
     folder.mkdir(parents=True, exist_ok=True)
     progress.say(f"starting a simulated cell: {' '.join(arguments)}")
+    # A worn arm is worth poses that tell its table from the rest.
+    aim: Aim = "arm" if "high" in arguments else "camera"
     async with (
         simulated_daemon(folder, arguments) as socket,
         await Client.connect(socket, "the demo") as client,
@@ -125,7 +132,7 @@ async def _run(
         await wait_until_idle(client)
         await client.call(Lease("take"))
         progress.say(f"planning {poses} poses")
-        await client.call(MakePlan(poses, seed), timeout_s=120.0)
+        await client.call(MakePlan(poses, seed, aim=aim), timeout_s=120.0)
         with progress:
             outcome = await carry_out(
                 client, Purpose.RUN, approve_simulated, progress, finish_with_loss=True, headless=True
@@ -136,7 +143,10 @@ async def _run(
     calibration, report = session / CALIBRATION_FILE, session / "report.html"
     progress.say("solving the recording, in a process of its own")
     solved = await _solve(recording, calibration, report)
-    translation_mm, rotation_deg = truth_error(recording, solved["result"]["matrix"])
+    arm = solved["arm_table"] or {}
+    # The camera's true pose is that on the true arm: the X of the corrected one is to be compared with it.
+    own = arm.get("result") or solved["result"]
+    translation_mm, rotation_deg = truth_error(recording, own["matrix"])
     return {
         "truth_error": {"translation_mm": translation_mm, "rotation_deg": rotation_deg},
         "sigma": solved["sigma"],
@@ -146,6 +156,12 @@ async def _run(
         "report": str(report),
         "holdout": solved["holdout"],
         "gates_passed": all(gate["passed"] for gate in solved["gates"]),
+        "arm": {
+            "offered": bool(arm.get("offered")),
+            "with_table_mm": arm.get("with_table_mm"),
+            "without_table_mm": arm.get("without_table_mm"),
+            "sentences": [*arm_sentences(read_calibration(calibration))],
+        },
     }
 
 

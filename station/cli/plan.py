@@ -15,6 +15,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 from rich.table import Table
 from rich.text import Text
 
+from calibrate.handeye.solution import MEASURED
 from recordings.plain_text import printed
 from recordings.schema.messages import Vector6
 from station.cell.config import StationConfig
@@ -26,10 +27,10 @@ from station.cell.scene import Scene, cell_geometry, geometry_from, scene_of
 from station.cell.socket_folder import default_socket
 from station.cli.console import AsJson, Socket, err, out
 from station.operate.motion import status_now
-from station.plan.choose import Criterion
+from station.plan.choose import CRITERIA, WITH_TABLE, Criterion
 from station.plan.files import import_list, load_plan, save_plan, taught_plan
 from station.plan.planner import make_plan
-from station.plan.predict import with_forecast
+from station.plan.predict import ArmForecast, forecast_arm, with_forecast
 from station.plan.preview import save_picture, save_scene, sketch
 
 _ASK_S = 3.0
@@ -56,6 +57,10 @@ def plan_command(
     seed: Annotated[int, typer.Option(help="The same seed gives the same plan")] = 0,
     scene: Annotated[str, typer.Option(help="Simulated cell: paper or blog")] = "paper",
     socket: Socket = None,
+    purpose: Annotated[
+        str,
+        typer.Option("--for", help="camera, arm (its table too) or both (board and lens too)"),
+    ] = "camera",
     d_optimal: Annotated[
         bool, typer.Option("--d-optimal", help="Smallest error ellipsoid, not smallest error")
     ] = False,
@@ -75,7 +80,7 @@ def plan_command(
     cell, standing = _cell(config, scene, start)
     if config is not None and standing is None:
         standing = asked_standing(cell, socket or default_socket())
-    criterion: Criterion = "D" if d_optimal else "A"
+    criterion = _criterion(purpose, d_optimal)
     plan = _given(cell, standing, check, from_list, taught)
     plan = plan or _made(cell, standing, poses, seed, criterion, quiet=as_json)
     geometry = cell_geometry(cell) if standing is None else geometry_from(cell, standing)
@@ -86,17 +91,62 @@ def plan_command(
         plan = told
         if output is not None:
             save_plan(plan, output)
+    arm = None
+    if shown is not None and criterion in WITH_TABLE:
+        arm = forecast_arm(shown, plan)
     if shown is not None and picture is not None:
         save_picture(shown, plan, picture)
     if shown is not None and foxglove is not None:
         save_scene(shown, plan, foxglove)
     if as_json:
-        typer.echo(json.dumps(_summary(plan, told, outcome)))
+        typer.echo(json.dumps(_summary(plan, told, outcome) | _arm_summary(arm)))
     else:
         drawn = sketch(shown, told) if shown is not None else ""
         _show(told, outcome, drawn, cut, output if check is None else None, cell.capture.goal_m)
+        if arm is not None:
+            _show_arm(arm)
     if outcome.problems:
         raise typer.Exit(LimitError.exit_code)
+
+
+def _criterion(purpose: str, d_optimal: bool) -> Criterion:
+    criterion = CRITERIA.get(purpose)  # type: ignore[call-overload]
+    if criterion is None:
+        raise ConfigError(
+            f"--for {purpose} is no aim of a plan.", code="usage", remedy="Give camera, arm or both."
+        )
+    if d_optimal and criterion != "A":
+        raise ConfigError(
+            f"--d-optimal is for the camera, not for --for {purpose}.", code="usage", remedy="Leave it out."
+        )
+    return "D" if d_optimal else criterion
+
+
+def _arm_summary(arm: ArmForecast | None) -> dict[str, float | list[str]]:
+    if arm is None:
+        return {}
+    return {
+        "workspace_mm": round(1000 * arm.with_table_m, 4),
+        "workspace_if_board_measured_mm": round(1000 * arm.if_measured_m, 4),
+        "open_parameters": list(arm.open),
+    }
+
+
+def _show_arm(arm: ArmForecast) -> None:
+    out.print(
+        f"with the arm's table from these poses a point is placed to about {1000 * arm.with_table_m:.2f} mm "
+        "(1σ) over the workspace, if corners, board and arm are as good as assumed"
+    )
+    if arm.if_measured_m < _WORTH * arm.with_table_m:
+        out.print(
+            f"a board measured to {MEASURED:.2%} (board: square_tolerance) makes that "
+            f"{1000 * arm.if_measured_m:.2f} mm"
+        )
+    if arm.open:
+        out.print(f"these poses tell little of {', '.join(arm.open)}: take more poses, or tilt them more")
+
+
+_WORTH = 0.85
 
 
 def _require_replaceable(output: Path) -> None:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from typing import Protocol, runtime_checkable
 
 from recordings.schema.clocks import ClockFit
-from recordings.schema.messages import CameraIdentity, Image, RobotIdentity, RobotState
+from recordings.schema.messages import ArmKinematics, CameraIdentity, Image, RobotIdentity, RobotState
 from station.devices.frames import CameraCounts, FrameTiming, TriggerPulse
 
 
@@ -24,6 +24,10 @@ class Robot(Protocol):
     @property
     def control_path(self) -> str:
         """What drives the arm: ur_rtde or script; empty where nothing real moves."""
+
+    @property
+    def kinematics(self) -> ArmKinematics | None:
+        """The maker's calibration of this arm, that its poses follow; None where it is not known."""
 
     @property
     def notice(self) -> str:

@@ -277,7 +277,7 @@ class PlaybackRobot:
         self._thread: threading.Thread | None = None
         self.control = False
         self.identity = self._recording.info.robot
-        self.control_path, self.notice, self.remote = "", "", None
+        self.control_path, self.notice, self.remote, self.kinematics = "", "", None, None
 
     def plan(self) -> Plan:
         """The recorded poses as a plan."""

@@ -13,7 +13,7 @@ from collections.abc import Callable
 
 from calibrate.kinematics import MODELS
 from recordings.schema.clocks import ClockFit
-from recordings.schema.messages import RobotIdentity, RobotState
+from recordings.schema.messages import ArmKinematics, RobotIdentity, RobotState
 from station.cell.config import RobotConfig
 from station.cell.errors import RobotError, StaleStateError, StationError
 from station.cell.process import waited_share
@@ -187,6 +187,10 @@ class UrLink:
             except Exception:
                 log.exception("a subscriber of the robot's state failed and is dropped")
                 self._subscribers = [s for s in self._subscribers if s is not callback]
+
+    @property
+    def kinematics(self) -> ArmKinematics | None:
+        return None if self._tool is None else self._tool.kinematics
 
     @property
     def connected(self) -> bool:

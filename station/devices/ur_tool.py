@@ -10,12 +10,14 @@ from __future__ import annotations
 
 import logging
 import math
+from typing import Literal
 
 import numpy as np
 
 from calibrate.geometry import Array, difference, inverse, pose_from_rotvec, rotation_log
 from calibrate.kinematics import DhDeltas, RobotModel, forward
-from recordings.schema.messages import RobotState, Vector6
+from recordings.schema.messages import ArmKinematics, RobotState, Vector6
+from station.cell.config import vector6
 from station.cell.errors import RobotError
 from station.devices.ur_primary import DhParameters, Installation
 from station.devices.ur_state import Payload
@@ -43,6 +45,7 @@ class TcpCheck:
         """Raises RobotError when pose, kinematics and stated offset do not fit together."""
         self._model = model
         self._tolerance = CALIBRATED_TOLERANCE if calibrated else NOMINAL_TOLERANCE
+        self._source: Literal["controller", "configuration"] | None = "configuration" if calibrated else None
         self._stated = installation.tcp_offset
         if not calibrated and installation.dh is not None and self._stated is not None:
             self._try_controllers_model(_stated_model(model, installation.dh), first)
@@ -75,6 +78,16 @@ class TcpCheck:
             log.warning("the kinematics stated by the controller do not explain its tool pose; using ours")
             return
         self._model, self._tolerance = model, CALIBRATED_TOLERANCE
+        self._source = "controller"
+
+    @property
+    def kinematics(self) -> ArmKinematics | None:
+        """The table of this very arm that explains the controller's tool pose; None for the published one."""
+        m = self._model
+        if self._source is None:
+            return None
+        numbers = (vector6(column) for column in (m.a_m, m.d_m, m.alpha_rad, m.theta_offset_rad))
+        return ArmKinematics(m.name, self._source, *numbers)
 
     @property
     def offset(self) -> Vector6:

@@ -10,14 +10,25 @@ import numpy as np
 
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array
+from calibrate.handeye.arm import RELATIVE_SIGMA, by_parameters
 from calibrate.handeye.information import MeasurementNoise, covariance_of, prior_information, view_information
 from calibrate.handeye.priors import BoardTolerance
+from calibrate.handeye.workspace import Workspace, sample_workspace
+from calibrate.kinematics import with_near_axes
 from calibrate.projection import intrinsics_names
 from station.cell.scene import Scene
 
-Criterion = Literal["A", "D"]
-_LENS_SHARE = {"A": 0.02, "D": 0.2}
+Criterion = Literal["A", "D", "arm", "all"]
+"""Smallest error of X; smallest ellipsoid of X; smallest error over the workspace with the arm's table;
+smallest ellipsoid of X, board, lens and table together."""
+WITH_TABLE = ("arm", "all")
+Aim = Literal["camera", "arm", "both"]
+CRITERIA: dict[Aim, Criterion] = {"camera": "A", "arm": "arm", "both": "all"}
+"""What the poses are to tell best, for people → criterion."""
+_LENS_SHARE = {"A": 0.02, "D": 0.2, "arm": 0.0, "all": 0.0}
 """Weight of the lens, so that the image is covered."""
+TABLE_MM = 0.3
+"""1σ of the errors of an arm's table that a plan expects, mm and mrad."""
 _ENOUGH_TO_RANK, _SHORTLIST = 8, 60
 """With so many views known the first order ranks further ones well; so many of them are then looked at."""
 
@@ -33,8 +44,16 @@ class Objective:
     """(p, p) what is known beforehand."""
     lens: slice | None
     """Places of a lens that is found from the same images; None where it is known."""
+    workspace: Array | None = None
+    """(p, p) K: the mean squared error of a point over the arm's workspace is trace(K C)."""
 
     def __call__(self, information: Array) -> Array:
+        if self.criterion == "all":
+            return -np.asarray(np.linalg.slogdet(information + self.prior)[1])
+        if self.criterion == "arm":
+            assert self.workspace is not None
+            C = covariance_of(information, self.prior)
+            return np.asarray(np.log(np.einsum("ij,...ji->...", self.workspace, C)))
         covariance, share = covariance_of(information, self.prior), _LENS_SHARE[self.criterion]
         if self.criterion == "D":
             return np.asarray(np.linalg.slogdet(covariance[..., :6, :6])[1] + share * self._lens(covariance))
@@ -45,7 +64,12 @@ class Objective:
     def slope(self, information: Array) -> Array:
         """(p, p) G, so that adding dM to the information changes the value by -trace(G dM), first order."""
         C = covariance_of(information, self.prior)
+        if self.criterion == "all":
+            return C
         inner = np.zeros_like(C)
+        if self.criterion == "arm":
+            assert self.workspace is not None
+            return np.asarray(C @ self.workspace @ C / np.trace(self.workspace @ C))
         if self.criterion == "D":
             inner[:6, :6] = np.linalg.inv(C[:6, :6])
         else:
@@ -62,16 +86,32 @@ class Objective:
         return np.asarray(np.linalg.slogdet(covariance[..., self.lens, self.lens])[1])
 
 
-def informations(scene: Scene, base_from_flange: Array, noise: MeasurementNoise) -> Array:
-    """(n, p, p) information of each pose by the scene's guess."""
-    points = board_points(scene.board)
-    return view_information(scene.mount, scene.camera, base_from_flange, scene.X, scene.Y, points, noise)
+def informations(
+    scene: Scene, base_from_flange: Array, noise: MeasurementNoise, joints_rad: Array | None = None
+) -> Array:
+    """(n, p, p) information of each pose by the scene's guess; with joints (n, 6) on the arm's table too."""
+    points, motion = board_points(scene.board), None
+    if joints_rad is not None:
+        motion = by_parameters(with_near_axes(scene.geometry.model), joints_rad) * RELATIVE_SIGMA
+    return view_information(
+        scene.mount, scene.camera, base_from_flange, scene.X, scene.Y, points, noise, motion
+    )
 
 
-def objective_for(scene: Scene, criterion: Criterion, free_intrinsics: bool) -> Objective:
-    prior = prior_information(scene.camera, not free_intrinsics, BoardTolerance.of(scene.board))
+def objective_for(
+    scene: Scene, criterion: Criterion, free_intrinsics: bool, joints_rad: Array | None = None
+) -> Objective:
+    """`joints_rad` (n, 6): where the arm is planned for; needed for the criteria with its table."""
+    table_mm = TABLE_MM if criterion in WITH_TABLE else 0.0
+    prior = prior_information(scene.camera, not free_intrinsics, BoardTolerance.of(scene.board), table_mm)
     lens = slice(12, 12 + len(intrinsics_names(scene.camera))) if free_intrinsics else None
-    return Objective(criterion, scene.working_distance_m, prior, lens)
+    K = None
+    if joints_rad is not None and table_mm:
+        model = with_near_axes(scene.geometry.model)
+        room = sample_workspace(model, joints_rad)
+        over = Workspace.of(scene.mount, model, room, scene.X, scene.Y, scene.working_distance_m)
+        K = over.among(len(prior))
+    return Objective(criterion, scene.working_distance_m, prior, lens, K)
 
 
 def choose(

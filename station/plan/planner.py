@@ -27,7 +27,15 @@ from station.plan.candidates import (
     best_group,
     find_candidates,
 )
-from station.plan.choose import Criterion, Objective, choose, informations, objective_for, sigma_of
+from station.plan.choose import (
+    WITH_TABLE,
+    Criterion,
+    Objective,
+    choose,
+    informations,
+    objective_for,
+    sigma_of,
+)
 from station.plan.order import BLOCKED, move_times, short_order, time_matrix
 from station.plan.visibility import ViewRange, blind_share, expected_view, planned_pose, view_range, visible
 
@@ -255,8 +263,9 @@ def _choose_and_order(
     captured: Array | None,
 ) -> Plan:
     """The checked plan. Poses that no free path leads to leave the set, and the choice is made again."""
-    objective = objective_for(scene, options.criterion, options.free_intrinsics)
-    information = informations(scene, pool.base_from_flange, options.noise)
+    joints = pool.joints_rad if options.criterion in WITH_TABLE else None
+    objective = objective_for(scene, options.criterion, options.free_intrinsics, joints)
+    information = informations(scene, pool.base_from_flange, options.noise, joints)
     known: Array | None = None
     if captured is not None:
         known = informations(scene, captured, options.noise).sum(axis=0)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import msgspec
 import numpy as np
@@ -11,13 +11,15 @@ from numpy.typing import ArrayLike, NDArray
 
 from calibrate.boards.model import board_points
 from calibrate.geometry import Array
-from calibrate.handeye.information import MeasurementNoise
+from calibrate.handeye.arm import PARAMETERS
+from calibrate.handeye.information import MeasurementNoise, covariance_of
+from calibrate.handeye.solution import MEASURED
 from calibrate.kinematics import forward
 from station.cell.limits import check_path
 from station.cell.plan import Plan, PlannedPose
 from station.cell.scene import Scene, flange_poses
 from station.plan.candidates import find_candidates
-from station.plan.choose import informations, objective_for, sigma_of
+from station.plan.choose import TABLE_MM, informations, objective_for, sigma_of
 from station.plan.visibility import ViewRange, planned_pose, view_range, visible
 
 _FURTHER_POSES = 60
@@ -53,6 +55,38 @@ class AdviceOptions:
     seed: int = 0
     onward_rad: Sequence[float] | None = None
     """Joints of the pose after it: the path on to it must be free too."""
+
+
+_OPEN = 0.7
+"""A parameter whose 1σ stays above this share of what it was beforehand stays open."""
+
+
+@dataclass(frozen=True)
+class ArmForecast:
+    """Expected errors after a plan, with X and the arm's table estimated from it."""
+
+    with_table_m: float
+    """1σ of a point over the arm's workspace."""
+    if_measured_m: float
+    """The same with a board whose length is known to `MEASURED`."""
+    open: tuple[str, ...]
+    """Parameters of the table of which the plan tells little."""
+
+
+def forecast_arm(scene: Scene, plan: Plan, free_intrinsics: bool = True) -> ArmForecast:
+    """Forecast by the scene's guess and the usual noise, for errors of the table of the usual size."""
+    joints = np.array([pose.joints_rad for pose in plan.poses])
+    gains = informations(scene, flange_poses(scene, plan), MeasurementNoise(), joints)
+    total, expected = gains.sum(axis=0), []
+    for tolerance in (scene.board.square_tolerance, MEASURED):
+        board = msgspec.structs.replace(scene.board, square_tolerance=tolerance)
+        objective = objective_for(replace(scene, board=board), "arm", free_intrinsics, joints)
+        expected.append(float(np.exp(objective(total) / 2)))
+        if tolerance is scene.board.square_tolerance:
+            left = np.diag(covariance_of(total, objective.prior))[-len(PARAMETERS) :]
+    wide = np.sqrt(left) > _OPEN * 1e-3 * TABLE_MM
+    names = tuple(name for name, stays in zip(PARAMETERS, wide, strict=True) if stays)
+    return ArmForecast(expected[0], expected[1], names)
 
 
 def with_forecast(scene: Scene, plan: Plan) -> tuple[Plan, tuple[str, ...]]:

@@ -199,6 +199,8 @@ class MakePlan(Verb[PlanFacts], frozen=True):
     poses: Annotated[int, msgspec.Meta(ge=4, le=200)] = 25
     seed: int = 0
     lens_known: bool = False
+    aim: Literal["camera", "arm", "both"] = "camera"
+    """What the poses are to tell best: where the camera is, the arm's table too, or all there is."""
 
 
 class Prepare(Verb[MotionPreview], frozen=True):

@@ -137,7 +137,7 @@ class SessionDispatcher:
         return self._plan_facts()
 
     async def _make_plan(self, caller: _Caller, args: verbs.MakePlan) -> verbs.PlanFacts:
-        await self._session.make_plan(caller.client_id, args.poses, args.seed, args.lens_known)
+        await self._session.make_plan(caller.client_id, args.poses, args.seed, args.lens_known, args.aim)
         return self._plan_facts()
 
     def _plan_facts(self) -> verbs.PlanFacts:

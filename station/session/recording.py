@@ -22,6 +22,7 @@ from recordings.files import EMPTY_SUFFIX, MAIN_CAMERA, PART_SUFFIX, require_fre
 from recordings.manifest import enter_part, read_manifest
 from recordings.recorder import Recorder
 from recordings.schema.messages import (
+    ARM_KINEMATICS_NAME,
     CameraModel,
     CaptureEvent,
     Image,
@@ -184,6 +185,8 @@ class SessionRecording:
         recorder.attach("plan.yaml", "application/yaml", msgspec.yaml.encode(plan))
         recorder.attach("config.yaml", "application/yaml", self._cell.config_yaml)
         recorder.attach("camera.json", "application/json", msgspec.json.encode(settings))
+        if (kinematics := self._cell.robot.kinematics) is not None:
+            recorder.attach(ARM_KINEMATICS_NAME, "application/json", msgspec.json.encode(kinematics))
         for name, content in self._cell.attachments.items():
             recorder.attach(name, "application/json", content)
         recorder.camera_model(info.camera)

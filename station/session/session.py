@@ -26,6 +26,7 @@ from station.cell.session_folder import interrupted_session
 from station.cell.status import HoverOffer, LeaseStatus, MotionPreview, StationState, StationStatus
 from station.cell.stillness import StillnessMonitor
 from station.devices.cell import Cell
+from station.plan.choose import CRITERIA, Aim
 from station.plan.planner import make_plan
 from station.protocol import verbs
 from station.protocol.states import RUNNING
@@ -290,7 +291,9 @@ class Session:
         self._require_no_session()
         self._replace_plan(plan)
 
-    async def make_plan(self, client_id: int, poses: int, seed: int, lens_known: bool = False) -> None:
+    async def make_plan(
+        self, client_id: int, poses: int, seed: int, lens_known: bool = False, aim: Aim = "camera"
+    ) -> None:
         """Made in the worker. ConfigError and LimitError say what is missing or in the way."""
         self.permit(verbs.MakePlan, client_id)
         self._require_no_session()
@@ -306,6 +309,7 @@ class Session:
             seed=seed,
             count=poses,
             lens_known=lens_known,
+            criterion=CRITERIA[aim],
             timeout_s=PLAN_TIMEOUT_S,
         )
         self.load_plan(client_id, plan)

@@ -35,10 +35,17 @@ class CellTruth(msgspec.Struct, frozen=True, omit_defaults=True):
     """Repeatability: the flange misses by this much per axis, drawn anew at every stop."""
     robot_sigma_rad: float = 8.7e-5
     dh_delta_a_m: Vector6 = (0.0,) * 6
-    """The true arm differs from the nominal table by these (systematic error)."""
+    """The true arm differs from the controller's table by these (systematic error)."""
     dh_delta_d_m: Vector6 = (0.0,) * 6
     dh_delta_alpha_rad: Vector6 = (0.0,) * 6
     dh_delta_theta_rad: Vector6 = (0.0,) * 6
+    factory_a_m: Vector6 = (0.0,) * 6
+    """The controller's table, its factory calibration, differs from the published one by these."""
+    factory_d_m: Vector6 = (0.0,) * 6
+    factory_alpha_rad: Vector6 = (0.0,) * 6
+    factory_theta_rad: Vector6 = (0.0,) * 6
+    states_factory: bool = True
+    """Port 30001 states that table; else the published one."""
     pixel_noise: float = 2.0
     """Grey levels, 1σ, at gain 0 dB."""
     blur_px: float = 0.7

@@ -52,13 +52,16 @@ class _CellNoise(NamedTuple):
     dh_sigma_rad: float
     pixel_noise: float
     blur_px: float
+    factory_mm: float = 0.0
+    """1σ of the factory calibration against the published table, mm and mrad."""
 
 
 _NOISE = {
     "low": _CellNoise(5.0e-5, 8.7e-5, 0.0, 0.0, 2.0, 0.7),
     "mid": _CellNoise(1.0e-4, 1.7e-4, 1.0e-4, 1.0e-4, 4.0, 0.9),
-    "high": _CellNoise(2.0e-4, 3.5e-4, 3.0e-4, 3.0e-4, 7.0, 1.2),
+    "high": _CellNoise(2.0e-4, 3.5e-4, 6.0e-4, 6.0e-4, 7.0, 1.2, 0.7),
 }
+_FAR_M = 0.6
 
 
 def make_cell(
@@ -166,8 +169,19 @@ def _with_noise(truth: CellTruth, level: _CellNoise, rng: np.random.Generator) -
     def deltas(sigma: float) -> Vector6:
         return vector6(rng.normal(0, sigma, 6) if sigma else np.zeros(6))
 
+    factory = np.zeros((4, 6))
+    if level.factory_mm:
+        drawn = np.random.default_rng([1945, truth.seed])
+        factory = 1e-3 * level.factory_mm * drawn.normal(size=(4, 6))
+        # Axes that are nearly parallel have their common normal far off: so makers state them.
+        factory[1, 1:4] += _FAR_M * np.array([1.0, -0.4, -0.6])
+        factory[[0, 2], 5] = 0.0
     return msgspec.structs.replace(
         truth,
+        factory_a_m=vector6(factory[0]),
+        factory_d_m=vector6(factory[1]),
+        factory_alpha_rad=vector6(factory[2]),
+        factory_theta_rad=vector6(factory[3]),
         robot_sigma_m=level.robot_sigma_m * spread,
         robot_sigma_rad=level.robot_sigma_rad * spread,
         dh_delta_a_m=deltas(level.dh_sigma_m),

@@ -16,6 +16,7 @@ from calibrate.geometry import rotation_log
 from calibrate.kinematics import MODELS, forward
 from recordings.reader import Recording, open_recording
 from recordings.schema.messages import (
+    ArmKinematics,
     CameraIdentity,
     FrameTime,
     Image,
@@ -49,6 +50,7 @@ class ArmInMemory:
         self.log: list[str] = []
         self.control, self.notice, self.remote = False, "", None
         self.control_path = "ur_rtde"
+        self.kinematics: ArmKinematics | None = None
         self.slow = self.under_way = False
         self.arrive = asyncio.Event()
         self.trouble: RobotError | None = None

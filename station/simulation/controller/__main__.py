@@ -116,6 +116,13 @@ def _settings(options: argparse.Namespace) -> Settings:
                 truth.dh_delta_alpha_rad,
                 truth.dh_delta_theta_rad,
             ),
+            "factory": (
+                truth.factory_a_m,
+                truth.factory_d_m,
+                truth.factory_alpha_rad,
+                truth.factory_theta_rad,
+            ),
+            "states_factory": truth.states_factory,
         }
     if options.joints is not None:
         given["start_joints_rad"] = tuple(options.joints)

@@ -8,7 +8,7 @@ the rows of its upper 3×4 block. Standard Denavit-Hartenberg parameters as publ
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from math import acos, atan2, cos, hypot, pi, sin, sqrt
 
 Rigid = tuple[float, ...]
@@ -25,6 +25,8 @@ class DhTable:
     d_m: Six
     alpha_rad: Six = (pi / 2, 0.0, 0.0, pi / 2, -pi / 2, 0.0)
     theta_rad: Six = (0.0,) * 6
+    published: DhTable | None = field(default=None, compare=False)
+    """The table it was made from; None: it is one itself."""
 
     def plus(self, a_m: Six, d_m: Six, alpha_rad: Six, theta_rad: Six) -> DhTable:
         def add(x: Six, y: Six) -> Six:
@@ -35,6 +37,7 @@ class DhTable:
             add(self.d_m, d_m),
             add(self.alpha_rad, alpha_rad),
             add(self.theta_rad, theta_rad),
+            self.published or self,
         )
 
 
@@ -186,6 +189,21 @@ def _wrap(angle: float) -> float:
 
 def inverse_nearest(table: DhTable, base_from_flange: Rigid, near_rad: Six) -> Six | None:
     """The solution nearest to `near_rad` (largest joint difference), turns chosen within ±2π; or None."""
+    published = table.published
+    if published is None:
+        return _nearest(table, base_from_flange, near_rad)
+    # The published table has an analytic inverse; the difference is millimetres, and gone after two rounds.
+    aim = base_from_flange
+    for _ in range(3):
+        joints = _nearest(published, aim, near_rad)
+        if joints is None:
+            return None
+        off = compose(base_from_flange, invert(forward(table, joints)))
+        aim = compose(off, forward(published, joints))
+    return joints
+
+
+def _nearest(table: DhTable, base_from_flange: Rigid, near_rad: Six) -> Six | None:
     best, best_distance = None, float("inf")
     for solution in inverse_all(table, base_from_flange):
         turned = tuple(_nearest_turn(q, near) for q, near in zip(solution, near_rad, strict=True))

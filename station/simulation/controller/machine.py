@@ -200,10 +200,10 @@ def script_services(host: str, robot: SimulatedRobot) -> list[Service]:
 
 
 class PrimaryConnection(ScriptConnection):
-    """States the controller's beliefs: the nominal table, never the true arm's lengths."""
+    """States the controller's beliefs: its factory calibration, never the true arm's lengths."""
 
     def opened(self) -> None:
-        table = self._robot.table
+        table = self._robot.stated_table
         self._send(DhParameters(table.theta_rad, table.a_m, table.d_m, table.alpha_rad))  # type: ignore[arg-type]
 
     def _send(self, dh: DhParameters | None = None) -> None:

@@ -51,7 +51,11 @@ class Settings:
     sigma_rad: float = 0.0
     seed: int = 0
     dh_delta: tuple[Six, Six, Six, Six] = ((0.0,) * 6,) * 4
-    """a_m, d_m, alpha_rad, theta_rad of the true arm against the nominal table."""
+    """a_m, d_m, alpha_rad, theta_rad of the true arm against the table that the controller uses."""
+    factory: tuple[Six, Six, Six, Six] = ((0.0,) * 6,) * 4
+    """The same of the controller's table, its maker's calibration, against the published one."""
+    states_factory: bool = True
+    """Port 30001 states the table in use; else the published one, which is then not true."""
     remote: bool = True
     paused_by_protective_stop: bool = True
     """runtime_state after a protective stop: paused (4), else stopped (1)."""
@@ -102,7 +106,9 @@ class ControllerState(ABC):
         self.settings = settings
         self.journal = journal
         self.dt_s = 1.0 / settings.rate_hz
-        self.table = TABLES[settings.model]
+        published = TABLES[settings.model]
+        self.table = published.plus(*settings.factory) if any(map(any, settings.factory)) else published
+        self.stated_table = self.table if settings.states_factory else published
         self.true_table: DhTable = self.table.plus(*settings.dh_delta)
         self._random = random.Random(settings.seed)
         self.arm = SimulatedArm(self.table, settings.start_joints_rad, self._draw_miss)

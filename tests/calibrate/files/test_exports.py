@@ -19,9 +19,12 @@ import pytest
 import yaml
 from scipy.spatial.transform import Rotation
 
-from calibrate.files.calibration import Calibration, FramePose
+from calibrate.errors import CalibrationError
+from calibrate.files.calibration import Calibration, CorrectedArm, DhTable, FramePose, TableError
 from calibrate.files.exports import FORMATS, ExportError, FrameNames, export
 from calibrate.geometry import Array, Transform, pose, pose_from_rotvec, rotation_exp
+from calibrate.handeye.arm import HELD, PARAMETERS, corrected_model
+from calibrate.kinematics import MODELS, DhDeltas, base_from_flange, forward, with_near_axes
 from calibrate.pipeline import SolvedRecording
 
 
@@ -30,13 +33,114 @@ def calibration(request: pytest.FixtureRequest, solved_real: SolvedRecording) ->
     """A result with nothing symmetric in it."""
     parent = "flange" if request.param == "eye-in-hand" else "base"
     X = pose(rotation_exp([0.4, -2.1, 1.3]), [0.123456789, -0.5, 1.75])
+    own = pose(rotation_exp([0.41, -2.11, 1.31]), [0.124, -0.501, 1.751])
     return msgspec.structs.replace(
-        solved_real.calibration, mount=request.param, result=FramePose.of(Transform(parent, "camera", X))
+        solved_real.calibration,
+        mount=request.param,
+        result=FramePose.of(Transform(parent, "camera", X)),
+        arm_table=offered_arm(FramePose.of(Transform(f"corrected_{parent}", "camera", own))),
+    )
+
+
+def offered_arm(X: FramePose) -> CorrectedArm:
+    errors = 5e-4 * np.random.default_rng(3).normal(size=len(PARAMETERS))
+    nominal = MODELS["UR10e"]
+    return CorrectedArm(
+        offered=True,
+        model=nominal.name,
+        nominal=DhTable.of(nominal),
+        nominal_source="published",
+        errors=[
+            TableError(name, value, 1e-4) for name, value in zip(PARAMETERS, errors.tolist(), strict=True)
+        ],
+        held=HELD,
+        covariance=tuple(tuple(row) for row in (1e-8 * np.eye(24)).tolist()),
+        with_table_mm=0.3,
+        without_table_mm=0.9,
+        corrected=DhTable.of(corrected_model(nominal, errors)),
+        result=X,
     )
 
 
 def parent_of(calibration: Calibration) -> str:
     return "tool0" if calibration.mount == "eye-in-hand" else "base"
+
+
+def flange_of_chain(origins: list[Array], joints: Array) -> Array:
+    """The rule of a chain of URDF: each joint's origin, then its turn about z."""
+    T = np.eye(4)
+    for origin, angle in zip(origins, joints, strict=True):
+        T = T @ origin @ pose(Rotation.from_euler("z", angle).as_matrix(), [0, 0, 0])
+    return T
+
+
+def check_chain(origins: list[Array], calibration: Calibration) -> None:
+    """To 1e-9 m (the corrected arm's own function) at postures anywhere, and farther from the nominal arm."""
+    arm = calibration.arm_table
+    assert arm is not None
+    for joints in np.random.default_rng(0).uniform(-3, 3, (20, 6)):
+        found, own = flange_of_chain(origins, joints), arm.base_from_flange(joints)
+        assert (own.parent, own.child) == ("corrected_base", "corrected_flange")
+        assert np.abs(found - own.matrix).max() < 1e-9
+        assert np.abs(found - forward(MODELS[arm.model], joints)).max() > 1e-5
+
+
+@pytest.mark.parametrize("factory", [False, True], ids=["published", "factory"])
+def test_ur_kinematics_is_the_corrected_arm_by_the_driver_s_rule(
+    calibration: Calibration, factory: bool
+) -> None:
+    """ur_description's macro: origin xyz, rpy of each link in this order, then the joint about z."""
+    if factory:  # parallel axes: a common normal a hundred metres away
+        model = with_near_axes(
+            MODELS["UR10e"].calibrated(
+                DhDeltas(
+                    alpha_rad=(1e-4, 2e-4, -1e-4, 0, 3e-4, 0),
+                    d_m=(0, 120.0, -70.0, -50.0, 0, 0),
+                    theta_rad=(0, 0.4, -0.1, -0.3, 1e-4, 0),
+                )
+            )
+        )
+        arm = msgspec.structs.replace(calibration.arm_table, corrected=DhTable.of(model))
+        calibration = msgspec.structs.replace(calibration, arm_table=arm)
+    read = yaml.safe_load(export(calibration, "ur-kinematics"))["kinematics"]
+    assert read["hash"].startswith("calib_")
+    origins = []
+    for link in ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3"):
+        x, y, z, *rpy = (read[link][key] for key in ("x", "y", "z", "roll", "pitch", "yaw"))
+        assert abs(x) + abs(y) + abs(z) < 2.0
+        origins.append(pose(Rotation.from_euler("xyz", rpy).as_matrix(), [x, y, z]))
+    check_chain(origins, calibration)
+
+
+def test_arm_urdf_is_the_corrected_arm_with_its_own_camera(calibration: Calibration) -> None:
+    root = ElementTree.fromstring(export(calibration, "arm-urdf"))
+    joints = {joint.attrib["name"]: joint for joint in root.iter("joint")}
+    turning = [joint for joint in joints.values() if joint.attrib["type"] == "revolute"]
+    check_chain([urdf_origin(joint) for joint in turning], calibration)
+    X = urdf_origin(joints["camera_link_joint"]) @ urdf_origin(joints["camera_optical_frame_joint"])
+    assert np.abs(X - calibration.arm_table.result.matrix).max() < 1e-12
+    assert np.abs(X - calibration.transform.matrix).max() > 1e-3
+
+
+def test_arm_json_holds_table_and_camera_together(calibration: Calibration) -> None:
+    read = json.loads(export(calibration, "arm-json"))["arm_table"]
+    joints = np.array([0.3, -1.2, 1.4, -0.8, 1.1, 0.2])
+    own = calibration.arm_table.base_from_flange(joints).matrix
+    assert np.abs(base_from_flange(read["corrected"], joints) - own).max() < 1e-12
+    assert read["result"]["parent_frame"].startswith("corrected_")
+
+
+@pytest.mark.parametrize("name", ["ur-kinematics", "arm-urdf", "arm-json"])
+def test_a_table_that_is_not_offered_is_not_exported(calibration: Calibration, name: str) -> None:
+    refused = msgspec.structs.replace(
+        calibration.arm_table, offered=False, refused="no-joints", corrected=None, result=None
+    )
+    with pytest.raises(CalibrationError) as caught:
+        export(msgspec.structs.replace(calibration, arm_table=refused), name)
+    assert caught.value.code == "table-not-offered" and caught.value.values["reason"] == "no-joints"
+    with pytest.raises(ExportError) as unknown:
+        export(msgspec.structs.replace(calibration, arm_table=None), name)
+    assert unknown.value.code == "no-arm-table"
 
 
 def same(found: Array, calibration: Calibration, tolerance: float = 1e-12) -> None:

@@ -10,9 +10,10 @@ from scipy import stats
 
 from benchmarks.kinematics import worn_cell
 from calibrate.geometry import Array, difference, inverse, pose, rotation_exp
-from calibrate.handeye.arm import PARAMETERS, by_parameters, table_motion
+from calibrate.handeye.arm import PARAMETERS, arm_postures, by_parameters
 from calibrate.handeye.solve import SolveOptions, solve_views
 from calibrate.kinematics import MODELS, DhDeltas, forward, link_frames
+from calibrate.views import ViewSet
 from tests.calibrate.cells import changed, inside
 
 WITH = SolveOptions(holdout=False, folds=False)
@@ -86,6 +87,11 @@ def test_seven_views_are_too_few_for_eighteen_errors():
 UR10 = MODELS["UR10"]
 
 
+def motion_of(views: ViewSet) -> Array:
+    arm = arm_postures(views)
+    return by_parameters(arm.model, arm.joints_rad)
+
+
 def with_error(name: str, size: float, joints: Array) -> Array:
     """(n, 4, 4) flange of an arm whose table has this one error."""
     parameter, joint = name[:-1], int(name[-1]) - 1
@@ -111,7 +117,7 @@ def test_each_error_moves_the_flange_as_stated(seed):
 def test_the_errors_are_all_that_camera_and_board_do_not_take():
     """With X and the board's pose beside them, none is a combination of the others."""
     views = worn_cell(np.random.default_rng(0), 0.0).views
-    motion = table_motion(views)
+    motion = motion_of(views)
     F, n = views.base_from_flange, len(views)
     by_base = np.zeros((n, 6, 6))
     by_base[:] = np.eye(6)
@@ -127,18 +133,18 @@ def test_the_errors_are_all_that_camera_and_board_do_not_take():
 
 def test_joints_are_read_or_else_found_in_one_branch():
     views = worn_cell(np.random.default_rng(1), 0.0).views
-    read = table_motion(views)
+    read = motion_of(views)
     bare = replace(views, views=tuple(replace(view, joints_rad=None) for view in views))
-    found = table_motion(bare)
+    found = motion_of(bare)
     assert read is not None and found is not None and found.shape == read.shape == (25, 6, 18)
     one_missing = changed(views, [3], joints_rad=lambda _: None)
-    np.testing.assert_array_equal(table_motion(one_missing), found)
+    np.testing.assert_array_equal(motion_of(one_missing), found)
     # Joints that do not lead to the flange are another arm's: the poses are believed, not they.
     foreign = changed(views, [3], joints_rad=lambda view: view.joints_rad + 0.2)
-    np.testing.assert_array_equal(table_motion(foreign), found)
+    np.testing.assert_array_equal(motion_of(foreign), found)
 
 
 @pytest.mark.parametrize("model", ["unknown", "UR3"])
 def test_an_unknown_or_impossible_arm_has_no_table(model):
     views = worn_cell(np.random.default_rng(1), 0.0).views
-    assert table_motion(replace(views, robot_model=model)) is None
+    assert arm_postures(replace(views, robot_model=model)) is None

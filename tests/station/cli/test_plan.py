@@ -133,3 +133,8 @@ def test_only_plans_and_scenes_are_written_over(made, tmp_path, small_recording)
     assert refused.returncode == 1
     assert (config.read_bytes(), small_recording.read_bytes()) == before
     assert run(*check, files["plan.mcap"]).returncode == 0
+
+
+def test_an_aim_that_is_none_is_refused():
+    for arguments in (["--for", "wrist"], ["--for", "arm", "--d-optimal"]):
+        assert run(*arguments).returncode == 2

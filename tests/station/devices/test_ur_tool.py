@@ -50,6 +50,19 @@ def test_the_controllers_words_are_taken_when_they_fit() -> None:
     check.check(sample(UR10, THERE, TOOL), stated(UR10, TOOL))
 
 
+def test_the_factory_calibration_is_told_where_it_explains_the_poses() -> None:
+    own = UR10.calibrated(FACTORY)
+    told = TcpCheck(UR10, False, sample(own, HERE, TOOL), stated(own, TOOL)).kinematics
+    assert told is not None and (told.model, told.source) == ("UR10", "controller")
+    assert told.a_m == own.a_m and told.theta_rad == own.theta_offset_rad
+    # Stated untruly: the poses follow another table than the one on the wire.
+    far = UR10.calibrated(DhDeltas(a_m=(0.0, 0.003, 0.0, 0.0, 0.0, 0.0)))
+    assert TcpCheck(UR10, False, sample(far, HERE, TOOL), stated(UR10, TOOL)).kinematics is None
+    assert TcpCheck(UR10, False, sample(UR10, HERE, TOOL), Installation()).kinematics is None
+    configured = TcpCheck(own, True, sample(own, HERE, TOOL), Installation()).kinematics
+    assert configured is not None and configured.source == "configuration"
+
+
 def test_without_words_the_offset_is_derived() -> None:
     check = TcpCheck(UR10, False, sample(UR10, HERE, TOOL), Installation())
     assert check.offset == pytest.approx(TOOL, abs=1e-9)

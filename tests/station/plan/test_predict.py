@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from calibrate.handeye.arm import PARAMETERS
 from calibrate.handeye.information import MeasurementNoise
 from calibrate.kinematics import forward
 from station.analysis.estimation import next_best_text
@@ -15,8 +16,9 @@ from station.cell.config import CaptureConfig
 from station.cell.limits import check_path
 from station.cell.plan import PlannedPose
 from station.cell.scene import scene_of
+from station.plan.choose import CRITERIA
 from station.plan.planner import make_plan
-from station.plan.predict import AdviceOptions, advise, forecast_views, with_forecast
+from station.plan.predict import AdviceOptions, advise, forecast_arm, forecast_views, with_forecast
 from station.simulation.scenes import cell_config, make_cell
 
 
@@ -99,3 +101,22 @@ def test_the_session_names_the_next_best_pose_until_it_is_enough():
     assert "for 0.1 mm" in next_best_text(strict, flange, plan.poses[-1].joints_rad)
     unknown = msgspec.structs.replace(config, board_guess=None)
     assert next_best_text(unknown, flange[:5], plan.poses[4].joints_rad) == ""
+
+
+@pytest.mark.parametrize(("aim", "share"), [("arm", 0.95), ("both", 1.0)])
+def test_poses_for_the_arm_tell_more_of_its_table_than_poses_for_the_camera(aim, share):
+    scene, plan, _ = world()
+    truth = make_cell("paper", 0, "low", "eye-in-hand")
+    start = truth.start_joints_rad
+    own = make_plan(cell_config(truth), start_joints_rad=start, criterion=CRITERIA[aim])
+    planned, usual = forecast_arm(scene, own), forecast_arm(scene, plan)
+    assert planned.with_table_m < share * usual.with_table_m
+    assert planned.if_measured_m <= planned.with_table_m
+    assert set(planned.open) <= set(PARAMETERS)
+
+
+def test_a_single_view_leaves_the_table_open_and_a_measured_board_helps():
+    scene, plan, _ = world()
+    few = forecast_arm(scene, msgspec.structs.replace(plan, poses=plan.poses[:4]))
+    assert len(few.open) > len(forecast_arm(scene, plan).open)
+    assert few.with_table_m > forecast_arm(scene, plan).with_table_m

@@ -11,7 +11,9 @@ import msgspec
 import numpy as np
 import pytest
 
+from calibrate.load import load_views
 from recordings.reader import open_recording
+from recordings.schema.messages import ArmKinematics
 from station.cell.errors import LimitError, RobotError
 from station.cell.plan import Plan
 from station.cell.status import StationState as S
@@ -20,6 +22,21 @@ from tests.codes import raises
 from tests.station.session_rig import POSES, HeldDisk, Rig, sealed
 
 WHOLE_POSE = [S.MOVING, S.SETTLING, S.CAPTURING, S.WRITING]
+
+
+async def test_the_recording_keeps_the_arm_s_own_table(rig: Rig, small_plan: Plan) -> None:
+    table = ArmKinematics("UR10", "controller", (0.1,) * 6, (0.2,) * 6, (0.3,) * 6, (0.4,) * 6)
+    rig.arm.kinematics = table
+    await rig.give_go()
+    await rig.until(S.IDLE)
+    arm = load_views(sealed(rig), fewest=0).views.arm
+    assert arm is not None and arm.name == "UR10"
+    assert (arm.a_m, arm.d_m, arm.alpha_rad, arm.theta_offset_rad) == (
+        (0.1,) * 6,
+        (0.2,) * 6,
+        (0.3,) * 6,
+        (0.4,) * 6,
+    )
 
 
 async def test_a_go_takes_every_pose_and_seals(rig: Rig, small_plan: Plan) -> None:

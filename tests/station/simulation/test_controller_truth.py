@@ -9,6 +9,7 @@ from calibrate.geometry import perturb
 from calibrate.kinematics import MODELS, DhDeltas
 from calibrate.kinematics import forward as station_forward
 from station.simulation.controller.arm import SPAN_S, History
+from station.simulation.controller.kinematics import forward, inverse_nearest
 
 Q = (0.3, -1.2, 1.6, -1.0, -1.3, 0.4)
 
@@ -58,6 +59,32 @@ def test_reported_poses_know_nothing_of_the_truth(context) -> None:
     assert made.robot.true_flange(made.robot.arm.actual, made.robot.arm.miss)[3] != pytest.approx(
         nominal[0], abs=1e-4
     )
+
+
+@pytest.mark.parametrize("true", [True, False])
+def test_a_factory_calibration_is_what_poses_follow_and_is_stated_or_not(context, true) -> None:
+    far = (
+        (0.0, 5e-4, 0, 0, 0, 0),
+        (0, 0.6, -0.2, -0.4, 0, 0),
+        (0, 1e-4, 2e-4, 0, 0, 0),
+        (0, 1e-3, 0, 0, 0, 0),
+    )
+    made = context(factory=far, states_factory=true, dh_delta=((0.0, 1e-3, 0, 0, 0, 0),) + ((0.0,) * 6,) * 3)
+    made.run(0.1)
+    own = MODELS["UR10"].calibrated(DhDeltas(*far))
+    reported = made.robot.outputs.vector("actual_TCP_pose")[:3]
+    assert reported == pytest.approx(station_forward(own, made.robot.arm.actual)[:3, 3], abs=1e-12)
+    expected = own if true else MODELS["UR10"]
+    assert made.robot.stated_table.d_m == pytest.approx(expected.d_m)
+    assert made.robot.stated_table.a_m == pytest.approx(expected.a_m)
+    flange = np.array(made.robot.true_flange(Q, (0.0,) * 6)).reshape(3, 4)
+    worn = own.calibrated(DhDeltas(a_m=(0.0, 1e-3, 0, 0, 0, 0)))
+    assert np.allclose(flange, station_forward(worn, Q)[:3], atol=1e-12)
+    # The controller's own inverse goes where its poses say.
+    goal = forward(made.robot.table, tuple(Q))
+    joints = inverse_nearest(made.robot.table, goal, tuple(Q))
+    assert joints is not None
+    assert np.abs(np.subtract(forward(made.robot.table, joints), goal)).max() < 1e-6
 
 
 def test_the_misses_have_the_sigma_they_were_asked_for_and_repeat_with_the_seed(context) -> None:

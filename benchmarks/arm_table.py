@@ -1,0 +1,280 @@
+"""The arm's table as a result: over the whole workspace, with it, without it, and planned for.
+
+An own simulator of a UR10e: every error of its table that X and the board do not take, turns of the parallel
+axes included, is drawn (mm and mrad); the robot states joints and the flange of the nominal table, misses by
+0.05 mm and 0.003° per axis; corners 0.15 px; a board of 0.2 m, 0.4 to 0.62 m away, printed, bent (1 mm) and
+seen through a lens as far off as their stated tolerances say. Workspace: rms over 400 random poses of points
+0.5 m before the camera (eye-to-hand: of the board's middle), one rigid motion of all of them allowed.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from benchmarks.imperfect_cells import BOARD, LENSES, _look
+from benchmarks.scene import grid
+from calibrate.geometry import (
+    Array,
+    difference,
+    inverse,
+    perturb,
+    pose,
+    random_rotation,
+    rotation_exp,
+    transform_points,
+)
+from calibrate.handeye.arm import RELATIVE_SIGMA, by_parameters
+from calibrate.handeye.axxb.pairs import mount_poses
+from calibrate.handeye.axxb.peer_methods import HAND_EYE, opencv_hand_eye
+from calibrate.handeye.information import MeasurementNoise, prior_information, view_information
+from calibrate.handeye.priors import BoardTolerance, LensPrior
+from calibrate.handeye.solve import Solution, SolveOptions, solve_views
+from calibrate.handeye.workspace import Workspace, sample_workspace
+from calibrate.kinematics import MODELS, forward, inverse_many
+from calibrate.lens.pnp import solve_pnp
+from calibrate.projection import intrinsics_names, intrinsics_vector, project_pixels, with_intrinsics_vector
+from calibrate.quality.gates import GateInputs, GateLimits, judge
+from calibrate.views import BoardView, ViewSet
+from recordings.schema.messages import Mount
+from station.plan.choose import TABLE_MM, Criterion, Objective, choose
+
+ARM = MODELS["UR10e"]
+LENS, POINTS = LENSES["plumb_bob"], grid(9, 7, 0.025)
+CORNER_PX, ROBOT_M, ROBOT_RAD = 0.15, 5e-5, float(np.radians(0.003))
+POOL = 600
+TRIALS = 100
+_BENT_M, _AHEAD_M = 1e-3, 0.5
+
+
+@dataclass(frozen=True)
+class Tolerances:
+    """1σ of what is stated, relative: the lens's focal length, the board's squares and print."""
+
+    lens: float
+    board: float
+
+
+LOOSE, GOOD = Tolerances(2e-3, 3e-3), Tolerances(2e-4, 2e-4)
+
+
+@dataclass(frozen=True, eq=False)
+class Truth:
+    """One cell, and what its pictures would show from anywhere."""
+
+    mount: Mount
+    X: Array
+    Y: Array
+    errors: Array
+    """(5, 6): a, d, alpha, theta, beta."""
+    points: Array
+    """(k, 3) the board as it is."""
+    told: Tolerances
+
+    def flange(self, q: Array) -> Array:
+        """True base_from_flange (n, 4, 4) of joints (n, 6): the chain once more, step by step."""
+        T = np.tile(np.eye(4), (len(q), 1, 1))
+        for i in range(6):
+            a, d, alpha, theta, beta = self.errors[:, i]
+            for axis, angle, shift in (
+                (2, q[:, i] + theta, ARM.d_m[i] + d),
+                (0, np.full(len(q), ARM.alpha_rad[i] + alpha), ARM.a_m[i] + a),
+                (1, np.full(len(q), beta), 0.0),
+            ):
+                unit = np.eye(3)[axis]
+                T = T @ pose(rotation_exp(angle[:, None] * unit), shift * unit)
+        return np.asarray(T)
+
+    def board_seen(self, flange: Array) -> Array:
+        """camera_from_board (n, 4, 4)"""
+        if self.mount == "eye-in-hand":
+            return np.asarray(inverse(flange @ self.X) @ self.Y)
+        return np.asarray(inverse(self.X) @ flange @ self.Y)
+
+
+def draw_errors(rng: np.random.Generator, size: float) -> Array:
+    """(5, 6) of all but the eight that X and the board's pose take."""
+    errors = np.zeros((5, 6))
+    errors[[0, 2], :5] = rng.normal(size=(2, 5))
+    errors[1, 3:5] = rng.normal(size=2) * [3**0.5, 1.0]
+    errors[3, 1:5], errors[4, 1:3] = rng.normal(size=4), rng.normal(size=2)
+    return np.asarray(1e-3 * size * errors)
+
+
+def draw_cell(rng: np.random.Generator, mount: Mount, size: float, told: Tolerances) -> tuple[Truth, Array]:
+    """A cell, and joints (POOL, 6) of one arm branch from where its camera sees the board."""
+    while True:
+        held = pose(rotation_exp(0.3 * rng.normal(size=3)), 0.05 * rng.normal(size=3) + [0, 0, 0.1])
+        if mount == "eye-in-hand":
+            turn = rotation_exp([np.pi, 0, 0]) @ rotation_exp(0.1 * rng.normal(size=3))
+            X, Y = held, pose(turn, [0.1, -0.7, 0.1])
+        else:
+            towards = np.array([[0.0, 0.0, -1.0], [1.0, 0.0, 0.0], [0.0, -1.0, 0.0]])
+            X, Y = pose(towards @ rotation_exp(0.15 * rng.normal(size=3)), [1.15, 0.2, 0.6]), held
+        C = np.array([_look(rng, LENS, POINTS) for _ in range(POOL)])
+        flange = Y @ inverse(C) @ inverse(X) if mount == "eye-in-hand" else X @ C @ inverse(Y)
+        _, joints, branch = inverse_many(ARM, flange)
+        joints = joints[branch == np.bincount(branch).argmax()]
+        if len(joints) >= 0.5 * POOL:
+            break
+    u, v = (2 * POINTS[:, :2].T - POINTS[:, :2].T.max(axis=1)[:, None]) / POINTS[:, :2].T.max(axis=1)[:, None]
+    s, unequal = told.board * rng.normal(size=2)
+    scale = 1.0 + s + np.array([unequal, -unequal]) / 2
+    about = rng.uniform(0, np.pi)
+    bend = _BENT_M * rng.normal() * (1.0 - (np.cos(about) * u + np.sin(about) * v) ** 2)
+    errors = draw_errors(rng, size)
+    points = np.column_stack([POINTS[:, :2] * scale, bend])
+    return Truth(mount, X, Y, errors, points, told), joints
+
+
+def lens_sigma(told: Tolerances) -> Array:
+    """(9,) the usual tolerance of a given lens, smaller with its focal length's."""
+    return LensPrior.given(LENS).sigma * told.lens / 2e-3
+
+
+def capture(rng: np.random.Generator, truth: Truth, joints: Array) -> ViewSet:
+    n = len(joints)
+    true = perturb(truth.flange(joints), rng.normal(size=(n, 6)) * np.repeat([ROBOT_M, ROBOT_RAD], 3))
+    pixels = project_pixels(LENS, transform_points(truth.board_seen(true), truth.points))
+    pixels = pixels + CORNER_PX * rng.normal(size=pixels.shape)
+    said = forward(ARM, joints)
+    views = tuple(BoardView(i, f"view {i}", said[i], POINTS, pixels[i], joints[i]) for i in range(n))
+    off = lens_sigma(truth.told) * rng.normal(size=len(intrinsics_names(LENS)))
+    off[1] = off[0]  # pixels are square
+    told = with_intrinsics_vector(LENS, intrinsics_vector(LENS) + off)
+    return solve_pnp(ViewSet(truth.mount, views, told, ARM.name), BOARD)
+
+
+def planned(
+    truth: Truth, pool: Array, count: int, rng: np.random.Generator, criterion: Criterion = "arm"
+) -> Array:
+    """Joints (count, 6) chosen as `station plan --for arm` does: from the nominal cell alone."""
+    nominal = replace(truth, errors=np.zeros((5, 6)))
+    flange = nominal.flange(pool)
+    motion = by_parameters(ARM, pool) * RELATIVE_SIGMA
+    noise = MeasurementNoise(CORNER_PX, ROBOT_M, ROBOT_RAD)
+    gains = view_information(truth.mount, LENS, flange, truth.X, truth.Y, POINTS, noise, motion)
+    board = BoardTolerance(truth.told.board, _BENT_M)
+    prior = prior_information(LENS, True, board, TABLE_MM, LensPrior.given(LENS, lens_sigma(truth.told)))
+    room = Workspace.of(truth.mount, ARM, sample_workspace(ARM, pool), truth.X, truth.Y, _AHEAD_M)
+    objective = Objective(criterion, _AHEAD_M, prior, None, room.among(len(prior)))
+    best = choose(gains, count, objective, rng, sweeps=2)
+    return np.asarray(pool[best])
+
+
+@dataclass(frozen=True, eq=False)
+class Judge:
+    """Points over the workspace and near the board, their true places, and how far an answer is off."""
+
+    truth: Truth
+    joints: Array
+    points: Array
+    """(m, 3) in the camera, or on the board (eye-to-hand)."""
+
+    @classmethod
+    def everywhere(cls, truth: Truth, like: Array, rng: np.random.Generator) -> Judge:
+        """400 poses, any way up, 0.35 to 0.9 of the reach about the shoulder and above it, in one branch."""
+        _, solutions, branches = inverse_many(ARM, forward(ARM, like[:1]))
+        own = branches[np.abs(np.exp(1j * solutions) - np.exp(1j * like[0])).max(axis=1).argmin()]
+        reach, joints = abs(ARM.a_m[1]) + abs(ARM.a_m[2]), np.zeros((0, 6))
+        while len(joints) < 400:
+            at = rng.uniform(-1, 1, (3000, 3)) * [1, 1, 0.5] + [0, 0, 0.5]
+            at = at[(np.linalg.norm(at, axis=1) > 0.35) & (np.linalg.norm(at, axis=1) < 0.9)]
+            R = np.array([random_rotation(rng) for _ in at])
+            _, q, branch = inverse_many(ARM, pose(R, reach * at + [0, 0, ARM.d_m[0]]))
+            joints = np.concatenate([joints, q[branch == own]])
+        return cls(truth, joints[:400], cls._points(truth))
+
+    @staticmethod
+    def _points(truth: Truth) -> Array:
+        if truth.mount == "eye-in-hand":
+            return np.array([[0.0, 0.0, _AHEAD_M]])
+        return np.asarray(POINTS.mean(axis=0)[None])
+
+    @classmethod
+    def near(cls, truth: Truth, pool: Array) -> Judge:
+        return cls(truth, pool[:200], cls._points(truth))
+
+    def error_mm(self, X: Array, flange: Callable[[Array], Array]) -> float:
+        """rms, one rigid motion of all points taken out."""
+        true = self.truth.flange(self.joints)
+        said = flange(self.joints)
+        if self.truth.mount == "eye-in-hand":
+            at = (true @ self.truth.X @ np.append(self.points[0], 1.0))[:, :3]
+            told = (said @ X @ np.append(self.points[0], 1.0))[:, :3]
+            return float(1e3 * rms_fitted(told, at))
+        held = (self.truth.Y @ np.append(self.points[0], 1.0))[:3]
+        at = transform_points(X @ inverse(self.truth.X), true[:, :3, :3] @ held + true[:, :3, 3])
+        # The point that the flange carries is free: at = said (R p + t).
+        A, b = said[:, :3, :3].reshape(-1, 3), (at - said[:, :3, 3]).reshape(-1)
+        off = b - A @ np.linalg.lstsq(A, b, rcond=None)[0]
+        return float(1e3 * np.sqrt(3 * (off**2).mean()))
+
+
+def rms_fitted(told: Array, at: Array) -> float:
+    """rms distance after the best rigid motion (Kabsch)."""
+    a, b = told - told.mean(axis=0), at - at.mean(axis=0)
+    U, _, Vt = np.linalg.svd(a.T @ b)
+    R = (U @ np.diag([1, 1, np.sign(np.linalg.det(U @ Vt))]) @ Vt).T
+    return float(np.sqrt(((a @ R.T - b) ** 2).sum(axis=1).mean()))
+
+
+def solved(views: ViewSet, told: Tolerances, model_arm: bool = True, folds: bool = False) -> Solution:
+    options = SolveOptions(
+        holdout=False,
+        folds=folds,
+        model_arm=model_arm,
+        lens_sigma=tuple(lens_sigma(told).tolist()),
+        board=BoardTolerance(told.board, _BENT_M),
+    )
+    return solve_views(views, options)
+
+
+def measure(
+    seed: int, mount: Mount, size: float, told: Tolerances, count: int, plan: bool
+) -> dict[str, float]:
+    """Figures of one cell; the same seed gives the same cell to every way."""
+    rng = np.random.default_rng([77, seed, int(1e3 * size), mount == "eye-in-hand"])
+    truth, pool = draw_cell(rng, mount, size, told)
+    everywhere, near = Judge.everywhere(truth, pool, rng), Judge.near(truth, pool)
+    chosen = planned(truth, pool, count, rng) if plan else pool[rng.permutation(len(pool))[:count]]
+    views = capture(rng, truth, chosen)
+    found: dict[str, float] = {}
+    nominal = partial(forward, ARM)
+    H, C = mount_poses(views.base_from_flange, mount), views.camera_from_board
+    park = opencv_hand_eye(H, C, HAND_EYE["Park-Martin"])
+    plain = solved(views, told, model_arm=False)
+    with_table = solved(views, told, folds=True)
+    arm = with_table.arm
+    assert arm is not None and arm.result is not None
+    result = arm.result
+    corrected = partial(forward, result.corrected)
+    for name, judge_ in (("everywhere", everywhere), ("near", near)):
+        for way, X, flange in (
+            ("park", park, nominal),
+            ("plain", plain.matrix, nominal),
+            ("bare", with_table.matrix, nominal),
+            ("compromise", result.for_uncorrected, nominal),
+            ("table", with_table.matrix, corrected),
+        ):
+            found[f"{name} {way}"] = judge_.error_mm(X, flange)
+    found["claimed"] = 1e3 * result.with_table_m
+    found["claimed without"] = 1e3 * result.without_table_m
+    for way, solution in (("plain", plain), ("table", with_table)):
+        delta = difference(solution.matrix, truth.X)
+        found[f"X {way}"] = 1e3 * float(np.linalg.norm(delta[:3]))
+        square = delta @ np.linalg.solve(solution.covariance, delta)
+        found[f"inside {way}"] = float(square <= solution.confidence_threshold)
+    q = everywhere.joints[:100]
+    delta = difference(corrected(q), truth.flange(q))
+    S = (T := by_parameters(ARM, q)) @ result.covariance[6:, 6:] @ np.swapaxes(T, 1, 2)
+    square = np.einsum("ni,nij,nj->n", delta, np.linalg.inv(S), delta)
+    found["inside flange"] = float((square <= with_table.confidence_threshold).mean())
+    gates = judge(with_table, GateInputs(None, None), GateLimits())
+    found["refused"] = float(not all(gate.passed for gate in gates))
+    found["evidence"] = arm.log_bayes
+    found["offered"] = float(result.offered)
+    return found

@@ -1,0 +1,193 @@
+"""The arm's table as a result: what is offered, what it brings on poses elsewhere, what is never mixed up."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from benchmarks.kinematics import Worn, worn_cell
+from calibrate.geometry import Array, difference, inverse, perturb, pose, random_rotation
+from calibrate.handeye.arm import HELD, PARAMETERS, by_parameters, corrected_model
+from calibrate.handeye.solution import Solution, TableResult
+from calibrate.handeye.solve import SolveOptions, solve_views
+from calibrate.handeye.workspace import Workspace, sample_workspace
+from calibrate.kinematics import MODELS, DhDeltas, forward, with_near_axes
+
+UR10 = MODELS["UR10"]
+FACTORY = UR10.calibrated(
+    DhDeltas(
+        a_m=(0.0, 8e-4, -6e-4, 4e-4, 0.0, 0.0),
+        d_m=(0.0, 40.0, -15.0, -25.0, 0.0, 0.0),
+        alpha_rad=(3e-4, 1e-5, -2e-5, 4e-4, -3e-4, 0.0),
+        theta_rad=(0.0, 1e-3, -2e-3, 1e-3, 5e-4, 0.0),
+    )
+)
+"""Parallel axes to within 0.02 mrad, their common normals tens of metres off, as makers state them."""
+
+
+@pytest.fixture(scope="module")
+def worn() -> Worn:
+    return worn_cell(np.random.default_rng(4), 0.4)
+
+
+@pytest.fixture(scope="module")
+def solved(worn: Worn) -> Solution:
+    return solve_views(worn.views, SolveOptions(holdout=False))
+
+
+def table_of(solution: Solution) -> TableResult:
+    assert solution.arm is not None and solution.arm.result is not None
+    return solution.arm.result
+
+
+def spread(flange: Array, X: Array, C: Array) -> float:
+    """rms distance of the board's origin from its mean over all poses: one place, if all is right."""
+    at = (flange @ X @ C)[:, :3, 3]
+    return float(np.sqrt(((at - at.mean(axis=0)) ** 2).sum(axis=1).mean()))
+
+
+def test_the_table_with_its_own_x_is_best_at_new_poses(worn: Worn, solved: Solution) -> None:
+    table = table_of(solved)
+    assert table.offered
+    nominal, corrected = (forward(model, worn.new_joints) for model in (UR10, table.corrected))
+    both = spread(corrected, solved.matrix, worn.new_board_poses)
+    uncorrected = spread(nominal, table.for_uncorrected, worn.new_board_poses)
+    assert both < 0.6 * uncorrected
+    assert table.with_table_m < 0.7 * table.without_table_m
+
+
+def test_held_out_poses_elsewhere_say_the_same(solved: Solution) -> None:
+    missed = table_of(solved).held_out_m
+    assert missed is not None and missed.shape == (2, 25)
+    without, with_table = np.sqrt(np.nanmean(missed**2, axis=1))
+    assert with_table < 0.8 * without
+
+
+def test_without_joints_the_table_is_not_offered(worn: Worn) -> None:
+    bare = replace(worn.views, views=tuple(replace(v, joints_rad=None) for v in worn.views))
+    table = table_of(solve_views(bare, SolveOptions(holdout=False, folds=False)))
+    assert table.refused == "no-joints" and not table.offered
+
+
+def test_a_good_arm_is_offered_nothing() -> None:
+    views = worn_cell(np.random.default_rng(1), 0.0).views
+    assert table_of(solve_views(views, SolveOptions(holdout=False, folds=False))).refused == "no-evidence"
+
+
+def test_a_table_that_fails_elsewhere_is_not_offered(worn: Worn, monkeypatch: pytest.MonkeyPatch) -> None:
+    worse = np.tile([[1e-3], [2e-3]], (1, 25))
+    monkeypatch.setattr("calibrate.handeye.workspace.held_out_elsewhere", lambda fit, joints: worse)
+    assert table_of(solve_views(worn.views, SolveOptions(holdout=False))).refused == "not-better"
+
+
+@pytest.mark.parametrize("stated", [True, False])
+def test_flanges_of_a_factory_calibration_need_that_table(worn: Worn, stated: bool) -> None:
+    """The controller's poses follow its own table: with that all is well, else nothing is offered."""
+    moved = [
+        replace(v, base_from_flange=forward(FACTORY, q) @ inverse(forward(UR10, q)) @ v.base_from_flange)
+        for v, q in ((v, np.asarray(v.joints_rad)) for v in worn.views)
+    ]
+    views = replace(worn.views, views=tuple(moved), arm=FACTORY if stated else None)
+    table = table_of(solve_views(views, SolveOptions(holdout=False, folds=False)))
+    assert table.factory is stated
+    if stated:
+        assert table.refused in (None, "no-evidence") and max(np.abs(table.nominal.d_m)) < 0.5
+    else:
+        assert table.refused == "not-nominal"
+
+
+@settings(max_examples=15, deadline=None)
+@given(seed=st.integers(0, 10_000))
+def test_far_axes_are_restated_and_the_flange_stays(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    far = 100 * rng.normal()
+    arm = UR10.calibrated(
+        DhDeltas(
+            tuple(1e-3 * rng.normal(size=6)),
+            (0.0, far, -0.7 * far, -0.3 * far, 0.0, 0.0),
+            tuple(1e-5 * rng.normal(size=6)),
+            (0.0, *rng.uniform(-0.5, 0.5, 3), 0.0, 0.0),
+        )
+    )
+    near, joints = with_near_axes(arm), rng.uniform(-3, 3, (10, 6))
+    assert near.d_m[1:3] == (0.0, 0.0) and abs(near.d_m[3]) < 0.5
+    np.testing.assert_allclose(forward(near, joints), forward(arm, joints), atol=1e-9)
+
+
+def test_every_number_of_a_table_is_estimated_or_held_with_a_reason() -> None:
+    table = {f"{kind}{joint}" for kind in ("a", "d", "alpha", "theta") for joint in range(1, 7)}
+    assert table | {"beta2", "beta3"} == set(PARAMETERS) | set(HELD)
+    assert not set(PARAMETERS) & set(HELD) and all(HELD.values())
+
+
+@pytest.mark.parametrize("mount", ["eye-in-hand", "eye-to-hand"])
+def test_workspace_derivatives_are_those_of_the_points(mount: str) -> None:
+    """Error of a point by X and by the table: against moving both, to first order."""
+    rng = np.random.default_rng(8)
+    joints = rng.uniform(-2, 2, (4, 6))
+    X, Y = (pose(random_rotation(rng), 0.3 * rng.normal(size=3)) for _ in range(2))
+    room = Workspace.of(mount, UR10, joints, X, Y, 0.5)  # type: ignore[arg-type]
+    shift, errors = 1e-5 * rng.normal(size=6), 1e-5 * rng.normal(size=18)
+    true = forward(corrected_model(UR10, errors), joints)
+    said, wrong = forward(UR10, joints), perturb(X, shift)
+    ahead = np.array([0.0, 0.0, 0.5, 1.0])
+    if mount == "eye-in-hand":
+        off = (said @ wrong @ ahead - true @ X @ ahead)[:, :3]
+    else:
+        held = Y[:, 3]
+        off = (said @ held - wrong @ inverse(X) @ true @ held)[:, :3]
+    linear = room.by_camera @ shift - room.by_table @ errors
+    np.testing.assert_allclose(linear.reshape(-1, 3), off, atol=3e-9)
+
+
+def test_the_uncorrected_arm_gets_the_best_x_over_its_poses() -> None:
+    rng = np.random.default_rng(2)
+    like = rng.uniform(-1, 1, (5, 6)) + np.array([0, -1.5, 1.5, -1.5, -1.5, 0])
+    joints = sample_workspace(UR10, like, 100)
+    X = pose(random_rotation(rng), [0.05, 0.02, 0.1])
+    beside = np.array([[0, 0], [0.2, 0.2], [0.2, -0.2], [-0.2, 0.2]])
+    room = Workspace.of("eye-in-hand", UR10, joints, X, np.eye(4), 0.5, beside)
+    errors = 3e-4 * rng.normal(size=18)
+    best = room.for_uncorrected() @ errors
+    least = room.error_m(best, errors)
+    assert least < room.error_m(np.zeros(6), errors)
+    for nudge in 1e-4 * rng.normal(size=(20, 6)):
+        assert least < room.error_m(best + nudge, errors)
+
+
+def test_the_sampled_workspace_is_of_one_branch_and_within_reach() -> None:
+    like = np.array([[0.1, -1.5, 1.5, -1.5, -1.5, 0.0]] * 3)
+    joints = sample_workspace(UR10, like, 50)
+    assert joints.shape == (50, 6) and (joints == sample_workspace(UR10, like, 50)).all()
+    assert (np.sin(joints[:, 2]) > 0).all() and (np.sin(joints[:, 4]) < 0).all()
+    away = np.linalg.norm(forward(UR10, joints)[:, :3, 3] - [0, 0, UR10.d_m[0]], axis=1)
+    assert away.max() < 0.9 * (abs(UR10.a_m[1]) + abs(UR10.a_m[2])) + 1e-9
+
+
+def test_stated_covariance_of_the_corrected_flange_holds(worn: Worn, solved: Solution) -> None:
+    """At poses that took no part; the true flange from the true board and camera, up to what X and Y take."""
+    table = table_of(solved)
+    T = by_parameters(UR10, worn.new_joints)
+    sigma = np.sqrt(np.einsum("nij,jk,nik->n", T[:, :3], table.covariance[6:, 6:], T[:, :3]))
+    true = worn.new_board_poses  # camera_from_board: Y is one for all of them
+    implied = inverse(worn.X @ true)
+    Y = forward(table.corrected, worn.new_joints) @ inverse(implied)
+    off = difference(Y, np.broadcast_to(Y[0], Y.shape))[:, :3]
+    assert np.median(np.linalg.norm(off - off.mean(axis=0), axis=1) / sigma) < 2.0
+
+
+def test_the_corrected_arm_needs_numpy_only() -> None:
+    code = (
+        "import sys; from calibrate.kinematics import base_from_flange;"
+        "t = dict.fromkeys(('a_m', 'd_m', 'alpha_rad', 'theta_rad', 'beta_rad'), (0.1,) * 6);"
+        "assert base_from_flange(t, [[0.0] * 6] * 3).shape == (3, 4, 4);"
+        "print(sorted({'scipy', 'cv2', 'msgspec', 'yaml'} & {m.split('.')[0] for m in sys.modules}))"
+    )
+    said = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert said.stdout.strip() == "[]"

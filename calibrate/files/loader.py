@@ -278,7 +278,7 @@ class InstalledCalibration:
 
     @cached_property
     def transform(self) -> Transform:
-        """flange_from_camera (eye-in-hand) or base_from_camera (eye-to-hand), metres; for the arm as it is."""
+        """flange_from_camera (eye-in-hand) or base_from_camera (eye-to-hand), metres; the arm as it is."""
         result = self.plain["result"]
         return Transform(result["parent_frame"], result["child_frame"], np.array(result["matrix"], float))
 

@@ -20,9 +20,20 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from calibrate.errors import CalibrationError
-from calibrate.files.calibration import Calibration, CorrectedArm, DhTable, FramePose, TableError
+from calibrate.files.calibration import (
+    Calibration,
+    CorrectedArm,
+    DhTable,
+    FramePose,
+    TableError,
+    decode_calibration,
+    encode_calibration,
+    write_calibration,
+)
 from calibrate.files.exports import FORMATS, ExportError, FrameNames, export
-from calibrate.geometry import Array, Transform, pose, pose_from_rotvec, rotation_exp
+from calibrate.files.loader import InstalledCalibration, check_result, proven_plain
+from calibrate.files.validity import unrecorded
+from calibrate.geometry import Array, FrameMismatchError, Transform, pose, pose_from_rotvec, rotation_exp
 from calibrate.handeye.arm import HELD, PARAMETERS, corrected_model
 from calibrate.kinematics import MODELS, DhDeltas, base_from_flange, forward, with_near_axes
 from calibrate.pipeline import SolvedRecording
@@ -384,3 +395,43 @@ def test_other_frame_names_and_unknown_formats(calibration: Calibration) -> None
     assert f"--frame-id {parent} --child-frame-id cam" in text
     with pytest.raises(ExportError):
         export(calibration, "nix")
+
+
+def test_the_installed_table_chains_with_its_own_camera_and_nothing_else(
+    calibration: Calibration, tmp_path: Path
+) -> None:
+    path = tmp_path / "cell.yaml"
+    write_calibration(calibration, path)
+    plain = proven_plain(path.read_bytes(), str(path))
+    check_result(plain, str(path))
+    installed = InstalledCalibration("main", 1, path, unrecorded(1, "2026-01-01T00:00:00+00:00"), plain)
+    arm, joints = installed.corrected_arm, [0.3, -1.2, 1.4, -0.8, 1.1, 0.2]
+    flange = arm.base_from_flange(joints)
+    np.testing.assert_allclose(
+        flange.matrix, calibration.arm_table.base_from_flange(joints).matrix, atol=1e-12
+    )
+    if calibration.mount == "eye-in-hand":
+        assert (flange @ arm.transform).parent == "corrected_base"
+        with pytest.raises(FrameMismatchError):
+            flange @ installed.transform
+    else:
+        assert arm.transform.parent == flange.parent != installed.transform.parent
+    with pytest.raises(FrameMismatchError):
+        Transform("base", "flange", np.eye(4)) @ arm.transform
+
+
+@pytest.mark.parametrize("change", ["bare", "frames", "no table", "not offered"])
+def test_a_table_without_its_own_camera_is_a_contradiction(calibration: Calibration, change: str) -> None:
+    arm = calibration.arm_table
+    replaced = {
+        "bare": {"result": calibration.result},
+        "frames": {"result": msgspec.structs.replace(arm.result, child_frame="board")},
+        "no table": {"corrected": None},
+        "not offered": {"offered": False},
+    }[change]
+    content = encode_calibration(
+        msgspec.structs.replace(calibration, arm_table=msgspec.structs.replace(arm, **replaced))
+    )
+    with pytest.raises(CalibrationError) as caught:
+        decode_calibration(content, "cell.yaml")
+    assert caught.value.code == "contradiction"

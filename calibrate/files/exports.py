@@ -278,7 +278,7 @@ def _of_table(calibration: Calibration, frames: FrameNames) -> tuple[Array, str]
     table, X = calibration.arm_table.installable()
     values = " ".join(repr(float(v)) for v in (*X.translation_m, *X.quaternion_xyzw))
     note = (
-        f"{comment(calibration)}\n{calibration.arm_table.model}: use it only with this camera pose, and this "
+        f"{comment(calibration, frames)}\n{calibration.arm_table.model}: use it only with this camera pose, and this "
         "camera pose only with it:\n"
         f"{frames.parent(calibration)} {frames.camera} (x y z, qx qy qz qw) {values}"
     )
@@ -326,7 +326,11 @@ def arm_urdf(calibration: Calibration, frames: FrameNames) -> str:
 def arm_json(calibration: Calibration, frames: FrameNames) -> str:
     """Only the arm's table and the X that belongs to it."""
     _of_table(calibration, frames)
-    plain = {"of": comment(calibration), "mount": calibration.mount, "arm_table": calibration.arm_table}
+    plain = {
+        "of": comment(calibration, frames),
+        "mount": calibration.mount,
+        "arm_table": calibration.arm_table,
+    }
     return msgspec.json.format(msgspec.json.encode(plain)).decode() + "\n"
 
 

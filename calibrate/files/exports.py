@@ -278,8 +278,8 @@ def _of_table(calibration: Calibration, frames: FrameNames) -> tuple[Array, str]
     table, X = calibration.arm_table.installable()
     values = " ".join(repr(float(v)) for v in (*X.translation_m, *X.quaternion_xyzw))
     note = (
-        f"{comment(calibration, frames)}\n{calibration.arm_table.model}: use it only with this camera pose, and this "
-        "camera pose only with it:\n"
+        f"{comment(calibration, frames)}\n"
+        f"{calibration.arm_table.model}: use it only with this camera pose, and this one only with it:\n"
         f"{frames.parent(calibration)} {frames.camera} (x y z, qx qy qz qw) {values}"
     )
     return link_origins(table), note

@@ -38,7 +38,7 @@ from station.simulation.scenes import make_cell
 SHARE = float(os.environ.get("BENCH_SHARE", "1"))
 RUNS = max(2, round(40 * SHARE))
 FRAMES = max(20_000, round(1_000_000 * SHARE))
-RATE_HZ, EXPOSURE_S, READOUT_S, STATES_HZ = 10.0, 0.010, 0.0133, 500.0
+RATE_HZ, EXPOSURE_S, READOUT_S, STATES_HZ = 6.0, 0.010, 0.0133, 500.0
 MARGIN_S = 0.5
 """The arm stands before and after its swings."""
 START_NS = 10**13

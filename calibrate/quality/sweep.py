@@ -1,8 +1,8 @@
 """The time offset between camera and robot, from a sweep: an arm in slow motion before a free-running camera.
 
-For any X the flange and the camera (or the board on the flange) turn by equal angles between two moments,
-so the angles of the robot, taken later or earlier until they fit those of the images, give the offset with
-no calibration at hand. The arm must speed up and slow down: at constant speed every offset fits.
+Whatever the calibration, flange and camera (or the board on the flange) turn alike: the rotations of the
+robot, taken later or earlier until they fit those of the images, give the offset with no calibration at hand.
+The arm must turn to and fro: at constant speed every offset fits.
 
 What is tested is the very time that a pose uses: each frame's own, `Image.time`. Robot states are placed by
 the controller's clock, tied to the host's by its quickest messages: a busy computer delays arrivals, never
@@ -37,8 +37,12 @@ LIMIT_S = 0.2
 _STEPS = 81
 """Steps of the first search, 5 ms apart."""
 _ITERATIONS = 20
-_DIFFERENCE_S = 1e-4
+_DIFFERENCE_S = 1e-3
 """Half the distance of the two values that give a slope."""
+_HUBER = 1.345
+"""Sigmas; 95 % efficient (Huber 1964): a picture with a wrong pose must not shift the time."""
+_LAGS = 6
+"""Neighbours whose scores count together in the sigma."""
 UNSEEN_DELAY_S = 1e-4
 """1 sigma of the controller's shortest delay: no arrival shows it, so it stays in the offset."""
 
@@ -227,16 +231,18 @@ def estimate_time_offset(
 ) -> TimeOffset:
     """Robot times (n,) and poses (n, 4, 4); picture times (m,) and PnP poses (m, 4, 4), in order; seconds.
 
-    Least squares over r_i = ∠(F(t_i + τ)⁻¹ F(t_i+1 + τ)) - ∠(C_i⁻¹ C_i+1), F base_from_flange (slerp between
-    the robot's times) and C camera_from_board: the best of a grid, then Gauss-Newton with Huber's weights.
-    Raises TooFewViewsError, BadViewsError for times out of order, DegenerateMotionError where the motion does
-    not determine the offset.
+    The start is the best of a grid by the angles between neighbours, equal for any mounting:
+    ∠(F(t_i + τ)⁻¹ F(t_i+1 + τ)) = ∠(C_i⁻¹ C_i+1), F base_from_flange (slerp between the robot's times) and C
+    camera_from_board. Then least squares with Huber's weights over τ and two rotations X and B in
+    r_i = log(Xᵀ G(t_i + τ) B C_iᵀ), where G is F⁻¹ (eye-in-hand) or F (eye-to-hand), whichever fits: every
+    picture tells by how fast the arm turned, not only by how its speed changed. Raises TooFewViewsError,
+    BadViewsError for times out of order, DegenerateMotionError where the motion does not tell the offset.
     """
     for name, times in (("robot", robot_s), ("camera", camera_s)):
         if not np.isfinite(times).all() or (np.diff(times) <= 0).any():
             raise BadViewsError(f"The {name}'s times are not in order.", code="bad-clock")
     inside = (camera_s - LIMIT_S >= robot_s[0]) & (camera_s + LIMIT_S <= robot_s[-1])
-    times, poses = camera_s[inside], camera_from_board[inside]
+    times, C = camera_s[inside], Rotation.from_matrix(camera_from_board[inside][:, :3, :3])
     if len(times) < FEWEST_PICTURES:
         raise TooFewViewsError(
             f"Only {len(times)} images lie within the robot's states ({FEWEST_PICTURES} needed).",
@@ -245,25 +251,12 @@ def estimate_time_offset(
             needed=FEWEST_PICTURES,
         )
     flange = Slerp(robot_s, Rotation.from_matrix(base_from_flange[:, :3, :3]))
-    R = poses[:, :3, :3]
-    seen = rotation_angle(np.swapaxes(R[:-1], -1, -2) @ R[1:])
-
-    def residual(offset_s: float) -> Array:
-        turned = flange(times + offset_s)
-        return np.asarray((turned[:-1].inv() * turned[1:]).magnitude() - seen)
-
-    grid = np.linspace(-LIMIT_S, LIMIT_S, _STEPS)
-    offset_s = float(grid[np.argmin([np.abs(residual(o)).sum() for o in grid])])
-    for _ in range(_ITERATIONS):
-        r, slope = residual(offset_s), _slope(residual, offset_s)
-        weight = _weights(r)
-        step_s = float(-(weight * slope * r).sum() / max((weight * slope**2).sum(), 1e-30))
-        offset_s = float(np.clip(offset_s + step_s, -LIMIT_S, LIMIT_S))
-        if abs(step_s) < 1e-8:
-            break
-    r, slope = residual(offset_s), _slope(residual, offset_s)
-    sigma_s = _sigma(r, slope, _weights(r))
-    if sigma_s > LIMIT_S / 4 or abs(offset_s) >= LIMIT_S - 1e-9:
+    start_s = _best_of_grid(flange, times, (C[:-1].inv() * C[1:]).magnitude())
+    mountings = [lambda at: flange(at).inv(), lambda at: flange(at)]
+    offset_s, sigma_s, rms_rad = min(
+        (_by_rotations(turned, times, C, start_s) for turned in mountings), key=lambda found: found[2]
+    )
+    if not sigma_s <= LIMIT_S / 4 or abs(offset_s) >= LIMIT_S - 1e-9:
         raise DegenerateMotionError(
             f"The motion does not determine the time offset (1σ {1000 * sigma_s:.0f} ms within "
             f"± {1000 * LIMIT_S:.0f} ms).",
@@ -271,26 +264,71 @@ def estimate_time_offset(
             sigma_s=sigma_s,
             limit_s=LIMIT_S,
         )
-    return TimeOffset(offset_s, sigma_s, float(np.sqrt(np.mean(r**2))), len(r))
+    return TimeOffset(offset_s, sigma_s, rms_rad, len(times) - 1)
 
 
-def _slope(residual: Callable[[float], Array], offset_s: float) -> Array:
-    low = max(offset_s - _DIFFERENCE_S, -LIMIT_S)
-    high = min(offset_s + _DIFFERENCE_S, LIMIT_S)
-    return np.asarray((residual(high) - residual(low)) / (high - low))
+def _best_of_grid(flange: Slerp, times: Array, seen_rad: Array) -> float:
+    def misfit(offset_s: float) -> float:
+        turned = flange(times + offset_s)
+        return float(np.abs((turned[:-1].inv() * turned[1:]).magnitude() - seen_rad).sum())
+
+    return float(min(np.linspace(-LIMIT_S, LIMIT_S, _STEPS), key=misfit))
 
 
-def _weights(r: Array) -> Array:
-    """Huber's (1964), 95 % efficient at 1.345 sigmas: a picture with a wrong pose must not shift the time."""
-    scale = 1.345 * max(1.4826 * float(np.median(np.abs(r))), 1e-12)
-    return np.asarray(np.minimum(1.0, scale / np.maximum(np.abs(r), 1e-15)))
+def _by_rotations(
+    turned: Callable[[Array], Rotation], times: Array, C: Rotation, offset_s: float
+) -> tuple[float, float, float]:
+    """(offset, sigma, robust RMS of the residuals in rad) by Gauss-Newton; NaN where nothing tells."""
+    X, B = _first_rotations(turned(times + offset_s), C)
+    n = len(times)
+
+    def residual(at_s: float) -> Array:
+        return np.asarray((X.inv() * turned(times + at_s) * B * C.inv()).as_rotvec())
+
+    for _ in range(_ITERATIONS):
+        r = residual(offset_s)
+        low, high = max(offset_s - _DIFFERENCE_S, -LIMIT_S), min(offset_s + _DIFFERENCE_S, LIMIT_S)
+        slope = (residual(high) - residual(low)) / (high - low)
+        # A rotation about the optical axis is seen far better than a tilt: each has its own scale.
+        scale = np.maximum(1.4826 * np.median(np.abs(r), axis=0), 1e-9)
+        size = np.linalg.norm(r / scale, axis=1) / math.sqrt(3)
+        weight = np.minimum(1.0, _HUBER / np.maximum(size, 1e-15))[:, None] / scale**2
+        turns = (X.inv() * turned(times + offset_s)).as_matrix()
+        J = np.concatenate([slope[:, :, None], -np.tile(np.eye(3), (n, 1, 1)), turns], axis=2)
+        scores = np.einsum("nki,nk,nk->ni", J, weight, r)
+        A = np.einsum("nki,nk,nkj->ij", J, weight, J)
+        step = -np.linalg.pinv(A, rcond=1e-12, hermitian=True) @ scores.sum(axis=0)
+        offset_s = float(np.clip(offset_s + step[0], -LIMIT_S, LIMIT_S))
+        X, B = X * Rotation.from_rotvec(step[1:4]), Rotation.from_rotvec(step[4:]) * B
+        if abs(step[0]) < 1e-8:
+            break
+    return offset_s, _sigma(A, scores), float(np.sqrt(np.mean(scale**2)))
 
 
-def _sigma(r: Array, slope: Array, weight: Array) -> float:
-    """Sandwich estimate (Huber 1967); neighbouring angles share a picture, so their products count too."""
-    score = weight * slope * r
-    together = float((score**2).sum() + 2 * (score[:-1] * score[1:]).sum())
-    # The sum of neighbours can be negative by chance: a quarter of the plain estimate is the least believed.
-    spread = max(together, 0.25 * float((score**2).sum()))
-    curvature = float((weight * slope**2).sum())
-    return float(np.sqrt(spread)) / max(curvature, 1e-30)
+def _first_rotations(G: Rotation, C: Rotation) -> tuple[Rotation, Rotation]:
+    """X and B from the axes of turns over an eighth of the sweep, as Park and Martin (1994) do."""
+    apart = max(1, len(C) // 8)
+    robot, camera = ((each[apart:] * each[:-apart].inv()).as_rotvec() for each in (G, C))
+    off = np.abs(np.linalg.norm(robot, axis=1) - np.linalg.norm(camera, axis=1))
+    sound = off <= 4 * np.median(off) + 1e-9
+    X, _ = Rotation.align_vectors(robot[sound], camera[sound])
+    each = (G.inv() * X * C).as_matrix()
+    u, _, vt = np.linalg.svd(np.median(each, axis=0))
+    return X, Rotation.from_matrix(u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt)
+
+
+def _sigma(A: Array, scores: Array) -> float:
+    """Sandwich estimate of the first unknown's (Huber 1967), the larger one of with and without neighbours.
+
+    Neighbours' scores belong together where detection errs alike in similar pictures (Newey and West 1987).
+    NaN where the information is nothing but rounding.
+    """
+    information = A[0, 0] - A[0, 1:] @ np.linalg.pinv(A[1:, 1:], rcond=1e-12, hermitian=True) @ A[1:, 0]
+    if not information > 1e-9 * A[0, 0]:
+        return math.nan
+    # What is left of each picture's score for the offset once the rotations have taken their part.
+    own = scores[:, 0] - scores[:, 1:] @ np.linalg.pinv(A[1:, 1:], rcond=1e-12, hermitian=True) @ A[1:, 0]
+    alone = spread = float(own @ own)
+    for lag in range(1, _LAGS + 1):
+        spread += 2 * (1 - lag / (_LAGS + 1)) * float(own[lag:] @ own[:-lag])
+    return math.sqrt(max(alone, spread) * len(own) / (len(own) - A.shape[0])) / float(information)

@@ -396,23 +396,26 @@ def _find(aravis: Any, wanted: str) -> str:
     if wanted.count(".") == 3 and wanted.replace(".", "").isdigit():
         return wanted
     aravis.update_device_list()
-    found = []
+    exact, by_model, found = [], [], []
     for i in range(aravis.get_n_devices()):
-        names = (
+        serial, address, identity, model = (
             aravis.get_device_serial_nbr(i),
             aravis.get_device_address(i),
-            aravis.get_device_id(i),
+            str(aravis.get_device_id(i)),
             aravis.get_device_model(i),
         )
-        if wanted in names:
-            return str(names[2])
-        found.append(f"{names[3]} {names[0]} at {names[1]}")
-    if len(found) == 1 and not wanted:
-        return str(aravis.get_device_id(0))
-    which = f"no camera '{wanted}'" if wanted else "camera.device must name one camera"
+        if wanted in (serial, address, identity):
+            exact.append(identity)
+        if wanted in (model, ""):
+            by_model.append(identity)
+        found.append(f"{model} {serial} at {address}")
+    chosen = exact or by_model
+    if len(chosen) == 1:
+        return chosen[0]
+    which = f"no camera '{wanted}'" if not chosen else "camera.device must name one camera, by its serial"
     raise CameraError(
         f"{which}: found {'; '.join(found) or 'none'}",
-        code="no-camera",
-        remedy="Check power, cable and network, or give its IP address.",
+        code="no-camera" if not chosen else "several-cameras",
+        remedy="Check power, cable and network, or give its serial number or IP address.",
         found=len(found),
     )

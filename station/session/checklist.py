@@ -9,6 +9,7 @@ from calibrate.boards.model import BoardError, check_board, describe_board
 from recordings.files import bytes_text
 from station.cell.errors import CameraError, RobotError
 from station.cell.status import StationState
+from station.devices.gige_discovery import discover
 from station.devices.ur import control_trouble
 from station.devices.ur_condition import mode_word, not_powered, safety_stop, safety_word
 from station.devices.ur_probe import probe
@@ -23,6 +24,7 @@ async def checklist(context: SessionContext, troubles: dict[str, str]) -> list[C
     return [
         *await _robot_checks(context, troubles),
         await _camera_check(context, troubles),
+        *await _network_checks(context),
         _trigger_check(context, troubles),
         _board_check(context),
         _disk_check(context),
@@ -92,6 +94,32 @@ async def _camera_check(context: SessionContext, troubles: dict[str, str]) -> Ch
         case [_, _, width, height]:
             pass
     return Check("camera", "ok", f"{camera.identity.model} {camera.identity.serial}, {width}×{height}")
+
+
+async def _network_checks(context: SessionContext) -> list[Check]:
+    """GigE Vision cameras on the wire, and what keeps one from being used. None for other drivers."""
+    if context.cell.config.camera.driver != "aravis":
+        return []
+    found = await asyncio.to_thread(discover)
+    wanted = context.cell.config.camera.device
+    opened = context.cell.camera.identity.serial
+    lines, problems = [], []
+    for camera in found:
+        name, address = f"{camera.model} {camera.serial}", camera.address.partition("/")[0]
+        ours = camera.serial == opened
+        line = f"{name} at {camera.address}, firmware {camera.firmware or 'not told'}"
+        if not camera.reachable:
+            line += f", not in this computer's network ({camera.seen_from})"
+            problems.append(f"give {name} and this computer addresses and masks of one network")
+        elif camera.controlled and not ours:
+            line += f", in use by {camera.controlled_from or 'another program'}"
+            if wanted in ("", camera.serial, address, camera.model):
+                problems.append(f"end the program that has {name}")
+        lines.append(line)
+    if not found:
+        return [Check("network cameras", "skipped", "no GigE Vision camera answers")]
+    problem = "; ".join(problems)
+    return [Check("network cameras", "warning" if problem else "ok", "; ".join(lines), problem)]
 
 
 def _trigger_check(context: SessionContext, troubles: dict[str, str]) -> Check:

@@ -36,7 +36,7 @@ PREVIEW_SCALE = 0.5
 Message = tuple[Json, NDArray[np.uint8] | None]
 ONE_SHOT = ("missed-trigger", "lost-frame", "double-frame")
 """value: how often, 1 if none is given"""
-LASTING = ("illumination", "exposure", "clock-step", "cover", "board", "ringing")
+LASTING = ("illumination", "exposure", "clock-step", "stamp-error", "cover", "board", "ringing")
 
 
 class Ringing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
@@ -63,6 +63,8 @@ class CameraFaults:
         self.exposure_us: float | None = None
         """The camera's exposure changed by itself"""
         self.clock_step_ns = 0
+        self.stamp_error_ns = 0
+        """Added to the frames' stamps, not to the clock that is read"""
         self.board: BoardSpec | None = None
         """Another board lies there"""
         self._covered = 0.0
@@ -78,6 +80,8 @@ class CameraFaults:
             self.exposure_us = None if value is None else float(value)
         elif name == "clock-step":
             self.clock_step_ns += int(value)
+        elif name == "stamp-error":
+            self.stamp_error_ns = int(value)
         elif name == "cover":
             self._covered = float(value)
         elif name == "board":
@@ -171,7 +175,7 @@ class CameraProcess:
         header = {
             "kind": kind,
             "frame_id": frame_id,
-            "device_ns": self.device_ns(start_ns),
+            "device_ns": self.device_ns(start_ns) + self.faults.stamp_error_ns,
             "arrival_monotonic_ns": arrival_ns,
             "exposure_us": exposure_us,
             "gain_db": self.gain_db,

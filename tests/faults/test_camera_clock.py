@@ -29,6 +29,19 @@ async def test_24_an_ntp_step_of_an_hour_moves_no_mid_exposure(
     assert 3600 < stepped_s < 3630, "the wall clock is recorded as it was"
 
 
+@pytest.mark.process
+async def test_25_a_stamp_that_cannot_be_is_replaced_by_the_arrival_and_counted(
+    camera: RenderedCamera,
+) -> None:
+    await camera.inject("stamp-error", -(10**10))
+    wrong = await camera.capture()
+    assert wrong.time is not None and wrong.time.source == "arrival"
+    assert camera.timing is not None and camera.timing.impossible == 1
+    await camera.inject("stamp-error", 0)
+    right = await camera.capture()
+    assert right.time is not None and right.time.source == "latched"
+
+
 def simulated_readings(
     rng: np.random.Generator, drift_ppm: float, seconds: int
 ) -> tuple[DeviceClock, Callable[[int], int]]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import socket
 import time
 from collections.abc import AsyncIterator
 from contextlib import asynccontextmanager
@@ -13,6 +14,7 @@ import pytest
 from recordings.schema.messages import Image
 from station.cell.config import CameraConfig
 from station.devices.aravis import AravisCamera
+from station.devices.gige_discovery import discover
 from tests.codes import raises
 from tests.gige_vision import description
 from tests.gige_vision.camera import EmulatedCamera
@@ -125,3 +127,28 @@ async def test_lines_delay_edge_and_gap_are_set_as_configured(lonely_network: No
     assert emulated.register(description.LINE_SOURCE) == 1 and emulated.register(description.LINE_MODE) == 1
     assert emulated.register(description.PACKET_DELAY) == 1000, "ticks of 8 ns"
     assert settings["TriggerSource"] == "Line2" and settings["TriggerActivation"] == "FallingEdge"
+
+
+async def test_doctor_sees_every_camera_on_the_wire_and_what_keeps_it_from_use(lonely_network: None) -> None:
+    emulated = emulator()
+    async with opened(emulated) as camera:
+        (found,) = discover()
+        assert (found.vendor, found.model, found.serial) == ("Judge", "Emulated", "EMU7")
+        assert found.address.startswith("127.0.0.1/") and found.reachable and found.controlled
+        await camera.close()
+        assert not discover()[0].controlled
+        for place, address in ((0x24, "192.168.7.3"), (0x34, "255.255.255.0")):
+            emulated.set_register(place, int.from_bytes(socket.inet_aton(address), "big"))
+        (elsewhere,) = discover()
+        assert elsewhere.address == "192.168.7.3/24" and not elsewhere.reachable
+
+
+async def test_two_cameras_of_one_model_are_told_apart_by_serial_only(lonely_network: None) -> None:
+    with emulator(), EmulatedCamera("127.0.0.2", "EMU8", size=(320, 240)):
+        assert [found.serial for found in discover()] == ["EMU7", "EMU8"]
+        for device in ("", "Emulated"):
+            with raises("several-cameras", found=2):
+                await AravisCamera(CameraConfig(device=device)).open()
+        camera = AravisCamera(CameraConfig(device="EMU8"))
+        assert (await camera.open()).serial == "EMU8"
+        await camera.close()

@@ -7,6 +7,10 @@ from collections.abc import Callable
 import msgspec
 import pytest
 
+from recordings.schema.clocks import ClockFit
+from recordings.schema.messages import TimeSource
+from station.devices.frames import FrameTiming
+from station.devices.gige_discovery import FoundCamera
 from station.devices.ur_dashboard import Dashboard, DashboardError
 from station.protocol.verbs import Check
 from station.session.checklist import checklist
@@ -90,3 +94,49 @@ async def test_a_robot_that_only_lacks_its_stream_is_told_by_name(
     rig.arm.stale = True
     running = controller("UR10e")
     assert f"UR10e 20263000001 answers at {running.host}" in (await robot_check(rig, running.host)).remedy
+
+
+@pytest.mark.parametrize(
+    ("source", "clock", "bound_s", "impossible", "state"),
+    [
+        ("latched", True, 0.0005, 0, "ok"),
+        ("ptp", True, 0.0005, 0, "ok"),
+        ("latched", True, 0.0005, 3, "warning"),
+        ("latched", True, 0.009, 0, "warning"),
+        ("latched", True, 0.03, 0, "failed"),
+        ("arrival", False, 0.0005, 0, "warning"),  # it has no clock: never ok
+        ("arrival", False, 0.025, 0, "failed"),
+    ],
+)
+async def test_clocks_are_ok_only_where_frames_have_a_time(
+    rig: Rig, source: TimeSource, clock: bool, bound_s: float, impossible: int, state: str
+) -> None:
+    cell = rig.session.context.cell
+    capture = msgspec.structs.replace(cell.config.capture, time_bound_s=0.02)
+    object.__setattr__(cell, "config", msgspec.structs.replace(cell.config, capture=capture))
+    fit = ClockFit(0.0, 0.0, 0.0, 0.0, 0.0, 0.0001, 9, 60.0)
+    rig.arm.clock = lambda: fit  # type: ignore[method-assign]
+    rig.camera.timing = FrameTiming(source, bound_s, fit if clock else None, impossible)
+    found = next(c for c in await checklist(rig.session.context, {}) if c.name == "clocks")
+    assert found.state == state and bool(found.remedy) == (state != "ok")
+
+
+@pytest.mark.parametrize(
+    ("camera", "state"),
+    [
+        (None, "skipped"),
+        (FoundCamera("V", "M", "S", "1", "10.0.0.5/24", "10.0.0.1/24"), "ok"),
+        (FoundCamera("V", "M", "S", "1", "10.0.0.5/24", "192.168.1.9/24"), "warning"),
+        (FoundCamera("V", "M", "S", "1", "10.0.0.5/32", "10.0.0.1/24"), "warning"),  # its mask is wrong
+        (FoundCamera("V", "M", "S", "1", "10.0.0.5/24", "10.0.0.1/24", True, "10.0.0.9"), "warning"),
+    ],
+)
+async def test_a_wrong_mask_and_a_camera_in_use_are_named(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, camera: FoundCamera | None, state: str
+) -> None:
+    cell = rig.session.context.cell
+    wired = msgspec.structs.replace(cell.config.camera, driver="aravis", device="S")
+    object.__setattr__(cell, "config", msgspec.structs.replace(cell.config, camera=wired))
+    monkeypatch.setattr("station.session.checklist.discover", lambda: [] if camera is None else [camera])
+    found = next(c for c in await checklist(rig.session.context, {}) if c.name == "network cameras")
+    assert found.state == state and bool(found.remedy) == (state == "warning")

@@ -1,0 +1,139 @@
+"""GigE Vision cameras on this computer's networks: what they are, and why one cannot be used.
+
+Asked by GVCP itself, and answered by broadcast: a camera of another network answers too, which no library
+that opens cameras can reach. Addresses are those of the standard's bootstrap registers, which the answer to
+DISCOVERY_CMD repeats from 0 on.
+"""
+
+from __future__ import annotations
+
+import fcntl
+import select
+import socket
+import struct
+import time
+from contextlib import suppress
+from ipaddress import IPv4Interface
+
+import msgspec
+
+_PORT = 3956
+_DISCOVERY = struct.pack(">BBHHH", 0x42, 0x11, 0x0002, 0, 1)
+"""Answers may be broadcast."""
+_ANSWER = struct.Struct(">HHHH")
+_DISCOVERY_ANSWER, _READ_ANSWER = 0x0003, 0x0081
+_ADDRESS, _MASK = 0x24, 0x34
+_TEXTS = ((0x48, 32), (0x68, 32), (0x88, 32), (0xD8, 16))
+"""Vendor, model, firmware, serial: address and length"""
+_LENGTH = 248
+_PRIVILEGE, _PRIMARY_ADDRESS = 0xA00, 0xA14
+_GET_ADDRESS, _GET_MASK = 0x8915, 0x891B
+"""Linux: SIOCGIFADDR, SIOCGIFNETMASK"""
+
+
+class FoundCamera(msgspec.Struct, frozen=True):
+    vendor: str
+    model: str
+    serial: str
+    firmware: str
+    address: str
+    """With its mask, as the camera has it: 192.168.1.20/24"""
+    seen_from: str
+    """The same of this computer, on the network that it answered on"""
+    controlled: bool = False
+    controlled_from: str = ""
+    """Address of the program that has it; empty = not told"""
+
+    @property
+    def reachable(self) -> bool:
+        """Camera and computer are in each other's network."""
+        camera, here = IPv4Interface(self.address), IPv4Interface(self.seen_from)
+        return camera.ip in here.network and here.ip in camera.network
+
+
+def discover(wait_s: float = 0.5) -> list[FoundCamera]:
+    """Broadcasts on every network that is up, and takes the answers that come in time; blocking."""
+    asked = []
+    try:
+        for name, here in _interfaces():
+            link = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+            asked.append((link, here))
+            link.setsockopt(socket.SOL_SOCKET, socket.SO_BROADCAST, 1)
+            with suppress(OSError):  # not permitted everywhere; then one network may answer on all
+                link.setsockopt(socket.SOL_SOCKET, socket.SO_BINDTODEVICE, name.encode())
+            for to in {"255.255.255.255", str(here.network.broadcast_address)}:
+                with suppress(OSError):
+                    link.sendto(_DISCOVERY, (to, _PORT))
+        found = _answers(asked, wait_s)
+    finally:
+        for link, _ in asked:
+            link.close()
+    return [_with_user(camera) for camera in found]
+
+
+def _answers(asked: list[tuple[socket.socket, IPv4Interface]], wait_s: float) -> list[FoundCamera]:
+    found: dict[tuple[str, str], FoundCamera] = {}
+    here = dict(asked)
+    end_s = time.monotonic() + wait_s
+    while (left_s := end_s - time.monotonic()) > 0:
+        for link in select.select(list(here), [], [], left_s)[0]:
+            camera = _camera(link.recv(1024), here[link])
+            if camera is not None and (camera.serial, camera.address) not in found:
+                found[camera.serial, camera.address] = camera
+    return sorted(found.values(), key=lambda camera: (camera.model, camera.serial))
+
+
+def _camera(answer: bytes, here: IPv4Interface) -> FoundCamera | None:
+    head, data = answer[: _ANSWER.size], answer[_ANSWER.size :]
+    if len(data) < _LENGTH or _ANSWER.unpack(head)[:2] != (0, _DISCOVERY_ANSWER):
+        return None
+    ip, mask = (socket.inet_ntoa(data[at : at + 4]) for at in (_ADDRESS, _MASK))
+    vendor, model, firmware, serial = (
+        data[at : at + length].split(b"\0")[0].decode("ascii", "replace") for at, length in _TEXTS
+    )
+    try:
+        address = str(IPv4Interface(f"{ip}/{mask}"))
+    except ValueError:  # a mask with holes
+        address = f"{ip}/32"
+    return FoundCamera(vendor, model, serial, firmware, address, str(here))
+
+
+def _with_user(camera: FoundCamera) -> FoundCamera:
+    """Says whether a program controls it: anybody may read that."""
+    if not camera.reachable:
+        return camera
+    address = camera.address.partition("/")[0]
+    privilege = _register(address, _PRIVILEGE)
+    if not (privilege or 0) & 0b11:
+        return camera
+    user = _register(address, _PRIMARY_ADDRESS)
+    told = socket.inet_ntoa(struct.pack(">I", user)) if user else ""
+    return msgspec.structs.replace(camera, controlled=True, controlled_from=told)
+
+
+def _register(address: str, register: int, wait_s: float = 0.3) -> int | None:
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+        link.settimeout(wait_s)
+        try:
+            link.sendto(struct.pack(">BBHHHI", 0x42, 0x01, 0x0080, 4, 1, register), (address, _PORT))
+            answer = link.recv(64)
+        except OSError:
+            return None
+    if len(answer) < 12 or _ANSWER.unpack(answer[:8])[:2] != (0, _READ_ANSWER):
+        return None
+    return int.from_bytes(answer[8:12], "big")
+
+
+def _interfaces() -> list[tuple[str, IPv4Interface]]:
+    """Networks that are up and have an IPv4 address."""
+    found = []
+    with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as link:
+        for _, name in socket.if_nameindex():
+            ask = struct.pack("256s", name.encode()[:15])
+            with suppress(OSError):
+                ip, mask = (
+                    socket.inet_ntoa(fcntl.ioctl(link, request, ask)[20:24])
+                    for request in (_GET_ADDRESS, _GET_MASK)
+                )
+                found.append((name, IPv4Interface(f"{ip}/{mask}")))
+    return found

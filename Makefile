@@ -61,6 +61,7 @@ bench: $(READY)  ## the benchmarks; tables go to benchmarks/README.md
 
 pages: $(READY)  ## the pages of docs/ that are made from the sources
 	for page in api errors protocol; do $(BIN)/python docs/$$page.py > docs/$$page.md; done
+	$(BIN)/python docs/schemas.py
 
 soak: $(READY)  ## the long runs that CI shortens
 	$(BIN)/python -m pytest -m soak --timeout 3600
@@ -94,7 +95,8 @@ install-files:  # the part of install that needs no network
 	install -D -m 644 systemd/60-station.rules $(DESTDIR)$(SYSCONFDIR)/udev/rules.d/60-station.rules
 	test -e $(DESTDIR)$(SYSCONFDIR)/station/station.env || \
 		install -D -m 644 systemd/station.env $(DESTDIR)$(SYSCONFDIR)/station/station.env
-	install -d $(DESTDIR)$(DOC) && install -m 644 docs/*.md $(DESTDIR)$(DOC)
+	install -d $(DESTDIR)$(DOC)/schemas && install -m 644 docs/*.md $(DESTDIR)$(DOC)
+	install -m 644 docs/schemas/*.json $(DESTDIR)$(DOC)/schemas
 
 uninstall:  ## stop the services and remove what install put there; configuration and data stay
 	$(if $(DESTDIR),,-systemctl disable --now station.service 'station-tui@.service' 2>/dev/null)

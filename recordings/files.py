@@ -6,8 +6,6 @@ import errno
 import fcntl
 import os
 import re
-import secrets
-import shutil
 from pathlib import Path
 
 from recordings.errors import RecordingError, disk_error, exists_error
@@ -107,6 +105,8 @@ def write_atomically(path: Path, content: bytes, mode: int = 0o640) -> None:
     """
     if path.exists() and not path.is_file():
         raise OSError(errno.EEXIST, "it exists and is no file", str(path))
+    import secrets  # programs that only use a camera need not wait for it
+
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(4)}.tmp")
     descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL | os.O_CLOEXEC, mode)
     try:
@@ -126,6 +126,8 @@ def require_free_space(folder: Path, reserve_bytes: int) -> int:
 
     Asked before each pose, so that a pose is never begun that cannot be stored.
     """
+    import shutil
+
     free = shutil.disk_usage(folder).free
     if free < reserve_bytes:
         raise RecordingError(

@@ -7,12 +7,12 @@ are booleans, numbers are decimal, and aliases, tags and duplicate keys are erro
 
 from __future__ import annotations
 
-import difflib
 import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import Enum
+from functools import cache
 from types import NoneType, UnionType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
@@ -51,25 +51,40 @@ class StrictYamlError(ValueError):
         self.problems = problems
 
 
-class _Loader(yaml.SafeLoader):  # type: ignore[misc]  # yaml has no types
-    """Plain data of the YAML 1.2 core schema."""
+@cache
+def _loader() -> Any:
+    """Loader of plain data of the YAML 1.2 core schema. Made at its first use: `load_plain` needs none."""
 
-    yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
-    depth = 0
+    class Loader(yaml.SafeLoader):  # type: ignore[misc]  # yaml has no types
+        yaml_implicit_resolvers: dict[str, list[tuple[str, re.Pattern[str]]]] = {}  # noqa: RUF012
+        depth = 0
 
-    def compose_node(self, parent: Any, index: Any) -> Any:
-        mark = self.peek_event().start_mark
-        if self.check_event(yaml.AliasEvent) or getattr(self.peek_event(), "anchor", None):
-            raise yaml.MarkedYAMLError(problem="anchors (&) and aliases (*) are refused", problem_mark=mark)
-        if getattr(self.peek_event(), "tag", None):
-            raise yaml.MarkedYAMLError(problem="tags (!) are refused", problem_mark=mark)
-        _refuse_orders(self.peek_event())
-        self.depth += 1
-        if self.depth > _NEST_LIMIT:
-            raise yaml.MarkedYAMLError(problem="nested too deeply", problem_mark=mark)
-        node = super().compose_node(parent, index)
-        self.depth -= 1
-        return node
+        def compose_node(self, parent: Any, index: Any) -> Any:
+            mark = self.peek_event().start_mark
+            if self.check_event(yaml.AliasEvent) or getattr(self.peek_event(), "anchor", None):
+                raise yaml.MarkedYAMLError(
+                    problem="anchors (&) and aliases (*) are refused", problem_mark=mark
+                )
+            if getattr(self.peek_event(), "tag", None):
+                raise yaml.MarkedYAMLError(problem="tags (!) are refused", problem_mark=mark)
+            _refuse_orders(self.peek_event())
+            self.depth += 1
+            if self.depth > _NEST_LIMIT:
+                raise yaml.MarkedYAMLError(problem="nested too deeply", problem_mark=mark)
+            node = super().compose_node(parent, index)
+            self.depth -= 1
+            return node
+
+    for tag, pattern, first in (
+        ("null", r"~|null|", "~n"),
+        ("bool", r"true|false", "tf"),
+        ("int", r"[-+]?(0|[1-9][0-9]*)", "-+0123456789"),
+        ("float", r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.inf|\.nan", "-+.0123456789"),
+    ):
+        Loader.add_implicit_resolver(f"tag:yaml.org,2002:{tag}", re.compile(f"^(?:{pattern})$"), list(first))
+    Loader.add_implicit_resolver("tag:yaml.org,2002:null", re.compile("^$"), [""])
+    Loader.add_constructor("tag:yaml.org,2002:float", lambda _, node: _float(node.value))
+    return Loader
 
 
 def _refuse_orders(event: Any) -> None:
@@ -94,17 +109,6 @@ def load_plain(content: bytes) -> Any:
         return yaml.load(content, yaml.CSafeLoader)
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError) as error:
         raise StrictYamlError([YamlProblem(0, "", f"not YAML ({' '.join(str(error).split())})")]) from None
-
-
-for _tag, _pattern, _first in (
-    ("null", r"~|null|", "~n"),
-    ("bool", r"true|false", "tf"),
-    ("int", r"[-+]?(0|[1-9][0-9]*)", "-+0123456789"),
-    ("float", r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?|[-+]?\.inf|\.nan", "-+.0123456789"),
-):
-    _Loader.add_implicit_resolver(f"tag:yaml.org,2002:{_tag}", re.compile(f"^(?:{_pattern})$"), list(_first))
-_Loader.add_implicit_resolver("tag:yaml.org,2002:null", re.compile("^$"), [""])
-_Loader.add_constructor("tag:yaml.org,2002:float", lambda _, node: _float(node.value))
 
 
 def _float(text: str) -> float:
@@ -133,8 +137,8 @@ def examine(content: bytes, kind: type[Any]) -> Examined:
     except StrictYamlError as error:
         problems = error.problems
     try:
-        node = _Loader(content).get_single_node()
-        plain = _Loader(content).get_single_data()
+        node = _loader()(content).get_single_node()
+        plain = _loader()(content).get_single_data()
     except (yaml.YAMLError, UnicodeDecodeError, RecursionError, ValueError, OverflowError):
         raise StrictYamlError(problems) from None
     if not isinstance(plain, dict) or len(content) > LIMIT_BYTES:
@@ -171,7 +175,7 @@ def load(content: bytes, kind: type[T], under: str = "") -> T:
     if len(content) > LIMIT_BYTES:
         raise StrictYamlError([YamlProblem(0, "", f"larger than {LIMIT_BYTES // 1024} kB")])
     try:
-        loader = _Loader(content)
+        loader = _loader()(content)
         node, where = _below(loader.get_single_node(), under)
         problems = list(_problems(node, kind, where)) if node else [YamlProblem(0, "", "the file is empty")]
         if problems:
@@ -238,6 +242,8 @@ def _struct_problems(node: yaml.MappingNode, kind: type[msgspec.Struct], where: 
         if name in seen:
             yield YamlProblem(line, inside, "stands here twice")
         elif name not in fields:
+            import difflib
+
             near = difflib.get_close_matches(name, fields, n=1)
             hint = f"did you mean '{near[0]}'?" if near else f"known here: {', '.join(fields)}"
             yield YamlProblem(line, inside, f"unknown key; {hint}")
@@ -253,7 +259,7 @@ def _leaf_problems(node: yaml.Node, kind: Any, where: str) -> Iterator[YamlProbl
     import msgspec
 
     line = node.start_mark.line + 1
-    loader = _Loader("")
+    loader = _loader()("")
     value = loader.construct_object(node, deep=True)
     try:
         msgspec.convert(value, kind)

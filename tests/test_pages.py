@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+import runpy
 import subprocess
 import sys
 from importlib import import_module
@@ -21,6 +22,13 @@ def test_a_made_page_is_fresh(page: str) -> None:
     command = [sys.executable, ROOT / "docs" / f"{page}.py"]
     made = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
     assert made.stdout == (ROOT / "docs" / f"{page}.md").read_text()
+
+
+def test_the_schemas_are_fresh() -> None:
+    """`make pages` makes them anew."""
+    folder = ROOT / "docs" / "schemas"
+    made = runpy.run_path(str(ROOT / "docs/schemas.py"))["schemas"]()
+    assert dict(made) == {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
 def test_every_error_has_a_code_of_its_own_kind() -> None:

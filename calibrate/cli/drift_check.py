@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from calibrate.cli.contracts import DriftCheckJson
 from calibrate.cli.installed import Root, named_or_installed
 from calibrate.cli.job import Threads
 from calibrate.cli.output import AsJson, OutputError, detection_progress, out, print_json
@@ -86,14 +87,7 @@ def drift_check(
     validity = _judge(result, info, root, camera) if judged else None
     proves_nothing = own and result.passed
     if as_json:
-        print_json(
-            {
-                **_plain(result, trend),
-                "passed": result.passed and not own,
-                "own_views": own,
-                "validity": validity,
-            }
-        )
+        print_json(_plain(result, trend, own, validity))
     elif proves_nothing:
         out.print(OWN_VIEWS.format(recording=recording), style="yellow")
     else:
@@ -235,9 +229,11 @@ def _more_text(result: DriftCheck, calibration: Calibration) -> str:
     )
 
 
-def _plain(result: DriftCheck, trend: Trend | None) -> dict[str, object]:
+def _plain(result: DriftCheck, trend: Trend | None, own: bool, validity: Validity | None) -> DriftCheckJson:
     return {
-        "passed": result.passed,
+        "passed": result.passed and not own,
+        "own_views": own,
+        "validity": validity,
         "shift": result.shift.tolist(),
         "covariance": result.covariance.tolist(),
         "statistic": result.statistic,

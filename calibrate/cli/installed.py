@@ -12,6 +12,7 @@ import numpy as np
 import typer
 from rich.table import Column, Table
 
+from calibrate.cli.contracts import DiffJson, InstalledJson, ListedJson
 from calibrate.cli.files import CellFacts, read_cell
 from calibrate.cli.output import AsJson, OutputError, check_target, err, out, print_json
 from calibrate.files import exports
@@ -80,14 +81,13 @@ def diff(
     millimetres, degrees, sigmas = pose_difference(a, b)
     lens_px = _lens_difference_px(a.intrinsics, b.intrinsics)
     if as_json:
-        print_json(
-            {
-                "translation_mm": millimetres,
-                "rotation_deg": degrees,
-                "sigmas": sigmas,
-                "lens_matrix_px": lens_px,
-            }
-        )
+        apart: DiffJson = {
+            "translation_mm": millimetres,
+            "rotation_deg": degrees,
+            "sigmas": sigmas,
+            "lens_matrix_px": lens_px,
+        }
+        print_json(apart)
         return
     names = (Column(str(name), overflow="fold") for name in (first, second or "installed"))
     table = Table("", *names, box=None)
@@ -234,8 +234,14 @@ def _switched(version: InstalledVersion, as_json: bool) -> None:
     folder = version.path.parents[1]
     stable = folder / "current"
     if as_json:
-        plain = {"generation": version.number, "path": str(version.path), "current": str(stable)}
-        print_json(plain | {"validity": version.validity, "hooks": version.hooks})
+        made: InstalledJson = {
+            "generation": version.number,
+            "path": str(version.path),
+            "current": str(stable),
+            "validity": version.validity,
+            "hooks": version.hooks,
+        }
+        print_json(made)
         return
     log = read_lines(folder / "log.jsonl", LogEntry)
     out.print(f"Installed: version {version.number}, {stable}", soft_wrap=True)
@@ -297,7 +303,7 @@ def history_rows(root: Path | None) -> list[tuple[str, str, str, str]]:
     ]
 
 
-def _plain(camera: str, version: InstalledVersion) -> dict[str, Any]:
+def _plain(camera: str, version: InstalledVersion) -> ListedJson:
     calibration = version.calibration
     return {
         "camera": camera,
@@ -308,6 +314,6 @@ def _plain(camera: str, version: InstalledVersion) -> dict[str, Any]:
         "session": None if calibration is None else calibration.provenance.session,
         "created": None if calibration is None else calibration.created,
         "source": None if calibration is None else calibration.source,
-        "sigma": None if calibration is None else msgspec.to_builtins(calibration.sigma),
-        "validity": None if version.validity is None else msgspec.to_builtins(version.validity),
+        "sigma": None if calibration is None else calibration.sigma,
+        "validity": version.validity,
     }

@@ -78,7 +78,7 @@ def solve(
 
 
 def solve_json(job: SolvedRecording) -> dict[str, Any]:
-    """The contract of `calibrate solve --json`."""
+    """The contract of `calibrate solve --json`: `contracts.SolveJson` as plain data."""
     plain = msgspec.to_builtins(job.calibration)
     views, quality, lens = plain["views"], plain["quality"], plain["intrinsics"]
     holdout = quality.get("holdout")

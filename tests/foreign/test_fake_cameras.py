@@ -1,0 +1,208 @@
+"""The whole daemon before two cameras that are not ours or not Aravis's, at a simulated controller.
+
+Debian's `arv-fake-gv-camera` shows a pattern of its own: there is no board to find, and it has no clock.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import getpass
+import shutil
+import subprocess
+import sys
+import time
+from collections.abc import AsyncIterator, Iterator
+from contextlib import ExitStack, asynccontextmanager
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from numpy.typing import NDArray
+
+from recordings.reader import open_recording
+from station.cell.config import ApprovalConfig, StationConfig
+from station.cell.plan import Plan
+from station.cell.status import MotionPreview, StationState, StationStatus
+from station.operate.motion import SessionOutcome, carry_out, prepared_motion, wait_until_idle
+from station.plan.planner import make_plan
+from station.protocol.client import Client
+from station.protocol.verbs import Check, Doctor, Finish, Lease, LoadPlan, Purpose, Stop
+from station.simulation.camera_process import CameraProcess
+from station.simulation.cell import write_truth
+from station.simulation.launch import SimulatedController, start_controller
+from station.simulation.scenes import cell_config, make_cell
+from tests.foreign.test_gige_vision import loss
+from tests.gige_vision.camera import EmulatedCamera, Picture
+from tests.system.conftest import AT_REST_RAD_S, status_when
+
+pytestmark = [pytest.mark.gige, pytest.mark.process]
+TRUTH = make_cell(seed=5)
+FAKE = "arv-fake-gv-camera-0.8"
+GOOD_S = 40.0
+
+
+@pytest.fixture
+def arm(lonely_network: None, tmp_path: Path) -> Iterator[SimulatedController]:
+    write_truth(TRUTH, tmp_path / "truth.json")
+    with start_controller("UR10", truth=tmp_path / "truth.json", time_scale=3.0) as running:
+        yield running
+
+
+def configuration(arm: SimulatedController, **camera: object) -> StationConfig:
+    """As of a real cell."""
+    config = cell_config(TRUTH, arm.host)
+    changes = {"driver": "aravis", "device": "127.0.0.1"} | camera
+    return msgspec.structs.replace(
+        config,
+        camera=msgspec.structs.replace(config.camera, **changes),
+        robot=msgspec.structs.replace(config.robot, control="script"),
+        capture=msgspec.structs.replace(config.capture, free_space_bytes=1),
+        approval=ApprovalConfig(services=(getpass.getuser(),)),
+    )
+
+
+@asynccontextmanager
+async def served(config: StationConfig, folder: Path) -> AsyncIterator[Client]:
+    """`station serve --config`, and a client that has control."""
+    (folder / "station.yaml").write_bytes(msgspec.yaml.encode(config))
+    socket = folder / "control.sock"
+    command = [sys.executable, "-m", "station.cli", "serve", "--config", str(folder / "station.yaml")]
+    with subprocess.Popen(
+        [*command, "--socket", str(socket), "--root", str(folder)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+    ) as daemon:
+        try:
+            assert daemon.stdout is not None
+            assert await asyncio.to_thread(daemon.stdout.readline), "it did not start"
+            async with await Client.connect(socket) as client:
+                await wait_until_idle(client)
+                await client.call(Lease("take"))
+                yield client
+        finally:
+            daemon.terminate()
+            daemon.wait(20)
+
+
+async def checked(client: Client) -> dict[str, Check]:
+    return {check.name: check for check in await client.call(Doctor())}
+
+
+async def good(client: Client, *names: str) -> None:
+    """Until doctor says so of these."""
+    async with asyncio.timeout(GOOD_S):
+        while {(await checked(client))[name].state for name in names} != {"ok"}:
+            await asyncio.sleep(0.2)
+
+
+async def yes(preview: MotionPreview) -> bool:
+    return True
+
+
+async def captured(client: Client, plan: Plan) -> SessionOutcome:
+    await client.call(LoadPlan(plan))
+    return await carry_out(client, Purpose.RUN, yes, lambda status: None, headless=True)
+
+
+async def stopped_in_mid_move(client: Client, plan: Plan, arm: SimulatedController) -> StationStatus:
+    """STOP at full speed; the arm's own account says that it rests."""
+    await client.call(LoadPlan(plan))
+    with arm.admin() as admin:
+
+        def speed_rad_s() -> float:
+            return float(max(map(abs, admin.ask("state")["joint_speeds_rad_s"])))
+
+        assert await prepared_motion(client, Purpose.RUN, yes, headless=True)
+        async with asyncio.timeout(30):
+            while speed_rad_s() < 0.1:
+                await asyncio.sleep(0.005)
+            await client.call(Stop())
+            while speed_rad_s() > AT_REST_RAD_S:
+                await asyncio.sleep(0.005)
+    return await status_when(client, lambda status: status.state is StationState.STOPPED)
+
+
+def planned(config: StationConfig, poses: int) -> Plan:
+    return make_plan(config, start_joints_rad=TRUTH.start_joints_rad, seed=5, count=poses)
+
+
+@pytest.fixture
+def seen(arm: SimulatedController) -> Iterator[Picture]:
+    """What a camera on that arm sees now."""
+    renders = CameraProcess(TRUTH, arm.host, TRUTH.exposure_us, TRUTH.gain_db)
+    renders.warm_up()
+
+    def picture(number: int, width: int, height: int) -> NDArray[np.uint8]:
+        return np.ascontiguousarray(renders.picture(time.monotonic_ns(), TRUTH.camera)[:height, :width])
+
+    yield picture
+    if renders._admin is not None:
+        renders._admin.close()
+
+
+async def test_a_session_with_the_emulated_camera(
+    arm: SimulatedController, seen: Picture, tmp_path: Path
+) -> None:
+    config = configuration(arm)
+    plan = planned(config, 3)
+    with ExitStack() as power:
+        camera = power.enter_context(EmulatedCamera(picture=seen))
+        camera.mtu = 1500
+        async with served(config, tmp_path) as client:
+            await good(client, "camera", "clocks")
+            camera.mangle = loss(0.002)
+            ended = await captured(client, plan)
+            assert ended.captured == 3, ended.status.reason
+            assert ended.status.camera.resent_packets > 0
+            views = open_recording(Path(ended.recording)).views()
+            assert all(view.time_bound_s is not None and view.time_bound_s < 0.02 for view in views)
+            power.close()
+            assert (await checked(client))["camera"].state == "failed"
+            power.enter_context(EmulatedCamera(picture=seen))
+            await good(client, "camera")
+            assert (await stopped_in_mid_move(client, plan, arm)).camera.connected
+
+
+def fake(lost_permille: int) -> subprocess.Popen[bytes]:
+    command = [FAKE, "-i", "127.0.0.1", "-s", "GV01", "-r", str(lost_permille)]
+    return subprocess.Popen(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
+
+
+def frames_in(recording: str) -> int:
+    """Images that no view belongs to are in no view either: the reference reader counts them."""
+    with Path(recording).open("rb") as stream:
+        reader = make_reader(stream)
+        return sum(1 for _ in reader.iter_messages(topics=["/camera/frame"]))
+
+
+@pytest.mark.skipif(shutil.which(FAKE) is None, reason=f"no {FAKE}: apt install aravis-tools")
+async def test_a_session_with_debians_fake_camera(arm: SimulatedController, tmp_path: Path) -> None:
+    config = configuration(arm, region=(0, 0, 1280, 1024), packet_size=8996)
+    config = msgspec.structs.replace(
+        config,
+        stillness=msgspec.structs.replace(config.stillness, image_motion_px=1000.0),  # its pattern runs
+        capture=msgspec.structs.replace(config.capture, time_bound_s=0.2),  # it has no clock
+    )
+    plan = planned(config, 3)
+    with ExitStack() as power:
+        camera = power.enter_context(fake(0))
+        power.callback(camera.kill)
+        await asyncio.sleep(0.5)
+        async with served(config, tmp_path) as client:
+            checks = await checked(client)
+            assert checks["camera"].state == "ok" and "GV01" in checks["camera"].text
+            power.close()
+            assert (await checked(client))["camera"].state == "failed"
+            camera = power.enter_context(fake(2))
+            power.callback(camera.kill)
+            await good(client, "camera")
+            ended = await captured(client, plan)
+            assert ended.status.state is StationState.PAUSED and ended.captured == 0
+            failed = [pose for pose in ended.status.session.poses if pose.state == "failed"]
+            assert len(failed) == 3, "there is no board"
+            await client.call(Finish())
+            finished = await status_when(client, lambda status: bool(status.session.recording))
+            assert 1 <= frames_in(finished.session.recording) <= 3, "some lost a packet; it sends none again"
+            assert (await stopped_in_mid_move(client, plan, arm)).camera.connected

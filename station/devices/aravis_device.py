@@ -300,6 +300,8 @@ class GenicamDevice:
             )
         wall_ns = buffer.get_system_timestamp()
         arrival_ns = monotonic_from_wall_ns(wall_ns)
+        if applied.chunks and not buffer.has_chunks():  # Aravis 0.8 reads them of GigE Vision 2 only
+            applied = self._applied = applied._replace(chunks=frozenset())
         device_ns, exposure_us, gain = self._told(buffer, applied)
         image = decode(buffer.get_data(), width, height, self._config.pixel_format)
         return Image(

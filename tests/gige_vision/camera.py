@@ -28,7 +28,7 @@ CONTROL_PORT = 3956
 _DISCOVERY, _RESEND, _READ_REGISTER, _WRITE_REGISTER = 0x0002, 0x0040, 0x0080, 0x0082
 _READ_MEMORY, _WRITE_MEMORY = 0x0084, 0x0086
 _NOT_IMPLEMENTED, _INVALID_PARAMETER, _INVALID_ADDRESS = 0x8001, 0x8002, 0x8003
-_WRITE_PROTECT, _ACCESS_DENIED, _UNAVAILABLE = 0x8004, 0x8006, 0x800C
+_WRITE_PROTECT, _ACCESS_DENIED, _UNAVAILABLE, _RESENT = 0x8004, 0x8006, 0x800C, 0x0100
 _PRIVILEGE, _HEARTBEAT, _CAPABILITY = 0xA00, 0x938, 0x934
 _STREAM_PORT, _STREAM_ADDRESS = 0xD00, 0xD18
 _CAPABILITIES = (
@@ -37,6 +37,8 @@ _CAPABILITIES = (
 _PTP_ENABLE, _EXTENDED_IDS, _FIRE_TEST, _LATCH = 0x8_0000, 0x4000_0000, 0x8000_0000, 2
 _LEADER, _TRAILER, _PAYLOAD, _EXTENDED = 1, 2, 3, 0x80
 _IP_UDP = 28
+_CHUNK_LAYOUT = 1
+"""Another one would say that chunks were switched on or off"""
 _KEPT_FRAMES = 8
 Picture = Callable[[int, int, int], NDArray[np.uint8]]
 """(number, width, height) → grey, (height, width)"""
@@ -378,6 +380,7 @@ class EmulatedCamera:
         room = (self.register(at.PACKET_SIZE) & 0xFFFF) - _IP_UDP - (20 if extended else 8)
         blocks = [data[i : i + room] for i in range(0, len(data), room)]
         trailer = struct.pack(">HHI", 0, payload_type, self.register(at.HEIGHT))
+        trailer += struct.pack(">II", len(data), _CHUNK_LAYOUT) if chunks else b""
         parts = [(_LEADER, leader), *((_PAYLOAD, b) for b in blocks), (_TRAILER, trailer)]
         return [_packet(0, frame_id, kind, n, part, extended) for n, (kind, part) in enumerate(parts)]
 
@@ -419,7 +422,7 @@ class EmulatedCamera:
         for number in range(first, min(last, first + 5000) + 1):
             if number < len(packets) and not self.forgets:
                 self.resent += 1
-                self._stream.sendto(packets[number], self._client())
+                self._stream.sendto(_marked_as_resent(packets[number], extended), self._client())
             else:
                 self.unavailable += 1
                 lost = _packet(_UNAVAILABLE, frame_id, _PAYLOAD, number, b"", extended)
@@ -430,6 +433,11 @@ def _packet(status: int, frame_id: int, kind: int, number: int, data: bytes, ext
     if extended:
         return struct.pack(">HHIQI", status, 0, (_EXTENDED | kind) << 24, frame_id, number) + data
     return struct.pack(">HHI", status, frame_id & 0xFFFF, kind << 24 | number) + data
+
+
+def _marked_as_resent(packet: bytes, extended: bool) -> bytes:
+    """By a flag beside 64-bit ids, else by the status."""
+    return packet[:3] + b"\x01" + packet[4:] if extended else struct.pack(">H", _RESENT) + packet[2:]
 
 
 def _bound(address: str) -> socket.socket:

@@ -139,7 +139,7 @@ def export(
     The file says whether the installed calibration still holds; a warning on stderr does where it does not.
     """
     calibration, validity = named_or_installed(file, root, camera)
-    names = FrameNames.of_camera(calibration.camera_name)
+    names = FrameNames.of_camera(camera if file is None else calibration.camera_name)
     frames = FrameNames(base, flange, frame or names.camera, body or names.body, validity)
     text = exports.export(calibration, str(to.value), frames)
     if validity is not None and validity.state is not ValidityState.VALID:
@@ -252,7 +252,8 @@ def _switched(version: InstalledVersion, as_json: bool) -> None:
     for run in version.hooks:
         if run.failed:
             why = run.problem or f"exit code {run.exit_code}"
-            err.print(f"Hook {run.program}: {why} Output: {folder / 'hooks.jsonl'}", style="yellow")
+            out_path = folder / "hooks.jsonl"
+            err.print(f"Hook {run.program}: {why} Output: {out_path}", style="yellow", soft_wrap=True)
 
 
 def list_installed(
@@ -295,12 +296,17 @@ def _verdict_text(calibration: Calibration) -> str:
     return text if calibration.override is None else f"{text}; {override_text(calibration.override)}"
 
 
-def history_rows(root: Path | None) -> list[tuple[str, str, str, str]]:
-    """For the report: version, when and by whom, what was done, change."""
-    return [
+def history_rows(root: Path | None, camera: str) -> list[tuple[str, str, str, str]]:
+    """For the report: version, when and by whom, what was done, change; at last whether it still holds."""
+    rows = [
         (str(entry.generation), f"{entry.wall}, {entry.who}", entry.action, entry.change)
-        for entry in read_log(root)
+        for entry in read_log(root, camera)
     ]
+    if not rows:
+        return []
+    held = current_validity(readable_folder(root, camera))
+    state = held.state.replace("-", " ")
+    return [*rows, (str(held.version), f"{held.since}, {held.who}", state, held.reason.text)]
 
 
 def _plain(camera: str, version: InstalledVersion) -> ListedJson:

@@ -147,13 +147,13 @@ def _write_report(job: SolvedRecording, target: Path, options: JobOptions, root:
         peers = compare_all(job.views, solver_options(options, job))
     except CalibrationError:  # the report stands without the comparison
         peers = []
-    write_report(job, target, peers, history_rows(root), _touches(job, root))
+    write_report(job, target, peers, history_rows(root, job.calibration.camera_name), _touches(job, root))
 
 
 def _touches(job: SolvedRecording, root: Path | None) -> list[Touch]:
     """Touch tests of the installed calibration, when it is of this recording."""
     try:
-        installed = installed_calibration(root)
+        installed = installed_calibration(root, job.calibration.camera_name)
     except CalibrationError:
         return []
     same = installed.provenance.recording_sha256 == job.calibration.provenance.recording_sha256

@@ -59,7 +59,7 @@ def announce(root: Path | None, camera: str, event: HookEvent, validity: Validit
     Each program gets the event as its argument and CALIBRATION_EVENT, _CAMERA, _VERSION, _STATE, _SINCE,
     _REASON, _TEXT and _PATH (of `current`) in its environment.
     """
-    folder = calibrations_folder(root, camera)
+    folder = calibrations_folder(root, camera).absolute()
     fields = {
         "CALIBRATION_EVENT": event,
         "CALIBRATION_CAMERA": camera,
@@ -71,7 +71,7 @@ def announce(root: Path | None, camera: str, event: HookEvent, validity: Validit
         "CALIBRATION_PATH": str(folder / "current"),
     }
     _tell_journal(fields, _PRIORITY.get(validity.state, 5))
-    runs = tuple(_runs(state_root(root) / "hooks", event, fields))
+    runs = tuple(_runs(state_root(root).absolute() / "hooks", event, fields))
     with suppress(OSError):  # the change is made and told; the runs are in the answer
         for run in runs:
             append_line(folder / "hooks.jsonl", run)

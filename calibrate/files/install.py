@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import shlex
 from collections.abc import Callable
 from dataclasses import replace
@@ -56,6 +57,7 @@ _CELL_OF: dict[Source, Cell] = {
 }
 _ARTICLE: dict[Cell, str] = {"real": "a", "imported": "an", "simulated": "a"}
 
+_LOG = logging.getLogger(__name__)
 WORSE_TIMES = 1.5
 """More than the estimates of two good sessions differ by chance."""
 REASON_LETTERS = 5
@@ -270,7 +272,9 @@ def _change_validity(
             append_line(folder / VALIDITY_FILE, after)
     told = after.at(datetime.now(UTC))
     if told.state is not shown.state:
-        announce(root, camera, told.state.value, told)
+        for run in announce(root, camera, told.state.value, told):
+            if run.failed:
+                _LOG.warning("Hook %s: %s", run.program, run.problem or f"exit code {run.exit_code}")
     return told
 
 

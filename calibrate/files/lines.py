@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import os
+import stat
+from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
@@ -13,7 +15,10 @@ S = TypeVar("S", bound=msgspec.Struct)
 
 def append_line(path: Path, entry: object) -> None:
     """Append a struct or dataclass. Raises OSError. What a crash left half-written is ended first."""
+    new = not path.exists()
     with path.open("a+b") as file:
+        if new:
+            share(path)
         if file.tell() > 0:
             file.seek(-1, os.SEEK_END)
             if file.read(1) != b"\n":
@@ -21,6 +26,14 @@ def append_line(path: Path, entry: object) -> None:
         file.write(msgspec.json.encode(entry) + b"\n")
         file.flush()
         os.fsync(file.fileno())
+
+
+def share(path: Path) -> None:
+    """Let the group write to what was just made here where it may write to the folder: operators share it."""
+    group_writes = path.parent.stat().st_mode & stat.S_IWGRP
+    if group_writes:
+        with suppress(PermissionError):  # another operator made it
+            path.chmod(path.stat().st_mode | stat.S_IRGRP | group_writes)
 
 
 def read_lines(path: Path, kind: type[S]) -> list[S]:

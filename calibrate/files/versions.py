@@ -28,7 +28,7 @@ import msgspec
 from calibrate.errors import CalibrationFileError, InstallError
 from calibrate.files.calibration import Calibration, decode_calibration, encode_calibration, read_calibration
 from calibrate.files.hooks import HookRun
-from calibrate.files.lines import append_line, read_lines
+from calibrate.files.lines import append_line, read_lines, share
 from calibrate.files.loader import VERSION_NAME, readable_folder
 from calibrate.files.validity import FILE as VALIDITY_FILE
 from calibrate.files.validity import Validity, ValidityState, read_validity, time_text, unrecorded
@@ -180,8 +180,11 @@ def _switch(folder: Path, name: str, content: bytes) -> None:
 def locked(folder: Path) -> Iterator[None]:
     """One installer at a time; the folders exist inside."""
     try:
-        (folder / "gen").mkdir(parents=True, exist_ok=True)
-        descriptor = os.open(folder / "lock", os.O_RDWR | os.O_CREAT, 0o640)
+        for part in (folder.parent, folder, folder / "gen", folder / "lock"):
+            if not part.exists():
+                part.touch() if part.name == "lock" else part.mkdir(parents=True, exist_ok=True)
+                share(part)
+        descriptor = os.open(folder / "lock", os.O_RDWR)
     except OSError as problem:
         raise InstallError(
             f"{folder} cannot be used: {problem.strerror}.",

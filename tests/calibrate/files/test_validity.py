@@ -271,8 +271,10 @@ def hook(root: Path, name: str, text: str, mode: int = 0o755) -> Path:
 
 
 def test_hooks_run_in_order_with_what_happened_and_their_output_is_kept(
-    root: Path, make_file: MakeFile
+    root: Path, make_file: MakeFile, monkeypatch: pytest.MonkeyPatch
 ) -> None:
+    monkeypatch.chdir(root.parent)
+    root = root.relative_to(root.parent)  # as a person types it
     hook(root, "10-tell", 'echo "$1 $CALIBRATION_CAMERA $CALIBRATION_VERSION $CALIBRATION_STATE"')
     hook(root, "20-fail", "echo no; exit 3")
     made = install(make_file(0.001), root)

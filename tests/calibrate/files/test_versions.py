@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import tempfile
 from pathlib import Path
 
 import msgspec
@@ -158,3 +160,32 @@ def test_another_mount_does_not_follow(make_file, tmp_path: Path) -> None:  # ty
     install(make_file(), tmp_path / "s")
     with raises_code(InstallError, "objection", objections=1):
         install(make_file(mount="eye-to-hand"), tmp_path / "s")
+
+
+@pytest.mark.skipif(os.getuid() != 0, reason="only root can be two operators")
+def test_two_operators_of_a_group_share_a_folder(make_file) -> None:  # type: ignore[no-untyped-def]
+    """As /var/lib/station/calibrations: setgid, the group may write."""
+    with tempfile.TemporaryDirectory() as place:  # pytest's own folders are for one user
+        Path(place).chmod(0o755)
+        shared = Path(place) / "s" / "calibrations"
+        shared.mkdir(parents=True)
+        os.chown(shared, 65531, 65530)
+        shared.chmod(0o2775)
+        for operator, shift_m in ((65531, 0.0), (65532, 0.001)):
+            file = Path(place) / f"{operator}.yaml"
+            file.write_bytes(make_file(shift_m).read_bytes())
+            file.chmod(0o644)
+            child = os.fork()
+            if child == 0:
+                os.umask(0o022)
+                os.setgroups([65530])
+                os.setgid(operator)
+                os.setuid(operator)
+                try:
+                    install(file, shared.parent)
+                    os._exit(0)
+                except BaseException as problem:
+                    print(problem, flush=True)
+                    os._exit(1)
+            assert os.waitpid(child, 0)[1] == 0
+        assert [version.current for version in installed_versions(shared.parent)] == [False, True]

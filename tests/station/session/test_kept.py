@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 
+import msgspec
 import pytest
 
 from recordings.errors import RecordingError
@@ -117,3 +118,14 @@ async def test_the_name_of_a_sessions_folder_is_on_the_disk_before_its_first_pos
         until_then = list(order)
         await rig.until(S.IDLE)
     assert {"sync sessions", f"sync {rig.session.context.root.name}"} <= set(until_then)
+
+
+@pytest.mark.parametrize(("name", "kept"), [("main", ""), ("overhead", "overhead")])
+async def test_the_cameras_name_goes_with_its_recording(rig: Rig, name: str, kept: str) -> None:
+    """Under it the calibration is installed; recordings of a cell with one camera stay as they were."""
+    cell = rig.session.context.cell
+    camera = msgspec.structs.replace(cell.config.camera, name=name)
+    cell.config = msgspec.structs.replace(cell.config, camera=camera)
+    await rig.give_go()
+    await rig.until(S.IDLE)
+    assert sealed(rig).info.camera_identity.name == kept

@@ -125,7 +125,7 @@ async def test_the_cameras_name_goes_with_its_recording(rig: Rig, name: str, kep
     """Under it the calibration is installed; recordings of a cell with one camera stay as they were."""
     cell = rig.session.context.cell
     camera = msgspec.structs.replace(cell.config.camera, name=name)
-    cell.config = msgspec.structs.replace(cell.config, camera=camera)
+    object.__setattr__(cell, "config", msgspec.structs.replace(cell.config, camera=camera))
     await rig.give_go()
     await rig.until(S.IDLE)
     assert sealed(rig).info.camera_identity.name == kept

@@ -468,14 +468,12 @@ def limits_of(draft: Draft, found: FoundCell) -> LimitsConfig:
 
 
 def table_height_m(draft: Draft, found: FoundCell) -> float:
-    """As a person said; else just below a board that lies, else the height of the arm's base."""
+    """As a person said; else the height of the arm's base, or just below a board that lies lower."""
     if draft.table_m is not None:
         return draft.table_m
     if draft.mount == "eye-in-hand" and draft.board is not None:
-        corners = transform_points(found.Y, board_points(draft.board))
-        if abs(found.Y[2, 2]) > math.cos(math.radians(15)):
-            return float(corners[:, 2].min()) - _BELOW_BOARD_M
-        return min(0.0, float(corners[:, 2].min()) - _BELOW_BOARD_M)
+        lowest_m = float(transform_points(found.Y, board_points(draft.board))[:, 2].min())
+        return min(0.0, lowest_m - _BELOW_BOARD_M)
     return 0.0
 
 

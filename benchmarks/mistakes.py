@@ -63,7 +63,7 @@ class Said:
     """What `calibrate solve` answers."""
 
     code: str
-    """The hypothesis where one is named; else the error's class; else the verdict."""
+    """The hypothesis where one is named; else the error's code; else the verdict."""
     hypothesis: str
     rejected: tuple[int, ...]
     """Views of which it is said that their recorded pose belongs to another picture."""
@@ -79,10 +79,8 @@ class Mistake:
     name: str
     make: Callable[[MadeSession], MadeSession]
     causes: tuple[str, ...]
-    """Hypotheses that are true of it. Some mistakes are the same to the data: inverted poses and the other
+    """Codes that are true of it. Some mistakes are the same to the data: inverted poses and the other
     mounting; in eye-to-hand a board that slipped on the flange and a changed TCP."""
-    words: str
-    """The cause in a sentence, for answers that carry no hypothesis."""
     rejected: tuple[int, ...] = ()
     """Views whose poses were exchanged: these must be named, and no others."""
 
@@ -94,7 +92,7 @@ def what_is_said(folder: Path, output: Path) -> Said:
         job = solve_recording(output)
     except (CalibrationError, RecordingError) as error:
         hypothesis = str(getattr(error, "hypothesis", "") or "")
-        return Said(hypothesis or type(error).__name__, hypothesis, (), str(error), answered=False)
+        return Said(hypothesis or error.code, hypothesis, (), str(error), answered=False)
     answer = solve_json(job)
     hypothesis = answer["session"]["hypothesis"]
     if hypothesis == Reading.AS_RECORDED.value:
@@ -116,9 +114,7 @@ def named_truly(mistake: Mistake, said: Said) -> bool:
         return said.rejected == mistake.rejected
     if not mistake.causes:
         return said.answered and not (said.hypothesis or said.rejected or said.inconsistent)
-    if said.hypothesis:
-        return said.hypothesis in mistake.causes
-    return re.search(mistake.words, said.text, re.IGNORECASE) is not None
+    return said.code in mistake.causes
 
 
 def _half(session: MadeSession) -> slice:
@@ -207,31 +203,27 @@ def _zoomed_out(image: Array) -> Array:
 
 _CONVENTION = ("inverse-poses",)
 _FRAME = ("board-moved", "camera-moved")
-_SIZE_WORDS = r"square_m|squares of|size of (the )?square|board scaled"
 MISTAKES = (
-    Mistake("none", lambda session: session, (), ""),
-    Mistake("two poses swapped", _with_poses(_swap), (), "", rejected=_SWAPPED),
-    Mistake(
-        "poses shifted by one picture", _shift, ("shifted-pictures",), r"shifted|one picture (later|earlier)"
-    ),
-    Mistake("millimetres", _with_poses(_millimetres), ("millimetres",), r"not millimetres"),
-    Mistake("quaternion w first", _w_first, ("quaternion-order",), r"order w, x, y, z"),
-    Mistake("inverse poses", _with_poses(_invert), _CONVENTION, r"flange_from_base in place"),
-    Mistake("other mounting", _other_mount, _CONVENTION, r"in place of base_from_flange.*other mount"),
+    Mistake("none", lambda session: session, ()),
+    Mistake("two poses swapped", _with_poses(_swap), (), rejected=_SWAPPED),
+    Mistake("poses shifted by one picture", _shift, ("shifted-pictures",)),
+    Mistake("millimetres", _with_poses(_millimetres), ("not-metres",)),
+    Mistake("quaternion w first", _w_first, ("quaternion-order",)),
+    Mistake("inverse poses", _with_poses(_invert), _CONVENTION),
+    Mistake("other mounting", _other_mount, _CONVENTION),
     Mistake(
         "rotation vector as rpy",
         _with_poses(_vector_as_angles),
         ("rotation-vector-as-angles", "angles-as-rotation-vector"),
-        r"rotation vectors that were read as roll",
     ),
-    Mistake("square size + 4 %", _size(1.04), ("square-size",), _SIZE_WORDS),
-    Mistake("square size - 4 %", _size(0.96), ("square-size",), _SIZE_WORDS),
-    Mistake("square size × 2", _size(2.0), ("square-size",), _SIZE_WORDS),
-    Mistake("square size × 0.5", _size(0.5), ("square-size",), _SIZE_WORDS),
-    Mistake("mirrored pictures", _mirror, ("mirrored-pictures", "mirrored"), r"mirror"),
-    Mistake("refocused at half", _refocus, ("refocused",), r"focus"),
-    Mistake("TCP changed at half", _with_poses(_change_tcp), ("camera-moved",), r"TCP"),
-    Mistake("board moved at half", _with_poses(_move_board), ("board-moved",), r"board (was )?moved"),
+    Mistake("square size + 4 %", _size(1.04), ("square-size",)),
+    Mistake("square size - 4 %", _size(0.96), ("square-size",)),
+    Mistake("square size × 2", _size(2.0), ("square-size",)),
+    Mistake("square size × 0.5", _size(0.5), ("square-size",)),
+    Mistake("mirrored pictures", _mirror, ("mirrored-pictures", "mirrored")),
+    Mistake("refocused at half", _refocus, ("refocused",)),
+    Mistake("TCP changed at half", _with_poses(_change_tcp), ("camera-moved",)),
+    Mistake("board moved at half", _with_poses(_move_board), ("board-moved",)),
 )
 
 

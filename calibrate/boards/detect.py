@@ -118,7 +118,7 @@ def _reason(grey: Grey, spec: BoardSpec, count: int, fewest: int, thorough: bool
         return "few-corners", f"{count} corners of the board are seen (minimum {fewest})"
     level = float(grey.mean())
     if level < 12.0:
-        return "too-dark", f"the image is too dark (mean grey {level:.0f})"
+        return "too-dark", f"the image is dark (mean grey {level:.0f}): lens covered, or light off"
     if float((grey >= _SATURATED_GREY).mean()) > 0.5:
         return "over-exposed", "the image is over-exposed: more than half of it is saturated"
     if float(grey.std()) < 3.0:

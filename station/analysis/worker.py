@@ -181,6 +181,8 @@ class ExposureAdvice:
     """Sigma of the sharpest edges; None where there is too little contrast to tell."""
     warnings: tuple[str, ...]
     """Sentences for people; empty = all is well."""
+    causes: tuple[str, ...] = ()
+    """Beside each of them, for programs: over-exposed, under-exposed, low-contrast, blurred."""
 
 
 def assess(
@@ -202,18 +204,23 @@ def assess(
     wanted_us, wanted_db = _settings(exposure_us, gain_db, factor)
     blur_px = _blur(grey, white - black)
     advice = f"set {wanted_us:.0f} µs and {wanted_db:.1f} dB"
-    warnings = []
+    warnings, causes = [], []
     if saturated > _SATURATED_SHARE or white > _BRIGHT_WHITE:
+        causes.append("over-exposed")
         warnings.append(f"too bright: {saturated:.1%} of the pixels are saturated; {advice}")
     elif white < _DARK_WHITE:
+        causes.append("under-exposed")
         warnings.append(f"too dark: the board's white is at {white:.0%} of full scale; {advice}")
     elif white - black < _LOW_CONTRAST:
+        causes.append("low-contrast")
         warnings.append(
             f"low contrast: white {white:.0%}, black {black:.0%}; look for reflections and stray light"
         )
     if blur_px is not None and blur_px > _BLUR_PX:
+        causes.append("blurred")
         warnings.append(f"blurred: edges are {blur_px:.1f} px wide; focus the lens, or the arm moves")
-    return ExposureAdvice(wanted_us, wanted_db, white, black, saturated, blur_px, tuple(warnings))
+    told = tuple(warnings), tuple(causes)
+    return ExposureAdvice(wanted_us, wanted_db, white, black, saturated, blur_px, *told)
 
 
 def _levels(image: Pixels) -> NDArray[np.float32]:

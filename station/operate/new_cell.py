@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from enum import StrEnum
 from itertools import combinations
 from pathlib import Path
-from typing import Protocol
+from typing import Literal, Protocol
 
 import cv2
 import msgspec
@@ -39,7 +39,7 @@ from recordings.schema.messages import (
     Vector6,
 )
 from station.analysis.estimation import quick_sigma, solve_quickly
-from station.analysis.worker import CapturedView
+from station.analysis.worker import CapturedView, assess
 from station.cell.config import (
     CameraConfig,
     LimitsConfig,
@@ -73,6 +73,8 @@ _WRONG_SCALE = 0.03
 """Share by which the squares may differ from what is stated before a person is told."""
 _SCALE_SIGMA, _TRAVEL_M = 0.5, 0.001
 """What is known of it before, and how well the arm's travel and the camera's agree."""
+_LIT = 0.15
+"""Brightest part of an image without a board, of full scale, that could be read."""
 _OTHER_MOUNT = 3.0
 """The other mounting fits so many times better: the answer was wrong."""
 _ROOM_M = 0.35
@@ -251,6 +253,19 @@ def read_board(text: str) -> BoardSpec:
     return BoardSpec(kind=BoardKind.CHESSBOARD, columns=columns, rows=rows, square_m=size_mm / 1000)
 
 
+def image_trouble(image: Image, found: Detection) -> tuple[str, str]:
+    """What is wrong with an image, for a program and for a person; both empty: the board is seen well."""
+    advice = assess(image.pixels, found.pixels if found.found else None, image.exposure_us, image.gain_db)
+    if found.cause and found.cause != "not-found":
+        return found.cause, found.reason
+    told = dict(zip(advice.causes, advice.warnings, strict=True))
+    if not found.found and advice.white > _LIT:
+        told.pop("under-exposed", None)  # the board's paper is the brightest thing, and it is not there
+        told.pop("low-contrast", None)
+    cause = next(iter(told), "")
+    return (cause, told[cause]) if cause else (found.cause, found.reason)
+
+
 def guided_view(state: RobotState, tcp_offset: Vector6, found: Detection) -> GuidedView:
     """The view of an arm at rest."""
     tcp = pose_from_rotvec(tcp_offset[:3], tcp_offset[3:])
@@ -341,16 +356,25 @@ class FoundCell:
         return self.sigma_m <= GOOD_M and self.sigma_rad <= GOOD_RAD and not self.warning
 
     @property
+    def cause(self) -> Literal["", "other-mounting", "square-size", "moved"]:
+        """What cannot be right, for a program; empty: it can."""
+        if self.other_fits:
+            return "other-mounting"
+        if abs(self.scale - 1) > _WRONG_SCALE:
+            return "square-size"
+        return "moved" if self.spread_m > _MOVED_M else ""
+
+    @property
     def warning(self) -> str:
         """Why this cannot be right, and what to do; empty: it can."""
-        if self.other_fits:
+        if self.cause == "other-mounting":
             return "These views fit the other drawing (step 3): the camera is mounted the other way."
-        if abs(self.scale - 1) > _WRONG_SCALE:
+        if self.cause == "square-size":
             return (
                 f"By the arm's travel the squares are {self.scale:.2f} times as large as stated (step 4). "
                 "Measure one square."
             )
-        if self.spread_m > _MOVED_M:
+        if self.cause == "moved":
             return (
                 f"The board or the camera moved: the views see it {1000 * self.spread_m:.0f} mm apart. "
                 "Fix both, and take the views again (F3)."

@@ -204,6 +204,8 @@ class NewCell(App[Ending]):
         self._moved_s = time.monotonic()
         self._seen: tuple[float, Detection] | None = None
         """When the newest image was begun, and the board in it."""
+        self._trouble = ""
+        """Fault of the newest image; empty: none."""
         self._busy = False
         self._pictures = 0
         self.views_taken_by_hand = 0
@@ -385,6 +387,7 @@ class NewCell(App[Ending]):
                 detect, image.pixels, board, step is Step.BOARD and self._seen is None
             )
             self._seen = (begun_s, found)
+            self._trouble = flow.image_trouble(image, found)[1]
         await self._show_picture(image.pixels, found)
         if found is not None and found.found and step is Step.VIEWS and not self._busy:
             missing = flow.what_is_missing(self.draft, self._flange())
@@ -737,8 +740,9 @@ class NewCell(App[Ending]):
             return f"{describe_board(self.draft.board)}: looking …"
         found = self._seen[1]
         if not found.found:
-            return f"✗ {describe_board(self.draft.board)} is not seen: {found.reason or 'not in the picture'}"
-        return f"✓ {len(found.pixels)} corners; O is the origin, x and y the axes"
+            return f"✗ {self._trouble or 'not in the picture'}"
+        seen = f"✓ {len(found.pixels)} corners; O is the origin, x and y the axes"
+        return f"{seen}\n! {self._trouble}" if self._trouble else seen
 
     def _view_lines(self) -> list[str]:
         missing = flow.what_is_missing(self.draft, self._flange())

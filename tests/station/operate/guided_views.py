@@ -26,7 +26,7 @@ def guided_joints(truth: CellTruth) -> list[Array]:
     in_hand = truth.mount == "eye-in-hand"
     first = inverse(flange @ X) @ Y if in_hand else inverse(X) @ flange @ Y
     middle = transform_points(first, board_points(truth.board).mean(axis=0))
-    found = []
+    found: list[Array] = []
     for tilt, nearer_m in zip(TILTS, NEARER_M, strict=True):
         R = rotation_exp(np.array(tilt))
         away = middle * (1 + nearer_m / middle[2])

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 
+from benchmarks.operator_mistakes import MISTAKES, Mistake
 from calibrate.geometry import difference
 from recordings.schema.messages import Mount
 from station.cell.config import matrix4
@@ -102,3 +103,12 @@ def test_a_board_is_typed_as_people_write_it() -> None:
     for wrong in ("", "8x5", "8 5 30", "8x5 0.03", "2x5 30", "8x5 30 4"):
         with raises("no-board-typed"):
             flow.read_board(wrong)
+
+
+@pytest.mark.parametrize(
+    ("mistake"),
+    [m for m in MISTAKES if {"too-dark", "not-found", "squares-counted", "blurred"} & set(m.causes)],
+    ids=lambda mistake: mistake.name,
+)
+async def test_a_fault_of_the_picture_is_named(mistake: Mistake) -> None:
+    assert (await mistake.plant()).code in mistake.causes

@@ -50,6 +50,7 @@ def sweep(
                 "agrees": found.agrees,
                 "source": found.source,
                 "bound_s": found.bound_s,
+                "derived_s": found.derived_s,
                 "rms_deg": math.degrees(found.rms_rad),
                 "pairs": found.pairs,
                 "lost": found.lost,
@@ -62,6 +63,9 @@ def sweep(
         out.print("This recording is of an earlier version: its times are arrivals, not mid-exposures.")
         return
     out.print(f"Frame times are known by {found.source}, within {1000 * found.bound_s:.2f} ms.")
+    if found.derived_s is not None:
+        moved = f"{1000 * found.derived_s:.2f} ms"
+        out.print(f"Derived again from the raw readings of the camera's clock, they move by {moved} at most.")
     if found.agrees:
         out.print("They agree with the robot: nothing to correct.")
     else:

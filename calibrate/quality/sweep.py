@@ -29,6 +29,7 @@ from calibrate.lens.pnp import candidate_poses
 from calibrate.views import BoardView, ViewSet
 from recordings.errors import BadImageError
 from recordings.reader import Recording
+from recordings.schema.frame_time import derived_again
 from recordings.schema.messages import CameraModel, Image, TimeSource
 
 FEWEST_PICTURES = 12
@@ -66,6 +67,8 @@ class TimeOffset:
     """How most frames' times are known; None in recordings without frame times"""
     bound_s: float | None = None
     """Largest 95 % bound of those times"""
+    derived_s: float | None = None
+    """Largest difference to times derived again from the raw readings of the camera's clock"""
 
     @property
     def agrees(self) -> bool:
@@ -112,7 +115,15 @@ def sweep_time_offset(recording: Recording, camera: CameraModel | None = None) -
         lost=tuple(lost),
         source=sources[0][0] if sources else None,
         bound_s=max((time.bound_s for time in told), default=None),
+        derived_s=max(_derived_differences_s(recording), default=None),
     )
+
+
+def _derived_differences_s(recording: Recording) -> Iterator[float]:
+    for part in recording.segments:
+        frames = ((f.stamps.device_ns, f.exposure_us, f.time) for f in part.image_facts() if f.time)
+        for recorded, derived in derived_again(frames, list(part.clock_readings())):
+            yield abs(derived.host_monotonic_ns - recorded.host_monotonic_ns) / 1e9
 
 
 def at_time_offset(recording: Recording, views: ViewSet, offset_s: float) -> ViewSet:

@@ -19,7 +19,16 @@ from calibrate.views import BoardView, ViewSet
 from recordings import strict_yaml
 from recordings.images import encode_png
 from recordings.reader import open_recording
-from recordings.schema.messages import CameraModel, FrameTime, Image, RobotState, SessionInfo, Stamps, View
+from recordings.schema.messages import (
+    CameraModel,
+    ClockReading,
+    FrameTime,
+    Image,
+    RobotState,
+    SessionInfo,
+    Stamps,
+    View,
+)
 from recordings.writer import RecordingWriter
 from station.cell.config import PAPER_BOARD, CameraConfig, matrix4
 from station.simulation.renderer import Light, render, scaled
@@ -66,9 +75,12 @@ def record(
             )
             cut = encode_png(image)[:-2000] if k == broken else None
             told = None
+            readings = ()
             if time_error_s is not None:
                 told = FrameTime(start_ns + round((t + time_error_s) * 1e9), 0.001, "latched")
-            writer.image(Image(image, stamps, k + 1, k, time=told), cut)
+                host_ns, device_ns = start_ns + round(t * 1e9), stamps.device_ns
+                readings = (ClockReading(host_ns - 200_000, host_ns + 200_000, device_ns),)
+            writer.image(Image(image, stamps, k + 1, k, time=told, clock_readings=readings), cut)
         return writer.finish()
 
 
@@ -84,6 +96,7 @@ def test_it_tests_the_very_time_of_the_frames(tmp_path: Path, error_s: float) ->
     found = sweep_time_offset(open_recording(record(tmp_path / "sweep.mcap", 60, time_error_s=error_s)))
     assert found.offset_s == pytest.approx(-error_s, abs=3 * found.sigma_s) and found.sigma_s < 0.0005
     assert (found.source, found.bound_s, found.agrees) == ("latched", 0.001, error_s == 0)
+    assert found.derived_s == pytest.approx(abs(error_s), abs=1e-5), "the raw readings tell the truth again"
 
 
 def test_what_it_measured_goes_into_the_configuration_and_into_a_solve(tmp_path: Path) -> None:

@@ -177,9 +177,8 @@ def _camera(config: StationConfig, trigger: Trigger | None) -> tuple[Camera, Sou
 
         return AravisCamera(config.camera, trigger), "real"
     if config.camera.driver == "webcam":
-        from station.devices.webcam import WebcamCamera, require_device
+        from station.devices.webcam import WebcamCamera
 
-        require_device(config.camera)
         return WebcamCamera(config.camera), "real"
     # A recorded or rendered image beside an arm that really moves would be a wrong calibration.
     raise ConfigError(

@@ -18,7 +18,7 @@ from recordings import strict_yaml
 from recordings.files import is_session_name
 from recordings.schema.messages import BoardSpec
 from recordings.strict_yaml import YamlProblem
-from station.cell.config import Plane, PoseGuess, StationConfig
+from station.cell.config import CameraConfig, Plane, PoseGuess, StationConfig
 from station.cell.errors import ConfigError
 from station.cell.limits import SPEED_CAP_M_S
 
@@ -149,6 +149,15 @@ def _readable(plain: dict[str, Any]) -> tuple[StationConfig, set[str]]:
     return StationConfig(**values), known
 
 
+def _webcam_problems(camera: CameraConfig) -> Iterator[YamlProblem]:
+    if camera.trigger == "hardware":
+        yield YamlProblem(0, "camera.trigger", "a webcam has no trigger line", "Choose software.")
+    if camera.device and not camera.device.isdecimal() and not camera.device.startswith("/dev/"):
+        # A film beside an arm that really moves would be a wrong calibration.
+        text = f"'{camera.device}' is no webcam of this computer"
+        yield YamlProblem(0, "camera.device", text, "Give its number, or its link in /dev/v4l/by-id.")
+
+
 def _meaning_problems(config: StationConfig) -> Iterator[YamlProblem]:
     """Finds what types cannot say: ranges, and things that must fit each other."""
     limits, robot, camera = config.limits, config.robot, config.camera
@@ -185,6 +194,8 @@ def _meaning_problems(config: StationConfig) -> Iterator[YamlProblem]:
         yield YamlProblem(
             0, "camera.trigger", text, "Add `trigger: {port: /dev/ttyACM0}`, or choose software."
         )
+    if camera.driver == "webcam":
+        yield from _webcam_problems(camera)
     try:
         check_board(config.board)
     except BoardError as problem:

@@ -22,7 +22,7 @@ import numpy as np
 from recordings.schema.frame_time import by_arrival
 from recordings.schema.messages import CameraIdentity, Image, Stamps
 from station.cell.config import CameraConfig
-from station.cell.errors import CameraError, ConfigError
+from station.cell.errors import CameraError
 from station.devices.frames import RETAKE, CameraCounts, FrameTiming
 
 T = TypeVar("T")
@@ -45,12 +45,6 @@ class WebcamCamera:
     """`station.devices.base.Camera` and `StreamingCamera` over `config.device`: a number or a path."""
 
     def __init__(self, config: CameraConfig) -> None:
-        if config.trigger == "hardware":
-            raise CameraError(
-                "a webcam has no trigger line",
-                code="no-trigger",
-                remedy="Set camera.trigger to software or free-running.",
-            )
         self._config = config
         self._video: cv2.VideoCapture | None = None
         self._worker: ThreadPoolExecutor | None = None
@@ -129,6 +123,8 @@ class WebcamCamera:
     def _open(self) -> None:
         self._release()
         device = self._config.device or "0"
+        # The daemon tries again and again, and says itself what is missing.
+        cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
         video = cv2.VideoCapture(int(device) if device.isdecimal() else device)
         if not video.isOpened():
             raise CameraError(
@@ -274,16 +270,6 @@ class WebcamCamera:
                 self._check(video)
                 checked_s = time.monotonic()
             image = self._image(video, self._grab(video))
-
-
-def require_device(config: CameraConfig) -> None:
-    """ConfigError for a file or an address: a film beside an arm that moves would be a wrong calibration."""
-    if config.device and not config.device.isdecimal() and not config.device.startswith("/dev/"):
-        raise ConfigError(
-            f"camera.device '{config.device}' is no webcam",
-            code="unreal-camera",
-            remedy="Give its number, or its link in /dev/v4l/by-id.",
-        )
 
 
 def _wanted_size(config: CameraConfig) -> tuple[int, int] | None:

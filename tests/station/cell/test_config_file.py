@@ -161,6 +161,21 @@ def test_pictures_that_are_not_real_never_stand_beside_a_real_arm(tmp_path: Path
         configured_cell(*load_config(path), tmp_path)
 
 
+@pytest.mark.parametrize("device", ["", "0", "/dev/v4l/by-id/usb-x"])
+def test_a_webcam_is_a_device_of_this_computer(tmp_path: Path, device: str) -> None:
+    path = tmp_path / "station.yaml"
+    path.write_text(GOOD.replace("driver: aravis, device: KJ001", f"driver: webcam, device: '{device}'"))
+    assert configured_cell(*load_config(path), tmp_path).source == "real"
+
+
+@pytest.mark.parametrize("wrong", ["device: film.avi", "device: 'http://127.0.0.1/v'", "trigger: hardware"])
+def test_a_film_and_a_trigger_line_are_no_webcams(tmp_path: Path, wrong: str) -> None:
+    path = tmp_path / "station.yaml"
+    path.write_text(GOOD.replace("driver: aravis, device: KJ001", f"driver: webcam, {wrong}"))
+    with raises("invalid-config"):
+        load_config(path)
+
+
 UPSIDE_DOWN = """\
 robot: {model: UR10, host: 192.0.2.10}
 camera:

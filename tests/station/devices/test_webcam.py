@@ -9,11 +9,9 @@ import cv2
 import numpy as np
 import pytest
 
-from station.cell.config import CameraConfig, CaptureConfig, RobotConfig, StationConfig
-from station.daemon import configured_cell
+from station.cell.config import CameraConfig, CaptureConfig
 from station.devices import webcam
 from station.devices.webcam import WebcamCamera
-from station.simulation.scenes import make_cell
 from tests.codes import raises
 
 SIZE = (240, 320)
@@ -142,25 +140,6 @@ async def test_a_webcam_that_is_gone_is_opened_again(controls: type[Controls], p
 async def test_no_webcam_at_all() -> None:
     with raises("no-camera"):
         await WebcamCamera(CameraConfig(driver="webcam", device="/dev/video-none")).open()
-
-
-def test_it_has_no_trigger_line() -> None:
-    with raises("no-trigger"):
-        WebcamCamera(CameraConfig(driver="webcam", trigger="hardware"))
-
-
-@pytest.mark.parametrize(
-    ("device", "taken"),
-    [("0", True), ("/dev/v4l/by-id/usb-x", True), ("film.avi", False), ("http://127.0.0.1/video", False)],
-)
-def test_a_film_is_no_webcam_of_a_cell_with_a_real_arm(tmp_path: Path, device: str, taken: bool) -> None:
-    camera = CameraConfig(driver="webcam", device=device)
-    config = StationConfig(RobotConfig("UR10", "192.0.2.1"), camera, make_cell().board)
-    if taken:
-        assert configured_cell(config, b"", tmp_path).source == "real"
-    else:
-        with raises("unreal-camera"):
-            configured_cell(config, b"", tmp_path)
 
 
 @pytest.mark.skipif(not DEVICES, reason="this machine has no /dev/video*: the driver is tried on films only")

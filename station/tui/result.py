@@ -17,6 +17,7 @@ from textual.widgets import Static
 
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import Calibration, read_calibration
+from calibrate.files.formatting import arm_sentences
 from calibrate.files.install import objections_beside
 from calibrate.files.validity import ValidityState, validity_text
 from calibrate.files.verification import agrees, touch_text
@@ -95,7 +96,7 @@ def answer_text(calibration: Calibration) -> Text:
     if quality.holdout is not None:
         e_t, e_R = quality.holdout.e_t_m, quality.holdout.e_R
         lines.append(f"held-out error e_t {1000 * e_t:.2f} mm, e_R {e_R:.4f}")
-    return Text("\n".join([*lines, *quality.warnings]))
+    return Text("\n".join([*lines, *arm_sentences(calibration), *quality.warnings]))
 
 
 def residual_text(calibration: Calibration) -> Text:

@@ -1,0 +1,94 @@
+"""The exported arm, chained by pytransform3d: the corrected arm to 1e-9 m, with its own camera."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import msgspec
+import numpy as np
+import pytest
+import yaml
+
+from calibrate.files.calibration import Calibration, FramePose
+from calibrate.files.exports import export
+from calibrate.geometry import Array, Transform, pose, rotation_exp
+from recordings.schema.messages import CameraIdentity, RobotIdentity
+from station.simulation.scenes import make_cell
+from tests.calibrate.files.test_exports import offered_arm
+from tests.foreign.judges import FOLDER, missing
+from tests.station.hover_cell import calibration_of
+
+JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+POSTURES = np.random.default_rng(5).uniform(-3, 3, (30, 6))
+
+
+@pytest.fixture(scope="module")
+def calibration() -> Calibration:
+    made = calibration_of(make_cell(), RobotIdentity("UR10e"), CameraIdentity(model="camera"))
+    own = pose(rotation_exp([0.4, -2.1, 1.3]), [0.12, -0.05, 0.17])
+    arm = offered_arm(FramePose.of(Transform("corrected_flange", "camera", own)))
+    return msgspec.structs.replace(made, arm_table=arm)
+
+
+def by_pytransform3d(path: Path, parent: str, child: str) -> Array:
+    """(n, 4, 4) at `POSTURES`."""
+    library = FOLDER / "python"
+    if not (library / "pytransform3d").is_dir():
+        missing("pytransform3d")
+    script = Path(__file__).with_name("pytransform3d_urdf.py")
+    postures = [
+        {f"{name}_joint": q for name, q in zip(JOINTS, row, strict=True)} for row in POSTURES.tolist()
+    ]
+    ran = subprocess.run(
+        [sys.executable, str(script), str(path), parent, child],
+        input=json.dumps(postures),
+        env={**os.environ, "PYTHONPATH": str(library)},
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=120,
+    )
+    return np.array(json.loads(ran.stdout))
+
+
+def own(calibration: Calibration) -> Array:
+    assert calibration.arm_table is not None
+    return np.array([calibration.arm_table.base_from_flange(row).matrix for row in POSTURES])
+
+
+def test_the_urdf(calibration: Calibration, tmp_path: Path) -> None:
+    path = tmp_path / "arm.urdf"
+    path.write_text(export(calibration, "arm-urdf"))
+    assert np.abs(by_pytransform3d(path, "base", "tool0") - own(calibration)).max() < 1e-9
+    assert calibration.arm_table is not None
+    _, X = calibration.arm_table.installable()
+    camera = by_pytransform3d(path, "base", "camera_optical_frame")
+    assert np.abs(camera - own(calibration) @ X.matrix).max() < 1e-9
+
+
+def test_the_driver_s_kinematics_file_in_the_joints_of_its_description(
+    calibration: Calibration, tmp_path: Path
+) -> None:
+    """As ur_description's macro puts it into URDF: origin xyz and rpy of each link, axis z."""
+    read = yaml.safe_load(export(calibration, "ur-kinematics"))["kinematics"]
+    parts = ['<robot name="ur">', '<link name="base_link_inertia"/>']
+    parent = "base_link_inertia"
+    for joint, link in zip(JOINTS, LINKS, strict=True):
+        place = {key: read[link][key] for key in ("x", "y", "z", "roll", "pitch", "yaw")}
+        child = f"{link}_link"
+        parts.append(
+            f'<link name="{child}"/><joint name="{joint}_joint" type="revolute"><parent link="{parent}"/>'
+            f'<child link="{child}"/><origin xyz="{place["x"]!r} {place["y"]!r} {place["z"]!r}" '
+            f'rpy="{place["roll"]!r} {place["pitch"]!r} {place["yaw"]!r}"/><axis xyz="0 0 1"/>'
+            '<limit lower="-6.3" upper="6.3" effort="1" velocity="1"/></joint>'
+        )
+        parent = child
+    path = tmp_path / "ur.urdf"
+    path.write_text("".join([*parts, "</robot>"]))
+    found = by_pytransform3d(path, "base_link_inertia", "wrist_3_link")
+    assert np.abs(found - own(calibration)).max() < 1e-9

@@ -13,6 +13,7 @@ from functools import cached_property
 from typing import Literal
 
 import numpy as np
+from scipy import linalg
 
 from calibrate.geometry import Array, perturb
 from calibrate.handeye.corners import CornerBlocks, linearise_corners
@@ -347,7 +348,11 @@ def inverse_of(N: Array) -> Array:
     infinite one.
     """
     scale = 1.0 / np.sqrt(np.maximum(np.diag(N), 1e-300))
-    values, vectors = np.linalg.eigh((N + N.T) / 2 * np.outer(scale, scale))
+    scaled = (N + N.T) / 2 * np.outer(scale, scale)
+    try:
+        values, vectors = np.linalg.eigh(scaled)
+    except np.linalg.LinAlgError:  # LAPACK's divide and conquer gives up on a matrix in some thousand
+        values, vectors = linalg.eigh(scaled, driver="ev")
     if not values[0] > -_ROUNDING:
         raise np.linalg.LinAlgError("some unknowns are left open")
     root = vectors * scale[:, None]

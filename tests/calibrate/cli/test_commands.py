@@ -31,7 +31,7 @@ def test_solve_json_is_exactly_the_contract(session_file: Path, tmp_path: Path) 
     answer = json.loads(done.stdout)
     assert list(answer) == [
         "mount", "result", "sigma", "covariance", "views", "intrinsics", "holdout", "certificate", "gates",
-        "verdict", "warnings", "cross_validation", "board", "session", "arm", "solve_ms",
+        "verdict", "warnings", "cross_validation", "board", "session", "arm", "arm_table", "solve_ms",
     ]  # fmt: skip
     assert set(answer["result"]) == {
         "parent_frame",

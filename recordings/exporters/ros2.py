@@ -16,6 +16,7 @@ import numpy as np
 from recordings.errors import RecordingError
 from recordings.images import raw_encoding
 from recordings.reader import Recording
+from recordings.schema.definitions import PictureFacts
 from recordings.schema.messages import CameraModel, Matrix4, View
 from recordings.schema.topics import Topic
 from recordings.schema.viewing import CAMERA_FRAME, JOINT_NAMES, base_from_flange, quaternion_xyzw
@@ -67,7 +68,11 @@ def _entries(messages: _Messages, recording: Recording, segment: RecordingSegmen
     """In time order."""
     counted = {view.picture_sequence: view for view in recording.views() if view.part == segment.info.part}
     stored = {message.sequence: message.time_ns for message in segment.stored(Topic.PICTURE_FACTS)}
-    times = {number: _mid_exposure_ns(counted.get(number), time_ns) for number, time_ns in stored.items()}
+    facts = {facts.sequence: facts for facts in segment.image_facts()}
+    times = {
+        number: _mid_exposure_ns(counted.get(number), facts[number], time_ns)
+        for number, time_ns in stored.items()
+    }
     states = segment.messages(Topic.ROBOT_STATE)
     first_ns = min([*times.values(), *([states.start_ns] if len(states) else [])], default=0)
     camera = segment.camera_model or segment.info.camera
@@ -79,8 +84,14 @@ def _entries(messages: _Messages, recording: Recording, segment: RecordingSegmen
     )
 
 
-def _mid_exposure_ns(view: View | None, recorded_ns: int) -> int:
-    return (view.stamps.host_wall_ns if view else 0) or recorded_ns
+def _mid_exposure_ns(view: View | None, facts: PictureFacts, recorded_ns: int) -> int:
+    """By the view, else by the frame's own time; when it was recorded where there is neither."""
+    if view is not None and view.stamps.host_wall_ns:
+        return view.stamps.host_wall_ns
+    stamps = facts.stamps
+    if facts.time is None or not stamps.host_wall_ns:
+        return recorded_ns
+    return stamps.host_wall_ns + facts.time.host_monotonic_ns - stamps.host_monotonic_ns
 
 
 def _fixed_frames(messages: _Messages, segment: RecordingSegment, time_ns: int) -> Iterator[_Entry]:

@@ -23,7 +23,7 @@ from recordings.exporters.excerpt import write_excerpt
 from recordings.exporters.folder import Target, export_recording
 from recordings.importers.folder import import_folder
 from recordings.reader import open_recording
-from recordings.schema.messages import CameraModel, Stamps
+from recordings.schema.messages import CameraModel, FrameTime, Stamps
 from recordings.schema.viewing import quaternion_xyzw
 from recordings.writer import RecordingWriter
 from tests.command_line import call
@@ -187,6 +187,19 @@ def read_bag(bag: Path) -> dict[str, list[Any]]:
             assert header.stamp.sec * 10**9 + header.stamp.nanosec == time_ns
             found.setdefault(connection.topic, []).append(message)
     return found
+
+
+def test_an_image_between_poses_has_its_own_time_in_a_bag(tmp_path: Path) -> None:
+    """Of a sweep, say: the middle of its exposure, not its arrival."""
+    arrived = make_picture(0).stamps
+    told = FrameTime(arrived.host_monotonic_ns - 21_000_000, 0.001, "latched")
+    with RecordingWriter(tmp_path / "a.mcap", make_info()) as writer:
+        writer.image(msgspec.structs.replace(make_picture(0), time=told))
+        recording = open_recording(writer.finish())
+    out = export_recording(recording, tmp_path / "bag", Target.ROS2)
+    (image,) = read_bag(out)["/camera/image_raw"]
+    stamp = image.header.stamp
+    assert stamp.sec * 10**9 + stamp.nanosec == arrived.host_wall_ns - 21_000_000
 
 
 def test_a_bag_holds_the_pose_that_counts_and_no_lens_that_nobody_knows(tmp_path: Path) -> None:

@@ -7,16 +7,18 @@ import threading
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
 
 from recordings.schema.frame_time import DeviceClock
+from recordings.schema.messages import Image, Stamps
 from station.cell.config import CameraConfig
 from station.cell.errors import CameraError
 from station.devices import aravis_device
 from station.devices.aravis import AravisCamera
 from station.devices.aravis_device import GenicamDevice
 from station.devices.frames import TriggerPulse
-from station.devices.genicam_settings import Applied, apply_settings, require_settings
+from station.devices.genicam_settings import CHUNKS, Applied, apply_settings, require_settings
 from tests.codes import raises
 
 REGION = (0, 0, 1280, 1024)
@@ -139,6 +141,35 @@ async def test_a_frame_that_nobody_asked_for_costs_the_pose_not_the_next() -> No
     device.surplus = 2
     with raises("surplus-frames"):
         await camera.capture()
+    await camera.close()
+
+
+class Turned(Device):
+    """Somebody turns a knob while it exposes; its frames bring `chunks` along."""
+
+    exposed = False
+
+    def check_settings(self) -> tuple[float, float]:
+        if self.exposed:
+            raise CameraError("another exposure", code="settings-changed")
+        return 1000.0, 0.0
+
+    def frame(self, timeout_s: float) -> Any:
+        self.exposed = True
+        return Image(np.zeros((2, 2), np.uint8), Stamps(10**9), 1, 0, exposure_us=1000.0)
+
+    def trigger(self) -> None: ...
+
+
+async def test_settings_are_read_after_the_exposure_too_unless_the_frame_tells_them() -> None:
+    camera = opened(Turned(), CameraConfig())
+    with raises("settings-changed"):
+        await camera.capture()
+    await camera.close()
+    told = Turned()
+    told.chunks = frozenset(CHUNKS)
+    camera = opened(told, CameraConfig())
+    assert (await camera.capture()).exposure_us == 1000.0
     await camera.close()
 
 

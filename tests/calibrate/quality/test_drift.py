@@ -13,15 +13,18 @@ from scipy import stats
 from calibrate.boards.model import board_points
 from calibrate.cli.drift_check import check_text
 from calibrate.errors import BadViewsError, TooFewViewsError
-from calibrate.geometry import Array, inverse, perturb, pose, rotation_exp
+from calibrate.files.calibration import FramePose
+from calibrate.geometry import Array, Transform, inverse, perturb, pose, rotation_exp
+from calibrate.kinematics import MODELS, forward
 from calibrate.lens.model import project
 from calibrate.lens.pnp import solve_pnp
 from calibrate.pipeline import SolvedRecording
 from calibrate.quality.checks import CheckEntry, append_check, earlier_results, find_trend, read_checks
-from calibrate.quality.drift import POWER, DriftCheck, Noise, judge_shift, pnp_covariance, powers
+from calibrate.quality.drift import POWER, DriftCheck, Noise, check_drift, judge_shift, pnp_covariance, powers
 from calibrate.views import BoardView, ViewSet
 from recordings.schema.messages import CameraModel, Mount
 from tests.calibrate.calling import raises_code
+from tests.calibrate.files.test_exports import offered_arm
 from tests.calibrate.sessions import PAPER_BOARD, X_TRUE, looking
 
 CAMERA = CameraModel(1280, 1024, ((1667.0, 0, 639.5), (0, 1667.0, 511.5), (0, 0, 1)), (0.0,) * 5)
@@ -270,3 +273,36 @@ def test_a_cut_history_line_is_skipped(tmp_path: Path) -> None:
     path = tmp_path / "calibrations/checks.jsonl"
     path.write_bytes(path.read_bytes() + b'{"wall_s": 12')
     assert len(read_checks(tmp_path)) == 1
+
+
+def test_a_worn_arm_is_checked_with_its_table_where_joints_are_recorded(solved_real: SolvedRecording) -> None:
+    """Views of the corrected arm, its camera where it was: nothing moved. Without joints `result` counts."""
+    rng = np.random.default_rng(6)
+    own = pose(rotation_exp([0.02, -0.01, 0.3]), [0.01, -0.06, 0.087])
+    arm = offered_arm(FramePose.of(Transform("corrected_flange", "camera", own)))
+    quality = msgspec.structs.replace(
+        solved_real.calibration.quality,
+        board=None,
+        noise={"corner_px": 0.1, "robot_mm": 0.05, "robot_deg": 0.003},
+    )
+    elsewhere = own @ pose(rotation_exp([0.0, 0.004, 0.0]), [0.002, 0.0, 0.0])
+    calibration = msgspec.structs.replace(
+        solved_real.calibration,
+        mount="eye-in-hand",
+        result=FramePose.of(Transform("flange", "camera", elsewhere)),
+        quality=quality,
+        arm_table=arm,
+    )
+    nominal, seen = MODELS[arm.model], few_views(rng, X_TRUE, 8)
+    joints = rng.uniform(-0.3, 0.3, (8, 6)) + np.array([0.0, -1.5, 1.5, -1.5, -1.5, 0.0])
+    true = np.array([arm.base_from_flange(q).matrix for q in joints])
+    Y = true[0] @ own @ seen.camera_from_board[0]
+    told = [
+        replace(v, base_from_flange=forward(nominal, q), joints_rad=q, camera_from_board=inverse(F @ own) @ Y)
+        for v, q, F in zip(seen, joints, true, strict=True)
+    ]
+    views = replace(seen, views=tuple(told))
+    with_table = check_drift(views, calibration)
+    assert with_table.passed and with_table.shift_mm < 0.05
+    bare = replace(views, views=tuple(replace(v, joints_rad=None) for v in told))
+    assert check_drift(bare, calibration).shift_mm > 1.0

@@ -27,7 +27,7 @@ from tests.tui.terminal import ScreenProcess
 
 PRESSES = 200
 CAPTURE_POSES = 12
-STOP_GOAL_MS, CPU_GOAL = 100.0, 0.15
+STOP_GOAL_MS, CPU_GOAL = 40.0, 0.10
 RUNNING = (StationState.MOVING, StationState.SETTLING, StationState.CAPTURING, StationState.WRITING)
 
 
@@ -74,10 +74,10 @@ async def _measure(sixels: bool) -> tuple[list[float], float, float, int]:
             await operator.request("make_plan", poses=CAPTURE_POSES, seed=1, timeout_s=120.0)
             screen = await asyncio.to_thread(ScreenProcess, socket, 160, 48, sixels)
             try:
-                await asyncio.to_thread(screen.wait_for, "IDLE SIMULATED")
+                await asyncio.to_thread(screen.wait_for, "● IDLE +SIMULATED")
                 await asyncio.sleep(3.0)
-                screen.press("1")
-                await asyncio.to_thread(screen.wait_for, "Detection")
+                screen.press("3")
+                await asyncio.to_thread(screen.wait_for, "Devices")
                 before = screen.pictures
                 share, watched_s = await _cpu_share(operator, screen)
                 pictures = screen.pictures - before

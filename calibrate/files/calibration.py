@@ -310,11 +310,36 @@ class Gate(msgspec.Struct, frozen=True):
     ) -> Gate:
         """Judge `value` against `limit` and render both: the only place that makes a gate's text."""
         passed = bool(np.isfinite(value) and (value >= limit if sense == "≥" else value <= limit))
-        factor, suffix = _SHOWN[unit]
-        limit_unit = suffix if suffix in ("°", " %") else ""
-        shown = f"{title}: {value * factor:.3g}{suffix} ({sense} {limit * factor:.3g}{limit_unit})"
-        text = f"{shown} PASS" if passed else f"{shown} FAIL. {remedy}"
-        return cls(name, passed, float(value), float(limit), text, unit, "" if passed else remedy)
+        gate = cls(name, passed, float(value), float(limit), "", unit, "" if passed else remedy)
+        limit_unit = _SHOWN[unit][1] if _SHOWN[unit][1] in ("°", " %") else ""
+        bare = gate.shown(limit).removesuffix(_SHOWN[unit][1])
+        text = f"{title}: {gate.shown(value)} ({sense} {bare}{limit_unit})"
+        return msgspec.structs.replace(gate, text=f"{text} PASS" if passed else f"{text} FAIL. {remedy}")
+
+    def shown(self, figure: float | None) -> str:
+        """A figure of this gate with its unit, as people read it."""
+        factor, suffix = _SHOWN.get(self.unit, (1.0, ""))
+        return "–" if figure is None else f"{figure * factor:.3g}{suffix}"
+
+    @property
+    def title(self) -> str:
+        """Its name for people."""
+        return self.text.partition(":")[0] or self.name
+
+    @property
+    def sense(self) -> Sense | None:
+        """Side of the limit on which a value passes; None where the gate is no number."""
+        if self.value is None or self.limit is None:
+            return None
+        above = self.value >= self.limit
+        return "≥" if above is self.passed else "≤"
+
+    @property
+    def narrow(self) -> bool:
+        """Passed, and within a tenth of its limit."""
+        if not self.passed or self.value is None or not self.limit:
+            return False
+        return abs(self.value / self.limit - 1) <= _NARROW
 
 
 Sense = Literal["≥", "≤"]
@@ -327,6 +352,7 @@ _SHOWN = {
     "": (1.0, ""),
 }
 """Unit inside → factor and unit where a person reads."""
+_NARROW = 0.1
 
 
 class Calibration(msgspec.Struct, frozen=True, omit_defaults=True):

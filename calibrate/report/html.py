@@ -26,6 +26,14 @@ td.n, th.n { text-align: right; font-variant-numeric: tabular-nums; }
 .pass { color: var(--good); font-weight: 700; } .fail { color: var(--bad); font-weight: 700; }
 td:first-child { white-space: nowrap; }
 .note { color: var(--soft); } .warning { color: var(--warn); } code { font-size: 13px; }
+.good, .reason, .bad { break-inside: avoid; } .reason { background: var(--warn); }
+.cards { display: grid; grid-template-columns: repeat(auto-fit, minmax(180px, 1fr)); gap: 12px;
+  margin: 16px 0; }
+.cards div { border: 1px solid var(--line); border-radius: 8px; padding: 10px 14px; }
+.cards strong { display: block; font-size: 20px; } .cards span { color: var(--soft); font-size: 13px; }
+details { border-bottom: 1px solid var(--line); } details > *:last-child { margin-bottom: 20px; }
+summary { cursor: pointer; font-size: 16px; font-weight: 600; padding: 7px 0; }
+summary span { color: var(--soft); font-weight: 400; float: right; font-size: 14px; }
 figure { margin: 8px 0; } figure svg { max-width: 100%; height: auto; } figcaption { color: var(--soft); }
 .views { display: grid; grid-template-columns: repeat(auto-fill, minmax(240px, 1fr)); gap: 12px; }
 .views img { width: 100%; border-radius: 4px; border: 1px solid var(--line); }
@@ -36,7 +44,13 @@ pre { overflow-x: auto; }
   figure { overflow-x: auto; } figure svg[width="720pt"] { max-width: none; width: 720px; }
   table { display: block; overflow-x: auto; } td:last-child:not(.n) { min-width: 11em; }
   pre { font-size: 11px; } }
-@media print { body { max-width: none; } h2 { break-after: avoid; } figure, tr { break-inside: avoid; } }
+/* On paper: verdict, result, gates, residuals and provenance, on two pages; the rest is for the screen. */
+@page { size: A4; margin: 12mm; }
+@media print { body { max-width: none; padding: 0; font-size: 11.5px; line-height: 1.35; }
+  * { print-color-adjust: exact; -webkit-print-color-adjust: exact; }
+  details.screen { display: none; } details { border: 0; } summary { list-style: none; break-after: avoid; }
+  details::details-content { content-visibility: visible; display: block; }
+  td, th { padding: 2px 12px 2px 0; } figure, tr { break-inside: avoid; } figure svg { max-height: 78mm; } }
 """
 
 
@@ -52,6 +66,29 @@ def page(title: str, sections: Iterable[str]) -> str:
 
 def heading(text: str) -> str:
     return f"<h2>{escape(text)}</h2>"
+
+
+def folded(title: str, parts: Iterable[str], *, aside: str = "", printed: bool = False) -> str:
+    """A section that opens by a click; empty without parts. `printed`: on paper open, others gone."""
+    inside = "\n".join(part for part in parts if part)
+    if not inside:
+        return ""
+    kind = "" if printed else ' class="screen"'
+    return (
+        f"<details{kind}><summary>{escape(title)}<span>{escape(aside)}</span></summary>\n{inside}</details>"
+    )
+
+
+def cards(facts: Iterable[tuple[str, str]]) -> str:
+    """Figures side by side, each with what it is."""
+    return (
+        '<div class="cards">'
+        + "".join(
+            f"<div><strong>{escape(figure)}</strong><span>{escape(what)}</span></div>"
+            for figure, what in facts
+        )
+        + "</div>"
+    )
 
 
 def paragraph(text: str, kind: str = "") -> str:

@@ -33,7 +33,8 @@ from calibrate.report import html, plots
 from calibrate.results import PeerResult
 
 _PICTURES_LIMIT = 60
-_WIDTH_PX = 480
+_WIDTHS_PX = ((12, 480), (30, 320), (_PICTURES_LIMIT, 240))
+"""Up to so many views, their pictures are so wide: a page stays below a megabyte."""
 
 
 def write_report(
@@ -58,27 +59,40 @@ def report_page(
     touches: Sequence[Touch] = (),
 ) -> str:
     name = job.recording.info.name
+    calibration = job.calibration
+    passed = len(job.gates) - len(calibration.quality.failed)
+    result = calibration.result
+    views = f"{len(job.solution.used)} used, {len(calibration.views.rejected)} rejected"
     return html.page(
         f"Calibration of {name}",
         [
-            *_verdict(job),
-            *_result(job),
-            *_touches(touches),
-            *_gates(job),
-            *_error(job),
-            *_residuals(job),
-            *_holdout(job, peers),
-            *_arm(job),
-            *_methods(peers),
-            *_lens(job),
-            *_views(job),
-            *_history(history),
-            *_provenance(job),
+            *_verdict(job, touches),
+            html.folded("Gates", _gates(job), aside=f"{passed} of {len(job.gates)} passed", printed=True),
+            html.folded(
+                "Camera pose",
+                _result(job),
+                aside=f"{result.parent_frame}_from_{result.child_frame}",
+                printed=True,
+            ),
+            html.folded("Touch tests", _touches(touches), aside=f"{len(touches)} corners", printed=True),
+            html.folded("Residuals", _residuals(job), aside="reprojection error per view", printed=True),
+            html.folded("Error sources", _error(job)),
+            html.folded("Held-out error", _holdout(job, peers)),
+            html.folded("Arm", _arm(job)),
+            html.folded("All methods on the same views", _methods(peers)),
+            html.folded("Intrinsics", _lens(job)),
+            html.folded("Views", _views(job), aside=views),
+            html.folded("Installed versions", _history(history)),
+            html.folded("Provenance", _provenance(job), printed=True),
         ],
     )
 
 
-def _verdict(job: SolvedRecording) -> Iterator[str]:
+_KINDS = {"PASS": "good", "PASS WITH A REASON": "reason", "FAIL": "bad"}
+
+
+def _verdict(job: SolvedRecording, touches: Sequence[Touch]) -> Iterator[str]:
+    """All that one screen holds: the verdict, and the figures it stands on."""
     calibration = job.calibration
     good, quality = calibration.verdict != "FAIL", calibration.quality
     yield f"<h1>Calibration of {html.escape(job.recording.info.name)}</h1>"
@@ -90,10 +104,11 @@ def _verdict(job: SolvedRecording) -> Iterator[str]:
         distance_mm = quality.working_distance_m * 1000
         expected = f"Predicted error at {distance_mm:.0f} mm: {quality.predicted_error_mm:.2f} mm (1σ)."
     yield (
-        f'<div class="verdict {"good" if good else "bad"}"><strong>'
+        f'<div class="verdict {_KINDS[calibration.verdict]}"><strong>'
         f"{html.escape(verdict_text(calibration))}</strong>"
         f"{html.escape(expected)}</div>"
     )
+    yield html.cards(_figures(job, touches))
     for warning in quality.warnings:
         yield html.paragraph(warning, "warning")
 
@@ -119,11 +134,24 @@ def rehearsal_text(job: SolvedRecording) -> str:
     )
 
 
+def _figures(job: SolvedRecording, touches: Sequence[Touch]) -> Iterator[tuple[str, str]]:
+    quality, score = job.calibration.quality, job.solution.holdout
+    if quality.predicted_error_mm is not None and quality.working_distance_m is not None:
+        yield (
+            f"± {quality.predicted_error_mm:.2f} mm",
+            f"predicted error (1σ) of a point {1000 * quality.working_distance_m:.0f} mm away",
+        )
+    if score is not None:
+        yield f"{1000 * score.e_t_m:.2f} mm", f"held-out error over {len(score.pairs)} samples"
+    yield f"{len(job.gates) - len(quality.failed)} of {len(job.gates)}", "quality gates passed"
+    yield f"{len(job.solution.used)} views", f"used, {len(job.calibration.views.rejected)} rejected"
+    if touches:
+        yield f"{sum(map(agrees, touches))} of {len(touches)}", "corners as predicted in the touch test"
+
+
 def _result(job: SolvedRecording) -> Iterator[str]:
     calibration = job.calibration
     result, sigma = calibration.result, np.sqrt(np.diag(np.array(calibration.covariance)))
-    name = f"{result.parent_frame}_from_{result.child_frame}"
-    yield html.heading(f"Where the camera is: {name}")
     yield f'<p class="big">{html.escape(pose_text(calibration))}</p>'
     rows = [
         (
@@ -149,7 +177,6 @@ def _result(job: SolvedRecording) -> Iterator[str]:
 
 
 def _gates(job: SolvedRecording) -> Iterator[str]:
-    yield html.heading("Gates")
     yield html.table(
         ("", "gate", "result"), [("✓" if gate.passed else "✗", gate.name, gate.text) for gate in job.gates]
     )
@@ -157,7 +184,6 @@ def _gates(job: SolvedRecording) -> Iterator[str]:
 
 def _touches(touches: Sequence[Touch]) -> Iterator[str]:
     if touches:
-        yield html.heading("Touch tests")
         yield html.table(
             ("", "tip beside the corner, against the prediction", "time", "operator"),
             [("✓" if agrees(t) else "✗", touch_text(t), t.wall, f"{t.who}, {t.found}") for t in touches],
@@ -166,7 +192,6 @@ def _touches(touches: Sequence[Touch]) -> Iterator[str]:
 
 def _error(job: SolvedRecording) -> Iterator[str]:
     quality = job.calibration.quality
-    yield html.heading("Error sources")
     if quality.error_shares:
         shares = {name: share for name, share in quality.error_shares.items() if share > 0.001}
         listed = ", ".join(f"{name.replace('_', ' ')} {share:.0%}" for name, share in shares.items())
@@ -202,7 +227,6 @@ def _modelled_pixels(job: SolvedRecording) -> dict[int, tuple[Array, Array]]:
 
 def _residuals(job: SolvedRecording) -> Iterator[str]:
     solution = job.solution
-    yield html.heading("Residuals")
     if solution.residual_px:
         robot_mm = {index: metres * 1000 for index, (metres, _) in solution.residual_robot.items()}
         limit = next((gate.limit for gate in job.gates if gate.name == "view_rms_px"), None)
@@ -225,7 +249,6 @@ def _holdout(job: SolvedRecording, peers: Sequence[PeerResult]) -> Iterator[str]
     score = job.solution.holdout
     if score is None:
         return
-    yield html.heading("Held-out error")
     methods = [("this calibration", np.asarray(score.samples_e_t_m), np.asarray(score.samples_e_R))]
     methods += [
         (peer.name, peer.samples_e_t_m, peer.samples_e_R)
@@ -273,13 +296,11 @@ def _arm(job: SolvedRecording) -> Iterator[str]:
 def _methods(peers: Sequence[PeerResult]) -> Iterator[str]:
     if not peers:
         return
-    yield html.heading("All methods on the same views")
     yield html.table(PEER_HEAD, map(peer_cells, peers), range(1, 8))
 
 
 def _lens(job: SolvedRecording) -> Iterator[str]:
     lens = job.calibration.intrinsics
-    yield html.heading("Intrinsics")
     origin = "estimated from these images" if job.intrinsics is not None else "fixed, refined with X"
     rms = "" if lens.rms_px is None else f", RMS {lens.rms_px:.3f} px"
     yield html.paragraph(f"{lens.distortion_model}, {lens.width}×{lens.height}, {origin}{rms}.")
@@ -318,7 +339,6 @@ def _distortion_names(model: str) -> tuple[str, ...]:
 
 def _views(job: SolvedRecording) -> Iterator[str]:
     rejected = {view.index: view.reason for view in job.calibration.views.rejected}
-    yield html.heading(f"Views: {len(job.solution.used)} used, {len(rejected)} rejected")
     if rejected:
         names = {view.index: view.name for view in job.recording.views()}
         yield html.table(
@@ -327,14 +347,15 @@ def _views(job: SolvedRecording) -> Iterator[str]:
         )
     modelled = _modelled_pixels(job)
     cells = []
-    for view in job.recording.views()[:_PICTURES_LIMIT]:
+    shown = job.recording.views()[:_PICTURES_LIMIT]
+    width_px = next(width for most, width in _WIDTHS_PX if len(shown) <= most)
+    for view in shown:
         detection = job.loaded.detections.get(view.index)
         if detection is None:  # its picture cannot be decoded: the table above says so
             continue
         found = detection.pixels
-        jpeg = drawn_view(
-            job.recording.image(view).viewable(), found, modelled.get(view.index, (found, None))[1]
-        )
+        ours = modelled.get(view.index, (found, None))[1]
+        jpeg = drawn_view(job.recording.image(view).viewable(), found, ours, width_px)
         px = job.solution.residual_px.get(view.index)
         name = "" if view.name == str(view.index) else f": {view.name}"
         caption = f"pose {view.index + 1}{name}" + (f", {px:.2f} px" if px is not None else "")
@@ -355,14 +376,12 @@ def _views(job: SolvedRecording) -> Iterator[str]:
 
 def _history(history: Sequence[Sequence[str]]) -> Iterator[str]:
     if history:
-        yield html.heading("Installed versions")
         yield html.table(("version", "time", "action", "change"), history)
 
 
 def _provenance(job: SolvedRecording) -> Iterator[str]:
     calibration = job.calibration
     origin, robot, camera = calibration.provenance, calibration.robot, calibration.camera
-    yield html.heading("Provenance")
     rows = [
         ("recording", f"{origin.recording}, SHA-256 {origin.recording_sha256}"),
         ("source", calibration.source),
@@ -377,20 +396,22 @@ def _provenance(job: SolvedRecording) -> Iterator[str]:
     yield html.table(("", ""), rows)
 
 
-def drawn_view(image: Any, found: Array, modelled: Array | None) -> bytes:
+def drawn_view(image: Any, found: Array, modelled: Array | None, width_px: int = 480) -> bytes:
     """JPEG of the picture, brightened, with the found corners (orange) and the modelled ones (blue rings)."""
     grey = to_grey(image)
-    scale = _WIDTH_PX / grey.shape[1]
+    scale = width_px / grey.shape[1]
     small = cv2.resize(grey, None, fx=scale, fy=scale, interpolation=cv2.INTER_AREA)
     top = max(float(np.percentile(small, 99.5)), 1.0)
     canvas = cv2.cvtColor(np.clip(small * (245.0 / top), 0, 255).astype(np.uint8), cv2.COLOR_GRAY2BGR)
     if modelled is not None:
         for x, y in _places(modelled, scale):
-            cv2.circle(canvas, (x, y), 7, (218, 105, 9), 2, cv2.LINE_AA)
+            cv2.circle(
+                canvas, (x, y), max(4, width_px // 68), (218, 105, 9), 1 + width_px // 400, cv2.LINE_AA
+            )
     for k, (x, y) in enumerate(_places(found, scale)):
         colour = (0, 0, 255) if k == 0 else (0, 140, 255)
-        cv2.drawMarker(canvas, (x, y), colour, cv2.MARKER_CROSS, 8 if k else 18, 2)
-    _, jpeg = cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, 70])
+        cv2.drawMarker(canvas, (x, y), colour, cv2.MARKER_CROSS, 8 if k else 18, 1 + width_px // 400)
+    _, jpeg = cv2.imencode(".jpg", canvas, [cv2.IMWRITE_JPEG_QUALITY, 65])
     return jpeg.tobytes()
 
 

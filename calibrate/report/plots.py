@@ -21,6 +21,8 @@ from recordings.schema.messages import CameraModel
 
 _BLUE, _RED, _GREY, _ORANGE = "#0969da", "#b42318", "#8c959f", "#bc4c00"
 _FAR_WORSE = 3.0
+_DPI = 120
+"""Of clouds of points, which would be most of the page as lines."""
 STYLE: Any = {
     "svg.hashsalt": "report",
     "svg.fonttype": "none",
@@ -42,7 +44,7 @@ def new_figure(width: float, height: float, columns: int = 1) -> tuple[Figure, A
 
 def svg_text(figure: Figure) -> str:
     buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None, "Creator": None})
+    figure.savefig(buffer, format="svg", dpi=_DPI, metadata={"Date": None, "Creator": None})
     text = buffer.getvalue()
     return text[text.index("<svg") :]
 
@@ -95,7 +97,9 @@ def residual_scatter(misses: Array, pixels: Array, camera: CameraModel) -> str:
     with matplotlib.rc_context(STYLE):
         figure, axes = new_figure(10, 3.6, 2)
         reach = float(np.abs(misses).max(initial=1e-3)) * 1.05
-        axes[0].scatter(misses[:, 0], misses[:, 1], s=3, color=_BLUE, alpha=0.5, linewidths=0)
+        axes[0].scatter(
+            misses[:, 0], misses[:, 1], s=3, color=_BLUE, alpha=0.5, linewidths=0, rasterized=True
+        )
         axes[0].set(xlim=(-reach, reach), ylim=(-reach, reach), xlabel="x miss, px", ylabel="y miss, px")
         axes[0].set_aspect("equal")
         sigma = float(np.sqrt(np.square(misses).mean()))
@@ -111,6 +115,7 @@ def residual_scatter(misses: Array, pixels: Array, camera: CameraModel) -> str:
             angles="xy",
             color=_BLUE,
             width=0.0015,
+            rasterized=True,
         )
         axes[1].set(xlim=(0, camera.width), ylim=(camera.height, 0), xlabel="x, px", ylabel="y, px")
         axes[1].set_aspect("equal")
@@ -171,7 +176,9 @@ def coverage_map(views: ViewSet) -> str:
         shown = axes[0].imshow(seen, extent=extent, cmap="Blues", interpolation="nearest")
         figure.colorbar(shown, ax=axes[0], label="views", ticks=MaxNLocator(integer=True))
         for view in views:
-            axes[0].plot(view.pixels[:, 0], view.pixels[:, 1], ".", markersize=1, color=_ORANGE)
+            axes[0].plot(
+                view.pixels[:, 0], view.pixels[:, 1], ".", markersize=1, color=_ORANGE, rasterized=True
+            )
         axes[0].set(xlim=(0, camera.width), ylim=(camera.height, 0), xlabel="x, px", ylabel="y, px")
         _distortion_curve(axes[1], camera)
         return svg_text(figure)
@@ -197,7 +204,9 @@ def uncertainty_map(known: LensUncertainty, views: ViewSet) -> str:
         filled = axis.contourf(u, v, grid, levels=10, cmap="YlOrBr")
         figure.colorbar(filled, ax=axis, label="1σ, px")
         for view in views:
-            axis.plot(view.pixels[:, 0], view.pixels[:, 1], ".", markersize=1, color="#0969da")
+            axis.plot(
+                view.pixels[:, 0], view.pixels[:, 1], ".", markersize=1, color="#0969da", rasterized=True
+            )
         axis.set(xlim=(0, camera.width), ylim=(camera.height, 0), xlabel="x, px", ylabel="y, px")
         axis.set_aspect("equal")
         return svg_text(figure)

@@ -41,8 +41,13 @@ def running_estimate(
     goal_m: float,
 ) -> EstimateStatus:
     """Few views or degenerate motion give an answer without numbers and with advice."""
-    coverage = image_coverage(camera, [view.pixels for view in seen])
-    blank = EstimateStatus(len(seen), goal_mm=1000 * goal_m, image_coverage=coverage)
+    shown = [image_coverage(camera, [view.pixels]) for view in seen]
+    blank = EstimateStatus(
+        len(seen),
+        goal_mm=1000 * goal_m,
+        image_coverage=image_coverage(camera, [view.pixels for view in seen]),
+        image_views=tuple(tuple(int(n) for n in row) for row in np.greater(shown, 0).sum(axis=0)),
+    )
     if len(seen) < FEWEST_VIEWS:
         return msgspec.structs.replace(blank, advice="too few views yet")
     try:

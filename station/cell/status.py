@@ -42,6 +42,8 @@ class PoseStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     attempt: int = 0
     corners: int | None = None
     predicted_sigma_mm: float | None = None
+    estimated_sigma_mm: float | None = None
+    """Expected error after this pose by the images so far; `predicted_sigma_mm`: as planned."""
     coverage: float | None = None
     base_from_flange: Matrix4 | None = None
     """Where the flange is expected to be."""
@@ -168,6 +170,8 @@ class EstimateStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     """Why and how the poses that are left should be planned anew; empty = no need."""
     image_coverage: tuple[tuple[int, ...], ...] = ()
     """Corners seen so far in each part of the image, rows from the top."""
+    image_views: tuple[tuple[int, ...], ...] = ()
+    """Images that show the board in each of these parts."""
 
 
 class SessionStatus(msgspec.Struct, frozen=True, omit_defaults=True):
@@ -207,6 +211,10 @@ class Event(msgspec.Struct, frozen=True, omit_defaults=True):
     """Kind, for programs: kebab-case."""
     values: dict[str, Value] = {}
     """Figures of it; each name ends in its unit"""
+
+
+APPROVAL_LIFETIME_S = 120.0
+"""How long a motion that was offered waits for a person."""
 
 
 class MotionPreview(msgspec.Struct, frozen=True, omit_defaults=True):

@@ -19,7 +19,8 @@ from station.cell.plan import Plan
 from station.cell.status import StationStatus
 from station.cli.attended import attended
 from station.cli.console import AsJson, Headless, Socket, err, out
-from station.operate.drift_check import POSES, check_arguments, start_drift_check
+from station.operate.drift_check import POSES, check_arguments, judged, start_drift_check
+from station.operate.ending import after_capture
 from station.operate.motion import SessionOutcome, wait_until_idle
 from station.plan.files import load_plan, sweep_plan
 from station.protocol.client import Client
@@ -125,6 +126,8 @@ def drift_check_command(
         _finish(outcome, False)
     what = check_arguments(outcome.recording, outcome.status.session.folder)
     done = subprocess.run([sys.executable, "-m", "calibrate.cli", *what])
+    if (end := judged(outcome.status.session.folder)) is not None:
+        out.print(str(end))
     raise typer.Exit(done.returncode)
 
 
@@ -164,6 +167,7 @@ def _finish(outcome: SessionOutcome, as_json: bool) -> None:
         print(json.dumps({"state": state, "poses": poses, "recording": outcome.recording}))
     elif outcome.recording:
         out.print(f"{outcome.captured} of {outcome.planned} poses, finished: {outcome.recording}")
+        out.print(str(after_capture(outcome.status.session)))
     else:
         _say_state(outcome.status, outcome.status.reason)
     raise typer.Exit(outcome.exit_code)

@@ -5,7 +5,9 @@ from __future__ import annotations
 from pathlib import Path
 
 from calibrate.files.install import installed_calibration
+from calibrate.quality.checks import find_trend, read_checks
 from station.cell.status import SessionStatus, StationState, StationStatus
+from station.operate.ending import Ending, after_drift_check
 from station.operate.motion import PREPARE_S, Approve, Link, prepared_motion
 from station.protocol.verbs import GetPlan, LoadPlan, MakePlan, Purpose
 
@@ -59,6 +61,17 @@ async def recorded(link: Link, plan_sha256: str) -> SessionStatus | None:
         if ours and session.recording and status.state is StationState.IDLE:
             return session
     return None
+
+
+def judged(folder: str) -> Ending | None:
+    """What to do after the drift check of this session; None: it was not judged."""
+    path = Path(folder).resolve()
+    history = read_checks(path.parents[1])
+    entry = next((entry for entry in reversed(history) if entry.recording == path.name), None)
+    if entry is None:
+        return None
+    trend = find_trend(history, entry.generation)
+    return after_drift_check(entry, "" if trend is None else trend.text)
 
 
 def check_arguments(recording: str, folder: str) -> tuple[str, ...]:

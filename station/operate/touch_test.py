@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import getpass
+import re
 from collections.abc import Awaitable
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -23,6 +24,7 @@ from recordings.files import MAIN_CAMERA
 from recordings.schema.messages import BoardSpec, Matrix4
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import HoverOffer, MotionPreview, StationState, StationStatus
+from station.operate.ending import after_touches
 from station.operate.motion import Link, approved_motion
 from station.protocol.client import DaemonGoneError
 from station.protocol.verbs import Hover
@@ -72,8 +74,8 @@ class Hovering:
         return (
             f"The tip stands {1000 * abs(float(self.tip_m[2])):.0f} mm above corner {self.offer.corner}. "
             "Guide it by hand (freedrive on the pendant).\nEither\n"
-            "  lower it straight and type how far from the corner it lands, in mm along the board's\n"
-            f"  x (from corner {origin} to {x_end}) and y (from {origin} to {y_end}): 0.2,-0.1\n"
+            "  lower it straight and type how far from the corner it lands, along the board's\n"
+            f"  x (from corner {origin} to {x_end}) and y (from {origin} to {y_end}): 0.2 mm, -0.1 mm\n"
             "  or bring it exactly onto the corner, hold it and press Enter: the arm's position is read"
         )
 
@@ -137,7 +139,7 @@ def touch_told(hovering: Hovering, said: str, status: StationStatus | None) -> T
     `status`: as the arm stands now; None: not known. Raises RefusedError.
     """
     if said:
-        return touch_of(hovering, told_offset_mm(hovering, two_numbers(said)), "told by a person")
+        return touch_of(hovering, told_offset_mm(hovering, two_lengths_mm(said)), "told by a person")
     if status is None or status.robot.base_from_flange is None:
         raise RefusedError("The robot's position is not known now.", code="no-robot-state")
     tip = tip_on_board_m(hovering.offer, status.robot.base_from_flange)
@@ -147,7 +149,7 @@ def touch_told(hovering: Hovering, said: str, status: StationStatus | None) -> T
 def note_touches(
     root: Path | None, file: Path | None, touches: list[Touch], camera: str = MAIN_CAMERA
 ) -> str:
-    """Keep what was found in the file, and in the installed calibration of the same solve; where, in words.
+    """Keep what was found in the file and in the installed calibration of the same solve; what next, too.
 
     `file`: None: the installed one of `camera` alone. Raises CalibrationError, OSError.
     """
@@ -161,9 +163,10 @@ def note_touches(
         except CalibrationError:
             now = None
         if not same_solve(noted, now):
-            return words[0]
+            return f"{words[0]}. {after_touches(touches)}."
     made = note_installed(root, touches, camera)
-    return " and ".join([*words, f"into the installed calibration, now version {made.number}"])
+    words.append(f"into the installed calibration, now version {made.number}")
+    return f"{' and '.join(words)}. {after_touches(touches)}."
 
 
 def tip_on_board_m(offer: HoverOffer, base_from_flange: Matrix4 | Array) -> Array:
@@ -200,18 +203,24 @@ def read_offset_mm(offer: HoverOffer, touching_m: Array) -> Array:
     return np.asarray(1000 * offset)
 
 
-def two_numbers(said: str) -> Array:
-    """(2,) mm as a person types them: '0.2,-0.1'. RefusedError for anything else."""
-    try:
-        numbers = np.array([float(part) for part in said.replace(";", ",").split(",")])
-    except ValueError:
-        numbers = np.zeros(0)
+_UNITS_MM = {"": 1.0, "mm": 1.0, "um": 1e-3, "µm": 1e-3, "cm": 10.0, "in": 25.4}
+_LENGTH = r"\s*([-+]?\d*\.?\d+(?:e[-+]?\d+)?)\s*(" + "|".join(_UNITS_MM) + r")\s*"
+_OFFSET = re.compile(_LENGTH + "[,;]" + _LENGTH, re.IGNORECASE)
+
+
+def two_lengths_mm(said: str) -> Array:
+    """(2,) mm as a person types them: '0.2 mm, -0.1 mm', '0.2,-0.1' (mm). RefusedError for anything else."""
+    typed = _OFFSET.fullmatch(said)
+    numbers = np.zeros(0)
+    if typed is not None:
+        x, x_unit, y, y_unit = typed.groups()
+        numbers = np.array([float(x) * _UNITS_MM[x_unit.lower()], float(y) * _UNITS_MM[y_unit.lower()]])
     limit_mm = 1000 * _BESIDE_M
     if numbers.shape != (2,) or not np.isfinite(numbers).all() or np.abs(numbers).max() > limit_mm:
         raise RefusedError(
             "That is no offset.",
             code="no-offset",
-            remedy=f"Type two numbers in mm, at most {limit_mm:.0f}: 0.2,-0.1",
+            remedy=f"Type two lengths of at most {limit_mm:.0f} mm: 0.2 mm, -0.1 mm",
             limit_mm=limit_mm,
         )
     return numbers

@@ -15,6 +15,7 @@ import msgspec
 
 from recordings.files import MAIN_CAMERA
 from station.cell import status
+from station.cell.config import StationConfig
 from station.cell.errors import RefusedError
 from station.cell.plan import Plan, PlannedPose
 from station.cell.session_folder import SessionSummary
@@ -310,6 +311,12 @@ class Preview(Verb[PreviewImage], frozen=True):
 
 class Doctor(Verb[list[Check]], frozen=True):
     """Run the preflight check."""
+
+    control = False
+
+
+class Configuration(Verb[StationConfig], frozen=True):
+    """Return the cell as it is configured."""
 
     control = False
 

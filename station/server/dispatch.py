@@ -8,6 +8,7 @@ from collections.abc import Awaitable, Callable, Coroutine
 
 import msgspec
 
+from station.cell.config import StationConfig
 from station.cell.errors import RefusedError
 from station.cell.session_folder import SessionSummary, list_sessions
 from station.cell.socket_folder import user_name
@@ -199,6 +200,9 @@ class SessionDispatcher:
 
     async def _doctor(self, caller: _Caller, args: verbs.Doctor) -> list[verbs.Check]:
         return await checklist(self._session.context, self._session.devices.troubles)
+
+    async def _configuration(self, caller: _Caller, args: verbs.Configuration) -> StationConfig:
+        return self._session.context.cell.config
 
     async def _sessions(self, caller: _Caller, args: verbs.Sessions) -> list[SessionSummary]:
         # In a thread: hundreds of files are read, and the arm's heartbeat does not wait.

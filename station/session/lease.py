@@ -11,12 +11,11 @@ import numpy as np
 from recordings.errors import Value
 from recordings.schema.messages import Vector6
 from station.cell.errors import RefusedError
-from station.cell.status import LeaseStatus, MotionPreview
+from station.cell.status import APPROVAL_LIFETIME_S, LeaseStatus, MotionPreview
 from station.plan.hover import HoverPath
 from station.protocol.verbs import Purpose
 from station.session.queue import PlanRevision
 
-APPROVAL_LIFETIME_S = 120.0
 START_TOLERANCE_RAD = 0.005
 """The arm must stand where it stood when the person was asked."""
 

@@ -111,6 +111,11 @@ class PoseQueue:
         """Notes what the image showed."""
         self._status[index] = msgspec.structs.replace(self.status(index), corners=corners, coverage=coverage)
 
+    def note_estimate(self, index: int, sigma_mm: float | None) -> None:
+        """Note the expected error after this pose; nothing for one that is gone meanwhile."""
+        if index in self._status:
+            self._status[index] = msgspec.structs.replace(self._status[index], estimated_sigma_mm=sigma_mm)
+
     def with_fresh(self, poses: Sequence[PlannedPose]) -> PoseQueue:
         """A copy with these, at most as many, in place of the fresh ones, by the same numbers, at the end."""
         fresh = self.fresh

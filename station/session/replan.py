@@ -209,6 +209,9 @@ class Estimator:
             if hint and not context.store.status.estimate.improve:
                 context.store.event("replan-helps", hint)
             context.store.update(estimate=msgspec.structs.replace(estimate, improve=hint))
+            if (queue := context.queue) is not None:
+                queue.note_estimate(self._known[-1], estimate.sigma_translation_mm)
+                context.store.update_session(poses=queue.statuses)
             if (recording := context.recording) is not None:
                 with contextlib.suppress(RecordingError):  # a full disk ends the run, not this look
                     recording.show_frames(estimate.camera_pose, estimate.board_pose, stamps_now())

@@ -29,19 +29,22 @@ from station.cell.status import StationState, StationStatus
 from station.protocol.client import Client
 from station.protocol.states import RUNNING
 from station.protocol.stop_client import send_stop
-from station.protocol.verbs import Lease, Sessions, Watch
-from station.tui.checklist import ChecklistScreen
+from station.protocol.verbs import Configuration, Lease, Sessions, Watch
+from station.tui.connect import ConnectScreen
 from station.tui.desk import ScreenLink
 from station.tui.dialogs import Help
+from station.tui.frame import Framed
+from station.tui.installed import LOOK_S
 from station.tui.live import LiveScreen, LogScreen
 from station.tui.plan import PlanScreen
 from station.tui.replay import ReplayLink
 from station.tui.replay_screen import Player, ReplayScreen
-from station.tui.result import ResultScreen
+from station.tui.result import InstallScreen, SolveScreen, VerifyScreen
 from station.tui.results import ResultsDesk
 from station.tui.screen import StationScreen
 from station.tui.sessions import SessionsScreen
-from station.tui.themes import THEMES, chosen_theme
+from station.tui.task import DIGITS
+from station.tui.themes import THEMES, TOKENS, NoColour, chosen_theme
 from station.tui.widgets.graphics import detect
 from station.tui.widgets.preview import PreviewPane
 
@@ -73,14 +76,15 @@ def freeze_startup() -> None:
     gc.freeze()
 
 
-SCREENS = Binding.Group("Screens", compact=True)
-SCREEN_TOOLTIPS = {
-    "live": "The running capture",
-    "plan": "All poses, their state and reasons",
-    "result": "Calibration result",
+TOOLTIPS = {
+    "connect": "What is missing, and its remedy",
+    "plan": "All poses, their gain and reason",
+    "capture": "The running capture",
+    "solve": "The verdict, and what it stands on",
+    "verify": "Touch test and drift checks",
+    "install": "What is installed, and what would change",
     "sessions": "Past recordings",
     "log": "Event log",
-    "checklist": "Setup check",
 }
 
 
@@ -119,33 +123,43 @@ class StationApp(ResultsDesk):
     TITLE = "Calibration station"
     CSS_PATH = "station.tcss"
     MODES = {  # noqa: RUF012 - declared by App
-        "live": LiveScreen,
+        "connect": ConnectScreen,
         "plan": PlanScreen,
-        "result": ResultScreen,
+        "capture": LiveScreen,
+        "solve": SolveScreen,
+        "verify": VerifyScreen,
+        "install": InstallScreen,
         "sessions": SessionsScreen,
         "log": LogScreen,
-        "checklist": ChecklistScreen,
     }
-    DEFAULT_MODE = "live"
+    DEFAULT_MODE = "capture"
     _unanswered: int | None = None
     """Questions since the last answer; None: there was none yet."""
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("f12", "stop", "STOP", show=False, priority=True, id="stop", tooltip="Stop the arm now"),
-        Binding("f1", "help", "Help", id="help", tooltip="What this screen is for, and all its keys"),
+        Binding(
+            "f1", "help", "Help", show=False, id="help", tooltip="What this screen is for, and all its keys"
+        ),
         Binding("f5", "start('run')", "Run", id="run", tooltip="Check the path, show the motion, and ask"),
         Binding("f6", "ask('pause')", "Pause", id="pause", tooltip="Stop after this pose; nothing is lost"),
         Binding("f7", "finish", "Finish", id="finish", tooltip="Finish the recording with what is there"),
         Binding(
-            "f8", "acknowledge", "Ack", priority=True, id="acknowledge", tooltip="Leave STOPPED or FAULT"
-        ),
-        *(
-            Binding(key, f"switch_mode('{mode}')", mode.title(), id=mode, group=SCREENS, tooltip=tooltip)
-            for key, (mode, tooltip) in zip("123456", SCREEN_TOOLTIPS.items(), strict=True)
+            "f8",
+            "acknowledge",
+            "Acknowledge",
+            show=False,
+            priority=True,
+            id="acknowledge",
+            tooltip="Leave STOPPED or FAULT after looking",
         ),
         Binding("f9", "solve_newest", "Solve", id="solve", tooltip="Solve the session just recorded"),
-        Binding("f3", "freedrive", "Hand", id="freedrive", tooltip="Freedrive: move the arm by hand"),
+        Binding("f3", "freedrive", "Freedrive", id="freedrive", tooltip="Freedrive: move the arm by hand"),
         Binding("f2", "ask('record')", "Grab", id="record", tooltip="Capture an image here (freedrive)"),
         Binding("f4", "release", "Release", show=False, id="release", tooltip="Release control of the arm"),
+        *(
+            Binding(DIGITS[mode], f"open('{mode}')", mode.title(), show=False, id=mode, tooltip=tooltip)
+            for mode, tooltip in TOOLTIPS.items()
+        ),
         Binding(
             "ctrl+q", "leave", "Quit", show=False, id="quit", tooltip="Close this screen; the daemon goes on"
         ),
@@ -157,7 +171,13 @@ class StationApp(ResultsDesk):
         self._greeted = False
         for theme in THEMES:
             self.register_theme(theme)
-        self.theme = chosen_theme()
+        self.theme = chosen_theme(self.no_color)
+        if self.no_color:
+            self._filters.append(NoColour())
+
+    def get_theme_variable_defaults(self) -> dict[str, str]:
+        """For the themes that Textual brings."""
+        return TOKENS
 
     def on_mount(self) -> None:
         self.follow()
@@ -165,6 +185,15 @@ class StationApp(ResultsDesk):
         self.set_timer(SETTLED_S, freeze_startup)
         self._ask_terminal()
         self.set_interval(ASK_S, self._look_for_terminal)
+        self.set_interval(LOOK_S, self._look)
+
+    def _look(self) -> None:
+        """A daemon at work is left in peace."""
+        if self.status is None or self.status.state not in RUNNING:
+            self.look_at_results()
+
+    async def action_open(self, mode: str) -> None:
+        await self.switch_mode(mode)
 
     # --- the person: an ssh that dies silently leaves this screen alive, and with it control of the arm ---
 
@@ -222,19 +251,21 @@ class StationApp(ResultsDesk):
 
     def _tell_trouble(self, trouble: str) -> None:
         self.trouble = trouble
-        for screen in self._screens():
-            screen.doubt(trouble, self.silent_s)
+        self._show()
 
-    def _screens(self) -> list[StationScreen]:
-        return [s for s in self.screen_stack if isinstance(s, StationScreen) and s.is_mounted]
+    def _show(self) -> None:
+        """On every screen and question that stands over another."""
+        known = self.known()
+        for screen in self.screen_stack:
+            if isinstance(screen, Framed) and screen.is_mounted:
+                screen.show(known)
 
     def playing(self) -> bool:
         return any(isinstance(screen, ReplayScreen) for screen in self.screen_stack)
 
     def tell_busy(self, words: str) -> None:
         super().tell_busy(words)
-        for screen in self._screens():
-            screen.say_busy(words)
+        self._show()
 
     async def _pace(self, status: StationStatus) -> None:
         """A new state or reason is shown at once; numbers that only flicker, a few times a second."""
@@ -249,24 +280,34 @@ class StationApp(ResultsDesk):
             await asyncio.sleep(PREVIEW_PERIOD_S)
             screen = self.screen
             link = screen.link if isinstance(screen, ReplayScreen) else self.link
-            if link is None or not isinstance(screen, LiveScreen):
+            if link is None:
                 continue
             for preview in screen.query(PreviewPane):
                 with contextlib.suppress(OSError, StationError):
                     await preview.fetch(link)
 
     def on_status_changed(self, message: StatusChanged) -> None:
-        self.status = message.status
-        self.known = message.status or self.known
+        before, self.status = self.status, message.status
         if message.status is None:
             self.silent_s = None
+        elif before is None or before.session.calibration != message.status.session.calibration:
+            self.look_at_results()
+        elif before.session.name and not message.status.session.name:
+            self.result_path = ""  # another session begins: what was looked at is no part of it
         if message.status is not None and not self._greeted:
             self._greeted = True
             self.greet(message.status)
-        for screen in self._screens():
-            screen.show(message.status)
+            self.learn_cell()
+        self._show()
         if self.silent_s is None and self.trouble != message.why:
             self._tell_trouble(message.why)
+
+    @work(exit_on_error=False)
+    async def learn_cell(self) -> None:
+        """What the scenes are drawn from; an older daemon does not tell."""
+        if self.link is not None:
+            with contextlib.suppress(OSError, StationError):
+                self.configuration = await self.link.call(Configuration())
 
     @work(exit_on_error=False)
     async def greet(self, status: StationStatus) -> None:
@@ -276,7 +317,7 @@ class StationApp(ResultsDesk):
         missing = status.state is StationState.DISCONNECTED
         unused = not status.session.poses and await self.ask(Sessions()) == []
         if (missing or unused) and self.current_mode == self.DEFAULT_MODE:
-            await self.switch_mode("checklist")
+            await self.switch_mode("connect")
 
     def common_actions(self) -> list[str]:
         """Actions that have a key on every screen; a playback adds its own."""
@@ -291,10 +332,10 @@ class StationApp(ResultsDesk):
         """Own bindings in a window that fits a console; Textual's panel halves the screen."""
         screen = self.screen
         if isinstance(screen, StationScreen):
-            own = vars(type(screen)).get("BINDINGS", [])
+            own = screen.BINDINGS
             ours = [kind for kind in type(self).__mro__ if kind.__module__.startswith("station.")]
             common = [binding for kind in ours for binding in vars(kind).get("BINDINGS", [])]
-            self.push_screen(Help(screen.HELP or "", [*own, *common]))
+            self.push_screen(Help(screen.NAME, screen.HELP or "", [*own, *common]))
 
     @work(exclusive=True, group="command", exit_on_error=False)
     async def action_new_cell(self) -> None:
@@ -306,7 +347,7 @@ class StationApp(ResultsDesk):
         """Every key's action by name too; what moves the arm asks the same question from here."""
         yield from super().get_system_commands(screen)
         yield SystemCommand("New cell", "Set up a robot, a camera and a board", self.action_new_cell)
-        own = vars(type(screen)).get("BINDINGS", []) if isinstance(screen, StationScreen) else []
+        own = screen.BINDINGS if isinstance(screen, StationScreen) else []
         for place, bindings in ((screen, own), (self, self.BINDINGS)):
             for binding in (b for b in bindings if isinstance(b, Binding) and b.tooltip):
                 yield SystemCommand(

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import asyncio
 from collections.abc import AsyncIterator, Awaitable, Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Protocol, TypeVar
 
 from textual import work
 from textual.app import App
+from textual.content import Content
 from textual.reactive import reactive
 
 from recordings.errors import CodedError
 from recordings.files import MAIN_CAMERA
+from station.cell.config import StationConfig
 from station.cell.errors import RefusedError, StationError
 from station.cell.status import MotionPreview, SessionStatus, StationState, StationStatus
 from station.operate import motion
@@ -22,15 +25,17 @@ from station.protocol.client import ANSWER_S
 from station.protocol.states import RUNNING
 from station.protocol.verbs import Purpose, Verb
 from station.tui.dialogs import Confirm, ConfirmMotion
+from station.tui.task import Known
 from station.tui.widgets.graphics import Graphics
+from station.tui.widgets.scene import cell_scene, draw
 
 R = TypeVar("R")
 STOP_UNHEARD = "STOP was sent, but the station does not answer: press the EMERGENCY STOP on the pendant."
 DECELERATES = "It decelerates at once, and the session pauses."
 REMEDIES = {
-    "nothing-installed": "3 shows the newest result, i installs it.",
+    "nothing-installed": "4 shows the newest result, i installs it.",
     "no-pointer": "Give its length (Tab in the list of corners), or set the tool on the pendant.",
-    "unfinished-recording": "c on screen 4 recovers it.",
+    "unfinished-recording": "c on 7 recovers it.",
 }
 """By an error's code, where the way out on a screen is another than in a shell."""
 BUSY: dict[Purpose, str] = {
@@ -56,8 +61,6 @@ class Desk(App[None]):
     """
 
     status: reactive[StationStatus | None] = reactive(None, repaint=False)
-    known: StationStatus | None = None
-    """The newest status; it outlives the daemon."""
     serves = True
     """A station stands behind this screen, not a recording alone."""
     link: ScreenLink | None = None
@@ -72,6 +75,8 @@ class Desk(App[None]):
     """Long work of the daemon for this screen, in words; empty: none."""
     graphics: Graphics | None = None
     """The terminal's own graphics; None: half blocks only."""
+    configuration: StationConfig | None = None
+    """Of the cell; None until the daemon told it."""
     _own_id: int | None = None
     """The daemon's number of this connection, once it had control."""
     _newest: StationStatus | None = None
@@ -95,6 +100,14 @@ class Desk(App[None]):
     def max_age_days(self) -> float | None:
         """Oldest proof of a calibration by the cell's rule."""
         return None if self.link is None else self.link.max_age_days
+
+    def known(self) -> Known:
+        """All that rail and next action are made of."""
+        return Known(self.status, silent_s=self.silent_s, busy=self.busy, trouble=self.trouble)
+
+    def newest(self) -> Known:
+        """With the newest status there ever was; it outlives the daemon."""
+        return replace(self.known(), status=self._newest)
 
     def common_actions(self) -> list[str]:
         """Actions that have a key on every screen."""
@@ -179,12 +192,23 @@ class Desk(App[None]):
 
     async def approves(self, preview: MotionPreview) -> bool:
         """The one question before anything moves."""
-        question: Confirm = ConfirmMotion(preview)
+
+        def drawn(width: int, height: int) -> Content:
+            status = self.status or StationStatus()
+            scene = cell_scene(self.configuration, status)
+            return Content() if scene is None else draw(scene, status, self._first(), width, height)
+
+        question: Confirm = ConfirmMotion(preview, drawn)
         return await self.push_screen_wait(question)
 
     async def plans_here(self, refusal: StationError) -> bool:
         """Offer to plan again from where the arm stands."""
         return await self.push_screen_wait(Confirm("Plan again from here?", refusal.text, yes="Plan"))
+
+    def _first(self) -> int | None:
+        """Place of the pose that comes next."""
+        poses = () if self.status is None else self.status.session.poses
+        return next((place for place, pose in enumerate(poses) if pose.state == "planned"), None)
 
     async def start(self, begun: Awaitable[R]) -> R | None:
         """A flow that begins with a motion; None when it did not come to that."""

@@ -1,59 +1,70 @@
-"""Windows over a screen: questions with consequences, choices, a reason, the help."""
+"""Windows over a screen: questions with consequences, choices, a reason, long work, the help."""
 
 from __future__ import annotations
 
+import asyncio
+import os
+import sys
 import textwrap
-from collections.abc import Sequence
+import time
+from collections.abc import Callable, Sequence
 from typing import ClassVar
 
 from rich.console import Group
 from rich.table import Table
 from rich.text import Text
+from textual import work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
-from textual.containers import Horizontal, Vertical, VerticalScroll
-from textual.screen import ModalScreen
-from textual.widgets import Button, Input, Label, OptionList, Static
+from textual.containers import Horizontal, VerticalScroll
+from textual.content import Content
+from textual.widgets import Button, Input, Label, OptionList, RichLog, Static
 from textual.widgets.option_list import Option
 
 from calibrate.files.exports import FORMATS
 from calibrate.files.install import reason_problem
-from station.cell.status import MotionPreview
+from station.cell.status import APPROVAL_LIFETIME_S, MotionPreview
 from station.operate.motion import motion_facts
+from station.tui.frame import Question
+from station.tui.task import Action, Known
+from station.tui.words import duration, limit_bar
 
-WIDTH, INDENT = 70, 11
-"""Letters in a line of the question on the narrowest screen, and those before a fact."""
-APPROVE = (
-    "\nThe emergency stop on the pendant is the safety device. F12 stops too."
-    "\nIs everybody out of the arm's reach?"
-)
+TERMINATE_S = 5.0
+WIDTH, INDENT = 54, 10
+"""Letters of a fact in one line, and those before it."""
+KEYS = "Tab marks the other answer, Enter gives it; Escape: no"
+SIMULATED = "SIMULATED cell: nothing real moves"
 HELP_END = (
     "\nCtrl-P finds every action by name, and the colour themes. The emergency stop on the pendant is the "
     "safety device. Escape closes this help."
 )
 
 
-class Confirm(ModalScreen[bool]):
+class Confirm(Question[bool]):
     """A question with consequences. Enter presses the focused button, which is the harmless one."""
 
+    BOX = "confirm"
     BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("escape", "dismiss(False)", "No", tooltip="Close without doing anything")
+        Binding("tab", "app.focus_next", "Other answer"),
+        Binding("escape", "dismiss(False)", "No", tooltip="Close without doing anything"),
     ]
 
     def __init__(self, title: str, body: str, yes: str, no: str = "Cancel") -> None:
         super().__init__()
         self._title, self._body, self._yes, self._no = title, body, yes, no
 
-    def compose(self) -> ComposeResult:
-        with Vertical(id="confirm"):
-            yield Label(self._title, id="confirm-title")
-            yield Static(self._body, id="confirm-body", markup=False)
-            with Horizontal(id="confirm-buttons"):
-                yield Button(self._no, id="no")
-                yield Button(self._yes, id="yes", variant="warning")
-            yield Label("Tab marks the other answer, Enter gives it; Escape: no", id="confirm-keys")
+    def body(self) -> ComposeResult:
+        yield Static(self._body, id="confirm-body", markup=False)
+        yield from self.buttons()
+
+    def buttons(self) -> ComposeResult:
+        with Horizontal(id="confirm-buttons"):
+            yield Button(self._no, id="no")
+            yield Button(self._yes, id="yes", variant="warning")
+        yield Label(KEYS, id="confirm-keys")
 
     def on_mount(self) -> None:
+        self.titled(self._title)
         self.app.clear_notifications()  # they would stand before the words
         self.query_one("#no", Button).focus()
 
@@ -62,38 +73,85 @@ class Confirm(ModalScreen[bool]):
 
 
 class ConfirmMotion(Confirm):
-    """Approve exactly this motion, once."""
+    """Approve exactly this motion, once, while the station still holds it."""
 
-    def __init__(self, preview: MotionPreview) -> None:
-        super().__init__("The arm will move", motion_text(preview), yes="Start motion", no="Do not move")
+    BOX = "motion"
+
+    def __init__(self, preview: MotionPreview, scene: Callable[[int, int], Content] | None = None) -> None:
+        """`scene`: the cell in so many cells and rows."""
+        super().__init__("The arm will move", "", yes="Start motion", no="Do not move")
+        self._preview, self._scene = preview, scene
+        self._until_s = time.monotonic() + APPROVAL_LIFETIME_S
+
+    def body(self) -> ComposeResult:
+        with Horizontal(id="motion-facts"):
+            yield Static(motion_text(self._preview), id="confirm-body")
+            yield Static(id="motion-scene")
+        yield Static(id="motion-holds")
+        yield from self.buttons()
+
+    def on_mount(self) -> None:
+        super().on_mount()
+        self.call_after_refresh(self._draw)
+        self.set_interval(1.0, self._count_down)
+        self._count_down()
+
+    def show(self, known: Known) -> None:
+        super().show(known)
+        if known.status is not None and known.status.simulated:
+            self.titled("The arm will move", SIMULATED)
+
+    def _draw(self) -> None:
+        scene = self.query_one("#motion-scene", Static)
+        if self._scene is not None and scene.display and scene.size.width > 20:
+            scene.update(self._scene(scene.size.width, scene.size.height))
+
+    def _count_down(self) -> None:
+        left_s = max(0.0, self._until_s - time.monotonic())
+        line = Content.assemble(
+            ("this question holds for ", "$dim"), (duration(left_s), "bold $strong"), "  "
+        )
+        line += limit_bar(left_s, APPROVAL_LIFETIME_S, 24, "$warn", 1.0)
+        self.query_one("#motion-holds", Static).update(line)
+        if not left_s:
+            self.notify("The question was too old: nothing moved. F5 asks anew.", severity="warning")
+            self.dismiss(False)
 
 
-def motion_text(preview: MotionPreview) -> str:
-    """The facts of a motion, one a line; long ones go on below themselves."""
-    lines = (
-        textwrap.fill(text, WIDTH, initial_indent=f"{name:<{INDENT}}", subsequent_indent=" " * INDENT)
-        for name, text in motion_facts(preview)
-    )
-    return "\n".join([*lines, APPROVE])
+def motion_text(preview: MotionPreview) -> Content:
+    """The facts of a motion, one a line; then the question."""
+    rows = []
+    for name, text in motion_facts(preview):
+        style = "bold $warn" if name == "WARNING" else "$foreground"
+        first, *more = textwrap.wrap(text, WIDTH) or [""]
+        rows.append(Content.assemble((f"{name:<{INDENT}}", "$dim"), (first, style)))
+        rows += [Content.styled(" " * INDENT + line, style) for line in more]
+    rows += [
+        Content(""),
+        Content.styled("▲ Is everybody out of the arm's reach?", "bold $warn"),
+        Content("The emergency stop on the pendant is the safety device. F12 stops too."),
+    ]
+    return Content("\n").join(rows)
 
 
-class ChooseFormat(ModalScreen[str | None]):
+class ChooseFormat(Question[str | None]):
     """Choice of an export format."""
 
     BINDINGS: ClassVar[list[BindingType]] = [Binding("escape", "dismiss(None)", "Cancel")]
 
-    def compose(self) -> ComposeResult:
-        with Vertical(id="choose"):
-            yield Label("Export for", id="choose-title")
-            lines = [Option(f"{name:<20}  {kind.says}", id=name) for name, kind in FORMATS.items()]
-            yield OptionList(*lines, id="formats", markup=False, compact=True)
-            yield Label("Enter writes it beside the recording, Escape: no", id="choose-keys")
+    def body(self) -> ComposeResult:
+        lines = [Option(f"{name:<20}  {kind.says}", id=name) for name, kind in FORMATS.items()]
+        yield OptionList(*lines, id="formats", markup=False, compact=True)
+        yield Label("Enter writes it beside the recording, Escape: no", id="dialog-keys")
+
+    def on_mount(self) -> None:
+        self.titled("Export for")
 
     def on_option_list_option_selected(self, event: OptionList.OptionSelected) -> None:
         self.dismiss(event.option.id)
 
 
-class Reason(ModalScreen[str]):
+class Reason(Question[str]):
     """A person's reason to install a calibration that is refused; empty: they do not."""
 
     BINDINGS: ClassVar[list[BindingType]] = [
@@ -104,16 +162,16 @@ class Reason(ModalScreen[str]):
         super().__init__()
         self._refusal = refusal
 
-    def compose(self) -> ComposeResult:
-        with Vertical(id="dialog"):
-            yield Label("Not installed", id="dialog-title")
-            yield Static(self._refusal, markup=False)
-            yield Input(id="reason", placeholder="to override: your reason, in words", compact=True)
-            yield Label("", id="dialog-problem", markup=False)
-            yield Label(
-                "Your name and the reason go into the file. Enter installs, Escape does not.",
-                id="dialog-keys",
-            )
+    def body(self) -> ComposeResult:
+        yield Static(self._refusal, markup=False)
+        yield Input(id="reason", placeholder="to override: your reason, in words", compact=True)
+        yield Label("", id="dialog-problem", markup=False)
+        yield Label(
+            "Your name and the reason go into the file. Enter installs, Escape does not.", id="dialog-keys"
+        )
+
+    def on_mount(self) -> None:
+        self.titled("Not installed")
 
     def on_input_submitted(self, event: Input.Submitted) -> None:
         if problem := reason_problem(event.value):
@@ -122,23 +180,105 @@ class Reason(ModalScreen[str]):
             self.dismiss(event.value.strip())
 
 
-class Help(ModalScreen[None]):
+class Help(Question[None]):
     """The purpose of a screen, and every key with what it does. Scrolls where it does not fit."""
 
+    BOX, NAME, NEXT = "help", "Help", Action("Esc", "Close this help", "F12 stops the arm here too.")
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("escape,f1,enter", "dismiss(None)", "Close", tooltip="Close this help")
     ]
 
-    def __init__(self, about: str, keys: Sequence[BindingType]) -> None:
+    def __init__(self, title: str, about: str, keys: Sequence[BindingType]) -> None:
         super().__init__()
-        self._about, self._keys = about, keys
+        self._title, self._about, self._keys = title, about, keys
 
-    def compose(self) -> ComposeResult:
+    def body(self) -> ComposeResult:
         table = Table.grid(padding=(0, 2))
         for binding in self._keys:
             # A binding without words is Textual's own.
             if isinstance(binding, Binding) and binding.tooltip:
                 key = Text(self.app.get_key_display(binding), style="bold")
                 table.add_row(key, f"{binding.description}: {binding.tooltip}")
-        with VerticalScroll(id="help"):
+        with VerticalScroll(id="help-lines"):
             yield Static(Group(Text(self._about + "\n", style="bold"), table, Text(HELP_END)))
+
+    def on_mount(self) -> None:
+        self.titled(self._title)
+
+
+class JobScreen(Question[int]):
+    """Runs `python -m MODULE ARGS…` and returns its exit code; Escape or Cancel ends it (-1).
+
+    What it said stays until it is read, unless the code is one of `close_on`.
+    """
+
+    BOX, NAME = "job", "At work"
+    NEXT = Action("", "Wait", "This work runs beside the station; Escape ends it.")
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("escape", "cancel", "Cancel", tooltip="End this work; nothing half-written stays")
+    ]
+
+    def __init__(self, title: str, module: str, *args: str, close_on: tuple[int, ...] = (0, 4)) -> None:
+        super().__init__()
+        self._close_on = close_on
+        self.said: list[str] = []
+        self._title, self._command = title, (sys.executable, "-m", module, *args)
+        self._process: asyncio.subprocess.Process | None = None
+        self._exit_code: int | None = None
+        self._cancelled = False
+
+    def body(self) -> ComposeResult:
+        yield Label(self._title, id="job-title")
+        yield RichLog(id="job-lines", wrap=True, max_lines=500, min_width=0)
+        yield Button("Cancel", id="job-cancel")
+
+    def on_mount(self) -> None:
+        self._begun_s = time.monotonic()
+        self.set_interval(1.0, self._say_how_long)
+        self.call_after_refresh(self.run_job)  # the width of its lines is known then
+
+    def _say_how_long(self) -> None:
+        """It may say nothing for a while; the seconds tell that it works."""
+        if self._exit_code is None:
+            spent = duration(time.monotonic() - self._begun_s)
+            self.query_one("#job-title", Label).update(f"{spent} {self._title} …")
+
+    @work(exclusive=True, exit_on_error=False)
+    async def run_job(self) -> None:
+        lines = self.query_one("#job-lines", RichLog)
+        width = str(max(40, lines.scrollable_content_region.width))  # its own line breaks are then ours
+        self._process = await asyncio.create_subprocess_exec(
+            *self._command,
+            stdin=asyncio.subprocess.DEVNULL,
+            stdout=asyncio.subprocess.PIPE,
+            stderr=asyncio.subprocess.STDOUT,
+            env=os.environ | {"CALIBRATE_PROGRESS": "lines", "PYTHONUNBUFFERED": "1", "COLUMNS": width},
+        )
+        assert self._process.stdout is not None
+        async for line in self._process.stdout:
+            self.said.append(line.decode(errors="replace").rstrip())
+            lines.write(self.said[-1])
+        self._exit_code = await self._process.wait()
+        self.query_one("#job-title", Label).update(self._title)
+        if self._cancelled and self._exit_code != 0:
+            self.dismiss(-1)
+        elif self._cancelled or self._exit_code in self._close_on:  # it may have been done all the same
+            self.dismiss(self._exit_code)
+        else:  # The person reads why before it goes away.
+            close = self.query_one("#job-cancel", Button)
+            close.label = "Close"
+            close.focus()
+
+    async def action_cancel(self) -> None:
+        if self._process is None or self._exit_code is not None:
+            self.dismiss(-1 if self._exit_code is None else self._exit_code)
+            return
+        self._cancelled = True
+        self._process.terminate()
+        try:
+            await asyncio.wait_for(self._process.wait(), TERMINATE_S)
+        except TimeoutError:
+            self._process.kill()
+
+    async def on_button_pressed(self) -> None:
+        await self.action_cancel()

@@ -11,11 +11,12 @@ from itertools import pairwise
 from pathlib import Path
 
 from calibrate.errors import CalibrationError
-from calibrate.files.calibration import Calibration, read_calibration
-from calibrate.files.install import installed_calibration
+from calibrate.files.calibration import Calibration, Verdict, read_calibration
+from calibrate.files.install import installed_calibration, objections_beside
 from calibrate.files.loader import calibrations_folder, current_validity
 from calibrate.files.validity import FILE as VALIDITY_FILE
 from calibrate.files.validity import Validity, ValidityState
+from calibrate.files.verification import agrees
 from calibrate.files.versions import LogEntry, read_log, same_solve
 from recordings.files import MAIN_CAMERA
 
@@ -85,12 +86,19 @@ def read_installed(root: Path, camera: str = MAIN_CAMERA) -> Installed:
 
 def _generation(root: Path, camera: str, number: int) -> Calibration | None:
     """None when it is damaged or gone."""
-    return next(map(_read, (calibrations_folder(root, camera) / "gen").glob(f"{number:04d}-*.yaml")), None)
+    return next(map(readable, (calibrations_folder(root, camera) / "gen").glob(f"{number:04d}-*.yaml")), None)
+
+
+def readable(path: Path) -> Calibration | None:
+    """A session's calibration, read once for as long as the file is the same; None when it is damaged."""
+    try:
+        return _read_at(path, path.stat().st_mtime_ns)
+    except OSError:
+        return None
 
 
 @lru_cache(maxsize=256)
-def _read(path: Path) -> Calibration | None:
-    """A generation's file never changes."""
+def _read_at(path: Path, changed_ns: int) -> Calibration | None:
     try:
         return read_calibration(path)
     except CalibrationError:
@@ -135,3 +143,42 @@ def _mark(path: Path) -> tuple[str, int]:
         return str(path), path.lstat().st_mtime_ns
     except OSError:
         return str(path), 0
+
+
+@dataclass(frozen=True)
+class Result:
+    """A calibration file as the screens show it, beside what is installed."""
+
+    path: str
+    calibration: Calibration | None = None
+    """None: it cannot be read, and `problem`."""
+    state: Installed = Installed()
+    objections: tuple[str, ...] = ()
+    """Reasons, other than gates, for which installing would ask a reason."""
+    problem: str = ""
+
+    @property
+    def installed(self) -> bool:
+        return self.calibration is not None and same_solve(self.calibration, self.state.now)
+
+    @property
+    def verdict(self) -> Verdict:
+        """PASS WITH A REASON: a person gave one, or would have to, for something else than a gate."""
+        if self.calibration is None or self.calibration.verdict == "FAIL":
+            return "FAIL"
+        off = not all(map(agrees, self.calibration.verification))
+        taken = self.installed and self.state.now is not None and self.state.now.override is not None
+        if taken or off or (self.objections and not self.installed):
+            return "PASS WITH A REASON"
+        return self.calibration.verdict
+
+
+def read_result(path: str) -> Result:
+    """For a thread. What cannot be read is said in `problem`."""
+    try:
+        root = state_root(path)
+        calibration = read_calibration(Path(path))
+        state = read_installed(root, calibration.camera_name)
+        return Result(path, calibration, state, tuple(objections_beside(calibration, root)))
+    except CalibrationError as problem:
+        return Result(path, problem=str(problem))

@@ -1,86 +1,465 @@
-"""Live: what the operator watches while the arm works. Log: everything that was said meanwhile."""
+"""Capture: what the operator watches while the arm works. Log: everything that was said meanwhile."""
 
 from __future__ import annotations
 
 import re
+from collections.abc import Callable, Iterator
 
+import numpy as np
 from rich.text import Text
 from textual.app import ComposeResult
 from textual.containers import Horizontal, Vertical
+from textual.content import Content
 from textual.reactive import reactive
-from textual.widgets import RichLog, Static
+from textual.widgets import ProgressBar, RichLog, Static
 
-from station.cell.status import Event, StationStatus
+from station.cell.scene import Scene
+from station.cell.status import Event, PoseStatus, SessionStatus, StationState, StationStatus
+from station.protocol.states import LATCHED, RUNNING
 from station.tui.screen import StationScreen
-from station.tui.widgets import panels
+from station.tui.task import Known
+from station.tui.widgets.canvas import Series, curve
 from station.tui.widgets.preview import PreviewPane
-from station.tui.words import POSE_MARKS, clock
+from station.tui.widgets.scene import cell_scene, fields_of
+from station.tui.words import UNKNOWN, clock, degrees, duration, facts, mark, mm
 
-_STYLES = {"debug": "dim", "info": "", "warning": "bold", "error": "bold reverse"}
+CLOCKS_POOR_MS = 20.0
+"""The default of `capture.time_bound_s`: poses known worse than that are refused."""
+BURNT = 0.01
+"""Share of saturated pixels from which on a person should look."""
+_STEPS = {"moving": "move", "settling": "settle", "capturing": "capture", "writing": "save"}
+_LEVELS = {"debug": "$dim", "info": "", "warning": "$warn", "error": "bold $bad"}
+_SIGNS = {"debug": "", "info": "", "warning": "▲ ", "error": "✗ "}
 _FOLDERS = re.compile(r"(?<!\S)/\S*/(?=[^/\s]+/[^/\s]+)")
 """All but the last two names of an absolute path."""
-_WORDS = {"debug": "", "info": "", "warning": "WARN ", "error": "ERROR "}
+CHIPS: dict[str, tuple[str, str]] = {
+    "done": ("✓", "$ok on $okbg"),
+    "planned": ("·", "$dim"),
+    "skipped": ("-", "$dim"),
+    "failed": ("✗", "bold $bad on $badbg"),
+}
+LEGEND = "✓ saved  ! saved, look  ▶ now  · to come  - skipped  ✗ failed"
 
 
-def event_text(event: Event, width: int = 0) -> Text:
+def event_text(event: Event, width: int = 0) -> Content:
     """`width`: cells of the line; where a path makes it longer, its last two names stand for it. 0: whole."""
     pose = "" if event.pose_index is None else f"pose {event.pose_index + 1} "
-    when, said = clock(event.wall_ns), _WORDS[event.level] + pose + event.text
+    when, said = clock(event.wall_ns), _SIGNS[event.level] + pose + event.text
     if 0 < width <= len(when) + len(said):
         said = _FOLDERS.sub("…/", said)
-    return Text.assemble((when, "dim"), " ", (said, _STYLES[event.level]))
+    return Content.assemble((when, "$faint"), "  ", (said, _LEVELS[event.level]))
 
 
-class Events(Static):
-    """The newest events, as many as fit."""
+class Panel(Static):
+    """A titled box that is drawn anew only when its own text, or its size, changes."""
 
-    status: reactive[StationStatus | None] = reactive(None)
+    old: reactive[bool] = reactive(False)
+    """No longer how it is; said in the title too."""
 
-    def __init__(self, *, id: str = "events") -> None:
+    def __init__(
+        self, title: str, body: Callable[[Known, int, int], Content], *, id: str, below: str = ""
+    ) -> None:
+        """`body`: of what is known, in so many cells and rows. `below`: unit or keys, in the border."""
         super().__init__(id=id, classes="panel")
-        self.border_title = "Events"
-        self._shown: tuple[int, tuple[Event, ...]] | None = None
+        self.border_title, self.border_subtitle = title, below
+        self._title, self._body = title, body
+        self._known: Known | None = None
+        self._shown = Content()
 
     def on_resize(self) -> None:
-        self.watch_status(self.status)
+        if self._known is not None:
+            self.show(self._known)
 
-    def watch_status(self, status: StationStatus | None) -> None:
-        if status is None:
-            return  # what was said last stands there
-        newest, width = status.events[-max(4, self.size.height) :], self.content_size.width
-        if (width, newest) != self._shown:
-            self._shown = width, newest
-            text = Text("\n", no_wrap=True, overflow="ellipsis")
-            self.update(text.join(event_text(event, width) for event in reversed(newest)), layout=False)
+    def watch_old(self, old: bool) -> None:
+        self.border_title = f"{self._title}: OLD" if old else self._title
+
+    def show(self, known: Known) -> None:
+        """What was known last stands there while there is no status, marked old."""
+        self.old = bool(known.trouble) or known.silent_s is not None
+        if known.status is None or not self.display:
+            return
+        self._known = known
+        size = self.content_size
+        text = self._body(known, size.width, size.height)
+        if not text.is_same(self._shown):
+            grown = text.plain.count("\n") != self._shown.plain.count("\n")
+            self._shown = text
+            self.update(text, layout=grown and self.styles.height is not None and self.styles.height.is_auto)
+
+
+def lines(*parts: Content) -> Content:
+    return Content("\n").join(parts)
+
+
+def quality_line(status: StationStatus) -> Content:
+    """The board in the newest image: each with a mark, a value and, where it is poor, a word."""
+    seen = status.detection
+    if not seen.found:
+        advice = f"  {seen.advice}" if seen.advice else ""
+        return mark("look", seen.reason or "no board in view") + Content.styled(advice, "$dim")
+    whole, burnt = seen.corners == seen.expected, seen.saturated > BURNT
+    parts = [
+        mark("done" if whole else "look")
+        + Content(" ")
+        + facts(("corners", f"{seen.corners}/{seen.expected}", "")),
+        mark("look" if seen.advice and not burnt else "done")
+        + Content(" ")
+        + facts(("sharp", f"{seen.sharpness:.2f}", "")),
+        mark("look" if burnt else "done")
+        + Content(" ")
+        + facts(("light", f"{100 * seen.saturated:.1f} %", "burnt" if burnt else "good")),
+    ]
+    if seen.tilt_rad is not None:
+        parts.append(facts(("tilt", degrees(seen.tilt_rad, 0), "")))
+    if seen.distance_m is not None:
+        parts.append(facts(("at", mm(seen.distance_m, 0), "")))
+    parts.append(facts(("fills", f"{100 * seen.coverage:.0f} %", "")))
+    line = Content("  ").join(parts)
+    return line + Content.styled(f"   {seen.advice}", "$warn") if seen.advice else line
+
+
+def pose_line(status: StationStatus) -> Content:
+    """Steps of the pose under way, or what comes next at rest."""
+    session = status.session
+    pose = _under_way(status)
+    if pose is None:
+        return counted_line(session)
+    if pose.state == "failed":
+        return mark("failed", f"{pose.name}: {pose.reason}")
+    at = list(_STEPS).index(pose.state) if pose.state in _STEPS else (4 if pose.state == "done" else -1)
+    parts = []
+    for i, word in enumerate(_STEPS.values()):
+        if i == at:
+            parts.append(Content.styled(f" ▶ {word} ", "bold $strong on $accentbg"))
+        else:
+            parts.append(mark("done" if i < at else "todo", word))
+    return Content.styled(" ─ ", "$line").join(parts)
+
+
+def _under_way(status: StationStatus) -> PoseStatus | None:
+    session = status.session
+    if session.current is None or session.current >= len(session.poses):
+        return None
+    pose = session.poses[session.current]
+    resting = status.state in (StationState.IDLE, StationState.PAUSED)
+    return None if pose.state == "done" and resting else pose
+
+
+def counted_line(session: SessionStatus) -> Content:
+    """Progress of a session while no pose is under way, and what comes next."""
+    if not session.poses:
+        return Content.styled("No plan yet: 2, then n makes one.", "$dim")
+    if not session.name:
+        return Content.styled("Not begun: F5 shows the motion and asks first.", "$dim")
+    again = sum(pose.kept for pose in session.poses)
+    if session.calibration:
+        return mark("done", "finished and solved: 4 shows the result")
+    if session.recording:
+        return mark("done", "finished: k on 7 judges it" if session.check else "finished: F9 solves it")
+    return Content.styled(f"{again} to be captured again" if again else "resting", "$dim")
+
+
+def progress_lines(known: Known, width: int, height: int) -> Content:
+    """How many are saved, the steps of this pose, a chip a pose."""
+    status = known.status or StationStatus()
+    session, pose = status.session, _under_way(status)
+    saved = sum(pose.counts for pose in session.poses)
+    left = (
+        ()
+        if session.remaining_s is None or status.state not in RUNNING
+        else (("", duration(session.remaining_s), "left"),)
+    )
+    head = facts(("", str(saved), f"of {len(session.poses)} saved"), *left)
+    if status.playback:
+        head += Content.styled("   played, no arm moves", "$sim")
+    why = "" if pose is None else f"{pose.name}: {pose.why}" if pose.why else pose.name
+    return lines(
+        head, pose_line(status), Content.styled(why, "$dim"), *chips(session, width, max(1, height - 3))
+    )
+
+
+def chips(session: SessionStatus, width: int, rows: int) -> Iterator[Content]:
+    """A chip a pose, in the order of driving; of a long plan the rows around the one under way."""
+    each = 4 if len(session.poses) < 100 else 5
+    per_row = max(1, (width + 1) // (each + 1))
+    made = [_chip(pose, place == session.current, each) for place, pose in enumerate(session.poses)]
+    whole = [made[i : i + per_row] for i in range(0, len(made), per_row)]
+    first = max(0, min((session.current or 0) // per_row - 1, len(whole) - rows))
+    for row in whole[first : first + rows]:
+        yield Content(" ").join(row)
+
+
+def _chip(pose: PoseStatus, current: bool, cells: int) -> Content:
+    number = f"{pose.index + 1:>{cells - 2}}"
+    if current and pose.state in _STEPS:
+        return Content.styled(f"{number}▶ ", "bold $strong on $accentbg")
+    if pose.kept or (pose.state == "done" and pose.attempt > 1):
+        return Content.styled(f"{number}! ", "$warn on $warnbg")
+    sign, style = CHIPS.get(pose.state, ("▶", "bold $strong on $accentbg"))
+    return Content.styled(f"{number}{sign} ", style)
+
+
+def error_lines(known: Known, width: int, height: int) -> Content:
+    """The expected error as it falls towards its goal: measured solid, planned dotted."""
+    status = known.status or StationStatus()
+    estimate, poses = status.estimate, status.session.poses
+    goal = estimate.goal_mm
+    now = estimate.sigma_translation_mm
+    if status.playback and estimate.advice:
+        return Content.styled(estimate.advice, "$dim")
+    head = facts(("", f"± {now:.2f}" if now is not None else f"± {UNKNOWN}", "mm"))
+    if goal:
+        head += Content.assemble(("   goal ", "$dim"), (f"± {goal:.2f}", "$warn"))
+    if estimate.enough:
+        head += Content("   ") + mark("done", "reached")
+    measured = [(i + 1.0, p.estimated_sigma_mm) for i, p in enumerate(poses) if p.estimated_sigma_mm]
+    planned = [
+        (i + 1.0, p.predicted_sigma_mm)
+        for i, p in enumerate(poses)
+        if p.predicted_sigma_mm and p.predicted_sigma_mm < 100 * (goal or 0.5)
+    ]
+    end = f"by the plan ± {planned[-1][1]:.2f} mm" if planned else ""
+    rows = [head]
+    if end and height > 6:
+        rows.append(
+            Content.styled(f"{end} after {len(poses)} poses" + _advice(estimate.advice, width), "$dim")
+        )
+    rows.append(
+        curve(
+            [Series(planned, "$faint", dash=2), Series(measured, "$accent")],
+            goal,
+            width,
+            height - len(rows),
+            ends=f"pose 1|{len(poses)}" if height > 6 else "",
+        )
+    )
+    return lines(*rows)
+
+
+def _advice(advice: str, width: int) -> str:
+    return f". {advice}" if advice and len(advice) < width - 36 else ""
+
+
+_HEAT = ("$dim on $h0", "$foreground on $h1", "$strong on $h2", "$onaccent on $h3", "$onaccent on $h4")
+
+
+def coverage_lines(known: Known, width: int, height: int, scene: Scene | None = None) -> Content:
+    """The picture as a grid: in how many images each part showed the board, and which poses fill the rest."""
+    status = known.status or StationStatus()
+    views = status.estimate.image_views
+    if not views:
+        return Content.styled("no image of the board yet", "$dim")
+    columns = len(views[0])
+    cell = max(3, min(9, (width - 2) // columns - 1))
+    most = max(1, max(max(row) for row in views))
+    tall = 2 if height >= 2 * len(views) + 1 else 1
+    rows: list[Content] = []
+    for row in views:
+        words = [("empty" if cell > 5 else "--") if not count else str(count) for count in row]
+        heat = [0 if not count else 1 + min(3, 4 * count // (most + 1)) for count in row]
+        shown = [
+            Content.styled(word.center(cell), _HEAT[h] if h else "$warn on $h0")
+            for word, h in zip(words, heat, strict=True)
+        ]
+        rows.append(Content(" ").join(shown))
+        if tall == 2:
+            rows.append(Content(" ").join(Content.styled(" " * cell, _HEAT[h]) for h in heat))
+    if len(rows) < height:
+        rows.append(_empty_words(status, scene))
+    return lines(*rows[:height])
+
+
+def _empty_words(status: StationStatus, scene: Scene | None) -> Content:
+    views = status.estimate.image_views
+    empty = np.array(views) == 0
+    if not empty.any():
+        return mark("done", "the board was seen in every part")
+    said = f"{int(empty.sum())} of {empty.size} parts empty"
+    if scene is not None:
+        open_poses = [p for p in status.session.poses if p.state == "planned"]
+        filling = [str(p.index + 1) for p in open_poses if (fields_of(scene, p, *empty.shape) & empty).any()]
+        if filling:
+            return mark("look", said) + Content.styled(
+                f": pose {', '.join(filling[:6])} will show it there", "$dim"
+            )
+    return mark("look", said)
+
+
+def device_lines(known: Known, width: int, height: int) -> Content:
+    """Each device with its rate; two a line."""
+    status = known.status or StationStatus()
+    robot, camera, recorder, bounds = status.robot, status.camera, status.recorder, status.clock
+    if status.playback:
+        return Content.styled("robot not live   camera not live", "$dim")
+    parts = [
+        _device("robot", robot.connected, f"{robot.rate_hz:.0f} Hz"),
+        _device(
+            "camera",
+            camera.connected,
+            f"{camera.fps:.0f} fps" + f", {camera.dropped} lost" * bool(camera.dropped),
+        ),
+    ]
+    if status.trigger.present:
+        pulses, frames = status.trigger.pulses, status.trigger.frames
+        parts.append(_device("trigger", pulses == frames, f"{pulses} = {frames}"))
+    if recorder.recording or recorder.error:
+        parts.append(_device("record", not recorder.error, f"sync {recorder.sync_ms:.0f} ms"))
+    else:
+        parts.append(mark("todo", "not recording"))
+    known_ms = [ms for ms in (bounds.camera_bound_ms, bounds.controller_bound_ms) if ms is not None]
+    if known_ms:
+        parts.append(
+            _device(
+                "clocks",
+                sum(known_ms) < CLOCKS_POOR_MS,
+                f"± {sum(known_ms):.1f} ms {bounds.camera_source or ''}".rstrip(),
+            )
+        )
+    rows = [Content("")]
+    for part in parts:
+        longer = rows[-1] + Content("   ") + part if rows[-1] else part
+        if longer.cell_length > width and rows[-1]:
+            rows.append(part)
+        else:
+            rows[-1] = longer
+    return lines(*rows)
+
+
+def _device(name: str, good: bool, text: str) -> Content:
+    return mark("done" if good else "failed", name) + Content.styled(f" {text}", "$dim")
+
+
+class Events(Panel):
+    """The newest events, as many as fit."""
+
+    def __init__(self) -> None:
+        super().__init__("What happened", _newest, id="events", below="8 all")
+
+
+def _newest(known: Known, width: int, height: int) -> Content:
+    status = known.status or StationStatus()
+    return lines(*(event_text(event, width) for event in reversed(status.events[-max(1, height) :])))
+
+
+class Stopped(Static):
+    """Over the capture while STOP or a fault is latched: what happened, and the way on in three steps."""
+
+    def show(self, known: Known) -> None:
+        status = known.status
+        latched = status is not None and status.state in LATCHED and known.silent_s is None
+        self.display = latched
+        if status is None or not latched:
+            return
+        self.border_title = f"■ {status.state.value.upper()}"
+        self.border_subtitle = "latched until F8"
+        self.update(stopped_text(status))
+
+
+def stopped_text(status: StationStatus) -> Content:
+    session, robot = status.session, status.robot
+    on_way = _under_way(status)
+    again = (
+        f" Pose {on_way.index + 1} was on its way and is captured again."
+        if on_way and on_way.state != "done"
+        else ""
+    )
+    saved = (
+        f"{session.captured} of {len(session.poses)} poses are saved.{again}"
+        if session.poses
+        else "No session was running."
+    )
+    pendant = mark("look", robot.held) if robot.held else mark("done", "nothing to clear there")
+    safety = Content.assemble(("safety ", "$dim"), (robot.safety or UNKNOWN, "bold $strong"))
+    return lines(
+        Content.styled(f"The arm was told to stop. {status.reason}", "bold $strong"),
+        Content(""),
+        Content(saved),
+        Content(""),
+        Content.assemble(
+            (" 1  ", "bold $strong"),
+            ("Look at the cell. ", "bold"),
+            "Is anybody in reach? Did the arm touch anything?",
+        ),
+        Content.assemble((" 2  ", "bold $strong"), ("At the pendant: ", "bold"), safety, "  ", pendant),
+        Content.assemble(
+            (" 3  ", "bold $strong"),
+            (" F8  Acknowledge ", "bold $onaccent on $warn"),
+            ("  Nothing moves by it; F5 then asks again.", "$dim"),
+        ),
+    )
 
 
 class LiveScreen(StationScreen):
-    """Camera, quality, progress on the left; devices, poses, estimate on the right; events below."""
+    """The camera's picture as large as it can be; progress, error, coverage and devices beside it."""
 
+    MODE, NAME = "capture", "Capture"
     HELP = (
-        "The running capture. F5 asks before the arm moves; F12 stops it at once, in every screen. Poses: "
-        + " ".join(f"{mark} {state}" for state, mark in POSE_MARKS.items())
-        + "."
+        "The running capture. F5 asks before the arm moves; F12 stops it at once, on every screen. Poses: "
+        f"{LEGEND}."
     )
 
     def body(self) -> ComposeResult:
         with Horizontal(id="live"):
             with Vertical(id="live-left"):
-                yield PreviewPane(id="preview")
-                yield panels.Panel("Detection", panels.detection_lines, id="detection")
-                yield panels.Panel("Pose", panels.progress_lines, id="progress")
+                with Vertical(id="picture", classes="panel"):
+                    yield PreviewPane(id="preview")
+                    yield Static(id="quality")
+                yield Events()
             with Vertical(id="live-right"):
-                yield panels.Panel("Devices", panels.device_lines, id="devices")
-                yield panels.Panel("Poses", panels.pose_map_lines, id="poses")
-                yield panels.Panel("Image coverage", panels.coverage_lines, id="coverage")
-                yield panels.Panel("Estimate (not final)", panels.estimate_lines, id="estimate", wrap=True)
-                yield panels.Panel("Robot (mm, °)", panels.robot_lines, id="robot")
-        yield Events()
+                with Vertical(id="progress", classes="panel"):
+                    yield ProgressBar(id="bar-of-poses", show_eta=False, show_percentage=False)
+                    yield Panel("", progress_lines, id="poses")
+                yield Panel("Expected error of the camera's position (1σ)", error_lines, id="error")
+                yield Panel(
+                    "Where in the picture the board was seen",
+                    self._coverage,
+                    id="coverage",
+                    below="images per part",
+                )
+                yield Panel("Devices", device_lines, id="devices")
+        yield Stopped(id="stopped")
+
+    def on_mount(self) -> None:
+        self.query_one("#picture").border_title = "Camera"
+        self.query_one("#picture").border_subtitle = "+ found corners"
+
+    def _coverage(self, known: Known, width: int, height: int) -> Content:
+        status = known.status or StationStatus()
+        return coverage_lines(known, width, height, cell_scene(self.desk.configuration, status))
+
+    def show(self, known: Known) -> None:
+        super().show(known)
+        for part in self.query("Panel, Stopped"):
+            part.show(known)  # type: ignore[attr-defined]
+        old = bool(known.trouble) or known.silent_s is not None
+        self.query_one(PreviewPane).old = old
+        status = known.status
+        if status is None:
+            return
+        session = status.session
+        place = 0 if session.current is None else session.current + 1
+        title = f"Pose {place} of {len(session.poses)}" if place and status.state in RUNNING else "Poses"
+        self.query_one("#progress").border_title = f"{title}: OLD" if old else title
+        self.query_one("#picture").border_title = (
+            f"Camera  {status.camera.model}"
+            if status.camera.connected or status.playback
+            else "Camera: not connected"
+        )
+        bar = self.query_one(ProgressBar)
+        saved, total = float(sum(pose.counts for pose in session.poses)), float(len(session.poses) or 1)
+        if (bar.progress, bar.total) != (saved, total):
+            bar.update(total=total, progress=saved)
+        quality = quality_line(status)
+        if not quality.is_same(getattr(self, "_quality", Content("?"))):
+            self._quality = quality
+            self.query_one("#quality", Static).update(quality, layout=False)
+        self.query_one("#live").set_class(status.state in LATCHED, "-dimmed")
 
 
 class LogScreen(StationScreen):
     """All events, newest last, to scroll through."""
 
+    MODE, NAME = "log", "Log"
     HELP = "All events the daemon still holds; the same lines are in the journal and in the recording."
 
     def __init__(self) -> None:
@@ -93,12 +472,17 @@ class LogScreen(StationScreen):
     def on_mount(self) -> None:
         self.query_one("#log", RichLog).focus()
 
-    def show(self, status: StationStatus | None) -> None:
-        super().show(status)
+    def show(self, known: Known) -> None:
+        super().show(known)
+        status = known.status
         events = () if status is None else status.events
         start = events.index(self._last) + 1 if self._last in events else 0
+        log = self.query_one("#log", RichLog)
         if status is not None and status.playback and start == 0:  # it went back
-            self.query_one("#log", RichLog).clear()
+            log.clear()
         for event in events[start:]:
-            self.query_one("#log", RichLog).write(event_text(event))
+            log.write(Text(event_text(event).plain, style=_RICH[event.level]))
             self._last = event
+
+
+_RICH = {"debug": "dim", "info": "", "warning": "yellow", "error": "bold red"}

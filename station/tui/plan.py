@@ -1,147 +1,150 @@
-"""Plan: every pose with its state and reason; add, drop, skip, retake before and while the arm works."""
+"""Plan: every pose with its gain and reason, the cell around it; add, drop, skip, retake."""
 
 from __future__ import annotations
 
+import math
+import re
 from typing import ClassVar
 
-from rich.text import Text
 from textual import work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
 from textual.containers import Horizontal, Vertical
-from textual.widgets import DataTable, Static
+from textual.content import Content
+from textual.coordinate import Coordinate
+from textual.widgets import Static
 
-from recordings.schema.messages import Matrix4
 from station.cell.plan import PlannedPose
+from station.cell.scene import Scene
 from station.cell.status import PoseStatus, StationStatus
 from station.operate.motion import PREPARE_S
 from station.protocol.verbs import Add, Drop, MakePlan, Reorder, Retake, Skip
+from station.tui.live import Panel
 from station.tui.screen import Rows, StationScreen
-from station.tui.words import POSE_MARKS
+from station.tui.task import Known
+from station.tui.widgets.scene import LEGEND, cell_scene, draw, view_of
+from station.tui.words import UNKNOWN, Mark, degrees, facts, limit_bar, many, mark, mm, rich_text
 
-COLUMNS = ("#", "pose", "state", "± then", "why it is there / what happened", "attempt", "corners")
+COLUMNS = ("#", "error then", "", "distance", "tilt", "why it is there", "state")
 NO_PLAN = "No plan yet: n makes one of 25 poses (some seconds, nothing moves); a adds the arm's posture."
 RETAKE = "Capture this pose again at the next run; the view it has counts until then"
 SKIP = "Leave this pose out; of one that has a view only its retake"
 POSE_VERBS = {"retake": Retake, "skip": Skip, "drop": Drop}
-MOVE = Binding.Group("Move", compact=True)
+MOVE = Binding.Group("order", compact=True)
 SIGMA_SHOWN_MM = 100.0
+"""The first poses alone determine nothing: a number in metres would only puzzle."""
+BAR_CELLS = 12
+TURN_DEG, ZOOM = 15.0, 1.25
+_SEEN = re.compile(r"^\d+ mm, tilt \d+°, ")
+"""What the columns beside it say of the planned pose."""
+_STATES: dict[str, tuple[Mark, str]] = {
+    "planned": ("todo", "planned"),
+    "done": ("done", "saved"),
+    "failed": ("failed", "failed"),
+    "skipped": ("todo", "skipped"),
+}
 
-Point = tuple[float, float, str]
 
-
-def row_of(pose: PoseStatus) -> tuple[str, ...]:
-    """One line of the table, plain words and marks."""
-    sigma_mm = pose.predicted_sigma_mm
-    # The first poses alone determine nothing: a number in metres would only puzzle.
-    gain = "-" if sigma_mm is None or sigma_mm > SIGMA_SHOWN_MM else f"{sigma_mm:.2f} mm"
+def row_of(pose: PoseStatus, goal_mm: float, scene: Scene | None) -> tuple[Content, ...]:
+    """One line of the table."""
+    sigma_mm = pose.estimated_sigma_mm or pose.predicted_sigma_mm
+    shown = sigma_mm is not None and sigma_mm <= SIGMA_SHOWN_MM
+    view = None if scene is None else view_of(scene, pose)
+    kind, word = _STATES.get(pose.state, ("now", pose.state))
+    state = f"{word}: {pose.reason}" if pose.state == "failed" and pose.reason else word
+    good = sigma_mm is not None and sigma_mm <= goal_mm
     return (
-        str(pose.index + 1),
-        pose.name,
-        f"{POSE_MARKS[pose.state]} {pose.state}",
-        gain,
-        pose.reason or pose.why,
-        str(pose.attempt or ""),
-        "" if pose.corners is None else str(pose.corners),
+        Content.styled(f"{pose.index + 1:>3}", "$foreground"),
+        facts(("", f"{sigma_mm:7.2f}" if shown else f"{UNKNOWN:>7}", "mm")),
+        limit_bar(
+            _log(sigma_mm, goal_mm) if sigma_mm else 9.0, 1.0, BAR_CELLS, "$ok" if good else "$warn", 0.5
+        ),
+        Content.styled(mm(view[0], 0) if view else UNKNOWN, "$foreground"),
+        Content.styled(f"{degrees(view[1], 0):>4}" if view else UNKNOWN, "$foreground"),
+        Content.styled(_SEEN.sub("", pose.why) if view else pose.why or pose.name, "$foreground"),
+        mark("look" if pose.kept else kind, "to be captured again" if pose.kept else state),
     )
 
 
-def detail_of(pose: PoseStatus) -> str:
+def _log(sigma_mm: float, goal_mm: float) -> float:
+    """1 at the goal, 0 at a tenth of it, 2 at ten times as much."""
+    return max(0.05, 1 + math.log10(max(sigma_mm, 1e-6) / goal_mm))
+
+
+def facts_line(status: StationStatus) -> Content:
+    """The plan in one line."""
+    poses = status.session.poses
+    if not poses:
+        return Content.styled(NO_PLAN, "$dim")
+    ends = [pose.predicted_sigma_mm for pose in poses if pose.predicted_sigma_mm is not None]
+    line = facts(("", str(len(poses)), "poses" if len(poses) != 1 else "pose"))
+    if ends:
+        line += Content("   ") + facts(("expected at the end", f"± {ends[-1]:.2f}", "mm (1σ)"))
+        if (goal := status.estimate.goal_mm) is not None:
+            line += Content("   ") + mark("done" if ends[-1] <= goal else "look", f"goal {goal:g} mm")
+    left_out = sum(pose.state == "skipped" for pose in poses)
+    return line + Content.styled(f"   {many(left_out, 'pose')} skipped" * bool(left_out), "$dim")
+
+
+def detail_of(pose: PoseStatus, before: PoseStatus | None, scene: Scene | None) -> Content:
     """One pose in words, with what the table has no room for."""
-    seen = "" if pose.corners is None else f" {pose.corners} corners in attempt {pose.attempt}."
-    why = f" {pose.why}." if pose.why and pose.reason else ""
-    return f"{pose.name}: {pose.reason or pose.why}.{why}{seen}"
-
-
-def scatter(points: list[Point], width: int, height: int) -> list[str]:
-    """Points (right, up, mark) scaled alike in both directions; a cell is twice as high as wide."""
-    if not points:
-        return []
-    low_x, high_x = min(p[0] for p in points), max(p[0] for p in points)
-    low_y, high_y = min(p[1] for p in points), max(p[1] for p in points)
-    per_cell = max((high_x - low_x) / max(1, width - 1), (high_y - low_y) / max(1, 2 * (height - 1)), 1e-3)
-    grid = [[" "] * width for _ in range(height)]
-    for x, y, mark in points:
-        row = height - 1 - round((y - low_y) / per_cell / 2)
-        grid[max(0, min(height - 1, row))][min(width - 1, round((x - low_x) / per_cell))] = mark
-    return ["".join(row).rstrip() for row in grid]
-
-
-class PlanSketch(Static):
-    """Two small views; the highlighted pose is `@`, the arm's flange is `A`."""
-
-    def __init__(self, *, id: str) -> None:
-        super().__init__(id=id, classes="panel")
-        self.border_title = "Where the arm goes"
-        self._shown = ""
-        self._last: tuple[StationStatus | None, int] = (None, 0)
-
-    def on_resize(self) -> None:
-        self.show(*self._last)
-
-    def show(self, status: StationStatus | None, line: int) -> None:
-        self._last = (status, line)
-        if status is None or not self.size:
-            return
-        stops = [
-            (pose.base_from_flange, "@" if i == line else POSE_MARKS[pose.state])
-            for i, pose in enumerate(status.session.poses)
-            if pose.base_from_flange is not None
-        ]
-        if status.robot.base_from_flange is not None:
-            stops.append((status.robot.base_from_flange, "A"))
-        width, height = max(10, self.size.width - 2), max(4, (self.size.height - 5) // 2)
-        above = scatter([(x, y, m) for (x, y, _), m in map(_place, stops)], width, height)
-        side = scatter([(x, z, m) for (x, _, z), m in map(_place, stops)], width, height)
-        lines = ["from above (x right, y up)", *above, "from the side (x right, z up)", *side]
-        if (text := "\n".join(lines)) != self._shown:
-            self._shown = text
-            self.update(Text(text, no_wrap=True), layout=False)
-
-
-def _place(stop: tuple[Matrix4, str]) -> tuple[tuple[float, float, float], str]:
-    matrix, mark = stop
-    return (matrix[0][3], matrix[1][3], matrix[2][3]), mark
+    view = None if scene is None else view_of(scene, pose)
+    seen = "" if pose.corners is None else f"{many(pose.corners, 'corner')} in attempt {pose.attempt}"
+    rows = [Content.assemble((f"{pose.name}  ", "bold $strong"), pose.why or "added by hand")]
+    gains = [p.predicted_sigma_mm for p in (before, pose) if p is not None and p.predicted_sigma_mm]
+    if len(gains) == 2 and max(gains) <= SIGMA_SHOWN_MM:
+        rows.append(facts(("brings", f"± {gains[0]:.2f} → ± {gains[1]:.2f}", "mm")))
+    if view is not None:
+        rows.append(facts(("board", mm(view[0], 0), "away"), ("tilted", degrees(view[1], 0), "")))
+    if pose.reason or seen:
+        kind: Mark = "failed" if pose.state == "failed" else "look" if pose.reason else "done"
+        rows.append(mark(kind, ". ".join(words for words in (pose.reason, seen) if words)))
+    return Content("\n").join(rows)
 
 
 class PlanScreen(StationScreen):
     """The table is the plan as the daemon holds it; every change is asked of the daemon."""
 
+    MODE, NAME = "plan", "Plan"
     HELP = (
         "Poses in capture order. Nothing moves without your approval: F5, p and b show the motion and ask. "
-        "Home and End go to the first and the last pose. ± then: the expected error after this pose, "
-        "as planned."
+        "Home and End go to the first and the last pose. Error then: the expected error (1σ) after this "
+        "pose, against the goal."
     )
     BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("n", "make", "New", tooltip="Plan 25 poses from the configured initial poses (seconds)"),
         Binding("r", "pose('retake')", "Retake", tooltip=RETAKE),
         Binding("s", "pose('skip')", "Skip", tooltip=SKIP),
         Binding("d", "pose('drop')", "Drop", tooltip="Remove this pose from the plan"),
-        Binding("a", "add", "Add", tooltip="Add the arm's present posture as a pose"),
-        Binding("n", "make", "New", tooltip="Plan 25 poses from the configured guesses (seconds)"),
-        Binding(
-            "p",
-            "app.start('improve')",
-            "Replan",
-            tooltip="Plan the remaining poses again",
-        ),
+        Binding("a", "add", "Add here", tooltip="Add the arm's present posture as a pose"),
+        Binding("p", "app.start('improve')", "Replan", tooltip="Plan the remaining poses again (asks)"),
         Binding("b", "app.start('best')", "Next pose", tooltip="Add and capture the most useful pose (asks)"),
-        Binding("ctrl+up", "shift(-1)", "Move", group=MOVE, tooltip="Visit this pose earlier"),
-        Binding("ctrl+down", "shift(1)", "Move", group=MOVE, tooltip="Visit this pose later"),
+        Binding("ctrl+up", "shift(-1)", "Order", group=MOVE, tooltip="Visit this pose earlier"),
+        Binding("ctrl+down", "shift(1)", "Order", group=MOVE, tooltip="Visit this pose later"),
+        Binding("left_square_bracket", "turn(-1)", "Turn", show=False, tooltip="Turn the view of the cell"),
+        Binding("right_square_bracket", "turn(1)", "Turn", show=False, tooltip="Turn it the other way"),
+        Binding("plus,equals_sign", "zoom(1)", "Zoom", show=False, tooltip="See the cell larger"),
+        Binding("minus", "zoom(-1)", "Zoom", show=False, tooltip="See the cell smaller"),
     ]
 
     def __init__(self) -> None:
         super().__init__()
-        self._detail = NO_PLAN
-        self._rows: list[tuple[str, ...]] = []
+        self._rows: list[tuple[Content, ...]] = []
+        self._turn_deg, self._zoom = -60.0, 1.0
 
     def body(self) -> ComposeResult:
+        yield Static(NO_PLAN, id="plan-facts")
         with Horizontal(id="plan"):
             with Vertical(id="plan-left"):
-                yield Rows(id="plan-table")
-                yield Static(NO_PLAN, id="plan-detail")
-            yield PlanSketch(id="plan-sketch")
+                with Vertical(id="plan-poses", classes="panel"):
+                    yield Rows(id="plan-table")
+                yield Panel("Why", self._why, id="plan-detail")
+            with Vertical(id="plan-right"):
+                yield Panel("The cell", self._cell, id="plan-cell", below="\\[ ] turn  + − zoom")
+                yield Panel("From above", self._above, id="plan-above", below=LEGEND)
 
     def on_mount(self) -> None:
+        self.query_one("#plan-poses").border_title = "Poses"
         self.table.add_columns(*COLUMNS)
         self.table.focus()
 
@@ -149,37 +152,71 @@ class PlanScreen(StationScreen):
     def table(self) -> Rows:
         return self.query_one(Rows)
 
-    def show(self, status: StationStatus | None) -> None:
-        super().show(status)
+    def show(self, known: Known) -> None:
+        super().show(known)
+        status = known.status
         if status is None:
             return  # what was known last stands there
-        poses = status.session.poses
-        rows = [row_of(pose) for pose in poses]
+        poses, goal_mm = status.session.poses, status.estimate.goal_mm or 0.5
+        scene = cell_scene(self.desk.configuration, status)
+        rows = [row_of(pose, goal_mm, scene) for pose in poses]
+        self.query_one("#plan-facts", Static).update(facts_line(status), layout=False)
+        variables = self.app.theme_variables
         if len(rows) != self.table.row_count:
             at = self.table.cursor_row
             self.table.clear()
             for row in rows:
-                self.table.add_row(*row)
+                self.table.add_row(*(rich_text(cell, variables) for cell in row))
             self.table.move_cursor(row=at)  # a dropped pose leaves the next one marked
         else:
             for line, (row, before) in enumerate(zip(rows, self._rows, strict=True)):
-                for column, text in enumerate(row):
-                    if before[column] != text:
-                        self.table.update_cell_at((line, column), text, update_width=True)  # type: ignore[arg-type]
+                for column, cell in enumerate(row):
+                    if not cell.is_same(before[column]):
+                        text = rich_text(cell, variables)
+                        self.table.update_cell_at(Coordinate(line, column), text, update_width=True)
         self._rows = rows
-        self._explain(status, self.table.cursor_row)
+        self._explain(known)
 
-    def on_data_table_row_highlighted(self, event: DataTable.RowHighlighted) -> None:
-        self._explain(self.desk.status, event.cursor_row)
+    def on_data_table_row_highlighted(self) -> None:
+        self._explain(self.desk.known())
 
-    def _explain(self, status: StationStatus | None, line: int) -> None:
-        """The highlighted pose in words and in the sketch."""
-        self.query_one(PlanSketch).show(status, line)
-        poses = () if status is None else status.session.poses
-        text = detail_of(poses[line]) if line < len(poses) else NO_PLAN
-        if text != self._detail:
-            self._detail = text
-            self.query_one("#plan-detail", Static).update(Text(text))
+    def _explain(self, known: Known) -> None:
+        """The highlighted pose in words and in the scene."""
+        for panel in self.query(Panel):
+            panel.show(known)
+
+    def _why(self, known: Known, width: int, height: int) -> Content:
+        status = known.status or StationStatus()
+        poses, line = status.session.poses, self.table.cursor_row
+        if not line < len(poses):
+            return Content.styled(NO_PLAN, "$dim")
+        before = poses[line - 1] if line else None
+        return detail_of(poses[line], before, cell_scene(self.desk.configuration, status))
+
+    def _cell(self, known: Known, width: int, height: int) -> Content:
+        return self._drawn(known, width, height, self._turn_deg, 22.0, self._zoom)
+
+    def _above(self, known: Known, width: int, height: int) -> Content:
+        return self._drawn(known, width, height, -90.0, 90.0, 1.0)
+
+    def _drawn(
+        self, known: Known, width: int, height: int, turn_deg: float, lift_deg: float, zoom: float
+    ) -> Content:
+        status = known.status or StationStatus()
+        scene = cell_scene(self.desk.configuration, status)
+        if scene is None:
+            words = "To draw the cell, the configuration needs initial camera and board poses."
+            return Content.styled(words, "$dim")
+        chosen = self.table.cursor_row if status.session.poses else None
+        return draw(scene, status, chosen, width, height, turn_deg=turn_deg, lift_deg=lift_deg, zoom=zoom)
+
+    def action_turn(self, by: int) -> None:
+        self._turn_deg += by * TURN_DEG
+        self._explain(self.desk.known())
+
+    def action_zoom(self, by: int) -> None:
+        self._zoom = min(4.0, max(0.5, self._zoom * ZOOM**by))
+        self._explain(self.desk.known())
 
     def _selected(self) -> int | None:
         status = self.desk.status

@@ -10,6 +10,7 @@ from textual.binding import Binding, BindingType
 from station.cell.status import StationState, StationStatus
 from station.tui.live import LiveScreen
 from station.tui.replay import ReplayLink
+from station.tui.task import Known
 
 WATCHABLE = (StationState.IDLE, StationState.DISCONNECTED)
 """A cell at rest: nobody looks at an old recording while the arm works or waits for an answer."""
@@ -44,6 +45,7 @@ class Player:
 class ReplayScreen(Player, LiveScreen):
     """Shows `link`'s statuses in place of the daemon's. STOP still goes to the daemon."""
 
+    NAME = "Playback"
     HELP = (
         "PLAYBACK of a recording. Nothing can be commanded; F12 still stops this cell's arm. Escape leaves."
     )
@@ -60,19 +62,20 @@ class ReplayScreen(Player, LiveScreen):
     def on_mount(self) -> None:
         self.play()
 
-    def show(self, status: StationStatus | None) -> None:
+    def show(self, known: Known) -> None:
         """The cell's own status shows nothing here, but its work ends the playback."""
+        status = known.status
         if status is not None and status.state not in WATCHABLE:
             self.notify(f"The playback was closed: the cell is {status.state.value}.", severity="warning")
             self.action_close()
             return
-        super().show(self._played)
+        super().show(Known(self._played))
 
     @work(exclusive=True, exit_on_error=False)
     async def play(self) -> None:
         async for status in self.link.statuses():
             self._played = status
-            super().show(status)
+            super().show(Known(status))
 
     async def on_unmount(self) -> None:
         await self.link.close()

@@ -1,231 +1,518 @@
-"""Result: the gates first, then the camera pose with its uncertainty, then the views."""
+"""Solve, Verify, Install: the verdict of one calibration first, then what each step needs of it."""
 
 from __future__ import annotations
 
-import asyncio
 from collections.abc import Sequence
-from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
-from rich.text import Text
-from textual import work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
-from textual.containers import Horizontal, VerticalScroll
-from textual.widgets import Static
+from textual.containers import Horizontal, Vertical
+from textual.content import Content
+from textual.widgets import DataTable, Static
 
-from calibrate.errors import CalibrationError
-from calibrate.files.calibration import Calibration, read_calibration
+from calibrate.files.calibration import Calibration, Gate
 from calibrate.files.formatting import arm_sentences
-from calibrate.files.install import objections_beside
 from calibrate.files.validity import ValidityState, validity_text
-from calibrate.files.verification import agrees, touch_text
-from calibrate.files.versions import same_solve
+from calibrate.files.verification import agrees, touch_sigmas
+from calibrate.files.versions import LogEntry, read_log
 from calibrate.geometry import difference
-from station.tui.installed import LOOK_S, Ended, Installed, Marks, marks, read_installed, state_root
-from station.tui.screen import StationScreen
+from calibrate.quality.checks import CheckEntry, find_trend, read_checks
+from recordings.files import MAIN_CAMERA
+from station.operate.ending import Way, after_drift_check, after_solve
+from station.tui.installed import Result, local, state_root
+from station.tui.live import Panel
+from station.tui.screen import Rows, StationScreen
+from station.tui.task import Known
+from station.tui.widgets.canvas import Series, curve
+from station.tui.words import UNKNOWN, Mark, facts, limit_bar, many, mark, rich_text, signed
 
-NO_RESULT = "No result yet. F9 solves the session just captured; on screen 4, v shows older ones."
-NOTHING = Installed()
-BAR_CELLS = 24
-REASONED = {False: "installs only with a reason", True: "installed, overridden"}
+NO_RESULT = "No result yet. F9 solves the session just captured; on 7, Enter shows older ones."
+STYLES = {"PASS": "-pass", "PASS WITH A REASON": "-reason", "FAIL": "-fail"}
+SIGNS: dict[str, str] = {"PASS": "✓", "PASS WITH A REASON": "▲", "FAIL": "✗"}
+BAR_CELLS = 14
+FEWEST_CHECKS = 5
+"""Drift checks from which on a trend may be told (`quality.checks`)."""
 
 
-def ended_words(end: Ended) -> str:
-    return f"It was installed before, and {end.how} by {end.by}"
-
-
-def verdict_text(
-    calibration: Calibration, state: Installed = NOTHING, objections: Sequence[str] = ()
-) -> Text:
-    """The checklist: what passed, what failed and what to do about it.
-
-    `objections`: what else installing would ask a reason for.
-    """
-    installed, end = same_solve(calibration, state.now), state.end_of(calibration)
-    gates = sorted(calibration.quality.gates, key=lambda gate: gate.passed)  # the failed ones first
-    touches = sorted(calibration.verification, key=agrees)
-    against = [
-        _many(len(calibration.quality.failed), "GATE") + " FAILED",
-        _many(sum(not agrees(touch) for touch in touches), "CORNER") + " OFF IN THE TOUCH TEST",
-        _many(len(objections), "OBJECTION"),
+def verdict_lines(result: Result) -> Content:
+    """The verdict; the accuracy in a sentence; what speaks against it; what was checked."""
+    calibration = result.calibration
+    if calibration is None:
+        return Content(result.problem or NO_RESULT)
+    quality, failed = calibration.quality, calibration.quality.failed
+    ended = result.state.end_of(calibration)
+    if result.installed:
+        state = result.state.held
+    elif ended is not None:
+        state = ended.how.upper()
+    else:
+        state = "ready to install" if result.verdict == "PASS" else "installs only with a reason"
+    rows = [Content.styled(f"{SIGNS[result.verdict]} {result.verdict}, {state}", "bold")]
+    rows.append(Content.styled(f"  {_accuracy(calibration)}", "bold"))
+    if result.installed and (validity := result.state.validity) is not None:
+        doubted = validity.state is not ValidityState.VALID
+        rows.append(Content.styled(f"  {validity_text(validity)}", "bold $warn" if doubted else ""))
+    rows += [Content(f"  {why}") for why in _against(result, calibration)]
+    if ended is not None:
+        rows.append(
+            Content(f"  It was installed before, and {ended.how} by {ended.by}. i installs it again.")
+        )
+    narrow, touches = sum(gate.narrow for gate in quality.gates), calibration.verification
+    gates = f"{len(quality.gates) - len(failed)} of {len(quality.gates)} gates passed"
+    said = [
+        gates + f", {narrow} narrowly" * bool(narrow),
+        f"{many(len(calibration.views.rejected), 'view')} rejected",
+        f"touch test: {sum(map(agrees, touches))} of {len(touches)} corners" if touches else "no touch test",
+        f"session {calibration.provenance.session}",
     ]
-    against = [words for words in against if not words.startswith("0 ")]
-    stamp = "" if calibration.source == "real" else f"{calibration.source.upper()}: never for a real cell\n"
-    ready = state.held if installed else end.how.upper() if end else "READY TO INSTALL"
-    head = ", ".join(against) + f": {REASONED[installed]}" if against else ready
-    text = Text().append(stamp, "bold").append(f"{head}\n", "bold reverse" if against else "bold")
-    if installed and state.now is not None and (taken := state.now.override) is not None:
-        text.append(f"Override by {taken.who}: “{taken.reason}”\n")
-    if installed and state.validity is not None:
-        doubted = state.validity.state is not ValidityState.VALID
-        text.append(f"{validity_text(state.validity)}\n", "bold reverse" if doubted else "")
-    if end is not None:
-        text.append(f"{ended_words(end)}. i installs it again\n")
-    text.append(f"session {calibration.provenance.session}\n")
-    for passed, words in (
-        *((False, words) for words in objections),
-        *((agrees(touch), f"touch test, {touch_text(touch)}") for touch in touches),
-        *((gate.passed, gate.text) for gate in gates),
-    ):
-        text.append(f"\n[{'ok' if passed else 'FAIL'}] ", style="" if passed else "bold reverse")
-        text.append(words)
-    return text
+    if calibration.source != "real":
+        said.append(f"{calibration.source.upper()}: never for a real cell")
+    return Content("\n").join([*rows, Content(f"  {'. '.join(said)}.")])
 
 
-def _many(count: int, what: str) -> str:
-    return f"{count} {what}{'S' * (count != 1)}"
+def _accuracy(calibration: Calibration) -> str:
+    """The gate that failed, or how far a point may be off."""
+    quality = calibration.quality
+    if quality.failed:
+        return quality.failed[0].text.partition(" FAIL")[0]
+    if quality.predicted_error_mm is None or quality.working_distance_m is None:
+        return f"The camera's position is right to ± {calibration.sigma.translation_mm:.2f} mm (1σ)."
+    judged = next((gate for gate in quality.gates if gate.name == "predicted_error_m"), None)
+    limit = f" The limit is {judged.shown(judged.limit)}." if judged is not None else ""
+    far = f"A point {quality.working_distance_m:.2f} m away is right to"
+    return f"{far} ± {quality.predicted_error_mm:.2f} mm (1σ).{limit}"
 
 
-def answer_text(calibration: Calibration) -> Text:
-    """The camera pose in millimetres and degrees, with standard uncertainties (1σ)."""
-    result, quality = calibration.result, calibration.quality
-    x, y, z = (1000 * v for v in result.translation_m)
-    sx, sy, sz = 1000 * np.sqrt(np.diag(np.array(calibration.covariance))[:3])
-    lines = [
-        f"{result.parent_frame}_from_{result.child_frame}",
-        f"x {x:9.2f} ± {sx:.2f} mm",
-        f"y {y:9.2f} ± {sy:.2f} mm",
-        f"z {z:9.2f} ± {sz:.2f} mm",
-        "quaternion " + " ".join(f"{q:.5f}" for q in result.rotation_xyzw),
-        f"rotation ± {calibration.sigma.rotation_deg:.3f}°",
-    ]
-    if quality.predicted_error_mm is not None and quality.working_distance_m is not None:
-        lines.append(f"a point at {quality.working_distance_m:.2f} m: ± {quality.predicted_error_mm:.2f} mm")
-    if quality.holdout is not None:
-        e_t, e_R = quality.holdout.e_t_m, quality.holdout.e_R
-        lines.append(f"held-out error e_t {1000 * e_t:.2f} mm, e_R {e_R:.4f}")
-    return Text("\n".join([*lines, *arm_sentences(calibration), *quality.warnings]))
+def _against(result: Result, calibration: Calibration) -> list[str]:
+    """What speaks against it, or who installed it all the same."""
+    if result.installed and result.state.now is not None and (taken := result.state.now.override) is not None:
+        return [f"Override by {taken.who}: “{taken.reason}”"]
+    end = after_solve(calibration, () if result.installed else result.objections)
+    others = [] if result.installed else [f"▲ {objection}" for objection in result.objections]
+    return others if end.way is Way.INSTALL or end.text in result.objections else [str(end), *others]
 
 
-def residual_text(calibration: Calibration) -> Text:
-    """Rejected views with their reasons, then reprojection per view as bars."""
-    rms = {v.index: v.rms_px for v in calibration.quality.views if v.rms_px is not None}
-    longest = max(rms.values(), default=1.0)
-    lines = [
-        f"{index + 1:>3} {'█' * max(1, round(BAR_CELLS * value / longest)):<{BAR_CELLS}} {value:.2f} px"
-        for index, value in sorted(rms.items())
-    ]
-    rejected = [f"{r.index + 1:>3} REJECTED {r.name}: {r.reason}" for r in calibration.views.rejected]
-    return Text("\n".join([*rejected, "reprojection error per view", *lines]))
-
-
-def change_text(calibration: Calibration, installed: Calibration | None) -> Text:
-    """Describe what installing would change."""
-    if installed is None:
-        return Text("\nnothing is installed yet")
-    if same_solve(calibration, installed):
-        return Text("\nthis one is installed")
-    if installed.mount != calibration.mount:
-        return Text(f"\ninstalled: {installed.mount}, this one: {calibration.mount}")
-    delta = difference(calibration.transform.matrix, installed.transform.matrix)
-    moved_mm, turned_deg = 1000 * np.linalg.norm(delta[:3]), np.degrees(np.linalg.norm(delta[3:]))
-    return Text(
-        f"\nagainst the installed one the camera is {moved_mm:.2f} mm and {turned_deg:.3f}° elsewhere"
+def gate_row(gate: Gate) -> tuple[Content, ...]:
+    """Mark, name, value, bar, limit, word."""
+    kind: Mark = "failed" if not gate.passed else "look" if gate.narrow else "done"
+    colour = {"failed": "$bad", "look": "$warn", "done": "$ok"}[kind]
+    style = "bold $strong" if kind != "done" else "$foreground"
+    name = mark(kind) + Content(" ") + Content.styled(gate.title, style)
+    word = Content.styled({"failed": "FAIL", "look": "narrow", "done": "pass"}[kind], colour)
+    if gate.sense is None or gate.value is None or gate.limit is None:
+        return name, Content(""), Content(""), Content(""), word
+    return (
+        name,
+        Content.styled(gate.shown(gate.value), "bold $strong"),
+        limit_bar(gate.value, gate.limit, BAR_CELLS, colour),
+        Content.styled(f"{gate.sense} {gate.shown(gate.limit)}", "$dim"),
+        word,
     )
 
 
-class ResultScreen(StationScreen):
-    """A calibration file: its verdict, its numbers, and what may be done with it."""
+def accuracy_card(calibration: Calibration) -> Content:
+    quality = calibration.quality
+    if quality.predicted_error_mm is None:
+        return facts(("", f"± {calibration.sigma.translation_mm:.2f}", "mm, camera position (1σ)"))
+    far = f"of a point {quality.working_distance_m or 0:.2f} m away (1σ)"
+    return Content("\n").join(
+        [
+            facts(("", f"± {quality.predicted_error_mm:.2f}", "mm")),
+            Content.styled(f"predicted error {far}", "$dim"),
+        ]
+    )
 
-    HELP = "The newest result, or the one picked on the sessions screen. Installing can be undone."
+
+def proof_card(calibration: Calibration) -> Content:
+    held = calibration.quality.holdout
+    if held is None:
+        return Content.styled(f"{UNKNOWN} no views were held out", "$dim")
+    return Content("\n").join(
+        [
+            facts(("", f"{1000 * held.e_t_m:.2f}", "mm"), ("", f"{held.e_R:.4f}", "rotation")),
+            Content.styled(f"held-out error over {many(len(held.pairs), 'sample')}", "$dim"),
+        ]
+    )
+
+
+def change_card(result: Result) -> Content:
+    """What installing would change."""
+    calibration, installed = result.calibration, result.state.now
+    if calibration is None:
+        return Content()
+    if result.installed:
+        return mark("done", "this one is installed")
+    if installed is None:
+        return Content.styled("Nothing is installed yet.", "$dim")
+    if installed.mount != calibration.mount:
+        return mark("look", f"installed: {installed.mount}, this one: {calibration.mount}")
+    delta = difference(calibration.transform.matrix, installed.transform.matrix)
+    moved_mm, turned_deg = 1000 * np.linalg.norm(delta[:3]), np.degrees(np.linalg.norm(delta[3:]))
+    return Content("\n").join(
+        [
+            facts(("", f"{moved_mm:.2f}", "mm"), ("", f"{turned_deg:.3f}", "°")),
+            Content.styled(f"from the installed one of {local(installed.created)}", "$dim"),
+        ]
+    )
+
+
+def pose_table(result: Result) -> Content:
+    """The camera pose, this one beside the installed one; positions in millimetres."""
+    calibration, installed = result.calibration, result.state.now
+    if calibration is None:
+        return Content()
+    beside = installed is not None and not result.installed and installed.mount == calibration.mount
+    frame = f"{calibration.result.parent_frame}_from_{calibration.result.child_frame}"
+    rows = [Content.styled(f"{frame:<26}" + ("installed        difference" if beside else ""), "$dim")]
+    sigmas = 1000 * np.sqrt(np.diag(np.array(calibration.covariance))[:3])
+    for axis, ours, sigma, k in zip("xyz", calibration.result.translation_m, sigmas, range(3), strict=True):
+        row = Content.assemble(
+            (f"{axis} ", "bold"),
+            (f"{signed(1000 * ours):>9}", "bold $strong"),
+            (f" ± {sigma:.2f} mm", "$dim"),
+        )
+        if beside and installed is not None:
+            theirs = installed.result.translation_m[k]
+            row += Content.styled(
+                f"   {signed(1000 * theirs):>9} mm  {signed(1000 * (ours - theirs)):>8} mm", "$dim"
+            )
+        rows.append(row)
+    rows.append(Content.styled(f"rotation ± {calibration.sigma.rotation_deg:.3f}° (1σ)", "$dim"))
+    quaternion = " ".join(signed(q, 5) for q in calibration.result.rotation_xyzw)
+    rows.append(Content.styled(f"x y z w  {quaternion}", "$dim"))
+    return Content("\n").join([*rows, *map(Content, arm_sentences(calibration))])
+
+
+def residual_lines(calibration: Calibration, width: int, height: int) -> Content:
+    """Reprojection error per view against the limit; rejected views with their reason first."""
+    rms = {v.index: v.rms_px for v in calibration.quality.views if v.rms_px is not None}
+    limit = next((g.limit for g in calibration.quality.gates if g.name == "view_rms_px"), None)
+    scale = limit or max(rms.values(), default=1.0)
+    rows = [mark("look", f"view {r.index + 1} rejected: {r.reason}") for r in calibration.views.rejected]
+    cells = max(8, width - 18)
+    # A limit far above every view would leave nothing to be seen.
+    shown = max([4 * max(rms.values(), default=0.0)], default=scale)
+    reach = min(scale, shown) or 1.0
+    rows.append(
+        Content.styled(f"bars to {reach:.2g} px" + (f", limit {limit:g} px" if limit else ""), "$dim")
+    )
+    weights = {v.index: v.weight for v in calibration.views.weights}
+    for index, value in sorted(rms.items()):
+        doubt = weights.get(index, 1.0) < 0.5
+        colour = "$bad" if limit and value > limit else "$warn" if doubt else "$accent"
+        row = Content.styled(f"{index + 1:>3} ", "$dim") + limit_bar(value, reach, cells, colour, 1.0)
+        rows.append(
+            row + Content.assemble((f" {value:.3f} px", "$foreground"), (" suspect" * doubt, "$warn"))
+        )
+    return Content("\n").join(rows)
+
+
+class ResultScreen(StationScreen):
+    """What the three have in common: the verdict on top, and what may be done with a calibration."""
+
     BINDINGS: ClassVar[list[BindingType]] = [
         Binding("i", "install", "Install", tooltip="Make this the cell's calibration; b undoes it"),
-        Binding("b", "roll_back", "Back", tooltip="Back to the calibration that was installed before"),
         Binding("h", "touch_test", "Touch test", tooltip="Bring the tip onto corners of the board"),
         Binding("e", "export", "Export", tooltip="Write it for ROS, OpenCV, URDF … beside the recording"),
+        Binding("b", "roll_back", "Roll back", tooltip="Back to the calibration that was installed before"),
         Binding("x", "discard", "Discard", tooltip="Delete this result; the recording stays"),
     ]
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._calibration: Calibration | None = None
-        self._loaded = ""
-        """Its file; the one to be shown next may be another already."""
-        self._state = NOTHING
-        self._marks: Marks = frozenset()
-
     def body(self) -> ComposeResult:
-        with Horizontal(id="result"):
-            with VerticalScroll(id="result-left"):
-                yield Static(NO_RESULT, id="verdict")
-            with VerticalScroll(id="result-right"):
-                yield Static(id="answer")
-                yield Static(id="change")
-                yield Static(id="residuals")
+        yield Static(NO_RESULT, id="verdict")
+        with Vertical(id="result"):
+            yield from self.evidence()
+
+    def evidence(self) -> ComposeResult:
+        yield from ()
 
     def on_mount(self) -> None:
-        self.query_one("#result-left").focus()
-        self.watch(self.desk, "result_path", self._picked, init=False)
-        self.set_interval(LOOK_S, self.look_again)
+        self.watch(self.desk, "result", self._changed, init=False)
+
+    def _changed(self) -> None:
+        self.show(self.desk.known())
 
     def on_screen_resume(self) -> None:
         super().on_screen_resume()
-        self.load()
+        self.desk.look_at_results()
 
-    def _picked(self) -> None:
-        self.load()
-
-    async def look_again(self) -> None:
-        """Another screen or a shell may have installed, gone back or solved again."""
-        path = self._shown
-        if not path or not self.is_current:
+    def show(self, known: Known) -> None:
+        super().show(known)
+        result = known.result
+        if result is getattr(self, "_drawn", ()):
             return
-        before, self._marks = self._marks, await asyncio.to_thread(marks, state_root(path))
-        if self._marks != before:
-            self.load()
+        self._drawn = result
+        verdict = self.query_one("#verdict", Static)
+        verdict.set_classes("" if result is None else STYLES[result.verdict])
+        verdict.update(Content(NO_RESULT) if result is None else verdict_lines(result))
+        self.query_one("#result").display = result is not None and result.calibration is not None
+        if result is not None and result.calibration is not None:
+            self.tell(result, result.calibration)
+        for panel in self.query(Panel):
+            panel.show(known)
 
-    @property
-    def _shown(self) -> str:
-        """The file that was picked, else that of the session just captured; empty: neither."""
-        status = self.desk.status
-        return self.desk.result_path or (status.session.calibration if status is not None else "")
+    def tell(self, result: Result, calibration: Calibration) -> None:
+        """Fill what is no panel."""
 
-    @work(exclusive=True, group="load", exit_on_error=False)
-    async def load(self) -> None:
-        path = self._shown
-        found, why, objections = None, NO_RESULT, []
-        if path:
-            try:
-                root = state_root(path)
-                found = await asyncio.to_thread(read_calibration, Path(path))
-                self._state = await asyncio.to_thread(read_installed, root, found.camera_name)
-                objections = await asyncio.to_thread(objections_beside, found, root)
-            except CalibrationError as problem:
-                why = str(problem)
-        self._calibration, self._loaded = found, path  # only now: keys work on what is shown
-        texts = [Text(why), Text(), Text(), Text()]
-        if found is not None:
-            change = change_text(found, self._state.now)
-            verdict = verdict_text(found, self._state, objections)
-            texts = [verdict, answer_text(found), change, residual_text(found)]
-        for name, text in zip(("verdict", "answer", "change", "residuals"), texts, strict=True):
-            self.query_one(f"#{name}", Static).update(text)
-
-    def _path(self) -> str | None:
-        if self._calibration is None:
-            self.notify("There is no result to use: F9 on the sessions screen makes one.")
+    def _of(self, line: str) -> Result | None:
+        """The shown result; None after saying that there is none."""
+        result = self.desk.result
+        if result is None or result.calibration is None:
+            self.notify(f"There is no result to {line}: F9 on 7 makes one.")
             return None
-        return self._loaded
+        return result
 
     def action_install(self) -> None:
-        if (path := self._path()) is not None and self._calibration is not None:
-            end = self._state.end_of(self._calibration)
-            self.desk.install(path, f"{ended_words(end)}." if end is not None else "")
+        if (result := self._of("install")) is not None and result.calibration is not None:
+            end = result.state.end_of(result.calibration)
+            before = "" if end is None else f"It was installed before, and {end.how} by {end.by}."
+            self.desk.install(result.path, before)
 
     def action_roll_back(self) -> None:
-        if (path := self._path()) is not None:
-            self.desk.roll_back(path)
+        if (result := self._of("roll back from")) is not None:
+            self.desk.roll_back(result.path)
 
     def action_touch_test(self) -> None:
-        if (path := self._path()) is not None:
-            self.desk.touch_test(path)
+        if (result := self._of("test")) is not None:
+            self.desk.touch_test(result.path)
 
     def action_export(self) -> None:
-        if (path := self._path()) is not None:
-            self.desk.export(path)
+        if (result := self._of("export")) is not None:
+            self.desk.export(result.path)
 
     def action_discard(self) -> None:
-        if (path := self._path()) is not None:
-            self.desk.discard(path)
+        if (result := self._of("discard")) is not None:
+            self.desk.discard(result.path)
+
+
+def _panel(title: str, text, *, id: str, below: str = "") -> Panel:  # type: ignore[no-untyped-def]
+    """A panel of the shown result: `text` of it, and of the room."""
+
+    def body(known: Known, width: int, height: int) -> Content:
+        result = known.result
+        return Content() if result is None or result.calibration is None else text(result, width, height)
+
+    return Panel(title, body, id=id, below=below)
+
+
+class SolveScreen(ResultScreen):
+    """The gates with value and limit, the camera pose, the views."""
+
+    MODE, NAME = "solve", "Solve"
+    HELP = (
+        "The newest result, or the one picked on 7. Enter on a gate tells its sentence. Installing can be "
+        "undone."
+    )
+
+    def evidence(self) -> ComposeResult:
+        with Horizontal(id="cards"):
+            yield _panel("Accuracy", lambda r, w, h: accuracy_card(r.calibration), id="accuracy")
+            yield _panel("Proof", lambda r, w, h: proof_card(r.calibration), id="proof")
+            yield _panel("Change", lambda r, w, h: change_card(r), id="change")
+        with Horizontal(id="solve"):
+            with Vertical(id="solve-left"):
+                with Vertical(id="gates-box", classes="panel"):
+                    yield Rows(id="gates")
+                yield _panel("Camera pose", lambda r, w, h: pose_table(r), id="answer")
+            yield _panel(
+                "How well each view fits",
+                lambda r, w, h: residual_lines(r.calibration, w, h),
+                id="residuals",
+                below="reprojection error",
+            )
+
+    def on_mount(self) -> None:
+        super().on_mount()
+        self.query_one("#gates-box").border_title = "Quality gates"
+        self.query_one("#gates-box").border_subtitle = "Enter tells why"
+        self.query_one(Rows).add_columns("gate", "value", "", "limit", "")
+        self.query_one(Rows).focus()
+
+    def tell(self, result: Result, calibration: Calibration) -> None:
+        table = self.query_one(Rows)
+        table.clear()
+        self._gates = sorted(calibration.quality.gates, key=lambda gate: (gate.passed, not gate.narrow))
+        for gate in self._gates:
+            table.add_row(*(rich_text(cell, self.app.theme_variables) for cell in gate_row(gate)))
+        passed = sum(gate.passed for gate in self._gates)
+        self.query_one("#gates-box").border_title = f"Quality gates  {passed} of {len(self._gates)} passed"
+
+    def on_data_table_row_selected(self, event: DataTable.RowSelected) -> None:
+        self.notify(self._gates[event.cursor_row].text, timeout=10, markup=False)
+
+
+class VerifyScreen(ResultScreen):
+    """What proves it apart from the images it was made of: the touch test, and drift checks over time."""
+
+    MODE, NAME = "verify", "Verify"
+    HELP = "h starts the touch test: a tip over corners of the board, by hand. d on 7 captures a drift check."
+
+    def evidence(self) -> ComposeResult:
+        with Horizontal(id="verify"):
+            yield _panel(
+                "Touch test", lambda r, w, h: touch_lines(r.calibration), id="touches", below="h starts it"
+            )
+            yield _panel("Held-out views", lambda r, w, h: held_out_lines(r.calibration, w), id="held-out")
+        yield _panel(
+            "Drift checks of the installed calibration",
+            lambda r, w, h: drift_lines(drift_history(r), w, h),
+            id="drift",
+            below="d on 7 captures one",
+        )
+
+
+def touch_lines(calibration: Calibration) -> Content:
+    if not calibration.verification:
+        return Content("\n").join(
+            [
+                mark("todo", "not yet"),
+                Content("The one check that needs no mathematics: a pointer's tip"),
+                Content("is put over corners of the board, and your hand tells how"),
+                Content("far it lands beside them. Every motion asks first."),
+            ]
+        )
+    rows = []
+    for touch in calibration.verification:
+        x, y = touch.offset_mm
+        kind: Mark = "done" if agrees(touch) else "failed"
+        rows.append(
+            mark(kind, f"corner {touch.corner:>3}")
+            + Content("  ")
+            + facts(
+                ("x", signed(x), ""),
+                ("y", signed(y), "mm"),
+                ("", f"{touch_sigmas(touch):.1f}", "σ of at most 3.0"),
+            )
+        )
+    return Content("\n").join(rows)
+
+
+def held_out_lines(calibration: Calibration, width: int) -> Content:
+    folds = calibration.quality.cross_validation
+    rows = [proof_card(calibration)]
+    if folds is not None:
+        rows.append(
+            facts(
+                ("left-out views:", f"{folds.rms_mm:.2f}", "mm"), ("claimed", f"{folds.claimed_mm:.2f}", "mm")
+            )
+        )
+    if calibration.quality.noise:
+        noise = calibration.quality.noise
+        rows.append(
+            facts(
+                ("robot", f"{noise['robot_mm']:.3f}", "mm"),
+                ("", f"{noise['robot_deg']:.4f}", "°"),
+                ("corners", f"{noise['corner_px']:.3f}", "px (1σ)"),
+            )
+        )
+    return Content("\n").join(rows)
+
+
+def drift_history(result: Result) -> Sequence[CheckEntry]:
+    """Drift checks of what is installed now, oldest first."""
+    root = state_root(result.path)
+    entries = read_checks(root)
+    return [entry for entry in entries if entry.generation == entries[-1].generation] if entries else []
+
+
+def drift_lines(entries: Sequence[CheckEntry], width: int, height: int) -> Content:
+    """The camera's shift over time against what would be found, and a sentence; from five checks on."""
+    if not entries:
+        return Content.styled("No drift check yet. d on 7 captures one: eight poses, two minutes.", "$dim")
+    trend = find_trend(entries, entries[-1].generation)
+    end = after_drift_check(entries[-1], "" if trend is None else trend.text)
+    shifts = [1000 * float(np.linalg.norm(entry.shift[:3])) for entry in entries]
+    kind: Mark = "done" if end.way is Way.KEEP else "look" if entries[-1].passed else "failed"
+    head = facts(("", f"{shifts[-1]:.2f}", "mm")) + Content("  ") + mark(kind, str(end))
+    days = [(entry.wall_s - entries[0].wall_s) / 86400 for entry in entries]
+    limits = [
+        s * np.sqrt(e.threshold / e.statistic)
+        for s, e in zip(shifts, entries, strict=True)
+        if e.statistic > 0
+    ]
+    limit = float(np.median(limits)) if limits else None
+    if len(entries) < FEWEST_CHECKS:
+        said = f"{many(len(entries), 'check')}: too few to say whether it drifts."
+    elif trend is None:
+        said = f"No trend in {len(entries)} checks."
+    else:
+        rate = trend.shift_mm / max(trend.days, 1e-9)
+        left = (limit - shifts[-1]) / rate if limit is not None and rate > 0 else 0.0
+        soon = f" The limit is reached in about {_span(left)}." if left > 0 else " The limit is reached."
+        said = f"Rising by {7 * rate:.2f} mm a week.{soon}"
+    drawn = curve(
+        [Series(list(zip(days, shifts, strict=True)), "$accent")],
+        limit,
+        width,
+        height - 2,
+        log=False,
+        ends=f"{_day(entries[0])}|{_day(entries[-1])}",
+    )
+    return Content("\n").join([head, Content.styled(said, "$foreground"), drawn])
+
+
+def _day(entry: CheckEntry) -> str:
+    import time
+
+    return time.strftime("%d %b", time.localtime(entry.wall_s))
+
+
+def _span(days: float) -> str:
+    return many(round(days / 7), "week") if days >= 14 else many(max(1, round(days)), "day")
+
+
+class InstallScreen(ResultScreen):
+    """This one beside the installed one, what speaks against it, and every version before."""
+
+    MODE, NAME = "install", "Install"
+    HELP = "i installs the shown calibration, b goes back to the one before; e writes it for other programs."
+
+    def evidence(self) -> ComposeResult:
+        with Horizontal(id="install"):
+            yield _panel("Camera pose", lambda r, w, h: pose_table(r), id="answer")
+            yield _panel(
+                "What installing does",
+                lambda r, w, h: install_lines(r),
+                id="change",
+                below="i installs  b rolls back",
+            )
+        yield _panel("Installed so far", lambda r, w, h: log_lines(_log(r), h), id="versions")
+
+
+def install_lines(result: Result) -> Content:
+    calibration = result.calibration
+    if calibration is None:
+        return Content()
+    rows = [change_card(result)]
+    rows += [mark("look", objection) for objection in result.objections if not result.installed]
+    if calibration.source != "real":
+        rows.append(
+            Content.styled(f"{calibration.source.upper()}: for this {calibration.source} cell only.", "$sim")
+        )
+    rows.append(Content.styled("Every program that reads this cell's calibration gets it at once.", "$dim"))
+    return Content("\n").join(rows)
+
+
+def _log(result: Result) -> Sequence[LogEntry]:
+    try:
+        camera = MAIN_CAMERA if result.calibration is None else result.calibration.camera_name
+        return read_log(state_root(result.path), camera)
+    except OSError:
+        return ()
+
+
+def log_lines(entries: Sequence[LogEntry], height: int) -> Content:
+    if not entries:
+        return Content.styled("Nothing was installed yet.", "$dim")
+    return Content("\n").join(
+        Content.assemble(
+            (f"{local(entry.wall)}  ", "$dim"),
+            (f"{entry.action:<9}", "bold $strong"),
+            f"version {entry.generation}  ",
+            (f"{entry.who}  {entry.change}", "$dim"),
+            (f"  “{entry.reason}”" if entry.reason else "", "$warn"),
+        )
+        for entry in reversed(entries[-max(1, height) :])
+    )

@@ -6,20 +6,11 @@ Long work runs in a process of its own, its lines shown, and can be cancelled.
 from __future__ import annotations
 
 import asyncio
-import os
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
-from typing import ClassVar
 
 from textual import work
-from textual.app import ComposeResult
-from textual.binding import Binding, BindingType
-from textual.containers import Vertical
 from textual.reactive import reactive
-from textual.screen import ModalScreen
-from textual.widgets import Button, Label, RichLog
 
 from calibrate.errors import CalibrationError
 from calibrate.files.calibration import read_calibration
@@ -29,96 +20,17 @@ from calibrate.files.versions import InstalledVersion, before_current, installed
 from recordings.files import ASKED_FOR, write_atomically
 from station.cell.session_folder import CALIBRATION_FILE
 from station.cell.status import SessionStatus
-from station.operate.drift_check import check_arguments, recorded, start_drift_check
+from station.operate.drift_check import check_arguments, judged, recorded, start_drift_check
+from station.protocol.verbs import Check
 from station.tui.desk import Desk
-from station.tui.dialogs import ChooseFormat, Confirm, Reason
-from station.tui.installed import local, read_installed, state_root
+from station.tui.dialogs import ChooseFormat, Confirm, JobScreen, Reason
+from station.tui.installed import Marks, Result, local, marks, read_installed, read_result, state_root
+from station.tui.task import Known
 from station.tui.touch_test import run_touch_test
-from station.tui.words import duration
 
-TERMINATE_S = 5.0
 OVERRIDABLE = ("gate-failed", "objection")
 """Codes of refusals that a person may override with a reason."""
-NO_VERDICT = (
-    "Another plan was loaded: the drift check has no verdict. Its views, if any, are on screen 4 (k)."
-)
-
-
-class JobScreen(ModalScreen[int]):
-    """Runs `python -m MODULE ARGS…` and returns its exit code; Escape or Cancel ends it (-1).
-
-    What it said stays until it is read, unless the code is one of `close_on`.
-    """
-
-    BINDINGS: ClassVar[list[BindingType]] = [
-        Binding("escape", "cancel", "Cancel", tooltip="End this work; nothing half-written stays")
-    ]
-
-    def __init__(self, title: str, module: str, *args: str, close_on: tuple[int, ...] = (0, 4)) -> None:
-        super().__init__()
-        self._close_on = close_on
-        self.said: list[str] = []
-        self._title, self._command = title, (sys.executable, "-m", module, *args)
-        self._process: asyncio.subprocess.Process | None = None
-        self._exit_code: int | None = None
-        self._cancelled = False
-
-    def compose(self) -> ComposeResult:
-        with Vertical(id="job"):
-            yield Label(self._title, id="job-title")
-            yield RichLog(id="job-lines", wrap=True, max_lines=500, min_width=0)
-            yield Button("Cancel", id="job-cancel")
-
-    def on_mount(self) -> None:
-        self._begun_s = time.monotonic()
-        self.set_interval(1.0, self._say_how_long)
-        self.call_after_refresh(self.run_job)  # the width of its lines is known then
-
-    def _say_how_long(self) -> None:
-        """It may say nothing for a while; the seconds tell that it works."""
-        if self._exit_code is None:
-            spent = duration(time.monotonic() - self._begun_s)
-            self.query_one("#job-title", Label).update(f"{spent} {self._title} …")
-
-    @work(exclusive=True, exit_on_error=False)
-    async def run_job(self) -> None:
-        lines = self.query_one("#job-lines", RichLog)
-        width = str(max(40, lines.scrollable_content_region.width))  # its own line breaks are then ours
-        self._process = await asyncio.create_subprocess_exec(
-            *self._command,
-            stdin=asyncio.subprocess.DEVNULL,
-            stdout=asyncio.subprocess.PIPE,
-            stderr=asyncio.subprocess.STDOUT,
-            env=os.environ | {"CALIBRATE_PROGRESS": "lines", "PYTHONUNBUFFERED": "1", "COLUMNS": width},
-        )
-        assert self._process.stdout is not None
-        async for line in self._process.stdout:
-            self.said.append(line.decode(errors="replace").rstrip())
-            lines.write(self.said[-1])
-        self._exit_code = await self._process.wait()
-        self.query_one("#job-title", Label).update(self._title)
-        if self._cancelled and self._exit_code != 0:
-            self.dismiss(-1)
-        elif self._cancelled or self._exit_code in self._close_on:  # it may have been done all the same
-            self.dismiss(self._exit_code)
-        else:  # The person reads why before it goes away.
-            close = self.query_one("#job-cancel", Button)
-            close.label = "Close"
-            close.focus()
-
-    async def action_cancel(self) -> None:
-        if self._process is None or self._exit_code is not None:
-            self.dismiss(-1 if self._exit_code is None else self._exit_code)
-            return
-        self._cancelled = True
-        self._process.terminate()
-        try:
-            await asyncio.wait_for(self._process.wait(), TERMINATE_S)
-        except TimeoutError:
-            self._process.kill()
-
-    async def on_button_pressed(self) -> None:
-        await self.action_cancel()
+NO_VERDICT = "Another plan was loaded: the drift check has no verdict. Its views, if any, are on 7 (k)."
 
 
 class ResultsDesk(Desk):
@@ -127,9 +39,50 @@ class ResultsDesk(Desk):
     result_path: reactive[str] = reactive("", repaint=False, always_update=True)
     """The calibration file that the result screen shows; empty: that of the session just captured."""
 
+    result: reactive[Result | None] = reactive(None, repaint=False)
+    """What the screens say of that file; None: there is none."""
+    looked: reactive[int] = reactive(0, repaint=False)
+    """Counts the times that anything below the root was found changed."""
+    checks: tuple[Check, ...] = ()
+    """The preflight check, as it was last seen."""
+    _marks: tuple[str, Marks] = ("", frozenset())
+    _looking = False
+
+    def known(self) -> Known:
+        """All that rail and next action are made of."""
+        return replace(super().known(), checks=self.checks, result=self.result)
+
+    def watch_result_path(self) -> None:
+        self.look_at_results()
+
+    @work(group="look", exit_on_error=False)
+    async def look_at_results(self) -> None:
+        """Read the shown result again where it changed on the disk; another screen or a shell may do that."""
+        if self._looking:
+            return  # what is under way comes to the newest, too
+        self._looking = True
+        try:
+            while (found := await self._found()) not in (None, self._marks):
+                assert found is not None
+                path, self._marks = found[0], found
+                self.result = await asyncio.to_thread(read_result, path) if path else None
+                self.looked += 1
+        finally:
+            self._looking = False
+
+    async def _found(self) -> tuple[str, Marks] | None:
+        """The shown file, and marks of all below the root; None without a root."""
+        path = self.result_path or (self.status.session.calibration if self.status is not None else "")
+        root = state_root(path) if path else self.root
+        return None if root is None else (path, await asyncio.to_thread(marks, root))
+
+    def forget_look(self) -> None:
+        """Take whatever is found next for changed."""
+        self._marks = ("", frozenset())
+
     async def show_result(self, calibration: str) -> None:
         self.result_path = calibration
-        await self.switch_mode("result")
+        await self.switch_mode("solve")
 
     async def job(
         self, title: str, module: str, *arguments: str, close_on: tuple[int, ...] = (0, 4)
@@ -148,7 +101,7 @@ class ResultsDesk(Desk):
         if session.recording:
             self.solve(session.recording, session.folder)
         else:
-            self.notify("Nothing is finished yet: F7 finishes a session; older ones are on screen 4.")
+            self.notify("Nothing is finished yet: F7 finishes a session; older ones are on 7.")
 
     @work(exclusive=True, group="job", exit_on_error=False)
     async def recover(self, folder: str) -> None:
@@ -172,12 +125,14 @@ class ResultsDesk(Desk):
         plan_sha256 = await self.start(start_drift_check(self, status, self.approves))
         if not plan_sha256:
             return
-        await self.switch_mode("live")
+        await self.switch_mode("capture")
         session = await recorded(self, plan_sha256)
         if session is None:
             self.notify(NO_VERDICT, timeout=10)
         else:
             await self._check(session.recording, session.folder)
+            if (end := judged(session.folder)) is not None:
+                self.notify(str(end), title="Drift check", timeout=60, markup=False)
 
     @work(exclusive=True, group="job", exit_on_error=False)
     async def touch_test(self, calibration: str) -> None:
@@ -190,7 +145,7 @@ class ResultsDesk(Desk):
 
         `ended`: how this one stopped being installed before; empty: it never was.
         """
-        body = f"{path}\nbecomes what every consumer of this cell reads. Key b on this screen undoes it."
+        body = f"{path}\nbecomes what every consumer of this cell reads. b on 6 undoes it."
         body += f"\n\n{ended}" if ended else ""
         if not await self.push_screen_wait(Confirm("Install this calibration?", body, yes="Install")):
             return
@@ -217,7 +172,7 @@ class ResultsDesk(Desk):
             )
         except CalibrationError as refusal:
             return refusal
-        self.notify("Installed. Key b on this screen goes back to the one before.")
+        self.notify("Installed. b on 6 goes back to the one before.")
         self._say_hooks(made)
         return None
 
@@ -244,7 +199,7 @@ class ResultsDesk(Desk):
             return
         made = await self.attempt(asyncio.to_thread(rollback, root, camera=camera))
         if made is not None:
-            self.notify("The calibration before is installed again; a drift check proves it (4, k).")
+            self.notify("The calibration before is installed again; a drift check proves it (7, k).")
             self._say_hooks(made)
 
     def _say_hooks(self, version: InstalledVersion) -> None:

@@ -9,26 +9,32 @@ from typing import ClassVar
 from textual import work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
-from textual.widgets import Static
+from textual.containers import Horizontal, Vertical
+from textual.content import Content
+from textual.widgets import DataTable, Static
 
+from calibrate.quality.checks import CheckEntry, read_checks
 from station.cell.session_folder import SessionSummary
 from station.operate.drift_check import POSES
-from station.protocol.states import RUNNING
 from station.protocol.verbs import Sessions
-from station.tui.installed import LOOK_S, Installed, Marks, marks, read_installed
+from station.tui.installed import Installed, read_installed, readable
+from station.tui.live import Panel
 from station.tui.replay import ReplayLink
 from station.tui.replay_screen import WATCHABLE, ReplayScreen
+from station.tui.result import drift_lines
 from station.tui.screen import Rows, StationScreen
-from station.tui.words import size
+from station.tui.task import Known
+from station.tui.words import UNKNOWN, facts, mark, rich_text, size
 
 DRIFT = f"Drift check: capture {POSES} poses in place of the loaded plan (asks)"
 NO_SESSION = "No session is recorded yet: 2 then n makes a plan, F5 shows its path and asks."
-COLUMNS = ("session", "source", "views", "size", "state", "calibration")
+COLUMNS = ("session", "views", "predicted", "held-out", "verdict", "what became of it")
 
 
 class SessionsScreen(StationScreen):
     """Past recordings and their calibrations."""
 
+    MODE, NAME = "sessions", "Sessions"
     HELP = (
         "Past recordings. Solving runs in its own process; the daemon and a running capture go on. Home and "
         "End go to the newest and the oldest."
@@ -45,27 +51,32 @@ class SessionsScreen(StationScreen):
     def __init__(self) -> None:
         super().__init__()
         self._sessions: list[SessionSummary] = []
-        self._marks: Marks = frozenset()
+        self._checks: list[CheckEntry] = []
 
     def body(self) -> ComposeResult:
         yield Static(NO_SESSION, id="sessions-none")
-        yield Rows(id="sessions-table")
+        with Horizontal(id="sessions"):
+            with Vertical(id="sessions-box", classes="panel"):
+                yield Rows(id="sessions-table")
+            with Vertical(id="sessions-right"):
+                yield Panel(
+                    "Drift of the installed calibration", self._drift, id="drift", below="mm over time"
+                )
+                yield Panel("Highlighted", self._highlighted, id="highlighted")
 
     def on_mount(self) -> None:
+        self.query_one("#sessions-box").border_title = "Sessions"
         self.table.add_columns(*COLUMNS)
         self.table.focus()
-        self.set_interval(LOOK_S, self.look_again)
+        self.watch(self.desk, "looked", self._looked, init=False)
 
     def on_screen_resume(self) -> None:
         super().on_screen_resume()
         self.fetch()
 
-    async def look_again(self) -> None:
-        """Another screen or a shell may have solved or installed. A daemon at work is left in peace."""
-        root, status = self.desk.root, self.desk.status
-        if not self.is_current or root is None or status is None or status.state in RUNNING:
-            return
-        if await asyncio.to_thread(marks, root) != self._marks:
+    def _looked(self) -> None:
+        """Another screen or a shell has recorded, solved or installed."""
+        if self.is_current:
             self.fetch()
 
     @property
@@ -75,30 +86,61 @@ class SessionsScreen(StationScreen):
     @work(exclusive=True, group="fetch", exit_on_error=False)
     async def fetch(self) -> None:
         root = self.desk.root
-        if root is not None:  # noted first: a slow answer must not be asked for again and again
-            self._marks = await asyncio.to_thread(marks, root)
         answer = await self.desk.ask(Sessions())
         if answer is None:
-            self._marks = frozenset()
+            self.desk.forget_look()
             return  # why was said; what was known stays
-        installed = (
-            Installed() if root is None else await asyncio.to_thread(read_installed, root, self.desk.camera)
-        )
+        self._fill(answer, *(await asyncio.to_thread(_beside, root, self.desk.camera, answer)))
+
+    def _fill(
+        self, sessions: list[SessionSummary], rows: list[tuple[Content, ...]], checks: list[CheckEntry]
+    ) -> None:
         at = self._sessions[self.table.cursor_row].name if self._sessions else ""
-        self._sessions = answer
-        self.query_one("#sessions-none").display = not self._sessions
+        self._sessions, self._checks = sessions, checks
+        self.query_one("#sessions-none").display = not sessions
+        self.query_one("#sessions").display = bool(sessions)
         self.table.clear()
-        for session in self._sessions:
-            self.table.add_row(
-                session.name,
-                session.source,
-                str(session.views),
-                size(session.bytes),
-                "finished" if session.sealed else "UNFINISHED",
-                installed.word(session.name) or ("solved" if session.calibration else "-"),
-            )
-        names = [session.name for session in self._sessions]
+        for row in rows:
+            self.table.add_row(*(rich_text(cell, self.app.theme_variables) for cell in row))
+        names = [session.name for session in sessions]
         self.table.move_cursor(row=names.index(at) if at in names else 0)
+        self._tell()
+
+    def _tell(self) -> None:
+        for panel in self.query(Panel):
+            panel.show(self.desk.known())
+
+    def on_data_table_row_highlighted(self, event: DataTable.RowHighlighted) -> None:
+        self._tell()
+
+    def _drift(self, known: Known, width: int, height: int) -> Content:
+        newest = [check for check in self._checks if check.generation == self._checks[-1].generation]
+        return drift_lines(newest, width, height)
+
+    def _highlighted(self, known: Known, width: int, height: int) -> Content:
+        if not self.table.row_count or self.table.cursor_row >= len(self._sessions):
+            return Content()
+        session = self._sessions[self.table.cursor_row]
+        state = mark("done", "finished") if session.sealed else mark("look", "UNFINISHED: c recovers it")
+        rows = [
+            Content.styled(session.name, "bold $strong")
+            + Content.styled(f"  {session.source.upper()}" if session.source != "real" else "", "$sim"),
+            facts(("", str(session.views), "views"), ("", size(session.bytes), "")) + Content("   ") + state,
+        ]
+        found = readable(Path(session.calibration)) if session.calibration else None
+        if found is not None:
+            gates = found.quality.gates
+            rows += [
+                Content(
+                    f"{found.robot.model} {found.robot.serial}, {found.camera.model} {found.camera.serial}"
+                ),
+                mark(
+                    "failed" if found.quality.failed else "done",
+                    f"{sum(g.passed for g in gates)} of {len(gates)} gates passed",
+                ),
+            ]
+        keys = "Enter result  " * bool(session.calibration) + "F9 solve  w play  k drift check on it"
+        return Content("\n").join([*rows, Content(""), Content.styled(keys, "$accent")])
 
     def _selected(self) -> SessionSummary | None:
         if not self._sessions:
@@ -146,3 +188,40 @@ class SessionsScreen(StationScreen):
     def action_recover(self) -> None:
         if (session := self._selected()) is not None:
             self.desk.recover(session.folder)
+
+
+def _beside(
+    root: Path | None, camera: str, sessions: list[SessionSummary]
+) -> tuple[list[tuple[Content, ...]], list[CheckEntry]]:
+    """A row for each session, and the drift checks; reads files, for a thread."""
+    installed = Installed() if root is None else read_installed(root, camera)
+    checks = [] if root is None else read_checks(root)
+    judged = {check.recording: check for check in checks}
+    return [_row(session, installed, judged) for session in sessions], checks
+
+
+def _row(session: SessionSummary, installed: Installed, judged: dict[str, CheckEntry]) -> tuple[Content, ...]:
+    found = readable(Path(session.calibration)) if session.calibration else None
+    predicted = held = UNKNOWN
+    became, verdict = installed.word(session.name), mark("todo", "not solved")
+    if found is not None:
+        quality = found.quality
+        predicted = UNKNOWN if quality.predicted_error_mm is None else f"± {quality.predicted_error_mm:.2f}"
+        held = UNKNOWN if quality.holdout is None else f"{1000 * quality.holdout.e_t_m:.2f}"
+        verdict = mark("failed" if found.verdict == "FAIL" else "done", found.verdict)
+        became = became or "solved, not installed"
+    elif (check := judged.get(session.name)) is not None:
+        verdict = mark("done" if check.passed else "failed", "PASS" if check.passed else "FAIL")
+        became = "drift check"
+    if not session.sealed:
+        verdict, became = mark("look", "UNFINISHED"), "c recovers it"
+    now = became.startswith("INSTALLED")
+    style = "bold $accent" if now else "$foreground"
+    return (
+        Content.styled(session.name, "$foreground"),
+        Content.styled(f"{session.views:>4}", "$foreground"),
+        facts(("", f"{predicted:>6}", "mm")),
+        facts(("", f"{held:>5}", "mm")),
+        verdict,
+        Content.styled(("● " if now else "") + became, style),
+    )

@@ -11,8 +11,6 @@ from rich.text import Text
 from textual import work
 from textual.app import ComposeResult
 from textual.binding import Binding, BindingType
-from textual.containers import Vertical
-from textual.screen import ModalScreen
 from textual.widgets import Input, Label, OptionList, Static
 from textual.widgets.option_list import Option
 
@@ -24,6 +22,7 @@ from station.cell.errors import RefusedError, StationError
 from station.cell.status import HoverOffer, MotionPreview
 from station.operate.touch_test import Hovering, note_touches, touch_test, touch_told
 from station.tui.desk import Desk, told
+from station.tui.frame import Question
 from station.tui.installed import state_root
 
 ABOUT = (
@@ -34,7 +33,7 @@ ABOUT = (
 POINTER = "pointer's length in mm; empty: as configured, or as on the pendant"
 
 
-class ChooseCorner(ModalScreen[int | None]):
+class ChooseCorner(Question[int | None]):
     """Choice of the next corner and of the pointer. None: no more corners."""
 
     BINDINGS: ClassVar[list[BindingType]] = [
@@ -47,17 +46,16 @@ class ChooseCorner(ModalScreen[int | None]):
         self.pointer_mm = pointer_mm
         """Text of the input; empty: the configured pointer, or the tool set on the pendant."""
 
-    def compose(self) -> ComposeResult:
-        with Vertical(id="dialog"):
-            yield Label("Touch test of this calibration", id="dialog-title")
-            yield Static(ABOUT, markup=False)
-            lines = [Option(self._line(corner), str(corner)) for corner in outer_corners(self._board)]
-            end = "end, and write what was found" if self._found else "end; nothing was found yet"
-            yield OptionList(*lines, Option(end, "end"), id="corners", compact=True)
-            yield Input(self.pointer_mm, id="pointer", type="number", placeholder=POINTER, compact=True)
-            yield Label("Enter: that corner. Tab: the pointer's length. Escape: no more.", id="dialog-keys")
+    def body(self) -> ComposeResult:
+        yield Static(ABOUT, markup=False)
+        lines = [Option(self._line(corner), str(corner)) for corner in outer_corners(self._board)]
+        end = "end, and write what was found" if self._found else "end; nothing was found yet"
+        yield OptionList(*lines, Option(end, "end"), id="corners", compact=True)
+        yield Input(self.pointer_mm, id="pointer", type="number", placeholder=POINTER, compact=True)
+        yield Label("Enter: that corner. Tab: the pointer's length. Escape: no more.", id="dialog-keys")
 
     def on_mount(self) -> None:
+        self.titled("Touch test of this calibration")
         corners = outer_corners(self._board)
         left = [line for line, corner in enumerate(corners) if corner not in self._found]
         self.query_one(OptionList).highlighted = left[0] if left else len(corners)
@@ -78,7 +76,7 @@ class ChooseCorner(ModalScreen[int | None]):
         self.dismiss(None if event.option_id == "end" else int(str(event.option_id)))
 
 
-class Touching(ModalScreen[Touch | None]):
+class Touching(Question[Touch | None]):
     """From the start of the motion to what the hand found. None: nothing was."""
 
     BINDINGS: ClassVar[list[BindingType]] = [
@@ -90,15 +88,14 @@ class Touching(ModalScreen[Touch | None]):
         self._desk, self._corner, self._board, self._arrival = desk, corner, board, arrival
         self._hovering: Hovering | None = None
 
-    def compose(self) -> ComposeResult:
-        with Vertical(id="dialog"):
-            yield Label(f"Corner {self._corner}", id="dialog-title")
-            yield Static("The arm moves; F12 stops it.", id="touch-text", markup=False)
-            yield Input(id="touch-offset", placeholder="x,y in mm, or only Enter", compact=True)
-            yield Label("", id="dialog-problem", markup=False)
-            yield Label("Escape leaves this corner out", id="dialog-keys")
+    def body(self) -> ComposeResult:
+        yield Static("The arm moves; F12 stops it.", id="touch-text", markup=False)
+        yield Input(id="touch-offset", placeholder="0.2 mm, -0.1 mm, or only Enter", compact=True)
+        yield Label("", id="dialog-problem", markup=False)
+        yield Label("Escape leaves this corner out", id="dialog-keys")
 
     def on_mount(self) -> None:
+        self.titled(f"Corner {self._corner}")
         self.query_one(Input).display = False
         self.await_arrival()
 

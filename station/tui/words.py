@@ -1,11 +1,16 @@
-"""Words for numbers and states: millimetres and degrees begin here."""
+"""Words, marks and styled text for numbers and states: millimetres and degrees begin here."""
 
 from __future__ import annotations
 
 import math
+import re
 import time
+from typing import Literal
 
-from station.cell.status import PoseState, StationState
+from rich.text import Text
+from textual.content import Content
+
+from station.cell.status import PoseState, StationState, StationStatus
 
 STATE_WORDS = {state: state.value.upper() for state in StationState} | {StationState.DISCONNECTED: "NO ROBOT"}
 
@@ -20,6 +25,76 @@ POSE_MARKS: dict[PoseState, str] = {
     "failed": "x",
 }
 """One plain character a state, so that neither colour nor a Unicode font is needed."""
+
+Mark = Literal["done", "now", "stopped", "look", "failed", "todo"]
+MARKS: dict[Mark, tuple[str, str]] = {
+    "done": ("✓", "$ok"),
+    "now": ("▶", "$accent"),
+    "stopped": ("■", "$bad"),
+    "look": ("▲", "$warn"),
+    "failed": ("✗", "$bad"),
+    "todo": ("○", "$faint"),
+}
+"""Sign and colour: no state is told by colour alone."""
+UNKNOWN = "–"
+"""A number that is not known; never 0."""
+BAR, TRACK, LIMIT = "━", "─", "┃"
+
+
+def mark(kind: Mark, text: str = "") -> Content:
+    sign, colour = MARKS[kind]
+    return Content.styled(f"{sign} {text}" if text else sign, colour)
+
+
+def facts(*pairs: tuple[str, str, str]) -> Content:
+    """(label, value, unit) … in one line: labels and units dim, values bold."""
+    parts: list[Content | tuple[str, str]] = []
+    for label, value, unit in pairs:
+        parts += [
+            (f"{label} " if label else "", "$dim"),
+            (value, "bold $strong"),
+            (f" {unit}".rstrip(), "$dim"),
+        ]
+        parts.append(("   ", ""))
+    return Content.assemble(*parts[:-1])
+
+
+def limit_bar(value: float, limit: float, cells: int, colour: str, at: float = 0.7) -> Content:
+    """A line as long as the value, with the limit as a stroke at the share `at` of the cells."""
+    stroke = min(cells - 1, round(at * cells))
+    ratio = value / limit if limit > 0 else 1.0
+    reach = max(0, min(cells, round(stroke * ratio) if math.isfinite(ratio) else cells))
+    signs = [LIMIT if i == stroke else BAR if i < reach else TRACK for i in range(cells)]
+    styles = ["$strong" if i == stroke else colour if i < reach else "$line" for i in range(cells)]
+    return Content.assemble(*zip(signs, styles, strict=True)).simplify()
+
+
+def rich_text(content: Content, variables: dict[str, str]) -> Text:
+    """The same for a table's cell, which knows no theme's names."""
+    text = Text(content.plain, no_wrap=True)
+    for start, end, style in content.spans:
+        named = re.sub(r"\$([\w-]+)", lambda found: variables.get(found[1], "default"), str(style))
+        text.stylize(named.replace("ansi_", ""), start, end)
+    return text
+
+
+def signed(value: float, digits: int = 2) -> str:
+    """With its sign always, and a minus as wide as a plus."""
+    return f"{value:+.{digits}f}".replace("-", "−")
+
+
+def state_of(status: StationStatus) -> tuple[str, str]:
+    """The chip of the state: text and style."""
+    state = status.state
+    if state in (StationState.STOPPED, StationState.FAULT):
+        return f"■ {STATE_WORDS[state]}", "bold $onstop on $stop"
+    if state is StationState.DISCONNECTED:
+        return f"▲ {STATE_WORDS[state]}", "bold $onaccent on $warn"
+    if state in (StationState.IDLE, StationState.SEALING):
+        return f"● {STATE_WORDS[state]}", "bold $strong on $panel"
+    if state in (StationState.PAUSED, StationState.FREE_DRIVE):
+        return f"‖ {STATE_WORDS[state]}", "bold $onaccent on $warn"
+    return f"▶ {STATE_WORDS[state]}", "bold $onaccent on $accent"
 
 
 def size(count: float) -> str:
@@ -45,3 +120,7 @@ def mm(metres: float, digits: int = 1) -> str:
 
 def degrees(radians: float, digits: int = 1) -> str:
     return f"{math.degrees(radians):.{digits}f}°"
+
+
+def many(count: int, what: str) -> str:
+    return f"{count} {what}{'s' * (count != 1)}"

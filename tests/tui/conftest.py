@@ -18,6 +18,8 @@ from textual.app import App
 from textual.pilot import Pilot
 from textual.widgets import Static
 
+from recordings.schema.messages import CameraModel
+from station.cell.config import PAPER_BOARD, PoseGuess
 from station.cell.session_folder import SessionSummary
 from station.cell.status import (
     CameraStatus,
@@ -29,7 +31,8 @@ from station.cell.status import (
     StationState,
     StationStatus,
 )
-from station.protocol.verbs import Done, Preview, PreviewImage, Sessions, Verb, Watch
+from station.protocol.verbs import Configuration, Done, Preview, PreviewImage, Sessions, Verb, Watch
+from station.simulation.placement import cell_description
 from station.tui.app import StationApp
 
 SUMMARY = MotionPreview(
@@ -45,6 +48,14 @@ SUMMARY = MotionPreview(
 )
 
 
+CELL = cell_description(
+    "eye-in-hand",
+    CameraModel(1280, 1024, ((1400.0, 0.0, 640.0), (0.0, 1400.0, 512.0), (0.0, 0.0, 1.0)), (), "plumb_bob"),
+    PAPER_BOARD,
+    PoseGuess((0.0, 0.08, 0.05), (0.0, 0.0, 0.0, 1.0), 0.01, 0.05),
+    PoseGuess((0.6, 0.0, 0.0), (1.0, 0.0, 0.0, 0.0), 0.01, 0.05),
+)
+"""A UR10 on a table, a camera on its flange, the board before it."""
 UNTIL_S = 40.0
 
 
@@ -71,6 +82,7 @@ class FakeLink:
             "preview": _image(),
             "lease": LeaseStatus("me", 7),
             "sessions": [summary("s-0")],
+            "configuration": CELL,
         }
         self.silent = asyncio.Event()
         """While set nothing is answered, as by a daemon that hangs."""
@@ -84,7 +96,11 @@ class FakeLink:
 
     @property
     def verbs(self) -> list[str]:
-        return [verb.verb() for verb in self.asked if not isinstance(verb, (Preview, Sessions, Watch))]
+        return [
+            verb.verb()
+            for verb in self.asked
+            if not isinstance(verb, (Configuration, Preview, Sessions, Watch))
+        ]
 
     async def call(self, verb: Verb[Any], *, timeout_s: float = 0.0) -> Any:
         self.asked.append(verb)

@@ -19,8 +19,7 @@ from station.protocol import verbs
 from station.tui import results
 from station.tui.app import StationApp
 from station.tui.desk import REMEDIES, busy_words
-from station.tui.dialogs import ConfirmMotion
-from station.tui.results import JobScreen
+from station.tui.dialogs import ConfirmMotion, JobScreen
 from tests.tui.conftest import FakeLink, app_on, idle, text_of, until
 from tests.tui.test_install import GOOD
 from tests.tui.test_plan_screen import SlowPlanner
@@ -68,7 +67,7 @@ def check_session(root: Path, recording: str = "", state: StationState = Station
 
 async def ask_for_it(pilot: Pilot[None]) -> None:
     await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
-    await pilot.press("4", "d")
+    await pilot.press("7", "d")
 
 
 def said(app: StationApp, words: str) -> bool:
@@ -97,7 +96,7 @@ async def test_a_no_leaves_arm_and_plan_as_they_were(link: FakeLink, installed: 
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await ask_for_it(pilot)
         await until(pilot, lambda: pilot.app.screen.query("#confirm-body"))
-        assert "Change     replaces the loaded plan of 3 poses" in text_of(pilot.app, "#confirm-body")
+        assert "Change    replaces the loaded plan of 3 poses" in text_of(pilot.app, "#confirm-body")
         await pilot.press("escape")
         await until(pilot, lambda: link.verbs[-1] == "load_plan")
         assert verbs.LoadPlan(LOADED) in link.asked
@@ -130,7 +129,7 @@ async def test_the_verdict_comes_when_the_recording_is_sealed(link: FakeLink, in
         assert "go" not in link.verbs
         assert verbs.Prepare(verbs.Purpose.DRIFT_CHECK) in link.asked
         await pilot.press("tab", "enter")
-        await until(pilot, lambda: "go" in link.verbs and app.current_mode == "live")
+        await until(pilot, lambda: "go" in link.verbs and app.current_mode == "capture")
         link.show(check_session(installed, state=StationState.PAUSED))
         await until(pilot, lambda: "PAUSED" in text_of(app, "#bar"))
         link.show(check_session(installed, recording, StationState.SEALING))
@@ -165,11 +164,11 @@ async def test_planning_it_is_said_on_every_screen(tmp_path: Path) -> None:
     app = app_on(link)
     async with app.run_test(size=(80, 24)) as pilot:
         await ask_for_it(pilot)
-        await until(pilot, lambda: PLANNING in text_of(app, "#reason"))
-        await pilot.press("5")
-        await until(pilot, lambda: app.current_mode == "log" and PLANNING in text_of(app, "#reason"))
+        await until(pilot, lambda: PLANNING in text_of(app, "#next"))
+        await pilot.press("8")
+        await until(pilot, lambda: app.current_mode == "log" and PLANNING in text_of(app, "#next"))
         link.show(idle(StationState.PAUSED, "poses 3, 7 failed: retake or skip them, or finish"))
-        await until(pilot, lambda: "poses 3, 7 failed" in text_of(app, "#reason"))
-        assert text_of(app, "#reason").strip().startswith(PLANNING)  # a long reason may be cut
+        await until(pilot, lambda: "poses 3, 7 failed" in text_of(app, "#next"))
+        assert PLANNING in text_of(app, "#next")
         link.made.set()
         await until(pilot, lambda: not app.busy)

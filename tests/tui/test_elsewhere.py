@@ -14,7 +14,7 @@ from calibrate.files.install import install, rollback
 from calibrate.files.verification import note_installed
 from calibrate.files.versions import who
 from station.cell.errors import StationError
-from station.tui import result, sessions
+from station.tui import app as app_module
 from station.tui.app import StationApp
 from station.tui.dialogs import Confirm
 from station.tui.installed import read_installed
@@ -32,8 +32,7 @@ def root(link: FakeLink, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Pat
         write_calibration(
             msgspec.structs.replace(GOOD, created=created, provenance=provenance), folder / "calibration.yaml"
         )
-    monkeypatch.setattr(sessions, "LOOK_S", 0.05)
-    monkeypatch.setattr(result, "LOOK_S", 0.05)
+    monkeypatch.setattr(app_module, "LOOK_S", 0.05)
     link.root = tmp_path
     link.answers["sessions"] = [
         summary(name, tmp_path / "sessions" / name / "calibration.yaml") for name in ("s-2", "s-1")
@@ -47,7 +46,7 @@ def put(root: Path, session: str) -> None:
 
 async def list_of_sessions(app: StationApp, pilot: Pilot[None]) -> DataTable[str]:
     await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
-    await pilot.press("4")
+    await pilot.press("7")
     await until(pilot, lambda: app.current_mode == "sessions")
     return app.screen.query_one(DataTable)
 
@@ -58,20 +57,20 @@ async def test_the_list_of_sessions_names_what_is_installed_now(link: FakeLink, 
         table = await list_of_sessions(app, pilot)
 
         def states() -> list[str]:
-            return [table.get_row_at(line)[-1] for line in range(table.row_count)]
+            return [str(table.get_row_at(line)[-1]) for line in range(table.row_count)]
 
-        await until(pilot, lambda: states() == ["solved", "solved"])
+        await until(pilot, lambda: states() == ["solved, not installed"] * 2)
         await pilot.press("end")
         put(root, "s-1")
-        await until(pilot, lambda: states() == ["solved", "INSTALLED"])
+        await until(pilot, lambda: states() == ["solved, not installed", "● INSTALLED"])
         assert table.cursor_row == 1  # what was marked still is
         put(root, "s-2")
-        await until(pilot, lambda: states() == ["INSTALLED", "replaced"])
+        await until(pilot, lambda: states() == ["● INSTALLED", "replaced"])
         rollback(root)
-        await until(pilot, lambda: states() == ["rolled back", "INSTALLED, unverified"])
+        await until(pilot, lambda: states() == ["rolled back", "● INSTALLED, unverified"])
         link.answers["sessions"] = [summary("s-3"), *link.answers["sessions"]]
         (root / "sessions" / "s-3").mkdir()
-        await until(pilot, lambda: states() == ["-", "rolled back", "INSTALLED, unverified"])
+        await until(pilot, lambda: states() == ["", "rolled back", "● INSTALLED, unverified"])
         assert table.cursor_row == 2
 
 
@@ -80,14 +79,14 @@ async def test_the_result_says_when_it_is_the_installed_one(link: FakeLink, root
     async with app.run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: "SIMULATED" in text_of(app, "#bar"))
         await app.show_result(str(root / "sessions" / "s-1" / "calibration.yaml"))
-        await until(pilot, lambda: "READY TO INSTALL" in text_of(app, "#verdict"))
-        assert "nothing is installed" in text_of(app, "#change")
+        await until(pilot, lambda: "ready to install" in text_of(app, "#verdict"))
+        assert "Nothing is installed" in text_of(app, "#change")
         put(root, "s-1")
-        await until(pilot, lambda: "INSTALLED" in text_of(app, "#verdict").splitlines()[1])
+        await until(pilot, lambda: "INSTALLED" in text_of(app, "#verdict"))
         assert "this one is installed" in text_of(app, "#change")
         put(root, "s-2")
-        await until(pilot, lambda: "against the installed one" in text_of(app, "#change"))
-        assert "REPLACED" in text_of(app, "#verdict").splitlines()[1]
+        await until(pilot, lambda: "from the installed one" in text_of(app, "#change"))
+        assert "REPLACED" in text_of(app, "#verdict")
 
 
 async def test_a_calibration_that_was_taken_back_says_so_and_who_did_it(link: FakeLink, root: Path) -> None:
@@ -98,9 +97,9 @@ async def test_a_calibration_that_was_taken_back_says_so_and_who_did_it(link: Fa
         put(root, "s-2")
         rollback(root, reason="the camera had slipped")
         await app.show_result(str(root / "sessions" / "s-2" / "calibration.yaml"))
-        await until(pilot, lambda: "ROLLED BACK" in text_of(app, "#verdict").splitlines()[1:])
+        await until(pilot, lambda: "ROLLED BACK" in text_of(app, "#verdict"))
         said = text_of(app, "#verdict")
-        assert "READY TO INSTALL" not in said
+        assert "ready to install" not in said
         assert f"installed before, and rolled back by {who()}, 20" in said
         assert "the camera had slipped" in said
         await pilot.press("i")
@@ -108,7 +107,7 @@ async def test_a_calibration_that_was_taken_back_says_so_and_who_did_it(link: Fa
         assert "installed before, and rolled back" in text_of(app, "#confirm-body")
         await pilot.press("escape")
         put(root, "s-2")
-        await until(pilot, lambda: "INSTALLED" in text_of(app, "#verdict").splitlines()[1:])
+        await until(pilot, lambda: "INSTALLED" in text_of(app, "#verdict"))
         assert "rolled back" not in text_of(app, "#verdict")
 
 
@@ -129,7 +128,7 @@ async def test_the_result_of_the_session_just_captured_needs_no_picking(link: Fa
     )
     async with app.run_test(size=(80, 24)) as pilot:
         await until(pilot, lambda: app.status is not None and app.status.session.calibration)
-        await pilot.press("3")
+        await pilot.press("4")
         await until(pilot, lambda: "session s-1" in text_of(app, "#verdict"))
 
 
@@ -155,4 +154,4 @@ async def test_enter_on_a_session_shows_what_it_gave(link: FakeLink, root: Path)
         table = await list_of_sessions(app, pilot)
         await until(pilot, lambda: table.row_count == 2)
         await pilot.press("down", "enter")
-        await until(pilot, lambda: app.current_mode == "result" and "session s-1" in text_of(app, "#verdict"))
+        await until(pilot, lambda: app.current_mode == "solve" and "session s-1" in text_of(app, "#verdict"))

@@ -18,8 +18,8 @@ from calibrate.files.verification import note_installed
 from calibrate.files.versions import installed_versions
 from recordings.schema.messages import CameraIdentity, RobotIdentity
 from station.tui.dialogs import ChooseFormat, Confirm, Reason
-from station.tui.installed import Installed, local
-from station.tui.result import verdict_text
+from station.tui.installed import Installed, Result, local
+from station.tui.result import verdict_lines
 from tests.station.hover_cell import calibration_of
 from tests.station.session_rig import TRUTH
 from tests.tui.conftest import FakeLink, app_on, opened, text_of, until
@@ -40,18 +40,28 @@ def calibration(tmp_path: Path) -> Path:
     return path
 
 
-def test_only_what_matters_most_is_bold() -> None:
-    text = verdict_text(DOUBTED)
-    assert not text.style
-    bold = [text.plain[span.start : span.end].strip() for span in text.spans if "bold" in str(span.style)]
-    assert bold == ["SIMULATED: never for a real cell", text.plain.splitlines()[1], "[FAIL]"]
+@pytest.mark.parametrize(
+    ("result", "verdict"),
+    [
+        (Result("", GOOD), "PASS"),
+        (Result("", DOUBTED), "PASS WITH A REASON"),
+        (Result("", GOOD, objections=("another camera",)), "PASS WITH A REASON"),
+        (Result("", GOOD, Installed(GOOD), ("another camera",)), "PASS"),
+        (Result("", problem="damaged"), "FAIL"),
+    ],
+)
+def test_there_is_one_verdict_in_three_states(result: Result, verdict: str) -> None:
+    assert result.verdict == verdict
+    if result.calibration is not None:
+        assert verdict_lines(result).plain.split(", ")[0][2:] == verdict
+        assert f"session {GOOD.provenance.session}" in verdict_lines(result).plain
 
 
 async def press_on_result(pilot: Pilot[None], calibration: Path, *keys: str) -> None:
     await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
     pilot.app.result_path = str(calibration)  # type: ignore[attr-defined]
-    await pilot.press("3")
-    await until(pilot, lambda: "1 CORNER OFF IN THE TOUCH TEST" in text_of(pilot.app, "#verdict"))
+    await pilot.press("4")
+    await until(pilot, lambda: "PASS WITH A REASON" in text_of(pilot.app, "#verdict"))
     await pilot.press(*keys)
 
 
@@ -113,9 +123,10 @@ async def test_going_back_names_both_and_asks(link: FakeLink, calibration: Path)
 
 def test_a_calibration_that_was_installed_all_the_same_says_by_whom_and_why() -> None:
     taken = Override("measured with the tape", "anna", ["corner 0 is off"])
-    said = verdict_text(DOUBTED, Installed(msgspec.structs.replace(DOUBTED, override=taken))).plain
+    now = Installed(msgspec.structs.replace(DOUBTED, override=taken))
+    said = verdict_lines(Result("", DOUBTED, now)).plain
     assert "Override by anna: “measured with the tape”" in said
-    assert "Override" not in verdict_text(DOUBTED, Installed(DOUBTED)).plain
+    assert "Override" not in verdict_lines(Result("", DOUBTED, Installed(DOUBTED))).plain
 
 
 async def test_a_result_that_is_worse_than_the_installed_one_is_not_called_ready(
@@ -129,11 +140,11 @@ async def test_a_result_that_is_worse_than_the_installed_one_is_not_called_ready
     write_calibration(msgspec.structs.replace(LATER, sigma=vague), calibration)
     async with opened(link) as pilot:
         pilot.app.result_path = str(calibration)  # type: ignore[attr-defined]
-        await pilot.press("3")
+        await pilot.press("4")
         await until(pilot, lambda: "INSTALL" in text_of(pilot.app, "#verdict").upper())
         told = text_of(pilot.app, "#verdict")
-        assert "1 OBJECTION: installs only with a reason" in told and "READY" not in told
-        assert "[FAIL] Regression" in told
+        assert "PASS WITH A REASON, installs only with a reason" in told
+        assert "Regression" in told
 
 
 def test_times_are_the_wall_clocks(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -145,10 +156,6 @@ def test_times_are_the_wall_clocks(monkeypatch: pytest.MonkeyPatch) -> None:
     finally:
         monkeypatch.undo()
         time.tzset()
-
-
-def test_a_result_names_its_session() -> None:
-    assert f"session {GOOD.provenance.session}" in verdict_text(GOOD).plain.splitlines()
 
 
 async def test_the_formats_say_who_reads_them(link: FakeLink, calibration: Path) -> None:
@@ -170,6 +177,6 @@ def test_a_calibration_that_no_longer_holds_says_so_where_it_said_installed() ->
     reason = ValidityReason("drift-check", "Drift check FAIL: camera shift 3.00 mm.")
     doubt = Validity(1, ValidityState.IN_DOUBT, "2026-11-22T04:50:00+00:00", reason)
     state = Installed(GOOD, validity=doubt)
-    head, told, *_ = verdict_text(GOOD, state).plain.splitlines()[1:]
-    assert head == state.word(GOOD.provenance.session) == "INSTALLED, in doubt"
-    assert reason.text in told
+    told = verdict_lines(Result("", GOOD, state)).plain
+    assert state.word(GOOD.provenance.session) == "INSTALLED, in doubt"
+    assert "PASS, INSTALLED, in doubt" in told and reason.text in told

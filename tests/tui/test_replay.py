@@ -53,10 +53,10 @@ def test_a_picture_that_cannot_be_decoded_is_said_in_its_place(tmp_path: Path) -
 
 async def test_it_plays_to_its_end_with_pictures_and_marks(link: FakeLink) -> None:
     async with replay_app(pace=1000.0).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: "25/25" in text_of(pilot.app, "#bar"))
+        await until(pilot, lambda: "Capture 25/25" in text_of(pilot.app, "#rail"))
         assert "PLAYBACK" in text_of(pilot.app, "#bar")
-        assert END_TEXT in text_of(pilot.app, "#reason")
-        assert text_of(pilot.app, "#estimate").split("\n") == ["25 views", NO_ESTIMATE]
+        assert END_TEXT in text_of(pilot.app, "#next")
+        assert NO_ESTIMATE in text_of(pilot.app, "#error")
         preview = pilot.app.screen.query_one(PreviewPane)
         await until(pilot, lambda: preview._image is not None and len(preview._corners) == 42)
 
@@ -66,8 +66,8 @@ async def test_it_pauses_steps_jumps_and_starts_again() -> None:
     async with app.run_test(size=(80, 24)) as pilot:
 
         async def shows(pictures: int, text: str) -> None:
-            await until(pilot, lambda: f"│{pictures}/25" in text_of(pilot.app, "#bar"))
-            await until(pilot, lambda: text in text_of(pilot.app, "#reason"))
+            await until(pilot, lambda: f"Capture {pictures}/25" in text_of(pilot.app, "#rail"))
+            await until(pilot, lambda: text in text_of(pilot.app, "#next"))
 
         await shows(0, "playing")
         await pilot.press("right", "right", "right")
@@ -114,7 +114,7 @@ def beside(link: FakeLink) -> FakeLink:
 async def test_beside_a_cell_only_stop_goes_through(beside: FakeLink) -> None:
     async with app_on(beside).run_test(size=(80, 24), notifications=True) as pilot:
         await pilot.pause()
-        await pilot.press("4")
+        await pilot.press("7")
         await until(pilot, lambda: pilot.app.screen.query_one(DataTable).row_count == 1)
         await pilot.press("w")
         await until(pilot, lambda: isinstance(pilot.app.screen, ReplayScreen))
@@ -132,7 +132,7 @@ async def test_beside_a_cell_only_stop_goes_through(beside: FakeLink) -> None:
 async def test_the_cells_own_work_ends_the_playback(beside: FakeLink) -> None:
     async with app_on(beside).run_test(size=(80, 24)) as pilot:
         await pilot.pause()
-        await pilot.press("4")
+        await pilot.press("7")
         await until(pilot, lambda: pilot.app.screen.query_one(DataTable).row_count == 1)
         await pilot.press("w")
         await until(pilot, lambda: isinstance(pilot.app.screen, ReplayScreen))

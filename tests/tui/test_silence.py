@@ -31,16 +31,16 @@ async def test_a_daemon_that_does_not_answer_is_announced_and_what_it_said_is_ol
         await until(pilot, lambda: "NO ANSWER" in text_of(pilot.app, "#bar"))
         await pilot.pause()
         assert "MOVING" not in text_of(pilot.app, "#bar")
-        assert "EMERGENCY STOP" in text_of(pilot.app, "#bar")
-        assert SILENT in " ".join(text_of(pilot.app, "#reason").split())
+        assert "EMERGENCY STOP" in text_of(pilot.app, "#next")
+        assert SILENT in " ".join(text_of(pilot.app, "#next").split())
         assert str(pilot.app.screen.query_one("#devices").border_title) == "Devices: OLD"
         assert OLD in preview.render_line(preview.size.height // 2).text
         await pilot.press("2")  # every screen says it
         await until(pilot, lambda: "NO ANSWER" in text_of(pilot.app, "#bar"))
-        await pilot.press("1")
+        await pilot.press("3")
         link.silent.clear()
         await until(pilot, lambda: "MOVING" in text_of(pilot.app, "#bar"))
-        assert not pilot.app.screen.query_one("#reason").display
+        assert "F6" in text_of(pilot.app, "#next")
         assert OLD not in preview.render_line(preview.size.height // 2).text
 
 
@@ -64,13 +64,13 @@ async def test_why_there_is_no_daemon_is_said(link: FakeLink) -> None:
         await pilot.pause()
         link.show(None)
         await until(pilot, lambda: "NO DAEMON" in text_of(pilot.app, "#bar"))
-        assert "The daemon ended" in text_of(pilot.app, "#reason")
+        assert "The daemon ended" in text_of(pilot.app, "#next")
 
 
 async def test_what_the_daemon_said_last_stays_and_is_marked_old(link: FakeLink) -> None:
     said = Event(1, "warning", "pose 3 did not come to rest")
     link.show(msgspec.structs.replace(idle(StationState.MOVING), events=(said,)))
-    async with app_on(link).run_test(size=(80, 24)) as pilot:
+    async with app_on(link).run_test(size=(160, 48)) as pilot:
         await until(pilot, lambda: "pose 3" in text_of(pilot.app, "#events"))
         link.show(None)
         await until(pilot, lambda: "NO DAEMON" in text_of(pilot.app, "#bar"))
@@ -99,10 +99,10 @@ async def test_a_screen_that_was_away_meanwhile_shows_what_was_known_last(link: 
         await until(pilot, lambda: "MOVING" in text_of(pilot.app, "#bar"))
         link.show(None)
         await until(pilot, lambda: "NO DAEMON" in text_of(pilot.app, "#bar"))
-        await pilot.press("1")
-        await until(pilot, lambda: "p08" in text_of(pilot.app, "#progress"))
+        await pilot.press("3")
+        await until(pilot, lambda: "p08" in text_of(pilot.app, "#poses"))
         assert "NO DAEMON" in text_of(pilot.app, "#bar")
-        assert str(pilot.app.screen.query_one("#progress").border_title) == "Pose: OLD"
+        assert str(pilot.app.screen.query_one("#progress").border_title) == "Pose 8 of 25: OLD"
 
 
 async def test_without_a_connection_stop_is_sent_all_the_same() -> None:

@@ -9,7 +9,7 @@ from textual.widgets import DataTable
 from station.cell.status import StationState
 from station.protocol.verbs import Check
 from station.tui.app import StationApp
-from station.tui.checklist import ChecklistScreen
+from station.tui.connect import ConnectScreen
 from station.tui.dialogs import Help
 from station.tui.live import LiveScreen
 from station.tui.plan import NO_PLAN, PlanScreen
@@ -26,7 +26,7 @@ async def test_without_a_robot_the_checklist_comes_first(link: FakeLink) -> None
     link.show(idle(StationState.DISCONNECTED))
     link.answers["doctor"] = MISSING
     async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: isinstance(pilot.app.screen, ChecklistScreen))
+        await until(pilot, lambda: isinstance(pilot.app.screen, ConnectScreen))
         await until(pilot, lambda: "switch&#160;it&#160;on" in pilot.app.export_screenshot())
         assert "MISSING" in pilot.app.export_screenshot()
 
@@ -34,11 +34,11 @@ async def test_without_a_robot_the_checklist_comes_first(link: FakeLink) -> None
 async def test_a_long_checklist_is_read_to_its_end_with_keys(link: FakeLink) -> None:
     link.answers["doctor"] = MISSING * 20
     async with opened(link) as pilot:
-        await pilot.press("6")
+        await pilot.press("1")
         await until(pilot, lambda: "MISSING" in pilot.app.export_screenshot())
-        assert "Something&#160;is&#160;missing" not in pilot.app.export_screenshot()
+        assert "This&#160;list&#160;looks" not in pilot.app.export_screenshot()
         await pilot.press("end")
-        await until(pilot, lambda: "Something&#160;is&#160;missing" in pilot.app.export_screenshot())
+        await until(pilot, lambda: "This&#160;list&#160;looks" in pilot.app.export_screenshot())
 
 
 async def test_before_the_first_session_too(link: FakeLink) -> None:
@@ -47,8 +47,8 @@ async def test_before_the_first_session_too(link: FakeLink) -> None:
     link.show(msgspec.structs.replace(fresh, session=msgspec.structs.replace(fresh.session, poses=())))
     link.answers |= {"doctor": THERE, "sessions": []}
     async with app_on(link).run_test(size=(80, 24)) as pilot:
-        await until(pilot, lambda: isinstance(pilot.app.screen, ChecklistScreen))
-        await until(pilot, lambda: "F5&#160;asks" in pilot.app.export_screenshot())
+        await until(pilot, lambda: isinstance(pilot.app.screen, ConnectScreen))
+        await until(pilot, lambda: "Nothing&#160;is&#160;missing" in pilot.app.export_screenshot())
 
 
 async def test_later_the_live_screen_comes_first(link: FakeLink) -> None:
@@ -60,21 +60,21 @@ async def test_later_the_live_screen_comes_first(link: FakeLink) -> None:
 
 async def test_a_key_that_can_do_nothing_says_why(link: FakeLink) -> None:
     reasons = [
-        ("1", "f7", "no session is running"),
-        ("1", "f9", "Nothing is finished yet"),
+        ("3", "f7", "no session is running"),
+        ("3", "f9", "Nothing is finished yet"),
         ("2", "r", "No plan is loaded"),
         ("2", "ctrl+up", "No plan is loaded"),
-        ("3", "i", "There is no result"),
-        ("3", "e", "There is no result"),
-        ("4", "v", "No session is recorded yet"),
-        ("4", "w", "No session is recorded yet"),
+        ("4", "i", "There is no result"),
+        ("4", "e", "There is no result"),
+        ("7", "v", "No session is recorded yet"),
+        ("7", "w", "No session is recorded yet"),
     ]
     link._statuses.get_nowait()
     fresh = idle()
     link.show(msgspec.structs.replace(fresh, session=msgspec.structs.replace(fresh.session, poses=())))
     link.answers |= {"doctor": THERE, "sessions": []}
     async with app_on(link).run_test(size=(80, 24), notifications=True) as pilot:
-        await until(pilot, lambda: isinstance(pilot.app.screen, ChecklistScreen))
+        await until(pilot, lambda: isinstance(pilot.app.screen, ConnectScreen))
         for screen, key, words in reasons:
             await pilot.press(screen)
             await pilot.pause()
@@ -86,12 +86,12 @@ async def test_a_key_that_can_do_nothing_says_why(link: FakeLink) -> None:
 
 async def test_an_empty_list_says_how_to_begin_but_not_before_it_is_known(link: FakeLink) -> None:
     async with opened(link) as pilot:
-        await pilot.press("4")
+        await pilot.press("7")
         await until(pilot, lambda: pilot.app.screen.query_one(DataTable).row_count == 1)
         hint = pilot.app.screen.query_one("#sessions-none")
         assert not hint.display
         link.answers["sessions"] = []
-        await pilot.press("1", "4")
+        await pilot.press("3", "7")
         await until(pilot, lambda: hint.display)
 
 
@@ -161,7 +161,7 @@ async def test_the_state_is_a_word_in_every_theme(
     async with app_on(link).run_test(size=(80, 24)) as pilot:
         await pilot.pause()
         assert pilot.app.theme == theme
-        assert text_of(pilot.app, "#bar").startswith(" FAULT")
+        assert "■ FAULT" in text_of(pilot.app, "#bar")
 
 
 def test_a_console_with_16_colours_gets_its_own(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -61,8 +61,8 @@ async def choose(pilot: Pilot[None], link: FakeLink, calibration: Path, *pointer
     link.answers["hover"] = OFFER
     await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
     pilot.app.result_path = str(calibration)  # type: ignore[attr-defined]
-    await pilot.press("3")
-    await until(pilot, lambda: "INSTALL" in text_of(pilot.app, "#verdict"))
+    await pilot.press("4")
+    await until(pilot, lambda: "install" in text_of(pilot.app, "#verdict").lower())
     await pilot.press("h")
     await until(pilot, lambda: isinstance(pilot.app.screen, ChooseCorner))
     if pointer:

@@ -96,7 +96,9 @@ class PreviewPane(Widget):
         graphics = cast(Desk, self.app).graphics
         if graphics is None or self.old or not self.screen.is_active or not graphics.ready():
             return None
-        return None if any(part.display for part in self.screen.query("Toast, Tooltip")) else graphics
+        return (
+            None if any(part.display for part in self.screen.query("Toast, Tooltip, Stopped")) else graphics
+        )
 
     def wanted_pixels(self) -> tuple[int, int]:
         """Width and height of an image that shows all that this widget can: a cell is one by two."""
@@ -148,7 +150,8 @@ def _runs(line: list[int], few: bool) -> list[Segment]:
         if cell < 0:
             runs += [CORNER] * count
         elif few:
-            runs.append(Segment(FEW_SHADES[cell * len(FEW_SHADES) // (2 * LEVELS - 1)] * count))
+            shade = FEW_SHADES[cell * len(FEW_SHADES) // (2 * LEVELS - 1)]
+            runs.append(Segment(shade * count, Style()))
         else:
             runs.append(Segment("▀" * count, _style(cell)))
     return runs

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from station.tui.widgets.panels import detection_lines
 
 import recordings
 from recordings.reader import open_recording
@@ -15,7 +16,6 @@ from station.cell.status import StationStatus
 from station.simulation.placement import seen_from
 from station.simulation.renderer import Light, render, scaled
 from station.simulation.scenes import make_cell
-from station.tui.widgets.panels import detection_lines
 
 
 def test_a_picture_too_bright_says_what_to_set_on_the_screen() -> None:

@@ -14,7 +14,7 @@ from station.operate.touch_test import (
     tip_on_board_m,
     told_offset_mm,
     touch_of,
-    two_numbers,
+    two_lengths_mm,
 )
 
 TIP = (0.01, -0.02, 0.15)
@@ -76,15 +76,19 @@ def test_a_tip_off_the_board_or_at_another_corner_is_no_touch(
     assert refused.value.values["distance_m"] == pytest.approx(distance_m)
 
 
-@pytest.mark.parametrize("said", ["0.2,-0.1", " 0.2 ; -0.1 ", "0.2, -0.1"])
-def test_two_numbers_as_people_type_them(said: str) -> None:
-    assert two_numbers(said) == pytest.approx([0.2, -0.1])
+@pytest.mark.parametrize(
+    "said", ["0.2,-0.1", " 0.2 ; -0.1 ", "0.2 mm, -0.1mm", "200 um, -100 µm", "0.02 CM,-.1"]
+)
+def test_two_lengths_as_people_type_them(said: str) -> None:
+    assert two_lengths_mm(said) == pytest.approx([0.2, -0.1])
 
 
-@pytest.mark.parametrize("said", ["", "0.2", "0.2,0.1,0", "a,b", "nan,0", "inf,0", "51,0", "0,-51"])
+@pytest.mark.parametrize(
+    "said", ["", "0.2", "0.2,0.1,0", "a,b", "nan,0", "inf,0", "51,0", "0,-51", "6 cm, 0", "0.2 px, 0"]
+)
 def test_anything_else_is_refused(said: str) -> None:
     with pytest.raises(RefusedError) as refused:
-        two_numbers(said)
+        two_lengths_mm(said)
     assert (refused.value.code, refused.value.values["limit_mm"]) == ("no-offset", 50.0)
 
 

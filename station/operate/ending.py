@@ -1,0 +1,85 @@
+"""The end of every flow: install it, retake something, or look for a cause. For the shell and the screen."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import StrEnum
+
+from calibrate.files.calibration import Calibration, Touch
+from calibrate.files.verification import agrees, touch_sigmas
+from calibrate.quality.checks import CheckEntry
+from station.cell.status import SessionStatus
+
+
+class Way(StrEnum):
+    """What to do after a flow."""
+
+    SOLVE = "solve"
+    INSTALL = "install"
+    KEEP = "keep"
+    RETAKE = "retake"
+    LOOK_FOR = "look for"
+
+
+@dataclass(frozen=True)
+class Ending:
+    """A way on, and its reason in a sentence."""
+
+    way: Way
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.way.value.capitalize()}: {self.text}"
+
+
+def after_capture(session: SessionStatus) -> Ending:
+    """A recording that is finished, or a session that rests."""
+    failed = [str(pose.index + 1) for pose in session.poses if pose.state == "failed"]
+    if failed:
+        causes = {pose.reason for pose in session.poses if pose.state == "failed" and pose.reason}
+        why = f" ({'; '.join(sorted(causes)[:2])})" if causes else ""
+        return Ending(Way.RETAKE, f"pose {', '.join(failed)} was not captured{why}")
+    if session.check:
+        return Ending(Way.SOLVE, "the drift check judges the installed calibration by this recording")
+    return Ending(Way.SOLVE, "the recording is finished")
+
+
+def after_solve(calibration: Calibration, objections: Sequence[str] = ()) -> Ending:
+    """A calibration file; `objections`: what else installing would ask a reason for."""
+    quality, rejected = calibration.quality, calibration.views.rejected
+    if quality.failed:
+        gate = quality.failed[0]
+        if rejected and gate.name in ("weight", "views"):
+            numbers = ", ".join(str(view.index + 1) for view in rejected)
+            return Ending(Way.RETAKE, f"view {numbers}. {rejected[0].reason}")
+        return Ending(Way.LOOK_FOR, gate.remedy or gate.text)
+    if failed := [touch for touch in calibration.verification if not agrees(touch)]:
+        return after_touches(failed)
+    if objections:
+        return Ending(Way.LOOK_FOR, objections[0])
+    return Ending(Way.INSTALL, f"all {len(quality.gates)} gates passed")
+
+
+def after_touches(touches: Sequence[Touch]) -> Ending:
+    """Corners that a hand found."""
+    off = [touch for touch in touches if not agrees(touch)]
+    if not off:
+        return Ending(Way.INSTALL, f"the tip met {len(touches)} corners as predicted")
+    worst = max(off, key=touch_sigmas)
+    return Ending(
+        Way.LOOK_FOR,
+        f"a wrong pointer length or tool, or a board that was moved: the tip stood "
+        f"{max(map(abs, worst.offset_mm)):.1f} mm beside corner {worst.corner}",
+    )
+
+
+def after_drift_check(entry: CheckEntry, trend: str = "") -> Ending:
+    """A drift check of the installed calibration; `trend`: what the checks before it show."""
+    if trend:
+        return Ending(Way.LOOK_FOR, trend)
+    if entry.passed:
+        return Ending(Way.KEEP, "the installed calibration holds")
+    return Ending(
+        Way.LOOK_FOR, "a loose camera or board mount. Tighten it, then capture and install a new calibration"
+    )

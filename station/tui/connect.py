@@ -1,0 +1,91 @@
+"""Connect: what a capture needs, what is there, and the remedy for what is not, beside the live picture."""
+
+from __future__ import annotations
+
+from typing import ClassVar
+
+from textual import work
+from textual.app import ComposeResult
+from textual.binding import Binding, BindingType
+from textual.containers import Horizontal, Vertical, VerticalScroll
+from textual.content import Content
+from textual.widgets import Static
+
+from station.protocol.verbs import Check, Doctor
+from station.tui.screen import StationScreen
+from station.tui.task import Known
+from station.tui.widgets.preview import PreviewPane
+from station.tui.words import Mark, mark
+
+AGAIN_S = 5.0
+STATES: dict[str, tuple[Mark, str]] = {
+    "ok": ("done", "ready"),
+    "warning": ("look", "look"),
+    "failed": ("failed", "MISSING"),
+    "skipped": ("todo", "not used"),
+}
+READY = "Nothing is missing."
+NOT_READY = "This list looks again every few seconds."
+
+
+def checklist_text(checks: list[Check]) -> Content:
+    """What is missing first; the remedy stands below it."""
+    rows = []
+    for check in sorted(checks, key=lambda check: ("failed", "warning", "ok", "skipped").index(check.state)):
+        kind, word = STATES[check.state]
+        style = "bold $strong" if check.state in ("failed", "warning") else "$foreground"
+        rows.append(
+            mark(kind, f"{word:<9}")
+            + Content.styled(f"{check.name:<15}", style)
+            + Content.styled(check.text, "$dim")
+        )
+        if check.remedy and check.state != "ok":
+            rows.append(Content.styled(f"{'':11}→ {check.remedy}", "$foreground"))
+    missing = any(check.state == "failed" for check in checks)
+    end = mark("look", NOT_READY) if missing else mark("done", READY)
+    return Content("\n").join([*rows, Content(""), end])
+
+
+class ConnectScreen(StationScreen):
+    """The preflight check, looked at again while something is missing."""
+
+    MODE, NAME = "connect", "Connect"
+    HELP = "The same list as `station doctor`. It only looks: nothing moves and nothing is changed."
+    BINDINGS: ClassVar[list[BindingType]] = [
+        Binding("r", "refresh_checks", "Look again", tooltip="Look at every item again")
+    ]
+
+    def on_mount(self) -> None:
+        self.query_one("#checklist-scroll").border_title = "What a capture needs"
+        self.query_one("#connect-picture").border_title = "Camera"
+        self.query_one("#checklist-scroll").focus()  # where much is missing, keys reach the end of it
+        self.set_interval(AGAIN_S, self.look_again)
+
+    def body(self) -> ComposeResult:
+        with Horizontal(id="connect"):
+            with VerticalScroll(id="checklist-scroll", classes="panel"):
+                yield Static("checking …", id="checklist")
+            with Vertical(id="connect-picture", classes="panel"):
+                yield PreviewPane(id="preview")
+
+    def on_screen_resume(self) -> None:
+        super().on_screen_resume()
+        self.action_refresh_checks()
+
+    def show(self, known: Known) -> None:
+        super().show(known)
+        self.query_one(PreviewPane).old = bool(known.trouble) or known.silent_s is not None
+
+    @work(exclusive=True, exit_on_error=False)
+    async def action_refresh_checks(self) -> None:
+        answer = await self.desk.ask(Doctor())
+        if answer is None:
+            return
+        self.desk.checks = tuple(answer)
+        self.query_one("#checklist", Static).update(checklist_text(answer))
+        self.show(self.desk.known())
+
+    def look_again(self) -> None:
+        """Check again while something is missing; what is there is left in peace."""
+        if self.is_current and self.desk.known().missing is not None:
+            self.action_refresh_checks()

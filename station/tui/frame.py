@@ -1,0 +1,313 @@
+"""The frame of every screen: state, task rail, the one next action, STOP; and the keys at the bottom."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import groupby
+from typing import ClassVar, Protocol, TypeVar, cast
+
+from textual import events
+from textual.app import ComposeResult
+from textual.binding import Binding
+from textual.containers import Container, Horizontal, Vertical
+from textual.content import Content
+from textual.markup import escape
+from textual.reactive import reactive
+from textual.screen import ModalScreen, Screen
+from textual.widgets import Static
+
+from station.cell.status import StationStatus
+from station.protocol.states import LATCHED
+from station.tui.task import DIGITS, STEPS, UNTOLD, Action, Known, Step, next_action, steps
+from station.tui.words import MARKS, duration, size, state_of
+
+R = TypeVar("R")
+STOP_WIDE = "■ STOP   F12", "■ STOPPED   F12"
+STOP_NARROW = "STOP F12", "STOPPED"
+DRIVEN_BY = {"ur_rtde": "by ur_rtde", "script": "by own script"}
+"""What drives the arm. The own script is not yet accepted on a real arm."""
+RAIL_WIDE = 96
+"""Cells from which on a step has a second line of its own."""
+GO_TO = (("1-6", "step"), ("7", "sessions"), ("8", "log"))
+ANSWER = Action(
+    "", "Answer the question", "Enter alone is no; Tab marks the other answer. F12 stops.", look=True
+)
+
+
+class StopBlock(Static):
+    """STOP, on every screen and question: never dimmed, covered or cut; a click presses it too."""
+
+    latched: reactive[bool] = reactive(False)
+
+    def render(self) -> Content:
+        words = STOP_NARROW if self.size.width < 16 else STOP_WIDE
+        return Content(words[self.latched])
+
+    def on_click(self) -> None:
+        cast(Knowing, self.app).action_stop()
+
+
+class Line(Static):
+    """Text that is drawn anew only when it, or the width, changed."""
+
+    def __init__(self, line: Callable[[Known, int], Content], *, id: str, layout: bool = False) -> None:
+        super().__init__(id=id)
+        self._line, self._layout = line, layout
+        self._known: Known | None = None
+        self._shown = Content()
+
+    def on_resize(self) -> None:
+        if self._known is not None:
+            self.show(self._known)
+
+    def show(self, known: Known) -> None:
+        self._known = known
+        text = self._line(known, self.container_size.width if self._layout else self.size.width)
+        if not text.is_same(self._shown):
+            self._shown = text
+            self.update(text, layout=self._layout)
+
+
+class Rail(Line):
+    """The six steps; a click opens one."""
+
+    def on_click(self, event: events.Click) -> None:
+        if self.size.height > 1:
+            self.run_worker(self.app.run_action(f"open('{STEPS[min(5, 6 * event.x // self.size.width)]}')"))
+
+
+class Frame(Horizontal):
+    """The first rows of every screen and of every question over it."""
+
+    def __init__(self, title: str, mode: str, question: Action | None = None) -> None:
+        super().__init__(classes="frame")
+        self._title, self._mode, self._question = title, mode, question
+
+    def compose(self) -> ComposeResult:
+        with Vertical(classes="head"):
+            yield Line(lambda known, width: bar_line(known, self._title, width), id="bar")
+            yield Rail(lambda known, width: rail_line(steps(known), self._mode, width), id="rail")
+            yield Line(self._next, id="next", layout=True)
+        yield StopBlock(id="stop")
+
+    def _next(self, known: Known, width: int) -> Content:
+        action = self._question or next_action(known).on(self._mode)
+        return next_line(action, width - self.query_one(StopBlock).size.width)
+
+    def show(self, known: Known) -> None:
+        for line in self.query(Line):
+            line.show(known)
+        self.query_one(StopBlock).latched = known.status is not None and known.status.state in LATCHED
+
+
+def bar_line(known: Known, title: str, width: int) -> Content:
+    """Where one is, state, robot, speed and safety; what is less important gives way first."""
+    parts = list(_bar_parts(known, title))
+    for count in range(len(parts), 1, -1):
+        line = Content("").join(parts[:count])
+        if line.cell_length <= width:
+            return line
+    return Content("").join(parts[:2])
+
+
+def _bar_parts(known: Known, title: str) -> Iterator[Content]:
+    """Most important first."""
+    status = known.status
+    yield Content.styled(f" {title} ", "bold $accent")
+    if known.silent_s is not None:
+        yield Content.styled(
+            f" ▲ NO ANSWER for {known.silent_s:.0f} s, state UNKNOWN ", "bold $onstop on $stop"
+        )
+        return
+    if status is None:
+        yield Content.styled(" ▲ NO DAEMON ", "bold $onstop on $stop")
+        yield Content.styled("  to stop the arm use the pendant", "$dim")
+        return
+    if status.playback:
+        chip, style = state_of(status)
+        yield Content.styled(" PLAYBACK, no live arm ", "bold $sim on $simbg")
+        yield Content.styled(f" {chip} ", "$dim")
+        if status.simulated:
+            yield Content.styled(" SIMULATED ", "bold $sim on $simbg")
+        yield Content.styled(f"  {status.robot.model}", "$dim")
+        return
+    chip, style = state_of(status)
+    yield Content.styled(f" {chip} ", style)
+    if status.simulated:
+        yield Content.styled(" SIMULATED ", "bold $sim on $simbg")
+    yield from _robot_parts(status)
+
+
+def _robot_parts(status: StationStatus) -> Iterator[Content]:
+    robot = status.robot
+    safe = robot.safety or "not known"
+    style = "bold $strong" if robot.safety == "NORMAL" else "bold $warn"
+    yield Content.assemble(("  safety ", "$dim"), (safe, style))
+    yield Content.assemble(
+        ("  ", ""),
+        (f"{robot.speed_m_s:.2f}", "bold $strong"),
+        (f" of {robot.speed_limit_m_s:.2f} m/s", "$dim"),
+    )
+    yield Content.styled(f"  {robot.model or 'no robot'}", "bold $strong")
+    if status.recorder.free_bytes is not None:
+        yield Content.styled(f"  {size(status.recorder.free_bytes)} free", "$dim")
+    if robot.remote is not None:
+        yield Content.styled(f"  {'remote' if robot.remote else 'LOCAL'}", "$dim")
+    if robot.control_path:
+        yield Content.styled(f"  {DRIVEN_BY[robot.control_path]}", "$dim")
+    if status.lease.holder:
+        yield Content.styled(f"  control: {status.lease.holder}", "$dim")
+    if status.session.elapsed_s:
+        yield Content.styled(f"  {duration(status.session.elapsed_s)}", "$dim")
+
+
+_BACK = {"now": "$strong on $accentbg", "stopped": "$strong on $badbg", "look": "$warn", "done": "$ok"}
+
+
+def rail_line(made: tuple[Step, ...], mode: str, width: int) -> Content:
+    """Two lines where there is room, else one; the open step's name is underlined."""
+    if width < RAIL_WIDE:
+        parts = []
+        for step in made:
+            brief = f" {step.brief}" if step.brief and step.mark in ("now", "stopped") else ""
+            parts.append(_step_name(step, mode, f"{MARKS[step.mark][0]}{step.mode.title()}{brief}"))
+        return Content(" ").join(parts)
+    cell = width // len(made)
+    names, texts = [], []
+    for step in made:
+        back = _BACK[step.mark] if step.mark in ("now", "stopped") else ""
+        head = f" {MARKS[step.mark][0]} {DIGITS[step.mode]} {step.mode.title()}".ljust(cell - 1)
+        names += [_step_name(step, mode, head), Content.styled("│", "$line")]
+        below = f"   {step.text if step.text != UNTOLD else '–'}"[: cell - 1].ljust(cell - 1)
+        texts += [Content.styled(below, back or ("$dim" if step.mark != "todo" else "$faint"))]
+        texts.append(Content.styled("│", "$line"))
+    return Content("").join([*names[:-1], Content("\n"), *texts[:-1]])
+
+
+def _step_name(step: Step, mode: str, text: str) -> Content:
+    style = _BACK.get(step.mark, MARKS[step.mark][1])
+    bold = "bold " if step.mark != "todo" or step.mode == mode else ""
+    name = Content.styled(text, f"{bold}{style}")
+    at = text.find(step.mode.title())
+    return name.stylize("underline", at, at + len(step.mode)) if step.mode == mode else name
+
+
+def next_line(action: Action, width: int) -> Content:
+    """The filled chip, then a sentence: one line; where a person should look, as many as it takes."""
+    chip = f" {action.key}  {action.label} " if action.key else f" {action.label} "
+    back = "$warn" if action.look else "$accent"
+    head = Content.assemble(
+        (" NEXT " if width >= RAIL_WIDE else " ", "$dim"), (chip, f"bold $onaccent on {back}"), ("  ", "")
+    )
+    room = max(8, width - head.cell_length - 1)
+    if not action.look or len(action.why) <= room:
+        why = action.why if len(action.why) <= room else action.why[: room - 1] + "…"
+        return head + Content.styled(why, "$foreground")
+    return head + Content.styled(action.why, "$foreground")
+
+
+class Keys(Static):
+    """The keys in named groups: this screen's own, the session's, where to go, help."""
+
+    def __init__(self, own: str = "") -> None:
+        super().__init__(id="keys")
+        self._own = own
+
+    def on_mount(self) -> None:
+        self.screen.bindings_updated_signal.subscribe(self, lambda _: self.refresh())
+
+    def render(self) -> Content:
+        if not self.app.screen_stack:  # between two modes, or while the app closes: it is asked for again
+            return Content()
+        shown = [active.binding for active in self.screen.active_bindings.values() if active.binding.show]
+        ours = [b for b in shown if b.action not in cast(Knowing, self.app).common_actions()]
+        common = [b for b in shown if b not in ours]
+        display = self.app.get_key_display
+        groups = [(self._own, _pairs(ours, display))]
+        if not isinstance(self.screen, ModalScreen):
+            groups += [("session", _pairs(common, display)), ("go to", list(GO_TO))]
+        groups.append(("", [("F1", "help"), ("^P", "all actions")]))
+        return keys_line(groups, self.size.width)
+
+
+def _pairs(bindings: list[Binding], display: Callable[[Binding], str]) -> list[tuple[str, str]]:
+    alike = groupby(bindings, lambda binding: binding.description)
+    return [("".join(display(b) for b in same), name.lower()) for name, same in alike if name]
+
+
+def keys_line(groups: list[tuple[str, list[tuple[str, str]]]], width: int) -> Content:
+    """As full as the width allows: first the groups' names go, then where to go becomes short, then words."""
+    groups = [group for group in groups if group[1]]
+    short = [(name, [("1-8", "go to")] if name == "go to" else pairs) for name, pairs in groups]
+    short[-1] = ("", [("F1", "help")])
+    fewer = [(name, pairs) for name, pairs in short if name != "session"] if len(short) > 2 else short
+    line = Content()
+    for candidate, named in ((groups, True), (groups, False), (short, False), (fewer, False)):
+        line = Content.styled(" │ ", "$line").join(_group(name if named else "", p) for name, p in candidate)
+        if line.cell_length < width:
+            break
+    return Content(" ") + line
+
+
+def _group(name: str, pairs: list[tuple[str, str]]) -> Content:
+    parts: list[Content | tuple[str, str]] = [(f"{name} ", "$faint")] if name else []
+    for key, word in pairs:
+        parts += [(key, "bold $accent"), (f" {word}  ", "$foreground")]
+    return Content.assemble(*parts).rstrip()
+
+
+class Knowing(Protocol):
+    """The app, as frames see it."""
+
+    def known(self) -> Known: ...
+
+    def newest(self) -> Known:
+        """With the newest status there ever was; it outlives the daemon."""
+
+    def common_actions(self) -> list[str]: ...
+
+    def action_stop(self) -> object: ...
+
+
+BREAKPOINTS = [(0, "-narrow"), (110, "-wide")], [(0, "-short"), (32, "-tall"), (44, "-high")]
+"""Classes of a screen by its columns, and by its rows."""
+
+
+class Framed(Screen[R]):
+    """A screen or a question under the frame."""
+
+    AUTO_FOCUS = ""
+    HORIZONTAL_BREAKPOINTS, VERTICAL_BREAKPOINTS = BREAKPOINTS
+
+    def show(self, known: Known) -> None:
+        """Hand what is known to every part that shows some of it."""
+        for frame in self.query(Frame):
+            frame.show(known)
+
+    def on_screen_resume(self) -> None:
+        app = cast(Knowing, self.app)
+        for known in (app.newest(), app.known()):  # it may be the first time, or long ago
+            self.show(known)
+
+
+class Question(ModalScreen[R], Framed[R]):
+    """A window over a screen, below the same frame: STOP stays where it is."""
+
+    AUTO_FOCUS = "*"
+    NAME: ClassVar[str] = "Question"
+    NEXT: ClassVar[Action | None] = ANSWER
+    BOX: ClassVar[str] = "dialog"
+
+    def compose(self) -> ComposeResult:
+        yield Frame(self.NAME, "", self.NEXT)
+        with Container(id="question"), Vertical(id=self.BOX):
+            yield from self.body()
+        yield Keys("answer")
+
+    def body(self) -> ComposeResult:
+        yield from ()
+
+    def titled(self, title: str, below: str = "") -> None:
+        """Say in the window's border what it is about."""
+        box = self.query_one(f"#{self.BOX}")
+        box.border_title, box.border_subtitle = escape(title), escape(below)

@@ -1,0 +1,239 @@
+"""The task in six steps, and the one next action: pure functions of what is known."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from station.cell.status import StationState, StationStatus
+from station.operate.ending import Way, after_solve
+from station.protocol.states import LATCHED, RUNNING
+from station.protocol.verbs import Check
+from station.tui.installed import Result
+from station.tui.words import Mark, duration, many
+
+STEPS = ("connect", "plan", "capture", "solve", "verify", "install")
+DIGITS = {mode: str(place) for place, mode in enumerate((*STEPS, "sessions", "log"), start=1)}
+_STILL = {StationState.IDLE, StationState.PAUSED, StationState.FREE_DRIVE}
+
+
+@dataclass(frozen=True)
+class Step:
+    """One step of the rail: what it holds, or what it waits for."""
+
+    mode: str
+    mark: Mark
+    text: str
+    brief: str = ""
+    """Where there is room for no more than a number."""
+
+
+@dataclass(frozen=True)
+class Action:
+    """The one thing to do next."""
+
+    key: str
+    label: str
+    why: str
+    at: str = ""
+    """The screen on which the key works; empty: on all."""
+    look: bool = False
+    """A person should look first."""
+
+    def on(self, mode: str) -> Action:
+        """With the key that leads there, on any other screen."""
+        if not self.at or self.at == mode:
+            return self
+        return Action(DIGITS[self.at], self.label, f"then {self.key}. {self.why}", look=self.look)
+
+
+@dataclass(frozen=True)
+class Known:
+    """All that rail and next action are made of."""
+
+    status: StationStatus | None = None
+    checks: Sequence[Check] = ()
+    result: Result | None = None
+    """What the session gave, or what was picked; None: nothing is solved."""
+    silent_s: float | None = None
+    busy: str = ""
+    trouble: str = ""
+
+    @property
+    def missing(self) -> Check | None:
+        return next((check for check in self.checks if check.state == "failed"), None)
+
+
+def steps(known: Known) -> tuple[Step, ...]:
+    """The rail, from left to right."""
+    status = known.status
+    if status is None:
+        return tuple(Step(mode, "todo", UNTOLD) for mode in STEPS)
+    made = [_connect(known, status), _plan(status), _capture(status), *_results(known)]
+    now = _now(made, status, known)
+    return tuple(
+        Step(step.mode, "now", step.text, step.brief)
+        if place == now and step.mark in ("todo", "done")
+        else step
+        for place, step in enumerate(made)
+    )
+
+
+UNTOLD = "not known"
+
+
+def _now(made: list[Step], status: StationStatus, known: Known) -> int:
+    if status.state in RUNNING or status.state in (StationState.PAUSED, StationState.FREE_DRIVE):
+        return 2
+    undone = [place for place, step in enumerate(made) if step.mark != "done"]
+    if known.result is not None and known.result.calibration is not None:
+        undone = [place for place in undone if place >= 3]
+        # A touch test is a person's choice: what passed may be installed without one.
+        undone = [place for place in undone if place != 4] or undone
+    return undone[0] if undone else 5
+
+
+def _connect(known: Known, status: StationStatus) -> Step:
+    devices = [status.robot.connected, status.camera.connected]
+    devices += [True] if status.trigger.present else []
+    if known.missing is not None:
+        return Step("connect", "look", f"{known.missing.name} missing")
+    if status.playback:
+        return Step("connect", "todo", "a recording")
+    ready = sum(devices)
+    text = f"{many(ready, 'device')} ready" if all(devices) else f"{ready} of {len(devices)} devices"
+    return Step("connect", "done" if all(devices) else "look", text)
+
+
+def _plan(status: StationStatus) -> Step:
+    poses = status.session.poses
+    if not poses:
+        return Step("plan", "todo", "no plan yet")
+    ends = [pose.predicted_sigma_mm for pose in poses if pose.predicted_sigma_mm is not None]
+    expected = f", ± {ends[-1]:.2f} mm" if ends else ""
+    return Step("plan", "done", f"{many(len(poses), 'pose')}{expected}", str(len(poses)))
+
+
+def _capture(status: StationStatus) -> Step:
+    session, state = status.session, status.state
+    count = f"{session.captured} of {len(session.poses)}"
+    brief = f"{session.captured}/{len(session.poses)}"
+    if state in (StationState.STOPPED, StationState.FAULT):
+        return Step("capture", "stopped", f"{state.value} at {count}", brief)
+    if not session.poses:
+        return Step("capture", "todo", "after plan")
+    if session.recording:
+        return Step("capture", "done", f"{count} saved", brief)
+    if state in RUNNING:
+        left = "" if session.remaining_s is None else f", {duration(session.remaining_s)} left"
+        return Step("capture", "now", f"{count}{left}", brief)
+    if not session.name:
+        return Step("capture", "todo", "not begun")
+    return Step("capture", "now", f"{count}, {state.value}", brief)
+
+
+def _results(known: Known) -> tuple[Step, Step, Step]:
+    result, status = known.result, known.status
+    calibration = None if result is None else result.calibration
+    if result is None or calibration is None:
+        waits = "after capture" if status is None or not status.session.recording else "not yet"
+        first = Step(
+            "solve", "todo" if result is None else "failed", waits if result is None else "unreadable"
+        )
+        return first, Step("verify", "todo", "after solve"), Step("install", "todo", "after solve")
+    gates, failed = calibration.quality.gates, calibration.quality.failed
+    solved = Step(
+        "solve", "failed" if failed else "done", f"{len(gates) - len(failed)} of {len(gates)} gates passed"
+    )
+    touches = calibration.verification
+    end = after_solve(calibration)
+    if not touches:
+        verified = Step("verify", "todo", "no touch test")
+    else:
+        bad = end.way is Way.LOOK_FOR and not failed
+        verified = Step("verify", "look" if bad else "done", many(len(touches), "corner") + " touched")
+    if result.installed:
+        return solved, verified, Step("install", "done", "installed")
+    return solved, verified, Step("install", "todo", "not installed")
+
+
+def next_action(known: Known) -> Action:
+    """Exactly one; alternatives stand in its sentence."""
+    status = known.status
+    if known.silent_s is not None:
+        why = f"No answer for {known.silent_s:.0f} s: what stands below is old. {known.trouble}"
+        return Action("", "EMERGENCY STOP if it moves", why, look=True)
+    if status is None:
+        return Action("", "Wait", known.trouble or "Connecting …", look=bool(known.trouble))
+    if status.playback:
+        return Action("Space", "Pause or play", status.reason)
+    latched = status.state in LATCHED or status.state is StationState.DISCONNECTED
+    if known.busy and not latched:
+        why = " ".join(words for words in (known.busy, status.reason) if words)
+        return Action("", "Wait", why, look=bool(status.reason))
+    if (action := _by_state(known, status)) is not None:
+        return action
+    return _at_rest(known, status)
+
+
+def _by_state(known: Known, status: StationStatus) -> Action | None:
+    """Where the arm works or is held; None at rest."""
+    state, held = status.state, status.robot.held
+    if state in LATCHED:
+        why = " ".join(words for words in ("Look at the cell first; nothing moves.", status.reason) if words)
+        return Action("F8", "Acknowledge", why, look=True)
+    if state is StationState.DISCONNECTED:
+        why = status.reason or "The robot does not answer."
+        return Action("1", "See what is missing", why, look=True)
+    if state in RUNNING:
+        why = status.pending or status.reason or _progress(status)
+        return Action("F6", "Pause after this pose", why)
+    if state is StationState.SEALING:
+        return Action("", "Wait", "The recording is being finished.")
+    if held and state in _STILL:
+        return Action("", "At the pendant", held, look=True)
+    if state is StationState.PAUSED:
+        saved = f"{status.session.captured} of {len(status.session.poses)} are saved; F7 finishes with these."
+        why = " ".join(words for words in (status.reason, saved) if words)
+        return Action("F5", "Continue", why, look=bool(status.reason))
+    if state is StationState.FREE_DRIVE:
+        return Action("F2", "Capture an image here", "Guide the arm by the pendant's button; F3 ends it.")
+    return None
+
+
+def _progress(status: StationStatus) -> str:
+    estimate = status.estimate
+    if estimate.enough:
+        return f"The goal of {estimate.goal_mm:g} mm is reached: F7 finishes, or take all poses."
+    return estimate.improve or estimate.advice or "F12 stops the arm at once."
+
+
+def _at_rest(known: Known, status: StationStatus) -> Action:
+    session, result, missing = status.session, known.result, known.missing
+    if missing is not None:
+        return Action("1", f"Mend: {missing.name}", missing.remedy or missing.text, look=True)
+    if session.poses and not session.recording:
+        asks = f"{many(len(session.poses), 'pose')}: F5 shows the motion and asks before the arm moves."
+        return Action("F5", "Start the capture", f"{status.reason} {asks}".strip())
+    if result is not None:
+        return _with_result(result, status)
+    if not session.poses:
+        return Action("n", "Plan 25 poses", "Some seconds; nothing moves.", at="plan")
+    if session.check:
+        return Action("k", "Judge the drift check", "Its recording is finished.", at="sessions")
+    return Action("F9", "Solve", f"{many(session.captured, 'pose')} saved; solving takes some seconds.")
+
+
+def _with_result(result: Result, status: StationStatus) -> Action:
+    calibration = result.calibration
+    if calibration is None:
+        return Action("7", "Choose a session", result.problem, look=True)
+    end = after_solve(calibration, () if result.installed else result.objections)
+    if result.installed:
+        return Action("d", "Drift check", "Installed. Check in some days that it still holds.", at="sessions")
+    if end.way is Way.INSTALL:
+        touch = "" if calibration.verification or status.simulated else " Or h on 5: a touch test first."
+        return Action("i", "Install", f"PASS: {end.text}.{touch}", at="install")
+    if end.way is Way.RETAKE:
+        return Action("n", "Plan and retake", end.text, at="plan", look=True)
+    return Action("4", "See what failed", f"Look for: {end.text}", look=True)

@@ -1,0 +1,170 @@
+"""Drawing by dots inside letters: lines and areas with ranks, a curve with its axis."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from textual.content import Content
+
+from station.tui.themes import few_signs
+
+Points = NDArray[np.float64]
+BRAILLE = np.array([[0x01, 0x08], [0x02, 0x10], [0x04, 0x20], [0x40, 0x80]])
+"""Bits of a braille letter's dots, rows from the top."""
+BLOCKS = " ▀▄█"
+
+
+class Canvas:
+    """`width` × `height` letters; x right, y down, in dots. A letter has the colour of its highest rank."""
+
+    def __init__(self, width: int, height: int) -> None:
+        self.columns, self.rows = max(1, width), max(1, height)
+        self._blocks = few_signs()
+        self._per = (1, 2) if self._blocks else (2, 4)
+        self.width, self.height = self.columns * self._per[0], self.rows * self._per[1]
+        self._dots = np.zeros((self.height, self.width), dtype=bool)
+        self._rank = np.zeros((self.rows, self.columns), dtype=int)
+        self._texts: list[tuple[int, int, str, int]] = []
+
+    def points(self, where: Points, rank: int) -> None:
+        """(n, 2) dots; what lies outside is left out."""
+        if not len(where):
+            return
+        at = np.floor(where).astype(int)
+        at = at[(at >= 0).all(axis=1) & (at[:, 0] < self.width) & (at[:, 1] < self.height)]
+        self._dots[at[:, 1], at[:, 0]] = True
+        np.maximum.at(self._rank, (at[:, 1] // self._per[1], at[:, 0] // self._per[0]), rank)
+
+    def lines(self, starts: Points, ends: Points, rank: int, dash: int = 0) -> None:
+        """(n, 2) to (n, 2); `dash`: dots of a dash and of the gap after it, 0: whole."""
+        for start, end in zip(starts, ends, strict=True):
+            length = float(np.abs(end - start).max())
+            if not math.isfinite(length) or length > 8 * (self.width + self.height):
+                continue
+            steps = np.arange(round(length) + 1)
+            if dash:
+                steps = steps[steps % (2 * dash) < dash]
+            self.points(start + (end - start) * (steps / max(length, 1.0))[:, None], rank)
+
+    def rod(self, start: Points, end: Points, radius: float, rank: int) -> None:
+        """All dots within `radius` of the line from `start` to `end`, (2,) each."""
+        low = np.floor(np.minimum(start, end) - radius).clip(0).astype(int)
+        high = np.ceil(np.maximum(start, end) + radius).astype(int) + 1
+        x, y = np.meshgrid(
+            np.arange(low[0], min(high[0], self.width)), np.arange(low[1], min(high[1], self.height))
+        )
+        if not x.size:
+            return
+        dots = np.stack([x.ravel(), y.ravel()], axis=1).astype(float)
+        along = end - start
+        share = ((dots - start) @ along / max(float(along @ along), 1e-9)).clip(0, 1)
+        near = np.linalg.norm(dots - start - share[:, None] * along, axis=1) <= max(radius, 0.5)
+        self.points(dots[near], rank)
+
+    def text(self, at: Points, words: str, rank: int) -> None:
+        """Words whose first letter holds the dot `at` (2,)."""
+        if np.isfinite(at).all():
+            column, row = (at // self._per).astype(int).tolist()
+            self._texts.append((column, row, words, rank))
+
+    def content(self, styles: Sequence[str]) -> Content:
+        """`styles`: of each rank, from 1."""
+        across, down = self._per
+        cells = self._dots.reshape(self.rows, down, self.columns, across).transpose(0, 2, 1, 3)
+        if self._blocks:
+            codes = cells[..., 0, 0] + 2 * cells[..., 1, 0]
+            letters = [[BLOCKS[code] for code in row] for row in codes.tolist()]
+        else:
+            codes = (cells * BRAILLE).sum(axis=(2, 3))
+            letters = [[chr(0x2800 + code) if code else " " for code in row] for row in codes.tolist()]
+        rank = self._rank.copy()
+        for column, row, words, order in sorted(self._texts, key=lambda text: text[3]):
+            for i, letter in enumerate(words):
+                if 0 <= row < self.rows and 0 <= column + i < self.columns:
+                    letters[row][column + i] = letter
+                    rank[row, column + i] = order
+        return Content("\n").join(
+            _row(row, ranks, styles) for row, ranks in zip(letters, rank.tolist(), strict=True)
+        )
+
+
+def _row(letters: list[str], ranks: list[int], styles: Sequence[str]) -> Content:
+    """Neighbours alike become one run."""
+    runs: list[tuple[str, str]] = []
+    begun = 0
+    for i in range(1, len(letters) + 1):
+        if i == len(letters) or ranks[i] != ranks[begun]:
+            style = styles[ranks[begun] - 1] if ranks[begun] else ""
+            runs.append(("".join(letters[begun:i]), style))
+            begun = i
+    return Content.assemble(*runs)
+
+
+@dataclass(frozen=True)
+class Series:
+    """A curve: numbers by place, None where there is none."""
+
+    values: Sequence[tuple[float, float]]
+    style: str
+    dash: int = 0
+
+
+def curve(
+    series: Sequence[Series], goal: float | None, width: int, height: int, *, log: bool = True, ends: str = ""
+) -> Content:
+    """Curves over one axis whose numbers stand at the left; the goal is a dashed amber line.
+
+    `ends`: words below the axis, its two ends parted by '|'.
+    """
+    values = [y for line in series for _, y in line.values if math.isfinite(y) and (y > 0 or not log)]
+    places = [x for line in series for x, _ in line.values]
+    if not values or width < 20 or height < 3:
+        return Content()
+    low, high = min([*values, *([goal] if goal else [])]), max([*values, *([goal] if goal else [])])
+    if log:
+        low, high = low / 1.15, high * 1.15
+    else:
+        low, high = min(0.0, low), high * 1.1 or 1.0
+    label = 7
+    rows = height - bool(ends)
+    canvas = Canvas(width - label, rows)
+    left, right = min(places), max(max(places), min(places) + 1e-9)
+
+    def dots(line: Sequence[tuple[float, float]]) -> Points:
+        shown = [(x, y) for x, y in line if math.isfinite(y) and (y > 0 or not log)]
+        xy = np.array(shown, dtype=float).reshape(-1, 2)
+        share = np.log(xy[:, 1] / low) / math.log(high / low) if log else (xy[:, 1] - low) / (high - low)
+        across = (xy[:, 0] - left) / (right - left)
+        return np.stack([across * (canvas.width - 1), (1 - share) * (canvas.height - 1)], axis=1)
+
+    goal_row = -1
+    if goal:
+        at = dots([(left, goal), (right, goal)])
+        canvas.lines(at[:1], at[1:], 1, dash=3)
+        goal_row = min(rows - 1, max(0, int(at[0, 1]) * rows // canvas.height))
+    for rank, line in enumerate(series, start=2):
+        at = dots(line.values)
+        canvas.lines(at[:-1], at[1:], rank, dash=line.dash)
+        canvas.points(at, rank)
+    drawn = canvas.content(["$warn", *(line.style for line in series)]).split("\n")
+    marks = {0: (_label(high), "$dim"), rows - 1: (_label(low), "$dim")}
+    if goal:
+        marks[goal_row] = (_label(goal), "$warn")
+    lines = []
+    for row, text in enumerate(drawn):
+        words, style = marks.get(row, ("", "$dim"))
+        lines.append(Content.assemble((f"{words:>5} ", style), ("│", "$line"), text))
+    if ends:
+        first, _, last = ends.partition("|")
+        gap = " " * max(1, width - label - len(first) - len(last))
+        lines.append(Content.styled(" " * label + first + gap + last, "$dim"))
+    return Content("\n").join(lines)
+
+
+def _label(value: float) -> str:
+    """At most 5 letters."""
+    return f"{value:.2f}" if value < 99 else f"{value:.0f}" if value < 1e5 else f"{value:.0e}"

@@ -1,0 +1,198 @@
+"""A little 3-D scene: the arm from its kinematics, camera frusta, board, and where the arm must not go."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import lru_cache
+
+import msgspec
+import numpy as np
+from textual.content import Content
+
+from calibrate.geometry import Array, transform_points
+from station.cell.collision import body_segments
+from station.cell.config import StationConfig
+from station.cell.errors import StationError
+from station.cell.scene import Scene, board_extent, scene_of
+from station.cell.status import PoseStatus, StationStatus
+from station.tui.widgets.canvas import Canvas
+
+STYLES = ("$line", "$bad", "$accent", "$ok", "$strong", "bold $strong", "bold $warn")
+FLOOR, KEEP_OUT, PLANNED, SAVED, ARM, BOARD, CHOSEN = range(1, 8)
+"""Ranks: the higher is drawn over the lower."""
+LEGEND = "saved green  planned blue  chosen amber  keep-out red"
+_SHORT_M = 0.07
+"""Length of a frustum that is not the chosen one."""
+
+
+@lru_cache(maxsize=4)
+def _scene(encoded: bytes) -> Scene | None:
+    try:
+        return scene_of(msgspec.json.decode(encoded, type=StationConfig))
+    except StationError:
+        return None
+
+
+def cell_scene(config: StationConfig | None, status: StationStatus) -> Scene | None:
+    """The cell as configured, with camera and board where the images say; None without initial poses."""
+    if config is None or (scene := _scene(msgspec.json.encode(config))) is None:
+        return None
+    estimate = status.estimate
+    if estimate.camera_pose is None or estimate.board_pose is None:
+        return scene
+    return replace(scene, X=np.array(estimate.camera_pose), Y=np.array(estimate.board_pose))
+
+
+def view_of(scene: Scene, pose: PoseStatus) -> tuple[float, float] | None:
+    """Distance (m) and tilt (rad) of the board as this pose sees it."""
+    if pose.base_from_flange is None:
+        return None
+    seen = scene.camera_from_board(np.array(pose.base_from_flange))
+    low, high = board_extent(scene.board)
+    middle = transform_points(seen, np.array([[*(low + high) / 2, 0.0]]))[0]
+    return float(np.linalg.norm(middle)), float(np.arccos(min(1.0, abs(seen[2, 2]))))
+
+
+def fields_of(scene: Scene, pose: PoseStatus, rows: int, columns: int) -> Array:
+    """(rows, columns) of bool: parts of the picture whose middle the board will cover in this pose."""
+    lens, covered = scene.camera, np.zeros((rows, columns), dtype=bool)
+    if pose.base_from_flange is None or lens.matrix is None:
+        return covered
+    points = _board_corners(scene)[[0, 1, 3, 2]]
+    seen = scene.seen(np.array(pose.base_from_flange), points)
+    if (seen[:, 2] <= 0).any():
+        return covered
+    pixels = (seen / seen[:, 2:]) @ np.array(lens.matrix).T
+    y, x = np.meshgrid(
+        (np.arange(rows) + 0.5) * lens.height / rows,
+        (np.arange(columns) + 0.5) * lens.width / columns,
+        indexing="ij",
+    )
+    edges = np.roll(pixels, -1, axis=0) - pixels
+    side = [e[0] * (y - p[1]) - e[1] * (x - p[0]) for p, e in zip(pixels, edges, strict=True)]
+    return np.asarray(np.all(np.array(side) > 0, axis=0) | np.all(np.array(side) < 0, axis=0))
+
+
+def _board_corners(scene: Scene) -> Array:
+    low, high = board_extent(scene.board)
+    return np.array([[x, y, 0.0] for x in (low[0], high[0]) for y in (low[1], high[1])])
+
+
+def draw(
+    scene: Scene,
+    status: StationStatus,
+    chosen: int | None,
+    width: int,
+    height: int,
+    *,
+    turn_deg: float = -60.0,
+    lift_deg: float = 22.0,
+    zoom: float = 1.0,
+) -> Content:
+    """The scene as text. `chosen`: place in `session.poses`.
+
+    `turn_deg`: of the eye about the base's z axis, `lift_deg`: above the floor.
+    """
+    canvas = Canvas(width, height)
+    turn, lift = np.radians([turn_deg, lift_deg])
+    right = np.array([-np.sin(turn), np.cos(turn), 0.0])
+    up = np.array([-np.cos(turn) * np.sin(lift), -np.sin(turn) * np.sin(lift), np.cos(lift)])
+    poses = [(i, p) for i, p in enumerate(status.session.poses) if p.base_from_flange is not None]
+    flange = {i: np.array(pose.base_from_flange) for i, pose in poses}
+    joints = status.robot.joints_rad
+    bodies = None if joints is None else body_segments(scene.geometry, np.array([joints]))
+    board = _board_corners(scene)
+    in_hand = scene.mount == "eye-in-hand"
+    still = transform_points(scene.Y if in_hand else scene.X, board if in_hand else np.zeros((1, 3)))
+    ground = [np.zeros((1, 3)), still, *(T[None, :3, 3] for T in flange.values())]
+    if bodies is not None:
+        ground += [bodies[0][0], bodies[1][0]]
+    everything = np.concatenate(ground)
+    flat = np.stack([everything @ right, everything @ up], axis=1)
+    low, high = flat.min(axis=0), flat.max(axis=0)
+    scale = (
+        zoom
+        * 0.86
+        * min(canvas.width / max(high[0] - low[0], 0.2), canvas.height / max(high[1] - low[1], 0.2))
+    )
+    middle = (low + high) / 2
+
+    def place(points: Array) -> Array:
+        at = (np.stack([points @ right, points @ up], axis=-1) - middle) * scale
+        return np.stack([canvas.width / 2 + at[..., 0], canvas.height / 2 - at[..., 1]], axis=-1)
+
+    def edges(points: Array, pairs: list[tuple[int, int]], rank: int, dash: int = 0) -> None:
+        at = place(points)
+        canvas.lines(at[[a for a, _ in pairs]], at[[b for _, b in pairs]], rank, dash)
+
+    _surroundings(scene, everything, edges, lambda at, words, rank: canvas.text(place(at), words, rank))
+    for i, pose in poses:
+        rank = CHOSEN if i == chosen else SAVED if pose.counts else PLANNED
+        if in_hand:
+            far = scene.working_distance_m if i == chosen else _SHORT_M
+            edges(_frustum(scene, flange[i] @ scene.X, far), _FRUSTUM, rank)
+        else:
+            edges(transform_points(flange[i] @ scene.Y, board), _QUAD, rank)
+    if not in_hand:
+        edges(_frustum(scene, scene.X, 2 * _SHORT_M), _FRUSTUM, BOARD)
+        canvas.text(place(scene.X[:3, 3]), "camera", BOARD)
+    else:
+        edges(still, [*_QUAD, (0, 3), (1, 2)], BOARD)
+        canvas.text(place(still.mean(axis=0)) + np.array([6, 0]), "board", BOARD)
+    if bodies is not None:
+        for start, end, radius in zip(bodies[0][0], bodies[1][0], bodies[2], strict=True):
+            canvas.rod(place(start), place(end), float(radius) * scale * 0.8, ARM)
+    if chosen is not None and chosen in flange:
+        where = flange[chosen] @ (scene.X if in_hand else scene.Y)
+        canvas.text(
+            place(where[:3, 3]) - np.array([0, 4]), str(status.session.poses[chosen].index + 1), CHOSEN
+        )
+    return canvas.content(STYLES)
+
+
+_QUAD = [(0, 1), (1, 3), (3, 2), (2, 0)]
+_FRUSTUM = [(0, 1), (0, 2), (0, 3), (0, 4), (1, 2), (2, 4), (4, 3), (3, 1)]
+
+
+def _frustum(scene: Scene, base_from_camera: Array, far_m: float) -> Array:
+    """(5, 3) in `base`: the camera's centre and the picture's corners at this distance."""
+    lens = scene.camera
+    corners = np.array([[x, y, 1.0] for y in (0, lens.height) for x in (0, lens.width)])
+    rays = corners @ np.linalg.inv(np.array(lens.matrix)).T * far_m
+    return transform_points(base_from_camera, np.vstack([np.zeros(3), rays]))
+
+
+Edges = Callable[[Array, list[tuple[int, int]], int, int], None]
+
+
+def _surroundings(
+    scene: Scene, everything: Array, edges: Edges, text: Callable[[Array, str, int], None]
+) -> None:
+    """Planes and the workspace's box, as large as what stands on them."""
+    low, high = everything.min(axis=0) - 0.15, everything.max(axis=0) + 0.15
+    limits = scene.geometry.limits
+    for plane in limits.planes:
+        point, normal = np.array(plane.point_m), np.array(plane.normal) / np.linalg.norm(plane.normal)
+        level = abs(normal[2]) > 0.9
+        axis = int(np.argmax(np.abs(normal)))
+        across = [k for k in range(3) if k != axis]
+        corners = []
+        for a in (low[across[0]], high[across[0]]):
+            for b in (low[across[1]], high[across[1]]):
+                corner = np.zeros(3)
+                corner[across] = a, b
+                corner[axis] = (normal @ point - normal[across] @ corner[across]) / normal[axis]
+                corners.append(corner)
+        rank = FLOOR if level else KEEP_OUT
+        edges(np.array(corners), _QUAD, rank, 0 if level else 3)
+        text(corners[0] * 0.9 + corners[3] * 0.1, plane.name, rank)
+    if limits.workspace_min_m is not None and limits.workspace_max_m is not None:
+        sides = zip(limits.workspace_min_m, limits.workspace_max_m, strict=True)
+        ends = list(sides)
+        box = np.array([[x, y, z] for x in ends[0] for y in ends[1] for z in ends[2]])
+        edges(box, _BOX, KEEP_OUT, 3)
+        text(box[0], "workspace", KEEP_OUT)
+
+
+_BOX = [(0, 1), (2, 3), (4, 5), (6, 7), (0, 2), (1, 3), (4, 6), (5, 7), (0, 4), (1, 5), (2, 6), (3, 7)]

@@ -1,0 +1,169 @@
+"""The parts of the capture screen, as text: progress, error, coverage, events."""
+
+from __future__ import annotations
+
+import msgspec
+import numpy as np
+import pytest
+
+from calibrate.geometry import pose as pose_of
+from station.cell.config import matrix4
+from station.cell.scene import scene_of
+from station.cell.status import EstimateStatus, Event, PoseStatus, StationState, StationStatus
+from station.tui.live import (
+    chips,
+    counted_line,
+    coverage_lines,
+    device_lines,
+    error_lines,
+    event_text,
+    pose_line,
+)
+from station.tui.task import Known
+from station.tui.widgets.canvas import Canvas, Series, curve
+from station.tui.widgets.scene import draw, fields_of, view_of
+from station.tui.words import limit_bar
+from tests.tui.conftest import CELL, idle
+
+SEALED = Event(
+    0, "info", "sealed with 25 of 26 poses: /var/lib/station/sessions/20260131-101500-cell/session.mcap"
+)
+
+
+def session(status: StationStatus, **changes: object) -> StationStatus:
+    return msgspec.structs.replace(status, session=msgspec.structs.replace(status.session, **changes))
+
+
+def test_a_played_arm_is_said_to_be_none() -> None:
+    said = device_lines(Known(msgspec.structs.replace(idle(), playback=True)), 60, 2).plain
+    assert "robot not live" in said and "Hz" not in said
+
+
+def test_what_comes_next_fits_what_was_recorded() -> None:
+    assert "F5" in counted_line(session(idle(), name="").session).plain
+    assert "F9" in counted_line(session(idle(), recording="/r").session).plain
+    assert "4 shows" in counted_line(session(idle(), recording="/r", calibration="/c").session).plain
+    check = counted_line(session(idle(), recording="/r", check=True).session).plain
+    assert "k on 7" in check and "F9" not in check
+
+
+def test_steps_of_a_pose_are_marked_one_after_the_other() -> None:
+    first, *rest = idle().session.poses
+    moving = session(
+        idle(StationState.SETTLING),
+        poses=(msgspec.structs.replace(first, state="settling"), *rest),
+        current=0,
+    )
+    assert pose_line(moving).plain == "✓ move ─  ▶ settle  ─ ○ capture ─ ○ save"
+    failed = msgspec.structs.replace(first, state="failed", reason="the board is cut")
+    assert "the board is cut" in pose_line(session(idle(), poses=(failed, *rest), current=0)).plain
+
+
+@pytest.mark.parametrize(("count", "current"), [(25, None), (25, 24), (200, 0), (200, 199)])
+@pytest.mark.parametrize(("width", "rows"), [(35, 3), (60, 3)])
+def test_the_chip_of_the_pose_under_way_is_always_there(
+    count: int, current: int | None, width: int, rows: int
+) -> None:
+    poses = [PoseStatus(index=i, name=f"p{i}") for i in range(count)]
+    if current is not None:
+        poses[current] = msgspec.structs.replace(poses[current], state="moving")
+    shown = [
+        row.plain for row in chips(session(idle(), poses=tuple(poses), current=current).session, width, rows)
+    ]
+    assert len(shown) <= rows
+    assert max(map(len, shown)) <= width
+    if current is not None:
+        assert f"{current + 1}▶" in "".join(shown)
+
+
+def test_the_error_falls_towards_its_goal() -> None:
+    poses = tuple(
+        PoseStatus(
+            index=i,
+            name=f"p{i}",
+            predicted_sigma_mm=4 / (i + 1),
+            estimated_sigma_mm=5 / (i + 1) if i < 6 else None,
+        )
+        for i in range(25)
+    )
+    estimate = EstimateStatus(6, (1.0, 2.0, 3.0), 0.83, goal_mm=0.5)
+    status = msgspec.structs.replace(session(idle(), poses=poses), estimate=estimate)
+    lines = error_lines(Known(status), 60, 14).plain.split("\n")
+    assert "± 0.83 mm" in lines[0] and "goal ± 0.50" in lines[0] and "reached" not in lines[0]
+    assert len(lines) == 14
+    assert any(line.startswith(" 0.50 ") for line in lines)
+    enough = msgspec.structs.replace(status, estimate=msgspec.structs.replace(estimate, enough=True))
+    assert "✓ reached" in error_lines(Known(enough), 60, 14).plain
+
+
+def test_a_curve_stays_in_its_room_whatever_it_is_given() -> None:
+    for values in ([], [(1.0, 0.0)], [(1.0, float("inf"))], [(1.0, 1e-9), (2.0, 1e9)]):
+        for goal in (None, 0.5):
+            drawn = curve([Series(values, "$accent")], goal, 40, 8).plain
+            assert all(len(line) <= 40 for line in drawn.split("\n"))
+
+
+def seeing(x_m: float, y_m: float) -> PoseStatus:
+    """Straight above a place on the table, looking down, 0.5 m high."""
+    down = np.diag([1.0, -1.0, -1.0])
+    return PoseStatus(index=3, name="p4", base_from_flange=matrix4(pose_of(down, np.array([x_m, y_m, 0.5]))))
+
+
+def test_a_part_without_images_is_named_with_the_pose_that_will_fill_it() -> None:
+    scene = scene_of(CELL)
+    status = session(idle(), poses=(seeing(0.6, 0.0),))
+    view = view_of(scene, status.session.poses[0])
+    assert view is not None and 0.3 < view[0] < 0.7 and view[1] < 0.01
+    fields = fields_of(scene, status.session.poses[0], 4, 6)
+    assert 0 < fields.sum() < fields.size
+    empty = tuple(tuple(0 if hit else 3 for hit in row) for row in fields.tolist())
+    known = Known(msgspec.structs.replace(status, estimate=EstimateStatus(3, image_views=empty)))
+    said = coverage_lines(known, 60, 12, scene).plain
+    assert f"{fields.sum()} of 24 parts empty: pose 4 will show it there" in said
+    full = msgspec.structs.replace(status, estimate=EstimateStatus(3, image_views=((1,) * 6,) * 4))
+    assert "in every part" in coverage_lines(Known(full), 60, 12, scene).plain
+
+
+@pytest.mark.parametrize("term", ["xterm-256color", "linux"])
+def test_the_scene_shows_arm_board_and_table(term: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", term)
+    status = session(idle(), poses=(seeing(0.6, 0.0), seeing(0.5, 0.2)))
+    status = msgspec.structs.replace(
+        status, robot=msgspec.structs.replace(status.robot, joints_rad=(0.0, -1.6, -1.5, -1.6, 1.5, 0.0))
+    )
+    drawn = draw(scene_of(CELL), status, 0, 60, 24).plain
+    assert "board" in drawn and "table" in drawn
+    signs = {letter for letter in drawn if ord(letter) > 0x2500}
+    assert all(letter in "▀▄█" for letter in signs) is (term == "linux")
+    assert len(signs) > 2
+
+
+def test_a_letter_has_the_colour_of_its_highest_rank() -> None:
+    canvas = Canvas(2, 1)
+    canvas.points(np.array([[0.0, 0.0], [1.0, 1.0], [2.0, 0.0]]), 1)
+    canvas.points(np.array([[0.0, 3.0], [-5.0, 0.0], [99.0, 0.0]]), 2)
+    assert [(span.start, str(span.style)) for span in canvas.content(["red", "blue"]).spans] == [
+        (0, "blue"),
+        (1, "red"),
+    ]
+
+
+@pytest.mark.parametrize(("value", "reach"), [(0.0, 0), (0.5, 5), (1.0, 10), (9.0, 19)])
+def test_a_bar_reaches_its_limit_where_the_stroke_stands(value: float, reach: int) -> None:
+    bar = limit_bar(value, 1.0, 20, "$ok", 0.5).plain
+    assert len(bar) == 20 and bar[10] == "┃"
+    assert bar.count("━") == reach
+
+
+@pytest.mark.parametrize(
+    ("width", "end"),
+    [
+        (80, "25 of 26 poses: …/20260131-101500-cell/session.mcap"),
+        (160, "25 of 26 poses: /var/lib/station/sessions/20260131-101500-cell/session.mcap"),
+        (0, "25 of 26 poses: /var/lib/station/sessions/20260131-101500-cell/session.mcap"),
+    ],
+)
+def test_a_path_that_does_not_fit_keeps_its_end(width: int, end: str) -> None:
+    line = event_text(SEALED, width).plain
+    assert line.endswith(end)
+    assert not width or len(line) <= width

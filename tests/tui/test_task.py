@@ -1,0 +1,185 @@
+"""Rail, next action and frame: one next action in every state, STOP on every screen and question."""
+
+from __future__ import annotations
+
+import msgspec
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from textual.screen import Screen
+
+from station.cell.status import LeaseStatus, RecorderStatus, RobotStatus, StationState, StationStatus
+from station.protocol.verbs import Check
+from station.tui.dialogs import ChooseFormat, Confirm, ConfirmMotion, Help, Reason
+from station.tui.frame import StopBlock, bar_line, keys_line, next_line, rail_line
+from station.tui.task import DIGITS, Action, Known, next_action, steps
+from tests.tui.conftest import SUMMARY, FakeLink, app_on, idle, opened, text_of, until
+
+SIZES = [(80, 24), (120, 36), (160, 48)]
+HELD = "protective stop: find what the arm ran into, then enable it again on the pendant"
+
+
+def resting(state: StationState = StationState.IDLE, **session: object) -> StationStatus:
+    status = idle(state)
+    return msgspec.structs.replace(status, session=msgspec.structs.replace(status.session, **session))
+
+
+def held(state: StationState) -> StationStatus:
+    status = idle(state)
+    return msgspec.structs.replace(status, robot=msgspec.structs.replace(status.robot, held=HELD))
+
+
+CASES = [
+    (Known(), ""),
+    (Known(idle(), silent_s=3.0), ""),
+    (Known(idle(), busy="Planning"), ""),
+    (Known(idle(StationState.STOPPED)), "F8"),
+    (Known(idle(StationState.FAULT)), "F8"),
+    (Known(idle(StationState.DISCONNECTED)), "1"),
+    (Known(idle(StationState.CHECKING)), "F6"),
+    (Known(idle(StationState.MOVING)), "F6"),
+    (Known(idle(StationState.SEALING)), ""),
+    (Known(idle(StationState.PAUSED)), "F5"),
+    (Known(idle(StationState.FREE_DRIVE)), "F2"),
+    (Known(held(StationState.IDLE)), ""),
+    (Known(held(StationState.PAUSED)), ""),
+    (Known(idle(), (Check("camera", "failed", "none", "plug it in"),)), "1"),
+    (Known(resting(poses=())), "n"),
+    (Known(resting(name="")), "F5"),
+    (Known(resting(recording="/r")), "F9"),
+    (Known(resting(recording="/r", check=True)), "k"),
+]
+
+
+@pytest.mark.parametrize(("known", "key"), CASES)
+def test_every_state_has_one_next_action(known: Known, key: str) -> None:
+    assert next_action(known).key == key
+
+
+def test_a_key_of_another_screen_becomes_the_way_there() -> None:
+    action = next_action(Known(resting(poses=())))
+    assert (action.on("plan").key, action.on("capture").key) == ("n", DIGITS["plan"])
+
+
+@pytest.mark.parametrize("known", [known for known, _ in CASES])
+@pytest.mark.parametrize("width", [70, 100, 140])
+def test_rail_names_six_steps_and_marks_one_now(known: Known, width: int) -> None:
+    made = steps(known)
+    assert [step.mode for step in made] == ["connect", "plan", "capture", "solve", "verify", "install"]
+    line = rail_line(made, "plan", width)
+    assert max(len(row) for row in line.plain.split("\n")) <= width
+    assert all(step.mode.title() in line.plain for step in made)
+    latched = known.status is not None and known.status.state in (StationState.STOPPED, StationState.FAULT)
+    assert sum(step.mark == "stopped" for step in made) == latched
+
+
+@given(
+    width=st.integers(40, 200),
+    model=st.text(alphabet="UR10e x", max_size=60),
+    safety=st.sampled_from(["", "NORMAL", "PROTECTIVE STOP", "ROBOT EMERGENCY STOP"]),
+    state=st.sampled_from(list(StationState)),
+)
+def test_the_bar_fits_and_keeps_state_and_simulated_first(
+    width: int, model: str, safety: str, state: StationState
+) -> None:
+    robot = RobotStatus(connected=True, model=model, safety=safety, remote=True)
+    status = msgspec.structs.replace(
+        idle(state),
+        robot=robot,
+        recorder=RecorderStatus(free_bytes=10**11),
+        lease=LeaseStatus("anna on tty1", 7),
+    )
+    line = bar_line(Known(status), "Capture", width).plain
+    assert len(line) <= width
+    assert line.startswith(" Capture ")
+    assert "SIMULATED" in line
+
+
+@given(why=st.text(alphabet="abc ü…°", max_size=300), look=st.booleans(), width=st.integers(60, 160))
+def test_what_a_person_should_look_at_is_never_cut(why: str, look: bool, width: int) -> None:
+    line = next_line(Action("F8", "Acknowledge", why, look=look), width).plain
+    assert " F8  Acknowledge " in line
+    assert why in line if look else len(line) <= width
+
+
+@pytest.mark.parametrize("width", [60, 80, 120, 160])
+def test_the_keys_fit_into_one_line(width: int) -> None:
+    own = [("r", "retake"), ("s", "skip"), ("d", "drop"), ("a", "add here")]
+    common = [("F5", "run"), ("F6", "pause"), ("F7", "finish"), ("F9", "solve"), ("F3", "freedrive")]
+    groups = [
+        ("plan", own),
+        ("session", common),
+        ("go to", [("1-6", "step"), ("7", "sessions")]),
+        ("", [("F1", "help")]),
+    ]
+    line = keys_line(groups, width).plain
+    assert len(line) <= width
+    assert "retake" in line and "F1 help" in line
+
+
+WINDOWS = [
+    lambda: Confirm("Finish?", "words", "Finish"),
+    lambda: ConfirmMotion(SUMMARY),
+    lambda: ChooseFormat(),
+    lambda: Reason("a gate failed"),
+    lambda: Help("Plan", "about", []),
+]
+
+
+@pytest.mark.parametrize("size", SIZES)
+async def test_stop_stands_whole_on_every_screen_and_question(link: FakeLink, size: tuple[int, int]) -> None:
+    link.answers["sessions"], link.answers["doctor"] = [], []
+    async with opened(link, size) as pilot:
+
+        def whole(screen: Screen[object]) -> bool:
+            if not screen.query(StopBlock):
+                return False  # not composed yet
+            block = screen.query_one(StopBlock)
+            words = str(block.render())
+            return (
+                "STOP" in words
+                and "F12" in words
+                and block.region.right == size[0]
+                and block.region.y == 0
+                and block.region.height >= 3
+                and block.region.width >= len(words)
+                and screen.get_widget_at(size[0] - 3, 1)[0] is block
+            )
+
+        for key in DIGITS.values():
+            await pilot.press(key)
+            await until(pilot, lambda: whole(pilot.app.screen))
+            assert str(pilot.app.screen.query_one("#bar").render()).split()[0].lower() in DIGITS  # type: ignore[attr-defined]
+        for window in WINDOWS:
+            pilot.app.push_screen(window())  # type: ignore[arg-type,misc]
+            await until(pilot, lambda: whole(pilot.app.screen))
+            assert "SIMULATED" in text_of(pilot.app, "#bar")
+            stops = link.verbs.count("stop")
+            await pilot.click(StopBlock)
+            await until(pilot, lambda stops=stops: link.verbs.count("stop") == stops + 1)  # type: ignore[misc]
+            await pilot.app.pop_screen()
+
+
+@pytest.mark.parametrize("theme", ["station-dark", "station-light", "ansi-dark", "ansi-light", "nord"])
+async def test_every_screen_can_be_drawn_in_every_theme(link: FakeLink, theme: str) -> None:
+    link.answers["sessions"], link.answers["doctor"] = [], []
+    async with opened(link, (120, 36)) as pilot:
+        pilot.app.theme = theme
+        for key in DIGITS.values():
+            await pilot.press(key)
+            await pilot.pause()
+            assert "SIMULATED" in pilot.app.export_screenshot()
+
+
+async def test_without_colours_stop_and_chips_are_reversed(
+    link: FakeLink, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("NO_COLOR", "1")
+    async with app_on(link).run_test(size=(80, 24)) as pilot:
+        await until(pilot, lambda: "SIMULATED" in text_of(pilot.app, "#bar"))
+        strips = pilot.app.screen._compositor.render_strips()
+        for filter_ in pilot.app._filters:
+            strips = [strip.apply_filter(filter_, pilot.app.background_colors[1]) for strip in strips]
+        reversed_ = "".join(s.text for strip in strips for s in strip if s.style and s.style.reverse)
+        assert "STOP F12" in reversed_ and "SIMULATED" in reversed_
+        assert all(s.style is None or s.style.color is None for strip in strips for s in strip)

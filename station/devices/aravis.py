@@ -111,7 +111,8 @@ class AravisCamera:
             return self._newest
         async with self._busy:
             try:
-                return await self._one(_GLIMPSE_S, sequenced=False)
+                self._newest = await self._one(_GLIMPSE_S, sequenced=False)
+                return self._newest
             except CameraError:
                 self.counter.restart()
                 return None

@@ -148,7 +148,7 @@ class NewCell(App[Ending]):
     #bar { width: 1fr; height: 3; }
     #stop { width: 20; height: 3; background: #C8231B; color: white; text-style: bold;
             content-align: center middle; }
-    #rail { width: 30; border: round $primary; padding: 0 1; }
+    #rail { width: 28; border: round $primary; padding: 0 1; }
     #work { width: 1fr; padding: 0 1; }
     #title { text-style: bold; }
     #about { height: auto; margin-bottom: 1; }
@@ -271,6 +271,7 @@ class NewCell(App[Ending]):
         try:
             arm = await self._hardware.arm(host)
         except StationError as problem:
+            self._say_live("")
             self._say_problem(str(problem))
             return False
         if self._arm is not None:
@@ -693,12 +694,12 @@ class NewCell(App[Ending]):
         self.query_one("#rail", Static).update(rail)
 
     def _show_bar(self) -> None:
-        bar = Text(" ● READ ONLY ", "reverse")
+        bar = Text(" ● READ ONLY ", "reverse", no_wrap=True, overflow="ellipsis")
         if self._arm is not None:
             bar.append(f"  {self._arm.identity.model} {self._arm.identity.serial}  ", "bold")
             bar.append(self._arm.trouble() or "ready", "")
         bar.append(
-            "\n Nothing moves by this wizard: your hand does. The emergency stop is the safety device.", "dim"
+            "\n Your hand moves the arm, never this wizard. The emergency stop is the safety device.", "dim"
         )
         bar.append("\n NEXT ", "dim")
         bar.append(f" {self._next()} ", "bold reverse")

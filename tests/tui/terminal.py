@@ -83,16 +83,26 @@ class Glass:
 
 
 class ScreenProcess:
-    """`station tui` in a terminal of its own; `sixels`: one that says it draws them."""
+    """`station tui` in a terminal of its own; `sixels`: one that says it draws them.
 
-    def __init__(self, socket: Path, columns: int = 100, rows: int = 34, sixels: bool = False) -> None:
+    `command`: another one of `station`'s.
+    """
+
+    def __init__(
+        self,
+        socket: Path,
+        columns: int = 100,
+        rows: int = 34,
+        sixels: bool = False,
+        command: tuple[str, ...] = (),
+    ) -> None:
         self._master, slave = pty.openpty()
         pixels = (columns * CELL[0], rows * CELL[1]) if sixels else (0, 0)
         fcntl.ioctl(slave, termios.TIOCSWINSZ, struct.pack("HHHH", rows, columns, *pixels))
         self._sixels, self.pictures = sixels, 0
         """`pictures`: how many came."""
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "station.cli", "tui", "--socket", str(socket)],
+            [sys.executable, "-m", "station.cli", *(command or ("tui", "--socket", str(socket)))],
             stdin=slave,
             stdout=slave,
             stderr=slave,

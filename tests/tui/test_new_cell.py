@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import asyncio
+import json
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -20,6 +23,7 @@ from station.cell.scene import guess_matrix
 from station.operate.new_cell import STEPS, Step, load_draft
 from station.simulation.cell import CellTruth, write_truth
 from station.simulation.launch import SimulatedController, start_controller
+from station.simulation.netns import isolated_command
 from station.simulation.scenes import make_cell
 from station.tui.new_cell import NewCell
 from tests.station.operate.guided_views import guided_joints
@@ -127,3 +131,18 @@ async def test_from_an_address_to_a_configuration(tmp_path: Path) -> None:
     assert b"# " in content
     assert person.keys <= 40
     assert load_draft(tmp_path).written and len(STEPS) == 7
+
+
+@pytest.mark.soak
+@pytest.mark.gige
+@pytest.mark.timeout(1800)
+def test_from_an_empty_home_to_a_planned_cell(tmp_path: Path) -> None:
+    """By keys alone, with the real drivers; needs Aravis."""
+    pytest.importorskip("gi")
+    command = isolated_command([sys.executable, "-m", "tests.tui.whole_cell", str(tmp_path / "cell")])
+    done = subprocess.run(command, capture_output=True, text=True, timeout=1800)
+    assert done.returncode == 0, done.stdout + done.stderr
+    told = json.loads(done.stdout.splitlines()[-1])
+    print(told)
+    assert told["keys"] <= 40
+    assert told["off_m"] < 3 * told["sigma_m"]

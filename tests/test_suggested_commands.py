@@ -1,0 +1,62 @@
+"""Commands that errors and screens suggest are taken by the parser as they are printed."""
+
+from __future__ import annotations
+
+import ast
+import re
+import shlex
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+import typer
+
+from tests.test_examples import PROGRAMS
+
+ROOT = Path(__file__).parents[1]
+_COMMAND = re.compile(r"`((?:station|calibrate|recordings)(?: [^`]*)?)`")
+
+
+def suggested() -> Iterator[tuple[str, str]]:
+    """(where, command) of every quoted command in a text that is no docstring; what is filled in reads X."""
+    for package in PROGRAMS:
+        for path in sorted((ROOT / package).rglob("*.py")):
+            tree = ast.parse(path.read_text())
+            docs = {id(node.value) for node in ast.walk(tree) if isinstance(node, ast.Expr)}
+            inside = {
+                id(part) for node in ast.walk(tree) if isinstance(node, ast.JoinedStr) for part in node.values
+            }
+            for node in ast.walk(tree):
+                if id(node) in docs or id(node) in inside:
+                    continue
+                if isinstance(node, ast.JoinedStr):
+                    text = "".join(
+                        str(part.value) if isinstance(part, ast.Constant) else "X" for part in node.values
+                    )
+                elif isinstance(node, ast.Constant) and isinstance(node.value, str):
+                    text = node.value
+                else:
+                    continue
+                for command in _COMMAND.findall(text):
+                    yield f"{path.relative_to(ROOT)}:{node.lineno}", command
+
+
+COMMANDS = sorted(set(suggested()))
+
+
+def test_commands_are_suggested() -> None:
+    assert len(COMMANDS) > 30
+
+
+@pytest.mark.parametrize(("where", "command"), COMMANDS, ids=[f"{w} {c}" for w, c in COMMANDS])
+def test_a_suggested_command_exists_with_its_options(where: str, command: str) -> None:
+    program, *words = shlex.split(command.replace("…", "X"), comments=True)
+    group = PROGRAMS[program]
+    named = next((word for word in words if not word.startswith("-")), None)
+    if named is None or named in ("X", "--X"):
+        return
+    _, found, _ = group.resolve_command(typer.Context(group), [named])  # type: ignore[attr-defined]
+    options = {name for param in found.params for name in (*param.opts, *param.secondary_opts)}
+    for word in words:
+        if word.startswith("--"):
+            assert word.partition("=")[0] in options, f"{where}: {command}: no {word}"

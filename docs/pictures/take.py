@@ -29,8 +29,8 @@ from station.tui.result import SolveScreen
 
 SIZES = {"80x24": (80, 24), "120x36": (120, 36), "160x48": (160, 48)}
 PATIENCE_S = 120.0
-COLOURS = 64
-SCALE = 0.75
+COLOURS = 200
+SCALE = 0.6
 
 
 class Camera:
@@ -62,7 +62,7 @@ class Camera:
             image = image.resize(
                 (round(image.width * SCALE), round(image.height * SCALE)), Image.Resampling.LANCZOS
             )
-            image.quantize(COLOURS, Image.Quantize.MAXCOVERAGE, dither=Image.Dither.NONE).save(
+            image.quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
                 self._folder / f"{name}.png", optimize=True
             )
 

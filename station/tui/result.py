@@ -31,7 +31,7 @@ from station.tui.words import UNKNOWN, Mark, facts, limit_bar, many, mark, rich_
 NO_RESULT = "No result yet. F9 solves the session just captured; on 7, Enter shows older ones."
 STYLES = {"PASS": "-pass", "PASS WITH A REASON": "-reason", "FAIL": "-fail"}
 SIGNS: dict[str, str] = {"PASS": "✓", "PASS WITH A REASON": "▲", "FAIL": "✗"}
-BAR_CELLS = 14
+BAR_CELLS, NAME_CELLS = 14, 25
 FEWEST_CHECKS = 5
 """Drift checks from which on a trend may be told (`quality.checks`)."""
 
@@ -99,7 +99,9 @@ def gate_row(gate: Gate) -> tuple[Content, ...]:
     kind: Mark = "failed" if not gate.passed else "look" if gate.narrow else "done"
     colour = {"failed": "$bad", "look": "$warn", "done": "$ok"}[kind]
     style = "bold $strong" if kind != "done" else "$foreground"
-    name = mark(kind) + Content(" ") + Content.styled(gate.title, style)
+    short = gate.title.partition(" (")[0]
+    short = short if len(short) <= NAME_CELLS else f"{short[: NAME_CELLS - 1]}…"
+    name = mark(kind) + Content(" ") + Content.styled(short, style)
     word = Content.styled({"failed": "FAIL", "look": "narrow", "done": "pass"}[kind], colour)
     if gate.sense is None or gate.value is None or gate.limit is None:
         return name, Content(""), Content(""), Content(""), word

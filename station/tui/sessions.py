@@ -28,7 +28,7 @@ from station.tui.words import UNKNOWN, facts, mark, rich_text, size
 
 DRIFT = f"Drift check: capture {POSES} poses in place of the loaded plan (asks)"
 NO_SESSION = "No session is recorded yet: 2 then n makes a plan, F5 shows its path and asks."
-COLUMNS = ("session", "views", "predicted", "held-out", "verdict", "what became of it")
+COLUMNS = ("session", "what became of it", "verdict", "predicted", "held-out", "views")
 
 
 class SessionsScreen(StationScreen):
@@ -219,9 +219,9 @@ def _row(session: SessionSummary, installed: Installed, judged: dict[str, CheckE
     style = "bold $accent" if now else "$foreground"
     return (
         Content.styled(session.name, "$foreground"),
-        Content.styled(f"{session.views:>4}", "$foreground"),
+        Content.styled(("● " if now else "") + became, style),
+        verdict,
         facts(("", f"{predicted:>6}", "mm")),
         facts(("", f"{held:>5}", "mm")),
-        verdict,
-        Content.styled(("● " if now else "") + became, style),
+        Content.styled(f"{session.views:>4}", "$foreground"),
     )

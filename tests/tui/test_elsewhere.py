@@ -57,7 +57,7 @@ async def test_the_list_of_sessions_names_what_is_installed_now(link: FakeLink, 
         table = await list_of_sessions(app, pilot)
 
         def states() -> list[str]:
-            return [str(table.get_row_at(line)[-1]) for line in range(table.row_count)]
+            return [str(table.get_row_at(line)[1]) for line in range(table.row_count)]
 
         await until(pilot, lambda: states() == ["solved, not installed"] * 2)
         await pilot.press("end")

@@ -29,7 +29,7 @@ from station.tui.result import SolveScreen
 
 SIZES = {"80x24": (80, 24), "120x36": (120, 36), "160x48": (160, 48)}
 PATIENCE_S = 120.0
-COLOURS = 200
+LIMIT_BYTES = 60_000
 SCALE = 0.6
 
 
@@ -57,14 +57,22 @@ class Camera:
 
     def develop(self) -> None:
         for name, svg in self._pages:
-            png = _png(svg)
-            image = Image.open(io.BytesIO(png)).convert("RGB")
-            image = image.resize(
-                (round(image.width * SCALE), round(image.height * SCALE)), Image.Resampling.LANCZOS
-            )
-            image.quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
-                self._folder / f"{name}.png", optimize=True
-            )
+            image = Image.open(io.BytesIO(_png(svg))).convert("RGB")
+            for colours, scale in (
+                (200, SCALE),
+                (64, SCALE),
+                (32, SCALE),
+                (32, 0.8 * SCALE),
+                (24, 0.6 * SCALE),
+            ):
+                size = round(image.width * scale), round(image.height * scale)
+                small = image.resize(size, Image.Resampling.LANCZOS)
+                file = io.BytesIO()
+                few = small.quantize(colours, Image.Quantize.FASTOCTREE, kmeans=2, dither=Image.Dither.NONE)
+                few.save(file, "PNG", optimize=True)
+                if file.tell() <= LIMIT_BYTES:
+                    break
+            (self._folder / f"{name}.png").write_bytes(file.getvalue())
 
 
 def _png(svg: str) -> bytes:

@@ -99,7 +99,7 @@ COMMANDS = {
     ),
     "sweep": LazyCommand(
         "calibrate.cli.sweep:sweep",
-        "Estimate the time offset between camera and robot.",
+        "Test the time of a camera's frames against the robot's.",
         ("calibrate sweep sweep.mcap", "calibrate sweep sweep.mcap --calibration cell.yaml"),
     ),
 }

@@ -432,7 +432,8 @@ class LiveScreen(StationScreen):
         for part in self.query("Panel, Stopped"):
             part.show(known)  # type: ignore[attr-defined]
         old = bool(known.trouble) or known.silent_s is not None
-        self.query_one(PreviewPane).old = old
+        for pane in self.query(PreviewPane):  # none while the screen is still being built
+            pane.old = old
         status = known.status
         if status is None:
             return

@@ -30,7 +30,7 @@ from tests.station.operate.guided_views import guided_joints
 from tests.tui.new_cell_rig import SimulatedHardware
 
 pytestmark = pytest.mark.process
-UNTIL_S = 60.0
+UNTIL_S = 120.0
 
 
 def other_cell() -> CellTruth:

@@ -238,7 +238,7 @@ async def test_a_defect_in_the_estimate_costs_one_estimate(rig: Rig, monkeypatch
     assert rig.pose_states == ["done"] * POSES
 
 
-def _hang(seconds: float) -> None:
+def _hang(seconds: float = 0.5) -> None:
     time.sleep(seconds)
 
 

@@ -81,6 +81,7 @@ class Operator:
         await asyncio.to_thread(lead)
 
 
+@pytest.mark.soak
 async def test_from_an_address_to_a_configuration(tmp_path: Path) -> None:
     truth = other_cell()
     write_truth(truth, tmp_path / "truth.json")

@@ -257,7 +257,8 @@ class StationApp(ResultsDesk):
         """On every screen and question that stands over another."""
         known = self.known()
         for screen in self.screen_stack:
-            if isinstance(screen, Framed) and screen.is_mounted:
+            # Closing, the app takes the screens' parts away before its workers end.
+            if isinstance(screen, Framed) and screen.is_mounted and self.is_running:
                 screen.show(known)
 
     def playing(self) -> bool:

@@ -432,8 +432,7 @@ class LiveScreen(StationScreen):
         for part in self.query("Panel, Stopped"):
             part.show(known)  # type: ignore[attr-defined]
         old = bool(known.trouble) or known.silent_s is not None
-        for pane in self.query(PreviewPane):  # none while the screen is still being built
-            pane.old = old
+        self.query_one(PreviewPane).old = old
         status = known.status
         if status is None:
             return

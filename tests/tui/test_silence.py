@@ -11,6 +11,7 @@ from station.protocol.client import DaemonGoneError
 from station.tui import app as attendance
 from station.tui.app import SILENT, StationApp
 from station.tui.desk import STOP_UNHEARD
+from station.tui.live import LiveScreen
 from station.tui.widgets.preview import OLD, PreviewPane
 from tests.tui.conftest import FakeLink, app_on, idle, opened, text_of, until
 
@@ -115,3 +116,19 @@ async def test_without_a_connection_stop_is_sent_all_the_same() -> None:
     async with app.run_test(size=(80, 24)) as pilot:
         await pilot.press("f12")
         await until(pilot, lambda: bool(sent))
+
+
+async def test_news_that_arrive_while_the_screen_closes_do_no_harm(
+    link: FakeLink, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    app = app_on(link)
+    heard: list[bool] = []
+
+    def on_unmount(screen: LiveScreen) -> None:
+        app.hear(5.0)
+        heard.append(True)
+
+    monkeypatch.setattr(LiveScreen, "on_unmount", on_unmount, raising=False)
+    async with app.run_test() as pilot:
+        await until(pilot, lambda: isinstance(app.screen, LiveScreen) and app.screen.is_mounted)
+    assert heard

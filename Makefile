@@ -60,7 +60,7 @@ bench: $(READY)  ## the benchmarks; tables go to benchmarks/README.md
 	$(BIN)/python -m benchmarks
 
 pages: $(READY)  ## the pages of docs/ that are made from the sources
-	for page in api errors protocol; do $(BIN)/python docs/$$page.py > docs/$$page.md; done
+	for page in api errors protocol; do $(BIN)/python docs/$$page.py > docs/reference/$$page.md; done
 	$(BIN)/python docs/schemas.py
 
 soak: $(READY)  ## the long runs that CI shortens
@@ -83,7 +83,7 @@ install: install-files  ## install programs, units and users' definitions below 
 	install -d $(DESTDIR)$(PREFIX)/share/man/man1
 	for name in station calibrate recordings; do \
 		$(DESTDIR)$(APP)/bin/python docs/man.py $$name > $(DESTDIR)$(PREFIX)/share/man/man1/$$name.1; done
-	@echo "Next: systemd/README.md (users, configuration, start)."
+	@echo "Next: docs/integrator/service.md (users, configuration, start)."
 
 install-files:  # the part of install that needs no network
 	for unit in $(UNITS); do \
@@ -95,8 +95,9 @@ install-files:  # the part of install that needs no network
 	install -D -m 644 systemd/60-station.rules $(DESTDIR)$(SYSCONFDIR)/udev/rules.d/60-station.rules
 	test -e $(DESTDIR)$(SYSCONFDIR)/station/station.env || \
 		install -D -m 644 systemd/station.env $(DESTDIR)$(SYSCONFDIR)/station/station.env
-	install -d $(DESTDIR)$(DOC)/schemas && install -m 644 docs/*.md $(DESTDIR)$(DOC)
-	install -m 644 docs/schemas/*.json $(DESTDIR)$(DOC)/schemas
+	for folder in . operator integrator contributor reference; do \
+		install -d $(DESTDIR)$(DOC)/$$folder && install -m 644 docs/$$folder/*.md $(DESTDIR)$(DOC)/$$folder; done
+	install -d $(DESTDIR)$(DOC)/schemas && install -m 644 docs/schemas/*.json $(DESTDIR)$(DOC)/schemas
 
 uninstall:  ## stop the services and remove what install put there; configuration and data stay
 	$(if $(DESTDIR),,-systemctl disable --now station.service 'station-tui@.service' 2>/dev/null)

@@ -1,4 +1,4 @@
-"""Prints docs/api.md from the docstrings of the three public doors: `make pages`."""
+"""Prints docs/reference/api.md from the docstrings of the three public doors: `make pages`."""
 
 from __future__ import annotations
 

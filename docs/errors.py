@@ -1,4 +1,4 @@
-"""Prints docs/errors.md from the places that make errors: `make pages`."""
+"""Prints docs/reference/errors.md from the places that make errors: `make pages`."""
 
 from __future__ import annotations
 

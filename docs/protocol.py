@@ -1,4 +1,4 @@
-"""Prints docs/protocol.md from the table of verbs: `make pages`."""
+"""Prints docs/reference/protocol.md from the table of verbs: `make pages`."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ A client sends JSON lines of at most {messages.LINE_LIMIT_BYTES // 1024} kB to t
 ```
 
 `error` is a sentence for a person. Programs decide on `problem.code`; `problem.values` holds its figures.
-STOP also has a socket of its own, for which no connection is needed ([safety](safety.md)).
+STOP also has a socket of its own, for which no connection is needed ([safety](../operator/safety.md)).
 
 | verb | arguments | result | states | control | does |
 |---|---|---|---|---|---|

@@ -14,7 +14,7 @@
 
 Poses are `base_from_flange`, 4×4 in metres; angles are radians, stamps ns or s as their names end. Errors are
 `RecordingError`s with `code`, `values` and `remedy`. Names are loaded at their first use. The file format is
-docs/recording-format.md. Everything else is private.
+docs/integrator/recording-format.md. Everything else is private.
 """
 
 from importlib import import_module

@@ -26,7 +26,7 @@ COMMANDS = [
     for name in group.commands  # type: ignore[attr-defined]
     if (program, name) != HANDED_ON
 ]
-DOCUMENTS = ("README.md", "docs/*.md", "systemd/README.md")
+DOCUMENTS = ("README.md", "docs/**/*.md")
 _ROOT = Path(__file__).parent.parent
 
 

@@ -21,7 +21,7 @@ def test_a_made_page_is_fresh(page: str) -> None:
     """`make pages` makes them anew."""
     command = [sys.executable, ROOT / "docs" / f"{page}.py"]
     made = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    assert made.stdout == (ROOT / "docs" / f"{page}.md").read_text()
+    assert made.stdout == (ROOT / "docs/reference" / f"{page}.md").read_text()
 
 
 def test_the_schemas_are_fresh() -> None:
@@ -32,7 +32,7 @@ def test_the_schemas_are_fresh() -> None:
 
 
 def test_every_error_has_a_code_of_its_own_kind() -> None:
-    cells = re.findall(r"^\| `(.+?)` \|", (ROOT / "docs" / "errors.md").read_text(), re.MULTILINE)
+    cells = re.findall(r"^\| `(.+?)` \|", (ROOT / "docs/reference/errors.md").read_text(), re.MULTILINE)
     codes = [code for cell in cells for code in cell.split(" / ")]
     assert len(codes) > 100
     assert all(re.fullmatch("[a-z0-9]+(-[a-z0-9]+)*", code) for code in codes)

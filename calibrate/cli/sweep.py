@@ -69,7 +69,7 @@ def sweep(
     if found.agrees:
         out.print("They agree with the robot: nothing to correct.")
     else:
-        out.print("They do not agree with the robot. Correct them: -o FILE, see docs/cameras.md, A sweep.")
+        out.print("They do not agree with the robot. Correct them: -o FILE, docs/integrator/cameras.md.")
 
 
 def _correction(recording: Recording, found: TimeOffset) -> TimeCorrection:

@@ -1,7 +1,7 @@
 """The calibration file, `format: handeye-calibration/1`: what it holds, writing, and reading it with proof.
 
-Field by field in docs/calibration-file.md. Metres and radians unless the name says otherwise; covariances are
-of `geometry.perturb`'s delta.
+Field by field in docs/integrator/calibration-file.md. Metres and radians unless the name says
+otherwise; covariances are of `geometry.perturb`'s delta.
 """
 
 from __future__ import annotations

@@ -118,7 +118,7 @@ def _description(source: Path, given: Path | None, needed: bool) -> tuple[Datase
         raise ImportSourceError(
             f"Nothing says which board {source} shows and how the camera is mounted",
             code="no-dataset",
-            remedy=f"Name a {DATASET_FILE} with mount and board (docs/recording-format.md) by --dataset.",
+            remedy=f"Name a {DATASET_FILE} with mount and board by --dataset (docs/integrator/import.md).",
         )
     return None, b""
 

@@ -44,7 +44,7 @@ _REACH_LIMIT_M = 20.0
 _UNIT_TOLERANCE = 0.01
 _TURN_LIMIT_RAD = 4 * math.pi
 """No joint turns this far: such numbers are degrees."""
-_HELP = "See docs/recording-format.md, 'Bring your own pictures'."
+_HELP = "See docs/integrator/import.md."
 
 
 class Dataset(msgspec.Struct, frozen=True, forbid_unknown_fields=True):

@@ -31,7 +31,7 @@ END_S = 1.0
 REAP_S = 2.0
 LOG_LIMIT_BYTES = 1_000_000
 STOP_DECELERATION = 2.0
-"""The script reads it as m/s² of the tool for an asynchronous stop (see docs/safety.md)."""
+"""The script reads it as m/s² of the tool for an asynchronous stop (see docs/operator/safety.md)."""
 
 REFUSALS = {
     "registers-in-use": (

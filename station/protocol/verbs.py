@@ -2,7 +2,7 @@
 
 Its fields are the arguments, its type parameter the result, its docstring the line of help; `states` says in
 which states it is allowed, `control` whether only the client that has control may ask. Dispatch, client,
-`--json` and docs/protocol.md follow from it.
+`--json` and docs/reference/protocol.md follow from it.
 """
 
 from __future__ import annotations

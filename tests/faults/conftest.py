@@ -186,7 +186,7 @@ async def cell(
 
 @pytest.fixture
 def fault_times(request: pytest.FixtureRequest) -> Callable[[Outcome], None]:
-    """Keeps measured times for the matrix in docs/faults.md: JSON lines in $FAULT_TIMES, if set."""
+    """Keeps measured times for docs/contributor/fault-tests.md: JSON lines in $FAULT_TIMES, if set."""
 
     def keep(outcome: Outcome) -> None:
         place = os.environ.get("FAULT_TIMES")

@@ -296,7 +296,7 @@ def test_every_real_dataset_imports(datasets: Path, tmp_path: Path) -> None:
         assert recording.image(recording.views()[0]).pixels.shape[:2] == (camera.height, camera.width)
 
 
-DOCUMENT = Path(__file__).parent.parent.parent / "docs/recording-format.md"
+DOCUMENT = Path(__file__).parent.parent.parent / "docs/integrator/import.md"
 
 
 def test_the_recipes_for_poses_of_other_tools_give_the_pose(tmp_path: Path) -> None:

@@ -32,7 +32,7 @@ examples
 
 The port numbers are fixed (clients have them built in): give every arm its own 127.x.y.z address.
 When all ports listen, one JSON line {"ready": true, "host": …} appears on standard output.
-What is verified and what a real controller may do differently: docs/simulated-controller.md."""
+What is verified and what a real controller may do differently: docs/contributor/simulator.md."""
 
 
 def main(arguments: list[str] | None = None) -> int:

@@ -1,4 +1,7 @@
-"""The figures that docs/safety.md promises, written out: whoever changes a constant changes the promise."""
+"""The figures that docs/operator/safety.md promises, written out.
+
+Whoever changes a constant changes the promise.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,7 @@ from station.devices import ur_child, ur_condition, ur_control, ur_moves
 from station.plan import hover
 from station.session import lease, supervisor
 
-PROMISES = (Path(__file__).parents[3] / "docs" / "safety.md").read_text()
+PROMISES = (Path(__file__).parents[3] / "docs/operator/safety.md").read_text()
 
 
 @pytest.mark.parametrize(

@@ -122,7 +122,7 @@ def test_help_teaches() -> None:
         text=True,
         check=True,
     ).stdout
-    for word in ("30004", "29990", "truth", '{"cmd": "pstop"}', "docs/simulated-controller.md"):
+    for word in ("30004", "29990", "truth", '{"cmd": "pstop"}', "docs/contributor/simulator.md"):
         assert word in text
 
 

@@ -1,7 +1,7 @@
 """A Universal Robots arm behind `devices.base.Robot`: one control process per approval, two ways to stop.
 
 Everything here runs in one event loop and returns to it within milliseconds; the state stream has its own
-thread, ur_rtde its own process. Safety rules: docs/operator/safety.md. What each fault does: docs/contributor/fault-tests.md.
+thread, ur_rtde its own process. Rules: docs/operator/safety.md, faults: docs/contributor/fault-tests.md.
 """
 
 from __future__ import annotations

@@ -14,7 +14,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from recordings.schema.messages import Source
-from station.cell.config import StationConfig
+from station.cell.config import REAL_DRIVERS, StationConfig
 from station.cell.errors import ConfigError, RobotError
 from station.cell.status import StationState
 from station.devices.base import Camera, Trigger
@@ -180,11 +180,10 @@ def _camera(config: StationConfig, trigger: Trigger | None) -> tuple[Camera, Sou
         from station.devices.webcam import WebcamCamera
 
         return WebcamCamera(config.camera), "real"
-    # A recorded or rendered image beside an arm that really moves would be a wrong calibration.
     raise ConfigError(
         f"camera.driver '{config.camera.driver}' shows no real image and never runs beside a real arm",
         code="unreal-camera",
-        remedy="Use 'aravis' or 'webcam', or `station serve --simulate`.",
+        remedy=f"Use {' or '.join(REAL_DRIVERS)}, or rehearse: `station serve --config FILE --rehearse`.",
     )
 
 

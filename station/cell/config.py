@@ -74,6 +74,10 @@ class RobotConfig(Section, frozen=True):
     """None = ur_rtde where it is installed, else script"""
 
 
+REAL_DRIVERS = ("aravis", "webcam")
+"""The others never stand beside an arm that really moves: their image would be a wrong calibration."""
+
+
 class CameraConfig(Section, frozen=True):
     name: str = MAIN_CAMERA
     """Of the cell's cameras: its calibrations are installed under it; a-z, 0-9 and -."""

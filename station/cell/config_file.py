@@ -18,7 +18,7 @@ from recordings import strict_yaml
 from recordings.files import is_session_name
 from recordings.schema.messages import BoardSpec
 from recordings.strict_yaml import YamlProblem
-from station.cell.config import CameraConfig, Plane, PoseGuess, StationConfig
+from station.cell.config import REAL_DRIVERS, CameraConfig, Plane, PoseGuess, StationConfig
 from station.cell.errors import ConfigError
 from station.cell.limits import SPEED_CAP_M_S
 
@@ -68,7 +68,7 @@ class ConfigReport:
     wrong: tuple[YamlProblem, ...]
     """With these nothing is started."""
     missing: tuple[YamlProblem, ...]
-    """What planning poses needs besides; capture by hand does without."""
+    """What planned capture with a real arm needs besides."""
 
 
 def load_config(path: Path) -> tuple[StationConfig, bytes]:
@@ -106,7 +106,7 @@ def examine_config(path: Path) -> ConfigReport:
         kept = (problem for problem in problems if _section(problem) in known)
         return tuple(replace(problem, line=_line(found.lines, problem.where)) for problem in kept)
 
-    meant, missing = placed(_meaning_problems(config)), placed(_planning_problems(config))
+    meant, missing = placed(_meaning_problems(config)), placed(_real_capture_problems(config))
     told = {problem.where for problem in found.problems}
     wrong = (*found.problems, *(problem for problem in meant if problem.where not in told))
     wrong = tuple(sorted(wrong, key=lambda problem: problem.line))
@@ -311,8 +311,11 @@ def _reach_problems(config: StationConfig) -> Iterator[YamlProblem]:
         yield YamlProblem(0, f"{name}.translation_m", text, remedy)
 
 
-def _planning_problems(config: StationConfig) -> Iterator[YamlProblem]:
-    """What planning needs and capture by hand does not."""
+def _real_capture_problems(config: StationConfig) -> Iterator[YamlProblem]:
+    """What planned capture with a real arm needs, and a rehearsal or capture by hand does not."""
+    if config.camera.driver not in REAL_DRIVERS:
+        text = f"'{config.camera.driver}' shows no real image"
+        yield YamlProblem(0, "camera.driver", text, "Choose aravis or webcam, or rehearse: `--rehearse`.")
     model = config.camera.model
     if model is None or model.matrix is None:
         yield YamlProblem(0, "camera.model", "planning needs a rough lens (matrix)", _FOCAL_LENGTH)

@@ -9,10 +9,11 @@ from calibrate.boards.model import BoardError, check_board, describe_board
 from recordings.files import bytes_text
 from station.cell.errors import CameraError, RobotError
 from station.cell.status import StationState
-from station.devices.gige_discovery import discover
+from station.devices.gige_discovery import FoundCamera, discover
 from station.devices.ur import control_trouble
 from station.devices.ur_condition import mode_word, not_powered, safety_stop, safety_word
 from station.devices.ur_probe import probe
+from station.devices.usb3_discovery import USB3_MBIT_S, UsbCamera, discover_usb
 from station.protocol.verbs import Check
 from station.session.context import SessionContext
 
@@ -24,7 +25,7 @@ async def checklist(context: SessionContext, troubles: dict[str, str]) -> list[C
     return [
         *await _robot_checks(context, troubles),
         await _camera_check(context, troubles),
-        *await _network_checks(context),
+        *await _wire_checks(context),
         _trigger_check(context, troubles),
         _board_check(context),
         _disk_check(context),
@@ -96,30 +97,45 @@ async def _camera_check(context: SessionContext, troubles: dict[str, str]) -> Ch
     return Check("camera", "ok", f"{camera.identity.model} {camera.identity.serial}, {width}×{height}")
 
 
-async def _network_checks(context: SessionContext) -> list[Check]:
-    """GigE Vision cameras on the wire, and what keeps one from being used. None for other drivers."""
+async def _wire_checks(context: SessionContext) -> list[Check]:
+    """GenICam cameras on this computer's wires, and what keeps one from being used; no other driver's."""
     if context.cell.config.camera.driver != "aravis":
         return []
-    found = await asyncio.to_thread(discover)
-    wanted = context.cell.config.camera.device
-    opened = context.cell.camera.identity.serial
-    lines, problems = [], []
-    for camera in found:
-        name, address = f"{camera.model} {camera.serial}", camera.address.partition("/")[0]
-        ours = camera.serial == opened
-        line = f"{name} at {camera.address}, firmware {camera.firmware or 'not told'}"
-        if not camera.reachable:
-            line += f", not in this computer's network ({camera.seen_from})"
-            problems.append(f"give {name} and this computer addresses and masks of one network")
-        elif camera.controlled and not ours:
-            line += f", in use by {camera.controlled_from or 'another program'}"
-            if wanted in ("", camera.serial, address, camera.model):
-                problems.append(f"end the program that has {name}")
-        lines.append(line)
-    if not found:
-        return [Check("network cameras", "skipped", "no GigE Vision camera answers")]
-    problem = "; ".join(problems)
-    return [Check("network cameras", "warning" if problem else "ok", "; ".join(lines), problem)]
+    network, usb = await asyncio.gather(asyncio.to_thread(discover), asyncio.to_thread(discover_usb))
+    return [
+        _listed("network cameras", "no GigE camera answers", [_on_network(context, c) for c in network]),
+        _listed("usb cameras", "no USB3 Vision camera", [_on_usb(c) for c in usb]),
+    ]
+
+
+def _listed(name: str, none: str, cameras: list[tuple[str, str]]) -> Check:
+    """What each camera is, and what to do about it or ""."""
+    problem = "; ".join(problem for _, problem in cameras if problem)
+    text = "; ".join(line for line, _ in cameras)
+    return Check(name, "warning" if problem else "ok" if text else "skipped", text or none, problem)
+
+
+def _on_network(context: SessionContext, camera: FoundCamera) -> tuple[str, str]:
+    name, address = f"{camera.model} {camera.serial}", camera.address.partition("/")[0]
+    line = f"{name} at {camera.address}, firmware {camera.firmware or 'not told'}"
+    if not camera.reachable:
+        line += f", not in this computer's network ({camera.seen_from})"
+        return line, f"give {name} and this computer addresses and masks of one network"
+    if camera.controlled and camera.serial != context.cell.camera.identity.serial:
+        line += f", in use by {camera.controlled_from or 'another program'}"
+        if context.cell.config.camera.device in ("", camera.serial, address, camera.model):
+            return line, f"end the program that has {name}"
+    return line, ""
+
+
+def _on_usb(camera: UsbCamera) -> tuple[str, str]:
+    name = f"{camera.model} {camera.serial}"
+    line = f"{name} at USB port {camera.port}, {camera.speed_mbit_s:g} Mbit/s, release {camera.firmware}"
+    if not camera.permitted:
+        return f"{line}, not permitted", f"install systemd/60-station.rules and plug {name} in again"
+    if camera.speed_mbit_s < USB3_MBIT_S:
+        return line, f"plug {name} into a USB 3 port, with a USB 3 cable"
+    return line, ""
 
 
 def _trigger_check(context: SessionContext, troubles: dict[str, str]) -> Check:

@@ -159,6 +159,7 @@ def test_pictures_that_are_not_real_never_stand_beside_a_real_arm(tmp_path: Path
     path.write_text(GOOD.replace("driver: aravis", "driver: rendered"))
     with raises("unreal-camera"):
         configured_cell(*load_config(path), tmp_path)
+    assert "camera.driver" in [problem.where for problem in examine_config(path).missing]
 
 
 @pytest.mark.parametrize("device", ["", "0", "/dev/v4l/by-id/usb-x"])
@@ -219,7 +220,7 @@ def test_the_remedy_of_a_board_that_lies_upside_down_mends_it(tmp_path: Path) ->
 def test_no_cell_that_works_has_a_problem(mount: Mount, seed: int, tmp_path: Path) -> None:
     config = cell_config(make_cell("paper", seed, "low", mount), "192.0.2.10")
     report = examined(tmp_path, msgspec.yaml.encode(config).decode())
-    assert not report.wrong and not report.missing
+    assert not report.wrong and [problem.where for problem in report.missing] == ["camera.driver"]
 
 
 def test_a_lens_in_metres_a_centre_in_millimetres_and_a_board_out_of_reach(tmp_path: Path) -> None:

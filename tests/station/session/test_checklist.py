@@ -12,6 +12,7 @@ from recordings.schema.messages import TimeSource
 from station.devices.frames import FrameTiming
 from station.devices.gige_discovery import FoundCamera
 from station.devices.ur_dashboard import Dashboard, DashboardError
+from station.devices.usb3_discovery import UsbCamera
 from station.protocol.verbs import Check
 from station.session.checklist import checklist
 from station.simulation.launch import SimulatedController
@@ -139,4 +140,25 @@ async def test_a_wrong_mask_and_a_camera_in_use_are_named(
     object.__setattr__(cell, "config", msgspec.structs.replace(cell.config, camera=wired))
     monkeypatch.setattr("station.session.checklist.discover", lambda: [] if camera is None else [camera])
     found = next(c for c in await checklist(rig.session.context, {}) if c.name == "network cameras")
+    assert found.state == state and bool(found.remedy) == (state == "warning")
+
+
+@pytest.mark.parametrize(
+    ("camera", "state"),
+    [
+        (None, "skipped"),
+        (UsbCamera("V", "M", "S", "1", "2-1", 5000.0, True), "ok"),
+        (UsbCamera("V", "M", "S", "1", "2-1", 480.0, True), "warning"),  # a USB 2 cable or port
+        (UsbCamera("V", "M", "S", "1", "2-1", 5000.0, False), "warning"),
+    ],
+)
+async def test_usb_cameras_are_listed_with_what_keeps_one_from_being_used(
+    rig: Rig, monkeypatch: pytest.MonkeyPatch, camera: UsbCamera | None, state: str
+) -> None:
+    cell = rig.session.context.cell
+    wired = msgspec.structs.replace(cell.config.camera, driver="aravis", device="S")
+    object.__setattr__(cell, "config", msgspec.structs.replace(cell.config, camera=wired))
+    monkeypatch.setattr("station.session.checklist.discover", list)
+    monkeypatch.setattr("station.session.checklist.discover_usb", lambda: [] if camera is None else [camera])
+    found = next(c for c in await checklist(rig.session.context, {}) if c.name == "usb cameras")
     assert found.state == state and bool(found.remedy) == (state == "warning")

@@ -1,26 +1,67 @@
-"""`python -m benchmarks [name …]`: run benchmarks and write their tables into benchmarks/README.md.
+"""`python -m benchmarks [name …]`: run benchmarks, write results/NAME.md and the page README.md.
 
 Every module here with a `run() -> str` is one. BENCH_SHARE=0.05 runs a twentieth of the trials,
-BENCH_SETS=six-views,denso-long only these recordings (real, mistakes).
+BENCH_SETS=six-views,denso-long only these recordings (real, mistakes). `--page` runs none and writes the page.
 """
 
 from __future__ import annotations
 
 import importlib
+import itertools
 import os
 import platform
 import re
 import subprocess
 import sys
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 HERE = Path(__file__).parent
 README = HERE / "README.md"
+RESULTS = HERE / "results"
+HEAD = """# Benchmarks
+Made by `python -m benchmarks`; do not edit. Each table shows the rows that say most. `results/NAME.md` has
+all of them, how they were measured, on what computer and with how many trials. `python -m benchmarks NAME`
+measures anew. Robot and camera are simulated unless said otherwise.
+"""
+SHOWN: dict[str, str] = {
+    "real": r"^\| (ours /|the same|sets|split|good views)",
+    "paper": r"true X|DE, paper|Zhao CO, 18|\| ours|Daniilidis",
+    "blog": "",
+    "certainty": "20 mm|nearly one|swapped",
+    "floor": r"^\| (mid|high) \| same pictures \| 25 \| measured",
+    "coverage": r"^\| (clean|size 0.5 %|bent 0.5 mm|arm 0.4 mm, arm unknown) \| eye-to",
+    "outliers": r"^\| (far|shuffled) \| 40 % \| eye-in|moved \| 35 % \| eye-in",
+    "kinematics": r"^\| (0|0.5) \|",
+    "arm_table": r"^\| 0.3 mm, (measured|usual), 50 planned \| 100 \|",
+    "mistakes": r"^\*\*",
+    "detection": r"^\| (good|20°) ",
+    "speed": r"^\| (18|4950) \|",
+    "offline": r"all\*\*|OpenCV: read|ratio|peak",
+    "batch": "speed-up|bits",
+    "planning": r"^\| (moderate|wide) \| planned 25|^\| (full plan|moves, plan|predicted)",
+    "improving": "improved",
+    "drift": r"planned \| [38] \|",
+    "stop_latency": r"^\| both \| (first|bytes).* 200 \||no heartbeat \| rest",
+    "stop_denied": "busy|fake",
+    "daemon_latency": "",
+    "screen_stop": "F12",
+    "daemon_stream": r"^\| (75 \| 10|150) ",
+    "state_reader": "samples|fitted|share",
+    "recorder": r"plain write\(\) of|Recorder \(",
+    "time_sync": "",
+    "frame_time": r"\+0 ms \| \+0|-1 ms",
+    "operator_mistakes": "of 25 named",
+}
+"""The rows of each benchmark that the page shows, as a pattern; in the page's order."""
 _THREADS = ("OPENBLAS_NUM_THREADS", "OMP_NUM_THREADS", "MKL_NUM_THREADS")
 
 
 def main() -> int:
+    if sys.argv[1:] == ["--page"]:
+        _replace(README, page())
+        return 0
     names = sys.argv[1:] or sorted(_benchmarks())
     unknown = set(names) - set(_benchmarks())
     if unknown:
@@ -39,6 +80,7 @@ def main() -> int:
         took_s = time.perf_counter() - start
         _write(name, f"{text}\n\n{_where()}; took {took_s:.0f} s.")
         print(text, flush=True)
+    _replace(README, page())
     return 0
 
 
@@ -55,18 +97,48 @@ def _where() -> str:
 
 
 def _write(name: str, text: str) -> None:
-    """Replace the section of this benchmark, or append it. Title: the module's first docstring line."""
+    """Keep all rows in results/NAME.md. Title: the module's first docstring line."""
     title = (importlib.import_module(f"benchmarks.{name}").__doc__ or name).strip().splitlines()[0]
-    section = f"<!-- {name} -->\n## {title}\n`python -m benchmarks {name}`\n\n{text}\n<!-- /{name} -->"
-    page = README.read_text() if README.exists() else "# Benchmarks\n"
-    pattern = re.compile(rf"<!-- {name} -->.*?<!-- /{name} -->", re.DOTALL)
-    if pattern.search(page):
-        page = pattern.sub(lambda _: section, page)
-    else:
-        page = page.rstrip() + "\n\n" + section + "\n"
-    partial = README.with_suffix(".tmp")
-    partial.write_text(page)
-    partial.replace(README)
+    _replace(RESULTS / f"{name}.md", f"# {title}\n`python -m benchmarks {name}`\n\n{text}\n")
+
+
+def page() -> str:
+    """The rows in SHOWN of every result; of a benchmark that is not named there, the first three."""
+    sections = [HEAD]
+    for result in sorted(RESULTS.glob("*.md"), key=_order):
+        text = result.read_text()
+        title = text.partition("\n")[0].removeprefix("# ")
+        rows = "\n".join(_shown(text, SHOWN.get(result.stem)))
+        sections.append(f"\n## {result.stem}\n{title}\n{rows}\n")
+    return "".join(sections)
+
+
+def _order(result: Path) -> tuple[int, str]:
+    """As in SHOWN, others behind."""
+    names = list(SHOWN)
+    return (names.index(result.stem) if result.stem in names else len(names), result.stem)
+
+
+def _shown(text: str, wanted: str | None) -> Iterator[str]:
+    """Rows that match, each table with its head (the head's rule is short), and short lines that match."""
+    head: list[str] = []
+    first = 3
+    for line, after in itertools.pairwise([*text.splitlines()[2:], ""]):
+        row = line.startswith("|")
+        if re.fullmatch(r"\|([- ]+\|)+", after):
+            head = ["", line, "|-" * (after.count("|") - 1) + "|"]
+        elif not line or re.fullmatch(r"\|([- ]+\|)+", line) or (not row and (not wanted or len(line) > 80)):
+            continue
+        elif re.search(wanted, line) if wanted is not None else first:
+            yield from head if row else [""]
+            yield line
+            head, first = [], first - 1
+
+
+def _replace(path: Path, text: str) -> None:
+    partial = path.with_suffix(".tmp")
+    partial.write_text(text)
+    partial.replace(path)
 
 
 if __name__ == "__main__":

@@ -31,6 +31,13 @@ def test_the_schemas_are_fresh() -> None:
     assert dict(made) == {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
+def test_the_page_of_benchmarks_is_fresh_and_short() -> None:
+    """`python -m benchmarks --page` makes it anew from the results."""
+    page = (ROOT / "benchmarks/README.md").read_text()
+    assert page == import_module("benchmarks.__main__").page()
+    assert len(page.split()) < 3500
+
+
 def test_every_error_has_a_code_of_its_own_kind() -> None:
     cells = re.findall(r"^\| `(.+?)` \|", (ROOT / "docs/reference/errors.md").read_text(), re.MULTILINE)
     codes = [code for cell in cells for code in cell.split(" / ")]

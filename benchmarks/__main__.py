@@ -1,7 +1,7 @@
 """`python -m benchmarks [name …]`: run benchmarks, write results/NAME.md and the page README.md.
 
 Every module here with a `run() -> str` is one. BENCH_SHARE=0.05 runs a twentieth of the trials,
-BENCH_SETS=six-views,denso-long only these recordings (real, mistakes). `--page` runs none and writes the page.
+BENCH_SETS=six-views,denso-long only these recordings (real, mistakes). `--page` writes the page alone.
 """
 
 from __future__ import annotations

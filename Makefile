@@ -61,6 +61,7 @@ bench: $(READY)  ## the benchmarks; tables go to benchmarks/README.md
 
 pages: $(READY)  ## the pages of docs/ that are made from the sources
 	for page in api errors protocol; do $(BIN)/python docs/$$page.py > docs/reference/$$page.md; done
+	$(BIN)/python docs/decisions.py > docs/decisions/README.md
 	$(BIN)/python docs/schemas.py
 
 soak: $(READY)  ## the long runs that CI shortens

@@ -16,12 +16,21 @@ from tests.command_line import call
 ROOT = Path(__file__).parents[1]
 
 
-@pytest.mark.parametrize("page", ["api", "errors", "protocol"])
+@pytest.mark.parametrize("page", ["api", "errors", "protocol", "decisions"])
 def test_a_made_page_is_fresh(page: str) -> None:
     """`make pages` makes them anew."""
     command = [sys.executable, ROOT / "docs" / f"{page}.py"]
     made = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=True)
-    assert made.stdout == (ROOT / "docs/reference" / f"{page}.md").read_text()
+    place = "decisions/README" if page == "decisions" else f"reference/{page}"
+    assert made.stdout == (ROOT / "docs" / f"{place}.md").read_text()
+
+
+def test_a_decision_record_is_short_and_whole() -> None:
+    for path in (ROOT / "docs/decisions").glob("0*.md"):
+        text = path.read_text()
+        headings = re.findall(r"^## (.+)$", text, re.MULTILINE)
+        assert headings == ["Context", "Decision", "Consequences"], path.name
+        assert len(text.split()) <= 250, path.name
 
 
 def test_the_schemas_are_fresh() -> None:

@@ -1,4 +1,4 @@
-"""CRC-32 as zlib-ng computes it, in a quarter of the standard library's time (docs/decisions/0037)."""
+"""CRC-32 as zlib-ng computes it, in a quarter of the standard library's time (docs/decisions/0030)."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ PYTHON ?= $(or $(SYSTEM_PYTHON),python3)
 VENV_FLAGS := $(if $(SYSTEM_PYTHON),--system-site-packages,)
 READY := $(VENV)/.ready
 
-.PHONY: help venv demo demo-gige test foreign check bench pages soak install install-files uninstall clean
+.PHONY: help venv demo demo-gige test foreign check bench pages docs soak install install-files uninstall clean
 help:  ## list the commands
 	@grep -hE '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 14
 
@@ -60,9 +60,13 @@ bench: $(READY)  ## the benchmarks; tables go to benchmarks/README.md
 	$(BIN)/python -m benchmarks
 
 pages: $(READY)  ## the pages of docs/ that are made from the sources
-	for page in api errors protocol; do $(BIN)/python docs/$$page.py > docs/reference/$$page.md; done
+	for page in api cli errors protocol; do $(BIN)/python docs/$$page.py > docs/reference/$$page.md; done
+	for page in configuration json; do $(BIN)/python docs/structs.py $$page > docs/reference/$$page.md; done
 	$(BIN)/python docs/decisions.py > docs/decisions/README.md
 	$(BIN)/python docs/schemas.py
+
+docs: $(READY)  ## the books as a site in site/, to be read without a server
+	$(BIN)/mkdocs build --strict -q -d site && echo site/index.html
 
 soak: $(READY)  ## the long runs that CI shortens
 	$(BIN)/python -m pytest -m soak --timeout 3600
@@ -96,7 +100,7 @@ install-files:  # the part of install that needs no network
 	install -D -m 644 systemd/60-station.rules $(DESTDIR)$(SYSCONFDIR)/udev/rules.d/60-station.rules
 	test -e $(DESTDIR)$(SYSCONFDIR)/station/station.env || \
 		install -D -m 644 systemd/station.env $(DESTDIR)$(SYSCONFDIR)/station/station.env
-	for folder in . operator integrator contributor reference; do \
+	for folder in . operator integrator contributor reference decisions; do \
 		install -d $(DESTDIR)$(DOC)/$$folder && install -m 644 docs/$$folder/*.md $(DESTDIR)$(DOC)/$$folder; done
 	install -d $(DESTDIR)$(DOC)/schemas && install -m 644 docs/schemas/*.json $(DESTDIR)$(DOC)/schemas
 
@@ -111,4 +115,4 @@ uninstall:  ## stop the services and remove what install put there; configuratio
 	rm -f $(DESTDIR)$(SYSCONFDIR)/udev/rules.d/60-station.rules
 
 clean:  ## remove the venv and caches
-	rm -rf $(VENV) $(FOREIGN) build *.egg-info .mypy_cache .ruff_cache .pytest_cache
+	rm -rf $(VENV) $(FOREIGN) build site *.egg-info .mypy_cache .ruff_cache .pytest_cache

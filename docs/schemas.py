@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 
 from calibrate.cli.contracts import DiffJson, DriftCheckJson, InstalledJson, ListedJson, SolveJson
+from calibrate.cli.follow import Followed
 from calibrate.files.calibration import Calibration
 from calibrate.files.validity import Validity
 from recordings.errors import ErrorReport
@@ -25,6 +26,7 @@ TYPES: dict[str, tuple[str, Any]] = {
     "list": ("calibrate list --json", list[ListedJson]),
     "install": ("calibrate install --json, calibrate rollback --json", InstalledJson),
     "validity": ("calibrate withdraw --json; `validity` of other commands", Validity),
+    "follow": ("A line of calibrate follow", Followed),
     "diff": ("calibrate diff --json", DiffJson),
     "drift-check": ("calibrate drift-check --json", DriftCheckJson),
     "status": ("station status --json", StationStatus),

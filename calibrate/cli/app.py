@@ -38,7 +38,7 @@ COMMANDS = {
         f"{_FILES}:export",
         "Write a calibration in another program's format.",
         (
-            "calibrate export --to ros-launch -o camera.launch.py  # of the installed one",
+            "calibrate export --to ros-launch-follow -o camera.launch.py  # follows what is installed",
             "calibrate export cell.yaml --to ros-camera-info -o camera_info.yaml",
         ),
     ),
@@ -69,6 +69,11 @@ COMMANDS = {
         "calibrate.cli.metrics:metrics",
         "Print the state of the installed calibrations for Prometheus.",
         ("calibrate metrics", "calibrate metrics -o /var/lib/node_exporter/calibration.prom"),
+    ),
+    "follow": LazyCommand(
+        "calibrate.cli.follow:follow",
+        "Print the installed calibration as JSON, and again after every change.",
+        ("calibrate follow --camera overhead",),
     ),
     "drift-check": LazyCommand(
         "calibrate.cli.drift_check:drift_check",

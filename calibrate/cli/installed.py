@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from enum import StrEnum
 from itertools import groupby
 from pathlib import Path
@@ -140,15 +141,24 @@ def export(
     """
     calibration, validity = named_or_installed(file, root, camera)
     names = FrameNames.of_camera(camera if file is None else calibration.camera_name)
-    frames = FrameNames(base, flange, frame or names.camera, body or names.body, validity)
-    text = exports.export(calibration, str(to.value), frames)
+    follow = () if file is not None else _follow_command(root, camera)
+    frames = FrameNames(base, flange, frame or names.camera, body or names.body, validity, follow)
+    content = exports.export(calibration, str(to.value), frames)
     if validity is not None and validity.state is not ValidityState.VALID:
         err.print(f"Warning: the calibration is {validity_text(validity)}", style="yellow")
     if output is None:
-        typer.echo(text, nl=False)
+        if b"\0" in content:
+            raise OutputError(f"{to.value} is no text.", remedy="Name a file with -o.")
+        typer.echo(content.decode(), nl=False)
         return
     check_target(output, "export")
-    write_output(output, text.encode())
+    write_output(output, content)
+
+
+def _follow_command(root: Path | None, camera: str) -> tuple[str, ...]:
+    """The command that tells another program of every change here, wherever that is started."""
+    place = ("--root", str(state_root(root).resolve()), "--camera", camera)
+    return (sys.executable, "-m", "calibrate.cli", "follow", *place)
 
 
 def install(

@@ -15,7 +15,14 @@ import yaml
 from numpy.typing import ArrayLike
 
 from calibrate.errors import CalibrationFileError
-from calibrate.files.loader import check_result, content_sha256, proven_plain, read_bounded, refused_table
+from calibrate.files.loader import (
+    InstalledCalibration,
+    check_result,
+    content_sha256,
+    proven_plain,
+    read_bounded,
+    refused_table,
+)
 from calibrate.geometry import Transform
 from calibrate.kinematics import RobotModel, base_from_flange
 from calibrate.results import BoardShape, HoldoutScore, RejectedView
@@ -444,6 +451,6 @@ def write_output(path: Path, content: bytes) -> None:
         raise CalibrationFileError(f"{path} cannot be written: {problem.strerror or problem}.") from None
 
 
-def source_stamp(calibration: Calibration) -> str:
+def source_stamp(calibration: Calibration | InstalledCalibration) -> str:
     """Stamp for everything that shows a calibration of no real cell; else empty."""
     return _STAMPS.get(calibration.source, "")

@@ -488,9 +488,16 @@ class InstallationChange:
 
 
 def watch(
-    root: Path | None = None, *, camera: str = MAIN_CAMERA, poll_s: float = 1.0, stop_s: float | None = None
+    root: Path | None = None,
+    *,
+    camera: str = MAIN_CAMERA,
+    poll_s: float = 1.0,
+    stop_s: float | None = None,
+    first: bool = False,
 ) -> Iterator[InstallationChange]:
     """Yield every change of the installed calibration of `camera`: install, rollback, doubt, its end.
+
+    `first`: begin with what is installed now, so that nothing is missed between loading and watching.
 
     Looks every `poll_s` seconds at two files' times, on any file system; reads only what changed. Also yields
     when the last proof grows too old by the cell's rule. `stop_s`: seconds after which it ends; None: never.
@@ -498,7 +505,10 @@ def watch(
     """
     folder = calibrations_folder(root, camera)
     ends_s = None if stop_s is None else time.monotonic() + stop_s
-    before, marks = _look(root, camera, None), _marks(folder)
+    marks = _marks(folder)  # before looking: what changes meanwhile is seen at the next look
+    before = _look(root, camera, None)
+    if first:
+        yield before
     while ends_s is None or time.monotonic() < ends_s:
         time.sleep(poll_s)
         seen = _marks(folder)

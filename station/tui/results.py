@@ -221,8 +221,7 @@ class ResultsDesk(Desk):
             installed = read_installed(root, calibration.camera_name)
             if same_solve(calibration, installed.now):
                 names = replace(names, validity=installed.validity)
-            text = export(calibration, chosen, names)
-            write_atomically(output, text.encode(), ASKED_FOR)
+            write_atomically(output, export(calibration, chosen, names), ASKED_FOR)
             return output
 
         if await self.attempt(asyncio.to_thread(write)) is not None:

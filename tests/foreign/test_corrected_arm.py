@@ -63,7 +63,7 @@ def own(calibration: Calibration) -> Array:
 
 def test_the_urdf(calibration: Calibration, tmp_path: Path) -> None:
     path = tmp_path / "arm.urdf"
-    path.write_text(export(calibration, "arm-urdf"))
+    path.write_bytes(export(calibration, "arm-urdf"))
     assert np.abs(by_pytransform3d(path, "base", "tool0") - own(calibration)).max() < 1e-9
     assert calibration.arm_table is not None
     _, X = calibration.arm_table.installable()

@@ -20,6 +20,7 @@ import yaml
 from scipy.spatial.transform import Rotation
 
 from calibrate.errors import CalibrationError
+from calibrate.files import exports
 from calibrate.files.calibration import (
     Calibration,
     CorrectedArm,
@@ -30,13 +31,20 @@ from calibrate.files.calibration import (
     encode_calibration,
     write_calibration,
 )
-from calibrate.files.exports import FORMATS, ExportError, FrameNames, export
+from calibrate.files.exports import FORMATS, ExportError, FrameNames
 from calibrate.files.loader import InstalledCalibration, check_result, proven_plain
 from calibrate.files.validity import unrecorded
 from calibrate.geometry import Array, FrameMismatchError, Transform, pose, pose_from_rotvec, rotation_exp
 from calibrate.handeye.arm import HELD, PARAMETERS, corrected_model
 from calibrate.kinematics import MODELS, DhDeltas, base_from_flange, forward, with_near_axes
 from calibrate.pipeline import SolvedRecording
+
+FOLLOWED = FrameNames(follow=("calibrate", "follow"))
+
+
+def export(calibration: Calibration, name: str, frames: FrameNames = FOLLOWED) -> str:
+    """The content as text; of a binary format its characters."""
+    return exports.export(calibration, name, frames).decode("utf-8" if name != "matlab" else "latin-1")
 
 
 @pytest.fixture(params=["eye-in-hand", "eye-to-hand"])
@@ -241,12 +249,12 @@ def urdf_origin(joint: ElementTree.Element) -> Array:
 def test_a_name_with_hyphens_does_not_end_the_urdfs_comment(calibration: Calibration) -> None:
     named = msgspec.structs.replace(calibration.provenance, session="a--b---c----")
     text = export(msgspec.structs.replace(calibration, provenance=named), "urdf")
-    assert len(ElementTree.fromstring(f"<robot name='x'>{text}</robot>")) == 4
+    assert len(ElementTree.fromstring(text)) == 5
     assert "a- -b- - -c- - - -" in text
 
 
 def test_urdf_chain_ends_in_the_optical_frame(calibration: Calibration) -> None:
-    tree = ElementTree.fromstring(f"<robot name='x'>{export(calibration, 'urdf')}</robot>")
+    tree = ElementTree.fromstring(export(calibration, "urdf"))
     first, second = tree.findall("joint")
     assert first.find("parent").attrib["link"] == parent_of(calibration)  # type: ignore[union-attr]
     assert first.find("child").attrib["link"] == second.find("parent").attrib["link"] == "camera_link"  # type: ignore[union-attr]
@@ -267,7 +275,7 @@ def test_urdf_of_a_camera_that_looks_straight_along_the_flange(
     R = rotation_exp([0.0, 0.0, roll_rad]) @ rotation_exp([0.6 * off_rad, -0.8 * off_rad, 0.0])
     transform = Transform(calibration.result.parent_frame, "camera", pose(R, [0.0, 0.0, 0.1]))
     straight = msgspec.structs.replace(calibration, result=FramePose.of(transform))
-    tree = ElementTree.fromstring(f"<robot name='x'>{export(straight, 'urdf')}</robot>")
+    tree = ElementTree.fromstring(export(straight, "urdf"))
     body, optical = (urdf_origin(joint) for joint in tree.findall("joint"))
     same(body @ optical, straight)
 

@@ -1,0 +1,54 @@
+"""Exports: the content of a file in each format of other programs, made from a calibration."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+from calibrate.files.calibration import Calibration
+from calibrate.files.exports import models, ros, vision
+from calibrate.files.exports.frames import ExportError as ExportError
+from calibrate.files.exports.frames import FrameNames as FrameNames
+
+
+class Format(NamedTuple):
+    suffix: str
+    says: str
+    make: Callable[[Calibration, FrameNames], str | bytes]
+
+
+FORMATS: dict[str, Format] = {
+    "ros-camera-info": Format(".yaml", "ROS camera_info YAML: the intrinsics", ros.ros_camera_info),
+    "ros-static-transform": Format(
+        ".sh", "command line of ROS 2 static_transform_publisher", ros.ros_static_transform
+    ),
+    "ros-launch": Format(".launch.py", "ROS 2 launch file with the static transform", ros.ros_launch),
+    "ros-launch-follow": Format(
+        ".launch.py", "ROS 2 launch file that follows what is installed", ros.ros_launch_follow
+    ),
+    "easy-handeye2": Format(".calib", "easy_handeye2 calibration", ros.easy_handeye2),
+    "urdf": Format(".urdf", "URDF: camera body and optical frame", models.urdf),
+    "xacro": Format(".xacro", "the same as a macro for a robot's xacro", models.xacro),
+    "mjcf": Format(".xml", "MuJoCo model with the camera", models.mjcf),
+    "opencv": Format(".yml", "OpenCV FileStorage: transform and intrinsics", vision.opencv),
+    "halcon": Format(".dat", "HALCON pose: tool_in_cam_pose or base_in_cam_pose", vision.halcon),
+    "zivid": Format(".yaml", "Zivid Matrix4x4: the transform, mm", vision.zivid),
+    "kalibr": Format(".yaml", "Kalibr camchain: intrinsics and transform", vision.kalibr),
+    "nerfstudio": Format(".json", "nerfstudio transforms.json", vision.nerfstudio),
+    "matlab": Format(".mat", "MATLAB: rigidtform3d and cameraIntrinsics", vision.matlab),
+    "json": Format(".json", "everything, as JSON", vision.plain_json),
+    "ur-tool": Format(".txt", "camera as tool (TCP) or feature on the UR pendant", vision.ur_tool),
+    "ur-kinematics": Format(".yaml", "the corrected arm for ROS 2's ur_description", models.ur_kinematics),
+    "arm-urdf": Format(".urdf", "URDF of the corrected arm and its camera", models.arm_urdf),
+    "arm-json": Format(".json", "the corrected arm and the X that belongs to it", vision.arm_json),
+}
+
+
+def export(calibration: Calibration, name: str, frames: FrameNames | None = None) -> bytes:
+    """Make the file's content. Raises ExportError for an unknown format, or one that cannot hold it."""
+    if name not in FORMATS:
+        raise ExportError(
+            f"There is no format {name!r}.", remedy=f"Choose one of {', '.join(FORMATS)}.", format=name
+        )
+    made = FORMATS[name].make(calibration, frames or FrameNames())
+    return made.encode() if isinstance(made, str) else made

@@ -1,0 +1,93 @@
+"""Names of our frames elsewhere, the comment of every export, and rotations as others write them."""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import yaml
+
+from calibrate.errors import CalibrationError
+from calibrate.files.calibration import Calibration, source_stamp
+from calibrate.files.validity import Validity, validity_text
+from calibrate.geometry import Array, pose
+from recordings.files import MAIN_CAMERA
+
+BODY_FROM_OPTICAL: Array = pose([[0, 0, 1], [-1, 0, 0], [0, -1, 0]], [0, 0, 0])
+"""REP-103: a body frame looks along x with z up, an optical frame along z with y down."""
+OPTICAL_FROM_OPENGL: Array = np.diag([1.0, -1.0, -1.0, 1.0])
+"""A camera of OpenGL looks along -z with y up."""
+
+
+class ExportError(CalibrationError):
+    """This calibration cannot be written in that format, or there is no such format."""
+
+    code = "export-format"
+    exit_code = 2
+
+
+@dataclass(frozen=True)
+class FrameNames:
+    """Names of our frames elsewhere.
+
+    Defaults of the UR ROS driver: its `base` is the controller's (base_link is turned by 180°), and its
+    `tool0` is the controller's flange (its `flange` is turned).
+    """
+
+    base: str = "base"
+    flange: str = "tool0"
+    camera: str = "camera_optical_frame"
+    body: str = "camera_link"
+    validity: Validity | None = None
+    """Of the installed calibration, for the file's comment; None: of a file that may never be installed."""
+    follow: tuple[str, ...] = ()
+    """Command that prints every change of the installed calibration; empty: of a file."""
+
+    @classmethod
+    def of_camera(cls, name: str) -> FrameNames:
+        """Names of the frames of this camera of a cell: those of `main` have no name of their own."""
+        return cls() if name == MAIN_CAMERA else cls(camera=f"{name}_optical_frame", body=f"{name}_link")
+
+    def parent(self, calibration: Calibration) -> str:
+        return self.flange if calibration.mount == "eye-in-hand" else self.base
+
+    @property
+    def node(self) -> str:
+        """The camera's name as ROS and xacro allow it: letters, digits and underscores."""
+        name = re.sub(r"\W", "_", self.body.removesuffix("_link"), flags=re.ASCII)
+        return name if name[:1].isalpha() else f"camera{name}"
+
+
+def comment(calibration: Calibration, frames: FrameNames, with_table: bool = False) -> str:
+    """One line on where this comes from, stamped where it must be; `with_table`: of the corrected arm.
+
+    One line whatever the file says: the rest of a name must not become a line of a launch file or a script.
+    """
+    stamp = source_stamp(calibration)
+    origin = f"{calibration.provenance.session}, solved {calibration.created}"
+    held = "" if frames.validity is None else validity_text(frames.validity)
+    two = calibration.arm_table is not None and calibration.arm_table.offered
+    table = _AS_IT_IS if two and not with_table else ""
+    return " ".join(". ".join(filter(None, (stamp, origin, table, held))).split())
+
+
+_AS_IT_IS = "Camera pose for the arm as it is, not for its corrected table"
+
+
+def commented_yaml(calibration: Calibration, frames: FrameNames, plain: dict[str, Any], **layout: Any) -> str:
+    return f"# {comment(calibration, frames)}\n{yaml.safe_dump(plain, sort_keys=False, **layout)}"
+
+
+def roll_pitch_yaw(R: Array) -> tuple[float, float, float]:
+    """Radians, of R (3, 3). Yaw is what is left after the roll: Rz(yaw) Ry(pitch) = R Rx(roll)ᵀ.
+
+    So the three are right together at a pitch of 90° too, where SciPy's lose half the digits: the body frame
+    of a camera that looks straight along the flange is pitched so.
+    """
+    roll = np.arctan2(R[2, 1], R[2, 2])
+    pitch = np.arctan2(-R[2, 0], np.hypot(R[0, 0], R[1, 0]))
+    across = R[:, 1] * np.cos(roll) - R[:, 2] * np.sin(roll)
+    yaw = np.arctan2(-across[0], across[1])
+    return float(roll), float(pitch), float(yaw)

@@ -1,0 +1,181 @@
+"""Exports that place the camera in a model of the robot: URDF, xacro, MuJoCo, and the corrected arm."""
+
+from __future__ import annotations
+
+import re
+from typing import Any
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+import yaml
+from numpy.typing import ArrayLike
+
+from calibrate.files.calibration import Calibration, DhTable
+from calibrate.files.exports.frames import (
+    BODY_FROM_OPTICAL,
+    OPTICAL_FROM_OPENGL,
+    ExportError,
+    FrameNames,
+    comment,
+    roll_pitch_yaw,
+)
+from calibrate.files.loader import content_sha256
+from calibrate.geometry import Array, Transform, inverse, pose, rotation_exp
+from calibrate.kinematics import MODELS, RobotModel, link_frames
+from calibrate.projection import camera_matrix
+
+
+def urdf(calibration: Calibration, frames: FrameNames) -> str:
+    """A whole URDF: the robot's frame, the camera's body and its optical frame."""
+    parent = frames.parent(calibration)
+    name = quoteattr(f"{frames.node}_calibrated")
+    return (
+        f"{_commented(comment(calibration, frames))}<robot name={name}>\n<link name={quoteattr(parent)}/>\n"
+        f"{_camera(calibration.transform.matrix, parent, frames)}</robot>\n"
+    )
+
+
+def xacro(calibration: Calibration, frames: FrameNames) -> str:
+    """A macro for a robot's own xacro: body and optical frame below the link `parent`."""
+    parent = frames.parent(calibration)
+    plain = FrameNames(camera=_verbatim(frames.camera), body=_verbatim(frames.body))
+    return (
+        f'{_commented(comment(calibration, frames))}<robot xmlns:xacro="http://www.ros.org/wiki/xacro">\n'
+        f'<xacro:macro name="calibrated_{frames.node}" params={quoteattr(f"parent:={_verbatim(parent)}")}>\n'
+        f"{_camera(calibration.transform.matrix, '${parent}', plain)}</xacro:macro>\n</robot>\n"
+    )
+
+
+def mjcf(calibration: Calibration, frames: FrameNames) -> str:
+    """A whole MuJoCo model (3.6 and newer): a body where the robot's frame is, and the camera in it.
+
+    MuJoCo measures the principal point from the image's middle, away from the axis, and draws no distortion.
+    """
+    camera, matrix = calibration.intrinsics.model, calibration.transform.matrix @ OPTICAL_FROM_OPENGL
+    K, size = camera_matrix(camera), np.array([camera.width, camera.height])
+    x, y, z, w = Transform("", "", matrix).quaternion_xyzw
+    values: dict[str, ArrayLike] = {
+        "pos": matrix[:3, 3],
+        "quat": (w, x, y, z),
+        "focalpixel": (K[0, 0], K[1, 1]),
+        "principalpixel": size / 2 - (K[:2, 2] + 0.5),
+        "sensorsize": 1e-6 * size,  # any size: the focal length is in pixels
+    }
+    said = " ".join(f'{name}="{_numbers(value)}"' for name, value in values.items())
+    return (
+        f"{_commented(comment(calibration, frames))}<mujoco model={quoteattr(frames.node)}>\n<worldbody>\n"
+        f"<body name={quoteattr(frames.parent(calibration))}>\n"
+        f'<camera name={quoteattr(frames.camera)} resolution="{camera.width} {camera.height}" {said}/>\n'
+        "</body>\n</worldbody>\n</mujoco>\n"
+    )
+
+
+def _commented(note: str) -> str:
+    safe = re.sub("-(?=-)", "- ", note)  # no -- inside a comment of XML
+    return f"<!-- {safe} -->\n"
+
+
+def _verbatim(name: str) -> str:
+    """A name that xacro does not evaluate."""
+    return re.sub(r"\$(?=[{(])", "$$", name)
+
+
+def _camera(parent_from_optical: Array, parent: str, frames: FrameNames) -> str:
+    return (
+        f"<link name={quoteattr(frames.body)}/>\n<link name={quoteattr(frames.camera)}/>\n"
+        + _joint(parent, frames.body, parent_from_optical @ inverse(BODY_FROM_OPTICAL))
+        + _joint(frames.body, frames.camera, BODY_FROM_OPTICAL)
+    )
+
+
+def _numbers(values: ArrayLike) -> str:
+    return " ".join(repr(v) for v in np.asarray(values, float).tolist())
+
+
+def _joint(parent: str, child: str, matrix: Array) -> str:
+    return (
+        f'<joint name={quoteattr(f"{child}_joint")} type="fixed">\n'
+        f"  <parent link={quoteattr(parent)}/>\n  <child link={quoteattr(child)}/>\n"
+        f"  {_origin(matrix)}\n</joint>\n"
+    )
+
+
+def _origin(matrix: Array) -> str:
+    rpy = roll_pitch_yaw(matrix[:3, :3])
+    return f'<origin xyz="{_numbers(matrix[:3, 3])}" rpy="{_numbers(rpy)}"/>'
+
+
+_LINKS = ("shoulder", "upper_arm", "forearm", "wrist_1", "wrist_2", "wrist_3")
+_JOINTS = ("shoulder_pan", "shoulder_lift", "elbow", "wrist_1", "wrist_2", "wrist_3")
+
+
+def link_origins(table: DhTable) -> Array:
+    """Compute the fixed transforms (6, 4, 4) before each joint's turn about z, as URDF chains them.
+
+    Raises ExportError where the table moves the flange behind the last joint, which that chain cannot say.
+    """
+    a, d, alpha, theta, beta = (getattr(table, name) for name in table.__struct_fields__)
+    model, after = RobotModel("corrected", a, d, "", alpha, theta, beta), [a[5], alpha[5], beta[5]]
+    if np.abs(after).max() > 1e-12:
+        raise ExportError("The table has a, alpha or beta of joint 6.", code="table-behind-joint-6")
+    frames, behind, found = link_frames(model, np.zeros(6)), np.eye(4), []
+    for i in range(6):
+        step = inverse(frames[i]) @ frames[i + 1]
+        turned = pose(rotation_exp([0.0, 0.0, theta[i]]), [0.0, 0.0, d[i]])
+        found.append(behind @ turned)
+        behind = inverse(turned) @ step
+    return np.array(found)
+
+
+def table_origins(calibration: Calibration, frames: FrameNames) -> tuple[Array, str]:
+    """The corrected arm's origins (6, 4, 4), and a comment with the one X that belongs to them."""
+    if calibration.arm_table is None:
+        raise ExportError(
+            "This calibration holds no table of an arm.",
+            code="no-arm-table",
+            remedy="Solve a recording of a robot whose model is known.",
+        )
+    table, X = calibration.arm_table.installable()
+    values = _numbers([*X.translation_m, *X.quaternion_xyzw])
+    note = (
+        f"{comment(calibration, frames, with_table=True)}\n"
+        f"{calibration.arm_table.model}: use it only with this camera pose, and this one only with it:\n"
+        f"{frames.parent(calibration)} {frames.camera} (x y z, qx qy qz qw) {values}"
+    )
+    return link_origins(table), note
+
+
+def ur_kinematics(calibration: Calibration, frames: FrameNames) -> str:
+    """`kinematics_params_file` of ROS 2's ur_description: x y z, and URDF's roll pitch yaw, of each link."""
+    origins, note = table_origins(calibration, frames)
+    names = ("x", "y", "z", "roll", "pitch", "yaw")
+    plain: dict[str, Any] = {
+        link: dict(zip(names, (*T[:3, 3].tolist(), *roll_pitch_yaw(T[:3, :3])), strict=True))
+        for link, T in zip(_LINKS, origins, strict=True)
+    }
+    # The driver compares it with the controller's own table and says that they differ: they do.
+    plain["hash"] = f"calib_station_{content_sha256(plain)[:16]}"
+    commented = "".join(f"# {line}\n" for line in note.splitlines())
+    return commented + str(yaml.safe_dump({"kinematics": plain}, sort_keys=False))
+
+
+def arm_urdf(calibration: Calibration, frames: FrameNames) -> str:
+    """A whole URDF: the arm with corrected origins (no shapes), and the camera of this table."""
+    origins, note = table_origins(calibration, frames)
+    assert calibration.arm_table is not None
+    _, X = calibration.arm_table.installable()
+    limit = MODELS[calibration.arm_table.model].joint_limit_rad
+    links = [frames.base, *(f"{link}_link" for link in _LINKS), frames.flange]
+    parts = [f"<link name={quoteattr(link)}/>" for link in links]
+    for name, parent, child, T in zip(_JOINTS, links, links[1:], origins, strict=False):
+        parts.append(
+            f'<joint name="{name}_joint" type="revolute">\n  <parent link={quoteattr(parent)}/>\n'
+            f"  <child link={quoteattr(child)}/>\n  {_origin(T)}\n"
+            f'  <axis xyz="0 0 1"/>\n'
+            f'  <limit lower="{-limit}" upper="{limit}" effort="0" velocity="0"/>\n</joint>'
+        )
+    parts.append(_joint("wrist_3_link", frames.flange, np.eye(4)))
+    parent = frames.parent(calibration)
+    parts.append(_camera(X.matrix, parent, frames))
+    name = quoteattr(f"{calibration.arm_table.model}_corrected")
+    return f"{_commented(note)}<robot name={name}>\n" + "\n".join(parts) + "\n</robot>\n"

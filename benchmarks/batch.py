@@ -6,15 +6,13 @@ import os
 import signal
 import tempfile
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from pathlib import Path
 
 from benchmarks.offline import make_recording
 from benchmarks.trials import trials
-from calibrate.batch import BatchResult
-from calibrate.batch.run import Progress, Solved, Solver, Task, run_batch, solve_one
-from calibrate.bounds import Limits
-from calibrate.pipeline import JobOptions
+from calibrate.batch.run import BatchResult, Progress, run_batch
+from calibrate.batch.workers import Lost, R, T, Workers, pool
 
 _PARTS = 4
 """Both ways take turns, a quarter of the recordings each, so that both see the same load of the machine."""
@@ -31,12 +29,12 @@ def run() -> str:
             part = recordings[k::_PARTS]
             seconds, alone = _timed(part, Path(folder) / f"one-{k}", _in_this_process)
             one_s += seconds
-            seconds, pool = _timed(part, Path(folder) / f"two-{k}", None)
+            seconds, pooled = _timed(part, Path(folder) / f"two-{k}", pool(2))
             two_s += seconds
-            same = same and _bits(alone) == _bits(pool)
+            same = same and _bits(alone) == _bits(pooled)
         part = recordings[::_PARTS]
         kill = _Kill(len(part) // 2)
-        _, survived = _timed(part, Path(folder) / "killed", None, kill)
+        _, survived = _timed(part, Path(folder) / "killed", pool(2), kill)
         killed = len(kill.pids)
         lost = sum(not result.solved for result in survived)
         same_after = _bits(survived) == _bits(_timed(part, Path(folder) / "one-0", _in_this_process)[1])
@@ -67,16 +65,16 @@ def _recordings(folder: Path, count: int) -> list[Path]:
     return paths
 
 
-def _in_this_process(todo: Sequence[Task], options: JobOptions) -> Iterator[Solved]:
-    for recording, key in todo:
-        yield solve_one(recording, key, options, Limits())
+def _in_this_process(work: Callable[[T], R], tasks: Sequence[T]) -> Generator[tuple[T, R | Lost]]:
+    for task in tasks:
+        yield task, work(task)
 
 
 def _timed(
-    recordings: Sequence[Path], output: Path, solver: Solver | None, progress: Progress | None = None
+    recordings: Sequence[Path], output: Path, workers: Workers, progress: Progress | None = None
 ) -> tuple[float, list[BatchResult]]:
     start = time.perf_counter()
-    results = run_batch(recordings, output, workers=2, progress=progress, solver=solver)
+    results = run_batch(recordings, output, workers=workers, progress=progress)
     return time.perf_counter() - start, results
 
 

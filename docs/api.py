@@ -1,4 +1,4 @@
-"""Prints docs/reference/api.md from the docstrings of the three public doors: `make pages`."""
+"""Prints docs/reference/api.md from the docstrings of the public doors: `make pages`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import importlib
 import inspect
 import re
 
-DOORS = ("recordings", "calibrate", "calibrate.handeye")
+DOORS = ("recordings", "calibrate", "calibrate.batch", "calibrate.handeye")
 
 
 def page() -> str:

@@ -8,7 +8,7 @@ from typing import Any
 
 import msgspec
 
-from calibrate.cli.contracts import DiffJson, DriftCheckJson, InstalledJson, ListedJson, SolveJson
+from calibrate.cli.contracts import DiffJson, DriftCheckJson, FleetJson, InstalledJson, ListedJson, SolveJson
 from calibrate.cli.follow import Followed
 from calibrate.files.calibration import Calibration
 from calibrate.files.validity import Validity
@@ -29,6 +29,7 @@ TYPES: dict[str, tuple[str, Any]] = {
     "follow": ("A line of calibrate follow", Followed),
     "diff": ("calibrate diff --json", DiffJson),
     "drift-check": ("calibrate drift-check --json", DriftCheckJson),
+    "fleet": ("calibrate fleet --json", FleetJson),
     "status": ("station status --json", StationStatus),
     "error": ("Every command with --json that fails", ErrorReport),
 }

@@ -1,33 +1,23 @@
-"""Many recordings, solved in a process pool or on a cluster, and their trends."""
+"""Many recordings solved, many cells collected: in processes here, or on a Dask cluster.
 
-from __future__ import annotations
+`run_batch(recordings, "results", workers=dask_workers(client))` solves on a `distributed.Client` that is
+there already; `collect_fleet(cells, workers=…)` reads the state of every cell. Places are paths or URLs.
+"""
 
-import msgspec
+from calibrate.batch.cluster import Cluster, cluster_workers, dask_workers
+from calibrate.batch.fleet import CameraRecord, collect_fleet, fleet_table
+from calibrate.batch.run import BatchResult, run_batch
+from calibrate.batch.workers import BatchError, pool
 
-
-class BatchResult(msgspec.Struct, frozen=True, omit_defaults=True):
-    recording: str
-    key: str
-    """Key of recording and options: a finished one is not solved again."""
-    solved: bool
-    passed: bool = False
-    error: str = ""
-    session: str = ""
-    robot: str = ""
-    camera: str = ""
-    recorded_wall_ns: int = 0
-    mount: str = ""
-    translation_m: tuple[float, ...] = ()
-    rotation_xyzw: tuple[float, ...] = ()
-    covariance: tuple[tuple[float, ...], ...] = ()
-    sigma_mm: float | None = None
-    sigma_deg: float | None = None
-    e_t_mm: float | None = None
-    rms_px: float | None = None
-    views: int = 0
-    rejected: int = 0
-    failed_gates: tuple[str, ...] = ()
-    calibration: str = ""
-    """File name in the output folder."""
-    content_sha256: str = ""
-    """Hash of the calibration: equal for equal results, whoever computed them."""
+__all__ = [
+    "BatchError",
+    "BatchResult",
+    "CameraRecord",
+    "Cluster",
+    "cluster_workers",
+    "collect_fleet",
+    "dask_workers",
+    "fleet_table",
+    "pool",
+    "run_batch",
+]

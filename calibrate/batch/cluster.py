@@ -1,22 +1,21 @@
-"""`calibrate batch` on a Dask cluster: the only module that knows `distributed` (optional extra `cluster`).
+"""A Dask cluster as workers: the only module that knows `distributed` (optional extra `cluster`).
 
-Workers need this package and the recordings under the same paths; what they find comes back over the wire
-and is written here. The client connects out to the scheduler and listens on nothing itself.
+They need this package and the files under the same paths or URLs; what they find comes back over the wire and
+is written here. The client connects out to the scheduler and listens on nothing itself.
 """
 
 from __future__ import annotations
 
 import importlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from calibrate.batch import BatchResult
-from calibrate.batch.run import BatchError, Solved, Solver, Task, solve_one
-from calibrate.bounds import Limits
+import msgspec
+
+from calibrate.batch.workers import BatchError, Lost, R, T, Workers
 from calibrate.document import software_versions
-from calibrate.pipeline import JobOptions
 
 _CONNECT_S = 30
 
@@ -39,19 +38,38 @@ class Cluster:
     tls_cert: Path | None = None
     tls_key: Path | None = None
 
+    @classmethod
+    def from_file(
+        cls,
+        path: Path,
+        tls_ca: Path | None = None,
+        tls_cert: Path | None = None,
+        tls_key: Path | None = None,
+    ) -> Cluster:
+        """Read `dask scheduler --scheduler-file`'s JSON. Raises ClusterError."""
+        try:
+            address = msgspec.json.decode(path.read_bytes(), type=_SchedulerFile).address
+        except (OSError, msgspec.DecodeError, UnicodeDecodeError) as problem:
+            raise ClusterError(
+                f"{path} is no scheduler file ({problem}).",
+                code="cluster-file",
+                remedy="Start the scheduler with: dask scheduler --scheduler-file FILE",
+            ) from None
+        return cls(address, tls_ca, tls_cert, tls_key)
+
     def check(self) -> None:
         """Raises ClusterError where address and files do not belong together."""
         scheme, _, place = self.address.partition("://")
         if scheme not in ("tcp", "tls") or ":" not in place:
             raise ClusterError(
-                f"--scheduler {self.address!r} is no address.",
+                f"The scheduler's address {self.address!r} is none.",
                 code="cluster-address",
                 remedy="Write tcp://HOST:PORT or tls://HOST:PORT, as `dask scheduler` prints it.",
             )
         given = [path for path in (self.tls_ca, self.tls_cert, self.tls_key) if path is not None]
         if (scheme == "tls") != (len(given) == 3) or (scheme == "tcp" and given):
             raise ClusterError(
-                f"--scheduler {self.address}: a tls:// address needs --tls-ca, --tls-cert and --tls-key; a "
+                f"{self.address}: a tls:// address needs --tls-ca, --tls-cert and --tls-key; a "
                 "tcp:// address takes none of them.",
                 code="cluster-tls",
             )
@@ -60,43 +78,61 @@ class Cluster:
                 raise ClusterError(f"{path} does not exist or is no file.", code="cluster-file")
 
 
-def cluster_solver(cluster: Cluster) -> Solver:
-    """Checks at once that `distributed` is installed and the address makes sense; connects when solving."""
+class _SchedulerFile(msgspec.Struct):
+    address: str
+
+
+def cluster_workers(cluster: Cluster) -> Workers:
+    """Check at once that `distributed` is installed and the address makes sense; connect when there is work.
+
+    Raises ClusterError.
+    """
     cluster.check()
     try:
         dask: Any = importlib.import_module("distributed")
     except ImportError:
         raise ClusterError(
-            "--scheduler needs the package `distributed`.",
+            "A cluster needs the package `distributed`.",
             code="package-missing",
             remedy="pip install 'calibration-station[cluster]', the same version as on the workers.",
         ) from None
-    return lambda todo, options: _solve(dask, cluster, todo, options) if todo else iter(())
+
+    def run(work: Callable[[T], R], tasks: Sequence[T]) -> Generator[tuple[T, R | Lost]]:
+        if tasks:
+            with _connect(dask, cluster) as client:
+                yield from dask_workers(client)(work, tasks)
+
+    return run
 
 
-def _solve(dask: Any, cluster: Cluster, todo: Sequence[Task], options: JobOptions) -> Iterator[Solved]:
-    with _connect(dask, cluster) as client:
-        _require_same_software(client, cluster.address)
-        futures = {
-            client.submit(solve_one, recording, key, options, Limits(), pure=False): (recording, key)
-            for recording, key in todo
-        }
+def dask_workers(client: Any) -> Workers:
+    """Make workers of a `distributed.Client` that is connected; it stays open.
+
+    When the batch ends early, or its process is killed, the scheduler forgets what has not begun.
+    """
+    dask: Any = importlib.import_module("distributed")
+
+    def run(work: Callable[[T], R], tasks: Sequence[T]) -> Generator[tuple[T, R | Lost]]:
+        address = client.scheduler.address
+        _require_same_software(client, address)
+        futures = dict(zip(client.map(work, tasks, pure=False), tasks, strict=True))
         for future in dask.as_completed(futures):
-            recording, key = futures.pop(future)
+            task = futures.pop(future)
             if future.cancelled() or client.status not in ("running", "connecting"):
                 raise BatchError(
-                    f"The connection to {cluster.address} is lost; finished results are kept.",
+                    f"The connection to {address} is lost; finished results are kept.",
                     code="cluster-lost",
                     remedy="Run the same command again to go on.",
                 )
             problem = future.exception()
             if problem is None:
-                yield future.result()
+                yield task, future.result()
             elif isinstance(problem, dask.KilledWorker):
-                error = "its worker process was killed again and again"
-                yield Solved(BatchResult(recording, key, False, error=error))
+                yield task, Lost("its worker process was killed again and again")
             else:
-                yield Solved(BatchResult(recording, key, False, error=f"on the cluster: {problem}"))
+                yield task, Lost(f"on the cluster: {problem}")
+
+    return run
 
 
 def _connect(dask: Any, cluster: Cluster) -> Any:

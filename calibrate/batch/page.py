@@ -1,4 +1,4 @@
-"""Page of a batch: every cell's camera over time, moves first. Self-contained, no network."""
+"""Pages of many cells: what moved or is in doubt first, then each over time. Self-contained, no network."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ import matplotlib
 import numpy as np
 from matplotlib.dates import AutoDateLocator, ConciseDateFormatter
 
-from calibrate.batch import BatchResult
+from calibrate.batch.fleet import UNREADABLE, CameraRecord
+from calibrate.batch.run import BatchResult
 from calibrate.batch.trends import HEAD, NOT_FOLLOWED, CellHistory, place, quiet_text, rows
-from calibrate.geometry import difference
+from calibrate.files.validity import ValidityState, parse_time
+from calibrate.geometry import Array, difference
 from calibrate.report import html
 from calibrate.report.plots import STYLE, new_figure, svg_text
 
@@ -20,14 +22,14 @@ _FINDINGS_LISTED = 3
 _COLOURS = ("#0969da", "#1a7f37", "#bc4c00")
 
 
-def fleet_page(results: Sequence[BatchResult], cells: Sequence[CellHistory]) -> str:
+def trends_page(results: Sequence[BatchResult], cells: Sequence[CellHistory]) -> str:
     """The findings, then one section per cell, then what could not be solved."""
     solved = sum(result.solved for result in results)
     count = f"{len(cells)} cell{'s' * (len(cells) != 1)}"
     return html.page(
-        "Calibrations of a fleet",
+        "Calibrations over time",
         [
-            "<h1>Calibrations of a fleet</h1>",
+            "<h1>Calibrations over time</h1>",
             html.paragraph(f"{len(results)} recordings, {solved} solved, {count}."),
             *_findings(cells),
             *(part for cell in cells for part in _section(cell)),
@@ -72,24 +74,34 @@ def _unsolved(results: Sequence[BatchResult]) -> Iterator[str]:
 
 
 def place_over_time(cell: CellHistory) -> str:
-    """SVG: translation (mm) and rotation (°) of X since the first session, by axis, with sigmas."""
+    """SVG: X since the first session, by axis; a red line where it moved."""
     first = place(cell.sessions[0])
-    delta = np.array([difference(place(session), first) for session in cell.sessions])
-    sigma = np.sqrt([np.diag(np.array(session.covariance)) for session in cell.sessions])
-    when = [datetime.fromtimestamp(s.recorded_wall_ns / 1e9, UTC) for s in cell.sessions]
-    known = len({s.recorded_wall_ns for s in cell.sessions}) == len(cell.sessions)
+    return _shift_over_time(
+        [session.recorded_wall_ns / 1e9 for session in cell.sessions],
+        np.array([difference(place(session), first) for session in cell.sessions]),
+        np.array([session.covariance for session in cell.sessions]),
+        [k + 1 for k, move in enumerate(cell.moves) if move.real],
+    )
+
+
+def _shift_over_time(
+    wall_s: Sequence[float], shifts: Array, covariances: Array, marked: Sequence[int]
+) -> str:
+    """SVG: translation (mm) and rotation (°), (n, 6) in metres and radians, by axis, with sigmas."""
+    sigma = np.sqrt(np.diagonal(covariances, axis1=1, axis2=2))
+    known = len(set(wall_s)) == len(wall_s)
+    when = [datetime.fromtimestamp(second, UTC) for second in wall_s]
     across = np.array(when if known else range(1, len(when) + 1))
     with matplotlib.rc_context(STYLE):
         figure, axes = new_figure(10, 2.8, 2)
         for axis, start, factor, unit in ((axes[0], 0, 1e3, "mm"), (axes[1], 3, np.degrees(1.0), "°")):
             for k, name in enumerate("xyz"):
-                value, bar = delta[:, start + k] * factor, sigma[:, start + k] * factor
+                value, bar = shifts[:, start + k] * factor, sigma[:, start + k] * factor
                 axis.errorbar(
                     across, value, bar, marker="o", markersize=3, linewidth=1, color=_COLOURS[k], label=name
                 )
-            for place_of, move in enumerate(cell.moves):
-                if move.real:
-                    axis.axvline(across[place_of + 1], color="#b42318", linewidth=1, alpha=0.6)
+            for number in marked:
+                axis.axvline(across[number], color="#b42318", linewidth=1, alpha=0.6)
             axis.set_ylabel(f"{'shift' if start == 0 else 'turn'}, {unit}")
             if known:
                 dates = AutoDateLocator(maxticks=7)  # type: ignore[no-untyped-call]
@@ -99,3 +111,81 @@ def place_over_time(cell: CellHistory) -> str:
                 axis.set_xlabel("session")
         axes[0].legend(fontsize=7, frameon=False, ncols=3)
         return svg_text(figure)
+
+
+# --- validity and drift of a fleet ---
+_STATES = (*reversed(ValidityState), UNREADABLE)
+_FIGURES = 20
+"""Cameras in doubt that are drawn; all of them are in the table."""
+_FLEET_HEAD = ("cell", "camera", "state", "since (UTC)", "checks", "failed", "last shift", "last check (UTC)")
+
+
+def fleet_page(records: Sequence[CameraRecord], now: datetime) -> str:
+    """Which cameras are in doubt and since when, the drift of each over its checks, then all cameras."""
+    doubted = sorted((r for r in records if r.in_doubt), key=lambda r: (r.state != "in-doubt", r.since))
+    count = {state: sum(record.state == state for record in records) for state in _STATES}
+    drifting = sum(record.trend is not None for record in records)
+    cells = len({record.cell for record in records})
+    facts = [(str(number), state.replace("-", " ")) for state, number in count.items()]
+    return html.page(
+        "Calibrations of a fleet",
+        [
+            "<h1>Calibrations of a fleet</h1>",
+            html.paragraph(f"{cells} cells, {len(records)} cameras, {now:%Y-%m-%d %H:%M} UTC."),
+            _fleet_verdict(len(doubted), len(records)),
+            html.cards([*facts, (str(drifting), "drifting")]),
+            *_doubted_cells(doubted),
+            html.folded("All cameras", [html.table(_FLEET_HEAD, map(_fleet_row, records), (4, 5))]),
+        ],
+    )
+
+
+def _fleet_verdict(doubted: int, total: int) -> str:
+    kind = "bad" if doubted else "good"
+    said = f"{doubted} of {total} cameras need a look" if doubted else "No camera is in doubt"
+    return f'<div class="verdict {kind}"><strong>{said}</strong></div>'
+
+
+def _doubted_cells(doubted: Sequence[CameraRecord]) -> Iterator[str]:
+    if doubted:
+        yield html.heading("Cameras to look at")
+        head = ("cell", "camera", "state", "since (UTC)", "why")
+        yield html.table(head, [(*_fleet_row(record)[:4], _why(record)) for record in doubted])
+    for record in [record for record in doubted if record.current_checks][:_FIGURES]:
+        checks = record.current_checks
+        yield html.heading(record.name)
+        yield html.figure(
+            _shift_over_time(
+                [entry.wall_s for entry in checks],
+                np.array([entry.shift for entry in checks]),
+                np.array([entry.covariance for entry in checks]),
+                [k for k, entry in enumerate(checks) if not entry.passed],
+            ),
+            "Camera shift found by each drift check, bars: 1σ. A red line: the check failed.",
+        )
+
+
+def _why(record: CameraRecord) -> str:
+    trend = "" if record.trend is None else record.trend.text
+    said = record.reason_text or record.reason
+    return f"{said} {trend}".strip() if record.state != ValidityState.VALID else trend
+
+
+def _fleet_row(record: CameraRecord) -> tuple[str, ...]:
+    checks = record.current_checks
+    shift, last = "", ""
+    if checks:
+        found = np.array(checks[-1].shift)
+        shift = f"{np.linalg.norm(found[:3]) * 1e3:.2f} mm, {np.degrees(np.linalg.norm(found[3:])):.3f}°"
+        last = f"{datetime.fromtimestamp(checks[-1].wall_s, UTC):%Y-%m-%d %H:%M}"
+    since = parse_time(record.since)
+    return (
+        record.cell,
+        record.camera,
+        record.state.replace("-", " "),
+        "" if since is None else f"{since.astimezone(UTC):%Y-%m-%d %H:%M}",
+        str(len(checks)),
+        str(sum(not entry.passed for entry in checks)),
+        shift,
+        last,
+    )

@@ -1,44 +1,60 @@
-"""Batch of recordings: a process pool, resumable, one result each, none stops the rest.
-
-A Dask cluster instead of the pool: `cluster`.
-"""
+"""Batch of recordings: resumable, one result each, none stops the rest."""
 
 from __future__ import annotations
 
 import csv
 import hashlib
 import io
-import multiprocessing
-import os
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
-from concurrent.futures.process import BrokenProcessPool
+from collections.abc import Callable, Iterable, Sequence
+from contextlib import closing, suppress
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import cv2
 import msgspec
 
-from calibrate.batch import BatchResult
+from calibrate.batch.storage import Results, facts, is_url, local_copy
+from calibrate.batch.workers import BatchError, Lost, Workers, pool
 from calibrate.bounds import Limits, bounded
 from calibrate.errors import CalibrationError
-from calibrate.files.calibration import encode_calibration, write_output
-from calibrate.files.lines import append_line, read_lines
+from calibrate.files.calibration import encode_calibration
 from calibrate.files.loader import content_sha256
 from calibrate.pipeline import JobOptions, SolvedRecording, solve_recording
 from recordings.errors import RecordingError
-from recordings.files import usable_cores
 
 RESULTS = "results.jsonl"
-_ATTEMPTS = 2
-"""A recording whose worker died this often is reported as failed."""
 
 
-class BatchError(CalibrationError):
-    """The batch cannot start or go on; finished results are kept."""
+class BatchResult(msgspec.Struct, frozen=True, omit_defaults=True):
+    """One recording of a batch: its camera pose and how good it is, or why it could not be solved."""
 
-    code = "batch"
+    recording: str
+    key: str
+    """Key of recording and options: a finished one is not solved again."""
+    solved: bool
+    passed: bool = False
+    error: str = ""
+    session: str = ""
+    robot: str = ""
+    camera: str = ""
+    recorded_wall_ns: int = 0
+    mount: str = ""
+    translation_m: tuple[float, ...] = ()
+    rotation_xyzw: tuple[float, ...] = ()
+    covariance: tuple[tuple[float, ...], ...] = ()
+    sigma_mm: float | None = None
+    sigma_deg: float | None = None
+    e_t_mm: float | None = None
+    rms_px: float | None = None
+    views: int = 0
+    rejected: int = 0
+    failed_gates: tuple[str, ...] = ()
+    calibration: str = ""
+    """File name in the output folder."""
+    content_sha256: str = ""
+    """Hash of the calibration: equal for equal results, whoever computed them."""
 
 
 @dataclass(frozen=True)
@@ -51,71 +67,72 @@ class Solved:
 
 
 Progress = Callable[[int, int, BatchResult], None]
-Task = tuple[str, str]
-"""Recording (absolute path) and key."""
-Solver = Callable[[Sequence[Task], JobOptions], Iterator[Solved]]
-"""Tasks and options → what was solved, as it comes, in any order; every task once."""
 
 
 def run_batch(
-    recordings: Sequence[Path],
-    output: Path,
+    recordings: Sequence[Path | str],
+    output: Path | str,
     options: JobOptions | None = None,
-    workers: int | None = None,
+    workers: Workers | None = None,
     progress: Progress | None = None,
-    solver: Solver | None = None,
     limits: Limits | None = None,
 ) -> list[BatchResult]:
     """Solve what is not solved yet; return all results in the order of `recordings`.
 
-    Each result is a calibration file and a line of `results.jsonl` in `output`, written at once, so that a
-    batch that was killed goes on where it stopped. `workers` and `limits` (of each solve) are those of the
-    pool; a `solver` has its own. Raises BatchError when `output` cannot be written.
+    Recordings and `output` are paths or fsspec's URLs. Each result is a calibration file and a line of
+    `results.jsonl` in `output`, written at once: a batch that was killed goes on where it stopped. `workers`:
+    a pool of processes, one per core, if none are given. Raises BatchError when `output` cannot be written.
     """
     options = options or JobOptions()
+    store = Results(str(output))
     try:
-        output.mkdir(parents=True, exist_ok=True)
-        done = {result.key: result for result in read_results(output) if result.solved}
-        keys = [(str(path.resolve()), batch_key(path, options)) for path in recordings]
-        todo = [(path, key) for path, key in dict.fromkeys(keys) if key not in done]
-        solve = solver or _pool_solver(workers, limits or Limits())
-        for count, solved in enumerate(solve(todo, options), 1):
-            result = solved.result
-            if solved.content:
-                write_output(output / result.calibration, solved.content)
-            done[result.key] = result
-            append_line(output / RESULTS, result)
-            if progress:
-                progress(count, len(todo), result)
-        results = [done[key] for _, key in keys]
-        write_output(output / "results.csv", _csv(results))
+        store.prepare()
+        done = {result.key: result for result in store.read(RESULTS, BatchResult) if result.solved}
+        tasks = [(whole(place), batch_key(place, options)) for place in recordings]
+        todo = [task for task in dict.fromkeys(tasks) if task[1] not in done]
+        work = partial(solve_one, options=options, limits=limits or Limits())
+        with closing((workers or pool())(work, todo)) as answers:
+            for count, ((recording, key), answer) in enumerate(answers, 1):
+                if isinstance(answer, Lost):
+                    answer = Solved(BatchResult(recording, key, False, error=answer.reason))
+                result = answer.result
+                if answer.content:
+                    store.write(result.calibration, answer.content)
+                done[key] = result
+                store.add(RESULTS, key, result)
+                if progress:
+                    progress(count, len(todo), result)
+        results = [done[key] for _, key in tasks]
+        store.write("results.csv", _csv(results))
     except OSError as problem:
         raise BatchError(f"{output}: {problem.strerror or problem}.", code="batch-folder") from None
     return results
 
 
-def batch_key(path: Path, options: JobOptions) -> str:
+def whole(place: Path | str) -> str:
+    """An absolute path, or the URL as it is."""
+    return str(place) if is_url(str(place)) else str(Path(place).resolve())
+
+
+def batch_key(place: Path | str, options: JobOptions) -> str:
     """Key that changes with the recording's place, size and date, and with every option of the result."""
-    try:
-        stat = path.stat()
-        facts: list[Any] = [str(path.resolve()), stat.st_size, stat.st_mtime_ns]
-    except OSError:
-        facts = [str(path.resolve()), 0, 0]
+    found: list[Any] = [whole(place), 0, 0]
+    if is_url(str(place)):
+        found = [str(place), *facts(str(place))]
+    else:
+        with suppress(OSError):
+            stat = Path(place).stat()
+            found = [whole(place), stat.st_size, stat.st_mtime_ns]
     chosen = {name: msgspec.to_builtins(value) for name, value in vars(options).items() if name != "threads"}
-    return hashlib.sha256(msgspec.json.encode([facts, chosen], order="deterministic")).hexdigest()[:24]
+    return hashlib.sha256(msgspec.json.encode([found, chosen], order="deterministic")).hexdigest()[:24]
 
 
-def read_results(output: Path) -> list[BatchResult]:
-    """Read the results of earlier runs, oldest first."""
-    return read_lines(output / RESULTS, BatchResult)
-
-
-def solve_one(recording: str, key: str, options: JobOptions, limits: Limits) -> Solved:
-    """Solve in a worker, here or on a cluster. Any failure is a result."""
+def solve_one(task: tuple[str, str], options: JobOptions, limits: Limits) -> Solved:
+    """Solve (recording, key) in a worker, here or on a cluster. Any failure is a result."""
+    recording, key = task
     cv2.setNumThreads(1)
-    path = Path(recording)
     try:
-        with bounded(limits.time_s, limits.memory_mib):
+        with local_copy(recording) as path, bounded(limits.time_s, limits.memory_mib):
             job = solve_recording(path, replace(options, threads=1))
         content = encode_calibration(job.calibration)
     except (CalibrationError, RecordingError) as problem:
@@ -153,51 +170,6 @@ def _result(recording: str, key: str, job: SolvedRecording, name: str) -> BatchR
         calibration=name,
         content_sha256=content_sha256(plain),
     )
-
-
-def _pool_solver(workers: int | None, limits: Limits) -> Solver:
-    """Processes of this machine. A killed worker costs a new pool, no recording."""
-    count = workers or usable_cores()
-
-    def solve(todo: Sequence[Task], options: JobOptions) -> Iterator[Solved]:
-        attempts: dict[str, int] = {key: 0 for _, key in todo}
-        waiting = list(todo)
-        while waiting:
-            # Alone, a recording that kills its worker takes no others with it.
-            suspects = [task for task in waiting if attempts[task[1]] > 0]
-            tasks = [suspects[0]] if suspects else waiting
-            finished: set[str] = set()
-            for solved in _one_pool(tasks, options, limits, count):
-                finished.add(solved.result.key)
-                yield solved
-            lost = [task for task in tasks if task[1] not in finished]
-            for recording, key in lost:
-                attempts[key] += 1
-                if attempts[key] >= _ATTEMPTS:
-                    finished.add(key)
-                    error = f"worker process killed {_ATTEMPTS} times"
-                    yield Solved(BatchResult(recording, key, False, error=error))
-            waiting = [task for task in waiting if task[1] not in finished]
-
-    return solve
-
-
-def _one_pool(tasks: Sequence[Task], options: JobOptions, limits: Limits, count: int) -> Iterator[Solved]:
-    """Solve in one pool; ends early when a worker dies, and what was not yielded is lost."""
-    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
-    context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["calibrate.batch.run"])
-    with ProcessPoolExecutor(min(count, len(tasks)), mp_context=context) as pool:
-        pending: set[Future[Solved]] = {
-            pool.submit(solve_one, recording, key, options, limits) for recording, key in tasks
-        }
-        while pending:
-            finished, pending = wait(pending, return_when=FIRST_COMPLETED)
-            for future in finished:
-                try:
-                    yield future.result()
-                except BrokenProcessPool:
-                    continue
 
 
 def _csv(results: Iterable[BatchResult]) -> bytes:

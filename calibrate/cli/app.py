@@ -100,6 +100,15 @@ COMMANDS = {
         (
             "calibrate batch monday.mcap tuesday.mcap -o results",
             "calibrate batch sessions/* -o results --workers 2  # each worker needs the memory of a solve",
+            "calibrate batch 's3://robots/sessions/*.mcap' -o s3://robots/results",
+        ),
+    ),
+    "fleet": LazyCommand(
+        "calibrate.cli.batch:fleet",
+        "Collect validity and drift of many cells into one table and one page.",
+        (
+            "calibrate fleet cells/* -o fleet  # copies of the cells' state folders",
+            "calibrate fleet 's3://robots/cells/*' -o s3://robots/fleet",
         ),
     ),
     "sweep": LazyCommand(

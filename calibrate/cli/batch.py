@@ -1,46 +1,64 @@
-"""`calibrate batch`: solve many recordings again."""
+"""`calibrate batch | fleet`: solve many recordings again; collect the state of many cells."""
 
 from __future__ import annotations
 
-from contextlib import nullcontext
+import signal
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from contextlib import contextmanager, nullcontext
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
 import typer
 
-from calibrate.batch import BatchResult
-from calibrate.batch.cluster import Cluster, cluster_solver
-from calibrate.batch.run import Solver, run_batch
+from calibrate.batch.cluster import Cluster, cluster_workers
+from calibrate.batch.fleet import UNREADABLE, collect_fleet, fleet_table
+from calibrate.batch.run import BatchResult, run_batch
+from calibrate.batch.storage import Results, expand
 from calibrate.batch.trends import CellHistory, cells, trends_text
+from calibrate.batch.workers import Workers, pool
 from calibrate.bounds import MEMORY_LIMIT_MIB, TIME_LIMIT_S, Limits
+from calibrate.cli.contracts import FleetJson
 from calibrate.cli.job import GatesFile, MemoryLimit, Profile, ProfileName, Seed, TimeLimit
-from calibrate.cli.output import AsJson, OutputError, err, out, progress_bar
-from calibrate.files.calibration import write_output
+from calibrate.cli.output import AsJson, OutputError, err, out, print_json, progress_bar
+from calibrate.load import Progress as LoadProgress
 from calibrate.pipeline import JobOptions
 from calibrate.quality.gates import GateLimits, read_limits
 
 DONE_WITH_LOSS = 3
+Processes = Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core")]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(
+        help="Work on this Dask cluster, tcp://HOST:PORT or tls://HOST:PORT, not in processes here. Its "
+        "workers see the files under the same paths. Whoever reaches a tcp:// scheduler can run code on it: "
+        "use tls:// outside a closed network"
+    ),
+]
+SchedulerFile = Annotated[
+    Path | None, typer.Option(help="The same, by the file of `dask scheduler --scheduler-file`")
+]
+TlsCa = Annotated[Path | None, typer.Option(help="The cluster's certificate authority, PEM")]
+TlsCert = Annotated[Path | None, typer.Option(help="Your certificate, PEM")]
+TlsKey = Annotated[Path | None, typer.Option(help="Your private key, PEM")]
+OutputFolder = Annotated[str, typer.Option("-o", "--output", help="Folder of the results, or a URL")]
 
 
 def batch(
-    recordings: Annotated[list[Path], typer.Argument(help="Recordings or session folders")],
-    output: Annotated[Path, typer.Option("-o", "--output", help="Folder of the results")] = Path("batch"),
-    workers: Annotated[int | None, typer.Option(min=1, help="Processes; default: one per core")] = None,
+    recordings: Annotated[list[str], typer.Argument(help="Recordings or session folders; URLs may have *")],
+    output: OutputFolder = "batch",
+    workers: Processes = None,
     profile: Profile = ProfileName.robust,
     seed: Seed = 0,
     gates: GatesFile = None,
-    scheduler: Annotated[
-        str | None,
-        typer.Option(
-            help="Solve on this Dask cluster, tcp://HOST:PORT or tls://HOST:PORT, not in processes here. Its "
-            "workers see the recordings under the same paths. Whoever reaches a tcp:// scheduler can run "
-            "code on it: use tls:// outside a closed network"
-        ),
-    ] = None,
-    tls_ca: Annotated[Path | None, typer.Option(help="The cluster's certificate authority, PEM")] = None,
-    tls_cert: Annotated[Path | None, typer.Option(help="Your certificate, PEM")] = None,
-    tls_key: Annotated[Path | None, typer.Option(help="Your private key, PEM")] = None,
+    scheduler: Scheduler = None,
+    scheduler_file: SchedulerFile = None,
+    tls_ca: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
     time_limit_s: TimeLimit = TIME_LIMIT_S,
     memory_limit_mib: MemoryLimit = MEMORY_LIMIT_MIB,
     as_json: AsJson = False,
@@ -51,20 +69,20 @@ def batch(
     The limits are those of one solve in a process here; on a cluster the workers' own hold.
     Exit codes: 0 all solved, 3 some recordings could not be solved.
     """
-    from calibrate.batch.page import fleet_page  # matplotlib is slow to load
+    from calibrate.batch.page import trends_page  # matplotlib is slow to load
 
-    if output.exists() and not output.is_dir():
-        raise OutputError(f"{output} is a file; the results need a folder.", code="target-exists")
+    store = _results(output)
     gate_limits = GateLimits() if gates is None else read_limits(gates)
     options = JobOptions(profile=profile.value, seed=seed, limits=gate_limits)
-    solver = _solver(scheduler, workers, tls_ca, tls_cert, tls_key)
+    chosen = _workers(workers, scheduler, scheduler_file, tls_ca, tls_cert, tls_key)
     limits = Limits(time_limit_s, memory_limit_mib)
-    with progress_bar("solving") if err.is_terminal else nullcontext() as bar:
+    places = [place for word in recordings for place in expand(word)]
+    with _stoppable("solving") as bar:
         told = None if bar is None else lambda done, total, result: bar(done, total, result.session)
-        results = run_batch(recordings, output, options, workers, told, solver, limits)
+        results = run_batch(places, output, options, chosen, told, limits)
     found = cells(results)
-    write_output(output / "trends.txt", trends_text(found).encode())
-    write_output(output / "trends.html", fleet_page(results, found).encode())
+    store.write("trends.txt", trends_text(found).encode())
+    store.write("trends.html", trends_page(results, found).encode())
     if as_json:
         for result in results:
             typer.echo(msgspec.json.encode(result).decode())
@@ -74,7 +92,66 @@ def batch(
         raise typer.Exit(DONE_WITH_LOSS)
 
 
-def _tell(results: list[BatchResult], found: tuple[CellHistory, ...], output: Path) -> None:
+def fleet(
+    roots: Annotated[list[str], typer.Argument(help="State folders of the cells; URLs may have *")],
+    output: OutputFolder = "fleet",
+    workers: Processes = None,
+    scheduler: Scheduler = None,
+    scheduler_file: SchedulerFile = None,
+    tls_ca: TlsCa = None,
+    tls_cert: TlsCert = None,
+    tls_key: TlsKey = None,
+    as_json: AsJson = False,
+) -> None:
+    """Collect validity and drift of many cells into one table and one page.
+
+    Reads `calibrations` below each ROOT, all cameras, and writes fleet.sqlite (tables cameras, checks) and
+    fleet.html: which cameras are in doubt, since when, and their drift over time.
+    Exit codes: 0 all cells read, 3 some could not be read.
+    """
+    from calibrate.batch.page import fleet_page  # matplotlib is slow to load
+
+    store, now = _results(output), datetime.now(UTC)
+    chosen = _workers(workers, scheduler, scheduler_file, tls_ca, tls_cert, tls_key)
+    places = [place for word in roots for place in expand(word)]
+    with _stoppable("reading") as bar:
+        records = collect_fleet(places, now, chosen, bar)
+    store.prepare()
+    store.write("fleet.sqlite", fleet_table(records))
+    store.write("fleet.html", fleet_page(records, now).encode())
+    doubted = [record for record in records if record.in_doubt]
+    lost = sum(record.state == UNREADABLE for record in records)
+    if as_json:
+        plain: FleetJson = {
+            "cameras": len(records),
+            "states": dict(Counter(record.state for record in records)),
+            "doubted": [
+                {
+                    "cell": record.cell,
+                    "camera": record.camera,
+                    "state": record.state,
+                    "since": record.since,
+                    "reason": record.reason,
+                    "drifting": record.trend is not None,
+                }
+                for record in doubted
+            ],
+        }
+        print_json(plain)
+    else:
+        for record in doubted:
+            since = f" since {record.since}" if record.since else ""
+            said = record.trend.text if record.trend else record.reason_text or record.reason
+            out.print(f"{record.name}: {record.state}{since}: {said}", soft_wrap=True)
+        out.print(
+            f"{len(records)} cameras: {len(doubted)} in doubt, {lost} unreadable. "
+            f"{output}/fleet.html, fleet.sqlite"
+        )
+    if lost:
+        raise typer.Exit(DONE_WITH_LOSS)
+
+
+def _tell(results: list[BatchResult], found: tuple[CellHistory, ...], output: str) -> None:
     good = sum(result.passed for result in results)
     failed = [result for result in results if not result.solved]
     out.print(
@@ -88,16 +165,39 @@ def _tell(results: list[BatchResult], found: tuple[CellHistory, ...], output: Pa
         err.print(f"{Path(result.recording).name}: {result.error}", soft_wrap=True)
 
 
-def _solver(
-    scheduler: str | None, workers: int | None, ca: Path | None, cert: Path | None, key: Path | None
-) -> Solver | None:
-    """Solver on a cluster; None: the process pool."""
+def _results(output: str) -> Results:
+    if Path(output).is_file():
+        raise OutputError(f"{output} is a file; the results need a folder.", code="target-exists")
+    return Results(output)
+
+
+@contextmanager
+def _stoppable(label: str) -> Iterator[LoadProgress | None]:
+    """A bar on a terminal. SIGTERM ends the command as Ctrl-C does, with everything it started."""
+    before = signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))
+    try:
+        with progress_bar(label) if err.is_terminal else nullcontext() as bar:
+            yield bar
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _workers(
+    count: int | None,
+    scheduler: str | None,
+    scheduler_file: Path | None,
+    ca: Path | None,
+    cert: Path | None,
+    key: Path | None,
+) -> Workers:
+    if scheduler is None and scheduler_file is None:
+        if ca or cert or key:
+            raise OutputError("--tls-ca, --tls-cert and --tls-key need --scheduler.", code="options")
+        return pool(count)
+    if count is not None:
+        raise OutputError("--workers counts processes here, not on a cluster.", code="options")
+    if scheduler_file is None:
+        return cluster_workers(Cluster(scheduler or "", ca, cert, key))
     if scheduler is not None:
-        if workers is not None:
-            raise OutputError("--workers counts processes here, not on a cluster.", code="options")
-        return cluster_solver(Cluster(scheduler, ca, cert, key))
-    if ca or cert or key:
-        raise OutputError(
-            "--tls-ca, --tls-cert and --tls-key need --scheduler tls://HOST:PORT.", code="options"
-        )
-    return None
+        raise OutputError("Give --scheduler or --scheduler-file, not both.", code="options")
+    return cluster_workers(Cluster.from_file(scheduler_file, ca, cert, key))

@@ -129,3 +129,22 @@ class DriftCheckJson(TypedDict):
     views: int
     trend: str
     validity: Validity | None
+
+
+class DoubtedJson(TypedDict):
+    """One camera that needs a look."""
+
+    cell: str
+    camera: str
+    state: str
+    since: str
+    reason: str
+    drifting: bool
+
+
+class FleetJson(TypedDict):
+    """`calibrate fleet --json`"""
+
+    cameras: int
+    states: dict[str, int]
+    doubted: list[DoubtedJson]

@@ -24,7 +24,7 @@ from calibrate.files.formatting import override_text, pose_difference, pose_text
 from calibrate.files.lines import read_lines
 from calibrate.files.loader import cameras, current_validity, readable_folder
 from calibrate.files.validity import Validity, ValidityReason, ValidityState, validity_text
-from calibrate.files.versions import InstalledVersion, LogEntry, installed_versions, read_log
+from calibrate.files.versions import LOG, InstalledVersion, LogEntry, installed_versions, read_log
 from recordings.files import MAIN_CAMERA, state_root
 
 Root = Annotated[
@@ -253,7 +253,7 @@ def _switched(version: InstalledVersion, as_json: bool) -> None:
         }
         print_json(made)
         return
-    log = read_lines(folder / "log.jsonl", LogEntry)
+    log = read_lines(folder / LOG, LogEntry)
     out.print(f"Installed: version {version.number}, {stable}", soft_wrap=True)
     if log and log[-1].change:
         out.print(f"Change: {log[-1].change}")

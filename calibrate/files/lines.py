@@ -38,8 +38,12 @@ def share(path: Path) -> None:
 
 def read_lines(path: Path, kind: type[S]) -> list[S]:
     """Oldest first; empty when there is no file. Lines that are no `kind` are left out."""
+    return parse_lines(path.read_bytes(), kind) if path.exists() else []
+
+
+def parse_lines(content: bytes, kind: type[S]) -> list[S]:
     found = []
-    for line in path.read_bytes().splitlines() if path.exists() else []:
+    for line in content.splitlines():
         try:
             found.append(msgspec.json.decode(line, type=kind))
         except (msgspec.DecodeError, UnicodeDecodeError):

@@ -34,6 +34,7 @@ from calibrate.files.validity import FILE as VALIDITY_FILE
 from calibrate.files.validity import Validity, ValidityState, read_validity, time_text, unrecorded
 from recordings.files import MAIN_CAMERA, sync_folder, write_atomically
 
+LOG = "log.jsonl"
 Action = Literal["install", "rollback", "verify"]
 
 
@@ -110,7 +111,7 @@ def before_current(known: list[InstalledVersion]) -> InstalledVersion | None:
 
 def read_log(root: Path | None = None, camera: str = MAIN_CAMERA) -> list[LogEntry]:
     """Oldest first."""
-    return read_lines(readable_folder(root, camera) / "log.jsonl", LogEntry)
+    return read_lines(readable_folder(root, camera) / LOG, LogEntry)
 
 
 def add_version(
@@ -122,7 +123,7 @@ def add_version(
     """
     content = encode_calibration(calibration)
     number = _next_number(folder)
-    path = folder / "gen" / f"{number:04d}-{_content_name(content)}.yaml"
+    path = folder / "gen" / f"{number:04d}-{content_name(content)}.yaml"
     write_atomically(path, content)
     decode_calibration(path.read_bytes(), str(path))
     version = InstalledVersion(number, path, True, calibration)
@@ -137,11 +138,11 @@ def make_current(
     append_line(folder / VALIDITY_FILE, validity)  # before anybody can ask for it
     _switch(folder, version.path.name, version.path.read_bytes())
     entry = LogEntry(_now_text(), action, version.number, who(), change, reason)
-    append_line(folder / "log.jsonl", entry)
+    append_line(folder / LOG, entry)
     return replace(version, current=True, validity=validity)
 
 
-def _content_name(content: bytes) -> str:
+def content_name(content: bytes) -> str:
     """First 8 hex digits of the content's own hash, as written in the file."""
     found = re.search(rb"^sha256: '?([0-9a-f]{8})", content, re.MULTILINE)
     if found is None:

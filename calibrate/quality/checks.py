@@ -16,6 +16,7 @@ from calibrate.files.loader import calibrations_folder
 from calibrate.quality.drift import DriftCheck
 from recordings.files import MAIN_CAMERA
 
+FILE = "checks.jsonl"
 _FEWEST_FOR_TREND = 5
 _TREND_P = 0.01
 
@@ -51,7 +52,7 @@ def append_check(entry: CheckEntry, root: Path | None = None, camera: str = MAIN
     folder = calibrations_folder(root, camera)
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        append_line(folder / "checks.jsonl", entry)
+        append_line(folder / FILE, entry)
     except OSError as problem:
         raise InstallError(
             f"{folder}: the drift check cannot be logged: {problem.strerror}.", code="state-folder"
@@ -60,7 +61,7 @@ def append_check(entry: CheckEntry, root: Path | None = None, camera: str = MAIN
 
 def read_checks(root: Path | None = None, camera: str = MAIN_CAMERA) -> list[CheckEntry]:
     """Oldest first."""
-    return read_lines(calibrations_folder(root, camera) / "checks.jsonl", CheckEntry)
+    return read_lines(calibrations_folder(root, camera) / FILE, CheckEntry)
 
 
 def earlier_results(history: Sequence[CheckEntry], generation: int) -> list[bool]:

@@ -9,17 +9,18 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 
-from calibrate.batch import BatchResult
-from calibrate.batch.cluster import Cluster, ClusterError, cluster_solver
-from calibrate.batch.run import BatchError, Solved, Task, read_results, run_batch
-from calibrate.pipeline import JobOptions
-from tests.calibrate.batch.test_run import in_this_process
+from calibrate.batch.cluster import Cluster, ClusterError, cluster_workers, dask_workers
+from calibrate.batch.fleet import collect_fleet
+from calibrate.batch.run import BatchResult, run_batch
+from calibrate.batch.workers import BatchError, pool
+from tests.calibrate.batch.test_run import Counted, in_this_process, read_results, wait_until
 from tests.calibrate.calling import raises_code
 
 needs_distributed = pytest.mark.skipif(
@@ -65,7 +66,8 @@ def dask_cluster(folder: Path, workers: int, tls: list[str] | None = None) -> It
             stack.callback(process.kill)
             return process
 
-        scheduler = start("scheduler", *place, *common).pid
+        file = ["--scheduler-file", str(folder / "scheduler.json")]
+        scheduler = start("scheduler", *place, *common, *file).pid
         alone = ["--no-nanny", "--nthreads", "1", "--host", "127.0.0.1", "--local-directory", str(folder)]
         yield address, [scheduler, *(start("worker", address, *alone, *common).pid for _ in range(workers))]
 
@@ -80,20 +82,21 @@ def recordings(session_file: Path, tmp_path: Path) -> list[Path]:
 def test_a_killed_worker_loses_nothing_and_the_bits_are_the_pools(
     recordings: list[Path], tmp_path: Path
 ) -> None:
-    pool = run_batch(recordings, tmp_path / "pool", workers=2)
+    pooled = run_batch(recordings, tmp_path / "pool", workers=pool(2))
     before = listening_inodes(os.getpid())
     opened: set[str] = set()
-    with dask_cluster(tmp_path, workers=2) as (address, pids):
+    with dask_cluster(tmp_path, workers=2) as (_, pids):
 
         def kill_one(done: int, total: int, result: BatchResult) -> None:
             if done == 1:
                 os.kill(pids[1], signal.SIGKILL)
             opened.update(listening_inodes(os.getpid()) - before)
 
-        solver = cluster_solver(Cluster(address))
-        spread = run_batch(recordings, tmp_path / "dask", progress=kill_one, solver=solver)
+        wait_until((tmp_path / "scheduler.json").exists, 30)
+        workers = cluster_workers(Cluster.from_file(tmp_path / "scheduler.json"))
+        spread = run_batch(recordings, tmp_path / "dask", progress=kill_one, workers=workers)
     assert [result.error for result in spread] == [""] * 4
-    assert [r.content_sha256 for r in spread] == [r.content_sha256 for r in pool]
+    assert [r.content_sha256 for r in spread] == [r.content_sha256 for r in pooled]
     assert not opened, "the client listens on a port of its own"
     for result in spread:
         assert (tmp_path / "dask" / result.calibration).is_file()
@@ -111,20 +114,15 @@ def test_a_lost_scheduler_is_said_and_finished_results_are_kept(
 
         begun_s = time.monotonic()
         with raises_code(BatchError, "cluster-lost"):
-            solver = cluster_solver(Cluster(address))
-            run_batch(recordings, tmp_path / "out", progress=kill_scheduler, solver=solver)
+            workers = cluster_workers(Cluster(address))
+            run_batch(recordings, tmp_path / "out", progress=kill_scheduler, workers=workers)
         assert time.monotonic() - begun_s < 60
     kept = [result.recording for result in read_results(tmp_path / "out") if result.solved]
     assert kept
-    asked: list[str] = []
-
-    def counted(todo: Sequence[Task], options: JobOptions) -> Iterator[Solved]:
-        asked.extend(recording for recording, _ in todo)
-        return in_this_process(todo, options)
-
-    results = run_batch(recordings, tmp_path / "out", solver=counted)
+    counted = Counted()
+    results = run_batch(recordings, tmp_path / "out", workers=counted)
     assert all(result.solved for result in results)
-    assert not set(asked) & set(kept)
+    assert not set(counted.asked) & set(kept)
 
 
 @needs_distributed
@@ -137,11 +135,38 @@ def test_over_tls_and_without_the_key_nobody_answers(recordings: list[Path], tmp
     tls = [f"--tls-ca-file={cert}", f"--tls-cert={cert}", f"--tls-key={key}"]
     with dask_cluster(tmp_path, 1, tls) as (address, _):
         there = Cluster(address, cert, cert, key)
-        solved = run_batch(recordings[:1], tmp_path / "tls", solver=cluster_solver(there))
+        solved = run_batch(recordings[:1], tmp_path / "tls", workers=cluster_workers(there))
         assert [result.error for result in solved] == [""]
         plain = Cluster(address.replace("tls", "tcp"))
         with raises_code(BatchError, "cluster-silent"):
-            run_batch(recordings[1:2], tmp_path / "plain", solver=cluster_solver(plain))
+            run_batch(recordings[1:2], tmp_path / "plain", workers=cluster_workers(plain))
+
+
+@needs_distributed
+@pytest.mark.process
+def test_a_client_that_is_there_is_used_and_stays_open(recordings: list[Path], tmp_path: Path) -> None:
+    """For cells, too; a client's process that is killed leaves the cluster idle."""
+    distributed = pytest.importorskip("distributed")
+    with dask_cluster(tmp_path, workers=1) as (address, _), distributed.Client(address) as client:
+        workers = dask_workers(client)
+        assert run_batch(recordings[:1], tmp_path / "out", workers=workers)[0].solved
+        now = datetime(2026, 1, 1, tzinfo=UTC)
+        there = collect_fleet([tmp_path / "no cell"], now, workers)
+        assert there == collect_fleet([tmp_path / "no cell"], now, in_this_process)
+        command = ["batch", *map(str, recordings), "-o", "killed", "--scheduler", address]
+        other = subprocess.Popen([sys.executable, "-m", "calibrate.cli", *command], cwd=tmp_path)
+        wait_until((tmp_path / "killed/results.jsonl").exists, 60)
+        other.kill()
+        assert other.wait(10) == -signal.SIGKILL
+        wait_until(lambda: not any(client.processing().values()), 20)
+        assert client.status == "running"
+
+
+def test_a_scheduler_file_that_is_none_is_named(tmp_path: Path) -> None:
+    (tmp_path / "other.json").write_text("[]")
+    for name in ("other.json", "missing.json"):
+        with raises_code(ClusterError, "cluster-file"):
+            Cluster.from_file(tmp_path / name)
 
 
 def test_what_cannot_be_meant_is_refused_with_the_next_step(tmp_path: Path) -> None:
@@ -159,10 +184,10 @@ def test_what_cannot_be_meant_is_refused_with_the_next_step(tmp_path: Path) -> N
 def test_without_the_extra_it_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     with raises_code(ClusterError, "package-missing"):
-        cluster_solver(Cluster("tcp://127.0.0.1:8786"))
+        cluster_workers(Cluster("tcp://127.0.0.1:8786"))
 
 
 def test_nothing_left_to_solve_needs_no_cluster(recordings: list[Path], tmp_path: Path) -> None:
-    run_batch(recordings[:1], tmp_path / "out", solver=in_this_process)
-    nobody = cluster_solver(Cluster("tcp://127.0.0.1:9")) if shutil.which("dask") else in_this_process
-    assert run_batch(recordings[:1], tmp_path / "out", solver=nobody)[0].solved
+    run_batch(recordings[:1], tmp_path / "out", workers=in_this_process)
+    nobody = cluster_workers(Cluster("tcp://127.0.0.1:9")) if shutil.which("dask") else in_this_process
+    assert run_batch(recordings[:1], tmp_path / "out", workers=nobody)[0].solved

@@ -5,21 +5,41 @@ from __future__ import annotations
 import os
 import shutil
 import signal
-from collections.abc import Iterator, Sequence
+import subprocess
+import sys
+import time
+from collections.abc import Callable, Generator, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
 from benchmarks.batch import worker_pids
-from calibrate.batch import BatchResult
-from calibrate.batch.run import Solved, Task, batch_key, read_results, run_batch, solve_one
+from calibrate.batch.run import RESULTS, BatchResult, batch_key, run_batch
+from calibrate.batch.storage import Results
+from calibrate.batch.workers import Lost, R, T, pool
 from calibrate.bounds import Limits
 from calibrate.pipeline import JobOptions
 
 
-def in_this_process(todo: Sequence[Task], options: JobOptions) -> Iterator[Solved]:
-    for recording, key in todo:
-        yield solve_one(recording, key, options, Limits())
+def in_this_process(work: Callable[[T], R], tasks: Sequence[T]) -> Generator[tuple[T, R | Lost]]:
+    for task in tasks:
+        yield task, work(task)
+
+
+def read_results(folder: Path) -> list[BatchResult]:
+    return Results(str(folder)).read(RESULTS, BatchResult)
+
+
+class Counted:
+    """`in_this_process`, and which recordings it was asked for."""
+
+    def __init__(self) -> None:
+        self.asked: list[str] = []
+
+    def __call__(self, work: Callable[[T], R], tasks: Sequence[T]) -> Generator[tuple[T, R | Lost]]:
+        self.asked += [recording for recording, _ in tasks]
+        return in_this_process(work, tasks)
 
 
 @pytest.fixture
@@ -38,17 +58,17 @@ def test_a_killed_worker_loses_nothing_and_the_bits_are_those_of_one_process(
             killed.extend(worker_pids()[:1])
             os.kill(killed[0], signal.SIGKILL)
 
-    pooled = run_batch(recordings, tmp_path / "pool", workers=2, progress=kill_one)
+    pooled = run_batch(recordings, tmp_path / "pool", workers=pool(2), progress=kill_one)
     assert killed, "no worker was found to kill"
     assert all(result.solved for result in pooled), [r.error for r in pooled]
-    alone = run_batch(recordings, tmp_path / "alone", workers=1)
+    alone = run_batch(recordings, tmp_path / "alone", workers=pool(1))
     assert [r.content_sha256 for r in pooled] == [r.content_sha256 for r in alone]
     assert len({r.content_sha256 for r in alone}) == len(alone), "file names are part of the provenance"
 
 
 def test_a_broken_recording_is_a_result_and_the_rest_goes_on(recordings: list[Path], tmp_path: Path) -> None:
     recordings[0].write_bytes(recordings[0].read_bytes()[:-3000])
-    results = run_batch([*recordings[:2], tmp_path / "none.mcap"], tmp_path / "out", solver=in_this_process)
+    results = run_batch([*recordings[:2], tmp_path / "none.mcap"], tmp_path / "out", workers=in_this_process)
     assert [result.solved for result in results] == [False, True, False]
     assert results[2].recording.endswith("none.mcap")
 
@@ -62,32 +82,27 @@ def test_a_solve_beyond_its_limits_costs_itself_only(
     recordings: list[Path], tmp_path: Path, limits: Limits, said: str
 ) -> None:
     """And is tried again next time, when more may be allowed."""
-    beyond = run_batch(recordings[:1], tmp_path / "out", workers=1, limits=limits)
+    beyond = run_batch(recordings[:1], tmp_path / "out", workers=pool(1), limits=limits)
     assert all(said in result.error for result in beyond), [result.error for result in beyond]
-    assert all(result.solved for result in run_batch(recordings[:1], tmp_path / "out", workers=1))
+    assert all(result.solved for result in run_batch(recordings[:1], tmp_path / "out", workers=pool(1)))
 
 
 def test_it_goes_on_where_it_was_killed(recordings: list[Path], tmp_path: Path) -> None:
-    def one_then_dies(todo: Sequence[Task], options: JobOptions) -> Iterator[Solved]:
-        yield from in_this_process(todo[:1], options)
+    def one_then_dies(work: Callable[[T], R], tasks: Sequence[T]) -> Generator[tuple[T, R | Lost]]:
+        yield from in_this_process(work, tasks[:1])
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        run_batch(recordings, tmp_path / "out", solver=one_then_dies)
+        run_batch(recordings, tmp_path / "out", workers=one_then_dies)
     log = tmp_path / "out/results.jsonl"
     log.write_bytes(log.read_bytes() + b'{"recording": "half a li')
     assert len(read_results(tmp_path / "out")) == 1
-    asked: list[str] = []
-
-    def counted(todo: Sequence[Task], options: JobOptions) -> Iterator[Solved]:
-        asked.extend(recording for recording, _ in todo)
-        return in_this_process(todo, options)
-
-    results = run_batch(recordings, tmp_path / "out", solver=counted)
-    assert len(asked) == 2
+    counted = Counted()
+    results = run_batch(recordings, tmp_path / "out", workers=counted)
+    assert len(counted.asked) == 2
     assert all(result.solved for result in results)
-    assert len(run_batch(recordings, tmp_path / "out", solver=counted)) == 3
-    assert len(asked) == 2
+    assert len(run_batch(recordings, tmp_path / "out", workers=counted)) == 3
+    assert len(counted.asked) == 2
 
 
 def test_other_options_or_a_changed_recording_are_solved_again(recordings: list[Path]) -> None:
@@ -97,3 +112,52 @@ def test_other_options_or_a_changed_recording_are_solved_again(recordings: list[
     assert key != batch_key(recordings[1], JobOptions())
     os.utime(recordings[0], (1, 1))
     assert key != batch_key(recordings[0], JobOptions())
+
+
+def of_session(leader: int) -> set[int]:
+    """Processes of the session that `leader` began, dead ones excepted."""
+    found = set()
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        with suppress(OSError):
+            state, _, _, session = stat.read_text().rpartition(")")[2].split()[:4]
+            if int(session) == leader and state != "Z":
+                found.add(int(stat.parent.name))
+    return found
+
+
+@pytest.mark.process
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGKILL, signal.SIGINT])
+def test_a_killed_batch_leaves_no_process_and_goes_on(
+    recordings: list[Path], tmp_path: Path, number: signal.Signals
+) -> None:
+    """While other recordings are being solved; what was finished is not solved again."""
+    many = [Path(shutil.copy(recordings[0], tmp_path / f"many-{k}.mcap")) for k in range(12)]
+    log = tmp_path / "out/results.jsonl"
+    command = [sys.executable, "-m", "calibrate.cli", "batch", *many, "-o", tmp_path / "out", "--workers", 2]
+    with subprocess.Popen([str(word) for word in command], start_new_session=True) as batch:
+        try:
+            wait_until(lambda: log.exists() and log.stat().st_size > 0, 60)
+            assert len(of_session(batch.pid)) >= 3, "no worker beside it"
+            os.kill(batch.pid, number)
+            assert batch.wait(10) in (-number, 128 + number, 1)
+            wait_until(lambda: not of_session(batch.pid), 5)
+        finally:
+            for pid in of_session(batch.pid):
+                os.kill(pid, signal.SIGKILL)
+    kept = {result.recording for result in read_results(tmp_path / "out") if result.solved}
+    asked: set[str] = set()
+
+    def nobody(work: Callable[[T], R], tasks: Sequence[T]) -> Generator[tuple[T, R | Lost]]:
+        asked.update(recording for recording, _ in tasks)
+        yield from ((task, Lost("not today")) for task in tasks)
+
+    run_batch(many, tmp_path / "out", workers=nobody)
+    assert 1 <= len(kept) < len(many)
+    assert asked == {str(path) for path in many} - kept
+
+
+def wait_until(condition: Callable[[], bool], timeout_s: float) -> None:
+    end_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end_s
+        time.sleep(0.02)

@@ -7,8 +7,8 @@ import pytest
 from msgspec.structs import replace
 from scipy import stats
 
-from calibrate.batch import BatchResult
-from calibrate.batch.page import fleet_page
+from calibrate.batch.page import trends_page
+from calibrate.batch.run import BatchResult
 from calibrate.batch.trends import cells, trends_text
 from calibrate.geometry import Array, Transform, perturb, pose, rotation_exp
 
@@ -134,19 +134,19 @@ def test_one_unnamed_robot_does_not_silence_the_others() -> None:
 def test_the_page_is_whole_and_asks_the_network_for_nothing() -> None:
     results = [session(k, shift_mm=1.8 if k >= 3 else 0.0) for k in range(6)]
     results.append(BatchResult("<broken>.mcap", "b", False, error="cut & short"))
-    page = fleet_page(results, cells(results))
+    page = trends_page(results, cells(results))
     assert "1 of 1 cameras moved" in page and page.count("<svg") == 1
     assert "&lt;broken&gt;.mcap" in page and "cut &amp; short" in page
     for word in ('src="http', 'href="http', "@import", "<script"):
         assert word not in page
-    assert page == fleet_page(results, cells(results))
+    assert page == trends_page(results, cells(results))
 
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_few_results_are_no_trouble(count: int) -> None:
     results = [session(k) for k in range(count)]
     assert "No camera moved" in trends_text(cells(results))
-    assert "No camera moved" in fleet_page(results, cells(results))
+    assert "No camera moved" in trends_page(results, cells(results))
 
 
 def test_recordings_that_name_no_robot_are_listed_but_not_taken_for_one_cell() -> None:
@@ -154,7 +154,7 @@ def test_recordings_that_name_no_robot_are_listed_but_not_taken_for_one_cell() -
     results = [replace(session(k, shift_mm=500.0 * k), robot="unknown", camera="unknown") for k in range(4)]
     found = cells(results)
     assert [cell.findings for cell in found] == [[]]
-    text, page = trends_text(found), fleet_page(results, found)
+    text, page = trends_text(found), trends_page(results, found)
     for shown in (text, page):
         assert "MOVED" not in shown and "do not say of which robot" in shown
         assert "No camera was followed" in shown and "No camera moved" not in shown
@@ -164,7 +164,7 @@ def test_recordings_that_name_no_robot_are_listed_but_not_taken_for_one_cell() -
 
 def test_a_camera_that_moves_all_the_time_does_not_hide_the_others() -> None:
     restless = [session(k, shift_mm=1.8 * k) for k in range(8)]
-    page = fleet_page(restless, cells(restless))
+    page = trends_page(restless, cells(restless))
     verdict = page[page.index("verdict") : page.index("<h2>")]
     assert verdict.count("Camera moved") == 3
     assert "and 4 more" in verdict

@@ -1,0 +1,101 @@
+"""Who does the tasks of a batch: processes of this machine, or (`cluster`) the workers of a Dask cluster."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import signal
+import threading
+from collections.abc import Callable, Generator, Iterator, Sequence
+from concurrent.futures import Future, ProcessPoolExecutor, as_completed
+from concurrent.futures.process import BrokenProcessPool
+from dataclasses import dataclass
+from multiprocessing.connection import Connection
+from typing import Protocol, TypeVar
+
+from calibrate.errors import CalibrationError
+from recordings.files import usable_cores
+
+_ATTEMPTS = 2
+"""A task whose worker died this often is given up."""
+T = TypeVar("T")
+R = TypeVar("R")
+
+
+class BatchError(CalibrationError):
+    """The batch cannot start or go on; finished results are kept."""
+
+    code = "batch"
+
+
+@dataclass(frozen=True)
+class Lost:
+    """A task without an answer."""
+
+    reason: str
+
+
+class Workers(Protocol):
+    """Calls `work`, a module's own function, with each task; tasks can be hashed and pickled.
+
+    Yields every task once with its answer, as they come, in any order. Closed early, nothing goes on.
+    """
+
+    def __call__(self, work: Callable[[T], R], tasks: Sequence[T]) -> Generator[tuple[T, R | Lost]]: ...
+
+
+def pool(count: int | None = None) -> Workers:
+    """Make workers of `count` processes here (default: one per core). A killed one costs no task."""
+
+    def run(work: Callable[[T], R], tasks: Sequence[T]) -> Generator[tuple[T, R | Lost]]:
+        attempts = dict.fromkeys(tasks, 0)
+        while attempts:
+            # Alone, a task that kills its worker takes no others with it.
+            suspect = next((task for task, deaths in attempts.items() if deaths), None)
+            tried = list(attempts) if suspect is None else [suspect]
+            for task, answer in _one_pool(work, tried, count or usable_cores()):
+                del attempts[task]
+                yield task, answer
+            for task in tried:
+                if task in attempts:
+                    attempts[task] += 1
+                    if attempts[task] >= _ATTEMPTS:
+                        del attempts[task]
+                        yield task, Lost(f"worker process killed {_ATTEMPTS} times")
+
+    return run
+
+
+def _one_pool(work: Callable[[T], R], tasks: Sequence[T], count: int) -> Iterator[tuple[T, R]]:
+    """Until all is done or a worker dies: what was not yielded then is lost."""
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    context = multiprocessing.get_context("forkserver")
+    context.set_forkserver_preload(["calibrate.batch.run"])
+    theirs, ours = context.Pipe(duplex=False)
+    with ours, theirs:
+        executor = ProcessPoolExecutor(min(count, len(tasks)), context, _end_with, (theirs,))
+        try:
+            futures: dict[Future[R], T] = {executor.submit(work, task): task for task in tasks}
+            for future in as_completed(futures):
+                try:
+                    answer = future.result()
+                except BrokenProcessPool:
+                    continue
+                yield futures.pop(future), answer
+        finally:
+            ours.close()
+            executor.shutdown(cancel_futures=True)
+
+
+def _end_with(parent: Connection) -> None:
+    """In a worker: end when the parent closes its side of the pipe, as the kernel does for a killed one.
+
+    Ctrl-C is the parent's to answer.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+    def watch() -> None:
+        parent.poll(None)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()

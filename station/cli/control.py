@@ -155,7 +155,7 @@ def doctor_command(
     Exit codes: 0 all is there, 1 something is missing, 2 the configuration is wrong.
     """
     if example:
-        print((Path(__file__).parent / "example.yaml").read_text(), end="")
+        print((Path(__file__).parents[1] / "example.yaml").read_text(), end="")
         return
     if config is not None:
         from station.cell.config_file import config_error, examine_config

@@ -240,3 +240,11 @@ def test_doctor_counts_what_is_missing_as_missing(tmp_path: Path) -> None:
     assert call(main, "doctor", "--config", str(path)).returncode == 1
     path.write_text(UPSIDE_DOWN)
     assert call(main, "doctor", "--config", str(path)).returncode == 2
+
+
+def test_the_example_that_doctor_prints_is_a_good_configuration(tmp_path: Path) -> None:
+    printed = call(main, "doctor", "--example")
+    path = tmp_path / "station.yaml"
+    path.write_text(printed.stdout)
+    assert printed.returncode == 0
+    assert call(main, "doctor", "--config", str(path)).returncode == 0

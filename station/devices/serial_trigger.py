@@ -170,7 +170,7 @@ class SerialTrigger:
                         f"what is on {self._config.port} does not answer like a trigger box",
                         code="no-trigger-box",
                         remedy="Check trigger.port; a udev rule gives the box a name of its own "
-                        "(docs/integrator/trigger-box.md).",
+                        "(docs/integrator/cameras.md).",
                     ) from error
         if (product, protocol) != (PRODUCT, PROTOCOL):
             raise TriggerError(

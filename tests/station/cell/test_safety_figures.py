@@ -34,7 +34,7 @@ PROMISES = (Path(__file__).parents[3] / "docs/operator/safety.md").read_text()
         (ur_moves.SLIDER_ZERO_S, 10.0, "after 10 s the move is given up"),
         (ur_child.STOP_DECELERATION, 2.0, "decelerates the tool with 2 m/s²"),
         (hover.SPEED_M_S, 0.05, "faster than 0.05 m/s"),
-        (lease.APPROVAL_LIFETIME_S, 120.0, "A go is for one use"),
+        (lease.APPROVAL_LIFETIME_S, 120.0, "It is for one use"),
         (lease.START_TOLERANCE_RAD, 0.005, "from where the arm stood"),
     ],
 )

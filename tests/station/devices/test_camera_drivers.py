@@ -1,6 +1,6 @@
 """What the session relies on, held against every camera driver: `camera_drivers.DRIVERS`.
 
-docs/contributor/write-a-driver.md says how a new one gets in.
+docs/contributor/drivers.md says how a new one gets in.
 """
 
 from __future__ import annotations

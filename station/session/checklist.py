@@ -6,6 +6,9 @@ import asyncio
 import shutil
 
 from calibrate.boards.model import BoardError, check_board, describe_board
+from calibrate.errors import CalibrationError
+from calibrate.files.loader import load_installed
+from calibrate.files.validity import ValidityState, validity_text
 from recordings.files import bytes_text
 from station.cell.errors import CameraError, RobotError
 from station.cell.status import StationState
@@ -28,6 +31,7 @@ async def checklist(context: SessionContext, troubles: dict[str, str]) -> list[C
         *await _wire_checks(context),
         _trigger_check(context, troubles),
         _board_check(context),
+        await asyncio.to_thread(_calibration_check, context),
         _disk_check(context),
         _clock_check(context),
     ]
@@ -153,6 +157,28 @@ def _board_check(context: SessionContext) -> Check:
     except BoardError as error:
         return Check("board", "failed", str(error), "correct `board` in the configuration")
     return Check("board", "ok", describe_board(board))
+
+
+def _calibration_check(context: SessionContext) -> Check:
+    """Whether what is installed holds, and is of this robot and this camera."""
+    cell = context.cell
+    try:
+        found = load_installed(
+            context.root,
+            allow_simulated=True,
+            camera=cell.config.camera.name,
+            require_valid=False,
+            robot_serial=cell.robot.identity.serial,
+            camera_serial=cell.camera.identity.serial,
+        )
+    except CalibrationError as error:
+        if error.code == "nothing-installed":
+            return Check("calibration", "skipped", "nothing is installed")
+        return Check("calibration", "failed", error.text, error.remedy)
+    text = f"version {found.version}: {validity_text(found.validity)}"
+    if found.validity.state is ValidityState.VALID:
+        return Check("calibration", "ok", text)
+    return Check("calibration", "warning", text, "run station drift-check, or calibrate again")
 
 
 def _disk_check(context: SessionContext) -> Check:

@@ -16,8 +16,11 @@ import pytest
 from calibrate import load_installed
 from calibrate.errors import InstallError
 from calibrate.files.calibration import read_calibration, write_calibration
+from calibrate.files.install import install
+from calibrate.files.validity import ValidityState
 from recordings.exporters.excerpt import write_excerpt
 from recordings.reader import open_recording
+from recordings.schema.messages import CameraIdentity, RobotIdentity
 from tests.calibrate.calling import raises_code, refused, run
 from tests.calibrate.sessions import Scene, write_session
 
@@ -130,6 +133,33 @@ def _everything_says_that_it_is_in_doubt(folder: Path) -> None:
     withdrawn = run("withdraw", "a pallet hit the camera", "--json", cwd=folder)
     assert json.loads(withdrawn.stdout)["state"] == "withdrawn"
     refused(run("withdraw", "xxx", cwd=folder), 2, "reason-too-short")
+
+
+@pytest.mark.parametrize(("device", "elsewhere"), [("robot", False), ("camera", False), ("robot", True)])
+def test_a_session_of_this_cell_with_another_device_puts_what_is_installed_in_doubt(
+    real_file: Path, tmp_path: Path, device: str, elsewhere: bool
+) -> None:
+    root = tmp_path / "cell"
+    install(real_file, root)
+    folder = tmp_path / "elsewhere" if elsewhere else root / "sessions" / "later"
+    folder.mkdir(parents=True)
+    other = {
+        "robot": {"robot": RobotIdentity("UR10", "other")},
+        "camera": {"camera_identity": CameraIdentity("rendered", "MER", "other")},
+    }
+    recording = write_session(
+        folder / "later.mcap", Scene(views=3, seed=7), known_lens=True, source="real",
+        created_wall_ns=1_800_000_000_000_000_000, **other[device],
+    )  # fmt: skip
+    answer = run("drift-check", recording, "--root", root, "--json", cwd=tmp_path)
+    told = json.loads(answer.stdout)["error"]
+    assert (answer.returncode, told["code"], told["values"]["differs"]) == (2, "other-cell", device)
+    validity = load_installed(root, require_valid=False).validity
+    if elsewhere:
+        assert validity.state is ValidityState.VALID
+        return
+    assert (validity.state, validity.reason.code) == (ValidityState.IN_DOUBT, f"{device}-changed")
+    assert validity.reason.values["found"] == "other"
 
 
 def test_simulated_never_installs_on_a_real_cell(session_file: Path, tmp_path: Path) -> None:

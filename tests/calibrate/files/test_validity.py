@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import socket
 import subprocess
 import sys
 import threading
@@ -291,6 +292,28 @@ def test_hooks_run_in_order_with_what_happened_and_their_output_is_kept(
         ("in-doubt", "10-tell"),
         ("rollback", "10-tell"),
     ]
+
+
+def test_the_journal_gets_the_fields_of_every_change(
+    root: Path, make_file: MakeFile, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    """Read as systemd.io/JOURNAL_NATIVE_PROTOCOL says: NAME=VALUE, one a line."""
+    monkeypatch.chdir(tmp_path)  # a socket's path is short
+    monkeypatch.setattr(hooks, "JOURNAL", Path("journal"))
+    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as journal:
+        journal.bind("journal")
+        journal.settimeout(1.0)
+        install(make_file(0.001), root)
+        set_validity(root, W, ValidityReason("withdrawn", "A pallet\nPRIORITY=0 hit it."))
+        told = [dict(line.split("=", 1) for line in journal.recv(65536).decode().splitlines()) for _ in "12"]
+    assert [(entry["CALIBRATION_EVENT"], entry["PRIORITY"]) for entry in told] == [
+        ("install", "5"),
+        ("withdrawn", "4"),
+    ]
+    assert told[1]["CALIBRATION_STATE"] == "withdrawn" and told[1]["CALIBRATION_REASON"] == "withdrawn"
+    assert told[1]["CALIBRATION_CAMERA"] == "main" and told[1]["CALIBRATION_VERSION"] == "2"
+    assert {entry["SYSLOG_IDENTIFIER"] for entry in told} == {"calibrate"}
+    assert Path(told[0]["CALIBRATION_PATH"]) == (root / "calibrations/current").absolute()
 
 
 def test_a_hook_that_hangs_is_ended_with_its_children(

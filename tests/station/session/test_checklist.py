@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import msgspec
 import pytest
 
+from calibrate.files.calibration import write_calibration
+from calibrate.files.install import install, set_validity
+from calibrate.files.validity import ValidityReason, ValidityState
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import TimeSource
 from station.devices.frames import FrameTiming
@@ -16,6 +20,8 @@ from station.devices.usb3_discovery import UsbCamera
 from station.protocol.verbs import Check
 from station.session.checklist import checklist
 from station.simulation.launch import SimulatedController
+from station.simulation.scenes import make_cell
+from tests.station.hover_cell import calibration_of
 from tests.station.session_rig import Rig
 
 
@@ -162,3 +168,31 @@ async def test_usb_cameras_are_listed_with_what_keeps_one_from_being_used(
     monkeypatch.setattr("station.session.checklist.discover_usb", lambda: [] if camera is None else [camera])
     found = next(c for c in await checklist(rig.session.context, {}) if c.name == "usb cameras")
     assert found.state == state and bool(found.remedy) == (state == "warning")
+
+
+@pytest.mark.parametrize(
+    ("change", "state"),
+    [("", "ok"), ("robot", "warning"), ("camera", "warning"), ("doubt", "warning"), ("damage", "failed")],
+)
+async def test_what_is_installed_is_of_this_robot_and_camera_and_holds(
+    rig: Rig, tmp_path: Path, change: str, state: str
+) -> None:
+    async def check() -> Check:
+        return next(c for c in await checklist(rig.session.context, {}) if c.name == "calibration")
+
+    root, cell = rig.session.context.root, rig.session.context.cell
+    assert (await check()).state == "skipped"
+    robot, camera = (
+        msgspec.structs.replace(
+            device.identity, serial="another" if change == name else device.identity.serial
+        )
+        for name, device in (("robot", cell.robot), ("camera", cell.camera))
+    )
+    write_calibration(calibration_of(make_cell(), robot, camera), tmp_path / "cell.yaml")
+    install(tmp_path / "cell.yaml", root, cell="simulated")
+    if change == "doubt":
+        set_validity(root, ValidityState.IN_DOUBT, ValidityReason("drift-check"))
+    if change == "damage":
+        (root / "calibrations/current").resolve().write_text("format: handeye-calibration/1")
+    found = await check()
+    assert found.state == state and bool(found.remedy) == (state != "ok")

@@ -36,6 +36,12 @@ def test_a_made_page_is_fresh(page: str) -> None:
     assert made.stdout == (ROOT / "docs" / f"{page}.md").read_text()
 
 
+def test_the_books_have_short_sentences() -> None:
+    """At most 30 words, 18 on average."""
+    done = subprocess.run([sys.executable, ROOT / "docs/sentences.py"], capture_output=True, text=True)
+    assert done.returncode == 0, done.stdout
+
+
 def test_the_books_have_no_dead_link(tmp_path: Path) -> None:
     command = [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-d", tmp_path / "site"]
     done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)

@@ -77,6 +77,8 @@ class RobotStatus(msgspec.Struct, frozen=True, omit_defaults=True):
     """A control child lives."""
     control_path: str = ""
     """What drives the arm: ur_rtde, or script (the station's own)"""
+    not_accepted: str = ""
+    """Why the stops of this real arm are not accepted (`station accept`); empty: they are."""
     speed_m_s: float = 0.0
     """Fastest modelled point, now."""
     speed_limit_m_s: float = 0.25

@@ -107,6 +107,11 @@ STATION = LazyGroup(
                 "station touch-test cell.yaml --corner 0 --corner 20",
             ),
         ),
+        "accept": LazyCommand(
+            "station.cli.accept:accept_command",
+            "Test how the arm stops: STOP, watchdog, pulled cable, slider.",
+            ("station accept  # at the arm, the pendant in the hand", "station accept --speed 0.05"),
+        ),
         "new": LazyCommand(
             "station.cli.new:new_command",
             "Set up a cell in a wizard that only reads.",

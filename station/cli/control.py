@@ -47,6 +47,8 @@ def status_command(socket: Socket = None, as_json: AsJson = False) -> None:
     words = [f"{robot.model} {robot.safety or 'not connected'}", f"slider {100 * robot.slider:.0f} %"]
     if robot.control_path:
         words.append(f"control by {robot.control_path}")
+    if robot.not_accepted:
+        words.append(robot.not_accepted)
     if session.poses:
         words.append(f"{session.captured} of {len(session.poses)} poses")
     if session.name:
@@ -172,7 +174,7 @@ def doctor_command(
         )
         for problem in report.missing:
             out.print(Text.assemble(("MISSING", "red"), f" {problem}"))
-        if words := ": ".join(filter(None, control_trouble(path, real=True))):
+        if words := ": ".join(filter(None, control_trouble(path))):
             out.print(words)
         out.print(f"next: station serve --config {shlex.quote(str(config))}, then station doctor beside it")
         if report.missing:

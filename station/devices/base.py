@@ -8,6 +8,7 @@ from typing import Protocol, runtime_checkable
 
 from recordings.schema.clocks import ClockFit
 from recordings.schema.messages import ArmKinematics, CameraIdentity, Image, RobotIdentity, RobotState
+from station.cell.acceptance import StopWay
 from station.devices.frames import CameraCounts, FrameTiming, TriggerPulse
 
 
@@ -63,6 +64,13 @@ class Robot(Protocol):
 
     def heartbeat(self) -> None:
         """Called by the session loop at least every 50 ms while control lives; without it the arm stops."""
+
+    @property
+    def payload(self) -> tuple[float, ...]:
+        """Mass (kg) and centre (m, in `flange`) as the controller tells them; empty: not told."""
+
+    def stop_one_way(self, way: StopWay) -> None:
+        """Ends the move under way by one way alone, for a stop test. RobotError where that is not there."""
 
     async def stop(self, reason: str) -> None:
         """Decelerates now, by both paths; idempotent, in any state, never raises."""

@@ -5,10 +5,12 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import msgspec
 
 from recordings.schema.messages import CameraModel, Source
+from station.cell.acceptance import ArmSubject, not_accepted, read_acceptance
 from station.cell.config import StationConfig
 from station.cell.plan import Plan
 from station.devices.base import Camera, Robot, Trigger
@@ -36,6 +38,21 @@ class Cell:
     @property
     def simulated(self) -> bool:
         return self.source == "simulated"
+
+    @property
+    def subject(self) -> ArmSubject:
+        """The arm as it is now: what an acceptance is bound to."""
+        robot, identity = self.robot, self.robot.identity
+        firmware = identity.controller_version
+        return ArmSubject(
+            self.source, identity.model, identity.serial, firmware, robot.payload, robot.control_path
+        )
+
+    def acceptance_trouble(self, root: Path) -> str:
+        """Why the stops of this real arm are not accepted; empty: they are, or nothing real moves."""
+        if self.source != "real" or not self.robot.identity.serial or not self.robot.control_path:
+            return ""
+        return not_accepted(read_acceptance(root), self.subject)
 
     @property
     def config_sha256(self) -> str:

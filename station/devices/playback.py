@@ -32,6 +32,7 @@ from recordings.schema.messages import (
     Vector6,
     View,
 )
+from station.cell.acceptance import StopWay
 from station.cell.config import CameraConfig, StationConfig, vector6
 from station.cell.errors import CameraError, ConfigError, RobotError, StaleStateError
 from station.cell.plan import Plan, PlannedPose
@@ -278,6 +279,7 @@ class PlaybackRobot:
         self.control = False
         self.identity = self._recording.info.robot
         self.control_path, self.notice, self.remote, self.kinematics = "", "", None, None
+        self.payload: tuple[float, ...] = ()
 
     def plan(self) -> Plan:
         """The recorded poses as a plan."""
@@ -361,6 +363,9 @@ class PlaybackRobot:
         await asyncio.sleep(MOVE_S)
 
     def heartbeat(self) -> None: ...
+
+    def stop_one_way(self, way: StopWay) -> None:
+        raise RobotError("a played-back arm has no ways to stop", code="playback")
 
     async def stop(self, reason: str) -> None:
         with self._lock:

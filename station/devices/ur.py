@@ -9,6 +9,8 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
+import os
+import signal
 import time
 from collections import deque
 from collections.abc import Callable, Coroutine, Sequence
@@ -17,6 +19,7 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+from station.cell.acceptance import StopWay
 from station.cell.config import ControlPath, RobotConfig
 from station.cell.errors import RobotError, SafetyStopError, StaleStateError
 from station.devices.rtde import RuntimeState
@@ -38,6 +41,8 @@ from station.devices.ur_moves import MoveWatch, check_goal
 log = logging.getLogger(__name__)
 
 POLL_S = 0.005
+ONE_WAY_S = 1.0
+RESTING_RAD_S = 0.005
 STOP_WAIT_S = 0.05
 UNANSWERED_S = 0.1
 """A heartbeat that the control process did not answer for so long kicked nothing any more."""
@@ -77,15 +82,10 @@ def library_installed() -> bool:
     return find_spec("rtde_control") is not None
 
 
-def control_trouble(path: str, real: bool) -> tuple[str, str]:
+def control_trouble(path: str) -> tuple[str, str]:
     """What speaks against driving an arm that way, and what to do; empty: nothing."""
     if path == "ur_rtde" and not library_installed():
         return "ur_rtde is not installed", REFUSALS["ur-rtde-missing"][1]
-    if path == "script" and real:
-        return (
-            "the station's own script drives the arm: not yet accepted on a real arm",
-            "lower the speed slider, keep a hand on the emergency stop; or install ur_rtde where it exists",
-        )
     return "", ""
 
 
@@ -103,6 +103,8 @@ class UrRobot(UrLink):
         self._moving = False
         self._stop_reason = self._link_loss = ""
         self._heart = HeartbeatMonitor()
+        self._one_way_s: float | None = None
+        """When a stop test gave its one way (host monotonic); until then, and afterwards, None."""
         self._played_s = 0.0
         """When the control program was last seen playing, in a move."""
         self._background: set[asyncio.Task[object]] = set()
@@ -208,11 +210,14 @@ class UrRobot(UrLink):
             await self._follow(watch, child)
         except BaseException as error:
             cause = self._explain(error, child)
-            await asyncio.shield(self.stop(str(cause) or type(cause).__name__))
+            try:
+                await self._one_way_ends()
+            finally:
+                await asyncio.shield(self.stop(str(cause) or type(cause).__name__))
             raise await self._ask_remote(cause) from None
         finally:
             self._moving = False
-            self.notice = ""
+            self.notice, self._one_way_s = "", None
 
     async def _follow(self, watch: MoveWatch, child: ControlChild) -> None:
         while True:
@@ -292,6 +297,35 @@ class UrRobot(UrLink):
         waits: list[asyncio.Future[Any]] = [w for w in both if w is not None]
         if waits:
             await asyncio.wait(waits, timeout=STOP_WAIT_S)
+
+    def stop_one_way(self, way: StopWay) -> None:
+        """Ends the move under way by one way alone: the others follow at rest, or after `ONE_WAY_S`.
+
+        For a stop test. STOP, a lost lease and a fault of the session use all ways at once, then too.
+        """
+        child = self._child
+        if child is None:
+            raise RobotError("control has ended", code="no-control")
+        if way is StopWay.KILLED:
+            os.kill(child.pid, signal.SIGKILL)
+            return
+        self._one_way_s = time.monotonic()
+        if way is StopWay.CONTROL:
+            child.stop()
+        elif self.dashboard is not None and self.dashboard.alive:
+            self.dashboard.send(STOP)
+        else:
+            raise RobotError("the dashboard is not connected", code="dashboard")
+
+    async def _one_way_ends(self) -> None:
+        """Waits for the rest of an arm that one way alone was to stop, but not for long."""
+        while self._one_way_s is not None and time.monotonic() < self._one_way_s + ONE_WAY_S:
+            await asyncio.sleep(POLL_S)
+            try:
+                if max(map(abs, self.latest().joint_speeds_rad_s)) < RESTING_RAD_S:
+                    return
+            except RobotError:
+                return
 
     async def idle(self) -> None:
         """Returns when everything behind a stop is done: control ended, its process gone."""

@@ -65,6 +65,11 @@ class UrLink:
         self._trouble: RobotError | None = None
         self._supervisor: asyncio.Task[None] | None = None
 
+    @property
+    def payload(self) -> tuple[float, ...]:
+        """Mass (kg) and centre (m, in `flange`) at connect; empty: not told."""
+        return (self._payload.mass_kg, *self._payload.centre_m) if self._payload is not None else ()
+
     async def connect(self) -> RobotIdentity:
         """Reads identity and starts the state stream; changes nothing on the robot. Raises RobotError."""
         if self._supervisor is not None:

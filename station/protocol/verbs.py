@@ -15,6 +15,7 @@ import msgspec
 
 from recordings.files import MAIN_CAMERA
 from station.cell import status
+from station.cell.acceptance import StopTestOffer, StopWay
 from station.cell.config import StationConfig
 from station.cell.errors import RefusedError
 from station.cell.plan import Plan, PlannedPose
@@ -226,6 +227,21 @@ class Hover(Verb[HoverOffer], frozen=True):
     """Length of a pointer along the flange's z axis; None: the configured one, or the pendant's tool."""
     new_picture: bool = True
     """False: the board as it was last seen for this calibration."""
+
+
+class StopTest(Verb[StopTestOffer], frozen=True):
+    """Check a slow, short move of one joint that is ended in one way, and offer its approval."""
+
+    states = frozenset({S.IDLE})
+    spoken = "a stop test"
+    way: StopWay
+    joint: Annotated[int, msgspec.Meta(ge=0, le=5)] = 0
+    speed_m_s: Annotated[float, msgspec.Meta(gt=0, le=0.25)] = 0.05
+    """Of the fastest modelled point."""
+    duration_s: Annotated[float, msgspec.Meta(ge=1, le=12)] = 3.0
+    """Of the whole move, as far as its path is free."""
+    forward: bool = True
+    """The direction that is tried first."""
 
 
 class Go(Verb[Done], frozen=True):

@@ -8,6 +8,7 @@ from collections.abc import Awaitable, Callable, Coroutine
 
 import msgspec
 
+from station.cell.acceptance import StopTestOffer
 from station.cell.config import StationConfig
 from station.cell.errors import RefusedError
 from station.cell.session_folder import SessionSummary, list_sessions
@@ -154,10 +155,14 @@ class SessionDispatcher:
         self._rule.by_person(await self._asks(caller), "A move over the board")
         return await self._session.prepare_hover(caller.client_id, args)
 
+    async def _stop_test(self, caller: _Caller, args: verbs.StopTest) -> StopTestOffer:
+        self._rule.by_person(await self._asks(caller), "A stop test")
+        return await self._session.prepare_stop_test(caller.client_id, args)
+
     async def _go(self, caller: _Caller, args: verbs.Go) -> None:
         asks, waiting = await self._asks(caller), self._session.approvals.waiting
-        if waiting is not None and waiting.hover is not None:
-            how = self._rule.by_person(asks, "A move over the board")
+        if waiting is not None and waiting.beside_plan:
+            how = self._rule.by_person(asks, "This move")
         else:
             how = self._rule.approve(asks, args.plan_sha256, waiting.summary.plan_sha256 if waiting else "")
         approval = f"motion approved by {caller.who}, {how}"

@@ -21,6 +21,7 @@ from station.protocol.verbs import Check
 from station.session.context import SessionContext
 
 CLOCK_BOUND_S = 0.005
+NOT_ACCEPTED_REMEDY = "run `station accept`; until then: low speed slider, a hand on the emergency stop"
 
 
 async def checklist(context: SessionContext, troubles: dict[str, str]) -> list[Check]:
@@ -62,9 +63,11 @@ async def _robot_checks(context: SessionContext, troubles: dict[str, str]) -> li
 
 def _control_check(context: SessionContext) -> Check:
     path = context.cell.robot.control_path
-    trouble, remedy = control_trouble(path, real=context.cell.source == "real")
+    trouble, remedy = control_trouble(path)
     if trouble:
-        return Check("control", "failed" if path == "ur_rtde" else "warning", trouble, remedy)
+        return Check("control", "failed", trouble, remedy)
+    if trouble := context.cell.acceptance_trouble(context.root):
+        return Check("control", "warning", f"{path}, {trouble}", NOT_ACCEPTED_REMEDY)
     return Check("control", "ok", path) if path else Check("control", "skipped", "no arm moves")
 
 

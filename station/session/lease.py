@@ -5,6 +5,7 @@ from __future__ import annotations
 import secrets
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,6 +16,9 @@ from station.cell.status import APPROVAL_LIFETIME_S, LeaseStatus, MotionPreview
 from station.plan.hover import HoverPath
 from station.protocol.verbs import Purpose
 from station.session.queue import PlanRevision
+
+if TYPE_CHECKING:
+    from station.session.stop_test import StopTestMove
 
 START_TOLERANCE_RAD = 0.005
 """The arm must stand where it stood when the person was asked."""
@@ -66,13 +70,20 @@ class MotionApproval:
     again: bool = False
     """Nobody is there to be asked: poses that do not settle are tried once more at the end."""
     purpose: Purpose | None = None
-    """None: a touch test."""
+    """None: a touch test, or a stop test."""
     replanned: PlanRevision | None = None
     """Poses that take the place of the session's with this approval."""
     hover: HoverPath | None = None
     """A path over one corner of the board instead of poses of the plan."""
+    stop_test: StopTestMove | None = None
+    """A move of the acceptance test instead of them."""
     approval: str = ""
     """Who approved it, and how."""
+
+    @property
+    def beside_plan(self) -> bool:
+        """It drives to no pose of the plan and records nothing."""
+        return self.hover is not None or self.stop_test is not None
 
     @property
     def said(self) -> str:
@@ -101,13 +112,14 @@ class ApprovalManager:
         hover: HoverPath | None = None,
         purpose: Purpose | None = None,
         replanned: PlanRevision | None = None,
+        stop_test: StopTestMove | None = None,
     ) -> MotionApproval:
         """From where the summary begins. An older one is void."""
         start = summary.start_joints_rad
         assert start is not None
         expires_s = self._clock() + APPROVAL_LIFETIME_S
         self.waiting = MotionApproval(
-            summary, client_id, expires_s, start, poses, purpose=purpose, hover=hover, replanned=replanned
+            summary, client_id, expires_s, start, poses, False, purpose, replanned, hover, stop_test
         )
         return self.waiting
 
@@ -135,7 +147,7 @@ class ApprovalManager:
         if asked.client_id != client_id:
             raise _void("approval-of-another", "Approval was asked for by another client.")
         before = asked.replanned.before_sha256 if asked.replanned else asked.summary.plan_sha256
-        if asked.hover is None and before != plan_sha256:  # a touch test carries its own plan
+        if not asked.beside_plan and before != plan_sha256:  # those carry their own
             raise _void("plan-changed", "The plan changed since the approval was asked for.")
         require_start(joints_rad, asked.start_joints_rad, "since the approval was asked for")
         return replace(asked, again=again)

@@ -101,6 +101,9 @@ class Monitor:
             remote=robot.remote,
             control=robot.control,
             control_path=robot.control_path,
+            not_accepted=context.store.status.robot.not_accepted  # no file is read while heartbeats flow
+            if context.store.state in RUNNING
+            else context.cell.acceptance_trouble(context.root),
             speed_limit_m_s=limit,
             rate_hz=self._rate_hz(),
         )

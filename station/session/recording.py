@@ -173,7 +173,9 @@ class SessionRecording:
             created_wall_ns=time.time_ns(),
             plan_sha256=plan_sha256,
             config_sha256=self._cell.config_sha256,
-            software=software() | {"robot control": self._cell.robot.control_path or "none"},
+            software=software()
+            | {"robot control": self._cell.robot.control_path or "none"}
+            | ({"robot stops": stops} if (stops := self._cell.acceptance_trouble(self._root)) else {}),
         )
         path = segment_path(self.folder, self.segment)
         recorder = Recorder(path, info, lossless_png=config.capture.lossless_png)

@@ -19,6 +19,7 @@ import msgspec
 from recordings.errors import RecordingError
 from station.analysis.pool import Workers
 from station.analysis.worker import start_worker, warm_up
+from station.cell.acceptance import StopTestOffer
 from station.cell.errors import RefusedError, RobotError
 from station.cell.plan import Plan
 from station.cell.scene import cell_geometry
@@ -40,6 +41,7 @@ from station.session.queue import PoseQueue
 from station.session.recording import Logbook, SessionRecording
 from station.session.replan import Estimator, Replanner
 from station.session.run import Run, close_or_seal, unmark_busy
+from station.session.stop_test import StopTestRun, prepare_stop_test
 from station.session.store import StatusStore
 from station.session.summary import begun_anew, poses_to_drive, summarise
 from station.session.supervisor import SessionSupervisor
@@ -191,6 +193,17 @@ class Session:
         self._show_offer(offer.go)
         return offer
 
+    async def prepare_stop_test(self, client_id: int, request: verbs.StopTest) -> StopTestOffer:
+        """Offers a one-use approval for a short move that is ended in one way."""
+        self.permit(verbs.StopTest, client_id)
+        self._require_no_session()
+        voids = await self._begin_offer()
+        move, offer = await prepare_stop_test(self.context, request)
+        self._require_unchanged(client_id, voids)
+        self.approvals.offer(offer.go, client_id, (), stop_test=move)
+        self._show_offer(offer.go)
+        return offer
+
     async def _begin_offer(self) -> int:
         """The number of voided approvals before the path is checked."""
         await self._run_ended()  # it is finished and shown; its control process may take a moment more
@@ -227,7 +240,7 @@ class Session:
             self.store.update(go=None)
         self._notes = ()
         context.requests = RunRequests()
-        if context.recording is None and go.hover is None:
+        if context.recording is None and not go.beside_plan:
             context.forget_session(check=go.purpose is Purpose.DRIFT_CHECK)
         if go.replanned is not None:
             self._replanner.adopt(go.replanned)
@@ -239,6 +252,8 @@ class Session:
     def _run_for(self, go: MotionApproval) -> Run:
         if go.hover is not None:
             return HoverRun(self.context, go, go.hover)
+        if go.stop_test is not None:
+            return StopTestRun(self.context, go, go.stop_test)
         sweeps = self.context.require_queue().plan.motion == "sweep"
         return (SweepRun if sweeps else Run)(self.context, go)
 

@@ -17,7 +17,6 @@ from station.cell.limits import PlanCheck
 from station.cell.plan import Plan
 from station.cell.status import MotionPreview
 from station.cell.stillness import RestingCheck
-from station.devices.ur import control_trouble
 from station.protocol.verbs import PLANNED_ELSEWHERE, Purpose
 from station.session.context import SessionContext, displacement
 from station.session.lease import ApprovalManager
@@ -161,9 +160,8 @@ def motion_warnings(context: SessionContext) -> list[str]:
     slider = context.cell.robot.latest().target_speed_fraction
     if slider < _SLOW_SLIDER:
         warnings.append(f"the speed slider stands at {100 * slider:.0f} %")
-    trouble, _ = control_trouble(context.cell.robot.control_path, real=context.cell.source == "real")
-    if trouble:
-        warnings.append(trouble)
+    if trouble := context.cell.acceptance_trouble(context.root):
+        warnings.append(f"the arm's stops are {trouble}")
     if context.cell.simulated:
         warnings.append("SIMULATED cell: nothing real moves")
     if context.cell.source == "playback":

@@ -113,13 +113,15 @@ def start_controller(
     timeout_s: float = 15.0,
     log: Path | None = None,
     options: tuple[str, ...] = (),
+    module: str = "station.simulation.controller",
 ) -> SimulatedController:
     """Starts the child and waits until all its ports listen; blocking, call it outside an event loop.
 
     host None: a random free 127.x.y.z. log: where its standard error goes. options: further arguments of
-    the command line. Raises RobotError with the child's last words.
+    the command line. module: another program with the same one. Raises RobotError with the child's last
+    words.
     """
-    command = [sys.executable, "-m", "station.simulation.controller", "--model", model, "--die-with-parent"]
+    command = [sys.executable, "-m", module, "--model", model, "--die-with-parent"]
     command += ["--time-scale", str(time_scale), *options]
     if truth is not None:
         command += ["--truth", str(truth)]

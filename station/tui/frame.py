@@ -25,7 +25,7 @@ R = TypeVar("R")
 STOP_WIDE = "■ STOP   F12", "■ STOPPED   F12"
 STOP_NARROW = "STOP F12", "STOPPED"
 DRIVEN_BY = {"ur_rtde": "by ur_rtde", "script": "by own script"}
-"""What drives the arm. The own script is not yet accepted on a real arm."""
+"""What drives the arm."""
 RAIL_WIDE = 96
 """Cells from which on a step has a second line of its own."""
 GO_TO = (("1-6", "step"), ("7", "sessions"), ("8", "log"))
@@ -155,6 +155,8 @@ def _robot_parts(status: StationStatus) -> Iterator[Content]:
         yield Content.styled(f"  {'remote' if robot.remote else 'LOCAL'}", "$dim")
     if robot.control_path:
         yield Content.styled(f"  {DRIVEN_BY[robot.control_path]}", "$dim")
+    if robot.not_accepted:
+        yield Content.styled("  not accepted", "$warn")
     if status.lease.holder:
         yield Content.styled(f"  control: {status.lease.holder}", "$dim")
     if status.session.elapsed_s:

@@ -25,6 +25,7 @@ from recordings.schema.messages import (
     Stamps,
 )
 from station.analysis.worker import BoardDetection, sight
+from station.cell.acceptance import StopWay
 from station.cell.config import StationConfig
 from station.cell.errors import CameraError, RobotError, StaleStateError
 from station.cell.status import DetectionStatus, Event, StationState
@@ -50,6 +51,7 @@ class ArmInMemory:
         self.log: list[str] = []
         self.control, self.notice, self.remote = False, "", None
         self.control_path = "ur_rtde"
+        self.payload: tuple[float, ...] = ()
         self.kinematics: ArmKinematics | None = None
         self.slow = self.under_way = False
         self.arrive = asyncio.Event()
@@ -146,6 +148,10 @@ class ArmInMemory:
 
     def heartbeat(self) -> None:
         self.beats += 1
+
+    def stop_one_way(self, way: StopWay) -> None:
+        self.log.append(f"stop by {way.value}")
+        self._stopped.set()
 
     async def stop(self, reason: str) -> None:
         self.log.append("stop")

@@ -39,9 +39,10 @@ async def test_a_robot_that_is_there_is_ok(rig: Rig) -> None:
 @pytest.mark.parametrize(
     ("path", "source", "installed", "state"),
     [
-        ("ur_rtde", "real", True, "ok"),
+        ("ur_rtde", "real", True, "warning"),  # its stops are not accepted
         ("ur_rtde", "real", False, "failed"),
-        ("script", "real", False, "warning"),  # not yet accepted
+        ("script", "real", False, "warning"),
+        ("ur_rtde", "simulated", True, "ok"),
         ("script", "simulated", False, "ok"),
         ("", "playback", False, "skipped"),
     ],

@@ -1,0 +1,161 @@
+"""Whether this arm's ways to stop passed `station accept`: the result that is kept with the cell.
+
+It holds for one arm with one firmware, payload and control path. Another one of these makes it void.
+"""
+
+from __future__ import annotations
+
+from enum import StrEnum
+from pathlib import Path
+
+import msgspec
+
+from recordings.files import write_atomically
+from station.cell.status import MotionPreview
+
+ACCEPTANCE_NAME = "acceptance.json"
+"""Below the daemon's root."""
+PAYLOAD_TOLERANCE = 0.005
+"""kg, and m of its centre: less is rounding on the way through RTDE."""
+
+
+class StopWay(StrEnum):
+    """What ends a move of the acceptance test."""
+
+    ARRIVE = "arrive"
+    """Nothing: it arrives."""
+    CONTROL = "control"
+    """STOP by the control process alone."""
+    DASHBOARD = "dashboard"
+    """STOP by the dashboard alone."""
+    BOTH = "both"
+    """STOP by both at once, as the station does it."""
+    KILLED = "control-killed"
+    """The control process is killed."""
+    FROZEN = "daemon-frozen"
+    """The daemon's working loop stands still for a second: the watchdog alone is left."""
+    NETWORK = "network-cut"
+    """A person pulls the robot's network cable, and plugs it in again."""
+    SLIDER = "slider"
+    """The speed slider stands at 0 until the move is given up; then a person raises it."""
+
+
+BY_PERSON = frozenset({StopWay.NETWORK, StopWay.SLIDER})
+"""What only a person at the robot can do."""
+
+
+class ArmSubject(msgspec.Struct, frozen=True):
+    """What an acceptance holds for."""
+
+    source: str
+    """real, or simulated"""
+    model: str
+    serial: str
+    controller_version: str
+    payload: tuple[float, ...]
+    """Mass (kg) and centre of gravity (m, flange) as set on the pendant; empty: not told."""
+    control_path: str
+
+    def difference(self, other: ArmSubject) -> str:
+        """The first thing that is another one there; empty: none."""
+        pairs = zip(self.payload, other.payload, strict=False)
+        same_payload = len(self.payload) == len(other.payload) and all(
+            abs(a - b) <= PAYLOAD_TOLERANCE for a, b in pairs
+        )
+        for words, same in (
+            ("the cell", self.source == other.source),
+            ("the arm", (self.model, self.serial) == (other.model, other.serial)),
+            ("the firmware", self.controller_version == other.controller_version),
+            ("the payload", same_payload),
+            ("the control path", self.control_path == other.control_path),
+        ):
+            if not same:
+                return words
+        return ""
+
+
+class StopTestOffer(msgspec.Struct, frozen=True):
+    """A move of the acceptance test that waits for its approval."""
+
+    go: MotionPreview
+    subject: ArmSubject
+    joint: int
+    """That moves, from 0."""
+    target_rad: float
+    """Where it would arrive."""
+    speed_rad_s: float
+    """Of that joint."""
+
+
+class Figure(msgspec.Struct, frozen=True):
+    """One measured figure of a stop against its limit."""
+
+    name: str
+    value: float | None
+    """None: it never came."""
+    unit: str
+    limit: float
+    source: str
+    """Where the limit comes from."""
+    least: bool = False
+    """The limit is the least that passes, not the most."""
+
+    @property
+    def passed(self) -> bool:
+        if self.value is None:
+            return False
+        return self.value >= self.limit if self.least else self.value <= self.limit
+
+
+class StopResult(msgspec.Struct, frozen=True):
+    """One move of the test, and how it ended."""
+
+    way: StopWay
+    speed_m_s: float
+    """Of the fastest modelled point, as approved."""
+    figures: tuple[Figure, ...]
+
+    @property
+    def failed(self) -> tuple[Figure, ...]:
+        return tuple(figure for figure in self.figures if not figure.passed)
+
+
+class Acceptance(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One test of an arm, whether it passed or not."""
+
+    subject: ArmSubject
+    accepted: bool
+    speed_m_s: float
+    """The fastest stage that passed; 0: none."""
+    wall_ns: int
+    who: str
+    results: tuple[StopResult, ...]
+    report: str = ""
+    """Its page, beside this file."""
+    format: str = "arm-acceptance/1"
+
+
+def write_acceptance(root: Path, acceptance: Acceptance) -> Path:
+    """Raises OSError."""
+    path = root / ACCEPTANCE_NAME
+    write_atomically(path, msgspec.json.format(msgspec.json.encode(acceptance)))
+    return path
+
+
+def read_acceptance(root: Path) -> Acceptance | None:
+    """The newest test below this root; None: there is none, or its file cannot be read."""
+    try:
+        return msgspec.json.decode((root / ACCEPTANCE_NAME).read_bytes(), type=Acceptance)
+    except (OSError, msgspec.DecodeError):
+        return None
+
+
+def not_accepted(found: Acceptance | None, subject: ArmSubject) -> str:
+    """Why the stops of this arm are not accepted; empty: they are."""
+    if found is None:
+        return "not accepted: its stops were never tested"
+    if changed := found.subject.difference(subject):
+        return f"not accepted: {changed} changed since its stops were tested"
+    if not found.accepted:
+        return "not accepted: the last test of its stops failed or was ended"
+    return ""

@@ -1,0 +1,182 @@
+"""`station accept`: the acceptance test of an arm's ways to stop."""
+
+from __future__ import annotations
+
+import asyncio
+from pathlib import Path
+from typing import Annotated
+
+import msgspec
+import typer
+
+from recordings.files import write_atomically
+from station.cell.acceptance import Acceptance, StopWay, write_acceptance
+from station.cell.errors import RefusedError
+from station.cell.socket_folder import default_socket
+from station.cell.status import MotionPreview
+from station.cli.attended import Attended, attended, ctrl_c_at_once
+from station.cli.console import AsJson, Socket, err, out
+from station.operate.acceptance import SPEEDS_M_S, AcceptanceTest, JudgedStop
+from station.operate.acceptance_report import acceptance_page, figure_text
+from station.protocol.verbs import Configuration
+
+SEEN_S = 0.3
+"""The daemon has heard of a simulated slider after so long."""
+PULLED_S = 3.0
+"""A simulated cable is out for so long."""
+
+
+def accept_command(
+    joint: Annotated[int, typer.Option(help="Joint that moves, 1 (base) to 6 (wrist 3)", min=1, max=6)] = 1,
+    speed: Annotated[
+        float, typer.Option(help="Fastest stage, m/s: 0.05, 0.1 or 0.25", min=SPEEDS_M_S[0], max=0.25)
+    ] = SPEEDS_M_S[-1],
+    socket: Socket = None,
+    as_json: AsJson = False,
+) -> None:
+    """Test how the arm stops: STOP, watchdog, pulled cable, slider.
+
+    About 20 short moves of one joint, each approved by itself. The first stage is at 0.05 m/s; a faster one
+    follows only when the slower one passed. The first figure beyond its limit ends the test, and nothing is
+    cleared: after a protective stop you stand at the pendant. Have the pendant with its emergency stop in
+    your hand, the slider at 100 %, and the robot's network cable within reach. Ctrl-C stops the arm.
+
+    The result is kept with the cell (acceptance.json and a page with curves, below the daemon's root). It
+    holds until firmware, payload or control path change.
+
+    --json: no questions, simulated cells only.
+
+    Exit codes: 0 accepted, 1 ended or not possible, 4 a stop was beyond its limits.
+    """
+    acceptance = asyncio.run(_accept(socket, joint - 1, speed, as_json))
+    if as_json:
+        print(msgspec.json.encode(acceptance).decode())
+    if not acceptance.accepted:
+        raise typer.Exit(4 if any(result.failed for result in acceptance.results) else 1)
+
+
+async def _accept(socket: Path | None, joint: int, fastest_m_s: float, quiet: bool) -> Acceptance:
+    # Reading the arm beside the daemon is this command's alone: the flow knows it as a `Recorder`.
+    from station.devices.ur_trace import TraceRecorder
+
+    async with attended(socket or default_socket(), quiet=quiet) as shell:
+        status = await shell.status()
+        if quiet and not status.simulated:
+            text = "Nothing moved: --json prompts nobody, and is for simulated cells only."
+            raise RefusedError(text, code="no-person")
+        host = (await shell.client.call(Configuration())).robot.host
+        tester = _SimulatedTester(shell, host, quiet) if status.simulated else _ShellTester(shell)
+        speeds = [speed for speed in SPEEDS_M_S if speed <= fastest_m_s]
+        test = AcceptanceTest(shell.client, tester, TraceRecorder(host), joint, speeds)
+        try:
+            acceptance = await test.run()
+        except BaseException:
+            if test.stops and shell.client.root is not None:  # what was measured is not lost
+                _keep(shell.client.root, test.outcome(False), test.stops)
+            raise
+        if shell.client.root is not None:
+            acceptance = _keep(shell.client.root, acceptance, test.stops)
+        if not quiet:
+            words, style = ("ACCEPTED", "green") if acceptance.accepted else ("NOT ACCEPTED", "bold red")
+            err.print(words, style=style)
+            out.print(acceptance.report)
+        return acceptance
+
+
+def _keep(root: Path, acceptance: Acceptance, stops: list[JudgedStop]) -> Acceptance:
+    """The result, and its page beside it."""
+    report = root / "acceptance.html"
+    acceptance = msgspec.structs.replace(acceptance, report=str(report))
+    write_atomically(report, acceptance_page(acceptance, stops).encode())
+    write_acceptance(root, acceptance)
+    return acceptance
+
+
+class _ShellTester:
+    """The person at this terminal, with the pendant in their hand."""
+
+    quiet = False
+
+    def __init__(self, shell: Attended) -> None:
+        self._shell = shell
+
+    async def holds_emergency_stop(self) -> bool:
+        if not self._shell.interactive:
+            raise RefusedError(
+                "No terminal.", code="no-person", remedy="A person must stand at the arm (docs: Safety)."
+            )
+        err.print("The arm will be stopped in mid-move, again and again, also by taking its control away.")
+        return self._said_yes("Is the emergency stop in your hand, and everybody out of the arm's reach?")
+
+    async def approves(self, preview: MotionPreview) -> bool:
+        return await self._shell.approves(preview)
+
+    async def before(self, way: StopWay) -> None:
+        if way is StopWay.SLIDER:
+            self._wait_for("Draw the speed slider on the pendant down to 0.")
+
+    async def meanwhile(self, way: StopWay) -> None:
+        err.print("NOW pull the robot's network cable.", style="bold yellow")
+
+    async def afterwards(self, way: StopWay) -> None:
+        if way is StopWay.NETWORK:
+            err.print("Plug the cable in again.", style="bold yellow")
+        else:
+            err.print("Raise the speed slider to 100 %. The arm must not move.", style="bold yellow")
+
+    def judged(self, tested: JudgedStop) -> None:
+        result = tested.result
+        if self.quiet:
+            return
+        failed = result.failed
+        mark, style = ("FAIL", "bold red") if failed else ("PASS", "green")
+        figures = failed or [f for f in result.figures if f.name in ("reaction", "rest", "distance", "moved")]
+        said = ", ".join(f"{f.name} {figure_text(f)}" for f in figures)
+        err.print(f"{mark}  {result.way.value}, {result.speed_m_s:.2f} m/s: {said}", style=style)
+
+    def _said_yes(self, question: str) -> bool:
+        try:
+            with ctrl_c_at_once():
+                return typer.confirm(question, default=False, err=True)
+        except typer.Abort:
+            err.print()
+            return False
+
+    def _wait_for(self, what: str) -> None:
+        if not self._said_yes(f"{what} Done?"):
+            raise RefusedError("The test was ended.", code="ended")
+
+
+class _SimulatedTester(_ShellTester):
+    """Pulls the simulated cable and moves the simulated slider by the simulation's own port."""
+
+    def __init__(self, shell: Attended, host: str, quiet: bool) -> None:
+        from station.simulation.launch import AdminClient
+
+        super().__init__(shell)
+        self._admin, self.quiet = AdminClient(host), quiet
+
+    async def holds_emergency_stop(self) -> bool:
+        return self.quiet or not self._shell.interactive or await super().holds_emergency_stop()
+
+    async def approves(self, preview: MotionPreview) -> bool:
+        if self.quiet:
+            self._shell.moving = True
+            return True
+        return await super().approves(preview)
+
+    async def before(self, way: StopWay) -> None:
+        if way is StopWay.SLIDER:
+            self._admin.ask("slider", fraction=0.0)
+            await asyncio.sleep(SEEN_S)
+
+    async def meanwhile(self, way: StopWay) -> None:
+        await asyncio.sleep(3.0)
+        self._admin.ask("black_hole")
+
+    async def afterwards(self, way: StopWay) -> None:
+        if way is StopWay.NETWORK:
+            await asyncio.sleep(PULLED_S)
+            self._admin.ask("black_hole", on=False)
+        else:
+            self._admin.ask("slider", fraction=1.0)

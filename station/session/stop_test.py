@@ -1,0 +1,212 @@
+"""A move of the acceptance test: short, slow, checked, approved by itself, ended in one way in its middle.
+
+Nothing is recorded here: who judges the stop reads the arm by a connection of its own.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import msgspec
+import numpy as np
+
+from calibrate.kinematics import JOINT_NAMES, forward
+from recordings.schema.messages import Vector6
+from station.cell.acceptance import StopTestOffer, StopWay
+from station.cell.collision import CellGeometry
+from station.cell.config import matrix4, vector6
+from station.cell.errors import LimitError, RefusedError, RobotError, SafetyStopError
+from station.cell.limits import MoveCheck, PlanCheck, check_path, check_plan
+from station.cell.plan import Plan, PlannedPose, plan_sha256
+from station.cell.scene import geometry_from
+from station.cell.status import StationState
+from station.cell.stillness import RestingCheck
+from station.protocol import verbs
+from station.session.context import SessionContext, displacement
+from station.session.lease import MotionApproval
+from station.session.run import Run
+from station.session.summary import motion_preview, motion_warnings
+
+STOP_TESTED = "stop-tested"
+"""Cause of the state after such a move, however it ended."""
+STOP_GIVEN = "stop-given"
+"""Code of the event that tells when: `moment_ns`, host monotonic."""
+ACCELERATION_RAD_S2 = 1.4
+LONGEST_TURN_RAD = 0.4
+_PROBE_RAD = 0.05
+FROZEN_S = 1.0
+_MIDDLE = 0.5
+"""Share of the turn after which the stop is given."""
+_LOOK_S = 0.002
+_SLIDER_ZERO, _SLIDER_FULL = 0.005, 0.99
+_WORDS = {
+    StopWay.ARRIVE: "arrives",
+    StopWay.CONTROL: "is stopped by the control process alone",
+    StopWay.DASHBOARD: "is stopped by the dashboard alone",
+    StopWay.BOTH: "is stopped by both at once",
+    StopWay.KILLED: "ends as the control process is killed",
+    StopWay.FROZEN: "ends as the daemon stands still for 1 s: the watchdog alone stops it",
+    StopWay.NETWORK: "ends as you pull the robot's network cable",
+    StopWay.SLIDER: "waits at slider 0 and is given up after 10 s",
+}
+
+
+@dataclass(frozen=True, eq=False)
+class StopTestMove:
+    """The checked move, and what ends it."""
+
+    way: StopWay
+    target_rad: Vector6
+    check: MoveCheck
+    geometry: CellGeometry
+
+
+async def prepare_stop_test(
+    context: SessionContext, request: verbs.StopTest
+) -> tuple[StopTestMove, StopTestOffer]:
+    """RefusedError, LimitError and RobotError say what is in the way. Nothing moves."""
+    robot = context.cell.robot
+    await RestingCheck(robot.check).news()
+    state = robot.latest()
+    _require_slider(request.way, state.target_speed_fraction)
+    start = state.joints_rad
+    target, check, geometry, plan = await asyncio.to_thread(_free_move, context, request, start)
+    move = check.moves[0]
+    joint = JOINT_NAMES[request.joint]
+    preview = motion_preview(
+        check,
+        start,
+        purpose=f"stop test: {joint} turns {np.rad2deg(move.step_rad):.0f}° and {_WORDS[request.way]}",
+        plan_sha256=plan_sha256(plan),
+        poses=1,
+        first_move=displacement(context, start, target),
+        warnings=tuple(motion_warnings(context)),
+    )
+    offer = StopTestOffer(
+        preview, context.cell.subject, request.joint, target[request.joint], move.joint_speed_rad_s
+    )
+    return StopTestMove(request.way, target, move, geometry), offer
+
+
+def _require_slider(way: StopWay, fraction: float) -> None:
+    if way is StopWay.SLIDER:
+        if fraction > _SLIDER_ZERO:
+            raise RefusedError(
+                f"The speed slider stands at {100 * fraction:.0f} % (wanted: 0 %).",
+                code="slider-not-zero",
+                remedy="Draw it down to 0 on the pendant.",
+                fraction=fraction,
+            )
+    elif fraction < _SLIDER_FULL:
+        raise RefusedError(
+            f"The speed slider stands at {100 * fraction:.0f} % (wanted: 100 %).",
+            code="slider-low",
+            remedy="Raise it to 100 %: the test itself is slow.",
+            fraction=fraction,
+        )
+
+
+def _free_move(
+    context: SessionContext, request: verbs.StopTest, start: Vector6
+) -> tuple[Vector6, PlanCheck, CellGeometry, Plan]:
+    """The first of some turns whose path is free: the longest first, in the wanted direction first."""
+    geometry = geometry_from(context.cell.config, start)
+    limits = geometry.limits
+    slow = msgspec.structs.replace(
+        limits,
+        speed_m_s=min(limits.speed_m_s, request.speed_m_s),
+        joint_acceleration_rad_s2=min(limits.joint_acceleration_rad_s2, ACCELERATION_RAD_S2),
+    )
+    geometry = replace(geometry, limits=slow)
+    refused: PlanCheck | None = None
+    for turn_rad in _turns(geometry, request, start):
+        target = vector6(np.array(start) + turn_rad * np.eye(6)[request.joint])
+        pose = PlannedPose(request.way.value, target, matrix4(forward(geometry.model, np.array(target))))
+        plan = Plan(
+            context.cell.config.robot.model,
+            context.cell.config.mount,
+            (pose,),
+            joint_speed_rad_s=slow.joint_speed_rad_s,
+            joint_acceleration_rad_s2=slow.joint_acceleration_rad_s2,
+            note="stop test",
+        )
+        check = check_plan(plan, start, geometry)
+        if not check.problems:
+            return target, check, geometry, plan
+        refused = refused or check
+    assert refused is not None
+    raise LimitError(
+        f"{JOINT_NAMES[request.joint]} has no free path from here: {refused.problems[0]}",
+        code="stop-test-path",
+        remedy="Jog the arm to where it has room, or choose another joint (--joint).",
+    )
+
+
+def _turns(geometry: CellGeometry, request: verbs.StopTest, start: Vector6) -> Iterator[float]:
+    """Turns (rad) of the joint that last as long as asked for, then shorter ones."""
+    sign = 1.0 if request.forward else -1.0
+    near = vector6(np.array(start) + sign * _PROBE_RAD * np.eye(6)[request.joint])
+    speed = check_path(geometry, start, near).joint_speed_rad_s
+    ramp_s = speed / geometry.limits.joint_acceleration_rad_s2
+    whole = float(np.clip(speed * (request.duration_s - ramp_s), _PROBE_RAD, LONGEST_TURN_RAD))
+    for share in (1.0, 0.7):
+        yield from (sign * share * whole, -sign * share * whole)
+
+
+class StopTestRun(Run):
+    """Carries out one approved stop test: one move, no image, nothing recorded."""
+
+    def __init__(self, context: SessionContext, go: MotionApproval, test: StopTestMove) -> None:
+        self._context, self._go, self._test = context, go, test
+        self._geometry, self._failures = test.geometry, 0
+
+    async def _open_recording(self) -> None:
+        return None
+
+    async def _poses(self) -> None:
+        context, robot, test = self._context, self._context.cell.robot, self._test
+        await RestingCheck(robot.check).news()
+        context.store.enter(StationState.MOVING)
+        driving = asyncio.create_task(self._drive(robot.latest().joints_rad, test.target_rad, "stop test"))
+        try:
+            await self._give_stop(driving)
+            await driving
+            said = "The arm arrived."
+        except SafetyStopError:
+            raise
+        except (RobotError, LimitError) as error:
+            await robot.stop("stop test")
+            said = str(error)
+        finally:
+            driving.cancel()
+            with contextlib.suppress(asyncio.CancelledError, RobotError, LimitError):
+                await driving
+        if not context.requests.halt:
+            context.store.event(STOP_TESTED, said)
+            context.store.enter(StationState.IDLE, said, STOP_TESTED)
+
+    async def _give_stop(self, driving: asyncio.Task[None]) -> None:
+        """In the middle of the move, and told to the microsecond. RobotError where a way is not there."""
+        robot, test = self._context.cell.robot, self._test
+        start, target = (np.array(q) for q in (robot.latest().joints_rad, test.target_rad))
+        way = test.way
+        if way in (StopWay.ARRIVE, StopWay.NETWORK, StopWay.SLIDER):
+            return
+        while not driving.done():
+            if np.abs(robot.latest().joints_rad - start).max() >= _MIDDLE * np.abs(target - start).max():
+                break
+            await asyncio.sleep(_LOOK_S)
+        else:
+            return  # it ended by itself, and says why
+        moment_ns = time.monotonic_ns()
+        if way is StopWay.FROZEN:
+            time.sleep(FROZEN_S)  # on purpose: heartbeat, STOP and screen all hang on this loop
+        elif way is StopWay.BOTH:
+            await robot.stop("stop test")
+        else:
+            robot.stop_one_way(way)
+        self._context.store.event(STOP_GIVEN, f"stop given: {way.value}", moment_ns=moment_ns)

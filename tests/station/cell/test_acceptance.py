@@ -1,0 +1,54 @@
+"""What an acceptance holds for, and what makes it void."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import msgspec
+import pytest
+
+from station.cell.acceptance import (
+    ACCEPTANCE_NAME,
+    Acceptance,
+    ArmSubject,
+    not_accepted,
+    read_acceptance,
+    write_acceptance,
+)
+
+SUBJECT = ArmSubject("real", "UR10e", "2024", "5.11.1", (1.2, 0.0, 0.0, 0.05), "ur_rtde")
+PASSED = Acceptance(SUBJECT, True, 0.25, 1, "anna", ())
+
+
+def test_it_holds_for_the_arm_that_was_tested(tmp_path: Path) -> None:
+    write_acceptance(tmp_path, PASSED)
+    assert read_acceptance(tmp_path) == PASSED
+    assert not_accepted(read_acceptance(tmp_path), SUBJECT) == ""
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"serial": "2025"},
+        {"controller_version": "5.12.0"},
+        {"payload": (1.3, 0.0, 0.0, 0.05)},
+        {"payload": (1.2, 0.0, 0.02, 0.05)},
+        {"payload": ()},
+        {"control_path": "script"},
+        {"source": "simulated"},
+    ],
+)
+def test_another_arm_firmware_payload_or_path_makes_it_void(change: dict[str, object]) -> None:
+    assert not_accepted(PASSED, msgspec.structs.replace(SUBJECT, **change))
+
+
+def test_rounding_of_the_payload_does_not() -> None:
+    rounded = msgspec.structs.replace(SUBJECT, payload=(1.2001, 0.0, 0.0001, 0.05))
+    assert not_accepted(PASSED, rounded) == ""
+
+
+def test_never_tested_failed_and_unreadable_are_not_accepted(tmp_path: Path) -> None:
+    assert not_accepted(read_acceptance(tmp_path), SUBJECT)
+    assert not_accepted(msgspec.structs.replace(PASSED, accepted=False), SUBJECT)
+    (tmp_path / ACCEPTANCE_NAME).write_text('{"accepted": true}')
+    assert not_accepted(read_acceptance(tmp_path), SUBJECT)

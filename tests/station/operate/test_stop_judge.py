@@ -1,0 +1,146 @@
+"""The judge of the acceptance test: planted weaknesses are found, a sound controller is not accused."""
+
+from __future__ import annotations
+
+import pytest
+
+from recordings.schema.messages import RobotState, Stamps
+from station.cell.acceptance import Figure, StopWay
+from station.operate.stop_judge import StopMove, judge
+from station.simulation.controller.programs import Upload
+from station.simulation.controller.state import Journal, Settings
+from tests.weak_controller import WEAKNESSES, WeakRobot, weak
+
+START = (0.3, -1.6, 1.9, -1.9, -1.57, 0.0)
+TURN_RAD = 0.3
+SLOW_RAD_S, FAST_RAD_S = 0.06, 0.3
+"""What 0.05 and 0.25 m/s are for a base joint with the arm stretched out."""
+MOVE = "def move():\n  movej([{}], a=1.4, v={})\nend\n"
+
+
+class Stand:
+    """A controller without sockets, a clock that is only counted, and one move on it."""
+
+    def __init__(self, weakness: str = "", model: str = "UR10e") -> None:
+        self.robot: WeakRobot = weak(weakness)(Settings(model=model, start_joints_rad=START), Journal())
+        self.cut = False
+        self.robot.is_cut = lambda: self.cut  # type: ignore[method-assign]
+        self.states: list[RobotState] = []
+        self._forth = True
+
+    @property
+    def now_ns(self) -> int:
+        return 10**12 + round(self.robot.time_s * 1e9)
+
+    def run(self, seconds: float, kicked: bool = True) -> None:
+        for _ in range(round(seconds / self.robot.dt_s)):
+            if kicked:
+                self.robot._silence_s = 0.0
+            self.robot.tick(self.now_ns)
+            if not self.cut:
+                self.states.append(self._state())
+
+    def _state(self) -> RobotState:
+        out = self.robot.outputs
+        return RobotState(
+            stamps=Stamps(self.now_ns + 400_000, 0, self.robot.time_s),
+            joints_rad=out.vector("actual_q"),  # type: ignore[arg-type]
+            joint_speeds_rad_s=out.vector("actual_qd"),  # type: ignore[arg-type]
+            target_joints_rad=out.vector("target_q"),  # type: ignore[arg-type]
+            tcp_pose=out.vector("actual_TCP_pose"),  # type: ignore[arg-type]
+            robot_mode=int(out.get("robot_mode")),
+            safety_mode=int(out.get("safety_mode")),
+            safety_status_bits=int(out.get("safety_status_bits")),
+            runtime_state=int(out.get("runtime_state")),
+            robot_status_bits=int(out.get("robot_status_bits")),
+            speed_scaling=out.get("speed_scaling"),
+            target_speed_fraction=out.get("target_speed_fraction"),
+        )
+
+    def test(self, way: StopWay, speed_rad_s: float = FAST_RAD_S) -> tuple[Figure, ...]:
+        """One move that ends in this way, and what the judge says of it."""
+        robot = self.robot
+        target = START[0] + TURN_RAD if self._forth else START[0]
+        self._forth = not self._forth
+        if way is StopWay.SLIDER:
+            robot.slider = 0.0
+            self.run(0.4)
+        self.states = []
+        joints = ", ".join(map(str, (target, *START[1:])))
+        robot.upload(Upload("move", MOVE.format(joints, speed_rad_s)))
+        self.run(0.1)
+        robot.watchdog_s = 0.2
+        goes = abs(target - robot.arm.command[0])
+        self.run(0.5 * goes / speed_rad_s + 0.1)
+        moment_ns: int | None = self.now_ns
+        if way is StopWay.CONTROL:
+            robot.arm.brake_tool(2.0)
+            robot.stop_program("stop")
+        elif way in (StopWay.DASHBOARD, StopWay.BOTH, StopWay.KILLED):
+            robot.stop_program("stop")
+        elif way is StopWay.FROZEN:
+            self.run(1.0, kicked=False)
+        elif way is StopWay.NETWORK:
+            self.cut, moment_ns = True, None
+            self.run(3.0, kicked=False)
+            self.cut = False
+            self.robot.stop_program("the station's stop, late")
+        elif way is StopWay.SLIDER:
+            self.run(1.0)
+            robot.stop_program("given up")
+            robot.slider, moment_ns = 1.0, None
+        else:
+            self.run(goes / speed_rad_s)
+        self.run(2.0)
+        return judge(self.states, StopMove(way, 0, target, speed_rad_s, moment_ns))
+
+
+def failed(figures: tuple[Figure, ...]) -> set[str]:
+    return {figure.name for figure in figures if not figure.passed}
+
+
+@pytest.mark.parametrize("speed_rad_s", [SLOW_RAD_S, FAST_RAD_S])
+@pytest.mark.parametrize("model", ["UR10", "UR10e"])
+def test_a_sound_controller_passes_every_way(model: str, speed_rad_s: float) -> None:
+    stand = Stand(model=model)
+    for way in StopWay:
+        assert not failed(stand.test(way, speed_rad_s)), way
+
+
+FOUND = {
+    "late-watchdog": (StopWay.FROZEN, "reaction"),
+    "abrupt-braking": (StopWay.DASHBOARD, "deceleration"),
+    "slow-braking": (StopWay.DASHBOARD, "rest"),
+    "stop-ignored-once": (StopWay.DASHBOARD, "reaction"),
+    "swings-back": (StopWay.BOTH, "back after the stop"),
+    "resumes-after-slider": (StopWay.SLIDER, "moved"),
+    "goes-on-after-cut": (StopWay.NETWORK, "distance"),
+    "hidden-protective-stop": (StopWay.KILLED, "held by safety"),
+    "drifts-at-rest": (StopWay.BOTH, "drift at rest"),
+    "too-fast": (StopWay.ARRIVE, "top speed"),
+}
+
+
+@pytest.mark.parametrize("weakness", WEAKNESSES)
+@pytest.mark.parametrize("model", ["UR10", "UR10e"])
+def test_a_planted_weakness_is_found_where_it_shows(weakness: str, model: str) -> None:
+    way, name = FOUND[weakness]
+    assert name in failed(Stand(weakness, model).test(way))
+
+
+def test_a_weakness_is_found_only_where_it_is() -> None:
+    stand = Stand("late-watchdog")
+    assert not any(failed(stand.test(way)) for way in StopWay if way not in (StopWay.FROZEN, StopWay.NETWORK))
+
+
+def test_no_samples_pass_nothing() -> None:
+    assert failed(judge([], StopMove(StopWay.BOTH, 0, 0.3, 0.3, 0))) == {"samples"}
+
+
+def test_an_arm_that_stood_still_passes_no_stop() -> None:
+    stand = Stand()
+    stand.run(3.0)
+    move = StopMove(
+        StopWay.BOTH, 0, START[0] + TURN_RAD, FAST_RAD_S, stand.states[500].stamps.host_monotonic_ns
+    )
+    assert "speed at the stop" in failed(judge(stand.states, move))

@@ -1,0 +1,118 @@
+"""The acceptance test with the real driver and daemon: its stops, its judge, what it keeps and refuses."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from station.cell.acceptance import Acceptance, StopWay
+from station.cell.errors import RefusedError
+from station.cell.status import MotionPreview
+from station.cell.status import StationState as S
+from station.devices.ur_trace import TraceRecorder
+from station.operate.acceptance import AcceptanceTest, JudgedStop
+from station.operate.acceptance_report import acceptance_page
+from station.protocol.client import Client
+from station.protocol.verbs import Lease, Stop
+from station.simulation.cell import write_truth
+from station.simulation.launch import AdminClient, SimulatedController
+from tests.system.conftest import AT_REST_RAD_S, TRUTH, SystemRig, both_paths, status_when
+
+pytestmark = pytest.mark.process
+SLOW = (0.05,)
+
+
+class SimulatedHands:
+    """A person whose hands are the simulation's own port."""
+
+    def __init__(self, admin: AdminClient, holds: bool = True) -> None:
+        self._admin, self.holds = admin, holds
+        self.approved: list[MotionPreview] = []
+        self.told: list[JudgedStop] = []
+
+    async def holds_emergency_stop(self) -> bool:
+        return self.holds
+
+    async def approves(self, preview: MotionPreview) -> bool:
+        self.approved.append(preview)
+        return True
+
+    async def before(self, way: StopWay) -> None: ...
+
+    async def meanwhile(self, way: StopWay) -> None: ...
+
+    async def afterwards(self, way: StopWay) -> None: ...
+
+    def judged(self, tested: JudgedStop) -> None:
+        self.told.append(tested)
+
+
+async def begun(
+    rig: SystemRig, *ways: StopWay, holds: bool = True
+) -> tuple[Client, SimulatedHands, AcceptanceTest]:
+    daemon = await rig.daemon()
+    client = await daemon.client()
+    await status_when(client, lambda s: s.state is S.IDLE and s.camera.connected)
+    await client.call(Lease("take"))
+    tester = SimulatedHands(rig.admin, holds)
+    return client, tester, AcceptanceTest(client, tester, TraceRecorder(rig.controller.host), 0, SLOW, ways)
+
+
+@both_paths
+async def test_a_sound_arm_passes_and_every_move_was_approved_by_itself(rig: SystemRig) -> None:
+    ways = (StopWay.CONTROL, StopWay.FROZEN)
+    client, tester, test = await begun(rig, *ways)
+    found: Acceptance = await test.run()
+    await client.close()
+    assert [stop.result.way for stop in test.stops] == list(ways)
+    assert not [f for stop in test.stops for f in stop.result.failed]
+    assert len({preview.token for preview in tester.approved}) == len(ways)
+    assert all(preview.top_speed_m_s <= SLOW[0] for preview in tester.approved)
+    assert not found.accepted, "some ways only were tested"
+    assert found.speed_m_s == SLOW[0] and found.subject.source == "simulated"
+    assert acceptance_page(found, test.stops).count("<svg") == len(ways)
+
+
+async def test_a_stop_that_is_ignored_ends_the_test_and_the_arm_is_stopped_all_the_same(
+    controller: Callable[..., SimulatedController], short_folder: Path, tmp_path: Path
+) -> None:
+    write_truth(TRUTH, short_folder / "truth.json")
+    deaf = controller(
+        "UR10",
+        truth=short_folder / "truth.json",
+        module="tests.weak_controller",
+        options=("--weakness", "stop-ignored-once"),
+    )
+    rig = SystemRig(deaf, short_folder, tmp_path)
+    try:
+        client, _, test = await begun(rig, StopWay.CONTROL, StopWay.BOTH)
+        found = await test.run()
+        await client.close()
+        assert [stop.result.way for stop in test.stops] == [StopWay.CONTROL]
+        assert {f.name for f in test.stops[0].result.failed} >= {"reaction", "rest"}
+        assert not found.accepted and found.speed_m_s == 0
+        assert rig.speed_rad_s() < AT_REST_RAD_S, "the other way stopped it"
+    finally:
+        rig.end()
+
+
+async def test_nothing_moves_without_emergency_stop_full_slider_and_acknowledged_stop(rig: SystemRig) -> None:
+    client, hands, test = await begun(rig, StopWay.ARRIVE, holds=False)
+    with pytest.raises(RefusedError) as refused:
+        await test.run()
+    assert refused.value.code == "no-emergency-stop"
+    hands.holds = True
+    rig.admin.ask("slider", fraction=0.5)
+    await status_when(client, lambda s: s.robot.slider < 0.6)
+    with pytest.raises(RefusedError) as refused:
+        await test.run()
+    assert refused.value.code == "slider-low"
+    rig.admin.ask("slider", fraction=1.0)
+    await status_when(client, lambda s: s.robot.slider > 0.99)
+    await client.call(Stop())
+    with pytest.raises(RefusedError) as refused:
+        await test.run()
+    assert refused.value.code == "wrong-state" and not hands.approved
+    await client.close()

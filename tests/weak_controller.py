@@ -1,0 +1,145 @@
+"""A simulated controller with one weakness planted: python -m tests.weak_controller --weakness NAME …
+
+Each weakness is what an acceptance test of the arm must find.
+"""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable
+from typing import Any
+
+from station.devices.rtde import SafetyMode
+from station.simulation.controller import __main__, machine
+from station.simulation.controller.arm import JointMotion, MakePath, SimulatedArm
+from station.simulation.controller.paths import JointPath
+from station.simulation.controller.robot import SimulatedRobot
+
+WEAKNESSES = (
+    "late-watchdog",
+    "abrupt-braking",
+    "slow-braking",
+    "stop-ignored-once",
+    "swings-back",
+    "resumes-after-slider",
+    "goes-on-after-cut",
+    "hidden-protective-stop",
+    "drifts-at-rest",
+    "too-fast",
+)
+LATE_S, SLOW_RAD_S2, BACK_RAD, DRIFT_RAD_S, FASTER = 0.6, 0.3, 0.01, 0.004, 1.4
+
+
+class WeakArm(SimulatedArm):
+    """The arm of a `WeakRobot`, whose weakness it shares."""
+
+    weakness = ""
+    ignored = braked = False
+
+    def start(self, make_path: MakePath, speed: float, acceleration: float) -> JointMotion:
+        return super().start(make_path, speed * (FASTER if self.weakness == "too-fast" else 1), acceleration)
+
+    def brake(self, deceleration_rad_s2: float) -> None:
+        self._weakly(lambda: super(WeakArm, self).brake(deceleration_rad_s2))
+
+    def brake_tool(self, deceleration_m_s2: float) -> None:
+        self._weakly(lambda: super(WeakArm, self).brake_tool(deceleration_m_s2))
+
+    def _weakly(self, brake: Callable[[], None]) -> None:
+        if not self.moving:
+            return
+        self.braked = True
+        if self.weakness == "stop-ignored-once" and not self.ignored:
+            self.ignored = True
+        elif self.weakness == "abrupt-braking":
+            self.freeze()
+        elif self.weakness == "slow-braking":
+            super().brake(SLOW_RAD_S2)
+        else:
+            brake()
+
+
+class WeakRobot(SimulatedRobot):
+    weakness = ""
+    is_cut: Callable[[], bool] = staticmethod(lambda: False)
+
+    def __init__(self, *settings: Any) -> None:
+        super().__init__(*settings)
+        self.arm.__class__ = WeakArm
+        self.weak_arm.weakness = self.weakness
+        self._kept: tuple[MakePath, float, float] | None = None
+
+    @property
+    def weak_arm(self) -> WeakArm:
+        assert isinstance(self.arm, WeakArm)
+        return self.arm
+
+    def tick(self, monotonic_ns: int, late: bool = False) -> None:
+        if self.weakness == "late-watchdog" and self.watchdog_s:
+            self.watchdog_s = LATE_S
+        if self.weakness == "goes-on-after-cut" and self.is_cut():
+            self.watchdog_s = 0.0
+        super().tick(monotonic_ns, late)
+        arm = self.weak_arm
+        if self._kept is not None and self.slider > 0:
+            arm.start(*self._kept)
+            self._kept = None
+        if arm.braked and not arm.moving:
+            self._rests()
+
+    def _rests(self) -> None:
+        """The arm came to rest by a stop."""
+        arm = self.weak_arm
+        q = arm.command
+        if self.weakness == "swings-back":
+            arm.braked = False
+            arm.start(lambda start: JointPath(start, (start[0] - BACK_RAD * self._way, *start[1:])), 0.1, 1.4)
+        elif self.weakness == "drifts-at-rest":
+            arm.command = (q[0] + DRIFT_RAD_S * self.dt_s, *q[1:])
+
+    @property
+    def _way(self) -> float:
+        return 1.0 if self.last_speed >= 0 else -1.0
+
+    last_speed = 0.0
+
+    def stop_program(self, reason: str) -> None:
+        arm = self.weak_arm
+        moving = arm.motion
+        if arm.moving:
+            self.last_speed = arm.command_speed[0]
+        if self.weakness == "resumes-after-slider" and moving is not None and self.slider == 0:
+            self._kept = (moving.make_path, moving.speed, moving.acceleration)
+        super().stop_program(reason)
+        if self.weakness == "hidden-protective-stop" and moving is not None and self.safe:
+            self.protective_stop(reason)
+
+    def publish(self) -> None:
+        super().publish()
+        if self.weakness == "hidden-protective-stop":
+            self.outputs.set("safety_mode", SafetyMode.NORMAL)  # only the bits tell
+
+
+def weak(weakness: str) -> type[WeakRobot]:
+    """A robot with this weakness; '' has none."""
+    return type("Weak", (WeakRobot,), {"weakness": weakness})
+
+
+def main(arguments: list[str]) -> int:
+    at = arguments.index("--weakness")
+    kind = weak(arguments[at + 1])
+
+    class Machine(machine.Machine):
+        def __init__(self, *settings: Any) -> None:
+            super().__init__(*settings)
+            service = self.rtde.service
+            assert isinstance(self.robot, WeakRobot)
+            self.robot.is_cut = lambda: service.silent
+
+    vars(machine)["SimulatedRobot"] = kind
+    vars(__main__)["Machine"] = Machine
+    return __main__.main([*arguments[:at], *arguments[at + 2 :]])
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

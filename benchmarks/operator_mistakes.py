@@ -33,7 +33,8 @@ from station.cell.plan import Plan, PlannedPose
 from station.cell.status import StationState
 from station.cli.new import RealHardware
 from station.devices.ur import UrRobot
-from station.operate.new_cell import Draft, find_cell, image_trouble
+from station.operate.draft import Draft
+from station.operate.guided_views import find_cell, image_trouble
 from station.protocol.verbs import Purpose
 from station.simulation.launch import SimulatedController, start_controller
 from station.simulation.renderer import Light, render

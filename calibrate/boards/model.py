@@ -92,6 +92,15 @@ def check_board(spec: BoardSpec) -> None:
             )
 
 
+def usual_markers(kind: BoardKind, square_m: float) -> tuple[float | None, str | None]:
+    """Choose `marker_m` and dictionary of a board of which only the squares are stated; None: it has none."""
+    if kind is BoardKind.CHARUCO:
+        return 0.75 * square_m, "DICT_6X6_250"
+    if kind is BoardKind.APRIL_GRID:
+        return 0.3 * square_m, None
+    return None, "DICT_4X4_50" if kind is BoardKind.ARUCO else None
+
+
 def tag_dictionary(spec: BoardSpec) -> str:
     """Return the dictionary of a board of markers; AprilTags have a usual one."""
     return spec.dictionary or APRIL_DICTIONARY

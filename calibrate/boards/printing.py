@@ -88,7 +88,7 @@ def board_sheet(spec: BoardSpec, paper: str | None = None) -> Sheet:
     ruler_y = y + height + _MARGIN_MM
     length = int(min(max(width, 60.0), 150.0) // 10) * 10
     says = f"{describe_board(spec)}. The bar is {length} mm: measure it, and one square, before use."
-    marks, letters = _origin(spec, x, y)
+    marks, letters = _origin(spec, x, y, height)
     return Sheet(
         sheet_w,
         sheet_h,
@@ -98,16 +98,21 @@ def board_sheet(spec: BoardSpec, paper: str | None = None) -> Sheet:
     )
 
 
-def _origin(spec: BoardSpec, x: float, y: float) -> tuple[Array, tuple[tuple[float, float, str], ...]]:
+def _origin(
+    spec: BoardSpec, x: float, y: float, height: float
+) -> tuple[Array, tuple[tuple[float, float, str], ...]]:
     """Marks in the margins where the lines through the board's origin leave the pattern, with their axes.
 
-    Tags and grids of tags say by their numbers where they begin: no marks.
+    A single tag has none: its origin is the top left of the black square.
     """
-    if spec.kind in (BoardKind.APRIL_GRID, *SINGLE_TAGS):
+    if spec.kind in SINGLE_TAGS:
         return np.zeros((0, 4)), ()
-    at = spec.square_m * 1000
-    ticks = np.array([[x + at - 0.15, y - 4.5, 0.3, 3.0], [x - 4.5, y + at - 0.15, 3.0, 0.3]])
-    return ticks, ((x + at + 1.0, y - 2.0, "x → from the origin"), (x - 5.0, y + at + 3.5, "y ↓"))
+    right = down = spec.square_m * 1000
+    if spec.kind is BoardKind.APRIL_GRID:
+        right = (spec.marker_m or 0.0) * 1000
+        down = height - right
+    ticks = np.array([[x + right - 0.15, y - 4.5, 0.3, 3.0], [x - 4.5, y + down - 0.15, 3.0, 0.3]])
+    return ticks, ((x + right + 1.0, y - 2.0, "x → from the origin"), (x - 5.0, y + down + 3.5, "y ↓"))
 
 
 def _paper(paper: str, need_w: float, need_h: float, spec: BoardSpec) -> tuple[float, float]:

@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-from calibrate.boards.model import ambiguity_text, describe_board
+from calibrate.boards.model import ambiguity_text, describe_board, usual_markers
 from calibrate.boards.printing import PAPER_MM, board_sheet
 from calibrate.cli.files import read_board
 from calibrate.cli.output import OutputError, check_target, err, out
@@ -41,15 +41,11 @@ def board(
     if output.suffix.lower() not in (".pdf", ".svg"):
         raise OutputError(f"{output}: the name must end in .pdf or .svg.", code="board-format")
     check_target(output, "export")
-    marker_m = None if marker_mm is None else marker_mm / 1000
-    if marker_m is None and kind in (BoardKind.CHARUCO, BoardKind.APRIL_GRID):
-        marker_m = square_mm / 1000 * (0.75 if kind is BoardKind.CHARUCO else 0.3)
-    if dictionary is None and kind is BoardKind.CHARUCO:
-        dictionary = "DICT_6X6_250"
+    usual_m, usual = usual_markers(kind, square_mm / 1000)
+    marker_m = usual_m if marker_mm is None else marker_mm / 1000
+    dictionary = dictionary or usual
     if kind in SINGLE_TAGS:
         columns = rows = 1
-    if dictionary is None and kind is BoardKind.ARUCO:
-        dictionary = "DICT_4X4_50"
     spec = BoardSpec(kind, columns, rows, square_mm / 1000, marker_m, dictionary, legacy, tag_id=tag_id)
     if board_file is not None:
         spec = read_board(board_file)

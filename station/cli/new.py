@@ -26,7 +26,8 @@ from station.devices.ur_condition import what_holds
 from station.devices.ur_dashboard import STOP, DashboardError
 from station.devices.ur_link import UrLink
 from station.devices.ur_probe import probe
-from station.operate.new_cell import ArmReader, CameraReader, FoundCamera, default_place
+from station.operate.draft import ArmReader, CameraReader, FoundCamera
+from station.operate.new_cell import default_place
 
 SERVICES = (
     "From PolyScope 5.17 on: ☰ → Settings → Security → Services, enable Dashboard Server, RTDE and the "
@@ -36,7 +37,7 @@ READY_S = 60.0
 
 
 class LinkedArm:
-    """`new_cell.ArmReader` over the read-only half of the driver."""
+    """`draft.ArmReader` over the read-only half of the driver."""
 
     def __init__(self, link: UrLink) -> None:
         self._link = link
@@ -72,7 +73,7 @@ class LinkedArm:
 
 
 class GenicamReader:
-    """`new_cell.CameraReader` over the GenICam driver."""
+    """`draft.CameraReader` over the GenICam driver."""
 
     def __init__(self, device: str) -> None:
         self._config = CameraConfig(device=device)

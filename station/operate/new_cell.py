@@ -6,40 +6,17 @@ kept after every step, so that a person may leave and take it up again.
 
 from __future__ import annotations
 
-import contextlib
-import math
 import os
-from collections.abc import Sequence
-from dataclasses import dataclass
-from enum import StrEnum
-from itertools import combinations
+import re
 from pathlib import Path
-from typing import Literal, Protocol
 
-import cv2
 import msgspec
 import numpy as np
 
-from calibrate.boards.detect import Detection
-from calibrate.boards.model import board_points, describe_board
-from calibrate.errors import CalibrationError
-from calibrate.geometry import Array, inverse, pose_from_rotvec, rotation_log, transform_points
-from calibrate.lens.intrinsics import calibrate_intrinsics
-from calibrate.views import BoardView, ViewSet
+from calibrate.boards.model import board_points, check_board, usual_markers
+from calibrate.geometry import Array, inverse, transform_points
 from recordings.files import ASKED_FOR, write_atomically
-from recordings.schema.messages import (
-    BoardKind,
-    BoardSpec,
-    CameraModel,
-    Image,
-    Matrix4,
-    Mount,
-    RobotIdentity,
-    RobotState,
-    Vector6,
-)
-from station.analysis.estimation import quick_sigma, solve_quickly
-from station.analysis.worker import CapturedView, assess
+from recordings.schema.messages import BoardKind, BoardSpec
 from station.cell.config import (
     CameraConfig,
     LimitsConfig,
@@ -48,157 +25,25 @@ from station.cell.config import (
     RobotConfig,
     StationConfig,
     Vector3,
-    matrix4,
     vector3,
 )
 from station.cell.config_file import config_error, examine_config
 from station.cell.errors import ConfigError, RefusedError
 from station.cell.scene import guess_from, scene_of
+from station.operate.draft import STEPS, Draft, Step
+from station.operate.guided_views import FEWEST_GUIDED, FoundCell, enough, find_cell
 
-DRAFT_FILE = "new-cell.json"
-FEWEST_GUIDED, MOST_GUIDED = 4, 6
-"""Views that are guided by hand."""
-TURN_RAD = math.radians(20.0)
-"""Turn of the flange that makes a view a new one."""
-_OTHER_AXIS = math.sin(math.radians(25.0))
-"""Smallest share of the turns across the main axis: then they are about more than one axis."""
-STILL_RAD_S, STILL_S = 0.003, 0.4
-GOOD_M, GOOD_RAD = 0.010, math.radians(2.0)
-"""1σ of the camera's pose that is enough to plan from."""
-_LEAST_SIGMA_M, _LEAST_SIGMA_RAD = 0.003, 0.01
-"""A guess is never said to be better: the true arm differs from its nominal table."""
-_MOVED_M = 0.006
-"""The board stands further apart between the views than any arm's table explains."""
-_WRONG_SCALE = 0.03
-"""Share by which the squares may differ from what is stated before a person is told."""
-_SCALE_SIGMA, _TRAVEL_M = 0.5, 0.001
-"""What is known of it before, and how well the arm's travel and the camera's agree."""
-_LIT = 0.15
-"""Brightest part of an image without a board, of full scale, that could be read."""
-_OTHER_MOUNT = 3.0
-"""The other mounting fits so many times better: the answer was wrong."""
 _ROOM_M = 0.35
 """Room around the guided views that the workspace leaves, either way."""
 _BELOW_BOARD_M = 0.01
-
-
-class Step(StrEnum):
-    """The steps of the wizard, in order."""
-
-    ROBOT = "robot"
-    CAMERA = "camera"
-    MOUNTING = "mounting"
-    BOARD = "board"
-    VIEWS = "views"
-    LIMITS = "limits"
-    SAVE = "save"
-
-
-STEPS = tuple(Step)
-
-
-class FoundCamera(msgspec.Struct, frozen=True):
-    """A camera that answered."""
-
-    driver: str
-    device: str
-    """Serial number, address or name, as `camera.device` takes it."""
-    name: str
-
-
-class ArmReader(Protocol):
-    """The read-only half of an arm."""
-
-    @property
-    def identity(self) -> RobotIdentity: ...
-
-    @property
-    def remote(self) -> bool | None:
-        """Remote control is on; None where there is no such switch."""
-
-    def latest(self) -> RobotState:
-        """Newest state. Raises RobotError."""
-
-    def trouble(self) -> str:
-        """Why the arm cannot be guided now, and what to do on the pendant; empty: nothing."""
-
-    async def stop(self) -> None:
-        """STOP, by the dashboard: it ends whatever program runs on the controller. Never raises."""
-
-    async def close(self) -> None: ...
-
-
-class CameraReader(Protocol):
-    """A camera that shows what it sees."""
-
-    async def glimpse(self) -> Image | None:
-        """An image exposed after this call. Raises CameraError."""
-
-    async def expose(self, exposure_us: float) -> None:
-        """Set another exposure time."""
-
-    @property
-    def exposure_us(self) -> float: ...
-
-    async def close(self) -> None: ...
-
-
-class Hardware(Protocol):
-    """What a shell brings for this flow: it alone knows devices."""
-
-    async def arm(self, host: str) -> ArmReader:
-        """Connect for reading only. Raises RobotError with the pendant's own menu words."""
-
-    async def cameras(self) -> tuple[FoundCamera, ...]:
-        """Cameras that answer now. Raises CameraError."""
-
-    async def camera(self, found: FoundCamera) -> CameraReader:
-        """Open it. Raises CameraError."""
-
-
-class GuidedView(msgspec.Struct, frozen=True):
-    """What the camera saw from where a hand brought the arm."""
-
-    joints_rad: Vector6
-    base_from_flange: Matrix4
-    indices: tuple[int, ...]
-    """Rows of `board_points`"""
-    pixels: tuple[tuple[float, float], ...]
-
-
-class Draft(msgspec.Struct, frozen=True, omit_defaults=True):
-    """What is known of the cell so far."""
-
-    host: str = ""
-    robot: RobotIdentity | None = None
-    camera: FoundCamera | None = None
-    width: int = 0
-    height: int = 0
-    exposure_us: float = 10_000.0
-    mount: Mount | None = None
-    board: BoardSpec | None = None
-    views: tuple[GuidedView, ...] = ()
-    table_m: float | None = None
-    """Height of the table in `base`; None: by the board."""
-    limits_seen: bool = False
-    written: str = ""
-    """The configuration's path, once it is written."""
-
-    def without_views(self, **changes: object) -> Draft:
-        """With changes that make the views taken so far worthless."""
-        return msgspec.structs.replace(self, views=(), limits_seen=False, written="", **changes)
-
-
-def load_draft(root: Path) -> Draft:
-    """What was found before; an empty one where there is nothing, or nothing readable."""
-    with contextlib.suppress(OSError, msgspec.DecodeError):
-        return msgspec.json.decode((root / DRAFT_FILE).read_bytes(), type=Draft)
-    return Draft()
-
-
-def save_draft(root: Path, draft: Draft) -> None:
-    root.mkdir(parents=True, exist_ok=True)
-    write_atomically(root / DRAFT_FILE, msgspec.json.encode(draft), ASKED_FOR)
+_COUNTED = {
+    BoardKind.CHESSBOARD: "columns and rows of inner corners",
+    BoardKind.CHARUCO: "columns and rows of squares",
+    BoardKind.CIRCLES: "columns and rows of circles",
+    BoardKind.ASYMMETRIC_CIRCLES: "columns and rows of circles",
+    BoardKind.APRIL_GRID: "columns and rows of tags",
+}
+"""Boards that the wizard offers; a single tag shows too little of the lens."""
 
 
 def next_step(draft: Draft) -> Step:
@@ -220,258 +65,54 @@ def summary(draft: Draft, step: Step) -> str:
     """What a step holds, in a few words; empty: nothing yet."""
     match step:
         case Step.ROBOT if draft.robot is not None:
-            return f"{draft.robot.model} at {draft.host}"
+            return f"{draft.robot.model}, {draft.host}"
         case Step.CAMERA if draft.camera is not None:
             return draft.camera.name
         case Step.MOUNTING if draft.mount is not None:
-            return "on the flange" if draft.mount == "eye-in-hand" else "beside the arm"
+            return "on flange" if draft.mount == "eye-in-hand" else "beside the arm"
         case Step.BOARD if draft.board is not None:
-            return describe_board(draft.board)
+            return board_words(draft.board)
         case Step.VIEWS if draft.views:
             return f"{len(draft.views)} of {max(FEWEST_GUIDED, len(draft.views))}"
         case Step.LIMITS if draft.limits_seen:
-            return "table and workspace"
+            return "set"
         case Step.SAVE if draft.written:
             return Path(draft.written).name
     return ""
 
 
 def read_board(text: str) -> BoardSpec:
-    """A chessboard as a person types it: '8x5 30' is 8 × 5 inner corners, squares of 30 mm. ConfigError."""
-    words = text.lower().replace("×", "x").replace("mm", "").replace(",", " ").split()
+    """A board as a person types it: '8x5 30' is a chessboard of 8 × 5 inner corners, squares of 30 mm.
+
+    Others by their kind first, marker (charuco) or gap (april-grid) and dictionary last where they are not
+    the usual ones: 'charuco 8x6 30 22 DICT_5X5_100'. Raises ConfigError, BoardError.
+    """
+    words = re.sub(r"(?<=\d) *mm|,", " ", text.replace("×", "x")).split()
     try:
-        columns, rows = (int(part) for part in words[0].split("x"))
-        [size_mm] = (float(word) for word in words[1:])
-        if columns < 3 or rows < 3 or not 2 <= size_mm <= 500:
+        kind = BoardKind.CHESSBOARD if words[0][0].isdigit() else BoardKind(words.pop(0).lower())
+        columns, rows = (int(part) for part in words[0].lower().split("x"))
+        dictionary = words.pop().upper() if words[-1].upper().startswith("DICT_") else None
+        size_m, *marker = (float(word) / 1000 for word in words[1:])
+        usual_m, usual = usual_markers(kind, size_m)
+        if len(marker) > (usual_m is not None) or min(columns, rows) < 3 or not 0.002 <= size_m <= 0.5:
             raise ValueError
     except (ValueError, IndexError):
         raise ConfigError(
             f"{text!r} is no board.",
             code="no-board-typed",
-            remedy="Type inner corners and the square's size in mm, e.g. 7x6 25.",
+            remedy="Type columns, rows and size in mm, e.g. 7x6 25, or charuco 8x6 30 22 DICT_5X5_100.",
         ) from None
-    return BoardSpec(kind=BoardKind.CHESSBOARD, columns=columns, rows=rows, square_m=size_mm / 1000)
+    board = BoardSpec(kind, columns, rows, size_m, marker[0] if marker else usual_m, dictionary or usual)
+    check_board(board)
+    return board
 
 
-def image_trouble(image: Image, found: Detection) -> tuple[str, str]:
-    """What is wrong with an image, for a program and for a person; both empty: the board is seen well."""
-    advice = assess(image.pixels, found.pixels if found.found else None, image.exposure_us, image.gain_db)
-    if found.cause and found.cause != "not-found":
-        return found.cause, found.reason
-    told = dict(zip(advice.causes, advice.warnings, strict=True))
-    if not found.found and advice.white > _LIT:
-        told.pop("under-exposed", None)  # the board's paper is the brightest thing, and it is not there
-        told.pop("low-contrast", None)
-    cause = next(iter(told), "")
-    return (cause, told[cause]) if cause else (found.cause, found.reason)
-
-
-def guided_view(state: RobotState, tcp_offset: Vector6, found: Detection) -> GuidedView:
-    """The view of an arm at rest."""
-    tcp = pose_from_rotvec(tcp_offset[:3], tcp_offset[3:])
-    flange = pose_from_rotvec(state.tcp_pose[:3], state.tcp_pose[3:]) @ inverse(tcp)
-    return GuidedView(
-        state.joints_rad,
-        matrix4(flange),
-        tuple(int(k) for k in found.indices),
-        tuple((float(x), float(y)) for x, y in found.pixels),
-    )
-
-
-@dataclass(frozen=True)
-class Missing:
-    """What the next view should show."""
-
-    text: str
-    """For a person; empty: nothing is missing."""
-    turn_rad: float = 0.0
-    """Turn of the flange from the nearest view so far, to `TURN_RAD`."""
-    new: bool = False
-    """The arm stands where a view helps."""
-
-
-_WANTED = (
-    "Show the whole board in the middle of the picture",
-    "Tilt by 20° or more to one side, the whole board in the picture",
-    "Tilt by 20° or more to another side than before, a hand's width nearer",
-    "Tilt by 20° or more the opposite way, a hand's width further away",
-    "Tilt once more, to a side not seen yet",
-    "Tilt once more, to a side not seen yet",
-)
-
-
-def what_is_missing(draft: Draft, joints_flange: Array | None) -> Missing:
-    """Sentence and figures for where the arm stands now, base_from_flange (4, 4); None: not known."""
-    if enough(draft) or len(draft.views) >= MOST_GUIDED:
-        return Missing("")
-    text = _WANTED[len(draft.views)]
-    if joints_flange is None:
-        return Missing(text)
-    turns = [
-        rotation_log(np.array(v.base_from_flange)[:3, :3].T @ joints_flange[:3, :3]) for v in draft.views
-    ]
-    if not turns:
-        return Missing(text, 0.0, True)
-    nearest = min(float(np.linalg.norm(turn)) for turn in turns)
-    other = len(turns) < 2 or _across([*_turns(draft.views), turns[0]]) >= _OTHER_AXIS
-    if nearest >= TURN_RAD and not other:
-        text = "This turn is about the same axis as before: tilt to another side"
-    return Missing(text, nearest, nearest >= TURN_RAD and other)
-
-
-def _turns(views: Sequence[GuidedView]) -> list[Array]:
-    """Rotation vectors of the flange from the first view to each other one."""
-    first = np.array(views[0].base_from_flange)[:3, :3]
-    return [rotation_log(first.T @ np.array(view.base_from_flange)[:3, :3]) for view in views[1:]]
-
-
-def _across(turns: list[Array]) -> float:
-    """How far the turns spread about a second axis, 0…1 of the first."""
-    if len(turns) < 2:
-        return 0.0
-    spread = np.linalg.svd(np.array(turns), compute_uv=False)
-    return float(spread[1] / max(spread[0], 1e-9))
-
-
-@dataclass(frozen=True, eq=False)
-class FoundCell:
-    """Camera and board as the views show them."""
-
-    camera: CameraModel
-    X: Array
-    """flange_from_camera (eye-in-hand) or base_from_camera, (4, 4)"""
-    Y: Array
-    """base_from_board (eye-in-hand) or flange_from_board, (4, 4)"""
-    sigma_m: float
-    sigma_rad: float
-    spread_m: float
-    """Root mean square of how far the board stands apart between the views."""
-    scale: float
-    """Size of the squares by the arm's travel over the stated size."""
-    other_fits: bool
-    """The other mounting explains the views far better."""
-
-    @property
-    def good(self) -> bool:
-        return self.sigma_m <= GOOD_M and self.sigma_rad <= GOOD_RAD and not self.warning
-
-    @property
-    def cause(self) -> Literal["", "other-mounting", "square-size", "moved"]:
-        """What cannot be right, for a program; empty: it can."""
-        if self.other_fits:
-            return "other-mounting"
-        if abs(self.scale - 1) > _WRONG_SCALE:
-            return "square-size"
-        return "moved" if self.spread_m > _MOVED_M else ""
-
-    @property
-    def warning(self) -> str:
-        """Why this cannot be right, and what to do; empty: it can."""
-        if self.cause == "other-mounting":
-            return "These views fit the other drawing (step 3): the camera is mounted the other way."
-        if self.cause == "square-size":
-            return (
-                f"By the arm's travel the squares are {self.scale:.2f} times as large as stated (step 4). "
-                "Measure one square."
-            )
-        if self.cause == "moved":
-            return (
-                f"The board or the camera moved: the views see it {1000 * self.spread_m:.0f} mm apart. "
-                "Fix both, and take the views again (F3)."
-            )
-        return ""
-
-
-def find_cell(draft: Draft) -> FoundCell | None:
-    """Mounting, board and a rough lens from the views; None while they say too little. Takes a second."""
-    if draft.mount is None or draft.board is None or len(draft.views) < 3:
-        return None
-    try:
-        return _find(draft, draft.mount, draft.board)
-    except (CalibrationError, cv2.error, np.linalg.LinAlgError):
-        return None
-
-
-def _find(draft: Draft, mount: Mount, board: BoardSpec) -> FoundCell:
-    points = board_points(board)
-    seen = [
-        CapturedView(k, np.array(v.base_from_flange), np.array(v.indices), np.array(v.pixels))
-        for k, v in enumerate(draft.views)
-    ]
-    blank = ViewSet(
-        mount,
-        tuple(
-            BoardView(v.index, f"view {v.index + 1}", v.base_from_flange, points[v.indices], v.pixels)
-            for v in seen
-        ),
-        CameraModel(draft.width, draft.height),
-    )
-    camera = calibrate_intrinsics(blank).camera
-    views, X, Y = solve_quickly(mount, camera, True, board, seen)
-    spread_m = _spread_m(mount, views, X)
-    other: Mount = "eye-to-hand" if mount == "eye-in-hand" else "eye-in-hand"
-    other_views, other_X, _ = solve_quickly(other, camera, True, board, seen)
-    other_m = _spread_m(other, other_views, other_X)
-    sigma_m, sigma_rad = quick_sigma(views, board, X, Y, True)
-    # Repeatability of the arm and a lens from few views: what the views disagree by is not less than known.
-    sigma_m = float(np.hypot(sigma_m, spread_m))
-    return FoundCell(
-        camera=_rounded(camera),
-        X=X,
-        Y=Y,
-        sigma_m=max(sigma_m, _LEAST_SIGMA_M),
-        sigma_rad=max(sigma_rad, _LEAST_SIGMA_RAD),
-        spread_m=spread_m,
-        scale=_scale(views, X),
-        other_fits=_OTHER_MOUNT * other_m < spread_m,
-    )
-
-
-def _rounded(camera: CameraModel) -> CameraModel:
-    assert camera.matrix is not None
-    rows = tuple(tuple(round(value, 2) for value in row) for row in camera.matrix)
-    return msgspec.structs.replace(camera, matrix=rows, distortion=())
-
-
-def _spread_m(mount: Mount, views: ViewSet, X: Array) -> float:
-    """Root mean square distance of the board's places, one a view, from their middle."""
-    flange = views.base_from_flange
-    chain = flange if mount == "eye-in-hand" else np.array([inverse(E) for E in flange])
-    places = (chain @ X @ views.camera_from_board)[:, :3, 3]
-    return float(np.sqrt(((places - places.mean(axis=0)) ** 2).sum(axis=1).mean()))
-
-
-def _scale(views: ViewSet, X: Array) -> float:
-    """Factor on the board's size for which camera and arm travel alike; 1 where the views cannot tell.
-
-    AX = XB by translations (Shiu & Ahmad 1989) with t_B times an unknown factor: linear in it and in t_X.
-    Views that only turn about one point say nothing of it, so it begins as 1 ± `_SCALE_SIGMA`.
-    """
-    flange = views.base_from_flange
-    gripper = flange if views.mount == "eye-in-hand" else np.array([inverse(E) for E in flange])
-    left, right = (
-        [np.array([[0.0, 0.0, 0.0, _TRAVEL_M / _SCALE_SIGMA]])],
-        [np.array([_TRAVEL_M / _SCALE_SIGMA])],
-    )
-    for i, j in combinations(range(len(gripper)), 2):
-        A = inverse(gripper[j]) @ gripper[i]
-        B = views.camera_from_board[j] @ inverse(views.camera_from_board[i])
-        left.append(np.hstack([A[:3, :3] - np.eye(3), -(X[:3, :3] @ B[:3, 3])[:, None]]))
-        right.append(-A[:3, 3])
-    rows = np.vstack(left)
-    solution = np.linalg.lstsq(rows, np.concatenate(right), rcond=None)[0]
-    sigma = _TRAVEL_M * float(np.sqrt(np.linalg.inv(rows.T @ rows)[3, 3]))
-    left_m = rows[1:] @ solution - np.concatenate(right[1:])
-    explained = float(np.sqrt((left_m**2).mean())) <= 2 * _TRAVEL_M
-    return float(solution[3]) if explained and abs(solution[3] - 1) > 3 * sigma else 1.0
-
-
-def enough(draft: Draft) -> bool:
-    """Whether the views so far are enough to plan from."""
-    if len(draft.views) < FEWEST_GUIDED or _across(_turns(draft.views)) < _OTHER_AXIS:
-        return False
-    found = find_cell(draft)
-    return found is not None and (found.good or (len(draft.views) >= MOST_GUIDED and not found.warning))
+def board_words(board: BoardSpec) -> str:
+    """As `read_board` reads it."""
+    kind = () if board.kind is BoardKind.CHESSBOARD else (board.kind.value,)
+    sizes = (f"{1000 * size_m:g}" for size_m in (board.square_m, board.marker_m) if size_m)
+    named = (board.dictionary,) if board.dictionary else ()
+    return " ".join((*kind, f"{board.columns}x{board.rows}", *sizes, *named))
 
 
 def limits_of(draft: Draft, found: FoundCell) -> LimitsConfig:
@@ -575,7 +216,7 @@ def config_text(config: StationConfig) -> str:
         "  model:   # rough, from the guided views: the session's own images give the lens",
         f"    {{width: {model.width}, height: {model.height}, matrix: {flow(model.matrix)}}}",
         "  model_is_rough: true",
-        f"board: {flow(msgspec.to_builtins(config.board))}   # inner corners",
+        f"board: {flow(msgspec.to_builtins(config.board))}   # {_COUNTED[config.board.kind]}",
     ]
     for name in ("camera_guess", "board_guess"):
         guess: PoseGuess = getattr(config, name)

@@ -18,8 +18,8 @@ from textual.widgets import Static
 
 from station.cell.status import StationStatus
 from station.protocol.states import LATCHED
-from station.tui.task import DIGITS, STEPS, UNTOLD, Action, Known, Step, next_action, steps
-from station.tui.words import MARKS, duration, size, state_of
+from station.tui.task import STEPS, UNTOLD, Action, Known, Step, next_action, steps
+from station.tui.words import MARKS, UNKNOWN, duration, shortened, size, state_of
 
 R = TypeVar("R")
 STOP_WIDE = "■ STOP   F12", "■ STOPPED   F12"
@@ -176,11 +176,12 @@ def rail_line(made: tuple[Step, ...], mode: str, width: int) -> Content:
         return Content(" ").join(parts)
     cell = width // len(made)
     names, texts = [], []
-    for step in made:
+    for number, step in enumerate(made, start=1):
         back = _BACK[step.mark] if step.mark in ("now", "stopped") else ""
-        head = f" {MARKS[step.mark][0]} {DIGITS[step.mode]} {step.mode.title()}".ljust(cell - 1)
+        head = f" {MARKS[step.mark][0]} {number} {step.mode.title()}".ljust(cell - 1)
         names += [_step_name(step, mode, head), Content.styled("│", "$line")]
-        below = f"   {step.text if step.text != UNTOLD else '–'}"[: cell - 1].ljust(cell - 1)
+        text = UNKNOWN if step.text == UNTOLD else step.text
+        below = f" {shortened(text, cell - 2, parts=True)}".ljust(cell - 1)
         texts += [Content.styled(below, back or ("$dim" if step.mark != "todo" else "$faint"))]
         texts.append(Content.styled("│", "$line"))
     return Content("").join([*names[:-1], Content("\n"), *texts[:-1]])
@@ -202,10 +203,7 @@ def next_line(action: Action, width: int) -> Content:
         (" NEXT " if width >= RAIL_WIDE else " ", "$dim"), (chip, f"bold $onaccent on {back}"), ("  ", "")
     )
     room = max(8, width - head.cell_length - 1)
-    if not action.look or len(action.why) <= room:
-        why = action.why if len(action.why) <= room else action.why[: room - 1] + "…"
-        return head + Content.styled(why, "$foreground")
-    return head + Content.styled(action.why, "$foreground")
+    return head + Content.styled(action.why if action.look else shortened(action.why, room), "$foreground")
 
 
 class Keys(Static):

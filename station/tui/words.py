@@ -41,6 +41,16 @@ UNKNOWN = "–"
 BAR, TRACK, LIMIT = "━", "─", "┃"
 
 
+def shortened(text: str, cells: int, parts: bool = False) -> str:
+    """As many whole words as fit, then `…`; `parts`: as many parts between commas, without a sign."""
+    while parts and len(text) > cells and ", " in text:
+        text = text.rpartition(", ")[0]
+    if len(text) <= cells:
+        return text
+    whole = text[: cells + parts].rpartition(" ")[0].rstrip(" ,;:")
+    return whole if whole and parts else f"{whole or text[: cells - 1]}…"
+
+
 def mark(kind: Mark, text: str = "") -> Content:
     sign, colour = MARKS[kind]
     return Content.styled(f"{sign} {text}" if text else sign, colour)

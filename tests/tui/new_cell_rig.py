@@ -5,7 +5,7 @@ from __future__ import annotations
 from recordings.schema.messages import Image
 from station.cell.config import CameraConfig
 from station.cli.new import RealHardware
-from station.operate.new_cell import CameraReader, FoundCamera
+from station.operate.draft import CameraReader, FoundCamera
 from station.simulation.camera import RenderedCamera
 from station.simulation.cell import CellTruth
 
@@ -13,7 +13,7 @@ CAMERA = FoundCamera("aravis", "SIM00001", "MER-131-75GM SIM00001")
 
 
 class RenderedReader:
-    """`new_cell.CameraReader` of what the simulated arm shows."""
+    """`draft.CameraReader` of what the simulated arm shows."""
 
     def __init__(self, truth: CellTruth, host: str) -> None:
         self._truth, self._host = truth, host

@@ -102,14 +102,21 @@ class ScreenProcess:
         self._sixels, self.pictures = sixels, 0
         """`pictures`: how many came."""
         self.process = subprocess.Popen(
-            [sys.executable, "-m", "station.cli", *(command or ("tui", "--socket", str(socket)))],
+            # The terminal controls it, as a person's does: the daemon asks for that before a real arm moves.
+            [
+                "setsid",
+                "--ctty",
+                sys.executable,
+                "-m",
+                "station.cli",
+                *(command or ("tui", "--socket", str(socket))),
+            ],
             stdin=slave,
             stdout=slave,
             stderr=slave,
             env=os.environ
             | {"TERM": "xterm-256color", "COLUMNS": str(columns), "LINES": str(rows)}
             | ({"STATION_PICTURES": "sharp"} if sixels else {}),
-            start_new_session=True,
         )
         os.close(slave)
         self.glass = Glass(columns, rows)

@@ -20,7 +20,7 @@ from calibrate.geometry import difference
 from recordings.schema.messages import BoardKind, BoardSpec
 from station.cell.config_file import load_config
 from station.cell.scene import guess_matrix
-from station.operate.new_cell import STEPS, Step, load_draft
+from station.operate.draft import STEPS, Step, load_draft
 from station.simulation.cell import CellTruth, write_truth
 from station.simulation.launch import SimulatedController, start_controller
 from station.simulation.netns import isolated_command
@@ -46,7 +46,7 @@ async def until(pilot: Pilot[object], condition: Callable[[], object], what: str
         if time.monotonic() > give_up_s:
             app = pilot.app
             assert isinstance(app, NewCell)
-            said = [str(app.query_one(part, Static).render()) for part in ("#live", "#problem", "#bar")]
+            said = [str(app.query_one(part, Static).render()) for part in ("#live-lines", "#problem", "#bar")]
             pytest.fail("\n".join([what, *said]))
         await pilot.pause(0.05)
 
@@ -92,31 +92,33 @@ async def test_from_an_address_to_a_configuration(tmp_path: Path) -> None:
             await person.type(controller.host)
             await person.press("enter")
             await person.until_step(Step.CAMERA)
-            await until(pilot, lambda: app._camera is not None, "no camera was opened")
+            await until(pilot, lambda: app.setup.camera is not None, "no camera was opened")
             await person.press("enter")
             await person.until_step(Step.MOUNTING)
             await person.press("enter")
             await person.until_step(Step.BOARD)
             await person.type("8x5 23")
             await person.press("enter")
-            await until(pilot, lambda: app._seen is not None and app._seen[1].found, "the board is not seen")
+            await until(
+                pilot, lambda: app.setup.seen is not None and app.setup.seen[1].found, "the board is not seen"
+            )
             await person.press("enter")
             await person.until_step(Step.VIEWS)
             for joints in guided_joints(truth)[1:]:  # it stands at the first one
                 if app.step is not Step.VIEWS:
                     break
-                before = len(app.draft.views)
+                before = len(app.setup.draft.views)
                 await person.guide(joints)
                 await until(
                     pilot,
-                    lambda before=before: len(app.draft.views) > before or app.step is not Step.VIEWS,
+                    lambda before=before: len(app.setup.draft.views) > before or app.step is not Step.VIEWS,
                     "no view was taken",
                 )
             await person.until_step(Step.LIMITS)
             await person.press("enter")
             await person.until_step(Step.SAVE)
             await person.press("enter")
-            await until(pilot, lambda: app.draft.written, "nothing was written")
+            await until(pilot, lambda: app.setup.draft.written, "nothing was written")
             await person.press("enter")
         assert app.return_value == "serve"
         with controller.admin() as admin:

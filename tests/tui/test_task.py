@@ -13,6 +13,7 @@ from station.protocol.verbs import Check
 from station.tui.dialogs import ChooseFormat, Confirm, ConfirmMotion, Help, Reason
 from station.tui.frame import StopBlock, bar_line, keys_line, next_line, rail_line
 from station.tui.task import DIGITS, Action, Known, next_action, steps
+from station.tui.words import shortened
 from tests.tui.conftest import SUMMARY, FakeLink, app_on, idle, opened, text_of, until
 
 SIZES = [(80, 24), (120, 36), (160, 48)]
@@ -183,3 +184,13 @@ async def test_without_colours_stop_and_chips_are_reversed(
         reversed_ = "".join(s.text for strip in strips for s in strip if s.style and s.style.reverse)
         assert "STOP F12" in reversed_ and "SIMULATED" in reversed_
         assert all(s.style is None or s.style.color is None for strip in strips for s in strip)
+
+
+@given(st.text("ab ,", max_size=40), st.integers(4, 30), st.booleans())
+def test_shortened_text_fits_and_ends_with_a_word(text: str, cells: int, parts: bool) -> None:
+    short = shortened(text, cells, parts)
+    assert len(short) <= cells
+    kept = short.removesuffix("…")
+    assert text.startswith(kept)
+    if short != text and " " in text[:cells].strip():
+        assert text[len(kept)] in " ,"

@@ -10,7 +10,7 @@ from calibrate.kinematics import MODELS, forward, inverse_nearest
 from calibrate.projection import project
 from recordings.schema.messages import RobotIdentity
 from station.cell.config import matrix4, vector6
-from station.operate.new_cell import Draft, FoundCamera, GuidedView
+from station.operate.draft import Draft, FoundCamera, GuidedView
 from station.simulation.cell import CellTruth
 
 NEARER_M = (0.0, 0.02, -0.05, 0.06, 0.0)

@@ -10,12 +10,14 @@ import pytest
 
 from benchmarks.operator_mistakes import MISTAKES, Mistake
 from calibrate.geometry import difference
-from recordings.schema.messages import Mount
+from recordings.schema.messages import BoardKind, Mount
 from station.cell.config import matrix4
 from station.cell.config_file import load_config
 from station.cell.scene import scene_of
+from station.operate import draft as drafts
+from station.operate import guided_views
 from station.operate import new_cell as flow
-from station.operate.new_cell import Draft, Step
+from station.operate.draft import Draft, Step
 from station.plan.planner import PlanOptions, candidate_pool
 from station.simulation.scenes import make_cell
 from tests.codes import raises
@@ -32,8 +34,8 @@ def done(request: pytest.FixtureRequest) -> tuple[Draft, object]:
 
 def test_four_views_give_mounting_board_and_lens(done: tuple[Draft, object]) -> None:
     draft, truth = done
-    found = flow.find_cell(draft)
-    assert found is not None and found.good and flow.enough(draft)
+    found = guided_views.find_cell(draft)
+    assert found is not None and found.good and guided_views.enough(draft)
     for guess, true in ((found.X, truth.camera_mount), (found.Y, truth.board_place)):
         off = difference(guess, np.array(true))
         assert np.linalg.norm(off[:3]) < 3 * found.sigma_m
@@ -45,32 +47,32 @@ def test_four_views_give_mounting_board_and_lens(done: tuple[Draft, object]) -> 
 def test_a_wrong_answer_is_told_by_its_step(done: tuple[Draft, object]) -> None:
     draft, _ = done
     other: Mount = "eye-to-hand" if draft.mount == "eye-in-hand" else "eye-in-hand"
-    mounted = flow.find_cell(msgspec.structs.replace(draft, mount=other))
+    mounted = guided_views.find_cell(msgspec.structs.replace(draft, mount=other))
     assert mounted is not None and mounted.other_fits and not mounted.good
     board = msgspec.structs.replace(draft.board, square_m=1.05 * draft.board.square_m)
-    sized = flow.find_cell(msgspec.structs.replace(draft, board=board))
+    sized = guided_views.find_cell(msgspec.structs.replace(draft, board=board))
     assert sized is not None and abs(sized.scale * 1.05 - 1) < 0.01 and sized.warning and not sized.other_fits
     moved = np.array(draft.views[-1].base_from_flange)
     moved[:3, 3] += [0.03, 0.0, 0.02]
     last = msgspec.structs.replace(draft.views[-1], base_from_flange=matrix4(moved))
-    shifted = flow.find_cell(msgspec.structs.replace(draft, views=(*draft.views[:-1], last)))
+    shifted = guided_views.find_cell(msgspec.structs.replace(draft, views=(*draft.views[:-1], last)))
     assert shifted is not None and shifted.scale == 1.0 and shifted.warning and not shifted.other_fits
 
 
 def test_a_view_from_where_one_was_taken_is_none(done: tuple[Draft, object]) -> None:
     draft, _ = done
     first = np.array(draft.views[0].base_from_flange)
-    assert flow.what_is_missing(msgspec.structs.replace(draft, views=()), first).new
+    assert guided_views.what_is_missing(msgspec.structs.replace(draft, views=()), first).new
     one = msgspec.structs.replace(draft, views=draft.views[:1])
-    assert not flow.what_is_missing(one, first).new
-    assert flow.what_is_missing(one, np.array(draft.views[1].base_from_flange)).new
-    assert not flow.what_is_missing(draft, first).text
+    assert not guided_views.what_is_missing(one, first).new
+    assert guided_views.what_is_missing(one, np.array(draft.views[1].base_from_flange)).new
+    assert not guided_views.what_is_missing(draft, first).text
 
 
 def test_turns_about_one_axis_are_not_enough(done: tuple[Draft, object]) -> None:
     draft, _ = done
     again = tuple(draft.views[k] for k in (0, 1, 0, 1))
-    assert not flow.enough(msgspec.structs.replace(draft, views=again))
+    assert not guided_views.enough(msgspec.structs.replace(draft, views=again))
 
 
 def test_what_was_written_is_read_back_and_can_be_planned(done: tuple[Draft, object], tmp_path: Path) -> None:
@@ -88,21 +90,51 @@ def test_what_was_written_is_read_back_and_can_be_planned(done: tuple[Draft, obj
 
 def test_it_is_taken_up_where_it_was_left(done: tuple[Draft, object], tmp_path: Path) -> None:
     draft, _ = done
-    assert flow.next_step(flow.load_draft(tmp_path)) is Step.ROBOT
-    flow.save_draft(tmp_path, draft)
-    again = flow.load_draft(tmp_path)
+    assert flow.next_step(drafts.load_draft(tmp_path)) is Step.ROBOT
+    drafts.save_draft(tmp_path, draft)
+    again = drafts.load_draft(tmp_path)
     assert again == draft and flow.next_step(again) is Step.LIMITS
     assert flow.next_step(draft.without_views(board=draft.board)) is Step.VIEWS
-    (tmp_path / flow.DRAFT_FILE).write_text("{")
-    assert flow.load_draft(tmp_path) == Draft()
+    (tmp_path / drafts.DRAFT_FILE).write_text("{")
+    assert drafts.load_draft(tmp_path) == Draft()
 
 
 def test_a_board_is_typed_as_people_write_it() -> None:
     board = flow.read_board("8×5 30mm")
     assert (board.columns, board.rows, board.square_m) == (8, 5, 0.03)
-    for wrong in ("", "8x5", "8 5 30", "8x5 0.03", "2x5 30", "8x5 30 4"):
+    charuco = flow.read_board("ChArUco 8x6 30 20 dict_5x5_100")
+    assert (charuco.kind, charuco.marker_m, charuco.dictionary) == (BoardKind.CHARUCO, 0.02, "DICT_5X5_100")
+    for wrong in (
+        "",
+        "8x5",
+        "8 5 30",
+        "8x5 0.03",
+        "2x5 30",
+        "8x5 30 4",
+        "april-tag 1x1 30",
+        "squares 8x5 30",
+    ):
         with raises("no-board-typed"):
             flow.read_board(wrong)
+    with raises("board-marker"):
+        flow.read_board("charuco 8x6 30 40")
+
+
+BOARDS = ("8x5 23", "charuco 8x6 23", "circles 7x6 23", "asymmetric-circles 4x11 15", "april-grid 5x4 30 9")
+
+
+@pytest.mark.parametrize("words", BOARDS)
+def test_a_cell_is_found_and_planned_with_every_board(words: str, tmp_path: Path) -> None:
+    board = flow.read_board(words)
+    assert flow.read_board(flow.board_words(board)) == board
+    truth = msgspec.structs.replace(make_cell("paper-binned", seed=11, noise="mid"), board=board)
+    draft = draft_of(truth)
+    found = guided_views.find_cell(draft)
+    assert found is not None and guided_views.enough(draft)
+    off = difference(found.X, np.array(truth.camera_mount))
+    assert np.linalg.norm(off[:3]) < 3 * found.sigma_m and np.linalg.norm(off[3:]) < 3 * found.sigma_rad
+    flow.write_config(draft, tmp_path / "station.yaml")
+    assert load_config(tmp_path / "station.yaml")[0].board == board
 
 
 @pytest.mark.parametrize(

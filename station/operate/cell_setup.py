@@ -1,0 +1,220 @@
+"""A cell that is being set up: its draft, the devices that answer, and what they show now."""
+
+from __future__ import annotations
+
+import math
+import time
+from pathlib import Path
+
+import msgspec
+import numpy as np
+
+from calibrate.boards.detect import Detection, detect
+from calibrate.boards.printing import board_sheet
+from calibrate.geometry import Array
+from recordings.files import ASKED_FOR, write_atomically
+from recordings.schema.messages import BoardSpec, Image, Mount, RobotState
+from station.cell.errors import RobotError, StationError
+from station.operate import draft as drafts
+from station.operate.draft import ArmReader, CameraReader, Draft, FoundCamera, Hardware, Step
+from station.operate.guided_views import (
+    STILL_RAD_S,
+    STILL_S,
+    FoundCell,
+    find_cell,
+    flange_of,
+    guided_view,
+    image_trouble,
+    what_is_missing,
+)
+
+GREY_WANTED = 110.0
+"""Mean grey of a well exposed image of paper and table, of 255."""
+EXPOSURE_US = (50.0, 200_000.0)
+_LOOKED_FOR = (Step.BOARD, Step.VIEWS, Step.LIMITS)
+
+
+class CellSetup:
+    """Only reads: no method here can move the arm but `stop`, which ends its program."""
+
+    def __init__(self, hardware: Hardware, root: Path, output: Path) -> None:
+        """`root` keeps the draft; `output` is the configuration to write."""
+        self._hardware, self.root, self.output = hardware, root, output
+        self.draft: Draft = drafts.load_draft(root)
+        self.arm: ArmReader | None = None
+        self.camera: CameraReader | None = None
+        self.cameras: tuple[FoundCamera, ...] = ()
+        self.mount: Mount = self.draft.mount or "eye-in-hand"
+        """The drawing that is marked."""
+        self.state: RobotState | None = None
+        """Newest of the arm; None: it does not answer."""
+        self._moved_s = time.monotonic()
+        self.seen: tuple[float, Detection] | None = None
+        """When the newest image was begun, and the board in it."""
+        self.trouble = ""
+        """Fault of the newest image; empty: none."""
+
+    @property
+    def found(self) -> FoundCell | None:
+        """Camera and board by the views so far."""
+        return find_cell(self.draft)
+
+    @property
+    def rests(self) -> bool:
+        return time.monotonic() > self._moved_s + STILL_S
+
+    @property
+    def flange(self) -> Array | None:
+        """base_from_flange now, (4, 4); None: not known."""
+        if self.state is None or self.arm is None:
+            return None
+        return flange_of(self.state, self.arm.identity.tcp_offset)
+
+    def keep(self, draft: Draft) -> None:
+        """Raises StationError where the disk does not take it; it holds until the end all the same."""
+        self.draft = draft
+        try:
+            drafts.save_draft(self.root, draft)
+        except OSError as problem:
+            raise StationError(
+                f"What was found cannot be kept in {self.root}: {problem.strerror}.",
+                code="draft-not-kept",
+                remedy="Free some space.",
+            ) from None
+
+    def change(self, **values: object) -> None:
+        """Keep values that the views taken so far do not depend on."""
+        self.keep(msgspec.structs.replace(self.draft, **values))
+
+    async def connect(self, host: str) -> None:
+        """Read the arm at this address from now on. Raises RobotError."""
+        arm = await self._hardware.arm(host)
+        if self.arm is not None:
+            await self.arm.close()
+        self.arm = arm
+        same = self.draft.robot is not None and self.draft.robot.serial == arm.identity.serial
+        changed = {"host": host, "robot": arm.identity}
+        self.keep(
+            msgspec.structs.replace(self.draft, **changed) if same else self.draft.without_views(**changed)
+        )
+
+    async def look_for_cameras(self) -> bool:
+        """Whether others answer than before; one that is alone is opened: its picture says what it is."""
+        found = await self._hardware.cameras()
+        changed, self.cameras = found != self.cameras, found
+        if len(found) == 1:
+            await self.open(found[0])
+        return changed
+
+    async def open(self, chosen: FoundCamera) -> None:
+        """Show what this camera sees from now on, exposed well. Raises CameraError."""
+        if self.draft.camera == chosen and self.camera is not None:
+            return
+        camera = await self._hardware.camera(chosen)
+        await camera.expose(self.draft.exposure_us)
+        image = await _exposed(camera)
+        if self.camera is not None:
+            await self.camera.close()
+        self.camera = camera
+        height, width = image.pixels.shape[:2]
+        values = {"camera": chosen, "width": width, "height": height, "exposure_us": camera.exposure_us}
+        same = self.draft.camera == chosen
+        self.keep(
+            msgspec.structs.replace(self.draft, **values) if same else self.draft.without_views(**values)
+        )
+
+    async def expose(self, factor: float) -> None:
+        """Raises CameraError."""
+        if self.camera is not None:
+            await self.camera.expose(float(np.clip(factor * self.camera.exposure_us, *EXPOSURE_US)))
+            self.change(exposure_us=self.camera.exposure_us)
+
+    def read_arm(self) -> None:
+        """Take the newest state; none while the arm does not answer."""
+        try:
+            self.state = None if self.arm is None else self.arm.latest()
+        except RobotError:
+            self.state = None
+        if self.state is None or max(map(abs, self.state.joint_speeds_rad_s)) > STILL_RAD_S:
+            self._moved_s = time.monotonic()
+
+    def look(self, begun_s: float, image: Image, step: Step) -> Detection | None:
+        """Look for the board; None in steps that do not ask for it. A tenth of a second, in any thread."""
+        board = self.draft.board
+        if board is None or step not in _LOOKED_FOR:
+            return None
+        found = detect(image.pixels, board, step is Step.BOARD and self.seen is None)
+        self.seen, self.trouble = (begun_s, found), image_trouble(image, found)[1]
+        return found
+
+    def new_view(self) -> bool:
+        """The newest image shows the board from where a view helps, and the arm rested before it."""
+        return not self._not_takable() and what_is_missing(self.draft, self.flange).new
+
+    def _not_takable(self) -> str:
+        if self.seen is None or not self.seen[1].found:
+            return "The board is not seen."
+        if self.state is None or self.seen[0] < self._moved_s + STILL_S:
+            return "The arm does not rest yet."
+        return ""
+
+    def take_view(self) -> None:
+        """Take the view that the newest image shows. StationError: there is none."""
+        if problem := self._not_takable():
+            raise StationError(problem, code="no-view")
+        assert self.state is not None and self.arm is not None and self.seen is not None
+        view = guided_view(self.state, self.arm.identity.tcp_offset, self.seen[1])
+        self.change(views=(*self.draft.views, view), limits_seen=False)
+
+    def drop_view(self) -> None:
+        self.change(views=self.draft.views[:-1], limits_seen=False, written="")
+
+    def set_mount(self) -> None:
+        """Keep the drawing that is marked."""
+        if self.draft.mount != self.mount:
+            self.change(mount=self.mount, limits_seen=False, written="")
+
+    def set_board(self, board: BoardSpec) -> None:
+        self.seen = None
+        self.keep(self.draft.without_views(board=board))
+
+    def print_board(self) -> Path:
+        """Write the board as a PDF beside the draft. Raises StationError, BoardError, OSError."""
+        board = self.draft.board
+        if board is None:
+            raise StationError("Type the board first.", code="no-board-typed")
+        name = f"board-{board.kind.value}-{board.columns}x{board.rows}-{1000 * board.square_m:g}mm.pdf"
+        write_atomically(self.root / name, board_sheet(board).encode("pdf"), ASKED_FOR)
+        return self.root / name
+
+    async def stop(self) -> None:
+        if self.arm is not None:
+            await self.arm.stop()
+
+    async def close(self) -> None:
+        for device in (self.camera, self.arm):
+            if device is not None:
+                await device.close()
+
+    def arm_words(self) -> str:
+        """The joints, or why they are not known."""
+        if self.state is not None:
+            return f"joints {', '.join(f'{math.degrees(q):.1f}' for q in self.state.joints_rad)}°"
+        return "" if self.arm is None else self.arm.trouble()
+
+
+async def _exposed(camera: CameraReader) -> Image:
+    """Image of the camera, its exposure brought to a middle grey in a few tries. Raises CameraError."""
+    image = None
+    for _ in range(4):
+        image = await camera.glimpse()
+        if image is None:
+            continue
+        mean = float(np.mean(image.pixels)) / (1 if image.pixels.dtype == np.uint8 else 257)
+        wanted_us = float(np.clip(camera.exposure_us * GREY_WANTED / max(mean, 2.0), *EXPOSURE_US))
+        if 0.6 < mean / GREY_WANTED < 1.5 or wanted_us == camera.exposure_us:
+            return image
+        await camera.expose(wanted_us)
+    if image is None:
+        raise StationError("The camera shows no image.", code="no-image", remedy="Check its cable and power.")
+    return image

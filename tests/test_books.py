@@ -23,7 +23,7 @@ NEEDS_A_CELL = (
     "calibrate sweep",
     "calibrate solve session.mcap --time-offset",
 )
-"""Run against a simulated cell by tests/system, tests/station/cli and the sweep's own tests; parsed here too."""
+"""Run against a simulated cell by tests/system and tests/station/cli; parsed by tests/test_examples.py."""
 
 
 def pages() -> list[Path]:
